@@ -86,10 +86,11 @@ def fit_attitude(
     parameters = camera.params.detach()
     everywhere = torch.from_numpy(directions)
     star, reach = np.full(len(pixels), -1), np.full(len(pixels), _ROUGH)
+    least = math.cos(min(_half_field(camera) + 0.01, math.pi))
     weights, target = torch.from_numpy(1.0 / sigma), torch.from_numpy(pixels).T
     for attempt in range(12):
         before = star
-        star = _names_at(pixels, reach, everywhere, magnitude, camera, turn)
+        star = _names_at(pixels, reach, everywhere, magnitude, camera, turn, least)
         known = torch.from_numpy(star >= 0)
         if int(known.sum()) < 3:
             return None
@@ -125,10 +126,19 @@ def fit_attitude(
 
 
 def _names_at(
-    pixels: Floats, reach: Floats, directions: Tensor, magnitude: Floats, camera: Camera, rotation: Tensor
+    pixels: Floats,
+    reach: Floats,
+    directions: Tensor,
+    magnitude: Floats,
+    camera: Camera,
+    rotation: Tensor,
+    least: float,
 ) -> NDArray[np.int64]:
-    """(N,) the star of the catalogue at each pixel; -1 for none, or where another star pulls it."""
-    ahead = np.flatnonzero((directions @ rotation[2] > math.cos(min(_half_field(camera) + 0.01, math.pi))).numpy())
+    """(N,) the star of the catalogue at each pixel; -1 for none, or where another star pulls it.
+
+    Stars whose cosine from the optical axis is at least `least` may be in the image.
+    """
+    ahead = np.flatnonzero((directions @ rotation[2] > least).numpy())
     seen, valid = camera.project(FAR * (directions[ahead] @ rotation.T))
     ahead, places = ahead[valid.numpy()], seen[valid].numpy()
     star = np.full(len(pixels), -1)
