@@ -22,7 +22,7 @@ from kcal.stars.lens_fit import StarLens, fit_star_lens
 from kcal.stars.night import SkyView
 from kcal.stars.sky import celestial_directions
 from kcal.stars.star_problem import StarField
-from kcal.stars.with_boards import Agreement, refine_by_stars
+from kcal.stars.with_boards import Agreement, joined, refine_by_stars
 
 # Degrees between opposite corners: the widest and narrowest lens that is looked for, and steps between.
 _WIDEST, _NARROWEST, _STEP = 115.0, 6.0, 1.02
@@ -47,6 +47,7 @@ class StarCamera:
         pixels: (N, 2) where these were seen.
         refused: number of each other image, and why it was not used.
         agreement: of the stars with the boards that calibrated the camera before; None where none did.
+        joint: the calibration by boards, refined by the stars; None likewise.
     """
 
     lens: StarLens
@@ -55,6 +56,7 @@ class StarCamera:
     pixels: tuple[np.ndarray, ...]
     refused: dict[int, str]
     agreement: Agreement | None = None
+    joint: CameraCalibrationResult | None = None
 
 
 def calibrate_by_stars(
@@ -132,6 +134,7 @@ def calibrate_by_stars(
         pixels=tuple(pixels),
         refused=refused,
         agreement=agreement,
+        joint=None if boards is None or agreement is None else joined(boards, lens, agreement),
     )
 
 

@@ -41,7 +41,7 @@ class Agreement(NamedTuple):
     Attributes:
         chi2: squared differences over their variances, in the directions of which stars say as much as boards or more.
         freedom: how many directions these are.
-        by_chance: how probable so large a χ² is, if both saw the same lens.
+        by_chance: how probable so large a χ², or so large a difference in any one direction, is by chance.
         moved_px: by how much stars move the lens, RMS along an axis over the stars seen, after the images' rotations.
         stated_px: the standard deviation of that, as the boards stated it.
     """
@@ -94,6 +94,8 @@ def refine_by_stars(
     for _ in range(_ROUNDS):
         parameters = fit.minimize(parameters, model, unknowns, _known(lens, sigma), 10)
         fit.leave_out(parameters, model, CUT)
+        # As `whitened` counts them.
+        fit.variance = max(fit.variance, 1.0)
         told = fit.whitened(parameters, model, unknowns)
         if boards.hybrid is not None:
             sigma = _by_evidence(boards.hybrid, unknowns, lens, told, parameters[leading])
@@ -105,6 +107,29 @@ def refine_by_stars(
     wide = dataclasses.replace(whole, sigma=torch.cat([sigma, whole.sigma[len(sigma) :]]))
     found = star_lens(fit, refined, known, told, _stacked(wide, told, change))
     return found, _agreement(told, change, lens, *_typical(fit))
+
+
+def joined(boards: CameraCalibrationResult, found: StarLens, agreement: Agreement) -> CameraCalibrationResult:
+    """The calibration by boards with camera, error bars and warnings of both; residuals stay those of boards alone.
+
+    Args:
+        boards: before.
+        found: by `refine_by_stars`.
+        agreement: likewise.
+    """
+    known = found.camera.calibration
+    assert known is not None
+    assert known.information is not None
+    assert known.sigma is not None
+    contradiction = agreement.contradiction
+    return dataclasses.replace(
+        boards,
+        camera=found.camera,
+        sigma={name: known.sigma[name] for name in boards.sigma},
+        covariance=known.information.covariance(),
+        information=known.information,
+        warnings=boards.warnings + (() if contradiction is None else (contradiction,)),
+    )
 
 
 def _known(lens: CameraInformation, sigma: Tensor) -> KnownLens:
@@ -180,10 +205,16 @@ def _agreement(stars: Tensor, change: Tensor, lens: CameraInformation, count: in
     use = told.square() > _TOLD
     squares = ((left.T @ residual).square() / (1.0 + told.square()))[use]
     chi2, freedom = float(squares.sum()), int(use.sum())
+    # A change of focus is one direction, which the sum over many that agree would hide.
+    by_chance = (
+        min(float(stats.chi2.sf(chi2, freedom)), freedom * float(stats.chi2.sf(float(squares.max()), 1)))
+        if freedom
+        else 1.0
+    )
     return Agreement(
         chi2=chi2,
         freedom=freedom,
-        by_chance=float(stats.chi2.sf(chi2, freedom)) if freedom else 1.0,
+        by_chance=min(2.0 * by_chance, 1.0),
         moved_px=sigma * math.sqrt(float((rows @ change).square().sum()) / count),
         stated_px=sigma * math.sqrt(float(spread.square().sum()) / count),
     )

@@ -29,6 +29,8 @@ from scripts.shared.simulated import CHI2, LENSES
 from scripts.shared.traced import BOARD, capture, printed
 
 SIZE = (1280, 800)
+# Shares of the image that boards fill.
+FILL = (0.40, 0.94)
 
 
 def true_lens() -> Camera:
@@ -120,8 +122,8 @@ def compared(camera: Camera, lens: TruthLens, agreement: Agreement | None = None
 
 def lens_trials(seed: int, boards: int = 20, images: int = 20) -> dict[str, LensTrial]:
     """One traced lens calibrated by boards, by stars, and by both, level and tilted up by 30°."""
-    lens = drawn_lens(LENSES[seed % len(LENSES)], 1.0, seed, focal=1600.0)
-    seen = capture(lens, boards, 0.1, seed, printed(BOARD.points, seed))
+    lens = drawn_lens(LENSES[seed % len(LENSES)], 1.0, seed, wander=1.0)
+    seen = capture(lens, boards, 0.1, seed, printed(BOARD.points, seed), FILL)
     known = calibrate_camera(seen)
     out = {"boards": compared(known.camera, lens)}
     for tilt in (0.0, 30.0):
