@@ -11,11 +11,14 @@ where one of them is installed.
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -30,6 +33,8 @@ from kcal.stars.night import SkyView, name_stars
 from kcal.stars.night_image import read_night, time_of
 from scripts.shared.page import write_section
 
+# Trials that are done already, one a line; a run continues where another one ended.
+RIGS, LENSES = (Path(os.environ.get("KCAL_TRIALS", "."), f"stars-{what}.jsonl") for what in ("rigs", "lens"))
 DELFT = Origin(lat=52.0, lon=4.37, height=0.0)
 _said: list[str] = []
 _ABOUT = {
@@ -154,15 +159,26 @@ def random_points(count: int) -> None:
     say(f"{count} fields of 4 to 20 random points: {wrong} with names; {spent:.2f} CPU s each")
 
 
+def kept(path: Path, names: list[str], seeds: range, run: Callable[[int], dict[str, Any]]) -> dict[str, list[Any]]:
+    """Trials of all seeds by name, those that the file has already left as they are."""
+    lines = [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
+    done = {line["seed"]: line["found"] for line in lines}
+    for seed in seeds:
+        if seed not in done:
+            done[seed] = run(seed)
+            with path.open("a") as file:
+                file.write(json.dumps({"seed": seed, "found": done[seed]}) + "\n")
+    return {name: [done[seed][name] for seed in seeds] for name in names}
+
+
 def rigs(count: int) -> None:
     """Ranges of rigs behind traced lenses that boards calibrated: errors, and coverage of their 95 % intervals."""
     from scripts.shared.traced_nights import CASES, PAIRS_OF_LENSES, trial
 
-    found: dict[str, list[np.ndarray]] = {case.name: [] for case in CASES}
-    for seed in range(count):
-        for case in CASES:
-            found[case.name].append(trial(200 + seed % PAIRS_OF_LENSES, case, seed))
-            print(seed, case.name, found[case.name][-1].round(7).tolist(), flush=True)
+    def run(seed: int) -> dict[str, Any]:
+        return {case.name: trial(200 + seed % PAIRS_OF_LENSES, case, seed).tolist() for case in CASES}
+
+    found = kept(RIGS, [case.name for case in CASES], range(count), run)
     say("| rig from a taped baseline and | σ, % of range at 1, 2, 5 km | RMS error | error over σ | truth in the rig's "
         "95 % | with marks by day ± 0.1 px |\n|---|---|---|---|---|---|")  # fmt: skip
     for name, trials in found.items():
@@ -179,13 +195,12 @@ def rigs(count: int) -> None:
 
 def lens(count: int) -> None:
     """A lens from boards, stars, and both, against the traced one at infinity; level and tilted by 30°."""
-    from scripts.shared.star_lenses import LensTrial, lens_trials
+    from scripts.shared.star_lenses import LENSES_FROM, lens_trials
 
-    found: dict[str, list[LensTrial]] = {}
-    for seed in range(count):
-        for name, trial in lens_trials(seed).items():
-            found.setdefault(name, []).append(trial)
-            print(seed, name, trial, flush=True)
+    def run(seed: int) -> dict[str, Any]:
+        return {name: list(trial) for name, trial in lens_trials(seed).items()}
+
+    found = kept(LENSES, LENSES_FROM, range(count), run)
     say("| from | error at infinity, px: median of the RMS | largest RMS | largest anywhere | inside 95 % "
         "| χ² of boards against stars, over its freedom | contradictions |\n|---|---|---|---|---|---|---|")  # fmt: skip
     for name, trials in found.items():

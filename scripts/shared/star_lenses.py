@@ -29,6 +29,8 @@ from scripts.shared.simulated import CHI2, LENSES
 from scripts.shared.traced import BOARD, capture, printed
 
 SIZE = (1280, 800)
+LENSES_FROM = ["boards", *(f"{what}, {where}" for where in ("level", "tilted 30°")
+                           for what in ("stars", "boards and stars"))]  # fmt: skip
 # Shares of the image that boards fill.
 FILL = (0.40, 0.94)
 
