@@ -89,6 +89,7 @@ def _named_images(
 ) -> list[NamedStars]:
     from kcal.cli.console import steps, warn
     from kcal.cli.night_images import sky_view
+    from kcal.stars.contradictions import clock_doubts
     from kcal.stars.night import name_stars
     from kcal.stars.night_image import expand_nights, read_night
 
@@ -112,6 +113,8 @@ def _named_images(
                     warn(f"{side} {path.name}: {text}")
                 found.append(image)
             advance(path.name)
+    for number, text in clock_doubts(found):
+        warn(f"{side}, image {number + 1} with names: {text}")
     if not found:
         raise InputError(f"--stars: in none of the {len(files)} images of {side} stars have names")
     return found

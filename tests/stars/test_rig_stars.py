@@ -14,16 +14,18 @@ import torch
 from typer.testing import CliRunner
 
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
+from kcal.calibrate.rig.sources import Landmarks
 from kcal.cli.main import app
 from kcal.errors import DegenerateError, InputError
 from kcal.io.camera_file import save_camera
 from kcal.io.images import write_png
 from kcal.io.rig_file import load_rig
-from kcal.lens.pose import vector_from_rotation
+from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.locate.geodesy import enu_from_cam
 from kcal.stars.catalog import StarCatalog
 from kcal.stars.night import NamedStars, SkyView, name_stars
 from kcal.stars.rig_stars import moments_of, star_source
+from kcal.stars.sky import pole_in_enu
 from scripts.shared.night_scenes import PLACE, TIME, night_camera, rendered, star_pixels
 from scripts.shared.star_rigs import LOOKS, star_rig
 
@@ -73,6 +75,30 @@ def test_a_clock_that_drifts_is_found_and_in_the_sigma() -> None:
         error = turn_error(found, truth)
         squares[stated] = float(error @ torch.linalg.solve(found.relative_covariance()[:3, :3], error))
     assert squares[0.2] < 16.3 < squares[0.0]  # one in a thousand
+
+
+@pytest.mark.parametrize(("seconds", "message"), [(20.0, "contradict the stars"), (3600.0, "time, zone and place")])
+def test_landmarks_tell_a_wrong_time(seconds: float, message: str) -> None:
+    """Of the stars' attitude and that by surveyed landmarks."""
+    data, truth, center = star_rig(CAMERA, seed=3, named=True, faintest=4.5, matches=0)
+    draw = np.random.default_rng(1)
+    rays = torch.nn.functional.pad(torch.from_numpy(draw.uniform((-0.4, -0.2), (0.4, 0.2), (12, 2))), (0, 1), value=1.0)
+    points = torch.from_numpy(draw.uniform(50, 950, (12, 1))) * rays @ truth[0]
+    at = torch.stack([CAMERA.project((points - c) @ r.T)[0] for r, c in zip(truth, center, strict=True)], 1)
+    marks = Landmarks(
+        names=tuple(f"post {k}" for k in range(12)), points=points + torch.from_numpy(draw.normal(0, 0.02, (12, 3))),
+        sigma=torch.full((12, 3), 0.02).double(), pixels=at + torch.from_numpy(draw.normal(0, 0.1, at.shape)),
+        pixel_sigma=0.1,
+    )  # fmt: skip
+    assert data.stars is not None
+    turn = rotation_from_vector(torch.from_numpy(pole_in_enu(PLACE.lat)) * 7.292e-5 * seconds)
+    stars = dataclasses.replace(data.stars, direction=data.stars.direction @ turn.T)
+    wrong = dataclasses.replace(data, stars=stars, landmarks=marks)
+    try:
+        said = " ".join(solve_rig(wrong, STRAIGHT).warnings)
+    except InputError as error:
+        said = str(error)
+    assert message in said
 
 
 def test_nights_begin_anew(nights: list[list[NamedStars]]) -> None:
