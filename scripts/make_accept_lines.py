@@ -26,8 +26,8 @@ HEAD = """\
 # camera NAME | model, width x height, fx fy cx cy | coefficients by name
 # NAME | pixel u v | ray x y z | tolerance, px | source
 #
-# Pixels: (0, 0) is the center of the first pixel, v down. Rays: x right, y down, z forward, of any length. A line holds if
-# the ray's pixel is within the tolerance, and if the pixel's ray, seen by the camera again, is.
+# Pixels: (0, 0) is the center of the first pixel, v down. Rays: x right, y down, z forward, of any length. A line holds
+# if the ray's pixel is within the tolerance, and if the pixel's ray, seen by the camera again, is.
 # scripts/make_accept_lines.py writes this file; tests/promises/test_accept.py reads it.
 """
 # Name: model, size, (fx, fy, cx, cy), coefficients. Those of published calibrations are named by their data set.
@@ -47,13 +47,15 @@ CAMERAS: dict[str, tuple[str, tuple[int, int], tuple[float, ...], dict[str, floa
                    {"k1": -0.28340811, "k2": 0.07395907, "p1": 0.00019359, "p2": 1.76187114e-05}),
     "kitti-0926-cam0": ("opencv5", (1392, 512), (984.2439, 980.8141, 690.0, 233.1966),
                         {"k1": -0.3728755, "k2": 0.2037299, "p1": 0.002219027, "p2": 0.001383707, "k3": -0.07233722}),
-    "tumvi-cam0": ("fisheye4", (512, 512), (190.97847715128717, 190.9733070521226, 254.93170605935475, 256.8974428996504),
+    "tumvi-cam0": ("fisheye4", (512, 512),
+                   (190.97847715128717, 190.9733070521226, 254.93170605935475, 256.8974428996504),
                    {"k1": 0.0034823894022493434, "k2": 0.0007150348452162257, "k3": -0.0020532361418706202,
                     "k4": 0.00020293673591811182}),
     "rational": ("opencv8", (1920, 1080), (1400, 1405, 962, 538),
                  {"k1": 0.31, "k2": -0.12, "p1": 4e-4, "p2": -3e-4, "k3": 0.004, "k4": 0.62, "k5": 0.05, "k6": 0.01}),
     "thin-prism": ("opencv12", (1920, 1080), (1400, 1405, 962, 538),
-                   {"k1": -0.21, "k2": 0.05, "p1": 4e-4, "p2": -3e-4, "s1": 1e-3, "s2": -4e-4, "s3": -6e-4, "s4": 2e-4}),
+                   {"k1": -0.21, "k2": 0.05, "p1": 4e-4, "p2": -3e-4,
+                    "s1": 1e-3, "s2": -4e-4, "s3": -6e-4, "s4": 2e-4}),
     "tilted": ("opencv14", (1920, 1080), (1400, 1405, 962, 538),
                {"k1": -0.21, "k2": 0.05, "p1": 4e-4, "p2": -3e-4, "s1": 1e-3, "tau_x": 0.03, "tau_y": -0.05}),
     "many-terms": ("ext20", (1920, 1080), (1400, 1405, 962, 538),
@@ -68,7 +70,7 @@ plain | 600 350 | 0.2 -0.1 2 | 1e-10 | the same ray, twice as long
 plain | 0 400 | -0.5 0 1 | 1e-10 | 500 - 1000 x 0.5
 plain | 1000 800 | 0.5 0.4 1 | 1e-10 | the last pixel
 oblong | 600 375 | 0.1 -0.05 1 | 1e-10 | fy is half of fx: 400 - 500 x 0.05
-phone-26mm | 4031.5 1511.5 | 18 0 26 | 1e-9 | 26 mm on film of 36 mm: f = 4032 x 26 / 36 = 2912, the image's edge is at tan = 18/26
+phone-26mm | 4031.5 1511.5 | 18 0 26 | 1e-9 | 26 mm on 36 mm: f = 4032 x 26 / 36 = 2912, the edge is at tan = 18/26
 phone-26mm | -0.5 1511.5 | -18 0 26 | 1e-9 | the other edge, half a pixel beyond the first pixel's center
 lens-50mm | 3599.5 1199.5 | 18 0 50 | 1e-9 | 50 mm on 36 mm: f = 3600 x 50 / 36 = 5000
 lens-50mm | 1799.5 2399.5 | 0 12 50 | 1e-9 | the lower edge of 24 mm
@@ -129,7 +131,7 @@ def by_opencv() -> Iterator[str]:
 
 
 def by_mrcal(python: str) -> Iterator[str]:
-    """mrcal's `project`, in the Python that has it; the release does not tell its version."""
+    """Mrcal's `project`, in the Python that has it; the release does not tell its version."""
     for name in PEERS:
         model, _, (fx, fy, cx, cy), named = CAMERAS[name]
         if model not in MRCAL:

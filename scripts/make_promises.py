@@ -34,7 +34,7 @@ def _arguments(value: Any) -> str:
         if each.kind is each.KEYWORD_ONLY and not starred:
             out.append("*")
         starred |= each.kind in (each.KEYWORD_ONLY, each.VAR_POSITIONAL)
-        star = {each.VAR_POSITIONAL: "*", each.VAR_KEYWORD: "**"}.get(each.kind, "")
+        star = "*" if each.kind is each.VAR_POSITIONAL else "**" if each.kind is each.VAR_KEYWORD else ""
         out.append(star + each.name + ("" if star or each.default is each.empty else "="))
     return f"({', '.join(name for name in out if name != 'self')})"
 

@@ -37,9 +37,7 @@ def camera_of(kind: str, coefficients: str) -> Camera:
 
 
 CAMERAS = {
-    row[0].removeprefix("camera "): camera_of(row[1], row[2])
-    for _, row in cells()
-    if row[0].startswith("camera ")
+    row[0].removeprefix("camera "): camera_of(row[1], row[2]) for _, row in cells() if row[0].startswith("camera ")
 }
 LINES = [(number, row) for number, row in cells() if not row[0].startswith("camera ")]
 
