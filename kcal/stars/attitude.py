@@ -25,6 +25,8 @@ _CUT = 5.0
 _ROUGH = 4.0
 # px: the sigma of the most disturbed star that is still worth naming.
 _LEAST_REACH = 1.0
+# Standard deviations by which refraction must differ from that of place and time, and px by which a good lens errs.
+_SURE, _LENS = 5.0, 0.04
 # px: another star of the catalogue that is nearer, and not fainter by more magnitudes, pulls a star's center.
 _CROWDED, _FAINTER = 6.0, 2.5
 
@@ -122,6 +124,37 @@ def fit_attitude(
         residual=residual,
         rms_px=float(np.sqrt((off**2).mean())),
         widened=widened,
+    )
+
+
+def refraction_doubt(seen: Attitude, sigma: Floats, refracted: Tensor, straight: Tensor, camera: Camera) -> str | None:
+    """Whether stars are refracted as they would be at the place and time that were given; None if they are.
+
+    Args:
+        seen: the attitude on the Earth, with its N named stars.
+        sigma: (N,) of these, px.
+        refracted: (N, 3) directions in which they would be seen there and then.
+        straight: (N, 3) likewise without air.
+        camera: which lens.
+    """
+    at, rows = star_rows(refracted, seen.rotation, camera, camera.params.detach())
+    without, _ = star_rows(straight, seen.rotation, camera, camera.params.detach())
+    weight = torch.from_numpy(1.0 / sigma) / seen.widened
+    pattern = (at - without) * weight
+    turns = (rows * weight).flatten(1)
+    own = pattern.flatten() - turns.T @ torch.linalg.lstsq(turns.T, pattern.flatten()[:, None]).solution[:, 0]
+    residual = torch.from_numpy(seen.residual[seen.star >= 0]).T * weight
+    length = float(own.norm())
+    if length == 0.0:
+        return None
+    # The residual is projected minus seen: seen refraction is (1 - excess) of what was assumed.
+    excess = float(own @ residual.flatten()) / length**2
+    moved = abs(excess) * float((own.reshape(2, -1) / weight).square().mean().sqrt())
+    if abs(excess) * length < _SURE or moved < _LENS:
+        return None
+    return (
+        f"refraction is {1.0 - excess:.2f} ± {1.0 / length:.2f} times what it would be there and then: the stars stand "
+        f"{'lower' if excess < 0 else 'higher'} than place and time say; one of them is wrong, or the lens"
     )
 
 

@@ -1,67 +1,24 @@
-"""Whether place and time of night images can be right, from the images themselves.
+"""Whether the times of night images can be right, from a camera that stands still.
 
-Not noticed can be: a place or a clock that is wrong by the same for all images that look high up, where refraction says
-little of the altitude. Landmarks, positions of both cameras or a compass tell then.
+What no image tells: a place or a clock that is wrong by the same in all images, where they look high up and refraction
+(`kcal.stars.attitude.refraction_doubt`) says little of the altitude. Landmarks or a compass tell it then.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
-from torch import Tensor
 
-from kcal.lens.camera import Camera
 from kcal.lens.pose import vector_from_rotation
-from kcal.stars.attitude import Attitude, star_rows
+from kcal.stars.night import NamedStars
 from kcal.stars.sky import EARTH_RATE, pole_in_enu
-
-if TYPE_CHECKING:
-    from kcal.stars.night import NamedStars
 
 # Standard deviations beyond which chance explains nothing.
 _SURE = 5.0
-# px: refraction of a wrong altitude must differ by more than a good lens errs.
-_LENS = 0.04
 # Degrees by which a mast may bend between two images.
 _BENDS = 0.02
-
-
-def refraction_doubt(
-    seen: Attitude, sigma: NDArray[np.float64], refracted: Tensor, straight: Tensor, camera: Camera
-) -> str | None:
-    """Whether stars are refracted as they would be at the place and time that were given; None if they are.
-
-    Args:
-        seen: the attitude on the Earth, with its N named stars.
-        sigma: (N,) of these, px.
-        refracted: (N, 3) directions in which they would be seen there and then.
-        straight: (N, 3) likewise without air.
-        camera: which lens.
-    """
-    at, rows = star_rows(refracted, seen.rotation, camera, camera.params.detach())
-    without, _ = star_rows(straight, seen.rotation, camera, camera.params.detach())
-    weight = torch.from_numpy(1.0 / sigma) / seen.widened
-    pattern = (at - without) * weight
-    turns = (rows * weight).flatten(1)
-    own = pattern.flatten() - turns.T @ torch.linalg.lstsq(turns.T, pattern.flatten()[:, None]).solution[:, 0]
-    residual = torch.from_numpy(seen.residual[seen.star >= 0]).T * weight
-    length = float(own.norm())
-    if length == 0.0:
-        return None
-    # The residual is projected minus seen: seen refraction is (1 - excess) of what was assumed.
-    excess = float(own @ residual.flatten()) / length**2
-    moved = abs(excess) * float((own.reshape(2, -1) / weight).square().mean().sqrt())
-    if abs(excess) * length < _SURE or moved < _LENS:
-        return None
-    return (
-        f"refraction is {1.0 - excess:.2f} ± {1.0 / length:.2f} times what it would be there and then: the stars stand "
-        f"{'lower' if excess < 0 else 'higher'} than place and time say; one of them is wrong, or the lens"
-    )
 
 
 def clock_doubts(images: Sequence[NamedStars]) -> list[tuple[int, str]]:
@@ -71,6 +28,10 @@ def clock_doubts(images: Sequence[NamedStars]) -> list[tuple[int, str]]:
 
     Returns:
         number of the image, and what to tell.
+
+    Example:
+        >>> clock_doubts([])
+        []
     """
     found = []
     on_earth = [number for number, image in enumerate(images) if image.on_earth]

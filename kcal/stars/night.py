@@ -17,9 +17,8 @@ from kcal.lens.camera import Camera
 from kcal.lens.mounting import Origin
 from kcal.lens.pose import vector_from_rotation
 from kcal.locate.mounting import attitude
-from kcal.stars.attitude import Attitude, field_angle, fit_attitude
+from kcal.stars.attitude import Attitude, field_angle, fit_attitude, refraction_doubt
 from kcal.stars.catalog import StarCatalog
-from kcal.stars.contradictions import refraction_doubt
 from kcal.stars.detect import DetectedStars, detect_stars
 from kcal.stars.identification import identify, turn_between
 from kcal.stars.sky import (

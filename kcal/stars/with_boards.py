@@ -44,6 +44,10 @@ class Agreement(NamedTuple):
         by_chance: how probable so large a χ², or so large a difference in any one direction, is by chance.
         moved_px: by how much stars move the lens, RMS along an axis over the stars seen, after the images' rotations.
         stated_px: the standard deviation of that, as the boards stated it.
+
+    Example:
+        >>> Agreement(chi2=31.0, freedom=28, by_chance=0.3, moved_px=0.2, stated_px=0.3).contradiction is None
+        True
     """
 
     chi2: float

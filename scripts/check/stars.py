@@ -73,19 +73,24 @@ def real() -> None:
     say(f"{len(whole.images)} of {len(files)} images, {sum(int(u.sum()) for u in lens.used)} stars, "
           f"{sum(int((~u).sum()) for u in lens.used)} left out, RMS along an axis {lens.rms_px:.4f} px, "
           f"{lens.effective:.1f} effective unknowns, f {float(lens.camera.params[0]):.2f} px")  # fmt: skip
-    say("\n| image | stars | named | RMS px | detect and name, CPU s |\n|---|---|---|---|---|")
+    theirs = peer(files)
+    say("\n| image | stars | named | RMS px | detect and name, CPU s | cedar-solve: stars | its RMSE | CPU s |\n"
+        "|---|---|---|---|---|---|---|---|")  # fmt: skip
     for path, view in zip(files, views, strict=True):
         image = read_night(path)
         begin = time.process_time()
         found = name_stars(image, lens.camera, view)
         spent = time.process_time() - begin
         stars = found.attitude
-        say(f"| {path.stem} | {len(found.detected.pixels)} | {stars.count} | {stars.rms_px:.3f} | {spent:.2f} |")
+        told = theirs.get(path, "not installed | |")
+        name = path.stem.split("_", 1)[-1]
+        say(f"| {name} | {len(found.detected.pixels)} | {stars.count} | {stars.rms_px:.3f} | {spent:.2f} | {told} |")
+        for text in found.warnings:
+            say(f"\n{path.stem}: {text}\n")
     say("\n| magnitude | stars | RMS along an axis, px |\n|---|---|---|")
     by_magnitude(whole)
     say("")
     held_out(images, views, size, float(lens.camera.params[0]))
-    peer(files)
 
 
 def by_magnitude(whole: StarCamera) -> None:
@@ -124,22 +129,23 @@ def held_out(images: list, views: list, size: tuple[int, int], focal: float) -> 
           f"median distance {np.median(np.linalg.norm(error, axis=1)):.3f} px")  # fmt: skip
 
 
-def peer(files: list[Path]) -> None:
-    """cedar-solve or tetra3 on the same images."""
+def peer(files: list[Path]) -> dict[Path, str]:
+    """Cells of the table: cedar-solve or tetra3 on the same images; nothing where neither is installed."""
     try:
         import tetra3  # type: ignore[import-not-found, unused-ignore]
     except ImportError:
-        say("cedar-solve and tetra3 are not installed: not compared")
-        return
+        return {}
     from PIL import Image
 
     np.math = math  # type: ignore[attr-defined]  # cedar-solve 0.5 uses what numpy 2 does not have
-    solver = tetra3.Tetra3()
+    solver, told = tetra3.Tetra3(), {}
     for path in files:
         begin = time.process_time()
         found = solver.solve_from_image(Image.open(path), fov_estimate=11.4, fov_max_error=1.0)
         spent = time.process_time() - begin
-        say(f"tetra3 {path.stem}: {found.get('Matches')} stars, RMSE {found.get('RMSE')}″, {spent:.2f} CPU s")
+        rmse = found.get("RMSE")
+        told[path] = f"{found.get('Matches')} | {'' if rmse is None else f'{rmse:.1f}″'} | {spent:.2f}"
+    return told
 
 
 def random_points(count: int) -> None:
