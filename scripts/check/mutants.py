@@ -4,12 +4,12 @@ Mistakes (`scripts/check/mutations.py`) are drawn at random and planted one at a
 each, those tests of the room's own folder run that execute its lines (`coverage` knows), the quickest first, without
 the slow ones. A line that no test executes is not noticed. Each mistake costs a forked process that has kcal loaded.
 
-    python -m scripts.check.mutants [ROOM ...] [--sample 8] [--seed 1] [--seconds 3600] [--budget 20] [--page]
+    python -m scripts.check.mutants [ROOM ...] [--sample 8] [--seed 1] [--seconds 3600] [--budget 6] [--write]
 
 First, every test file runs once, to see which lines each test executes and what time it takes; `--times` prints the
 rooms and tests that take long. All results are kept in .mutants/, and another run goes on where the last one stopped.
 Another seed draws afresh: what was drawn with one seed is not drawn with the next. `--again` repeats mistakes that went
-unnoticed, with the tests as they are now; `--page` writes the table of this seed into docs/measured/mutants.md.
+unnoticed, with the tests as they are now; `--write` writes the table of this seed into docs/measured/mutants.md.
 
 Neither mutmut (8 hours for one run of each mistake; it rewrites every function, which `torch.compile` refuses) nor
 cosmic-ray (a new process and the whole suite for each mistake) draws samples or chooses tests by what they execute.
@@ -56,8 +56,10 @@ ROOMS = (
 # Loaded once, before anything is forked.
 LIBRARIES = ("torch", "kornia", "scipy.stats", "scipy.spatial", "skimage", "cv2", "hypothesis", "matplotlib.pyplot")
 # A mistake that makes tests so much slower is noticed. Seconds of processor time, and of the clock for each of them.
-SLOWER, AT_LEAST, CLOCK = 3.0, 10.0, 20.0
+SLOWER, AT_LEAST, CLOCK = 3.0, 10.0, 100.0
 MEMORY = 6 << 30
+# Seconds of processor time after which the rest of a file of tests does not count.
+FILE = 15.0
 
 
 def forked(work: Callable[[], object], seconds: float) -> Any:
@@ -101,6 +103,7 @@ class Lines:
         self.coverage = coverage.Coverage(data_file=None, include=[f"{ROOT}/kcal/*"], config_file=False)
         self.seconds: dict[str, float] = {}
         self.failed: set[str] = set()
+        self.end = time.process_time() + FILE
 
     @pytest.hookimpl(hookwrapper=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:
@@ -109,6 +112,13 @@ class Lines:
         begin = time.process_time()
         yield
         self.seconds[item.nodeid] = round(time.process_time() - begin, 2)
+
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_runtest_setup(self, item: pytest.Item) -> None:
+        """Leave out the rest of a file that takes too long, and what needs a browser, whose time is not counted."""
+        browser = any("Chromium" in mark.kwargs.get("reason", "") for mark in item.iter_markers("skipif"))
+        if browser or time.process_time() > self.end:
+            pytest.skip("too long")
 
     @pytest.hookimpl(hookwrapper=True)
     def pytest_fixture_setup(self, fixturedef: Any, request: Any) -> Iterator[None]:
@@ -230,7 +240,7 @@ def observe(room: str, stop: float) -> list[dict]:
         if known.get("digest") != digest:
             known = {}
         if not known and time.monotonic() < stop:
-            answer = forked(lambda name=name: observed(name), 600.0)  # type: ignore[misc]
+            answer = forked(lambda name=name: observed(name), 3 * FILE)  # type: ignore[misc]
             known = {"digest": digest, **(answer if isinstance(answer, dict) else {"seconds": {}, "lines": {}})}
             kept.write_text(json.dumps(known))
             note = "" if isinstance(answer, dict) and not answer["failed"] else f" ({answer})"[:300]
@@ -356,10 +366,10 @@ def main() -> None:
     parser.add_argument("--sample", type=int, default=8, help="mistakes in each room")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--seconds", type=float, default=math.inf, help="after which nothing is begun")
-    parser.add_argument("--budget", type=float, default=20.0, help="seconds of tests for one mistake")
+    parser.add_argument("--budget", type=float, default=6.0, help="seconds of tests for one mistake")
     parser.add_argument("--again", action="store_true", help="only what went unnoticed, with the tests as they are now")
     parser.add_argument("--times", action="store_true", help="print the time that tests take, and nothing else")
-    parser.add_argument("--page", action="store_true", help="write the table into docs/measured/mutants.md")
+    parser.add_argument("--write", action="store_true", help="write the table into docs/measured/mutants.md")
     arguments = parser.parse_args()
     if arguments.times:
         print(times(arguments.rooms))
@@ -382,7 +392,7 @@ def main() -> None:
                 judge(files, path, number, site, arguments.budget, arguments.seed)
     rooms, lines = report(arguments.seed)
     print(f"{rooms}\n\n{lines}")
-    if arguments.page:
+    if arguments.write:
         write_section("mutants.md", "mutants", rooms)
 
 
