@@ -18,5 +18,12 @@ HARMLESS = {
     "4beb85845d5b49a6": "a number that is set again before it is read",
     "ffa3e8654c336e29": "a row of nodes more, beyond the image",
     "7900d21ef92672db": "a number that stands where it is not read",
+    "2166b957298e0a07": "how coordinates lie in memory: only time",
+    "76620474b9ce23e3": "by what a covariance is divided where a variance is zero: how much rounding is let through",
+    "4ba3346cb1ac1a53": "rounds more than are needed where pixels are not square",
+    "901479ab88fb1d4e": "where a search of amplitudes begins",
+    "24324b097f27a6bd": "the rows without one more, of which the pupil's are none",
+    "622e793a3790f775": "fy for fx of a camera with square pixels",
+    "eb5d59136d2feaa9": "where a thing stands on a site that is made up",
     "9d350f625c8848c9": "a negative number, which means none whatever its size",
 }

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 
+import pytest
 import torch
 
+from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.nets.inverse import InverseNet, InverseNetOptions, train_inverse
 
@@ -38,3 +40,18 @@ def test_the_net_sees_and_answers_lengths_of_one_at_most() -> None:
     truth = torch.stack(net.to_chart(rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2]))
     assert math.isclose(float(guess.norm(dim=0).max()), float(net.reach), rel_tol=1e-9)
     assert math.isclose(float((truth - guess).norm(dim=0).max()), float(net.amplitude), rel_tol=1e-6)
+
+
+def test_a_fisheye_has_its_own_chart() -> None:
+    fisheye = Camera.build(focal=(300, 300), center=(320, 240), size=(640, 480), coefficients=[0.02, 0, 0, 0], model="fisheye4")
+    net = InverseNet(fisheye)
+    x, y = torch.tensor([[0.3, 2.0], [0.1, -0.4]], dtype=torch.float64)
+    for mapped in (net.to_chart(x, y), net.from_chart(x, y)):
+        assert torch.equal(torch.stack(mapped), torch.stack([x, y]))
+
+
+@pytest.mark.parametrize(("name", "least", "less"), [("hidden", 1, 0), ("iterations", 1, 0), ("samples", (2, 2), (1, 2))])
+def test_the_least_that_options_may_be(name: str, least: object, less: object) -> None:
+    InverseNetOptions(**{name: least})  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="must be at least 1, samples at least 2 x 2"):
+        InverseNetOptions(**{name: less})  # type: ignore[arg-type]

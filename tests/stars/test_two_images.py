@@ -9,7 +9,7 @@ import pytest
 
 from kcal.stars.catalog import StarCatalog
 from kcal.stars.lens import StarCamera, calibrate_by_stars
-from kcal.stars.pair_table import pair_table
+from kcal.stars.pair_table import cache_folder, pair_table
 from scripts.shared.star_lenses import SIZE, lens_difference, star_images, true_lens
 
 
@@ -67,3 +67,20 @@ def test_all_pairs_of_bright_stars_are_in_the_table(tmp_path: Path, monkeypatch:
         own = (table.pairs < bright).all(1)
         np.testing.assert_allclose(np.sort(table.angle[own]), wanted, atol=1e-4)
         assert np.all(np.diff(table.angle) >= 0)
+
+
+@pytest.mark.parametrize(
+    ("platform", "folder"),
+    [("win32", "AppData/Local/kcal"), ("darwin", "Library/Caches/kcal"), ("linux", ".cache/kcal")],
+)
+def test_folders_of_caches(platform: str, folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("KCAL_CACHE", "LOCALAPPDATA", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(Path, "home", lambda: tmp_path)
+    monkeypatch.setattr("sys.platform", platform)
+    assert cache_folder() == tmp_path / folder
+    monkeypatch.setenv("LOCALAPPDATA", "/local")
+    monkeypatch.setenv("XDG_CACHE_HOME", "/xdg")
+    assert str(cache_folder()) == {"win32": "/local/kcal", "linux": "/xdg/kcal"}.get(platform, str(tmp_path / folder))
+    monkeypatch.setenv("KCAL_CACHE", "/given")
+    assert str(cache_folder()) == "/given"
