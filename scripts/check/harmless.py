@@ -6,13 +6,10 @@ By the key of `scripts.check.mutations.Site`: a change of the code around such a
 from __future__ import annotations
 
 HARMLESS = {
-    "ad42b6f7fdeaa86c": "compares no elements at all: it asks whether values may be read",
     "cc931d9fd18dd576": "`repr` or `compare` of a field that follows from the others",
     "b0297d28c7fdb75f": "how finely a start of Newton's method is tabulated",
     "1861c5cc51a9507f": "a cell is cut in unequal parts that still cover it: the proof takes longer",
-    "a2e2c6fb0726f3ff": "a point with Z = 0 has no finite image, which makes it invalid before",
     "c1c0d87e7ed882a1": "a number that stands where it is not read",
-    "97f4df08b85439b6": "when stopped elements are dropped from a batch: only time",
     "b65b2b83af420b66": "cells without spaces are stripped: only time",
     "b32215be7946701c": "zero times a number, added or subtracted",
     "4beb85845d5b49a6": "a number that is set again before it is read",
@@ -25,5 +22,9 @@ HARMLESS = {
     "24324b097f27a6bd": "the rows without one more, of which the pupil's are none",
     "622e793a3790f775": "fy for fx of a camera with square pixels",
     "eb5d59136d2feaa9": "where a thing stands on a site that is made up",
+    "3fd88ae2dcad7243": "compares no elements at all",
+    "5ffe52c4f8d4ca51": "random numbers that nothing reads: other draws of the same kind",
+    "3bfb151f959b9181": "where a thing stands on a site that is made up",
+    "cdd6206bf027eb13": "how finely the truth is tabulated",
     "9d350f625c8848c9": "a negative number, which means none whatever its size",
 }
