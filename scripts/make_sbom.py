@@ -71,7 +71,7 @@ def licenses(name: str) -> list[dict[str, Any]]:
     heads = [
         text.rpartition("::")[2].strip() for text in about.get_all("Classifier") or [] if text.startswith("License")
     ]
-    words = heads or [(about["License"] if "License" in about else "not stated").strip().splitlines()[0][:100]]
+    words = heads or [(about.get_all("License") or ["not stated"])[0].strip().splitlines()[0][:100]]
     return [{"license": {"name": word}} for word in words]
 
 
