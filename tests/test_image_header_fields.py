@@ -16,7 +16,9 @@ def tiff(order: str, big: bool, entries: list[tuple[int, int, int]], pad: int = 
     mark = b"II" if order == "<" else b"MM"
     size = 8 if big else 4
     if big:
-        data = mark + struct.pack(f"{order}HHHQ", 43, 8, 0, 16 + pad) + bytes(pad) + struct.pack(f"{order}Q", len(entries))
+        data = (
+            mark + struct.pack(f"{order}HHHQ", 43, 8, 0, 16 + pad) + bytes(pad) + struct.pack(f"{order}Q", len(entries))
+        )
     else:
         data = mark + struct.pack(f"{order}HI", 42, 8 + pad) + bytes(pad) + struct.pack(f"{order}H", len(entries))
     for tag, kind, value in entries:
@@ -59,13 +61,24 @@ def test_sizes(data: bytes) -> None:
 
 
 def test_what_has_no_size_is_truncated() -> None:
-    for data in (tiff("<", False, [(256, 3, 53), (257, 3, 37)])[:-12], b"P5 53", b"\xff\xd8\xff\xda", jpeg2000(1, 1, 0, 0)[:20]):
+    for data in (
+        tiff("<", False, [(256, 3, 53), (257, 3, 37)])[:-12],
+        b"P5 53",
+        b"\xff\xd8\xff\xda",
+        jpeg2000(1, 1, 0, 0)[:20],
+    ):
         with pytest.raises(FileError, match="x: the image is truncated or corrupt"):
             check_image_header(data, "x")
 
 
 def test_words_are_no_images() -> None:
-    for data in (b"BMW is a car, and much more than thirty letters", b"P5 is a title", b"BM" + bytes(40), b"GIF89a", b""):
+    for data in (
+        b"BMW is a car, and much more than thirty letters",
+        b"P5 is a title",
+        b"BM" + bytes(40),
+        b"GIF89a",
+        b"",
+    ):
         assert not is_image(data)
     assert not is_image(b"P5 0 5 255 ")
     assert not is_image(b"P5 1048576 5 255 ")

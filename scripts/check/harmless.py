@@ -26,5 +26,6 @@ HARMLESS = {
     "5ffe52c4f8d4ca51": "random numbers that nothing reads: other draws of the same kind",
     "3bfb151f959b9181": "where a thing stands on a site that is made up",
     "cdd6206bf027eb13": "how finely the truth is tabulated",
+    "de053044b2589680": "when stopped elements are dropped from a batch: only time",
     "9d350f625c8848c9": "a negative number, which means none whatever its size",
 }

@@ -9,7 +9,7 @@ the slow ones. A line that no test executes is not noticed. Each mistake costs a
 First, every test file runs once, to see which lines each test executes and what time it takes; `--times` prints the
 rooms and tests that take long. All results are kept in .mutants/, and another run goes on where the last one stopped.
 Another seed draws afresh: what was drawn with one seed is not drawn with the next. `--again` repeats mistakes that went
-unnoticed, with the tests as they are now; `--write` writes the table of this seed into docs/measured/mutants.md.
+unnoticed, with the tests as they are now; `--write` writes the table of all seeds into docs/measured/mutants.md.
 
 Neither mutmut (8 hours for one run of each mistake; it rewrites every function, which `torch.compile` refuses) nor
 cosmic-ray (a new process and the whole suite for each mistake) draws samples or chooses tests by what they execute.
@@ -36,7 +36,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import CodeType, FunctionType
-from typing import Any
+from typing import Any, NamedTuple
 
 import coverage
 import pytest
@@ -314,42 +314,60 @@ def interval(hits: int, count: int) -> tuple[float, float]:
     return (middle - half) / (count + z2), (middle + half) / (count + z2)
 
 
-def report(seed: int) -> tuple[str, str]:
-    """A table of the rooms; what was not noticed, and what is harmless, line by line."""
+class Draw(NamedTuple):
+    """What became of the mistakes of a room that one seed drew: number, harmless ones, noticed ones."""
+
+    drawn: int
+    harmless: int
+    noticed: int
+
+    @property
+    def share(self) -> str:
+        """Noticed ones among those that change a result."""
+        return f"{self.noticed} of {self.drawn - self.harmless}"
+
+
+def report() -> tuple[str, str]:
+    """A table of the rooms, the first and the last draw of each; and what was not noticed, or is harmless, by line."""
     kept, rows = results(), []
     missed: list[tuple[object, ...]] = []
     idle: list[tuple[object, ...]] = []
-    hits = total = 0
+    total = noticed = 0
     for room in ROOMS:
-        judged = [(path, site) for path, _, site in draws(room, seed) if kept.get(site.key, {}).get("seed") == seed]
-        harmless = noticed = 0
-        for path, site in sorted(judged, key=lambda row: (row[0], row[1].line)):
+        judged = [(path, site, kept[site.key]) for path, _, site in draws(room, 0) if site.key in kept]
+        by_seed: dict[int, Draw] = {}
+        for seed in sorted({entry["seed"] for _, _, entry in judged}):
+            own = [(site.key, entry["noticed"]) for _, site, entry in judged if entry["seed"] == seed]
+            matter = [found for key, found in own if key not in HARMLESS]
+            by_seed[seed] = Draw(len(own), len(own) - len(matter), sum(matter))
+        if not by_seed:
+            continue
+        first, last = min(by_seed), max(by_seed)
+        for path, site, entry in sorted(judged, key=lambda row: (row[0], row[1].line)):
             texts = (f"`{' '.join(text.split())[:70]}`".replace("|", "\\|") for text in (site.before, site.after))
-            where = f"{path}:{site.line}", site.kind, *texts
+            where = f"{path}:{site.line}", entry["seed"], site.kind, *texts
             if site.key in HARMLESS:
-                harmless += 1
                 idle.append((*where, HARMLESS[site.key]))
-            elif kept[site.key]["noticed"]:
-                noticed += 1
-            else:
-                missed.append((*where, kept[site.key]["tests"], site.key))
-        count = len(judged) - harmless
-        hits, total = hits + noticed, total + count
-        if count:
-            rows.append((f"`{room}`", len(judged), harmless, noticed, f"{100 * noticed / count:.0f} %"))
+            elif not entry["noticed"]:
+                missed.append((*where, entry["tests"], site.key))
+        end = by_seed[last]
+        total, noticed = total + end.drawn - end.harmless, noticed + end.noticed
+        before = by_seed[first].share if first < last else ""
+        rows.append((f"`{room}`", before, last, end.drawn, end.harmless, end.share))
     if not total:
-        return f"Nothing was drawn with seed {seed}.", ""
-    low, high = interval(hits, total)
+        return "Nothing was drawn yet.", ""
+    low, high = interval(noticed, total)
     summary = (
-        f"Seed {seed}: the tests notice {hits} of {total} mistakes that change a result, {100 * hits / total:.0f} % "
-        f"(95 % interval {100 * low:.0f} to {100 * high:.0f} %)."
+        f"In the last draw of each room, {noticed} of {total} mistakes that change a result were noticed: "
+        f"{100 * noticed / total:.0f} % (95 % interval {100 * low:.0f} to {100 * high:.0f} %)."
     )
-    rooms = "\n".join([summary, "", *table(("room", "drawn", "harmless", "noticed", "share"), rows)])
+    heads = ("room", "first draw", "last draw: seed", "drawn", "harmless", "noticed")
     lines = [
-        f"Not noticed ({len(missed)})", "", *table(("line", "kind", "before", "after", "tests", "key"), missed), "",
-        f"Harmless ({len(idle)})", "", *table(("line", "kind", "before", "after", "why"), idle),
+        f"Not noticed ({len(missed)})", "",
+        *table(("line", "seed", "kind", "before", "after", "tests", "key"), missed), "",
+        f"Harmless ({len(idle)})", "", *table(("line", "seed", "kind", "before", "after", "why"), idle),
     ]  # fmt: skip
-    return rooms, "\n".join(lines)
+    return "\n".join([*table(heads, rows), "", summary]), "\n".join(lines)
 
 
 def times(rooms: list[str]) -> str:
@@ -392,7 +410,7 @@ def main() -> None:
             again = arguments.again and not kept.get(site.key, {"noticed": True})["noticed"]
             if site.key not in HARMLESS and (site.key not in kept or again):
                 judge(files, path, number, site, arguments.budget, arguments.seed)
-    rooms, lines = report(arguments.seed)
+    rooms, lines = report()
     print(f"{rooms}\n\n{lines}")
     if arguments.write:
         write_section("mutants.md", "mutants", rooms)

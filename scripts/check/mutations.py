@@ -1,8 +1,8 @@
 """Small mistakes that a test should notice: the places of a module where they can be planted, and the planting.
 
 Mistakes are those that numerical code suffers from: a comparison the other way round, plus for minus, a number off by
-one, `any` for `all`, a root left out, arguments or entries swapped, a matrix not transposed or multiplied from the wrong
-side. Messages, annotations, docstrings and decorators are let alone.
+one, `any` for `all`, a root left out, arguments or entries swapped, a matrix not transposed or on the other side of a
+product. Messages, annotations, docstrings and decorators are let alone.
 """
 
 from __future__ import annotations

@@ -36,7 +36,9 @@ def session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> CaptureSession:
     """Every frame shows a board at the place whose number is its first pixel; calibrations cost nothing."""
 
     def detect(image: Any, board: Any, refine: Any) -> Detection:
-        return Detection(pixels=place(int(image[0, 0]))) if image[0, 0] < 90 else Detection(pixels=None, reason="no board")
+        return (
+            Detection(pixels=place(int(image[0, 0]))) if image[0, 0] < 90 else Detection(pixels=None, reason="no board")
+        )
 
     def calibrate(seen: Any) -> SimpleNamespace:
         turns = torch.tensor([[0.5, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]]).double()
@@ -66,7 +68,13 @@ def test_before_the_first_frame(session: CaptureSession) -> None:
     assert session.picture() is None
     assert not session.think()
     state = session.state()
-    assert (state["views"], state["size"], state["next"], state["corners"], state["outlines"]) == (0, [0, 0], None, [], [])
+    assert (state["views"], state["size"], state["next"], state["corners"], state["outlines"]) == (
+        0,
+        [0, 0],
+        None,
+        [],
+        [],
+    )
     assert (state["most"], state["until"], state["message"], state["finished"]) == (7, 0.19, "show the board", "")
     assert math.isnan(session.sigma)
 

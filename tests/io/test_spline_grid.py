@@ -30,8 +30,14 @@ def test_weights_are_those_of_cubic_b_splines() -> None:
     basis = []
     for values, count in ((u[:, 0], GRID.columns), (u[:, 1], GRID.rows)):
         place = values * GRID.per_unit + 0.5 * (count - 1)
-        basis.append(np.stack([BSpline.basis_element(np.arange(-2.0, 3.0) + k, extrapolate=False)(place) for k in range(count)], -1))
-    np.testing.assert_allclose(dense, np.nan_to_num(basis[1])[:, :, None] * np.nan_to_num(basis[0])[:, None], atol=1e-12)
+        basis.append(
+            np.stack(
+                [BSpline.basis_element(np.arange(-2.0, 3.0) + k, extrapolate=False)(place) for k in range(count)], -1
+            )
+        )
+    np.testing.assert_allclose(
+        dense, np.nan_to_num(basis[1])[:, :, None] * np.nan_to_num(basis[0])[:, None], atol=1e-12
+    )
 
 
 def test_beyond_the_grid_the_last_piece_goes_on() -> None:

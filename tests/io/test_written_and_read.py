@@ -16,8 +16,14 @@ from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import StereoRig
 
 LENS = (-0.21, 0.052, 1.1e-3, -2.3e-3, 0.013, 0.021, -0.032, 0.0041, 5e-4, -6e-4, 7e-4, -8e-4)
-SUFFIXES = {"opencv": (".yml", ".xml", ".json"), "colmap": (".txt", ".bin"), "mrcal": (".cameramodel",), "matlab": (".mat",),
-            "nerfstudio": (".json",), "opensfm": (".json",), "ros": (".yaml",), "kalibr": (".yaml",)}  # fmt: skip
+SUFFIXES = {
+    "opencv": (".yml", ".xml", ".json"),
+    "colmap": (".txt", ".bin"),
+    "mrcal": (".cameramodel",),
+    "matlab": (".mat",),
+    **dict.fromkeys(("nerfstudio", "opensfm"), (".json",)),
+    **dict.fromkeys(("ros", "kalibr"), (".yaml",)),
+}
 
 
 def camera(model: str, number: int = 0, skew: float = 0.0) -> Camera:

@@ -31,7 +31,10 @@ TRUE = {
 def test_a_blurred_wedge_is_the_normal_probability() -> None:
     h, k = DRAW.normal(size=(2, 40))
     for correlation in (-0.98, -0.5, 0.0, 0.3, 0.9):
-        wanted = [stats.multivariate_normal.cdf(pair, cov=[[1, correlation], [correlation, 1]]) for pair in zip(h, k, strict=True)]
+        wanted = [
+            stats.multivariate_normal.cdf(pair, cov=[[1, correlation], [correlation, 1]])
+            for pair in zip(h, k, strict=True)
+        ]
         np.testing.assert_allclose(_both_positive(h, k, correlation), wanted, atol=2e-4)
     assert _both_positive(np.zeros(1), np.zeros(1), 0.5)[0] == pytest.approx(1 / 3, abs=1e-6)
 
@@ -51,7 +54,9 @@ def test_patterns() -> None:
     upright = BLOB.patterns(x[:, ::-1], np.array([*right, 0.0, 5.0, 2.0, 1.5]))
     np.testing.assert_allclose(upright, blob)
     corner = CORNER.patterns(x, np.array([*right, 0.0, math.pi / 2, 0.5]))
-    np.testing.assert_allclose(corner, np.stack([0 * AXIS + 1, ndtr(AXIS / 0.5), 0 * AXIS + 0.5, ndtr(AXIS / 0.5) / 2], -1))
+    np.testing.assert_allclose(
+        corner, np.stack([0 * AXIS + 1, ndtr(AXIS / 0.5), 0 * AXIS + 0.5, ndtr(AXIS / 0.5) / 2], -1)
+    )
     np.testing.assert_allclose(WEDGE.patterns(x, np.array([*right, 0.0, math.pi / 2, 0.5])), corner[:, [0, 3]])
     # Lines that nearly coincide are one edge, and stay finite.
     assert np.isfinite(CORNER.patterns(WHERE, np.array([*right, 0.0, 1e-3, 0.5]))).all()

@@ -1,4 +1,4 @@
-"""The chart on which the inverse net works, and its units: what the net sees and answers has a length of one at most."""
+"""The chart on which the inverse net works, and its units: what the net sees and answers has a length of one."""
 
 from __future__ import annotations
 
@@ -21,7 +21,9 @@ def test_the_chart_is_undone_up_to_89_9_degrees() -> None:
     x, y = tangents * direction[0], tangents * direction[1]
     back = net.from_chart(*net.to_chart(x, y))
     # 2 tan(angle / 2): stereographic.
-    torch.testing.assert_close(net.to_chart(x, y)[0][1], torch.tensor(2 * math.tan(math.radians(15)) * direction[0]).double())
+    torch.testing.assert_close(
+        net.to_chart(x, y)[0][1], torch.tensor(2 * math.tan(math.radians(15)) * direction[0]).double()
+    )
     torch.testing.assert_close(back[0][:4], x[:4], rtol=1e-9, atol=1e-12)
     torch.testing.assert_close(back[1][:4], y[:4], rtol=1e-9, atol=1e-12)
     beyond = torch.stack(back)[:, 4]
@@ -43,14 +45,18 @@ def test_the_net_sees_and_answers_lengths_of_one_at_most() -> None:
 
 
 def test_a_fisheye_has_its_own_chart() -> None:
-    fisheye = Camera.build(focal=(300, 300), center=(320, 240), size=(640, 480), coefficients=[0.02, 0, 0, 0], model="fisheye4")
+    fisheye = Camera.build(
+        focal=(300, 300), center=(320, 240), size=(640, 480), coefficients=[0.02, 0, 0, 0], model="fisheye4"
+    )
     net = InverseNet(fisheye)
     x, y = torch.tensor([[0.3, 2.0], [0.1, -0.4]], dtype=torch.float64)
     for mapped in (net.to_chart(x, y), net.from_chart(x, y)):
         assert torch.equal(torch.stack(mapped), torch.stack([x, y]))
 
 
-@pytest.mark.parametrize(("name", "least", "less"), [("hidden", 1, 0), ("iterations", 1, 0), ("samples", (2, 2), (1, 2))])
+@pytest.mark.parametrize(
+    ("name", "least", "less"), [("hidden", 1, 0), ("iterations", 1, 0), ("samples", (2, 2), (1, 2))]
+)
 def test_the_least_that_options_may_be(name: str, least: object, less: object) -> None:
     InverseNetOptions(**{name: least})  # type: ignore[arg-type]
     with pytest.raises(InputError, match="must be at least 1, samples at least 2 x 2"):

@@ -21,7 +21,9 @@ def test_noise_joins_its_random_values_smoothly() -> None:
     # Between two values along a line of the lattice: 3 u² - 2 u³ of the way.
     for u in (0.2, 0.7):
         share = u * u * (3 - 2 * u)
-        np.testing.assert_allclose(smooth_noise(x + u, y, 1), lattice[:4, :5] + share * np.diff(lattice[:4, :6]), atol=1e-6)
+        np.testing.assert_allclose(
+            smooth_noise(x + u, y, 1), lattice[:4, :5] + share * np.diff(lattice[:4, :6]), atol=1e-6
+        )
         down = np.diff(lattice[:5, :5], axis=0)
         np.testing.assert_allclose(smooth_noise(x, y + u, 1), lattice[:4, :5] + share * down, atol=1e-6)
     # No step anywhere.

@@ -48,13 +48,13 @@ class ScriptedBatch:
         return SimpleNamespace(cost=torch.ones(len(self.costs)).double(), step=self.step)
 
     def step(self, damping: Tensor) -> tuple[Tensor, Tensor]:
-        self.trial += 1
-        return torch.zeros(len(self.costs)).double(), self.promised[:, self.trial - 1]
+        return torch.zeros(len(self.costs)).double(), self.promised[:, self.trial]
 
     def retract(self, state: tuple[Tensor], step: Tensor) -> tuple[Tensor]:
         return state
 
     def cost(self, state: tuple[Tensor]) -> Tensor:
+        self.trial += 1
         return self.costs[:, self.trial - 1]
 
     def select(self, elements: Tensor) -> ScriptedBatch:
@@ -75,3 +75,15 @@ def test_little_gain_is_counted_from_each_elements_own_costs(promised: float, st
     assert found.iterations.tolist() == [1, 1, steps, 1]
     assert found.cost.tolist() == [0.5, 0.5, pytest.approx(1.0 - 1e-9 * steps, rel=1e-15), 0.5]
     assert found.history.shape == (steps + 1, 4)
+
+
+@pytest.mark.parametrize(("promised", "steps"), [(5e-6, 20), (1e-9, 100)])
+def test_only_the_last_steps_count(promised: float, steps: int) -> None:
+    """Thirty steps gain much, each half of the cost; those after them little."""
+    costs = torch.cat([0.5 ** torch.arange(1.0, 31.0), torch.full((200,), 0.5**30)]).double()
+    costs = costs * (1.0 - 1e-9 * torch.arange(len(costs), dtype=torch.float64))
+    options = LMOptions(flatness=1e-6, residual_floor=0.0)
+    problem = ScriptedBatch(costs[None], promised * costs[None])
+    found = minimize(problem, (torch.zeros(1, 1).double(),), options)  # type: ignore[arg-type,type-var]
+    assert found.status.tolist() == [SolverStatus.FLAT]
+    assert found.iterations.tolist() == [30 + steps]

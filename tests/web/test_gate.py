@@ -61,7 +61,9 @@ def client() -> Iterator[TestClient]:
         Route("/api/point", point, methods=["POST"]),
         Route("/api/fail/{how}", fail),
     ]
-    app = local_app(routes, {"/": (b"<p>", "text/html"), "/a.js": (b"1", "text/javascript")}, TOKEN, (HOST, "localhost:1"))
+    app = local_app(
+        routes, {"/": (b"<p>", "text/html"), "/a.js": (b"1", "text/javascript")}, TOKEN, (HOST, "localhost:1")
+    )
     with TestClient(app, base_url=f"http://{HOST}", headers={"X-Kcal-Token": TOKEN}) as found:
         yield found
 
@@ -144,7 +146,11 @@ def test_status_and_text_of_errors(client: TestClient) -> None:
     for path, body, status, text in answers:
         answer = client.post(f"/api/{path}", content=json.dumps(body))
         assert (answer.status_code, answer.json()["error"]) == (status, text)
-    for how, status, text in (("disk", 503, "the disk is full"), ("file", 400, "no such file"), ("x", 400, "not a number")):
+    for how, status, text in (
+        ("disk", 503, "the disk is full"),
+        ("file", 400, "no such file"),
+        ("x", 400, "not a number"),
+    ):
         answer = client.get(f"/api/fail/{how}")
         assert (answer.status_code, answer.json()["error"]) == (status, text)
 

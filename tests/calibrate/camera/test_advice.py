@@ -94,7 +94,9 @@ def test_rolls() -> None:
         assert roll_span(turned(rolls=[float(a) for a in angles])) == pytest.approx(span, abs=1e-4)
     assert roll_span(turned(rolls=[0.0])[:0]) == 0.0
     assert board_rolls(turned(rolls=[-30.0, 170.0])).tolist() == pytest.approx([-30.0, 170.0])
-    assert board_tilts(turned(rolls=[20.0, 0.0, 0.0], tilts=[35.0, -50.0, 170.0])).tolist() == pytest.approx([35, 50, 10])
+    assert board_tilts(turned(rolls=[20.0, 0.0, 0.0], tilts=[35.0, -50.0, 170.0])).tolist() == pytest.approx(
+        [35, 50, 10]
+    )
 
 
 def test_boards_all_the_same_way_up() -> None:

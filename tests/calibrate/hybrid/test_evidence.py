@@ -82,7 +82,7 @@ def test_gradient(moving: bool, tempering: float) -> None:
 
 def test_beyond_numbers_is_worse_than_before() -> None:
     loss, at = EvidenceLoss(data(False), FAMILIES, PRIOR, 1.0), vector(False)
-    beyond = at + [0, 0, 400.0]
+    beyond = at + np.array([0.0, 0.0, 400.0])
     assert loss.value(beyond) == math.inf
     assert loss(beyond)[0] == 1e30
     value = loss(at)[0]

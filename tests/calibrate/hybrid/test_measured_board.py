@@ -48,10 +48,13 @@ def test_values() -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_sigmas(kind: str) -> None:
     """That of a function of the amplitudes, to first order."""
+
     def value(amplitudes: Tensor) -> float:
         return float(getattr(made(amplitudes), kind).value)
 
-    slope = torch.tensor([value(drawn() + step) - value(drawn() - step) for step in 1e-9 * torch.eye(28).double()]) / 2e-9
+    slope = (
+        torch.tensor([value(drawn() + step) - value(drawn() - step) for step in 1e-9 * torch.eye(28).double()]) / 2e-9
+    )
     board = made(drawn(), 1e-7)
     assert getattr(board, kind).sigma == pytest.approx(float((board.half @ slope.double()).norm()), rel=1e-4)
 

@@ -20,7 +20,9 @@ def test_each_coefficient_shifts_a_place_at_the_reach_by_the_width(reach: float)
     """Radial terms by r^(2 j + 1) of the radius, each by itself; assembly errors are twenty times as rare."""
     model = LensModel.named("opencv14")
     prior = CoefficientPrior(0.3, reach).term(model, noise=0.2)
-    sigma = dict(zip([parameter_names(model)[i] for i in prior.index.tolist()], (0.2 / prior.weight).tolist(), strict=True))
+    sigma = dict(
+        zip([parameter_names(model)[i] for i in prior.index.tolist()], (0.2 / prior.weight).tolist(), strict=True)
+    )
     for power, names in ((2, ("k1", "k4")), (4, ("k2", "k5")), (6, ("k3", "k6"))):
         for name in names:
             assert sigma[name] == pytest.approx(0.3 / reach**power), name
@@ -35,7 +37,10 @@ def test_each_coefficient_shifts_a_place_at_the_reach_by_the_width(reach: float)
 
 
 def test_models_with_terms_that_are_nearly_redundant() -> None:
-    found = {name: is_overparameterized(LensModel.named(name)) for name in ("opencv4", "opencv5", "opencv8", "opencv12", "opencv14")}
+    found = {
+        name: is_overparameterized(LensModel.named(name))
+        for name in ("opencv4", "opencv5", "opencv8", "opencv12", "opencv14")
+    }
     assert found == {"opencv4": False, "opencv5": False, "opencv8": True, "opencv12": True, "opencv14": True}
 
 
