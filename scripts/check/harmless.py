@@ -27,5 +27,8 @@ HARMLESS = {
     "3bfb151f959b9181": "where a thing stands on a site that is made up",
     "cdd6206bf027eb13": "how finely the truth is tabulated",
     "de053044b2589680": "when stopped elements are dropped from a batch: only time",
+    "e0ea7adc7be67053": "how many steps a search may take that ends long before",
+    "919fd48b3143c8b7": "a number, from the same factors in another order",
+    "0596630b21cb4ec2": "a number, from the same factors in another order",
     "9d350f625c8848c9": "a negative number, which means none whatever its size",
 }
