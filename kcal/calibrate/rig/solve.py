@@ -132,7 +132,8 @@ def solve_rig(
         data = dataclasses.replace(data, boards=dataclasses.replace(data.boards, covariance=None))
     data, warnings = without_rayless(data)
     progress("what is known of cameras and board")
-    data, unknowns = _what_may_change(data, options)
+    data, unknowns, doubts = _what_may_change(data, options)
+    warnings += doubts
     progress("first poses")
     initial = first_poses(data, options.solver)
     masks, reasons = _first_masks(initial, reject=options.reject)
@@ -193,9 +194,9 @@ def _first_masks(initial: InitialPoses, *, reject: bool) -> tuple[PerKind, Reaso
     return masks, reasons
 
 
-def _what_may_change(data: RigData, options: RigOptions) -> tuple[RigData, SharedUnknowns]:
-    """What may change of cameras, board and air, and the data with the board as it is expected."""
-    boards = data.boards
+def _what_may_change(data: RigData, options: RigOptions) -> tuple[RigData, SharedUnknowns, list[str]]:
+    """What may change of cameras, board and air, the data with the board as it is expected, and warnings of it."""
+    boards, doubts = data.boards, []
     if options.intrinsics == "prior":
         known = []
         for number, camera in enumerate(data.cameras):
@@ -208,6 +209,12 @@ def _what_may_change(data: RigData, options: RigOptions) -> tuple[RigData, Share
         else:
             knowledge = gathered(data.cameras, known, boards.board)
             measured = boards.deviation is not None
+            doubts = [
+                f"the calibrations of {data.names[one]} and {data.names[other]} contradict each other about their "
+                f"board ({boards.board}): two prints, or one that bent in between; calibrate both cameras from views "
+                "of the board in the pairs"
+                for one, other in knowledge.apart
+            ]
             unknowns, deviation = joint_unknowns(data.cameras, knowledge, boards.board, measured=measured)
             if deviation is not None:
                 data = dataclasses.replace(data, boards=dataclasses.replace(boards, deviation=deviation))
@@ -219,7 +226,7 @@ def _what_may_change(data: RigData, options: RigOptions) -> tuple[RigData, Share
         unknowns = unknowns.and_refraction(options.refraction, options.refraction_sigma)
     if data.stars is not None and data.stars.effects:
         unknowns = unknowns.and_effects(*(effect.name for effect in data.stars.effects))
-    return data, unknowns
+    return data, unknowns, doubts
 
 
 @functools.lru_cache(maxsize=2)
