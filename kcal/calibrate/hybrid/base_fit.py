@@ -227,7 +227,7 @@ def _fit_known(
     model = LensModel(hybrid=lens.form)
     params = _leading(model, lens.focal, families)
     unknowns = hybrid_unknowns(model, square)
-    params[list(unknowns.indices)] = unknowns.expand(lens.mean)
+    params[list(unknowns.indices)] = unknowns.expand(lens.unknowns.mean)
     state = BoardState.still(params, torch.zeros_like(board.unit), rotation, translation)
     held = _held(families, board, square, False)
     problem, result = _solve_base(points, pixels, weights, (model, families), state, h, held, robust, board)

@@ -257,7 +257,7 @@ def fit_hybrid(
     if start is not None:
         state = start.state
         if isinstance(board, BoardPrior):
-            state = state._replace(board=torch.zeros_like(board.mean))
+            state = state._replace(board=torch.zeros_like(board.own.at))
         estimate = Estimate(
             start.model,
             start.families.with_board(shown),
@@ -314,9 +314,10 @@ def fit_hybrid(
     half = math.sqrt(wider) * inverse * deviation
     information = information_of(problem, state, math.sqrt(wider * variance), off)
     if isinstance(board, BoardPrior):
-        state = state._replace(board=board.mean + state.board @ board.half)
+        mean, root = board.whole.mean_and_half()
+        state = state._replace(board=mean + state.board @ root)
         information = board.in_modes(information, state.board)
-        half = torch.cat([half[:, : -len(board.mean)], half[:, -len(board.mean) :] @ board.half], 1)
+        half = torch.cat([half[:, : -len(mean)], half[:, -len(mean) :] @ root], 1)
     return HybridFit(
         model=model,
         size=size,

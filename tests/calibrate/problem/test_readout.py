@@ -215,7 +215,8 @@ def test_deviations_of_motions_by_evidence() -> None:
 
     def value(h: Tensor, ratio: np.ndarray, variance: float) -> float:
         integrated = data.integrated(ratio)
-        K, g, c, freedom, _ = integrated.data
+        form = integrated.data
+        K, g, c, freedom = form.K, form.g, form.c, form.freedom
         d = families.deviation(h)
         A = K * d[:, None] * d / variance + torch.eye(len(d), dtype=F64)
         b = d * g / variance
