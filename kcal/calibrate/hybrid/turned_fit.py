@@ -15,7 +15,6 @@ from kcal.calibrate.hybrid.families import BOARD
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.fleet import LensPrior, hyper_likelihood
 from kcal.calibrate.hybrid.quadratic import Quadratic
-from kcal.calibrate.hybrid.unknowns import hybrid_problem
 from kcal.corners.observations import Observations
 from kcal.gaussian import Gaussian, numbered
 from kcal.lens.information import BOARD_SLOT, LENS_SLOT
@@ -121,18 +120,7 @@ def _absolute_rows(fit: HybridFit, points: Tensor, pixels: Tensor, weights: Tens
     """(V, S + 1, R) derivatives by lens and board off poses and motions, and the target of these rows, pixels."""
     count = len(fit.state.board)
     mean = torch.cat([fit.families.mean[:-count], torch.zeros_like(fit.state.board)])
-    problem = hybrid_problem(
-        points,
-        fit.board_shapes.shapes,
-        pixels,
-        weights,
-        fit.model,
-        mean,
-        torch.zeros_like(mean),
-        fit.readout,
-        fit.stillness,
-        fit.square,
-    )
+    problem = fit.problem(points, pixels, weights, mean, torch.zeros_like(mean))
     rows = problem.off_poses(fit.state)
     rows[:, -1] = torch.einsum("s,vsn->vn", problem.unknowns(fit.state) - mean, rows[:, :-1]) - rows[:, -1]
     return rows
