@@ -193,6 +193,23 @@ def posterior_half(rows: Tensor) -> Tensor:
     return torch.where(known, change, change / _ROUNDING).T
 
 
+def inverse_root(information: Tensor, scale: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
+    """Invert scaled normal equations as far as they determine anything.
+
+    Args:
+        information: (S, S) of unknowns over their scale.
+        scale: (S,).
+        tolerance: eigenvalues below this share of the largest are rounding.
+
+    Returns:
+        a root (S, R) of the covariance of the unknowns, and orthonormal directions (S, O) that are open, of the scaled
+        unknowns.
+    """
+    values, vectors = torch.linalg.eigh(information)
+    known = values > tolerance * values[-1:].sum()
+    return (scale[:, None] * vectors)[:, known] * values[known].rsqrt(), vectors[:, ~known]
+
+
 class Whitened(NamedTuple):
     """Unknowns y in place of x: x = change (y - begin).
 

@@ -169,11 +169,7 @@ class HybridFit:
     def covariance(self) -> Tensor:
         """(5 + P, 5 + P) of the camera's parameters in the order of `Camera.names`: fx and fy alike, skew held."""
         unknowns = hybrid_unknowns(self.model, self.square)
-        count = len(self.state.parameters)
-        onto = self.half.new_zeros(len(self.half), count)
-        onto[list(unknowns.slots), list(unknowns.indices)] = 1.0
-        root = self.half @ onto
-        return root.T @ root
+        return unknowns.by_parameter(self.half.T @ self.half, len(self.state.parameters))
 
 
 def fit_hybrid(
