@@ -143,9 +143,29 @@ class CameraInformation:
         """Data, priors, and what other cameras say of the board, about the estimate."""
         return self.data + self.lens_prior + self.board_prior + self.told
 
+    def data_rows(self) -> Tensor:
+        """(R, U + 1) rows of the data; the last column holds their residuals at the estimate."""
+        return self.data.rows
+
+    def prior_rows(self, *, board: bool) -> Tensor:
+        """(Q, U + 1) likewise of the prior of the board's unknowns, or of the camera's."""
+        return (self.board_prior if board else self.lens_prior).placed(self.data.slots, self.estimate).rows
+
+    def board_rows(self) -> Tensor:
+        """(Q, U + 1) likewise of all that is known of the board otherwise: its prior, and what other cameras say."""
+        return (self.board_prior + self.told).placed(self.data.slots, self.estimate).rows
+
+    def all_rows(self) -> Tensor:
+        """(R + Q, U + 1) rows of data, priors, and what other cameras say of the board."""
+        return self.whole.rows
+
+    def triangle(self) -> Tensor:
+        """(U, U + 1) upper triangle of the data's rows, their residuals last; the rest says nothing of the unknowns."""
+        return self.data.compressed().rows
+
     def with_data(self, data: Gaussian) -> CameraInformation:
         """The same with other data."""
-        rows = data.placed((*self.lens, *self.board), self.estimate).rows
+        rows = data.placed(self.data.slots, self.estimate).rows
         return dataclasses.replace(self, rows=rows[:, :-1], residuals=rows[:, -1])
 
     def half(self) -> Tensor:
