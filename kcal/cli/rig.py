@@ -109,6 +109,15 @@ def solve_command(
             hidden=True,
         ),
     ] = 0.1,
+    clock_drift: Annotated[
+        float,
+        typer.Option(
+            metavar="S",
+            help="Of the rate at which it changes, seconds an hour; 0 where GPS or a network keeps the clocks.",
+            min=0,
+            hidden=True,
+        ),
+    ] = 0.05,
     celsius: Annotated[
         float | None, typer.Option(metavar="C", help="Temperature at night, for stars.", hidden=True)
     ] = None,
@@ -185,8 +194,9 @@ def solve_command(
     night = None
     if stars is not None:
         night = NightOptions(
-            images=stars, time=star_time, clock_sigma=clock_sigma, celsius=celsius, hectopascal=hectopascal, dut1=dut1
-        )
+            images=stars, time=star_time, clock_sigma=clock_sigma, drift_sigma=clock_drift, celsius=celsius,
+            hectopascal=hectopascal, dut1=dut1,
+        )  # fmt: skip
     sources = Sources(
         pairs=pairs, match=match, landmarks=landmarks, marks=marks, features=features, positions=positions,
         baseline=baseline, origin=origin, mark_sigma=noise, survey_sigma=survey_sigma, geoid=geoid,
