@@ -27,7 +27,12 @@ def export_command(
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="File to write.")],
     format: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="opencv, ros, kalibr, mrcal, colmap, nerfstudio, matlab, opensfm or remap."),
+        typer.Option(
+            "--to",
+            "--format",
+            metavar="NAME",
+            help="opencv, ros, kalibr, mrcal, colmap, nerfstudio, matlab, opensfm, gtsam, ceres, numpy or remap.",
+        ),
     ] = None,
     model: Annotated[
         str | None, typer.Option(metavar="NAME", help="Lens model of the format to fit, for example opencv5.")

@@ -20,6 +20,7 @@ from kcal.io import (
     format_nerfstudio,
     format_opencv,
     format_opensfm,
+    format_prior,
     format_ros,
 )
 from kcal.io.camera_file import load_camera
@@ -43,6 +44,7 @@ class CameraFormat:
         write: cameras and their poses, all of one of the models.
         skew: whether it can hold a skew.
         pose: whether it can hold the relative pose of two cameras.
+        prior: whether it is a file of priors, which has the parameters and their square-root information.
     """
 
     title: str
@@ -52,6 +54,14 @@ class CameraFormat:
     write: Callable[[Sequence[Camera], Sequence[CameraPose], Path], list[Path]]
     skew: bool = False
     pose: bool = True
+    prior: bool = False
+
+
+def _prior_format(program: str, title: str, models: tuple[str, ...]) -> CameraFormat:
+    return CameraFormat(
+        title=title, suffixes=(), models=models, read=format_prior.read_prior,
+        write=format_prior.prior_writer(program), skew=program == "gtsam", pose=False, prior=True,
+    )  # fmt: skip
 
 
 FORMATS = {
@@ -115,6 +125,9 @@ FORMATS = {
         write=format_opensfm.write_opensfm,
         pose=False,
     ),
+    "gtsam": _prior_format("gtsam", "Values and noise model for GTSAM, JSON", format_prior.GTSAM_MODELS),
+    "ceres": _prior_format("ceres", "A and b of Ceres's NormalPrior, JSON", format_prior.PLAIN_MODELS),
+    "numpy": _prior_format("numpy", "Parameters and their square-root information, .npz", format_prior.PLAIN_MODELS),
 }
 
 
@@ -162,8 +175,8 @@ def recognized(path: Path) -> str:
     """
     suffix = path.suffix.lower()
     read_head(path, 0)
-    if suffix in (".mat", ".cameramodel", ".bin"):
-        return {".mat": "matlab", ".cameramodel": "mrcal", ".bin": "colmap"}[suffix]
+    if suffix in (".mat", ".cameramodel", ".bin", ".npz"):
+        return {".mat": "matlab", ".cameramodel": "mrcal", ".bin": "colmap", ".npz": "numpy"}[suffix]
     text = read_text(path, MOST_BYTES)
     # mrcal's files begin with comments.
     if suffix == ".json" or re.sub(r"^\s*#.*$", "", text, flags=re.MULTILINE).lstrip()[:1] in ("{", "["):
@@ -189,6 +202,8 @@ def _json_format(path: Path, text: str) -> str:
         raise FileError(f"{path}: neither a camera file that kcal knows nor JSON that can be read ({error})") from None
     if isinstance(content, dict) and "kcal" in content:
         return "kcal"
+    if isinstance(content, dict) and "kcal_prior" in content:
+        return "ceres"
     if isinstance(content, dict) and ("fl_x" in content or "frames" in content):
         return "nerfstudio"
     if "projection_type" in text:

@@ -10,67 +10,37 @@ from __future__ import annotations
 import dataclasses
 import io
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from kcal.calibrate.camera.misfit import Misfit, measured_misfit
 from kcal.calibrate.camera.refit import refit_camera
 from kcal.errors import DegenerateError, InputError
 from kcal.files import write_atomic
 from kcal.io.foreign import CameraPose, camera_name, paths_for, plain, rig_poses
 from kcal.io.format_kalibr import write_omni
 from kcal.io.format_mrcal import fit_spline, project_spline, write_model
+from kcal.io.format_prior import prior_of, write_priors
 from kcal.io.formats import FORMATS, CameraFormat, format_named, held_exactly
 from kcal.io.kalibr_omni import NAME as OMNI
 from kcal.io.kalibr_omni import fit_omni, project_omni
+from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
+from kcal.lens.carry_over import carried_covariance
 from kcal.lens.images import undistort_maps
 from kcal.lens.model import LensModel
 from kcal.lens.pinhole import new_pinhole
 from kcal.lens.rig import StereoRig
 
-# Columns and rows on which a misfit is measured: four times as dense as the fit's, reaching to the image's edge.
-_DENSE = (129, 97)
 _SPLINE_SAMPLES = (193, 145)
 REMAP = "remap"
 # Pixels (RMS) up to which a pinhole model of Kalibr stands for a lens.
 _NEAR = 0.2
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class Misfit:
-    """What is written instead of a lens, and how far it is from it, over the image and at infinity.
-
-    Args:
-        model: of the format.
-        pixels: (rows, columns, 2) that the camera sees rays at.
-        shift: (rows, columns, 2) pixels at which what was written sees them, minus `pixels`; NaN where the camera
-            itself has no ray.
-    """
-
-    model: str
-    pixels: Tensor
-    shift: Tensor
-
-    @property
-    def length(self) -> Tensor:
-        """(rows, columns) length of the shift, pixels."""
-        return torch.linalg.vector_norm(self.shift, dim=-1)
-
-    @property
-    def rms(self) -> float:
-        """Root mean square of the length, pixels."""
-        return float(self.length[self.length.isfinite()].square().mean().sqrt())
-
-    @property
-    def largest(self) -> float:
-        """Bound of the length: its maximum on the grid, and what it can be more between the grid's points."""
-        bends = [torch.diff(self.shift, n=2, dim=axis).abs() for axis in (0, 1)]
-        most = [float(torch.nan_to_num(bend).max()) for bend in bends]
-        return float(self.length[self.length.isfinite()].max()) + sum(most) / 4.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -171,6 +141,7 @@ def export_cameras(
     if name == "mrcal" and model is None and None in exact:
         return _write_splines(several, exact, poses, path, _lost(several, rig, known))
     found = _in_one_model(several, exact, name, model)
+    notes = _worse_together(several, exact, found, name, model)
     if name == "kalibr" and model is None and (omni := _nearer_omni(several, found)) is not None:
         values, omni_misfits = omni
         return ExportedCameras(
@@ -179,22 +150,34 @@ def export_cameras(
             models=(OMNI,) * len(several),
             misfits=omni_misfits,
             lost=_lost(several, rig, known),
+            notes=_omni_instead(several, found, omni_misfits),
         )
-    written, misfits = [], []
-    for camera, (substitute, misfit) in zip(several, found, strict=True):
-        substitute.calibration = substitute.calibration or (camera.calibration and dataclasses.replace(
-            camera.calibration, sigma=None, covariance=None, information=None
-        ))  # fmt: skip
-        written.append(substitute)
-        misfits.append(misfit)
+    written = [_with_covariance(camera, *one) for camera, one in zip(several, found, strict=True)]
+    priors = [
+        prior_of(name, camera, one.misfit and (one.misfit.rms, one.misfit.largest))
+        for camera, one in zip(written, found, strict=True)
+    ]
+    carried = any(prior["sqrt_information"] is not None for prior in priors)
+    if known.prior:
+        paths = [write_priors(name, priors, path)]
+    else:
+        paths = known.write(written, poses, path)
+        paths += [write_priors(name, priors, path.with_name(f"{path.stem}.prior.json"))] if carried else []
     return ExportedCameras(
         format=name,
-        paths=tuple(known.write(written, poses, path)),
+        paths=tuple(paths),
         models=tuple(str(camera.model) for camera in written),
-        misfits=tuple(misfits),
-        lost=_lost(several, rig, known),
-        notes=_mixed(written),
+        misfits=tuple(one.misfit for one in found),
+        lost=_lost(several, rig, known, carried),
+        notes=notes + _mixed(written),
     )
+
+
+def _with_covariance(camera: Camera, substitute: Camera, misfit: Misfit | None, width: Tensor | None) -> Camera:
+    """The substitute with the camera's name and what is known of it, misfit included."""
+    covariance = carried_covariance(camera, substitute, misfit=misfit.rms if misfit else 0.0, width=width)
+    substitute.calibration = CameraCalibration(name=camera_name(camera, ""), covariance=covariance)
+    return substitute
 
 
 def _mixed(cameras: Sequence[Camera]) -> tuple[str, ...]:
@@ -207,14 +190,22 @@ def _mixed(cameras: Sequence[Camera]) -> tuple[str, ...]:
     )
 
 
+class _Fitted(NamedTuple):
+    """A camera in a model of a format, how far it is from the original (None: not at all), and the fit's weak prior."""
+
+    camera: Camera
+    misfit: Misfit | None = None
+    width: Tensor | None = None
+
+
 def _in_one_model(
     cameras: Sequence[Camera], exact: Sequence[Camera | None], name: str, model: str | None
-) -> list[tuple[Camera, Misfit | None]]:
+) -> list[_Fitted]:
     """Each camera in a model of the format, in one model for all unless every camera is held exactly."""
-    held = [(camera, None) for camera in exact if camera is not None]
+    held = [_Fitted(camera) for camera in exact if camera is not None]
     if len(held) == len(cameras):
-        return list(held)
-    found: list[list[tuple[Camera, Misfit | None]]] = []
+        return held
+    found: list[list[_Fitted]] = []
     for kind in _richest([model] if model else FORMATS[name].models):
         try:
             found.append([_in_model(camera, kind, name) for camera in cameras])
@@ -222,26 +213,62 @@ def _in_one_model(
             continue
     if found:
         return min(found, key=_squares)
-    own = [(one, None) if one is not None else _refitted(camera, name, model)
-           for camera, one in zip(cameras, exact, strict=True)]  # fmt: skip
-    return list(own)
+    return [_alone(camera, one, name, model) for camera, one in zip(cameras, exact, strict=True)]
 
 
-def _in_model(camera: Camera, kind: LensModel, name: str) -> tuple[Camera, Misfit | None]:
+def _alone(camera: Camera, exact: Camera | None, name: str, model: str | None) -> _Fitted:
+    """A camera as it would be written if there were no other one."""
+    return _Fitted(exact) if exact is not None else _refitted(camera, name, model)
+
+
+def _in_model(camera: Camera, kind: LensModel, name: str) -> _Fitted:
     """A camera in a lens model, exactly where it contains the lens."""
     held = held_exactly(camera, [str(kind)], FORMATS[name].skew)
-    if held is not None:
-        return held, None
-    fitted = refit_camera(camera, kind).camera
-    return fitted, measured_misfit(camera, str(kind), fitted.project_rays)
+    return _Fitted(held) if held is not None else _fitted(camera, kind)
 
 
-def _squares(found: Sequence[tuple[Camera, Misfit | None]]) -> float:
-    return sum(misfit.rms**2 for _, misfit in found if misfit is not None)
+def _fitted(camera: Camera, kind: LensModel) -> _Fitted:
+    fitted = refit_camera(camera, kind)
+    return _Fitted(fitted.camera, measured_misfit(camera, str(kind), fitted.camera.project_rays), fitted.width)
+
+
+def _squares(found: Sequence[_Fitted]) -> float:
+    return sum(one.misfit.rms**2 for one in found if one.misfit is not None)
+
+
+def _worse_together(
+    cameras: Sequence[Camera], exact: Sequence[Camera | None], found: Sequence[_Fitted], name: str, model: str | None
+) -> tuple[str, ...]:
+    """Notes on cameras that would be nearer to what they are without the others of the file."""
+    notes = []
+    for number, (camera, one) in enumerate(zip(cameras, found, strict=True)):
+        if one.misfit is None or len(cameras) == 1:
+            continue
+        alone = _alone(camera, exact[number], name, model)
+        nearest = 0.0 if alone.misfit is None else alone.misfit.rms
+        if one.camera.model != alone.camera.model and one.misfit.rms > nearest:
+            notes.append(
+                f"{camera_name(camera, f'camera {number + 1}')}: written as {one.misfit.model} (RMS {one.misfit.rms:.2g} "
+                f"px) so that all cameras have one lens model; in a file of its own it is {alone.camera.model} "
+                f"({'exact' if not nearest else f'RMS {nearest:.2g} px'})"
+            )
+    return tuple(notes)
+
+
+def _omni_instead(
+    cameras: Sequence[Camera], found: Sequence[_Fitted], misfits: Sequence[Misfit]
+) -> tuple[str, ...]:
+    """A note that Kalibr's own wide lens stands for lenses of other kinds."""
+    names = ", ".join(
+        f"{camera_name(camera, f'camera {number + 1}')} RMS {misfit.rms:.2g} px"
+        for number, (camera, misfit) in enumerate(zip(cameras, misfits, strict=True))
+    )
+    return (f"all cameras became {OMNI} ({names}): Kalibr's pinhole lenses are farther off, "
+            f"RMS up to {max(one.misfit.rms for one in found if one.misfit):.2g} px",)  # fmt: skip
 
 
 def _nearer_omni(
-    cameras: Sequence[Camera], found: Sequence[tuple[Camera, Misfit | None]]
+    cameras: Sequence[Camera], found: Sequence[_Fitted]
 ) -> tuple[list[list[float]], tuple[Misfit, ...]] | None:
     """Kalibr's omni-radtan of each camera, where its pinhole models are far off and this one is much nearer."""
     if _squares(found) <= len(cameras) * _NEAR**2:
@@ -265,11 +292,13 @@ def _nearer_omni(
     return (values, tuple(misfits)) if nearer else None
 
 
-def _lost(cameras: Sequence[Camera], rig: StereoRig | None, known: CameraFormat) -> tuple[str, ...]:
+def _lost(
+    cameras: Sequence[Camera], rig: StereoRig | None, known: CameraFormat, carried: bool = False
+) -> tuple[str, ...]:
     """What the cameras have that the format does not, in words."""
     records = [camera.calibration for camera in cameras if camera.calibration is not None]
     found = {
-        "error bars": any(record.covariance is not None or record.sigma is not None for record in records),
+        "error bars": not carried and any(record.covariance is not None or record.sigma is not None for record in records),
         "calibration record": any(record.record is not None for record in records),
         "entrance pupil": any(bool((camera.coefficients[1:3] != 0).any()) for camera in cameras if camera.model.hybrid),
         "relative pose": rig is not None and not known.pose,
@@ -279,43 +308,19 @@ def _lost(cameras: Sequence[Camera], rig: StereoRig | None, known: CameraFormat)
     return tuple(what for what, there in found.items() if there)
 
 
-def measured_misfit(camera: Camera, model: str, project: Callable[[Tensor], tuple[Tensor, Tensor]]) -> Misfit:
-    """Compare what a camera sees with pixels and a mask that `project` returns for rays (N, 3).
-
-    Raises:
-        DegenerateError: rays of the camera without a pixel, because the other lens folds or ends.
-    """
-    columns, rows = _DENSE
-    width, height = camera.size
-    # From edge to edge: half a pixel beyond the centers of the outer pixels.
-    u = torch.linspace(-0.5, width - 0.5, columns, dtype=torch.float64)
-    v = torch.linspace(-0.5, height - 0.5, rows, dtype=torch.float64)
-    pixels = torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
-    rays, valid = camera.unproject(pixels.reshape(-1, 2))
-    if not bool(valid.any()):
-        raise DegenerateError("this camera has no ray for any pixel")
-    seen, shown = project(rays)
-    if not bool(shown[valid].all()):
-        share = float(shown[valid].double().mean())
-        raise DegenerateError(f"{model} shows only {share:.1%} of what the camera sees: it folds or ends before")
-    shift = torch.where(valid[:, None], seen - pixels.reshape(-1, 2), torch.nan)
-    return Misfit(model=model, pixels=pixels, shift=shift.reshape(pixels.shape))
-
-
 def _richest(models: Sequence[str]) -> list[LensModel]:
     """The models that no other one of them contains."""
     kinds = [LensModel.named(model) for model in models]
     return [kind for kind in kinds if not any(other != kind and other.contains(kind) for other in kinds)]
 
 
-def _refitted(camera: Camera, name: str, model: str | None) -> tuple[Camera, Misfit]:
+def _refitted(camera: Camera, name: str, model: str | None) -> _Fitted:
     """The model of a format that comes nearest to a camera."""
-    found: list[tuple[Camera, Misfit]] = []
+    found: list[_Fitted] = []
     refused = []
     for kind in _richest([model] if model else FORMATS[name].models):
         try:
-            fitted = refit_camera(camera, kind).camera
-            found.append((fitted, measured_misfit(camera, str(kind), fitted.project_rays)))
+            found.append(_fitted(camera, kind))
         except (InputError, DegenerateError) as error:
             refused.append(str(error))
     if not found:
@@ -323,7 +328,7 @@ def _refitted(camera: Camera, name: str, model: str | None) -> tuple[Camera, Mis
             f"no lens model of {name} files can stand for this camera ({'; '.join(refused)}). mrcal files hold it as a "
             "spline (.cameramodel), and maps for cv2.remap its undistorted image (.npz)"
         )
-    return min(found, key=lambda entry: entry[1].rms)
+    return min(found, key=lambda one: one.misfit.rms if one.misfit else 0.0)
 
 
 def _write_splines(
