@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -12,6 +12,9 @@ from kcal.cli.console import out, print_wrote, steps, warn
 from kcal.cli.inputs import CAMERA_OR_RIG, FOREIGN
 from kcal.errors import InputError
 from kcal.files import check_picture, check_writable
+
+if TYPE_CHECKING:
+    from kcal.lens.camera import Camera
 
 # Pixels (RMS) beyond which a lens model does not stand for a lens.
 _FAR = 0.5
@@ -31,7 +34,7 @@ def export_command(
             "--to",
             "--format",
             metavar="NAME",
-            help="opencv, ros, kalibr, mrcal, colmap, nerfstudio, matlab, opensfm, gtsam, ceres, numpy or remap.",
+            help="opencv, ros, kalibr, mrcal, colmap, nerfstudio, matlab, opensfm, toml, gtsam, ceres, numpy or remap.",
         ),
     ] = None,
     model: Annotated[
@@ -120,7 +123,10 @@ def import_command(
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="Camera or rig file to write.")],
     format: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="opencv, ros, kalibr, mrcal, colmap, nerfstudio, matlab or opensfm."),
+        typer.Option(
+            metavar="NAME",
+            help="opencv, ros, kalibr, mrcal, colmap, nerfstudio, matlab, opensfm, toml, qualisys or agisoft.",
+        ),
     ] = None,
     camera: Annotated[str | None, typer.Option(metavar="NAME", help="Take this camera of several.")] = None,
     size: Annotated[
@@ -191,8 +197,17 @@ def import_command(
         chosen = picked(found, camera, " ".join(map(str, sources)))
         save_camera(chosen, output)
         out.print(f"camera from {found.format}: {chosen.model}, {chosen.size[0]}x{chosen.size[1]} px", markup=False)
-    out.print("not in the file: error bars, calibration record")
+    if without := [name for name, one in zip(found.names, found.cameras, strict=True) if not _has_error_bars(one)]:
+        out.print(
+            f"no error bars in the file: {', '.join(without)}. A rig takes such a camera as exact, and no σ knows "
+            "the lens's errors",
+            markup=False,
+        )
     print_wrote(output)
+
+
+def _has_error_bars(camera: Camera) -> bool:
+    return camera.calibration is not None and camera.calibration.covariance is not None
 
 
 def _import_corners(

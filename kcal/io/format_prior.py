@@ -1,9 +1,8 @@
-"""Priors for the bundle adjustment of other programs: parameters in a program's own order, and their square-root
-information.
+"""Priors for the bundle adjustment of other programs: a program's own parameters and their square-root information.
 
 A JSON file (or a numpy archive) says for each camera that the program's parameters x have the density
 exp(-½ ‖R (x - mean)‖²). R is upper triangular: `NormalPrior(A, b)` of Ceres takes A = R and b = mean, GTSAM
-`noiseModel.Gaussian.SqrtInformation(R)`, pyceres the inverse of RᵀR. R is in pixels as they are; a program whose
+`noiseModel.Gaussian.SqrtInformation(R)`. R is in pixels as they are; a program whose
 reprojection errors are not divided by their standard deviation σ needs σR.
 """
 
@@ -72,8 +71,8 @@ def arranged(program: str, camera: Camera) -> tuple[str, list[Parameter]]:
                       for name in core + lens]  # fmt: skip
     if program == "kalibr":
         kind = {"pinhole": "pinhole-none", "opencv4": "pinhole-radtan", "fisheye4": "pinhole-equi"}[model]
-        there = ["fu", "fv", "pu", "pv", *(name.replace("p", "r") for name in lens)]
-        return kind, [Parameter(*pair) for pair in zip(there, core + lens, strict=True)]
+        own = ["fu", "fv", "pu", "pv", *(name.replace("p", "r") for name in lens)]
+        return kind, [Parameter(*pair) for pair in zip(own, core + lens, strict=True)]
     if program == "matlab":
         there = {"fx": "FocalLength(1)", "fy": "FocalLength(2)", "cx": "PrincipalPoint(1)", "cy": "PrincipalPoint(2)",
                  "skew": "Skew", "k1": "RadialDistortion(1)", "k2": "RadialDistortion(2)", "k3": "RadialDistortion(3)",
@@ -134,7 +133,7 @@ def write_priors(program: str, priors: Sequence[dict[str, Any]], path: Path) -> 
             texts = ("kcal", "misfit_px")
             arrays |= {f"{key}_{index}": json.dumps(value) if key in texts else value
                        for key, value in prior.items() if value is not None}  # fmt: skip
-        np.savez(data, **{key: np.asarray(value) for key, value in arrays.items()})
+        np.savez(data, allow_pickle=False, **{key: np.asarray(value) for key, value in arrays.items()})
         return write_atomic(path, data.getvalue())
     content = {"kcal_prior": 1, "program": program, "cameras": list(priors)}
     return write_atomic(path, json.dumps(content, indent=1) + "\n")

@@ -115,13 +115,19 @@ def square_root_information(camera: Camera, order: Sequence[int]) -> tuple[Tenso
     if known is None:
         return None
     lens = known.without_board()
-    slopes, _, good = pixel_slopes(camera, camera.grid(17, 13).reshape(-1, 2), torch.inf, list(range(len(camera.names))))
+    slopes, _, good = pixel_slopes(
+        camera, camera.grid(17, 13).reshape(-1, 2), torch.inf, list(range(len(camera.names)))
+    )
     stiff = slopes[good].abs().flatten(0, 1).amax(0).clamp_min(_ROUNDING) / _HELD_PX
     # Each unknown is the mean of the parameters that share it; these are equal.
     share = lens.selection()
     mean = (share / share.sum(0)).T
     held = share.sum(1) == 0
-    rows = [lens.all_rows()[:, :-1] @ mean, torch.diag(stiff)[held], stiff[:, None] * (torch.diag(1.0 * ~held) - share @ mean)]
+    rows = [
+        lens.all_rows()[:, :-1] @ mean,
+        torch.diag(stiff)[held],
+        stiff[:, None] * (torch.diag(1.0 * ~held) - share @ mean),
+    ]
     # Columns of what is not asked for first: below their triangle, rows say nothing of them.
     others = [index for index in range(len(camera.names)) if index not in order]
     triangle = triangular(torch.cat(rows)[:, [*others, *order]])[len(others) :, len(others) :]

@@ -38,8 +38,7 @@ Project = Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
 
 
 class Scene(NamedTuple):
-    """What is seen, and the truth: poses (I, 3, 3) and (I, 3) from the world to the cameras, points (P, 3), pixels
-    (I, P, 2), NaN if not seen; and where points start."""
+    """Poses (I, 3, 3), (I, 3) from the world, points (P, 3), pixels (I, P, 2) or NaN, and where points begin."""
 
     rotations: np.ndarray
     translations: np.ndarray
@@ -111,11 +110,15 @@ def by_colmap(scene: Scene, camera: Camera, way: str, folder: Path) -> Adjusted:
     done = export_cameras(camera, folder / "cameras.txt", format="colmap")
     reconstruction = pycolmap.Reconstruction()
     _, model, width, height, *values = done.paths[0].read_text().splitlines()[-1].split()
-    lens = pycolmap.Camera(model=model, width=int(width), height=int(height), params=list(map(float, values)), camera_id=1)
+    lens = pycolmap.Camera(
+        model=model, width=int(width), height=int(height), params=list(map(float, values)), camera_id=1
+    )
     reconstruction.add_camera_with_trivial_rig(lens)
     for number, (rotation, translation) in enumerate(zip(scene.rotations, scene.translations, strict=True), 1):
         marks = np.nan_to_num(scene.pixels[number - 1] + 0.5, nan=-1.0)
-        image = pycolmap.Image(f"{number}.png", pycolmap.Point2DList([pycolmap.Point2D(mark) for mark in marks]), 1, number)
+        image = pycolmap.Image(
+            f"{number}.png", pycolmap.Point2DList([pycolmap.Point2D(mark) for mark in marks]), 1, number
+        )
         reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), translation))
     for index, point in enumerate(scene.start):
         track = pycolmap.Track()

@@ -24,7 +24,7 @@ from kcal.errors import DegenerateError, InputError
 from kcal.files import write_atomic
 from kcal.io.foreign import CameraPose, camera_name, paths_for, plain, rig_poses
 from kcal.io.format_kalibr import write_omni
-from kcal.io.format_mrcal import fit_spline, project_spline, write_model
+from kcal.io.format_mrcal import fit_spline, project_spline, write_model, write_mrcal
 from kcal.io.format_prior import prior_of, write_priors
 from kcal.io.formats import FORMATS, CameraFormat, format_named, held_exactly
 from kcal.io.kalibr_omni import NAME as OMNI
@@ -72,15 +72,21 @@ def format_for(path: str | Path, format: str | None = None) -> str:
     """
     path = Path(path)
     if format is not None:
-        if format != REMAP:
-            format_named(format)
+        if format != REMAP and format_named(format).write is None:
+            raise InputError(
+                f"kcal reads {format} files and does not write them; choose one of {', '.join(_written())}"
+            )
         return format
     by_suffix = {suffix: name for name, known in FORMATS.items() for suffix in known.suffixes} | {".npz": REMAP}
     if path.name == "camera_models.json":
         return "opensfm"
     if path.suffix.lower() not in by_suffix:
-        raise InputError(f"{path}: no format for this suffix; name one (--format {', '.join([*FORMATS, REMAP])})")
+        raise InputError(f"{path}: no format for this suffix; name one (--to {', '.join(_written())})")
     return by_suffix[path.suffix.lower()]
+
+
+def _written() -> list[str]:
+    return [*(name for name, known in FORMATS.items() if known.write is not None), REMAP]
 
 
 def export_cameras(
@@ -140,8 +146,7 @@ def export_cameras(
     exact = [held_exactly(camera, [model] if model else known.models, known.skew) for camera in several]
     if name == "mrcal" and model is None and None in exact:
         return _write_splines(several, exact, poses, path, _lost(several, rig, known))
-    found = _in_one_model(several, exact, name, model)
-    notes = _worse_together(several, exact, found, name, model)
+    found, notes = _in_one_model(several, exact, name, model)
     if name == "kalibr" and model is None and (omni := _nearer_omni(several, found)) is not None:
         values, omni_misfits = omni
         return ExportedCameras(
@@ -150,17 +155,18 @@ def export_cameras(
             models=(OMNI,) * len(several),
             misfits=omni_misfits,
             lost=_lost(several, rig, known),
-            notes=_omni_instead(several, found, omni_misfits),
+            notes=(_omni_instead(several, found, omni_misfits),),
         )
     written = [_with_covariance(camera, *one) for camera, one in zip(several, found, strict=True)]
     priors = [
-        prior_of(name, camera, one.misfit and (one.misfit.rms, one.misfit.largest))
+        prior_of(name, camera, None if one.misfit is None else (one.misfit.rms, one.misfit.largest))
         for camera, one in zip(written, found, strict=True)
     ]
     carried = any(prior["sqrt_information"] is not None for prior in priors)
     if known.prior:
         paths = [write_priors(name, priors, path)]
     else:
+        assert known.write is not None
         paths = known.write(written, poses, path)
         paths += [write_priors(name, priors, path.with_name(f"{path.stem}.prior.json"))] if carried else []
     return ExportedCameras(
@@ -200,71 +206,72 @@ class _Fitted(NamedTuple):
 
 def _in_one_model(
     cameras: Sequence[Camera], exact: Sequence[Camera | None], name: str, model: str | None
-) -> list[_Fitted]:
-    """Each camera in a model of the format, in one model for all unless every camera is held exactly."""
+) -> tuple[list[_Fitted], tuple[str, ...]]:
+    """Each camera in a model of the format, in one model for all unless every camera is held exactly.
+
+    With notes on cameras that would be nearer to what they are without the others.
+    """
     held = [_Fitted(camera) for camera in exact if camera is not None]
     if len(held) == len(cameras):
-        return held
-    found: list[list[_Fitted]] = []
+        return held, ()
+    fits = [_candidates(camera, name, model) for camera in cameras]
+    alone = [
+        _Fitted(one) if one is not None else min(found.values(), key=_rms)
+        for one, found in zip(exact, fits, strict=True)
+    ]
+    shared = [[found[kind] for found in fits] for kind in fits[0] if all(kind in found for found in fits)]
+    chosen = min(shared, key=_squares, default=alone)
+    return chosen, tuple(
+        f"{camera_name(camera, f'camera {number}')}: written as {one.camera.model} (RMS {_rms(one):.2g} px) so that "
+        f"all cameras have one lens model; in a file of its own it is {own.camera.model} "
+        f"({f'RMS {_rms(own):.2g} px' if own.misfit else 'exact'})"
+        for number, (camera, one, own) in enumerate(zip(cameras, chosen, alone, strict=True), 1)
+        if _rms(one) > _rms(own)
+    )
+
+
+def _candidates(camera: Camera, name: str, model: str | None) -> dict[LensModel, _Fitted]:
+    """The camera in each model of a format that shows its whole image."""
+    found, refused = {}, []
     for kind in _richest([model] if model else FORMATS[name].models):
         try:
-            found.append([_in_model(camera, kind, name) for camera in cameras])
-        except (InputError, DegenerateError):
-            continue
-    if found:
-        return min(found, key=_squares)
-    return [_alone(camera, one, name, model) for camera, one in zip(cameras, exact, strict=True)]
-
-
-def _alone(camera: Camera, exact: Camera | None, name: str, model: str | None) -> _Fitted:
-    """A camera as it would be written if there were no other one."""
-    return _Fitted(exact) if exact is not None else _refitted(camera, name, model)
+            found[kind] = _in_model(camera, kind, name)
+        except (InputError, DegenerateError) as error:
+            refused.append(str(error))
+    if not found:
+        raise InputError(
+            f"no lens model of {name} files can stand for this camera ({'; '.join(refused)}). mrcal files hold it as a "
+            "spline (.cameramodel), and maps for cv2.remap its undistorted image (.npz)"
+        )
+    return found
 
 
 def _in_model(camera: Camera, kind: LensModel, name: str) -> _Fitted:
     """A camera in a lens model, exactly where it contains the lens."""
     held = held_exactly(camera, [str(kind)], FORMATS[name].skew)
-    return _Fitted(held) if held is not None else _fitted(camera, kind)
-
-
-def _fitted(camera: Camera, kind: LensModel) -> _Fitted:
+    if held is not None:
+        return _Fitted(held)
     fitted = refit_camera(camera, kind)
     return _Fitted(fitted.camera, measured_misfit(camera, str(kind), fitted.camera.project_rays), fitted.width)
 
 
+def _rms(one: _Fitted) -> float:
+    return one.misfit.rms if one.misfit is not None else 0.0
+
+
 def _squares(found: Sequence[_Fitted]) -> float:
-    return sum(one.misfit.rms**2 for one in found if one.misfit is not None)
+    return sum(_rms(one) ** 2 for one in found)
 
 
-def _worse_together(
-    cameras: Sequence[Camera], exact: Sequence[Camera | None], found: Sequence[_Fitted], name: str, model: str | None
-) -> tuple[str, ...]:
-    """Notes on cameras that would be nearer to what they are without the others of the file."""
-    notes = []
-    for number, (camera, one) in enumerate(zip(cameras, found, strict=True)):
-        if one.misfit is None or len(cameras) == 1:
-            continue
-        alone = _alone(camera, exact[number], name, model)
-        nearest = 0.0 if alone.misfit is None else alone.misfit.rms
-        if one.camera.model != alone.camera.model and one.misfit.rms > nearest:
-            notes.append(
-                f"{camera_name(camera, f'camera {number + 1}')}: written as {one.misfit.model} (RMS {one.misfit.rms:.2g} "
-                f"px) so that all cameras have one lens model; in a file of its own it is {alone.camera.model} "
-                f"({'exact' if not nearest else f'RMS {nearest:.2g} px'})"
-            )
-    return tuple(notes)
-
-
-def _omni_instead(
-    cameras: Sequence[Camera], found: Sequence[_Fitted], misfits: Sequence[Misfit]
-) -> tuple[str, ...]:
-    """A note that Kalibr's own wide lens stands for lenses of other kinds."""
+def _omni_instead(cameras: Sequence[Camera], found: Sequence[_Fitted], misfits: Sequence[Misfit]) -> str:
+    """A note that Kalibr's own wide lens stands for all cameras."""
     names = ", ".join(
-        f"{camera_name(camera, f'camera {number + 1}')} RMS {misfit.rms:.2g} px"
-        for number, (camera, misfit) in enumerate(zip(cameras, misfits, strict=True))
+        f"{camera_name(camera, f'camera {number}')} RMS {misfit.rms:.2g} px"
+        for number, (camera, misfit) in enumerate(zip(cameras, misfits, strict=True), 1)
     )
-    return (f"all cameras became {OMNI} ({names}): Kalibr's pinhole lenses are farther off, "
-            f"RMS up to {max(one.misfit.rms for one in found if one.misfit):.2g} px",)  # fmt: skip
+    return (
+        f"written as {OMNI} ({names}): in one pinhole model of Kalibr the RMS is up to {max(map(_rms, found)):.2g} px"
+    )
 
 
 def _nearer_omni(
@@ -298,7 +305,8 @@ def _lost(
     """What the cameras have that the format does not, in words."""
     records = [camera.calibration for camera in cameras if camera.calibration is not None]
     found = {
-        "error bars": not carried and any(record.covariance is not None or record.sigma is not None for record in records),
+        "error bars": not carried
+        and any(record.covariance is not None or record.sigma is not None for record in records),
         "calibration record": any(record.record is not None for record in records),
         "entrance pupil": any(bool((camera.coefficients[1:3] != 0).any()) for camera in cameras if camera.model.hybrid),
         "relative pose": rig is not None and not known.pose,
@@ -314,23 +322,6 @@ def _richest(models: Sequence[str]) -> list[LensModel]:
     return [kind for kind in kinds if not any(other != kind and other.contains(kind) for other in kinds)]
 
 
-def _refitted(camera: Camera, name: str, model: str | None) -> _Fitted:
-    """The model of a format that comes nearest to a camera."""
-    found: list[_Fitted] = []
-    refused = []
-    for kind in _richest([model] if model else FORMATS[name].models):
-        try:
-            found.append(_fitted(camera, kind))
-        except (InputError, DegenerateError) as error:
-            refused.append(str(error))
-    if not found:
-        raise InputError(
-            f"no lens model of {name} files can stand for this camera ({'; '.join(refused)}). mrcal files hold it as a "
-            "spline (.cameramodel), and maps for cv2.remap its undistorted image (.npz)"
-        )
-    return min(found, key=lambda one: one.misfit.rms if one.misfit else 0.0)
-
-
 def _write_splines(
     cameras: Sequence[Camera],
     exact: Sequence[Camera | None],
@@ -344,7 +335,7 @@ def _write_splines(
     misfits: list[Misfit | None] = []
     for camera, held, pose, target in itertools.zip_longest(cameras, exact, poses, paths):
         if held is not None:
-            FORMATS["mrcal"].write([held], [pose] if pose else [], target)
+            write_mrcal([held], [pose] if pose else [], target)
             models.append(str(held.model))
             misfits.append(None)
             continue
