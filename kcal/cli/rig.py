@@ -327,8 +327,8 @@ def _exact_line(result: RigResult, rig: StereoRig) -> str:
 
     far, share = 100.0 * float(rig.baseline), 10.0 / float(rig.left.focal.mean())
     text = (
-        f"taken as exact, so that errors of these lenses are in no σ: {' and '.join(result.exact)}. An error of 0.1 px in "
-        f"one of them is {number_text(100.0 * share, digits=2)} % of a range of {length_text(far, digits=2)}"
+        f"taken as exact, so that errors of these lenses are in no σ: {' and '.join(result.exact)}. An error of 0.1 px "
+        f"in one of them is {number_text(100.0 * share, digits=2)} % of a range of {length_text(far, digits=2)}"
     )
     cameras = dict(zip(result.names, result.data.cameras, strict=True))
     known = {name: cameras[name].calibration for name in result.exact}

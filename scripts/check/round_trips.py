@@ -1,4 +1,4 @@
-"""What goes to other programs and comes from them: lens, error bars, pupil, board, and the largest error over the image.
+"""What goes to other programs and comes from them: lens, error bars, pupil, board, and the largest error in the image.
 
     PYTHONPATH=.:FOLDER python -m scripts.check.round_trips [--mrcal /usr/bin/python3] [--write]
 
@@ -197,8 +197,8 @@ def in_files(folder: Path, mrcal: str | None) -> Iterator[tuple[str, str, Path, 
         "radialDistortion3",
     )
     qualisys.write_text(
-        '<calibration><cameras><camera serial="1"><fov_video left="0" top="0" right="1279" bottom="719"/><transform x="0" '
-        'y="0" z="0" r11="1" r12="0" r13="0" r21="0" r22="1" r23="0" r31="0" r32="0" r33="1"/><intrinsic skew="0" '
+        '<calibration><cameras><camera serial="1"><fov_video left="0" top="0" right="1279" bottom="719"/><transform '
+        'x="0" y="0" z="0" r11="1" r12="0" r13="0" r21="0" r22="1" r23="0" r31="0" r32="0" r33="1"/><intrinsic skew="0" '
         f'focalLengthU="{64 * K[0, 0]}" focalLengthV="{64 * K[1, 1]}" centerPointU="{64 * K[0, 2] + 31.5}" '
         f'centerPointV="{64 * K[1, 2] + 31.5}" ' + " ".join(f'{n}="{v}"' for n, v in zip(names, D, strict=True))
         + "/></camera></cameras></calibration>"
