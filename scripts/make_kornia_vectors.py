@@ -2,8 +2,8 @@
 
     python -m scripts.make_kornia_vectors
 
-They go to tests/kornia_conformance/vectors.json. The test beside it needs torch, kornia and pytest alone, so that kornia
-can take both files as they are. `tests/lens/test_kornia.py` checks that kcal still computes these values, and
+They go to tests/kornia_conformance/vectors.json. The test beside it needs torch, kornia and pytest alone, so that
+kornia can take both files as they are. `tests/lens/test_kornia.py` checks that kcal still computes these values, and
 `cv2.projectPoints` agrees with the pixels.
 """
 

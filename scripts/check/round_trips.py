@@ -45,6 +45,8 @@ K, D = np.array([[1000.1, 0, 640.3], [0, 1001.3, 359.2], [0, 0, 1]]), np.array([
 SIGMA = np.array([0.5, 0.6, 0.7, 0.8, 1e-3, 2e-3, 1e-4, 2e-4, 3e-3])
 SIZE, OMNI = (1280, 720), (0.9, np.array([-0.1, 0.02, 1e-3, -5e-4]))
 Row = list[str]
+# Program, its lens, a file, the σ in it, who reads or wrote it, and a projection of points by the program.
+Given = tuple[str, str, Path, np.ndarray | None, str, Callable[[np.ndarray], Any]]
 
 
 def known(model: str) -> Camera:
@@ -146,8 +148,8 @@ def opencv_file(path: Path, **more: Any) -> Path:
     return path
 
 
-def in_files(folder: Path, mrcal: str | None) -> Iterator[tuple[str, str, Path, np.ndarray | None, str, Any]]:
-    """Program, its lens, a file, the σ in it, who reads or wrote it, and a projection of points by the program."""
+def in_files(folder: Path, mrcal: str | None) -> Iterator[Given]:
+    """Files of other programs, or in their formats."""
     zero = np.zeros(3)
     deviations = np.append(SIGMA, np.zeros(18 - len(SIGMA)))
     brown = opencv_file(folder / "o.yml", distortion_coefficients=D, stdDeviationsIntrinsics=deviations)
@@ -173,33 +175,31 @@ def in_files(folder: Path, mrcal: str | None) -> Iterator[tuple[str, str, Path, 
         f"  distortion: [{joined(D[:4])}] +- [{joined(SIGMA[4:8])}]\n"
         f"  projection: [{joined([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])}] +- [{joined(SIGMA[:4])}]\n"
     )
-    yield (
-        "kalibr",
-        "radtan",
-        text,
-        SIGMA[:8],
-        "its text, cv2.projectPoints",
-        lambda p: opencv_formula(p, K, D[:4], False),
-    )
-    cells = {"FocalLength": [[K[0, 0], K[1, 1]]], "PrincipalPoint": [[K[0, 2] + 1, K[1, 2] + 1]],
-             "RadialDistortion": [[*D[:2], D[4]]], "TangentialDistortion": [D[2:4]], "ImageSize": [[720.0, 1280.0]]}  # fmt: skip
-    errors = {"FocalLengthError": [SIGMA[:2]], "PrincipalPointError": [SIGMA[2:4]],
-              "RadialDistortionError": [[*SIGMA[4:6], SIGMA[8]]], "TangentialDistortionError": [SIGMA[6:8]]}  # fmt: skip
+    formula = "its text, cv2.projectPoints"
+    yield "kalibr", "radtan", text, SIGMA[:8], formula, lambda p: opencv_formula(p, K, D[:4], False)
+    cells = {
+        "FocalLength": [[K[0, 0], K[1, 1]]],
+        "PrincipalPoint": [[K[0, 2] + 1, K[1, 2] + 1]],
+        "RadialDistortion": [[*D[:2], D[4]]],
+        "TangentialDistortion": [D[2:4]],
+        "ImageSize": [[720.0, 1280.0]],
+    }
+    errors = {
+        "FocalLengthError": [SIGMA[:2]],
+        "PrincipalPointError": [SIGMA[2:4]],
+        "RadialDistortionError": [[*SIGMA[4:6], SIGMA[8]]],
+        "TangentialDistortionError": [SIGMA[6:8]],
+    }
     savemat(folder / "in.mat", {"cameraParams": cells, "estimationErrors": {"IntrinsicsErrors": errors}})
     yield "matlab", "opencv5", folder / "in.mat", SIGMA, "SciPy", lambda p: opencv_formula(p, K, D, False)
     yield "agisoft", "frame", *agisoft(folder)
     qualisys = folder / "q.qca.txt"
-    names = (
-        "radialDistortion1",
-        "radialDistortion2",
-        "tangentalDistortion1",
-        "tangentalDistortion2",
-        "radialDistortion3",
-    )
+    order = ("radial", 1), ("radial", 2), ("tangental", 1), ("tangental", 2), ("radial", 3)
+    names = [f"{kind}Distortion{number}" for kind, number in order]
     qualisys.write_text(
         '<calibration><cameras><camera serial="1"><fov_video left="0" top="0" right="1279" bottom="719"/><transform '
-        'x="0" y="0" z="0" r11="1" r12="0" r13="0" r21="0" r22="1" r23="0" r31="0" r32="0" r33="1"/><intrinsic skew="0" '
-        f'focalLengthU="{64 * K[0, 0]}" focalLengthV="{64 * K[1, 1]}" centerPointU="{64 * K[0, 2] + 31.5}" '
+        'x="0" y="0" z="0" r11="1" r12="0" r13="0" r21="0" r22="1" r23="0" r31="0" r32="0" r33="1"/><intrinsic '
+        f'skew="0" focalLengthU="{64 * K[0, 0]}" focalLengthV="{64 * K[1, 1]}" centerPointU="{64 * K[0, 2] + 31.5}" '
         f'centerPointV="{64 * K[1, 2] + 31.5}" ' + " ".join(f'{n}="{v}"' for n, v in zip(names, D, strict=True))
         + "/></camera></cameras></calibration>"
     )  # fmt: skip
@@ -225,18 +225,10 @@ def in_files(folder: Path, mrcal: str | None) -> Iterator[tuple[str, str, Path, 
     except ImportError as missing:
         print(f"colmap: left out, {missing}", flush=True)
     if mrcal:
-        camera = sample_camera("opencv8")
-        export_cameras(camera, folder / "a.cameramodel")
-        ask(mrcal, "mrcal-write", str(folder / "a.cameramodel"), folder, folder / "b.cameramodel")
+        solved, deviations_path = folder / "b.cameramodel", folder / "sigma.npy"
+        ask(mrcal, "mrcal-solve", str(solved), folder, deviations_path)
         project = peer(mrcal, "mrcal")
-        yield (
-            "mrcal",
-            "opencv8",
-            folder / "b.cameramodel",
-            None,
-            "mrcal",
-            lambda p: project(folder / "b.cameramodel", p),
-        )
+        yield "mrcal", "opencv5", solved, np.load(deviations_path), "mrcal", lambda p: project(solved, p)
 
 
 def agisoft(folder: Path) -> tuple[Path, np.ndarray, str, Callable[[np.ndarray], np.ndarray]]:

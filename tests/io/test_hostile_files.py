@@ -5,6 +5,8 @@ Each reader runs in a process of its own, so that a crash is a finding and not t
 
 from __future__ import annotations
 
+import base64
+import io
 import json
 import math
 import os
@@ -33,6 +35,7 @@ from kcal.corners.observations import Observations, View
 from kcal.corners.orientation import turned_images
 from kcal.corners.video import VideoFrames, read_frames
 from kcal.errors import KcalError
+from kcal.files import read_bytes
 from kcal.io.camera_file import load_camera, save_camera
 from kcal.io.format_prior import prior_of, write_priors
 from kcal.io.formats import FORMATS, import_cameras
@@ -137,6 +140,32 @@ _AGISOFT = """<document><chunk><sensors><sensor id="0"><calibration type="frame"
 <covariance><params>f k1</params><coeffs>4 0 0 1e-6</coeffs></covariance></sensor></sensors></chunk></document>"""
 
 
+def _packed_inputs() -> bytes:
+    turned = np.array([[0.3, 0.1 * k, 0.0, 0.1 * k - 0.2, 0.0, 1.0] for k in range(5)])
+    grid = np.stack(np.meshgrid(np.arange(7.0), np.arange(6.0), np.ones(1)), -1).reshape(1, 6, 7, 3)
+    index = np.array([[k, 0, -1] for k in range(5)])
+    data = io.BytesIO()
+    np.savez(data, intrinsics=[[300.0, 301, 159.5, 119.5]], frames_rt_toref=turned, calibration_object_spacing=0.05,
+             observations_board=grid.repeat(5, 0), indices_frame_camintrinsics_camextrinsics=index)  # fmt: skip
+    return data.getvalue()
+
+
+def _mrcal_inputs(path: Path) -> None:
+    content = {"lensmodel": "LENSMODEL_PINHOLE", "intrinsics": [300.0, 301.0, 159.5, 119.5], "extrinsics": [0.0] * 6,
+               "imagersize": [320, 240], "optimization_inputs": base64.b85encode(_packed_inputs())}  # fmt: skip
+    path.write_text(repr(content))
+
+
+def _unpacked(path: Path) -> object:
+    """Damage below the base 85, which damage of the text hardly ever reaches."""
+    model = path.with_suffix(".cameramodel")
+    content = {"lensmodel": "LENSMODEL_PINHOLE", "intrinsics": [300.0, 301.0, 159.5, 119.5], "extrinsics": [0.0] * 6,
+               "imagersize": [320, 240],
+               "optimization_inputs": base64.b85encode(read_bytes(path, 2**26))}  # fmt: skip
+    model.write_text(repr(content))
+    return import_cameras(model)
+
+
 def _corners(path: Path) -> Observations:
     return import_corners(path, BOARD, (320, 240))
 
@@ -148,6 +177,8 @@ READERS = {
         ("opencv", ".yml"), ("opencv", ".xml"), ("opencv", ".json"), ("ros", ".yaml"), ("kalibr", ".yaml"),
         ("mrcal", ".cameramodel"), ("colmap", ".txt"), ("colmap", ".bin"), ("nerfstudio", ".json"), ("matlab", ".mat"),
         ("opensfm", ".json"), ("toml", ".toml"), ("gtsam", ".json"))},
+    "mrcal inputs": Reader(import_cameras, ".cameramodel", _mrcal_inputs),
+    "packed inputs": Reader(_unpacked, ".npz", lambda path: path.write_bytes(_packed_inputs())),
     "prior .json": Reader(import_cameras, ".json", _prior),
     "prior .npz": Reader(import_cameras, ".npz", _prior),
     "omni": Reader(import_cameras, ".yaml", _text(_OMNI)),
