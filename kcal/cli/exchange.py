@@ -47,15 +47,20 @@ def export_command(
     """Write a camera or a rig for another program.
 
     The format follows from the suffix: .yaml and .xml OpenCV, .cameramodel mrcal, .txt and .bin COLMAP, .json
-    nerfstudio, .mat MATLAB, .npz maps for cv2.remap. ROS, Kalibr and OpenSfM are named by --format. A lens that the
-    format cannot hold is never cut short: the nearest model of the format is fitted, and its error over the image is
-    printed. Pixel origins are converted.
+    nerfstudio, .mat MATLAB, .toml aniposelib, .npz maps for cv2.remap. Others are named by --to. A lens that the format
+    cannot hold is never cut short: the nearest model of the format is fitted, and its error over the image is printed.
+    Pixel origins are converted.
+
+    What is known of a camera goes along as a prior for bundle adjustment: the parameters in the program's order and
+    their square-root information, in NAME.prior.json.
 
     **Examples**
 
     `kcal export left.camera.json -o left.yaml`
 
-    `kcal export rig.json --format kalibr -o camchain.yaml`
+    `kcal export rig.json --to kalibr -o camchain.yaml`
+
+    `kcal export left.camera.json --to gtsam -o left.gtsam.json`
 
     `kcal export left.camera.json -o left.cameramodel --picture misfit.png`
     """

@@ -81,13 +81,13 @@ def inputs_covariance(packed: bytes | str, number: int, camera: Camera, source: 
 def _views(stored: dict[str, np.ndarray], number: int, camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Corners (V, N, 3) of a camera with their weights, poses (V, 6), board (N, 3), and modes of its warp (2, N)."""
     try:
-        corners, index = stored["observations_board"], stored["indices_frame_camintrinsics_camextrinsics"]
+        seen, index = stored["observations_board"], stored["indices_frame_camintrinsics_camextrinsics"]
         frames, extrinsics = stored["frames_rt_toref"], stored.get("extrinsics_rt_fromref", np.zeros((0, 6)))
         intrinsics, spacing = stored["intrinsics"], float(stored["calibration_object_spacing"])
         bend = np.asarray(stored.get("calobject_warp", np.zeros(2)), dtype=float)
     except KeyError as missing:
         raise NoInformationError(f"no {missing.args[0]} in the optimization inputs") from None
-    if corners.ndim != 4 or corners.shape[3] != 3 or index.shape != (len(corners), 3) or len(corners) > _MOST_VIEWS:
+    if seen.ndim != 4 or seen.shape[3] != 3 or index.shape != (len(seen), 3) or len(seen) > _MOST_VIEWS:
         raise NoInformationError("optimization inputs without boards, or with too many")
     if bend.shape != (2,):
         bend = np.zeros(2)
@@ -97,7 +97,7 @@ def _views(stored: dict[str, np.ndarray], number: int, camera: Camera) -> tuple[
     if np.abs(intrinsics[number] - own).max() > _SAME * np.abs(own).max():
         raise NoInformationError("the optimization inputs are of other intrinsics than the file")
     mine = index[:, 1] == number
-    corners, index = torch.from_numpy(corners[mine].astype(float)), index[mine]
+    corners, index = torch.from_numpy(seen[mine].astype(float)), index[mine]
     if not len(index) or not bool(corners.isfinite().all()):
         raise NoInformationError("no corner of this camera, or one that is not finite")
     if index[:, 0].min() < 0 or index[:, 0].max() >= len(frames) or index[:, 2].max() >= len(extrinsics):

@@ -5,8 +5,7 @@
 KIND is mrcal, ros, colmap or one of the writers mrcal-write and colmap-write, which read the file and write it anew at
 the place of PIXELS.npy. `mrcal-solve` calibrates a camera from simulated corners, writes it to PATH, and to PIXELS.npy
 its standard deviations, without mrcal's regularization and with noise by degrees of freedom. `mrcal-diff` takes two
-files joined by a comma and writes a .npz with mrcal's difference of
-them: with equal frames, and after its own turn.
+files joined by a comma and writes a .npz with mrcal's difference of them: with equal frames, and after its own turn.
 """
 
 from __future__ import annotations

@@ -221,7 +221,14 @@ def in_files(folder: Path, mrcal: str | None) -> Iterator[Given]:
         reconstruction = pycolmap.Reconstruction()
         reconstruction.add_camera_with_trivial_rig(colmap)
         reconstruction.write_text(str(folder))
-        yield "colmap", "OPENCV", folder / "cameras.txt", None, "pycolmap", lambda p: colmap.img_from_cam(p) - 0.5
+        yield (
+            "colmap",
+            "OPENCV",
+            folder / "cameras.txt",
+            None,
+            "pycolmap",
+            lambda p: colmap.img_from_cam(p).astype(float) - 0.5,
+        )
     except ImportError as missing:
         print(f"colmap: left out, {missing}", flush=True)
     if mrcal:

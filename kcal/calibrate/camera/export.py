@@ -99,11 +99,14 @@ def export_cameras(
     """Write one camera, several, or a rig for another program.
 
     The format follows from the suffix: `.yml`, `.yaml`, `.xml` OpenCV; `.cameramodel` mrcal; `.txt`, `.bin` COLMAP;
-    `.json` nerfstudio; `.mat` MATLAB; `.npz` maps for `cv2.remap`. Others are named: ros, kalibr, opensfm. Formats
-    with one camera per file get NAME_left and NAME_right for a rig.
+    `.json` nerfstudio; `.mat` MATLAB; `.toml` aniposelib; `.npz` maps for `cv2.remap`. Others are named: ros, kalibr,
+    opensfm, gtsam, ceres, numpy. Formats with one camera per file get NAME_left and NAME_right for a rig.
 
-    Cameras of one file get one lens model, the one that is nearest to all of them. Kalibr's chains hold wide lenses as
-    omni-radtan, where its pinhole models are far off.
+    Cameras of one file get one lens model, the one that is nearest to all of them, with a note on those that would be
+    nearer without the others. Kalibr's chains hold wide lenses as omni-radtan, where its pinhole models are far off.
+
+    What is known of the cameras is written beside the file, as NAME.prior.json, or in it (gtsam, ceres, numpy): the
+    parameters in the program's order and their square-root information, the misfit of a lens that was fitted included.
 
     Args:
         cameras: a single camera, a rig, or single cameras without poses.
