@@ -69,13 +69,13 @@ def _agisoft_camera(sensor: Element, number: int) -> Camera:
     fx, fy, cx, cy, skew, *lens = values.values()
     center = cx + 0.5 * width - 0.5, cy + 0.5 * height - 0.5
     camera = named_camera(name, (fx, fy, *center), (width, height), model, lens, skew)
-    covariance = _covariance(sensor, own, names)
+    covariance = _sensor_covariance(sensor, own, names)
     if covariance is not None:
         camera.calibration = CameraCalibration(name=name, covariance=covariance)
     return camera
 
 
-def _covariance(sensor: Element, own: dict[str, tuple[str, ...]], names: tuple[str, ...]) -> torch.Tensor | None:
+def _sensor_covariance(sensor: Element, own: dict[str, tuple[str, ...]], names: tuple[str, ...]) -> torch.Tensor | None:
     stated = sensor.find("covariance")
     if stated is None:
         return None

@@ -47,7 +47,7 @@ def read_qualisys(path: Path, hints: Hints) -> ImportedCameras:
     return ImportedCameras(format="qualisys", cameras=tuple(cameras), poses=tuple(poses), notes=tuple(notes))
 
 
-def _values(part: Element, tag: str, names: tuple[str, ...]) -> list[float]:
+def _attributes(part: Element, tag: str, names: tuple[str, ...]) -> list[float]:
     found = part.find(tag)
     if found is None:
         raise ValueError(f"a camera has no {tag}")
@@ -55,17 +55,17 @@ def _values(part: Element, tag: str, names: tuple[str, ...]) -> list[float]:
 
 
 def _qualisys_camera(part: Element, name: str) -> Camera:
-    left, top, right, bottom = _values(part, "fov_video", ("left", "top", "right", "bottom"))
-    fx, fy, cx, cy, skew = (value / _UNITS for value in _values(part, "intrinsic", _CORE))
+    left, top, right, bottom = _attributes(part, "fov_video", ("left", "top", "right", "bottom"))
+    fx, fy, cx, cy, skew = (value / _UNITS for value in _attributes(part, "intrinsic", _CORE))
     size = whole_size(right - left + 1.0, bottom - top + 1.0)
     center = cx - _FIRST - left, cy - _FIRST - top
-    return named_camera(name, (fx, fy, *center), size, "opencv5", _values(part, "intrinsic", _LENS), skew)
+    return named_camera(name, (fx, fy, *center), size, "opencv5", _attributes(part, "intrinsic", _LENS), skew)
 
 
 def _qualisys_pose(part: Element) -> CameraPose:
     names = tuple(f"r{row}{column}" for row in "123" for column in "123")
-    axes = np.array(_values(part, "transform", names)).reshape(3, 3)
+    axes = np.array(_attributes(part, "transform", names)).reshape(3, 3)
     # From axes to the right, up and backwards to those to the right, down and ahead.
     rotation = np.diag([1.0, -1.0, -1.0]) @ axes
-    center = 1e-3 * np.array(_values(part, "transform", ("x", "y", "z")))
+    center = 1e-3 * np.array(_attributes(part, "transform", ("x", "y", "z")))
     return checked_pose(rotation.tolist(), (-rotation @ center).tolist())

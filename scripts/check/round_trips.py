@@ -221,14 +221,7 @@ def in_files(folder: Path, mrcal: str | None) -> Iterator[Given]:
         reconstruction = pycolmap.Reconstruction()
         reconstruction.add_camera_with_trivial_rig(colmap)
         reconstruction.write_text(str(folder))
-        yield (
-            "colmap",
-            "OPENCV",
-            folder / "cameras.txt",
-            None,
-            "pycolmap",
-            lambda p: colmap.img_from_cam(p).astype(float) - 0.5,
-        )
+        yield "colmap", "OPENCV", folder / "cameras.txt", None, "pycolmap", lambda p: _half_less(colmap.img_from_cam(p))
     except ImportError as missing:
         print(f"colmap: left out, {missing}", flush=True)
     if mrcal:
@@ -236,6 +229,10 @@ def in_files(folder: Path, mrcal: str | None) -> Iterator[Given]:
         ask(mrcal, "mrcal-solve", str(solved), folder, deviations_path)
         project = peer(mrcal, "mrcal")
         yield "mrcal", "opencv5", solved, np.load(deviations_path), "mrcal", lambda p: project(solved, p)
+
+
+def _half_less(pixels: Any) -> np.ndarray:
+    return np.asarray(pixels) - 0.5
 
 
 def agisoft(folder: Path) -> tuple[Path, np.ndarray, str, Callable[[np.ndarray], np.ndarray]]:

@@ -217,23 +217,23 @@ def _in_one_model(
     held = [_Fitted(camera) for camera in exact if camera is not None]
     if len(held) == len(cameras):
         return held, ()
-    fits = [_candidates(camera, name, model) for camera in cameras]
+    fits = [_fits(camera, name, model) for camera in cameras]
     alone = [
-        _Fitted(one) if one is not None else min(found.values(), key=_rms)
+        _Fitted(one) if one is not None else min(found.values(), key=_misfit_rms)
         for one, found in zip(exact, fits, strict=True)
     ]
     shared = [[found[kind] for found in fits] for kind in fits[0] if all(kind in found for found in fits)]
     chosen = min(shared, key=_squares, default=alone)
     return chosen, tuple(
-        f"{camera_name(camera, f'camera {number}')}: written as {one.camera.model} (RMS {_rms(one):.2g} px) so that "
+        f"{camera_name(camera, f'camera {number}')}: written as {one.camera.model} (RMS {_misfit_rms(one):.2g} px) so that "
         f"all cameras have one lens model; in a file of its own it is {own.camera.model} "
-        f"({f'RMS {_rms(own):.2g} px' if own.misfit else 'exact'})"
+        f"({f'RMS {_misfit_rms(own):.2g} px' if own.misfit else 'exact'})"
         for number, (camera, one, own) in enumerate(zip(cameras, chosen, alone, strict=True), 1)
-        if _rms(one) > _rms(own)
+        if _misfit_rms(one) > _misfit_rms(own)
     )
 
 
-def _candidates(camera: Camera, name: str, model: str | None) -> dict[LensModel, _Fitted]:
+def _fits(camera: Camera, name: str, model: str | None) -> dict[LensModel, _Fitted]:
     """The camera in each model of a format that shows its whole image."""
     found, refused = {}, []
     for kind in _richest([model] if model else FORMATS[name].models):
@@ -258,12 +258,12 @@ def _in_model(camera: Camera, kind: LensModel, name: str) -> _Fitted:
     return _Fitted(fitted.camera, measured_misfit(camera, str(kind), fitted.camera.project_rays), fitted.width)
 
 
-def _rms(one: _Fitted) -> float:
+def _misfit_rms(one: _Fitted) -> float:
     return one.misfit.rms if one.misfit is not None else 0.0
 
 
 def _squares(found: Sequence[_Fitted]) -> float:
-    return sum(_rms(one) ** 2 for one in found)
+    return sum(_misfit_rms(one) ** 2 for one in found)
 
 
 def _omni_instead(cameras: Sequence[Camera], found: Sequence[_Fitted], misfits: Sequence[Misfit]) -> str:
@@ -272,9 +272,7 @@ def _omni_instead(cameras: Sequence[Camera], found: Sequence[_Fitted], misfits: 
         f"{camera_name(camera, f'camera {number}')} RMS {misfit.rms:.2g} px"
         for number, (camera, misfit) in enumerate(zip(cameras, misfits, strict=True), 1)
     )
-    return (
-        f"written as {OMNI} ({names}): in one pinhole model of Kalibr the RMS is up to {max(map(_rms, found)):.2g} px"
-    )
+    return f"written as {OMNI} ({names}): in one pinhole model of Kalibr the RMS is up to {max(map(_misfit_rms, found)):.2g} px"
 
 
 def _nearer_omni(
