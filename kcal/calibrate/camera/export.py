@@ -217,7 +217,7 @@ def _in_one_model(
     held = [_Fitted(camera) for camera in exact if camera is not None]
     if len(held) == len(cameras):
         return held, ()
-    fits = [_fits(camera, name, model) for camera in cameras]
+    fits = [_fit_each(camera, name, model) for camera in cameras]
     alone = [
         _Fitted(one) if one is not None else min(found.values(), key=_misfit_rms)
         for one, found in zip(exact, fits, strict=True)
@@ -225,15 +225,15 @@ def _in_one_model(
     shared = [[found[kind] for found in fits] for kind in fits[0] if all(kind in found for found in fits)]
     chosen = min(shared, key=_squares, default=alone)
     return chosen, tuple(
-        f"{camera_name(camera, f'camera {number}')}: written as {one.camera.model} (RMS {_misfit_rms(one):.2g} px) so that "
-        f"all cameras have one lens model; in a file of its own it is {own.camera.model} "
+        f"{camera_name(camera, f'camera {number}')}: written as {one.camera.model} (RMS {_misfit_rms(one):.2g} px) so "
+        f"that all cameras have one lens model; in a file of its own it is {own.camera.model} "
         f"({f'RMS {_misfit_rms(own):.2g} px' if own.misfit else 'exact'})"
         for number, (camera, one, own) in enumerate(zip(cameras, chosen, alone, strict=True), 1)
         if _misfit_rms(one) > _misfit_rms(own)
     )
 
 
-def _fits(camera: Camera, name: str, model: str | None) -> dict[LensModel, _Fitted]:
+def _fit_each(camera: Camera, name: str, model: str | None) -> dict[LensModel, _Fitted]:
     """The camera in each model of a format that shows its whole image."""
     found, refused = {}, []
     for kind in _richest([model] if model else FORMATS[name].models):
@@ -272,7 +272,8 @@ def _omni_instead(cameras: Sequence[Camera], found: Sequence[_Fitted], misfits: 
         f"{camera_name(camera, f'camera {number}')} RMS {misfit.rms:.2g} px"
         for number, (camera, misfit) in enumerate(zip(cameras, misfits, strict=True), 1)
     )
-    return f"written as {OMNI} ({names}): in one pinhole model of Kalibr the RMS is up to {max(map(_misfit_rms, found)):.2g} px"
+    most = max(map(_misfit_rms, found))
+    return f"written as {OMNI} ({names}): in one pinhole model of Kalibr the RMS is up to {most:.2g} px"
 
 
 def _nearer_omni(
