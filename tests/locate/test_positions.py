@@ -260,7 +260,7 @@ def test_kml_in_another_reader(tmp_path: Path) -> None:
 def test_cursor_on_target_in_another_reader() -> None:
     takproto = pytest.importorskip("takproto", reason="takproto is not installed")
     located = mixed()
-    moment = datetime.datetime(2026, 5, 4, 10, 0, tzinfo=datetime.timezone.utc)
+    moment = datetime.datetime(2026, 5, 4, 10, 0, tzinfo=datetime.UTC)
     packed = takproto.xml2proto(cot_events(located.columns, located, time=moment, stale_s=60))
     event = takproto.parse_proto(packed).cotEvent
     position = located.positions[0]
