@@ -20,6 +20,7 @@ from kcal.cli.board import app as board
 from kcal.cli.budget import budget_command
 from kcal.cli.calibrate import calibrate_command
 from kcal.cli.capture import capture_command
+from kcal.cli.check import check_command
 from kcal.cli.commands import Command
 from kcal.cli.compare import compare_command
 from kcal.cli.console import err, warn, with_json
@@ -132,6 +133,7 @@ app.command("export", cls=Command)(with_json(with_inputs(export_command)))
 app.command("import", cls=Command)(with_json(with_inputs(import_command)))
 app.command("show", cls=Command)(with_json(with_inputs(show_command)))
 app.command("diff", cls=Command)(with_json(with_inputs(diff_command)))
+app.command("check", cls=Command)(with_json(with_inputs(check_command)))
 app.command("report", cls=Command)(with_json(with_inputs(report_command)))
 
 

@@ -94,7 +94,7 @@ def load_lookup(path: str | Path) -> LookupCamera:
         Traceback (most recent call last):
         kcal.errors.FileError: no-such-file.npz: cannot read: No such file or directory
     """
-    arrays = _read_arrays(read_bytes(path, _MOST_BYTES), path)
+    arrays = read_arrays(path, "a lookup camera")
     kind, version = arrays.get("kcal"), arrays.get("version")
     if kind is None or str(kind) != KIND or version is None or str(version) != str(VERSION):
         raise FileError(f"{path}: not a kcal {KIND} file of version {VERSION}")
@@ -125,19 +125,29 @@ def load_lookup(path: str | Path) -> LookupCamera:
         raise FileError(f"{path}: bad lookup file: {error}") from error
 
 
-def _read_arrays(data: bytes, path: str | Path) -> dict[str, np.ndarray]:
+def read_arrays(path: str | Path, content: str) -> dict[str, np.ndarray]:
+    """The arrays of an .npz file of at most 256 MiB, of which nothing is executed.
+
+    Args:
+        path: of the file.
+        content: what it should have, for messages.
+
+    Raises:
+        FileError: missing, no .npz file, damaged, or too large.
+    """
+    data = read_bytes(path, _MOST_BYTES)
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             size = sum(member.file_size for member in archive.infolist())
         if size > _MOST_BYTES:
-            raise FileError(f"{path}: unpacks to {size / 2**20:.0f} MiB; no lookup camera is larger than 256 MiB")
+            raise FileError(f"{path}: unpacks to {size / 2**20:.0f} MiB; at most 256 MiB are read")
         with np.load(io.BytesIO(data), allow_pickle=False) as file:
             return {name: np.asarray(file[name]) for name in file.files}
     except FileError:
         raise
     except Exception as error:
         # Damaged archives and headers raise errors of a dozen kinds, from zlib.error to MemoryError.
-        raise FileError(f"{path}: not an .npz file with a lookup camera, or a damaged one") from error
+        raise FileError(f"{path}: not an .npz file with {content}, or a damaged one") from error
 
 
 def _two(arrays: dict[str, np.ndarray], key: str, kinds: str, low: float, high: float) -> tuple[float, float]:
