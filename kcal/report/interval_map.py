@@ -51,7 +51,12 @@ def interval_figure(check: IntervalCheck, observations: Observations, title: str
         left = _BESIDE + i * (_WIDE + _BESIDE)
         axes = figure.add_axes((left / across, _BELOW / down, _WIDE / across, tall / down))
         drawn = axes.contourf(
-            places[..., 0], places[..., 1], coverage.numpy(), levels=_LEVELS, cmap="RdYlBu", norm=BoundaryNorm(_LEVELS, 256)
+            places[..., 0],
+            places[..., 1],
+            coverage.numpy(),
+            levels=_LEVELS,
+            cmap="RdYlBu",
+            norm=BoundaryNorm(_LEVELS, 256),
         )
         if not seen.all():
             axes.contour(columns, rows, seen, levels=[0.5], colors=INK, linewidths=1.0, linestyles="dashed")

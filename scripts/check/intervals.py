@@ -133,7 +133,9 @@ def cold_and_warm(count: int) -> list[str]:
                 start = time.process_time()
                 cameras.append(drawn.calibrated(options, warm=warm))
                 took[which] += time.process_time() - start
-            apart.append(float((pixel_errors(cameras[0], cameras[1], places).square().sum(-1) / sigma).nanmean().sqrt()))
+            apart.append(
+                float((pixel_errors(cameras[0], cameras[1], places).square().sum(-1) / sigma).nanmean().sqrt())
+            )
         kind = f"{views} views {'by hand' if by_hand else 'on a stand'}"
         rows.append([kind, count, f"{statistics.median(apart):.3f}", f"{max(apart):.3f}",
                      *(f"{spent / count:.2f}" for spent in took)])  # fmt: skip
