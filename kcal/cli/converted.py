@@ -88,6 +88,13 @@ class Journal:
         write_atomic(self.path, dump_json({"view": self.view, "done": self.done}))
         self._saved = time.monotonic()
 
+    def close(self) -> None:
+        """Write the journal; where no image could be made, none is left."""
+        if self.done:
+            self.save()
+        else:
+            self.path.unlink(missing_ok=True)
+
 
 def _state_of(path: Path) -> list[int]:
     state = path.stat()
@@ -118,7 +125,7 @@ def convert_images(
                     err.print(f"[yellow]failed[/] {escape(str(error))}")
             advance(path.name)
     finally:
-        journal.save()
+        journal.close()
     return before, failures
 
 

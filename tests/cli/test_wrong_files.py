@@ -26,7 +26,7 @@ LINES = [
     "calibrate seen.json -o new.json --board-shape board.json",
     "compare seen.json --model opencv5",
     "detect picture.png --board 9x6 --square 25mm -o new.json",
-    "undistort picture.png camera.json -o straight",
+    "rectify camera.json picture.png -o straight",
     "bake camera.json -o new.npz",
     "board measure seen.json -o new.json",
     "diff camera.json rig.json:left",
@@ -152,7 +152,7 @@ def test_a_wrong_file_is_named(
     ("line", "right"),
     [
         ("locate marks.csv rig.json", "kcal locate rig.json marks.csv"),
-        ("undistort camera.json picture.png -o s", "kcal undistort picture.png camera.json -o s"),
+        ("rectify picture.png camera.json -o s", "kcal rectify camera.json picture.png -o s"),
         ("report seen.json --observations=camera.json", "kcal report camera.json --observations=seen.json"),
         ("bake rig.json -o new.npz", "kcal bake rig.json:left -o new.npz"),
         (
