@@ -56,10 +56,11 @@ def check_command(
 
     Simulates the camera's own capture again and again: its poses, corners, noise and motion, with true cameras and
     boards drawn from what the calibration leaves open. Each is calibrated, and its error is compared with what the
-    camera file states, over the image and at each range. A hundred take about 40 s.
+    camera file states, over the image and at each range. A hundred take about a minute.
 
-    A lens or a board that the model cannot describe shows only against a second capture: --against calibrates that one
-    too, and tests whether both cameras differ by more than they state.
+    That supposes that the model can describe lens and board. Two tests do not: halves of the views, and the default
+    lens where another was chosen, must agree with the camera; and so must a second capture (--against), which is
+    calibrated, too.
 
     What is done is kept: after an interruption the same command continues.
 
@@ -87,8 +88,10 @@ def check_command(
         raise typer.Exit(_INTERRUPTED)
     found = interval_check(result, at, done)
     fine = _told(found, len(done))
-    if against is not None and whole:
-        fine = _told_against(result, against, options, at) and fine
+    if whole:
+        fine = _told_views(result, options) and fine
+        if against is not None:
+            fine = _told_against(result, against, options, at) and fine
     if picture is not None:
         from kcal.report.interval_map import save_interval_picture
 
@@ -240,6 +243,21 @@ def _told(found: IntervalCheck, count: int) -> bool:
         factors=found.factors,
     )
     return found.true
+
+
+def _told_views(result: CameraCalibrationResult, options: CalibrationOptions) -> bool:
+    """Print whether the capture's own views contradict the intervals: by their halves, and by the default lens."""
+    from kcal.report.model_findings import fault_of_views
+
+    with steps("examining the views", None) as advance:
+        fault = fault_of_views(result, options, advance)
+    out.print(f"[bold]{'YES' if fault is None else 'NO'}[/]:", end=" ")
+    if fault is None:
+        out.print("its own views say nothing against lens model and board", markup=False)
+    else:
+        out.print(f"its own views contradict the stated intervals: {fault.text}; {fault.action}", markup=False)
+    tell(fault=None if fault is None else fault.text)
+    return fault is None
 
 
 def _told_against(

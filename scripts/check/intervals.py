@@ -36,6 +36,7 @@ from kcal.calibrate.camera.interval_check import (
 from kcal.calibrate.camera.options import CalibrationOptions
 from kcal.errors import KcalError
 from kcal.lens.uncertainty import pixel_covariance, pixel_errors
+from kcal.report.model_findings import fault_of_views
 from scripts.shared.infinity import error_at_infinity
 from scripts.shared.page import table, write_section
 from scripts.shared.records import Record, finish, read, seeds
@@ -60,6 +61,7 @@ def judged(model: str, seed: int, refits: int) -> Record:
         start = time.process_time()
         check = interval_check(result, AT, simulated_refits(result, options, AT, range(refits)))
         spent = time.process_time() - start
+        fault = fault_of_views(result, options)
         found = against_capture(result, second.seen, options, AT)[0]
     except KcalError as refusal:
         return {"refused": str(refusal)}
@@ -71,6 +73,7 @@ def judged(model: str, seed: int, refits: int) -> Record:
         "own": check.own_shares[0],
         "factor": check.factors[0],
         "true": check.true,
+        "fault": None if fault is None else fault.text,
         "same": found.same,
         "probability": found.probability,
         "cpu_s": spent,
@@ -83,7 +86,8 @@ def line(record: Record) -> str:
         return f"refused: {record['refused'][:90]}"
     return (
         f"truth {record['truth']:.2f} inside; check {record['share']:.3f} (own ellipses {record['own']:.3f}), factor "
-        f"{record['factor']:.2f}, {'true' if record['true'] else 'FALSE'}; against p {record['probability']:.2g}; "
+        f"{record['factor']:.2f}, {'true' if record['true'] else 'FALSE'}; views {record['fault']}; against "
+        f"p {record['probability']:.2g}; "
         f"{record['cpu_s']:.0f} s"
     )
 
@@ -96,23 +100,26 @@ def lines(records: list[Record]) -> list[str]:
         if not some:
             continue
         true = [one["truth"] > HALF for one in some]
-        alone = sum(one["true"] == ok for one, ok in zip(some, true, strict=True))
-        both = sum((one["true"] and one["same"]) == ok for one, ok in zip(some, true, strict=True))
+        alone = [one["true"] and one["fault"] is None for one in some]
+        both = [ok and one["same"] for ok, one in zip(alone, some, strict=True)]
+        agree = [sum(a == b for a, b in zip(said, true, strict=True)) for said in (alone, both)]
         rows.append([
             "default" if model == MODELS[0] else model,
             len(some),
-            f"{100 * statistics.fmean(one['truth'] for one in some):.0f} %",
             sum(true),
+            f"{100 * statistics.fmean(one['truth'] for one in some):.0f} %",
             f"{100 * statistics.fmean(one['share'] for one in some):.1f} %",
             sum(one["true"] for one in some),
-            f"{alone} of {len(some)}",
+            sum(one["fault"] is None for one in some),
             sum(bool(one["same"]) for one in some),
-            f"{both} of {len(some)}",
+            f"{agree[0]} of {len(some)}",
+            f"{agree[1]} of {len(some)}",
             f"{statistics.median(one['cpu_s'] / one['key'][2] for one in some) * 100:.0f}",
         ])  # fmt: skip
     heads = (
-        "lens", "calibrations", "truth inside, of the image", "intervals true", "refits inside", "check says true",
-        "agree", "second capture says true", "both agree with the truth", "CPU s for 100 refits",
+        "lens", "calibrations", "truly true", "truth inside, of the image", "refits inside", "refits say true",
+        "views say true", "second capture says true", "check agrees", "check with --against agrees",
+        "CPU s, 100 refits",
     )  # fmt: skip
     return table(heads, rows)
 

@@ -133,9 +133,7 @@ def test_new_camera_file_is_a_pinhole(folder: Path, monkeypatch: pytest.MonkeyPa
     assert content["coefficients"] == {}
 
 
-def test_the_old_command(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_old_command(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """It warns, and makes the same images under the old names."""
     (folder / "in" / "a.png").write_bytes(encode_png(picture(np.uint8, 1)))
     assert run(monkeypatch, "left.camera.json", "in", "-o", "new") == 0

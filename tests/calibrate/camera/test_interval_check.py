@@ -21,16 +21,18 @@ from kcal.corners.observations import Observations
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.uncertainty import pixel_covariance, pixel_errors
+from kcal.report.model_findings import fault_of_views
+from kcal.report.verdict import Finding
 from scripts.shared.views import observed, simulate
 
 OPTIONS = CalibrationOptions(model="opencv5", weak_prior=None)
-# The default lens is fitted in the last test only: its refits take longer.
-AT = [math.inf, 5.0]
+# The default lens is fitted in one test only: its refits take longer.
+AT = [math.inf]
 
 
 def capture(seed: int, noise: float = 0.2) -> Observations:
     truth = Camera.build(focal=(1600, 1600), center=(963, 536), size=(1920, 1080), coefficients=[-0.25, 0.08])
-    return observed(simulate(8, truth, seed=seed, noise=noise)["pixels"].tolist())
+    return observed(simulate(6, truth, seed=seed, noise=noise)["pixels"].tolist())
 
 
 @pytest.fixture(scope="module")
@@ -40,14 +42,14 @@ def result() -> CameraCalibrationResult:
 
 @pytest.fixture(scope="module")
 def refits(result: CameraCalibrationResult) -> list[module.Refit]:
-    return list(simulated_refits(result, OPTIONS, AT, range(30)))
+    return list(simulated_refits(result, OPTIONS, AT, range(16)))
 
 
 def test_true_intervals(result: CameraCalibrationResult, refits: list[module.Refit]) -> None:
     found = interval_check(result, AT, refits)
     assert found.true
     assert found.failed == 0
-    assert all(0.88 < share < 1.0 for share, _ in found.shares)
+    assert all(0.85 < share < 1.0 for share, _ in found.shares)
     assert all(0.75 < factor < 1.3 for factor in found.factors)
     assert all(0.8 < seen / told < 1.25 for seen, told in found.rms)
 
@@ -68,8 +70,8 @@ def test_false_intervals(result: CameraCalibrationResult, refits: list[module.Re
 def test_refits_are_the_same_again(result: CameraCalibrationResult, refits: list[module.Refit]) -> None:
     """A seed determines its refit, so that a run may be continued."""
     again = next(simulated_refits(result, OPTIONS, AT, [7]))
-    assert torch.equal(again.errors, refits[7].errors)
-    assert not torch.equal(again.errors, refits[8].errors)
+    assert torch.allclose(again.errors, refits[7].errors, atol=1e-6)
+    assert not torch.allclose(again.errors, refits[8].errors, atol=1e-2)
 
 
 def test_errors_are_what_the_covariance_predicts() -> None:
@@ -114,36 +116,48 @@ def test_command(
 
     def interrupted(*arguments: object) -> object:
         for number, refit in enumerate(whole(*arguments)):  # type: ignore[arg-type]
-            if number == 11:
+            if number == 10:
                 raise KeyboardInterrupt
             yield refit
 
     monkeypatch.setattr(module, "simulated_refits", interrupted)
-    assert run(monkeypatch, "left.camera.json", "--refits", "14") == 130
+    monkeypatch.setattr("kcal.report.model_findings.fault_of_views", lambda *_: None)
+    assert run(monkeypatch, "left.camera.json", "--refits", "11") == 130
     printed = capsys.readouterr()
-    assert "of 11 refits" in printed.out
-    assert "interrupted after 11 of 14 refits" in printed.err
+    assert "of 10 refits" in printed.out
+    assert "interrupted after 10 of 11 refits" in printed.err
     monkeypatch.setattr(module, "simulated_refits", whole)
-    assert run(monkeypatch, "left.camera.json", "--refits", "14", "--picture", "map.png", "--json") == 0
+    command = ("left.camera.json", "--refits", "11", "--picture", "map.png", "--against", "second.obs.json", "--json")
+    assert run(monkeypatch, *command) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["true"] is True
-    assert told["refits"] == 14
-    assert "11 refits are done already" in told["text"][0]
+    assert told["refits"] == 11
+    assert told["against"]["same"] is True
+    assert "10 refits are done already" in told["text"][0]
     assert Path("map.png").stat().st_size > 10_000
-    assert run(monkeypatch, "left.camera.json", "--refits", "14", "--against", "second.obs.json") == 0
-    assert "the second capture agrees with the stated intervals" in capsys.readouterr().out
-    assert run(monkeypatch, "left.camera.json", "--refits", "14", "--against", "wrong.obs.json") == 3
-    assert "the second capture contradicts the stated intervals" in capsys.readouterr().out
-    assert run(monkeypatch, "left.camera.json", "--refits", "10", "--observations", "second.obs.json") == 1
+    fault = Finding(name="model", severity="doubt", text="halves differ", action="take more views")
+    monkeypatch.setattr("kcal.report.model_findings.fault_of_views", lambda *_: fault)
+    assert run(monkeypatch, "left.camera.json", "--refits", "11", "--against", "wrong.obs.json") == 3
+    printed = capsys.readouterr()
+    assert "the second capture contradicts the stated intervals" in printed.out
+    assert "its own views contradict the stated intervals: halves differ; take more views" in printed.out
+    assert run(monkeypatch, "left.camera.json", "--observations", "second.obs.json") == 1
     assert "not the views that the camera was calibrated from" in capsys.readouterr().err
-    Path("left.obs.json").unlink()
-    assert run(monkeypatch, "left.camera.json") == 1
-    assert "name them with --observations" in capsys.readouterr().err
+
+
+def test_own_views_find_a_wrong_model() -> None:
+    """A lens that needs three coefficients, fitted with one, is contradicted by the default lens."""
+    truth = Camera.build(focal=(900, 900), center=(963, 536), size=(1920, 1080), coefficients=[-0.3, 0.15, 0, 0, -0.03])
+    seen = observed(simulate(12, truth, seed=5, noise=0.05)["pixels"].tolist())
+    options = CalibrationOptions(model="opencv4", fixed={"k2": 0.0, "p1": 0.0, "p2": 0.0})
+    assert fault_of_views(calibrate_camera(seen, options), options) is not None
 
 
 def test_default_lens() -> None:
     """Refits of the hybrid lens begin at the found one, and its intervals are true."""
     result = calibrate_camera(capture(4))
-    found = interval_check(result, AT, simulated_refits(result, CalibrationOptions(), AT, range(4)))
-    assert found.errors.shape == (4, 2, 17, 25, 2)
+    found = interval_check(
+        result, [math.inf, 5.0], simulated_refits(result, CalibrationOptions(), [math.inf, 5.0], range(3))
+    )
+    assert found.errors.shape == (3, 2, 17, 25, 2)
     assert all(0.3 < seen / told < 2.5 for seen, told in found.rms)
