@@ -3,7 +3,7 @@
     python -m scripts.check.intervals --out FILE --seeds 0-19 --refits 100     # all of it
     python -m scripts.check.intervals --out FILE --seeds 0-9 --refits 30       # a fifth of the time
     python -m scripts.check.intervals --out FILE [OTHER ...] --write           # the table in docs/measured
-    python -m scripts.check.intervals --cold 10                                # warm refits beside cold ones
+    python -m scripts.check.intervals --cold 8 [--write]                       # warm refits beside cold ones
 
 Calibrations that FILE has are not made again, so that a run can be interrupted, and split over several files.
 
@@ -161,7 +161,9 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     if arguments.cold:
-        show(cold_and_warm(arguments.cold))
+        text = show(cold_and_warm(arguments.cold))
+        if arguments.write:
+            write_section(PAGE, "warm refits", "\n".join(text))
         return
     if not arguments.out:
         parser.error("--out is needed")
