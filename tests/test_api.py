@@ -62,7 +62,8 @@ PUBLIC = {
     """,
     "kcal.locate": """
         BudgetErrors DisparityRanges Geoid GroundPlaces Localization Marks RangeImage Position PositionColumns
-        RangeError Sensitivity Triangulate TriangulateViews Triangulation Viewpoint ViewsResult circular_error enu_from_cam enu_to_geodetic
+        RangeError Sensitivity Triangulate TriangulateViews Triangulation Viewpoint ViewsResult
+        circular_error enu_from_cam enu_to_geodetic
         find_geoid geodetic_to_enu level_ground locate_on_ground position_errors range_errors read_marks
         read_truth terrain true_from_grid write_positions
     """,
@@ -74,7 +75,8 @@ PUBLIC = {
     "kcal.report": """
         FailedImage Finding RangeAnswer Requirement Verdict calibration_figure camera_verdict positions_figure
         rig_figure rig_verdict save_board_picture save_budget_picture save_calibration_picture save_coverage
-        save_difference_picture save_gallery save_interval_picture save_map save_positions_picture save_rig_picture save_verdict_page
+        save_difference_picture save_gallery save_interval_picture save_map save_positions_picture
+        save_rig_picture save_verdict_page
         stored_verdict
     """,
     "kcal.stars": """

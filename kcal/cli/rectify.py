@@ -90,13 +90,16 @@ def rectify_command(
     `kcal rectify rig.json left/ right/ -o stereo --maps`
     """
     rig = rig_of(source)
-    common = {"alpha": alpha, "size": parse_size(size), "at": at}
+    shape = parse_size(size)
     if rig is None:
-        _rectify_camera(source, images or [], output, fov, cylinder, (pan, tilt), maps, mask, "rectified", **common)
+        _rectify_camera(
+            source, images or [], output, fov, cylinder, (pan, tilt), maps, mask, "rectified", alpha=alpha, size=shape,
+            at=at,
+        )  # fmt: skip
     elif cylinder or pan or tilt:
         raise InputError("--cylinder, --pan and --tilt are for a camera, not for a rig; RIG.json:left is a camera")
     else:
-        _rectify_rig(source, rig, images or [], output, fov, maps, mask, **common)
+        _rectify_rig(rig, images or [], output, fov, maps, mask, alpha=alpha, size=shape, at=at)
 
 
 def undistort_command(
@@ -190,7 +193,6 @@ def _rectify_camera(
 
 
 def _rectify_rig(
-    source: str,
     rig: StereoRig,
     images: list[str],
     folder: Path,
@@ -221,7 +223,7 @@ def _rectify_rig(
     prepare(folder, extras)
     for name, files in targets.items():
         prepare(folder / name, files)
-    before, failures = 0, []
+    before, failures = 0, list[str]()
     with steps("rectifying", 1 + sum(map(len, sides.values()))) as advance:
         module = StereoRectification(rig, alpha=alpha, size=size, field_of_view=fov, at=at)
         advance("maps")

@@ -13,6 +13,7 @@ in turn, and ratios are taken within a round; medians, one thread.
 from __future__ import annotations
 
 import argparse
+import functools
 import time
 from collections.abc import Callable
 
@@ -22,7 +23,7 @@ import torch
 from kornia.geometry.calibration import undistort_image
 
 from kcal.lens.camera import Camera
-from kcal.lens.images import Undistort, undistort_maps
+from kcal.lens.images import Undistort, UndistortMaps, undistort_maps
 from kcal.lens.rectification import StereoRectification
 from kcal.lens.rig import StereoRig
 from kcal.lens.views import cylinder_view, looking, pinhole_view
@@ -83,10 +84,8 @@ def views(rounds: int) -> list[str]:
             array = np.ascontiguousarray(image[0].permute(1, 2, 0).numpy())
             maps = [undistort_maps(one.camera, one.new_camera, one.rotation) for one in modules]
             calls: list[Callable[[], object]] = [
-                lambda image=image, modules=modules: [module(image) for module in modules],
-                lambda array=array, maps=maps: [
-                    cv2.remap(array, one.map_x, one.map_y, cv2.INTER_LINEAR) for one in maps
-                ],
+                functools.partial(_each, modules, image),
+                functools.partial(_each_by_opencv, maps, array),
             ]
             for call in calls:
                 taken = []
@@ -119,6 +118,14 @@ def tables(rounds: int) -> list[str]:
     for name, channels, dtype in CASES:
         lines += show([_row(name, camera, undistort, _image(channels, dtype), rounds)])
     return lines
+
+
+def _each(modules: list[Undistort], image: torch.Tensor) -> list[object]:
+    return [module(image) for module in modules]
+
+
+def _each_by_opencv(maps: list[UndistortMaps], array: np.ndarray) -> list[object]:
+    return [cv2.remap(array, one.map_x, one.map_y, cv2.INTER_LINEAR) for one in maps]
 
 
 def _image(channels: int, dtype: torch.dtype) -> torch.Tensor:
