@@ -81,13 +81,13 @@ def check_command(
     from kcal.calibrate.camera.interval_check import FEWEST, interval_check
 
     at = [float(one) for one in ranges] if ranges else [math.inf]
-    result, options = _calibrated_again(camera, observations)
-    done, whole = _refitted(result, options, at, refits, kept)
+    result, options = _calibration_of(camera, observations)
+    done, whole = _all_refits(result, options, at, refits, kept)
     if len(done) < FEWEST:
         err.print(f"interrupted after {len(done)} of {refits} refits: too few to tell; {kept} has them", markup=False)
         raise typer.Exit(_INTERRUPTED)
     found = interval_check(result, at, done)
-    fine = _told(found, len(done))
+    fine = _told_refits(found, len(done))
     if whole:
         fine = _told_views(result, options) and fine
         if against is not None:
@@ -104,7 +104,7 @@ def check_command(
         raise typer.Exit(NO)
 
 
-def _calibrated_again(path: Path, observations: Path | None) -> tuple[CameraCalibrationResult, CalibrationOptions]:
+def _calibration_of(path: Path, observations: Path | None) -> tuple[CameraCalibrationResult, CalibrationOptions]:
     """The calibration, with residuals and poses, which a camera file does not have."""
     from kcal.calibrate.camera.calibrate import calibrate_camera
     from kcal.calibrate.camera.trust import stored_options
@@ -117,7 +117,7 @@ def _calibrated_again(path: Path, observations: Path | None) -> tuple[CameraCali
         raise InputError(
             f"{path}: the camera has no error bars that could be checked; calibrate it with kcal calibrate"
         )
-    file = observations or _beside(path, camera)
+    file = observations or _observations_beside(path, camera)
     seen, options = Observations.load(file), stored_options(camera)
     check_views_of([camera], [seen], [file])
     with steps("calibrating", None) as advance:
@@ -128,7 +128,7 @@ def _calibrated_again(path: Path, observations: Path | None) -> tuple[CameraCali
     return result, options
 
 
-def _beside(path: Path, camera: Camera) -> Path:
+def _observations_beside(path: Path, camera: Camera) -> Path:
     record = camera.calibration.record if camera.calibration else None
     name = record.observations if record else None
     if name is None or not path.with_name(Path(name).name).exists():
@@ -137,14 +137,14 @@ def _beside(path: Path, camera: Camera) -> Path:
     return path.with_name(Path(name).name)
 
 
-def _refitted(
+def _all_refits(
     result: CameraCalibrationResult, options: CalibrationOptions, ranges: list[float], count: int, path: Path
 ) -> tuple[list[Refit], bool]:
     """So many refits, those of an earlier run included; and whether these are all."""
     from kcal.calibrate.camera.interval_check import GRID, simulated_refits
 
     key = repr((result.camera.fingerprint, [view.pixels for view in result.observations.views], ranges, GRID))
-    done = _stored(path, key)[:count]
+    done = _kept_refits(path, key)[:count]
     if done:
         out.print(f"{len(done)} refits are done already ({path})", markup=False)
     seen = {refit.seed for refit in done}
@@ -157,16 +157,16 @@ def _refitted(
                 done.append(refit)
                 advance(f"{len(done)} of {count}")
                 if time.monotonic() - saved > _OFTEN:
-                    _store(path, key, done)
+                    _keep_refits(path, key, done)
                     saved = time.monotonic()
     except KeyboardInterrupt:
         whole = False
     if todo and done:
-        _store(path, key, done)
+        _keep_refits(path, key, done)
     return done, whole
 
 
-def _digest(key: str) -> str:
+def _run_digest(key: str) -> str:
     import hashlib
 
     from kcal import __version__
@@ -174,16 +174,16 @@ def _digest(key: str) -> str:
     return hashlib.sha256(f"{__version__}{key}".encode()).hexdigest()[:16]
 
 
-def _store(path: Path, key: str, refits: list[Refit]) -> None:
+def _keep_refits(path: Path, key: str, refits: list[Refit]) -> None:
     import numpy as np
 
     data = io.BytesIO()
     parts = {name: np.stack([np.asarray(getattr(one, name)) for one in refits]) for name in ("seed", "errors", "own")}
-    np.savez_compressed(data, allow_pickle=False, kcal=np.array("check"), key=np.array(_digest(key)), **parts)
+    np.savez_compressed(data, allow_pickle=False, kcal=np.array("check"), key=np.array(_run_digest(key)), **parts)
     write_atomic(path, data.getvalue())
 
 
-def _stored(path: Path, key: str) -> list[Refit]:
+def _kept_refits(path: Path, key: str) -> list[Refit]:
     """The refits of an earlier run; none where the file is of another camera, other ranges or another version."""
     import torch
 
@@ -195,7 +195,7 @@ def _stored(path: Path, key: str) -> list[Refit]:
     arrays = read_arrays(path, "refits of kcal check")
     if str(arrays.get("kcal")) != "check":
         raise FileError(f"{path}: not a file of kcal check; choose another name with -o")
-    if str(arrays.get("key")) != _digest(key):
+    if str(arrays.get("key")) != _run_digest(key):
         warn(f"{path} has refits of another camera, capture, range or version of kcal; they are made anew")
         return []
     try:
@@ -207,7 +207,7 @@ def _stored(path: Path, key: str) -> list[Refit]:
         raise FileError(f"{path}: damaged; remove it and start again") from error
 
 
-def _told(found: IntervalCheck, count: int) -> bool:
+def _told_refits(found: IntervalCheck, count: int) -> bool:
     """Print the answer."""
     from kcal.report.interval_map import range_label
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from kcal.lens.images import Undistort
 
 # In every folder of images: how they were made, and which are done.
-JOURNAL = "rectify.json"
+IMAGE_JOURNAL = "rectify.json"
 # Seconds between two writes of the journal.
 _OFTEN = 5.0
 
@@ -43,11 +43,11 @@ def targets_of(paths: list[Path], folder: Path, others: list[Path]) -> list[Path
 def prepare(folder: Path, files: list[Path]) -> None:
     """Make the folder, and refuse now what could not be written later."""
     make_folder(folder)
-    for path in [*files, folder / JOURNAL]:
+    for path in [*files, folder / IMAGE_JOURNAL]:
         check_writable(path)
 
 
-class Journal:
+class ImageJournal:
     """Which images of a folder are done, by which views: nothing is taken for done that another view made.
 
     Args:
@@ -59,7 +59,7 @@ class Journal:
         values = [value.tolist() for value in (module.camera.params, module.new_camera.params, module.rotation)]
         kinds = repr((type(module.new_camera).__name__, str(module.camera.model), module.camera.model.hybrid))
         text = repr((values, kinds, module.camera.size, module.new_camera.size, module.at))
-        self.path = folder / JOURNAL
+        self.path = folder / IMAGE_JOURNAL
         self.view = hashlib.sha256(text.encode()).hexdigest()[:16]
         self.done: dict[str, list[int]] = {}
         self._saved = time.monotonic()
@@ -75,11 +75,11 @@ class Journal:
 
     def has(self, path: Path, target: Path) -> bool:
         """Whether this image was made of this file, as it is now."""
-        return target.exists() and self.done.get(target.name) == _state_of(path)
+        return target.exists() and self.done.get(target.name) == _file_state(path)
 
     def add(self, path: Path, target: Path) -> None:
         """Note that an image is done."""
-        self.done[target.name] = _state_of(path)
+        self.done[target.name] = _file_state(path)
         if time.monotonic() - self._saved > _OFTEN:
             self.save()
 
@@ -96,7 +96,7 @@ class Journal:
             self.path.unlink(missing_ok=True)
 
 
-def _state_of(path: Path) -> list[int]:
+def _file_state(path: Path) -> list[int]:
     state = path.stat()
     return [state.st_size, state.st_mtime_ns]
 
@@ -109,7 +109,7 @@ def convert_images(
     Returns:
         how many were done before, and what was wrong with those that failed.
     """
-    journal = Journal(targets[0].parent, module)
+    journal = ImageJournal(targets[0].parent, module)
     failures: list[str] = []
     before = 0
     try:

@@ -173,10 +173,10 @@ def simulated_capture(result: CameraCalibrationResult, options: CalibrationOptio
     pixels = torch.where(counted, seen.pixels(), torch.nan)
     fit = None if result.hybrid is None else result.hybrid.only(used)
     if fit is not None:
-        truth = _drawn(fit, random)
+        truth = _possible_fit(fit, random)
         camera, clean, weights = truth.camera, truth.residuals_of(pixels) + pixels, fit.weights
     else:
-        camera = _drawn_parametric(result, random)
+        camera = _possible_camera(result, random)
         rotation, translation = result.cam_from_board_rotation[used], result.cam_from_board_translation[used]
         clean, valid = camera.project(result.board_points @ rotation.mT + translation[:, None])
         clean = torch.where(valid[..., None] & counted, clean, torch.nan)
@@ -220,7 +220,7 @@ def simulated_refits(
             again = drawn.calibrated(options)
             errors = torch.stack([pixel_errors(again, drawn.camera, places, at=at) for at in ranges])
             known = torch.stack([pixel_covariance(again, places, at=at) for at in ranges])
-            yield Refit(seed, errors, _squares(errors, known))
+            yield Refit(seed, errors, _own_squares(errors, known))
         except KcalError:
             lost = torch.full((len(ranges), len(places)), torch.nan, dtype=torch.float64)
             yield Refit(seed, lost[..., None].expand(-1, -1, 2), lost)
@@ -265,7 +265,7 @@ def against_capture(
     return [camera_difference(result.camera, again.camera, at=at) for at in ranges]
 
 
-def _squares(errors: Tensor, covariance: Tensor) -> Tensor:
+def _own_squares(errors: Tensor, covariance: Tensor) -> Tensor:
     """(...) of errors (..., 2) over covariances (..., 2, 2); NaN where these are."""
     good = covariance.isfinite().all(-1).all(-1) & errors.isfinite().all(-1)
     eye = torch.eye(2, dtype=torch.float64)
@@ -273,7 +273,7 @@ def _squares(errors: Tensor, covariance: Tensor) -> Tensor:
     return torch.where(good, (errors.nan_to_num(0.0)[..., None] * solved).sum((-1, -2)), torch.nan)
 
 
-def _drawn(fit: HybridFit, random: torch.Generator) -> HybridFit:
+def _possible_fit(fit: HybridFit, random: torch.Generator) -> HybridFit:
     """A camera, a board and motions that the calibration takes for possible; poses as they are."""
     unknowns, state = hybrid_unknowns(fit.model, fit.square), fit.state
     # Error bars of few moving views are wider than the posterior, which is what the refits are to tell.
@@ -293,7 +293,7 @@ def _drawn(fit: HybridFit, random: torch.Generator) -> HybridFit:
     )
 
 
-def _drawn_parametric(result: CameraCalibrationResult, random: torch.Generator) -> Camera:
+def _possible_camera(result: CameraCalibrationResult, random: torch.Generator) -> Camera:
     half = half_of_covariance(result.covariance)
     change = torch.randn(len(half), dtype=torch.float64, generator=random) @ half
     return result.camera.with_parameters(result.camera.params.detach() + change)

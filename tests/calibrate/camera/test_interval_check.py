@@ -145,6 +145,7 @@ def test_command(
     assert "not the views that the camera was calibrated from" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_own_views_find_a_wrong_model() -> None:
     """A lens that needs three coefficients, fitted with one, is contradicted by the default lens."""
     truth = Camera.build(focal=(900, 900), center=(963, 536), size=(1920, 1080), coefficients=[-0.3, 0.15, 0, 0, -0.03])
