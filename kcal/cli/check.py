@@ -81,8 +81,8 @@ def check_command(
     from kcal.calibrate.camera.interval_check import FEWEST, interval_check
 
     at = [float(one) for one in ranges] if ranges else [math.inf]
-    result, options = _calibration_of(camera, observations)
-    done, whole = _all_refits(result, options, at, refits, kept)
+    result, options, fingerprint = _calibration_of(camera, observations)
+    done, whole = _all_refits(result, options, at, refits, fingerprint, kept)
     if len(done) < FEWEST:
         err.print(f"interrupted after {len(done)} of {refits} refits: too few to tell; {kept} has them", markup=False)
         raise typer.Exit(_INTERRUPTED)
@@ -104,8 +104,8 @@ def check_command(
         raise typer.Exit(NO)
 
 
-def _calibration_of(path: Path, observations: Path | None) -> tuple[CameraCalibrationResult, CalibrationOptions]:
-    """The calibration, with residuals and poses, which a camera file does not have."""
+def _calibration_of(path: Path, observations: Path | None) -> tuple[CameraCalibrationResult, CalibrationOptions, str]:
+    """The calibration, with residuals and poses, which a camera file does not have; and the file's fingerprint."""
     from kcal.calibrate.camera.calibrate import calibrate_camera
     from kcal.calibrate.camera.trust import stored_options
     from kcal.corners.observations import Observations
@@ -125,7 +125,7 @@ def _calibration_of(path: Path, observations: Path | None) -> tuple[CameraCalibr
     others, _ = other_views(camera, result)
     if others:
         raise InputError(f"{file}: {others[0].text}; {others[0].action}")
-    return result, options
+    return result, options, camera.fingerprint
 
 
 def _observations_beside(path: Path, camera: Camera) -> Path:
@@ -138,12 +138,18 @@ def _observations_beside(path: Path, camera: Camera) -> Path:
 
 
 def _all_refits(
-    result: CameraCalibrationResult, options: CalibrationOptions, ranges: list[float], count: int, path: Path
+    result: CameraCalibrationResult,
+    options: CalibrationOptions,
+    ranges: list[float],
+    count: int,
+    fingerprint: str,
+    path: Path,
 ) -> tuple[list[Refit], bool]:
     """So many refits, those of an earlier run included; and whether these are all."""
     from kcal.calibrate.camera.interval_check import GRID, simulated_refits
 
-    key = repr((result.camera.fingerprint, [view.pixels for view in result.observations.views], ranges, GRID))
+    # That of the file: a calibration that is made again differs in the last digits.
+    key = repr((fingerprint, [view.pixels for view in result.observations.views], ranges, GRID))
     done = _kept_refits(path, key)[:count]
     if done:
         out.print(f"{len(done)} refits are done already ({path})", markup=False)

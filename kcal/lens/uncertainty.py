@@ -99,7 +99,7 @@ def pixel_errors(
         >>> camera = Camera.build(focal=(800, 800), center=(320.5, 239.5), size=(640, 480), model="pinhole")
         >>> error = pixel_errors(camera, truth, torch.tensor([[319.5, 239.5], [0.0, 0.0]]))
         >>> [round(float(value), 2) for value in error[:, 0]]  # nearly a turn
-        [-0.06, 0.15]
+        [0.06, -0.09]
     """
 
     def seen_apart(pixels: Tensor, at: float) -> Tensor:
