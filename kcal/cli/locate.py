@@ -13,7 +13,7 @@ from kcal.cli.inputs import MARKS, RIG, SURVEY
 from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_and_source
 from kcal.cli.settings import taken
 from kcal.errors import DegenerateError, InputError
-from kcal.files import check_picture, check_writable
+from kcal.files import check_picture, check_writable, written_files
 from kcal.texts import one_line
 
 if TYPE_CHECKING:
@@ -232,39 +232,38 @@ def locate_command(
     )  # fmt: skip
     survey = None if truth is None else read_survey(truth, locate.localize.origin, measured=False)
     sample = PositionSample(frozenset(survey.names if survey else ()))
-    written: list[Path] = []
-    try:
-        size = points.stat().st_size if points.is_file() else None
-        with open_writers(outputs, located_by(locate), suffix) as writers, steps("locating", size) as advance:
-            read, stated = 0, False
-            for chunk in read_mark_chunks(points):
-                cov = filled(chunk.covariance, noise)
-                stated = stated or cov is not None
-                columns = locate(chunk.names, chunk.pixels, cov, chunk.extras)
-                for writer in writers:
-                    writer.add(columns)
-                sample.add(columns)
-                advance(f"{sample.count:,} rows", chunk.bytes_read - read)
-                read = chunk.bytes_read
-            if note and not stated:
-                err.print(note)
-            located = sample.located(locate)
-            true = None if truth is None else read_truth(truth, located)
-        written += [path for path in outputs if path != STREAM]
-        if picture is not None:
-            from kcal.report.positions import save_positions_picture
+    with written_files() as written:
+        try:
+            size = points.stat().st_size if points.is_file() else None
+            with open_writers(outputs, located_by(locate), suffix) as writers, steps("locating", size) as advance:
+                read, stated = 0, False
+                for chunk in read_mark_chunks(points):
+                    cov = filled(chunk.covariance, noise)
+                    stated = stated or cov is not None
+                    columns = locate(chunk.names, chunk.pixels, cov, chunk.extras)
+                    for writer in writers:
+                        writer.add(columns)
+                    sample.add(columns)
+                    advance(f"{sample.count:,} rows", chunk.bytes_read - read)
+                    read = chunk.bytes_read
+                if note and not stated:
+                    err.print(note)
+                located = sample.located(locate)
+                true = None if truth is None else read_truth(truth, located)
+            if picture is not None:
+                from kcal.report.positions import save_positions_picture
 
-            written.append(save_positions_picture(picture, located, true))
-        if web_map is not None:
-            from kcal.report.map_page import save_map
+                save_positions_picture(picture, located, true)
+            if web_map is not None:
+                from kcal.report.map_page import save_map
 
-            written.append(save_map(web_map, located, true, tiles=tiles, image=image, online=online))
-    except KeyboardInterrupt:
-        kept = ", ".join(map(str, written)) or "nothing"
-        err.print(
-            f"interrupted after {sample.count:,} rows; written: {kept}; other files are as they were", markup=False
-        )
-        raise typer.Exit(130) from None
+                save_map(web_map, located, true, tiles=tiles, image=image, online=online)
+        except KeyboardInterrupt:
+            kept = ", ".join(map(str, written)) or "nothing"
+            err.print(
+                f"interrupted after {sample.count:,} rows; written: {kept}; other files are as they were", markup=False
+            )
+            raise typer.Exit(130) from None
     if as_json:
         summary = {
             "table": str(points),

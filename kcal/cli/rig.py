@@ -207,9 +207,8 @@ def solve_command(
     calibrated = load_camera(left), load_camera(right)
     check_sides(calibrated, (left, right))
     data, frame, unpaired, notes, stated = read_sources(calibrated, sources)
-    with steps("solving the rig", 1) as advance:
-        result = solve_rig(data, options)
-        advance("done")
+    with steps("solving the rig", None) as advance:
+        result = solve_rig(data, options, advance)
     rig = result.stereo() if frame is None else placed_rig(result, frame)
     known = stated if pixel_sigma is None else pixel_sigma
     if rig.calibration is not None and known is not None:

@@ -37,10 +37,12 @@ class Knowledge(NamedTuple):
     Attributes:
         cameras: of each camera; None: nothing, it is held.
         board: which of them saw the rig's board, whose modes are then their last unknowns.
+        apart: pairs of cameras whose boards have one name, and shapes that contradict each other.
     """
 
     cameras: tuple[CameraInformation | None, ...]
     board: tuple[bool, ...]
+    apart: tuple[tuple[int, int], ...] = ()
 
 
 def gathered(cameras: Sequence[Camera], known: Sequence[CameraInformation | None], board: Board | None) -> Knowledge:
@@ -53,6 +55,7 @@ def gathered(cameras: Sequence[Camera], known: Sequence[CameraInformation | None
     """
     out, sharing = list(known), [False] * len(cameras)
     first: CameraInformation | None = None
+    apart: list[tuple[int, int]] = []
     for number, (camera, own) in enumerate(zip(cameras, known, strict=True)):
         record = None if camera.calibration is None else camera.calibration.record
         if own is None or not own.board_size or record is None:
@@ -63,7 +66,9 @@ def gathered(cameras: Sequence[Camera], known: Sequence[CameraInformation | None
         turned = own if first is None else _agreeing(first, own, board)
         if turned is not None:
             first, sharing[number], out[number] = first or own, True, turned
-    return Knowledge(tuple(out), tuple(sharing))
+        else:
+            apart.append((sharing.index(True), number))
+    return Knowledge(tuple(out), tuple(sharing), tuple(apart))
 
 
 def _agreeing(first: CameraInformation, other: CameraInformation, board: Board) -> CameraInformation | None:

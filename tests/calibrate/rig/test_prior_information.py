@@ -143,7 +143,16 @@ def test_one_board_is_shared_and_two_are_not() -> None:
     moved = own.estimate.clone()
     moved[own.lens_size :] += 20.0 * sigma
     other = dataclasses.replace(own, estimate=moved)
-    assert gathered((left, right), [informations[0], other], BOARD).board == (True, False)
+    apart = gathered((left, right), [informations[0], other], BOARD)
+    assert (apart.board, apart.apart) == ((True, False), ((0, 1),))
+    changed = Camera(right.params.detach(), size=SIZE, model=right.model)
+    assert right.calibration is not None
+    changed.calibration = dataclasses.replace(right.calibration, information=other)
+    views = pairs(14)[0].names[:6]
+    for camera, said in ((right, False), (changed, True)):
+        found = calibrate_rig(left, camera, *pairs(14), [(n, n) for n in views], RigOptions(reject=False))
+        text = f"the calibrations of left and right contradict each other about their board ({BOARD}): two prints"
+        assert any(warning.startswith(text) for warning in found.warnings) == said
     # A rig's board of another size is nobody's.
     assert gathered((left, right), informations, Board(columns=9, rows=6, square=0.1)).board == (False, False)
 
