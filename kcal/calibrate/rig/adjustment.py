@@ -124,7 +124,7 @@ class Adjustment:
         effects = (
             self._effects if self._effects is not None else self.state.unknown.new_zeros(0, len(self.state.unknown))
         )
-        moves = stars.by_effects(), stars.shifts()[:, mask]
+        moves = stars.by_effects(), stars.factors()[:, mask], stars.shifts()[:, mask]
         return StarBlock(stars.pixels[mask], white, *known, *moves, effects, unknowns.by_effects)
 
     @property

@@ -33,7 +33,7 @@ _NEAR, _PX_PER_METER = 1.0, 1000.0
 
 def gathered(
     cameras: Sequence[Camera], known: Sequence[CameraInformation | None], board: Board | None
-) -> tuple[CameraInformation | None, ...]:
+) -> tuple[tuple[CameraInformation | None, ...], tuple[tuple[int, int], ...]]:
     """What is known of each camera, and of one board by those that saw it, by the evidence of both.
 
     Args:
@@ -42,20 +42,26 @@ def gathered(
         board: in the rig, if there is any; else that of the first camera that has one.
 
     Returns:
-        Of cameras that saw another board, what is said of the camera alone; None: nothing, it is held.
+        What is known: of cameras that saw another board, what is said of the camera alone; None: nothing, it is held.
+        And pairs of cameras whose boards have one name, and shapes that contradict each other.
     """
-    out = []
+    out: list[CameraInformation | None] = []
     first: CameraInformation | None = None
-    for camera, own in zip(cameras, known, strict=True):
+    begun = 0
+    apart: list[tuple[int, int]] = []
+    for number, (camera, own) in enumerate(zip(cameras, known, strict=True)):
         record = None if camera.calibration is None else camera.calibration.record
         sharing = None
         if own is not None and own.board_size and record is not None:
             board = board or Board.of(record.board)
             if record.board == board.record:
                 sharing = own if first is None else _agreeing(first, own, board)
-                first = first or sharing
+                if sharing is None:
+                    apart.append((begun, number))
+                elif first is None:
+                    first, begun = sharing, number
         out.append(sharing or (None if own is None else own.without_board()))
-    return tuple(out)
+    return tuple(out), tuple(apart)
 
 
 def _agreeing(first: CameraInformation, other: CameraInformation, board: Board) -> CameraInformation | None:

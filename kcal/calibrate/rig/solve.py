@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Literal
 
 import torch
@@ -12,12 +13,12 @@ import torch
 from kcal.calibrate.rig.adjustment import Adjustment
 from kcal.calibrate.rig.assess import rig_result
 from kcal.calibrate.rig.blocks import KINDS, PerKind
-from kcal.calibrate.rig.board_consensus import MINIMUM_CORNERS
 from kcal.calibrate.rig.explanations import explained
 from kcal.calibrate.rig.initial_poses import InitialPoses, first_poses
 from kcal.calibrate.rig.mixups import cost_of_features_behind, refuse_same_camera
 from kcal.calibrate.rig.outliers import LOSS, ROUGHLY, possible
 from kcal.calibrate.rig.prior_information import gathered, joint_unknowns
+from kcal.calibrate.rig.rayless import without_rayless
 from kcal.calibrate.rig.records import Reasons, item_records
 from kcal.calibrate.rig.repeated_views import without_repeated
 from kcal.calibrate.rig.result import RigResult
@@ -72,7 +73,9 @@ class RigOptions:
         check_refraction(self.refraction, self.refraction_sigma)
 
 
-def solve_rig(data: RigData, options: RigOptions | None = None) -> RigResult:
+def solve_rig(
+    data: RigData, options: RigOptions | None = None, progress: Callable[[str], None] = lambda _: None
+) -> RigResult:
     """Solve for the poses of all cameras of a rig (and their parameters, if asked) from everything that is known.
 
     Least squares of all residuals over their standard deviations; landmarks, far features and boards are unknowns too
@@ -82,6 +85,7 @@ def solve_rig(data: RigData, options: RigOptions | None = None) -> RigResult:
     Args:
         data: see `RigData`.
         options: see `RigOptions`.
+        progress: called with what is done next.
 
     Raises:
         InputError: data that contradict each other as a whole, or that have several explanations; a measured baseline
@@ -112,15 +116,20 @@ def solve_rig(data: RigData, options: RigOptions | None = None) -> RigResult:
     refuse_same_camera(data)
     if not options.weighted and data.boards is not None:
         data = dataclasses.replace(data, boards=dataclasses.replace(data.boards, covariance=None))
-    data, warnings = _without_rayless(data)
-    data, unknowns = _what_may_change(data, options)
+    data, warnings = without_rayless(data)
+    progress("what is known of cameras and board")
+    data, unknowns, doubts = _what_may_change(data, options)
+    warnings += doubts
+    progress("first poses")
     initial = first_poses(data, options.solver)
     masks, reasons = _first_masks(initial, reject=options.reject)
+    progress("robust solution")
     work = _robust(initial, masks, unknowns)
     if options.motion:
         work.fit_motion(possible(work, masks))
     # With lenses among the unknowns digits are dear, and what is wrong shows without them.
     looking = ROUGHLY if unknowns.refine_lenses else options.solver
+    progress("what contradicts the rest")
     if options.reject:
         masks = kept = explained(work, masks, looking)
     else:
@@ -129,6 +138,7 @@ def solve_rig(data: RigData, options: RigOptions | None = None) -> RigResult:
         warnings += doubts
     if options.motion:
         work.fit_motion(kept)
+    progress("solution")
     # The robust solution is near, so that the first step may be the undamped one.
     near = dataclasses.replace(options.solver, initial_damping=_NEAR_DAMPING)
     _, found = work.solve(masks, near)
@@ -139,35 +149,8 @@ def solve_rig(data: RigData, options: RigOptions | None = None) -> RigResult:
             _, found = work.solve(masks, near)
         if abs(work.sigma_corner / before - 1.0) < 1e-3:
             break
+    progress("uncertainty")
     return rig_result(work, found, masks, reasons, initial, warnings, refuse=options.reject)
-
-
-def _without_rayless(data: RigData) -> tuple[RigData, list[str]]:
-    """The data with pixels at which a lens model has no ray taken as unseen."""
-    warnings, changed = [], {}
-    for kind in KINDS:
-        source = getattr(data, kind)
-        if source is None:
-            continue
-        pixels = source.pixels.clone()
-        for c, camera in enumerate(data.cameras):
-            seen = torch.isfinite(pixels[:, c]).all(-1)
-            _, valid = camera.unproject(pixels[:, c])
-            lost = seen & ~valid
-            if not bool(lost.any()):
-                continue
-            if kind == "boards":
-                few = (seen.sum(-1) >= MINIMUM_CORNERS) & ((seen & valid).sum(-1) < MINIMUM_CORNERS)
-                for i in few.nonzero()[:, 0].tolist():
-                    raise InputError(
-                        f"board {source.names[i]}: the {data.names[c]} camera's lens model has no ray at most of its "
-                        "corners: it folds inside the image; calibrate with views nearer the image's border or with a "
-                        "smaller model"
-                    )
-            warnings.append(f"{int(lost.sum())} pixels of {kind} left out where {data.names[c]}'s lens has no ray")
-            pixels[:, c] = torch.where(lost[..., None], torch.nan, pixels[:, c])
-        changed[kind] = dataclasses.replace(source, pixels=pixels)
-    return dataclasses.replace(data, **changed), warnings
 
 
 def _first_masks(initial: InitialPoses, *, reject: bool) -> tuple[PerKind, Reasons]:
@@ -197,9 +180,9 @@ def _first_masks(initial: InitialPoses, *, reject: bool) -> tuple[PerKind, Reaso
     return masks, reasons
 
 
-def _what_may_change(data: RigData, options: RigOptions) -> tuple[RigData, SharedUnknowns]:
-    """What may change of cameras, board and air, and the data with the board as it is expected."""
-    boards = data.boards
+def _what_may_change(data: RigData, options: RigOptions) -> tuple[RigData, SharedUnknowns, list[str]]:
+    """What may change of cameras, board and air, the data with the board as it is expected, and warnings of it."""
+    boards, doubts = data.boards, []
     if options.intrinsics == "prior":
         known = []
         for number, camera in enumerate(data.cameras):
@@ -210,8 +193,14 @@ def _what_may_change(data: RigData, options: RigOptions) -> tuple[RigData, Share
         if boards is None:
             unknowns = _lens_unknowns(data.cameras, tuple(camera.fingerprint for camera in data.cameras), tuple(known))
         else:
-            parts = gathered(data.cameras, known, boards.board)
+            parts, apart = gathered(data.cameras, known, boards.board)
             measured = boards.deviation is not None
+            doubts = [
+                f"the calibrations of {data.names[one]} and {data.names[other]} contradict each other about their "
+                f"board ({boards.board}): two prints, or one that bent in between; calibrate both cameras from views "
+                "of the board in the pairs"
+                for one, other in apart
+            ]
             unknowns, deviation = joint_unknowns(data.cameras, parts, boards.board, measured=measured)
             if deviation is not None:
                 data = dataclasses.replace(data, boards=dataclasses.replace(boards, deviation=deviation))
@@ -223,7 +212,7 @@ def _what_may_change(data: RigData, options: RigOptions) -> tuple[RigData, Share
         unknowns = unknowns.and_refraction(options.refraction, options.refraction_sigma)
     if data.stars is not None and data.stars.effects:
         unknowns = unknowns.and_effects(*(effect.name for effect in data.stars.effects))
-    return data, unknowns
+    return data, unknowns, doubts
 
 
 @functools.lru_cache(maxsize=2)
@@ -231,7 +220,7 @@ def _lens_unknowns(
     cameras: tuple[Camera, ...], fingerprints: tuple[str, ...], known: tuple[CameraInformation | None, ...]
 ) -> SharedUnknowns:
     """Unknowns of cameras without boards. Whoever marks landmarks solves the same rig again and again."""
-    return joint_unknowns(cameras, gathered(cameras, known, None), None)[0]
+    return joint_unknowns(cameras, gathered(cameras, known, None)[0], None)[0]
 
 
 def _robust(initial: InitialPoses, masks: PerKind, unknowns: SharedUnknowns) -> Adjustment:

@@ -137,7 +137,7 @@ def test_a_rig_counts_each_camera_once() -> None:
 def joint_half(cameras: list[Camera]) -> Tensor:
     """σ of the leading parameters of both cameras in a rig."""
     known = [None if camera.calibration is None else camera.calibration.information for camera in cameras]
-    parts = gathered(cameras, known, BOARD)
+    parts = gathered(cameras, known, BOARD)[0]
     assert all(part is not None and part.board_size for part in parts)
     unknowns, _ = joint_unknowns(cameras, parts, BOARD)
     return torch.cat([onto.square().sum(1).sqrt()[[0, 2, 3]] for onto in unknowns.cameras])
