@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -66,6 +67,14 @@ def locate_command(
         float,
         typer.Option(metavar="DEG", help="Standard deviation of the relative yaw, added to the rig file's.", min=0),
     ] = 0.0,
+    aged: Annotated[
+        str | None,
+        typer.Option(
+            metavar="9h:DEG,8K:DEG",
+            help="Hours since the rig was solved, and degrees of yaw that it loses in one; the same for kelvin.",
+            hidden=True,
+        ),
+    ] = None,
     heading_sigma: Annotated[
         float,
         typer.Option(
@@ -172,6 +181,7 @@ def locate_command(
 
     from kcal.io.rig_file import load_rig
     from kcal.lens.mounting import Origin
+    from kcal.locate.aging import parse_aging
     from kcal.locate.datum import find_geoid, true_from_grid
     from kcal.locate.export import STREAM, check_format, open_writers
     from kcal.locate.marks import filled, read_mark_chunks
@@ -206,6 +216,7 @@ def locate_command(
         raise typer.BadParameter("--pitch, --roll and --grid belong to --heading; the rig file has its own attitude")
     # Parsed before the rig is read, so that a wrong option is reported first.
     place = None if origin is None else Origin.parse(origin)
+    yaw_sigma = math.hypot(yaw_sigma, parse_aging(aged))
     solved = load_rig(rig)
     noise, note = pixel_sigma_and_source(pixel_sigma, solved)
     if solved.mounting is not None and {"origin", "heading"} <= taken:
