@@ -33,7 +33,8 @@ def rough_rig(cameras: tuple[Camera, Camera], points: tuple[Keypoints, Keypoints
     """
     everything = torch.ones(len(points[0].pixels), dtype=torch.bool)
     pairs = _both_ways(points, [everything], [torch.ones(len(points[1].pixels), dtype=torch.bool)], None, _FREE_RATIO)
-    rays = [camera.unproject(own.pixels[pairs[:, k]]) for k, (camera, own) in enumerate(zip(cameras, points, strict=True))]
+    sides = zip(cameras, points, strict=True)
+    rays = [camera.unproject(own.pixels[pairs[:, k]]) for k, (camera, own) in enumerate(sides)]
     good = rays[0][1] & rays[1][1] & (rays[0][0][:, 2] > 0.1) & (rays[1][0][:, 2] > 0.1)
     first, second = rays[0][0][good], rays[1][0][good]
     count = 0
@@ -43,8 +44,8 @@ def rough_rig(cameras: tuple[Camera, Camera], points: tuple[Keypoints, Keypoints
         count = int(inside.sum())
     if count < _FEWEST:
         raise InputError(
-            f"{name}: both images have only {count} features in common; {_FEWEST} are needed. Are they of the same scene "
-            "and moment, and is left left?"
+            f"{name}: both images have only {count} features in common; {_FEWEST} are needed. Are they of the same "
+            "scene and moment, and is left left?"
         )
     return StereoRig(cameras[0], cameras[1], rotation, shift)
 

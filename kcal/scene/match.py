@@ -31,7 +31,7 @@ _KEYPOINTS = 8000
 # Cells across and down the left image among which matches are spread, and the most of one pair.
 _CELLS = (32, 18)
 # Matches of all pairs together, and of one without which it is not used.
-MOST, _FEWEST = 4000, 20
+MOST, _FEWEST = 10_000, 20
 # Of a baseline of one: it only sets the scale of a rig that is thrown away.
 _UNIT_SIGMA = 1e-3
 
@@ -172,8 +172,8 @@ def match_scene(cameras: tuple[Camera, Camera], pair: ImagePair) -> MatchedPair:
     fine = 0 if refined is None else int(refined.good.sum())
     if refined is None or fine < _FEWEST:
         raise InputError(
-            f"{pair.name}: only {fine} features were matched to a fraction of a pixel, {_FEWEST} are needed: is an image "
-            "blurred, or is there fog?"
+            f"{pair.name}: only {fine} features were matched to a fraction of a pixel, {_FEWEST} are needed: is an "
+            "image blurred, or is there fog?"
         )
     pixels = torch.stack([pixels[:, 0], refined.right], 1)[refined.good]
     covariance = refined.covariance[refined.good]
@@ -230,9 +230,7 @@ def _still(pairs: Sequence[ImagePair], found: Sequence[MatchedPair], k: int) -> 
     # Two others tell enough, far apart in the list.
     chosen = [others[0], others[-1]] if len(others) > 1 else others
     images = as_floats(pairs[k])
-    verdicts = torch.stack(
-        [stillness(own.rig, images, as_floats(one), own.pixels, own.covariance) for one in chosen]
-    )
+    verdicts = torch.stack([stillness(own.rig, images, as_floats(one), own.pixels, own.covariance) for one in chosen])
     good = (verdicts == int(Stillness.STILL)).any(0) & ~(verdicts == int(Stillness.ELSEWHERE)).any(0)
     return own.at(good, moved=int((~good).sum()), used=int(good.sum()))
 

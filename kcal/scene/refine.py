@@ -1,4 +1,4 @@
-"""Refine matches to a fraction of a pixel: patches are compared through both lenses on the plane of their epipolar line.
+"""Refine matches to a fraction of a pixel: patches are compared through both lenses on one plane.
 
 On that plane (`kcal.corners.object_planes`) a flat piece of the scene differs between the images by a shift, and by a
 scale and a shear along the baseline, whatever its slope. These, contrast and brightness are fitted by least squares
@@ -91,7 +91,9 @@ def _patch(
     Nine places of a patch are projected; a parabola goes through them, since a lens hardly bends within a patch.
     """
     nodes = _HALF * grid_of((1, 1), middle.device)
-    places, seen = plane_pixels(camera, planes, middle[:, None, None] + planes.step[:, None, None, None] * nodes, rotation)
+    places, seen = plane_pixels(
+        camera, planes, middle[:, None, None] + planes.step[:, None, None, None] * nodes, rotation
+    )
     t = torch.arange(-_HALF, _HALF + 1, dtype=torch.float64) / _HALF
     values = torch.stack([0.5 * t * (t - 1.0), 1.0 - t.square(), 0.5 * t * (t + 1.0)], 1)
     steps = torch.stack([t - 0.5, -2.0 * t, t + 0.5], 1) / _HALF

@@ -56,7 +56,9 @@ def stillness(
     sigma = (found.covariance + covariance[there]).diagonal(dim1=-2, dim2=-1).sqrt()
     stays = (change.abs() <= _SIGMAS * sigma + _SLACK).all(-1)
     known = found.good & now.good
-    status[there] = torch.where(known, torch.where(stays, int(Stillness.STILL), int(Stillness.ELSEWHERE)), status[there])
+    status[there] = torch.where(
+        known, torch.where(stays, int(Stillness.STILL), int(Stillness.ELSEWHERE)), status[there]
+    )
     return status
 
 
