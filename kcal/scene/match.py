@@ -229,8 +229,8 @@ def _still(pairs: Sequence[ImagePair], found: Sequence[MatchedPair], k: int) -> 
     others = [pairs[j] for j in range(len(pairs)) if j != k]
     # Two others tell enough, far apart in the list.
     chosen = [others[0], others[-1]] if len(others) > 1 else others
-    images = as_floats(pairs[k])
-    verdicts = torch.stack([stillness(own.rig, images, as_floats(one), own.pixels, own.covariance) for one in chosen])
+    image, _ = as_floats(pairs[k])
+    verdicts = torch.stack([stillness(own.rig, image, as_floats(one), own.pixels, own.covariance) for one in chosen])
     good = (verdicts == int(Stillness.STILL)).any(0) & ~(verdicts == int(Stillness.ELSEWHERE)).any(0)
     return own.at(good, moved=int((~good).sum()), used=int(good.sum()))
 
@@ -244,7 +244,8 @@ def _thinned(found: MatchedPair, size: tuple[int, int], most: int) -> MatchedPai
     order = worst.argsort()
     order = order[cell[order].argsort(stable=True)]
     _, counts = cell[order].unique_consecutive(return_counts=True)
-    first = (counts.cumsum(0) - counts).repeat_interleave(counts)
-    rank = torch.arange(len(order)) - first
-    kept = order[rank.argsort(stable=True)[:most]].sort().values
+    rank = torch.arange(len(order)) - (counts.cumsum(0) - counts).repeat_interleave(counts)
+    # The best of each cell, then the second best; of these the better ones first.
+    by_sigma = worst[order].argsort(stable=True)
+    kept = order[by_sigma[rank[by_sigma].argsort(stable=True)[:most]]].sort().values
     return found.at(kept, thinned=len(order) - len(kept), used=len(kept))

@@ -31,34 +31,32 @@ class Stillness(enum.IntEnum):
 
 @torch.no_grad()
 def stillness(
-    rig: StereoRig, images: tuple[Tensor, Tensor], others: tuple[Tensor, Tensor], pixels: Tensor, covariance: Tensor
+    rig: StereoRig, image: Tensor, others: tuple[Tensor, Tensor], pixels: Tensor, covariance: Tensor
 ) -> Tensor:
     """(M,) `Stillness` of matches, by a pair of images of another time.
 
     Args:
         rig: roughly as it stands.
-        images: (H, W) of the matches' own time, left and right.
-        others: of another time.
+        image: (H, W), the left one of the matches' own time.
+        others: left and right of another time.
         pixels: (M, 2, 2) left and right.
         covariance: (M, 2, 2) px² of the right one.
     """
     status = torch.full((len(pixels),), int(Stillness.NOT_THERE))
-    moved, score = _again(images[0], others[0], pixels[:, 0])
+    moved, score = _again(image, others[0], pixels[:, 0])
     there = (score > _SAME).nonzero()[:, 0]
     if not len(there):
         return status
     left = pixels[there, 0] + moved[there]
     found = refine_matches(rig, others, left, pixels[there, 1] + moved[there])
-    now = refine_matches(rig, images, pixels[there, 0], pixels[there, 1])
-    # Turns of both cameras move both pixels; a change along the line between them is one of range.
-    change = (found.right - left) - (now.right - pixels[there, 0])
-    change = change - change[found.good & now.good].median(0).values if bool((found.good & now.good).any()) else change
+    # Turns of both cameras move both pixels; a change of what lies between these is one of range.
+    change = (found.right - left) - (pixels[there, 1] - pixels[there, 0])
+    change = change - change[found.good].median(0).values if bool(found.good.any()) else change
     sigma = (found.covariance + covariance[there]).diagonal(dim1=-2, dim2=-1).sqrt()
-    stays = (change.abs() <= _SIGMAS * sigma + _SLACK).all(-1)
-    known = found.good & now.good
-    status[there] = torch.where(
-        known, torch.where(stays, int(Stillness.STILL), int(Stillness.ELSEWHERE)), status[there]
+    stays = torch.where(
+        (change.abs() <= _SIGMAS * sigma + _SLACK).all(-1), int(Stillness.STILL), int(Stillness.ELSEWHERE)
     )
+    status[there] = torch.where(found.good, stays, status[there])
     return status
 
 
