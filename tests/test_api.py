@@ -53,10 +53,10 @@ PUBLIC = {
         save_measured_board summarize
     """,
     "kcal.rig": """
-        Drift DriftEffect ItemResidual MarkedLandmarks Mounting RigCalibration RigCovariance RigSource Sides
-        SourceResidual Survey TurnedBoard camera_positions check_rig drift_effect import_survey match_landmarks
-        measure_drift mounting_covariance pair_by_name paired_boards placed_rig planned_rig read_features
-        read_pairs read_survey relocked triangulated_sides
+        Drift DriftEffect ImagePair ItemResidual MarkedLandmarks Mounting PairCounts RigCalibration RigCovariance
+        RigSource SceneMatches Sides SourceResidual Survey TurnedBoard camera_positions check_rig drift_effect
+        import_survey match_landmarks measure_drift mounting_covariance pair_by_name paired_boards placed_rig
+        planned_rig read_features read_pairs read_survey relocked scene_features triangulated_sides
     """,
     "kcal.locate": """
         BudgetErrors Geoid GroundPlaces Localization Marks Position PositionColumns RangeError Sensitivity Triangulate
@@ -134,6 +134,7 @@ RECORDS = {
     "Failure",
     "Features",
     "Geoid",
+    "ImagePair",
     "ImportedCameras",
     "InverseFit",
     "ItemResidual",
@@ -153,6 +154,7 @@ RECORDS = {
     "ObjectPairs",
     "OutlierRejection",
     "Position",
+    "PairCounts",
     "PositionColumns",
     "PositionStatus",
     "RefinedPoint",
@@ -162,6 +164,7 @@ RECORDS = {
     "RigResult",
     "RigSource",
     "Sensitivity",
+    "SceneMatches",
     "SharedBoard",
     "Sides",
     "SourceResidual",

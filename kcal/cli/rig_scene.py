@@ -23,7 +23,7 @@ def read_scene(cameras: tuple[Camera, Camera], given: tuple[str, str], *, scaled
         InputError: nothing tells a length, or images without partners or with too little in common.
     """
     from kcal.calibrate.rig.pairs import pair_by_name
-    from kcal.cli.console import steps
+    from kcal.cli.console import steps, warn
     from kcal.corners.images import expand_images, read_gray
     from kcal.scene.match import ImagePair, match_scene, scene_of
 
@@ -37,12 +37,20 @@ def read_scene(cameras: tuple[Camera, Camera], given: tuple[str, str], *, scaled
     chosen = [(named[0][0], named[1][0])] if len(named[0]) == len(named[1]) == 1 else pair_by_name(*named)
     if not chosen:
         raise InputError(f"--scene: no image of {given[0]} belongs to one of {given[1]}; name pairs alike")
-    pairs, found = [], []
+    pairs, found, refused = [], [], list[str]()
     with steps("matching the scene", len(chosen)) as advance:
         for left, right in chosen:
-            pairs.append(ImagePair(left, read_gray(files[0][left]), read_gray(files[1][right])))
-            found.append(match_scene(cameras, pairs[-1]))
+            pair = ImagePair(left, read_gray(files[0][left]), read_gray(files[1][right]))
+            try:
+                found.append(match_scene(cameras, pair))
+                pairs.append(pair)
+            except InputError as error:
+                refused.append(str(error))
             advance(left)
+    if not pairs:
+        raise InputError(f"--scene: {refused[0]}")
+    for text in refused:
+        warn(f"{text}; left out")
     features, counts = scene_of(cameras, pairs, found)
     rows = [("scene", "matched", "no texture", "off the line", "moved", "thinned", "used")]
     rows += [
@@ -54,6 +62,6 @@ def read_scene(cameras: tuple[Camera, Camera], given: tuple[str, str], *, scaled
     alone = len(named[0]) + len(named[1]) - 2 * len(chosen)
     if alone:
         lines.append(f"{alone} images of the scene without partner")
-    if len(chosen) == 1:
+    if len(pairs) == 1:
         lines.append("one pair: what moves cannot be told from what stands still; give pairs of several times")
     return features, lines

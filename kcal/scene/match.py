@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.adjustment import Adjustment, typical_ratio
+from kcal.calibrate.rig.adjustment import Adjustment
 from kcal.calibrate.rig.initial_poses import Start
 from kcal.calibrate.rig.limits import over_limit
 from kcal.calibrate.rig.outliers import LOSS, ROUGHLY, possible
@@ -30,8 +30,8 @@ from kcal.scene.still import Stillness, stillness
 _KEYPOINTS = 8000
 # Cells across and down the left image among which matches are spread, and the most of one pair.
 _CELLS = (32, 18)
-# Matches of all pairs together, and of one without which it is not used.
-MOST, _FEWEST = 10_000, 20
+# Matches of all pairs together, and of one pair: of fewer, in the dark, a third were wrong.
+MOST, _FEWEST = 10_000, 60
 # Of a baseline of one: it only sets the scale of a rig that is thrown away.
 _UNIT_SIGMA = 1e-3
 
@@ -115,6 +115,14 @@ def scene_features(cameras: tuple[Camera, Camera], pairs: Sequence[ImagePair], m
 
     Raises:
         InputError: no pairs, images of another size than the cameras', or too little in common.
+
+    Example:
+        >>> from kcal import Camera
+        >>> camera = Camera.build(focal=(500, 500), center=(239.5, 159.5), size=(480, 320), model="pinhole")
+        >>> scene_features((camera, camera), [])
+        Traceback (most recent call last):
+        ...
+        kcal.errors.InputError: scene: no pair of images
     """
     return scene_of(cameras, pairs, [match_scene(cameras, pair) for pair in pairs], most)
 
@@ -165,7 +173,7 @@ def match_scene(cameras: tuple[Camera, Camera], pair: ImagePair) -> MatchedPair:
     pixels = _guided(rig, points)
     if len(pixels) >= _FEWEST:
         # A pose from so many matches is good to a small part of the band in which the next ones are looked for.
-        rig, _, _ = _posed(rig, pixels, torch.eye(2, dtype=torch.float64).expand(len(pixels), 2, 2))
+        rig, _ = _posed(rig, pixels, torch.eye(2, dtype=torch.float64).expand(len(pixels), 2, 2))
         pixels = _guided(rig, points)
     matched = len(pixels)
     refined = refine_matches(rig, as_floats(pair), pixels[:, 0], pixels[:, 1]) if matched else None
@@ -177,13 +185,13 @@ def match_scene(cameras: tuple[Camera, Camera], pair: ImagePair) -> MatchedPair:
         )
     pixels = torch.stack([pixels[:, 0], refined.right], 1)[refined.good]
     covariance = refined.covariance[refined.good]
-    rig, over, scale = _posed(rig, pixels, covariance)
+    rig, over = _posed(rig, pixels, covariance)
     good = over <= 1.0
     counts = PairCounts(
         name=pair.name, matched=matched, untextured=matched - fine, off_line=int((~good).sum()), moved=0, thinned=0,
         used=int(good.sum()),
     )  # fmt: skip
-    return MatchedPair(pixels[good], scale * covariance[good], counts, rig)
+    return MatchedPair(pixels[good], covariance[good], counts, rig)
 
 
 def _guided(rig: StereoRig, points: tuple[Keypoints, Keypoints]) -> Tensor:
@@ -196,8 +204,8 @@ def as_floats(pair: ImagePair) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(pair.left.astype(np.float32)), torch.from_numpy(pair.right.astype(np.float32))
 
 
-def _posed(rig: StereoRig, pixels: Tensor, covariance: Tensor) -> tuple[StereoRig, Tensor, float]:
-    """The rig (baseline of one) that most of the matches make, each one's χ² over its limit, and χ² that is typical."""
+def _posed(rig: StereoRig, pixels: Tensor, covariance: Tensor) -> tuple[StereoRig, Tensor]:
+    """The rig (baseline of one) that most of the matches make, and each one's χ² over its limit."""
     count = len(pixels)
     features = _features(tuple(map(str, range(count))), pixels, covariance)
     cameras = rig.left, rig.right
@@ -217,10 +225,9 @@ def _posed(rig: StereoRig, pixels: Tensor, covariance: Tensor) -> tuple[StereoRi
     over = torch.where(masks.features, over, torch.inf)
     # Behind both cameras.
     over = torch.where(work.state.inverse_range < -_UNIT_SIGMA, torch.inf, over)
-    typical = max(1.0, typical_ratio(squares.features[masks.features], work.freedom(masks).features[masks.features]))
     rotation, center = work.state.rotation, work.state.center
     relative = rotation[1] @ rotation[0].T
-    return StereoRig(*cameras, relative, rotation[1] @ (center[0] - center[1])), over, typical
+    return StereoRig(*cameras, relative, rotation[1] @ (center[0] - center[1])), over
 
 
 def _still(pairs: Sequence[ImagePair], found: Sequence[MatchedPair], k: int) -> MatchedPair:

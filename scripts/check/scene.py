@@ -1,6 +1,6 @@
 """Rigs from the scene itself: matches against the truth, yaw from one and ten pairs, ranges at 5 km.
 
-    python -m scripts.check.scene matches yaw ranges speed [--seeds 30] [--write]
+    python -m scripts.check.scene matches yaw ranges speed picture [--seeds 30] [--write]
 
 Pictures of one terrain by two traced lenses 10 m apart are rendered once (`scripts.shared.terrain_scene`), 1920 x 1080,
 f 1600 px; noise, haze, blur and light come on top. `matches` compares what is found in them with the truth, beside
@@ -28,6 +28,7 @@ from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.sources import Baseline, Features, Landmarks, RigData
 from kcal.corners.keypoints import keypoints
+from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import vector_from_rotation
 from kcal.locate.localizer import StereoLocalizer
@@ -35,7 +36,7 @@ from kcal.scene.match import ImagePair, MatchedPair, match_scene, scene_of
 from kcal.sim.backdrop import exposed
 from kcal.sim.scene import demo_rig
 from scripts.shared.long_range import ORIGIN
-from scripts.shared.page import write_section
+from scripts.shared.page import DOCS, write_section
 from scripts.shared.terrain_scene import SKY, TerrainScene
 from scripts.shared.timing import show
 from scripts.shared.traced import as_camera, capture
@@ -151,17 +152,19 @@ def matches() -> list[str]:
         pairs = [photographed(moment, **how) for moment in (1, 2, 3)]
         visible = visible_keypoints(pairs[0], 1)
         start = time.process_time()
-        found = [match_scene(EXACT, pairs[0])]
-        seconds = time.process_time() - start
-        told(condition, "kcal, one pair", judged(found[0].pixels, found[0].covariance, 1, visible), seconds)
-        found += [match_scene(EXACT, pair) for pair in pairs[1:]]
-        start = time.process_time()
-        scene = scene_of(EXACT, pairs, found)
-        seconds += (time.process_time() - start) / 3
-        own = slice(0, scene.counts[0].used)
-        assert scene.features.covariance is not None
-        of_three = judged(scene.features.pixels[own], 2.0 * scene.features.covariance[own, 0], 1, visible)
-        told(condition, "kcal, three pairs", of_three, seconds)
+        try:
+            found = [match_scene(EXACT, pair) for pair in pairs]
+        except InputError:
+            lines.extend(show([f"| {condition} | kcal | refused | | | | | | |"]))
+        else:
+            seconds = (time.process_time() - start) / 3
+            told(condition, "kcal, one pair", judged(found[0].pixels, found[0].covariance, 1, visible), seconds)
+            scene = scene_of(EXACT, pairs, found)
+            seconds = (time.process_time() - start) / 3
+            own = slice(0, scene.counts[0].used)
+            assert scene.features.covariance is not None
+            of_three = judged(scene.features.pixels[own], 2.0 * scene.features.covariance[own, 0], 1, visible)
+            told(condition, "kcal, three pairs", of_three, seconds)
         start = time.process_time()
         pixels = opencv_matches(pairs[0])
         told(condition, "OpenCV SIFT + USAC", judged(pixels, None, 1, visible), time.process_time() - start)
@@ -323,14 +326,37 @@ def speed(_: int = 0) -> list[str]:
     return lines
 
 
+def picture() -> None:
+    """Matches of a pair on the left image, by their range: docs/howto/scene.png."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    pairs = [photographed(moment) for moment in (1, 2)]
+    scene = scene_of(EXACT, pairs, [match_scene(EXACT, pair) for pair in pairs])
+    left = scene.features.pixels[: scene.counts[0].used, 0]
+    _, distance = SCENE.true_right(left, 1)
+    figure, axes = plt.subplots(figsize=(9.6, 5.6), layout="constrained")
+    axes.imshow(pairs[0].left, cmap="gray", vmin=0, vmax=255)
+    dots = axes.scatter(*left.T.numpy(), s=5, c=distance, cmap="turbo", norm=matplotlib.colors.LogNorm(30, 20_000))
+    bar = figure.colorbar(dots, ax=axes, label="range, m", shrink=0.8)
+    bar.set_ticks([50, 100, 500, 1000, 5000, 20_000], labels=["50", "100", "500", "1000", "5000", "20000"])
+    axes.set(xlabel="u, px", ylabel="v, px", title=f"{len(left)} matches of one pair of images")
+    figure.savefig(DOCS.parent / "howto" / "scene.png", dpi=100)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="+", choices=("matches", "yaw", "ranges", "speed"))
+    parser.add_argument("parts", nargs="+", choices=("matches", "yaw", "ranges", "speed", "picture"))
     parser.add_argument("--seeds", type=int, default=30)
     parser.add_argument("--write", action="store_true")
     given = parser.parse_args()
     torch.set_num_threads(1)
     for part in given.parts:
+        if part == "picture":
+            picture()
+            continue
         lines = matches() if part == "matches" else {"yaw": yaw, "ranges": ranges, "speed": speed}[part](given.seeds)
         if given.write:
             write_section("scene.md", part, "\n".join(lines))
