@@ -52,7 +52,7 @@ def read_scene(cameras: tuple[Camera, Camera], given: tuple[str, str], *, scaled
     for text in refused:
         warn(f"{text}; left out")
     features, counts = scene_of(cameras, pairs, found)
-    rows = [("scene", "matched", "no texture", "off the line", "moved", "thinned", "used")]
+    rows: list[tuple[str, ...]] = [("scene", "matched", "no texture", "off the line", "moved", "thinned", "used")]
     rows += [
         (one.name, *map(str, (one.matched, one.untextured, one.off_line, one.moved, one.thinned, one.used)))
         for one in counts

@@ -40,7 +40,7 @@ def keypoints(image: Gray, most: int) -> Keypoints:
         image: (H, W) gray levels.
         most: number at most.
     """
-    found, descriptors = cv2.SIFT_create(contrastThreshold=_CONTRAST).detectAndCompute(to_8bit(image), None)
+    found, descriptors = cv2.SIFT_create(contrastThreshold=_CONTRAST).detectAndCompute(to_8bit(image), None)  # type: ignore[attr-defined]
     if descriptors is None:
         return Keypoints(torch.zeros(0, 2, dtype=torch.float64), torch.zeros(0, 128))
     pixels = np.array([point.pt for point in found], np.float64)
@@ -61,12 +61,11 @@ def pose_between(first: Tensor, second: Tensor, tolerance: float) -> tuple[Tenso
         tolerance: radians that a ray may be off its epipolar plane.
     """
     plane = [np.ascontiguousarray((rays[:, :2] / rays[:, 2:]).numpy()) for rays in (first, second)]
-    options = dict(method=cv2.USAC_MAGSAC, prob=0.9999, threshold=tolerance, maxIters=5000)
     cv2.setRNGSeed(_SEED)
-    matrix, inside = cv2.findEssentialMat(plane[0], plane[1], np.eye(3), **options)
+    matrix, inside = cv2.findEssentialMat(plane[0], plane[1], np.eye(3), cv2.USAC_MAGSAC, 0.9999, tolerance, 5000)
     nothing = torch.zeros(len(first), dtype=torch.bool)
     if matrix is None or matrix.shape != (3, 3):
         return torch.eye(3, dtype=torch.float64), torch.tensor([-1.0, 0.0, 0.0], dtype=torch.float64), nothing
-    mask: npt.NDArray[np.uint8] = (inside > 0).astype(np.uint8)
-    _, rotation, shift, mask = cv2.recoverPose(matrix, plane[0], plane[1], np.eye(3), mask=mask)
-    return torch.from_numpy(rotation), torch.from_numpy(shift[:, 0]), torch.from_numpy(mask[:, 0] > 0)
+    mask: npt.NDArray[np.uint8] = (np.asarray(inside) > 0).astype(np.uint8)
+    _, rotation, shift, ahead = cv2.recoverPose(matrix, plane[0], plane[1], np.eye(3), mask=mask)
+    return tuple(torch.from_numpy(np.asarray(part)) for part in (rotation, shift[:, 0], ahead[:, 0] > 0))  # type: ignore[return-value]

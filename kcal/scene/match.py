@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -95,7 +95,7 @@ class MatchedPair(NamedTuple):
     counts: PairCounts
     rig: StereoRig
 
-    def at(self, which: Tensor, **counts: int) -> MatchedPair:
+    def at(self, which: Tensor, **counts: Any) -> MatchedPair:
         """Those at some places."""
         counted = dataclasses.replace(self.counts, **counts)
         return self._replace(pixels=self.pixels[which], covariance=self.covariance[which], counts=counted)

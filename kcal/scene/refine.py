@@ -30,7 +30,7 @@ _LEAST_SHARE = 0.55
 _AT_ONCE = 1000
 
 
-class Refined(NamedTuple):
+class RefinedMatches(NamedTuple):
     """Matches of which the left pixel is given.
 
     Attributes:
@@ -45,7 +45,7 @@ class Refined(NamedTuple):
 
 
 @torch.no_grad()
-def refine_matches(rig: StereoRig, images: tuple[Tensor, Tensor], left: Tensor, right: Tensor) -> Refined:
+def refine_matches(rig: StereoRig, images: tuple[Tensor, Tensor], left: Tensor, right: Tensor) -> RefinedMatches:
     """Find where the right image shows what the left one shows at `left` (M, 2), from about `right` (M, 2) on.
 
     Args:
@@ -55,10 +55,10 @@ def refine_matches(rig: StereoRig, images: tuple[Tensor, Tensor], left: Tensor, 
         right: px.
     """
     parts = [_refined(rig, images, a, b) for a, b in zip(left.split(_AT_ONCE), right.split(_AT_ONCE), strict=True)]
-    return Refined(*(torch.cat(values) for values in zip(*parts, strict=True)))
+    return RefinedMatches(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
-def _refined(rig: StereoRig, images: tuple[Tensor, Tensor], left: Tensor, right: Tensor) -> Refined:
+def _refined(rig: StereoRig, images: tuple[Tensor, Tensor], left: Tensor, right: Tensor) -> RefinedMatches:
     planes = object_planes(rig, left, right, torch.zeros(len(left), dtype=torch.float64))
     turn = rig.right_from_left_rotation
     here, _, seen = _patch(rig.left, planes, planes.left, None)
@@ -80,7 +80,7 @@ def _refined(rig: StereoRig, images: tuple[Tensor, Tensor], left: Tensor, right:
     worst = torch.linalg.eigvalsh(covariance.nan_to_num(1e6))[:, -1].sqrt()
     near = torch.linalg.vector_norm(pixels[:, 0] - right, dim=-1) < _FARTHEST
     good = valid & fit.converged & again[:, 0] & near & (worst < _FAINTEST) & (fit.share > _LEAST_SHARE)
-    return Refined(pixels[:, 0], covariance, good)
+    return RefinedMatches(pixels[:, 0], covariance, good)
 
 
 def _patch(

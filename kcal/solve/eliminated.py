@@ -14,7 +14,7 @@ from kcal.solve.result import State
 from kcal.solve.schur import SchurLinearization, inverse_root
 
 
-class Eliminated:
+class EliminatedItems:
     """V items without their own unknowns.
 
     Args:
@@ -69,7 +69,7 @@ class PartlyEliminated:
         cost: of everything, if it is not half the sum of squares.
     """
 
-    def __init__(self, rest: SchurLinearization, own: Eliminated, first: int, cost: Tensor) -> None:
+    def __init__(self, rest: SchurLinearization, own: EliminatedItems, first: int, cost: Tensor) -> None:
         self._rest, self._own, self._first, self.cost = rest, own, first, cost
 
     def step(self, damping: Tensor) -> tuple[State, Tensor]:

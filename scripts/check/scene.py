@@ -16,6 +16,7 @@ import dataclasses
 import functools
 import math
 import time
+from collections.abc import Callable
 from typing import NamedTuple
 
 import cv2
@@ -71,7 +72,7 @@ class Judged(NamedTuple):
     """Matches beside the truth.
 
     Attributes:
-        count: all.
+        number: of all.
         wrong: 2 px off, or of what moves.
         beside: of these, off the true epipolar line by more than 0.5 px: the others have a wrong range alone.
         across: px, RMS across the epipolar lines of those that are not wrong.
@@ -79,7 +80,7 @@ class Judged(NamedTuple):
         recall: share of all visible keypoints that were found.
     """
 
-    count: int
+    number: int
     wrong: int
     beside: int
     across: float
@@ -103,7 +104,7 @@ def judged(pixels: Tensor, covariance: Tensor | None, moment: int, visible: int)
 
 def opencv_matches(pair: ImagePair) -> Tensor:
     """(M, 2, 2): SIFT, ratio test 0.75, both ways, USAC_MAGSAC on the fundamental matrix of undistorted pixels."""
-    sift = cv2.SIFT_create()
+    sift = cv2.SIFT_create()  # type: ignore[attr-defined]
     (first, one), (second, two) = (sift.detectAndCompute(image, None) for image in (pair.left, pair.right))
     matcher = cv2.BFMatcher()
     forth, back = matcher.knnMatch(one, two, k=2), matcher.knnMatch(two, one, k=1)
@@ -111,8 +112,8 @@ def opencv_matches(pair: ImagePair) -> Tensor:
     pixels = torch.tensor([[first[m.queryIdx].pt, second[m.trainIdx].pt] for m in kept], dtype=torch.float64)
     rays = [camera.unproject(pixels[:, k])[0] for k, camera in enumerate(EXACT)]
     flat = [(1600.0 * ray[:, :2] / ray[:, 2:]).numpy() for ray in rays]
-    _, inside = cv2.findFundamentalMat(*flat, cv2.USAC_MAGSAC, 1.0, 0.9999, 10_000)
-    return pixels[torch.from_numpy(inside[:, 0] > 0)]
+    _, inside = cv2.findFundamentalMat(flat[0], flat[1], cv2.USAC_MAGSAC, 1.0, 0.9999, 10_000)
+    return pixels[torch.from_numpy(np.asarray(inside)[:, 0] > 0)]
 
 
 def visible_keypoints(pair: ImagePair, moment: int) -> int:
@@ -131,7 +132,7 @@ def visible_keypoints(pair: ImagePair, moment: int) -> int:
 
 
 @torch.no_grad()
-def matches() -> list[str]:
+def matches(_: int = 0) -> list[str]:
     """Matches under several conditions against the truth."""
     lines = show(
         [
@@ -143,8 +144,8 @@ def matches() -> list[str]:
     def told(condition: str, by: str, found: Judged, seconds: float) -> None:
         sigmas = "" if math.isnan(found.sigmas) else f"{found.sigmas:.2f}"
         lines.extend(show([
-            f"| {condition} | {by} | {found.count} | {100 * found.wrong / found.count:.1f} % "
-            f"| {100 * found.beside / found.count:.1f} % | {100 * found.recall:.0f} % "
+            f"| {condition} | {by} | {found.number} | {100 * found.wrong / found.number:.1f} % "
+            f"| {100 * found.beside / found.number:.1f} % | {100 * found.recall:.0f} % "
             f"| {found.across:.3f} | {sigmas} | {seconds:.1f} |"
         ]))  # fmt: skip
 
@@ -339,11 +340,21 @@ def picture() -> None:
     _, distance = SCENE.true_right(left, 1)
     figure, axes = plt.subplots(figsize=(9.6, 5.6), layout="constrained")
     axes.imshow(pairs[0].left, cmap="gray", vmin=0, vmax=255)
-    dots = axes.scatter(*left.T.numpy(), s=5, c=distance, cmap="turbo", norm=matplotlib.colors.LogNorm(30, 20_000))
+    dots = axes.scatter(
+        left[:, 0].numpy(),
+        left[:, 1].numpy(),
+        s=5,
+        c=distance,
+        cmap="turbo",
+        norm=matplotlib.colors.LogNorm(30, 20_000),
+    )
     bar = figure.colorbar(dots, ax=axes, label="range, m", shrink=0.8)
     bar.set_ticks([50, 100, 500, 1000, 5000, 20_000], labels=["50", "100", "500", "1000", "5000", "20000"])
     axes.set(xlabel="u, px", ylabel="v, px", title=f"{len(left)} matches of one pair of images")
     figure.savefig(DOCS.parent / "howto" / "scene.png", dpi=100)
+
+
+_PARTS: dict[str, Callable[[int], list[str]]] = {"matches": matches, "yaw": yaw, "ranges": ranges, "speed": speed}
 
 
 def main() -> None:
@@ -357,7 +368,7 @@ def main() -> None:
         if part == "picture":
             picture()
             continue
-        lines = matches() if part == "matches" else {"yaw": yaw, "ranges": ranges, "speed": speed}[part](given.seeds)
+        lines = _PARTS[part](given.seeds)
         if given.write:
             write_section("scene.md", part, "\n".join(lines))
 

@@ -16,7 +16,7 @@ from kcal.calibrate.rig.blocks import LOCAL_SIZE, Block, PosedCamera, RigState
 from kcal.calibrate.rig.unknowns import SharedUnknowns
 from kcal.lens.camera import Camera
 from kcal.lens.pose import nearest_rotation, rotation_from_vector
-from kcal.solve.eliminated import Eliminated, PartlyEliminated
+from kcal.solve.eliminated import EliminatedItems, PartlyEliminated
 from kcal.solve.result import State
 from kcal.solve.robust import RobustLoss
 from kcal.solve.schur import SchurLinearization
@@ -214,7 +214,7 @@ class RigProblem:
         Returns:
             (V, L, S) and (V, L, L).
         """
-        return Eliminated(block.rows(self.posed(state), state, self.shared_size), block.size).response()
+        return EliminatedItems(block.rows(self.posed(state), state, self.shared_size), block.size).response()
 
     def _rows(self, state: RigState) -> tuple[list[Tensor], list[Tensor]]:
         """`Block.rows` of all blocks with the loss's weights, and `item_squares`."""
@@ -229,10 +229,10 @@ class RigProblem:
         return found, squares
 
     @staticmethod
-    def _without_own(block: Block, rows: Tensor) -> Tensor | Eliminated:
+    def _without_own(block: Block, rows: Tensor) -> Tensor | EliminatedItems:
         """The items without their own unknowns; for boards, of many residuals each, (V, S + 1, S + 1) products."""
         if block.kind != "boards":
-            return Eliminated(rows, block.size)
+            return EliminatedItems(rows, block.size)
         return _reduced(rows @ rows.mT, block.size)
 
     def linearize(self, state: State) -> SchurLinearization | PartlyEliminated:
@@ -241,10 +241,10 @@ class RigProblem:
         terms, (found, squares) = self.term_rows(state), self._rows(state)
         total, cost = terms @ terms.T, self._cost_of(terms[-1], squares)
         local, right = [total.new_zeros(0, LOCAL_SIZE, LOCAL_SIZE)], [total.new_zeros(0, LOCAL_SIZE, len(total))]
-        matched: tuple[Eliminated, int] | None = None
+        matched: tuple[EliminatedItems, int] | None = None
         for block, rows in zip(self.blocks, found, strict=True):
             if block.kind == "features":
-                own = Eliminated(rows, block.size)
+                own = EliminatedItems(rows, block.size)
                 matched, total = (own, sum(map(len, local))), total + own.gram
                 continue
             mine, others, missing = rows[:, : block.size], rows[:, block.size :], LOCAL_SIZE - block.size
@@ -307,7 +307,7 @@ def _reduced(gram: Tensor, size: int) -> Tensor:
     return gram[:, size:, size:] - coupling.mT @ torch.cholesky_solve(coupling, factor)
 
 
-def _summed(part: Tensor | Eliminated) -> Tensor:
+def _summed(part: Tensor | EliminatedItems) -> Tensor:
     return part.sum(0) if isinstance(part, Tensor) else part.gram
 
 
