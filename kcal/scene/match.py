@@ -24,7 +24,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
 from kcal.scene.guided import guided_matches, rough_rig
 from kcal.scene.refine import refine_matches
-from kcal.scene.still import Stillness, stillness
+from kcal.scene.still import Stillness, still_there
 
 # Keypoints of an image: more tell little more and cost as much again.
 _KEYPOINTS = 8000
@@ -237,7 +237,7 @@ def _still(pairs: Sequence[ImagePair], found: Sequence[MatchedPair], k: int) -> 
     # Two others tell enough, far apart in the list.
     chosen = [others[0], others[-1]] if len(others) > 1 else others
     image, _ = as_floats(pairs[k])
-    verdicts = torch.stack([stillness(own.rig, image, as_floats(one), own.pixels, own.covariance) for one in chosen])
+    verdicts = torch.stack([still_there(own.rig, image, as_floats(one), own.pixels, own.covariance) for one in chosen])
     good = (verdicts == int(Stillness.STILL)).any(0) & ~(verdicts == int(Stillness.ELSEWHERE)).any(0)
     return own.at(good, moved=int((~good).sum()), used=int(good.sum()))
 

@@ -30,7 +30,7 @@ class Stillness(enum.IntEnum):
 
 
 @torch.no_grad()
-def stillness(
+def still_there(
     rig: StereoRig, image: Tensor, others: tuple[Tensor, Tensor], pixels: Tensor, covariance: Tensor
 ) -> Tensor:
     """(M,) `Stillness` of matches, by a pair of images of another time.

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from kcal.solve.result import State
-from kcal.solve.schur import SchurLinearization, inverse_root
+from kcal.solve.schur import SchurLinearization, column_scale
 
 
 class EliminatedItems:
@@ -27,7 +27,7 @@ class EliminatedItems:
 
     def __init__(self, rows: Tensor, size: int) -> None:
         local = rows[:, :size].mT
-        self._scale = inverse_root(local.square().sum(1))
+        self._scale = column_scale(local.square().sum(1))
         basis, self._factor = torch.linalg.qr(local * self._scale[:, None], mode="complete")
         turned = rows[:, size:] @ basis
         self._inside, self.rows = turned[..., :size], turned[..., size:].contiguous()

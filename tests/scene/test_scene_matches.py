@@ -11,7 +11,7 @@ from kcal.calibrate.rig.sources import Baseline, RigData
 from kcal.errors import InputError
 from kcal.lens.pose import vector_from_rotation
 from kcal.scene.match import ImagePair, MatchedPair, match_scene, scene_features, scene_of
-from kcal.scene.still import Stillness, stillness
+from kcal.scene.still import Stillness, still_there
 from tests.helpers.scene_pairs import pair, small_rig, true_right
 
 RIG = small_rig()
@@ -82,12 +82,12 @@ def test_a_change_of_range_is_not_still(matched: MatchedPair) -> None:
         return torch.from_numpy(one.left).float(), torch.from_numpy(np.roll(one.right, shift, 1)).float()
 
     some = matched.pixels[::4], matched.covariance[::4]
-    same = stillness(matched.rig, images(1, 0)[0], images(2, 0), *some)
+    same = still_there(matched.rig, images(1, 0)[0], images(2, 0), *some)
     assert float((same == int(Stillness.STILL)).double().mean()) > 0.9
     # A part of the scene comes nearer by a pixel of disparity, the rest stays.
     after = images(2, 0)
     after[1][:, 340:] = images(2, -1)[1][:, 340:]
-    nearer = stillness(matched.rig, images(1, 0)[0], after, *some)
+    nearer = still_there(matched.rig, images(1, 0)[0], after, *some)
     half = some[0][:, 1, 0] > 355.0
     assert float((nearer[half] == int(Stillness.ELSEWHERE)).double().mean()) > 0.6
     assert float((nearer[some[0][:, 1, 0] < 325.0] == int(Stillness.ELSEWHERE)).double().mean()) < 0.1

@@ -24,7 +24,7 @@ def robust_solution(initial: InitialPoses, masks: PerKind, unknowns: SharedUnkno
     boards = initial.data.boards
     sigma = _CORNER_SIGMA if boards is None or boards.sigma is None else boards.sigma
     best: tuple[float, Adjustment] | None = None
-    some = masks._replace(features=_thinned(masks.features, _SCREENED))
+    some = masks._replace(features=_evenly_taken(masks.features, _SCREENED))
     for start in initial.starts:
         work = Adjustment(initial.data, start, unknowns, sigma)
         if unknowns.refine_lenses:
@@ -45,7 +45,7 @@ def robust_solution(initial: InitialPoses, masks: PerKind, unknowns: SharedUnkno
     return work
 
 
-def _thinned(mask: Tensor, most: int) -> Tensor:
+def _evenly_taken(mask: Tensor, most: int) -> Tensor:
     """The mask with `most` of its items at most, evenly taken."""
     chosen, out = mask.nonzero()[:, 0], torch.zeros_like(mask)
     out[chosen[torch.linspace(0, len(chosen) - 1, min(most, len(chosen))).round().long()]] = True
