@@ -93,7 +93,17 @@ NAMES = [(door, name) for door, names in PUBLIC.items() for name in names.split(
 NAMESPACES = {door.removeprefix("kcal.") for door in PUBLIC} - {"kcal"}
 # Names that were not in `kcal` itself before there were namespaces.
 NEW_NAMES = (
-    {"PositionColumns", "calibrate_views", "detect", "rotation_from_vector", "vector_from_rotation"}
+    {
+        "ImagePair",
+        "PairCounts",
+        "SceneMatches",
+        "scene_features",
+        "PositionColumns",
+        "calibrate_views",
+        "detect",
+        "rotation_from_vector",
+        "vector_from_rotation",
+    }
     | {"CameraRays", "Cylinder", "StereoRectification", "cylinder_view", "looking", "pinhole_view", "pixel_errors"}
     | {"pupil_shift", "ray_error", "IntervalCheck", "Refit", "against_capture", "interval_check", "simulated_refits"}
     | {"DisparityRanges", "RangeImage", "forgotten_yaw", "save_interval_picture"}

@@ -54,11 +54,11 @@ def refine_matches(rig: StereoRig, images: tuple[Tensor, Tensor], left: Tensor, 
         left: px.
         right: px.
     """
-    parts = [_refined_at_once(rig, images, a, b) for a, b in zip(left.split(_AT_ONCE), right.split(_AT_ONCE), strict=True)]
+    parts = [_refined_part(rig, images, a, b) for a, b in zip(left.split(_AT_ONCE), right.split(_AT_ONCE), strict=True)]
     return RefinedMatches(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
-def _refined_at_once(rig: StereoRig, images: tuple[Tensor, Tensor], left: Tensor, right: Tensor) -> RefinedMatches:
+def _refined_part(rig: StereoRig, images: tuple[Tensor, Tensor], left: Tensor, right: Tensor) -> RefinedMatches:
     planes = object_planes(rig, left, right, torch.zeros(len(left), dtype=torch.float64))
     turn = rig.right_from_left_rotation
     here, _, seen = _patch(rig.left, planes, planes.left, None)
