@@ -205,9 +205,8 @@ def calibrate_command(
     pupil's movement and of the board's bending and print errors there is. A small RMS does not prove an accurate
     camera; read the uncertainty of far directions, in pixels, and what to photograph next.
 
-    With --stars no board is needed, and nothing need be known of the camera: tilt it up by 30° on some clear nights'
-    images. The camera is right at infinity, and has no entrance pupil. With observations as well, boards give the
-    lens with its pupil and stars the field at infinity; whether they contradict each other is tested.
+    With --stars no board is needed: tilt the camera up by 30°. It is then right at infinity, without an entrance pupil.
+    With observations as well, boards and stars give one camera; whether they contradict each other is tested.
 
     Calibrate both cameras of a rig in one call: those that saw one printed board measure its errors together.
 
@@ -217,8 +216,6 @@ def calibrate_command(
 
     `kcal calibrate left.obs.json right.obs.json -o cameras`
 
-    `kcal calibrate left.obs.json -o left.camera.json --picture left.png --verbose`
-
     `kcal calibrate left.obs.json -o left.camera.json --require 5km:10% --report left.html`: exit code 3 for a no.
 
     `kcal calibrate --stars night/ --time name:Z --place 40.762,-113.896,1282 -o left.camera.json`
@@ -227,11 +224,8 @@ def calibrate_command(
     """
     from kcal.lens.model import LensModel
 
-    if not observations:
-        by_night(stars, star_time, star_place, output, name)
+    if by_night(stars, observations, star_time, star_place, output, name) or observations is None:
         return
-    if stars and len(observations) > 1:
-        raise InputError("--stars are of one camera: calibrate each with its own boards and night images")
     needs = required(require)
     if board not in ("printed", "exact"):
         check_file("--board-shape", board, BOARD)
@@ -276,7 +270,7 @@ def calibrate_command(
             )
         except DegenerateError as error:
             raise DegenerateError(f"{error}. {more_views(sets[0].board, places[0].observations)}") from error
-    if stars and not isinstance(outcomes[0], KcalError):
+    if stars:
         outcomes = [joined_by_stars(outcomes[0], stars, star_time, star_place, places[0].output)]
     failed = [place.name for place, result in zip(places, outcomes, strict=True) if isinstance(result, KcalError)]
     usable = True

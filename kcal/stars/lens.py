@@ -22,7 +22,7 @@ from kcal.stars.lens_fit import StarLens, fit_star_lens
 from kcal.stars.night import SkyView
 from kcal.stars.sky import celestial_directions
 from kcal.stars.star_problem import StarField
-from kcal.stars.with_boards import Agreement, joined, refine_by_stars
+from kcal.stars.with_boards import Agreement, joint_calibration, refine_by_stars
 
 # Degrees between opposite corners: the widest and narrowest lens that is looked for, and steps between.
 _WIDEST, _NARROWEST, _STEP = 115.0, 6.0, 1.02
@@ -134,7 +134,7 @@ def calibrate_by_stars(
         pixels=tuple(pixels),
         refused=refused,
         agreement=agreement,
-        joint=None if boards is None or agreement is None else joined(boards, lens, agreement),
+        joint=None if boards is None or agreement is None else joint_calibration(boards, lens, agreement),
     )
 
 

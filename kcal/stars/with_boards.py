@@ -96,24 +96,26 @@ def refine_by_stars(
     fit.leave_out(parameters, model, _FIRST_CUT)
     sigma = lens.sigma
     for _ in range(_ROUNDS):
-        parameters = fit.minimize(parameters, model, unknowns, _known(lens, sigma), 10)
+        parameters = fit.minimize(parameters, model, unknowns, _known_lens(lens, sigma), 10)
         fit.leave_out(parameters, model, CUT)
         # As `whitened` counts them.
         fit.variance = max(fit.variance, 1.0)
         told = fit.whitened(parameters, model, unknowns)
         if boards.hybrid is not None:
             sigma = _by_evidence(boards.hybrid, unknowns, lens, told, parameters[leading])
-    known = _known(lens, sigma)
+    known = _known_lens(lens, sigma)
     parameters = fit.minimize(parameters, model, unknowns, known, 10)
     told = fit.whitened(parameters, model, unknowns)
     change = parameters[leading] - lens.estimate
     refined = Camera(parameters, size=boards.camera.size, model=model)
     wide = dataclasses.replace(whole, sigma=torch.cat([sigma, whole.sigma[len(sigma) :]]))
-    found = star_lens(fit, refined, known, told, _stacked(wide, told, change))
-    return found, _agreement(told, change, lens, *_typical(fit))
+    found = star_lens(fit, refined, known, told, _with_star_rows(wide, told, change))
+    return found, _agreement_with(told, change, lens, *_star_noise(fit))
 
 
-def joined(boards: CameraCalibrationResult, found: StarLens, agreement: Agreement) -> CameraCalibrationResult:
+def joint_calibration(
+    boards: CameraCalibrationResult, found: StarLens, agreement: Agreement
+) -> CameraCalibrationResult:
     """The calibration by boards with camera, error bars and warnings of both; residuals stay those of boards alone.
 
     Args:
@@ -136,7 +138,7 @@ def joined(boards: CameraCalibrationResult, found: StarLens, agreement: Agreemen
     )
 
 
-def _known(lens: CameraInformation, sigma: Tensor) -> KnownLens:
+def _known_lens(lens: CameraInformation, sigma: Tensor) -> KnownLens:
     """What boards say of the lens, under a prior of standard deviations (S,)."""
     rows = dataclasses.replace(lens, sigma=sigma).all_rows()
     return KnownLens(lens.estimate, rows[:, :-1], rows[:, -1], torch.ones_like(sigma, dtype=torch.bool))
@@ -169,7 +171,7 @@ def _by_evidence(
     return families.deviation(best.h)
 
 
-def _stacked(known: CameraInformation, stars: Tensor, change: Tensor) -> CameraInformation:
+def _with_star_rows(known: CameraInformation, stars: Tensor, change: Tensor) -> CameraInformation:
     """What boards and stars say together, at the lens's new estimate and the board's that follows it.
 
     Args:
@@ -194,14 +196,14 @@ def _stacked(known: CameraInformation, stars: Tensor, change: Tensor) -> CameraI
     )
 
 
-def _typical(fit: StarProblem) -> tuple[int, float]:
+def _star_noise(fit: StarProblem) -> tuple[int, float]:
     """How many residuals of stars there are, and their sigma in px, as it counts."""
     weights = torch.cat([w / f.sigma for w, f in zip(fit.weights, fit.fields, strict=True)])
     count = int((weights > 0).sum())
     return 2 * count, math.sqrt(max(fit.variance, 1.0) * count / float(weights.square().sum()))
 
 
-def _agreement(stars: Tensor, change: Tensor, lens: CameraInformation, count: int, sigma: float) -> Agreement:
+def _agreement_with(stars: Tensor, change: Tensor, lens: CameraInformation, count: int, sigma: float) -> Agreement:
     """Whether stars ask for more than the covariance of boards allows, to first order."""
     rows, residual = stars[:, :-1], stars[:, -1] - stars[:, :-1] @ change
     spread = rows @ lens.half().T

@@ -68,13 +68,9 @@ def real() -> None:
     size = (1024, 768)
     begin = time.process_time()
     whole = calibrate_by_stars(images, views, size)
-    say(f"detection {np.mean(seconds):.2f} CPU s an image; lens and names {time.process_time() - begin:.0f}")
-    lens = whole.lens
-    say(f"{len(whole.images)} of {len(files)} images, {sum(int(u.sum()) for u in lens.used)} stars, "
-          f"{sum(int((~u).sum()) for u in lens.used)} left out, RMS along an axis {lens.rms_px:.4f} px, "
-          f"{lens.effective:.1f} effective unknowns, f {float(lens.camera.params[0]):.2f} px")  # fmt: skip
+    spent_on_lens, lens = time.process_time() - begin, whole.lens
     theirs = peer(files)
-    say("\n| image | stars | named | RMS px | detect and name, CPU s | cedar-solve: stars | its RMSE | CPU s |\n"
+    say("| image | stars | named | RMS px | detect and name, CPU s | cedar-solve: stars | its RMSE | CPU s |\n"
         "|---|---|---|---|---|---|---|---|")  # fmt: skip
     for path, view in zip(files, views, strict=True):
         image = read_night(path)
@@ -90,6 +86,10 @@ def real() -> None:
     say("\n| magnitude | stars | RMS along an axis, px |\n|---|---|---|")
     by_magnitude(whole)
     say("")
+    say(f"detection {np.mean(seconds):.2f} CPU s an image; lens and names {spent_on_lens:.0f}")
+    say(f"{len(whole.images)} of {len(files)} images, {sum(int(u.sum()) for u in lens.used)} stars, "
+          f"{sum(int((~u).sum()) for u in lens.used)} left out, RMS along an axis {lens.rms_px:.4f} px, "
+          f"{lens.effective:.1f} effective unknowns, f {float(lens.camera.params[0]):.2f} px")  # fmt: skip
     held_out(images, views, size, float(lens.camera.params[0]))
 
 

@@ -22,7 +22,7 @@ from kcal.stars.detect import detect_stars
 from kcal.stars.identification import identify
 from kcal.stars.night import SkyView, name_stars
 from kcal.stars.night_image import read_night
-from kcal.stars.pair_table import _loaded, cache_folder, pair_table
+from kcal.stars.pair_table import _table_of, cache_folder, pair_table
 from kcal.stars.sky import observed_directions
 from scripts.shared.night_scenes import PLACE, TIME, night_camera, rendered, star_pixels
 
@@ -169,12 +169,12 @@ def test_the_table_is_cached_and_a_broken_one_is_made_anew(tmp_path: Path, monke
     (file,) = cache_folder().iterdir()
     before = file.stat().st_mtime_ns
     assert pair_table(CATALOG, 0.05) is made  # of the next image of the same camera
-    _loaded.cache_clear()
+    _table_of.cache_clear()
     again = pair_table(CATALOG, 0.05)
     assert file.stat().st_mtime_ns == before
     assert np.array_equal(made.pairs, again.pairs)
     file.write_bytes(file.read_bytes()[:1000])
-    _loaded.cache_clear()
+    _table_of.cache_clear()
     assert np.array_equal(made.angle, pair_table(CATALOG, 0.05).angle)
     assert file.stat().st_size > 1000
 
