@@ -55,10 +55,10 @@ PUBLIC = {
         save_measured_board summarize
     """,
     "kcal.rig": """
-        Drift DriftEffect ItemResidual MarkedLandmarks Mounting RigCalibration RigCovariance RigSource Sides
-        SourceResidual Survey TurnedBoard camera_positions check_rig drift_effect import_survey match_landmarks
-        measure_drift mounting_covariance pair_by_name paired_boards placed_rig planned_rig read_features
-        read_pairs read_survey relocked triangulated_sides
+        Drift DriftEffect ImagePair ItemResidual MarkedLandmarks Mounting PairCounts RigCalibration RigCovariance
+        RigSource SceneMatches Sides SourceResidual Survey TurnedBoard camera_positions check_rig drift_effect
+        import_survey match_landmarks measure_drift mounting_covariance pair_by_name paired_boards placed_rig
+        planned_rig read_features read_pairs read_survey relocked scene_features triangulated_sides
     """,
     "kcal.locate": """
         BudgetErrors DisparityRanges Geoid GroundPlaces Localization Marks RangeImage Position PositionColumns
@@ -93,7 +93,17 @@ NAMES = [(door, name) for door, names in PUBLIC.items() for name in names.split(
 NAMESPACES = {door.removeprefix("kcal.") for door in PUBLIC} - {"kcal"}
 # Names that were not in `kcal` itself before there were namespaces.
 NEW_NAMES = (
-    {"PositionColumns", "calibrate_views", "detect", "rotation_from_vector", "vector_from_rotation"}
+    {
+        "ImagePair",
+        "PairCounts",
+        "SceneMatches",
+        "scene_features",
+        "PositionColumns",
+        "calibrate_views",
+        "detect",
+        "rotation_from_vector",
+        "vector_from_rotation",
+    }
     | {"CameraRays", "Cylinder", "StereoRectification", "cylinder_view", "looking", "pinhole_view", "pixel_errors"}
     | {"pupil_shift", "ray_error", "IntervalCheck", "Refit", "against_capture", "interval_check", "simulated_refits"}
     | {"DisparityRanges", "RangeImage", "forgotten_yaw", "save_interval_picture"}
@@ -149,6 +159,7 @@ RECORDS = {
     "Failure",
     "Features",
     "Geoid",
+    "ImagePair",
     "ImportedCameras",
     "InverseFit",
     "ItemResidual",
@@ -168,6 +179,7 @@ RECORDS = {
     "ObjectPairs",
     "OutlierRejection",
     "Position",
+    "PairCounts",
     "PositionColumns",
     "PositionStatus",
     "RefinedPoint",
@@ -177,6 +189,7 @@ RECORDS = {
     "RigResult",
     "RigSource",
     "Sensitivity",
+    "SceneMatches",
     "SharedBoard",
     "Sides",
     "SourceResidual",

@@ -20,6 +20,7 @@ FLOORS = {
     "web": 1,
     "pipeline": 9,
     "stars": 8,
+    "scene": 8,
     "nets": 2,
     "locate": 7,
     "calibrate/batch": 6,

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from kcal.lens.rig import StereoRig
 
 
+# Items of a source that are named when they are left out; of thousands of matches more are no news.
+_MOST_NAMED = 12
 app = typer.Typer(cls=group_with_default("solve"), rich_markup_mode="markdown", help="Solve a rig, and check it later.")
 
 
@@ -99,6 +101,14 @@ def solve_command(
             "the cameras are turned, yaw included; with --origin and --star-time also on the Earth.",
         ),
     ] = None,
+    scene: Annotated[
+        tuple[str, str] | None,
+        typer.Option(
+            metavar="LEFT RIGHT",
+            help="Images of the scene by each camera at the same moments (file, folder or quoted wildcard): features "
+            "seen by both determine how the cameras are turned; a length must come from elsewhere (--baseline).",
+        ),
+    ] = None,
     star_time: Annotated[str | None, typer.Option("--star-time", metavar="TIME", help=TIME_HELP, hidden=True)] = None,
     clock_sigma: Annotated[
         float,
@@ -169,6 +179,8 @@ def solve_command(
     Stars (--stars) need no survey: pairs of night images and a taped baseline determine ranges once matches of unknown
     range (--features) or measured positions tell the baseline's direction.
 
+    So does the scene itself (--scene): pairs of images, best of several days, and a taped baseline.
+
     `kcal rig check` tells later whether the cameras have turned since.
 
     **Examples**
@@ -202,7 +214,7 @@ def solve_command(
     sources = Sources(
         pairs=pairs, match=match, landmarks=landmarks, marks=marks, features=features, positions=positions,
         baseline=baseline, origin=origin, mark_sigma=noise, survey_sigma=survey_sigma, geoid=geoid,
-        stars=night,
+        stars=night, scene=scene,
     )  # fmt: skip
     check_writable(output, left, right, *sources.files)
     needs = required(require)
@@ -210,7 +222,7 @@ def solve_command(
         check_writable(report, left, right, *sources.files)
     if picture is not None:
         check_picture(picture)
-    if not any((pairs, landmarks, marks, features, positions, baseline, stars)):
+    if not any((pairs, landmarks, marks, features, positions, baseline, stars, scene)):
         raise typer.BadParameter("give boards (--pairs), landmarks (--landmarks and --marks) or features (--features)")
     options = RigOptions(
         intrinsics=intrinsics, board_warp=board_warp, reject=not keep_all, refraction=refraction,
@@ -365,8 +377,12 @@ def print_rig(result: RigResult, lines: list[str]) -> None:
     for turned in result.flipped:
         text = f"turned by 180°: {turned.board} ({turned.camera}; the board was read from its other end)"
         out.print(text, markup=False)
-    for item in result.left_out:
-        err.print("[yellow]left out:[/]", f"{item.label}: {item.reason}")
+    for source in dict.fromkeys(item.source for item in result.left_out):
+        gone = [item for item in result.left_out if item.source == source]
+        for item in gone[:_MOST_NAMED]:
+            err.print("[yellow]left out:[/]", f"{item.label}: {item.reason}")
+        if len(gone) > _MOST_NAMED:
+            err.print("[yellow]left out:[/]", f"{len(gone) - _MOST_NAMED} more {source}")
     for text in result.warnings:
         err.print("[yellow]warning:[/]", text)
 

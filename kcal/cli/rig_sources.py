@@ -33,6 +33,7 @@ class Sources:
     survey_sigma: float | None = None
     geoid: float | None = None
     stars: NightOptions | None = None
+    scene: tuple[str, str] | None = None
 
     @property
     def files(self) -> list[Path]:
@@ -120,12 +121,21 @@ def read_sources(cameras: tuple[Camera, Camera], sources: Sources) -> RigInput:
         from kcal.cli.rig_stars import read_stars
 
         stars, positions, notes = read_stars(cameras, sources.stars, origin, positions, placed=landmarks is not None)
+    features = None if sources.features is None else read_features(sources.features, sources.mark_sigma)
+    if sources.scene is not None:
+        from kcal.cli.rig_scene import read_scene
+
+        # One position alone tells no length; GNSS of both does.
+        scaled = any((boards, landmarks, sources.baseline, len(positions) > 1))
+        seen_by_both, more = read_scene(cameras, sources.scene, scaled=scaled)
+        features = seen_by_both if features is None else features + seen_by_both
+        notes = [*notes, *more]
     data = RigData(
         cameras=cameras,
         names=CAMERAS,
         boards=boards,
         landmarks=landmarks,
-        features=None if sources.features is None else read_features(sources.features, sources.mark_sigma),
+        features=features,
         baselines=() if sources.baseline is None else (parse_baseline(sources.baseline),),
         positions=positions,
         stars=stars,

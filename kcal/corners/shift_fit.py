@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kcal.corners.filters import gaussian_kernel
-from kcal.corners.patch_windows import IMAGE_BLUR, ImageWindows, sample
+from kcal.corners.patch_windows import IMAGE_BLUR, ImageWindows, grid_of, sample
 
 _MOST_STEPS = 25
 _CONVERGED = 1e-4  # steps
@@ -45,25 +45,32 @@ class _Patches(NamedTuple):
     moved: Tensor
     slopes: Tensor
     weight: Tensor
+    grid: Tensor | None
 
     def at(self, which: Tensor) -> _Patches:
         """The objects at some places."""
         right = self.right.at(which)
-        return _Patches(self.template[which], right, self.moved[which], self.slopes[which], self.weight[which])
+        slopes, weight = self.slopes[which], self.weight[which]
+        return _Patches(self.template[which], right, self.moved[which], slopes, weight, self.grid)
 
 
 def _residual(patches: _Patches, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Residual (N, K), slopes (N, K, 2) and design (N, K, 4) at theta (N, 4): shift, gain, offset."""
+    """Residual (N, K), slopes (N, K, 2) and design (N, K, 4 or 6) at theta: shift, gain, offset, scale and shear."""
     across, down = patches.slopes.unbind(-1)
     shift = theta[:, None, None, :2]
+    if patches.grid is not None:
+        along = torch.einsum("hwk,nk->nhw", patches.grid, theta[:, 4:])
+        shift = torch.stack([shift[..., 0] + along, shift[..., 1].expand_as(along)], -1)
     at = torch.addcmul(torch.addcmul(patches.moved, across, shift[..., :1]), down, shift[..., 1:])
     # The value and, for the slopes, a step to each side along both axes.
     places = torch.stack([at, at + across, at - across, at + down, at - down], 1)
     values, *sides = sample(patches.right, places).flatten(2).unbind(1)
     slope = torch.stack([0.5 * (sides[0] - sides[1]), 0.5 * (sides[2] - sides[3])], -1)
     template = patches.template.flatten(1)
-    residual = values - theta[:, 2:3] * template - theta[:, 3:]
+    residual = values - theta[:, 2:3] * template - theta[:, 3:4]
     design = torch.cat([slope, -template[..., None], -torch.ones_like(template)[..., None]], -1)
+    if patches.grid is not None:
+        design = torch.cat([design, slope[..., :1] * patches.grid.flatten(0, 1)], -1)
     return residual, slope, design
 
 
@@ -87,7 +94,7 @@ def _scale(residual: Tensor, weight: Tensor) -> Tensor:
 
 
 def _balance(patches: _Patches, theta: Tensor, scale: Tensor) -> Tensor:
-    """(N, 4) what is zero at the solution."""
+    """(N, 4 or 6) what is zero at the solution."""
     residual, _, design = _residual(patches, theta)
     weight = patches.weight.flatten(1) * _biweight(residual, scale, patches)
     return ((weight * residual)[..., None] * design).sum(1)
@@ -102,6 +109,7 @@ def fit_shifts(
     wanted: Tensor,
     *,
     robust: bool = True,
+    sheared: bool = False,
 ) -> ShiftFit:
     """Fit right(moved + slopes shift) = gain template + offset.
 
@@ -113,12 +121,15 @@ def fit_shifts(
         weight: (N, h, w) of the pixels.
         wanted: (N,) bool: objects to fit. Others have not converged, and zeros.
         robust: pixels that do not fit lose their weight.
+        sheared: the right patch may also be scaled and sheared along the plane's first axis.
     """
     which = wanted.nonzero()[:, 0]
     nothing = torch.zeros_like(moved[:, 0, 0])
     if not len(which):
         return ShiftFit(nothing, torch.zeros_like(slopes[:, 0, 0]), torch.zeros_like(wanted), nothing[:, 0])
-    patches = _Patches(template, right, moved, slopes, weight).at(which)
+    half = (template.shape[2] // 2, template.shape[1] // 2)
+    grid = grid_of(half, template.device) if sheared else None
+    patches = _Patches(template, right, moved, slopes, weight, grid).at(which)
     with torch.no_grad():
         values = patches.right.values.detach()
         still = patches._replace(template=patches.template.detach(), right=patches.right._replace(values=values))
@@ -141,9 +152,10 @@ def fit_shifts(
 def _fitted_shifts(patches: _Patches, robust: bool) -> tuple[Tensor, Tensor, Tensor]:
     """Theta, scale of the residuals and length of the last step; each object stops when it has converged."""
     count = len(patches.weight)
-    theta = patches.template.new_zeros(count, 4)
+    unknowns = 4 if patches.grid is None else 6
+    theta = patches.template.new_zeros(count, unknowns)
     theta[:, 2] = 1.0
-    eye = torch.eye(4, dtype=theta.dtype, device=theta.device)
+    eye = torch.eye(unknowns, dtype=theta.dtype, device=theta.device)
     step, scale = theta.new_full((count,), torch.inf), theta.new_full((count,), torch.inf)  # weights of one
     going = torch.arange(count, device=theta.device)
     for number in range(_MOST_STEPS):
@@ -189,8 +201,13 @@ def _covariance(
     total = robust.sum(1).clamp_min(1e-12)
     # Free of contrast and brightness.
     flat = torch.stack([template.flatten(1), torch.ones_like(residual)], -1)
-    gram = (robust[..., None] * flat).mT @ flat + 1e-9 * torch.eye(2, dtype=flat.dtype, device=flat.device)
     mixed = 0.5 * (own + slope)
+    if patches.grid is not None:
+        # And of scale and shear.
+        flat = torch.cat([flat, mixed[..., :1] * patches.grid.flatten(0, 1)], -1)
+    size = (robust[..., None] * flat.square()).sum(1, keepdim=True).clamp_min(1e-12).sqrt()
+    flat = flat / size
+    gram = (robust[..., None] * flat).mT @ flat + 1e-9 * torch.eye(flat.shape[-1], dtype=flat.dtype, device=flat.device)
     share = torch.linalg.solve_ex(gram, (robust[..., None] * flat).mT @ mixed)[0]
     across = mixed - flat @ share
     normal = (robust[..., None] * own).mT @ (slope - flat @ torch.linalg.solve_ex(
@@ -201,7 +218,7 @@ def _covariance(
     inverse = torch.linalg.inv_ex(torch.where(sound[:, None, None], normal, torch.eye(2).to(normal)))[0]
     kernel = _NOISE_BLUR.to(template)
     share_of_noise = float(kernel.square().sum()) ** 2
-    freedom = (1.0 - 4.0 / (total * share_of_noise)).clamp_min(0.2)
+    freedom = (1.0 - theta.shape[1] / (total * share_of_noise)).clamp_min(0.2)
     noise = (robust * residual.square()).sum(1) / total / (share_of_noise * freedom)
     force = (robust[..., None] * across).mT.reshape(-1, 1, height, width)
     beyond = 2 * (len(kernel) // 2)
@@ -228,9 +245,9 @@ def _implicit(patches: _Patches, theta: Tensor, scale: Tensor, converged: Tensor
             template=patches.template.detach(), right=patches.right._replace(values=patches.right.values.detach())
         )
         balance = _balance(fixed, free, scale)
-        rows = [torch.autograd.grad(balance[:, i].sum(), free, retain_graph=i < 3)[0] for i in range(4)]
+        rows = [torch.autograd.grad(balance[:, i].sum(), free, retain_graph=True)[0] for i in range(theta.shape[1])]
     jacobian = torch.stack(rows, 1)
-    jacobian = torch.where(converged[:, None, None], jacobian, torch.eye(4).to(jacobian))
+    jacobian = torch.where(converged[:, None, None], jacobian, torch.eye(theta.shape[1]).to(jacobian))
     inverse = torch.linalg.inv_ex(jacobian)[0]
     change = (inverse @ _balance(patches, theta.detach(), scale)[..., None])[..., 0]
     return theta.detach() - torch.where(converged[:, None], change, 0.0)

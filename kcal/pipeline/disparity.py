@@ -1,9 +1,9 @@
 """`ObjectDisparity`: where an object of the left image is in the right one, from all its pixels, to a fraction of one.
 
 The box or mask of the left image says which pixels count. They are compared on a common plane
-(`kcal.pipeline.patches`): correlation finds the shift, and a least-squares fit with contrast and brightness refines it
-(W. Förstner 1982; F. Ackermann, "Digital image correlation", 1984). Pixels that do not fit, of the background or of
-what stands in front, lose their weight (J. W. Tukey's biweight).
+(`kcal.corners.object_planes`): correlation finds the shift, and a least-squares fit with contrast and brightness
+refines it (W. Förstner 1982; F. Ackermann, "Digital image correlation", 1984). Pixels that do not fit, of the
+background or of what stands in front, lose their weight (J. W. Tukey's biweight).
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from torch import Tensor, nn
 
 from kcal.checks import as_points, keep_float64, require_finite
 from kcal.corners.match import MatchStatus
+from kcal.corners.object_planes import object_planes, plane_pixels, plane_places
 from kcal.corners.patch_correlation import highest_peak, is_textured, weighted_correlation
 from kcal.corners.patch_windows import grid_of, has_samples, image_windows, sample
 from kcal.corners.shift_fit import fit_shifts
 from kcal.errors import InputError
 from kcal.lens.rig import StereoRig
-from kcal.pipeline.patches import object_planes, plane_pixels, plane_places
 
 # Steps of a patch from its middle at most; larger objects get steps of powers of two pixels.
 _LARGEST_HALF = 24

@@ -12,6 +12,10 @@ from kcal.locate.survey import match_landmarks as match_landmarks
 from kcal.locate.survey import MarkedLandmarks as MarkedLandmarks
 from kcal.locate.survey import read_features as read_features
 from kcal.locate.survey import camera_positions as camera_positions
+from kcal.scene.match import ImagePair as ImagePair
+from kcal.scene.match import scene_features as scene_features
+from kcal.scene.match import SceneMatches as SceneMatches
+from kcal.scene.match import PairCounts as PairCounts
 
 # Results
 from kcal.calibrate.rig.result import ItemResidual as ItemResidual

@@ -142,9 +142,11 @@ def _minimize(problem: Problem[S], start: S, options: LMOptions, callback: Callb
         new_cost = on_host(problem.cost(candidate) if joint is None else joint.cost)
         predicted = on_host(decrease)
         solved = np.isfinite(predicted)
-        gain = (cost - np.where(np.isfinite(new_cost), new_cost, np.inf)) / np.where(
-            solved & (predicted > 0), predicted, np.inf
-        )
+        # An infinite fall over an infinite prediction is no gain, and not accepted.
+        with np.errstate(invalid="ignore"):
+            gain = (cost - np.where(np.isfinite(new_cost), new_cost, np.inf)) / np.where(
+                solved & (predicted > 0), predicted, np.inf
+            )
         accept = running & solved & (new_cost < cost)
         iterations = iterations + running
 

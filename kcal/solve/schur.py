@@ -28,8 +28,8 @@ class SchurLinearization:
 
     def __init__(self, local: Tensor, right: Tensor, total: Tensor) -> None:
         shared, gradient = total[..., :-1, :-1], total[..., :-1, -1]
-        self._local_scale = _inverse_root(local.diagonal(dim1=-2, dim2=-1))
-        self._shared_scale = _inverse_root(shared.diagonal(dim1=-2, dim2=-1))
+        self._local_scale = column_scale(local.diagonal(dim1=-2, dim2=-1))
+        self._shared_scale = column_scale(shared.diagonal(dim1=-2, dim2=-1))
         scale = torch.cat([self._shared_scale, torch.ones_like(total[..., -1, -1:])], -1)
         self._local = local * self._local_scale[..., :, None] * self._local_scale[..., None, :]
         self._right = right * self._local_scale[..., :, None] * scale[..., None, None, :]
@@ -119,12 +119,12 @@ class SchurLinearization:
 def without_local(rows: Tensor, local_size: int) -> Tensor:
     """(V, S + 1, R): rows (V, L + S + 1, R) off what each view's L local parameters can do, by QR."""
     local = rows[:, :local_size].transpose(-1, -2)
-    basis, _ = torch.linalg.qr(local * _inverse_root(local.square().sum(1, keepdim=True)))
+    basis, _ = torch.linalg.qr(local * column_scale(local.square().sum(1, keepdim=True)))
     others = rows[:, local_size:]
     return others - (others @ basis) @ basis.transpose(-1, -2)
 
 
-def _inverse_root(diagonal: Tensor) -> Tensor:
+def column_scale(diagonal: Tensor) -> Tensor:
     """Scale of each column; the parameter of a zero column never moves."""
     return torch.where(diagonal > 0, diagonal, 1.0).rsqrt()
 

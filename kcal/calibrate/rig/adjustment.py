@@ -255,7 +255,11 @@ def _masks_of_fields(masks: PerKind) -> RigState:
 
 
 def _weighted(source: Landmarks | Features, mask: Tensor) -> tuple[Tensor, Tensor]:
-    """Pixels and whitening of marks whose noise is the same along both axes."""
+    """Pixels and whitening of marks."""
+    if isinstance(source, Features) and source.covariance is not None:
+        # Where a mark is missing, its covariance may be anything.
+        known = source.covariance[mask].nan_to_num(1.0)
+        return source.pixels[mask], torch.linalg.inv(torch.linalg.cholesky_ex(known)[0])
     pixels, sigma = source.pixels[mask], source.pixel_sigma
     each = sigma[mask] if isinstance(sigma, Tensor) else torch.tensor(sigma, dtype=torch.float64)
     return pixels, (torch.eye(2, dtype=torch.float64) / each[..., None, None]).expand(*pixels.shape, 2)

@@ -196,8 +196,10 @@ class Block(ABC):
             shared = rows[:, self.size : -1]
             count = posed.by_unknown.shape[1]
             if count:
-                wanted = posed.by_unknown.any(1)
-                shared[:, :count] = torch.einsum("vpun,pk->vkun", found.by_camera, posed.by_unknown[wanted])
+                by_unknown = posed.by_unknown[posed.by_unknown.any(1)]
+                # Most unknowns are of another camera.
+                own = by_unknown.any(0).nonzero()[:, 0]
+                shared[:, own] = torch.einsum("vpun,pk->vkun", found.by_camera, by_unknown[:, own])
                 besides = self._by_board_or_air(state, by_q, offset, c)
                 if besides is not None:
                     shared[:, :count] += besides
@@ -360,6 +362,8 @@ class FeatureBlock(Block):
 
     def _prior(self, state: RigState) -> Tensor | None:
         # What is known of the range.
+        if not bool(self._weight.any()):
+            return None
         zero = torch.zeros_like(self._weight)
         error = (state.inverse_range - self._mean) * self._weight
         return torch.stack([zero, zero, self._weight, error], 1)[..., None]

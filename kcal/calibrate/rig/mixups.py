@@ -101,12 +101,10 @@ def _rightward(data: RigData, state: RigState, left: int, right: int) -> Tensor:
 
 def _features_behind(problem: RigProblem, state: RigState, covariance: SharedCovariance) -> tuple[int, int]:
     """How many features have an inverse range that is negative beyond chance, and how many there are."""
-    start = 0
     for block in problem.blocks:
         if isinstance(block, FeatureBlock):
             # The last local unknown is the inverse range; what the cameras' errors make of it is added.
-            follow, own = (value[start : start + len(block), -1] for value in problem.linearize(state).local_response())
-            variance = covariance.of(follow)[0].diagonal() + own[:, -1]
+            follow, own = (value[:, -1] for value in problem.response(state, block))
+            variance = covariance.variances(follow) + own[:, -1]
             return int((state.inverse_range < -_BEHIND_SIGMAS * variance.sqrt()).sum()), len(block)
-        start += len(block)
     return 0, 0

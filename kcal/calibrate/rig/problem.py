@@ -16,9 +16,13 @@ from kcal.calibrate.rig.blocks import LOCAL_SIZE, Block, PosedCamera, RigState
 from kcal.calibrate.rig.unknowns import SharedUnknowns
 from kcal.lens.camera import Camera
 from kcal.lens.pose import nearest_rotation, rotation_from_vector
+from kcal.solve.eliminated import EliminatedItems, PartlyEliminated
 from kcal.solve.result import State
 from kcal.solve.robust import RobustLoss
 from kcal.solve.schur import SchurLinearization
+
+# Share of a residual that the others must leave open for an item to be tested by them; less is rounding.
+_LEAST_LEFT = 1e-9
 
 
 class SharedTerm(ABC):
@@ -190,48 +194,71 @@ class RigProblem:
         g_iᵀ (N - N_i)⁻¹ g_i of the others'; for a single residual that is its squared external Studentized value
         (Baarda 1968; Cook and Weisberg 1982).
         """
-        gram, _ = self._gram(state)
-        reduced, terms = _reduced(gram), self.term_rows(state)
-        rest = (reduced.sum(0) + terms @ terms.T - reduced)[:, :-1, :-1]
-        unit = rest.diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).rsqrt()
-        roots, info = torch.linalg.cholesky_ex(rest * unit[:, :, None] * unit[:, None, :])
-        pull = torch.linalg.solve_triangular(roots, (reduced[:, :-1, -1] * unit)[..., None], upper=False)
-        # An item without which the rest would determine nothing cannot be tested.
-        others = torch.where(info == 0, pull.square().sum((-2, -1)), 0.0)
-        return list((gram[:, -1, -1] + others).split([len(block) for block in self.blocks]))
+        terms, (found, squares) = self.term_rows(state), self._rows(state)
+        parts = [self._without_own(block, rows) for block, rows in zip(self.blocks, found, strict=True)]
+        total = terms @ terms.T + sum((_summed(part) for part in parts), torch.zeros(()))
+        falls = []
+        for part, own in zip(parts, squares, strict=True):
+            others = _others_fall(total, part) if isinstance(part, Tensor) else _few_others_fall(total, part.rows)
+            falls.append(own + others)
+        return falls
 
     def block_grams(self, state: RigState) -> list[Tensor]:
         """For each block (S + 1, S + 1) products of the rows of all its items, their own unknowns eliminated."""
-        gram, _ = self._gram(state)
-        return [part.sum(0) for part in _reduced(gram).split([len(block) for block in self.blocks])]
+        found, _ = self._rows(state)
+        return [_summed(self._without_own(block, rows)) for block, rows in zip(self.blocks, found, strict=True)]
 
-    def _gram(self, state: RigState) -> tuple[Tensor, list[Tensor]]:
-        """(V, L + S + 1, L + S + 1) products of the rows of all items, with the loss's weights; and `item_squares`."""
-        size = LOCAL_SIZE + self.shared_size + 1
-        posed, grams = self.posed(state), [state.center.new_zeros(0, size, size)]
-        squares = []
+    def response(self, state: RigState, block: Block) -> tuple[Tensor, Tensor]:
+        """How the best unknowns of a block's items depend on the shared ones; see `SchurLinearization.local_response`.
+
+        Returns:
+            (V, L, S) and (V, L, L).
+        """
+        return EliminatedItems(block.rows(self.posed(state), state, self.shared_size), block.size).response()
+
+    def _rows(self, state: RigState) -> tuple[list[Tensor], list[Tensor]]:
+        """`Block.rows` of all blocks with the loss's weights, and `item_squares`."""
+        posed, found, squares = self.posed(state), list[Tensor](), list[Tensor]()
         for block in self.blocks:
             rows = block.rows(posed, state, self.shared_size)
             squares.append(rows[:, -1].square().sum(-1))
             if self.loss is not None:
                 count = block.counts.clamp_min(1)
                 rows = rows * self.loss.weight(squares[-1] / count).sqrt()[:, None, None]
-            missing = LOCAL_SIZE - block.size
-            gram = rows.new_zeros((len(block), size, size))
-            # Unknowns that smaller items do not have: with a one on the diagonal they change nothing.
-            gram[:, range(missing), range(missing)] = 1.0
-            gram[:, missing:, missing:] = rows @ rows.transpose(-1, -2)
-            grams.append(gram)
-        return torch.cat(grams), squares
+            found.append(rows)
+        return found, squares
 
-    def linearize(self, state: State) -> SchurLinearization:
+    @staticmethod
+    def _without_own(block: Block, rows: Tensor) -> Tensor | EliminatedItems:
+        """The items without their own unknowns; for boards, of many residuals each, (V, S + 1, S + 1) products."""
+        if block.kind != "boards":
+            return EliminatedItems(rows, block.size)
+        return _reduced(rows @ rows.mT, block.size)
+
+    def linearize(self, state: State) -> SchurLinearization | PartlyEliminated:
         """See `Problem.linearize`."""
         state = RigState(*state)
-        terms = self.term_rows(state)
-        gram, squares = self._gram(state)
-        linear = SchurLinearization.of_gram(gram, LOCAL_SIZE, terms @ terms.T)
-        if self.loss is not None:
-            linear.cost = self._cost_of(terms[-1], squares)
+        terms, (found, squares) = self.term_rows(state), self._rows(state)
+        total, cost = terms @ terms.T, self._cost_of(terms[-1], squares)
+        local, right = [total.new_zeros(0, LOCAL_SIZE, LOCAL_SIZE)], [total.new_zeros(0, LOCAL_SIZE, len(total))]
+        matched: tuple[EliminatedItems, int] | None = None
+        for block, rows in zip(self.blocks, found, strict=True):
+            if block.kind == "features":
+                own = EliminatedItems(rows, block.size)
+                matched, total = (own, sum(map(len, local))), total + own.gram
+                continue
+            mine, others, missing = rows[:, : block.size], rows[:, block.size :], LOCAL_SIZE - block.size
+            # Unknowns that smaller items do not have: with a one on the diagonal they change nothing.
+            square = torch.nn.functional.pad(mine @ mine.mT, (missing, 0, missing, 0))
+            square[:, range(missing), range(missing)] = 1.0
+            local.append(square)
+            right.append(torch.nn.functional.pad(mine @ others.mT, (0, 0, missing, 0)))
+            flat = others.transpose(0, 1).flatten(1)
+            total = total + flat @ flat.T
+        linear = SchurLinearization(torch.cat(local), torch.cat(right), total)
+        if matched is not None:
+            return PartlyEliminated(linear, *matched, cost)
+        linear.cost = cost
         return linear
 
     def select(self, elements: Tensor) -> None:
@@ -272,10 +299,38 @@ class RigProblem:
         return found._replace(rotation=nearest_rotation(found.rotation))
 
 
-def _reduced(gram: Tensor) -> Tensor:
+def _reduced(gram: Tensor, size: int) -> Tensor:
     """(V, S + 1, S + 1) products of rows (V, L + S + 1, L + S + 1) off what each item's own unknowns can do."""
-    L = LOCAL_SIZE
-    scale = gram[:, :L, :L].diagonal(dim1=-2, dim2=-1).rsqrt()
-    factor, _ = torch.linalg.cholesky_ex(gram[:, :L, :L] * scale[:, :, None] * scale[:, None, :])
-    coupling = gram[:, :L, L:] * scale[:, :, None]
-    return gram[:, L:, L:] - coupling.mT @ torch.cholesky_solve(coupling, factor)
+    scale = gram[:, :size, :size].diagonal(dim1=-2, dim2=-1).rsqrt()
+    factor, _ = torch.linalg.cholesky_ex(gram[:, :size, :size] * scale[:, :, None] * scale[:, None, :])
+    coupling = gram[:, :size, size:] * scale[:, :, None]
+    return gram[:, size:, size:] - coupling.mT @ torch.cholesky_solve(coupling, factor)
+
+
+def _summed(part: Tensor | EliminatedItems) -> Tensor:
+    return part.sum(0) if isinstance(part, Tensor) else part.gram
+
+
+def _others_fall(total: Tensor, part: Tensor) -> Tensor:
+    """(V,) by how much the others' χ² would fall without each item, from its products (V, S + 1, S + 1)."""
+    rest = (total - part)[:, :-1, :-1]
+    unit = rest.diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).rsqrt()
+    roots, info = torch.linalg.cholesky_ex(rest * unit[:, :, None] * unit[:, None, :])
+    pull = torch.linalg.solve_triangular(roots, (part[:, :-1, -1] * unit)[..., None], upper=False)
+    # An item without which the rest would determine nothing cannot be tested.
+    return torch.where(info == 0, pull.square().sum((-2, -1)), 0.0)
+
+
+def _few_others_fall(total: Tensor, rows: Tensor) -> Tensor:
+    """The same from an item's few rows (V, S + 1, k), e and B: eᵀ H (1 - H)⁻¹ e with H = Bᵀ N⁻¹ B (Woodbury 1950)."""
+    unit = total[:-1, :-1].diagonal().clamp_min(1e-300).rsqrt()
+    root, info = torch.linalg.cholesky_ex(total[:-1, :-1] * unit[:, None] * unit)
+    if int(info):
+        return rows.new_zeros(len(rows))
+    scaled = (rows[:, :-1] * unit[:, None]).transpose(0, 1).flatten(1)
+    thrown = torch.linalg.solve_triangular(root, scaled, upper=False).unflatten(1, (len(rows), -1)).transpose(0, 1)
+    values, vectors = torch.linalg.eigh(thrown.mT @ thrown)
+    along = (vectors.mT @ rows[:, -1, :, None])[..., 0]
+    testable = values[:, -1] < 1.0 - _LEAST_LEFT
+    fall = (along.square() * values / (1.0 - values).clamp_min(_LEAST_LEFT)).sum(-1)
+    return torch.where(testable, fall, 0.0)

@@ -15,13 +15,14 @@ from kcal.calibrate.rig.assess import rig_result
 from kcal.calibrate.rig.blocks import KINDS, PerKind
 from kcal.calibrate.rig.explanations import explained
 from kcal.calibrate.rig.initial_poses import InitialPoses, first_poses
-from kcal.calibrate.rig.mixups import cost_of_features_behind, refuse_same_camera
-from kcal.calibrate.rig.outliers import LOSS, ROUGHLY, possible
+from kcal.calibrate.rig.mixups import refuse_same_camera
+from kcal.calibrate.rig.outliers import ROUGHLY, possible
 from kcal.calibrate.rig.prior_information import gathered, joint_unknowns
 from kcal.calibrate.rig.rayless import without_rayless
 from kcal.calibrate.rig.records import Reasons, item_records
 from kcal.calibrate.rig.repeated_views import without_repeated
 from kcal.calibrate.rig.result import RigResult
+from kcal.calibrate.rig.robust_start import robust_solution
 from kcal.calibrate.rig.sources import RigData
 from kcal.calibrate.rig.unknowns import SharedUnknowns, free, held
 from kcal.errors import InputError
@@ -30,10 +31,6 @@ from kcal.lens.information import CameraInformation
 from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA, check_refraction
 from kcal.solve.lm import LMOptions
 
-# px: a corner's noise before the boards themselves tell it.
-_CORNER_SIGMA = 0.2
-# Enough steps to tell which of several starts is best.
-_SCREENING = LMOptions(max_iterations=25, tolerance=1e-6, residual_floor=1e-8)
 # λ of a solve that begins at the robust solution.
 _NEAR_DAMPING = 1e-9
 
@@ -124,7 +121,7 @@ def solve_rig(
     initial = first_poses(data, options.solver)
     masks, reasons = _first_masks(initial, reject=options.reject)
     progress("robust solution")
-    work = _robust(initial, masks, unknowns)
+    work = robust_solution(initial, masks, unknowns)
     if options.motion:
         work.fit_motion(possible(work, masks))
     # With lenses among the unknowns digits are dear, and what is wrong shows without them.
@@ -221,31 +218,6 @@ def _lens_unknowns(
 ) -> SharedUnknowns:
     """Unknowns of cameras without boards. Whoever marks landmarks solves the same rig again and again."""
     return joint_unknowns(cameras, gathered(cameras, known, None)[0], None)[0]
-
-
-def _robust(initial: InitialPoses, masks: PerKind, unknowns: SharedUnknowns) -> Adjustment:
-    """The best robust solution from all starts."""
-    boards = initial.data.boards
-    sigma = _CORNER_SIGMA if boards is None or boards.sigma is None else boards.sigma
-    best: tuple[float, Adjustment, PerKind] | None = None
-    for start in initial.starts:
-        work = Adjustment(initial.data, start, unknowns, sigma)
-        if unknowns.refine_lenses:
-            # From poses that are far off, lenses would bend towards them, beyond their folds even.
-            work.unknowns = held(initial.data.cameras)
-        here = possible(work, masks)
-        work.fit_corners(here, robust=True)
-        problem, result = work.solve(here, _SCREENING, LOSS)
-        cost = float(result.cost) + cost_of_features_behind(problem, work.part(here))
-        cost += 1e6 * sum(int((a & ~b).sum()) for a, b in zip(masks, here, strict=True))
-        if best is None or cost < best[0]:
-            best = (cost, work, here)
-    assert best is not None
-    _, work, here = best
-    work.unknowns = unknowns
-    work.fit_corners(here, robust=True)
-    work.solve(here, ROUGHLY, LOSS)
-    return work
 
 
 def _suspicions(work: Adjustment, masks: PerKind, reasons: Reasons, solver: LMOptions) -> tuple[PerKind, list[str]]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections import Counter
 
 import torch
 from torch import Tensor
@@ -37,7 +38,7 @@ def _check_marks(kind: str, names: tuple[str, ...], pixels: Tensor) -> None:
 def _names(kind: str, names: tuple[str, ...], count: int) -> None:
     if len(names) != count:
         raise InputError(f"{kind}: {len(names)} names for {count}; one each is needed")
-    twice = sorted({name for name in names if names.count(name) > 1})
+    twice = sorted(name for name, times in Counter(names).items() if times > 1)
     if twice:
         raise InputError(f"{kind}: the name {twice[0]!r} is there twice")
 
@@ -150,6 +151,7 @@ class Features:
         inverse_range: (F,) one over meters from the middle of the rig; 0 at infinity.
         inverse_range_sigma: (F,) its standard deviation; infinite where the range is not known.
         pixel_sigma: of a mark along an axis, px.
+        covariance: (F, C, 2, 2) px² of marks, in place of `pixel_sigma`.
     """
 
     names: tuple[str, ...]
@@ -157,6 +159,7 @@ class Features:
     inverse_range: Tensor
     inverse_range_sigma: Tensor
     pixel_sigma: float = 0.3
+    covariance: Tensor | None = None
 
     def __post_init__(self) -> None:
         count = len(self.names)
@@ -166,6 +169,25 @@ class Features:
         if not bool((torch.isfinite(self.inverse_range) & (self.inverse_range_sigma > 0)).all()):
             raise InputError("features: inverse ranges must be finite and their sigmas positive")
         _positive("features: pixel_sigma", self.pixel_sigma)
+        if self.covariance is not None and self.covariance.shape != (*self.pixels.shape, 2):
+            raise InputError(
+                f"features: a covariance {(*self.pixels.shape, 2)} is needed, got {tuple(self.covariance.shape)}"
+            )
+
+    def __add__(self, other: Features) -> Features:
+        """Both, with a covariance for each mark."""
+        both = self._whole(), other._whole()
+        return Features(
+            names=self.names + other.names,
+            pixels=torch.cat([self.pixels, other.pixels]),
+            inverse_range=torch.cat([self.inverse_range, other.inverse_range]),
+            inverse_range_sigma=torch.cat([self.inverse_range_sigma, other.inverse_range_sigma]),
+            covariance=torch.cat(both),
+        )
+
+    def _whole(self) -> Tensor:
+        alike = self.pixel_sigma**2 * torch.eye(2, dtype=torch.float64).expand(*self.pixels.shape, 2)
+        return alike if self.covariance is None else self.covariance
 
 
 def inverse_range_beyond(meters: float) -> tuple[float, float]:

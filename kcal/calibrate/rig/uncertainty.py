@@ -67,13 +67,20 @@ class SharedCovariance:
 
         What is not determined has infinite variance, and no covariance with anything.
         """
-        factor = rows @ self._root
-        scaled = rows * self._scale
-        length = scaled.square().sum(-1)
-        lost = (scaled @ self._open).square().sum(-1) > _LOST_SHARE * torch.where(length > 0, length, 1.0)
+        factor, lost = rows @ self._root, self._lost(rows)
         matrix = factor @ factor.T
         matrix = torch.where(lost[:, None] | lost[None, :], 0.0, 0.5 * (matrix + matrix.T))
         return matrix + torch.diag(torch.where(lost, torch.inf, 0.0)), ~lost
+
+    def variances(self, rows: Tensor) -> Tensor:
+        """(K,) variances of K linear functions (K, S) of a step; infinite for what is not determined."""
+        return torch.where(self._lost(rows), torch.inf, (rows @ self._root).square().sum(-1))
+
+    def _lost(self, rows: Tensor) -> Tensor:
+        """(K,) which functions are not determined."""
+        scaled = rows * self._scale
+        length = scaled.square().sum(-1)
+        return (scaled @ self._open).square().sum(-1) > _LOST_SHARE * torch.where(length > 0, length, 1.0)
 
     def half_of(self, rows: Tensor) -> Tensor | None:
         """(S, K) root of the covariance of K linear functions (K, S) of a step; None where one is not determined."""

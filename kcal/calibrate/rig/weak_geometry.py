@@ -225,7 +225,7 @@ def _targets(
     block = FeatureBlock(pixels, whitening, *nothing, state.center[first])
     turning, moving = ([slot is not None for slot in slots] for slots in (problem.turn, problem.shift))
     alone = RigProblem(problem.cameras, [block], (), problem.unknowns, turning, moving)
-    follow, own = alone.linearize(state._replace(direction=direction, inverse_range=inverse)).local_response()
+    follow, own = alone.response(state._replace(direction=direction, inverse_range=inverse), block)
     rows = follow[:, -1].clone()
     slot = problem.shift[first]
     if slot is not None:

@@ -1,0 +1,258 @@
+"""Match what both cameras of a rig see in pairs of images, for `kcal.calibrate.rig`."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kcal.calibrate.rig.adjustment import Adjustment
+from kcal.calibrate.rig.initial_poses import Start
+from kcal.calibrate.rig.limits import over_limit
+from kcal.calibrate.rig.outliers import LOSS, ROUGHLY, possible
+from kcal.calibrate.rig.sources import Baseline, Features, RigData
+from kcal.calibrate.rig.unknowns import held
+from kcal.corners.images import Gray
+from kcal.corners.keypoints import Keypoints, keypoints
+from kcal.errors import InputError
+from kcal.lens.camera import Camera
+from kcal.lens.rig import StereoRig
+from kcal.scene.guided import guided_matches, rough_rig
+from kcal.scene.refine import refine_matches
+from kcal.scene.still import Stillness, still_there
+
+# Keypoints of an image: more tell little more and cost as much again.
+_KEYPOINTS = 8000
+# Cells across and down the left image among which matches are spread, and the most of one pair.
+_CELLS = (32, 18)
+# Matches of all pairs together, and of one pair: of fewer, in the dark, a third were wrong.
+MOST, _FEWEST = 10_000, 60
+# Of a baseline of one: it only sets the scale of a rig that is thrown away.
+_UNIT_SIGMA = 1e-3
+
+
+class ImagePair(NamedTuple):
+    """Two images of one moment.
+
+    Attributes:
+        name: of the pair, in messages and of its matches.
+        left: (H, W) gray levels.
+        right: (H, W) gray levels.
+    """
+
+    name: str
+    left: Gray
+    right: Gray
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PairCounts:
+    """What became of the matches of a pair.
+
+    Args:
+        name: of the pair.
+        matched: keypoints that are each other's best along the epipolar line.
+        untextured: left out: no sub-pixel match, too little texture, or only a part of a patch is the same thing.
+        off_line: left out: off the epipolar line by more than noise explains.
+        moved: left out: not there in the other pairs, or at another range.
+        thinned: left out: others in the same part of the image are better.
+        used: those that are left.
+    """
+
+    name: str
+    matched: int
+    untextured: int
+    off_line: int
+    moved: int
+    thinned: int
+    used: int
+
+
+class SceneMatches(NamedTuple):
+    """Matches of all pairs as features of unknown range, and what became of the others."""
+
+    features: Features
+    counts: tuple[PairCounts, ...]
+
+
+class MatchedPair(NamedTuple):
+    """Matches (M,) of a pair.
+
+    Attributes:
+        pixels: (M, 2, 2) left and right.
+        covariance: (M, 2, 2) px² of the right one, the left one being given.
+        counts: what became of the others.
+        rig: with a baseline of one, as these matches make it.
+    """
+
+    pixels: Tensor
+    covariance: Tensor
+    counts: PairCounts
+    rig: StereoRig
+
+    def at(self, which: Tensor, **counts: Any) -> MatchedPair:
+        """Those at some places."""
+        counted = dataclasses.replace(self.counts, **counts)
+        return self._replace(pixels=self.pixels[which], covariance=self.covariance[which], counts=counted)
+
+
+def scene_features(cameras: tuple[Camera, Camera], pairs: Sequence[ImagePair], most: int = MOST) -> SceneMatches:
+    """Find and match what both cameras see, and check it: along epipolar lines, both ways, and in time.
+
+    Nothing is known of how the cameras stand but what the images tell; lenses are taken as calibrated. Each match has
+    the covariance of its least-squares fit. Where there are several pairs, what is not there in the others, or is
+    there at another range, is left out: vehicles, waves, clouds, leaves.
+
+    Args:
+        cameras: left and right, calibrated.
+        pairs: images of one moment each; days apart is good.
+        most: matches of all pairs together, evenly spread over the image.
+
+    Raises:
+        InputError: no pairs, images of another size than the cameras', or too little in common.
+
+    Example:
+        >>> from kcal import Camera
+        >>> camera = Camera.build(focal=(500, 500), center=(239.5, 159.5), size=(480, 320), model="pinhole")
+        >>> scene_features((camera, camera), [])
+        Traceback (most recent call last):
+        ...
+        kcal.errors.InputError: scene: no pair of images
+    """
+    return scene_of(cameras, pairs, [match_scene(cameras, pair) for pair in pairs], most)
+
+
+@torch.no_grad()
+def scene_of(
+    cameras: tuple[Camera, Camera], pairs: Sequence[ImagePair], found: Sequence[MatchedPair], most: int = MOST
+) -> SceneMatches:
+    """As `scene_features`, from matches of each pair (`match_scene`)."""
+    if not pairs:
+        raise InputError("scene: no pair of images")
+    if len(pairs) > 1:
+        found = [_still(pairs, found, k) for k in range(len(pairs))]
+    each = math.ceil(most / len(pairs))
+    found = [_thinned(one, cameras[0].size, each) for one in found]
+    names = tuple(f"{pair.name} {i}" for pair, one in zip(pairs, found, strict=True) for i in range(len(one.pixels)))
+    features = _features(names, torch.cat([one.pixels for one in found]), torch.cat([one.covariance for one in found]))
+    return SceneMatches(features, tuple(one.counts for one in found))
+
+
+def _features(names: tuple[str, ...], pixels: Tensor, covariance: Tensor) -> Features:
+    """Features of unknown range; the left pixel says which point is meant, and each has half of the uncertainty."""
+    nothing = torch.zeros(len(names), dtype=torch.float64)
+    return Features(
+        names=names,
+        pixels=pixels,
+        inverse_range=nothing,
+        inverse_range_sigma=torch.full_like(nothing, torch.inf),
+        covariance=0.5 * covariance[:, None].expand(-1, 2, 2, 2),
+    )
+
+
+@torch.no_grad()
+def match_scene(cameras: tuple[Camera, Camera], pair: ImagePair) -> MatchedPair:
+    """Matches of one pair.
+
+    Raises:
+        InputError: images of another size than the cameras', or too little in common.
+    """
+    for side, image, camera in zip(("left", "right"), (pair.left, pair.right), cameras, strict=True):
+        if image.shape[::-1] != tuple(camera.size):
+            raise InputError(
+                f"{pair.name}: the {side} image has {image.shape[1]}x{image.shape[0]} pixels, its camera "
+                f"{camera.size[0]}x{camera.size[1]}"
+            )
+    points = keypoints(pair.left, _KEYPOINTS), keypoints(pair.right, _KEYPOINTS)
+    rig = rough_rig(cameras, points, pair.name)
+    pixels = _guided(rig, points)
+    if len(pixels) >= _FEWEST:
+        # A pose from so many matches is good to a small part of the band in which the next ones are looked for.
+        rig, _ = _posed(rig, pixels, torch.eye(2, dtype=torch.float64).expand(len(pixels), 2, 2))
+        pixels = _guided(rig, points)
+    matched = len(pixels)
+    refined = refine_matches(rig, as_floats(pair), pixels[:, 0], pixels[:, 1]) if matched else None
+    fine = 0 if refined is None else int(refined.good.sum())
+    if refined is None or fine < _FEWEST:
+        raise InputError(
+            f"{pair.name}: only {fine} features were matched to a fraction of a pixel, {_FEWEST} are needed: is an "
+            "image blurred, or is there fog?"
+        )
+    pixels = torch.stack([pixels[:, 0], refined.right], 1)[refined.good]
+    covariance = refined.covariance[refined.good]
+    rig, over = _posed(rig, pixels, covariance)
+    good = over <= 1.0
+    counts = PairCounts(
+        name=pair.name, matched=matched, untextured=matched - fine, off_line=int((~good).sum()), moved=0, thinned=0,
+        used=int(good.sum()),
+    )  # fmt: skip
+    return MatchedPair(pixels[good], covariance[good], counts, rig)
+
+
+def _guided(rig: StereoRig, points: tuple[Keypoints, Keypoints]) -> Tensor:
+    index = guided_matches(rig, points)
+    return torch.stack([own.pixels[index[:, k]] for k, own in enumerate(points)], 1)
+
+
+def as_floats(pair: ImagePair) -> tuple[Tensor, Tensor]:
+    """Both images (H, W) float32."""
+    return torch.from_numpy(pair.left.astype(np.float32)), torch.from_numpy(pair.right.astype(np.float32))
+
+
+def _posed(rig: StereoRig, pixels: Tensor, covariance: Tensor) -> tuple[StereoRig, Tensor]:
+    """The rig (baseline of one) that most of the matches make, and each one's χ² over its limit."""
+    count = len(pixels)
+    features = _features(tuple(map(str, range(count))), pixels, covariance)
+    cameras = rig.left, rig.right
+    scale = Baseline(first=0, second=1, length=1.0, sigma=_UNIT_SIGMA)
+    data = RigData(cameras=cameras, names=("left", "right"), features=features, baselines=(scale,))
+    turn, shift = rig.right_from_left_rotation, rig.right_from_left_translation
+    start = Start(
+        rotation=torch.stack([torch.eye(3, dtype=torch.float64), turn]),
+        center=torch.stack([torch.zeros(3, dtype=torch.float64), -turn.T @ shift]),
+    )
+    work = Adjustment(data, start, held(cameras), 1.0)
+    masks = work.none()._replace(features=torch.ones(count, dtype=torch.bool))
+    masks = possible(work, masks)
+    work.solve(masks, ROUGHLY, LOSS)
+    squares = work.squares(masks)
+    over = over_limit(work, masks, squares).features
+    over = torch.where(masks.features, over, torch.inf)
+    # Behind both cameras.
+    over = torch.where(work.state.inverse_range < -_UNIT_SIGMA, torch.inf, over)
+    rotation, center = work.state.rotation, work.state.center
+    relative = rotation[1] @ rotation[0].T
+    return StereoRig(*cameras, relative, rotation[1] @ (center[0] - center[1])), over
+
+
+def _still(pairs: Sequence[ImagePair], found: Sequence[MatchedPair], k: int) -> MatchedPair:
+    """The matches of pair k without what is not still in any other pair."""
+    own = found[k]
+    others = [pairs[j] for j in range(len(pairs)) if j != k]
+    # Two others tell enough, far apart in the list.
+    chosen = [others[0], others[-1]] if len(others) > 1 else others
+    image, _ = as_floats(pairs[k])
+    verdicts = torch.stack([still_there(own.rig, image, as_floats(one), own.pixels, own.covariance) for one in chosen])
+    good = (verdicts == int(Stillness.STILL)).any(0) & ~(verdicts == int(Stillness.ELSEWHERE)).any(0)
+    return own.at(good, moved=int((~good).sum()), used=int(good.sum()))
+
+
+def _thinned(found: MatchedPair, size: tuple[int, int], most: int) -> MatchedPair:
+    """The best in each part of the image, as many as wanted."""
+    columns, rows = _CELLS
+    place = (found.pixels[:, 0] / torch.tensor(size) * torch.tensor(_CELLS)).long()
+    cell = place[:, 1].clamp(0, rows - 1) * columns + place[:, 0].clamp(0, columns - 1)
+    worst = found.covariance.diagonal(dim1=-2, dim2=-1).sum(-1)
+    order = worst.argsort()
+    order = order[cell[order].argsort(stable=True)]
+    _, counts = cell[order].unique_consecutive(return_counts=True)
+    rank = torch.arange(len(order)) - (counts.cumsum(0) - counts).repeat_interleave(counts)
+    # The best of each cell, then the second best; of these the better ones first.
+    by_sigma = worst[order].argsort(stable=True)
+    kept = order[by_sigma[rank[by_sigma].argsort(stable=True)[:most]]].sort().values
+    return found.at(kept, thinned=len(order) - len(kept), used=len(kept))

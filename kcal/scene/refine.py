@@ -1,0 +1,103 @@
+"""Refine matches to a fraction of a pixel: patches are compared through both lenses on one plane.
+
+On that plane (`kcal.corners.object_planes`) a flat piece of the scene differs between the images by a shift, and by a
+scale and a shear along the baseline, whatever its slope. These, contrast and brightness are fitted by least squares
+(A. Gruen, "Adaptive least squares correlation", 1985).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kcal.corners.object_planes import ObjectPlanes, object_planes, plane_pixels
+from kcal.corners.patch_windows import grid_of, has_samples, image_windows, sample
+from kcal.corners.shift_fit import fit_shifts
+from kcal.lens.camera import Camera
+from kcal.lens.rig import StereoRig
+
+# Steps of a patch from its middle.
+_HALF = 7
+# px: the least-squares fit ends that near to where it began, or it found something else.
+_FARTHEST = 3.0
+# px along the worst axis: beyond, there is too little texture.
+_FAINTEST = 0.35
+# Share of a patch that must fit: less stands before and behind an edge.
+_LEAST_SHARE = 0.55
+_AT_ONCE = 1000
+
+
+class RefinedMatches(NamedTuple):
+    """Matches of which the left pixel is given.
+
+    Attributes:
+        right: (M, 2) px.
+        covariance: (M, 2, 2) px² of it.
+        good: (M,) whether it was found.
+    """
+
+    right: Tensor
+    covariance: Tensor
+    good: Tensor
+
+
+@torch.no_grad()
+def refine_matches(rig: StereoRig, images: tuple[Tensor, Tensor], left: Tensor, right: Tensor) -> RefinedMatches:
+    """Find where the right image shows what the left one shows at `left` (M, 2), from about `right` (M, 2) on.
+
+    Args:
+        rig: roughly as it stands.
+        images: (H, W) float32 gray levels of both cameras.
+        left: px.
+        right: px.
+    """
+    parts = [_refined_part(rig, images, a, b) for a, b in zip(left.split(_AT_ONCE), right.split(_AT_ONCE), strict=True)]
+    return RefinedMatches(*(torch.cat(values) for values in zip(*parts, strict=True)))
+
+
+def _refined_part(rig: StereoRig, images: tuple[Tensor, Tensor], left: Tensor, right: Tensor) -> RefinedMatches:
+    planes = object_planes(rig, left, right, torch.zeros(len(left), dtype=torch.float64))
+    turn = rig.right_from_left_rotation
+    here, _, seen = _patch(rig.left, planes, planes.left, None)
+    there, slopes, shown = _patch(rig.right, planes, planes.right, turn)
+    valid = planes.valid & seen & shown
+    here = torch.where(valid[:, None, None, None], here, 0.0)
+    there = torch.where(valid[:, None, None, None], there, 0.0)
+    first = image_windows(images[0], here, 0, math.inf)
+    flat = there.flatten(1, 2)
+    second = image_windows(images[1], torch.cat([flat - _FARTHEST, flat + _FARTHEST], 1), 0, math.inf)
+    template = sample(first, here)
+    weight = (has_samples(first, here) & has_samples(second, there)).double()
+    valid &= weight.mean((1, 2)) > _LEAST_SHARE
+    fit = fit_shifts(template, second, there, slopes, weight, valid, sheared=True)
+    column = planes.right + planes.step[:, None] * fit.shift
+    pixels, again = plane_pixels(rig.right, planes, column[:, None], turn)
+    middle = slopes[:, _HALF, _HALF]
+    covariance = middle @ fit.covariance @ middle.mT
+    worst = torch.linalg.eigvalsh(covariance.nan_to_num(1e6))[:, -1].sqrt()
+    near = torch.linalg.vector_norm(pixels[:, 0] - right, dim=-1) < _FARTHEST
+    good = valid & fit.converged & again[:, 0] & near & (worst < _FAINTEST) & (fit.share > _LEAST_SHARE)
+    return RefinedMatches(pixels[:, 0], covariance, good)
+
+
+def _patch(
+    camera: Camera, planes: ObjectPlanes, middle: Tensor, rotation: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Pixels (M, h, w, 2) of patches, their derivatives (M, h, w, 2, 2) by a step, and which have all of them.
+
+    Nine places of a patch are projected; a parabola goes through them, since a lens hardly bends within a patch.
+    """
+    nodes = _HALF * grid_of((1, 1), middle.device)
+    places, seen = plane_pixels(
+        camera, planes, middle[:, None, None] + planes.step[:, None, None, None] * nodes, rotation
+    )
+    t = torch.arange(-_HALF, _HALF + 1, dtype=torch.float64) / _HALF
+    values = torch.stack([0.5 * t * (t - 1.0), 1.0 - t.square(), 0.5 * t * (t + 1.0)], 1)
+    steps = torch.stack([t - 0.5, -2.0 * t, t + 0.5], 1) / _HALF
+    pixels = torch.einsum("ya,xb,nabk->nyxk", values, values, places)
+    across = torch.einsum("ya,xb,nabk->nyxk", values, steps, places)
+    down = torch.einsum("ya,xb,nabk->nyxk", steps, values, places)
+    return pixels, torch.stack([across, down], -1), seen.all(-1).all(-1)
