@@ -38,7 +38,8 @@ class ViewsLocalization(NamedTuple):
         status: (...) int8, codes of `PositionStatus`. BEARING_ONLY: one camera saw it and its height is not known, or
             the parallax is below three of its sigmas; PARALLEL: the lines of sight meet nowhere before the cameras;
             CONTRADICTION: the views are not of one point, and which is wrong cannot be told.
-        anchor: (...) int64, the first camera that saw the point: from it count the bearing and the ranges.
+        anchor: (...) int64, the first camera that saw the point: from where it is said to stand count the bearing and
+            the ranges.
         bearing: (..., 3) unit vector in the frame; zeros where nothing is known.
         inverse_range: (...) one over meters, whose errors are Gaussian at any distance.
         inverse_range_sigma: (...) its standard deviation; zero where nothing is known.
@@ -312,7 +313,8 @@ class MultiViewLocalizer(Float64Module):
 
     def _at_height(self, place: Tensor, ray: Tensor, first: Tensor, height: Tensor, sigma: float) -> StatedHeight:
         """Where rays (N, 3) from places of cameras reach heights (N,) above the ellipsoid for the first time."""
-        assert self.up is not None and self.ecef_from_enu is not None
+        assert self.up is not None
+        assert self.ecef_from_enu is not None
         one = first.to(torch.float64)
         up, own = one @ self.up, one @ self.heights
         target = torch.where(torch.isfinite(height), height, own)
