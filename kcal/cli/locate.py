@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from kcal.cli.console import err, out, print_table, print_wrote, steps, warn
 from kcal.cli.inputs import MARKS, RIG, SURVEY
-from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_and_source
+from kcal.cli.pixel_sigma import ASSUMED, PixelSigma, pixel_sigma_and_source
 from kcal.cli.settings import taken
 from kcal.errors import DegenerateError, InputError
 from kcal.files import check_picture, check_writable
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from kcal.locate.positions import Located
+    from kcal.locate.sample import PositionSample
 
 
 def locate_command(
@@ -27,7 +28,8 @@ def locate_command(
     points: Annotated[
         Path,
         typer.Argument(
-            help="CSV with the columns name,left_u,left_v,right_u,right_v; others are carried into GeoJSON and CSV."
+            help="CSV with the columns name,left_u,left_v,right_u,right_v, or name,camera,u,v for any number of "
+            "cameras; others are carried into GeoJSON and CSV."
         ),
         MARKS,
     ],
@@ -98,6 +100,13 @@ def locate_command(
             hidden=True,
         ),
     ] = None,
+    height: Annotated[
+        str | None,
+        typer.Option(
+            metavar="M±SIGMA",
+            help="Height above the ellipsoid of what one camera alone saw; otherwise that has a bearing only.",
+        ),
+    ] = None,
     geoid: Annotated[
         Path | None, typer.Option(help="Geoid grid file (.tif, .gtx); one that PROJ finds if not given.", hidden=True)
     ] = None,
@@ -151,6 +160,9 @@ def locate_command(
     The rig file of a rig that was solved with landmarks contains its position: `--origin` and `--heading` are then not
     needed.
 
+    Of several cameras (one line for each mark: name,camera,u,v) any may have seen a thing; with three or more, a mark
+    that contradicts the others is left out and named. One camera alone gives a bearing, or a position at --height.
+
     A table may have any length: rows are read, located and written in turn. Beyond 1,000 rows the screen shows counts
     only, and pictures and maps show evenly spaced rows and those that have a true position.
 
@@ -166,9 +178,10 @@ def locate_command(
     --picture map.png`
 
     `kcal locate rig.json detections.csv -o - --format geojsonl | head`
-    """
-    import json
 
+    `kcal locate towers.rig.json smoke.csv --height 240±30 --map map.html`
+    """
+    from kcal.cli.stations import parse_height
     from kcal.io.rig_file import load_rig
     from kcal.lens.mounting import Origin
     from kcal.locate.datum import find_geoid, true_from_grid
@@ -177,9 +190,12 @@ def locate_command(
     from kcal.locate.mounting import run_errors
     from kcal.locate.positions import located_by
     from kcal.locate.sample import PositionSample
+    from kcal.locate.station_positions import locate_views
+    from kcal.locate.stations import load_camera_rig, names_of_rig
     from kcal.locate.survey import read_survey
     from kcal.locate.tabulate import Locator
     from kcal.locate.truth import read_truth
+    from kcal.locate.view_marks import is_long, read_views
 
     outputs = output or []
     streamed = STREAM in outputs
@@ -205,6 +221,33 @@ def locate_command(
         raise typer.BadParameter("--pitch, --roll and --grid belong to --heading; the rig file has its own attitude")
     # Parsed before the rig is read, so that a wrong option is reported first.
     place = None if origin is None else Origin.parse(origin)
+    stated_height = None if height is None else parse_height(height)
+    if stated_height is not None or is_long(points) or len(names_of_rig(rig)) != 2:
+        stated = (place, yaw_sigma, heading_sigma, origin_sigma, refraction, refraction_sigma)
+        if any(stated) and not {"origin", "heading"} & taken:
+            raise typer.BadParameter(
+                "of several cameras position, attitude and their errors come from the rig file: leave out --origin, "
+                "--heading, --yaw-sigma, --heading-sigma, --origin-sigma and --refraction"
+            )
+        stations = load_camera_rig(rig)
+        noise = pixel_sigma or (stations.calibration and stations.calibration.pixel_sigma) or ASSUMED
+        views = read_views(points, stations.names)
+        for text in stations.calibration.warnings if stations.calibration else ():
+            warn(f"{rig}: {text}")
+        located = locate_views(stations, views, pixel_sigma=noise, height=stated_height, geoid=find_geoid(geoid))
+        with open_writers(outputs, located, suffix) as writers:
+            for writer in writers:
+                writer.add(located.columns)
+        true = None if truth is None else read_truth(truth, located)
+        sample = PositionSample()
+        sample.add(located.columns)
+        written = [path for path in outputs if path != STREAM]
+        written += _drawn(located, true, picture, web_map, tiles=tiles, image=image, online=online)
+        _finish(
+            points, located, true, sample, written, as_json=as_json, streamed=streamed,
+            stated=bool(views.sigma.isfinite().any()), doubts=(),
+        )  # fmt: skip
+        return
     solved = load_rig(rig)
     noise, note = pixel_sigma_and_source(pixel_sigma, solved)
     if solved.mounting is not None and {"origin", "heading"} <= taken:
@@ -251,27 +294,60 @@ def locate_command(
             located = sample.located(locate)
             true = None if truth is None else read_truth(truth, located)
         written += [path for path in outputs if path != STREAM]
-        if picture is not None:
-            from kcal.report.positions import save_positions_picture
-
-            written.append(save_positions_picture(picture, located, true))
-        if web_map is not None:
-            from kcal.report.map_page import save_map
-
-            written.append(save_map(web_map, located, true, tiles=tiles, image=image, online=online))
+        written += _drawn(located, true, picture, web_map, tiles=tiles, image=image, online=online)
     except KeyboardInterrupt:
         kept = ", ".join(map(str, written)) or "nothing"
         err.print(
             f"interrupted after {sample.count:,} rows; written: {kept}; other files are as they were", markup=False
         )
         raise typer.Exit(130) from None
+    _finish(points, located, true, sample, written, as_json=as_json, streamed=streamed, stated=stated, doubts=doubts)
+
+
+def _drawn(
+    located: Located, true: Tensor | None, picture: Path | None, web_map: Path | None, **background: Any
+) -> list[Path]:
+    """The picture and the map, where they were asked for."""
+    written = []
+    if picture is not None:
+        from kcal.report.positions import save_positions_picture
+        from kcal.report.stations import save_stations_picture
+
+        draw = save_positions_picture if located.feet is None else save_stations_picture
+        written.append(draw(picture, located, true))
+    if web_map is not None:
+        from kcal.report.map_page import save_map
+
+        written.append(save_map(web_map, located, true, **background))
+    return written
+
+
+def _finish(
+    points: Path,
+    located: Located,
+    true: Tensor | None,
+    sample: PositionSample,
+    written: Sequence[Path],
+    *,
+    as_json: bool,
+    streamed: bool,
+    stated: bool,
+    doubts: Sequence[str],
+) -> None:
+    """Print what was found.
+
+    Raises:
+        DegenerateError: nothing could be located.
+    """
+    import json
+
     if as_json:
         summary = {
             "table": str(points),
             "rows": sample.count,
             "statuses": sample.statuses,
             "warnings": list(doubts),
-            "pixel_sigma": noise,
+            "pixel_sigma": located.pixel_sigma,
             "interval": located.interval_note,
             "geoid": located.geoid,
             "written": list(map(str, written)),
@@ -283,7 +359,8 @@ def locate_command(
         _print_positions(located, true, sample.statuses, stated=stated)
         print_wrote(*written)
     if "ok" not in sample.statuses:
-        raise DegenerateError(f"{points}: none of the {sample.count} pairs could be located; see the table")
+        rows = "pairs" if located.feet is None else "points"
+        raise DegenerateError(f"{points}: none of the {sample.count} {rows} could be located; see the table")
 
 
 def _counts(rows: int, statuses: dict[str, int]) -> str:

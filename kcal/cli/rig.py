@@ -31,9 +31,23 @@ def solve_command(
     left: Annotated[Path, typer.Argument(help="Camera file of the left camera."), CALIBRATED],
     right: Annotated[Path, typer.Argument(help="Camera file of the right camera."), CALIBRATED],
     output: Annotated[Path, typer.Option("-o", "--output", help="Rig file to write.")],
+    others: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="[CAMERA]...", help="More cameras; each is named by its file, up to the first dot."),
+        CALIBRATED,
+    ] = None,
     pairs: Annotated[
         tuple[Path, Path] | None,
         typer.Option("--pairs", metavar="LEFT.obs.json RIGHT.obs.json", help="Observations of boards seen by both."),
+        OBSERVATIONS,
+    ] = None,
+    observations: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="OBS.json",
+            help="Of three cameras and more: boards seen by any two, once for each camera, named as it is.",
+            hidden=True,
+        ),
         OBSERVATIONS,
     ] = None,
     match: Annotated[
@@ -53,7 +67,11 @@ def solve_command(
     ] = None,
     marks: Annotated[
         Path | None,
-        typer.Option(metavar="CSV", help="Where they are in the images: name,left_u,left_v,right_u,right_v."),
+        typer.Option(
+            metavar="CSV",
+            help="Where they are in the images: name,left_u,left_v,right_u,right_v, or one line for each camera: "
+            "name,camera,u,v.",
+        ),
         MARKS,
     ] = None,
     features: Annotated[
@@ -146,7 +164,7 @@ def solve_command(
         Path | None, typer.Option(help="A .png or .svg file: a plan, and residuals.", hidden=True)
     ] = None,
 ) -> None:
-    """Solve a stereo rig: where the right camera stands from the left, and where both stand on the Earth.
+    """Solve a rig: where the right camera stands from the left, and where both, or any number, stand on the Earth.
 
     From boards seen by both cameras, surveyed landmarks, far features, a measured baseline and measured camera
     positions: any of them, or all together in one adjustment. What contradicts the rest is left out and named. Boards
@@ -162,12 +180,17 @@ def solve_command(
 
     `kcal rig check` tells later whether the cameras have turned since.
 
+    Three cameras and more may stand kilometers apart and see different things: each needs four landmarks or more, of
+    its own or in common, and measured positions (--positions, by the cameras' names) help.
+
     **Examples**
 
     `kcal rig left.camera.json right.camera.json --pairs left.obs.json right.obs.json -o rig.json`
 
     `kcal rig left.camera.json right.camera.json --landmarks survey.csv --marks marks.csv --features far.csv
     --baseline 10.02±0.005 -o rig.json --require 5km:10% --report rig.html`
+
+    `kcal rig mill.camera.json mast.camera.json church.camera.json --landmarks survey.csv --marks marks.csv -o rig.json`
     """
     from kcal.calibrate.rig.solve import RigOptions, solve_rig
     from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
@@ -190,7 +213,7 @@ def solve_command(
     sources = Sources(
         pairs=pairs, match=match, landmarks=landmarks, marks=marks, features=features, positions=positions,
         baseline=baseline, origin=origin, mark_sigma=noise, survey_sigma=survey_sigma, geoid=geoid,
-        stars=night,
+        stars=night, names=tuple(path.name.split(".")[0] for path in (left, right)),
     )  # fmt: skip
     check_writable(output, left, right, *sources.files)
     needs = required(require)
@@ -198,12 +221,22 @@ def solve_command(
         check_writable(report, left, right, *sources.files)
     if picture is not None:
         check_picture(picture)
-    if not any((pairs, landmarks, marks, features, positions, baseline, stars)):
+    if not any((pairs, landmarks, marks, features, positions, baseline, stars, observations)):
         raise typer.BadParameter("give boards (--pairs), landmarks (--landmarks and --marks) or features (--features)")
     options = RigOptions(
         intrinsics=intrinsics, board_warp=board_warp, reject=not keep_all, refraction=refraction,
         refraction_sigma=refraction_sigma,
     )  # fmt: skip
+    if others:
+        from kcal.cli.stations import solve_stations
+
+        for given, option in ((require, "--require"), (report, "--report"), (picture, "--picture"), (match, "--match")):
+            if given:
+                raise typer.BadParameter(f"{option} is for rigs of two cameras")
+        solve_stations([left, right, *others], sources, options, output, observations or ())
+        return
+    if observations:
+        raise typer.BadParameter("--observations is for three cameras and more; give --pairs LEFT RIGHT")
     calibrated = load_camera(left), load_camera(right)
     check_sides(calibrated, (left, right))
     data, frame, unpaired, notes, stated = read_sources(calibrated, sources)
@@ -270,10 +303,9 @@ def _calibrated_from(rig: StereoRig, pairs: tuple[Path, Path]) -> bool:
     )
 
 
-def rig_lines(result: RigResult, rig: StereoRig, unpaired: int) -> list[str]:
-    """What a result says: residuals by source, the relative pose with its sigmas, the board's squares, the mounting."""
-    from kcal.locate.check import triangulated_sides
-    from kcal.quantities import length_text, measured_length, measured_text, number_text
+def source_lines(result: RigResult) -> list[str]:
+    """Residuals by source."""
+    from kcal.quantities import length_text
 
     rows = [["source", "used", "left out", "RMS px", "RMS", "sigmas"]]
     for source in result.sources:
@@ -284,7 +316,15 @@ def rig_lines(result: RigResult, rig: StereoRig, unpaired: int) -> list[str]:
         sigmas = "" if math.isnan(source.sigmas) else f"{source.sigmas:.2f}"
         rows.append([source.source, f"{source.used}", f"{source.left_out}", *cells, sigmas])
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip() for row in rows]
+    return ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip() for row in rows]
+
+
+def rig_lines(result: RigResult, rig: StereoRig, unpaired: int) -> list[str]:
+    """What a result says: residuals by source, the relative pose with its sigmas, the board's squares, the mounting."""
+    from kcal.locate.check import triangulated_sides
+    from kcal.quantities import length_text, measured_length, measured_text, number_text
+
+    lines = source_lines(result)
     boards, mounting = result.data.boards, rig.mounting
     lines += [
         f"RMS [bold]{result.rms:.4f} px[/] (left {result.rms_px[0]:.4f}, right {result.rms_px[1]:.4f}); "

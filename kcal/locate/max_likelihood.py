@@ -35,8 +35,8 @@ _MOST_STEPS, _TRACED_STEPS = 5, 3
 _CHORDS = 2
 # A step that moves no pixel by more than this, in units of the noise, is the last.
 _SHORT_STEP = 1e-5
-# Of ρ: light from beyond a thousand rigs' sizes is bent as if it came from there.
-_NEAREST_HORIZON = 1e-3
+# Meters: light from beyond is bent as if it came from there; nothing on the Earth is seen so far.
+_HORIZON = 5e5
 
 # Minors of a 3x4 matrix: the column pairs 01, 02, 03, 12, 13, 23; and for each column left out, those of the others.
 _FIRST, _SECOND = [0, 0, 0, 1, 1, 2], [1, 2, 3, 2, 3, 3]
@@ -229,7 +229,7 @@ def _evaluate(fixed: _Fixed, theta: Tensor) -> _Evaluated:
     seen = turned + inverse * shift
     around = fixed.around
     if around.up is not None:
-        seen = seen + lifted(seen, around, fixed.scale / inverse.abs().clamp_min(_NEAREST_HORIZON))
+        seen = seen + lifted(seen, around, length_of_one(fixed.scale, inverse))
     with torch.no_grad():
         good = fixed.usable[..., None, :].expand(seen[..., 2, :].shape)
         if around.present is not None:
@@ -271,6 +271,11 @@ def _evaluate(fixed: _Fixed, theta: Tensor) -> _Evaluated:
         off = (around.held * moved).sum(-2)
         cost, slope = cost + off * off, slope + around.held * off[..., None, :]
     return _Evaluated(cost, jacobian, weighted, residual, turned, tuple(projections), slope)
+
+
+def length_of_one(scale: Tensor, inverse: Tensor) -> Tensor:
+    """Meters of one in the units of ρ-scaled points, at most as far as anything on the Earth is seen."""
+    return scale / torch.maximum(inverse.abs(), scale / _HORIZON)
 
 
 def lifted(seen: Tensor, around: Surroundings, unit: Tensor | float) -> Tensor:

@@ -31,6 +31,14 @@ def load_camera_rig(path: str | Path) -> CameraRig:
     return stations_of(RigFile.parse(content, str(path)).rig())
 
 
+def names_of_rig(path: str | Path) -> tuple[str, ...]:
+    """Names of the cameras of a rig file, without reading more than that; left and right of a file of two."""
+    path = Path(path)
+    content = read_json(read_bytes(path, MOST_BYTES), str(path))
+    names = content.get("names") if isinstance(content, dict) else None
+    return tuple(map(str, names)) if isinstance(names, list) else ("left", "right")
+
+
 def stations_of(rig: StereoRig) -> CameraRig:
     """A stereo rig as a rig of two cameras, with all that is known of it.
 

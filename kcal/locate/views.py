@@ -17,12 +17,13 @@ from torch import Tensor
 from kcal.lens.camera import Camera
 from kcal.lens.camera_stack import project_each, unproject_each
 from kcal.lens.pose import side_axes, step_rows
-from kcal.locate.angular import first_seen, triangulate_angular
+from kcal.locate.angular import Found, first_seen, triangulate_angular
 from kcal.locate.max_likelihood import (
     PointFit,
     RelativeCamera,
     Surroundings,
     inverse_covariances,
+    length_of_one,
     lifted,
     most_likely,
     position_slope,
@@ -235,7 +236,9 @@ def fit_views(
         anchor = torch.cat([anchor[..., :1] | nothing[..., None], anchor[..., 1:]], -1)
         in_frame = (rays[..., None, :] @ posed.rotation)[..., 0, :]
         place, ray = (anchor[..., None] * center).sum(-2), (anchor[..., None] * in_frame).sum(-2)
-        found = triangulate_angular(posed.matrices, rays, used)
+        found = Found(torch.zeros_like(ray), torch.zeros_like(nothing))
+        if len(posed.cameras) > 1:
+            found = triangulate_angular(posed.matrices, rays, used)
         met, scale = found.valid & (count > 1), posed.scale.detach()
         away = found.points + center[0] - place
         held = None
@@ -291,7 +294,7 @@ def _shared_pixels(
     place, ahead, inverse = at
     line = ahead[..., None, :] + (inverse / scale)[..., None, None] * (place[..., None, :] - posed.center)
     seen = (posed.rotation @ line[..., None])[..., 0].movedim(-3, -1)  # (C, 3, N)
-    around, unit = posed.around, scale / inverse.abs().clamp_min(1e-3)
+    around, unit = posed.around, length_of_one(scale, inverse)
     seen = torch.where(used.mT[:, None], seen, seen.new_tensor([[0.0], [0.0], [1.0]]))
     higher = None
     if around.up is not None:

@@ -210,6 +210,18 @@ def test_one_camera_with_a_stated_height() -> None:
     assert (upward.status == int(PositionStatus.BEARING_ONLY)).all()
 
 
+@pytest.mark.parametrize("count", [1, 3])
+def test_one_camera_alone_is_as_one_of_several(count: int) -> None:
+    rig, points = ring(3, 9000.0), targets(4) - torch.tensor([0.0, 0.0, 400.0])
+    few = CameraRig(rig.each[:count], rig.names[:count], rig.rotation[:count], rig.center[:count], origin=ORIGIN)
+    pixels = marks(rig, points)[:, :count]
+    seen = torch.arange(count).expand(4, count) == 0
+    height = enu_to_geodetic(points, ORIGIN)[:, 2]
+    found = MultiViewLocalizer(few, root=few.with_errors(attitude_deg=0.01))(pixels, seen, height=height)
+    assert (found.status == OK).all()
+    assert (found.enu - points).norm(dim=-1).max() < 0.1
+
+
 def test_errors_of_clocks_widen_along_the_motion() -> None:
     rig = ring(3, 3000.0)
     pixels, velocity = marks(rig, targets(1)), torch.tensor([[[50.0, 0.0]] * 3], dtype=torch.float64)
