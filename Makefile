@@ -3,6 +3,7 @@
 # make test-all  the same with the slow ones, as CI does
 # make test-cpus  the tests as other makes of CPU round: six times as long
 # make check  linters and type check only
+# make wheel  a wheel in dist/, the same to the last byte from the same commit, and its checksum
 # make docs   the documentation site, in site/; it opens without a server and can be searched offline
 #
 # Each needs Python 3.11 or newer and nothing else; PYTHON=python3.12 make demo chooses another one.
@@ -18,7 +19,7 @@ export OMP_NUM_THREADS := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := demo
-.PHONY: demo test test-all test-cpus check docs clean
+.PHONY: demo test test-all test-cpus check wheel docs clean
 
 demo: $(VENV)/.installed
 	$(BIN)/kcal demo --output $(OUT)
@@ -42,6 +43,11 @@ test-all: check
 
 test-cpus: $(VENV)/.installed-dev
 	$(BIN)/python -m scripts.check.cpus
+
+wheel: $(VENV)/.installed-dev
+	SOURCE_DATE_EPOCH=$$(git log -1 --format=%ct) $(BIN)/python -m pip wheel --quiet --no-deps --no-build-isolation \
+	  --wheel-dir dist .
+	cd dist && sha256sum *.whl
 
 # The release of MkDocs is pinned, so its announcements of other programs are switched off.
 docs: $(VENV)/.installed-docs

@@ -35,6 +35,7 @@ from kcal.cli.mark import mark_command
 from kcal.cli.old_flags import with_new_names
 from kcal.cli.report import report_command
 from kcal.cli.rig import app as rig
+from kcal.cli.schema import schema_command
 from kcal.cli.settings import defaults_of, read_settings
 from kcal.cli.show import show_command
 from kcal.cli.stars import stars_command
@@ -132,6 +133,7 @@ app.command("undistort", cls=Command)(with_json(with_inputs(undistort_command)))
 app.command("bake", cls=Command)(with_json(with_inputs(bake_command)))
 app.command("export", cls=Command)(with_json(with_inputs(export_command)))
 app.command("import", cls=Command)(with_json(with_inputs(import_command)))
+app.command("schema", cls=Command)(schema_command)
 app.command("show", cls=Command)(with_json(with_inputs(show_command)))
 app.command("diff", cls=Command)(with_json(with_inputs(diff_command)))
 app.command("report", cls=Command)(with_json(with_inputs(report_command)))

@@ -1,0 +1,80 @@
+"""Files of every version load to the numbers that the version itself computed from them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from kcal.calibrate.hybrid.measured_board import load_measured_board
+from kcal.corners.observations import Observations
+from kcal.io.camera_file import load_camera, save_camera
+from kcal.io.file_summary import sigma_of
+from kcal.io.lookup_file import load_lookup
+from kcal.io.rig_file import load_rig
+from kcal.lens.camera import Camera
+
+FILES = Path(__file__).parent / "files"
+VERSIONS = sorted(path.name for path in FILES.iterdir())
+CAMERAS = sorted(f"{path.parent.name}/{path.name}" for path in FILES.glob("*/*.camera.json"))
+
+
+def close(found: torch.Tensor, stored: list[object]) -> None:
+    # Rays of an inverse that is iterated may end elsewhere within its tolerance, 1e-12 of a ray.
+    torch.testing.assert_close(found, torch.tensor(stored, dtype=torch.float64), rtol=1e-12, atol=2e-12, equal_nan=True)
+
+
+def same_camera(camera: Camera, known: dict[str, list[object]], whole: dict[str, list[object]]) -> None:
+    close(camera.params.detach(), known["params"])
+    close(camera.project(torch.tensor(whole["points"], dtype=torch.float64))[0].detach(), known["pixels"])
+    close(camera.unproject(torch.tensor(whole["marks"], dtype=torch.float64))[0].detach(), known["rays"])
+
+
+def computed(version: str) -> dict[str, dict[str, list[object]]]:
+    return json.loads((FILES / version / "computed.json").read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("file", CAMERAS)
+def test_cameras(file: str, tmp_path: Path) -> None:
+    version, _, name = file.partition("/")
+    whole = computed(version)
+    camera = load_camera(FILES / file)
+    same_camera(camera, whole[name], whole)
+    # Error bars are those that the file states, to 1e-9: the present version may keep them as a square root.
+    stored = json.loads((FILES / file).read_text(encoding="utf-8"))["standard_deviations"]
+    found = sigma_of(camera)
+    for parameter, value in stored.items():
+        assert found[parameter] == pytest.approx(value, rel=1e-9) if value else not found[parameter]
+    # And what the present version writes of them.
+    again = load_camera(save_camera(camera, tmp_path / "again.json"))
+    same_camera(again, whole[name], whole)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_other_files(version: str) -> None:
+    folder, whole = FILES / version, computed(version)
+    seen = Observations.load(folder / "observations.json")
+    total = sum(sum(map(sum, view.pixels)) for view in seen.views)
+    assert total == pytest.approx(whole["observations.json"]["sum"], rel=1e-12)
+    rig, known = load_rig(folder / "rig.json"), whole["rig.json"]
+    close(rig.right_from_left_rotation, known["rotation"])
+    close(rig.right_from_left_translation, known["translation"])
+    same_camera(rig.left, known["left"], whole)
+    same_camera(rig.right, known["right"], whole)
+    lookup = load_lookup(folder / "lookup.npz")
+    close(lookup.project(torch.tensor(whole["points"][3:], dtype=torch.float64))[0], whole["lookup.npz"]["pixels"])
+    if "board.json" in whole:
+        close(load_measured_board(folder / "board.json").points, whole["board.json"]["points"])
+
+
+def test_each_format_that_is_read_has_files() -> None:
+    """A new version of a format brings its files with it."""
+    from kcal.io.camera_file import CameraFile
+    from kcal.io.rig_file import RigFile
+
+    for kind in (CameraFile, RigFile):
+        name = {CameraFile: "opencv5.camera.json", RigFile: "rig.json"}[kind]
+        there = {json.loads((FILES / version / name).read_text(encoding="utf-8"))["version"] for version in VERSIONS}
+        assert there == {kind.VERSION, *kind.OLDER}

@@ -1,0 +1,58 @@
+"""The published schemas hold for what kcal writes, and refuse what it would refuse."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+from typer.testing import CliRunner
+
+from kcal.cli.main import app
+from kcal.cli.schema import FILES, file_schema
+from kcal.corners.observations import Observations
+from kcal.io.camera_file import load_camera, save_camera
+from kcal.io.rig_file import load_rig, save_rig
+
+NEWEST = Path(__file__).parent / "files" / "0.1-format2"
+WRITTEN = {
+    "camera": "hybrid.camera.json",
+    "rig": "rig.json",
+    "observations": "observations.json",
+    "board": "board.json",
+}
+
+
+def content(kind: str, folder: Path) -> dict[str, Any]:
+    """A file as the present version writes it."""
+    path = NEWEST / WRITTEN[kind]
+    if kind == "camera":
+        path = save_camera(load_camera(path), folder / "camera.json")
+    elif kind == "rig":
+        path = save_rig(load_rig(path), folder / "rig.json")
+    elif kind == "observations":
+        path = Observations.load(path).save(folder / "seen.json")
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_what_is_written_fits(kind: str, tmp_path: Path) -> None:
+    schema = file_schema(kind)
+    jsonschema.Draft202012Validator.check_schema(schema)
+    written = content(kind, tmp_path)
+    jsonschema.validate(written, schema, cls=jsonschema.Draft202012Validator)
+    for damage in ({"kcal": "table"}, {"version": 99}, {"unknown": 1}):
+        with pytest.raises(jsonschema.ValidationError):
+            jsonschema.validate({**written, **damage}, schema)
+    first = list(written)[2]
+    with pytest.raises(jsonschema.ValidationError, match=first):
+        jsonschema.validate({key: value for key, value in written.items() if key != first}, schema)
+
+
+def test_command() -> None:
+    done = CliRunner().invoke(app, ["schema", "rig"])
+    assert json.loads(done.stdout) == file_schema("rig")
+    assert [line.split()[0] for line in CliRunner().invoke(app, ["schema"]).stdout.splitlines()[1:]] == [*FILES]
+    assert "no kind of file is called 'car'" in str(CliRunner().invoke(app, ["schema", "car"]).exception)

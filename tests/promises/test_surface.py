@@ -1,0 +1,111 @@
+"""What users rely on stays: names, signatures, attributes, commands; `scripts/make_promises.py` lists them."""
+
+from __future__ import annotations
+
+import warnings
+
+import pytest
+
+from kcal.cli.old_flags import _NEEDLESS, _RENAMED
+from kcal.old_names import GONE, PLACES
+from scripts.make_promises import command_lines, python_lines, stored
+
+ADD = "python -m scripts.make_promises writes the lists"
+
+
+def split(line: str) -> tuple[str, list[str]]:
+    """A name and its arguments."""
+    name, _, arguments = line.partition("(")
+    return name, [each for each in arguments.removesuffix(")").split(", ") if each]
+
+
+def broken(then: list[str], now: list[str]) -> str | None:
+    """Why a call that was right with the arguments `then` may be wrong with `now`."""
+    places = [each.rstrip("=") for each in now]
+    by_place, starred = True, False
+    for i, each in enumerate(then):
+        name = each.rstrip("=")
+        by_place &= name != "*"
+        if name == "*":
+            continue
+        if name not in places:
+            return f"{name} is gone"
+        at = places.index(name)
+        if by_place and (at != i or "*" in places[:at]):
+            return f"{name} has another place"
+        if each.endswith("=") and not now[at].endswith("="):
+            return f"{name} must be given"
+    for each in now:
+        starred |= each == "*"
+        if (
+            not each.startswith("*")
+            and not each.endswith("=")
+            and each.rstrip("=") not in {x.rstrip("=") for x in then}
+        ):
+            return f"{each} is new and must be given"
+    return None
+
+
+def test_python() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        now = dict(map(split, python_lines()))
+        then = dict(map(split, stored("python.txt")))
+    faults = []
+    for name, arguments in then.items():
+        if name not in now:
+            old = name.removeprefix("kcal.")
+            faults += [] if old in PLACES or old in GONE else [f"{name} is gone without a warning"]
+        elif why := broken(arguments, now[name]):
+            faults.append(f"{name}: {why}")
+    assert faults == []
+    assert sorted(now.keys() - then.keys()) == [], ADD
+
+
+def limits(line: str) -> tuple[str, float, float]:
+    """A command, and how many arguments it takes at least and at most."""
+    name, _, counts = line.partition(" takes ")
+    low, _, high = counts.partition(" to ")
+    return name, float(low), float("inf" if high == "any number" else high)
+
+
+def warned(line: str) -> bool:
+    """Whether an option still works, with a warning."""
+    words = line.split()
+    flag = next(word for word in words if word.startswith("-"))
+    return any((command, flag) in {**_RENAMED, **_NEEDLESS} for command in ("", words[1]))
+
+
+def test_options_of_commands() -> None:
+    now, then = ({line for line in lines if " -" in line} for lines in (command_lines(), stored("commands.txt")))
+    assert sorted(line for line in then - now if not warned(line)) == []
+    assert sorted(now - then) == [], ADD
+
+
+def test_arguments_of_commands() -> None:
+    now, then = (
+        [limits(line) for line in lines if " takes " in line] for lines in (command_lines(), stored("commands.txt"))
+    )
+    counts = {name: (low, high) for name, low, high in now}
+    for name, low, high in then:
+        assert name in counts, f"{name} is gone"
+        assert counts[name][0] <= low, name
+        assert counts[name][1] >= high, name
+    assert counts.keys() == {name for name, _, _ in then}, ADD
+
+
+@pytest.mark.parametrize(
+    ("then", "now", "why"),
+    [
+        ("f(a, b=)", "f(a, b=, c=)", None),
+        ("f(a, b=)", "f(a, b=, *, c=)", None),
+        ("f(a, *, b=)", "f(a, b=)", None),
+        ("f(a, b=)", "f(b=, a)", "a has another place"),
+        ("f(a, b=)", "f(a)", "b is gone"),
+        ("f(a, b=)", "f(a, b)", "b must be given"),
+        ("f(a)", "f(a, b)", "b is new and must be given"),
+        ("f(a, b=)", "f(a, *, b=)", "b has another place"),
+    ],
+)
+def test_what_breaks_a_call(then: str, now: str, why: str | None) -> None:
+    assert broken(split(then)[1], split(now)[1]) == why
