@@ -53,12 +53,14 @@ PUBLIC = {
         save_measured_board summarize
     """,
     "kcal.rig": """
+        CameraRig CameraRigCalibration load_camera_rig save_camera_rig station_mounting stations_of
         Drift DriftEffect ItemResidual MarkedLandmarks Mounting RigCalibration RigCovariance RigSource Sides
         SourceResidual Survey TurnedBoard camera_positions check_rig drift_effect import_survey match_landmarks
         measure_drift mounting_covariance pair_by_name paired_boards placed_rig planned_rig read_features
         read_pairs read_survey relocked triangulated_sides
     """,
     "kcal.locate": """
+        MultiViewLocalizer ViewMarks ViewsLocalization locate_views read_views
         BudgetErrors Geoid GroundPlaces Localization Marks Position PositionColumns RangeError Sensitivity Triangulate
         TriangulateViews Triangulation Viewpoint ViewsResult circular_error enu_from_cam enu_to_geodetic
         find_geoid geodetic_to_enu level_ground locate_on_ground position_errors range_errors read_marks
@@ -87,13 +89,31 @@ PUBLIC = {
 NAMES = [(door, name) for door, names in PUBLIC.items() for name in names.split()]
 NAMESPACES = {door.removeprefix("kcal.") for door in PUBLIC} - {"kcal"}
 # Names that were not in `kcal` itself before there were namespaces.
-NEW_NAMES = {"PositionColumns", "calibrate_views", "detect", "rotation_from_vector", "vector_from_rotation"} | set(
-    PUBLIC["kcal.stars"].split()
-)
+NEW_NAMES = {
+    "CameraRig",
+    "CameraRigCalibration",
+    "load_camera_rig",
+    "save_camera_rig",
+    "station_mounting",
+    "stations_of",
+    "MultiViewLocalizer",
+    "ViewMarks",
+    "ViewsLocalization",
+    "locate_views",
+    "read_views",
+    "PositionColumns",
+    "calibrate_views",
+    "detect",
+    "rotation_from_vector",
+    "vector_from_rotation",
+} | set(PUBLIC["kcal.stars"].split())
 # Types of attributes in which only those look who work on kcal.
 INSIDE = {"FieldModes", "HybridFit", "BoardState", "Spline"}
 # What functions return, and blocks of files: examples are those of the functions.
 RECORDS = {
+    "CameraRigCalibration",
+    "ViewMarks",
+    "ViewsLocalization",
     "Attitude",
     "DetectedStars",
     "Identification",

@@ -242,7 +242,7 @@ def locate_command(
         sample = PositionSample()
         sample.add(located.columns)
         written = [path for path in outputs if path != STREAM]
-        written += _drawn(located, true, picture, web_map, tiles=tiles, image=image, online=online)
+        written += _drawings(located, true, picture, web_map, tiles=tiles, image=image, online=online)
         _finish(
             points, located, true, sample, written, as_json=as_json, streamed=streamed,
             stated=bool(views.sigma.isfinite().any()), doubts=(),
@@ -294,7 +294,7 @@ def locate_command(
             located = sample.located(locate)
             true = None if truth is None else read_truth(truth, located)
         written += [path for path in outputs if path != STREAM]
-        written += _drawn(located, true, picture, web_map, tiles=tiles, image=image, online=online)
+        written += _drawings(located, true, picture, web_map, tiles=tiles, image=image, online=online)
     except KeyboardInterrupt:
         kept = ", ".join(map(str, written)) or "nothing"
         err.print(
@@ -304,7 +304,7 @@ def locate_command(
     _finish(points, located, true, sample, written, as_json=as_json, streamed=streamed, stated=stated, doubts=doubts)
 
 
-def _drawn(
+def _drawings(
     located: Located, true: Tensor | None, picture: Path | None, web_map: Path | None, **background: Any
 ) -> list[Path]:
     """The picture and the map, where they were asked for."""

@@ -52,7 +52,7 @@ def solve_stations(
             instead = "; give boards by --observations" if option == "--pairs" else ""
             raise InputError(f"{option} is for rigs of two cameras{instead}")
     check_writable(output, *paths, *sources.files, *observations)
-    data, origin = _read(tuple(map(load_camera, paths)), names, sources, observations)
+    data, origin = _read_stations(tuple(map(load_camera, paths)), names, sources, observations)
     with steps("solving the stations", 1) as advance:
         result = solve_rig(data, options)
         advance("done")
@@ -60,12 +60,14 @@ def solve_stations(
     assert rig.calibration is not None
     rig.calibration = dataclasses.replace(rig.calibration, pixel_sigma=sources.mark_sigma)
     save_camera_rig(rig, output)
-    tell(rms_px=result.rms, cameras=_told(rig), warnings=list(result.warnings), undetermined=list(result.undetermined))
+    tell(
+        rms_px=result.rms, cameras=_stands(rig), warnings=list(result.warnings), undetermined=list(result.undetermined)
+    )
     _print_stations(result, rig)
     print_wrote(output)
 
 
-def _read(
+def _read_stations(
     cameras: tuple, names: tuple[str, ...], sources: Sources, observations: Sequence[Path]
 ) -> tuple[RigData, Origin | None]:
     from kcal.calibrate.rig.pairs import boards_of_several
@@ -112,7 +114,7 @@ def _read(
 
 
 def _print_stations(result: RigResult, rig: CameraRig) -> None:
-    from kcal.cli.rig import print_rig, source_lines
+    from kcal.cli.rig_text import print_rig, source_lines
     from kcal.locate.stations import station_mounting
     from kcal.quantities import length_text, measured_text, number_text
 
@@ -145,7 +147,7 @@ def _print_stations(result: RigResult, rig: CameraRig) -> None:
         out.print("No latitudes were given: positions are meters of the local frame. --origin anchors it on the Earth.")
 
 
-def _told(rig: CameraRig) -> dict[str, dict[str, float]]:
+def _stands(rig: CameraRig) -> dict[str, dict[str, float]]:
     """How each camera stands, for --json."""
     from kcal.locate.stations import station_mounting
 

@@ -128,5 +128,13 @@ def save_camera_rig(rig: CameraRig, path: str | Path) -> Path:
     Raises:
         InputError: see `camera_rig_to_file`.
         FileError: the file cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
+        >>> rig = CameraRig([camera], ["tower"], torch.eye(3)[None], torch.zeros(1, 3))
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     CameraRigFile.load(save_camera_rig(rig, Path(folder, "rig.json"))).names
+        ('tower',)
     """
     return camera_rig_to_file(rig).save(path)

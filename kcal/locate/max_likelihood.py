@@ -26,6 +26,7 @@ from kcal.lens.camera_stack import project_each
 from kcal.lens.dispatch import is_traced, known_true
 from kcal.lens.pose import side_axes, step_rows
 from kcal.lens.projection import Projection
+from kcal.locate.bent_light import Surroundings, length_of_one, lifted
 
 # Evaluations. Graphs cannot stop early: with three they err by 4e-6 of the noise where marks are 10 px off, with two by
 # 1e-2.
@@ -35,8 +36,6 @@ _MOST_STEPS, _TRACED_STEPS = 5, 3
 _CHORDS = 2
 # A step that moves no pixel by more than this, in units of the noise, is the last.
 _SHORT_STEP = 1e-5
-# Meters: light from beyond is bent as if it came from there; nothing on the Earth is seen so far.
-_HORIZON = 5e5
 
 # Minors of a 3x4 matrix: the column pairs 01, 02, 03, 12, 13, 23; and for each column left out, those of the others.
 _FIRST, _SECOND = [0, 0, 0, 1, 1, 2], [1, 2, 3, 2, 3, 3]
@@ -52,22 +51,6 @@ class RelativeCamera(NamedTuple):
     camera: Camera
     rotation: Tensor
     translation: Tensor
-
-
-class Surroundings(NamedTuple):
-    """What there may be besides pixels.
-
-    Attributes:
-        present: (..., C, N) bool: which camera saw what; all of them if None.
-        up: (C, 3) the vertical at each camera, in its axes; straight lines of sight if None.
-        bending: 1/m: light from the level distance d comes from bending * d² too high: k / 2R.
-        held: (..., 3, N) row of (a, b, ρ) that stays as it is at the start, over its sigma: a stated height.
-    """
-
-    present: Tensor | None = None
-    up: Tensor | None = None
-    bending: float = 0.0
-    held: Tensor | None = None
 
 
 class PointFit(NamedTuple):
@@ -271,20 +254,6 @@ def _evaluate(fixed: _Fixed, theta: Tensor) -> _Evaluated:
         off = (around.held * moved).sum(-2)
         cost, slope = cost + off * off, slope + around.held * off[..., None, :]
     return _Evaluated(cost, jacobian, weighted, residual, turned, tuple(projections), slope)
-
-
-def length_of_one(scale: Tensor, inverse: Tensor) -> Tensor:
-    """Meters of one in the units of ρ-scaled points, at most as far as anything on the Earth is seen."""
-    return scale / torch.maximum(inverse.abs(), scale / _HORIZON)
-
-
-def lifted(seen: Tensor, around: Surroundings, unit: Tensor | float) -> Tensor:
-    """By how much (..., C, 3, N) things are seen higher than `seen` in each camera's axes; one of it is `unit` m."""
-    assert around.up is not None
-    up = around.up[..., None]
-    along = (seen * up).sum(-2, keepdim=True)
-    level = seen.square().sum(-2, keepdim=True) - along * along
-    return around.bending * unit * level * up
 
 
 def _normal_matrix(at: _Evaluated, fixed: _Fixed) -> Six:

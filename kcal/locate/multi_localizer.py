@@ -19,7 +19,7 @@ from kcal.locate.geodesy import anchor, enu_to_geodetic, place_enu
 from kcal.locate.multiview import checked_views_covariance
 from kcal.locate.ranges import BEARING_SIGMAS, range_interval
 from kcal.locate.stereo import PositionStatus, flag_positions, piece_by_piece, reprojection_errors
-from kcal.locate.views import PosedCameras, SharedErrors, StatedHeight, ViewsFit, fit_views
+from kcal.locate.views import CommonErrors, PosedCameras, StatedHeight, ViewsFit, fit_views
 
 # How seldom good views are taken for bad ones.
 _BAD, _DOUBTFUL = 1e-4, 1e-2
@@ -147,7 +147,7 @@ class MultiViewLocalizer(Float64Module):
         self.register_buffer("ecef_of_origin", None if place is None else place[1])
         zero = torch.zeros(3, dtype=torch.float64) if rig.origin is None else rig.origin.geodetic
         self.register_buffer("geodetic_of_origin", zero.to(device))
-        errors, bending, self.lens = _by_camera(rig, root)
+        errors, bending, self.lens = _errors_by_camera(rig, root)
         self.register_buffer("errors", errors)
         self.register_buffer("bending_errors", None if bending is None else bending * self.half_curvature)
         freedom = 2.0 * torch.arange(len(rig) + 1, dtype=torch.float64) - 3.0
@@ -238,7 +238,7 @@ class MultiViewLocalizer(Float64Module):
         posed = PosedCameras(
             self.rig.each, self.rig.rotation, self.rig.center, self.up, self.rig.refraction * self.half_curvature
         )
-        shared = None if self.errors is None else SharedErrors(self.lens, self.errors, self.bending_errors)
+        shared = None if self.errors is None else CommonErrors(self.lens, self.errors, self.bending_errors)
         reach = None if height is None else partial(self._at_height, height=height, sigma=sigma)
         views = fit_views(
             posed, pixels, seen, noise=self.pixel_sigma, cov=cov, shared=shared, height=reach,
@@ -336,8 +336,10 @@ class MultiViewLocalizer(Float64Module):
         return StatedHeight(point, up + 2.0 * self.half_curvature * level, torch.full_like(height, sigma), reached)
 
 
-def _by_camera(rig: CameraRig, root: Tensor | None) -> tuple[Tensor | None, Tensor | None, tuple[tuple[int, ...], ...]]:
-    """What `SharedErrors` contains: `half`, `bending` per unit of k, and `lens`."""
+def _errors_by_camera(
+    rig: CameraRig, root: Tensor | None
+) -> tuple[Tensor | None, Tensor | None, tuple[tuple[int, ...], ...]]:
+    """What `CommonErrors` contains: `half`, `bending` per unit of k, and `lens`."""
     if root is None or not bool(root.any()):
         return None, None, ()
     root = root.to(rig.center)

@@ -57,6 +57,19 @@ def locate_views(
 
     Raises:
         InputError: a rig without a place on the Earth.
+
+    Example:
+        >>> from kcal import Camera, Origin
+        >>> from kcal.locate import enu_from_cam
+        >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
+        >>> look = torch.stack([enu_from_cam(heading).T for heading in (0.0, 315.0)])
+        >>> rig = CameraRig([camera] * 2, ["mill", "mast"], look, torch.tensor([[0.0, 0, 30], [5000, 0, 30]]),
+        ...                 origin=Origin(lat=45.0, lon=6.0, height=0.0), refraction=0.0)
+        >>> pixels, _ = rig(torch.tensor([[100.0, 5000, 60]]))
+        >>> views = ViewMarks(("smoke",), pixels, torch.full((1, 2), 2.0), {})
+        >>> located = locate_views(rig, views).positions[0]
+        >>> [round(value) for value in located.enu], located.status.name
+        ([100, 5000, 60], 'OK')
     """
     origin = rig.origin
     if origin is None:
@@ -86,13 +99,13 @@ def locate_views(
         heights[ok] = geoid_column(geoid, found.geodetic[ok, 0].numpy(), found.geodetic[ok, 1].numpy())
     numbers = number_table(as_pairs, (("geoid_height_m", ok, heights[None]),))
     extras = views.extras | {
-        "cameras": [_named(rig, row) for row in found.used],
-        "left_out": [_named(rig, row) for row in found.bad],
+        "cameras": [_camera_list(rig, row) for row in found.used],
+        "left_out": [_camera_list(rig, row) for row in found.bad],
         "misfit_sigmas": [_misfits(rig, row) for row in found.misfit],
     }
     first = station_mounting(rig, 0)
     return Located(
-        columns=PositionColumns(views.names, found.status.numpy(), _reasons(rig, found), numbers, extras),
+        columns=PositionColumns(views.names, found.status.numpy(), _row_reasons(rig, found), numbers, extras),
         cameras=tuple(
             viewpoint(name, camera, center, turn.T, tuple(place))
             for name, camera, center, turn, place in zip(
@@ -110,7 +123,7 @@ def locate_views(
     )
 
 
-def _named(rig: CameraRig, which: Tensor) -> str:
+def _camera_list(rig: CameraRig, which: Tensor) -> str:
     return " ".join(name for name, one in zip(rig.names, which.tolist(), strict=True) if one)
 
 
@@ -118,12 +131,12 @@ def _misfits(rig: CameraRig, row: Tensor) -> str:
     return " ".join(f"{name}={value:.1f}" for name, value in zip(rig.names, row.tolist(), strict=True) if value > 0)
 
 
-def _reasons(rig: CameraRig, found: ViewsLocalization) -> list[str]:
+def _row_reasons(rig: CameraRig, found: ViewsLocalization) -> list[str]:
     reasons = []
     for status, bad, misfit in zip(found.status.tolist(), found.bad, found.misfit, strict=True):
         text = _TEXTS.get(PositionStatus(status), "")
         if bool(bad.any()):
             worst = float(torch.where(bad, misfit, -math.inf).max())
-            text = f"left out: the mark in {_named(rig, bad)} contradicts the others ({worst:.0f} sigma); {text}"
+            text = f"left out: the mark in {_camera_list(rig, bad)} contradicts the others ({worst:.0f} sigma); {text}"
         reasons.append(text.removesuffix("; "))
     return reasons

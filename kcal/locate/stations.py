@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from kcal.errors import InputError
 from kcal.files import read_bytes
 from kcal.io.camera_rig_file import CameraRigFile
 from kcal.io.rig_file import RigFile
@@ -23,6 +24,14 @@ def load_camera_rig(path: str | Path) -> CameraRig:
 
     Raises:
         FileError: missing, not JSON, another kind of file, or a field that is wrong; it names the path.
+
+    Example:
+        >>> import tempfile
+        >>> from kcal import save_rig
+        >>> from kcal.rig import planned_rig
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     load_camera_rig(save_rig(planned_rig(), Path(folder, "rig.json"))).names
+        ('left', 'right')
     """
     path = Path(path)
     content = read_json(read_bytes(path, MOST_BYTES), str(path))
@@ -76,8 +85,8 @@ def stations_of(rig: StereoRig) -> CameraRig:
     first, second = stations.pose_columns(0).start, stations.pose_columns(1).start
     by[first : first + 3, center], by[first + 3 : first + 6, attitude] = still, still
     by[second : second + 3, center] = still
-    by[second : second + 3, attitude] = -_cross(apart)
-    by[second : second + 3, turn] = -right.T @ _cross(shift)
+    by[second : second + 3, attitude] = -_crossed(apart)
+    by[second : second + 3, turn] = -right.T @ _crossed(shift)
     by[second : second + 3, move] = -right.T
     by[second + 3 : second + 6, attitude], by[second + 3 : second + 6, turn] = still, -right.T
     by[-1, -1] = 1.0
@@ -85,8 +94,8 @@ def stations_of(rig: StereoRig) -> CameraRig:
     return stations
 
 
-def _cross(vector: Tensor) -> Tensor:
-    """(3, 3) with `_cross(v) @ w` = v × w."""
+def _crossed(vector: Tensor) -> Tensor:
+    """(3, 3) with `_crossed(v) @ w` = v × w."""
     x, y, z = vector.tolist()
     return torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64)
 
@@ -115,10 +124,20 @@ def station_mounting(rig: CameraRig, camera: int) -> Mounting:
     """How a camera stands: place on the Earth, heading, pitch and roll at its own vertical, and how well that is known.
 
     Raises:
-        ValueError: a rig without an origin.
+        InputError: a rig without an origin.
+
+    Example:
+        >>> from kcal import Camera, Origin
+        >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
+        >>> there = torch.tensor([[0.0, 50_000.0, 0.0]])  # north of the origin, where the Earth has curved away
+        >>> rig = CameraRig([camera], ["tower"], enu_from_cam(90.0).T[None], there,
+        ...                 origin=Origin(lat=45.0, lon=6.0, height=0.0))
+        >>> stands = station_mounting(rig, 0)
+        >>> round(stands.origin.height), round(stands.heading_deg, 3), round(stands.roll_deg, 3)
+        (196, 90.0, 0.45)
     """
     if rig.origin is None:
-        raise ValueError("this rig has no place on the Earth")
+        raise InputError("this rig has no place on the Earth: give it an origin")
     covariance = torch.zeros(7, 7, dtype=torch.float64)
     if rig.root is not None:
         own = torch.cat([rig.root[:, rig.pose_columns(camera)], rig.root[:, -1:]], 1)

@@ -18,13 +18,11 @@ from kcal.lens.camera import Camera
 from kcal.lens.camera_stack import project_each, unproject_each
 from kcal.lens.pose import side_axes, step_rows
 from kcal.locate.angular import Found, first_seen, triangulate_angular
+from kcal.locate.bent_light import Surroundings, length_of_one, lifted
 from kcal.locate.max_likelihood import (
     PointFit,
     RelativeCamera,
-    Surroundings,
     inverse_covariances,
-    length_of_one,
-    lifted,
     most_likely,
     position_slope,
     symmetric,
@@ -72,7 +70,7 @@ class PosedCameras(NamedTuple):
         return Surroundings(up=(self.rotation @ self.up[..., None])[..., 0], bending=self.bending)
 
 
-class SharedErrors(NamedTuple):
+class CommonErrors(NamedTuple):
     """What all marks of a camera have in common: K independent errors.
 
     Attributes:
@@ -189,7 +187,7 @@ def fit_views(
     *,
     noise: float,
     cov: Tensor | None = None,
-    shared: SharedErrors | None = None,
+    shared: CommonErrors | None = None,
     height: Callable[[Tensor, Tensor, Tensor], StatedHeight] | None = None,
     differentiated: bool = False,
 ) -> ViewsFit:
@@ -209,7 +207,7 @@ def fit_views(
     wanted = seen & finite
     middle = torch.stack([camera.center.detach() for camera in posed.cameras])
     pixels = torch.where(wanted[..., None], pixels, middle)
-    sound = wanted if cov is None else _positive(cov)
+    sound = wanted if cov is None else _sound_covariances(cov)
     if cov is not None:
         still = torch.eye(2, dtype=cov.dtype, device=cov.device)
         cov = torch.where((sound & wanted)[..., None, None], cov, still)
@@ -251,7 +249,7 @@ def fit_views(
         distance = torch.linalg.vector_norm(away, dim=-1)
         ahead, inverse = away / distance[..., None], torch.where(met, scale / distance, 0.0)
     if height is not None:
-        held = torch.where(alone[..., None, :], _held(ahead, inverse, scale, stated), 0.0)
+        held = torch.where(alone[..., None, :], _height_row(ahead, inverse, scale, stated), 0.0)
     fitted = code == int(PositionStatus.OK)
     around = posed.around._replace(present=used.mT, held=held)
     weight, variance = None, noise**2
@@ -271,7 +269,7 @@ def fit_views(
     return ViewsFit(fit, scale, anchor, place.detach(), in_frame.detach(), used, code, fitted, weight, variance)
 
 
-def _positive(cov: Tensor) -> Tensor:
+def _sound_covariances(cov: Tensor) -> Tensor:
     """(N, C) which covariances (N, C, 2, 2) are those of a pixel."""
     with torch.no_grad():
         a, b, c, d = cov.flatten(-2).unbind(-1)
@@ -279,7 +277,7 @@ def _positive(cov: Tensor) -> Tensor:
         return torch.isfinite(a + b + c + d) & (a > 0) & (a * d > b * c) & ((b - c).abs() <= 1e-6 * largest)
 
 
-def _held(ahead: Tensor, inverse: Tensor, scale: Tensor, stated: StatedHeight) -> Tensor:
+def _height_row(ahead: Tensor, inverse: Tensor, scale: Tensor, stated: StatedHeight) -> Tensor:
     """(3, N) the slope of the height by (a, b, ρ) over its sigma."""
     first, second = side_axes(ahead.detach())
     range_ = (scale / torch.where(inverse > 0, inverse, 1.0)).detach()
@@ -288,7 +286,7 @@ def _held(ahead: Tensor, inverse: Tensor, scale: Tensor, stated: StatedHeight) -
 
 
 def _shared_pixels(
-    posed: PosedCameras, shared: SharedErrors, at: tuple[Tensor, Tensor, Tensor], used: Tensor, scale: Tensor
+    posed: PosedCameras, shared: CommonErrors, at: tuple[Tensor, Tensor, Tensor], used: Tensor, scale: Tensor
 ) -> Tensor:
     """(K, 2 C, N) what each shared error moves in the pixels of points: anchor (N, 3), direction, inverse distance."""
     place, ahead, inverse = at

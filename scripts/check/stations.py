@@ -6,8 +6,8 @@
     python -m scripts.check.stations real              # KCAL_DATA/stations/pose2sim.npz
     python -m scripts.check.stations picture           # docs/howto/stations.png
 
-Other programs are used where they import: `pip install --no-deps aniposelib numba llvmlite jax jaxlib ml_dtypes opt_einsum pose2sim
-rtoml c3d anytree` into a folder on PYTHONPATH. OpenCV and kornia triangulate two views; `cv2.sfm` is in no wheel.
+Other programs are used where they import: `pip install --no-deps aniposelib numba llvmlite jax jaxlib ml_dtypes
+opt_einsum pose2sim rtoml c3d anytree` into a folder on PYTHONPATH. OpenCV and kornia triangulate two views; `cv2.sfm` is in no wheel.
 
 peers: cameras 5 m around a person-sized cloud (f 1,600 px, no distortion, so that nobody pays for undistortion), 1 px
 of noise; views are missing at random, and 5 % of those that are seen are off by 30 to 200 px. Median error, 95th
