@@ -223,29 +223,30 @@ def locate_command(
     place = None if origin is None else Origin.parse(origin)
     stated_height = None if height is None else parse_height(height)
     if stated_height is not None or is_long(points) or len(names_of_rig(rig)) != 2:
-        stated = (place, yaw_sigma, heading_sigma, origin_sigma, refraction, refraction_sigma)
-        if any(stated) and not {"origin", "heading"} & taken:
+        elsewhere = any((place, yaw_sigma, heading_sigma, origin_sigma, refraction, refraction_sigma))
+        if elsewhere and not {"origin", "heading"} & taken:
             raise typer.BadParameter(
                 "of several cameras position, attitude and their errors come from the rig file: leave out --origin, "
                 "--heading, --yaw-sigma, --heading-sigma, --origin-sigma and --refraction"
             )
         stations = load_camera_rig(rig)
-        noise = pixel_sigma or (stations.calibration and stations.calibration.pixel_sigma) or ASSUMED
         views = read_views(points, stations.names)
         for text in stations.calibration.warnings if stations.calibration else ():
             warn(f"{rig}: {text}")
-        located = locate_views(stations, views, pixel_sigma=noise, height=stated_height, geoid=find_geoid(geoid))
+        told = stations.calibration.pixel_sigma if stations.calibration else None
+        located = locate_views(
+            stations, views, pixel_sigma=pixel_sigma or told or ASSUMED, height=stated_height, geoid=find_geoid(geoid)
+        )
         with open_writers(outputs, located, suffix) as writers:
             for writer in writers:
                 writer.add(located.columns)
         true = None if truth is None else read_truth(truth, located)
         sample = PositionSample()
         sample.add(located.columns)
-        written = [path for path in outputs if path != STREAM]
-        written += _drawings(located, true, picture, web_map, tiles=tiles, image=image, online=online)
+        drawn = _drawings(located, true, picture, web_map, tiles=tiles, image=image, online=online)
         _finish(
-            points, located, true, sample, written, as_json=as_json, streamed=streamed,
-            stated=bool(views.sigma.isfinite().any()), doubts=(),
+            points, located, true, sample, [*(path for path in outputs if path != STREAM), *drawn], as_json=as_json,
+            streamed=streamed, stated=bool(views.sigma.isfinite().any()), doubts=(),
         )  # fmt: skip
         return
     solved = load_rig(rig)

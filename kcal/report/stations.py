@@ -56,8 +56,8 @@ def stations_figure(located: Located, truth: Tensor | None = None) -> Figure:
                 textcoords="offset points", fontsize="small",
             )  # fmt: skip
         elif position.azimuth_deg is not None and position.status == PositionStatus.BEARING_ONLY:
-            angle = math.radians(position.azimuth_deg)
-            ends = [foot[0], foot[0] + reach * math.sin(angle)], [foot[1], foot[1] + reach * math.cos(angle)]
+            way = math.radians(position.azimuth_deg)
+            ends = [foot[0], foot[0] + reach * math.sin(way)], [foot[1], foot[1] + reach * math.cos(way)]
             axes.plot(*([value / 1e3 for value in end] for end in ends), "--", color="gray", linewidth=1)
     if truth is not None:
         known = truth[truth.isfinite().all(-1)] / 1e3

@@ -7,7 +7,8 @@
     python -m scripts.check.stations picture           # docs/howto/stations.png
 
 Other programs are used where they import: `pip install --no-deps aniposelib numba llvmlite jax jaxlib ml_dtypes
-opt_einsum pose2sim rtoml c3d anytree` into a folder on PYTHONPATH. OpenCV and kornia triangulate two views; `cv2.sfm` is in no wheel.
+opt_einsum pose2sim rtoml c3d anytree` into a folder on PYTHONPATH. OpenCV and kornia triangulate two views; `cv2.sfm`
+is in no wheel.
 
 peers: cameras 5 m around a person-sized cloud (f 1,600 px, no distortion, so that nobody pays for undistortion), 1 px
 of noise; views are missing at random, and 5 % of those that are seen are off by 30 to 200 px. Median error, 95th
@@ -104,7 +105,7 @@ def peers_of(rig: CameraRig) -> dict[str, tuple[Solve, int]]:
     found["kcal `MultiViewLocalizer`"], found["kcal `TriangulateViews`"] = (ours, 1), (views, 1)
     try:
         import cv2
-        from aniposelib.cameras import Camera as OtherCamera
+        from aniposelib.cameras import Camera as OtherCamera  # type: ignore[import-not-found]
         from aniposelib.cameras import CameraGroup
 
         others = []
@@ -121,7 +122,7 @@ def peers_of(rig: CameraRig) -> dict[str, tuple[Solve, int]]:
     except ImportError:
         show(["aniposelib is not here"])
     try:
-        from Pose2Sim.triangulation import triangulation_from_best_cameras
+        from Pose2Sim.triangulation import triangulation_from_best_cameras  # type: ignore[import-not-found]
 
         settings = {"triangulation": {"reproj_error_threshold_triangulation": 15, "min_cameras_for_triangulation": 2}}
 
@@ -326,7 +327,11 @@ def real() -> list[str]:
              f"{float(own.square().mean().sqrt()):.2f}", f"{float(held.median()):.2f}" if len(held) else ""]
         )  # fmt: skip
     heads = ["cameras", "joints located", "of them a view left out", "contradictions", "RMS px", "held out, median px"]
-    note = f"{len(pixels)} joints; noise of a mark along an axis {sigma:.2f} px, from the joints that all four see."
+    again, _ = rig(first.points[four])
+    off = (pixels[four] - again).mean(0).norm(dim=-1).tolist()
+    note = f"{len(pixels)} joints; noise of a mark along an axis {sigma:.2f} px, from the joints that all four see; "
+    offsets = ", ".join(f"{name} {one:.1f}" for name, one in zip(rig.names, off, strict=True))
+    note += f"mean offset of a camera's marks: {offsets} px."
     return [note, "", *table(heads, rows)]
 
 
