@@ -212,9 +212,11 @@ class _YamlLines:
             balance += _open_brackets(parts[-1])
         text = " ".join(parts)
         self.at += 1
-        inside = text[1:-1]
-        if text[0] == "[" and text[-1] == "]" and not any(sign in inside for sign in "[]{}\"'#:"):
-            return [_scalar(part) for part in inside.split(",")] if inside.strip() else []
+        if text[0] == "[" and text[-1] == "]" and not any(sign in text[1:-1] for sign in "[]{}\"'#:"):
+            # A long list of numbers, without tokens.
+            cells = text[1:-1].split(",")
+            if all(cell.strip() for cell in cells):
+                return [_scalar(cell) for cell in cells]
         tokens = _tokens(text)
         value, end = _flow(tokens, 0, depth + 1)
         if end != len(tokens):

@@ -63,7 +63,7 @@ PUBLIC = {
         MultiViewLocalizer ViewMarks ViewsLocalization locate_views read_views
         BudgetErrors Geoid GroundPlaces Localization Marks Position PositionColumns RangeError Sensitivity Triangulate
         TriangulateViews Triangulation Viewpoint ViewsResult circular_error enu_from_cam enu_to_geodetic
-        find_geoid geodetic_to_enu level_ground locate_on_ground position_errors range_errors read_marks
+        find_geoid forgotten_yaw geodetic_to_enu level_ground locate_on_ground position_errors range_errors read_marks
         read_truth terrain true_from_grid write_positions
     """,
     "kcal.track": """
@@ -79,8 +79,9 @@ PUBLIC = {
     """,
     "kcal.stars": """
         NightPlan PlannedStars StarCamera StarLens calibrate_by_stars planned_stars
-        Air Attitude DetectedStars Identification NamedStars SkyView StarCatalog celestial_directions detect_stars
-        identify moments_of name_stars observed_directions parse_time star_source StarEffect StarSource
+        Agreement Air Attitude DetectedStars Identification NamedStars SkyView StarCatalog celestial_directions
+        clock_doubts detect_stars identify moments_of name_stars observed_directions parse_time star_source StarEffect
+        StarSource
     """,
     "kcal.solve": """
         LMOptions LevenbergMarquardt RobustLoss SolverStatus
@@ -90,23 +91,11 @@ NAMES = [(door, name) for door, names in PUBLIC.items() for name in names.split(
 NAMESPACES = {door.removeprefix("kcal.") for door in PUBLIC} - {"kcal"}
 # Names that were not in `kcal` itself before there were namespaces.
 NEW_NAMES = {
-    "CameraRig",
-    "CameraRigCalibration",
-    "load_camera_rig",
-    "save_camera_rig",
-    "station_mounting",
-    "stations_of",
-    "MultiViewLocalizer",
-    "ViewMarks",
-    "ViewsLocalization",
-    "locate_views",
-    "read_views",
-    "PositionColumns",
-    "calibrate_views",
-    "detect",
-    "rotation_from_vector",
-    "vector_from_rotation",
-} | set(PUBLIC["kcal.stars"].split())
+    "CameraRig", "CameraRigCalibration", "load_camera_rig", "save_camera_rig", "station_mounting", "stations_of",
+    "MultiViewLocalizer", "ViewMarks", "ViewsLocalization", "locate_views", "read_views",
+    "PositionColumns", "calibrate_views", "detect", "forgotten_yaw", "rotation_from_vector", "vector_from_rotation",
+    *PUBLIC["kcal.stars"].split(),
+}  # fmt: skip
 # Types of attributes in which only those look who work on kcal.
 INSIDE = {"FieldModes", "HybridFit", "BoardState", "Spline"}
 # What functions return, and blocks of files: examples are those of the functions.

@@ -50,3 +50,33 @@ def test_units_fit_the_range() -> None:
     assert length_unit([]).name == "m"
     assert (length_text(0.0), length_text(math.inf)) == ("0", "∞")
     assert length_text(-0.0012, sign=True) == "-1.20 mm"
+
+
+@pytest.mark.parametrize(
+    ("value", "sigma", "digits", "sign", "text"),
+    [
+        (83.21683, None, 2, False, "83"),
+        (83.21683, None, 5, False, "83.217"),
+        (999.96, None, 4, False, "1000"),
+        (0.0996, None, 2, False, "0.10"),
+        (1234.0, None, 2, False, "1200"),
+        (5.0, 1.0, 3, True, "+5.0"),
+        (-5.0, 1.0, 3, True, "-5.0"),
+        (2e-5, None, 3, False, "2.00e-05"),
+        (2e-4, None, 3, False, "0.000200"),
+        (3.0, 1e-7, 3, False, "3.00000000"),
+        (2e-5, 1e-8, 3, True, "+2.0000e-05"),
+    ],
+)
+def test_digits_signs_and_exponents(value: float, sigma: float | None, digits: int, sign: bool, text: str) -> None:
+    assert number_text(value, sigma, digits=digits, sign=sign) == text
+
+
+def test_units_change_where_they_should() -> None:
+    lengths = (0.9999, 1.0, 999.9, 9999.0, 1e4)
+    assert [length_unit([one]).name for one in lengths] == ["mm", "m", "m", "m", "km"]
+    assert [range_text(one) for one in (0.5, 1.0, 999.0, 1000.0)] == ["500 mm", "1 m", "999 m", "1 km"]
+    assert length_unit([-2e4, 1.0]).name == "km"
+    assert length_text(math.nan) == "–"
+    assert measured_text(2.0, math.inf, "px") == "2.00 px"
+    assert measured_text(2.0, 0.1, "px", sign=True) == "+2.00 ± 0.10 px"

@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
-from kcal.cli.console import err, out, print_table, print_wrote, steps, warn
+from kcal.cli.console import err, steps, warn
 from kcal.cli.inputs import MARKS, RIG, SURVEY
+from kcal.cli.located_text import draw_positions, tell_located
 from kcal.cli.pixel_sigma import ASSUMED, PixelSigma, pixel_sigma_and_source
 from kcal.cli.settings import taken
-from kcal.errors import DegenerateError, InputError
-from kcal.files import check_picture, check_writable
-from kcal.texts import one_line
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from kcal.locate.positions import Located
-    from kcal.locate.sample import PositionSample
+from kcal.errors import InputError
+from kcal.files import check_picture, check_writable, written_files
 
 
 def locate_command(
@@ -67,6 +61,14 @@ def locate_command(
         float,
         typer.Option(metavar="DEG", help="Standard deviation of the relative yaw, added to the rig file's.", min=0),
     ] = 0.0,
+    aged: Annotated[
+        str | None,
+        typer.Option(
+            metavar="9h:DEG,8K:DEG",
+            help="Hours since the rig was solved, and degrees of yaw that it loses in one; the same for kelvin.",
+            hidden=True,
+        ),
+    ] = None,
     heading_sigma: Annotated[
         float,
         typer.Option(
@@ -184,6 +186,7 @@ def locate_command(
     from kcal.cli.stations import parse_height
     from kcal.io.rig_file import load_rig
     from kcal.lens.mounting import Origin
+    from kcal.locate.aging import parse_aging
     from kcal.locate.datum import find_geoid, true_from_grid
     from kcal.locate.export import STREAM, check_format, open_writers
     from kcal.locate.marks import filled, read_mark_chunks
@@ -223,32 +226,35 @@ def locate_command(
     place = None if origin is None else Origin.parse(origin)
     stated_height = None if height is None else parse_height(height)
     if stated_height is not None or is_long(points) or len(names_of_rig(rig)) != 2:
-        elsewhere = any((place, yaw_sigma, heading_sigma, origin_sigma, refraction, refraction_sigma))
+        elsewhere = any((place, yaw_sigma, heading_sigma, origin_sigma, refraction, refraction_sigma, aged))
         if elsewhere and not {"origin", "heading"} & taken:
             raise typer.BadParameter(
                 "of several cameras position, attitude and their errors come from the rig file: leave out --origin, "
-                "--heading, --yaw-sigma, --heading-sigma, --origin-sigma and --refraction"
+                "--heading, --yaw-sigma, --heading-sigma, --origin-sigma, --refraction and --aged"
             )
         stations = load_camera_rig(rig)
         views = read_views(points, stations.names)
-        for text in stations.calibration.warnings if stations.calibration else ():
+        doubts = stations.calibration.warnings if stations.calibration else ()
+        for text in doubts:
             warn(f"{rig}: {text}")
         told = stations.calibration.pixel_sigma if stations.calibration else None
         located = locate_views(
             stations, views, pixel_sigma=pixel_sigma or told or ASSUMED, height=stated_height, geoid=find_geoid(geoid)
         )
-        with open_writers(outputs, located, suffix) as writers:
-            for writer in writers:
-                writer.add(located.columns)
-        true = None if truth is None else read_truth(truth, located)
+        with written_files() as written:
+            with open_writers(outputs, located, suffix) as writers:
+                for writer in writers:
+                    writer.add(located.columns)
+            true = None if truth is None else read_truth(truth, located)
+            draw_positions(located, true, picture, web_map, tiles=tiles, image=image, online=online)
         sample = PositionSample()
         sample.add(located.columns)
-        drawn = _drawings(located, true, picture, web_map, tiles=tiles, image=image, online=online)
-        _finish(
-            points, located, true, sample, [*(path for path in outputs if path != STREAM), *drawn], as_json=as_json,
-            streamed=streamed, stated=bool(views.sigma.isfinite().any()), doubts=(),
+        tell_located(
+            points, located, true, sample, written, as_json=as_json, streamed=streamed,
+            stated=bool(views.sigma.isfinite().any()), doubts=doubts,
         )  # fmt: skip
         return
+    yaw_sigma = math.hypot(yaw_sigma, parse_aging(aged))
     solved = load_rig(rig)
     noise, note = pixel_sigma_and_source(pixel_sigma, solved)
     if solved.mounting is not None and {"origin", "heading"} <= taken:
@@ -276,115 +282,31 @@ def locate_command(
     )  # fmt: skip
     survey = None if truth is None else read_survey(truth, locate.localize.origin, measured=False)
     sample = PositionSample(frozenset(survey.names if survey else ()))
-    written: list[Path] = []
-    try:
-        size = points.stat().st_size if points.is_file() else None
-        with open_writers(outputs, located_by(locate), suffix) as writers, steps("locating", size) as advance:
-            read, stated = 0, False
-            for chunk in read_mark_chunks(points):
-                cov = filled(chunk.covariance, noise)
-                stated = stated or cov is not None
-                columns = locate(chunk.names, chunk.pixels, cov, chunk.extras)
-                for writer in writers:
-                    writer.add(columns)
-                sample.add(columns)
-                advance(f"{sample.count:,} rows", chunk.bytes_read - read)
-                read = chunk.bytes_read
-            if note and not stated:
-                err.print(note)
-            located = sample.located(locate)
-            true = None if truth is None else read_truth(truth, located)
-        written += [path for path in outputs if path != STREAM]
-        written += _drawings(located, true, picture, web_map, tiles=tiles, image=image, online=online)
-    except KeyboardInterrupt:
-        kept = ", ".join(map(str, written)) or "nothing"
-        err.print(
-            f"interrupted after {sample.count:,} rows; written: {kept}; other files are as they were", markup=False
-        )
-        raise typer.Exit(130) from None
-    _finish(points, located, true, sample, written, as_json=as_json, streamed=streamed, stated=stated, doubts=doubts)
-
-
-def _drawings(
-    located: Located, true: Tensor | None, picture: Path | None, web_map: Path | None, **background: Any
-) -> list[Path]:
-    """The picture and the map, where they were asked for."""
-    written = []
-    if picture is not None:
-        from kcal.report.positions import save_positions_picture
-        from kcal.report.stations import save_stations_picture
-
-        draw = save_positions_picture if located.feet is None else save_stations_picture
-        written.append(draw(picture, located, true))
-    if web_map is not None:
-        from kcal.report.map_page import save_map
-
-        written.append(save_map(web_map, located, true, **background))
-    return written
-
-
-def _finish(
-    points: Path,
-    located: Located,
-    true: Tensor | None,
-    sample: PositionSample,
-    written: Sequence[Path],
-    *,
-    as_json: bool,
-    streamed: bool,
-    stated: bool,
-    doubts: Sequence[str],
-) -> None:
-    """Print what was found.
-
-    Raises:
-        DegenerateError: nothing could be located.
-    """
-    import json
-
-    if as_json:
-        summary = {
-            "table": str(points),
-            "rows": sample.count,
-            "statuses": sample.statuses,
-            "warnings": list(doubts),
-            "pixel_sigma": located.pixel_sigma,
-            "interval": located.interval_note,
-            "geoid": located.geoid,
-            "written": list(map(str, written)),
-        }
-        print(json.dumps(summary, indent=1))
-    elif streamed:
-        err.print(_counts(sample.count, sample.statuses), markup=False)
-    else:
-        _print_positions(located, true, sample.statuses, stated=stated)
-        print_wrote(*written)
-    if "ok" not in sample.statuses:
-        rows = "pairs" if located.feet is None else "points"
-        raise DegenerateError(f"{points}: none of the {sample.count} {rows} could be located; see the table")
-
-
-def _counts(rows: int, statuses: dict[str, int]) -> str:
-    return f"{rows:,} rows: " + ", ".join(f"{count:,} {name.replace('_', ' ')}" for name, count in statuses.items())
-
-
-def _print_positions(located: Located, true: Tensor | None, statuses: dict[str, int], *, stated: bool) -> None:
-    """Print the table with the reasons below it; of a long one the counts, and the rows that have a true position."""
-    from kcal.locate.truth import position_errors
-    from kcal.report.tables import position_rows
-
-    errors = None if true is None else position_errors(located, true)
-    rows = position_rows(located, errors)
-    shown: Sequence[int] = range(len(located.positions))
-    if located.rows is not None:
-        out.print(_counts(located.rows, statuses), markup=False)
-        shown = [] if true is None else true.isfinite().all(-1).nonzero()[:, 0].tolist()
-        out.print(f"Pictures and maps show {len(located.positions):,} of them.", markup=False)
-    if shown:
-        print_table([rows[0], *(rows[i + 1] for i in shown)], left=(0, len(rows[0]) - 1))
-    for position in (located.positions[i] for i in shown):
-        if position.reason:
-            out.print(f"* {one_line(position.name)}: {position.reason}", markup=False)
-    noise = "the noise that the CSV states" if stated else f"{located.pixel_sigma:g} px of noise"
-    out.print(f"Interval: {located.interval_note}; marks have {noise}.")
-    out.print(f"Heights are ellipsoidal; geoid: {located.geoid or 'none found'}.")
+    with written_files() as written:
+        try:
+            size = points.stat().st_size if points.is_file() else None
+            with open_writers(outputs, located_by(locate), suffix) as writers, steps("locating", size) as advance:
+                read, stated = 0, False
+                for chunk in read_mark_chunks(points):
+                    cov = filled(chunk.covariance, noise)
+                    stated = stated or cov is not None
+                    columns = locate(chunk.names, chunk.pixels, cov, chunk.extras)
+                    for writer in writers:
+                        writer.add(columns)
+                    sample.add(columns)
+                    advance(f"{sample.count:,} rows", chunk.bytes_read - read)
+                    read = chunk.bytes_read
+                if note and not stated:
+                    err.print(note)
+                located = sample.located(locate)
+                true = None if truth is None else read_truth(truth, located)
+            draw_positions(located, true, picture, web_map, tiles=tiles, image=image, online=online)
+        except KeyboardInterrupt:
+            kept = ", ".join(map(str, written)) or "nothing"
+            err.print(
+                f"interrupted after {sample.count:,} rows; written: {kept}; other files are as they were", markup=False
+            )
+            raise typer.Exit(130) from None
+    tell_located(
+        points, located, true, sample, written, as_json=as_json, streamed=streamed, stated=stated, doubts=doubts
+    )

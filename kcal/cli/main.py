@@ -154,6 +154,3 @@ def main() -> None:
     except MemoryError:
         err.print("[bold red]error:[/] not enough memory; use fewer or smaller inputs")
         sys.exit(1)
-    except KeyboardInterrupt:
-        err.print("interrupted; nothing was written")
-        sys.exit(130)

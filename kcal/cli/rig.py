@@ -126,6 +126,15 @@ def solve_command(
             hidden=True,
         ),
     ] = 0.1,
+    clock_drift: Annotated[
+        float,
+        typer.Option(
+            metavar="S",
+            help="Of the rate at which it changes, seconds an hour; 0 where GPS or a network keeps the clocks.",
+            min=0,
+            hidden=True,
+        ),
+    ] = 0.05,
     celsius: Annotated[
         float | None, typer.Option(metavar="C", help="Temperature at night, for stars.", hidden=True)
     ] = None,
@@ -207,8 +216,9 @@ def solve_command(
     night = None
     if stars is not None:
         night = NightOptions(
-            images=stars, time=star_time, clock_sigma=clock_sigma, celsius=celsius, hectopascal=hectopascal, dut1=dut1
-        )
+            images=stars, time=star_time, clock_sigma=clock_sigma, drift_sigma=clock_drift, celsius=celsius,
+            hectopascal=hectopascal, dut1=dut1,
+        )  # fmt: skip
     sources = Sources(
         pairs=pairs, match=match, landmarks=landmarks, marks=marks, features=features, positions=positions,
         baseline=baseline, origin=origin, mark_sigma=noise, survey_sigma=survey_sigma, geoid=geoid,
@@ -239,9 +249,8 @@ def solve_command(
     calibrated = load_camera(left), load_camera(right)
     check_sides(calibrated, (left, right))
     data, frame, unpaired, notes, stated = read_sources(calibrated, sources)
-    with steps("solving the rig", 1) as advance:
-        result = solve_rig(data, options)
-        advance("done")
+    with steps("solving the rig", None) as advance:
+        result = solve_rig(data, options, advance)
     rig = result.stereo() if frame is None else placed_rig(result, frame)
     known = stated if pixel_sigma is None else pixel_sigma
     if rig.calibration is not None and known is not None:

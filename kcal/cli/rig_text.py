@@ -39,7 +39,7 @@ def rig_lines(result: RigResult, rig: StereoRig, unpaired: int) -> list[str]:
         f"baseline [bold]{measured_length(float(rig.baseline), result.sigma_baseline)}[/]",
     ]
     if result.exact:
-        lines.append(f"taken as exact, so that errors of these lenses are in no σ: {' and '.join(result.exact)}")
+        lines.append(_exact_line(result, rig))
     if boards is not None:
         lines.append(f"{len(result.pairs)} of {len(boards.names)} pairs used, {unpaired} views without partner")
         if result.pairs:
@@ -66,6 +66,23 @@ def rig_lines(result: RigResult, rig: StereoRig, unpaired: int) -> list[str]:
         if mounting.refraction is not None and result.data.landmarks is not None:
             lines.append(f"refraction of light {measured_text(mounting.refraction, sigma[6])} of the Earth's curvature")
     return lines
+
+
+def _exact_line(result: RigResult, rig: StereoRig) -> str:
+    """Which cameras were taken as exact, what an error of their lenses does, and which files had no error bars."""
+    from kcal.quantities import length_text, number_text
+
+    far, share = 100.0 * float(rig.baseline), 10.0 / float(rig.left.focal.mean())
+    text = (
+        f"taken as exact, so that errors of these lenses are in no σ: {' and '.join(result.exact)}. An error of 0.1 px "
+        f"in one of them is {number_text(100.0 * share, digits=2)} % of a range of {length_text(far, digits=2)}"
+    )
+    cameras = dict(zip(result.names, result.data.cameras, strict=True))
+    known = {name: cameras[name].calibration for name in result.exact}
+    bare = [name for name, one in known.items() if one is None or one.covariance is None]
+    if not bare:
+        return text
+    return f"{text}. Without error bars came {' and '.join(bare)}: calibrate with kcal, or import a file that has them"
 
 
 def print_rig(result: RigResult, lines: list[str]) -> None:

@@ -45,3 +45,4 @@ from kcal.locate.datum import true_from_grid as true_from_grid
 from kcal.locate.budget import range_errors as range_errors
 from kcal.locate.budget import RangeError as RangeError
 from kcal.locate.budget import BudgetErrors as BudgetErrors
+from kcal.locate.aging import forgotten_yaw as forgotten_yaw

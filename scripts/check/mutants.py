@@ -1,238 +1,164 @@
-"""How many small planted mistakes the tests notice, folder by folder; those that no test noticed, line by line.
+"""How many small planted mistakes the tests of each room notice; those that no test noticed, line by line.
 
 Mistakes (`scripts/check/mutations.py`) are drawn at random and planted one at a time in memory; no file is changed. For
-each, tests run that call the function that was changed: those of the same folder of tests/ and its examples in
-docstrings, the quickest first, then those of other folders. Each mistake costs a forked process that has the libraries
-loaded already.
+each, those tests of the room's own folder run that execute its lines (`coverage` knows), the quickest first, without
+the slow ones. A line that no test executes is not noticed. Each mistake costs a forked process that has kcal loaded.
 
-    python -m scripts.check.mutants [FOLDER ...] [--sample 40] [--seed 0] [--seconds 3600] [--budget 60]
+    python -m scripts.check.mutants [ROOM ...] [--sample 8] [--seed 1] [--seconds 3600] [--budget 6] [--write]
 
-First, every test file runs once, to see which functions each test calls and what time it takes. All results are kept in
-.mutants/, and another run goes on where the last one stopped; what was changed since is drawn anew. `--again` repeats
-mistakes that went unnoticed, with the tests as they are now.
+First, every test file runs once, to see which lines each test executes and what time it takes; `--times` prints the
+rooms and tests that take long. All results are kept in .mutants/, and another run goes on where the last one stopped.
+Another seed draws afresh: what was drawn with one seed is not drawn with the next. `--again` repeats mistakes that went
+unnoticed, with the tests as they are now; `--write` writes the table of all seeds into docs/measured/mutants.md.
 
 Neither mutmut (8 hours for one run of each mistake; it rewrites every function, which `torch.compile` refuses) nor
-cosmic-ray (a new process and the whole suite for each mistake) draws samples or chooses tests by what they call.
+cosmic-ray (a new process and the whole suite for each mistake) draws samples or chooses tests by what they execute.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
-import contextlib
 import hashlib
 import importlib
 import importlib.machinery
+import inspect
 import json
 import math
-import os
-import resource
-import signal
+import pkgutil
 import sys
-import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from types import CodeType, FrameType
-from typing import Any
+from types import CodeType, FunctionType
+from typing import Any, NamedTuple
 
 import pytest
 
 from scripts.check.harmless import HARMLESS
 from scripts.check.mutations import Site, sites
-from scripts.shared.page import table
+from scripts.check.traced_tests import FILE, ROOT, First, forked, observed, run_tests
+from scripts.shared.page import table, write_section
 
-ROOT = Path(__file__).parents[2]
 STATE = ROOT / ".mutants"
-FOLDERS = ("lens", "solve", "calibrate", "locate", "corners", "io")
-# Folders of tests that count too, if those of the folders above notice nothing.
-ELSEWHERE = ("report", "capture", "sim")
+# The modules at the top, beside the rooms.
+TOP = "top"
+ROOMS = (
+    "lens", "solve", "corners", "io", "calibrate/problem", "calibrate/hybrid", "calibrate/camera", "calibrate/rig",
+    "calibrate/batch", "nets", "locate", "stars", "report", "mark", "capture", "web", "pipeline", "cli", "sim", TOP,
+)  # fmt: skip
 # Loaded once, before anything is forked.
-LIBRARIES = ("torch", "kornia", "scipy.stats", "scipy.spatial", "skimage", "cv2", "pydantic", "hypothesis", "typer")
-# A mistake that makes tests so much slower is noticed. Seconds of processor time, and of the clock for each of them.
-SLOWER, AT_LEAST, CLOCK = 3.0, 20.0, 10.0
-MEMORY = 6 << 30
+LIBRARIES = ("torch", "kornia", "scipy.stats", "scipy.spatial", "skimage", "cv2", "hypothesis", "matplotlib.pyplot")
+# A mistake that makes tests so much slower is noticed, or after so many seconds of processor time.
+SLOWER, AT_LEAST = 3.0, 10.0
 
 
-def forked(work: Callable[[], object], seconds: float) -> Any:
-    """What `work` returns in a process of its own, or "too slow" or "crash"; seconds of processor time."""
-    with tempfile.TemporaryDirectory() as folder:
-        answer = Path(folder, "answer.json")
-        pid = os.fork()
-        if pid == 0:
-            os.setpgid(0, 0)
-            resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(seconds), math.ceil(seconds) + 5))
-            resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
-            silence = os.open(os.devnull, os.O_RDWR)
-            for stream in (0, 1, 2):
-                os.dup2(silence, stream)
-            with contextlib.suppress(BaseException):
-                answer.write_text(json.dumps(work()))
-            os._exit(0)
-        end, status = time.monotonic() + CLOCK * seconds, None
-        while status is None and time.monotonic() < end:
-            done, code = os.waitpid(pid, os.WNOHANG)
-            status = code if done else None
-            time.sleep(0.02)
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(pid, signal.SIGKILL)
-        if status is None:
-            os.waitpid(pid, 0)
-        if answer.exists():
-            return json.loads(answer.read_text())
-        slow = status is None or (os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGXCPU)
-        return "too slow" if slow else "crash"
+def plant_in_function(path: str, site: Site, tree: ast.Module) -> bool:
+    """Give a function that is loaded the code of the changed module; False where none is found."""
+    module = sys.modules.get(path.removesuffix(".py").replace("/", "."))
+    name = site.function.split(".<locals>")[0]
+    found: Any = module
+    code: Any = compile(tree, str(ROOT / path), "exec", dont_inherit=True)
+    for part in name.split("."):
+        found = inspect.getattr_static(found, part, None)
+        code = next((c for c in code.co_consts if isinstance(c, CodeType) and c.co_name == part), None)
+        if found is None or code is None:
+            return False
+    found = inspect.unwrap(getattr(found, "__func__", getattr(found, "fget", getattr(found, "func", found))))
+    if not isinstance(found, FunctionType) or found.__code__.co_freevars != code.co_freevars:
+        return False
+    found.__code__ = code
+    return True
 
 
-class Calls:
-    """Plugin of pytest: which functions of kcal each test calls, and its processor time."""
-
-    def __init__(self) -> None:
-        self.tests: dict[str, dict] = {}
-        # What fixtures call counts for all tests of the file, because one test sets them up for the others.
-        self.fixtures: set[tuple[str, str]] = set()
-        self.setup = 0.0
-        self._called: set[tuple[str, str]] = set()
-
-    @pytest.hookimpl(hookwrapper=True)
-    def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:
-        """Trace the calls of one test."""
-        called = self._called = set()
-        known: set[CodeType] = set()
-        base = f"{ROOT}/kcal/"
-
-        def trace(frame: FrameType, event: str, arg: object) -> None:
-            if (code := frame.f_code) not in known:
-                known.add(code)
-                if code.co_filename.startswith(base):
-                    called.add((code.co_filename[len(str(ROOT)) + 1 :], code.co_qualname))
-
-        begin = time.process_time()
-        self.tests[item.nodeid] = {"passed": True}
-        sys.settrace(trace)
-        yield
-        sys.settrace(None)
-        self.tests[item.nodeid] |= {"seconds": round(time.process_time() - begin, 2), "calls": sorted(called)}
-
-    @pytest.hookimpl(hookwrapper=True)
-    def pytest_runtest_setup(self) -> Iterator[None]:
-        """Time the fixtures of one test."""
-        begin = time.process_time()
-        yield
-        self.setup = max(self.setup, time.process_time() - begin)
-        self.fixtures |= self._called
-
-    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Note which tests pass."""
-        if report.outcome != "passed":
-            self.tests[report.nodeid]["passed"] = False
-
-
-class First:
-    """Plugin of pytest: the test that noticed."""
-
-    name = ""
-
-    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Note a test that fails."""
-        if report.failed and not self.name:
-            self.name = report.nodeid
-
-    def pytest_collectreport(self, report: pytest.CollectReport) -> None:
-        """Note a file that cannot be imported."""
-        if report.failed and not self.name:
-            self.name = f"import of {report.nodeid}"
-
-
-def run_tests(arguments: list[str], plugin: object) -> int:
-    os.chdir(ROOT)
-    options = ["-q", "-p", "no:cacheprovider", "-p", "no:xdist", "--no-header", "--tb=no", "--assert=plain"]
-    return int(pytest.main([*options, *arguments], plugins=[plugin]))
-
-
-def observed(file: str) -> dict:
-    """The tests of one file."""
-    calls = Calls()
-    run_tests([file], calls)
-    return {"tests": calls.tests, "fixtures": sorted(calls.fixtures), "setup": round(calls.setup, 2)}
-
-
-def with_mistake(path: str, number: int, tests: list[str]) -> list[str]:
-    """Import kcal with one mistake in it and run tests; the first that fails, or nothing."""
+def plant_by_import(path: str, tree: ast.Module) -> None:
+    """Load kcal anew, with the changed module in it."""
     target, load = str(ROOT / path), importlib.machinery.SourceFileLoader.get_code
 
     def get_code(self: importlib.machinery.SourceFileLoader, name: str) -> CodeType | None:
-        if self.path != target:
-            return load(self, name)
-        tree = ast.parse(Path(target).read_text(encoding="utf-8"))
-        sites(tree, path)[number].plant()
-        return compile(ast.fix_missing_locations(tree), target, "exec", dont_inherit=True)
+        return compile(tree, target, "exec", dont_inherit=True) if self.path == target else load(self, name)
 
     setattr(importlib.machinery.SourceFileLoader, "get_code", get_code)  # noqa: B010
+    for name in [name for name in sys.modules if name.split(".")[0] == "kcal"]:
+        del sys.modules[name]
+
+
+def with_mistake(path: str, number: int, tests: list[str]) -> str:
+    """Run tests with one mistake in kcal; the first that fails, or nothing."""
+    tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))
+    site = sites(tree, path)[number]
+    site.plant()
+    ast.fix_missing_locations(tree)
+    if not (site.function and plant_in_function(path, site, tree)):
+        plant_by_import(path, tree)
     first = First()
     code = run_tests(["-x", *tests], first)
     # A test that is no longer there has noticed nothing.
-    missing = code == pytest.ExitCode.USAGE_ERROR and not first.name
-    return [first.name or f"pytest ended with {code}"] if code and not missing else []
+    missing = code in (pytest.ExitCode.USAGE_ERROR, pytest.ExitCode.NO_TESTS_COLLECTED) and not first.name
+    return first.name or f"pytest ended with {code}" if code and not missing else ""
 
 
-def modules(folder: str) -> list[Path]:
-    return [path for path in sorted((ROOT / "kcal" / folder).rglob("*.py")) if path.name != "__init__.py"]
+def modules(room: str) -> list[Path]:
+    folder = ROOT / "kcal" / ("" if room == TOP else room)
+    return [path for path in sorted(folder.glob("*.py")) if path.name != "__init__.py"]
 
 
-def observe(folder: str, stop: float) -> dict[str, dict]:
-    """The tests of a folder by file; from .mutants/ where the file is the same, none where time is up."""
-    examples = [path for path in modules(folder) if ">>>" in path.read_text(encoding="utf-8")]
-    found = {}
-    for file in [*sorted((ROOT / "tests" / folder).rglob("test_*.py")), *examples]:
+def test_files(room: str) -> list[Path]:
+    return sorted((ROOT / "tests" / ("" if room == TOP else room)).glob("test_*.py"))
+
+
+def observe(room: str, stop: float) -> list[dict]:
+    """The tests of a room by file; from .mutants/ where the file is the same, none where time is up."""
+    found = []
+    for file in test_files(room):
         name = str(file.relative_to(ROOT))
         kept, digest = STATE / f"{name.replace('/', '-')}.json", hashlib.sha256(file.read_bytes()).hexdigest()
         known = json.loads(kept.read_text()) if kept.exists() else {}
         if known.get("digest") != digest:
             known = {}
         if not known and time.monotonic() < stop:
-            answer = forked(lambda name=name: observed(name), 1800.0)  # type: ignore[misc]
-            known = {"digest": digest, **(answer if isinstance(answer, dict) else {"tests": {}})}
+            answer = forked(lambda name=name: observed(name), 3 * FILE)  # type: ignore[misc]
+            known = {"digest": digest, **(answer if isinstance(answer, dict) else {"seconds": {}, "lines": {}})}
             kept.write_text(json.dumps(known))
-            print(f"{name}: {len(known['tests'])} tests", flush=True)
-        if known.get("tests"):
-            found[name] = known
+            note = "" if isinstance(answer, dict) and not answer["failed"] else f" ({answer})"[:300]
+            print(f"{name}: {len(known['seconds'])} tests, {sum(known['seconds'].values()):.0f} s{note}", flush=True)
+        if known.get("seconds"):
+            found.append(known | {"cached": "functools.cache" in file.read_text(encoding="utf-8")})
     return found
 
 
-def chosen(known: dict[str, dict], path: str, function: str, budget: float) -> tuple[list[str], int, float]:
-    """Tests that call a function, the quickest first; how many the budget leaves out; seconds of processor time.
+def chosen(files: list[dict], path: str, site: Site, budget: float) -> tuple[list[str], int, float]:
+    """Tests that execute a mistake, the quickest first; how many the budget leaves out; seconds of processor time.
 
-    Outside of functions, all tests of a file that calls any of the module: they may read a constant alone.
+    Outside of functions, all tests that execute any line of the module: they may read a constant.
     """
-
-    def calls(places: list[list[str]]) -> bool:
-        return any(place[0] == path and function in ("", place[1]) for place in places)
-
     found = []
-    for file in known.values():
-        shared = calls(file["fixtures"])
-        if not function:
-            shared = shared or any(calls(test["calls"]) for test in file["tests"].values())
-        for name, test in file["tests"].items():
-            if test["passed"] and (shared or calls(test["calls"])):
-                found.append((test["seconds"], name, file["setup"]))
+    for file in files:
+        lines: dict[str, list[str]] = file["lines"].get(path, {})
+        names = {
+            name
+            for line, tests in lines.items()
+            if not site.function or site.first <= int(line) <= site.last
+            for name in tests
+        }
+        if "*" in names:
+            names = set(file["seconds"])
+        # What the first test leaves in a cache, others of the file look at.
+        more = set(file["seconds"]) - names if names and file["cached"] else set()
+        found += [(name in more, file["seconds"][name], name) for name in names | more if name not in file["failed"]]
     found.sort()
     total = 0.0
     tests: list[str] = []
-    setups: dict[str, float] = {}
-    for seconds, name, setup in found:
+    for _, seconds, name in found:
         if total + seconds <= budget or not tests:
             total += seconds
             tests.append(name)
-            setups[name.split("::")[0]] = setup
-    return tests, len(found) - len(tests), total + sum(setups.values())
+    return tests, len(found) - len(tests), total
 
 
-def draws(folder: str, seed: int) -> list[tuple[str, int, Site]]:
-    """All mistakes of a folder in a random order: path, number in its module, mistake."""
+def draws(room: str, seed: int) -> list[tuple[str, int, Site]]:
+    """All mistakes of a room in a random order: path, number in its module, mistake."""
     found = []
-    for path in modules(folder):
+    for path in modules(room):
         name = str(path.relative_to(ROOT))
         tree = ast.parse(path.read_text(encoding="utf-8"))
         found += [(name, number, site) for number, site in enumerate(sites(tree, name))]
@@ -246,20 +172,15 @@ def results() -> dict[str, dict]:
     return {entry["key"]: entry for entry in map(json.loads, lines)}
 
 
-def judge(groups: Sequence[dict[str, dict]], path: str, number: int, site: Site, budget: float) -> None:
-    """Plant one mistake and run tests, one group after the other until it is noticed."""
-    by, count, left = "", 0, 0
-    for known in groups:
-        tests, more, seconds = chosen(known, path, site.function, budget)
-        count, left = count + len(tests), left + more
-        if tests and not by:
-            answer = forked(lambda tests=tests: with_mistake(path, number, tests), AT_LEAST + SLOWER * seconds)  # type: ignore[misc]
-            by = answer if isinstance(answer, str) else "".join(answer)
-    entry = {"key": site.key, "noticed": bool(by), "by": by, "tests": count, "left": left}
+def judge(files: list[dict], path: str, number: int, site: Site, budget: float, seed: int) -> None:
+    """Plant one mistake and run tests."""
+    tests, left, seconds = chosen(files, path, site, budget)
+    by = forked(lambda: with_mistake(path, number, tests), AT_LEAST + SLOWER * seconds) if tests else ""
+    entry = {"key": site.key, "seed": seed, "noticed": bool(by), "by": by, "tests": len(tests), "left": left}
     with (STATE / "results.jsonl").open("a") as file:
         file.write(json.dumps(entry) + "\n")
-    verdict = f"noticed by {by}" if by else f"NOT NOTICED by {count} tests ({left} too slow)"
-    print(f"{path}:{site.line} {site.kind}: {site.before} -> {site.after}: {verdict}", flush=True)
+    verdict = f"noticed by {by}" if by else f"NOT NOTICED by {len(tests)} tests ({left} too slow)"
+    print(f"{path}:{site.line} {site.kind}: {site.before} -> {site.after}: {verdict} [{site.key}]", flush=True)
 
 
 def interval(hits: int, count: int) -> tuple[float, float]:
@@ -269,74 +190,106 @@ def interval(hits: int, count: int) -> tuple[float, float]:
     return (middle - half) / (count + z2), (middle + half) / (count + z2)
 
 
-def report(seed: int) -> str:
-    """A table of the folders, and what was not noticed, line by line."""
-    kept, rows, missed, counts = results(), [], [], {}
+class Draw(NamedTuple):
+    """What became of the mistakes of a room that one seed drew: number, harmless ones, noticed ones."""
+
+    drawn: int
+    harmless: int
+    noticed: int
+
+    @property
+    def share(self) -> str:
+        """Noticed ones among those that change a result."""
+        return f"{self.noticed} of {self.drawn - self.harmless}"
+
+
+def report() -> tuple[str, str]:
+    """A table of the rooms, the first and the last draw of each; and what was not noticed, or is harmless, by line."""
+    kept, rows = results(), []
+    missed: list[tuple[object, ...]] = []
     idle: list[tuple[object, ...]] = []
-    for folder in FOLDERS:
-        every = draws(folder, seed)
-        judged = [(path, site, kept[site.key]) for path, _, site in every if site.key in kept]
-        if not judged:
+    total = noticed = 0
+    for room in ROOMS:
+        judged = [(path, site, kept[site.key]) for path, _, site in draws(room, 0) if site.key in kept]
+        by_seed: dict[int, Draw] = {}
+        for seed in sorted({entry["seed"] for _, _, entry in judged}):
+            own = [(site.key, entry["noticed"]) for _, site, entry in judged if entry["seed"] == seed]
+            matter = [found for key, found in own if key not in HARMLESS]
+            by_seed[seed] = Draw(len(own), len(own) - len(matter), sum(matter))
+        if not by_seed:
             continue
-        before = len(idle)
+        first, last = min(by_seed), max(by_seed)
         for path, site, entry in sorted(judged, key=lambda row: (row[0], row[1].line)):
             texts = (f"`{' '.join(text.split())[:70]}`".replace("|", "\\|") for text in (site.before, site.after))
-            where = f"{path}:{site.line}", site.kind, *texts
+            where = f"{path}:{site.line}", entry["seed"], site.kind, *texts
             if site.key in HARMLESS:
                 idle.append((*where, HARMLESS[site.key]))
             elif not entry["noticed"]:
-                missed.append((*where, entry["tests"]))
-        harmless = len(idle) - before
-        hits = sum(entry["noticed"] and site.key not in HARMLESS for _, site, entry in judged)
-        counts[folder] = hits, len(judged) - harmless
-        low, high = interval(*counts[folder])
-        share = f"{100 * hits / counts[folder][1]:.0f} %", f"{100 * low:.0f} to {100 * high:.0f} %"
-        rows.append((f"`{folder}`", len(every), len(judged), harmless, hits, *share))
-    hits, total = (sum(values) for values in zip(*counts.values(), strict=True))
-    worst = min(counts, key=lambda folder: counts[folder][0] / counts[folder][1])
-    shares = (
-        f"{100 * hits / total:.0f} % over all folders, {100 * counts[worst][0] / counts[worst][1]:.0f} % in `{worst}`"
+                missed.append((*where, entry["tests"], site.key))
+        end = by_seed[last]
+        total, noticed = total + end.drawn - end.harmless, noticed + end.noticed
+        before = by_seed[first].share if first < last else ""
+        rows.append((f"`{room}`", before, last, end.drawn, end.harmless, end.share))
+    if not total:
+        return "Nothing was drawn yet.", ""
+    low, high = interval(noticed, total)
+    summary = (
+        f"In the last draw of each room, {noticed} of {total} mistakes that change a result were noticed: "
+        f"{100 * noticed / total:.0f} % (95 % interval {100 * low:.0f} to {100 * high:.0f} %)."
     )
-    return "\n".join([
-        f"The tests notice {hits} of {total} small mistakes planted at random that change a result: "
-        f"{shares}, the lowest.", "",
-        *table(("folder", "possible mistakes", "planted", "harmless", "noticed", "share", "95 % interval"), rows), "",
-        f"## Not noticed ({len(missed)})", "", "With the number of tests that call the function.", "",
-        *table(("line", "kind", "before", "after", "tests"), missed), "",
-        f"## Harmless ({len(idle)})", "", "They change no result and are in no share (`scripts/check/harmless.py`).",
-        "",
-        *table(("line", "kind", "before", "after", "why"), idle), "",
-    ])  # fmt: skip
+    heads = ("room", "first draw", "last draw: seed", "drawn", "harmless", "noticed")
+    lines = [
+        f"Not noticed ({len(missed)})", "",
+        *table(("line", "seed", "kind", "before", "after", "tests", "key"), missed), "",
+        f"Harmless ({len(idle)})", "", *table(("line", "seed", "kind", "before", "after", "why"), idle),
+    ]  # fmt: skip
+    return "\n".join([*table(heads, rows), "", summary]), "\n".join(lines)
+
+
+def times(rooms: list[str]) -> str:
+    """Processor time of each room's tests, and the tests that take longest."""
+    rows = []
+    for room in rooms:
+        tests = sorted(((s, name) for file in observe(room, -math.inf) for name, s in file["seconds"].items()))[::-1]
+        longest = ", ".join(f"{name.split('/')[-1]} {seconds:.0f}" for seconds, name in tests[:6] if seconds >= 2)
+        rows.append((f"`{room}`", len(tests), f"{sum(seconds for seconds, _ in tests):.0f}", longest))
+    return "\n".join(table(("room", "tests", "CPU s", "those of 2 s and more"), rows))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folders", nargs="*", default=FOLDERS, help="of kcal/")
-    parser.add_argument("--sample", type=int, default=40, help="mistakes in each folder")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("rooms", nargs="*", default=ROOMS, help=f"of kcal/, or {TOP} for the modules beside them")
+    parser.add_argument("--sample", type=int, default=8, help="mistakes in each room")
+    parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--seconds", type=float, default=math.inf, help="after which nothing is begun")
-    parser.add_argument("--budget", type=float, default=60.0, help="seconds of tests for one mistake")
+    parser.add_argument("--budget", type=float, default=6.0, help="seconds of tests for one mistake")
     parser.add_argument("--again", action="store_true", help="only what went unnoticed, with the tests as they are now")
+    parser.add_argument("--times", action="store_true", help="print the time that tests take, and nothing else")
+    parser.add_argument("--write", action="store_true", help="write the table into docs/measured/mutants.md")
     arguments = parser.parse_args()
+    if arguments.times:
+        print(times(arguments.rooms))
+        return
     STATE.mkdir(exist_ok=True)
     for library in LIBRARIES:
         importlib.import_module(library)
+    for module in pkgutil.walk_packages([str(ROOT / "kcal")], "kcal."):
+        importlib.import_module(module.name)
     stop = time.monotonic() + arguments.seconds
-    others: dict[str, dict] = {}
-    for folder in FOLDERS:
-        others |= observe(folder, -math.inf)
-    for folder in ELSEWHERE:
-        others |= observe(folder, stop)
-    for folder in arguments.folders:
-        own, kept = observe(folder, stop), results()
-        groups = own, {file: known for file, known in others.items() if file not in own}
-        for path, number, site in draws(folder, arguments.seed)[: arguments.sample]:
+    for room in arguments.rooms:
+        files, kept = observe(room, stop), results()
+        before = {key for key, entry in kept.items() if entry["seed"] != arguments.seed}
+        drawn = [draw for draw in draws(room, arguments.seed) if draw[2].key not in before]
+        for path, number, site in drawn[: arguments.sample]:
             if time.monotonic() > stop:
                 break
-            if site.key not in kept or (arguments.again and not kept[site.key]["noticed"]):
-                judge(groups, path, number, site, arguments.budget)
-    text = report(arguments.seed)
-    print(text)
+            again = arguments.again and not kept.get(site.key, {"noticed": True})["noticed"]
+            if site.key not in HARMLESS and (site.key not in kept or again):
+                judge(files, path, number, site, arguments.budget, arguments.seed)
+    rooms, lines = report()
+    print(f"{rooms}\n\n{lines}")
+    if arguments.write:
+        write_section("mutants.md", "mutants", rooms)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """Small mistakes that a test should notice: the places of a module where they can be planted, and the planting.
 
 Mistakes are those that numerical code suffers from: a comparison the other way round, plus for minus, a number off by
-one, `any` for `all`, arguments or entries swapped, a matrix not transposed or multiplied from the other side. Messages,
-annotations, docstrings and decorators are let alone.
+one, `any` for `all`, a root left out, arguments or entries swapped, a matrix not transposed or on the other side of a
+product. Messages, annotations, docstrings and decorators are let alone.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ _PAIRS = (("min", "max"), ("minimum", "maximum"), ("amin", "amax"), ("all", "any
 _FUNCTIONS = {a: b for pair in _PAIRS for a, b in (pair, pair[::-1])}
 # Swapped arguments change nothing, or only the type.
 _SYMMETRIC = {"min", "max", "minimum", "maximum", "hypot", "isinstance", "zip", "equal", "logical_and", "logical_or"}
+_LEFT_OUT = {"abs", "sqrt", "square", "log", "exp", "radians", "degrees", "deg2rad", "rad2deg"}
 _NOT_ENTERED = (ast.Raise, ast.Assert, ast.JoinedStr, ast.Import, ast.ImportFrom, ast.Global, ast.Nonlocal)
 _NOT_FIELDS = {"annotation", "returns", "decorator_list", "bases", "type_params"}
 _NOT_KEYWORDS = {"dtype", "device", "indexing", "prog", "help", "key", "encoding", "strict", "keepdim"}
@@ -40,6 +41,8 @@ class Site(NamedTuple):
         kind: of the mistake.
         before: the code that it changes.
         after: what it becomes.
+        first: line of the statement, or of what stands at its head, that contains it.
+        last: its last line.
         function: qualified name of the innermost function around it; empty outside of functions.
         key: the same as long as the statement of the module that contains it is.
         plant: changes the tree.
@@ -49,6 +52,8 @@ class Site(NamedTuple):
     kind: str
     before: str
     after: str
+    first: int
+    last: int
     function: str
     key: str
     plant: Callable[[], None]
@@ -65,7 +70,7 @@ def sites(tree: ast.Module, path: str) -> list[Site]:
     found = []
     for statement in tree.body:
         text = f"{path}\n{ast.unparse(statement)}"
-        for number, (place, kind, new, function) in enumerate(_walk(ast.Module([statement], []), "", "")):
+        for number, (place, kind, new, function) in enumerate(_walk(ast.Module([statement], []), "", "", (0, 0))):
             node = place.get()
             found.append(
                 Site(
@@ -73,6 +78,8 @@ def sites(tree: ast.Module, path: str) -> list[Site]:
                     kind=kind,
                     before=ast.unparse(node),
                     after=ast.unparse(ast.fix_missing_locations(new)),
+                    first=place.lines[0],
+                    last=place.lines[1],
                     function=function,
                     key=hashlib.sha256(f"{text}\n{number}".encode()).hexdigest()[:16],
                     plant=functools.partial(place.put, new),
@@ -82,11 +89,12 @@ def sites(tree: ast.Module, path: str) -> list[Site]:
 
 
 class _Place(NamedTuple):
-    """Where a node hangs."""
+    """Where a node hangs; first and last line of what is executed with it."""
 
     parent: ast.AST
     field: str
     number: int | None
+    lines: tuple[int, int]
 
     def get(self) -> ast.AST:
         value = getattr(self.parent, self.field)
@@ -99,25 +107,32 @@ class _Place(NamedTuple):
             getattr(self.parent, self.field)[self.number] = new
 
 
-def _walk(parent: ast.AST, scope: str, function: str) -> Iterator[tuple[_Place, str, ast.AST, str]]:
+def _walk(
+    parent: ast.AST, scope: str, function: str, lines: tuple[int, int]
+) -> Iterator[tuple[_Place, str, ast.AST, str]]:
     """Places below a node, each with its function; `scope` is what qualified names begin with there."""
     for field, value in ast.iter_fields(parent):
         for index, node in enumerate(value if isinstance(value, list) else [value]):
             if not isinstance(node, ast.AST) or field in _NOT_FIELDS or _is_left_alone(node):
                 continue
-            place = _Place(parent, field, index if isinstance(value, list) else None)
+            if isinstance(node, ast.stmt) or (isinstance(node, ast.expr) and isinstance(parent, ast.stmt)):
+                whole = parent if isinstance(parent, ast.stmt) and not hasattr(parent, "body") else node
+                span = getattr(whole, "lineno", 0), getattr(whole, "end_lineno", 0)
+            else:
+                span = lines
+            place = _Place(parent, field, index if isinstance(value, list) else None, span)
             for kind, new in _variants(node, field, bool(function)):
                 yield place, kind, ast.copy_location(new, node), function
             match node:
                 case ast.FunctionDef(name=name):
                     # Defaults belong to what is around the function.
-                    yield from _walk(node.args, scope, function)
+                    yield from _walk(node.args, scope, function, span)
                     body = ast.Module(node.body, [])
-                    yield from _walk(body, f"{scope}{name}.<locals>.", f"{scope}{name}")
+                    yield from _walk(body, f"{scope}{name}.<locals>.", f"{scope}{name}", span)
                 case ast.ClassDef(name=name):
-                    yield from _walk(node, f"{scope}{name}.", function)
+                    yield from _walk(node, f"{scope}{name}.", function, span)
                 case _:
-                    yield from _walk(node, scope, function)
+                    yield from _walk(node, scope, function, span)
 
 
 def _is_left_alone(node: ast.AST) -> bool:
@@ -183,6 +198,8 @@ def _calls(new: ast.Call) -> Iterator[tuple[str, ast.AST]]:
         func: ast.AST = other.func
         setattr(func, "attr" if isinstance(func, ast.Attribute) else "id", _FUNCTIONS[name])
         yield "function", other
+    if name in _LEFT_OUT and (inner := new.args or [getattr(new.func, "value", None)])[0] is not None:
+        yield "function left out", inner[0]
     first = 1 if name == "where" else 0
     pair = new.args[first : first + 2]
     if len(pair) == 2 and name not in _SYMMETRIC and _are_alike(pair):

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from kcal.calibrate.hybrid import evidence_rounds
 from kcal.calibrate.hybrid.board_modes import board_modes
 from kcal.calibrate.hybrid.families import SQUARE, prior_families, typical_hyperprior
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
@@ -129,3 +130,9 @@ def test_pixels_are_square_or_have_two_focal_lengths() -> None:
     torch.testing.assert_close(free.deviation(h)[kept], square.deviation(h), rtol=0, atol=0)
     weights = torch.linspace(-1.0, 2.0, len(free.mean), dtype=torch.float64) * kept
     torch.testing.assert_close(free.pulled(h, weights), square.pulled(h, weights[kept]), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("rounds", [1, 12])
+def test_rounds_that_run_out_are_said(rounds: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(evidence_rounds, "_ROUNDS", rounds)
+    assert fit_hybrid(BOARD.points, capture(6), SIZE).converged == (rounds == 12)

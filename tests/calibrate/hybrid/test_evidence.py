@@ -1,0 +1,109 @@
+"""The evidence of lens, board and motions against the density of the residuals, written out; its gradient."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from kcal.calibrate.hybrid.evidence import EvidenceLoss, Maximum, evidence_of_motion, hyper_bounds
+from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies
+from kcal.calibrate.hybrid.quadratic import ViewData, view_data
+from kcal.calibrate.problem.readout import AMPLITUDES, MEDIAN, MOTION, SPREAD
+
+F64 = torch.float64
+VIEWS, ROWS, UNKNOWNS = 3, 20, 5
+PRIOR = Hyperprior(torch.tensor([0.2, -0.5], dtype=F64), torch.tensor([1.5, 2.0], dtype=F64))
+# Two unknowns of one amplitude, one of the other with a decay, one that is given.
+FAMILIES = PriorFamilies(
+    mean=torch.zeros(UNKNOWNS, dtype=F64),
+    log_unit=torch.tensor([0.0, 0.1, -0.2, 0.3, 0.0], dtype=F64),
+    amplitude=torch.tensor([0, 0, 1, -1, 1]),
+    decay=torch.tensor([-1, -1, 0, -1, -1]),
+    degree=torch.tensor([0.0, 0.0, 0.7, 0.0, 0.0], dtype=F64),
+)
+# h, logarithms of the ratios, ln σ².
+AT = np.array([0.4, -0.3, 0.2, -0.4, 0.1, 0.5, -0.6])
+
+
+def rows(moving: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """U (V, M, R), A (V, S, R), residuals (V, R), and where they were taken: x (S,) and motions (V, M)."""
+    generator = np.random.default_rng(5)
+    motions = MOTION if moving else 0
+    shapes = (VIEWS, motions, ROWS), (VIEWS, UNKNOWNS, ROWS), (VIEWS, ROWS), (UNKNOWNS,), (VIEWS, motions)
+    return tuple(generator.normal(size=shape) for shape in shapes)  # type: ignore[return-value]
+
+
+def data(moving: bool) -> ViewData:
+    U, A, residual, x, motion = (torch.from_numpy(part) for part in rows(moving))
+    return view_data(torch.cat([U, A, residual[:, None]], 1), x, motion, float(VIEWS * ROWS))
+
+
+def density(moving: bool, still: bool = False) -> float:
+    """-ln p of the residuals, without (rows / 2) ln 2 pi."""
+    U, A, residual, x, motion = rows(moving)
+    offset = (residual - np.einsum("s,vsr->vr", x, A) - np.einsum("vm,vmr->vr", motion, U)).ravel()
+    deviation = FAMILIES.deviation(torch.from_numpy(AT[:2])).numpy()
+    flat = A.transpose(0, 2, 1).reshape(-1, UNKNOWNS) * deviation
+    variance = math.exp(AT[-1])
+    covariance = variance * np.eye(len(offset)) + flat @ flat.T
+    for view in range(VIEWS if moving and not still else 0):
+        ratio = np.repeat(np.exp(AT[2:6]), MOTION // AMPLITUDES)
+        own = slice(view * ROWS, (view + 1) * ROWS)
+        covariance[own, own] += variance * (U[view].T * ratio**2) @ U[view]
+    return -float(stats.multivariate_normal.logpdf(offset, cov=covariance)) - 0.5 * len(offset) * math.log(2 * math.pi)
+
+
+def vector(moving: bool) -> np.ndarray:
+    return AT if moving else AT[[0, 1, 6]]
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_value_is_the_density_of_the_residuals(moving: bool) -> None:
+    z = (AT[:2] - PRIOR.mean.numpy()) / PRIOR.sd.numpy()
+    # The motions' standard deviations themselves are log-normal, not their ratios to the noise.
+    w = (AT[2:6] + 0.5 * AT[-1] - math.log(MEDIAN)) / SPREAD if moving else np.zeros(0)
+    wanted = density(moving) + 0.5 * float(z @ z + w @ w)
+    loss = EvidenceLoss(data(moving), FAMILIES, PRIOR, 1.0)
+    assert loss.value(vector(moving)) == pytest.approx(wanted, rel=1e-10)
+    assert loss(vector(moving))[0] == pytest.approx(wanted, rel=1e-10)
+
+
+@pytest.mark.parametrize("tempering", [1.0, 1.7])
+@pytest.mark.parametrize("moving", [False, True])
+def test_gradient(moving: bool, tempering: float) -> None:
+    loss, at = EvidenceLoss(data(moving), FAMILIES, PRIOR, tempering), vector(moving)
+    slopes = [(loss.value(at + step) - loss.value(at - step)) / 2e-5 for step in 1e-5 * np.eye(len(at))]
+    np.testing.assert_allclose(loss(at)[1], slopes, rtol=1e-6, atol=1e-6)
+
+
+def test_beyond_numbers_is_worse_than_before() -> None:
+    loss, at = EvidenceLoss(data(False), FAMILIES, PRIOR, 1.0), vector(False)
+    beyond = at + np.array([0.0, 0.0, 400.0])
+    assert loss.value(beyond) == math.inf
+    assert loss(beyond)[0] == 1e30
+    value = loss(at)[0]
+    worse, slope = loss(beyond)
+    assert worse == value + 1.0
+    assert not slope.any()
+
+
+def test_worth_of_motions() -> None:
+    """The logarithm of the evidence with them less that without, all else the same."""
+    best = Maximum(torch.from_numpy(AT[:2]), AT[2:6], math.exp(AT[-1]), math.inf)
+    found = evidence_of_motion(data(True), best, FAMILIES, 1.0)
+    assert found == pytest.approx(density(True, still=True) - density(True), rel=1e-9)
+
+
+def test_bounds_of_hyperparameters() -> None:
+    """Five standard deviations, or the most that there may be; the noise is open above."""
+    bounds = hyper_bounds(PRIOR._replace(most=torch.tensor([1.0, 100.0], dtype=F64)), 1, -3.0)
+    assert bounds[:2] == [(0.2 - 7.5, 1.0), (-10.5, 9.5)]
+    assert bounds[2] == pytest.approx((math.log(1e-6) + 1.5, math.log(0.03) + 1.5))
+    assert bounds[3] == (-11.0, None)
+    assert hyper_bounds(PRIOR, 0, -3.0)[0] == (0.2 - 7.5, 0.2 + 7.5)
+    # No noise below a thousandth of a pixel.
+    assert hyper_bounds(PRIOR, 0, -8.0)[-1] == pytest.approx((2.0 * math.log(1e-3), None))

@@ -1,0 +1,95 @@
+"""What users pass is refused where it is no points, no covariance or not finite, and otherwise kept to the last bit."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from kcal.checks import Float64Module, as_covariance, as_points, require_finite
+from kcal.errors import InputError
+from kcal.image_size import check_pixel_count
+from kcal.sources import is_stream, source_name
+
+F64 = torch.float64
+
+
+def test_points_are_float64_of_the_right_shape() -> None:
+    found = as_points("x", torch.ones(3, 2, dtype=torch.float16), 2)
+    assert found.dtype == F64
+    assert as_points("x", torch.ones(2, dtype=F64), 2).shape == (2,)
+    for value, message in (
+        ([1.0, 2.0], "x: a torch tensor is needed, got list"),
+        (torch.ones(3, 2, dtype=torch.int64), r"floating point is needed, got torch.int64"),
+        (torch.tensor(1.0), r"shape \(..., 2\) is needed, got \(\)"),
+        (torch.ones(2, 3), r"shape \(..., 2\) is needed, got \(2, 3\)"),
+    ):
+        with pytest.raises(InputError, match=message):
+            as_points("x", value, 2)  # type: ignore[arg-type]
+
+
+def test_the_first_value_that_is_not_finite_is_named() -> None:
+    require_finite("x", torch.full((3,), 1e308, dtype=F64))  # whose sum is infinite
+    require_finite("x", torch.zeros(0))
+    value = torch.zeros(2, 3)
+    value[1, 0], value[1, 2] = torch.nan, -torch.inf
+    with pytest.raises(InputError, match=r"x: 2 of 6 values are not finite, first at \(1, 0\)"):
+        require_finite("x", value)
+
+
+def test_covariances() -> None:
+    assert torch.equal(as_covariance("x", None, 2), torch.zeros(2, 2, dtype=F64))
+    # Of units that differ by a million, with rounding that is not symmetric; and of rank one, and zero.
+    large = torch.tensor([[1e12, 3e5], [3e5 * (1 + 1e-10), 1.0]], dtype=F64)
+    found = as_covariance("x", large, 2)
+    assert torch.equal(found, found.T)
+    assert float(found[0, 1]) == pytest.approx(3e5 * (1 + 5e-11), rel=1e-13)
+    for good in (torch.ones(2, 2), torch.zeros(2, 2), torch.tensor([[0.0, 0.0], [0.0, 4.0]])):
+        assert torch.equal(as_covariance("x", good, 2), good.double())
+
+
+@pytest.mark.parametrize(
+    ("matrix", "message"),
+    [
+        (torch.eye(3), r"shape \(2, 2\) is needed, got \(3, 3\)"),
+        ([[1.0, 0.0], [0.0, 1.0]], "is needed, got list"),
+        (torch.tensor([[1.0, torch.nan], [torch.nan, 1.0]]), "2 of 4 values are not finite"),
+        (torch.tensor([[1.0, 1.01], [1.01, 1.0]]), "no negative eigenvalue"),
+        (torch.tensor([[-1e-3, 0.0], [0.0, 1.0]]), "no negative eigenvalue"),
+        (torch.tensor([[1e12, 3e5], [3.01e5, 1.0]]), "must be symmetric"),
+        (torch.tensor([[1e-12, 1e-7], [1.01e-7, 1.0]], dtype=F64), "must be symmetric"),
+    ],
+)
+def test_what_is_no_covariance(matrix: Tensor, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        as_covariance("x", matrix, 2)
+
+
+def test_modules_keep_their_precision() -> None:
+    module = Float64Module()
+    module.register_buffer("fine", torch.ones(1, dtype=F64) / 3)
+    module.register_buffer("coarse", torch.ones(1))
+    for moved in (module.float(), module.half(), module.to(torch.float16)):
+        assert float(moved.fine) == 1 / 3  # type: ignore[arg-type]
+    assert module.coarse.dtype == torch.float16
+
+
+def test_pixel_counts() -> None:
+    assert check_pixel_count((500_000_000, 1)) == (500_000_000, 1)
+    with pytest.raises(ValueError, match="500000001x1 pixels; an image may have at most 500 megapixels"):
+        check_pixel_count((500_000_001, 1))
+    with pytest.raises(ValueError, match=r"^more than 1e12 pixels"):
+        check_pixel_count((10**12, 1))
+
+
+def test_sources() -> None:
+    for text in ("rtsp://a/b", "RTSPS://a", "rtmp://a", "https://a", "udp://a", "tcp://a", "srt://a", "camera:12"):
+        assert is_stream(text)
+    for text in ("camera:", "camera:0.mp4", "a/rtsp://b", "file://a", "shots.mp4", ""):
+        assert not is_stream(text)
+    names = {
+        "rtsp://user:secret@10.0.0.7:554/main?token=1": "10.0.0.7", "udp://": "stream", "camera:3": "camera:3",
+        "night/shots.mp4": "shots.mp4", "x://b/c": "c",
+    }  # fmt: skip
+    for source, name in names.items():
+        assert source_name(source) == name

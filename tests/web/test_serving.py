@@ -1,0 +1,64 @@
+"""The socket of a local server: this machine's own address alone, and another port only where it may be."""
+
+from __future__ import annotations
+
+import http.client
+import socket
+import threading
+
+import pytest
+
+pytest.importorskip("starlette", reason="the extra `mark` is not installed")
+pytest.importorskip("uvicorn", reason="the extra `mark` is not installed")
+
+from kcal.errors import InputError
+from kcal.web.gate import local_app
+from kcal.web.listening import listening_socket
+from kcal.web.serving import LocalServer
+
+
+def test_a_port_in_use_is_refused_or_replaced() -> None:
+    with listening_socket(0, fallback=False) as first:
+        name, port = first.getsockname()
+        assert name == "127.0.0.1"
+        # Who connects before the server answers waits.
+        with socket.create_connection((name, port), timeout=5):
+            pass
+        with pytest.raises(InputError, match=f"port {port} cannot be used: .*; give another --port"):
+            listening_socket(port, fallback=False)
+        with listening_socket(port, fallback=True) as other:
+            assert other.getsockname()[0] == "127.0.0.1"
+            assert other.getsockname()[1] not in (0, port)
+
+
+def test_a_port_can_be_used_again_at_once() -> None:
+    with listening_socket(0, fallback=False) as first:
+        port = first.getsockname()[1]
+        with socket.create_connection(("127.0.0.1", port), timeout=5) as there:
+            first.accept()[0].close()
+            there.recv(1)
+    with listening_socket(port, fallback=False) as again:
+        assert again.getsockname()[1] == port
+
+
+def test_a_server_answers_at_its_address_until_it_is_stopped() -> None:
+    made: list[tuple[str, tuple[str, ...]]] = []
+
+    def make_app(token: str, hosts: tuple[str, ...]):
+        made.append((token, hosts))
+        return local_app([], {"/": (b"hello", "text/html")}, token, hosts)
+
+    server = LocalServer(make_app, 0, fallback=False)
+    ((token, hosts),) = made
+    host, _, given = server.address.removeprefix("http://").partition("/#")
+    assert given == token
+    assert set(hosts) == {host, host.replace("127.0.0.1", "localhost")}
+    thread = threading.Thread(target=server.run, daemon=True)
+    thread.start()
+    connection = http.client.HTTPConnection(host, timeout=20)
+    connection.request("GET", "/")
+    assert connection.getresponse().read() == b"hello"
+    connection.close()
+    server.stop()
+    thread.join(20)
+    assert not thread.is_alive()
