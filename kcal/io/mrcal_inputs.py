@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kcal.gaussian import posterior_half, triangular
 from kcal.lens.camera import Camera
-from kcal.lens.information import posterior_half, triangular
 from kcal.lens.pose import rotation_from_vector, step_rows, vector_from_rotation
 from kcal.lens.projection import project_components
 from kcal.strict_npz import read_npz

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from kcal.gaussian import triangular, whitened
 from kcal.lens.camera import Camera
-from kcal.lens.information import triangular, whitened
 from kcal.lens.uncertainty import pixel_slopes
 
 # Pixels by which parameters that a calibration held may move the image: other programs have no exact parameters.

@@ -19,10 +19,11 @@ from kcal.calibrate.hybrid.families import PriorFamilies, prior_families, typica
 from kcal.calibrate.hybrid.quadratic import view_data
 from kcal.calibrate.hybrid.unknowns import hybrid_unknowns
 from kcal.errors import InputError
+from kcal.gaussian import posterior_half
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.hybrid_terms import HybridForm
-from kcal.lens.information import CameraInformation, posterior_half
+from kcal.lens.information import CameraInformation
 from kcal.lens.model import LensModel
 from kcal.lens.zernike import ZernikeModes
 from kcal.stars.star_problem import KnownLens, StarField, StarProblem

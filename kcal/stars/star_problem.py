@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.problem.parameters import FreeParameters
-from kcal.lens.information import triangular
+from kcal.gaussian import triangular
 from kcal.lens.model import LensModel
 from kcal.lens.pose import rotation_from_vector, step_rows
 from kcal.lens.projection import project_components

@@ -21,6 +21,7 @@ SUFFIXES = {
     "colmap": (".txt", ".bin"),
     "mrcal": (".cameramodel",),
     "matlab": (".mat",),
+    "toml": (".toml",),
     **dict.fromkeys(("nerfstudio", "opensfm"), (".json",)),
     **dict.fromkeys(("ros", "kalibr"), (".yaml",)),
 }
