@@ -7,7 +7,6 @@ from functools import partial
 from typing import NamedTuple
 
 import torch
-from scipy.special import chdtri
 from torch import Tensor
 
 from kcal.checks import Float64Module, as_points
@@ -121,6 +120,9 @@ class MultiViewLocalizer(Float64Module):
         root: Tensor | None = None,
         clock_sigma: float = 0.0,
     ) -> None:
+        # SciPy takes long to load.
+        from scipy.special import chdtri
+
         super().__init__()
         if not 1e-6 <= pixel_sigma <= 1e6:
             raise InputError(f"pixel_sigma: a positive number of pixels, 1e-6 to 1e6, is needed, got {pixel_sigma}")
