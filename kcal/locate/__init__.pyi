@@ -19,6 +19,8 @@ from kcal.locate.triangulate import Triangulate as Triangulate
 from kcal.locate.triangulate import Triangulation as Triangulation
 from kcal.locate.multiview import TriangulateViews as TriangulateViews
 from kcal.locate.multiview import ViewsResult as ViewsResult
+from kcal.locate.disparity import DisparityRanges as DisparityRanges
+from kcal.locate.disparity import RangeImage as RangeImage
 
 # Any number of cameras
 from kcal.locate.multi_localizer import MultiViewLocalizer as MultiViewLocalizer
