@@ -83,7 +83,7 @@ def _foreign_kind(path: Path, head: bytes, size: int) -> str:
     if "<html" in low or "<!doctype html" in low:
         return "page"
     columns = {cell.strip().strip('"').lower() for cell in re.split("[,;\t]", text.partition("\n")[0])}
-    if columns & {"left_u", "right_u", "left_v", "right_v"}:
+    if columns & {"left_u", "right_u", "left_v", "right_v"} or columns >= {"camera", "u", "v"}:
         return "marks"
     if columns & {"lat", "lon", "east", "north"}:
         return "survey"

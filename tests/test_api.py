@@ -55,12 +55,14 @@ PUBLIC = {
         save_measured_board summarize
     """,
     "kcal.rig": """
+        CameraRig CameraRigCalibration load_camera_rig save_camera_rig station_mounting stations_of
         Drift DriftEffect ImagePair ItemResidual MarkedLandmarks Mounting PairCounts RigCalibration RigCovariance
         RigSource SceneMatches Sides SourceResidual Survey TurnedBoard camera_positions check_rig drift_effect
         import_survey match_landmarks measure_drift mounting_covariance pair_by_name paired_boards placed_rig
         planned_rig read_features read_pairs read_survey relocked scene_features triangulated_sides
     """,
     "kcal.locate": """
+        MultiViewLocalizer ViewMarks ViewsLocalization locate_views read_views
         BudgetErrors DisparityRanges Geoid GroundPlaces Localization Marks RangeImage Position PositionColumns
         RangeError Sensitivity Triangulate TriangulateViews Triangulation Viewpoint ViewsResult
         circular_error enu_from_cam enu_to_geodetic
@@ -107,12 +109,17 @@ NEW_NAMES = (
     | {"CameraRays", "Cylinder", "StereoRectification", "cylinder_view", "looking", "pinhole_view", "pixel_errors"}
     | {"pupil_shift", "ray_error", "IntervalCheck", "Refit", "against_capture", "interval_check", "simulated_refits"}
     | {"DisparityRanges", "RangeImage", "forgotten_yaw", "save_interval_picture"}
+    | {"CameraRig", "CameraRigCalibration", "load_camera_rig", "save_camera_rig", "station_mounting", "stations_of"}
+    | {"MultiViewLocalizer", "ViewMarks", "ViewsLocalization", "locate_views", "read_views"}
     | set(PUBLIC["kcal.stars"].split())
 )
 # Types of attributes in which only those look who work on kcal.
 INSIDE = {"FieldModes", "HybridFit", "BoardState", "Spline"}
 # What functions return, and blocks of files: examples are those of the functions.
 RECORDS = {
+    "CameraRigCalibration",
+    "ViewMarks",
+    "ViewsLocalization",
     "IntervalCheck",
     "RangeImage",
     "Refit",

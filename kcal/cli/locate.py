@@ -3,25 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from kcal.cli.console import err, out, print_table, print_wrote, steps, warn
-from kcal.cli.cures import mark_again, with_command
+from kcal.cli.console import err, steps, warn
 from kcal.cli.inputs import MARKS, RIG, SURVEY, typed_with
-from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_and_source
+from kcal.cli.located_text import draw_positions, tell_located
+from kcal.cli.pixel_sigma import ASSUMED, PixelSigma, pixel_sigma_and_source
 from kcal.cli.settings import taken
-from kcal.errors import DegenerateError, InputError
+from kcal.errors import InputError
 from kcal.files import check_picture, check_writable, written_files
-from kcal.texts import one_line
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from kcal.locate.positions import Located
 
 
 def locate_command(
@@ -29,7 +22,8 @@ def locate_command(
     points: Annotated[
         Path,
         typer.Argument(
-            help="CSV with the columns name,left_u,left_v,right_u,right_v; others are carried into GeoJSON and CSV."
+            help="CSV with the columns name,left_u,left_v,right_u,right_v, or name,camera,u,v for any number of "
+            "cameras; others are carried into GeoJSON and CSV."
         ),
         MARKS,
     ],
@@ -108,6 +102,13 @@ def locate_command(
             hidden=True,
         ),
     ] = None,
+    height: Annotated[
+        str | None,
+        typer.Option(
+            metavar="M±SIGMA",
+            help="Height above the ellipsoid of what one camera alone saw; otherwise that has a bearing only.",
+        ),
+    ] = None,
     geoid: Annotated[
         Path | None, typer.Option(help="Geoid grid file (.tif, .gtx); one that PROJ finds if not given.", hidden=True)
     ] = None,
@@ -161,6 +162,9 @@ def locate_command(
     The rig file of a rig that was solved with landmarks contains its position: `--origin` and `--heading` are then not
     needed.
 
+    Of several cameras (one line for each mark: name,camera,u,v) any may have seen a thing; with three or more, a mark
+    that contradicts the others is left out and named. One camera alone gives a bearing, or a position at --height.
+
     A table may have any length: rows are read, located and written in turn. Beyond 1,000 rows the screen shows counts
     only, and pictures and maps show evenly spaced rows and those that have a true position.
 
@@ -176,9 +180,10 @@ def locate_command(
     --picture map.png`
 
     `kcal locate rig.json detections.csv -o - --format geojsonl | head`
-    """
-    import json
 
+    `kcal locate towers.rig.json smoke.csv --height 240±30 --map map.html`
+    """
+    from kcal.cli.stations import parse_height
     from kcal.io.rig_file import load_rig
     from kcal.lens.mounting import Origin
     from kcal.locate.aging import parse_aging
@@ -188,9 +193,12 @@ def locate_command(
     from kcal.locate.mounting import run_errors
     from kcal.locate.positions import located_by
     from kcal.locate.sample import PositionSample
+    from kcal.locate.station_positions import locate_views
+    from kcal.locate.stations import load_camera_rig, names_of_rig
     from kcal.locate.survey import read_survey
     from kcal.locate.tabulate import Locator
     from kcal.locate.truth import read_truth
+    from kcal.locate.view_marks import is_long, read_views
 
     outputs = output or []
     streamed = STREAM in outputs
@@ -216,6 +224,36 @@ def locate_command(
         raise typer.BadParameter("--pitch, --roll and --grid belong to --heading; the rig file has its own attitude")
     # Parsed before the rig is read, so that a wrong option is reported first.
     place = None if origin is None else Origin.parse(origin)
+    stated_height = None if height is None else parse_height(height)
+    if stated_height is not None or is_long(points) or len(names_of_rig(rig)) != 2:
+        elsewhere = any((place, yaw_sigma, heading_sigma, origin_sigma, refraction, refraction_sigma, aged))
+        if elsewhere and not {"origin", "heading"} & taken:
+            raise typer.BadParameter(
+                "of several cameras position, attitude and their errors come from the rig file: leave out --origin, "
+                "--heading, --yaw-sigma, --heading-sigma, --origin-sigma, --refraction and --aged"
+            )
+        stations = load_camera_rig(rig)
+        views = read_views(points, stations.names)
+        doubts = stations.calibration.warnings if stations.calibration else ()
+        for text in doubts:
+            warn(f"{rig}: {text}")
+        told = stations.calibration.pixel_sigma if stations.calibration else None
+        located = locate_views(
+            stations, views, pixel_sigma=pixel_sigma or told or ASSUMED, height=stated_height, geoid=find_geoid(geoid)
+        )
+        with written_files() as written:
+            with open_writers(outputs, located, suffix) as writers:
+                for writer in writers:
+                    writer.add(located.columns)
+            true = None if truth is None else read_truth(truth, located)
+            draw_positions(located, true, picture, web_map, tiles=tiles, image=image, online=online)
+        sample = PositionSample()
+        sample.add(located.columns)
+        tell_located(
+            rig, points, located, true, sample, written, as_json=as_json, streamed=streamed,
+            stated=bool(views.sigma.isfinite().any()), doubts=doubts,
+        )  # fmt: skip
+        return
     yaw_sigma = math.hypot(yaw_sigma, parse_aging(aged))
     solved = load_rig(rig)
     noise, note = pixel_sigma_and_source(pixel_sigma, solved)
@@ -263,63 +301,13 @@ def locate_command(
                     err.print(note)
                 located = sample.located(locate)
                 true = None if truth is None else read_truth(truth, located)
-            if picture is not None:
-                from kcal.report.positions import save_positions_picture
-
-                save_positions_picture(picture, located, true)
-            if web_map is not None:
-                from kcal.report.map_page import save_map
-
-                save_map(web_map, located, true, tiles=tiles, image=image, online=online)
+            draw_positions(located, true, picture, web_map, tiles=tiles, image=image, online=online)
         except KeyboardInterrupt:
             kept = ", ".join(map(str, written)) or "nothing"
             err.print(
                 f"interrupted after {sample.count:,} rows; written: {kept}; other files are as they were", markup=False
             )
             raise typer.Exit(130) from None
-    if as_json:
-        summary = {
-            "table": str(points),
-            "rows": sample.count,
-            "statuses": sample.statuses,
-            "warnings": list(doubts),
-            "pixel_sigma": noise,
-            "interval": located.interval_note,
-            "geoid": located.geoid,
-            "written": list(map(str, written)),
-        }
-        print(json.dumps(summary, indent=1))
-    elif streamed:
-        err.print(_counts(sample.count, sample.statuses), markup=False)
-    else:
-        _print_positions(located, true, sample.statuses, stated=stated)
-        print_wrote(*written)
-    if "ok" not in sample.statuses:
-        text = f"{points}: none of the {sample.count} pairs could be located; see the table"
-        raise DegenerateError(with_command(text, mark_again(None, None, rig=rig)))
-
-
-def _counts(rows: int, statuses: dict[str, int]) -> str:
-    return f"{rows:,} rows: " + ", ".join(f"{count:,} {name.replace('_', ' ')}" for name, count in statuses.items())
-
-
-def _print_positions(located: Located, true: Tensor | None, statuses: dict[str, int], *, stated: bool) -> None:
-    """Print the table with the reasons below it; of a long one the counts, and the rows that have a true position."""
-    from kcal.locate.truth import position_errors
-    from kcal.report.tables import position_rows
-
-    errors = None if true is None else position_errors(located, true)
-    rows = position_rows(located, errors)
-    shown: Sequence[int] = range(len(located.positions))
-    if located.rows is not None:
-        out.print(_counts(located.rows, statuses), markup=False)
-        shown = [] if true is None else true.isfinite().all(-1).nonzero()[:, 0].tolist()
-        out.print(f"Pictures and maps show {len(located.positions):,} of them.", markup=False)
-    if shown:
-        print_table([rows[0], *(rows[i + 1] for i in shown)], left=(0, len(rows[0]) - 1))
-    for position in (located.positions[i] for i in shown):
-        if position.reason:
-            out.print(f"* {one_line(position.name)}: {position.reason}", markup=False)
-    noise = "the noise that the CSV states" if stated else f"{located.pixel_sigma:g} px of noise"
-    out.print(f"Interval: {located.interval_note}; marks have {noise}.")
-    out.print(f"Heights are ellipsoidal; geoid: {located.geoid or 'none found'}.")
+    tell_located(
+        rig, points, located, true, sample, written, as_json=as_json, streamed=streamed, stated=stated, doubts=doubts
+    )

@@ -42,6 +42,7 @@ from kcal.cli.schema import schema_command
 from kcal.cli.settings import defaults_of, read_settings
 from kcal.cli.show import show_command
 from kcal.cli.stars import stars_command
+from kcal.cli.stations import station_command
 from kcal.errors import KcalError
 from kcal.files import written_files
 from kcal.texts import visible
@@ -125,6 +126,7 @@ app.command("compare", cls=Command)(with_json(with_inputs(compare_command)))
 app.command("batch", cls=Command)(with_json(with_inputs(batch_command)))
 app.command("mark", cls=Command)(with_inputs(mark_command))
 app.add_typer(rig, name="rig")
+app.command("station", cls=Command)(with_json(with_inputs(station_command)))
 app.command("stars", cls=Command)(with_json(with_inputs(stars_command)))
 app.command("locate", cls=Command)(with_inputs(locate_command))
 app.command("live", cls=Command)(with_inputs(live_command))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -17,15 +16,13 @@ from kcal.cli.night_images import TIME_HELP
 from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_and_source
 from kcal.cli.report import NO, REQUIRE_HELP, required, told_usable
 from kcal.cli.rig_check import check
+from kcal.cli.rig_text import print_rig, rig_lines
 from kcal.errors import InputError
 
 if TYPE_CHECKING:
-    from kcal.calibrate.rig.result import RigResult
     from kcal.lens.rig import StereoRig
 
 
-# Items of a source that are named when they are left out; of thousands of matches more are no news.
-_MOST_NAMED = 12
 app = typer.Typer(cls=group_with_default("solve"), rich_markup_mode="markdown", help="Solve a rig, and check it later.")
 
 
@@ -33,9 +30,23 @@ def solve_command(
     left: Annotated[Path, typer.Argument(help="Camera file of the left camera."), CALIBRATED],
     right: Annotated[Path, typer.Argument(help="Camera file of the right camera."), CALIBRATED],
     output: Annotated[Path, typer.Option("-o", "--output", help="Rig file to write.")],
+    others: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="[CAMERA]...", help="More cameras; each is named by its file, up to the first dot."),
+        CALIBRATED,
+    ] = None,
     pairs: Annotated[
         tuple[Path, Path] | None,
         typer.Option("--pairs", metavar="LEFT.obs.json RIGHT.obs.json", help="Observations of boards seen by both."),
+        OBSERVATIONS,
+    ] = None,
+    observations: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="OBS.json",
+            help="Of three cameras and more: boards seen by any two, once for each camera, named as it is.",
+            hidden=True,
+        ),
         OBSERVATIONS,
     ] = None,
     match: Annotated[
@@ -55,7 +66,11 @@ def solve_command(
     ] = None,
     marks: Annotated[
         Path | None,
-        typer.Option(metavar="CSV", help="Where they are in the images: name,left_u,left_v,right_u,right_v."),
+        typer.Option(
+            metavar="CSV",
+            help="Where they are in the images: name,left_u,left_v,right_u,right_v, or one line for each camera: "
+            "name,camera,u,v.",
+        ),
         MARKS,
     ] = None,
     features: Annotated[
@@ -165,7 +180,7 @@ def solve_command(
         Path | None, typer.Option(help="A .png or .svg file: a plan, and residuals.", hidden=True)
     ] = None,
 ) -> None:
-    """Solve a stereo rig: where the right camera stands from the left, and where both stand on the Earth.
+    """Solve a rig: where the right camera stands from the left, and where both, or any number, stand on the Earth.
 
     From boards seen by both cameras, surveyed landmarks, far features, a measured baseline and measured camera
     positions: any of them, or all together in one adjustment. What contradicts the rest is left out and named. Boards
@@ -183,12 +198,17 @@ def solve_command(
 
     `kcal rig check` tells later whether the cameras have turned since.
 
+    Three cameras and more may stand kilometers apart and see different things: each needs four landmarks or more, of
+    its own or in common, and measured positions (--positions, by the cameras' names) help.
+
     **Examples**
 
     `kcal rig left.camera.json right.camera.json --pairs left.obs.json right.obs.json -o rig.json`
 
     `kcal rig left.camera.json right.camera.json --landmarks survey.csv --marks marks.csv --features far.csv
     --baseline 10.02±0.005 -o rig.json --require 5km:10% --report rig.html`
+
+    `kcal rig mill.camera.json mast.camera.json church.camera.json --landmarks survey.csv --marks marks.csv -o rig.json`
     """
     from kcal.calibrate.rig.solve import RigOptions, solve_rig
     from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
@@ -214,7 +234,7 @@ def solve_command(
     sources = Sources(
         pairs=pairs, match=match, landmarks=landmarks, marks=marks, features=features, positions=positions,
         baseline=baseline, origin=origin, mark_sigma=noise, survey_sigma=survey_sigma, geoid=geoid,
-        stars=night, scene=scene,
+        stars=night, scene=scene, names=tuple(path.name.split(".")[0] for path in (left, right)),
     )  # fmt: skip
     check_writable(output, left, right, *sources.files)
     needs = required(require)
@@ -222,12 +242,22 @@ def solve_command(
         check_writable(report, left, right, *sources.files)
     if picture is not None:
         check_picture(picture)
-    if not any((pairs, landmarks, marks, features, positions, baseline, stars, scene)):
+    if not any((pairs, landmarks, marks, features, positions, baseline, stars, scene, observations)):
         raise typer.BadParameter("give boards (--pairs), landmarks (--landmarks and --marks) or features (--features)")
     options = RigOptions(
         intrinsics=intrinsics, board_warp=board_warp, reject=not keep_all, refraction=refraction,
         refraction_sigma=refraction_sigma,
     )  # fmt: skip
+    if others:
+        from kcal.cli.stations import solve_stations
+
+        for given, option in ((require, "--require"), (report, "--report"), (picture, "--picture"), (match, "--match")):
+            if given:
+                raise typer.BadParameter(f"{option} is for rigs of two cameras")
+        solve_stations([left, right, *others], sources, options, output, observations or ())
+        return
+    if observations:
+        raise typer.BadParameter("--observations is for three cameras and more; give --pairs LEFT RIGHT")
     calibrated = load_camera(left), load_camera(right)
     check_sides(calibrated, (left, right))
 
@@ -298,93 +328,6 @@ def _calibrated_from(rig: StereoRig, pairs: tuple[Path, Path]) -> bool:
         record is not None and set(record.per_view_rms) <= set(Observations.load(file).names)
         for record, file in zip(records, pairs, strict=True)
     )
-
-
-def rig_lines(result: RigResult, rig: StereoRig, unpaired: int) -> list[str]:
-    """What a result says: residuals by source, the relative pose with its sigmas, the board's squares, the mounting."""
-    from kcal.locate.check import triangulated_sides
-    from kcal.quantities import length_text, measured_length, measured_text, number_text
-
-    rows = [["source", "used", "left out", "RMS px", "RMS", "sigmas"]]
-    for source in result.sources:
-        cells = [
-            "" if source.rms_px is None else f"{source.rms_px:.4f}",
-            "" if source.rms_m is None else length_text(source.rms_m),
-        ]
-        sigmas = "" if math.isnan(source.sigmas) else f"{source.sigmas:.2f}"
-        rows.append([source.source, f"{source.used}", f"{source.left_out}", *cells, sigmas])
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip() for row in rows]
-    boards, mounting = result.data.boards, rig.mounting
-    lines += [
-        f"RMS [bold]{result.rms:.4f} px[/] (left {result.rms_px[0]:.4f}, right {result.rms_px[1]:.4f}); "
-        f"{result.status.message}",
-        f"baseline [bold]{measured_length(float(rig.baseline), result.sigma_baseline)}[/]",
-    ]
-    if result.exact:
-        lines.append(_exact_line(result, rig))
-    if boards is not None:
-        lines.append(f"{len(result.pairs)} of {len(boards.names)} pairs used, {unpaired} views without partner")
-        if result.pairs:
-            board = boards.board
-            side, spread = triangulated_sides(rig, board.columns, board.rows, result.pixels, board.points)
-            true = float((board.points[1] - board.points[0]).norm())
-            what = {"checkerboard": "squares", "aprilgrid": "tags"}.get(board.pattern, "distances of circles")
-            lines.append(
-                f"triangulated {what}: {measured_length(side, spread)}, the board's are {length_text(true, digits=4)}"
-            )
-    if result.board_warp is not None:
-        x, y = (1e3 * result.board_warp).tolist()
-        lines.append(f"board warp: {x:+.3f} mm along its rows, {y:+.3f} mm along its columns")
-    if mounting is not None and mounting.covariance is not None:
-        sigma = mounting.covariance.diagonal().sqrt().tolist()
-        place, level = mounting.origin, math.degrees(max(sigma[3:5]))
-        heading = measured_text(mounting.heading_deg, math.degrees(sigma[5]))
-        pitch, roll = number_text(mounting.pitch_deg, level), number_text(mounting.roll_deg, level)
-        lines.append(
-            f"left camera at {place.lat:.7f}, {place.lon:.7f}, {number_text(place.height, sigma[2])} m above the "
-            f"ellipsoid (± {length_text(max(sigma[:2]), digits=2)} level, {length_text(sigma[2], digits=2)} up), "
-            f"heading {heading}°, pitch {pitch}°, roll {roll}°"
-        )
-        if mounting.refraction is not None and result.data.landmarks is not None:
-            lines.append(f"refraction of light {measured_text(mounting.refraction, sigma[6])} of the Earth's curvature")
-    return lines
-
-
-def _exact_line(result: RigResult, rig: StereoRig) -> str:
-    """Which cameras were taken as exact, what an error of their lenses does, and which files had no error bars."""
-    from kcal.quantities import length_text, number_text
-
-    far, share = 100.0 * float(rig.baseline), 10.0 / float(rig.left.focal.mean())
-    text = (
-        f"taken as exact, so that errors of these lenses are in no σ: {' and '.join(result.exact)}. An error of 0.1 px "
-        f"in one of them is {number_text(100.0 * share, digits=2)} % of a range of {length_text(far, digits=2)}"
-    )
-    cameras = dict(zip(result.names, result.data.cameras, strict=True))
-    known = {name: cameras[name].calibration for name in result.exact}
-    bare = [name for name, one in known.items() if one is None or one.covariance is None]
-    if not bare:
-        return text
-    return f"{text}. Without error bars came {' and '.join(bare)}: calibrate with kcal, or import a file that has them"
-
-
-def print_rig(result: RigResult, lines: list[str]) -> None:
-    """Print the lines of a result, and what was turned, left out and should be doubted."""
-    from kcal.cli.console import err, out
-
-    for line in lines:
-        out.print(line)
-    for turned in result.flipped:
-        text = f"turned by 180°: {turned.board} ({turned.camera}; the board was read from its other end)"
-        out.print(text, markup=False)
-    for source in dict.fromkeys(item.source for item in result.left_out):
-        gone = [item for item in result.left_out if item.source == source]
-        for item in gone[:_MOST_NAMED]:
-            err.print("[yellow]left out:[/]", f"{item.label}: {item.reason}")
-        if len(gone) > _MOST_NAMED:
-            err.print("[yellow]left out:[/]", f"{len(gone) - _MOST_NAMED} more {source}")
-    for text in result.warnings:
-        err.print("[yellow]warning:[/]", text)
 
 
 app.command("solve", hidden=True, cls=Command)(with_json(with_inputs(solve_command)))

@@ -34,6 +34,7 @@ class Sources:
     geoid: float | None = None
     stars: NightOptions | None = None
     scene: tuple[str, str] | None = None
+    names: tuple[str, ...] = CAMERAS
 
     @property
     def files(self) -> list[Path]:
@@ -83,6 +84,7 @@ def read_sources(cameras: tuple[Camera, Camera], sources: Sources) -> RigInput:
     from kcal.locate.marks import read_marks
     from kcal.locate.survey import camera_positions, match_landmarks, read_features
     from kcal.locate.survey_files import import_survey
+    from kcal.locate.view_marks import is_long, match_views, read_views
 
     if (sources.landmarks is None) != (sources.marks is None):
         raise InputError("--landmarks and --marks belong together: places by name, and where they are in the images")
@@ -102,11 +104,14 @@ def read_sources(cameras: tuple[Camera, Camera], sources: Sources) -> RigInput:
         if sources.positions is not None and survey.origin != origin:
             raise InputError("landmarks and positions: one has latitudes, the other local meters; give an --origin")
         origin = survey.origin
-        marks = read_marks(sources.marks, single=True)
-        found = match_landmarks(survey, marks, marks.sigmas(sources.mark_sigma))
+        if is_long(sources.marks):
+            found = match_views(survey, read_views(sources.marks, sources.names), sources.mark_sigma)
+        else:
+            marks = read_marks(sources.marks, single=True)
+            found = match_landmarks(survey, marks, marks.sigmas(sources.mark_sigma))
+            if marks.covariance is not None:
+                pixel_sigma = marks.typical_sigma(sources.mark_sigma)
         landmarks = found.landmarks
-        if marks.covariance is not None:
-            pixel_sigma = marks.typical_sigma(sources.mark_sigma)
         for names, text in ((found.unmarked, "surveyed, but not marked"), (found.unsurveyed, "marked, not surveyed")):
             if names:
                 err.print(f"[yellow]warning:[/] {text}:", ", ".join(names), markup=True)

@@ -11,14 +11,14 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar, Self
 
 import pydantic
 import torch
 from torch import Tensor
 
 from kcal.checks import as_covariance
-from kcal.errors import InputError
+from kcal.errors import FileError, InputError
 from kcal.io.camera_file import RETIRED_FIELDS, CameraFile, camera_to_file
 from kcal.io.file_summary import RigSummary
 from kcal.io.record import Packed, Record
@@ -187,6 +187,16 @@ class RigFile(NativeFile):
         if self.calibration and not math.isclose(self.calibration.baseline_m, length, rel_tol=1e-6):
             raise ValueError(f"baseline_m is {self.calibration.baseline_m:g}, but the translation is {length:g} m long")
         return self
+
+    @classmethod
+    def parse(cls, content: Any, source: str) -> Self:
+        """See `NativeFile.parse`."""
+        if isinstance(content, dict) and content.get("kcal") == cls.KIND and content.get("version") == 3:
+            many = len(content["names"]) if isinstance(content.get("names"), list) else "many"
+            raise FileError(
+                f"{source}: a rig of {many} cameras; a rig of two is needed here (kcal locate and kcal show take both)"
+            )
+        return super().parse(content, source)
 
     def _size(self) -> int:
         return len(self.left.coefficients) + len(self.right.coefficients) + 2 * len(INTRINSICS) + 6

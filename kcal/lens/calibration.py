@@ -209,7 +209,6 @@ class RigCalibration:
         sources: what the rig was solved from, where that is more than boards.
         warnings: what should be doubted of it, a sentence each, for example that its geometry is weak.
         pixel_sigma: noise of marks along each axis, pixels, as stated when the rig was solved; None if nobody did.
-    =======
         contradictions: which source contradicts the others beyond reasonable doubt, a sentence each.
         relocked: when only the cameras' attitudes were solved again, and from what.
         baseline_m: distance between the cameras' centers, meters; must be the length of the translation.

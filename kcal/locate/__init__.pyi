@@ -22,6 +22,13 @@ from kcal.locate.multiview import ViewsResult as ViewsResult
 from kcal.locate.disparity import DisparityRanges as DisparityRanges
 from kcal.locate.disparity import RangeImage as RangeImage
 
+# Any number of cameras
+from kcal.locate.multi_localizer import MultiViewLocalizer as MultiViewLocalizer
+from kcal.locate.multi_localizer import ViewsLocalization as ViewsLocalization
+from kcal.locate.station_positions import locate_views as locate_views
+from kcal.locate.view_marks import read_views as read_views
+from kcal.locate.view_marks import ViewMarks as ViewMarks
+
 # Points on the ground
 from kcal.locate.ground import locate_on_ground as locate_on_ground
 from kcal.locate.ground import GroundPlaces as GroundPlaces

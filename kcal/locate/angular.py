@@ -11,6 +11,7 @@ the rays miss each other across the epipolar plane.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -115,7 +116,7 @@ def _axes(axis: Tensor) -> Tensor:
     return torch.stack([axis, torch.linalg.cross(second, axis), second], -1)
 
 
-def triangulate_angular(cam_from_world: Tensor, rays: Tensor) -> Found:
+def triangulate_angular(cam_from_world: Tensor, rays: Tensor, seen: Tensor | None = None) -> Found:
     """Points nearest in angle to the rays of two or more cameras, in closed form.
 
     Two cameras: `triangulate_pairs`. More: the rows `ray x (R X + t) = 0` of Eq. 9 are solved for the point's
@@ -125,9 +126,10 @@ def triangulate_angular(cam_from_world: Tensor, rays: Tensor) -> Found:
     Args:
         cam_from_world: (..., C, 3, 4) matrices [R | t]; leading dimensions broadcast with those of `rays`.
         rays: (..., N, C, 3) directions in each camera's frame, any length but zero.
+        seen: (..., N, C) bool: which cameras saw what, two at least; what is False is not read. All, if left out.
 
     Returns:
-        Points in the world frame; the first camera's center where not valid.
+        Points in the world frame; the center of the first camera that saw it where not valid.
 
     Raises:
         InputError: wrong shapes or dtypes.
@@ -148,14 +150,30 @@ def triangulate_angular(cam_from_world: Tensor, rays: Tensor) -> Found:
         return Found(world, found.valid)
     centers = -(rotation.mT @ translation[..., None])[..., 0]
     length = torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
-    usable = (torch.isfinite(length) & (length > 0)).all(-2, keepdim=True)
+    usable = torch.isfinite(length) & (length > 0)
     units = torch.where(usable, rays, rays.new_tensor([0.0, 0.0, 1.0]))
     units = units / torch.linalg.vector_norm(units, dim=-1, keepdim=True)
-    directions = [units[..., c, :] @ rotation[..., c, :, :] for c in range(rays.shape[-2])]
-    first = centers[..., :1, :]
-    points, valid = _several(directions, first[..., None, :] - centers[..., None, :, :])
-    valid = valid & usable[..., 0, 0]
+    directions = torch.stack([units[..., c, :] @ rotation[..., c, :, :] for c in range(rays.shape[-2])], -2)
+    if seen is None:
+        ray, first, sound = directions[..., 0, :], centers[..., :1, :], usable.all(-2)[..., 0]
+    else:
+        one = first_seen(seen)[..., None]
+        ray, first = (one * directions).sum(-2), (one * centers[..., None, :, :]).sum(-2)
+        sound = (usable[..., 0] | ~seen).all(-1) & (seen.sum(-1) > 1)
+        ray = torch.where(sound[..., None], ray, ray.new_tensor([0.0, 0.0, 1.0]))
+    points, valid = _several(ray, directions.unbind(-2), first[..., None, :] - centers[..., None, :, :], seen)
+    valid = valid & sound
     return Found(first + torch.where(valid[..., None], points, 0.0), valid)
+
+
+def first_seen(seen: Tensor) -> Tensor:
+    """(..., C) bool: true for the first camera alone of those that saw something.
+
+    Example:
+        >>> first_seen(torch.tensor([False, True, True])).tolist()
+        [False, True, False]
+    """
+    return seen & (seen.to(torch.int64).cumsum(-1) == 1)
 
 
 def checked_views(cam_from_world: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
@@ -171,14 +189,14 @@ def checked_views(cam_from_world: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]
     return cam_from_world, rays
 
 
-def _several(world: list[Tensor], shifts: Tensor) -> tuple[Tensor, Tensor]:
-    """Points from the first camera; `shifts` (..., 1, C, 3) lead from each center to the first one."""
+def _several(ray: Tensor, world: Sequence[Tensor], shifts: Tensor, seen: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Points from the camera with the ray `ray`; `shifts` (..., 1 or N, C, 3) lead from each center to its own."""
     spread = torch.linalg.vector_norm(shifts, dim=-1).amax(-1)
     spread = torch.where(spread > 0, spread, 1.0)
     shifts = shifts / spread[..., None, None]
-    ray = world[0]
     e1, e2 = side_axes(ray)
-    weights: list[Tensor | None] = [None] * len(world)
+    counts = [None] * len(world) if seen is None else [one.to(ray.dtype) for one in seen.unbind(-1)]
+    weights: list[Tensor | None] = list(counts)
     for _ in range(2):
         rows = [_across_ray(w, (e1, e2, shifts[..., c, :], -ray), weights[c]) for c, w in enumerate(world)]
         p, q, u, r, v, s, f, g, h = (torch.stack(terms).sum(0) for terms in zip(*rows, strict=True))
@@ -191,9 +209,11 @@ def _several(world: list[Tensor], shifts: Tensor) -> tuple[Tensor, Tensor]:
         a = (r * f - q * g) * scale - first * inverse
         b = (p * g - q * f) * scale - second * inverse
         direction = ray + a[..., None] * e1 + b[..., None] * e2
-        seen = [direction + inverse[..., None] * shifts[..., c, :] for c in range(len(world))]
-        weights = [(point * point).sum(-1).clamp_min(EPIPOLE**2).reciprocal() for point in seen]
-    ahead = torch.stack([(point * w).sum(-1) > 0 for point, w in zip(seen, world, strict=True)]).all(0)
+        places = [direction + inverse[..., None] * shifts[..., c, :] for c in range(len(world))]
+        nearness = [(point * point).sum(-1).clamp_min(EPIPOLE**2).reciprocal() for point in places]
+        weights = [near if own is None else near * own for near, own in zip(nearness, counts, strict=True)]
+    ahead = torch.stack([(point * w).sum(-1) > 0 for point, w in zip(places, world, strict=True)], -1)
+    ahead = (ahead if seen is None else ahead | ~seen).all(-1)
     valid = determined & (inverse * HORIZON > 1.0) & ahead
     return spread[..., None] * direction / torch.where(valid, inverse, torch.inf)[..., None], valid
 

@@ -68,7 +68,7 @@ def point_features(columns: PositionColumns) -> Iterator[bytes]:
 def region_features(columns: PositionColumns, run: Located) -> Iterator[bytes]:
     """A polygon for each position: its 95 % region, a long and slightly skewed ellipse."""
     names = iter([columns.names[place] for place in np.flatnonzero(columns.located).tolist()])
-    for block in ring_blocks(columns, run.origin):
+    for block in ring_blocks(columns, run.origin, plain=run.feet is not None):
         corners = np.ascontiguousarray(block[..., ::-1]).round(CORNER_DECIMALS)
         beyond = (np.abs(block[..., 1]).max(-1) > 180.0).tolist()
         # Section 3.1.6: closed, counterclockwise; section 3.1.9: a polygon across the antimeridian is cut in two.

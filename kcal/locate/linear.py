@@ -12,7 +12,7 @@ from kcal.locate.angular import HORIZON, checked_views
 _LEAST_GAP = 1e-18
 
 
-def triangulate_linear(cam_from_world: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
+def triangulate_linear(cam_from_world: Tensor, rays: Tensor, seen: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """The point nearest to all rays in the sense of Eq. 9: the right singular vector of the smallest singular value.
 
     For each camera the three rows of `ray x (R X + t) = 0` are stacked. Eq. 9 has the first two of them in pixels;
@@ -28,6 +28,7 @@ def triangulate_linear(cam_from_world: Tensor, rays: Tensor) -> tuple[Tensor, Te
         cam_from_world: (..., C, 3, 4) matrices [R | t] with R a rotation; leading dimensions broadcast with those of
             `rays`. C is at least 2.
         rays: (..., N, C, 3) directions in each camera's frame, any length but zero.
+        seen: (..., N, C) bool: which cameras saw what, two at least; what is False is not read. All, if left out.
 
     Returns:
         points (..., N, 3) in the world frame, float64, and valid (..., N): true where the point is finite, determined
@@ -55,11 +56,15 @@ def triangulate_linear(cam_from_world: Tensor, rays: Tensor) -> tuple[Tensor, Te
     spread = 2.0 * torch.where(spread > 0, spread, 1.0)
     local = (rotation @ (middle - centers)[..., None]) / spread[..., None, None]
 
+    counts = torch.ones_like(rays[..., 0], dtype=torch.bool) if seen is None else seen
     length = torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
-    usable = (torch.isfinite(length) & (length > 0)).all(-2, keepdim=True)
+    usable = ((torch.isfinite(length) & (length > 0))[..., 0] | ~counts).all(-1) & (counts.sum(-1) > 1)
+    usable = usable[..., None, None]
     ahead = rays.new_tensor([0.0, 0.0, 1.0])
     units = torch.where(usable, rays, ahead)
     units = units / torch.linalg.vector_norm(units, dim=-1, keepdim=True)
+    if seen is not None:
+        units = torch.where(seen[..., None], units, 0.0)
 
     cameras = torch.cat([rotation, local], -1)[..., None, :, :, :]
     # (..., N, C, 3, 4): the ray crossed with each column of [R | t].
@@ -71,7 +76,7 @@ def triangulate_linear(cam_from_world: Tensor, rays: Tensor) -> tuple[Tensor, Te
     local_points = torch.where(finite, solution[..., :3], 0.0) / torch.where(finite, weight, 1.0)
 
     in_cameras = (cameras[..., :3] @ local_points[..., None, :, None] + cameras[..., 3:])[..., 0]
-    ahead_of_all = ((in_cameras * units).sum(-1) > 0).all(-1, keepdim=True)
+    ahead_of_all = (((in_cameras * units).sum(-1) > 0) | ~counts).all(-1, keepdim=True)
     valid = finite & ahead_of_all & usable[..., 0, :]
     points = middle + spread[..., None, :] * torch.where(valid, local_points, 0.0)
     return points, valid[..., 0]

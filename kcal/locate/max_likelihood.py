@@ -26,6 +26,7 @@ from kcal.lens.camera_stack import project_each
 from kcal.lens.dispatch import is_traced, known_true
 from kcal.lens.pose import side_axes, step_rows
 from kcal.lens.projection import Projection
+from kcal.locate.bent_light import Surroundings, length_of_one, lifted
 
 # Evaluations. Graphs cannot stop early: with three they err by 4e-6 of the noise where marks are 10 px off, with two by
 # 1e-2.
@@ -45,7 +46,7 @@ Six = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 
 
 class RelativeCamera(NamedTuple):
-    """A camera and its pose from the first one: points_cam = rotation @ points + translation."""
+    """A camera and its pose: points_cam = rotation @ points + translation, (3,), or (..., 3, N) for each point."""
 
     camera: Camera
     rotation: Tensor
@@ -85,6 +86,7 @@ class _Evaluated(NamedTuple):
     residual: Tensor
     turned: Tensor
     projections: tuple[Projection, ...]
+    slope: Tensor
 
 
 class _Fixed(NamedTuple):
@@ -99,6 +101,8 @@ class _Fixed(NamedTuple):
         usable: (..., N).
         weight: (..., 2 C, 2 C, N) or None.
         wanted: for each camera the parameters by which derivatives are formed.
+        start: (..., N) the first guess of ρ.
+        around: what there is besides pixels.
     """
 
     cameras: Sequence[Camera]
@@ -109,6 +113,8 @@ class _Fixed(NamedTuple):
     usable: Tensor
     weight: Tensor | None
     wanted: tuple[tuple[int, ...], ...]
+    start: Tensor
+    around: Surroundings
 
 
 def most_likely(
@@ -121,35 +127,42 @@ def most_likely(
     *,
     by_camera: bool = False,
     differentiated: bool = False,
+    around: Surroundings | None = None,
 ) -> PointFit:
     """Minimize the weighted squares of the reprojection errors, each point on its own.
 
     Args:
-        cameras: C cameras; the first has the identity as its pose.
+        cameras: C cameras; the points' frame is the first one's where its pose is the identity.
         scale: meters, the size of the rig; sets the unit of ρ.
-        start: unit directions (..., N, 3) in the first camera's frame, and ρ (..., N).
+        start: unit directions (..., N, 3) in that frame, and ρ (..., N).
         pixels: (..., 2 C, N): u, v of the first camera, u, v of the second, ...
         usable: (..., N); what is not gets a harmless answer.
         weight: (..., 2 C, 2 C, N) inverse covariance of the pixels; None: independent with a variance of one.
         by_camera: also form derivatives by the cameras' own parameters (`projections[c].by_camera`).
         differentiated: let gradients flow to pixels, weights, cameras and poses.
+        around: what there is besides pixels, if anything.
     """
     base = start[0].detach().mT
     sides = torch.stack([side.mT for side in side_axes(start[0].detach())], -3)
     lenses = [each.camera for each in cameras]
     wanted = tuple(tuple(range(lens.values.shape[-1])) if by_camera else () for lens in lenses)
     rotation = torch.stack([each.rotation for each in cameras])
-    shift = torch.stack([each.translation for each in cameras]) / scale
+    moves = [each.translation if each.translation.ndim > 1 else each.translation[:, None] for each in cameras]
+    shift = torch.stack(moves, -3) / scale
     turned_sides = rotation[:, None] @ sides[..., None, :, :, :]
-    columns = torch.cat([turned_sides, shift[:, None, :, None].expand_as(turned_sides[..., :1, :, :])], -3)
+    columns = torch.cat([turned_sides, shift[..., None, :, :].expand_as(turned_sides[..., :1, :, :])], -3)
     turned_base = rotation @ base[..., None, :, :]
-    fixed = _Fixed(lenses, scale, turned_base, columns, pixels, usable, weight, tuple(() for _ in cameras))
+    nothing = tuple(() for _ in cameras)
+    first = torch.where(usable, start[1], 0.0).detach()
+    fixed = _Fixed(
+        lenses, scale, turned_base, columns, pixels, usable, weight, nothing, first, around or Surroundings()
+    )
     whole = fixed._replace(wanted=wanted)
     # After a step, the evaluation that finds nothing left to move is also the last one.
     later = fixed if differentiated or is_traced() else whole
     zero = torch.zeros_like(start[1])
     with torch.no_grad():
-        theta = torch.stack([zero, zero, torch.where(usable, start[1], 0.0)], -2)
+        theta = torch.stack([zero, zero, first], -2)
         best, step, cost = theta, torch.zeros_like(theta), torch.full_like(zero, torch.inf)
         length, noise = torch.full_like(zero, torch.inf), _least_noise(weight)
         for number in range(_TRACED_STEPS if is_traced() else _MOST_STEPS):
@@ -157,8 +170,8 @@ def most_likely(
             # After so short a step, rounding may raise the cost.
             better = (at.cost <= cost) | (length <= _SHORT_STEP * noise)
             every = known_true(better)
-            covariance = _covariance_at(at, usable)
-            newton = -_product(covariance, _cost_slope(at))
+            covariance = _covariance_at(at, fixed)
+            newton = -_product(covariance, at.slope)
             moved = (at.jacobian * newton[..., None, :]).sum(-3)
             farthest = moved.abs().amax(-2)
             if every:
@@ -179,12 +192,12 @@ def most_likely(
         else:
             theta = best
     if differentiated:
-        inverse = tuple(value.detach() for value in _covariance_at(_evaluate(fixed, theta), usable))
+        inverse = tuple(value.detach() for value in _covariance_at(_evaluate(fixed, theta), fixed))
         for _ in range(_CHORDS):
             at = _evaluate(fixed, theta)
-            theta = theta - torch.where(usable[..., None, :], _product(inverse, _cost_slope(at)), 0.0)
+            theta = theta - torch.where(usable[..., None, :], _product(inverse, at.slope), 0.0)
     at = _evaluate(whole, theta)
-    return _fit_at(at, theta, sides, _covariance_at(at, usable))
+    return _fit_at(at, theta, sides, _covariance_at(at, fixed))
 
 
 def _least_noise(weight: Tensor | None) -> Tensor | float:
@@ -197,8 +210,13 @@ def _evaluate(fixed: _Fixed, theta: Tensor) -> _Evaluated:
     e1, e2, shift = fixed.columns.unbind(-3)
     turned = fixed.base + a * e1 + b * e2
     seen = turned + inverse * shift
+    around = fixed.around
+    if around.up is not None:
+        seen = seen + lifted(seen, around, length_of_one(fixed.scale, inverse))
     with torch.no_grad():
         good = fixed.usable[..., None, :].expand(seen[..., 2, :].shape)
+        if around.present is not None:
+            good = good & around.present
         wide = [camera.model.wide for camera in fixed.cameras]
         if not all(wide):
             # A perspective lens sees nothing beside and behind the camera.
@@ -219,32 +237,40 @@ def _evaluate(fixed: _Fixed, theta: Tensor) -> _Evaluated:
         slopes = torch.cat([slopes[..., :2, :, :], (slopes[..., 2, :, :] + moved)[..., None, :, :]], -3)
     jacobian = slopes.movedim(-4, -3).flatten(-3, -2)
     predicted = torch.cat([projection.pixels for projection in projections], -2)
-    residual = torch.where(fixed.usable[..., None, :], predicted - fixed.pixels, 0.0)
+    counts = fixed.usable[..., None, :]
+    if around.present is not None:
+        counts = counts & around.present.repeat_interleave(2, -2)
+        jacobian = torch.where(counts[..., None, :, :], jacobian, 0.0)
+    residual = torch.where(counts, predicted - fixed.pixels, 0.0)
     weighted = jacobian
     if fixed.weight is None:
         cost = (residual * residual).sum(-2)
     else:
         weighted = (fixed.weight[..., None, :, :, :] * jacobian[..., None, :, :]).sum(-2)
         cost = (fixed.weight * residual[..., None, :, :] * residual[..., None, :]).sum((-3, -2))
-    return _Evaluated(cost, jacobian, weighted, residual, turned, tuple(projections))
+    slope = (weighted * residual[..., None, :, :]).sum(-2)
+    if around.held is not None:
+        moved = torch.stack([*theta.unbind(-2)[:2], theta[..., 2, :] - fixed.start], -2)
+        off = (around.held * moved).sum(-2)
+        cost, slope = cost + off * off, slope + around.held * off[..., None, :]
+    return _Evaluated(cost, jacobian, weighted, residual, turned, tuple(projections), slope)
 
 
-def _normal_matrix(at: _Evaluated, usable: Tensor) -> Six:
+def _normal_matrix(at: _Evaluated, fixed: _Fixed) -> Six:
     """Jᵀ W J by its six entries 11, 12, 13, 22, 23, 33; the identity where a point is not usable."""
     j, w = at.jacobian.unbind(-3), at.weighted.unbind(-3)
     places = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
     entries = torch.stack([j[row] * w[column] for row, column in places], -3).sum(-2)
+    if fixed.around.held is not None:
+        held = fixed.around.held.unbind(-2)
+        entries = entries + torch.stack([held[row] * held[column] for row, column in places], -2)
     still = entries.new_tensor([[float(row == column)] for row, column in places])
-    return torch.where(usable[..., None, :], entries, still).unbind(-2)  # type: ignore[return-value]
+    return torch.where(fixed.usable[..., None, :], entries, still).unbind(-2)  # type: ignore[return-value]
 
 
-def _cost_slope(at: _Evaluated) -> Tensor:
-    return (at.weighted * at.residual[..., None, :, :]).sum(-2)
-
-
-def _covariance_at(at: _Evaluated, usable: Tensor) -> Six:
+def _covariance_at(at: _Evaluated, fixed: _Fixed) -> Six:
     """Of (a, b, ρ), from the noise of the pixels."""
-    return _inverse_of_six(_normal_matrix(at, usable))
+    return _inverse_of_six(_normal_matrix(at, fixed))
 
 
 def _inverse_of_six(m: Six) -> Six:

@@ -14,8 +14,8 @@ from kcal.lens.camera import Camera
 from kcal.lens.dispatch import is_differentiated
 from kcal.locate.angular import triangulate_angular
 from kcal.locate.linear import triangulate_linear
-from kcal.locate.max_likelihood import RelativeCamera, inverse_covariances, most_likely, position_slope, symmetric
-from kcal.locate.stereo import PositionStatus, flag_positions
+from kcal.locate.stereo import PositionStatus, flag_positions, reprojection_errors
+from kcal.locate.views import PosedCameras, fit_views
 
 Method = Literal["linear", "angular", "likelihood"]
 
@@ -27,8 +27,9 @@ class ViewsResult(NamedTuple):
         points: (..., N, 3) meters in the world frame; the first camera's center unless the status is OK.
         covariance: (..., N, 3, 3) from the pixels' noise, to first order; an infinite diagonal unless OK.
         status: (..., N) int8, codes of `PositionStatus`; PARALLEL stands for all rays that do not meet in front of
-            every camera.
-        reprojection: (..., N, C) distance in px between mark and reprojected point; zero unless OK.
+            every camera that saw the point, NOT_FINITE for points that fewer than two cameras saw.
+        reprojection: (..., N, C) distance in px between mark and reprojected point; zero unless OK, and where a camera
+            did not see the point.
     """
 
     points: Tensor
@@ -38,7 +39,7 @@ class ViewsResult(NamedTuple):
 
 
 class TriangulateViews(nn.Module):
-    """Points from their pixels in two or more cameras, with a covariance and a status each.
+    """Points from their pixels in any two or more of several cameras, with a covariance and a status each.
 
     Methods: `linear` is Eq. 9 by singular values, `angular` the closed form in angles, three to ten times faster and
     as accurate, `likelihood` (the default) the Gauss-Newton minimum of the reprojection errors, weighed by the pixels'
@@ -96,109 +97,86 @@ class TriangulateViews(nn.Module):
         self.method = method
         self.pixel_sigma = float(pixel_sigma)
         self.register_buffer("cam_from_world", poses.detach().clone())
-        if not float(self._scale()) > 0:
+        center = self.posed.center
+        if not float((center - center[0]).norm(dim=-1).amax()) > 0:
             raise DegenerateError("all cameras stand in the same place: no range can be measured")
 
-    def _from_first(self) -> tuple[Tensor, Tensor]:
-        """Rotations (C, 3, 3) and translations (C, 3) from the first camera's frame."""
-        rotation, translation = self.cam_from_world[:, :, :3], self.cam_from_world[:, :, 3]
-        turn = rotation @ rotation[0].mT
-        return turn, translation - (turn @ translation[0][:, None])[..., 0]
-
-    def _scale(self) -> Tensor:
-        return torch.linalg.vector_norm(self._from_first()[1], dim=-1).amax()
+    @property
+    def posed(self) -> PosedCameras:
+        """The cameras as they stand."""
+        cameras: list[Camera] = list(self.cameras)  # type: ignore[arg-type]
+        turn, shift = self.cam_from_world[:, :, :3], self.cam_from_world[:, :, 3]
+        return PosedCameras(cameras, turn, -(turn.mT @ shift[..., None])[..., 0])
 
     def forward(self, pixels: Tensor, cov: Tensor | None = None) -> ViewsResult:
         """Triangulate pixels (..., N, C, 2).
 
         Args:
-            pixels: integer coordinates at pixel centers.
+            pixels: integer coordinates at pixel centers; NaN where a camera did not see a point.
             cov: (..., N, C, 2, 2) covariance of each pixel, or broadcastable to it.
 
         Raises:
             InputError: not floating point, or wrong shapes.
         """
         pixels = as_points("pixels", pixels, 2)
-        count = len(self.cameras)
+        count, lead = len(self.cameras), pixels.shape[:-2]
         if pixels.ndim < 3 or pixels.shape[-2] != count:
             raise InputError(f"pixels: shape (..., N, {count}, 2) is needed, got {tuple(pixels.shape)}")
-        finite = torch.isfinite(pixels).all(-1).all(-1)
-        cameras: list[Camera] = list(self.cameras)  # type: ignore[arg-type]
-        middle = torch.stack([camera.center.detach() for camera in cameras])
-        pixels = torch.where(finite[..., None, None], pixels, middle)
-        rays, seen, inside = [], [], []
-        for number, camera in enumerate(cameras):
-            ray, valid = camera.unproject(pixels[..., number, :])
-            rays.append(ray)
-            seen.append(valid)
-            inside.append(camera.inside(pixels[..., number, :]))
-        weight, sound = inverse_covariances(_joint_covariance(cov, pixels))
-        turn, shift = self._from_first()
-        solve = triangulate_linear if self.method == "linear" else triangulate_angular
-        # The first camera's frame: a far world origin costs no digits.
-        points, valid = solve(torch.cat([turn, shift[..., None]], -1), torch.stack(rays, -2))
-        code = torch.zeros(points.shape[:-1], dtype=torch.int8, device=points.device)
+        cov = checked_views_covariance(cov, pixels)
+        pixels = pixels.reshape(-1, count, 2)
+        differentiated = self.method == "likelihood" and is_differentiated(
+            pixels, *self.parameters(), *([] if cov is None else [cov])
+        )
+        posed, finite = self.posed, torch.isfinite(pixels).all(-1)
+        views = fit_views(posed, pixels, finite, noise=self.pixel_sigma, cov=cov, differentiated=differentiated)
+        code, off = views.status, finite & ~views.used
+        with torch.no_grad():
+            inside = [camera.inside(pixels[..., c, :]) for c, camera in enumerate(posed.cameras)]
+        away = views.behind(posed.center) | (views.fit.inverse <= 0)
         for condition, status in (
-            (~valid, PositionStatus.PARALLEL),
-            (~torch.stack(seen).all(0), PositionStatus.OUTSIDE_LENS),
-            (~torch.stack(inside).all(0), PositionStatus.OUTSIDE_IMAGE),
-            (~sound, PositionStatus.BAD_COVARIANCE),
-            (~finite, PositionStatus.NOT_FINITE),
+            ((code == int(PositionStatus.OK)) & away, PositionStatus.PARALLEL),
+            (code == int(PositionStatus.BEARING_ONLY), PositionStatus.NOT_FINITE),
+            (off.any(-1), PositionStatus.OUTSIDE_LENS),
+            ((finite & ~torch.stack(inside, -1)).any(-1), PositionStatus.OUTSIDE_IMAGE),
+            (views.status == int(PositionStatus.BAD_COVARIANCE), PositionStatus.BAD_COVARIANCE),
         ):
             code = flag_positions(code, condition, status)
-        return self._refined(cameras, pixels, points, rays[0], code, weight)
-
-    def _refined(
-        self, cameras: list[Camera], pixels: Tensor, points: Tensor, ray: Tensor, code: Tensor, weight: Tensor | None
-    ) -> ViewsResult:
-        turn, shift = self._from_first()
-        scale = torch.linalg.vector_norm(shift, dim=-1).amax()
         ok = code == int(PositionStatus.OK)
-        with torch.no_grad():
-            distance = torch.where(ok, torch.linalg.vector_norm(points, dim=-1), 1.0)
-            ahead = torch.where(ok[..., None], points / distance[..., None], ray)
-        posed = [RelativeCamera(*each) for each in zip(cameras, turn, shift, strict=True)]
-        learns = self.method == "likelihood" and is_differentiated(
-            pixels, *self.parameters(), *([] if weight is None else [weight])
-        )
-        fit = most_likely(
-            posed, scale, (ahead, scale / distance), pixels.flatten(-2).mT, ok, weight, differentiated=learns,
-        )  # fmt: skip
-        if self.method == "likelihood":
-            ok = ok & (fit.inverse > 0)
-            code = flag_positions(code, (code == int(PositionStatus.OK)) & ~ok, PositionStatus.PARALLEL)
-            points = (scale / torch.where(ok, fit.inverse, 1.0))[..., None] * fit.direction.mT
-        points = torch.where(ok[..., None], points, 0.0)
-        rotation, translation = self.cam_from_world[0, :, :3], self.cam_from_world[0, :, 3]
-        variance = self.pixel_sigma**2 if weight is None else 1.0
-        slope = rotation.mT @ position_slope(fit, scale, ok)
-        covariance = variance * slope @ symmetric(fit.covariance) @ slope.mT
-        misses = []
-        for number, camera in enumerate(posed):
-            again, _ = camera.camera.project(
-                torch.where(ok[..., None], points, ray) @ camera.rotation.mT + camera.translation
-            )
-            misses.append(torch.where(ok[..., None], again - pixels[..., number, :], 0.0))
-        return ViewsResult(
-            points=(points - translation) @ rotation,
-            covariance=torch.where(
-                ok[..., None, None], covariance, torch.diag(covariance.new_full((3,), float("inf")))
-            ),
+        points, misses = views.points(ok), reprojection_errors(views.fit.residual)
+        if self.method != "likelihood":
+            points, misses = self._in_closed_form(posed, pixels, views.used, ok)
+        result = ViewsResult(
+            points=torch.where(ok[..., None], points, posed.center[0]),
+            covariance=views.covariance(ok),
             status=code,
-            reprojection=torch.linalg.vector_norm(torch.stack(misses, -2), dim=-1),
+            reprojection=torch.where(ok[..., None] & views.used, misses, 0.0),
         )
+        return ViewsResult(*(value.reshape(*lead[:-1], lead[-1], *value.shape[1:]) for value in result))
+
+    def _in_closed_form(self, posed: PosedCameras, pixels: Tensor, used: Tensor, ok: Tensor) -> tuple[Tensor, Tensor]:
+        """Points (N, 3) and what they miss the marks (N, C) by, px, by the other methods."""
+        used = used & ok[..., None]
+        middle = torch.stack([camera.center.detach() for camera in posed.cameras])
+        marks = torch.where(used[..., None], pixels, middle)
+        rays = torch.stack([camera.unproject(marks[..., c, :])[0] for c, camera in enumerate(posed.cameras)], -2)
+        solve = triangulate_linear if self.method == "linear" else triangulate_angular
+        found, _ = solve(posed.matrices, rays, used)
+        misses = []
+        for c, (camera, turn) in enumerate(zip(posed.cameras, posed.rotation, strict=True)):
+            seen = (found + (posed.center[0] - posed.center[c])) @ turn.T
+            seen = torch.where(used[..., c, None], seen, seen.new_tensor([0.0, 0.0, 1.0]))
+            misses.append(torch.where(used[..., c, None], camera.project(seen)[0] - marks[..., c, :], 0.0))
+        return found + posed.center[0], reprojection_errors(torch.cat(misses, -1).mT)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:
         return super()._apply(keep_float64(fn), recurse)
 
 
-def _joint_covariance(cov: Tensor | None, pixels: Tensor) -> Tensor | None:
-    """Covariances (..., N, C, 2, 2) of each pixel as blocks along the diagonal of (..., N, 2 C, 2 C)."""
+def checked_views_covariance(cov: Tensor | None, pixels: Tensor) -> Tensor | None:
+    """(N, C, 2, 2) float64 of covariances that broadcast to those of pixels (..., N, C, 2); all rows in one axis."""
     if cov is None:
         return None
     cov = as_points("cov", cov, 2)
     if cov.ndim < 2 or cov.shape[-2] != 2:
         raise InputError(f"cov: shape (..., N, {pixels.shape[-2]}, 2, 2) is needed, got {tuple(cov.shape)}")
-    still = torch.eye(pixels.shape[-2], dtype=cov.dtype, device=cov.device)
-    blocks = cov.expand(*pixels.shape, 2)[..., :, :, None, :] * still[:, None, :, None]  # (..., N, C, 2, C, 2)
-    return blocks.flatten(-2).flatten(-3, -2)
+    return cov.expand(*pixels.shape, 2).reshape(-1, pixels.shape[-2], 2, 2)

@@ -63,12 +63,14 @@ class Located:
 
     `columns` contains the positions as arrays, `positions` gives each row as a `Position`.
 
+    `feet` (N, 3) are the places, meters, from which bearings and ranges of the rows count; None: the left camera.
+
     `included` names the errors that intervals and covariances cover; `geoid` is the grid of the geoid heights, None
     without one. `rows` is the length of the table of which the positions are a sample, None if they are all.
     """
 
     columns: PositionColumns
-    cameras: tuple[Viewpoint, Viewpoint]
+    cameras: tuple[Viewpoint, ...]
     origin: Origin
     heading_deg: float
     pitch_deg: float
@@ -77,6 +79,7 @@ class Located:
     included: tuple[str, ...] = ("marks",)
     geoid: str | None = None
     rows: int | None = None
+    feet: Tensor | None = None
 
     @functools.cached_property
     def positions(self) -> tuple[Position, ...]:

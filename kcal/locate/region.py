@@ -30,7 +30,7 @@ _AT_ONCE = 512
 Ring = list[tuple[float, float]]
 
 
-def region_outline(enu: Tensor, covariance: Tensor, share: float = REGION_SHARE) -> Tensor:
+def region_outline(enu: Tensor, covariance: Tensor, share: float = REGION_SHARE, *, plain: bool = False) -> Tensor:
     """Outlines of the horizontal regions that contain the true positions with a probability of `share`.
 
     The ellipse is drawn where errors are Gaussian, in X / |X|² of the horizontal position, and carried back.
@@ -39,6 +39,7 @@ def region_outline(enu: Tensor, covariance: Tensor, share: float = REGION_SHARE)
         enu: (..., 3) meters from the left camera.
         covariance: (..., 3, 3) to first order.
         share: probability.
+        plain: ellipses in meters: of lines of sight from several places.
 
     Returns:
         (..., 72, 2) east, north in meters, counterclockwise.
@@ -49,16 +50,16 @@ def region_outline(enu: Tensor, covariance: Tensor, share: float = REGION_SHARE)
         >>> outline[:, 1].min().round().item(), outline[:, 1].max().round().item()
         (4554.0, 5543.0)
     """
-    return torch.stack(_level_outline(enu[..., :2].double(), covariance[..., :2, :2].double(), share), -1)
+    return torch.stack(_level_outline(enu[..., :2].double(), covariance[..., :2, :2].double(), share, plain), -1)
 
 
-def _level_outline(place: Tensor, spread: Tensor, share: float) -> tuple[Tensor, Tensor]:
-    """East and north (..., 72) each: one by one they take a third of the time."""
+def _level_outline(place: Tensor, spread: Tensor, share: float, plain: bool = False) -> tuple[Tensor, Tensor]:
+    """East and north (..., 72) each: one by one they take a third of the time. `plain`: ellipses in meters."""
     squared = place.square().sum(-1)
     some = torch.where(squared > 0, squared, 1.0)
     reach = math.sqrt(-2.0 * math.log(1.0 - share))
     along = (place * (spread @ place[..., None])[..., 0]).sum(-1)
-    wide = (squared == 0) | (reach * along.sqrt() > _TOO_WIDE * squared)
+    wide = (squared == 0) | (reach * along.sqrt() > _TOO_WIDE * squared) | plain
     still = torch.eye(2, dtype=torch.float64)
     slope = (still - 2.0 * place[..., :, None] * place[..., None, :] / some[..., None, None]) / some[..., None, None]
     root = _covariance_root(torch.where(wide[..., None, None], spread, slope @ spread @ slope.mT))
@@ -81,19 +82,22 @@ def _covariance_root(matrix: Tensor) -> Tensor:
 
 def region_rings(located: Located) -> list[Ring]:
     """The ring of each position: (latitude, longitude), closed, counterclockwise, longitudes without a jump."""
-    blocks = ring_blocks(located.columns, located.origin)
+    blocks = ring_blocks(located.columns, located.origin, plain=located.feet is not None)
     return [[(lat, lon) for lat, lon in ring] for block in blocks for ring in block.tolist()]
 
 
-def ring_blocks(columns: PositionColumns, origin: Origin) -> Iterator[NDArray[np.float64]]:
-    """The rings (M, 73, 2) of those rows that have a position, some rows at a time."""
+def ring_blocks(columns: PositionColumns, origin: Origin, *, plain: bool = False) -> Iterator[NDArray[np.float64]]:
+    """The rings (M, 73, 2) of those rows that have a position, some rows at a time.
+
+    Only lines of sight from one place skew a region; `plain` ones are ellipses.
+    """
     upper = NUMBERS.index("cov_ee_m2") + np.array([[0, 1], [1, 3]])
     rotation, translation = anchor(origin)
     located = torch.from_numpy(columns.numbers[columns.located])
     # Splitting no rows gives one part, of no rows.
     for part in located.split(_AT_ONCE) if len(located) else ():
         east, north, up, lon_of_point = (part[:, NUMBERS.index(name)] for name in ("east_m", "north_m", "up_m", "lon"))
-        outline = _level_outline(torch.stack([east, north], -1), part[:, upper], REGION_SHARE)
+        outline = _level_outline(torch.stack([east, north], -1), part[:, upper], REGION_SHARE, plain)
         x, y, z = (
             row[0] * outline[0] + row[1] * outline[1] + (row[2] * up[:, None] + offset)
             for row, offset in zip(rotation, translation, strict=True)

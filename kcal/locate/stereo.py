@@ -27,7 +27,10 @@ _PARALLEL = 1e-9
 
 
 class PositionStatus(enum.IntEnum):
-    """What became of a pixel pair. Only `OK` comes with a point; `PARALLEL` still has a bearing and a nearest range."""
+    """What became of a pixel pair. Only `OK` comes with a point; `PARALLEL` still has a bearing and a nearest range.
+
+    CONTRADICTION, of `MultiViewLocalizer`: the views are not of one point, and which is wrong cannot be told.
+    """
 
     OK = 0
     OUTSIDE_LENS = 1
@@ -38,6 +41,7 @@ class PositionStatus(enum.IntEnum):
     BEARING_ONLY = 6
     MASKED = 7
     BAD_COVARIANCE = 8
+    CONTRADICTION = 9
 
 
 def flag_positions(code: Tensor, condition: Tensor, status: PositionStatus) -> Tensor:
@@ -70,23 +74,29 @@ Tensors = TypeVar("Tensors", bound=tuple)
 
 
 def piece_by_piece(
-    locate: Callable[..., Tensors], left: Tensor, right: Tensor, *others: Tensor | None, differentiated: bool
+    locate: Callable[..., Tensors],
+    first: Tensor,
+    *others: Tensor | None,
+    differentiated: bool,
+    axis: int = -2,
+    share: int = 1,
 ) -> Tensors:
-    """Call `locate(left, right, *others)`, in pieces that fit the cache where nothing is traced or differentiated.
+    """Call `locate(first, *others)`, in pieces that fit the cache where nothing is traced or differentiated.
 
     Args:
         locate: returns a named tuple of tensors whose axis of points is that of the pixels.
-        left: (..., N, 2).
-        right: (..., N, 2).
+        first: (..., N, 2) pixels, or with more axes.
         others: tensors (..., N, ...) with the same leading axes, or None.
         differentiated: then everything is done in one piece, because the graph would keep all pieces anyway.
+        axis: of the points in `first`.
+        share: how many times as much memory a point takes as a pair does.
     """
-    axis = left.ndim - 2
-    size = max(1, CHUNK // max(1, math.prod(left.shape[:-2])))
-    if is_traced() or differentiated or left.shape[-2] <= size:
-        return locate(left, right, *others)
-    cut = [None if value is None else value.split(size, axis) for value in (left, right, *others)]
-    count = math.ceil(left.shape[-2] / size)
+    axis = first.ndim + axis
+    size = max(1, CHUNK // max(1, share * math.prod(first.shape[:axis])))
+    if is_traced() or differentiated or first.shape[axis] <= size:
+        return locate(first, *others)
+    cut = [None if value is None else value.split(size, axis) for value in (first, *others)]
+    count = math.ceil(first.shape[axis] / size)
     pieces = [locate(*(None if value is None else value[i] for value in cut)) for i in range(count)]
     return type(pieces[0])(*(torch.cat(values, axis) for values in zip(*pieces, strict=True)))
 

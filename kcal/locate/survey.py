@@ -166,7 +166,7 @@ def read_features(path: str | Path, pixel_sigma: float) -> Features:
     """
     rows = read_rows(path, "name,left_u,left_v,right_u,right_v,range,range_sigma", FEATURE_COLUMNS, PIXELS)
     pixels = [[pixel_of(row, side, False) for side in ("left", "right")] for row in rows]
-    known = torch.tensor([_inverse_range(row) for row in rows], dtype=torch.float64)
+    known = torch.tensor([inverse_range_of(row) for row in rows], dtype=torch.float64)
     return Features(
         names=tuple(row.name for row in rows),
         pixels=torch.tensor(pixels, dtype=torch.float64),
@@ -176,7 +176,8 @@ def read_features(path: str | Path, pixel_sigma: float) -> Features:
     )
 
 
-def _inverse_range(row: TableRow) -> tuple[float, float]:
+def inverse_range_of(row: TableRow) -> tuple[float, float]:
+    """Inverse range and its sigma, 1/m, by the cells range, range_sigma and beyond of a row."""
     distance, sigma, beyond = (row.positive(column) for column in ("range", "range_sigma", "beyond"))
     if beyond is not None and distance is not None:
         raise FileError(f"{row.where}: range or beyond is needed, not both")

@@ -147,6 +147,7 @@ def read_chunks(
     required: Sequence[str],
     *,
     extras: bool = False,
+    unique: bool = True,
     at_once: int = CHUNK_ROWS,
 ) -> Iterator[TableChunk]:
     """The same, some rows at a time, so that a table may be longer than memory.
@@ -159,6 +160,7 @@ def read_chunks(
         columns: all columns that are known.
         required: those that must be there.
         extras: accept other columns too.
+        unique: refuse a name that was used before.
         at_once: most rows of a chunk.
 
     Raises:
@@ -195,13 +197,29 @@ def read_chunks(
                 if "'" in "".join(cells):
                     by_column[name] = list(map(_unguarded, cells))
             own = by_column.get("name", [str(count + i) for i in range(1, len(lines) + 1)])
-            if "name" in by_column:
+            if "name" in by_column and unique:
                 seen = _check_names(path, own, lines, seen)
             count += len(lines)
             yield TableChunk(path, lines, own, by_column, read)
             read = _bytes_read(file)
     if count == 0:
         raise FileError(f"{path}: no rows under the header; write one line for each")
+
+
+def header_of(path: str | Path) -> list[str]:
+    """The columns of a table.
+
+    Raises:
+        FileError: the file cannot be read.
+    """
+    path = Path(path)
+    with _text_of(path) as file:
+        texts = _lines_of(path, file)
+        while text := next(texts, ""):
+            rows, _ = _split_any(path, [text], texts, 0)
+            if rows:
+                return rows[0][1]
+    return []
 
 
 @contextmanager

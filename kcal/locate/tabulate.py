@@ -39,8 +39,8 @@ class Viewpoint:
     """Where a camera of the rig stands and what it sees, for maps.
 
     Args:
-        name: "left" or "right".
-        enu: meters; zeros for the left camera.
+        name: "left" or "right", or that of a station.
+        enu: meters from the origin.
         geodetic: latitude, longitude in degrees, ellipsoidal WGS84 height in meters.
         azimuths_deg: of the left and right ends of the image's middle row, or None if the lens model has no ray there.
     """
@@ -176,14 +176,15 @@ def _viewpoints(rig: StereoRig, enu_from_left: Tensor, origin: Origin) -> tuple[
     lat, lon, height = enu_to_geodetic(enu, origin).tolist()
     here = (origin.lat, origin.lon, origin.height)
     return (
-        _viewpoint("left", rig.left, torch.zeros_like(enu), enu_from_left, here),
-        _viewpoint("right", rig.right, enu, enu_from_right, (lat, lon, height)),
+        viewpoint("left", rig.left, torch.zeros_like(enu), enu_from_left, here),
+        viewpoint("right", rig.right, enu, enu_from_right, (lat, lon, height)),
     )
 
 
-def _viewpoint(
+def viewpoint(
     name: str, camera: Camera, enu: Tensor, enu_from_camera: Tensor, geodetic: tuple[float, float, float]
 ) -> Viewpoint:
+    """Where a camera stands and what it sees, given its center (3,), attitude (3, 3) and place on the Earth."""
     width, height = camera.size
     ends = camera.focal.new_tensor([[-0.5, (height - 1) / 2], [width - 0.5, (height - 1) / 2]])
     rays, valid = camera.unproject(ends)

@@ -33,6 +33,14 @@ from kcal.locate.mounting import placed_rig as placed_rig
 from kcal.locate.mounting import mounting_covariance as mounting_covariance
 from kcal.locate.budget import planned_rig as planned_rig
 
+# Any number of cameras
+from kcal.lens.camera_rig import CameraRig as CameraRig
+from kcal.lens.camera_rig import CameraRigCalibration as CameraRigCalibration
+from kcal.locate.stations import load_camera_rig as load_camera_rig
+from kcal.io.camera_rig_file import save_camera_rig as save_camera_rig
+from kcal.locate.stations import station_mounting as station_mounting
+from kcal.locate.stations import stations_of as stations_of
+
 # Drift
 from kcal.locate.relock import check_rig as check_rig
 from kcal.calibrate.rig.drift import measure_drift as measure_drift

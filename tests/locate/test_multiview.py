@@ -93,7 +93,7 @@ def test_statuses_without_nan(method: str) -> None:
     pose[1, 0, 3], pose[2, 0, 3] = -10.0, -20.0
     good = tensor([990.0, 545.0], [980.0, 545.0], [970.0, 545.0])
     rows = [good, good[[1, 1, 1]], good[[2, 1, 0]], good.clone(), good.clone(), good.clone()]
-    rows[3][1, 0], rows[4][0, 1] = math.nan, 2000.0
+    rows[3][:2, 0], rows[4][0, 1] = math.nan, 2000.0
     cov = 0.01 * torch.eye(2, dtype=torch.float64).repeat(6, 3, 1, 1)
     cov[5, 2, 1, 1] = -1.0
     marks = torch.stack(rows).requires_grad_()
@@ -107,6 +107,24 @@ def test_statuses_without_nan(method: str) -> None:
     assert torch.isfinite(gradient).all()
     assert (gradient[1:] == 0).all()
     assert (gradient[0] != 0).any()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_point_that_one_camera_did_not_see(method: str) -> None:
+    marks = seen(tensor([40.0, 10.0, 800.0], [-60.0, 20.0, 900.0], [3.0, 1.0, 90.0]) + SHIFT)
+    marks = marks + 0.2 * torch.randn(marks.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    for row, camera in enumerate((2, 0, 1)):
+        others = [c for c in range(3) if c != camera]
+        without = TriangulateViews([CAMERAS[c] for c in others], poses()[others], method=method)(
+            marks[[row]][:, others]
+        )
+        marks[row, camera, 1] = math.nan
+        found = TriangulateViews(CAMERAS, poses(), method=method)(marks[[row]])
+        assert found.status.tolist() == [PositionStatus.OK]
+        assert (found.points - without.points).norm() < 1e-6 * (without.points - SHIFT).norm()
+        assert torch.allclose(found.covariance, without.covariance, rtol=1e-6)
+        assert torch.allclose(found.reprojection[:, others], without.reprojection, atol=1e-6)
+        assert found.reprojection[0, camera] == 0
 
 
 def test_batches() -> None:

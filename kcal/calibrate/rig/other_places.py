@@ -57,11 +57,16 @@ def refuse_several(work: Adjustment, masks: PerKind) -> None:
         if float(away @ matrix @ away) < _OTHER:
             continue
         names = work.data.names
-        apart = [float((one.state.center[1] - one.state.center[0]).norm()) for one in (here, there)]
+        moved = (there.state.center - here.state.center).norm(dim=-1)
+        which = int(moved.argmax())
+        if len(names) == 2:
+            apart = [float((one.state.center[1] - one.state.center[0]).norm()) for one in (here, there)]
+            what = f"{names[1]} may be {apart[0]:.3g} m or {apart[1]:.3g} m from {names[0]}"
+        else:
+            what = f"{names[which]} may stand in two places {float(moved[which]):.3g} m apart"
         raise DegenerateError(
-            f"the landmarks do not tell where the cameras stand: {names[1]} may be {apart[0]:.3g} m or {apart[1]:.3g} "
-            f"m from {names[0]}, which fit alike ({own.freedom} degrees of freedom). "
-            "Mark more surveyed landmarks in both images, or add a measured baseline or measured positions"
+            f"the landmarks do not tell where the cameras stand: {what}, which fit alike ({own.freedom} degrees of "
+            "freedom). Mark more surveyed landmarks in the images, or add a measured baseline or measured positions"
         )
 
 

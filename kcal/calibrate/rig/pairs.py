@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -177,4 +178,48 @@ def paired_boards(
         deviation=_deviation(cameras, boards[0]),
         views=tuple(tuple(pair[side] for pair in pairs) for side in (0, 1)),
         covariance=torch.stack(known, 1) if len(known) == 2 else None,
+    )
+
+
+def boards_of_several(
+    cameras: Sequence[Camera], names: Sequence[str], observations: Mapping[int, Observations]
+) -> Boards:
+    """Boards seen by any two or more of several cameras at the same moments.
+
+    Views belong together whose names are equal without the camera's name, the folder and the suffix.
+
+    Args:
+        cameras: C of them.
+        names: of the cameras.
+        observations: of some of the cameras, by number.
+
+    Raises:
+        InputError: boards or image sizes that differ, two views of one moment, no moment that two cameras saw.
+    """
+    boards = {number: seen.board for number, seen in observations.items()}
+    first = next(iter(boards))
+    moments: dict[str, dict[int, str]] = {}
+    for number, seen in observations.items():
+        if seen.board != boards[first]:
+            raise InputError(f"{names[first]} and {names[number]} saw different boards: {boards[first]}, {seen.board}")
+        if cameras[number].size != tuple(seen.image_size):
+            raise InputError(f"{names[number]}: images of {cameras[number].size}, observations of {seen.image_size}")
+        for name in seen.names:
+            key = re.sub(r"[ _-]+", "_", _stem(name).replace(names[number], "")).strip("_")
+            if number in moments.setdefault(key, {}):
+                raise InputError(f"{names[number]}: {moments[key][number]} and {name} are of one moment by their names")
+            moments[key][number] = name
+    shared = {key: own for key, own in moments.items() if len(own) > 1}
+    if not shared:
+        raise InputError("no moment at which two cameras saw the board: the names of views must be alike")
+    pixels = torch.full((len(shared), len(cameras), boards[first].corners, 2), math.nan, dtype=torch.float64)
+    for number, seen in observations.items():
+        rows = [i for i, own in enumerate(shared.values()) if number in own]
+        pixels[rows, number] = seen.subset([own[number] for own in shared.values() if number in own]).pixels()
+    return Boards(
+        board=boards[first],
+        pixels=pixels,
+        names=tuple(key or str(i) for i, key in enumerate(shared)),
+        deviation=_deviation([cameras[number] for number in observations], boards[first]),
+        views=tuple(tuple(own.get(c, "") for own in shared.values()) for c in range(len(cameras))),
     )

@@ -18,6 +18,8 @@ from kcal.calibrate.rig.uncertainty import SharedCovariance, mounting_rows, para
 from kcal.io.rig_file import save_rig
 from kcal.lens.calibration import Exclusion, RigCalibration, RigSource
 from kcal.lens.camera import Camera
+from kcal.lens.camera_rig import CameraRig, CameraRigCalibration
+from kcal.lens.mounting import Origin
 from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.solve.result import SolverStatus
 
@@ -216,11 +218,42 @@ class RigResult:
             pairs=len(self.pairs),
             per_pair_rms=dict(zip(self.pairs, self.pair_rms.tolist(), strict=True)),
             flipped=tuple(dict.fromkeys(turned.board for turned in self.flipped)),
+            contradictions=self.contradictions,
+            baseline_m=float(rig.baseline),
+            **self._history(),
+        )
+        return rig
+
+    def stations(self, origin: Origin | None = None) -> CameraRig:
+        """All cameras with what is known of them together, which is left out where the data leave something open.
+
+        Args:
+            origin: of the frame in which landmarks and positions were given.
+        """
+        each = range(len(self.cameras))
+        rig = CameraRig(
+            self.cameras, self.names, self.rotation, self.center, origin=origin if self.absolute else None,
+            refraction=self.refraction if self.absolute and origin is not None else 0.0,
+        )  # fmt: skip
+        poses = [mounting_rows(self._problem, self._state, camera) for camera in each]
+        lenses = [parameter_rows(self._problem, camera) for camera in each]
+        rig.root = self._covariance.half_of(torch.cat([*lenses, *(pose[:6] for pose in poses), poses[0][6:]]))
+        rig.calibration = CameraRigCalibration(
+            rms=self.rms,
+            rms_px=tuple(None if math.isnan(rms) else rms for rms in self.rms_px),
+            undetermined=self.undetermined,
+            **self._history(),
+        )
+        return rig
+
+    def _history(self) -> dict[str, Any]:
+        """What `stereo` and `stations` tell alike of how a rig was solved."""
+        return {
             # Boards by their names alone, as in `per_pair_rms`.
-            excluded=tuple(
+            "excluded": tuple(
                 Exclusion(f"{item.source} {item.name}".removeprefix("boards "), item.reason) for item in self.left_out
             ),
-            sources=tuple(
+            "sources": tuple(
                 RigSource(
                     name=source.source,
                     used=source.used,
@@ -231,12 +264,9 @@ class RigResult:
                 )
                 for source in self.sources
             ),
-            warnings=self.warnings,
-            contradictions=self.contradictions,
-            baseline_m=float(rig.baseline),
+            "warnings": self.warnings,
             **self._provenance,
-        )
-        return rig
+        }
 
     def save(self, path: str | Path) -> Path:
         """Write the rig of the first two cameras as `stereo` gives it; see `kcal.save_rig`."""

@@ -239,7 +239,7 @@ class RigData:
     """All that a rig is solved from; any of it may be missing.
 
     Args:
-        cameras: two or more, calibrated; unlike sizes and models are welcome.
+        cameras: calibrated, two or more, or one with landmarks; unlike sizes and models are welcome.
         names: of the cameras.
         boards: see `Boards`.
         landmarks: see `Landmarks`.
@@ -249,7 +249,7 @@ class RigData:
         stars: see `StarSource`.
 
     Raises:
-        InputError: names or shapes that do not fit each other, fewer than two cameras.
+        InputError: names or shapes that do not fit each other, one camera without landmarks.
 
     Example:
         >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080))
@@ -268,8 +268,8 @@ class RigData:
 
     def __post_init__(self) -> None:
         count = len(self.cameras)
-        if count < 2:
-            raise InputError("a rig has two cameras or more")
+        if not count or (count == 1 and self.landmarks is None):
+            raise InputError("a rig has two cameras or more; one camera alone needs landmarks")
         _names("cameras", self.names, count)
         if not all(isinstance(camera, Camera) and camera.params.ndim == 1 for camera in self.cameras):
             raise InputError("a rig is made of single cameras")

@@ -133,7 +133,7 @@ def _named_motions(
     if absolute:
         for axis, word in zip(_IDENTITY, ("east", "north", "up"), strict=True):
             rig_motion(f"where the rig stands ({word})", zero, axis.expand_as(center))
-        along = center[1] - center[0]
+        along = center[min(1, len(center) - 1)] - center[0]
         axes_of_turns = [(_IDENTITY[2], "the heading (a turn about the vertical)")]
         axes_of_turns += [
             (axis, f"a tilt of the rig about the {word} axis")

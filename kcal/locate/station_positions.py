@@ -1,0 +1,142 @@
+"""Marks of any number of cameras to positions on the Earth, with everything that is told to a user."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kcal.errors import InputError
+from kcal.lens.camera_rig import CameraRig
+from kcal.locate.columns import PositionColumns
+from kcal.locate.datum import Geoid, geoid_column
+from kcal.locate.ellipsoid import ecef_from_enu_rotation
+from kcal.locate.geodesy import anchor, enu_to_geodetic
+from kcal.locate.localizer import Localization
+from kcal.locate.multi_localizer import MultiViewLocalizer, ViewsLocalization
+from kcal.locate.positions import Located
+from kcal.locate.stations import station_mounting
+from kcal.locate.stereo import PositionStatus
+from kcal.locate.tabulate import number_table, viewpoint
+from kcal.locate.view_marks import ViewMarks
+
+_TEXTS = {
+    PositionStatus.BEARING_ONLY: "only the bearing is known: one camera, or a parallax below three sigma",
+    PositionStatus.PARALLEL: "the lines of sight do not meet before the cameras: are the marks the same thing?",
+    PositionStatus.BEHIND: "the lines of sight cross behind a camera: are the marks the same thing?",
+    PositionStatus.OUTSIDE_LENS: "the lens model has no ray for a mark",
+    PositionStatus.OUTSIDE_IMAGE: "a mark lies outside its image",
+    PositionStatus.NOT_FINITE: "no camera has a mark",
+    PositionStatus.CONTRADICTION: "the marks are not of one thing, and which is wrong cannot be told",
+}
+
+
+@torch.no_grad()
+def locate_views(
+    rig: CameraRig,
+    views: ViewMarks,
+    *,
+    pixel_sigma: float = 0.3,
+    height: tuple[float, float] | None = None,
+    geoid: Geoid | None = None,
+) -> Located:
+    """Positions of things that any of a rig's cameras saw.
+
+    Further columns tell which cameras a position is from (`cameras`), which was left out because it contradicts the
+    others (`left_out`), and what leaving out each changes (`misfit_sigmas`). Ranges, azimuths and elevations are those
+    from the first camera of a row, at its own vertical.
+
+    Args:
+        rig: with an origin.
+        views: marks, in the order of the rig's cameras.
+        pixel_sigma: of a mark along each axis, px, where the table does not say.
+        height: meters above the ellipsoid, and its sigma, of what one camera alone saw.
+        geoid: a grid from `kcal.locate.datum.find_geoid`.
+
+    Raises:
+        InputError: a rig without a place on the Earth.
+
+    Example:
+        >>> from kcal import Camera, Origin
+        >>> from kcal.locate import enu_from_cam
+        >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
+        >>> look = torch.stack([enu_from_cam(heading).T for heading in (0.0, 315.0)])
+        >>> rig = CameraRig([camera] * 2, ["mill", "mast"], look, torch.tensor([[0.0, 0, 30], [5000, 0, 30]]),
+        ...                 origin=Origin(lat=45.0, lon=6.0, height=0.0), refraction=0.0)
+        >>> pixels, _ = rig(torch.tensor([[100.0, 5000, 60]]))
+        >>> views = ViewMarks(("smoke",), pixels, torch.full((1, 2), 2.0), {})
+        >>> located = locate_views(rig, views).positions[0]
+        >>> [round(value) for value in located.enu], located.status.name
+        ([100, 5000, 60], 'OK')
+    """
+    origin = rig.origin
+    if origin is None:
+        raise InputError("this rig has no place on the Earth: solve it with landmarks or positions that have latitudes")
+    localize = MultiViewLocalizer(rig, pixel_sigma=pixel_sigma)
+    sigma = views.sigmas(pixel_sigma)
+    cov = sigma.square()[..., None, None] * torch.eye(2, dtype=torch.float64)
+    stated = None if height is None else torch.full((len(views.names),), height[0], dtype=torch.float64)
+    found = localize(
+        views.pixels,
+        cov=cov if bool(views.sigma.isfinite().any()) else None,
+        height=stated,
+        height_sigma=1.0 if height is None else height[1],
+    )
+    base = anchor(origin)[0]
+    geodetic = enu_to_geodetic(rig.center, origin)
+    to_own = torch.stack([ecef_from_enu_rotation(lat, lon).T @ base for lat, lon, _ in geodetic.tolist()])
+    bearing = (to_own[found.anchor] @ found.bearing[..., None])[..., 0]
+    as_pairs = Localization(
+        enu=found.enu, covariance=found.covariance, geodetic=found.geodetic, range_low=found.range_low,
+        range_high=found.range_high, status=found.status, bearing=bearing, inverse_range=found.inverse_range,
+        inverse_range_sigma=found.inverse_range_sigma, reprojection=found.reprojection[:, :2],
+    )  # fmt: skip
+    ok = (found.status == int(PositionStatus.OK)).numpy()
+    heights = np.full(len(ok), np.nan)
+    if geoid is not None:
+        heights[ok] = geoid_column(geoid, found.geodetic[ok, 0].numpy(), found.geodetic[ok, 1].numpy())
+    numbers = number_table(as_pairs, (("geoid_height_m", ok, heights[None]),))
+    extras = views.extras | {
+        "cameras": [_camera_list(rig, row) for row in found.used],
+        "left_out": [_camera_list(rig, row) for row in found.bad],
+        "misfit_sigmas": [_misfits(rig, row) for row in found.misfit],
+    }
+    first = station_mounting(rig, 0)
+    return Located(
+        columns=PositionColumns(views.names, found.status.numpy(), _row_reasons(rig, found), numbers, extras),
+        cameras=tuple(
+            viewpoint(name, camera, center, turn.T, tuple(place))
+            for name, camera, center, turn, place in zip(
+                rig.names, rig.each, rig.center, rig.rotation, geodetic.tolist(), strict=True
+            )
+        ),
+        origin=origin,
+        heading_deg=first.heading_deg,
+        pitch_deg=first.pitch_deg,
+        roll_deg=first.roll_deg,
+        pixel_sigma=pixel_sigma,
+        included=("marks",) if localize.errors is None else ("marks", "calibration", "mounting"),
+        geoid=None if geoid is None else geoid.name,
+        feet=rig.center[found.anchor],
+    )
+
+
+def _camera_list(rig: CameraRig, which: Tensor) -> str:
+    return " ".join(name for name, one in zip(rig.names, which.tolist(), strict=True) if one)
+
+
+def _misfits(rig: CameraRig, row: Tensor) -> str:
+    return " ".join(f"{name}={value:.1f}" for name, value in zip(rig.names, row.tolist(), strict=True) if value > 0)
+
+
+def _row_reasons(rig: CameraRig, found: ViewsLocalization) -> list[str]:
+    reasons = []
+    for status, bad, misfit in zip(found.status.tolist(), found.bad, found.misfit, strict=True):
+        text = _TEXTS.get(PositionStatus(status), "")
+        if bool(bad.any()):
+            worst = float(torch.where(bad, misfit, -math.inf).max())
+            text = f"left out: the mark in {_camera_list(rig, bad)} contradicts the others ({worst:.0f} sigma); {text}"
+        reasons.append(text.removesuffix("; "))
+    return reasons

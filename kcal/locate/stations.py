@@ -1,0 +1,145 @@
+"""Stations: rigs of any number of cameras on the Earth, from files and from pairs, and how each of them stands."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from kcal.errors import InputError
+from kcal.files import read_bytes
+from kcal.io.camera_rig_file import CameraRigFile
+from kcal.io.rig_file import RigFile
+from kcal.lens.camera_rig import CameraRig
+from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA, Mounting
+from kcal.lens.rig import StereoRig, half_of_covariance
+from kcal.locate.geodesy import enu_from_cam
+from kcal.locate.mounting import mounting_of
+from kcal.strict_json import MOST_BYTES, read_json
+
+
+def load_camera_rig(path: str | Path) -> CameraRig:
+    """Read any rig file: one of many cameras, or one of two (also of kcal 0.1), named left and right.
+
+    Raises:
+        FileError: missing, not JSON, another kind of file, or a field that is wrong; it names the path.
+
+    Example:
+        >>> import tempfile
+        >>> from kcal import save_rig
+        >>> from kcal.rig import planned_rig
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     load_camera_rig(save_rig(planned_rig(), Path(folder, "rig.json"))).names
+        ('left', 'right')
+    """
+    path = Path(path)
+    content = read_json(read_bytes(path, MOST_BYTES), str(path))
+    if isinstance(content, dict) and content.get("version") == CameraRigFile.VERSION:
+        return CameraRigFile.parse(content, str(path)).rig()
+    return stations_of(RigFile.parse(content, str(path)).rig())
+
+
+def names_of_rig(path: str | Path) -> tuple[str, ...]:
+    """Names of the cameras of a rig file, without reading more than that; left and right of a file of two."""
+    path = Path(path)
+    content = read_json(read_bytes(path, MOST_BYTES), str(path))
+    names = content.get("names") if isinstance(content, dict) else None
+    return tuple(map(str, names)) if isinstance(names, list) else ("left", "right")
+
+
+def stations_of(rig: StereoRig) -> CameraRig:
+    """A stereo rig as a rig of two cameras, with all that is known of it.
+
+    The frame is east, north, up of the left camera if the rig says where it stands, and the left camera's otherwise.
+
+    Example:
+        >>> from kcal.rig import planned_rig
+        >>> two = stations_of(planned_rig())
+        >>> two.names, two.center.round(decimals=6).abs().tolist()
+        (('left', 'right'), [[0.0, 0.0, 0.0], [10.0, 0.0, 0.0]])
+    """
+    stands = rig.mounting
+    left = torch.eye(3, dtype=torch.float64)
+    if stands is not None:
+        left = enu_from_cam(stands.heading_deg, stands.pitch_deg, stands.roll_deg).T
+    shift = rig.right_from_left_translation
+    left = left.to(shift)
+    right = rig.right_from_left_rotation @ left
+    apart = -right.T @ shift
+    centers = torch.stack([torch.zeros_like(apart), apart])
+    stations = CameraRig(
+        [rig.left, rig.right], ("left", "right"), torch.stack([left, right]), centers,
+        origin=None if stands is None else stands.origin,
+        refraction=(REFRACTION if stands.refraction is None else stands.refraction) if stands else 0.0,
+    )  # fmt: skip
+    joint = _joint_covariance(rig)
+    if joint is None:
+        return stations
+    size = len(joint) - 7
+    by = torch.zeros(stations.quantities, len(joint), dtype=torch.float64)
+    lenses = size - 6
+    by[:lenses, :lenses] = torch.eye(lenses, dtype=torch.float64)
+    turn, move, center, attitude = (slice(size + at, size + at + 3) for at in (-6, -3, 0, 3))
+    still = torch.eye(3, dtype=torch.float64)
+    first, second = stations.pose_columns(0).start, stations.pose_columns(1).start
+    by[first : first + 3, center], by[first + 3 : first + 6, attitude] = still, still
+    by[second : second + 3, center] = still
+    by[second : second + 3, attitude] = -_crossed(apart)
+    by[second : second + 3, turn] = -right.T @ _crossed(shift)
+    by[second : second + 3, move] = -right.T
+    by[second + 3 : second + 6, attitude], by[second + 3 : second + 6, turn] = still, -right.T
+    by[-1, -1] = 1.0
+    stations.root = half_of_covariance(joint) @ by.T
+    return stations
+
+
+def _crossed(vector: Tensor) -> Tensor:
+    """(3, 3) with `_crossed(v) @ w` = v × w."""
+    x, y, z = vector.tolist()
+    return torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64)
+
+
+def _joint_covariance(rig: StereoRig) -> Tensor | None:
+    """(P + 7, P + 7) of the calibration and the mounting of a rig; None where nothing is known."""
+    known, stands = rig.covariance, rig.mounting
+    if known is None and (stands is None or stands.covariance is None):
+        return None
+    size = rig.left.values.shape[-1] + rig.right.values.shape[-1] + 6
+    whole = torch.zeros(size + 7, size + 7, dtype=torch.float64)
+    if known is not None:
+        whole[:size, :size] = known.matrix
+    if stands is not None:
+        whole[-1, -1] = REFRACTION_SIGMA**2
+        if stands.covariance is not None:
+            count = len(stands.covariance)
+            whole[size : size + count, size : size + count] = stands.covariance
+            if stands.link is not None:
+                whole[:size, size : size + count] = stands.link
+                whole[size : size + count, :size] = stands.link.T
+    return whole
+
+
+def station_mounting(rig: CameraRig, camera: int) -> Mounting:
+    """How a camera stands: place on the Earth, heading, pitch and roll at its own vertical, and how well that is known.
+
+    Raises:
+        InputError: a rig without an origin.
+
+    Example:
+        >>> from kcal import Camera, Origin
+        >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
+        >>> there = torch.tensor([[0.0, 50_000.0, 0.0]])  # north of the origin, where the Earth has curved away
+        >>> rig = CameraRig([camera], ["tower"], enu_from_cam(90.0).T[None], there,
+        ...                 origin=Origin(lat=45.0, lon=6.0, height=0.0))
+        >>> stands = station_mounting(rig, 0)
+        >>> round(stands.origin.height), round(stands.heading_deg, 3), round(stands.roll_deg, 3)
+        (196, 90.0, 0.45)
+    """
+    if rig.origin is None:
+        raise InputError("this rig has no place on the Earth: give it an origin")
+    covariance = torch.zeros(7, 7, dtype=torch.float64)
+    if rig.root is not None:
+        own = torch.cat([rig.root[:, rig.pose_columns(camera)], rig.root[:, -1:]], 1)
+        covariance = own.T @ own
+    return mounting_of(rig.rotation[camera], rig.center[camera], covariance, rig.origin, refraction=rig.refraction)

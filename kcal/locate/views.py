@@ -1,0 +1,328 @@
+"""Pixels of any subset of cameras to points with errors, each point on its own.
+
+`TriangulateViews` and `MultiViewLocalizer` share what is here. A point is sought from the first camera that saw it, its
+anchor, as a direction and an inverse distance in the frame of all cameras. Errors that a camera's marks share (lens,
+center, attitude, refraction) are to first order correlated noise of the pixels: a point is weighed by the inverse
+covariance of all of them together, so that a camera whose attitude is poor counts less.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kcal.lens.camera import Camera
+from kcal.lens.camera_stack import project_each, unproject_each
+from kcal.lens.pose import side_axes, step_rows
+from kcal.locate.angular import Found, first_seen, triangulate_angular
+from kcal.locate.bent_light import Surroundings, length_of_one, lifted
+from kcal.locate.max_likelihood import (
+    PointFit,
+    RelativeCamera,
+    inverse_covariances,
+    most_likely,
+    position_slope,
+    symmetric,
+)
+from kcal.locate.stereo import PositionStatus, flag_positions
+
+# Share of a view's information that the others must be able to check: below, leaving it out tells nothing.
+_UNCHECKED = 1e-9
+
+
+class PosedCameras(NamedTuple):
+    """Cameras as they stand: points_cam = rotation @ (points - center).
+
+    Attributes:
+        cameras: C of them.
+        rotation: (C, 3, 3) cam_from_frame.
+        center: (C, 3) meters.
+        up: (C, 3) the vertical at each camera, in the frame; None where lines of sight are straight.
+        bending: k / 2R, 1/m.
+    """
+
+    cameras: Sequence[Camera]
+    rotation: Tensor
+    center: Tensor
+    up: Tensor | None = None
+    bending: float = 0.0
+
+    @property
+    def scale(self) -> Tensor:
+        """The largest distance of a camera from the first one, meters; one where all stand in one place."""
+        far = torch.linalg.vector_norm(self.center - self.center[0], dim=-1).amax()
+        return torch.where(far > 0, far, 1.0)
+
+    @property
+    def matrices(self) -> Tensor:
+        """(C, 3, 4) [R | t] of points from the first camera's center: a far origin costs no digits."""
+        moved = self.rotation @ (self.center[0] - self.center)[..., None]
+        return torch.cat([self.rotation, moved], -1)
+
+    @property
+    def around(self) -> Surroundings:
+        """How light bends, in the cameras' axes."""
+        if self.up is None:
+            return Surroundings()
+        return Surroundings(up=(self.rotation @ self.up[..., None])[..., 0], bending=self.bending)
+
+
+class CommonErrors(NamedTuple):
+    """What all marks of a camera have in common: K independent errors.
+
+    Attributes:
+        lens: for each camera the numbers of its parameters that are not exact.
+        half: (K, C, Q) change of a camera's center, of its turn and of these, by each error; padded with zeros.
+        bending: (K,) change of k / 2R.
+    """
+
+    lens: tuple[tuple[int, ...], ...]
+    half: Tensor
+    bending: Tensor
+
+
+class StatedHeight(NamedTuple):
+    """Where lines of sight reach a known height, by which one camera is enough.
+
+    Attributes:
+        point: (N, 3) in the frame.
+        up: (N, 3) the vertical there.
+        sigma: (N,) of the height, meters.
+        reached: (N,) bool.
+    """
+
+    point: Tensor
+    up: Tensor
+    sigma: Tensor
+    reached: Tensor
+
+
+class ViewsFit(NamedTuple):
+    """The most likely points.
+
+    Attributes:
+        fit: the optimum, its direction in the cameras' frame.
+        scale: meters, the unit of `fit.inverse`.
+        anchor: (N, C) bool: the camera from which a point is told; the first one where nobody saw it.
+        place: (N, 3) the anchor's center.
+        rays: (N, C, 3) in the frame.
+        used: (N, C) which views count.
+        status: (N,) int8, before anything is known of the range.
+        fitted: (N,) which points have an optimum.
+        weight: (2 C, 2 C, N) of the pixels; None: all have the variance `variance`.
+        variance: px².
+    """
+
+    fit: PointFit
+    scale: Tensor
+    anchor: Tensor
+    place: Tensor
+    rays: Tensor
+    used: Tensor
+    status: Tensor
+    fitted: Tensor
+    weight: Tensor | None
+    variance: float
+
+    def points(self, ok: Tensor) -> Tensor:
+        """(N, 3) in the frame; the anchor's center unless `ok`."""
+        depth = self.scale / torch.where(ok, self.fit.inverse, 1.0)
+        return self.place + torch.where(ok[..., None], depth[..., None] * self.fit.direction.mT, 0.0)
+
+    def covariance(self, ok: Tensor) -> Tensor:
+        """(N, 3, 3) of the points; an infinite diagonal unless `ok`."""
+        slope = position_slope(self.fit, self.scale, ok)
+        found = self.variance * (slope @ symmetric(self.fit.covariance) @ slope.mT)
+        return torch.where(ok[..., None, None], found, torch.diag(found.new_full((3,), torch.inf)))
+
+    @torch.no_grad()
+    def behind(self, center: Tensor) -> Tensor:
+        """(N,) whether a point is behind a camera that saw it; `center` (C, 3)."""
+        offset = self.fit.direction.mT[..., None, :] + (self.fit.inverse / self.scale)[..., None, None] * (
+            self.place[..., None, :] - center
+        )
+        return (((offset * self.rays).sum(-1) < 0) & self.used).any(-1) & self.fitted
+
+    @torch.no_grad()
+    def misfits(self) -> tuple[Tensor, Tensor]:
+        """χ² (N,) of the residuals, and (N, C) by how much it falls when a view is left out.
+
+        Of two views, either takes all of it. To first order, which is exact to rounding for views some sigmas off.
+        """
+        residual, jacobian = self.fit.residual, self.fit.jacobian
+        if self.weight is None:
+            still = torch.eye(len(residual), dtype=residual.dtype, device=residual.device)
+            weight = (still / self.variance)[..., None]
+        else:
+            weight = self.weight
+        pulled = (weight * residual).sum(-2)
+        chi2 = (residual * pulled).sum(-2)
+        weighted = (weight[None] * jacobian[:, None]).sum(-2)  # (3, 2 C, N)
+        a, b, c, d, e, f = (self.variance * entry for entry in self.fit.covariance)
+        spread = torch.stack([a, b, c, b, d, e, c, e, f]).unflatten(0, (3, 3))
+        gained = (spread[:, :, None] * weighted).sum(1)
+
+        def rest(i: int, j: int) -> Tensor:
+            """(C, N) entries of W - W J C Jᵀ W of each view."""
+            own = weight[i::2, j::2].diagonal(dim1=0, dim2=1).mT
+            return own - (weighted[:, i::2] * gained[:, j::2]).sum(0)
+
+        q, r, s = rest(0, 0), rest(0, 1), rest(1, 1)
+        u, v = pulled[0::2], pulled[1::2]
+        determinant = q * s - r * r
+        checked = determinant > _UNCHECKED * torch.maximum(q, s).square()
+        fall = (s * u * u - 2.0 * r * u * v + q * v * v) / torch.where(checked, determinant, 1.0)
+        several = (self.used.sum(-1) > 2)[..., None]
+        fall = torch.where(several, torch.where(checked, fall, 0.0).mT, chi2[..., None])
+        return chi2, torch.where(self.used & self.fitted[..., None], fall, 0.0)
+
+
+def fit_views(
+    posed: PosedCameras,
+    pixels: Tensor,
+    seen: Tensor,
+    *,
+    noise: float,
+    cov: Tensor | None = None,
+    shared: CommonErrors | None = None,
+    height: Callable[[Tensor, Tensor, Tensor], StatedHeight] | None = None,
+    differentiated: bool = False,
+) -> ViewsFit:
+    """The most likely point of each row of views: in closed form first, then by `most_likely`.
+
+    Args:
+        posed: C cameras.
+        pixels: (N, C, 2) float64; what is not finite was not seen.
+        seen: (N, C) bool; what is False is neither read nor differentiated.
+        noise: standard deviation of a pixel along each axis where there is no covariance, px.
+        cov: (N, C, 2, 2) covariance of each pixel.
+        shared: what marks of a camera have in common.
+        height: of places, rays and anchors of points that one camera saw: where their height is known.
+        differentiated: see `most_likely`.
+    """
+    finite = torch.isfinite(pixels).all(-1)
+    wanted = seen & finite
+    middle = torch.stack([camera.center.detach() for camera in posed.cameras])
+    pixels = torch.where(wanted[..., None], pixels, middle)
+    sound = wanted if cov is None else _sound_covariances(cov)
+    if cov is not None:
+        still = torch.eye(2, dtype=cov.dtype, device=cov.device)
+        cov = torch.where((sound & wanted)[..., None, None], cov, still)
+    center = posed.center
+    # Weights follow the place where a point is sought first, and derivatives follow them.
+    with torch.set_grad_enabled(differentiated and shared is not None):
+        rays, valid = unproject_each(posed.cameras, pixels.movedim(-2, -3))
+        rays, valid = rays.movedim(-3, -2), valid.mT
+        inside = torch.stack([camera.inside(pixels[..., c, :]) for c, camera in enumerate(posed.cameras)], -1)
+        used = wanted & valid & inside & sound
+        code = torch.full(used.shape[:-1], int(PositionStatus.OK), dtype=torch.int8, device=used.device)
+        count = used.sum(-1)
+        nothing = count == 0
+        for condition, status in (
+            (count == 1, PositionStatus.BEARING_ONLY),
+            (nothing & ~seen.any(-1), PositionStatus.MASKED),
+            (nothing & (seen & ~finite).any(-1), PositionStatus.NOT_FINITE),
+            (nothing & (wanted & ~inside).any(-1), PositionStatus.OUTSIDE_IMAGE),
+            (nothing & (wanted & inside & ~valid).any(-1), PositionStatus.OUTSIDE_LENS),
+            ((wanted & ~sound).any(-1), PositionStatus.BAD_COVARIANCE),
+        ):
+            code = flag_positions(code, condition, status)
+        anchor = first_seen(used)
+        anchor = torch.cat([anchor[..., :1] | nothing[..., None], anchor[..., 1:]], -1)
+        in_frame = (rays[..., None, :] @ posed.rotation)[..., 0, :]
+        place, ray = (anchor[..., None] * center).sum(-2), (anchor[..., None] * in_frame).sum(-2)
+        found = Found(torch.zeros_like(ray), torch.zeros_like(nothing))
+        if len(posed.cameras) > 1:
+            found = triangulate_angular(posed.matrices, rays, used)
+        met, scale = found.valid & (count > 1), posed.scale.detach()
+        away = found.points + center[0] - place
+        held = None
+        if height is not None:
+            stated = height(place, ray, anchor)
+            alone = (count == 1) & stated.reached
+            away, met = torch.where(alone[..., None], stated.point - place, away), met | alone
+            code = flag_positions(code, alone, PositionStatus.OK)
+        away = torch.where(met[..., None], away, ray)
+        distance = torch.linalg.vector_norm(away, dim=-1)
+        ahead, inverse = away / distance[..., None], torch.where(met, scale / distance, 0.0)
+    if height is not None:
+        held = torch.where(alone[..., None, :], _height_row(ahead, inverse, scale, stated), 0.0)
+    fitted = code == int(PositionStatus.OK)
+    around = posed.around._replace(present=used.mT, held=held)
+    weight, variance = None, noise**2
+    if cov is not None or shared is not None:
+        moved = None if shared is None else _shared_pixels(posed, shared, (place, ahead, inverse), used, scale)
+        weight, variance = _weight(cov, noise, used, moved), 1.0
+    apart = place.detach()[..., None, :] - center
+    lines = [
+        RelativeCamera(camera, turn, turn @ apart[..., c, :].mT)
+        for c, (camera, turn) in enumerate(zip(posed.cameras, posed.rotation, strict=True))
+    ]
+    fit = most_likely(
+        lines, scale, (ahead, inverse), pixels.flatten(-2).mT, fitted, weight, differentiated=differentiated,
+        around=around,
+    )  # fmt: skip
+    fit = fit._replace(direction=posed.rotation[0].mT @ fit.turned[0])
+    return ViewsFit(fit, scale, anchor, place.detach(), in_frame.detach(), used, code, fitted, weight, variance)
+
+
+def _sound_covariances(cov: Tensor) -> Tensor:
+    """(N, C) which covariances (N, C, 2, 2) are those of a pixel."""
+    with torch.no_grad():
+        a, b, c, d = cov.flatten(-2).unbind(-1)
+        largest = torch.maximum(a.abs(), d.abs())
+        return torch.isfinite(a + b + c + d) & (a > 0) & (a * d > b * c) & ((b - c).abs() <= 1e-6 * largest)
+
+
+def _height_row(ahead: Tensor, inverse: Tensor, scale: Tensor, stated: StatedHeight) -> Tensor:
+    """(3, N) the slope of the height by (a, b, ρ) over its sigma."""
+    first, second = side_axes(ahead.detach())
+    range_ = (scale / torch.where(inverse > 0, inverse, 1.0)).detach()
+    climb = [(axis * stated.up).sum(-1) * range_ / stated.sigma for axis in (first, second, ahead)]
+    return torch.stack([climb[0], climb[1], -climb[2] * range_ / scale], -2)
+
+
+def _shared_pixels(
+    posed: PosedCameras, shared: CommonErrors, at: tuple[Tensor, Tensor, Tensor], used: Tensor, scale: Tensor
+) -> Tensor:
+    """(K, 2 C, N) what each shared error moves in the pixels of points: anchor (N, 3), direction, inverse distance."""
+    place, ahead, inverse = at
+    line = ahead[..., None, :] + (inverse / scale)[..., None, None] * (place[..., None, :] - posed.center)
+    seen = (posed.rotation @ line[..., None])[..., 0].movedim(-3, -1)  # (C, 3, N)
+    around, unit = posed.around, length_of_one(scale, inverse)
+    seen = torch.where(used.mT[:, None], seen, seen.new_tensor([[0.0], [0.0], [1.0]]))
+    higher = None
+    if around.up is not None:
+        higher = lifted(seen, around._replace(bending=1.0), unit)
+        seen = seen + around.bending * higher
+    moved = []
+    for c, found in enumerate(project_each(posed.cameras, seen, shared.lens, inverse / scale)):
+        turn = posed.rotation[c]
+        turned = step_rows(found.by_point, seen[c])[:3]
+        by_center = torch.einsum("ij,iun->jun", -turn, found.by_point) * (inverse / scale)
+        by_turn = torch.einsum("ij,iun->jun", -turn, turned)
+        rows = torch.cat([by_center, by_turn, found.by_camera])
+        pixels = torch.einsum("kq,qun->kun", shared.half[:, c, : len(rows)], rows)
+        if higher is not None:
+            by_air = (found.by_point * higher[c, :, None]).sum(0)
+            pixels = pixels + shared.bending[:, None, None] * by_air
+        moved.append(torch.where(used[..., c], pixels, 0.0))
+    return torch.cat(moved, -2)
+
+
+def _weight(cov: Tensor | None, noise: float, used: Tensor, moved: Tensor | None) -> Tensor:
+    """(2 C, 2 C, N) inverse covariance of the pixels of used views; the identity for the others."""
+    still = torch.eye(2, dtype=torch.float64, device=used.device)
+    own = noise**2 * still if cov is None else cov
+    own = torch.where(used[..., None, None], own, still)  # (N, C, 2, 2)
+    among = torch.eye(used.shape[-1], dtype=torch.float64, device=used.device)
+    whole = (own[..., :, :, None, :] * among[:, None, :, None]).flatten(-2).flatten(-3, -2)
+    if moved is not None:
+        each = moved.movedim(-1, 0)  # (N, K, 2 C)
+        whole = whole + each.mT @ each
+    weight, _ = inverse_covariances(whole)
+    assert weight is not None
+    return weight

@@ -1,0 +1,132 @@
+"""`kcal rig` of many cameras, `kcal station` and `kcal locate` of what they saw."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from kcal.cli.main import app
+from kcal.errors import FileError, InputError
+from kcal.io.camera_file import save_camera
+from kcal.lens.camera import Camera
+from kcal.locate.geodesy import enu_to_geodetic
+from kcal.locate.stations import load_camera_rig
+from scripts.shared.station_scenes import ORIGIN, marks, ring, targets
+
+NAMES = ("mill", "mast", "church", "hill")
+FILES = (".json", ".csv", ".png", ".geojson")
+SMOKE = torch.tensor([[300.0, 500, 200], [-900, -300, 180], [1200, -800, 150], [0, 0, -400]], dtype=torch.float64)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out, rig, generator = tmp_path_factory.mktemp("stations"), ring(4, 5000.0), torch.Generator().manual_seed(3)
+    groups = [targets(8, generator, 800.0)]
+    for center in rig.center:
+        share = 0.1 + 0.6 * torch.rand(6, 1, dtype=torch.float64, generator=generator)
+        groups.append(center + share * (targets(6, generator, 1500.0) - center) - torch.tensor([0.0, 0.0, 60.0]))
+    points = torch.cat(groups)
+    pixels = marks(rig, points) + 0.3 * torch.randn(len(points), 4, 2, dtype=torch.float64, generator=generator)
+    places = enu_to_geodetic(points, ORIGIN).tolist()
+    survey = [f"post {i},{a:.9f},{b:.9f},{c:.4f},0.05" for i, (a, b, c) in enumerate(places)]
+    (out / "survey.csv").write_text("\n".join(["name,lat,lon,height,sigma", *survey]) + "\n")
+    lines = ["name,camera,u,v"]
+    for c, (name, camera) in enumerate(zip(NAMES, rig.each, strict=True)):
+        save_camera(camera, out / f"{name}.camera.json")
+        inside = camera.inside(pixels[:, c]).tolist()
+        own = [i for i in range(len(points)) if (i < 8 or (i - 8) // 6 == c) and inside[i]]
+        lines += [f"post {i},{name},{pixels[i, c, 0]:.3f},{pixels[i, c, 1]:.3f}" for i in own]
+    (out / "marks.csv").write_text("\n".join(lines) + "\n")
+    seen = marks(rig, SMOKE)
+    seen[1, 2, 0] += 60.0
+    lines = ["name,camera,u,v,what"]
+    for i in range(4):
+        cameras = [1] if i == 3 else range(4)
+        lines += [f"smoke {i},{NAMES[c]},{seen[i, c, 0]:.3f},{seen[i, c, 1]:.3f},smoke" for c in cameras]
+    (out / "smoke.csv").write_text("\n".join(lines) + "\n")
+    return out
+
+
+def run(folder: Path, *words: str) -> str:
+    result = CliRunner().invoke(app, [str(folder / word) if word.endswith(FILES) else word for word in words])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result.output
+
+
+def solve(folder: Path) -> None:
+    cameras = [f"{name}.camera.json" for name in NAMES]
+    text = run(folder, "rig", *cameras, "--landmarks", "survey.csv", "--marks", "marks.csv", "-o", "rig.json")
+    assert all(name in text for name in NAMES)
+
+
+def test_four_cameras_are_solved_and_locate_what_some_of_them_saw(folder: Path) -> None:
+    solve(folder)
+    rig, truth = load_camera_rig(folder / "rig.json"), ring(4, 5000.0)
+    assert rig.names == NAMES
+    assert rig.root is not None
+    assert rig.origin is not None
+    there = enu_to_geodetic(truth.center, ORIGIN)
+    assert (enu_to_geodetic(rig.center, rig.origin) - there)[:, :2].abs().max() < 4e-5  # 4 m
+    text = run(folder, "locate", "rig.json", "smoke.csv", "-o", "out.csv", "-o", "out.geojson", "--picture", "plan.png")
+    assert "the mark in church contradicts the others" in text
+    with (folder / "out.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["status"] for row in rows] == ["ok", "ok", "ok", "bearing_only"]
+    assert rows[1]["left_out"] == "church"
+    assert rows[1]["cameras"] == "mill mast hill"
+    assert [row["what"] for row in rows] == ["smoke"] * 4
+    for row, (lat, lon, _) in zip(rows[:3], enu_to_geodetic(SMOKE, ORIGIN).tolist(), strict=False):
+        # Meters of a degree at this latitude.
+        assert abs(float(row["lat"]) - lat) * 111_000 < 5 * float(row["cov_nn_m2"]) ** 0.5
+        assert abs(float(row["lon"]) - lon) * 78_000 < 5 * float(row["cov_ee_m2"]) ** 0.5
+    kinds = [one["properties"].get("kind") for one in json.loads((folder / "out.geojson").read_text())["features"]]
+    assert kinds.count("camera") == 4
+    assert (folder / "plan.png").stat().st_size > 10_000
+    height = float(enu_to_geodetic(SMOKE[3], ORIGIN)[2])
+    run(folder, "locate", "rig.json", "smoke.csv", "--height", f"{height:.1f}±3", "-o", "out.csv")
+    with (folder / "out.csv").open() as file:
+        last = list(csv.DictReader(file))[3]
+    assert last["status"] == "ok"
+    assert abs(float(last["lat"]) - float(enu_to_geodetic(SMOKE[3], ORIGIN)[0])) < 2e-3
+
+
+def test_one_station_alone(folder: Path) -> None:
+    text = run(folder, "station", "mill.camera.json", "survey.csv", "--marks", "marks.csv", "-o", "mill.json")
+    assert "mill" in text
+    assert load_camera_rig(folder / "mill.json").names == ("mill",)
+
+
+def test_messages(folder: Path) -> None:
+    solve(folder)
+    three = [f"{name}.camera.json" for name in NAMES[:3]]
+    given = ["--landmarks", "survey.csv", "--marks", "marks.csv", "-o", "x.json"]
+    with pytest.raises(FileError, match="no camera is named 'hill'"):
+        run(folder, "rig", *three, *given)
+    with pytest.raises(InputError, match="two cameras are named 'mill'"):
+        run(folder, "rig", *three, three[0], *given)
+    with pytest.raises(FileError, match="a rig of 4 cameras; a rig of two is needed"):
+        run(folder, "budget", "rig.json")
+    text = run(folder, "locate", "rig.json", "smoke.csv", "--yaw-sigma", "0.1").replace("│", " ")
+    assert "come from the rig file" in " ".join(text.split())
+    (folder / "twice.csv").write_text("name,camera,u,v\na,mill,1,2\na,mill,3,4\n")
+    with pytest.raises(FileError, match="line 3: 'a' was marked in mill before"):
+        run(folder, "locate", "rig.json", "twice.csv")
+    with pytest.raises(InputError, match="height '3x'"):
+        run(folder, "locate", "rig.json", "smoke.csv", "--height", "3x")
+
+
+def test_two_cameras_take_the_long_table_too(folder: Path) -> None:
+    others = {"church", "hill"}
+    lines = [line for line in (folder / "marks.csv").read_text().splitlines() if not others & {*line.split(",")}]
+    (folder / "two.csv").write_text("\n".join(lines) + "\n")
+    other = Camera.build(focal=(1600.001, 1600), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
+    save_camera(other, folder / "mast.camera.json")
+    given = ["--landmarks", "survey.csv", "--marks", "two.csv", "-o", "two.json"]
+    run(folder, "rig", "mill.camera.json", "mast.camera.json", *given)
+    assert json.loads((folder / "two.json").read_text())["version"] == 2

@@ -1,0 +1,243 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from kcal.errors import InputError
+from kcal.lens.camera_rig import CameraRig
+from kcal.locate.geodesy import enu_to_geodetic
+from kcal.locate.multi_localizer import MultiViewLocalizer
+from kcal.locate.stereo import PositionStatus
+from scripts.shared import station_scenes as scenes
+from scripts.shared.station_scenes import ORIGIN, drawn_errors, marks, ring
+
+OK = int(PositionStatus.OK)
+
+
+def targets(count: int, seed: int = 0) -> Tensor:
+    return scenes.targets(count, torch.Generator().manual_seed(seed))
+
+
+def noise(shape: tuple[int, ...], sigma: float, seed: int = 1) -> Tensor:
+    return sigma * torch.randn(shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.parametrize("radius", [1000.0, 5000.0, 40_000.0])
+def test_exact_marks_through_bent_light_give_the_point_back(radius: float) -> None:
+    rig, points = ring(4, radius), targets(6)
+    rig.root = rig.with_errors(attitude_deg=0.01)
+    found = MultiViewLocalizer(rig)(marks(rig, points))
+    assert (found.status == OK).all()
+    # Without refraction, points 40 km away would be 16 m too high; one radius serves for all verticals.
+    assert (found.enu - points).norm(dim=-1).max() < 1e-3
+    assert torch.allclose(found.geodetic, enu_to_geodetic(points, ORIGIN), atol=1e-9)
+    assert found.reprojection.max() < 1e-5
+
+
+@pytest.mark.parametrize("count", [2, 3, 5])
+def test_ellipses_contain_the_truth_as_often_as_they_say(count: int) -> None:
+    rig = ring(count, 4000.0)
+    root = rig.with_errors(position_m=0.3, attitude_deg=(0.004, 0.004, 0.02), refraction=0.1)
+    generator, points = torch.Generator().manual_seed(7), targets(2000)
+    seen = marks(rig, points, drawn_errors(root, 2000, generator)) + noise((2000, count, 2), 0.3)
+    found = MultiViewLocalizer(rig, pixel_sigma=0.3, root=root)(seen)
+    ok = found.status == OK
+    error = (found.enu - points)[ok]
+    assert ok.sum() > 1990
+    squares = (error * torch.linalg.solve(found.covariance[ok], error)).sum(-1)
+    # Four standard deviations of 2,000 draws.
+    assert abs(float((squares < 7.815).double().mean()) - 0.95) < 0.02
+
+
+def test_a_camera_with_a_poor_attitude_counts_less() -> None:
+    rig = ring(3, 5000.0)
+    root = rig.with_errors(attitude_deg=0.002)
+    root[:, rig.pose_columns(1)] *= 50.0
+    found = MultiViewLocalizer(rig, root=root)(marks(rig, targets(1)) + noise((1, 3, 2), 0.1))
+    alike = MultiViewLocalizer(rig, root=rig.with_errors(attitude_deg=0.1))(marks(rig, targets(1)))
+    assert found.covariance[0].diagonal().sum() < 0.05 * alike.covariance[0].diagonal().sum()
+
+
+def test_any_subset_of_cameras_is_as_if_the_others_were_not_there() -> None:
+    rig, points = ring(5, 5000.0), targets(3)
+    root = rig.with_errors(position_m=0.1, attitude_deg=0.01, refraction=0.1)
+    pixels = marks(rig, points) + noise((3, 5, 2), 0.3)
+    for chosen in ([0, 1], [1, 3], [0, 2, 4]):
+        seen = torch.zeros(3, 5, dtype=torch.bool)
+        seen[:, chosen] = True
+        found = MultiViewLocalizer(rig, root=root)(torch.where(seen[..., None], pixels, math.nan), seen)
+        few = CameraRig(
+            [rig.each[c] for c in chosen], [rig.names[c] for c in chosen], rig.rotation[chosen], rig.center[chosen],
+            origin=ORIGIN,
+        )  # fmt: skip
+        less = few.with_errors(position_m=0.1, attitude_deg=0.01, refraction=0.1)
+        alone = MultiViewLocalizer(few, root=less)(pixels[:, chosen])
+        assert torch.allclose(found.enu, alone.enu, atol=1e-5)
+        assert torch.allclose(found.covariance, alone.covariance, rtol=1e-6)
+        assert torch.equal(found.used, seen)
+        assert (found.anchor == chosen[0]).all()
+
+
+def test_every_row_is_alone() -> None:
+    rig, points = ring(4, 5000.0), targets(6)
+    pixels = marks(rig, points) + noise((6, 4, 2), 0.3)
+    good = MultiViewLocalizer(rig, root=rig.with_errors(attitude_deg=0.01))
+    whole = good(pixels)
+    spoiled = pixels.clone()
+    spoiled[1] = math.nan
+    spoiled[2, 0, 1] = math.inf
+    spoiled[3, 1:] = math.nan
+    seen = torch.ones(6, 4, dtype=torch.bool)
+    seen[4] = False
+    spoiled.requires_grad_()
+    found = good(spoiled, seen)
+    names = [PositionStatus(int(status)).name for status in found.status]
+    assert names == ["OK", "NOT_FINITE", "OK", "BEARING_ONLY", "MASKED", "OK"]
+    for row in (0, 5):
+        assert torch.allclose(found.enu[row], whole.enu[row], atol=1e-6)
+    assert found.used.sum(-1).tolist() == [4, 0, 3, 1, 0, 4]
+    (gradient,) = torch.autograd.grad(found.enu.sum() + found.inverse_range.sum(), spoiled)
+    assert torch.isfinite(gradient).all()
+    assert all(not value.isnan().any() for value in found if value.is_floating_point())
+
+
+@pytest.mark.parametrize("count", [3, 4, 7])
+def test_a_wrong_view_is_named_and_left_out(count: int) -> None:
+    rig = ring(count, 3000.0)
+    root = rig.with_errors(attitude_deg=0.003)
+    points = targets(40)
+    pixels = marks(rig, points) + noise((40, count, 2), 0.3)
+    wrong = torch.arange(40) % count
+    off = torch.tensor([[120.0, 90.0], [-20.0, 30.0]])[torch.arange(40) % 2]
+    pixels[torch.arange(40), wrong] += off
+    found = MultiViewLocalizer(rig, root=root)(pixels)
+    named = found.bad & (found.status == OK)[:, None]
+    # Of three views, an error along a line that the others allow may be anyone's; such rows say so.
+    assert named.any(-1).sum() >= (20 if count == 3 else 40)
+    rows = named.any(-1).nonzero()[:, 0]
+    assert (named[rows].to(int).argmax(-1) == wrong[rows]).all()
+    assert (found.misfit[rows].argmax(-1) == wrong[rows]).all()
+    assert (found.enu - points)[rows].norm(dim=-1).max() < 5.0
+    rest = (found.status != OK).nonzero()[:, 0]
+    assert (found.status[rest] == int(PositionStatus.CONTRADICTION)).all()
+
+
+def test_good_views_are_left_alone() -> None:
+    rig = ring(6, 3000.0)
+    root = rig.with_errors(attitude_deg=0.02)
+    errors = drawn_errors(root, 2000, torch.Generator().manual_seed(3))
+    pixels = marks(rig, targets(2000), errors) + noise((2000, 6, 2), 0.3)
+    found = MultiViewLocalizer(rig, root=root)(pixels)
+    # One in ten thousand; without the errors that pixels share, nearly all.
+    assert (found.bad.any(-1) | (found.status != OK)).sum() <= 2
+    assert MultiViewLocalizer(rig)(pixels).bad.any(-1).sum() > 1000
+
+
+def test_two_views_that_contradict_each_other_are_told() -> None:
+    rig = ring(2, 3000.0)
+    pixels = marks(rig, targets(2))
+    pixels[1, 0, 1] += 60.0
+    found = MultiViewLocalizer(rig)(pixels)
+    assert found.status.tolist() == [OK, int(PositionStatus.CONTRADICTION)]
+    assert (found.enu[1] == 0).all()
+    assert torch.isinf(found.covariance[1].diagonal()).all()
+
+
+def test_gradients_are_exact() -> None:
+    rig = ring(3, 5000.0)
+    locate = MultiViewLocalizer(rig, root=rig.with_errors(attitude_deg=0.01, refraction=0.1))
+    pixels = (marks(rig, targets(2)) + noise((2, 3, 2), 0.3)).requires_grad_()
+    cov = (0.1 * torch.eye(2, dtype=torch.float64)).repeat(2, 3, 1, 1).requires_grad_()
+
+    def places(pixels: Tensor, cov: Tensor) -> Tensor:
+        return locate(pixels, None, 0.5 * (cov + cov.mT)).enu
+
+    assert torch.autograd.gradcheck(places, (pixels, cov), eps=1e-4, rtol=1e-4, atol=1e-3)
+
+
+def mixed_rows() -> tuple[MultiViewLocalizer, Tensor, Tensor]:
+    rig = ring(3, 5000.0)
+    pixels = marks(rig, targets(8)) + noise((8, 3, 2), 0.3)
+    pixels[3, 2, 1] += 80.0
+    seen = torch.ones(8, 3, dtype=torch.bool)
+    seen[0, 1] = False
+    return MultiViewLocalizer(rig, root=rig.with_errors(attitude_deg=0.01)), pixels, seen
+
+
+def test_vmap() -> None:
+    locate, pixels, seen = mixed_rows()
+    plain = locate(pixels, seen)
+    mapped = torch.vmap(lambda pixels, seen: locate(pixels, seen))(pixels[:, None], seen[:, None])
+    assert torch.allclose(mapped.enu[:, 0], plain.enu, atol=1e-6)
+    assert torch.equal(mapped.bad[:, 0], plain.bad)
+    assert plain.bad.nonzero().tolist() == [[3, 2]]
+
+
+@pytest.mark.slow
+def test_export() -> None:
+    locate, pixels, seen = mixed_rows()
+    plain, program = locate(pixels, seen), torch.export.export(locate, (pixels, seen))
+    found = program.module()(pixels, seen)
+    assert torch.allclose(found.enu, plain.enu, atol=1e-3)
+    assert torch.equal(found.bad, plain.bad)
+
+
+def test_one_camera_with_a_stated_height() -> None:
+    rig = ring(3, 3000.0)
+    points = targets(5)
+    height = enu_to_geodetic(points, ORIGIN)[:, 2]
+    # Far below the towers, so that lines of sight meet the height steeply enough.
+    points = points - torch.tensor([0.0, 0.0, 300.0])
+    height = enu_to_geodetic(points, ORIGIN)[:, 2]
+    root = rig.with_errors(attitude_deg=0.02, refraction=0.1)
+    locate = MultiViewLocalizer(rig, root=root)
+    seen = torch.tensor([False, True, False]).expand(5, 3)
+    pixels = marks(rig, points)
+    found = locate(pixels, seen, height=height, height_sigma=2.0)
+    assert (found.status == OK).all()
+    assert (found.enu - points).norm(dim=-1).max() < 0.02
+    generator, many = torch.Generator().manual_seed(4), points.repeat(400, 1)
+    shifted = marks(rig, many, drawn_errors(root, 2000, generator)) + noise((2000, 3, 2), 0.3)
+    told = height.repeat(400) + noise((2000,), 2.0, 5)
+    result = locate(shifted, seen[:1].expand(2000, 3), height=told, height_sigma=2.0)
+    error = result.enu - many
+    squares = (error * torch.linalg.solve(result.covariance, error)).sum(-1)
+    assert abs(float((squares < 7.815).double().mean()) - 0.95) < 0.02
+    upward = locate(marks(rig, points + torch.tensor([0.0, 0.0, 900.0])), seen, height=height)
+    assert (upward.status == int(PositionStatus.BEARING_ONLY)).all()
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_one_camera_alone_is_as_one_of_several(count: int) -> None:
+    rig, points = ring(3, 9000.0), targets(4) - torch.tensor([0.0, 0.0, 400.0])
+    few = CameraRig(rig.each[:count], rig.names[:count], rig.rotation[:count], rig.center[:count], origin=ORIGIN)
+    pixels = marks(rig, points)[:, :count]
+    seen = torch.arange(count).expand(4, count) == 0
+    height = enu_to_geodetic(points, ORIGIN)[:, 2]
+    found = MultiViewLocalizer(few, root=few.with_errors(attitude_deg=0.01))(pixels, seen, height=height)
+    assert (found.status == OK).all()
+    assert (found.enu - points).norm(dim=-1).max() < 0.1
+
+
+def test_errors_of_clocks_widen_along_the_motion() -> None:
+    rig = ring(3, 3000.0)
+    pixels, velocity = marks(rig, targets(1)), torch.tensor([[[50.0, 0.0]] * 3], dtype=torch.float64)
+    still = MultiViewLocalizer(rig, clock_sigma=0.1)(pixels)
+    moving = MultiViewLocalizer(rig, clock_sigma=0.1)(pixels, velocity=velocity)
+    assert moving.covariance[0, 0, 0] > 50 * still.covariance[0, 0, 0]
+    assert moving.covariance[0, 2, 2] < 1.5 * still.covariance[0, 2, 2]
+
+
+def test_bad_arguments() -> None:
+    rig = ring(3, 3000.0)
+    with pytest.raises(InputError, match=r"shape \(\.\.\., 3, 2\)"):
+        MultiViewLocalizer(rig)(torch.zeros(4, 2, 2))
+    with pytest.raises(InputError, match="seen: bool"):
+        MultiViewLocalizer(rig)(torch.zeros(4, 3, 2), torch.ones(4, 3))
+    with pytest.raises(InputError, match="a root"):
+        MultiViewLocalizer(rig, root=torch.ones(2, 5))
+    with pytest.raises(InputError, match="unlike names"):
+        CameraRig(rig.each, ["a", "a", "b"], rig.rotation, rig.center)

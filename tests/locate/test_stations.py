@@ -1,0 +1,182 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from locate_rigs import real_rig, spread_points, tensor
+from torch import Tensor
+
+from kcal.calibrate.rig.solve import solve_rig
+from kcal.calibrate.rig.sources import Landmarks, MeasuredPosition, RigData
+from kcal.errors import DegenerateError, FileError
+from kcal.io.camera_rig_file import save_camera_rig
+from kcal.io.rig_file import load_rig, save_rig
+from kcal.lens.camera_rig import CameraRig
+from kcal.lens.mounting import Mounting
+from kcal.lens.rig import RigCovariance
+from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.mounting import placed_rig
+from kcal.locate.multi_localizer import MultiViewLocalizer
+from kcal.locate.stations import load_camera_rig, station_mounting, stations_of
+from scripts.shared.station_scenes import ORIGIN, marks, ring, targets
+
+OLD_RIG = Path(__file__).parents[1] / "io" / "rig-version-1.json"
+
+
+def survey(count: int = 4, seed: int = 0) -> tuple[CameraRig, RigData, Tensor]:
+    """Stations 5 km from the middle that see landmarks of their own, and few in common."""
+    rig, generator = ring(count, 5000.0), torch.Generator().manual_seed(seed)
+    groups = [targets(8, generator, 800.0)]
+    for center in rig.center:
+        share = 0.1 + 0.6 * torch.rand(6, 1, dtype=torch.float64, generator=generator)
+        groups.append(center + share * (targets(6, generator, 1500.0) - center) - tensor(0.0, 0.0, 60.0))
+    points = torch.cat(groups)
+    seen = torch.zeros(len(points), count, dtype=torch.bool)
+    seen[:8] = torch.rand(8, count, generator=generator) < 0.4
+    for c in range(count):
+        seen[8 + 6 * c : 14 + 6 * c, c] = True
+    pixels = marks(rig, points)
+    inside = torch.stack([camera.inside(pixels[:, c]) for c, camera in enumerate(rig.each)], 1)
+    seen &= inside
+    pixels = pixels + 0.3 * torch.randn(pixels.shape, dtype=torch.float64, generator=generator)
+    pixels = torch.where(seen[..., None], pixels, torch.nan)
+    kept = seen.any(1)
+    surveyed = points + 0.05 * torch.randn(points.shape, dtype=torch.float64, generator=generator)
+    names = tuple(f"post {i}" for i in range(int(kept.sum())))
+    sigma = torch.full((len(names), 3), 0.05, dtype=torch.float64)
+    landmarks = Landmarks(names=names, points=surveyed[kept], sigma=sigma, pixels=pixels[kept])
+    positions = tuple(
+        MeasuredPosition(camera=c, point=center + 0.3, sigma=tensor(0.5, 0.5, 0.5))
+        for c, center in enumerate(rig.center)
+    )
+    return rig, RigData(cameras=tuple(rig.each), names=rig.names, landmarks=landmarks, positions=positions), points
+
+
+def test_stations_are_solved_from_landmarks_of_their_own_and_their_file_says_all() -> None:
+    truth, data, _ = survey()
+    found = solve_rig(data).stations(ORIGIN)
+    errors = torch.cat([found.center - truth.center, torch.zeros(len(found), 0)], 1)
+    assert found.root is not None
+    spread = torch.cat([found.root[:, found.pose_columns(c)] for c in range(len(found))], 1)
+    variance = spread.square().sum(0).unflatten(0, (-1, 6))
+    assert ((errors / variance[:, :3].sqrt()).abs() < 4.0).all()
+    # A kilometer of lens and 0.3 px of noise: attitudes to some thousandths of a degree.
+    assert variance[:, 3:].sqrt().rad2deg().max() < 0.02
+    assert found.calibration is not None
+    assert found.calibration.undetermined == ()
+
+
+def test_positions_from_solved_stations_are_inside_their_ellipses() -> None:
+    squares = []
+    for seed in range(6):
+        truth, data, _ = survey(seed=seed)
+        found = solve_rig(data).stations(ORIGIN)
+        points = targets(50, torch.Generator().manual_seed(100 + seed))
+        noise = 0.3 * torch.randn(50, len(truth), 2, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+        located = MultiViewLocalizer(found)(marks(truth, points) + noise)
+        error = located.enu - points
+        squares.append((error * torch.linalg.solve(located.covariance, error)).sum(-1))
+    inside = float((torch.cat(squares) < 7.815).double().mean())
+    # Six rigs, each with errors of its own.
+    assert 0.80 < inside <= 1.0
+
+
+def test_one_camera_alone() -> None:
+    truth, data, _ = survey(count=2)
+    marks_of_one = data.landmarks
+    assert marks_of_one is not None
+    seen = marks_of_one.pixels[:, 0].isfinite().all(-1)
+    alone = Landmarks(
+        names=tuple(name for name, own in zip(marks_of_one.names, seen.tolist(), strict=True) if own),
+        points=marks_of_one.points[seen], sigma=marks_of_one.sigma[seen], pixels=marks_of_one.pixels[seen, :1],
+    )  # fmt: skip
+    result = solve_rig(RigData(cameras=data.cameras[:1], names=("mast",), landmarks=alone))
+    stands = station_mounting(result.stations(ORIGIN), 0)
+    there = station_mounting(truth, 0)
+    assert stands.covariance is not None
+    assert abs(stands.heading_deg - there.heading_deg) < 5 * float(stands.covariance[5, 5].sqrt().rad2deg())
+    assert abs(stands.origin.height - there.origin.height) < 5 * float(stands.covariance[2, 2].sqrt())
+    few = Landmarks(names=alone.names[:3], points=alone.points[:3], sigma=alone.sigma[:3], pixels=alone.pixels[:3])
+    with pytest.raises(DegenerateError, match="mast"):
+        solve_rig(RigData(cameras=data.cameras[:1], names=("mast",), landmarks=few))
+
+
+def test_file_of_many_cameras(tmp_path: Path) -> None:
+    _, data, _ = survey()
+    rig = solve_rig(data).stations(ORIGIN)
+    path = save_camera_rig(rig, tmp_path / "rig.json")
+    again = load_camera_rig(path)
+    assert again.names == rig.names
+    assert again.origin == ORIGIN
+    assert torch.equal(again.rotation, rig.rotation)
+    assert again.root is not None
+    assert torch.equal(again.root, rig.root)
+    assert again.calibration == rig.calibration
+    with pytest.raises(FileError, match="a rig of 4 cameras; a rig of two is needed here"):
+        load_rig(path)
+    content = json.loads(path.read_text())
+    content["poses"].pop()
+    path.write_text(json.dumps(content))
+    with pytest.raises(FileError, match="4 names, 4 cameras and 3 poses"):
+        load_camera_rig(path)
+
+
+def test_rigs_of_two_and_of_version_1_load() -> None:
+    old = load_camera_rig(OLD_RIG)
+    assert old.names == ("left", "right")
+    assert float((old.center[1] - old.center[0]).norm()) == pytest.approx(float(load_rig(OLD_RIG).baseline))
+
+
+@pytest.mark.parametrize("mounted", [True, False])
+def test_a_stereo_rig_gives_the_same_positions_and_covariances(tmp_path: Path, mounted: bool) -> None:
+    rig, generator = real_rig(), torch.Generator().manual_seed(1)
+    size = rig.left.values.shape[-1] + rig.right.values.shape[-1] + 6
+    scale = torch.cat([torch.full((size - 6,), 1e-5), tensor(1e-4, 1e-4, 1e-4, 0.01, 0.01, 0.01)])
+    half = torch.randn(8, size + 7, dtype=torch.float64, generator=generator)
+    half *= torch.cat([scale, tensor(0.1, 0.1, 0.2, 1e-4, 2e-4, 3e-4, 0.05)])
+    joint = half.T @ half
+    rig.covariance = RigCovariance(half=half[:, :size])
+    if mounted:
+        rig.mounting = Mounting(
+            origin=ORIGIN, heading_deg=35.0, pitch_deg=-1.0, roll_deg=0.5, covariance=joint[size:, size:],
+            link=joint[:size, size:], refraction=0.1,
+        )  # fmt: skip
+    points = spread_points(torch.linspace(80.0, 400.0, 5, dtype=torch.float64))
+    left, right, _ = rig(points)
+    right = right + tensor(0.05, 0.0)
+    many = MultiViewLocalizer(load_camera_rig(save_rig(rig, tmp_path / "rig.json")))
+    found = many(torch.stack([left, right], 1))
+    if mounted:
+        other = StereoLocalizer(rig)(left, right)
+        assert torch.allclose(found.geodetic, other.geodetic, atol=1e-6)
+        # Here ranges count from where the left camera is said to stand, 0.1 to 0.2 m off.
+        assert torch.allclose(found.range_high, other.range_high, atol=0.3)
+    else:
+        # Without a place on the Earth there are straight lines, in the left camera's frame.
+        other = StereoLocalizer(rig, origin=ORIGIN, heading_deg=0.0, refraction=0.0, refraction_sigma=0.0)(left, right)
+        turned = other.enu @ tensor([1, 0, 0], [0, 0, 1], [0, -1, 0])
+        assert torch.allclose(found.enu, turned, atol=0.01)
+    assert (found.enu.norm(dim=-1) - other.enu.norm(dim=-1)).abs().max() < 0.01
+    if mounted:
+        # The same errors, which also weigh the marks here: no direction is worse for it.
+        gained = torch.linalg.eigvalsh(other.covariance - found.covariance)
+        assert (gained[:, 0] > -1e-3 * torch.linalg.eigvalsh(other.covariance)[:, -1]).all()
+        rig.covariance, rig.mounting = None, dataclasses.replace(rig.mounting, link=None)
+        found = MultiViewLocalizer(stations_of(rig))(torch.stack([left, right], 1))
+        other = StereoLocalizer(rig)(left, right)
+        scale = other.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+        off = (found.covariance - other.covariance) / scale[:, :, None] / scale[:, None]
+        assert off.abs().max() < 1e-3
+
+
+def test_a_placed_rig_and_its_stations_stand_alike() -> None:
+    _, data, _ = survey(count=2)
+    result = solve_rig(data)
+    stereo, stations = placed_rig(result, ORIGIN), result.stations(ORIGIN)
+    ours, theirs = station_mounting(stations, 0), stereo.mounting
+    assert theirs is not None
+    assert ours.heading_deg == pytest.approx(theirs.heading_deg, abs=1e-9)
+    assert torch.allclose(ours.covariance, theirs.covariance, rtol=1e-9, atol=1e-18)
