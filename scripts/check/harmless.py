@@ -30,5 +30,6 @@ HARMLESS = {
     "e0ea7adc7be67053": "how many steps a search may take that ends long before",
     "919fd48b3143c8b7": "a number, from the same factors in another order",
     "0596630b21cb4ec2": "a number, from the same factors in another order",
+    "ab8b1729821ccfe0": "a first focal length, from which a fit begins",
     "9d350f625c8848c9": "a negative number, which means none whatever its size",
 }

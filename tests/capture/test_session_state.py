@@ -150,6 +150,7 @@ def test_a_board_must_rest_and_be_somewhere_new(session: CaptureSession) -> None
     assert session.message == "hold still"
     assert session.offer(frame(1), "b/c.png", moving=True)
     assert session.message == "kept b/c.png"
+    assert session.frames == session.output.parent / "left.frames"
     assert {path.name for path in session.frames.iterdir()} == {"a.png", "b_c.png"}
     assert not session.offer(frame(0), "d", moving=False)
     assert session.message.startswith("kept one like this already")
