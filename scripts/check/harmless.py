@@ -31,5 +31,7 @@ HARMLESS = {
     "919fd48b3143c8b7": "a number, from the same factors in another order",
     "0596630b21cb4ec2": "a number, from the same factors in another order",
     "ab8b1729821ccfe0": "a first focal length, from which a fit begins",
+    "02a20fa8d7b5185d": "where a thing stands on a site that is made up",
+    "96a90b97a1771eed": "a variance that is zero to the last bit",
     "9d350f625c8848c9": "a negative number, which means none whatever its size",
 }

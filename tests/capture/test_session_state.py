@@ -92,6 +92,14 @@ def test_a_frame_without_a_board_gives_the_size_and_a_first_proposal(session: Ca
     assert np.allclose(outline.mean(0), [160, 120], atol=25)
     assert np.ptp(outline[:, 0]) > 100
     assert ((outline > 0) & (outline < SIZE)).all()
+    suggestion = session.suggestion
+    assert suggestion is not None
+    upper = suggestion.pixels[: BOARD.columns] if "left" in suggestion.words else suggestion.pixels
+    seen = suggestion.rotation @ BOARD.points.T + suggestion.translation[:, None]
+    focal = (upper - upper.mean(0)).norm() / (seen[:2] / seen[2])[:, : len(upper)].sub(
+        (seen[:2] / seen[2])[:, : len(upper)].mean(1, keepdim=True)
+    ).norm()
+    assert float(focal) == pytest.approx(0.9 * 320, rel=1e-6)
     assert state["next"]["first"] == [state["next"]["outline"][0]]
 
 
