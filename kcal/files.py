@@ -181,14 +181,15 @@ def open_atomic(path: str | Path) -> Iterator[BinaryIO]:
             if mode is not None:
                 os.chmod(temporary, mode)
             os.replace(temporary, target)
-            for paths in _watching:
-                paths.append(path)
-        except BaseException:
-            temporary.unlink()
-            raise
         finally:
             if held is not None:
                 os.close(held)
+            if temporary.exists():
+                temporary.unlink()
+            else:
+                # In place, also where an interruption came right after that.
+                for paths in _watching:
+                    paths.append(path)
     except OSError as error:
         raise FileError(f"{path}: cannot write: {error.strerror or error}") from error
 

@@ -34,7 +34,8 @@ PUBLIC = {
         load_camera load_rig locate_points save_camera save_rig solve_rig
     """,
     "kcal.lens": """
-        BoardRecord CalibrationRecord CameraCalibration CameraDifference CameraInformation CameraPose Exclusion
+        BoardRecord CalibrationRecord CameraCalibration CameraDifference CameraInformation CameraPose CameraRays
+        Cylinder Exclusion StereoRectification cylinder_view looking pinhole_view pixel_errors pupil_shift ray_error
         ExportedCameras HybridForm ImageTransform ImportedCameras InverseFit InverseNet InverseNetOptions
         LearnedStart LensModel LookupCamera Misfit ParaxialFocal RefittedCamera Undistort UndistortImage
         UndistortMaps Unproject ZernikeModes bake camera_difference export_cameras image_sigma import_cameras
@@ -48,6 +49,7 @@ PUBLIC = {
     """,
     "kcal.calibrate": """
         CalibratedViews CalibrationLayer CalibrationSummary ComparisonResult Examination HalvesDifference
+        IntervalCheck Refit against_capture interval_check simulated_refits
         MeasuredBoard OutlierRejection RejectedCorner RejectedView ResidualStructure SharedBoard
         calibrate_cameras calibrate_views compare_models examine load_measured_board measure_board
         save_measured_board summarize
@@ -59,9 +61,10 @@ PUBLIC = {
         read_pairs read_survey relocked triangulated_sides
     """,
     "kcal.locate": """
-        BudgetErrors Geoid GroundPlaces Localization Marks Position PositionColumns RangeError Sensitivity Triangulate
-        TriangulateViews Triangulation Viewpoint ViewsResult circular_error enu_from_cam enu_to_geodetic
-        find_geoid geodetic_to_enu level_ground locate_on_ground position_errors range_errors read_marks
+        BudgetErrors DisparityRanges Geoid GroundPlaces Localization Marks RangeImage Position PositionColumns
+        RangeError Sensitivity Triangulate TriangulateViews Triangulation Viewpoint ViewsResult
+        circular_error enu_from_cam enu_to_geodetic
+        find_geoid forgotten_yaw geodetic_to_enu level_ground locate_on_ground position_errors range_errors read_marks
         read_truth terrain true_from_grid write_positions
     """,
     "kcal.track": """
@@ -72,13 +75,15 @@ PUBLIC = {
     "kcal.report": """
         FailedImage Finding RangeAnswer Requirement Verdict calibration_figure camera_verdict positions_figure
         rig_figure rig_verdict save_board_picture save_budget_picture save_calibration_picture save_coverage
-        save_difference_picture save_gallery save_map save_positions_picture save_rig_picture save_verdict_page
+        save_difference_picture save_gallery save_interval_picture save_map save_positions_picture
+        save_rig_picture save_verdict_page
         stored_verdict
     """,
     "kcal.stars": """
         NightPlan PlannedStars StarCamera StarLens calibrate_by_stars planned_stars
-        Air Attitude DetectedStars Identification NamedStars SkyView StarCatalog celestial_directions detect_stars
-        identify moments_of name_stars observed_directions parse_time star_source StarEffect StarSource
+        Agreement Air Attitude DetectedStars Identification NamedStars SkyView StarCatalog celestial_directions
+        clock_doubts detect_stars identify moments_of name_stars observed_directions parse_time star_source StarEffect
+        StarSource
     """,
     "kcal.solve": """
         LMOptions LevenbergMarquardt RobustLoss SolverStatus
@@ -87,13 +92,23 @@ PUBLIC = {
 NAMES = [(door, name) for door, names in PUBLIC.items() for name in names.split()]
 NAMESPACES = {door.removeprefix("kcal.") for door in PUBLIC} - {"kcal"}
 # Names that were not in `kcal` itself before there were namespaces.
-NEW_NAMES = {"PositionColumns", "calibrate_views", "detect", "rotation_from_vector", "vector_from_rotation"} | set(
-    PUBLIC["kcal.stars"].split()
+NEW_NAMES = (
+    {"PositionColumns", "calibrate_views", "detect", "rotation_from_vector", "vector_from_rotation"}
+    | {"CameraRays", "Cylinder", "StereoRectification", "cylinder_view", "looking", "pinhole_view", "pixel_errors"}
+    | {"pupil_shift", "ray_error", "IntervalCheck", "Refit", "against_capture", "interval_check", "simulated_refits"}
+    | {"DisparityRanges", "RangeImage", "forgotten_yaw", "save_interval_picture"}
+    | set(PUBLIC["kcal.stars"].split())
 )
 # Types of attributes in which only those look who work on kcal.
 INSIDE = {"FieldModes", "HybridFit", "BoardState", "Spline"}
 # What functions return, and blocks of files: examples are those of the functions.
 RECORDS = {
+    "IntervalCheck",
+    "RangeImage",
+    "Refit",
+    "against_capture",
+    "cylinder_view",
+    "interval_check",
     "Attitude",
     "DetectedStars",
     "Identification",
@@ -186,6 +201,7 @@ WITHOUT_EXAMPLE = {
     "save_coverage",
     "save_difference_picture",
     "save_gallery",
+    "save_interval_picture",
     "save_map",
     "save_positions_picture",
     "save_rig_picture",

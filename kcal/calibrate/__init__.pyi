@@ -19,6 +19,11 @@ from kcal.calibrate.camera.trust import examine as examine
 from kcal.calibrate.camera.trust import Examination as Examination
 from kcal.calibrate.camera.trust import HalvesDifference as HalvesDifference
 from kcal.calibrate.camera.trust import ResidualStructure as ResidualStructure
+from kcal.calibrate.camera.interval_check import interval_check as interval_check
+from kcal.calibrate.camera.interval_check import IntervalCheck as IntervalCheck
+from kcal.calibrate.camera.interval_check import simulated_refits as simulated_refits
+from kcal.calibrate.camera.interval_check import Refit as Refit
+from kcal.calibrate.camera.interval_check import against_capture as against_capture
 
 # Measured boards
 from kcal.calibrate.hybrid.cameras_fit import measure_board as measure_board

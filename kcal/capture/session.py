@@ -148,7 +148,23 @@ class CaptureSession:
             )
             self.seen.save(self.output)
             self.message = f"kept {name}"
-            return True
+        self._advise()
+        return True
+
+    def _advise(self) -> None:
+        """Say what to photograph next by what is known now: a fit takes long, and what was asked for is there."""
+        with self._lock:
+            seen, result, fitted = self.seen, self.result, self.history[-1][0] if self.history else 0
+        if seen is None:
+            return
+        if result is None or result.hybrid is None:
+            found: NextView | None = _first_view(seen.image_size, self.board, len(seen.views))
+        else:
+            found = next_view(result.camera, self.board, result.hybrid.sigma, seen.pixels()[fitted:])
+        with self._lock:
+            # What came meanwhile has its own.
+            if self.seen is seen and self.result is result:
+                self.suggestion = found
 
     def think(self) -> bool:
         """Calibrate with the views of this moment and find the next one; False if there is nothing new."""
@@ -166,14 +182,14 @@ class CaptureSession:
         self._calibrated = count
         try:
             result = calibrate_camera(seen)
-            assert result.hybrid is not None
-            sigma, suggestion = far_sigma(result.camera), next_view(result.camera, self.board, result.hybrid.sigma)
+            sigma = far_sigma(result.camera)
         except KcalError as error:
             self.message = f"cannot be calibrated yet: {error}"
             return True
         with self._lock:
-            self.result, self.suggestion = result, suggestion
+            self.result = result
             self.history.append((count, sigma))
+        self._advise()
         return True
 
     def picture(self) -> bytes | None:

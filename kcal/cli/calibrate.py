@@ -10,7 +10,7 @@ import typer
 from rich.markup import escape
 
 from kcal.cli.calibrate_result import calibration_numbers, print_calibration
-from kcal.cli.calibrate_stars import by_night
+from kcal.cli.calibrate_stars import by_night, joined_by_stars
 from kcal.cli.console import out, print_wrote, steps, tell, warn
 from kcal.cli.inputs import BOARD, CAMERA, OBSERVATIONS, check_file
 from kcal.cli.night_images import TIME_HELP
@@ -39,7 +39,7 @@ def calibrate_command(
     ] = None,
     stars: Annotated[
         list[str] | None,
-        typer.Option(metavar="IMAGES", help="Night images in place of observations: the lens at infinity, by stars."),
+        typer.Option(metavar="IMAGES", help="Night images: the lens at infinity, by stars, alone or with boards."),
     ] = None,
     star_time: Annotated[
         str | None, typer.Option("--time", metavar="TIME", help=f"Of --stars. {TIME_HELP}", hidden=True)
@@ -206,7 +206,8 @@ def calibrate_command(
     camera; read the uncertainty of far directions, in pixels, and what to photograph next.
 
     With --stars no board is needed, and nothing need be known of the camera: tilt it up by 30° on some clear nights'
-    images. The camera is right at infinity, and has no entrance pupil.
+    images. The camera is right at infinity, and has no entrance pupil. With observations as well, boards give the
+    lens with its pupil and stars the field at infinity; whether they contradict each other is tested.
 
     Calibrate both cameras of a rig in one call: those that saw one printed board measure its errors together.
 
@@ -226,9 +227,11 @@ def calibrate_command(
     """
     from kcal.lens.model import LensModel
 
-    if stars or not observations:
-        by_night(stars, observations, star_time, star_place, output, name)
+    if not observations:
+        by_night(stars, star_time, star_place, output, name)
         return
+    if stars and len(observations) > 1:
+        raise InputError("--stars are of one camera: calibrate each with its own boards and night images")
     needs = required(require)
     if board not in ("printed", "exact"):
         check_file("--board-shape", board, BOARD)
@@ -273,6 +276,8 @@ def calibrate_command(
             )
         except DegenerateError as error:
             raise DegenerateError(f"{error}. {more_views(sets[0].board, places[0].observations)}") from error
+    if stars and not isinstance(outcomes[0], KcalError):
+        outcomes = [joined_by_stars(outcomes[0], stars, star_time, star_place, places[0].output)]
     failed = [place.name for place, result in zip(places, outcomes, strict=True) if isinstance(result, KcalError)]
     usable = True
     figures: dict[str, dict[str, Any]] = {}

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kcal.errors import InputError
+from kcal.file_kind import file_kind
 
 if TYPE_CHECKING:
     from kcal.io.foreign import ImportedCameras
@@ -39,9 +40,12 @@ def picked(found: ImportedCameras, name: str | None, source: str) -> Camera:
 
 def single_camera(source: str) -> Camera:
     """The camera that FILE or FILE:CAMERA names."""
+    path, name = named_source(source)
+    # Without the readers of other programs' files, which take long to load.
+    if (file_kind(path), name) in (("camera", None), ("rig", "left"), ("rig", "right")):
+        return calibrated_camera(source)
     from kcal.io.formats import import_cameras
 
-    path, name = named_source(source)
     return picked(import_cameras(path), name, source)
 
 

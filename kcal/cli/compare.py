@@ -10,6 +10,7 @@ import typer
 from kcal.cli.console import out, print_table, steps, warn
 from kcal.cli.inputs import OBSERVATIONS
 from kcal.errors import InputError
+from kcal.quantities import number_text
 
 
 def compare_command(
@@ -53,7 +54,8 @@ def compare_command(
     rows = [["model", "held-out RMS, px", "more than the best, px", "± standard error"]]
     for name, rms in ranking:
         more, error = result.difference(name, best)
-        rows.append([name, f"{rms:.4f}", "" if name == best else f"{more:.4f}", "" if name == best else f"{error:.4f}"])
+        cells = ["", ""] if name == best else [number_text(more, error), number_text(error, error)]
+        rows.append([name, number_text(rms, digits=4), *cells])
     print_table(rows)
     for name, reason in result.failures.items():
         warn(f"{name} could not be fitted to some of the views: {reason}")

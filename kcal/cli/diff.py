@@ -12,6 +12,7 @@ from kcal.cli.camera_sources import single_camera
 from kcal.cli.console import out, print_wrote, tell
 from kcal.cli.inputs import ANY_CAMERA
 from kcal.files import check_picture
+from kcal.quantities import number_text
 
 if TYPE_CHECKING:
     from kcal.lens.camera import Camera
@@ -85,7 +86,9 @@ def _history(camera: Camera) -> str:
     from kcal.lens.paraxial import paraxial_focal
 
     record = camera.calibration.record if camera.calibration else None
-    when = f", {record.created:%Y-%m-%d %H:%M}, RMS {record.rms:.3f} px from {record.views} views" if record else ""
+    when = ""
+    if record:
+        when = f", {record.created:%Y-%m-%d %H:%M}, RMS {number_text(record.rms)} px from {record.views} views"
     if record and record.temperature is not None:
         when += f", at {record.temperature:g} °C"
     return f"{camera.model}, focal length {paraxial_focal(camera)}{when}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -12,6 +12,9 @@ from kcal.cli.console import out, print_wrote, steps, warn
 from kcal.cli.inputs import CAMERA_OR_RIG, FOREIGN
 from kcal.errors import InputError
 from kcal.files import check_picture, check_writable
+
+if TYPE_CHECKING:
+    from kcal.lens.camera import Camera
 
 # Pixels (RMS) beyond which a lens model does not stand for a lens.
 _FAR = 0.5
@@ -27,7 +30,12 @@ def export_command(
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="File to write.")],
     format: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="opencv, ros, kalibr, mrcal, colmap, nerfstudio, matlab, opensfm or remap."),
+        typer.Option(
+            "--to",
+            "--format",
+            metavar="NAME",
+            help="opencv, ros, kalibr, mrcal, colmap, nerfstudio, matlab, opensfm, toml, gtsam, ceres, numpy or remap.",
+        ),
     ] = None,
     model: Annotated[
         str | None, typer.Option(metavar="NAME", help="Lens model of the format to fit, for example opencv5.")
@@ -39,15 +47,20 @@ def export_command(
     """Write a camera or a rig for another program.
 
     The format follows from the suffix: .yaml and .xml OpenCV, .cameramodel mrcal, .txt and .bin COLMAP, .json
-    nerfstudio, .mat MATLAB, .npz maps for cv2.remap. ROS, Kalibr and OpenSfM are named by --format. A lens that the
-    format cannot hold is never cut short: the nearest model of the format is fitted, and its error over the image is
-    printed. Pixel origins are converted.
+    nerfstudio, .mat MATLAB, .toml aniposelib, .npz maps for cv2.remap. Others are named by --to. A lens that the format
+    cannot hold is never cut short: the nearest model of the format is fitted, and its error over the image is printed.
+    Pixel origins are converted.
+
+    What is known of a camera goes along as a prior for bundle adjustment: the parameters in the program's order and
+    their square-root information, in NAME.prior.json.
 
     **Examples**
 
     `kcal export left.camera.json -o left.yaml`
 
-    `kcal export rig.json --format kalibr -o camchain.yaml`
+    `kcal export rig.json --to kalibr -o camchain.yaml`
+
+    `kcal export left.camera.json --to gtsam -o left.gtsam.json`
 
     `kcal export left.camera.json -o left.cameramodel --picture misfit.png`
     """
@@ -115,7 +128,10 @@ def import_command(
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="Camera or rig file to write.")],
     format: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="opencv, ros, kalibr, mrcal, colmap, nerfstudio, matlab or opensfm."),
+        typer.Option(
+            metavar="NAME",
+            help="opencv, ros, kalibr, mrcal, colmap, nerfstudio, matlab, opensfm, toml, qualisys or agisoft.",
+        ),
     ] = None,
     camera: Annotated[str | None, typer.Option(metavar="NAME", help="Take this camera of several.")] = None,
     size: Annotated[
@@ -186,8 +202,17 @@ def import_command(
         chosen = picked(found, camera, " ".join(map(str, sources)))
         save_camera(chosen, output)
         out.print(f"camera from {found.format}: {chosen.model}, {chosen.size[0]}x{chosen.size[1]} px", markup=False)
-    out.print("not in the file: error bars, calibration record")
+    if without := [name for name, one in zip(found.names, found.cameras, strict=True) if not _has_error_bars(one)]:
+        out.print(
+            f"no error bars in the file: {', '.join(without)}. A rig takes such a camera as exact, and no σ knows "
+            "the lens's errors",
+            markup=False,
+        )
     print_wrote(output)
+
+
+def _has_error_bars(camera: Camera) -> bool:
+    return camera.calibration is not None and camera.calibration.covariance is not None
 
 
 def _import_corners(

@@ -18,6 +18,7 @@ from kcal.cli.inputs import RIG, VIDEO
 from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_of
 from kcal.cli.settings import taken
 from kcal.errors import InputError
+from kcal.quantities import measured_text
 
 if TYPE_CHECKING:
     from kcal.locate.columns import PositionColumns
@@ -216,7 +217,8 @@ def live_command(
         err.print(f"last malformed line: {counts.last_error}", markup=False)
     if clock_sigma:
         offset, sigma = stream.tracker.clock_estimate().offset(stream.tracker.time)
-        err.print(f"the right camera's images are {1e3 * offset:.1f} ± {1e3 * sigma:.1f} ms later than their times say")
+        late = measured_text(1e3 * offset, 1e3 * sigma, "ms")
+        err.print(f"the right camera's images are {late} later than their times say")
 
 
 def summary(counts: StreamCounts) -> str:

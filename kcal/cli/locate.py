@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -13,7 +14,7 @@ from kcal.cli.inputs import MARKS, RIG, SURVEY
 from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_and_source
 from kcal.cli.settings import taken
 from kcal.errors import DegenerateError, InputError
-from kcal.files import check_picture, check_writable
+from kcal.files import check_picture, check_writable, written_files
 from kcal.texts import one_line
 
 if TYPE_CHECKING:
@@ -65,6 +66,14 @@ def locate_command(
         float,
         typer.Option(metavar="DEG", help="Standard deviation of the relative yaw, added to the rig file's.", min=0),
     ] = 0.0,
+    aged: Annotated[
+        str | None,
+        typer.Option(
+            metavar="9h:DEG,8K:DEG",
+            help="Hours since the rig was solved, and degrees of yaw that it loses in one; the same for kelvin.",
+            hidden=True,
+        ),
+    ] = None,
     heading_sigma: Annotated[
         float,
         typer.Option(
@@ -171,6 +180,7 @@ def locate_command(
 
     from kcal.io.rig_file import load_rig
     from kcal.lens.mounting import Origin
+    from kcal.locate.aging import parse_aging
     from kcal.locate.datum import find_geoid, true_from_grid
     from kcal.locate.export import STREAM, check_format, open_writers
     from kcal.locate.marks import filled, read_mark_chunks
@@ -205,6 +215,7 @@ def locate_command(
         raise typer.BadParameter("--pitch, --roll and --grid belong to --heading; the rig file has its own attitude")
     # Parsed before the rig is read, so that a wrong option is reported first.
     place = None if origin is None else Origin.parse(origin)
+    yaw_sigma = math.hypot(yaw_sigma, parse_aging(aged))
     solved = load_rig(rig)
     noise, note = pixel_sigma_and_source(pixel_sigma, solved)
     if solved.mounting is not None and {"origin", "heading"} <= taken:
@@ -232,39 +243,38 @@ def locate_command(
     )  # fmt: skip
     survey = None if truth is None else read_survey(truth, locate.localize.origin, measured=False)
     sample = PositionSample(frozenset(survey.names if survey else ()))
-    written: list[Path] = []
-    try:
-        size = points.stat().st_size if points.is_file() else None
-        with open_writers(outputs, located_by(locate), suffix) as writers, steps("locating", size) as advance:
-            read, stated = 0, False
-            for chunk in read_mark_chunks(points):
-                cov = filled(chunk.covariance, noise)
-                stated = stated or cov is not None
-                columns = locate(chunk.names, chunk.pixels, cov, chunk.extras)
-                for writer in writers:
-                    writer.add(columns)
-                sample.add(columns)
-                advance(f"{sample.count:,} rows", chunk.bytes_read - read)
-                read = chunk.bytes_read
-            if note and not stated:
-                err.print(note)
-            located = sample.located(locate)
-            true = None if truth is None else read_truth(truth, located)
-        written += [path for path in outputs if path != STREAM]
-        if picture is not None:
-            from kcal.report.positions import save_positions_picture
+    with written_files() as written:
+        try:
+            size = points.stat().st_size if points.is_file() else None
+            with open_writers(outputs, located_by(locate), suffix) as writers, steps("locating", size) as advance:
+                read, stated = 0, False
+                for chunk in read_mark_chunks(points):
+                    cov = filled(chunk.covariance, noise)
+                    stated = stated or cov is not None
+                    columns = locate(chunk.names, chunk.pixels, cov, chunk.extras)
+                    for writer in writers:
+                        writer.add(columns)
+                    sample.add(columns)
+                    advance(f"{sample.count:,} rows", chunk.bytes_read - read)
+                    read = chunk.bytes_read
+                if note and not stated:
+                    err.print(note)
+                located = sample.located(locate)
+                true = None if truth is None else read_truth(truth, located)
+            if picture is not None:
+                from kcal.report.positions import save_positions_picture
 
-            written.append(save_positions_picture(picture, located, true))
-        if web_map is not None:
-            from kcal.report.map_page import save_map
+                save_positions_picture(picture, located, true)
+            if web_map is not None:
+                from kcal.report.map_page import save_map
 
-            written.append(save_map(web_map, located, true, tiles=tiles, image=image, online=online))
-    except KeyboardInterrupt:
-        kept = ", ".join(map(str, written)) or "nothing"
-        err.print(
-            f"interrupted after {sample.count:,} rows; written: {kept}; other files are as they were", markup=False
-        )
-        raise typer.Exit(130) from None
+                save_map(web_map, located, true, tiles=tiles, image=image, online=online)
+        except KeyboardInterrupt:
+            kept = ", ".join(map(str, written)) or "nothing"
+            err.print(
+                f"interrupted after {sample.count:,} rows; written: {kept}; other files are as they were", markup=False
+            )
+            raise typer.Exit(130) from None
     if as_json:
         summary = {
             "table": str(points),

@@ -20,6 +20,7 @@ from kcal.cli.board import app as board
 from kcal.cli.budget import budget_command
 from kcal.cli.calibrate import calibrate_command
 from kcal.cli.capture import capture_command
+from kcal.cli.check import check_command
 from kcal.cli.commands import Command
 from kcal.cli.compare import compare_command
 from kcal.cli.console import err, warn, with_json
@@ -33,13 +34,14 @@ from kcal.cli.live import live_command
 from kcal.cli.locate import locate_command
 from kcal.cli.mark import mark_command
 from kcal.cli.old_flags import with_new_names
+from kcal.cli.rays import rays_command
+from kcal.cli.rectify import rectify_command, undistort_command
 from kcal.cli.report import report_command
 from kcal.cli.rig import app as rig
 from kcal.cli.schema import schema_command
 from kcal.cli.settings import defaults_of, read_settings
 from kcal.cli.show import show_command
 from kcal.cli.stars import stars_command
-from kcal.cli.undistort import undistort_command
 from kcal.errors import KcalError
 from kcal.files import written_files
 from kcal.texts import visible
@@ -127,13 +129,16 @@ app.command("stars", cls=Command)(with_json(with_inputs(stars_command)))
 app.command("locate", cls=Command)(with_inputs(locate_command))
 app.command("live", cls=Command)(with_inputs(live_command))
 app.command("budget", cls=Command)(with_json(with_inputs(budget_command)))
-app.command("undistort", cls=Command)(with_json(with_inputs(undistort_command)))
+app.command("rectify", cls=Command)(with_json(with_inputs(rectify_command)))
+app.command("undistort", cls=Command, hidden=True)(with_json(with_inputs(undistort_command)))
+app.command("rays", cls=Command)(with_json(with_inputs(rays_command)))
 app.command("bake", cls=Command)(with_json(with_inputs(bake_command)))
 app.command("export", cls=Command)(with_json(with_inputs(export_command)))
 app.command("import", cls=Command)(with_json(with_inputs(import_command)))
 app.command("schema", cls=Command)(schema_command)
 app.command("show", cls=Command)(with_json(with_inputs(show_command)))
 app.command("diff", cls=Command)(with_json(with_inputs(diff_command)))
+app.command("check", cls=Command)(with_json(with_inputs(check_command)))
 app.command("report", cls=Command)(with_json(with_inputs(report_command)))
 
 
@@ -152,6 +157,3 @@ def main() -> None:
     except MemoryError:
         err.print("[bold red]error:[/] not enough memory; use fewer or smaller inputs")
         sys.exit(1)
-    except KeyboardInterrupt:
-        err.print("interrupted; nothing was written")
-        sys.exit(130)

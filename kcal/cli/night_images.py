@@ -9,6 +9,7 @@ from kcal.cli.console import steps
 from kcal.errors import InputError, KcalError
 
 if TYPE_CHECKING:
+    from kcal.calibrate.camera.result import CameraCalibrationResult
     from kcal.stars.detect import DetectedStars
     from kcal.stars.lens import StarCamera
     from kcal.stars.night import SkyView
@@ -43,8 +44,10 @@ def sky_view(
     return SkyView(time=time_of(time, path), origin=origin, air=air, dut1=dut1, time_sigma=time_sigma)
 
 
-def camera_by_stars(files: list[Path], views: list[SkyView], what: str) -> tuple[StarCamera, tuple[int, int]]:
-    """The camera of night images, and their size."""
+def camera_by_stars(
+    files: list[Path], views: list[SkyView], what: str, boards: CameraCalibrationResult | None = None
+) -> tuple[StarCamera, tuple[int, int]]:
+    """The camera of night images, and of what boards said of it before; and the images' size."""
     from kcal.stars.detect import detect_stars
     from kcal.stars.lens import calibrate_by_stars
     from kcal.stars.night_image import read_night
@@ -64,4 +67,4 @@ def camera_by_stars(files: list[Path], views: list[SkyView], what: str) -> tuple
         raise InputError(f"the images have several sizes ({sorted(sizes)}): one camera has one")
     (size,) = sizes
     with steps(what, None) as advance:
-        return calibrate_by_stars(stars, views, size, progress=advance), size
+        return calibrate_by_stars(stars, views, size, boards=boards, progress=advance), size

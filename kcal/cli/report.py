@@ -14,8 +14,8 @@ from kcal.cli.inputs import CAMERA_OR_RIG, OBSERVATIONS
 from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_of
 from kcal.cli.sides import check_views_of
 from kcal.errors import InputError
-from kcal.files import check_writable, read_bytes
-from kcal.strict_json import MOST_BYTES, read_json
+from kcal.file_kind import file_kind
+from kcal.files import check_writable
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -73,7 +73,7 @@ def report_command(
         check_writable(output, subject, *given)
     found = (
         _of_rig(subject, given, needs, pixel_sigma)
-        if _is_rig(subject)
+        if file_kind(subject) == "rig"
         else _of_camera(subject, given, needs, baseline, pixel_sigma_of(pixel_sigma))
     )
     tell(verdict=found[0].to_dict())
@@ -88,15 +88,6 @@ def required(text: str) -> tuple[Requirement, ...]:
     from kcal.report.verdict import Requirement
 
     return Requirement.parse(text)
-
-
-def _is_rig(path: Path) -> bool:
-    from kcal.io.formats import recognized
-
-    if recognized(path) != "kcal":
-        return False
-    content = read_json(read_bytes(path, MOST_BYTES), str(path))
-    return isinstance(content, dict) and content.get("kcal") == "rig"
 
 
 def told_usable(

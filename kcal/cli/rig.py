@@ -109,6 +109,15 @@ def solve_command(
             hidden=True,
         ),
     ] = 0.1,
+    clock_drift: Annotated[
+        float,
+        typer.Option(
+            metavar="S",
+            help="Of the rate at which it changes, seconds an hour; 0 where GPS or a network keeps the clocks.",
+            min=0,
+            hidden=True,
+        ),
+    ] = 0.05,
     celsius: Annotated[
         float | None, typer.Option(metavar="C", help="Temperature at night, for stars.", hidden=True)
     ] = None,
@@ -185,8 +194,9 @@ def solve_command(
     night = None
     if stars is not None:
         night = NightOptions(
-            images=stars, time=star_time, clock_sigma=clock_sigma, celsius=celsius, hectopascal=hectopascal, dut1=dut1
-        )
+            images=stars, time=star_time, clock_sigma=clock_sigma, drift_sigma=clock_drift, celsius=celsius,
+            hectopascal=hectopascal, dut1=dut1,
+        )  # fmt: skip
     sources = Sources(
         pairs=pairs, match=match, landmarks=landmarks, marks=marks, features=features, positions=positions,
         baseline=baseline, origin=origin, mark_sigma=noise, survey_sigma=survey_sigma, geoid=geoid,
@@ -207,9 +217,8 @@ def solve_command(
     calibrated = load_camera(left), load_camera(right)
     check_sides(calibrated, (left, right))
     data, frame, unpaired, notes, stated = read_sources(calibrated, sources)
-    with steps("solving the rig", 1) as advance:
-        result = solve_rig(data, options)
-        advance("done")
+    with steps("solving the rig", None) as advance:
+        result = solve_rig(data, options, advance)
     rig = result.stereo() if frame is None else placed_rig(result, frame)
     known = stated if pixel_sigma is None else pixel_sigma
     if rig.calibration is not None and known is not None:
@@ -292,7 +301,7 @@ def rig_lines(result: RigResult, rig: StereoRig, unpaired: int) -> list[str]:
         f"baseline [bold]{measured_length(float(rig.baseline), result.sigma_baseline)}[/]",
     ]
     if result.exact:
-        lines.append(f"taken as exact, so that errors of these lenses are in no σ: {' and '.join(result.exact)}")
+        lines.append(_exact_line(result, rig))
     if boards is not None:
         lines.append(f"{len(result.pairs)} of {len(boards.names)} pairs used, {unpaired} views without partner")
         if result.pairs:
@@ -319,6 +328,23 @@ def rig_lines(result: RigResult, rig: StereoRig, unpaired: int) -> list[str]:
         if mounting.refraction is not None and result.data.landmarks is not None:
             lines.append(f"refraction of light {measured_text(mounting.refraction, sigma[6])} of the Earth's curvature")
     return lines
+
+
+def _exact_line(result: RigResult, rig: StereoRig) -> str:
+    """Which cameras were taken as exact, what an error of their lenses does, and which files had no error bars."""
+    from kcal.quantities import length_text, number_text
+
+    far, share = 100.0 * float(rig.baseline), 10.0 / float(rig.left.focal.mean())
+    text = (
+        f"taken as exact, so that errors of these lenses are in no σ: {' and '.join(result.exact)}. An error of 0.1 px "
+        f"in one of them is {number_text(100.0 * share, digits=2)} % of a range of {length_text(far, digits=2)}"
+    )
+    cameras = dict(zip(result.names, result.data.cameras, strict=True))
+    known = {name: cameras[name].calibration for name in result.exact}
+    bare = [name for name, one in known.items() if one is None or one.covariance is None]
+    if not bare:
+        return text
+    return f"{text}. Without error bars came {' and '.join(bare)}: calibrate with kcal, or import a file that has them"
 
 
 def print_rig(result: RigResult, lines: list[str]) -> None:

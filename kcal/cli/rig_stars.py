@@ -26,6 +26,7 @@ class NightOptions:
     images: tuple[str, str]
     time: str | None = None
     clock_sigma: float = 0.1
+    drift_sigma: float = 0.05
     celsius: float | None = None
     hectopascal: float | None = None
     dut1: float | None = None
@@ -65,7 +66,7 @@ def read_stars(
         there = torch.zeros(3, dtype=torch.float64)
         positions = (MeasuredPosition(camera=0, point=there, sigma=torch.full_like(there, _PLACE_SIGMA)),)
     frame = origin if placed or positions else None
-    source = star_source(moments, cameras, clock_sigma=night.clock_sigma, origin=frame)
+    source = star_source(moments, cameras, clock_sigma=night.clock_sigma, drift_sigma=night.drift_sigma, origin=frame)
     named = int(source.named.sum())
     lines = [
         f"stars: {len(moments)} moments, {len(source.names)} stars, {named} with a direction on the Earth"
@@ -73,6 +74,11 @@ def read_stars(
         f"clocks of the cameras against each other: ± {night.clock_sigma:g} s, which no residual shows: up to "
         f"{math.degrees(7.292e-5 * night.clock_sigma):.5f}° of relative attitude, and part of every σ below",
     ]
+    if any(effect.factor is not None for effect in source.effects):
+        lines.append(
+            f"their drift: ± {night.drift_sigma:g} s an hour since the night's first images (--clock-drift 0 where GPS "
+            "or a network keeps them)"
+        )
     if on_earth and night.dut1 is None:
         lines.append("UT1 - UTC is not known (--dut1): 8″ of heading, part of its σ")
     return source, positions, lines
@@ -83,6 +89,7 @@ def _named_images(
 ) -> list[NamedStars]:
     from kcal.cli.console import steps, warn
     from kcal.cli.night_images import sky_view
+    from kcal.stars.contradictions import clock_doubts
     from kcal.stars.night import name_stars
     from kcal.stars.night_image import expand_nights, read_night
 
@@ -106,6 +113,8 @@ def _named_images(
                     warn(f"{side} {path.name}: {text}")
                 found.append(image)
             advance(path.name)
+    for number, text in clock_doubts(found):
+        warn(f"{side}, image {number + 1} with names: {text}")
     if not found:
         raise InputError(f"--stars: in none of the {len(files)} images of {side} stars have names")
     return found

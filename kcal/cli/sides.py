@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from kcal.corners.observations import Observations
     from kcal.lens.camera import Camera
 
-SIDES = ("left", "right")
 _SIDE = re.compile(r"(?<![a-z])(left|right)(?![a-z])", re.IGNORECASE)
 
 

@@ -67,6 +67,7 @@ def stars_command(
     """
     from kcal.cli.camera_sources import single_camera
     from kcal.stars.catalog import StarCatalog
+    from kcal.stars.contradictions import clock_doubts
     from kcal.stars.night import name_stars
     from kcal.stars.night_image import expand_nights, read_night
 
@@ -89,6 +90,7 @@ def stars_command(
     else:
         lens = single_camera(camera)
     told: list[dict[str, Any]] = []
+    named: list[tuple[str, NamedStars]] = []
     rows = [["image", "stars", "named", "RMS px", *_heads(views[0])]]
     drawn = picture is None
     with steps("naming stars", len(files)) as advance:
@@ -103,6 +105,7 @@ def stars_command(
                 warn(f"{path.name}: {error}")
             else:
                 told.append(_told(path, found))
+                named.append((path.name, found))
                 rows.append(_row(path, found))
                 for text in found.warnings:
                     warn(f"{path.name}: {text}")
@@ -111,6 +114,9 @@ def stars_command(
                     _draw(picture, image, found, catalog, path.name)
                     drawn = True
             advance(path.name)
+    for number, text in clock_doubts([found for _, found in named]):
+        warn(f"{named[number][0]}: {text}")
+        next(image for image in told if image["image"] == named[number][0])["warnings"].append(text)
     tell(images=told)
     if len(rows) == 1:
         raise InputError(f"in none of {len(files)} images stars have names")

@@ -20,11 +20,11 @@ import torch
 from torch import Tensor
 
 from kcal.corners.board import Board
-from kcal.corners.board_text import DICTIONARIES
 from kcal.corners.erf_fit import SHARE
 from kcal.corners.grid import as_grid, local_side
 from kcal.corners.grow import filled_grid
 from kcal.corners.layout import in_place
+from kcal.corners.markers import opencv_dictionary
 from kcal.errors import InputError
 
 MIN_CORNERS = 6
@@ -209,32 +209,6 @@ def free_side(pixels: Tensor, board: Board) -> Tensor:
     known = torch.isfinite(side)
     side = torch.where(known, side, side[known].median() if bool(known.any()) else 1.0)
     return side * min(1.0, _FREE_SHARE * math.sqrt(2.0) * _white_border(board) / SHARE)
-
-
-def marker_cells(board: Board) -> list[npt.NDArray[np.bool_]]:
-    """Which cells of each marker are black, border included, in the order of the light squares.
-
-    Raises:
-        InputError: the board has no markers.
-    """
-    if board.dictionary is None:
-        raise InputError(f"{board}: not a ChArUco board")
-    dictionary = opencv_dictionary(board.dictionary)
-    cells = dictionary.markerSize + 2
-    numbers = range(board.first, board.first + board.markers)
-    return [dictionary.generateImageMarker(number, cells, borderBits=1) == 0 for number in numbers]
-
-
-def opencv_dictionary(name: str) -> cv2.aruco.Dictionary:
-    """OpenCV's dictionary of a name in `DICTIONARIES`.
-
-    Raises:
-        InputError: an unknown name.
-    """
-    if name not in DICTIONARIES:
-        raise InputError(f"dictionary {name!r}: choose one of {', '.join(DICTIONARIES)}")
-    dictionary: cv2.aruco.Dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name.upper()}"))
-    return dictionary
 
 
 def _opencv_board(board: Board, legacy: bool = False) -> cv2.aruco.CharucoBoard:

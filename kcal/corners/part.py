@@ -32,7 +32,6 @@ MIN_FILLED = 0.5  # share of the places of the grown grid at which corners were 
 MIN_LINES = 3  # each way
 MIN_END, MIN_END_SHARE = 3, 0.8  # corners that must show the board's end on one side, and their share
 OUTER_SQUARE = 0.5  # of its contrast at the corner that the outer square must have up to the board's end
-SIDES = ("top", "bottom", "left", "right")  # of a grid
 
 
 class BoardPart(NamedTuple):

@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from kcal.corners.board import TAGS, Board
-from kcal.corners.charuco import marker_cells, opencv_dictionary
 from kcal.corners.drawing import Circle, Rectangle
+from kcal.corners.markers import marker_cells, opencv_dictionary
 
 CIRCLE_SHARE = 0.5  # of the least distance of two centers: the diameter of circles that are printed without one
 TAG_BORDER = 2  # cells: Kalibr draws tags with a border of two cells, other makers of tags one

@@ -7,7 +7,6 @@ from typing import Literal, get_args
 import cv2
 import numpy as np
 import torch
-from skimage.feature import corner_subpix
 from torch import Tensor
 
 from kcal.checks import as_points
@@ -175,6 +174,8 @@ def _opencv(image: Gray, start: Tensor, half: int) -> Tensor:
 
 
 def _skimage(image: Gray, start: Tensor, half: int) -> Tensor:
+    from skimage.feature import corner_subpix  # which loads scipy.stats, half a second
+
     rows_columns = np.rint(start.numpy()[:, ::-1]).astype(np.int64)
     found = corner_subpix(image.astype(np.float64), rows_columns, window_size=2 * half + 1)
     return torch.from_numpy(np.ascontiguousarray(found[:, ::-1], dtype=np.float64))

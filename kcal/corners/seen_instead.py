@@ -11,8 +11,8 @@ import numpy.typing as npt
 from kcal.corners.aprilgrid import BORDERS
 from kcal.corners.board import TAGS, Board
 from kcal.corners.board_text import DICTIONARIES
-from kcal.corners.charuco import opencv_dictionary
 from kcal.corners.circles import round_blobs
+from kcal.corners.markers import opencv_dictionary
 
 # Larger dictionaries contain the smaller ones of their family, and take seconds to search.
 _FAMILIES = (

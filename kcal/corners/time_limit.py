@@ -8,6 +8,7 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
+from kcal.child_processes import deaf_to_interrupts
 from kcal.errors import InputError, KcalError
 
 T = TypeVar("T")
@@ -90,7 +91,8 @@ class Limited:
             context = multiprocessing.get_context("spawn")
             self._pipe, theirs = context.Pipe()
             self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
-            self._process.start()
+            with deaf_to_interrupts():
+                self._process.start()
             theirs.close()
         try:
             self._pipe.send((function, arguments))

@@ -153,6 +153,24 @@ def named_camera(
     return camera
 
 
+def with_sigmas(camera: Camera, sigmas: Sequence[float]) -> str:
+    """Give a camera standard deviations in the order of fx, fy, cx, cy and its coefficients; return a note.
+
+    Raises:
+        ValueError: negative ones, or another number of them.
+    """
+    names = [name for name in camera.names if name != "skew"]
+    if len(sigmas) != len(names) or not all(0.0 <= sigma < math.inf for sigma in sigmas):
+        raise ValueError(f"standard deviations of {', '.join(names)} are needed, none negative")
+    known = dict(zip(names, sigmas, strict=True))
+    spread = torch.tensor([known.get(name, 0.0) for name in camera.names], dtype=torch.float64)
+    camera.calibration = CameraCalibration(
+        name=camera_name(camera, ""), sigma={name: known.get(name) or None for name in camera.names},
+        covariance=torch.diag(spread.square()),
+    )  # fmt: skip
+    return "the file has standard deviations without correlations: taken as independent"
+
+
 def numbers(value: Any, count: Sequence[int] | int, what: str) -> list[float]:
     """A list of finite numbers, flattened; `count` says how many, or which counts are allowed.
 

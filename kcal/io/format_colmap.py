@@ -35,7 +35,7 @@ COLMAP_MODELS = {
     "SIMPLE_RADIAL_FISHEYE": ColmapModel(8, ("f", *_CENTER, "k1"), "fisheye4"),
     "RADIAL_FISHEYE": ColmapModel(9, ("f", *_CENTER, "k1", "k2"), "fisheye4"),
 }
-_WRITTEN = {"pinhole": "PINHOLE", "opencv4": "OPENCV", "opencv8": "FULL_OPENCV", "fisheye4": "OPENCV_FISHEYE"}
+WRITTEN = {"pinhole": "PINHOLE", "opencv4": "OPENCV", "opencv8": "FULL_OPENCV", "fisheye4": "OPENCV_FISHEYE"}
 
 
 def read_colmap(path: Path, hints: Hints) -> ImportedCameras:
@@ -101,7 +101,7 @@ def write_colmap(cameras: Sequence[Camera], poses: Sequence[CameraPose], path: P
     entries = []
     for number, camera in enumerate(cameras, 1):
         fx, fy, cx, cy, _, *lens = camera.params.tolist()
-        entries.append((number, _WRITTEN[str(camera.model)], camera.size, [fx, fy, cx + _HALF, cy + _HALF, *lens]))
+        entries.append((number, WRITTEN[str(camera.model)], camera.size, [fx, fy, cx + _HALF, cy + _HALF, *lens]))
     if path.suffix.lower() == ".bin":
         data = struct.pack("<Q", len(entries))
         for number, name, size, values in entries:

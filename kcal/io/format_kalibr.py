@@ -2,34 +2,44 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from kcal.files import write_atomic
+from kcal.files import read_text, write_atomic
 from kcal.io.foreign import (
     CameraPose,
     Hints,
     ImportedCameras,
     checked_pose,
     dump_yaml,
-    load_yaml,
     named_camera,
     numbers,
     plain,
     whole_size,
+    with_sigmas,
 )
+from kcal.io.kalibr_omni import omni_camera
 from kcal.lens.camera import Camera
+from kcal.strict_yaml import MOST_BYTES as MOST_YAML
+from kcal.strict_yaml import read_yaml
 
 MODELS = ("pinhole", "opencv4", "fisheye4")
 _LENSES = {"radtan": "opencv4", "equidistant": "fisheye4", "none": "pinhole"}
+# Of a text of results: names of lenses, and lines with numbers and their standard deviations.
+_GEOMETRIES = {"DistortedPinholeCamera": "opencv4", "EquidistantDistortedPinholeCamera": "fisheye4"}
+_RESULTS = re.compile(r"^\s*(distortion|projection): \[([^\]\n]*)\] \+- \[([^\]\n]*)\]", re.MULTILINE)
 
 
 def read_kalibr(path: Path, hints: Hints) -> ImportedCameras:
-    """Read all cameras of a chain; poses are from the first camera's frame."""
-    content = load_yaml(path)
+    """Read all cameras of a chain, with poses from the first camera's frame; or of a `results-cam.txt`, with σ."""
+    text = read_text(path, MOST_YAML)
+    if _RESULTS.search(text):
+        return _read_results(text, hints)
+    content = read_yaml(text, str(path))
     cameras: list[Camera] = []
     poses: list[CameraPose] = []
     lost: set[str] = set()
@@ -37,15 +47,22 @@ def read_kalibr(path: Path, hints: Hints) -> ImportedCameras:
     while (name := f"cam{len(cameras)}") in content:
         part = content[name]
         kind, lens = str(part["camera_model"]), str(part["distortion_model"])
-        if kind != "pinhole" or lens not in _LENSES:
+        if kind == "omni" and lens in ("radtan", "none"):
+            core = numbers(part["intrinsics"], 5, f"{name} intrinsics")
+            terms = numbers(part.get("distortion_coeffs", []), (0, 4), f"{name} distortion_coeffs") or [0.0] * 4
+            camera, note = omni_camera(name, [*core, *terms], whole_size(*part["resolution"]))
+            cameras.append(camera)
+            lost.add(note)
+        elif kind != "pinhole" or lens not in _LENSES:
             raise ValueError(f"{name}: camera_model {kind} with distortion_model {lens}: kcal reads pinhole with "
-                             f"{', '.join(_LENSES)}")  # fmt: skip
-        model = _LENSES[lens]
-        coefficients = numbers(
-            part.get("distortion_coeffs", []), 0 if lens == "none" else 4, f"{name} distortion_coeffs"
-        )
-        intrinsics = numbers(part["intrinsics"], 4, f"{name} intrinsics")
-        cameras.append(named_camera(name, intrinsics, whole_size(*part["resolution"]), model, coefficients))
+                             f"{', '.join(_LENSES)}, and omni with radtan or none")  # fmt: skip
+        else:
+            coefficients = numbers(
+                part.get("distortion_coeffs", []), 0 if lens == "none" else 4, f"{name} distortion_coeffs"
+            )
+            intrinsics = numbers(part["intrinsics"], 4, f"{name} intrinsics")
+            size = whole_size(*part["resolution"])
+            cameras.append(named_camera(name, intrinsics, size, _LENSES[lens], coefficients))
         if "T_cn_cnm1" in part:
             step = np.array(numbers(part["T_cn_cnm1"], 16, f"{name} T_cn_cnm1")).reshape(4, 4)
             whole = step @ whole
@@ -63,6 +80,25 @@ def read_kalibr(path: Path, hints: Hints) -> ImportedCameras:
         poses=tuple(poses) if len(poses) == len(cameras) > 1 else (),
         notes=tuple(sorted(lost)),
     )
+
+
+def _read_results(text: str, hints: Hints) -> ImportedCameras:
+    """The cameras of Kalibr's text of results, which has standard deviations and no image size."""
+    if hints.size is None:
+        raise ValueError("the image size is not in a text of results; give it (--size WIDTHxHEIGHT)")
+    cameras, notes = [], {"poses are read from the camchain, not from the text of results"}
+    for part in re.split(r"^(?=cam\d+ \()", text, flags=re.MULTILINE)[1:]:
+        name, found = part.split(" ", 1)[0], {key: (value, sigma) for key, value, sigma in _RESULTS.findall(part)}
+        kind = re.search(r"type:.*?\.(\w+)Geometry", part)
+        if kind is None or kind[1] not in _GEOMETRIES:
+            raise ValueError(f"{name}: {kind[1] if kind else 'no type'}: kcal reads {', '.join(_GEOMETRIES)}")
+        lens = numbers(found["distortion"][0].split(), 4, f"{name} distortion")
+        core = numbers(found["projection"][0].split(), 4, f"{name} projection")
+        camera = named_camera(name, core, hints.size, _GEOMETRIES[kind[1]], lens)
+        sigmas = [numbers(found[key][1].split(), 4, f"{name} {key}") for key in ("projection", "distortion")]
+        notes.add(with_sigmas(camera, [*sigmas[0], *sigmas[1]]))
+        cameras.append(camera)
+    return ImportedCameras(format="kalibr", cameras=tuple(cameras), notes=tuple(sorted(notes)))
 
 
 class KalibrLens(NamedTuple):

@@ -6,6 +6,7 @@ because points were rows.
 
 from __future__ import annotations
 
+import dataclasses
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -24,11 +25,14 @@ from kcal.io.foreign import (
     numbers,
     plain,
     whole_size,
+    with_sigmas,
 )
 from kcal.lens.camera import Camera
 from kcal.mat_file import read_mat
 
 MODELS = ("pinhole", "opencv4", "opencv5")
+# Fields of the struct with standard deviations, which stands beside the parameters.
+_ERRORS = {"IntrinsicsErrors", "Camera1IntrinsicsErrors"}
 _METERS = {"mm": 1e-3, "millimeters": 1e-3, "cm": 1e-2, "centimeters": 1e-2, "m": 1.0, "meters": 1.0, "in": 0.0254,
            "inches": 0.0254}  # fmt: skip
 
@@ -38,13 +42,30 @@ def read_matlab(path: Path, hints: Hints) -> ImportedCameras:
     structs = read_mat(read_bytes(path, MOST_BYTES), str(path))
     # A file may hold one struct, or its fields.
     candidates = [*structs.items(), (path.stem, structs)]
+    errors = next((value for _, value in candidates if isinstance(value, Mapping) and _ERRORS & set(value)), {})
     for _, value in candidates:
         if isinstance(value, Mapping) and "CameraParameters1" in value:
-            return _pair(value, hints)
+            return _with_errors(_pair(value, hints), [errors.get(f"Camera{i}IntrinsicsErrors") for i in (1, 2)])
     for name, value in candidates:
         if isinstance(value, Mapping) and {"K", "IntrinsicMatrix", "FocalLength"} & set(value):
-            return ImportedCameras(format="matlab", cameras=(_matlab_camera(value, name, hints),))
+            found = ImportedCameras(format="matlab", cameras=(_matlab_camera(value, name, hints),))
+            return _with_errors(found, [errors.get("IntrinsicsErrors")])
     raise ValueError("no struct of camera parameters; save one with s = toStruct(params); save('file.mat', 's')")
+
+
+def _with_errors(found: ImportedCameras, errors: Sequence[Any]) -> ImportedCameras:
+    """Standard deviations from the struct of `cameraCalibrationErrors` or `stereoCalibrationErrors`, if it is there."""
+    notes = list(found.notes)
+    for camera, stated in zip(found.cameras, errors, strict=True):
+        if not isinstance(stated, Mapping):
+            continue
+        core = [*numbers(stated["FocalLengthError"], 2, "FocalLengthError"),
+                *numbers(stated["PrincipalPointError"], 2, "PrincipalPointError")]  # fmt: skip
+        radial = numbers(stated["RadialDistortionError"], (2, 3), "RadialDistortionError")
+        tangential = numbers(stated.get("TangentialDistortionError", [0.0, 0.0]), 2, "TangentialDistortionError")
+        lens = [*radial[:2], *tangential, *radial[2:]]
+        notes.append(with_sigmas(camera, [*core, *([*lens, 0.0])[: camera.model.size]]))
+    return dataclasses.replace(found, notes=tuple(dict.fromkeys(notes)))
 
 
 def _matlab_camera(value: Mapping[str, Any], name: str, hints: Hints) -> Camera:

@@ -32,6 +32,8 @@ from kcal.io.foreign import (
     plain,
     whole_size,
 )
+from kcal.io.mrcal_inputs import NoInformationError, inputs_covariance
+from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 
@@ -68,7 +70,14 @@ def read_mrcal(path: Path, hints: Hints) -> ImportedCameras:
     key = "rt_cam_ref" if "rt_cam_ref" in content else "extrinsics"
     *turn, x, y, z = numbers(content[key], 6, key)
     rotation = rotation_from_vector(torch.tensor(turn, dtype=torch.float64))
-    lost = [f"{name} are not kept" for name in ("optimization_inputs",) if name in content]
+    lost = []
+    if packed := content.get("optimization_inputs"):
+        try:
+            covariance = inputs_covariance(packed, int(content.get("icam_intrinsics", 0)), camera, str(path))
+            camera.calibration = CameraCalibration(name=path.stem, covariance=covariance)
+            lost = ["error bars are those of the corners in the file; the corners themselves are not kept"]
+        except NoInformationError as reason:
+            lost = [f"no error bars: {reason}"]
     return ImportedCameras(
         format="mrcal", cameras=(camera,), poses=(checked_pose(plain(rotation), [x, y, z]),), notes=tuple(lost)
     )

@@ -1,7 +1,8 @@
 """OpenCV's YAML, XML and JSON files of one camera or a stereo pair, as its samples write and read them.
 
 One camera: `image_width`, `image_height`, `camera_matrix`, `distortion_coefficients` (k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3
-s4 τx τy), `fisheye_model`. A pair: `M1`, `D1`, `M2`, `D2` and `R`, `T`, in one file or in two.
+s4 τx τy), `fisheye_model`; `xi` of an omnidir camera; `stdDeviationsIntrinsics` of `calibrateCamera`. A pair: `M1`,
+`D1`, `M2`, `D2` and `R`, `T`, in one file or in two.
 """
 
 from __future__ import annotations
@@ -25,13 +26,16 @@ from kcal.io.foreign import (
     numbers,
     plain,
     whole_size,
+    with_sigmas,
 )
+from kcal.io.kalibr_omni import omni_camera
 from kcal.lens.camera import Camera
 from kcal.opencv_storage import read_storage
 
 MODELS = ("pinhole", "opencv4", "opencv5", "opencv8", "opencv12", "opencv14", "fisheye4")
-_BY_COUNT = {0: "pinhole", 4: "opencv4", 5: "opencv5", 8: "opencv8", 12: "opencv12", 14: "opencv14"}
+BY_COUNT = {0: "pinhole", 4: "opencv4", 5: "opencv5", 8: "opencv8", 12: "opencv12", 14: "opencv14"}
 _MATRICES = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "mtx")
+_SIGMAS = ("stdDeviationsIntrinsics", "std_deviations_intrinsics", "stdDeviations", "std_deviations")
 _COEFFICIENTS = ("distortion_coefficients", "distCoeffs", "Distortion_Coefficients", "D", "dist")
 
 
@@ -92,7 +96,13 @@ def _opencv_camera(
         raise ValueError(f"{matrix} is no camera matrix")
     if skew:
         notes.append(f"{matrix} has a skew of {skew:g}, which OpenCV does not use and kcal does not take over")
-    lens = numbers(stored.get(coefficients, []), tuple(_BY_COUNT), coefficients)
+    lens = numbers(stored.get(coefficients, []), tuple(BY_COUNT), coefficients)
+    if "xi" in stored:
+        if len(lens) != 4 or skew:
+            raise ValueError("an omnidir camera has 4 coefficients and, here, no skew")
+        camera, note = omni_camera(name, [*numbers(stored["xi"], 1, "xi"), fx, fy, cx, cy, *lens], size)
+        notes.append(note)
+        return camera
     known = fisheye
     if known is None and "fisheye_model" in stored:
         known = bool(numbers([stored["fisheye_model"]], 1, "fisheye_model")[0])
@@ -100,8 +110,13 @@ def _opencv_camera(
         raise ValueError(f"a fisheye has 4 coefficients, {coefficients} has {len(lens)}")
     if known is None and len(lens) == 4:
         notes.append("4 coefficients read as k1 k2 p1 p2; if they are a fisheye's, use --fisheye")
-    model = "fisheye4" if known else _BY_COUNT[len(lens)]
-    return named_camera(name, (fx, fy, cx, cy), size, model, lens)
+    model = "fisheye4" if known else BY_COUNT[len(lens)]
+    camera = named_camera(name, (fx, fy, cx, cy), size, model, lens)
+    if (sigmas := _present(stored, _SIGMAS)) and matrix in _MATRICES:
+        # OpenCV always states those of 14 coefficients.
+        given = numbers(stored[sigmas], (4 + len(lens), 18), sigmas)
+        notes.append(with_sigmas(camera, given[: 4 + len(lens)]))
+    return camera
 
 
 def write_opencv(cameras: Sequence[Camera], poses: Sequence[CameraPose], path: Path) -> list[Path]:

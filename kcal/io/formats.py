@@ -13,6 +13,7 @@ import torch
 from kcal.errors import FileError, InputError
 from kcal.files import read_head, read_text
 from kcal.io import (
+    format_agisoft,
     format_colmap,
     format_kalibr,
     format_matlab,
@@ -20,7 +21,10 @@ from kcal.io import (
     format_nerfstudio,
     format_opencv,
     format_opensfm,
+    format_prior,
+    format_qualisys,
     format_ros,
+    format_toml,
 )
 from kcal.io.camera_file import load_camera
 from kcal.io.foreign import MOST_BYTES, CameraPose, Hints, ImportedCameras, reading, rig_poses
@@ -40,18 +44,31 @@ class CameraFormat:
         suffixes: of file names that mean this format where nothing else is said.
         models: kcal's lens models that it can hold.
         read: one file.
-        write: cameras and their poses, all of one of the models.
+        write: cameras and their poses, all of one of the models; None for formats that kcal only reads.
         skew: whether it can hold a skew.
         pose: whether it can hold the relative pose of two cameras.
+        prior: whether it is a file of priors, which has the parameters and their square-root information.
     """
 
     title: str
     suffixes: tuple[str, ...]
     models: tuple[str, ...]
     read: Callable[[Path, Hints], ImportedCameras]
-    write: Callable[[Sequence[Camera], Sequence[CameraPose], Path], list[Path]]
+    write: Callable[[Sequence[Camera], Sequence[CameraPose], Path], list[Path]] | None = None
     skew: bool = False
     pose: bool = True
+    prior: bool = False
+
+
+# What begins the cameras of Qualisys, and the sensors or the calibration of Metashape.
+_XML = re.compile(r"<cameras(?=>\s*<camera[^>]*serial)|<sensors(?=[ >])|<calibration(?=>\s*<(projection|width|type))")
+
+
+def _prior_format(program: str, title: str, models: tuple[str, ...]) -> CameraFormat:
+    return CameraFormat(
+        title=title, suffixes=(), models=models, read=format_prior.read_prior,
+        write=format_prior.prior_writer(program), skew=program == "gtsam", pose=False, prior=True,
+    )  # fmt: skip
 
 
 FORMATS = {
@@ -115,6 +132,22 @@ FORMATS = {
         write=format_opensfm.write_opensfm,
         pose=False,
     ),
+    "toml": CameraFormat(
+        title="TOML of aniposelib, pose2sim and Caliscope",
+        suffixes=(".toml",),
+        models=format_toml.MODELS,
+        read=format_toml.read_toml,
+        write=format_toml.write_toml,
+    ),
+    "qualisys": CameraFormat(
+        title="Qualisys .qca.txt", suffixes=(), models=(), read=format_qualisys.read_qualisys, pose=False
+    ),
+    "agisoft": CameraFormat(
+        title="Agisoft Metashape XML", suffixes=(), models=(), read=format_agisoft.read_agisoft, pose=False
+    ),
+    "gtsam": _prior_format("gtsam", "Values and noise model for GTSAM, JSON", format_prior.GTSAM_MODELS),
+    "ceres": _prior_format("ceres", "A and b of Ceres's NormalPrior, JSON", format_prior.PLAIN_MODELS),
+    "numpy": _prior_format("numpy", "Parameters and their square-root information, .npz", format_prior.PLAIN_MODELS),
 }
 
 
@@ -162,15 +195,19 @@ def recognized(path: Path) -> str:
     """
     suffix = path.suffix.lower()
     read_head(path, 0)
-    if suffix in (".mat", ".cameramodel", ".bin"):
-        return {".mat": "matlab", ".cameramodel": "mrcal", ".bin": "colmap"}[suffix]
+    if suffix in (".mat", ".cameramodel", ".bin", ".npz"):
+        return {".mat": "matlab", ".cameramodel": "mrcal", ".bin": "colmap", ".npz": "numpy"}[suffix]
     text = read_text(path, MOST_BYTES)
+    if suffix == ".toml":
+        return "toml"
     # mrcal's files begin with comments.
     if suffix == ".json" or re.sub(r"^\s*#.*$", "", text, flags=re.MULTILINE).lstrip()[:1] in ("{", "["):
         return _json_format(path, text)
+    if (found := _XML.search(text)) is not None:
+        return "qualisys" if found[0] == "<cameras" else "agisoft"
     if suffix == ".xml" or "opencv-matrix" in text or text.startswith("%YAML"):
         return "opencv"
-    if re.search(r"^cam0\s*:", text, re.MULTILINE):
+    if re.search(r"^cam0\s*:|^cam0 \(.*\):", text, re.MULTILINE):
         return "kalibr"
     if re.search(r"^camera_matrix\s*:", text, re.MULTILINE):
         return "ros"
@@ -189,6 +226,8 @@ def _json_format(path: Path, text: str) -> str:
         raise FileError(f"{path}: neither a camera file that kcal knows nor JSON that can be read ({error})") from None
     if isinstance(content, dict) and "kcal" in content:
         return "kcal"
+    if isinstance(content, dict) and "kcal_prior" in content:
+        return "ceres"
     if isinstance(content, dict) and ("fl_x" in content or "frames" in content):
         return "nerfstudio"
     if "projection_type" in text:
@@ -207,7 +246,9 @@ def import_cameras(
 ) -> ImportedCameras:
     """Read cameras, and how they stand to each other, from files of other programs or of kcal.
 
-    OpenCV (YAML, XML), ROS camera_info, Kalibr camchains, mrcal, COLMAP, nerfstudio, MATLAB structs and OpenSfM.
+    OpenCV (YAML, XML; fisheye and omnidir, too), ROS camera_info, Kalibr camchains and results, mrcal, COLMAP,
+    nerfstudio, MATLAB structs, OpenSfM, TOML of aniposelib, pose2sim and Caliscope, Qualisys, Agisoft Metashape, and
+    kcal's priors for other programs. Error bars come with a camera where its file has them.
     Principal points are converted to kcal's convention: (0, 0) is the center of the first pixel.
 
     Args:

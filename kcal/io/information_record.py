@@ -8,7 +8,7 @@ import pydantic
 import torch
 
 from kcal.io.record import Packed, Record
-from kcal.lens.information import CameraInformation, upper
+from kcal.lens.information import CameraInformation
 
 
 class InformationRecord(Record):
@@ -52,7 +52,7 @@ class InformationRecord(Record):
         for name, slot in zip(names, known.slots, strict=True):
             if slot >= 0:
                 groups[slot].append(name)
-        others = None if known.others is None else Packed.of(_above(upper(known.others)))
+        others = None if known.others is None else Packed.of(_above(known.told.compressed().rows))
         return cls(
             unknowns=tuple(map(tuple, groups)),
             board=tuple(known.estimate[known.lens_size :].tolist()),

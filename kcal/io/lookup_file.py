@@ -31,7 +31,6 @@ from __future__ import annotations
 
 import io
 import math
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +41,7 @@ from kcal.files import read_bytes, write_atomic
 from kcal.image_size import check_pixel_count
 from kcal.lens.lookup import LookupCamera
 from kcal.lens.spline import Spline
+from kcal.strict_npz import read_npz
 
 KIND, VERSION = "lookup", 1
 # Tables of 700 cells each way take 16 MB.
@@ -94,7 +94,7 @@ def load_lookup(path: str | Path) -> LookupCamera:
         Traceback (most recent call last):
         kcal.errors.FileError: no-such-file.npz: cannot read: No such file or directory
     """
-    arrays = _read_arrays(read_bytes(path, _MOST_BYTES), path)
+    arrays = read_npz(read_bytes(path, _MOST_BYTES), str(path), _MOST_BYTES, "lookup camera")
     kind, version = arrays.get("kcal"), arrays.get("version")
     if kind is None or str(kind) != KIND or version is None or str(version) != str(VERSION):
         raise FileError(f"{path}: not a kcal {KIND} file of version {VERSION}")
@@ -123,21 +123,6 @@ def load_lookup(path: str | Path) -> LookupCamera:
         raise FileError(f"{path}: bad lookup file: {error.args[0]} is missing") from error
     except (InputError, ValueError, TypeError, IndexError) as error:
         raise FileError(f"{path}: bad lookup file: {error}") from error
-
-
-def _read_arrays(data: bytes, path: str | Path) -> dict[str, np.ndarray]:
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            size = sum(member.file_size for member in archive.infolist())
-        if size > _MOST_BYTES:
-            raise FileError(f"{path}: unpacks to {size / 2**20:.0f} MiB; no lookup camera is larger than 256 MiB")
-        with np.load(io.BytesIO(data), allow_pickle=False) as file:
-            return {name: np.asarray(file[name]) for name in file.files}
-    except FileError:
-        raise
-    except Exception as error:
-        # Damaged archives and headers raise errors of a dozen kinds, from zlib.error to MemoryError.
-        raise FileError(f"{path}: not an .npz file with a lookup camera, or a damaged one") from error
 
 
 def _two(arrays: dict[str, np.ndarray], key: str, kinds: str, low: float, high: float) -> tuple[float, float]:

@@ -18,12 +18,21 @@ from kcal.lens.images import Undistort as Undistort
 from kcal.lens.images import UndistortImage as UndistortImage
 from kcal.lens.images import undistort_maps as undistort_maps
 from kcal.lens.images import UndistortMaps as UndistortMaps
+from kcal.lens.views import Cylinder as Cylinder
+from kcal.lens.views import cylinder_view as cylinder_view
+from kcal.lens.views import pinhole_view as pinhole_view
+from kcal.lens.views import looking as looking
+from kcal.lens.views import pupil_shift as pupil_shift
+from kcal.lens.rectification import StereoRectification as StereoRectification
+from kcal.lens.rays import CameraRays as CameraRays
+from kcal.lens.rays import ray_error as ray_error
 from kcal.lens.image_transform import ImageTransform as ImageTransform
 
 # Error bars
 from kcal.lens.uncertainty import projection_sigma as projection_sigma
 from kcal.lens.uncertainty import image_sigma as image_sigma
 from kcal.lens.uncertainty import pixel_covariance as pixel_covariance
+from kcal.lens.uncertainty import pixel_errors as pixel_errors
 from kcal.lens.information import CameraInformation as CameraInformation
 
 # Calibration records
@@ -38,7 +47,7 @@ from kcal.io.foreign import ImportedCameras as ImportedCameras
 from kcal.io.foreign import CameraPose as CameraPose
 from kcal.calibrate.camera.export import export_cameras as export_cameras
 from kcal.calibrate.camera.export import ExportedCameras as ExportedCameras
-from kcal.calibrate.camera.export import Misfit as Misfit
+from kcal.calibrate.camera.misfit import Misfit as Misfit
 from kcal.io.onnx_file import save_onnx as save_onnx
 
 # Tables and networks

@@ -1,4 +1,4 @@
-"""Undistort images: compute the source position of each new pixel, and resample.
+"""Undistort and rectify images: compute the source position of each new pixel, and resample.
 
 Each pixel of the new image is a ray, and the source camera projects it. Positions are computed in float64. Sampling
 runs in the image's own precision, to which positions are rounded once: in float32 that moves a sample by less than
@@ -17,7 +17,8 @@ from torch import Tensor, nn
 
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.lens.pinhole import new_pinhole, source_pixels
+from kcal.lens.pinhole import TurnedCamera, new_pinhole, source_pixels
+from kcal.lens.views import Cylinder
 
 if TYPE_CHECKING:
     import numpy as np
@@ -40,7 +41,9 @@ class UndistortMaps(NamedTuple):
     mask: NDArray[np.bool_]
 
 
-def undistort_maps(camera: Camera, new_camera: Camera | None = None) -> UndistortMaps:
+def undistort_maps(
+    camera: Camera, new_camera: Camera | Cylinder | None = None, rotation: Tensor | None = None, *, at: float = math.inf
+) -> UndistortMaps:
     """Compute maps for `cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR)`.
 
     Convention: new pixel (column x, row y) takes the source's value at (map_x[y, x], map_y[y, x]); whole numbers are
@@ -50,8 +53,10 @@ def undistort_maps(camera: Camera, new_camera: Camera | None = None) -> Undistor
 
     Args:
         camera: the single camera that took the image.
-        new_camera: the camera of the new image, by default `new_pinhole(camera)`. If it has a lens, the new image is
-            distorted by that lens.
+        new_camera: the camera of the new image, by default `new_pinhole(camera)`, or a `Cylinder`. If it has a lens,
+            the new image is distorted by that lens.
+        rotation: (3, 3) camera_from_new: where the new camera looks; by default where the camera does.
+        at: range of what is seen, meters. It matters for lenses with an entrance pupil that moves (`pupil_shift`).
 
     Returns:
         map_x, map_y (float32) and mask (bool) as NumPy arrays (H, W) of the new image's size. Rounding to float32
@@ -68,7 +73,7 @@ def undistort_maps(camera: Camera, new_camera: Camera | None = None) -> Undistor
         ((480, 640), True, [0.0, 639.0])
     """
     with torch.no_grad():
-        pixels, mask = _source_positions(camera, new_camera or new_pinhole(camera))
+        pixels, mask = _source_positions(camera, new_camera or new_pinhole(camera), rotation, at)
     if mask.ndim != 2:
         raise InputError(f"undistort_maps: a single camera is needed, not a batch of {tuple(mask.shape[:-2])}")
     map_x, map_y = pixels.to("cpu", torch.float32).unbind(-1)
@@ -87,8 +92,10 @@ class Undistort(nn.Module):
 
     Args:
         camera: the camera that took the images, or a batch of cameras.
-        new_camera: the camera of the new images, single or a batch. By default `new_pinhole(camera)`, for which every
-            new pixel is valid.
+        new_camera: the camera of the new images, single or a batch, or a `Cylinder`. By default `new_pinhole(camera)`,
+            for which every new pixel is valid.
+        rotation: (..., 3, 3) camera_from_new: where the new cameras look; by default where the cameras do.
+        at: range of what is seen, meters. It matters for lenses with an entrance pupil that moves (`pupil_shift`).
 
     Raises:
         InputError: an image less than two pixels wide or high, or batches of cameras that do not broadcast.
@@ -105,12 +112,23 @@ class Undistort(nn.Module):
     grid_x: Tensor
     grid_y: Tensor
     mask: Tensor
+    rotation: Tensor
     _made_from: Tensor
 
-    def __init__(self, camera: Camera, new_camera: Camera | None = None) -> None:
+    def __init__(
+        self,
+        camera: Camera,
+        new_camera: Camera | Cylinder | None = None,
+        rotation: Tensor | None = None,
+        *,
+        at: float = math.inf,
+    ) -> None:
         super().__init__()
         self.camera = camera
         self.new_camera = new_pinhole(camera) if new_camera is None else new_camera
+        self.at = at
+        turn = torch.eye(3) if rotation is None else rotation
+        self.register_buffer("rotation", turn.detach().to(camera.params), persistent=rotation is not None)
         for name, value in zip(("grid_x", "grid_y", "mask"), self._grid(torch.float32), strict=True):
             self.register_buffer(name, value.detach(), persistent=False)
         self.register_buffer("_made_from", self._camera_values(), persistent=False)
@@ -164,9 +182,9 @@ class Undistort(nn.Module):
 
     def _camera_values(self) -> Tensor:
         """All values that the maps depend on, to notice when they change."""
-        parts = [
-            part for camera in (self.camera, self.new_camera) for part in (*camera.parameters(), *camera.buffers())
-        ]
+        parts = [self.rotation]
+        for camera in (self.camera, self.new_camera):
+            parts += [*camera.parameters(), *camera.buffers()]
         return torch.cat([part.detach().flatten().to(torch.float64) for part in parts])
 
     def _maps(self, precision: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
@@ -186,7 +204,7 @@ class Undistort(nn.Module):
 
     def _grid(self, precision: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
         """Positions for `grid_sample`, -1 and 1 at the centers of the outer pixels, rounded once."""
-        pixels, mask = _source_positions(self.camera, self.new_camera)
+        pixels, mask = _source_positions(self.camera, self.new_camera, self.rotation, self.at)
         last = torch.tensor(self.camera.size, dtype=pixels.dtype, device=pixels.device) - 1
         x, y = (2 * pixels / last - 1).to(precision).unbind(-1)
         return x.contiguous(), y.contiguous(), mask
@@ -208,6 +226,7 @@ class UndistortImage(nn.Module):
     Args:
         camera: see `Undistort`.
         new_camera: see `Undistort`.
+        rotation: see `Undistort`.
 
     Example:
         >>> from kornia.augmentation import ImageSequential, RandomHorizontalFlip
@@ -216,20 +235,31 @@ class UndistortImage(nn.Module):
         torch.Size([2, 3, 480, 640])
     """
 
-    def __init__(self, camera: Camera, new_camera: Camera | None = None) -> None:
+    def __init__(
+        self, camera: Camera, new_camera: Camera | Cylinder | None = None, rotation: Tensor | None = None
+    ) -> None:
         super().__init__()
-        self.undistort = Undistort(camera, new_camera)
+        self.undistort = Undistort(camera, new_camera, rotation)
 
     def forward(self, image: Tensor) -> Tensor:
         """Undistort images (..., C, H, W); see `Undistort.forward`."""
         return self.undistort(image)[0]
 
 
-def _source_positions(camera: Camera, new_camera: Camera) -> tuple[Tensor, Tensor]:
+def _source_positions(
+    camera: Camera, new_camera: Camera | Cylinder, rotation: Tensor | None, at: float
+) -> tuple[Tensor, Tensor]:
     """Source pixel (..., H, W, 2) of each pixel of the new image, and mask (..., H, W)."""
     width, height = new_camera.size
     if min(width, height, *camera.size) < 2:
         raise InputError(f"images of {camera.size} and {new_camera.size}: at least 2 pixels each way are needed")
+    if not at > 0:
+        raise InputError(f"at: a positive range in meters is needed, got {at}")
+    if rotation is not None and rotation.shape[-2:] != (3, 3):
+        raise InputError(f"rotation: shape (..., 3, 3) is needed, got {tuple(rotation.shape)}")
+    plain = rotation is None and math.isinf(at)
+    turn = torch.eye(3) if rotation is None else rotation
+    source_camera = camera if plain else TurnedCamera(camera, turn.to(camera.params), at)
     shapes = [tuple(c.params.shape[:-1]) for c in (camera, new_camera)]
     try:
         torch.broadcast_shapes(*shapes)
@@ -238,7 +268,7 @@ def _source_positions(camera: Camera, new_camera: Camera) -> tuple[Tensor, Tenso
     bands = []
     for pixels in new_camera.grid(width, height).flatten(0, 1).split(_BAND):
         rays, valid = new_camera.unproject(pixels)
-        source, seen = source_pixels(camera, rays)
+        source, seen = source_pixels(source_camera, rays)
         bands.append((source, seen & valid))
     source, mask = torch.cat([band[0] for band in bands], -2), torch.cat([band[1] for band in bands], -1)
     source = torch.where(mask[..., None], source, NOWHERE)

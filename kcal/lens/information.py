@@ -1,24 +1,19 @@
-"""What a calibration says of a camera and of the board that it saw, as square roots of information.
-
-Covariances of rich lenses are nearly singular, and what nothing determines has none. Rows of whitened derivatives have
-neither trouble: they are stacked with those of other data, and inverted once, at the end (Bierman, Factorization
-Methods for Discrete Sequential Estimation, 1977).
-"""
+"""What a calibration says of a camera and of the board that it saw, as Gaussians (`kcal.gaussian`)."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from kcal.checks import as_covariance
 from kcal.errors import InputError
+from kcal.gaussian import Gaussian, Slots, numbered
 
-# Singular values of scaled rows below this share of the largest are rounding, not information.
-_ROUNDING = 1e-13
+# Names of the unknowns: (LENS_SLOT, 0), ... of the camera, (BOARD_SLOT, 0), ... of its board.
+LENS_SLOT, BOARD_SLOT = "lens", "board"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -83,19 +78,17 @@ class CameraInformation:
         """
         matrix = as_covariance("covariance of the camera's parameters", covariance, len(params))
         free = matrix.diagonal().nonzero()[:, 0]
-        spread = matrix.diagonal()[free].sqrt()
-        values, vectors = torch.linalg.eigh(matrix[free[:, None], free] / spread[:, None] / spread)
-        # A variance that is zero to rounding would weigh infinitely much.
-        known = values.clamp_min(_ROUNDING)
         places = {int(index): slot for slot, index in enumerate(free)}
-        roots = (vectors / known.sqrt()) @ vectors.T
+        known = Gaussian.from_covariance(
+            numbered(LENS_SLOT, len(free)), params.detach()[free].double(), matrix[free[:, None], free]
+        )
         return cls(
             slots=tuple(places.get(i, -1) for i in range(len(params))),
-            estimate=params.detach()[free].double(),
-            rows=roots / spread,
-            residuals=roots.new_zeros(len(free)),
-            mean=roots.new_zeros(len(free)),
-            sigma=torch.full_like(spread, math.inf),
+            estimate=known.at,
+            rows=known.rows[:, :-1],
+            residuals=known.rows[:, -1],
+            mean=torch.zeros_like(known.at),
+            sigma=torch.full_like(known.at, math.inf),
         )
 
     @property
@@ -108,35 +101,76 @@ class CameraInformation:
         """How many are the board's."""
         return len(self.estimate) - self.lens_size
 
+    @property
+    def lens(self) -> Slots:
+        """Names of the camera's unknowns."""
+        return numbered(LENS_SLOT, self.lens_size)
+
+    @property
+    def board(self) -> Slots:
+        """Names of the board's."""
+        return numbered(BOARD_SLOT, self.board_size)
+
+    @property
+    def data(self) -> Gaussian:
+        """What the data say, about the estimate."""
+        return Gaussian((*self.lens, *self.board), self.estimate, torch.cat([self.rows, self.residuals[:, None]], 1))
+
+    @property
+    def lens_prior(self) -> Gaussian:
+        """What was assumed of the camera; only of those unknowns of which anything was."""
+        return self._prior(range(self.lens_size))
+
+    @property
+    def board_prior(self) -> Gaussian:
+        """What was assumed of the board."""
+        return self._prior(range(self.lens_size, len(self.estimate)))
+
+    def _prior(self, numbers: range) -> Gaussian:
+        finite = self.sigma.isfinite().tolist()
+        known = [number for number in numbers if finite[number]]
+        slots = (*self.lens, *self.board)
+        return Gaussian.independent(tuple(slots[number] for number in known), self.mean[known], self.sigma[known])
+
+    @property
+    def told(self) -> Gaussian:
+        """What other cameras say of the board."""
+        at = self.estimate[self.lens_size :]
+        return Gaussian(self.board, at, at.new_zeros(0, len(at) + 1) if self.others is None else self.others)
+
+    @property
+    def whole(self) -> Gaussian:
+        """Data, priors, and what other cameras say of the board, about the estimate."""
+        return self.data + self.lens_prior + self.board_prior + self.told
+
     def data_rows(self) -> Tensor:
         """(R, U + 1) rows of the data; the last column holds their residuals at the estimate."""
-        return torch.cat([self.rows, self.residuals[:, None]], 1)
+        return self.data.rows
 
     def prior_rows(self, *, board: bool) -> Tensor:
         """(Q, U + 1) likewise of the prior of the board's unknowns, or of the camera's."""
-        known = self.sigma.isfinite() & ((torch.arange(len(self.sigma)) >= self.lens_size) == board)
-        weight = torch.where(known, 1.0 / self.sigma, 0.0)
-        rows = torch.cat([torch.diag(weight), ((self.estimate - self.mean) * weight)[:, None]], 1)
-        return rows[known]
+        return (self.board_prior if board else self.lens_prior).placed(self.data.slots, self.estimate).rows
 
     def board_rows(self) -> Tensor:
         """(Q, U + 1) likewise of all that is known of the board otherwise: its prior, and what other cameras say."""
-        prior = self.prior_rows(board=True)
-        if self.others is None:
-            return prior
-        return torch.cat([prior, torch.cat([self.others.new_zeros(len(self.others), self.lens_size), self.others], 1)])
+        return (self.board_prior + self.told).placed(self.data.slots, self.estimate).rows
 
     def all_rows(self) -> Tensor:
         """(R + Q, U + 1) rows of data, priors, and what other cameras say of the board."""
-        return torch.cat([self.data_rows(), self.prior_rows(board=False), self.board_rows()])
+        return self.whole.rows
 
     def triangle(self) -> Tensor:
         """(U, U + 1) upper triangle of the data's rows, their residuals last; the rest says nothing of the unknowns."""
-        return upper(self.data_rows())
+        return self.data.compressed().rows
+
+    def with_data(self, data: Gaussian) -> CameraInformation:
+        """The same with other data."""
+        rows = data.placed(self.data.slots, self.estimate).rows
+        return dataclasses.replace(self, rows=rows[:, :-1], residuals=rows[:, -1])
 
     def half(self) -> Tensor:
         """(U, U): halfᵀ half is the covariance of the unknowns; what nothing determines has a very large one."""
-        return posterior_half(self.all_rows()[:, :-1])
+        return self.whole.half()
 
     def by_parameter(self, columns: Tensor) -> Tensor:
         """Columns (K, U) by the unknowns as columns (K, 5 + P) by the parameters: zeros for those held."""
@@ -160,77 +194,12 @@ class CameraInformation:
         count = self.lens_size
         if not self.board_size:
             return self
-        # The board's columns first: below its triangle, rows say nothing of it.
-        rows, board = torch.cat([self.data_rows(), self.board_rows()]), self.board_size
-        order = [*range(count, count + board), *range(count), count + board]
-        triangle = triangular(rows[:, order])[board : board + count, board:]
+        alone = (self.data + self.board_prior + self.told).marginal(self.lens).rows
         return CameraInformation(
             slots=self.slots,
             estimate=self.estimate[:count],
-            rows=triangle[:, :-1],
-            residuals=triangle[:, -1],
+            rows=alone[:, :-1],
+            residuals=alone[:, -1],
             mean=self.mean[:count],
             sigma=self.sigma[:count],
         )
-
-
-def triangular(rows: Tensor) -> Tensor:
-    """(C, C) upper triangle with the same products as rows (R, C)."""
-    missing = max(0, rows.shape[1] - len(rows))
-    padded = torch.cat([rows, rows.new_zeros(missing, rows.shape[1])])
-    return torch.linalg.qr(padded, mode="r")[1]
-
-
-def upper(rows: Tensor) -> Tensor:
-    """(C, C + 1) upper triangle of rows (R, C + 1); what is one already stays as it is, to the last bit."""
-    if len(rows) == rows.shape[1] - 1 and not bool(rows.tril(-1).any()):
-        return rows
-    return triangular(rows)[:-1]
-
-
-def unit_scale(rows: Tensor) -> Tensor:
-    """(C,) factors that make the columns of rows (R, C) unit vectors; 1 for columns of zeros."""
-    length = torch.linalg.vector_norm(rows, dim=0)
-    return torch.where(length > 0, 1.0 / torch.where(length > 0, length, 1.0), 1.0)
-
-
-def posterior_half(rows: Tensor) -> Tensor:
-    """(U, U) whose product halfᵀ half is the inverse of rowsᵀ rows, from rows (R, U).
-
-    Directions that the rows do not determine get a very large variance, which only rounding limits.
-
-    Example:
-        >>> posterior_half(torch.tensor([[2.0, 0], [0, 4.0]]).double()).abs().sum(0)
-        tensor([0.5000, 0.2500], dtype=torch.float64)
-    """
-    change, _, known = whitened(rows, rows.new_zeros(len(rows)))
-    return torch.where(known, change, change / _ROUNDING).T
-
-
-class Whitened(NamedTuple):
-    """Unknowns y in place of x: x = change (y - begin).
-
-    Attributes:
-        change: (U, U).
-        begin: (U,) what y is at x = 0.
-        known: (U,) whether y is a standard normal; nothing is known of the others.
-    """
-
-    change: Tensor
-    begin: Tensor
-    known: Tensor
-
-
-def whitened(rows: Tensor, residuals: Tensor) -> Whitened:
-    """Change variables so that ‖rows x + residuals‖² = Σ y² over the known y, and a constant; rows (R, U).
-
-    Example:
-        >>> whitened(torch.tensor([[2.0, 0.0]]).double(), torch.tensor([6.0]).double()).known
-        tensor([ True, False])
-    """
-    triangle = triangular(torch.cat([rows, residuals[:, None]], 1))[: rows.shape[1]]
-    scale = unit_scale(triangle[:, :-1])
-    left, values, right = torch.linalg.svd(triangle[:, :-1] * scale)
-    known = values > _ROUNDING * values[:1].sum()
-    change = scale[:, None] * right.T / torch.where(known, values, 1.0)
-    return Whitened(change, torch.where(known, left.T @ triangle[:, -1], 0.0), known)

@@ -7,6 +7,7 @@ has a source pixel; the outer rectangle (alpha 1) contains every source pixel th
 from __future__ import annotations
 
 import math
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -23,7 +24,51 @@ _SIDE_SAMPLES = 129
 _WIDEST = math.radians(89.0)
 
 
-def source_pixels(camera: Camera, rays: Tensor) -> tuple[Tensor, Tensor]:
+class Sees(Protocol):
+    """What choosing a pinhole asks of a camera; `TurnedCamera` is one, too."""
+
+    @property
+    def params(self) -> Tensor:
+        """(..., 5 + P), for their batch shape, dtype and device."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of the image."""
+
+    def unproject(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        """As `Camera.unproject`."""
+
+    def project_rays(self, rays: Tensor) -> tuple[Tensor, Tensor]:
+        """As `Camera.project_rays`."""
+
+
+class TurnedCamera:
+    """A camera whose rays are those of a frame that is turned against its own; far away, or at a range.
+
+    Args:
+        camera: a camera or a batch.
+        rotation: (..., 3, 3) camera_from_frame.
+        at: range of what is seen, meters.
+    """
+
+    def __init__(self, camera: Camera, rotation: Tensor, at: float = math.inf) -> None:
+        self.camera, self.rotation, self.at = camera, rotation, at
+        self.params, self.size = camera.params, camera.size
+
+    def unproject(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        """As `Camera.unproject`, in the turned frame."""
+        rays, valid = self.camera.unproject(pixels)
+        return rays @ self.rotation, valid
+
+    def project_rays(self, rays: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels of what is seen in directions (..., N, 3) of the turned frame, at the range."""
+        rays = rays @ self.rotation.mT
+        if math.isinf(self.at):
+            return self.camera.project_rays(rays)
+        return self.camera.project(self.at * rays / rays.norm(dim=-1, keepdim=True))
+
+
+def source_pixels(camera: Sees, rays: Tensor) -> tuple[Tensor, Tensor]:
     """Project directions to pixels, and say whether the image has a value there.
 
     Args:
@@ -90,9 +135,9 @@ def new_pinhole(camera: Camera, alpha: float = 0.0, size: tuple[int, int] | None
 
     values = torch.zeros_like(camera.params[..., :5])
     if alpha < 1:
-        values = values + (1 - alpha) * _pinhole_parameters(*_inner_rectangle(camera, (width, height)), (width, height))
+        values = values + (1 - alpha) * _pinhole_parameters(*inner_rectangle(camera, (width, height)), (width, height))
     if alpha > 0:
-        values = values + alpha * _pinhole_parameters(*_outer_rectangle(camera), (width, height))
+        values = values + alpha * _pinhole_parameters(*outer_rectangle(camera), (width, height))
     return Camera(values, size=(width, height), model="pinhole")
 
 
@@ -119,7 +164,7 @@ def _points_on_sides(low: Tensor, high: Tensor, along: Tensor) -> Tensor:
     )
 
 
-def _side_extremes(camera: Camera, outermost: bool) -> Tensor:
+def _side_extremes(camera: Sees, outermost: bool) -> Tensor:
     """Innermost (or outermost) x of the left and right side and y of the top and bottom side of the image, (..., 4).
 
     Infinite for a side on which no pixel has a ray.
@@ -148,7 +193,7 @@ def _side_extremes(camera: Camera, outermost: bool) -> Tensor:
     return value
 
 
-def _inner_rectangle(camera: Camera, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+def inner_rectangle(camera: Sees, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """The rectangle in which every pixel of a new image of this size has a source."""
     vector = camera.params
     shape = torch.tensor(size, dtype=vector.dtype, device=vector.device) - 1
@@ -191,7 +236,7 @@ def _shrunk(center: Tensor, low: Tensor, high: Tensor, scale: Tensor) -> tuple[T
     return center + scale * (low - center), center + scale * (high - center)
 
 
-def _outer_rectangle(camera: Camera) -> tuple[Tensor, Tensor]:
+def outer_rectangle(camera: Sees) -> tuple[Tensor, Tensor]:
     """The rectangle around every source pixel that has a ray."""
     sides = _side_extremes(camera, outermost=True)
     low, high = sides[..., 0::2], sides[..., 1::2]
@@ -203,7 +248,7 @@ def _outer_rectangle(camera: Camera) -> tuple[Tensor, Tensor]:
     return low, high
 
 
-def _valid_rim(camera: Camera) -> Tensor:
+def _valid_rim(camera: Sees) -> Tensor:
     """Last valid points (..., 1440, 2) of the plane z = 1 along as many directions from the axis."""
     vector = camera.params
     turn = torch.arange(1440, dtype=vector.dtype, device=vector.device) * (2 * math.pi / 1440)

@@ -76,6 +76,47 @@ def pixel_covariance(
     return torch.where(good[:, None, None], found, torch.nan).reshape(*places.shape[:-1], 2, 2)
 
 
+@torch.no_grad()
+def pixel_errors(
+    camera: Camera, truth: Camera, places: Tensor, *, at: float = math.inf, grid: tuple[int, int] = (25, 17)
+) -> Tensor:
+    """Where a camera sees things minus where the true camera sees them: the errors that `pixel_covariance` predicts.
+
+    The turn that no board determines is taken out in the same way.
+
+    Args:
+        camera: a single camera.
+        truth: a single camera of the same image size.
+        places: (N, 2) pixels of the camera.
+        at: distance of the things, meters.
+        grid: columns and rows over which the turn is fitted.
+
+    Returns:
+        (N, 2) px; NaN where one of the two has no image.
+
+    Example:
+        >>> truth = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480), model="pinhole")
+        >>> camera = Camera.build(focal=(800, 800), center=(320.5, 239.5), size=(640, 480), model="pinhole")
+        >>> error = pixel_errors(camera, truth, torch.tensor([[319.5, 239.5], [0.0, 0.0]]))
+        >>> [round(float(value), 2) for value in error[:, 0]]  # nearly a turn
+        [0.06, -0.09]
+    """
+
+    def seen_apart(pixels: Tensor, at: float) -> Tensor:
+        rays, valid = camera.unproject(pixels)
+        points = FAR * rays if math.isinf(at) else camera.ray_origins(rays) + at * rays
+        seen, visible = truth.project(points)
+        return torch.where((valid & visible)[:, None], pixels - seen, torch.nan)
+
+    everywhere = camera.grid(*grid).reshape(-1, 2)
+    away, (_, by_motion, good) = seen_apart(everywhere, math.inf), pixel_slopes(camera, everywhere, math.inf, [])
+    good = good & away.isfinite().all(-1)
+    turn = torch.linalg.lstsq(by_motion[good][..., :3].flatten(0, 1), away[good].reshape(-1, 1)).solution
+    _, by_motion, good = pixel_slopes(camera, places, at, [])
+    error = seen_apart(places, at) - (by_motion[..., :3] @ turn)[..., 0]
+    return torch.where(good[:, None], error, torch.nan)
+
+
 def projection_sigma(camera: Camera, places: Tensor, *, at: float = math.inf) -> Tensor:
     """Standard deviation in pixels of where the camera sees things, in the direction in which it is largest.
 

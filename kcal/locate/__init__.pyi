@@ -19,6 +19,8 @@ from kcal.locate.triangulate import Triangulate as Triangulate
 from kcal.locate.triangulate import Triangulation as Triangulation
 from kcal.locate.multiview import TriangulateViews as TriangulateViews
 from kcal.locate.multiview import ViewsResult as ViewsResult
+from kcal.locate.disparity import DisparityRanges as DisparityRanges
+from kcal.locate.disparity import RangeImage as RangeImage
 
 # Points on the ground
 from kcal.locate.ground import locate_on_ground as locate_on_ground
@@ -38,3 +40,4 @@ from kcal.locate.datum import true_from_grid as true_from_grid
 from kcal.locate.budget import range_errors as range_errors
 from kcal.locate.budget import RangeError as RangeError
 from kcal.locate.budget import BudgetErrors as BudgetErrors
+from kcal.locate.aging import forgotten_yaw as forgotten_yaw

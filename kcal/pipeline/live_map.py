@@ -25,6 +25,7 @@ from kcal.locate.columns import PositionColumns
 from kcal.locate.map_places import camera_place, field_of_view
 from kcal.locate.positions import Located
 from kcal.locate.region import CORNER_DECIMALS, near, ring_blocks
+from kcal.quantities import length_text
 from kcal.web.gate import local_app, page_files
 from kcal.web.serving import LocalServer
 
@@ -122,6 +123,9 @@ def _tracks_text(columns: PositionColumns, sequence: int, origin: Origin) -> byt
     """The tracks with a position: name, place, 95 % region, and what is said of each."""
     located = np.flatnonzero(columns.located)
     rings = itertools.chain.from_iterable(ring_blocks(columns, origin))
+    distances = columns.column("range_m")
+    # Of an interval of 95 %; one without end tells no digits.
+    sigmas = (columns.column("range_high_m") - columns.column("range_low_m")) / 3.92
     tracks = []
     for i, ring in zip(located.tolist(), rings, strict=True):
         lat, lon = columns.numbers[i, :2].tolist()
@@ -132,7 +136,7 @@ def _tracks_text(columns: PositionColumns, sequence: int, origin: Origin) -> byt
                 "name": columns.names[i],
                 "place": [lat, lon + turn],
                 "region": np.round(ring + np.array([0.0, turn]), CORNER_DECIMALS).tolist(),
-                "text": f"{columns.extras['category'][i]}, {columns.column('range_m')[i]:,.0f} m",
+                "text": f"{columns.extras['category'][i]}, {length_text(distances[i], sigmas[i])}",
             }
         )
     return orjson.dumps({"sequence": sequence, "tracks": tracks})

@@ -24,4 +24,5 @@ from kcal.report.gallery import FailedImage as FailedImage
 from kcal.report.gallery import save_coverage as save_coverage
 from kcal.report.board import save_board_picture as save_board_picture
 from kcal.report.difference import save_difference_picture as save_difference_picture
+from kcal.report.interval_map import save_interval_picture as save_interval_picture
 from kcal.report.budget import save_budget_picture as save_budget_picture

@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcal.calibrate.camera.export import Misfit
+from kcal.calibrate.camera.misfit import Misfit
 from kcal.lens.difference import CameraDifference
 from kcal.report.colors import INK
 from kcal.report.difference_text import difference_text

@@ -76,7 +76,7 @@ def camera_verdict(
         for text in result.warnings
     ]
     if stored is not None:
-        other, apart = _other_views(stored, result)
+        other, apart = other_views(stored, result)
         found, beyond = [*other, *found], max(beyond, apart)
     # What another model that fits as well sees elsewhere is uncertain too, above all where no board was; what is known
     # to be wrong of it counts as a fault.
@@ -152,7 +152,7 @@ def stored_findings(camera: Camera) -> list[Finding]:
     return [unseen, *([] if record is None else record_findings(record))]
 
 
-def _other_views(stored: Camera, result: CameraCalibrationResult) -> tuple[list[Finding], float]:
+def other_views(stored: Camera, result: CameraCalibrationResult) -> tuple[list[Finding], float]:
     """Whether these views give another camera than the one to be used, and by how many px beyond their error bars."""
     found = camera_difference(stored, result.camera)
     record = stored.calibration.record if stored.calibration else None

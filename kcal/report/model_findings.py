@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from kcal.calibrate.camera.options import CalibrationOptions
+from kcal.calibrate.camera.options import CalibrationOptions, Progress
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.camera.summary import summarize
-from kcal.calibrate.camera.trust import Examination, HalvesDifference, unexplained
+from kcal.calibrate.camera.trust import Examination, HalvesDifference, examine, unexplained
 from kcal.calibrate.camera.warnings import REPEATING
 from kcal.lens.uncertainty import image_sigma
 from kcal.report.verdict import FAULTS, Finding
@@ -114,6 +114,15 @@ def model_findings(
             )
         )
     return findings, beyond
+
+
+def fault_of_views(
+    result: CameraCalibrationResult, options: CalibrationOptions, progress: Progress = lambda _: None
+) -> Finding | None:
+    """What a calibration's own views say against its error bars, if it moves the camera beyond these; else None."""
+    findings, beyond = model_findings(result, options, examine(result, options, progress))
+    faults = [finding for finding in findings if finding.part == FAULTS]
+    return faults[0] if faults and (beyond > 0.0 or faults[0].severity == "stop") else None
 
 
 def _prediction_finding(half: HalvesDifference) -> Finding:

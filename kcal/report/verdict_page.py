@@ -9,15 +9,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import jinja2
-
 import kcal
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.files import write_atomic
 from kcal.lens.camera import Camera
 from kcal.quantities import length_text, number_text, range_text
 from kcal.report.verdict import RangeAnswer, Verdict
-from kcal.report.verdict_pictures import range_picture
 from kcal.texts import page_policy, visible
 
 _HERE = Path(__file__).parent
@@ -52,8 +49,12 @@ def verdict_page(
         >>> "left &lt;camera&gt;" in page, "YES" in page, "http:" in page
         (True, True, False)
     """
+    import jinja2  # loaded here, like matplotlib below: answers without a page do without both
+
     drawn = dict(pictures or {})
     if any(math.isfinite(answer.sigma) for answer in verdict.answers):
+        from kcal.report.verdict_pictures import range_picture
+
         drawn = {"ranges": range_picture(verdict.answers), **drawn}
     style = (_HERE / "verdict_page.css").read_text(encoding="utf-8")
     environment = jinja2.Environment(

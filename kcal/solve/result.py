@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import enum
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Generic, TypeVar, cast
 
 import torch
@@ -30,11 +30,6 @@ def map_state(function: Callable[..., Tensor], *states: S) -> S:
 def blend(mask: Tensor, old: S, new: S) -> S:
     """Of each pair of tensors, which begin with the batch, the new one where the mask (...) is true."""
     return map_state(lambda a, b: torch.where(mask.reshape(mask.shape + (1,) * (a.ndim - mask.ndim)), a, b), new, old)
-
-
-def stack(states: Sequence[S]) -> S:
-    """Several states as one batch."""
-    return map_state(lambda *tensors: torch.stack(tensors), *states)
 
 
 def pick(state: S, elements: int | slice | Tensor) -> S:

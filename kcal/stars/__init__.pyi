@@ -9,6 +9,7 @@ from kcal.stars.identification import Identification as Identification
 from kcal.stars.night import name_stars as name_stars
 from kcal.stars.night import NamedStars as NamedStars
 from kcal.stars.attitude import Attitude as Attitude
+from kcal.stars.contradictions import clock_doubts as clock_doubts
 
 # Catalogue and sky
 from kcal.stars.catalog import StarCatalog as StarCatalog
@@ -28,6 +29,7 @@ from kcal.calibrate.rig.star_source import StarEffect as StarEffect
 from kcal.stars.lens import calibrate_by_stars as calibrate_by_stars
 from kcal.stars.lens import StarCamera as StarCamera
 from kcal.stars.lens_fit import StarLens as StarLens
+from kcal.stars.with_boards import Agreement as Agreement
 from kcal.stars.budget import planned_stars as planned_stars
 from kcal.stars.budget import NightPlan as NightPlan
 from kcal.stars.budget import PlannedStars as PlannedStars

@@ -25,6 +25,8 @@ _CUT = 5.0
 _ROUGH = 4.0
 # px: the sigma of the most disturbed star that is still worth naming.
 _LEAST_REACH = 1.0
+# Standard deviations by which refraction must differ from that of place and time, and px by which a good lens errs.
+_SURE, _LENS = 5.0, 0.04
 # px: another star of the catalogue that is nearer, and not fainter by more magnitudes, pulls a star's center.
 _CROWDED, _FAINTER = 6.0, 2.5
 
@@ -86,10 +88,11 @@ def fit_attitude(
     parameters = camera.params.detach()
     everywhere = torch.from_numpy(directions)
     star, reach = np.full(len(pixels), -1), np.full(len(pixels), _ROUGH)
+    least = math.cos(min(_half_field(camera) + 0.01, math.pi))
     weights, target = torch.from_numpy(1.0 / sigma), torch.from_numpy(pixels).T
     for attempt in range(12):
         before = star
-        star = _names_at(pixels, reach, everywhere, magnitude, camera, turn)
+        star = _names_at(pixels, reach, everywhere, magnitude, camera, turn, least)
         known = torch.from_numpy(star >= 0)
         if int(known.sum()) < 3:
             return None
@@ -124,11 +127,51 @@ def fit_attitude(
     )
 
 
+def refraction_doubt(seen: Attitude, sigma: Floats, refracted: Tensor, straight: Tensor, camera: Camera) -> str | None:
+    """Whether stars are refracted as they would be at the place and time that were given; None if they are.
+
+    Args:
+        seen: the attitude on the Earth, with its N named stars.
+        sigma: (N,) of these, px.
+        refracted: (N, 3) directions in which they would be seen there and then.
+        straight: (N, 3) likewise without air.
+        camera: which lens.
+    """
+    at, rows = star_rows(refracted, seen.rotation, camera, camera.params.detach())
+    without, _ = star_rows(straight, seen.rotation, camera, camera.params.detach())
+    weight = torch.from_numpy(1.0 / sigma) / seen.widened
+    pattern = (at - without) * weight
+    turns = (rows * weight).flatten(1)
+    own = pattern.flatten() - turns.T @ torch.linalg.lstsq(turns.T, pattern.flatten()[:, None]).solution[:, 0]
+    residual = torch.from_numpy(seen.residual[seen.star >= 0]).T * weight
+    length = float(own.norm())
+    if length == 0.0:
+        return None
+    # The residual is projected minus seen: seen refraction is (1 - excess) of what was assumed.
+    excess = float(own @ residual.flatten()) / length**2
+    moved = abs(excess) * float((own.reshape(2, -1) / weight).square().mean().sqrt())
+    if abs(excess) * length < _SURE or moved < _LENS:
+        return None
+    return (
+        f"refraction is {1.0 - excess:.2f} ± {1.0 / length:.2f} times what it would be there and then: the stars stand "
+        f"{'lower' if excess < 0 else 'higher'} than place and time say; one of them is wrong, or the lens"
+    )
+
+
 def _names_at(
-    pixels: Floats, reach: Floats, directions: Tensor, magnitude: Floats, camera: Camera, rotation: Tensor
+    pixels: Floats,
+    reach: Floats,
+    directions: Tensor,
+    magnitude: Floats,
+    camera: Camera,
+    rotation: Tensor,
+    least: float,
 ) -> NDArray[np.int64]:
-    """(N,) the star of the catalogue at each pixel; -1 for none, or where another star pulls it."""
-    ahead = np.flatnonzero((directions @ rotation[2] > math.cos(min(_half_field(camera) + 0.01, math.pi))).numpy())
+    """(N,) the star of the catalogue at each pixel; -1 for none, or where another star pulls it.
+
+    Stars whose cosine from the optical axis is at least `least` may be in the image.
+    """
+    ahead = np.flatnonzero((directions @ rotation[2] > least).numpy())
     seen, valid = camera.project(FAR * (directions[ahead] @ rotation.T))
     ahead, places = ahead[valid.numpy()], seen[valid].numpy()
     star = np.full(len(pixels), -1)

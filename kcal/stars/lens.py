@@ -11,15 +11,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.stars.attitude import fit_attitude
 from kcal.stars.catalog import StarCatalog
 from kcal.stars.detect import DetectedStars
 from kcal.stars.identification import Identification, identify, turn_between
-from kcal.stars.lens_fit import StarField, StarLens, fit_star_lens
+from kcal.stars.lens_fit import StarLens, fit_star_lens
 from kcal.stars.night import SkyView
 from kcal.stars.sky import celestial_directions
+from kcal.stars.star_problem import StarField
+from kcal.stars.with_boards import Agreement, joined, refine_by_stars
 
 # Degrees between opposite corners: the widest and narrowest lens that is looked for, and steps between.
 _WIDEST, _NARROWEST, _STEP = 115.0, 6.0, 1.02
@@ -43,6 +46,8 @@ class StarCamera:
         stars: (N,) index in the catalogue of each of their named stars.
         pixels: (N, 2) where these were seen.
         refused: number of each other image, and why it was not used.
+        agreement: of the stars with the boards that calibrated the camera before; None where none did.
+        joint: the calibration by boards, refined by the stars; None likewise.
     """
 
     lens: StarLens
@@ -50,6 +55,8 @@ class StarCamera:
     stars: tuple[np.ndarray, ...]
     pixels: tuple[np.ndarray, ...]
     refused: dict[int, str]
+    agreement: Agreement | None = None
+    joint: CameraCalibrationResult | None = None
 
 
 def calibrate_by_stars(
@@ -58,19 +65,22 @@ def calibrate_by_stars(
     size: tuple[int, int],
     *,
     focal: float | None = None,
+    boards: CameraCalibrationResult | None = None,
     catalog: StarCatalog | None = None,
     progress: Callable[[str], object] = lambda _: None,
 ) -> StarCamera:
-    """Calibrate a camera at infinity from the stars of several night images, of which nothing else is known.
+    """Calibrate a camera at infinity from the stars of several night images, alone or together with boards.
 
-    Tilt the camera up: stars then cover the whole image, and refraction bends little. The camera has no entrance pupil:
-    it is right for what is far away.
+    Tilt the camera up: stars then cover the whole image, and refraction bends little. By stars alone the camera has no
+    entrance pupil: it is right for what is far away. Boards tell the pupil and the lens where they were seen: together
+    both give one posterior.
 
     Args:
         images: the stars of each.
         views: when and where each was taken; with both, refraction is taken out.
         size: of the images, px.
         focal: px, where it is known to 3 %; otherwise it is looked for.
+        boards: what boards said of the camera; names are then found with it.
         catalog: the stars; kcal's own if left out.
         progress: called after each step.
 
@@ -84,6 +94,60 @@ def calibrate_by_stars(
     """
     catalog = catalog or StarCatalog.bundled()
     order = sorted(range(len(images)), key=lambda number: -len(images[number].pixels))
+    rotations: dict[int, np.ndarray] = {}
+    if boards is None:
+        camera, rotations = _first_lens(images, views, order, size, focal, catalog, progress)
+    else:
+        camera = boards.camera
+        if camera.size != size:
+            width, height = camera.size
+            raise InputError(f"the night images have {size[0]}x{size[1]} pixels, those of boards {width}x{height}")
+    refused: dict[int, str] = {}
+    for number in order:
+        if number in rotations:
+            continue
+        found_here = _by_camera(images[number], camera, catalog)
+        if found_here is None:
+            refused[number] = f"{len(images[number].pixels)} points of light have no names"
+        else:
+            rotations[number] = found_here.rotation
+    progress("names")
+    if not rotations:
+        raise InputError(f"in none of {len(images)} images stars have names by the boards' camera: is it of this lens?")
+    lens: StarLens | None = None
+    agreement: Agreement | None = None
+    for _ in range(3):
+        fields, star, pixels, kept = _star_fields(images, views, camera, rotations, catalog)
+        turns = [rotation for _, rotation in kept]
+        if boards is None:
+            lens = fit_star_lens(fields, turns, size, float(camera.params[0]))
+        else:
+            lens, agreement = refine_by_stars(fields, turns, boards)
+        camera = lens.camera
+        rotations = {n: found.numpy() for (n, _), found in zip(kept, lens.rotations, strict=True)}
+        progress("lens")
+    assert lens is not None
+    return StarCamera(
+        lens=lens,
+        images=tuple(n for n, _ in kept),
+        stars=tuple(star),
+        pixels=tuple(pixels),
+        refused=refused,
+        agreement=agreement,
+        joint=None if boards is None or agreement is None else joined(boards, lens, agreement),
+    )
+
+
+def _first_lens(
+    images: Sequence[DetectedStars],
+    views: Sequence[SkyView],
+    order: Sequence[int],
+    size: tuple[int, int],
+    focal: float | None,
+    catalog: StarCatalog,
+    progress: Callable[[str], object],
+) -> tuple[Camera, dict[int, np.ndarray]]:
+    """A rough camera from the first image whose stars have names, and its rotation."""
     named: dict[int, Identification] = {}
     for number in order[:_TRIES]:
         found = _search(images[number], size, focal, catalog)
@@ -96,32 +160,7 @@ def calibrate_by_stars(
             f"in none of {len(images)} images stars have names: too few are seen, or this is not the night sky"
         )
     first = next(iter(named))
-    camera, rotations = _from_middle_outward(images, views, size, focal, {first: named[first].rotation}, catalog)
-    refused: dict[int, str] = {}
-    for number in order:
-        if number in rotations:
-            continue
-        found_here = _by_camera(images[number], camera, catalog)
-        if found_here is None:
-            refused[number] = f"{len(images[number].pixels)} points of light have no names"
-        else:
-            rotations[number] = found_here.rotation
-    progress("names")
-    lens: StarLens | None = None
-    for _ in range(3):
-        fields, star, pixels, kept = _star_fields(images, views, camera, rotations, catalog)
-        lens = fit_star_lens(fields, [rotation for _, rotation in kept], size, float(camera.params[0]))
-        camera = lens.camera
-        rotations = {n: found.numpy() for (n, _), found in zip(kept, lens.rotations, strict=True)}
-        progress("lens")
-    assert lens is not None
-    return StarCamera(
-        lens=lens,
-        images=tuple(n for n, _ in kept),
-        stars=tuple(star),
-        pixels=tuple(pixels),
-        refused=refused,
-    )
+    return _from_middle_outward(images, views, size, focal, {first: named[first].rotation}, catalog)
 
 
 def _pinhole(focal: float, size: tuple[int, int]) -> Camera:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -20,33 +19,25 @@ from kcal.calibrate.hybrid.families import PriorFamilies, prior_families, typica
 from kcal.calibrate.hybrid.quadratic import view_data
 from kcal.calibrate.hybrid.unknowns import hybrid_unknowns
 from kcal.errors import InputError
+from kcal.gaussian import posterior_half
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.information import CameraInformation
 from kcal.lens.model import LensModel
-from kcal.lens.pose import rotation_from_vector, step_rows
-from kcal.lens.projection import project_components
 from kcal.lens.zernike import ZernikeModes
-from kcal.stars.attitude import FAR
+from kcal.stars.star_problem import KnownLens, StarField, StarProblem
 
 # Of the field's disc over the image's half diagonal.
 _REACH = 1.08
 # The pupil's two places among the unknowns, after focal length, principal point and shape.
 _PUPIL = slice(4, 6)
 _SHAPES = (1.0, 0.5, 0.25, 0.0, -0.3)
-_CUT = 5.0
+# Stars farther off than so many typical sigmas are left out.
+CUT = 5.0
 _ROUNDS = 6
 # Stars beyond which a lens of four numbers is not enough; fewer tell no field.
 _LEAST_STARS = 12
-
-
-class StarField(NamedTuple):
-    """The named stars of one image: (N, 3) unit directions in any frame, (N, 2) pixels, (N,) sigma of these."""
-
-    directions: Tensor
-    pixels: Tensor
-    sigma: Tensor
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -72,99 +63,6 @@ class StarLens:
     effective: float
 
 
-class _Fit:
-    """Gauss-Newton on one lens and the rotations of all images, under a normal prior on the lens."""
-
-    def __init__(self, fields: Sequence[StarField], rotations: Sequence[Tensor]) -> None:
-        self.fields, self.rotations = list(fields), [rotation.clone() for rotation in rotations]
-        self.weights = [torch.ones(len(field.pixels), dtype=torch.float64) for field in fields]
-        self.variance = 1.0
-
-    def _rows(self, number: int, rotation: Tensor, parameters: Tensor, model: LensModel) -> tuple[Tensor, Tensor]:
-        """(3 + S + 1, 2, N) derivatives by turn and lens, and last the residuals; these again with NaN where none."""
-        field, unknowns = self.fields[number], hybrid_unknowns(model)
-        points = FAR * (rotation @ field.directions.T)
-        seen = project_components(points, parameters, model, unknowns.indices)
-        error = seen.pixels - field.pixels.T
-        lens = unknowns.collapse(seen.by_camera, -3)
-        rows = torch.cat([step_rows(seen.by_point, points)[:3], lens, error[None]], 0)
-        return torch.where(seen.regular, rows, 0.0), torch.where(seen.regular, error, torch.nan)
-
-    def reduced(self, parameters: Tensor, model: LensModel) -> tuple[Tensor, list[tuple[Tensor, Tensor, Tensor]]]:
-        """(S + 1, R) rows of all images with their rotations projected out, and what gives the rotations back."""
-        out, back = [], []
-        for number, rotation in enumerate(self.rotations):
-            rows, _ = self._rows(number, rotation, parameters, model)
-            flat = (rows * (self.weights[number] / self.fields[number].sigma)).flatten(1)
-            q, r = torch.linalg.qr(flat[:3].T)
-            out.append(flat[3:] - (flat[3:] @ q) @ q.T)
-            back.append((q, r, flat))
-        return torch.cat(out, 1), back
-
-    def errors(self, parameters: Tensor, model: LensModel) -> list[Tensor]:
-        """(2, N) of each image."""
-        return [self._rows(n, rotation, parameters, model)[1] for n, rotation in enumerate(self.rotations)]
-
-    def cost(self, parameters: Tensor, model: LensModel, rotations: Sequence[Tensor]) -> float:
-        """χ² of all stars that are not left out."""
-        total = 0.0
-        for number, rotation in enumerate(rotations):
-            error = self._rows(number, rotation, parameters, model)[1]
-            weight = self.weights[number] / self.fields[number].sigma
-            total += float(torch.where(weight > 0, error * weight, 0.0).square().sum())
-        return total
-
-    def minimize(self, parameters: Tensor, model: LensModel, mean: Tensor, deviation: Tensor, steps: int) -> Tensor:
-        """The parameters of least squares; unknowns whose deviation is zero are held."""
-        unknowns, free, damping = hybrid_unknowns(model), deviation > 0, 0.0
-
-        def objective(values: Tensor, rotations: Sequence[Tensor]) -> float:
-            prior = ((_unknowns_of(values) - mean) / deviation)[free].square().sum()
-            return self.cost(values, model, rotations) + self.variance * float(prior)
-
-        now = objective(parameters, self.rotations)
-        for _ in range(steps):
-            rows, back = self.reduced(parameters, model)
-            lens, error = rows[:-1][free], rows[-1]
-            precision = self.variance / deviation[free] ** 2
-            normal = lens @ lens.T + torch.diag(precision)
-            slope = lens @ error + precision * (_unknowns_of(parameters) - mean)[free]
-            scale = normal.diagonal().sqrt()
-            unit, better = normal / scale / scale[:, None], False
-            for _ in range(8):
-                step = torch.zeros_like(deviation)
-                eye = damping * torch.eye(len(unit), dtype=torch.float64)
-                step[free] = -torch.linalg.solve(unit + eye, slope / scale) / scale
-                trial = parameters.clone()
-                for index, slot in zip(unknowns.indices, unknowns.slots, strict=True):
-                    trial[index] += step[slot]
-                turned = [
-                    rotation_from_vector(torch.linalg.solve(r, q.T @ -(flat[-1] + step @ flat[3:-1]))) @ rotation
-                    for (q, r, flat), rotation in zip(back, self.rotations, strict=True)
-                ]
-                new = objective(trial, turned)
-                if new <= now * (1 + 1e-12):
-                    better = True
-                    break
-                damping = max(10 * damping, 1e-6)
-            if not better:
-                break
-            damping *= 0.1
-            gain, now, parameters, self.rotations = now - new, new, trial, turned
-            if gain < 1e-7 * now:
-                break
-        return parameters
-
-    def leave_out(self, parameters: Tensor, model: LensModel, cut: float) -> None:
-        """Leave out stars that are off by more than `cut` typical sigmas, and estimate the variance."""
-        errors = self.errors(parameters, model)
-        size = [(e / f.sigma).norm(dim=0) for e, f in zip(errors, self.fields, strict=True)]
-        whole = torch.cat(size)
-        typical = float(whole[torch.isfinite(whole)].median()) / 1.18
-        self.weights = [(one < cut * typical).double() for one in size]
-        self.variance = max(typical**2, 1e-12)
-
-
 def fit_star_lens(
     fields: Sequence[StarField], rotations: Sequence[Tensor], size: tuple[int, int], focal: float
 ) -> StarLens:
@@ -184,12 +82,8 @@ def fit_star_lens(
         Traceback (most recent call last):
         kcal.errors.InputError: 0 named stars tell no lens; 12 are needed at least, and some hundred are good
     """
-    count = sum(len(field.pixels) for field in fields)
-    if count < _LEAST_STARS:
-        raise InputError(
-            f"{count} named stars tell no lens; {_LEAST_STARS} are needed at least, and some hundred are good"
-        )
-    modes, fit = ZernikeModes(), _Fit(fields, rotations)
+    require_stars(fields)
+    modes, fit = ZernikeModes(), StarProblem(fields, rotations)
     nothing = BoardModes(torch.zeros(0, 3, 0).double(), torch.zeros(0).double(), torch.zeros(0, dtype=torch.int64))
     hyperprior = typical_hyperprior(modes)
     h = hyperprior.mean
@@ -206,30 +100,58 @@ def fit_star_lens(
         model, families = model_of(shape), _families(model_of(shape), focal, nothing, size)
         base = torch.zeros(len(families.mean), dtype=torch.float64)
         base[:4] = families.deviation(h)[:4]
-        parameters = fit.minimize(parameters, model, families.mean, base, 15)
+        known = KnownLens.normal(families.mean, base)
+        parameters = fit.minimize(parameters, model, hybrid_unknowns(model), known, 15)
         fit.leave_out(parameters, model, 7.0)
         focal, shape = float(parameters[0]), shape + min(max(float(parameters[5]), -1.0), 1.0)
         parameters = parameters.clone()
         parameters[5] = 0.0
     model = model_of(shape)
-    families = _families(model, focal, nothing, size)
+    families, unknowns = _families(model, focal, nothing, size), hybrid_unknowns(model)
+    leading = list(unknowns.leading)
     for turn in range(_ROUNDS):
-        parameters = fit.minimize(parameters, model, families.mean, _without_pupil(families.deviation(h)), 10)
-        rows = fit.reduced(parameters, model)[0]
+        known = KnownLens.normal(families.mean, _without_pupil(families.deviation(h)))
+        parameters = fit.minimize(parameters, model, unknowns, known, 10)
+        rows = fit.reduced(parameters, model, unknowns)[0]
         rows[:-1][_PUPIL] = 0.0
         freedom = sum(2.0 * float((w > 0).sum()) - 3.0 for w in fit.weights)
-        data = view_data(rows[None], _unknowns_of(parameters) - families.mean, torch.zeros(1, 0).double(), freedom)
+        data = view_data(rows[None], parameters[leading] - families.mean, torch.zeros(1, 0).double(), freedom)
         before = h
         best = maximize_evidence(data, families, h, fit.variance, hyperprior)
         h, variance = best.h, best.variance
         if turn < 3:
-            fit.leave_out(parameters, model, _CUT)
+            fit.leave_out(parameters, model, CUT)
         fit.variance = variance
         if float((h - before).abs().max()) < 0.05:
             break
     deviation = _without_pupil(families.deviation(h))
-    parameters = fit.minimize(parameters, model, families.mean, deviation, 10)
-    return _star_lens(fit, parameters, model, families, deviation, size)
+    known = KnownLens.normal(families.mean, deviation)
+    parameters = fit.minimize(parameters, model, unknowns, known, 10)
+    rows = fit.whitened(parameters, model, unknowns)
+    kept = known.free.nonzero()[:, 0].tolist()
+    slots = dict(zip(unknowns.indices, unknowns.slots, strict=True))
+    information = CameraInformation(
+        slots=tuple(kept.index(slots[index]) if slots.get(index) in kept else -1 for index in range(len(parameters))),
+        estimate=parameters[leading][kept],
+        rows=rows[:, kept],
+        residuals=rows[:, -1],
+        mean=families.mean[kept],
+        sigma=deviation[kept],
+    )
+    return star_lens(fit, Camera(parameters, size=size, model=model), known, rows, information)
+
+
+def require_stars(fields: Sequence[StarField]) -> None:
+    """Refuse fewer stars than tell a lens.
+
+    Raises:
+        InputError: too few.
+    """
+    count = sum(len(field.pixels) for field in fields)
+    if count < _LEAST_STARS:
+        raise InputError(
+            f"{count} named stars tell no lens; {_LEAST_STARS} are needed at least, and some hundred are good"
+        )
 
 
 def _families(model: LensModel, focal: float, nothing: BoardModes, size: tuple[int, int]) -> PriorFamilies:
@@ -244,38 +166,27 @@ def _without_pupil(deviation: Tensor) -> Tensor:
     return deviation
 
 
-def _unknowns_of(parameters: Tensor) -> Tensor:
-    """(S,) focal length, principal point, and the coefficients."""
-    return torch.cat([parameters[[0, 2, 3]], parameters[5:]])
-
-
-def _star_lens(
-    fit: _Fit, parameters: Tensor, model: LensModel, families: PriorFamilies, deviation: Tensor, size: tuple[int, int]
+def star_lens(
+    fit: StarProblem, camera: Camera, known: KnownLens, rows: Tensor, information: CameraInformation
 ) -> StarLens:
-    rows = fit.reduced(parameters, model)[0]
-    errors = fit.errors(parameters, model)
-    kept = deviation.nonzero()[:, 0]
-    unknowns, place = hybrid_unknowns(model), {int(k): number for number, k in enumerate(kept)}
-    slots = dict(zip(unknowns.indices, unknowns.slots, strict=True))
-    # Sigmas as stated are not narrowed where residuals happen to be smaller.
-    spread = math.sqrt(max(fit.variance, 1.0))
-    triangle = torch.linalg.qr(rows[[*kept.tolist(), -1]].T / spread, mode="r").R[: len(kept)]
-    information = CameraInformation(
-        slots=tuple(place.get(slots.get(index, -1), -1) for index in range(5 + model.size)),
-        estimate=_unknowns_of(parameters)[kept],
-        rows=triangle[:, :-1],
-        residuals=triangle[:, -1],
-        mean=families.mean[kept],
-        sigma=deviation[kept],
-    )
-    camera = Camera(parameters, size=size, model=model)
+    """What a fit found, and the camera with what is known of it.
+
+    Args:
+        fit: at its minimum.
+        camera: that of the minimum.
+        known: what was known before.
+        rows: (S, S + 1) of the stars (`StarProblem.whitened`).
+        information: of stars and all else.
+    """
     sigma = information.covariance().diagonal().sqrt().tolist()
     named = {name: value or None for name, value in zip(camera.names, sigma, strict=True)}
     camera.calibration = CameraCalibration(sigma=named, information=information)
-    normal = rows[:-1] @ rows[:-1].T
-    whole = torch.eye(len(deviation), dtype=torch.float64) + normal * deviation[:, None] * deviation / spread**2
+    errors = fit.errors(camera.params.detach(), camera.model)
     used = tuple(weight > 0 for weight in fit.weights)
     good = torch.cat([error[:, use] for error, use in zip(errors, used, strict=True)], 1)
+    by_stars = rows[:, :-1][:, known.free]
+    # Of all that is known, the share that stars tell.
+    told = by_stars @ posterior_half(torch.cat([by_stars, known.rows[:, known.free]])).T
     return StarLens(
         camera=camera,
         rotations=tuple(fit.rotations),
@@ -283,5 +194,5 @@ def _star_lens(
         used=used,
         rms_px=float(good.square().mean().sqrt()),
         widened=math.sqrt(fit.variance),
-        effective=len(deviation) - float(torch.linalg.inv(whole).trace()),
+        effective=float(told.square().sum()),
     )

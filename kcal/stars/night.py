@@ -17,7 +17,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.mounting import Origin
 from kcal.lens.pose import vector_from_rotation
 from kcal.locate.mounting import attitude
-from kcal.stars.attitude import Attitude, field_angle, fit_attitude
+from kcal.stars.attitude import Attitude, field_angle, fit_attitude, refraction_doubt
 from kcal.stars.catalog import StarCatalog
 from kcal.stars.detect import DetectedStars, detect_stars
 from kcal.stars.identification import identify, turn_between
@@ -228,6 +228,12 @@ def _on_earth(
     doubts = [
         f"the camera would be rolled by {roll:.0f}°: unless it lies on its side, place or time is wrong"
     ] * (abs(roll) > _ON_ITS_SIDE)  # fmt: skip
+    part = _part(catalog, used)
+    vacuum = view.directions(part, Air(hectopascal=0.0))
+    sigma = blurred[on_ground.star >= 0]
+    doubt = refraction_doubt(on_ground, sigma, torch.from_numpy(there[used]), torch.from_numpy(vacuum), camera)
+    if doubt is not None:
+        doubts.append(doubt)
     return NamedStars(
         detected=found, view=view, attitude=on_ground, directions=there, on_earth=True, covariance=covariance,
         warnings=tuple(doubts),

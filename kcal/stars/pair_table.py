@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import io
 import os
@@ -56,10 +57,16 @@ def cache_folder() -> Path:
 def pair_table(catalog: StarCatalog, field: float) -> PairTable:
     """The table for images whose diagonal is `field` radians, from the disk or made now (a second or less)."""
     degrees = next((angle for angle in _ANGLES if angle >= min(0.8 * np.degrees(field), _ANGLES[-1])), _ANGLES[-1])
+    return _loaded(catalog, degrees, cache_folder())
+
+
+# Of many images of one camera; a table of 700,000 pairs takes 17 MB.
+@functools.lru_cache(maxsize=3)
+def _loaded(catalog: StarCatalog, degrees: float, folder: Path) -> PairTable:
     order = np.argsort(catalog.magnitude, kind="stable")
     directions = catalog.directions()[order]
     content = hashlib.sha256(directions.tobytes()).hexdigest()[:12]
-    path = cache_folder() / f"stars-{_VERSION}-{content}-{degrees:g}.npz"
+    path = folder / f"stars-{_VERSION}-{content}-{degrees:g}.npz"
     found = _table_on_disk(path)
     if found is None:
         found = _close_pairs(directions, np.radians(degrees))

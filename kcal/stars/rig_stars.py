@@ -27,6 +27,8 @@ _CATALOG_SIGMA = math.radians(1.0 / 3600)
 _MATCH = 2.0
 # s: images of one moment.
 _SAME_TIME = 1e-3
+# h: a gap that is longer is a day; and the shortest night in which clocks drift by something.
+_DAY_BETWEEN, _LEAST_NIGHT = 6.0, 1.0
 
 # Images of one moment: NamedStars by the number of the camera.
 Moment = Mapping[int, NamedStars]
@@ -37,6 +39,7 @@ def star_source(
     cameras: Sequence[Camera],
     *,
     clock_sigma: float = 0.1,
+    drift_sigma: float = 0.05,
     origin: Origin | None = None,
     catalog: StarCatalog | None = None,
 ) -> StarSource:
@@ -50,7 +53,10 @@ def star_source(
     Args:
         moments: images of each moment by the number of their camera.
         cameras: of the rig.
-        clock_sigma: of the offset between the clock of each camera and that of the first, seconds.
+        clock_sigma: of the offset between the clock of each camera and that of the first, seconds, as each night
+            begins.
+        drift_sigma: of the rate at which it changes, seconds an hour, another one each night; it counts in nights
+            of an hour or more. 0.05 are 14 millionths, a free quartz; 0 where GPS or a network keeps the clocks.
         origin: of the rig's frame, if that is one on the Earth.
         catalog: the stars; kcal's own if left out.
 
@@ -63,8 +69,9 @@ def star_source(
         Traceback (most recent call last):
         kcal.errors.InputError: no stars were named in two cameras at the same moment
     """
-    if not 0 <= clock_sigma < math.inf:
-        raise InputError(f"clock_sigma {clock_sigma}: seconds, not below 0, are needed")
+    for name, value in (("clock_sigma", clock_sigma), ("drift_sigma", drift_sigma)):
+        if not 0 <= value < math.inf:
+            raise InputError(f"{name} {value}: seconds, not below 0, are needed")
     catalog = catalog or StarCatalog.bundled()
     images = [image for moment in moments for image in moment.values()]
     on_earth = bool(images) and all(image.on_earth for image in images)
@@ -78,13 +85,14 @@ def star_source(
     altitude = torch.arcsin(direction[:, 2].clamp(-1, 1)).numpy()
     sigma = torch.from_numpy(np.hypot(_CATALOG_SIGMA, refraction_sigma(np.nan_to_num(altitude, nan=1.0))))
     sigma[direction.isnan().any(-1)] = math.inf
+    effects = _effects(moments, len(cameras), rows, clock_sigma, drift_sigma, origin, catalog, on_earth=on_earth)
     return StarSource(
         names=tuple(rows.names),
         pixels=torch.from_numpy(np.array(rows.pixels)),
         pixel_sigma=torch.from_numpy(np.array(rows.sigma)),
         direction=direction,
         direction_sigma=sigma,
-        effects=tuple(_effects(moments, len(cameras), rows, clock_sigma, origin, catalog, on_earth=on_earth)),
+        effects=tuple(effects),
     )
 
 
@@ -187,11 +195,31 @@ def _add_nameless(rows: _Rows, moment: Moment, cameras: Sequence[Camera], number
                 rows.pixels[-1][c], rows.sigma[-1][c] = image.detected.pixels[place], image.detected.sigma[place]
 
 
+def _nights(moments: Sequence[Moment], rows: _Rows) -> list[Tensor]:
+    """For each night of an hour or more: (S,) hours of each star since it began, 0 in other nights."""
+    times = [next(iter(moment.values())).view.time for moment in moments]
+    if None in times:
+        return []
+    hours = np.array([time.timestamp() / 3600.0 for time in times if time is not None])
+    order = np.argsort(hours, kind="stable")
+    night = np.empty(len(hours), np.int64)
+    night[order] = np.cumsum(np.diff(hours[order], prepend=hours[order[0]]) > _DAY_BETWEEN)
+    of_row = np.array(rows.moment)
+    found = []
+    for number in range(night.max() + 1):
+        own = night == number
+        if np.ptp(hours[own]) >= _LEAST_NIGHT:
+            since = np.where(own, hours - hours[own].min(), 0.0)
+            found.append(torch.from_numpy(since[of_row]))
+    return found
+
+
 def _effects(
     moments: Sequence[Moment],
     cameras: int,
     rows: _Rows,
     clock_sigma: float,
+    drift_sigma: float,
     origin: Origin | None,
     catalog: StarCatalog,
     *,
@@ -207,11 +235,16 @@ def _effects(
     found = []
     # An hour later the sky has turned from east to west: against the axis that points north.
     second = -EARTH_RATE * pole
+    nights = _nights(moments, rows) if drift_sigma > 0 else []
     for camera in range(1, cameras):
+        turn, whose = torch.zeros(cameras, 3, dtype=torch.float64), f"the clock of camera {camera + 1}"
+        turn[camera] = second
         if clock_sigma > 0:
-            turn = torch.zeros(cameras, 3, dtype=torch.float64)
-            turn[camera] = clock_sigma * second
-            found.append(StarEffect(name=f"the clock of camera {camera + 1} against that of the first", turn=turn))
+            found.append(StarEffect(name=f"{whose} against that of the first", turn=clock_sigma * turn))
+        for number, hours in enumerate(nights):
+            found.append(
+                StarEffect(name=f"drift of {whose}, night {number + 1}", turn=drift_sigma * turn, factor=hours)
+            )
     if not on_earth:
         return found
     turn = (some.view.clock_sigma * second).expand(cameras, 3)

@@ -15,7 +15,7 @@ from pathlib import Path
 import kcal
 from kcal.cli.main import app
 
-LARGE = ("torch", "kornia", "cv2", "scipy", "matplotlib", "pyproj")
+LARGE = ("torch", "kornia", "cv2", "scipy", "scipy.stats", "skimage", "matplotlib", "pyproj", "jinja2")
 ROOT = Path(kcal.__file__).parents[1]
 SAMPLE = ROOT / "assets" / "sample-rig.json"
 _BEGIN = "import sys; from kcal.cli.main import app, main\n"

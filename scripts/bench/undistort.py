@@ -1,8 +1,9 @@
 """Undistortion of 1080p images: kcal beside `cv2.remap` and kornia's `undistort_image`, eager, on the CPU.
 
     python -m scripts.bench.undistort [--quick]
+    python -m scripts.bench.undistort --views --write    # the table of kinds of rectification, in CPU time
 
-`scripts/bench/lens.py` puts the same table into docs/measured/lens.md.
+`scripts/bench/lens.py` puts the first table into docs/measured/lens.md.
 
 One image, one lens of 8 coefficients. The maps of kcal and OpenCV are made beforehand, as one would for a video;
 kornia's function has no way to keep them. All three keep the source's intrinsics. In each round every side runs once,
@@ -12,6 +13,8 @@ in turn, and ratios are taken within a round; medians, one thread.
 from __future__ import annotations
 
 import argparse
+import functools
+import time
 from collections.abc import Callable
 
 import cv2
@@ -20,7 +23,11 @@ import torch
 from kornia.geometry.calibration import undistort_image
 
 from kcal.lens.camera import Camera
-from kcal.lens.images import Undistort, undistort_maps
+from kcal.lens.images import Undistort, UndistortMaps, undistort_maps
+from kcal.lens.rectification import StereoRectification
+from kcal.lens.rig import StereoRig
+from kcal.lens.views import cylinder_view, looking, pinhole_view
+from scripts.shared.page import write_section
 from scripts.shared.timing import median, ratio, row, show, times
 
 SIZE = (1920, 1080)
@@ -37,7 +44,59 @@ CASES = (
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="3 rounds in place of 30")
-    tables(3 if parser.parse_args().quick else 30)
+    parser.add_argument("--views", action="store_true", help="kinds of rectification, milliseconds a megapixel")
+    parser.add_argument("--write", action="store_true", help="with --views: write the table into docs/measured/lens.md")
+    arguments = parser.parse_args()
+    rounds = 3 if arguments.quick else 30
+    if not arguments.views:
+        tables(rounds)
+        return
+    lines = views(rounds)
+    if arguments.write:
+        write_section("lens.md", "rectification", "\n".join(lines))
+
+
+def views(rounds: int) -> list[str]:
+    """Print the table of kinds of rectification, in CPU milliseconds a megapixel of the new image."""
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    camera = Camera.build(focal=(1400, 1400), center=(957, 541), size=SIZE, coefficients=LENS, model="opencv8")
+    fisheye = Camera.build(focal=(600, 600), center=(957, 541), size=SIZE, coefficients=[0.02], model="fisheye4")
+    turn = looking(1.0, 0.5)
+    rig = StereoRig(camera, camera, turn, -turn @ torch.tensor([10.0, 0.1, 0.2], dtype=torch.float64))
+    kinds: list[tuple[str, Callable[[], list[Undistort]]]] = [
+        ("pinhole, alpha 0", lambda: [Undistort(camera)]),
+        ("fisheye, 60 degrees at 40 degrees", lambda: [Undistort(fisheye, pinhole_view(60, SIZE), looking(40, 0))]),
+        ("fisheye on a cylinder", lambda: [Undistort(fisheye, cylinder_view(fisheye))]),
+        ("stereo pair", lambda: [getattr(StereoRectification(rig), side) for side in ("left", "right")]),
+    ]
+    lines = show([
+        row("view", "maps, once", "float32, color", "`cv2.remap`", "uint8, color", "`cv2.remap`"), row(*["---"] * 6),
+    ])  # fmt: skip
+    for name, make in kinds:
+        start = time.process_time()
+        modules = make()
+        spent = time.process_time() - start
+        pixels = sum(module.mask.numel() for module in modules) / 1e6
+        cells = [f"{1e3 * spent / pixels:.0f}"]
+        for dtype in (torch.float32, torch.uint8):
+            image = _image(3, dtype)
+            array = np.ascontiguousarray(image[0].permute(1, 2, 0).numpy())
+            maps = [undistort_maps(one.camera, one.new_camera, one.rotation) for one in modules]
+            calls: list[Callable[[], object]] = [
+                functools.partial(_each, modules, image),
+                functools.partial(_each_by_opencv, maps, array),
+            ]
+            for call in calls:
+                taken = []
+                for _ in range(rounds):
+                    start = time.process_time()
+                    with torch.no_grad():
+                        call()
+                    taken.append(1e3 * (time.process_time() - start) / pixels)
+                cells.append(median(taken))
+        lines += show([row(name, *cells)])
+    return lines
 
 
 def tables(rounds: int) -> list[str]:
@@ -59,6 +118,14 @@ def tables(rounds: int) -> list[str]:
     for name, channels, dtype in CASES:
         lines += show([_row(name, camera, undistort, _image(channels, dtype), rounds)])
     return lines
+
+
+def _each(modules: list[Undistort], image: torch.Tensor) -> list[object]:
+    return [module(image) for module in modules]
+
+
+def _each_by_opencv(maps: list[UndistortMaps], array: np.ndarray) -> list[object]:
+    return [cv2.remap(array, one.map_x, one.map_y, cv2.INTER_LINEAR) for one in maps]
 
 
 def _image(channels: int, dtype: torch.dtype) -> torch.Tensor:

@@ -28,7 +28,7 @@ MISSING = (
     "rig none.json none.json --pairs none.obs.json none.obs.json -o rig.json",
     "rig check none.json --marks none.csv",
     "locate none.json none.csv -o a.csv",
-    "undistort none.json none.png -o out",
+    "rectify none.json none.png -o out",
     "bake none.json -o a.npz",
     "export none.json -o a.yaml",
     "show none.json",

@@ -177,7 +177,8 @@ def _project(path: Path) -> None:
 COMMANDS: dict[str, list[str | Callable[[Path], object]]] = {
     "camera.json": [
         "bake FILE -o out.npz --tolerance 0.5",
-        "undistort image.png FILE -o u",
+        "rectify FILE image.png -o u",
+        "rays FILE -o r.npz",
     ],
     "rig.json": ["locate FILE marks.csv -o out.csv -o out.kml -o out.cot -o out.geojson", "budget FILE"],
     "obs.json": ["calibrate FILE --model pinhole -o out.json", "compare FILE --model pinhole opencv4 --parts 2"],

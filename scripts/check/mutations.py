@@ -198,8 +198,8 @@ def _calls(new: ast.Call) -> Iterator[tuple[str, ast.AST]]:
         func: ast.AST = other.func
         setattr(func, "attr" if isinstance(func, ast.Attribute) else "id", _FUNCTIONS[name])
         yield "function", other
-    if name in _LEFT_OUT and (new.args or isinstance(new.func, ast.Attribute)):
-        yield "function left out", new.args[0] if new.args else new.func.value  # type: ignore[attr-defined]
+    if name in _LEFT_OUT and (inner := new.args[0] if new.args else getattr(new.func, "value", None)) is not None:
+        yield "function left out", inner
     first = 1 if name == "where" else 0
     pair = new.args[first : first + 2]
     if len(pair) == 2 and name not in _SYMMETRIC and _are_alike(pair):

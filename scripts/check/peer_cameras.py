@@ -3,8 +3,9 @@
     PYTHON scripts/check/peer_cameras.py KIND PATH POINTS.npy PIXELS.npy
 
 KIND is mrcal, ros, colmap or one of the writers mrcal-write and colmap-write, which read the file and write it anew at
-the place of PIXELS.npy. `mrcal-diff` takes two files joined by a comma and writes a .npz with mrcal's difference of
-them: with equal frames, and after its own turn.
+the place of PIXELS.npy. `mrcal-solve` calibrates a camera from simulated corners, writes it to PATH, and to PIXELS.npy
+its standard deviations, without mrcal's regularization and with noise by degrees of freedom. `mrcal-diff` takes two
+files joined by a comma and writes a .npz with mrcal's difference of them: with equal frames, and after its own turn.
 """
 
 from __future__ import annotations
@@ -66,6 +67,39 @@ def by_colmap(path: str, points: Any) -> Any:
     return next(iter(colmap_camera(path).cameras.values())).img_from_cam(points) - 0.5
 
 
+def mrcal_solve(path: str) -> Any:
+    import mrcal
+
+    draw, lens = np.random.default_rng(0), "LENSMODEL_OPENCV5"
+    intrinsics = np.array([[1000.0, 1001, 640, 360, -0.1, 0.02, 1e-3, -5e-4, 0.003]])
+    frames = np.concatenate(
+        [draw.uniform(-0.4, 0.4, (12, 3)), draw.uniform([-0.5, -0.3, 0.8], [0.2, 0, 1.4], (12, 3))], 1
+    )
+    corners = np.ones((12, 7, 7, 3))
+    for corner, frame in zip(corners, frames, strict=True):
+        board = mrcal.transform_point_rt(frame, mrcal.ref_calibration_object(7, 7, 0.05))
+        corner[..., :2] = mrcal.project(board, lens, intrinsics[0]) + draw.normal(0, 0.2, (7, 7, 2))
+    index = np.stack([np.arange(12), np.zeros(12), -np.ones(12)], 1).astype(np.int32)
+    inputs = {
+        "intrinsics": intrinsics, "extrinsics_rt_fromref": np.zeros((0, 6)), "frames_rt_toref": frames, "points": None,
+        "observations_board": corners, "indices_frame_camintrinsics_camextrinsics": index, "observations_point": None,
+        "indices_point_camintrinsics_camextrinsics": None, "lensmodel": lens,
+        "imagersizes": np.array([[1280, 720]], dtype=np.int32), "calobject_warp": np.zeros(2),
+        "do_optimize_intrinsics_core": True, "do_optimize_intrinsics_distortions": True, "do_optimize_extrinsics": True,
+        "do_optimize_frames": True, "do_optimize_calobject_warp": True, "calibration_object_spacing": 0.05,
+        "do_apply_regularization": True, "verbose": False,
+    }  # fmt: skip
+    mrcal.optimize(**inputs, do_apply_outlier_rejection=False)
+    mrcal.cameramodel(optimization_inputs=inputs, icam_intrinsics=0).write(path)
+    _, x, slopes, _ = mrcal.optimizer_callback(**inputs)
+    seen = corners.size // 3 * 2
+    slopes = slopes.toarray()[:seen]
+    unpacked = np.eye(slopes.shape[1])
+    mrcal.unpack_state(unpacked, **inputs)
+    covariance = unpacked @ np.linalg.inv(slopes.T @ slopes) @ unpacked.T
+    return np.sqrt(np.diag(covariance)[:9] * np.square(x[:seen]).sum() / (seen - len(covariance)))
+
+
 def main() -> None:
     kind, path, points_path, output = sys.argv[1:]
     if kind == "mrcal-diff":
@@ -80,6 +114,9 @@ def main() -> None:
         import mrcal
 
         mrcal.cameramodel(path).write(output)
+        return
+    if kind == "mrcal-solve":
+        np.save(output, mrcal_solve(path))
         return
     if kind == "colmap-write":
         write = colmap_camera(path)

@@ -41,7 +41,14 @@ class Simulated(NamedTuple):
 
 
 def simulated(
-    seed: int, views: int, sigma: float, by_hand: bool, *, max_roll: float = math.radians(25.0), stretch: float = 1.0
+    seed: int,
+    views: int,
+    sigma: float,
+    by_hand: bool,
+    *,
+    max_roll: float = math.radians(25.0),
+    stretch: float = 1.0,
+    take: int = 0,
 ) -> Simulated:
     """Draw a lens, a printed board and views of it; lens and what is held follow from the seed in turn.
 
@@ -52,13 +59,14 @@ def simulated(
         by_hand: whether the camera or the board is held by hand.
         max_roll: largest turn of the boards about their normals, radians.
         stretch: factor by which the images' rows were stretched; 1 leaves pixels square.
+        take: another one has other poses, motions and noise, and the same lens and board.
     """
     lens = drawn_lens(LENSES[seed % len(LENSES)], 1.0, seed, wander=1.0)
     hands = Hands(holds="camera" if seed // len(LENSES) % 2 else "board") if by_hand else None
-    generator, options = torch.Generator().manual_seed(1000 + seed), PoseOptions(max_roll=max_roll)
+    generator, options = torch.Generator().manual_seed(1000 + seed + 10**6 * take), PoseOptions(max_roll=max_roll)
     poses = sample_board_poses(quick(lens), BOARD, views, generator, fill=FILL, options=options)
     board = PrintedBoard(BOARD.columns, BOARD.rows, BOARD.square, seed)
-    truth = moving_capture(lens, poses, sigma=sigma, seed=1000 + seed, hands=hands, board=board)
+    truth = moving_capture(lens, poses, sigma=sigma, seed=1000 + seed + 10**6 * take, hands=hands, board=board)
     seen = truth.pixels.isfinite().all(-1) & lens.inside(truth.pixels.nan_to_num(nan=-9.0))
     pixels = torch.where(seen[..., None], truth.pixels, torch.nan)
     return Simulated(lens, stretched(pixels, truth.covariance, lens.size, stretch), truth)

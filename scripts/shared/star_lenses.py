@@ -1,23 +1,38 @@
-"""A simulated lens under the stars: the error of a lens that was fitted to them."""
+"""Simulated lenses under the stars: the error of a lens that was fitted to them, to boards, or to both."""
 
 from __future__ import annotations
 
 import datetime
+import math
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
+from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.lens.camera import Camera
+from kcal.lens.uncertainty import pixel_covariance
 from kcal.locate.geodesy import enu_from_cam
+from kcal.sim.board import LensLike
+from kcal.sim.captures import drawn_lens
+from kcal.sim.truth import TruthLens
 from kcal.stars.attitude import FAR
 from kcal.stars.catalog import StarCatalog
 from kcal.stars.detect import DetectedStars
 from kcal.stars.lens import StarCamera, calibrate_by_stars
 from kcal.stars.night import SkyView
 from kcal.stars.sky import observed_directions
+from kcal.stars.with_boards import Agreement
+from scripts.shared.infinity import error_at_infinity
 from scripts.shared.night_scenes import PLACE, TIME
+from scripts.shared.simulated import CHI2, LENSES
+from scripts.shared.traced import BOARD, capture, printed
 
 SIZE = (1280, 800)
+LENSES_FROM = ["boards", *(f"{what}, {where}" for where in ("level", "tilted 30°")
+                           for what in ("stars", "boards and stars"))]  # fmt: skip
+# Shares of the image that boards fill.
+FILL = (0.40, 0.94)
 
 
 def true_lens() -> Camera:
@@ -30,21 +45,33 @@ def true_lens() -> Camera:
 
 
 def star_images(
-    tilt: float, images: int, seed: int, sigma: float = 0.1, faintest: float = 5.0
+    tilt: float, images: int, seed: int, sigma: float = 0.1, faintest: float = 5.0, lens: LensLike | None = None
 ) -> tuple[list[DetectedStars], list[SkyView]]:
-    """Stars of images of one fixed camera over a night, with noise, and five points that are no stars in each."""
-    draw, camera, catalog = np.random.default_rng(seed), true_lens(), StarCatalog.bundled()
+    """Stars of images of one fixed camera over a night, with noise, and five points that are no stars in each.
+
+    Args:
+        tilt: degrees above the horizon of the middle of the image.
+        images: how many, 25 minutes apart.
+        seed: of the noise.
+        sigma: of a star, px.
+        faintest: magnitude.
+        lens: that of `true_lens` if left out.
+    """
+    draw, camera, catalog = np.random.default_rng(seed), lens or true_lens(), StarCatalog.bundled()
     found, views = [], []
     for number in range(images):
         time = TIME + datetime.timedelta(minutes=25 * number)
         there = observed_directions(catalog, time, PLACE)
         index = np.flatnonzero((catalog.magnitude < faintest) & (there[:, 2] > 0.1))
         index = index[np.argsort(catalog.magnitude[index])]
-        at, valid = camera.project(FAR * torch.from_numpy(there[index]) @ enu_from_cam(130.0, tilt, 1.0))
+        rays = torch.from_numpy(there[index]) @ enu_from_cam(130.0, tilt, 1.0)
+        ahead = (rays[:, 2] > 0.2).numpy()
+        index, rays = index[ahead], rays[ahead]
+        at, valid = camera.project(FAR * rays)
         good = (valid & camera.inside(at)).numpy()
         pixels = at.numpy()[good] + draw.normal(0, sigma, (int(good.sum()), 2))
         flux = 10 ** (-0.4 * catalog.magnitude[index[good]])
-        none = draw.uniform(0, 1, (5, 2)) * SIZE
+        none = draw.uniform(0, 1, (5, 2)) * camera.size
         pixels, flux = np.concatenate([pixels, none]), np.concatenate([flux, np.full(5, flux.min())])
         found.append(DetectedStars(pixels, np.full(len(pixels), sigma), flux, 0.02, {}))
         views.append(SkyView(time=time, origin=PLACE))
@@ -53,21 +80,59 @@ def star_images(
 
 def lens_difference(found: StarCamera) -> np.ndarray:
     """(N,) distances in px between the found and the true lens over the image, after the best common turn."""
-    truth, camera = true_lens(), found.lens.camera
-    grid = truth.grid(17, 11).reshape(-1, 2)
-    rays = truth.unproject(grid)[0]
-    mine = camera.unproject(grid)[0]
-    rays, mine = (one / one.norm(dim=-1, keepdim=True) for one in (rays, mine))
-    u, _, vt = torch.linalg.svd(mine.T @ rays)
-    turn = u @ torch.diag(torch.tensor([1.0, 1.0, float(torch.linalg.det(u @ vt))]).double()) @ vt
-    at, _ = camera.project(FAR * rays @ turn.T)
-    return (at - grid).norm(dim=-1).numpy()
+    return (
+        error_at_infinity(found.lens.camera, true_lens(), columns=17, rows=11)
+        .errors.reshape(-1, 2)
+        .norm(dim=-1)
+        .numpy()
+    )
 
 
-def lens_error(tilt: float, seed: int) -> str:
-    """What a lens from twenty images differs by from the truth."""
-    found = calibrate_by_stars(*star_images(tilt, 20, seed), SIZE)
-    error = lens_difference(found)
-    count = sum(int(use.sum()) for use in found.lens.used)
-    rms, largest = np.sqrt((error**2).mean()), error.max()
-    return f"{count} stars, RMS {rms:.3f} px at infinity over the image, largest {largest:.2f}"
+class LensTrial(NamedTuple):
+    """A calibrated lens against the traced one, at infinity over the whole image.
+
+    Attributes:
+        rms: px, after the best turn.
+        largest: px.
+        inside: share of the image in which the truth lies in the stated 95 % ellipse.
+        chi2: of the agreement of boards and stars over its freedom; NaN where only one of them was used.
+        contradiction: whether it was stated.
+    """
+
+    rms: float
+    largest: float
+    inside: float
+    chi2: float = math.nan
+    contradiction: bool = False
+
+
+def compared(camera: Camera, lens: TruthLens, agreement: Agreement | None = None) -> LensTrial:
+    """How far a camera is from the traced lens."""
+    error = error_at_infinity(camera, lens, columns=33, rows=19)
+    off, at = error.errors.reshape(-1, 2), error.pixels.reshape(-1, 2)
+    covariance = pixel_covariance(camera, at)
+    good = off.isfinite().all(-1) & covariance.isfinite().all(-1).all(-1)
+    square = (off[good] * torch.linalg.solve(covariance[good], off[good])).sum(-1)
+    return LensTrial(
+        rms=error.rms,
+        largest=error.maximum,
+        inside=float((square < CHI2).double().mean()),
+        chi2=math.nan if agreement is None else agreement.chi2 / max(agreement.freedom, 1),
+        contradiction=agreement is not None and agreement.contradiction is not None,
+    )
+
+
+def lens_trials(seed: int, boards: int = 20, images: int = 20) -> dict[str, LensTrial]:
+    """One traced lens calibrated by boards, by stars, and by both, level and tilted up by 30°."""
+    lens = drawn_lens(LENSES[seed % len(LENSES)], 1.0, seed, wander=1.0)
+    seen = capture(lens, boards, 0.1, seed, printed(BOARD.points, seed), FILL)
+    known = calibrate_camera(seen)
+    out = {"boards": compared(known.camera, lens)}
+    for tilt in (0.0, 30.0):
+        stars = star_images(tilt, images, seed, lens=lens)
+        name = "level" if tilt == 0.0 else f"tilted {tilt:g}°"
+        alone = calibrate_by_stars(*stars, lens.size, focal=float(known.camera.params[0]))
+        out[f"stars, {name}"] = compared(alone.lens.camera, lens)
+        both = calibrate_by_stars(*stars, lens.size, boards=known)
+        out[f"boards and stars, {name}"] = compared(both.lens.camera, lens, both.agreement)
+    return out

@@ -31,6 +31,8 @@ def star_rig(
     sigma: float = 0.1,
     clock: float = 0.0,
     clock_sigma: float = 0.02,
+    drift: float = 0.0,
+    drift_sigma: float = 0.0,
     faintest: float = 5.0,
     positions: bool = True,
     matches: int = 12,
@@ -45,6 +47,8 @@ def star_rig(
         sigma: of a star, px.
         clock: seconds by which the second camera's images are late.
         clock_sigma: as stated.
+        drift: seconds an hour by which it is later and later.
+        drift_sigma: as stated.
         faintest: magnitude.
         positions: whether the cameras' positions are measured, to 1 cm.
         matches: features of unknown range.
@@ -55,7 +59,8 @@ def star_rig(
     catalog, names, pixels, direction = StarCatalog.bundled(), [], [], []
     for moment in range(moments):
         time = TIME + datetime.timedelta(minutes=25 * moment)
-        seen = [observed_directions(catalog, time + datetime.timedelta(seconds=s), PLACE) for s in (0.0, clock)]
+        late = (0.0, clock + drift * moment * 25 / 60)
+        seen = [observed_directions(catalog, time + datetime.timedelta(seconds=s), PLACE) for s in late]
         index = np.flatnonzero((catalog.magnitude < faintest) & (seen[0][:, 2] > math.sin(math.radians(6.0))))
         marks = [
             camera.project(FAR * torch.from_numpy(one[index]) @ turn.T)
@@ -67,14 +72,19 @@ def star_rig(
         names += [f"HR {catalog.number[i]} at {moment}" for i in index[good.numpy()]]
     clean, known = torch.cat(pixels), torch.cat(direction)
     turn = -EARTH_RATE * clock_sigma * torch.from_numpy(pole_in_enu(PLACE.lat))
-    effect = StarEffect(name="the clock of the second camera", turn=torch.stack([torch.zeros_like(turn), turn]))
+    effects = [StarEffect(name="the clock of the second camera", turn=torch.stack([torch.zeros_like(turn), turn]))]
+    if drift_sigma:
+        hours = torch.tensor([int(name.split()[-1]) * 25 / 60 for name in names]).double()
+        each = effects[0].turn
+        assert each is not None
+        effects.append(StarEffect(name="its drift", turn=each * drift_sigma / clock_sigma, factor=hours))
     stars = StarSource(
         names=tuple(names),
         pixels=clean + torch.from_numpy(draw.normal(0, sigma, clean.shape)),
         pixel_sigma=torch.full(clean.shape[:2], sigma).double(),
         direction=known if named else torch.full_like(known, torch.nan),
         direction_sigma=torch.full((len(names),), 5e-6 if named else math.inf).double(),
-        effects=(effect,),
+        effects=tuple(effects),
     )
     features = None
     if matches:

@@ -16,7 +16,7 @@ from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.model import LensModel
 from kcal.lens.projection import project_components
 from kcal.lens.zernike import ZernikeModes
-from kcal.sim.board import PrintedBoard
+from kcal.sim.board import LensLike, PrintedBoard
 from kcal.sim.captures import capture_corners
 from kcal.sim.truth import TruthLens
 
@@ -29,7 +29,7 @@ def printed(points: Tensor, seed: int) -> Tensor:
 
 
 def capture(
-    lens: TruthLens,
+    lens: LensLike,
     views: int,
     sigma: float,
     seed: int,
@@ -41,7 +41,7 @@ def capture(
 
 
 def captures(
-    lens: TruthLens,
+    lens: LensLike,
     views: int,
     sigmas: Sequence[float],
     seed: int,

@@ -67,6 +67,12 @@ def test_from_the_first_view_to_the_goal(tmp_path: Path) -> None:
     assert 0 < state["next"]["sigma"] < session.sigma < 50.0
     assert "enough" in state["finished"]
     follow(session, until=lambda: False)
+    # The advice goes on while a calibration runs, or fails: nothing is calibrated here.
+    assert session.offer(images()[FIRST_VIEWS], "late", moving=False)
+    late = session.state()["next"]
+    assert late["outline"] != state["next"]["outline"]
+    assert late["sigma"] < state["next"]["sigma"]
+    assert len(session.state()["history"]) == 1
     few = CaptureSession(tmp_path / "left.obs.json", BOARD, CaptureOptions(until=1e-9, most=4))
     assert "the most that were asked for" in few.finished
 

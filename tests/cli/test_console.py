@@ -91,7 +91,7 @@ def test_the_library_s_own_colors_stay() -> None:
         ["locate", "a" * 300, "b" * 300],
         ["locate", "rig.json", "marks.csv", "-o", "a" * 300 + ".csv"],
         ["calibrate", "a" * 300, "-o", "x.json"],
-        ["undistort", "a" * 300, "x.png", "-o", "b" * 300],
+        ["rectify", "a" * 300, "x.png", "-o", "b" * 300],
         ["compare", "a" * 300, "b" * 300],
         ["board", "a" * 300 + ".pdf", "--board", "9x6", "--square", "25mm"],
         ["budget", "a" * 300],

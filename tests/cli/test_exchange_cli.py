@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 from typer.testing import CliRunner
 
 from kcal.cli.main import app
+from kcal.cli.rig import _exact_line
 from kcal.corners.observations import Observations
 from kcal.errors import InputError
 from kcal.io.camera_file import load_camera, save_camera
@@ -38,8 +40,11 @@ def camera(tmp_path: Path) -> Path:
 def test_there_and_back(tmp_path: Path, camera: Path) -> None:
     text = run("export", camera, "-o", tmp_path / "a.yaml")
     assert "north: opencv5, exact" in text
-    assert "not in the file: error bars" in text
-    assert "camera from opencv: opencv5, 640x480 px" in run("import", tmp_path / "a.yaml", "-o", tmp_path / "b.json")
+    assert "not in the file" not in text
+    assert "a.prior.json" in text
+    text = run("import", tmp_path / "a.yaml", "-o", tmp_path / "b.json")
+    assert "camera from opencv: opencv5, 640x480 px" in text
+    assert "no error bars" in text
     assert load_camera(tmp_path / "b.json").params.tolist() == load_camera(camera).params.tolist()
     text = run("diff", camera, tmp_path / "b.json", "--picture", tmp_path / "diff.png")
     assert "same within their uncertainty" in text
@@ -103,3 +108,18 @@ def test_corners_and_surveys(tmp_path: Path) -> None:
 def test_bad_options(tmp_path: Path, camera: Path, words: list[str]) -> None:
     with pytest.raises(InputError):
         run("import", camera, "-o", tmp_path / "x.json", *words)
+
+
+def test_error_bars_come_along_and_a_rig_says_who_has_none(tmp_path: Path, camera: Path) -> None:
+    run("export", camera, "--to", "gtsam", "-o", tmp_path / "a.gtsam.json", "--model", "opencv4")
+    assert "no error bars" not in run("import", tmp_path / "a.gtsam.json", "-o", tmp_path / "b.json")
+    known, bare = load_camera(tmp_path / "b.json"), Camera.build(focal=(1000, 1000), center=(320, 240), size=(640, 480))
+    assert known.calibration is not None
+    assert known.calibration.covariance is not None
+    rig = StereoRig(bare, known, torch.eye(3), torch.tensor([-2.0, 0, 0]))
+    data = SimpleNamespace(cameras=(bare, known))
+    line = _exact_line(SimpleNamespace(exact=("left",), names=("left", "right"), data=data), rig)  # type: ignore[arg-type]
+    assert "An error of 0.1 px in one of them is 1.0 % of a range of 200 m" in line
+    assert "Without error bars came left:" in line
+    fixed = _exact_line(SimpleNamespace(exact=("right",), names=("left", "right"), data=data), rig)  # type: ignore[arg-type]
+    assert "Without error bars" not in fixed

@@ -5,8 +5,8 @@ import torch
 
 from kcal.corners.aprilgrid import find_aprilgrid
 from kcal.corners.board import Board
-from kcal.corners.charuco import opencv_dictionary
 from kcal.corners.detect import detect, detect_board
+from kcal.corners.markers import opencv_dictionary
 from kcal.corners.pattern_shapes import pattern_shapes
 from kcal.errors import InputError
 from kcal.lens.camera import Camera

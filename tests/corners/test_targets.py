@@ -10,8 +10,8 @@ import torch
 
 from kcal.corners.board import Board
 from kcal.corners.board_text import DICTIONARIES
-from kcal.corners.charuco import opencv_dictionary
 from kcal.corners.drawing import Circle, Drawing, to_pdf, to_svg
+from kcal.corners.markers import opencv_dictionary
 from kcal.corners.observations import Observations, View
 from kcal.corners.pattern_shapes import pattern_shapes, tag_cells
 from kcal.corners.print_board import board_sheet

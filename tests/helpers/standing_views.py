@@ -3,8 +3,16 @@
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 from kcal.calibrate.hybrid.quadratic import Quadratic, ViewData
+
+
+def quadratic(rows: Tensor, target: Tensor, at: Tensor) -> Quadratic:
+    """Data with rows (R, S), which aim at the target (R,) from `at` (S,)."""
+    K, g = rows.T @ rows, rows.T @ target[:, None]
+    products = torch.cat([torch.cat([K, -g], 1), torch.cat([-g.T, (target @ target)[None, None]], 1)])
+    return Quadratic(products, float(len(rows)), at)
 
 
 def standing(data: Quadratic) -> ViewData:

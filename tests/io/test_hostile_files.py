@@ -5,6 +5,8 @@ Each reader runs in a process of its own, so that a crash is a finding and not t
 
 from __future__ import annotations
 
+import base64
+import io
 import json
 import math
 import os
@@ -33,11 +35,14 @@ from kcal.corners.observations import Observations, View
 from kcal.corners.orientation import turned_images
 from kcal.corners.video import VideoFrames, read_frames
 from kcal.errors import KcalError
+from kcal.files import read_bytes
 from kcal.io.camera_file import load_camera, save_camera
+from kcal.io.format_prior import prior_of, write_priors
 from kcal.io.formats import FORMATS, import_cameras
 from kcal.io.lookup_file import load_lookup, save_lookup
 from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.baking import bake
+from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.mounting import Origin
 from kcal.lens.rig import StereoRig
@@ -112,6 +117,55 @@ def _four() -> Camera:
     return Camera.build(focal=(300, 301), center=(159.5, 119.5), size=(320, 240), model="opencv4")
 
 
+def _prior(path: Path) -> None:
+    camera = Camera.build(focal=(300, 301), center=(159.5, 119.5), size=(320, 240), coefficients=[-0.1, 0.02])
+    camera.calibration = CameraCalibration(covariance=1e-4 * torch.eye(10, dtype=torch.float64))
+    write_priors("ceres", [prior_of("ceres", camera)], path)
+
+
+_OMNI = ("cam0: {camera_model: omni, distortion_model: radtan, intrinsics: [0.9, 300, 301, 159.5, 119.5], "
+         "distortion_coeffs: [-0.1, 0.02, 0, 0], resolution: [320, 240]}\n")  # fmt: skip
+_RESULTS = """cam0 (/cam0/image_raw):
+     type: <class 'aslam_cv.libaslam_cv_python.DistortedPinholeCameraGeometry'>
+     distortion: [-0.1 0.02 0.0 0.0] +- [0.003 0.002 0.0001 0.0001]
+     projection: [300 301 159.5 119.5] +- [0.21 0.2 0.3 0.25]
+"""
+_QUALISYS = """<calibration><cameras><camera serial="1"><fov_video left="0" top="0" right="319" bottom="239"/>
+<transform x="0" y="0" z="0" r11="1" r12="0" r13="0" r21="0" r22="1" r23="0" r31="0" r32="0" r33="1"/>
+<intrinsic focalLengthU="19200" focalLengthV="19264" centerPointU="10240" centerPointV="7680" skew="0"
+ radialDistortion1="-0.1" radialDistortion2="0.02" radialDistortion3="0" tangentalDistortion1="0"
+ tangentalDistortion2="0"/></camera></cameras></calibration>"""
+_AGISOFT = """<document><chunk><sensors><sensor id="0"><calibration type="frame" class="adjusted">
+<resolution width="320" height="240"/><f>300</f><k1>-0.1</k1></calibration>
+<covariance><params>f k1</params><coeffs>4 0 0 1e-6</coeffs></covariance></sensor></sensors></chunk></document>"""
+
+
+def _packed_inputs() -> bytes:
+    turned = np.array([[0.3, 0.1 * k, 0.0, 0.1 * k - 0.2, 0.0, 1.0] for k in range(5)])
+    grid = np.stack(np.meshgrid(np.arange(7.0), np.arange(6.0), np.ones(1)), -1).reshape(1, 6, 7, 3)
+    index = np.array([[k, 0, -1] for k in range(5)])
+    data = io.BytesIO()
+    np.savez(data, intrinsics=[[300.0, 301, 159.5, 119.5]], frames_rt_toref=turned, calibration_object_spacing=0.05,
+             observations_board=grid.repeat(5, 0), indices_frame_camintrinsics_camextrinsics=index)  # fmt: skip
+    return data.getvalue()
+
+
+def _mrcal_inputs(path: Path) -> None:
+    content = {"lensmodel": "LENSMODEL_PINHOLE", "intrinsics": [300.0, 301.0, 159.5, 119.5], "extrinsics": [0.0] * 6,
+               "imagersize": [320, 240], "optimization_inputs": base64.b85encode(_packed_inputs())}  # fmt: skip
+    path.write_text(repr(content))
+
+
+def _unpacked(path: Path) -> object:
+    """Damage below the base 85, which damage of the text hardly ever reaches."""
+    model = path.with_suffix(".cameramodel")
+    content = {"lensmodel": "LENSMODEL_PINHOLE", "intrinsics": [300.0, 301.0, 159.5, 119.5], "extrinsics": [0.0] * 6,
+               "imagersize": [320, 240],
+               "optimization_inputs": base64.b85encode(read_bytes(path, 2**26))}  # fmt: skip
+    model.write_text(repr(content))
+    return import_cameras(model)
+
+
 def _corners(path: Path) -> Observations:
     return import_corners(path, BOARD, (320, 240))
 
@@ -122,7 +176,15 @@ READERS = {
     **{f"{name} {suffix}": _foreign(name, suffix) for name, suffix in (
         ("opencv", ".yml"), ("opencv", ".xml"), ("opencv", ".json"), ("ros", ".yaml"), ("kalibr", ".yaml"),
         ("mrcal", ".cameramodel"), ("colmap", ".txt"), ("colmap", ".bin"), ("nerfstudio", ".json"), ("matlab", ".mat"),
-        ("opensfm", ".json"))},
+        ("opensfm", ".json"), ("toml", ".toml"), ("gtsam", ".json"))},
+    "mrcal inputs": Reader(import_cameras, ".cameramodel", _mrcal_inputs),
+    "packed inputs": Reader(_unpacked, ".npz", lambda path: path.write_bytes(_packed_inputs())),
+    "prior .json": Reader(import_cameras, ".json", _prior),
+    "prior .npz": Reader(import_cameras, ".npz", _prior),
+    "omni": Reader(import_cameras, ".yaml", _text(_OMNI)),
+    "Kalibr's results": Reader(lambda path: import_cameras(path, size=(320, 240)), ".txt", _text(_RESULTS)),
+    "qualisys": Reader(lambda path: import_cameras(path, format="qualisys"), ".txt", _text(_QUALISYS)),
+    "agisoft": Reader(lambda path: import_cameras(path, format="agisoft"), ".xml", _text(_AGISOFT)),
     "any camera": Reader(import_cameras, ".yml", lambda path: FORMATS["opencv"].write([CAMERA], [], path)),
     "camera": Reader(load_camera, ".json", lambda path: save_camera(CAMERA, path)),
     "rig": Reader(load_rig, ".json", lambda path: save_rig(

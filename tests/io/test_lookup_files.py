@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -47,9 +48,10 @@ def test_what_is_no_lookup_camera_is_refused(camera: Camera, tmp_path: Path, mon
         with pytest.raises(FileError, match=f"bad lookup file: {name}"):
             load_lookup(tmp_path / "bad.npz")
     assert lookup_file._MOST_BYTES == 256 * 2**20
-    monkeypatch.setattr(lookup_file, "_MOST_BYTES", 1000)
+    monkeypatch.setattr(lookup_file, "_MOST_BYTES", 100_000)
+    np.savez_compressed(tmp_path / "large.npz", zeros=np.zeros(20_000))
     with pytest.raises(FileError, match="no lookup camera is larger"):
-        load_lookup(path)
+        load_lookup(tmp_path / "large.npz")
 
 
 def test_a_matlab_pair_without_a_unit_is_in_millimeters_and_that_is_said(camera: Camera, tmp_path: Path) -> None:
@@ -58,9 +60,16 @@ def test_a_matlab_pair_without_a_unit_is_in_millimeters_and_that_is_said(camera:
     assert import_cameras(path).notes == ()
     content = {key: value for key, value in loadmat(path).items() if not key.startswith("__")}
     (name,) = content
-    struct = content[name][0, 0]
-    fields = {field: struct[field] for field in struct.dtype.names if field != "WorldUnits"}
-    savemat(tmp_path / "unsaid.mat", {name: fields})
+
+    def without_unit(struct: np.ndarray) -> dict[str, Any]:
+        one = struct[0, 0]
+        return {
+            field: without_unit(one[field]) if one[field].dtype.names else one[field]
+            for field in one.dtype.names
+            if field != "WorldUnits"
+        }
+
+    savemat(tmp_path / "unsaid.mat", {name: without_unit(content[name])})
     found = import_cameras(tmp_path / "unsaid.mat")
     assert any("the translation is taken as millimeters" in note for note in found.notes)
     assert import_cameras(tmp_path / "unsaid.mat", meters=1.0).notes == ()

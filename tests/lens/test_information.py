@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import pytest
 import torch
 
 from kcal.errors import InputError
-from kcal.lens.information import CameraInformation, posterior_half, triangular
+from kcal.lens.information import CameraInformation
 
 
 def information(board: int = 2, scale: float = 1.0) -> CameraInformation:
@@ -47,9 +48,23 @@ def test_without_board_is_the_marginal() -> None:
     assert alone.board_size == 0
     torch.testing.assert_close(alone.covariance(), known.covariance(), rtol=1e-11, atol=1e-14)
     # The same best camera: the step to the minimum of everything is that of the camera alone.
-    whole, part = known.all_rows(), alone.all_rows()
+    whole, part = known.whole.rows, alone.whole.rows
     step = torch.linalg.lstsq(whole[:, :-1], -whole[:, -1:]).solution[:5]
     torch.testing.assert_close(torch.linalg.lstsq(part[:, :-1], -part[:, -1:]).solution, step, rtol=1e-11, atol=1e-12)
+
+
+def test_rows_are_those_of_its_parts() -> None:
+    """Data, priors and what others say, in the order of the unknowns, with residuals at the estimate."""
+    known = dataclasses.replace(information(), others=torch.ones(1, 3, dtype=torch.float64))
+    assert torch.equal(known.data_rows(), torch.cat([known.rows, known.residuals[:, None]], 1))
+    pull = (known.estimate - known.mean) / known.sigma
+    for board, own in ((False, [3, 4]), (True, [5, 6])):
+        rows = known.prior_rows(board=board)
+        assert torch.equal(rows[:, own], torch.diag(1.0 / known.sigma[own]))
+        torch.testing.assert_close(rows[:, -1], pull[own])
+    assert known.board_rows()[-1].tolist() == [0.0] * 5 + [1.0] * 3
+    torch.testing.assert_close(known.triangle().T @ known.triangle(), known.data.compressed().products)
+    assert known.all_rows().shape == (40 + 2 + 2 + 1, 8)
 
 
 def test_from_covariance_and_back() -> None:
@@ -60,32 +75,6 @@ def test_from_covariance_and_back() -> None:
     found = CameraInformation.from_covariance(torch.arange(7.0), matrix)
     assert found.slots == (0, 1, 2, -1, 3, 4, 5)
     torch.testing.assert_close(found.covariance(), matrix, rtol=1e-11, atol=1e-13)
-
-
-def test_nearly_undetermined_directions_survive() -> None:
-    """Columns of units 1e-4 apart and a valley 1e-10 wide: normal equations would lose it."""
-    rows = torch.tensor([[1.0, 1.0], [0.0, 1e-10]]).double()
-    half = posterior_half(rows)
-    # x = (1, -1) / 1e-10 moves the rows by one.
-    sigma = torch.linalg.vector_norm(half, dim=0)
-    torch.testing.assert_close(sigma, torch.full((2,), 1e10).double(), rtol=1e-5, atol=0)
-
-
-def test_undetermined_is_large() -> None:
-    """What no row determines gets a very large variance, not NaN."""
-    half = posterior_half(torch.tensor([[1.0, 0.0]]).double())
-    sigma = torch.linalg.vector_norm(half, dim=0)
-    assert float(sigma[0]) == pytest.approx(1.0)
-    assert 1e10 < float(sigma[1]) < math.inf
-
-
-def test_triangular_keeps_products() -> None:
-    """Also of fewer rows than columns."""
-    for count in (2, 9):
-        rows = torch.randn(count, 4, generator=torch.Generator().manual_seed(count), dtype=torch.float64)
-        found = triangular(rows)
-        assert found.shape == (4, 4)
-        torch.testing.assert_close(found.T @ found, rows.T @ rows, rtol=1e-12, atol=1e-13)
 
 
 def test_refused() -> None:

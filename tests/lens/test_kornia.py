@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import json
+
+import cv2
 import kornia.geometry.epipolar as epi
+import numpy as np
 import pytest
 import torch
 from kornia.augmentation import ImageSequential, RandomHorizontalFlip, VideoSequential
@@ -17,6 +21,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.images import Undistort, UndistortImage
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import StereoRig
+from scripts.make_kornia_vectors import PATH, vectors
 
 POINTS = torch.tensor([[0.1, -0.2, 1.1], [-0.3, 0.2, 1.3], [0.4, 0.3, 2.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
 LENSES = {
@@ -149,3 +154,21 @@ def test_undistort_in_sequences() -> None:
     frames = torch.stack([Undistort(camera)(video[:, :, i])[0] for i in range(2)], 2)
     flow = VideoSequential(UndistortImage(camera), RandomHorizontalFlip(p=1.0), data_format="BCTHW")
     assert torch.equal(flow(video), frames.flip(-1))
+
+
+def test_the_vectors_for_kornia_are_what_is_computed() -> None:
+    """tests/kornia_conformance/vectors.json; OpenCV agrees with its pixels."""
+    stored, made = json.loads(PATH.read_text()), vectors()
+    for old, new in zip(stored["cameras"], made["cameras"], strict=True):
+        assert old["type"] == new["type"]
+        for key in ("params", "points", "pixels", "pixels_by_point", "pixels_by_params"):
+            wanted = torch.tensor(new[key], dtype=torch.float64)
+            torch.testing.assert_close(torch.tensor(old[key], dtype=torch.float64), wanted, rtol=1e-11, atol=1e-11)
+        fx, fy, cx, cy, *lens = new["params"]
+        matrix, zero = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.zeros(3)
+        points = np.array(new["points"])
+        if new["type"] == "KANNALA_BRANDT_K3":
+            seen = cv2.fisheye.projectPoints(points[:, None], zero, zero, matrix, np.array(lens))[0][:, 0]
+        else:
+            seen = cv2.projectPoints(points, zero, zero, matrix, np.array(lens or [0.0] * 4))[0][:, 0]
+        assert np.abs(seen - np.array(new["pixels"])).max() < 1e-9

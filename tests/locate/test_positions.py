@@ -246,6 +246,31 @@ def test_kml(tmp_path: Path) -> None:
     ]
 
 
+def test_kml_in_another_reader(tmp_path: Path) -> None:
+    kml = pytest.importorskip("fastkml.kml", reason="fastkml is not installed")
+    located = mixed()
+    (document,) = kml.KML.parse(write_positions(tmp_path / "points.kml", located)).features
+    places = {place.name: place for place in document.features}
+    assert set(places) == {"left camera", "right camera", "mast", "mast, 95 %"}
+    position = located.positions[0]
+    assert places["mast"].geometry.coords == ((position.lon, position.lat),)
+    assert places["mast, 95 %"].geometry.geom_type == "Polygon"
+
+
+def test_cursor_on_target_in_another_reader() -> None:
+    takproto = pytest.importorskip("takproto", reason="takproto is not installed")
+    located = mixed()
+    moment = datetime.datetime(2026, 5, 4, 10, 0, tzinfo=datetime.UTC)
+    packed = takproto.xml2proto(cot_events(located.columns, located, time=moment, stale_s=60))
+    event = takproto.parse_proto(packed).cotEvent
+    position = located.positions[0]
+    assert (event.type, event.detail.contact.callsign) == ("a-u-G", "mast")
+    assert (event.lat, event.lon) == (position.lat, position.lon)
+    assert event.hae == pytest.approx(position.height, abs=1e-3)
+    assert event.ce == pytest.approx(position.cep95_m, abs=1e-3)
+    assert event.staleTime - event.startTime == 60_000
+
+
 def test_cursor_on_target() -> None:
     located = mixed()
     moment = datetime.datetime(2026, 5, 4, 12, 0, tzinfo=datetime.timezone(datetime.timedelta(hours=2)))

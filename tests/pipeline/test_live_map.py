@@ -75,7 +75,7 @@ def test_site_and_tracks_are_told(page: LiveMap) -> None:
     (track,) = told["tracks"]["tracks"]  # the other is too far for a position
     assert track["name"] == "track 1"
     assert track["place"] == pytest.approx([SITE.origin.lat + 500 / 110_700, SITE.origin.lon], abs=1e-4)
-    assert track["text"] == "car, 500 m"
+    assert track["text"] == "car, 500.0 m"
 
 
 def test_regions_are_those_of_the_covariance(page: LiveMap) -> None:
@@ -149,7 +149,7 @@ def test_the_page_in_a_browser(page: LiveMap) -> None:
         status(tab, "running")
         assert tab.inner_text("#count") == "1 track, moment 7"
         names = tab.locator(".leaflet-tooltip").all_inner_texts()
-        assert names == ["left camera", "right camera", "track 1, <img src=x onerror=alert(1)>, 500 m"]
+        assert names == ["left camera", "right camera", "track 1, <img src=x onerror=alert(1)>, 500.0 m"]
         assert tab.locator("#map img").count() == 0
         # A field of view for each camera, two cameras, a region, a trail, a target.
         assert tab.locator("#map path").count() == 2 + 2 + 1 + 1 + 1

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from kcal.calibrate.camera.advice import unreached_share
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.calibrate.camera.export import Misfit
+from kcal.calibrate.camera.misfit import Misfit
 from kcal.corners.observations import Observations, View
 from kcal.lens.camera import Camera
 from kcal.lens.difference import camera_difference

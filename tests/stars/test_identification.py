@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import builtins
+import datetime
 from pathlib import Path
 from typing import Any
 
@@ -10,16 +11,18 @@ import numpy as np
 import pytest
 import torch
 
-from kcal.errors import InputError
+from kcal.errors import FileError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.mounting import Origin
 from kcal.locate.geodesy import enu_from_cam
 from kcal.stars.attitude import field_angle
 from kcal.stars.catalog import StarCatalog
+from kcal.stars.contradictions import clock_doubts
 from kcal.stars.detect import detect_stars
 from kcal.stars.identification import identify
 from kcal.stars.night import SkyView, name_stars
-from kcal.stars.pair_table import cache_folder, pair_table
+from kcal.stars.night_image import read_night
+from kcal.stars.pair_table import _loaded, cache_folder, pair_table
 from kcal.stars.sky import observed_directions
 from scripts.shared.night_scenes import PLACE, TIME, night_camera, rendered, star_pixels
 
@@ -62,12 +65,18 @@ def test_what_is_no_star_is_counted(night: Any) -> None:
     for shift in range(-1, 2):
         image[300 + shift + along // 3, 400 + along] += 900.0 / (1 + shift**2)  # a satellite
     rows, columns = np.mgrid[0:600, 0:960]
+    flashes = [(620.0 + 45 * k, 200.0 + 22 * k) for k in range(6)]  # an aircraft's strobe: as sharp as stars
+    for u, v in flashes:
+        image += 900.0 * np.exp(-((rows - v) ** 2 + (columns - u) ** 2) / (2 * 1.1**2))
     image += 3000.0 * np.exp(-((rows - 480) ** 2 + (columns - 200) ** 2) / (2 * 6.0**2))  # a lamp
     image += 250.0 * np.exp(-((rows - 100) ** 2 + (columns - 700) ** 2) / (2 * 80.0**2))  # a cloud
     found = name_stars(np.clip(image, 0, 65535).astype(np.uint16), CAMERA, SkyView(time=TIME, origin=PLACE))
     assert found.detected.left_out["hot pixels"] >= 9
     assert found.detected.left_out["streaks"] >= 5
     assert found.detected.left_out["wider than a star"] >= 1
+    apart = np.linalg.norm(found.detected.pixels[:, None] - flashes, axis=-1)
+    assert (apart.min(0) < 0.5).sum() >= 5
+    assert bool((found.attitude.star[apart.min(1) < 0.5] == -1).all())
     assert found.heading_pitch_roll == pytest.approx(LOOK, abs=0.01)
 
 
@@ -159,10 +168,13 @@ def test_the_table_is_cached_and_a_broken_one_is_made_anew(tmp_path: Path, monke
     made = pair_table(CATALOG, 0.05)
     (file,) = cache_folder().iterdir()
     before = file.stat().st_mtime_ns
+    assert pair_table(CATALOG, 0.05) is made  # of the next image of the same camera
+    _loaded.cache_clear()
     again = pair_table(CATALOG, 0.05)
     assert file.stat().st_mtime_ns == before
     assert np.array_equal(made.pairs, again.pairs)
     file.write_bytes(file.read_bytes()[:1000])
+    _loaded.cache_clear()
     assert np.array_equal(made.angle, pair_table(CATALOG, 0.05).angle)
     assert file.stat().st_size > 1000
 
@@ -186,3 +198,55 @@ def test_wrong_camera() -> None:
     other = Camera.build(focal=(1500, 1500), center=(479.5, 299.5), size=(960, 600), model="pinhole")
     with pytest.raises(InputError, match="the camera file is of another lens"):
         name_stars(image, other)
+
+
+@pytest.mark.parametrize(
+    ("hours", "degrees", "share"),
+    [(0.0, 0.0, None), (-1.0, 0.0, 0.48), (0.0, 10.0, 0.62)],
+    ids=["right", "time", "place"],
+)
+def test_refraction_tells_a_wrong_time_or_place(night: Any, hours: float, degrees: float, share: float | None) -> None:
+    """All stars stay above the horizon; the camera would only stand otherwise."""
+    place = Origin(lat=PLACE.lat + degrees, lon=PLACE.lon, height=PLACE.height)
+    found = name_stars(night, CAMERA, SkyView(time=TIME + datetime.timedelta(hours=hours), origin=place))
+    assert found.on_earth
+    if share is None:
+        assert found.warnings == ()
+    else:
+        (text,) = found.warnings
+        assert text.startswith("refraction is ")
+        assert float(text.split()[2]) == pytest.approx(share, abs=0.1)
+
+
+def test_a_fixed_camera_tells_a_wrong_time(night: Any) -> None:
+    later = TIME + datetime.timedelta(hours=2)
+    pixels, index = star_pixels(CAMERA, LOOK, time=later)
+    second = rendered(CAMERA, pixels, CATALOG.magnitude[index], seed=1)
+    first = name_stars(night, CAMERA, SkyView(time=TIME, origin=PLACE))
+    right = name_stars(second, CAMERA, SkyView(time=later, origin=PLACE))
+    summer = name_stars(second, CAMERA, SkyView(time=later + datetime.timedelta(hours=1), origin=PLACE))
+    assert clock_doubts([first, right]) == []
+    ((number, text),) = clock_doubts([first, summer])
+    assert number == 1
+    assert "(1.00 h)" in text
+    # A camera that was turned is no doubt.
+    pixels, index = star_pixels(CAMERA, (140.0, 35.0, 2.0), time=later)
+    moved = name_stars(rendered(CAMERA, pixels, CATALOG.magnitude[index]), CAMERA, SkyView(time=later, origin=PLACE))
+    assert clock_doubts([first, moved]) == []
+
+
+def test_fits(night: Any, tmp_path: Path) -> None:
+    """The first image of a file whose rows count from below; tables and colors beside it."""
+    fits = pytest.importorskip("astropy.io.fits", reason="FITS files need astropy: pip install astropy")
+    path = tmp_path / "night.fits"
+    table = fits.BinTableHDU.from_columns([fits.Column(name="a", format="E", array=np.zeros(3))])
+    fits.HDUList([fits.PrimaryHDU(), table, fits.ImageHDU(night[::-1])]).writeto(path)
+    image = read_night(path)
+    assert np.array_equal(image, night)
+    assert name_stars(image, CAMERA).attitude.count > 30
+    fits.HDUList([fits.PrimaryHDU(np.zeros((3, 20, 20)))]).writeto(tmp_path / "color.fits")
+    with pytest.raises(FileError, match="no image"):
+        read_night(tmp_path / "color.fits")
+    (tmp_path / "no.fits").write_bytes(b"nothing")
+    with pytest.raises(FileError, match=r"no\.fits: not a FITS file"):
+        read_night(tmp_path / "no.fits")

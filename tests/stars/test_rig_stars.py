@@ -14,16 +14,18 @@ import torch
 from typer.testing import CliRunner
 
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
+from kcal.calibrate.rig.sources import Landmarks
 from kcal.cli.main import app
 from kcal.errors import DegenerateError, InputError
 from kcal.io.camera_file import save_camera
 from kcal.io.images import write_png
 from kcal.io.rig_file import load_rig
-from kcal.lens.pose import vector_from_rotation
+from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.locate.geodesy import enu_from_cam
 from kcal.stars.catalog import StarCatalog
 from kcal.stars.night import NamedStars, SkyView, name_stars
 from kcal.stars.rig_stars import moments_of, star_source
+from kcal.stars.sky import pole_in_enu
 from scripts.shared.night_scenes import PLACE, TIME, night_camera, rendered, star_pixels
 from scripts.shared.star_rigs import LOOKS, star_rig
 
@@ -62,6 +64,63 @@ def test_an_offset_of_a_clock_is_in_the_sigma() -> None:
     assert grown == pytest.approx(7.292e-5, rel=0.5)  # of a second; positions and matches tell some of it
 
 
+def test_a_clock_that_drifts_is_found_and_in_the_sigma() -> None:
+    """.2 s an hour over 5 h: as an unknown it is found, otherwise the rig is wrong by far more than it says."""
+    squares = {}
+    for stated in (0.0, 0.2):
+        data, truth, _ = star_rig(
+            CAMERA, seed=2, named=True, moments=12, faintest=4.0, clock_sigma=0.002, drift=0.2, drift_sigma=stated
+        )
+        found = solve_rig(data, STRAIGHT)
+        error = turn_error(found, truth)
+        squares[stated] = float(error @ torch.linalg.solve(found.relative_covariance()[:3, :3], error))
+    assert squares[0.2] < 16.3 < squares[0.0]  # one in a thousand
+
+
+@pytest.mark.parametrize(("seconds", "message"), [(20.0, "contradict the stars"), (3600.0, "time, zone and place")])
+def test_landmarks_tell_a_wrong_time(seconds: float, message: str) -> None:
+    """Of the stars' attitude and that by surveyed landmarks."""
+    data, truth, center = star_rig(CAMERA, seed=3, named=True, faintest=4.5, matches=0)
+    draw = np.random.default_rng(1)
+    rays = torch.nn.functional.pad(torch.from_numpy(draw.uniform((-0.4, -0.2), (0.4, 0.2), (12, 2))), (0, 1), value=1.0)
+    points = torch.from_numpy(draw.uniform(50, 950, (12, 1))) * rays @ truth[0]
+    at = torch.stack([CAMERA.project((points - c) @ r.T)[0] for r, c in zip(truth, center, strict=True)], 1)
+    marks = Landmarks(
+        names=tuple(f"post {k}" for k in range(12)), points=points + torch.from_numpy(draw.normal(0, 0.02, (12, 3))),
+        sigma=torch.full((12, 3), 0.02).double(), pixels=at + torch.from_numpy(draw.normal(0, 0.1, at.shape)),
+        pixel_sigma=0.1,
+    )  # fmt: skip
+    assert data.stars is not None
+    turn = rotation_from_vector(torch.from_numpy(pole_in_enu(PLACE.lat)) * 7.292e-5 * seconds)
+    stars = dataclasses.replace(data.stars, direction=data.stars.direction @ turn.T)
+    wrong = dataclasses.replace(data, stars=stars, landmarks=marks)
+    try:
+        said = " ".join(solve_rig(wrong, STRAIGHT).warnings)
+    except InputError as error:
+        said = str(error)
+    assert message in said
+
+
+def test_nights_begin_anew(nights: list[list[NamedStars]]) -> None:
+    """Drift counts in nights of an hour or more, from the first image of each."""
+    camera = night_camera(1100.0, (1280, 800))
+    pair = {side: nights[side][0] for side in (0, 1)}
+
+    def at(hours: float) -> dict[int, NamedStars]:
+        time = TIME + datetime.timedelta(hours=hours)
+        return {c: dataclasses.replace(one, view=dataclasses.replace(one.view, time=time)) for c, one in pair.items()}
+
+    moments = [at(hours) for hours in (0.0, 3.0, 24.0, 26.0, 48.0)]
+    source = star_source(moments, (camera, camera), origin=PLACE, drift_sigma=0.1)
+    drifts = [effect for effect in source.effects if effect.factor is not None]
+    assert [effect.name for effect in drifts] == [f"drift of the clock of camera 2, night {k}" for k in (1, 2)]
+    hours = torch.stack([effect.factor for effect in drifts if effect.factor is not None])
+    assert sorted(set(hours[0].tolist())) == pytest.approx([0.0, 3.0])
+    assert sorted(set(hours[1].tolist())) == pytest.approx([0.0, 2.0])
+    assert not any(effect.factor is not None for effect in star_source(moments[:1], (camera, camera)).effects)
+    assert len(star_source(moments, (camera, camera), drift_sigma=0.0).effects) == len(source.effects) - 2
+
+
 def test_stars_alone_say_what_is_missing() -> None:
     data, _, _ = star_rig(CAMERA, seed=1, named=False, positions=False, matches=0)
     with pytest.raises(DegenerateError, match="add matches of unknown range"):
@@ -76,12 +135,12 @@ def test_named_stars_need_a_frame_on_the_earth() -> None:
 def test_wrong_names_and_an_aircraft_are_left_out() -> None:
     data, truth, _ = star_rig(CAMERA, seed=3, named=True)
     assert data.stars is not None
-    direction, pixels = data.stars.direction.clone(), data.stars.pixels.clone()
+    names, direction, pixels = data.stars.names, data.stars.direction.clone(), data.stars.pixels.clone()
     direction[[4, 9]] = direction[[9, 4]]
     pixels[20, 1] += torch.tensor([3.0, -2.0])
     data = dataclasses.replace(data, stars=dataclasses.replace(data.stars, direction=direction, pixels=pixels))
     found = solve_rig(data, STRAIGHT)
-    assert {item.name for item in found.left_out} == {data.stars.names[i] for i in (4, 9, 20)}
+    assert {item.name for item in found.left_out} == {names[i] for i in (4, 9, 20)}
     assert all(item.source == "stars" for item in found.left_out)
     assert float(turn_error(found, truth).norm()) < 4 * float(found.sigma_rotation.norm())
 

@@ -21,6 +21,7 @@ from concurrent.futures import (
 from contextlib import contextmanager, suppress
 from typing import Any, NamedTuple
 
+from kcal.child_processes import deaf_to_interrupts
 from kcal.errors import FileError, InputError, KcalError
 
 
@@ -81,7 +82,8 @@ class Pool:
                 context = multiprocessing.get_context("spawn")
                 self._executor = ProcessPoolExecutor(self.workers, mp_context=context, initializer=_begin)
         try:
-            return self._executor.submit(task.function, *task.arguments)
+            with deaf_to_interrupts():
+                return self._executor.submit(task.function, *task.arguments)
         except (RuntimeError, OSError, ValueError) as error:
             # What a closed Dask client raises; a broken pool of processes is the caller's to mend.
             if self._client is None:

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 
 import torch
-from torch import Tensor
 
 from kcal.calibrate.camera.determined import check_directions
 from kcal.calibrate.camera.options import CalibrationOptions
@@ -21,7 +20,6 @@ from kcal.calibrate.camera.warnings import (
 )
 from kcal.calibrate.problem.covariance import Uncertainty, noise_variance, uncertainty_of
 from kcal.calibrate.problem.information import information_of
-from kcal.calibrate.problem.parameters import FreeParameters
 from kcal.calibrate.problem.priors import GaussianPrior
 from kcal.calibrate.problem.state import BoardState
 from kcal.corners.observations import Observations
@@ -49,8 +47,7 @@ def assess(observations: Observations, solution: Solution, options: CalibrationO
     uncertainty, information = _uncertainty(observations, solution, state, options.loss)
     free = problem.free
     slot = {camera.names[i]: k for i, k in zip(free.indices, free.slots, strict=True)}
-    unknowns = [" = ".join(name for name in slot if slot[name] == k) for k in range(len(free))]
-    spread = _by_parameter(uncertainty, free, len(camera.names))
+    spread = free.by_parameter(uncertainty.covariance, len(camera.names))
     sigma = {name: float(uncertainty.sigma[k]) if bool(uncertainty.determined[k]) else None for name, k in slot.items()}
     fixed = tuple(name for name in camera.names if name in solution.views.constraints.fixed)
     sigma = {name: sigma.get(name) for name in camera.names if name in slot or name in fixed}
@@ -67,7 +64,8 @@ def assess(observations: Observations, solution: Solution, options: CalibrationO
             state.rotation,
             observations.names,
         )
-        lost = [name for name, known in zip(unknowns, uncertainty.determined.tolist(), strict=False) if not known]
+        labels = free.labels(camera.names)
+        lost = [name for name, known in zip(labels, uncertainty.determined.tolist(), strict=False) if not known]
     else:
         # Unknown is not the same as undetermined by the views.
         doubts, lost = [NO_ERROR_BARS], []
@@ -134,11 +132,3 @@ def _led_by_prior(
                 if float(uncertainty.sigma[slot[names[index]]]) ** 2 > 0.5 * sigma**2:
                     led.append(names[index])
     return tuple(led)
-
-
-def _by_parameter(uncertainty: Uncertainty, free: FreeParameters, count: int) -> Tensor:
-    """(5 + P, 5 + P) from the covariance of the unknowns: tied parameters alike, held ones zero."""
-    out = uncertainty.covariance.new_zeros(count, count)
-    slots, indices = torch.tensor(free.slots, dtype=torch.long), torch.tensor(free.indices, dtype=torch.long)
-    out[indices[:, None], indices] = uncertainty.covariance[slots[:, None], slots]
-    return out

@@ -11,7 +11,6 @@ from torch import Tensor
 from kcal.calibrate.camera.options import CalibrationOptions
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard
-from kcal.calibrate.hybrid.unknowns import hybrid_problem
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.state import BoardState
 from kcal.errors import InputError
@@ -93,25 +92,14 @@ def hybrid_views(
         begin = fit.state
     else:
         fit, begin = start[0], BoardState(*(part.detach() for part in start[1]))
-    families, shapes = fit.families, fit.board_shapes.shapes
+    families = fit.families
     precision = fit.sigma**2 / families.deviation(fit.expected).square()
     if options.board == "exact":
-        precision[-len(shapes) :] = torch.inf
+        precision[-len(fit.board_shapes.unit) :] = torch.inf
 
     def problem_of(corners: Tensor, points: Tensor) -> BoardProblem:
         weights = torch.ones_like(corners[..., 0])
-        return hybrid_problem(
-            points,
-            shapes,
-            corners,
-            weights,
-            fit.model,
-            families.mean,
-            precision,
-            fit.readout,
-            fit.stillness,
-            fit.square,
-        )
+        return fit.problem(points, corners, weights, families.mean, precision)
 
     state, found = newton_minimum(problem_of(*fixed), begin, _POLISH)
     state = differentiated(problem_of, data, state, found, backward)

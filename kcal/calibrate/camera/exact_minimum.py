@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import torch
-
 from kcal.calibrate.camera.determined import check_directions
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.covariance import uncertainty_of
@@ -25,25 +23,13 @@ def exact_minimum(problem: BoardProblem, state: BoardState) -> tuple[BoardState,
     state, found = newton_minimum(problem, state, _POLISH)
     if problem.shared_size:
         known = uncertainty_of(found.linear, problem.residual_count, problem.shared_size + found.zero[1].numel())
-        groups = _unknowns(problem)
-        names = [*(" = ".join(group) for group in groups), *(["the board's warp"] * 2)]
+        names = [*problem.free.labels(parameter_names(problem.model)), *(["the board's warp"] * 2)]
         lost = [name for name, sure in zip(names, known.determined.tolist(), strict=False) if not sure]
         if lost:
             raise DegenerateError(
                 f"the views do not determine {', '.join(dict.fromkeys(lost))}, and the solution has no derivatives: "
                 "fix parameters, choose a smaller model, add views or priors"
             )
-        slots, places = torch.tensor(problem.free.slots), torch.tensor(problem.free.indices)
-        spread = state.parameters.new_zeros(2 * (len(state.parameters),))
-        spread[places[:, None], places] = known.covariance[slots[:, None], slots]
+        spread = problem.free.by_parameter(known.covariance, len(state.parameters))
         check_directions(state.parameters, problem.model, problem.points(state), problem.seen, spread, state.rotation)
     return state, found
-
-
-def _unknowns(problem: BoardProblem) -> list[list[str]]:
-    """Names of the parameters that follow each of the camera's unknowns."""
-    names, free = parameter_names(problem.model), problem.free
-    groups: list[list[str]] = [[] for _ in range(len(free))]
-    for index, slot in zip(free.indices, free.slots, strict=True):
-        groups[slot].append(names[index])
-    return groups

@@ -10,67 +10,37 @@ from __future__ import annotations
 import dataclasses
 import io
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from kcal.calibrate.camera.misfit import Misfit, measured_misfit
 from kcal.calibrate.camera.refit import refit_camera
 from kcal.errors import DegenerateError, InputError
 from kcal.files import write_atomic
 from kcal.io.foreign import CameraPose, camera_name, paths_for, plain, rig_poses
 from kcal.io.format_kalibr import write_omni
-from kcal.io.format_mrcal import fit_spline, project_spline, write_model
+from kcal.io.format_mrcal import fit_spline, project_spline, write_model, write_mrcal
+from kcal.io.format_prior import prior_of, write_priors
 from kcal.io.formats import FORMATS, CameraFormat, format_named, held_exactly
 from kcal.io.kalibr_omni import NAME as OMNI
 from kcal.io.kalibr_omni import fit_omni, project_omni
+from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
+from kcal.lens.carry_over import carried_covariance
 from kcal.lens.images import undistort_maps
 from kcal.lens.model import LensModel
 from kcal.lens.pinhole import new_pinhole
 from kcal.lens.rig import StereoRig
 
-# Columns and rows on which a misfit is measured: four times as dense as the fit's, reaching to the image's edge.
-_DENSE = (129, 97)
 _SPLINE_SAMPLES = (193, 145)
 REMAP = "remap"
 # Pixels (RMS) up to which a pinhole model of Kalibr stands for a lens.
 _NEAR = 0.2
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class Misfit:
-    """What is written instead of a lens, and how far it is from it, over the image and at infinity.
-
-    Args:
-        model: of the format.
-        pixels: (rows, columns, 2) that the camera sees rays at.
-        shift: (rows, columns, 2) pixels at which what was written sees them, minus `pixels`; NaN where the camera
-            itself has no ray.
-    """
-
-    model: str
-    pixels: Tensor
-    shift: Tensor
-
-    @property
-    def length(self) -> Tensor:
-        """(rows, columns) length of the shift, pixels."""
-        return torch.linalg.vector_norm(self.shift, dim=-1)
-
-    @property
-    def rms(self) -> float:
-        """Root mean square of the length, pixels."""
-        return float(self.length[self.length.isfinite()].square().mean().sqrt())
-
-    @property
-    def largest(self) -> float:
-        """Bound of the length: its maximum on the grid, and what it can be more between the grid's points."""
-        bends = [torch.diff(self.shift, n=2, dim=axis).abs() for axis in (0, 1)]
-        most = [float(torch.nan_to_num(bend).max()) for bend in bends]
-        return float(self.length[self.length.isfinite()].max()) + sum(most) / 4.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -102,15 +72,21 @@ def format_for(path: str | Path, format: str | None = None) -> str:
     """
     path = Path(path)
     if format is not None:
-        if format != REMAP:
-            format_named(format)
+        if format != REMAP and format_named(format).write is None:
+            raise InputError(
+                f"kcal reads {format} files and does not write them; choose one of {', '.join(_written())}"
+            )
         return format
     by_suffix = {suffix: name for name, known in FORMATS.items() for suffix in known.suffixes} | {".npz": REMAP}
     if path.name == "camera_models.json":
         return "opensfm"
     if path.suffix.lower() not in by_suffix:
-        raise InputError(f"{path}: no format for this suffix; name one (--format {', '.join([*FORMATS, REMAP])})")
+        raise InputError(f"{path}: no format for this suffix; name one (--to {', '.join(_written())})")
     return by_suffix[path.suffix.lower()]
+
+
+def _written() -> list[str]:
+    return [*(name for name, known in FORMATS.items() if known.write is not None), REMAP]
 
 
 def export_cameras(
@@ -123,11 +99,14 @@ def export_cameras(
     """Write one camera, several, or a rig for another program.
 
     The format follows from the suffix: `.yml`, `.yaml`, `.xml` OpenCV; `.cameramodel` mrcal; `.txt`, `.bin` COLMAP;
-    `.json` nerfstudio; `.mat` MATLAB; `.npz` maps for `cv2.remap`. Others are named: ros, kalibr, opensfm. Formats
-    with one camera per file get NAME_left and NAME_right for a rig.
+    `.json` nerfstudio; `.mat` MATLAB; `.toml` aniposelib; `.npz` maps for `cv2.remap`. Others are named: ros, kalibr,
+    opensfm, gtsam, ceres, numpy. Formats with one camera per file get NAME_left and NAME_right for a rig.
 
-    Cameras of one file get one lens model, the one that is nearest to all of them. Kalibr's chains hold wide lenses as
-    omni-radtan, where its pinhole models are far off.
+    Cameras of one file get one lens model, the one that is nearest to all of them, with a note on those that would be
+    nearer without the others. Kalibr's chains hold wide lenses as omni-radtan, where its pinhole models are far off.
+
+    What is known of the cameras is written beside the file, as NAME.prior.json, or in it (gtsam, ceres, numpy): the
+    parameters in the program's order and their square-root information, the misfit of a lens that was fitted included.
 
     Args:
         cameras: a single camera, a rig, or single cameras without poses.
@@ -170,7 +149,7 @@ def export_cameras(
     exact = [held_exactly(camera, [model] if model else known.models, known.skew) for camera in several]
     if name == "mrcal" and model is None and None in exact:
         return _write_splines(several, exact, poses, path, _lost(several, rig, known))
-    found = _in_one_model(several, exact, name, model)
+    found, notes = _in_one_model(several, exact, name, model)
     if name == "kalibr" and model is None and (omni := _nearer_omni(several, found)) is not None:
         values, omni_misfits = omni
         return ExportedCameras(
@@ -179,22 +158,35 @@ def export_cameras(
             models=(OMNI,) * len(several),
             misfits=omni_misfits,
             lost=_lost(several, rig, known),
+            notes=(_omni_instead(several, found, omni_misfits),),
         )
-    written, misfits = [], []
-    for camera, (substitute, misfit) in zip(several, found, strict=True):
-        substitute.calibration = substitute.calibration or (camera.calibration and dataclasses.replace(
-            camera.calibration, sigma=None, covariance=None, information=None
-        ))  # fmt: skip
-        written.append(substitute)
-        misfits.append(misfit)
+    written = [_with_covariance(camera, *one) for camera, one in zip(several, found, strict=True)]
+    priors = [
+        prior_of(name, camera, None if one.misfit is None else (one.misfit.rms, one.misfit.largest))
+        for camera, one in zip(written, found, strict=True)
+    ]
+    carried = any(prior["sqrt_information"] is not None for prior in priors)
+    if known.prior:
+        paths = [write_priors(name, priors, path)]
+    else:
+        assert known.write is not None
+        paths = known.write(written, poses, path)
+        paths += [write_priors(name, priors, path.with_name(f"{path.stem}.prior.json"))] if carried else []
     return ExportedCameras(
         format=name,
-        paths=tuple(known.write(written, poses, path)),
+        paths=tuple(paths),
         models=tuple(str(camera.model) for camera in written),
-        misfits=tuple(misfits),
-        lost=_lost(several, rig, known),
-        notes=_mixed(written),
+        misfits=tuple(one.misfit for one in found),
+        lost=_lost(several, rig, known, carried),
+        notes=notes + _mixed(written),
     )
+
+
+def _with_covariance(camera: Camera, substitute: Camera, misfit: Misfit | None, width: Tensor | None) -> Camera:
+    """The substitute with the camera's name and what is known of it, misfit included."""
+    covariance = carried_covariance(camera, substitute, misfit=misfit.rms if misfit else 0.0, width=width)
+    substitute.calibration = CameraCalibration(name=camera_name(camera, ""), covariance=covariance)
+    return substitute
 
 
 def _mixed(cameras: Sequence[Camera]) -> tuple[str, ...]:
@@ -207,41 +199,85 @@ def _mixed(cameras: Sequence[Camera]) -> tuple[str, ...]:
     )
 
 
+class _Fitted(NamedTuple):
+    """A camera in a model of a format, how far it is from the original (None: not at all), and the fit's weak prior."""
+
+    camera: Camera
+    misfit: Misfit | None = None
+    width: Tensor | None = None
+
+
 def _in_one_model(
     cameras: Sequence[Camera], exact: Sequence[Camera | None], name: str, model: str | None
-) -> list[tuple[Camera, Misfit | None]]:
-    """Each camera in a model of the format, in one model for all unless every camera is held exactly."""
-    held = [(camera, None) for camera in exact if camera is not None]
+) -> tuple[list[_Fitted], tuple[str, ...]]:
+    """Each camera in a model of the format, in one model for all unless every camera is held exactly.
+
+    With notes on cameras that would be nearer to what they are without the others.
+    """
+    held = [_Fitted(camera) for camera in exact if camera is not None]
     if len(held) == len(cameras):
-        return list(held)
-    found: list[list[tuple[Camera, Misfit | None]]] = []
+        return held, ()
+    fits = [_fit_each(camera, name, model) for camera in cameras]
+    alone = [
+        _Fitted(one) if one is not None else min(found.values(), key=_misfit_rms)
+        for one, found in zip(exact, fits, strict=True)
+    ]
+    shared = [[found[kind] for found in fits] for kind in fits[0] if all(kind in found for found in fits)]
+    chosen = min(shared, key=_squares, default=alone)
+    return chosen, tuple(
+        f"{camera_name(camera, f'camera {number}')}: written as {one.camera.model} (RMS {_misfit_rms(one):.2g} px) so "
+        f"that all cameras have one lens model; in a file of its own it is {own.camera.model} "
+        f"({f'RMS {_misfit_rms(own):.2g} px' if own.misfit else 'exact'})"
+        for number, (camera, one, own) in enumerate(zip(cameras, chosen, alone, strict=True), 1)
+        if _misfit_rms(one) > _misfit_rms(own)
+    )
+
+
+def _fit_each(camera: Camera, name: str, model: str | None) -> dict[LensModel, _Fitted]:
+    """The camera in each model of a format that shows its whole image."""
+    found, refused = {}, []
     for kind in _richest([model] if model else FORMATS[name].models):
         try:
-            found.append([_in_model(camera, kind, name) for camera in cameras])
-        except (InputError, DegenerateError):
-            continue
-    if found:
-        return min(found, key=_squares)
-    own = [(one, None) if one is not None else _refitted(camera, name, model)
-           for camera, one in zip(cameras, exact, strict=True)]  # fmt: skip
-    return list(own)
+            found[kind] = _in_model(camera, kind, name)
+        except (InputError, DegenerateError) as error:
+            refused.append(str(error))
+    if not found:
+        raise InputError(
+            f"no lens model of {name} files can stand for this camera ({'; '.join(refused)}). mrcal files hold it as a "
+            "spline (.cameramodel), and maps for cv2.remap its undistorted image (.npz)"
+        )
+    return found
 
 
-def _in_model(camera: Camera, kind: LensModel, name: str) -> tuple[Camera, Misfit | None]:
+def _in_model(camera: Camera, kind: LensModel, name: str) -> _Fitted:
     """A camera in a lens model, exactly where it contains the lens."""
     held = held_exactly(camera, [str(kind)], FORMATS[name].skew)
     if held is not None:
-        return held, None
-    fitted = refit_camera(camera, kind).camera
-    return fitted, measured_misfit(camera, str(kind), fitted.project_rays)
+        return _Fitted(held)
+    fitted = refit_camera(camera, kind)
+    return _Fitted(fitted.camera, measured_misfit(camera, str(kind), fitted.camera.project_rays), fitted.width)
 
 
-def _squares(found: Sequence[tuple[Camera, Misfit | None]]) -> float:
-    return sum(misfit.rms**2 for _, misfit in found if misfit is not None)
+def _misfit_rms(one: _Fitted) -> float:
+    return one.misfit.rms if one.misfit is not None else 0.0
+
+
+def _squares(found: Sequence[_Fitted]) -> float:
+    return sum(_misfit_rms(one) ** 2 for one in found)
+
+
+def _omni_instead(cameras: Sequence[Camera], found: Sequence[_Fitted], misfits: Sequence[Misfit]) -> str:
+    """A note that Kalibr's own wide lens stands for all cameras."""
+    names = ", ".join(
+        f"{camera_name(camera, f'camera {number}')} RMS {misfit.rms:.2g} px"
+        for number, (camera, misfit) in enumerate(zip(cameras, misfits, strict=True), 1)
+    )
+    most = max(map(_misfit_rms, found))
+    return f"written as {OMNI} ({names}): in one pinhole model of Kalibr the RMS is up to {most:.2g} px"
 
 
 def _nearer_omni(
-    cameras: Sequence[Camera], found: Sequence[tuple[Camera, Misfit | None]]
+    cameras: Sequence[Camera], found: Sequence[_Fitted]
 ) -> tuple[list[list[float]], tuple[Misfit, ...]] | None:
     """Kalibr's omni-radtan of each camera, where its pinhole models are far off and this one is much nearer."""
     if _squares(found) <= len(cameras) * _NEAR**2:
@@ -265,11 +301,14 @@ def _nearer_omni(
     return (values, tuple(misfits)) if nearer else None
 
 
-def _lost(cameras: Sequence[Camera], rig: StereoRig | None, known: CameraFormat) -> tuple[str, ...]:
+def _lost(
+    cameras: Sequence[Camera], rig: StereoRig | None, known: CameraFormat, carried: bool = False
+) -> tuple[str, ...]:
     """What the cameras have that the format does not, in words."""
     records = [camera.calibration for camera in cameras if camera.calibration is not None]
     found = {
-        "error bars": any(record.covariance is not None or record.sigma is not None for record in records),
+        "error bars": not carried
+        and any(record.covariance is not None or record.sigma is not None for record in records),
         "calibration record": any(record.record is not None for record in records),
         "entrance pupil": any(bool((camera.coefficients[1:3] != 0).any()) for camera in cameras if camera.model.hybrid),
         "relative pose": rig is not None and not known.pose,
@@ -279,51 +318,10 @@ def _lost(cameras: Sequence[Camera], rig: StereoRig | None, known: CameraFormat)
     return tuple(what for what, there in found.items() if there)
 
 
-def measured_misfit(camera: Camera, model: str, project: Callable[[Tensor], tuple[Tensor, Tensor]]) -> Misfit:
-    """Compare what a camera sees with pixels and a mask that `project` returns for rays (N, 3).
-
-    Raises:
-        DegenerateError: rays of the camera without a pixel, because the other lens folds or ends.
-    """
-    columns, rows = _DENSE
-    width, height = camera.size
-    # From edge to edge: half a pixel beyond the centers of the outer pixels.
-    u = torch.linspace(-0.5, width - 0.5, columns, dtype=torch.float64)
-    v = torch.linspace(-0.5, height - 0.5, rows, dtype=torch.float64)
-    pixels = torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
-    rays, valid = camera.unproject(pixels.reshape(-1, 2))
-    if not bool(valid.any()):
-        raise DegenerateError("this camera has no ray for any pixel")
-    seen, shown = project(rays)
-    if not bool(shown[valid].all()):
-        share = float(shown[valid].double().mean())
-        raise DegenerateError(f"{model} shows only {share:.1%} of what the camera sees: it folds or ends before")
-    shift = torch.where(valid[:, None], seen - pixels.reshape(-1, 2), torch.nan)
-    return Misfit(model=model, pixels=pixels, shift=shift.reshape(pixels.shape))
-
-
 def _richest(models: Sequence[str]) -> list[LensModel]:
     """The models that no other one of them contains."""
     kinds = [LensModel.named(model) for model in models]
     return [kind for kind in kinds if not any(other != kind and other.contains(kind) for other in kinds)]
-
-
-def _refitted(camera: Camera, name: str, model: str | None) -> tuple[Camera, Misfit]:
-    """The model of a format that comes nearest to a camera."""
-    found: list[tuple[Camera, Misfit]] = []
-    refused = []
-    for kind in _richest([model] if model else FORMATS[name].models):
-        try:
-            fitted = refit_camera(camera, kind).camera
-            found.append((fitted, measured_misfit(camera, str(kind), fitted.project_rays)))
-        except (InputError, DegenerateError) as error:
-            refused.append(str(error))
-    if not found:
-        raise InputError(
-            f"no lens model of {name} files can stand for this camera ({'; '.join(refused)}). mrcal files hold it as a "
-            "spline (.cameramodel), and maps for cv2.remap its undistorted image (.npz)"
-        )
-    return min(found, key=lambda entry: entry[1].rms)
 
 
 def _write_splines(
@@ -339,7 +337,7 @@ def _write_splines(
     misfits: list[Misfit | None] = []
     for camera, held, pose, target in itertools.zip_longest(cameras, exact, poses, paths):
         if held is not None:
-            FORMATS["mrcal"].write([held], [pose] if pose else [], target)
+            write_mrcal([held], [pose] if pose else [], target)
             models.append(str(held.model))
             misfits.append(None)
             continue

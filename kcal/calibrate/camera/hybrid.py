@@ -43,7 +43,7 @@ def calibrate_hybrid(
     ones = torch.ones_like(pixels[..., 0])
     fit = _fit_views(observations, pixels, ones, None, options, progress, expected=not weighted)
     if weighted:
-        fit = _fit_views(observations, pixels, _weights(observations, fit.residuals), fit, options, progress)
+        fit = _fit_views(observations, pixels, corner_weights(observations, fit.residuals), fit, options, progress)
     return hybrid_result(observations, fit, options)
 
 
@@ -72,7 +72,7 @@ def _fit_views(
     )
 
 
-def _weights(observations: Observations, residuals: Tensor) -> Tensor:
+def corner_weights(observations: Observations, residuals: Tensor) -> Tensor:
     """(V, N) by the corners' covariances, and by what residuals have beyond these, which is the same for all.
 
     Normalized to a mean information of one; 0 where a corner was not seen.
@@ -96,7 +96,7 @@ def _hybrid_without_outliers(
     # A few wrong corners bend a plain fit towards them; bounded weights let them stand out.
     robust = _fit_views(observations, pixels, own, None, options, progress, robust=True)
     if options.weighted:
-        own = _weights(observations, robust.residuals)
+        own = corner_weights(observations, robust.residuals)
 
     def fit(left: list[int], rejected: Tensor) -> tuple[HybridFit, Tensor]:
         some, weights = pixels[left], own[left]

@@ -16,6 +16,8 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.hybrid.board_modes import board_modes
+from kcal.calibrate.problem.poses import poses_under
+from kcal.calibrate.problem.views import Views
 from kcal.corners.board import Board
 from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
@@ -23,6 +25,7 @@ from kcal.lens.paraxial import paraxial_focal
 from kcal.lens.pose import rotation_from_vector, step_rows
 from kcal.lens.projection import project_components
 from kcal.lens.uncertainty import pixel_covariance, pixel_slopes
+from kcal.solve.lm import LMOptions
 
 T = TypeVar("T")
 
@@ -125,13 +128,14 @@ def far_sigma(camera: Camera) -> float:
     return math.sqrt(float(variances.nanmean()))
 
 
-def next_view(camera: Camera, board: Board, noise: float) -> NextView | None:
+def next_view(camera: Camera, board: Board, noise: float, taken: Tensor | None = None) -> NextView | None:
     """The view that reduces the uncertainty of far directions most.
 
     Args:
         camera: with its calibration.
         board: that is photographed.
         noise: of its corners along an axis, pixels.
+        taken: corners (V, N, 2) of views that the calibration does not know yet, NaN where one was not seen.
 
     Returns:
         None for a camera without error bars, or whose image no board fits into.
@@ -140,9 +144,10 @@ def next_view(camera: Camera, board: Board, noise: float) -> NextView | None:
     views = possible_views(camera, board)
     if known is None or not views.words:
         return None
-    half = known.half()
+    half, shapes = known.half(), board_modes(board.points).shapes
+    if taken is not None and len(taken):
+        half = _half_after(camera, known, board.points, shapes, half, taken, noise)
     slopes = _image_slopes(camera, known) @ half.T
-    shapes = board_modes(board.points).shapes
     gains = []
     for rotation, translation in zip(views.rotation, views.translation, strict=True):
         rows = _view_rows(camera, known, board.points, shapes, rotation, translation) @ half.T / noise
@@ -152,6 +157,20 @@ def next_view(camera: Camera, board: Board, noise: float) -> NextView | None:
     best = max(range(len(gains)), key=gains.__getitem__)
     sigma = math.sqrt(max(float(slopes.square().sum()) - gains[best], 0.0) / len(slopes))
     return NextView(views.rotation[best], views.translation[best], views.pixels[best], views.words[best], sigma)
+
+
+def _half_after(
+    camera: Camera, known: CameraInformation, points: Tensor, shapes: Tensor, half: Tensor, taken: Tensor, noise: float
+) -> Tensor:
+    """The half of the covariance after these views as well, each in the pose in which this camera sees it."""
+    poses, _ = poses_under(camera, Views(board_points=points, pixels=taken), LMOptions())
+    for pixels, rotation, translation in zip(taken, poses.rotation, poses.translation, strict=True):
+        seen = torch.isfinite(pixels).all(-1)
+        if bool(torch.isfinite(rotation).all()):
+            rows = _view_rows(camera, known, points[seen], shapes[..., seen], rotation, translation) @ half.T / noise
+            lower = torch.linalg.cholesky(torch.eye(rows.shape[1], dtype=rows.dtype) + rows.T @ rows)
+            half = torch.linalg.solve_triangular(lower, half, upper=False)
+    return half
 
 
 def _kept(items: Sequence[T], good: Tensor) -> list[T]:

@@ -32,6 +32,8 @@ class RefittedCamera:
         largest: largest ‖e‖.
         covered: share of the image that was fitted: without what the original camera has no ray for, and without what
             the model cannot show.
+        width: (5 + P,) standard deviations of the weak prior on the coefficients; infinite for what has none. None: no
+            prior.
 
     Example:
         >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480), coefficients=[-0.1, 0.01])
@@ -43,6 +45,7 @@ class RefittedCamera:
     rms: float
     largest: float
     covered: float
+    width: Tensor | None = None
 
 
 def refit_camera(
@@ -111,4 +114,5 @@ def refit_camera(
         rms=float(error.square().mean().sqrt()),
         largest=float(error.max()),
         covered=float(shown.sum()) / len(pixels),
+        width=torch.full_like(found.params, math.inf).index_put((prior.index,), _NOISE / prior.weight),
     )

@@ -7,10 +7,10 @@ import math
 import torch
 from torch import Tensor
 
-from kcal.calibrate.hybrid.base_fit import Estimate
 from kcal.calibrate.hybrid.board_modes import STRETCH, BoardModes
 from kcal.calibrate.hybrid.evidence_rounds import Rounds, expected_estimate
 from kcal.calibrate.hybrid.families import BOARD, Hyperprior, PriorFamilies
+from kcal.calibrate.hybrid.fitted_views import Estimate
 from kcal.calibrate.hybrid.quadratic import posterior_root
 
 # Stretch that a print may have whatever this board's amplitude is, in units of its extent to each side: one tenth of a

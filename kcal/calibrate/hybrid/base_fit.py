@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from kcal.calibrate.hybrid.board_modes import BoardModes
 from kcal.calibrate.hybrid.families import PriorFamilies, prior_families, typical_hyperprior
+from kcal.calibrate.hybrid.fitted_views import NO_MOTION, Estimate, FittedViews
 from kcal.calibrate.hybrid.fleet import LensPrior
-from kcal.calibrate.hybrid.unknowns import hybrid_problem, hybrid_unknowns
-from kcal.calibrate.problem.board_problem import BoardProblem
+from kcal.calibrate.hybrid.unknowns import hybrid_unknowns
 from kcal.calibrate.problem.closed_form import homographies, poses_from_homographies
 from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.views import LEAST_NOISE
@@ -24,8 +24,6 @@ from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.model import LensModel
 from kcal.lens.zernike import ZernikeModes
 from kcal.solve.lm import LMOptions, minimize
-from kcal.solve.result import Result
-from kcal.solve.robust import RobustLoss
 
 # R in half diagonals: the disc on which fields live reaches a little beyond the image's corners.
 _REACH = 1.08
@@ -41,20 +39,6 @@ _PINHOLE = torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=torch.float64)
 _DOUBT = 2.0
 # A field that is held at zero, as small as there is one.
 _NO_FIELD = ZernikeModes(radial=0, decentered=0, astigmatic=1, other=0)
-# The logarithms of motions' standard deviations over the noise, of views that stand still.
-NO_MOTION = np.zeros(0)
-
-
-class Estimate(NamedTuple):
-    """Where a fit stands."""
-
-    model: LensModel
-    families: PriorFamilies
-    state: BoardState
-    hyperparameters: Tensor
-    log_ratio: np.ndarray
-    variance: float
-    tempering: float
 
 
 class Base(NamedTuple):
@@ -89,7 +73,6 @@ def fit_projection(
     weights: Tensor,
     square: bool = True,
     known_focal: float | None = None,
-    robust: bool = False,
     *,
     exact_focal: bool = False,
 ) -> Base:
@@ -105,7 +88,6 @@ def fit_projection(
         weights: (V, N) by which residuals are multiplied.
         square: whether pixels are square.
         known_focal: roughly, pixels; None: it is found.
-        robust: bound the weight of corners that are far off.
         exact_focal: `known_focal` is not changed.
 
     Raises:
@@ -124,115 +106,104 @@ def fit_projection(
         >>> round(base.focal, 1), abs(base.shape - 1.0) < 1e-2  # a perspective image
         (800.0, True)
     """
+    capture = FittedViews(
+        points=points,
+        board=_no_modes(points),
+        pixels=pixels,
+        size=size,
+        weights=weights,
+        readout=None,
+        square=square,
+        robust=False,
+        exact=True,
+    )
+    return _base_of(capture, known_focal, exact_focal)
+
+
+def _no_modes(points: Tensor) -> BoardModes:
+    """No modes."""
+    return BoardModes(points.new_zeros(0, 3, len(points)), points.new_zeros(0), torch.zeros(0, dtype=torch.long))
+
+
+def _base_of(capture: FittedViews, known_focal: float | None, exact_focal: bool = False) -> Base:
+    pixels, weights = capture.pixels, capture.weights
     # Of many views some tell which projection it is; the poses of all follow from it.
     some = slice(None, None, 1 + (len(pixels) - 1) // _VIEWS)
-    base = _fit_some(points, pixels[some], size, weights[some], square, known_focal, robust, exact_focal)
+    few = dataclasses.replace(capture, pixels=pixels[some], weights=weights[some])
+    base = _fit_projection(few, known_focal, exact_focal)
     if len(base.state.rotation) == len(pixels):
         return base
-    seen = torch.isfinite(pixels).all(-1) & (weights > 0)
     params = base.state.parameters
-    offset = torch.where(seen[..., None], pixels - params[2:4], 0.0)
+    offset = torch.where(capture.seen[..., None], pixels - params[2:4], 0.0)
     if base.aspect is not None:
         offset = offset / torch.tensor([1.0, base.aspect], dtype=torch.float64)
-    ideal, usable = _through_base(offset, seen, base.focal, base.shape)
+    ideal, usable = _through_base(offset, capture.seen, base.focal, base.shape)
     if bool((usable.sum(-1) < _FEWEST).any()):
-        return _fit_some(points, pixels, size, weights, square, known_focal, robust, exact_focal)
-    poses = poses_from_homographies(homographies(points, ideal), _PINHOLE)
+        return _fit_projection(capture, known_focal, exact_focal)
+    poses = poses_from_homographies(homographies(capture.points, ideal), _PINHOLE)
     state = base.state._replace(rotation=poses[0], translation=poses[1], motion=pixels.new_zeros(len(pixels), 0))
     return base._replace(state=state)
 
 
-def _fit_some(
-    points: Tensor,
-    pixels: Tensor,
-    size: tuple[int, int],
-    weights: Tensor,
-    square: bool,
-    known_focal: float | None,
-    robust: bool,
-    exact_focal: bool,
-) -> Base:
-    focal, shape, rotation, translation = _base_start(points, pixels, size, weights, known_focal, None, exact_focal)
-    flat = BoardModes(points.new_zeros(0, 3, len(points)), points.new_zeros(0), torch.zeros(0, dtype=torch.long))
-    state = BoardState.still(points.new_zeros(0), flat.unit, rotation, translation)
-    base = Base(focal, shape, None if square else 1.0, state, 0.0, 0)
+def _fit_projection(capture: FittedViews, known_focal: float | None, exact_focal: bool) -> Base:
+    focal, shape, rotation, translation = _base_start(capture, known_focal, None, exact_focal)
+    flat = capture.board
+    state = BoardState.still(flat.unit, flat.unit, rotation, translation)
+    base = Base(focal, shape, None if capture.square else 1.0, state, 0.0, 0)
     h = typical_hyperprior(_NO_FIELD).mean
     for _ in range(6):
-        model, families = _with_constants(base, size, _NO_FIELD, flat)
+        model, families = _with_constants(base, capture.size, _NO_FIELD, flat)
         state = base.state
         if not len(state.parameters):
             state = state._replace(parameters=_leading(model, base.focal, families))
-        held = _held(families, flat, square, exact_focal)
-        problem, result = _solve_base(points, pixels, weights, (model, families), state, h, held, robust, flat)
-        state = result.state
+        state, variance, steps = _solve_base(capture, model, families, state, h, exact_focal)
         scale, bend = float(state.parameters[0]) / base.focal - 1.0, float(state.parameters[5])
         base = Base(
             float(state.parameters[0]),
             base.shape + min(max(bend, -1.0), 1.0),
-            None if square else float(state.parameters[1]) / float(state.parameters[0]),
+            None if capture.square else float(state.parameters[1]) / float(state.parameters[0]),
             state._replace(parameters=torch.cat([state.parameters[:5], torch.zeros_like(state.parameters[5:])])),
-            _residual_variance(problem, result),
-            base.steps + int(result.iterations),
+            variance,
+            base.steps + steps,
         )
         if not (0 < base.focal < math.inf and abs(base.shape) <= 10 and 0.1 < (base.aspect or 1.0) < 10):
             raise DegenerateError(
                 "the views do not determine the focal length: they are parallel to the image or too similar; add views "
                 "with the board tilted by 30 to 45 degrees in different directions"
             )
-        if not robust and abs(scale) < 1e-3 and abs(bend) < 1e-3 * (1 + abs(base.shape)):
+        if not capture.robust and abs(scale) < 1e-3 and abs(bend) < 1e-3 * (1 + abs(base.shape)):
             break
     return base
 
 
 def fit_base(
-    points: Tensor,
-    pixels: Tensor,
-    size: tuple[int, int],
-    weights: Tensor,
-    modes: FieldModes,
-    board: BoardModes,
-    square: bool,
-    known_focal: float | None,
-    robust: bool,
-    h: Tensor,
-    lens: LensPrior | None,
+    capture: FittedViews, modes: FieldModes, known_focal: float | None, h: Tensor, lens: LensPrior | None
 ) -> tuple[Estimate, int]:
     """Fit the base projection alone: its focal length and shape become constants of the lens. Also the trial steps."""
+    board = capture.board
     if lens is not None:
-        return _fit_known(points, pixels, size, weights, board, square, robust, h, lens)
-    base = fit_projection(points, pixels, size, weights, square, known_focal, robust)
-    model, families = _with_constants(base, size, modes, board)
+        return _fit_known(capture, h, lens)
+    base = _base_of(dataclasses.replace(capture, board=_no_modes(capture.points), readout=None), known_focal)
+    model, families = _with_constants(base, capture.size, modes, board)
     params = torch.zeros(5 + model.size, dtype=torch.float64)
     params[:5] = base.state.parameters[:5]
     state = base.state._replace(parameters=params, board=torch.zeros_like(board.unit))
     return Estimate(model, families, state, h, NO_MOTION, base.variance, 1.0), base.steps
 
 
-def _fit_known(
-    points: Tensor,
-    pixels: Tensor,
-    size: tuple[int, int],
-    weights: Tensor,
-    board: BoardModes,
-    square: bool,
-    robust: bool,
-    h: Tensor,
-    lens: LensPrior,
-) -> tuple[Estimate, int]:
+def _fit_known(capture: FittedViews, h: Tensor, lens: LensPrior) -> tuple[Estimate, int]:
     """Likewise for a camera of a known type, whose constants and typical field are given."""
-    _, _, rotation, translation = _base_start(points, pixels, size, weights, None, lens)
-    aspect = None if square else 1.0
+    _, _, rotation, translation = _base_start(capture, None, lens)
+    aspect = None if capture.square else 1.0
     distance = float(translation.norm(dim=-1).median())
-    families = lens.families(prior_families(lens.form, lens.focal, board, size, distance, aspect))
+    families = lens.families(prior_families(lens.form, lens.focal, capture.board, capture.size, distance, aspect))
     model = LensModel(hybrid=lens.form)
     params = _leading(model, lens.focal, families)
-    unknowns = hybrid_unknowns(model, square)
-    params[list(unknowns.indices)] = unknowns.expand(lens.mean)
-    state = BoardState.still(params, torch.zeros_like(board.unit), rotation, translation)
-    held = _held(families, board, square, False)
-    problem, result = _solve_base(points, pixels, weights, (model, families), state, h, held, robust, board)
-    estimate = Estimate(model, families, result.state, h, NO_MOTION, _residual_variance(problem, result), 1.0)
-    return estimate, int(result.iterations)
+    unknowns = hybrid_unknowns(model, capture.square)
+    params[list(unknowns.indices)] = unknowns.expand(lens.unknowns.mean)
+    state = BoardState.still(params, torch.zeros_like(capture.board.unit), rotation, translation)
+    state, variance, steps = _solve_base(dataclasses.replace(capture, readout=None), model, families, state, h, False)
+    return Estimate(model, families, state, h, NO_MOTION, variance, 1.0), steps
 
 
 def _with_constants(
@@ -251,66 +222,33 @@ def _leading(model: LensModel, focal: float, families: PriorFamilies) -> Tensor:
     return params
 
 
-def _held(families: PriorFamilies, board: BoardModes, square: bool, focal: bool) -> Tensor:
-    """(S,) all unknowns but focal length, principal point and shape: field, pupil and board are held."""
-    held = torch.ones(len(families.mean), dtype=torch.bool)
-    held[int(focal) : 4] = False
-    if not square:
-        held[-1 - len(board.unit)] = False
-    return held
-
-
 def _solve_base(
-    points: Tensor,
-    pixels: Tensor,
-    weights: Tensor,
-    lens: tuple[LensModel, PriorFamilies],
-    state: BoardState,
-    h: Tensor,
-    held: Tensor,
-    robust: bool,
-    board: BoardModes,
-) -> tuple[BoardProblem, Result[BoardState]]:
-    """Solve for what is not held, and for poses; pixels are square if the lens has no focal length of the rows."""
-    model, families = lens
-    square = len(families.mean) == len(hybrid_unknowns(model)) + len(board.unit)
-    precision = torch.where(held, torch.inf, families.deviation(h).square().reciprocal())
-    problem = hybrid_problem(points, board.shapes, pixels, weights, model, families.mean, precision, square=square)
-    if robust:
-        problem = problem.with_weights(cauchy_weights(problem, state, weights))
-    return problem, minimize(problem, state, LMOptions(max_iterations=15, tolerance=1e-6, initial_damping=1e-6))
+    capture: FittedViews, model: LensModel, families: PriorFamilies, state: BoardState, h: Tensor, exact_focal: bool
+) -> tuple[BoardState, float, int]:
+    """Solve for poses, focal length, principal point and shape; field, pupil and board are held.
 
-
-def _residual_variance(problem: BoardProblem, result: Result[BoardState]) -> float:
-    freedom = 2 * int(problem.seen.sum()) - 6 * len(problem.seen)
-    return max(2.0 * float(result.cost) / freedom, LEAST_NOISE**2)
-
-
-def cauchy_weights(problem: BoardProblem, state: BoardState, weights: Tensor) -> Tensor:
-    """(V, N) weights of a Cauchy loss at a state, its scale three robust standard deviations; 0 without an image."""
-    length = (problem.pixel_errors(state) * weights[:, None]).norm(dim=1)
-    shown = torch.isfinite(length) & problem.seen
-    # Of two normal components, the median length is 1.18 standard deviations.
-    scale = max(3.0 * float(length[shown].median()) / 1.18, LEAST_NOISE)
-    return torch.where(shown, weights * RobustLoss(kind="cauchy", scale=scale).weight(length.square()).sqrt(), 0.0)
+    Returns:
+        the state, the variance of residuals along an axis, px², and the trial steps.
+    """
+    held = torch.ones(len(families.mean), dtype=torch.bool)
+    held[int(exact_focal) : 4] = False
+    if not capture.square:
+        held[-1 - len(capture.board.unit)] = False
+    problem = capture.problem(Estimate(model, families, state, h, NO_MOTION, 1.0, 1.0), held)
+    found = minimize(problem, state, LMOptions(max_iterations=15, tolerance=1e-6, initial_damping=1e-6))
+    return found.state, max(2.0 * float(found.cost) / capture.freedom, LEAST_NOISE**2), int(found.iterations)
 
 
 def _base_start(
-    points: Tensor,
-    pixels: Tensor,
-    size: tuple[int, int],
-    weights: Tensor,
-    known: float | None,
-    lens: LensPrior | None,
-    exact: bool = False,
+    capture: FittedViews, known: float | None, lens: LensPrior | None, exact: bool = False
 ) -> tuple[float, float, Tensor, Tensor]:
     """Focal length, shape and poses: the base projection, among several, under which homographies fit best.
 
     A roughly known focal length is taken unless another one fits clearly better; an exact one is taken.
     """
-    seen = torch.isfinite(pixels).all(-1) & (weights > 0)
+    points, size, seen = capture.points, capture.size, capture.seen
     middle = torch.tensor([(size[0] - 1) / 2, (size[1] - 1) / 2], dtype=torch.float64)
-    offset = torch.where(seen[..., None], pixels - middle, 0.0)
+    offset = torch.where(seen[..., None], capture.pixels - middle, 0.0)
     half = 0.5 * math.hypot(*size)
     best: tuple[float, float, float, Tensor] | None = None
     angles = torch.tensor(_CORNERS, dtype=torch.float64).deg2rad()

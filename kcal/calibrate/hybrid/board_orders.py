@@ -13,8 +13,9 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.hybrid.board_modes import board_modes, undetermined_modes
-from kcal.calibrate.hybrid.board_prior import BoardPrior
 from kcal.corners.board import Board
+from kcal.gaussian import Gaussian, numbered
+from kcal.lens.information import BOARD_SLOT
 
 # Nats that turned views must gain, beyond the choices that there were: by chance they do once in e^10 = 22,000 times.
 # Measured: one turned view of a printed board gains 79 and more.
@@ -56,7 +57,14 @@ def mode_turn(turns: int) -> Tensor:
     return torch.linalg.lstsq(basis, turned).solution[: len(shapes)].round()
 
 
-def find_turns(rows: Tensor, board: Board, prior: BoardPrior, lens_deviation: Tensor, variance: float) -> Tensor:
+def turned(message: Gaussian, turns: int) -> Gaussian:
+    """What is said of a board and of whatever else, about the amplitudes after quarter turns of the board."""
+    change = mode_turn(turns).T
+    board = numbered(BOARD_SLOT, len(change))
+    return message.replaced(board, change.new_zeros(len(change)), change, board)
+
+
+def find_turns(rows: Tensor, board: Board, prior: Gaussian, lens_deviation: Tensor, variance: float) -> Tensor:
     """(V,) quarter turns of each view that bring all onto one board; none if that gains little.
 
     Lens, board and the orders are sought together: in turn, lens and board are solved for, and each view takes the
@@ -71,13 +79,14 @@ def find_turns(rows: Tensor, board: Board, prior: BoardPrior, lens_deviation: Te
     """
     turns = quarter_turns(board)
     views, size = len(rows), rows.shape[1]
-    if len(turns) == 1 or not bool(prior.half.any()):
+    if len(turns) == 1:
         return torch.zeros(views, dtype=torch.long)
     lens = len(lens_deviation)
+    mean, half = prior.mean_and_half()
     # Of (z, -1), with lens and board = affine functions of z, whose prior is a standard normal.
     affine = torch.zeros(size, size, dtype=rows.dtype)
     affine[range(lens), range(lens)] = lens_deviation
-    affine[lens:-1, lens:-1], affine[lens:-1, -1], affine[-1, -1] = prior.half.T, -prior.mean, 1.0
+    affine[lens:-1, lens:-1], affine[lens:-1, -1], affine[-1, -1] = half.T, -mean, 1.0
     parts = []
     for turn in turns:
         # A view that is to be turned shows the board turned back.
@@ -113,7 +122,7 @@ def find_turns(rows: Tensor, board: Board, prior: BoardPrior, lens_deviation: Te
     assert best is not None
     evidence, orders = best
     found = torch.tensor(turns)[orders]
-    if not bool(prior.mean.any()):
+    if not bool(mean.any()):
         # All views turned alike are the same board, turned: most views stay as they were read.
         found = (found - found.mode().values) % 4
     count = int((found > 0).sum())

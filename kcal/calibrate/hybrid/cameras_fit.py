@@ -15,14 +15,15 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.hybrid.board_groups import compared, grouped, others_of
-from kcal.calibrate.hybrid.board_prior import BoardPrior, multiplied, printed_board, told_by_others
-from kcal.calibrate.hybrid.families import Hyperprior, typical_hyperprior
+from kcal.calibrate.hybrid.board_prior import BoardPrior, printed_board
+from kcal.calibrate.hybrid.families import typical_hyperprior
 from kcal.calibrate.hybrid.fit import HybridFit
 from kcal.calibrate.hybrid.fleet import LEAST_CAMERAS, LensPrior, fleet_priors, typical_lens
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard
 from kcal.calibrate.hybrid.turned_fit import CameraFit, Shape, fit_turned
 from kcal.corners.observations import Observations
 from kcal.errors import InputError
+from kcal.gaussian import stacked
 from kcal.lens.zernike import ZernikeModes
 
 # Calls a function for each of the numbered argument lists; numbers and results come in any order.
@@ -106,7 +107,7 @@ def fit_cameras(
     cameras = [begun[i] for i in each]
     fitted = [camera.turns for camera in cameras]
     if known is not None:
-        cameras = [compared(camera, known, seen.board) for camera, seen in zip(cameras, sets, strict=True)]
+        cameras = [compared(camera, known.own, seen.board) for camera, seen in zip(cameras, sets, strict=True)]
     elif alone == "printed":
         cameras = grouped(cameras, [seen.board for seen in sets])
     fleet = one_type and len(sets) >= LEAST_CAMERAS
@@ -122,7 +123,7 @@ def fit_cameras(
             shape = alone if known is None else known
             if shape == "printed" and same is not None:
                 base, _ = printed_board(camera.fit.board_shapes, [camera.message, same])
-                shape = told_by_others(base, same)
+                shape = BoardPrior(base, same)
             if fleet or shape is not alone:
                 # Views that were turned since, and lenses of another form, have other unknowns.
                 kept = lenses[i] is None and torch.equal(camera.turns, fitted[i])
@@ -187,15 +188,13 @@ def _begun_fleet(cameras: Sequence[CameraFit]) -> LensPrior:
     assert form is not None
     hyperprior, _ = fleet_priors([camera.hyper for camera in cameras], typical_hyperprior())
     usual = typical_lens(form, middle.families, hyperprior.mean, middle.square)
-    return LensPrior(form, float(middle.families.mean[0]), usual.mean, usual.sd)
+    return LensPrior(form, float(middle.families.mean[0]), usual)
 
 
 def _learned_fleet(cameras: Sequence[CameraFit], typical: LensPrior) -> tuple[LensPrior, list[LensPrior]]:
     """The lens of the next camera, and each camera's from all others: what a camera tells does not enter its prior."""
-    following, each = fleet_priors([camera.lens for camera in cameras], Hyperprior(typical.mean, typical.sd))
-    return typical._replace(mean=following.mean, sd=following.sd), [
-        typical._replace(mean=prior.mean, sd=prior.sd) for prior in each
-    ]
+    following, each = fleet_priors([camera.lens for camera in cameras], typical.unknowns)
+    return typical._replace(unknowns=following), [typical._replace(unknowns=prior) for prior in each]
 
 
 def _measured(
@@ -205,14 +204,14 @@ def _measured(
     members = [i for i, camera in enumerate(cameras) if camera.board == index]
     messages = [cameras[i].message for i in members]
     prior, log_evidence = printed_board(cameras[members[0]].fit.board_shapes, messages)
-    found = multiplied(prior, messages).board
+    mean, half = stacked([prior, *messages]).mean_and_half()
     # Against the likelihood of a board without amplitudes.
-    flat = -0.5 * sum(float(message.target.square().sum()) for message in messages)
+    flat = -0.5 * float(stacked(messages).placed(prior.slots, torch.zeros_like(mean)).products[-1, -1])
     return MeasuredBoard(
         name=names[members[0]],
         board=sets[members[0]].board,
-        amplitudes=found.mean,
-        half=found.half,
+        amplitudes=mean,
+        half=half,
         log_evidence=log_evidence - flat,
         observations=tuple(names[i] for i in members),
     )

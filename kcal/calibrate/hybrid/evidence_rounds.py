@@ -12,15 +12,11 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.hybrid.amplitudes import expected_maximum
-from kcal.calibrate.hybrid.base_fit import NO_MOTION, Estimate, cauchy_weights
-from kcal.calibrate.hybrid.board_modes import BoardModes
 from kcal.calibrate.hybrid.evidence import WORTH, Maximum, evidence_of_motion, maximize_evidence
 from kcal.calibrate.hybrid.families import Hyperprior
-from kcal.calibrate.hybrid.quadratic import ViewData, overdispersion, view_data
-from kcal.calibrate.hybrid.unknowns import hybrid_problem
-from kcal.calibrate.problem.board_problem import BoardProblem
-from kcal.calibrate.problem.readout import AMPLITUDES, LARGEST, MOTION, Readout, motion_sigma, stillness
-from kcal.solve.lm import LMOptions, minimize
+from kcal.calibrate.hybrid.fitted_views import NO_MOTION, Estimate, FittedViews
+from kcal.calibrate.hybrid.quadratic import ViewData, overdispersion
+from kcal.calibrate.problem.readout import AMPLITUDES, LARGEST, MOTION, Readout, motion_sigma
 
 _ROUNDS = 12
 # Rounds after which views stand still if motion gains nothing.
@@ -39,77 +35,6 @@ _NEAR_REST = 0.3
 # With which motions begin: as a hand moves. From that of still views, field and board explain the motion first, and
 # the evidence has another maximum there (one of sixty simulated captures by hand).
 _MOVING = 3e-3
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class FittedViews:
-    """What a camera is fitted to.
-
-    Args:
-        points: (N, 3) the board as it was before, meters.
-        board: how it may differ.
-        pixels: (V, N, 2), NaN where not seen.
-        weights: (V, N) by which residuals are multiplied.
-        readout: how views move while they are read; None: they stand still.
-        square: whether pixels are square.
-        robust: bound the weight of corners that are far off.
-        exact: the board does not differ.
-    """
-
-    points: Tensor
-    board: BoardModes
-    pixels: Tensor
-    weights: Tensor
-    readout: Readout | None
-    square: bool
-    robust: bool
-    exact: bool
-
-    @property
-    def seen(self) -> Tensor:
-        """(V, N)."""
-        return torch.isfinite(self.pixels).all(-1) & (self.weights > 0)
-
-    @property
-    def freedom(self) -> int:
-        """Residuals without those that poses take up."""
-        return 2 * int(self.seen.sum()) - 6 * len(self.pixels)
-
-    def problem(self, estimate: Estimate, never: Tensor) -> BoardProblem:
-        """The least squares at amplitudes of an estimate; unknowns of which `never` is true are held."""
-        deviation = estimate.families.deviation(estimate.hyperparameters)
-        precision = torch.where(never, torch.inf, estimate.variance / deviation.square())
-        problem = hybrid_problem(
-            self.points,
-            self.board.shapes,
-            self.pixels,
-            self.weights,
-            estimate.model,
-            estimate.families.mean,
-            precision,
-            self.readout,
-            stillness(estimate.log_ratio),
-            self.square,
-        )
-        if self.robust:
-            return problem.with_weights(cauchy_weights(problem, estimate.state, self.weights))
-        return problem
-
-    def solved(
-        self, estimate: Estimate, never: Tensor, effort: tuple[int, float]
-    ) -> tuple[BoardProblem, Estimate, int]:
-        """The problem, the estimate with its solution, and the trial steps."""
-        problem = self.problem(estimate, never)
-        steps, gain = effort
-        options = LMOptions(max_iterations=steps, tolerance=gain / self.freedom, initial_damping=1e-6)
-        result = minimize(problem, estimate.state, options)
-        return problem, estimate._replace(state=result.state), int(result.iterations)
-
-    def data(self, problem: BoardProblem, estimate: Estimate, never: Tensor) -> ViewData:
-        """What the views say near an estimate."""
-        off, motion = problem.motion_off_poses(estimate.state), estimate.state.motion
-        off[:, motion.shape[1] : -1][:, never] = 0.0
-        return view_data(off, problem.unknowns(estimate.state) - estimate.families.mean, motion, self.freedom)
 
 
 class Rounds(NamedTuple):

@@ -13,12 +13,11 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.hybrid.aspect import square_pixels, with_square_pixels
-from kcal.calibrate.hybrid.base_fit import Estimate, fit_base
+from kcal.calibrate.hybrid.base_fit import fit_base
 from kcal.calibrate.hybrid.board_modes import BoardModes, board_modes
 from kcal.calibrate.hybrid.board_prior import BoardPrior
 from kcal.calibrate.hybrid.evidence_rounds import (
     LAST,
-    FittedViews,
     Rounds,
     columns_may_be_read,
     expected_estimate,
@@ -26,10 +25,12 @@ from kcal.calibrate.hybrid.evidence_rounds import (
     run_rounds,
 )
 from kcal.calibrate.hybrid.families import LEADING_UNKNOWNS, Hyperprior, PriorFamilies, typical_hyperprior
+from kcal.calibrate.hybrid.fitted_views import Estimate, FittedViews
 from kcal.calibrate.hybrid.fleet import LensPrior
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard
 from kcal.calibrate.hybrid.quadratic import posterior_root, quadratic_of
-from kcal.calibrate.hybrid.unknowns import hybrid_unknowns
+from kcal.calibrate.hybrid.unknowns import hybrid_problem, hybrid_unknowns
+from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.information import information_of
 from kcal.calibrate.problem.readout import MotionSigma, Readout, motion_sigma, stillness, widening
 from kcal.calibrate.problem.state import BoardState
@@ -131,6 +132,13 @@ class HybridFit:
         """Standard deviations of motions; None where views stand still."""
         return motion_sigma(self.log_ratio, self.sigma**2 / self.tempering) if self.readout else None
 
+    def problem(self, points: Tensor, pixels: Tensor, weights: Tensor, mean: Tensor, precision: Tensor) -> BoardProblem:
+        """The least squares of this lens, board and motion with other data and priors; see `hybrid_problem`."""
+        shapes = self.board_shapes.shapes
+        return hybrid_problem(
+            points, shapes, pixels, weights, self.model, mean, precision, self.readout, self.stillness, self.square
+        )
+
     def residuals_of(self, pixels: Tensor) -> Tensor:
         """(V, N, 2) as `residuals`, of any corners of the same views; infinite where the lens has no image of one."""
         state, points = self.state, self.board_points.T.expand(len(pixels), 3, -1)
@@ -161,11 +169,7 @@ class HybridFit:
     def covariance(self) -> Tensor:
         """(5 + P, 5 + P) of the camera's parameters in the order of `Camera.names`: fx and fy alike, skew held."""
         unknowns = hybrid_unknowns(self.model, self.square)
-        count = len(self.state.parameters)
-        onto = self.half.new_zeros(len(self.half), count)
-        onto[list(unknowns.slots), list(unknowns.indices)] = 1.0
-        root = self.half @ onto
-        return root.T @ root
+        return unknowns.by_parameter(self.half.T @ self.half, len(self.state.parameters))
 
 
 def fit_hybrid(
@@ -227,6 +231,7 @@ def fit_hybrid(
         points=points,
         board=shown,
         pixels=pixels,
+        size=size,
         weights=weights,
         readout=_readout(ordered, size) if start is None and motion else start.readout if start else None,
         square=start.square if start is not None else lens.square if lens is not None else square is True,
@@ -244,9 +249,7 @@ def fit_hybrid(
         return rounds, held
 
     def begin(capture: FittedViews) -> tuple[Rounds, Tensor]:
-        estimate, steps = fit_base(
-            points, pixels, size, weights, modes, shown, capture.square, focal, robust, hyperprior.mean, lens
-        )
+        estimate, steps = fit_base(capture, modes, focal, hyperprior.mean, lens)
         progress("base projection")
         if capture.readout is not None:
             distance = float(estimate.state.translation.norm(dim=-1).median())
@@ -257,7 +260,7 @@ def fit_hybrid(
     if start is not None:
         state = start.state
         if isinstance(board, BoardPrior):
-            state = state._replace(board=torch.zeros_like(board.mean))
+            state = state._replace(board=torch.zeros_like(board.own.at))
         estimate = Estimate(
             start.model,
             start.families.with_board(shown),
@@ -314,9 +317,10 @@ def fit_hybrid(
     half = math.sqrt(wider) * inverse * deviation
     information = information_of(problem, state, math.sqrt(wider * variance), off)
     if isinstance(board, BoardPrior):
-        state = state._replace(board=board.mean + state.board @ board.half)
+        mean, root = board.whole.mean_and_half()
+        state = state._replace(board=mean + state.board @ root)
         information = board.in_modes(information, state.board)
-        half = torch.cat([half[:, : -len(board.mean)], half[:, -len(board.mean) :] @ board.half], 1)
+        half = torch.cat([half[:, : -len(mean)], half[:, -len(mean) :] @ root], 1)
     return HybridFit(
         model=model,
         size=size,

@@ -1,6 +1,6 @@
 """What cameras of one type have in common, learned from each other: first amplitudes, then the lens itself.
 
-Each camera's data are a Gaussian likelihood of its unknowns x: hyperparameters near their best, or lens coefficients.
+Each camera's data are a Gaussian of its unknowns x: hyperparameters near their best, or lens coefficients.
 Over the cameras x is normal with unknown mean and spread, found by expectation maximization (empirical Bayes: Efron
 and Morris 1973). What the next camera may expect has the spread of Student's t, as a variance from few samples asks.
 """
@@ -18,6 +18,7 @@ from torch import Tensor
 from kcal.calibrate.hybrid.evidence import negative_log_evidence
 from kcal.calibrate.hybrid.families import LEADING_UNKNOWNS, Hyperprior, PriorFamilies
 from kcal.calibrate.hybrid.quadratic import Quadratic
+from kcal.gaussian import Gaussian, numbered
 from kcal.lens.hybrid_terms import HybridForm
 
 # Fewer tell no spread.
@@ -29,49 +30,35 @@ _LEAST_SPREAD = 0.1
 _FOCAL = 0.05
 
 
-class Likelihood(NamedTuple):
-    """exp(-½ xᵀ information x + vectorᵀ x) of a camera's unknowns.
-
-    Attributes:
-        information: (X, X).
-        vector: (X,).
-    """
-
-    information: Tensor
-    vector: Tensor
-
-
 class LensPrior(NamedTuple):
     """What is known of a camera's lens before it is calibrated.
 
     Attributes:
         form: constants of the lens.
         focal: F₀, pixels.
-        mean: (L,) of the unknowns: focal length, principal point, coefficients; the focal length of the rows too where
-            pixels are not square.
-        sd: (L,) standard deviations.
+        unknowns: (L,) focal length, principal point, coefficients; the focal length of the rows too where pixels are
+            not square.
     """
 
     form: HybridForm
     focal: float
-    mean: Tensor
-    sd: Tensor
+    unknowns: Hyperprior
 
     @property
     def square(self) -> bool:
         """Whether pixels are square."""
-        return len(self.mean) == LEADING_UNKNOWNS + len(self.form.modes)
+        return len(self.unknowns.mean) == LEADING_UNKNOWNS + len(self.form.modes)
 
     def families(self, usual: PriorFamilies) -> PriorFamilies:
         """Priors with this lens, and the board of others."""
-        own = torch.arange(len(usual.mean)) < len(self.mean)
+        own = torch.arange(len(usual.mean)) < len(self.unknowns.mean)
         mean, log_unit = usual.mean.clone(), usual.log_unit.clone()
-        mean[own], log_unit[own] = self.mean, self.sd.log()
+        mean[own], log_unit[own] = self.unknowns.mean, self.unknowns.sd.log()
         amplitude, decay = (torch.where(own, -1, index) for index in (usual.amplitude, usual.decay))
         return PriorFamilies(mean, log_unit, amplitude, decay, usual.degree)
 
 
-def hyper_likelihood(data: Quadratic, families: PriorFamilies, h: Tensor, variance: float) -> Likelihood:
+def hyper_likelihood(data: Quadratic, families: PriorFamilies, h: Tensor, variance: float) -> Gaussian:
     """What the data of a camera say about its hyperparameters, near h (H,); the noise is maximized over.
 
     Args:
@@ -89,15 +76,15 @@ def hyper_likelihood(data: Quadratic, families: PriorFamilies, h: Tensor, varian
     hessian = torch.from_numpy((up - down) / (2 * step))
     hessian = 0.5 * (hessian + hessian.T)
     information = hessian[:-1, :-1] - torch.outer(hessian[:-1, -1], hessian[-1, :-1]) / hessian[-1, -1]
+    slope = torch.from_numpy(negative_log_evidence(data, families, at)[1][:-1])
     # Far from where the data say anything the likelihood bends the wrong way: nothing is known there.
     values, vectors = torch.linalg.eigh(information)
-    information = (vectors * values.clamp_min(0.0)) @ vectors.T
-    slope = torch.from_numpy(negative_log_evidence(data, families, at)[1][:-1])
-    slope = (vectors * (values > 0)) @ (vectors.T @ slope)
-    return Likelihood(information, information @ h - slope)
+    root, vectors = values[values > 0].sqrt()[:, None], vectors[:, values > 0].T
+    rows = torch.cat([root * vectors, (vectors @ slope)[:, None] / root], 1)
+    return Gaussian(numbered("amplitude", len(h)), h, rows)
 
 
-def fleet_priors(cameras: Sequence[Likelihood], typical: Hyperprior) -> tuple[Hyperprior, list[Hyperprior]]:
+def fleet_priors(cameras: Sequence[Gaussian], typical: Hyperprior) -> tuple[Hyperprior, list[Hyperprior]]:
     """The prior of the next camera of a type, and that of each camera from all others.
 
     Args:
@@ -105,8 +92,8 @@ def fleet_priors(cameras: Sequence[Likelihood], typical: Hyperprior) -> tuple[Hy
         typical: what is expected of any camera.
     """
     unit, count = typical.sd, len(cameras)
-    information = torch.stack([camera.information for camera in cameras]) * unit[:, None] * unit
-    vector = torch.stack([camera.vector - camera.information @ typical.mean for camera in cameras]) * unit
+    products = torch.stack([camera.placed(camera.slots, typical.mean).products for camera in cameras])
+    information, vector = products[:, :-1, :-1] * unit[:, None] * unit, -products[:, :-1, -1] * unit
     # In units of the typical spread, about the typical mean.
     mean, variance = torch.zeros_like(unit), torch.ones_like(unit)
     for _ in range(_ITERATIONS):

@@ -15,6 +15,8 @@ from kcal.calibrate.hybrid.board_modes import board_modes, undetermined_modes
 from kcal.calibrate.hybrid.board_prior import BoardPrior
 from kcal.corners.board import Board
 from kcal.errors import InputError
+from kcal.gaussian import Gaussian, numbered
+from kcal.lens.information import BOARD_SLOT
 from kcal.native_file import NativeFile
 
 
@@ -66,7 +68,11 @@ class MeasuredBoard:
         """
         if not torch.equal(points, self.board.points):
             raise InputError(f"the measured board {self.name!r} is {self.board}; the observations show another board")
-        return BoardPrior(self.amplitudes, self.half)
+        rows, info = torch.linalg.inv_ex(self.half)
+        if int(info):
+            raise InputError(f"the measured board {self.name!r}: its covariance is singular")
+        weight = torch.nn.functional.pad(rows.T, (0, 1))
+        return BoardPrior(Gaussian(numbered(BOARD_SLOT, len(self.amplitudes)), self.amplitudes, weight))
 
     @property
     def points(self) -> Tensor:

@@ -24,25 +24,37 @@ Array = npt.NDArray[np.float64]
 class Quadratic(NamedTuple):
     """Data near a solution: chi² = c - 2 gᵀδ + δᵀKδ at x = `at` + δ, poses eliminated.
 
+    These are the normal equations of a `kcal.gaussian.Gaussian`, because the evidence forms them under hundreds of
+    priors.
+
     Attributes:
-        K: (S, S).
-        g: (S,).
-        c: number.
+        products: (S + 1, S + 1) of its rows, K and in the last row and column -g and c.
         freedom: ν, residuals without those that poses take up.
         at: (S,) x₀.
     """
 
-    K: Tensor
-    g: Tensor
-    c: float
+    products: Tensor
     freedom: float
     at: Tensor
 
+    @property
+    def K(self) -> Tensor:
+        """(S, S)."""
+        return self.products[:-1, :-1]
+
+    @property
+    def g(self) -> Tensor:
+        """(S,)."""
+        return -self.products[:-1, -1]
+
+    @property
+    def c(self) -> float:
+        """χ² at x₀."""
+        return float(self.products[-1, -1])
+
     def tempered(self, tempering: float) -> Quadratic:
         """The same data, counting less."""
-        if tempering == 1.0:
-            return self
-        return Quadratic(self.K / tempering, self.g / tempering, self.c / tempering, self.freedom / tempering, self.at)
+        return Quadratic(self.products / tempering, self.freedom / tempering, self.at) if tempering != 1.0 else self
 
 
 class ViewData(NamedTuple):
@@ -51,9 +63,9 @@ class ViewData(NamedTuple):
     Attributes:
         still: as if they had stood still.
         own: (V, M, M) UᵀU of each view.
-        cross: (V, M, S + 1) Uᵀ [A, b], b being the target of the rows A.
-        score: (V, S) Aᵀ r of each view, r being its residuals as if it had stood still.
-        residual: (V, M) Uᵀ r likewise.
+        cross: (V, M, S + 1) Uᵀ [A, r], A being the rows and r their residuals as if all views had stood still.
+        score: (V, S) Aᵀ r of each view.
+        residual: (V, M) Uᵀ r of each view.
     """
 
     still: Quadratic
@@ -78,11 +90,7 @@ class ViewData(NamedTuple):
         scaled = self.cross * torch.from_numpy(ratio)[:, None]
         half = torch.linalg.solve_triangular(root, scaled, upper=False)
         flat = half.flatten(0, 1)
-        gram = flat.T @ flat
-        still = self.still
-        data = Quadratic(
-            still.K - gram[:-1, :-1], still.g - gram[:-1, -1], still.c - float(gram[-1, -1]), still.freedom, still.at
-        )
+        data = self.still._replace(products=self.still.products - flat.T @ flat)
         log_determinant = 2.0 * float(root.diagonal(dim1=-2, dim2=-1).log().sum())
         return Integrated(data, log_determinant, root, half)
 
@@ -102,7 +110,7 @@ class Integrated(NamedTuple):
         data: the quadratic form of lens and board.
         log_determinant: ln det(R UᵀU R + I), over the views.
         root: (V, 12, 12) Cholesky factor of that.
-        half: (V, 12, S + 1) its inverse times R Uᵀ [A, b].
+        half: (V, 12, S + 1) its inverse times R Uᵀ [A, r].
     """
 
     data: Quadratic
@@ -126,7 +134,7 @@ class Integrated(NamedTuple):
         _, ones, _ = torch.broadcast_tensors(self.root, torch.eye(MOTION, dtype=self.root.dtype), self.root)
         inverse = torch.linalg.solve_triangular(self.root, ones, upper=False)
         kept = inverse.square().sum(1)
-        direction = torch.cat([torch.from_numpy(-step)[:, None], factor.T], 1)
+        direction = torch.cat([torch.from_numpy(step)[:, None], factor.T], 1)
         reach = self.half[..., :-1] @ direction
         reach[..., 0] += self.half[..., -1]
         moments = (inverse.transpose(1, 2) @ reach).square().sum(-1) / variance
@@ -137,7 +145,7 @@ class Integrated(NamedTuple):
 def quadratic_of(off: Tensor, x: Tensor, freedom: float) -> Quadratic:
     """From rows (V, S + 1, R) off the poses at x, the residuals last."""
     flat = off.transpose(0, 1).flatten(1)
-    return Quadratic(flat[:-1] @ flat[:-1].T, -flat[:-1] @ flat[-1], float(flat[-1] @ flat[-1]), freedom, x)
+    return Quadratic(flat @ flat.T, freedom, x)
 
 
 def view_data(off: Tensor, x: Tensor, motion: Tensor, freedom: float) -> ViewData:
@@ -145,16 +153,13 @@ def view_data(off: Tensor, x: Tensor, motion: Tensor, freedom: float) -> ViewDat
     own, others = off[:, : motion.shape[1]], off[:, motion.shape[1] :]
     # As if all views had stood still: motions are unknowns whose prior is about zero.
     still = others[:, -1] - torch.einsum("vm,vmr->vr", motion, own)
-    residual = still[..., None]
-    aimed = torch.cat([others[:, :-1], -still[:, None]], 1)
-    flat = aimed.transpose(0, 1).flatten(1)
-    gram = flat @ flat.T
+    others = torch.cat([others[:, :-1], still[:, None]], 1)
     return ViewData(
-        still=Quadratic(gram[:-1, :-1], gram[:-1, -1], float(gram[-1, -1]), freedom, x),
+        still=quadratic_of(others, x, freedom),
         own=own @ own.transpose(1, 2),
-        cross=own @ aimed.transpose(1, 2),
-        score=(others[:, :-1] @ residual)[..., 0],
-        residual=(own @ residual)[..., 0],
+        cross=own @ others.transpose(1, 2),
+        score=(others[:, :-1] @ still[..., None])[..., 0],
+        residual=(own @ still[..., None])[..., 0],
     )
 
 

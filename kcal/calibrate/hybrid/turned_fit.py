@@ -10,13 +10,14 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.hybrid.board_orders import find_turns, turned_corners
-from kcal.calibrate.hybrid.board_prior import BoardMessage, BoardPrior, message_from_rows, printed_prior
+from kcal.calibrate.hybrid.board_prior import BoardPrior, printed_prior
 from kcal.calibrate.hybrid.families import BOARD
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
-from kcal.calibrate.hybrid.fleet import LensPrior, Likelihood, hyper_likelihood
+from kcal.calibrate.hybrid.fleet import LensPrior, hyper_likelihood
 from kcal.calibrate.hybrid.quadratic import Quadratic
-from kcal.calibrate.hybrid.unknowns import hybrid_problem
 from kcal.corners.observations import Observations
+from kcal.gaussian import Gaussian, numbered
+from kcal.lens.information import BOARD_SLOT, LENS_SLOT
 from kcal.lens.zernike import ZernikeModes
 
 # How a board differs from the one that was ordered: as printers err, not at all, or as others tell.
@@ -44,9 +45,9 @@ class CameraFit:
 
     fit: HybridFit
     turns: Tensor
-    message: BoardMessage
-    hyper: Likelihood
-    lens: Likelihood
+    message: Gaussian
+    hyper: Gaussian
+    lens: Gaussian
     board: int = -1
     nats: float = math.nan
 
@@ -86,56 +87,46 @@ def fit_turned(
         deviation = fit.families.deviation(fit.expected)[: -len(fit.state.board)]
         if shape == "exact" or attempt == _MOST_FITS - 1:
             break
-        prior = printed_prior(fit.board_shapes, fit.expected[BOARD:]) if shape == "printed" else shape
+        prior = printed_prior(fit.board_shapes, fit.expected[BOARD:]) if shape == "printed" else shape.whole
         more = find_turns(rows, board, prior, deviation, fit.sigma**2)
         if not bool(more.any()):
             break
         turns, start = (turns + more) % 4, None
+    of_lens, of_board = numbered(LENS_SLOT, len(deviation)), numbered(BOARD_SLOT, len(fit.state.board))
+    mean = fit.families.mean[: len(deviation)]
     flat = rows.transpose(1, 2).flatten(0, 1)
-    freedom = 2 * int((torch.isfinite(ordered).all(-1) & (weighted > 0)).sum()) - 6 * len(pixels)
-    message = message_from_rows(flat, deviation, fit.sigma**2)
-    by_lens, by_board, target = flat.split([len(deviation), len(fit.state.board), 1], 1)
-    # The board in units of its prior, about its mean.
+    # The target is absolute, so that the residuals at the mean of lens and board are its negative.
+    flat[:, -1] *= -1.0
+    pixels_of = Gaussian((*of_lens, *of_board), torch.cat([mean, torch.zeros_like(fit.state.board)]), flat)
+    data = pixels_of.weighted(1.0 / fit.sigma)
+    message = (data + Gaussian.independent(of_lens, mean, deviation)).marginal(of_board)
     if shape == "exact":
-        by_board = torch.zeros_like(by_board)
+        lens_alone = data.conditioned(of_board).compressed()
+        pixels_of = pixels_of.conditioned(of_board).placed(pixels_of.slots, pixels_of.at)
     elif shape == "printed":
-        by_board = by_board * fit.families.deviation(fit.expected)[len(deviation) :]
+        sigma = fit.families.deviation(fit.expected)[len(deviation) :]
+        lens_alone = (data + Gaussian.independent(of_board, torch.zeros_like(sigma), sigma)).marginal(of_lens)
     else:
-        by_board, target = by_board @ shape.half.T, target - by_board @ shape.mean[:, None]
-    unit = torch.ones(by_board.shape[1], dtype=by_board.dtype)
-    about_lens = message_from_rows(torch.cat([by_board, by_lens, target], 1), unit, fit.sigma**2)
-    information = about_lens.root.T @ about_lens.root
-    vector = about_lens.root.T @ about_lens.target + information @ fit.families.mean[: len(deviation)]
-    if shape == "printed":
-        by_board = flat[:, len(deviation) : -1]
-    tempered = torch.cat([by_lens, by_board, target], 1) / math.sqrt(fit.tempering)
-    hyper = _about_hyperparameters(fit, tempered, freedom / fit.tempering)
-    return CameraFit(fit=fit, turns=turns, message=message, hyper=hyper, lens=Likelihood(information, vector))
+        lens_alone = (data + shape.whole).marginal(of_lens)
+        # In the variables of the fit's priors.
+        at, half = shape.whole.mean_and_half()
+        pixels_of = pixels_of.replaced(of_board, at, half.T, of_board)
+    freedom = 2 * int((torch.isfinite(ordered).all(-1) & (weighted > 0)).sum()) - 6 * len(pixels)
+    hyper = _about_hyperparameters(fit, pixels_of.weighted(fit.tempering**-0.5), freedom / fit.tempering)
+    return CameraFit(fit=fit, turns=turns, message=message, hyper=hyper, lens=lens_alone)
 
 
 def _absolute_rows(fit: HybridFit, points: Tensor, pixels: Tensor, weights: Tensor) -> Tensor:
     """(V, S + 1, R) derivatives by lens and board off poses and motions, and the target of these rows, pixels."""
     count = len(fit.state.board)
     mean = torch.cat([fit.families.mean[:-count], torch.zeros_like(fit.state.board)])
-    problem = hybrid_problem(
-        points,
-        fit.board_shapes.shapes,
-        pixels,
-        weights,
-        fit.model,
-        mean,
-        torch.zeros_like(mean),
-        fit.readout,
-        fit.stillness,
-        fit.square,
-    )
+    problem = fit.problem(points, pixels, weights, mean, torch.zeros_like(mean))
     rows = problem.off_poses(fit.state)
     rows[:, -1] = torch.einsum("s,vsn->vn", problem.unknowns(fit.state) - mean, rows[:, :-1]) - rows[:, -1]
     return rows
 
 
-def _about_hyperparameters(fit: HybridFit, rows: Tensor, freedom: float) -> Likelihood:
-    """What the rows (R, S + 1) say, in the variables of the fit's priors."""
-    A, target = rows[:, :-1], rows[:, -1]
-    data = Quadratic(A.T @ A, A.T @ target, float(target @ target), freedom, torch.zeros_like(A[0]))
-    return hyper_likelihood(data, fit.families, fit.hyperparameters, fit.sigma**2 / fit.tempering)
+def _about_hyperparameters(fit: HybridFit, data: Gaussian, freedom: float) -> Gaussian:
+    """What the data say, in pixels and about the mean of the fit's priors."""
+    quadratic = Quadratic(data.products, freedom, torch.zeros_like(fit.families.mean))
+    return hyper_likelihood(quadratic, fit.families, fit.hyperparameters, fit.sigma**2 / fit.tempering)

@@ -8,7 +8,8 @@ from torch import Tensor
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.priors import GaussianPrior
 from kcal.calibrate.problem.state import BoardState
-from kcal.lens.information import CameraInformation, triangular
+from kcal.gaussian import triangular
+from kcal.lens.information import CameraInformation
 
 
 def information_of(

@@ -62,6 +62,18 @@ class FreeParameters:
         """A step of the unknowns (..., len) as a step of each parameter."""
         return step if self._plain else step[..., list(self.slots)]
 
+    def by_parameter(self, covariance: Tensor, count: int) -> Tensor:
+        """(count, count) of all parameters from that of the unknowns: tied ones alike, held ones zero."""
+        out = covariance.new_zeros(count, count)
+        slots, indices = torch.tensor(self.slots, dtype=torch.long), torch.tensor(self.indices, dtype=torch.long)
+        out[indices[:, None], indices] = covariance[slots[:, None], slots]
+        return out
+
+    def labels(self, names: Sequence[str]) -> list[str]:
+        """For each unknown the names of the parameters that it is, among all `names`."""
+        pairs = list(zip(self.indices, self.slots, strict=True))
+        return [" = ".join(names[index] for index, own in pairs if own == slot) for slot in range(len(self))]
+
     @property
     def _plain(self) -> bool:
         """Whether each parameter is an unknown, in their order."""

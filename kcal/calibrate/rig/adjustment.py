@@ -124,7 +124,7 @@ class Adjustment:
         effects = (
             self._effects if self._effects is not None else self.state.unknown.new_zeros(0, len(self.state.unknown))
         )
-        moves = stars.by_effects(), stars.shifts()[:, mask]
+        moves = stars.by_effects(), stars.factors()[:, mask], stars.shifts()[:, mask]
         return StarBlock(stars.pixels[mask], white, *known, *moves, effects, unknowns.by_effects)
 
     @property
@@ -282,13 +282,20 @@ def _star_start(data: RigData, start: Start) -> Tensor:
     stars = data.stars
     if stars is None:
         return torch.empty(0, 3, dtype=torch.float64)
-    direction = torch.zeros(len(stars.names), 3, dtype=torch.float64)
+    seen = _first_rays(data, start, stars.pixels, torch.zeros(len(stars.names), dtype=torch.float64), start.center[0])
+    direction = torch.where(stars.named[:, None], stars.direction, seen)
+    return direction / torch.linalg.vector_norm(direction, dim=-1, keepdim=True)
+
+
+def _first_rays(data: RigData, start: Start, pixels: Tensor, inverse: Tensor, anchor: Tensor) -> Tensor:
+    """(F, 3) from the anchor along the ray of the first camera that has one, at inverse ranges (F,); else up."""
+    direction = torch.zeros(len(pixels), 3, dtype=torch.float64)
     direction[:, 2] = 1.0
     for c in reversed(range(len(data.cameras))):
-        rays, valid = data.cameras[c].unproject(stars.pixels[:, c])
-        direction = torch.where(valid[:, None], rays @ start.rotation[c], direction)
-    direction = torch.where(stars.named[:, None], stars.direction, direction)
-    return direction / torch.linalg.vector_norm(direction, dim=-1, keepdim=True)
+        rays, valid = data.cameras[c].unproject(pixels[:, c])
+        towards = rays @ start.rotation[c] - inverse[:, None] * (anchor - start.center[c])
+        direction = torch.where(valid[:, None], towards, direction)
+    return direction
 
 
 def _feature_start(data: RigData, start: Start, anchor: Tensor) -> tuple[Tensor, Tensor]:
@@ -297,10 +304,5 @@ def _feature_start(data: RigData, start: Start, anchor: Tensor) -> tuple[Tensor,
     if features is None:
         return torch.empty(0, 3, dtype=torch.float64), torch.empty(0, dtype=torch.float64)
     inverse = torch.where(torch.isfinite(features.inverse_range_sigma), features.inverse_range, 0.0)
-    direction = torch.zeros(len(features.names), 3, dtype=torch.float64)
-    direction[:, 2] = 1.0
-    for c in reversed(range(len(data.cameras))):
-        rays, valid = data.cameras[c].unproject(features.pixels[:, c])
-        towards = rays @ start.rotation[c] - inverse[:, None] * (anchor - start.center[c])
-        direction = torch.where(valid[:, None], towards, direction)
+    direction = _first_rays(data, start, features.pixels, inverse, anchor)
     return direction / torch.linalg.vector_norm(direction, dim=-1, keepdim=True), inverse

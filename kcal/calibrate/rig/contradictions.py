@@ -17,6 +17,7 @@ from torch import Tensor
 from kcal.calibrate.rig.adjustment import Adjustment, chi2_quantile
 from kcal.calibrate.rig.blocks import RigState
 from kcal.calibrate.rig.problem import RigProblem
+from kcal.gaussian import inverse_root
 
 # Standard deviations of a normal variable as unlikely as what is found: a doubt, and beyond reasonable doubt.
 _DOUBT, CERTAIN = 3.5, 4.5
@@ -140,11 +141,9 @@ def _sum(parts: list[_Part], chosen: tuple[int, ...] | set[int], known: _Part | 
 def _least(gram: Tensor) -> _Least:
     N, g = gram[:-1, :-1], gram[:-1, -1]
     scale = torch.where(N.diagonal() > 0, N.diagonal(), 1.0).rsqrt()
-    values, vectors = torch.linalg.eigh(N * scale[:, None] * scale)
-    good = values > _RANK_TOLERANCE * values.max().clamp_min(1e-300)
-    root = (scale[:, None] * vectors)[:, good] * values[good].rsqrt()
+    root, _ = inverse_root(N * scale[:, None] * scale, scale, _RANK_TOLERANCE)
     pull = g @ root
-    return _Least(float(gram[-1, -1] - pull.square().sum()), int(good.sum()), -root @ pull, root)
+    return _Least(float(gram[-1, -1] - pull.square().sum()), root.shape[1], -root @ pull, root)
 
 
 def _test(parts: list[_Part], group: tuple[int, ...], within: tuple[int, ...], known: _Part) -> _Test:

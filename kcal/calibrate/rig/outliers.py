@@ -42,9 +42,10 @@ def without_wrong(work: Adjustment, masks: PerKind, solver: LMOptions) -> PerKin
     squares, freedom = work.squares(masks), work.freedom(masks)
     for kind, square, dof in zip(KINDS, squares, freedom, strict=True):
         if (times := math.sqrt(typical_ratio(square, dof))) > WRONG_AS_A_WHOLE:
+            more = ", and time, zone and place of the night images" if kind == "stars" else ""
             raise InputError(
                 f"the {kind} contradict each other or the rest: typically they are {times:.0f} times as far off as "
-                "their sigmas say; check names, units, heights, sigmas and that the cameras are these"
+                f"their sigmas say; check names, units, heights, sigmas and that the cameras are these{more}"
             )
     over = over_limit(work, masks, squares)
     kept = PerKind(*(mask & ~(ratio > 1.0) for mask, ratio in zip(masks, over, strict=True)))

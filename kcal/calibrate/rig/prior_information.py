@@ -8,20 +8,20 @@ out of it first, so that no corner counts twice.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Hashable, Sequence
 
 import torch
 from torch import Tensor
 
 from kcal.calibrate.hybrid.board_modes import BoardModes, board_modes
-from kcal.calibrate.hybrid.board_orders import CLEAR, mode_turn, quarter_turns
-from kcal.calibrate.hybrid.board_prior import BoardMessage, message_from_rows, printed_board, printed_prior
+from kcal.calibrate.hybrid.board_orders import CLEAR, mode_turn, quarter_turns, turned
+from kcal.calibrate.hybrid.board_prior import printed_board, printed_prior
 from kcal.calibrate.hybrid.families import BOARD, typical_hyperprior
 from kcal.calibrate.rig.unknowns import SharedUnknowns, held
 from kcal.corners.board import Board
+from kcal.gaussian import Gaussian, stacked, unit_scale, whitened
 from kcal.lens.camera import Camera
-from kcal.lens.information import CameraInformation, triangular, unit_scale, whitened
+from kcal.lens.information import CameraInformation
 from kcal.lens.projection import project_components
 from kcal.lens.pupil import FAR
 
@@ -31,72 +31,62 @@ _FELT = 1e-3
 _NEAR, _PX_PER_METER = 1.0, 1000.0
 
 
-class Knowledge(NamedTuple):
-    """What is known of each camera, and of the board in the rig.
-
-    Attributes:
-        cameras: of each camera; None: nothing, it is held.
-        board: which of them saw the rig's board, whose modes are then their last unknowns.
-    """
-
-    cameras: tuple[CameraInformation | None, ...]
-    board: tuple[bool, ...]
-
-
-def gathered(cameras: Sequence[Camera], known: Sequence[CameraInformation | None], board: Board | None) -> Knowledge:
-    """Find which cameras saw one board, by the evidence of both.
+def gathered(
+    cameras: Sequence[Camera], known: Sequence[CameraInformation | None], board: Board | None
+) -> tuple[tuple[CameraInformation | None, ...], tuple[tuple[int, int], ...]]:
+    """What is known of each camera, and of one board by those that saw it, by the evidence of both.
 
     Args:
         cameras: with their calibrations.
         known: what each knows.
         board: in the rig, if there is any; else that of the first camera that has one.
+
+    Returns:
+        What is known: of cameras that saw another board, what is said of the camera alone; None: nothing, it is held.
+        And pairs of cameras whose boards have one name, and shapes that contradict each other.
     """
-    out, sharing = list(known), [False] * len(cameras)
+    out: list[CameraInformation | None] = []
     first: CameraInformation | None = None
+    begun = 0
+    apart: list[tuple[int, int]] = []
     for number, (camera, own) in enumerate(zip(cameras, known, strict=True)):
         record = None if camera.calibration is None else camera.calibration.record
-        if own is None or not own.board_size or record is None:
-            continue
-        board = board or Board.of(record.board)
-        if record.board != board.record:
-            continue
-        turned = own if first is None else _agreeing(first, own, board)
-        if turned is not None:
-            first, sharing[number], out[number] = first or own, True, turned
-    return Knowledge(tuple(out), tuple(sharing))
+        sharing = None
+        if own is not None and own.board_size and record is not None:
+            board = board or Board.of(record.board)
+            if record.board == board.record:
+                sharing = own if first is None else _agreeing(first, own, board)
+                if sharing is None:
+                    apart.append((begun, number))
+                elif first is None:
+                    first, begun = sharing, number
+        out.append(sharing or (None if own is None else own.without_board()))
+    return tuple(out), tuple(apart)
 
 
 def _agreeing(first: CameraInformation, other: CameraInformation, board: Board) -> CameraInformation | None:
     """The other camera's information with its board turned as the first camera's; None if they saw two boards."""
     modes = board_modes(board.points)
-    one, two = _message(first), _message(other)
+    # What the data of each say of the board, whatever its lens is within its prior.
+    one, two = ((known.data + known.lens_prior).marginal(known.board) for known in (first, other))
     apart = printed_board(modes, [one])[1] + printed_board(modes, [two])[1]
-    together = {
-        turns: printed_board(modes, [one, two.turned(mode_turn(turns))])[1] - apart for turns in quarter_turns(board)
-    }
+    together = {turns: printed_board(modes, [one, turned(two, turns)])[1] - apart for turns in quarter_turns(board)}
     best = max(together, key=lambda turns: together[turns])
-    return _board_turned(other, mode_turn(best)) if together[best] > -CLEAR else None
+    return _board_turned(other, best) if together[best] > -CLEAR else None
 
 
-def _message(known: CameraInformation) -> BoardMessage:
-    """What a camera's data say of its board, whatever its lens is within its prior."""
-    lens, at = known.lens_size, known.estimate.clone()
-    at[:lens] -= known.mean[:lens]
-    target = known.rows @ at - known.residuals
-    return message_from_rows(torch.cat([known.rows, target[:, None]], 1), known.sigma[:lens], 1.0)
-
-
-def _board_turned(known: CameraInformation, turn: Tensor) -> CameraInformation:
-    """The same with the board's modes turned: a' = turn a, and turns are orthogonal."""
-    lens = known.lens_size
-    return dataclasses.replace(
+def _board_turned(known: CameraInformation, turns: int) -> CameraInformation:
+    """The same with the board's modes turned."""
+    lens, turn = known.lens_size, mode_turn(turns)
+    estimate = torch.cat([known.estimate[:lens], turn @ known.estimate[lens:]])
+    out = dataclasses.replace(
         known,
-        estimate=torch.cat([known.estimate[:lens], turn @ known.estimate[lens:]]),
-        rows=torch.cat([known.rows[:, :lens], known.rows[:, lens:] @ turn.T], 1),
+        estimate=estimate,
         mean=torch.cat([known.mean[:lens], turn @ known.mean[lens:]]),
         sigma=torch.cat([known.sigma[:lens], turn.abs() @ known.sigma[lens:]]),
-        others=None if known.others is None else torch.cat([known.others[:, :-1] @ turn.T, known.others[:, -1:]], 1),
+        others=None if known.others is None else turned(known.told, turns).placed(known.board, estimate[lens:]).rows,
     )
+    return out.with_data(turned(known.data, turns))
 
 
 def less(known: CameraInformation, rows: Tensor) -> CameraInformation:
@@ -107,7 +97,7 @@ def less(known: CameraInformation, rows: Tensor) -> CameraInformation:
         rows: (R, U + 1) of the data that are taken out, in standard deviations, off all other unknowns; the last column
             holds their residuals at the estimate.
     """
-    scale = unit_scale(known.all_rows()[:, :-1])
+    scale = unit_scale(known.whole.rows[:, :-1])
     gone, whole = rows[:, :-1] * scale, known.rows * scale
     gradient = whole.T @ known.residuals - gone.T @ rows[:, -1]
     values, vectors = torch.linalg.eigh(whole.T @ whole - gone.T @ gone)
@@ -122,54 +112,54 @@ def less(known: CameraInformation, rows: Tensor) -> CameraInformation:
 
 
 def joint_unknowns(
-    cameras: Sequence[Camera], knowledge: Knowledge, board: Board | None, *, measured: bool = False
+    cameras: Sequence[Camera], parts: Sequence[CameraInformation | None], board: Board | None, *, measured: bool = False
 ) -> tuple[SharedUnknowns, Tensor | None]:
     """Unknowns that are standard normal beforehand, and the deviation (N, 3) of the board where they begin.
 
     A board that no camera knows is one as printers make them, if a camera is hybrid and the board was not `measured`
     otherwise; None: it is as it is given.
+
+    Args:
+        cameras: of the rig.
+        parts: what is known of each and of the board (`gathered`).
+        board: of the rig, or of the cameras.
+        measured: the board's shape is known.
     """
-    parts = [
-        part if part is None or shares else part.without_board()
-        for part, shares in zip(knowledge.cameras, knowledge.board, strict=True)
-    ]
-    sizes = [0 if part is None else part.lens_size for part in parts]
-    lenses, shared = sum(sizes), [part for part in parts if part is not None and part.board_size]
+    shared = [part for part in parts if part is not None and part.board_size]
+    lenses = sum(part.lens_size for part in parts if part is not None)
     modes = None
     printed = not measured and any(camera.model.hybrid for camera in cameras)
     if board is not None and (shared or printed):
         modes = board_modes(board.points)
     elif not shared and not lenses:
         return held(cameras), None
-    amplitudes, mean, sigma = _board_beforehand(shared, modes)
-    boards, total = len(sigma), lenses + len(sigma)
-    prior = torch.zeros(boards, total + 1, dtype=torch.float64)
-    prior[range(boards), range(lenses, total)] = 1.0 / sigma
-    prior[:, -1] = (amplitudes - mean) / sigma
-    rows, end = [prior], 0
-    selections = []
-    for camera, part, size in zip(cameras, parts, sizes, strict=True):
-        onto = torch.zeros(len(camera.names), total, dtype=torch.float64)
+    prior, amplitudes = _board_beforehand(shared, modes)
+    names: list[Hashable] = []
+    said, places = [prior], []
+    for number, part in enumerate(parts):
+        if part is None:
+            continue
+        own = part.data + part.lens_prior
+        if len(shared) == 1:
+            # What cameras told each other of their board counts once: of two in one rig, each brings its own rows.
+            own = own + part.told
+        said.append(own.named(tuple(slot if slot in prior.slots else (number, slot) for slot in own.slots)))
+        names += [(number, slot) for slot in part.lens]
+        places.append(part.estimate[: part.lens_size])
+    slots, at = (*names, *prior.slots), torch.cat([*places, amplitudes])
+    joint = stacked([one.placed(slots, at) for one in said]).compressed()
+    change, begin, known = whitened(joint.rows[:, :-1], joint.rows[:, -1])
+    selections, end = [], 0
+    for camera, part in zip(cameras, parts, strict=True):
+        onto = torch.zeros(len(camera.names), len(slots), dtype=torch.float64)
         if part is not None:
-            own = torch.cat([part.data_rows(), part.prior_rows(board=False)])
-            if len(shared) == 1 and part.others is not None:
-                # What cameras told each other of their board counts once: of two in one rig, each brings its own rows.
-                own = torch.cat([own, torch.cat([own.new_zeros(len(part.others), size), part.others], 1)])
-            wide = own.new_zeros(len(own), total + 1)
-            wide[:, end : end + size], wide[:, -1] = own[:, :size], own[:, -1]
-            if part.board_size:
-                wide[:, lenses:-1] = own[:, size:-1]
-                wide[:, -1] += own[:, size:-1] @ (amplitudes - part.estimate[size:])
-            rows.append(wide)
-            onto[:, end : end + size] = part.selection()[:, :size]
+            onto[:, end : end + part.lens_size] = part.selection()[:, : part.lens_size]
+            end += part.lens_size
         selections.append(onto)
-        end += size
-    triangle = triangular(torch.cat(rows))[:-1]
-    change, begin, known = whitened(triangle[:, :-1], triangle[:, -1])
     maps = [onto @ change for onto in selections]
     shapes = torch.zeros(0, 3, 0, dtype=torch.float64) if modes is None else modes.shapes
     by_board = change[lenses:] if modes is not None else change[:0]
-    turn = torch.eye(total, dtype=torch.float64)
+    turn = torch.eye(len(slots), dtype=torch.float64)
     if any(camera.model.hybrid for camera in cameras):
         turn = _felt(cameras, maps, torch.einsum("bk,bcn->kcn", by_board, shapes).flatten(1), known)
     found = SharedUnknowns(
@@ -183,18 +173,18 @@ def joint_unknowns(
     return found, None if modes is None else torch.einsum("b,bcn->nc", amplitudes, shapes)
 
 
-def _board_beforehand(shared: Sequence[CameraInformation], modes: BoardModes | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Amplitudes to begin with, and mean and sigma of the prior of a board's modes; empty for no board."""
+def _board_beforehand(shared: Sequence[CameraInformation], modes: BoardModes | None) -> tuple[Gaussian, Tensor]:
+    """The prior of a board's modes, and amplitudes to begin with; of no unknowns for no board."""
     if shared:
         # Each camera's evidence set amplitudes of its own; what is in between is as good as either.
         sigma = torch.stack([part.sigma[part.lens_size :].log() for part in shared]).mean(0).exp()
         mean = torch.stack([part.mean[part.lens_size :] for part in shared]).mean(0)
-        return shared[0].estimate[shared[0].lens_size :], mean, sigma
+        return Gaussian.independent(shared[0].board, mean, sigma), shared[0].estimate[shared[0].lens_size :]
     if modes is None:
         nothing = torch.zeros(0, dtype=torch.float64)
-        return nothing, nothing, nothing
-    sigma = printed_prior(modes, typical_hyperprior().mean[BOARD:]).half.diagonal()
-    return torch.zeros_like(sigma), torch.zeros_like(sigma), sigma
+        return Gaussian.independent((), nothing, nothing), nothing
+    prior = printed_prior(modes, typical_hyperprior().mean[BOARD:])
+    return prior, torch.zeros_like(prior.at)
 
 
 def _felt(cameras: Sequence[Camera], maps: Sequence[Tensor], by_corners: Tensor, known: Tensor) -> Tensor:

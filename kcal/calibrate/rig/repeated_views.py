@@ -14,8 +14,9 @@ from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.rig.board_consensus import MINIMUM_CORNERS, pose_alone
 from kcal.calibrate.rig.prior_information import less
 from kcal.calibrate.rig.sources import Boards
+from kcal.gaussian import triangular
 from kcal.lens.camera import Camera
-from kcal.lens.information import CameraInformation, triangular
+from kcal.lens.information import CameraInformation
 from kcal.solve.lm import LMOptions
 
 # A view of a calibration has the residuals that its record says, whatever corners were left out.

@@ -5,39 +5,30 @@ from __future__ import annotations
 import copy
 import dataclasses
 import functools
-import math
+from collections.abc import Callable
 from typing import Literal
 
 import torch
-from torch import Tensor
 
 from kcal.calibrate.rig.adjustment import Adjustment
+from kcal.calibrate.rig.assess import rig_result
 from kcal.calibrate.rig.blocks import KINDS, PerKind
-from kcal.calibrate.rig.board_consensus import MINIMUM_CORNERS
-from kcal.calibrate.rig.contradictions import CERTAIN, contradictions
 from kcal.calibrate.rig.explanations import explained
 from kcal.calibrate.rig.initial_poses import InitialPoses, first_poses
-from kcal.calibrate.rig.mixups import cost_of_features_behind, refuse_same_camera, swap_warnings
-from kcal.calibrate.rig.motion import moved_warnings
-from kcal.calibrate.rig.other_places import refuse_several
+from kcal.calibrate.rig.mixups import cost_of_features_behind, refuse_same_camera
 from kcal.calibrate.rig.outliers import LOSS, ROUGHLY, possible
 from kcal.calibrate.rig.prior_information import gathered, joint_unknowns
-from kcal.calibrate.rig.records import Reasons, item_records, places, source_records
-from kcal.calibrate.rig.redundancy import refuse_exact
+from kcal.calibrate.rig.rayless import without_rayless
+from kcal.calibrate.rig.records import Reasons, item_records
 from kcal.calibrate.rig.repeated_views import without_repeated
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.sources import RigData
-from kcal.calibrate.rig.uncertainty import SharedCovariance, goodness_of_fit, parameter_rows, relative_rows
 from kcal.calibrate.rig.unknowns import SharedUnknowns, free, held
-from kcal.calibrate.rig.weak_geometry import check_places
-from kcal.errors import DegenerateError, InputError
-from kcal.io.camera_file import provenance
-from kcal.lens.calibration import CameraCalibration
+from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
 from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA, check_refraction
 from kcal.solve.lm import LMOptions
-from kcal.solve.result import Result, SolverStatus
 
 # px: a corner's noise before the boards themselves tell it.
 _CORNER_SIGMA = 0.2
@@ -45,10 +36,6 @@ _CORNER_SIGMA = 0.2
 _SCREENING = LMOptions(max_iterations=25, tolerance=1e-6, residual_floor=1e-8)
 # λ of a solve that begins at the robust solution.
 _NEAR_DAMPING = 1e-9
-# Of fewer boards alone, a wrong one cannot be told from a good one.
-_FEW_BOARDS = 3
-# px: a higher RMS is not noise.
-_HIGH_RMS = 1.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -86,7 +73,9 @@ class RigOptions:
         check_refraction(self.refraction, self.refraction_sigma)
 
 
-def solve_rig(data: RigData, options: RigOptions | None = None) -> RigResult:
+def solve_rig(
+    data: RigData, options: RigOptions | None = None, progress: Callable[[str], None] = lambda _: None
+) -> RigResult:
     """Solve for the poses of all cameras of a rig (and their parameters, if asked) from everything that is known.
 
     Least squares of all residuals over their standard deviations; landmarks, far features and boards are unknowns too
@@ -96,6 +85,7 @@ def solve_rig(data: RigData, options: RigOptions | None = None) -> RigResult:
     Args:
         data: see `RigData`.
         options: see `RigOptions`.
+        progress: called with what is done next.
 
     Raises:
         InputError: data that contradict each other as a whole, or that have several explanations; a measured baseline
@@ -126,15 +116,20 @@ def solve_rig(data: RigData, options: RigOptions | None = None) -> RigResult:
     refuse_same_camera(data)
     if not options.weighted and data.boards is not None:
         data = dataclasses.replace(data, boards=dataclasses.replace(data.boards, covariance=None))
-    data, warnings = _without_rayless(data)
-    data, unknowns = _what_may_change(data, options)
+    data, warnings = without_rayless(data)
+    progress("what is known of cameras and board")
+    data, unknowns, doubts = _what_may_change(data, options)
+    warnings += doubts
+    progress("first poses")
     initial = first_poses(data, options.solver)
     masks, reasons = _first_masks(initial, reject=options.reject)
+    progress("robust solution")
     work = _robust(initial, masks, unknowns)
     if options.motion:
         work.fit_motion(possible(work, masks))
     # With lenses among the unknowns digits are dear, and what is wrong shows without them.
     looking = ROUGHLY if unknowns.refine_lenses else options.solver
+    progress("what contradicts the rest")
     if options.reject:
         masks = kept = explained(work, masks, looking)
     else:
@@ -143,6 +138,7 @@ def solve_rig(data: RigData, options: RigOptions | None = None) -> RigResult:
         warnings += doubts
     if options.motion:
         work.fit_motion(kept)
+    progress("solution")
     # The robust solution is near, so that the first step may be the undamped one.
     near = dataclasses.replace(options.solver, initial_damping=_NEAR_DAMPING)
     _, found = work.solve(masks, near)
@@ -153,35 +149,8 @@ def solve_rig(data: RigData, options: RigOptions | None = None) -> RigResult:
             _, found = work.solve(masks, near)
         if abs(work.sigma_corner / before - 1.0) < 1e-3:
             break
-    return _rig_result(work, found, masks, reasons, initial, warnings, refuse=options.reject)
-
-
-def _without_rayless(data: RigData) -> tuple[RigData, list[str]]:
-    """The data with pixels at which a lens model has no ray taken as unseen."""
-    warnings, changed = [], {}
-    for kind in KINDS:
-        source = getattr(data, kind)
-        if source is None:
-            continue
-        pixels = source.pixels.clone()
-        for c, camera in enumerate(data.cameras):
-            seen = torch.isfinite(pixels[:, c]).all(-1)
-            _, valid = camera.unproject(pixels[:, c])
-            lost = seen & ~valid
-            if not bool(lost.any()):
-                continue
-            if kind == "boards":
-                few = (seen.sum(-1) >= MINIMUM_CORNERS) & ((seen & valid).sum(-1) < MINIMUM_CORNERS)
-                for i in few.nonzero()[:, 0].tolist():
-                    raise InputError(
-                        f"board {source.names[i]}: the {data.names[c]} camera's lens model has no ray at most of its "
-                        "corners: it folds inside the image; calibrate with views nearer the image's border or with a "
-                        "smaller model"
-                    )
-            warnings.append(f"{int(lost.sum())} pixels of {kind} left out where {data.names[c]}'s lens has no ray")
-            pixels[:, c] = torch.where(lost[..., None], torch.nan, pixels[:, c])
-        changed[kind] = dataclasses.replace(source, pixels=pixels)
-    return dataclasses.replace(data, **changed), warnings
+    progress("uncertainty")
+    return rig_result(work, found, masks, reasons, initial, warnings, refuse=options.reject)
 
 
 def _first_masks(initial: InitialPoses, *, reject: bool) -> tuple[PerKind, Reasons]:
@@ -211,9 +180,9 @@ def _first_masks(initial: InitialPoses, *, reject: bool) -> tuple[PerKind, Reaso
     return masks, reasons
 
 
-def _what_may_change(data: RigData, options: RigOptions) -> tuple[RigData, SharedUnknowns]:
-    """What may change of cameras, board and air, and the data with the board as it is expected."""
-    boards = data.boards
+def _what_may_change(data: RigData, options: RigOptions) -> tuple[RigData, SharedUnknowns, list[str]]:
+    """What may change of cameras, board and air, the data with the board as it is expected, and warnings of it."""
+    boards, doubts = data.boards, []
     if options.intrinsics == "prior":
         known = []
         for number, camera in enumerate(data.cameras):
@@ -224,9 +193,15 @@ def _what_may_change(data: RigData, options: RigOptions) -> tuple[RigData, Share
         if boards is None:
             unknowns = _lens_unknowns(data.cameras, tuple(camera.fingerprint for camera in data.cameras), tuple(known))
         else:
-            knowledge = gathered(data.cameras, known, boards.board)
+            parts, apart = gathered(data.cameras, known, boards.board)
             measured = boards.deviation is not None
-            unknowns, deviation = joint_unknowns(data.cameras, knowledge, boards.board, measured=measured)
+            doubts = [
+                f"the calibrations of {data.names[one]} and {data.names[other]} contradict each other about their "
+                f"board ({boards.board}): two prints, or one that bent in between; calibrate both cameras from views "
+                "of the board in the pairs"
+                for one, other in apart
+            ]
+            unknowns, deviation = joint_unknowns(data.cameras, parts, boards.board, measured=measured)
             if deviation is not None:
                 data = dataclasses.replace(data, boards=dataclasses.replace(boards, deviation=deviation))
     else:
@@ -237,7 +212,7 @@ def _what_may_change(data: RigData, options: RigOptions) -> tuple[RigData, Share
         unknowns = unknowns.and_refraction(options.refraction, options.refraction_sigma)
     if data.stars is not None and data.stars.effects:
         unknowns = unknowns.and_effects(*(effect.name for effect in data.stars.effects))
-    return data, unknowns
+    return data, unknowns, doubts
 
 
 @functools.lru_cache(maxsize=2)
@@ -245,7 +220,7 @@ def _lens_unknowns(
     cameras: tuple[Camera, ...], fingerprints: tuple[str, ...], known: tuple[CameraInformation | None, ...]
 ) -> SharedUnknowns:
     """Unknowns of cameras without boards. Whoever marks landmarks solves the same rig again and again."""
-    return joint_unknowns(cameras, gathered(cameras, known, None), None)[0]
+    return joint_unknowns(cameras, gathered(cameras, known, None)[0], None)[0]
 
 
 def _robust(initial: InitialPoses, masks: PerKind, unknowns: SharedUnknowns) -> Adjustment:
@@ -286,115 +261,3 @@ def _suspicions(work: Adjustment, masks: PerKind, reasons: Reasons, solver: LMOp
         for item in item_records(trial, kept, reasons)
         if not item.used and (item.source, item.name) not in named
     ]
-
-
-def _refined(camera: Camera, parameters: Tensor, covariance: Tensor) -> Camera:
-    """The camera as the rig found it, with new sigmas; all that is known of it together is the rig's covariance."""
-    out, known = camera.with_parameters(parameters), camera.calibration
-    spread = covariance.diagonal().sqrt()
-    sigma = {
-        name: float(value) if 0 < value < math.inf else None for name, value in zip(camera.names, spread, strict=True)
-    }
-    name, record = ("", None) if known is None else (known.name, known.record)
-    out.calibration = CameraCalibration(name=name, sigma=sigma, record=record)
-    return out
-
-
-def _rig_result(
-    work: Adjustment,
-    found: Result,
-    masks: PerKind,
-    reasons: Reasons,
-    initial: InitialPoses,
-    warnings: list[str],
-    *,
-    refuse: bool,
-) -> RigResult:
-    data, state, problem = work.data, work.part(masks), work.problem(masks)
-    fit = goodness_of_fit(problem, state)
-    covariance = SharedCovariance(problem, state, fit.variance)
-    undetermined = covariance.open_directions(data.names, absolute=data.absolute)
-    for second in range(1, len(data.cameras)):
-        if not bool(covariance.of(relative_rows(problem, state, 0, second))[1].all()):
-            what = "; ".join(undetermined[:3]) + (" and more" if len(undetermined) > 3 else "")
-            cure = (
-                "add boards seen by both, surveyed landmarks, far features of known range, a measured baseline or "
-                "measured positions"
-            )
-            if data.stars is not None:
-                cure = (
-                    "stars and a baseline tell nothing of the baseline's direction: add matches of unknown range "
-                    "(features), or the measured positions of both cameras (GNSS)"
-                )
-            raise DegenerateError(
-                f"the data do not determine how {data.names[second]} stands from {data.names[0]}: {what} could be "
-                f"anything; {cure}"
-            )
-    refuse_exact(problem, data.names, fit.freedom)
-    refuse_several(work, masks)
-    against = contradictions(work, problem, state)
-    certain = [one for one in against if one.sigmas > CERTAIN]
-    if refuse and certain and certain[0].stated:
-        raise InputError(certain[0].text)
-    widen, doubts = check_places(problem, state, covariance, data.names, refuse=refuse)
-    if widen > 1.0:
-        covariance = SharedCovariance(problem, state, widen**2 * fit.variance)
-    squared, counts = torch.zeros(len(data.cameras)).double(), torch.zeros(len(data.cameras)).double()
-    for block in problem.blocks:
-        squared += block.errors(problem.posed(state), state).square().sum((0, 2, 3))
-        counts += block.seen.sum((0, 2))
-    rms, status = math.sqrt(float(squared.sum() / counts.sum())), SolverStatus(int(found.status))
-    if fit.variance > 1.0:
-        times = math.sqrt(fit.variance)
-        warnings.append(f"residuals are {times:.1f} times as large as their sigmas say; the covariance was widened")
-    warnings += [one.text for one in against]
-    only_boards = len(problem.blocks) == 1 and problem.blocks[0].kind == "boards"
-    if only_boards and (count := int(masks.boards.sum())) < _FEW_BOARDS:
-        warnings.append(f"{count} pair(s) only: a wrong one could not be noticed; 5 or more are good")
-    if only_boards and rms > _HIGH_RMS:
-        warnings.append(f"RMS {rms:.2f} px is high: were both views of each pair taken at the same moment?")
-    if status not in (SolverStatus.CONVERGED, SolverStatus.EXACT):
-        warnings.append(f"the solver {status.message}")
-    focal = [float(camera.params[0]) for camera in data.cameras]
-    warnings += moved_warnings(data.names, focal, work.motion, work.sigma_corner)
-    warnings += doubts
-    warnings += [f"not determined by the data: {text}" for text in undetermined]
-    whole = [parameter_rows(problem, c) for c in range(len(data.cameras))]
-    if not bool(covariance.of(torch.cat(whole))[1].all()):
-        warnings.append(
-            "the data do not determine all parameters of the cameras: the rig has no covariance, and intervals know "
-            "errors of the marks alone"
-        )
-    warnings += swap_warnings(data, problem, state, covariance)
-    items = item_records(work, masks, reasons)
-    cameras = data.cameras
-    if any(bool(part.any()) for part in problem.unknowns.cameras):
-        cameras = tuple(
-            _refined(camera, problem.parameters(state)[c], covariance.of(parameter_rows(problem, c))[0])
-            for c, camera in enumerate(data.cameras)
-        )
-    return RigResult(
-        data=data,
-        cameras=cameras,
-        rotation=state.rotation,
-        center=state.center,
-        board_warp=state.board if len(problem.unknowns.shapes) == 2 else None,
-        sources=source_records(work, masks, items),
-        items=items,
-        flipped=tuple(initial.flipped),
-        rms=rms,
-        rms_px=tuple((squared / counts).sqrt().tolist()),
-        chi2=fit.chi2,
-        freedom=fit.freedom,
-        variance=widen**2 * fit.variance,
-        sigma_corner=None if data.boards is None else work.sigma_corner,
-        undetermined=undetermined,
-        contradictions=tuple(one.text for one in certain),
-        status=status,
-        warnings=tuple(warnings),
-        _problem=problem,
-        _state=state,
-        _covariance=covariance,
-        _places=places(work),
-        _provenance=provenance(),
-    )

@@ -21,6 +21,7 @@ class StarBlock(Block):
         direction: (V, 3) of the catalogue; anything for stars without a name.
         sigma: (V,) radians; infinite for these.
         turns: (E, C, 3), see `StarSource.by_effects`.
+        factors: (E, V), see `StarSource.factors`.
         shifts: (E, V, 3), see `StarSource.shifts`.
         effects: (E, K) by which u is found among the unknowns of the state.
         by_unknown: (E, K) likewise of a step; None: they are held.
@@ -36,6 +37,7 @@ class StarBlock(Block):
         direction: Tensor,
         sigma: Tensor,
         turns: Tensor,
+        factors: Tensor,
         shifts: Tensor,
         effects: Tensor,
         by_unknown: Tensor | None,
@@ -44,7 +46,9 @@ class StarBlock(Block):
         named = torch.isfinite(sigma)
         self._weight = torch.where(named, 1.0 / sigma, 0.0)
         self._known = torch.where(named[:, None], direction, 0.0)
-        self._turns, self._shifts, self._effects, self._by_unknown = turns, shifts, effects, by_unknown
+        # (E, C, V, 3).
+        self._turns = turns[:, :, None] * factors[:, None, :, None]
+        self._shifts, self._effects, self._by_unknown = shifts, effects, by_unknown
 
     def _prior_count(self) -> Tensor:
         return 2 * (self._weight > 0).long()
@@ -54,7 +58,7 @@ class StarBlock(Block):
 
     def _moves(self, state: RigState, camera: int) -> Tensor:
         """(E, V, 3) by which one sigma of each effect shifts the stars for a camera."""
-        turned = torch.linalg.cross(self._turns[:, camera, None].expand(-1, len(self), 3), state.star[None])
+        turned = torch.linalg.cross(self._turns[:, camera], state.star.expand(len(self._turns), -1, -1))
         return turned + self._shifts
 
     def _bent(self, state: RigState, offset: Tensor, camera: int) -> Tensor:

@@ -18,11 +18,13 @@ class StarEffect:
     Args:
         name: what it is, for messages.
         turn: (C, 3) radians about the frame's axes by which each camera sees the sky turned at one sigma of it.
+        factor: (S,) by which the turn is larger for some stars, as that of a clock that drifts; 1 if left out.
         shift: (S, 3) by which each star is seen elsewhere at one sigma of it, in all cameras.
     """
 
     name: str
     turn: Tensor | None = None
+    factor: Tensor | None = None
     shift: Tensor | None = None
 
 
@@ -69,7 +71,9 @@ class StarSource:
         require_finite("stars: directions", self.direction[self.named])
         for effect in self.effects:
             turn, shift = effect.turn, effect.shift
-            if (turn is not None and turn.shape != (shape[1], 3)) or (shift is not None and shift.shape != (count, 3)):
+            fits = effect.factor is None or effect.factor.shape == (count,)
+            fits &= (turn is None or turn.shape == (shape[1], 3)) and (shift is None or shift.shape == (count, 3))
+            if not fits:
                 raise InputError(f"stars: the effect of {effect.name} has another shape than stars and cameras")
 
     @property
@@ -82,6 +86,12 @@ class StarSource:
         zero = torch.zeros(self.pixels.shape[1], 3, dtype=torch.float64)
         turns = [zero if effect.turn is None else effect.turn for effect in self.effects]
         return torch.stack(turns) if turns else zero.new_zeros(0, *zero.shape)
+
+    def factors(self) -> Tensor:
+        """(E, S) by which these turns are larger for each star."""
+        one = torch.ones(len(self.names), dtype=torch.float64)
+        factors = [one if effect.factor is None else effect.factor for effect in self.effects]
+        return torch.stack(factors) if factors else one.new_zeros(0, len(one))
 
     def shifts(self) -> Tensor:
         """(E, S, 3) shifts of the stars at one sigma of each effect."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -11,6 +12,7 @@ from torch import Tensor
 from kcal.calibrate.rig.adjustment import chi2_quantile
 from kcal.calibrate.rig.blocks import RigState
 from kcal.calibrate.rig.problem import RigProblem
+from kcal.gaussian import inverse_root
 
 # Eigenvalues of the scaled information below this share of the largest are rounding, not information.
 _RANK_TOLERANCE = 1e-12
@@ -57,11 +59,8 @@ class SharedCovariance:
     def __init__(self, problem: RigProblem, state: RigState, variance: float = 1.0) -> None:
         self._problem, self._state = problem, state
         information, self._scale = problem.linearize(state).information()
-        values, vectors = torch.linalg.eigh(information)
-        is_open = values <= _RANK_TOLERANCE * values[-1:].sum()
-        self._open = vectors[:, is_open]
-        inverse = torch.where(is_open, 0.0, 1.0 / torch.where(is_open, 1.0, values))
-        self._root = self._scale[:, None] * vectors * (inverse * variance).sqrt()
+        root, self._open = inverse_root(information, self._scale, _RANK_TOLERANCE)
+        self._root = root * math.sqrt(variance)
 
     def of(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         """Covariance (K, K) of K linear functions (K, S) of a step, and which of them are determined.

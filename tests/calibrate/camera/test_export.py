@@ -29,7 +29,8 @@ LENSES = {
     "fisheye4": [0.05, -0.01, 0.003, -0.001],
 }
 FILES = {"opencv": "c.yaml", "ros": "ros.yaml", "kalibr": "k.yaml", "mrcal": "m.cameramodel", "colmap": "cameras.txt",
-         "nerfstudio": "transforms.json", "matlab": "m.mat", "opensfm": "camera_models.json"}  # fmt: skip
+         "nerfstudio": "transforms.json", "matlab": "m.mat", "opensfm": "camera_models.json", "toml": "c.toml",
+         "gtsam": "g.json", "ceres": "c.json", "numpy": "n.npz"}  # fmt: skip
 ROTATION = rotation_from_vector(torch.tensor([0.01, -0.02, 0.03], dtype=torch.float64))
 TRANSLATION = torch.tensor([-1.0, 0.02, 0.01], dtype=torch.float64)
 

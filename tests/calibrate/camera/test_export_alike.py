@@ -33,7 +33,17 @@ def test_a_wide_pair_becomes_omni_in_kalibr(tmp_path: Path) -> None:
     assert done.models == ("omni-radtan",) * 2
     # 0.53 px as equidistant.
     assert [misfit is not None and misfit.rms < 0.1 for misfit in done.misfits] == [True, True]
-    assert done.notes == ()
+    (note,) = done.notes
+    assert note.startswith("written as omni-radtan (camera 1 RMS 0.0")
+
+
+def test_a_camera_that_gets_worse_beside_another_is_told(tmp_path: Path) -> None:
+    exact = camera(420, "fisheye4", 0.02, 0.0, 0.0, 0.0)
+    done = export_cameras(rig(exact, NARROW), tmp_path / "chain.yaml", format="kalibr")
+    assert done.models == ("fisheye4", "fisheye4")
+    (note,) = done.notes
+    assert note.startswith("camera 2: written as fisheye4 (RMS 0.19 px)")
+    assert note.endswith("it is opencv4 (RMS 0.0024 px)")
 
 
 def test_one_lens_model_for_all_of_a_file(tmp_path: Path) -> None:

@@ -39,7 +39,7 @@ def test_it_gives_what_it_promises(model: str, monkeypatch: pytest.MonkeyPatch) 
     )
     found = next_view(camera, BOARD, noise)
     assert found is not None
-    promised = []
+    promised, informed = [], []
     views, shapes = possible_views(camera, BOARD), module.board_modes(BOARD.points).shapes
     some = [i for i, text in enumerate(views.words) if text == found.words] + [0, 20, 40]
     for i in some:
@@ -50,10 +50,23 @@ def test_it_gives_what_it_promises(model: str, monkeypatch: pytest.MonkeyPatch) 
         )
         after = Camera(camera.params.detach(), size=SIZE, model=camera.model)
         after.calibration = CameraCalibration(information=more)
+        informed.append(more)
         promised.append(far_sigma(after))
     assert promised[0] == pytest.approx(found.sigma, rel=1e-6)
     assert found.sigma < 0.98 * far_sigma(camera)
     assert min(promised) == promised[0]
+    # Once it is taken, the next one is asked for, without a new calibration; a view without a pose tells nothing.
+    nothing = torch.full_like(found.pixels, torch.nan)
+    then = next_view(camera, BOARD, noise, torch.stack([found.pixels, nothing]))
+    again = next_view(camera, BOARD, noise, found.pixels[None].repeat(2, 1, 1))
+    assert then is not None
+    assert again is not None
+    after.calibration = CameraCalibration(information=informed[0])
+    known_then = next_view(after, BOARD, noise)
+    assert known_then is not None
+    assert then.words == known_then.words != found.words
+    assert then.sigma == pytest.approx(known_then.sigma, rel=1e-5)
+    assert again.sigma < then.sigma < found.sigma
 
 
 def test_rows_are_derivatives_of_what_is_seen() -> None:

@@ -109,7 +109,7 @@ def test_what_others_said_is_told_apart(tmp_path: Path) -> None:
         unit = known.covariance() / sigma / sigma[:, None]
         torch.testing.assert_close(unit, result.covariance / sigma / sigma[:, None], rtol=0, atol=1e-6)
         # Where data and priors are largest together, nothing pulls any more.
-        rows = known.all_rows()
+        rows = known.whole.rows
         pull = known.half() @ (rows[:, :-1].T @ rows[:, -1])
         assert float(pull.abs().max()) < 0.2
         # Without others: the camera's own data and its prior.
@@ -137,9 +137,9 @@ def test_a_rig_counts_each_camera_once() -> None:
 def joint_half(cameras: list[Camera]) -> Tensor:
     """σ of the leading parameters of both cameras in a rig."""
     known = [None if camera.calibration is None else camera.calibration.information for camera in cameras]
-    knowledge = gathered(cameras, known, BOARD)
-    assert knowledge.board == (True, True)
-    unknowns, _ = joint_unknowns(cameras, knowledge, BOARD)
+    parts = gathered(cameras, known, BOARD)[0]
+    assert all(part is not None and part.board_size for part in parts)
+    unknowns, _ = joint_unknowns(cameras, parts, BOARD)
     return torch.cat([onto.square().sum(1).sqrt()[[0, 2, 3]] for onto in unknowns.cameras])
 
 

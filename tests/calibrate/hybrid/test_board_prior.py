@@ -9,17 +9,12 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.hybrid.board_modes import board_modes
-from kcal.calibrate.hybrid.board_orders import find_turns, mode_turn, quarter_turns, turned_corners
-from kcal.calibrate.hybrid.board_prior import (
-    BoardMessage,
-    BoardPrior,
-    message_from_rows,
-    multiplied,
-    printed_board,
-    printed_prior,
-)
+from kcal.calibrate.hybrid.board_orders import find_turns, mode_turn, quarter_turns, turned, turned_corners
+from kcal.calibrate.hybrid.board_prior import BoardPrior, evidence, printed_board, printed_prior
 from kcal.calibrate.hybrid.families import BOARD, typical_hyperprior
 from kcal.corners.board import Board
+from kcal.gaussian import Gaussian, numbered
+from kcal.lens.information import BOARD_SLOT
 
 F64 = torch.float64
 BOARD_86 = Board(columns=8, rows=6, square=0.03)
@@ -34,63 +29,54 @@ def log_normal(x: Tensor, covariance: Tensor) -> float:
     return -0.5 * float(x @ torch.linalg.solve(covariance, x) + torch.logdet(2 * math.pi * covariance))
 
 
-def test_lens_is_integrated_out() -> None:
-    """The message is the Schur complement of the lens in the information matrix."""
-    rows, deviation, variance = normal(200, 12, seed=1), torch.tensor([0.5, 2.0, 0.1, 1.0], dtype=F64), 0.3
-    K, g = rows[:, :-1].T @ rows[:, :-1] / variance, rows[:, :-1].T @ rows[:, -1] / variance
-    lens = K[:4, :4] + torch.diag(deviation**-2)
-    message = message_from_rows(rows, deviation, variance)
-    schur = K[4:, 4:] - K[4:, :4] @ torch.linalg.solve(lens, K[:4, 4:])
-    torch.testing.assert_close(message.root.T @ message.root, schur)
-    torch.testing.assert_close(message.root.T @ message.target, g[4:] - K[4:, :4] @ torch.linalg.solve(lens, g[:4]))
+def about_board(rows: Tensor, target: Tensor) -> Gaussian:
+    """A message: rows (R, B) of the amplitudes, and what they come to."""
+    slots = numbered(BOARD_SLOT, rows.shape[1])
+    return Gaussian(slots, rows.new_zeros(len(slots)), torch.cat([rows, -target[:, None]], 1))
 
 
-def test_products_and_evidence() -> None:
-    """Messages with a prior: the posterior, and the density of the targets under the prior."""
-    prior = BoardPrior(normal(5, seed=2), normal(5, 5, seed=3))
-    messages = [BoardMessage(normal(rows, 5, seed=rows), normal(rows, seed=rows + 9)) for rows in (7, 4)]
-    A, d = torch.cat([m.root for m in messages]), torch.cat([m.target for m in messages])
-    covariance = prior.half.T @ prior.half
-    after = torch.linalg.inv(torch.linalg.inv(covariance) + A.T @ A)
-    found = multiplied(prior, messages)
-    torch.testing.assert_close(found.board.half.T @ found.board.half, after, rtol=1e-7, atol=1e-9)
-    mean = prior.mean + after @ A.T @ (d - A @ prior.mean)
-    torch.testing.assert_close(found.board.mean, mean, rtol=1e-7, atol=1e-9)
-    density = log_normal(d - A @ prior.mean, torch.eye(11, dtype=F64) + A @ covariance @ A.T)
-    assert found.log_evidence == pytest.approx(density + 0.5 * 11 * math.log(2 * math.pi), rel=1e-9)
-    nothing = multiplied(prior, [])
-    assert nothing.log_evidence == 0.0
-    torch.testing.assert_close(nothing.board.mean, prior.mean)
+def test_evidence_is_the_density_of_the_targets() -> None:
+    """Of messages under a prior, against the dense covariance of what they say."""
+    half = normal(5, 5, seed=3)
+    covariance, at = half.T @ half, normal(5, seed=2)
+    prior = Gaussian.from_covariance(numbered(BOARD_SLOT, 5), at, covariance)
+    A, d = normal(11, 5, seed=7), normal(11, seed=16)
+    messages = [about_board(A[:7], d[:7]), about_board(A[7:], d[7:])]
+    density = log_normal(d - A @ at, torch.eye(11, dtype=F64) + A @ covariance @ A.T)
+    assert evidence(prior, messages) == pytest.approx(density + 0.5 * 11 * math.log(2 * math.pi), rel=1e-9)
+    assert evidence(prior, []) == 0.0
 
 
 def test_amplitudes_of_largest_evidence() -> None:
     """Boards with known spreads, seen well: the families' amplitudes come back, and no neighbor is better."""
     spread = torch.tensor([1e-3, 1e-4, 3e-4, 2e-4], dtype=F64)
     a = MODES.unit * spread[MODES.family] * normal(28, seed=4)
-    message = BoardMessage(1e6 * torch.eye(28, dtype=F64), 1e6 * a)
+    message = about_board(1e6 * torch.eye(28, dtype=F64), 1e6 * a)
     prior, value = printed_board(MODES, [message])
     typical = typical_hyperprior()
     mean, sd = typical.mean[BOARD:], typical.sd[BOARD:]
-    h = torch.stack([(prior.half.diagonal() / MODES.unit)[MODES.family == k][0].log() for k in range(4)])
+    h = torch.stack([(1.0 / prior.rows.diagonal() / MODES.unit)[MODES.family == k][0].log() for k in range(4)])
 
-    def evidence(h: Tensor) -> float:
+    def at(h: Tensor) -> float:
         hyper = 0.5 * float(((h - mean) / sd).square().sum())
-        return multiplied(printed_prior(MODES, h), [message]).log_evidence - hyper
+        return evidence(printed_prior(MODES, h), [message]) - hyper
 
-    assert value == pytest.approx(evidence(h), rel=1e-9)
+    assert value == pytest.approx(at(h), rel=1e-9)
     for k in range(4):
         for sign in (-0.3, 0.3):
-            assert evidence(h + sign * torch.eye(4, dtype=F64)[k]) < value
+            assert at(h + sign * torch.eye(4, dtype=F64)[k]) < value
     # Twelve draws determine a spread to 20 %; two, as of stretch and trapezoid, to half.
     assert (h[[0, 2]] - spread[[0, 2]].log()).abs().max() < 0.6
 
 
 def test_a_change_of_variables_is_the_same_board() -> None:
-    prior = BoardPrior(1e-4 * normal(28, seed=5), 1e-5 * normal(28, 28, seed=6))
+    told = about_board(1e4 * normal(40, 28, seed=6), normal(40, seed=5))
+    prior = BoardPrior(printed_prior(MODES, torch.full((4,), -8.0, dtype=F64)), told)
     z = normal(28, seed=7)
     points, modes = prior.applied(BOARD_86.points, MODES)
     there = points + torch.einsum("b,bkn->nk", z, modes.shapes)
-    a = prior.mean + prior.half.T @ z
+    mean, half = prior.whole.mean_and_half()
+    a = mean + half.T @ z
     torch.testing.assert_close(there, BOARD_86.points + torch.einsum("b,bkn->nk", a, MODES.shapes))
 
 
@@ -127,10 +113,11 @@ def test_a_turned_board_has_turned_amplitudes(board: Board, turns: tuple[int, ..
 
 def test_a_message_turns_with_its_board() -> None:
     turn = mode_turn(1)
-    message = BoardMessage(normal(30, 28, seed=9), normal(30, seed=10))
+    message = about_board(normal(30, 28, seed=9), normal(30, seed=10))
     a = normal(28, seed=11)
-    there = message.turned(turn)
-    torch.testing.assert_close(there.root @ (turn @ a), message.root @ a)
+    there = turned(message, 1)
+    residuals = [one.placed(one.slots, at).rows[:, -1] for one, at in ((there, turn @ a), (message, a))]
+    torch.testing.assert_close(residuals[0], residuals[1])
 
 
 def linear_views(a: Tensor, turns: Tensor, seed: int) -> Tensor:
@@ -149,7 +136,7 @@ def test_turned_views_are_found(count: int) -> None:
     turns = 2 * (torch.randperm(20, generator=torch.Generator().manual_seed(3)) < count).long()
     lens = torch.full((4,), 10.0, dtype=F64)
     prior = printed_prior(MODES, torch.full((4,), math.log(5e-4), dtype=F64))
-    a = prior.half.diagonal() * normal(28, seed=12)
+    a = normal(28, seed=12) / prior.rows.diagonal()
     found = find_turns(linear_views(a, turns, 20), BOARD_86, prior, lens, 1.0)
     assert torch.equal(found, turns)
     flat = find_turns(linear_views(0.0 * a, turns, 20), BOARD_86, prior, lens, 1.0)
@@ -161,5 +148,5 @@ def test_views_are_turned_to_a_known_board() -> None:
     turns = 2 * (torch.arange(12) > 2).long()
     lens = torch.full((4,), 10.0, dtype=F64)
     a = 5e-4 * MODES.unit * normal(28, seed=13)
-    known = BoardPrior(a, torch.diag(1e-5 * MODES.unit))
+    known = Gaussian.independent(numbered(BOARD_SLOT, 28), a, 1e-5 * MODES.unit)
     assert torch.equal(find_turns(linear_views(a, turns, 30), BOARD_86, known, lens, 1.0), turns)

@@ -8,12 +8,12 @@ import math
 import numpy as np
 import pytest
 import torch
-from standing_views import standing
+from standing_views import quadratic, standing
 from torch import Tensor
 
 from kcal.calibrate.hybrid.board_modes import BENDING, PRINT, STRETCH, TRAPEZOID, board_modes
 from kcal.calibrate.hybrid.evidence import maximize_evidence, negative_log_evidence
-from kcal.calibrate.hybrid.families import prior_families, typical_hyperprior
+from kcal.calibrate.hybrid.families import PriorFamilies, prior_families, typical_hyperprior
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.quadratic import Quadratic
 from kcal.calibrate.hybrid.unknowns import hybrid_problem
@@ -190,7 +190,7 @@ def test_board_modes() -> None:
     assert int(torch.linalg.matrix_rank(both / both.norm(dim=0), rtol=1e-6)) == 28 + len(rigid)
 
 
-def linear_case() -> tuple[Tensor, Tensor, float, object]:
+def linear_case() -> tuple[Quadratic, PriorFamilies]:
     model = LensModel(hybrid=_form())
     board = board_modes(BOARD.points)
     families = prior_families(_form(), 800.0, board, SIZE, 0.6)
@@ -199,7 +199,7 @@ def linear_case() -> tuple[Tensor, Tensor, float, object]:
     rows = rows / families.deviation(typical_hyperprior().mean)
     target = 0.3 * torch.randn(400, generator=generator, dtype=torch.float64)
     assert len(families.mean) == 3 + model.size + 28
-    return rows.T @ rows, rows.T @ target, float(target @ target), families
+    return quadratic(rows, target, torch.zeros_like(families.mean)), families
 
 
 def _form():
@@ -209,7 +209,7 @@ def _form():
 
 
 def test_prior_slopes() -> None:
-    _, _, _, families = linear_case()
+    _, families = linear_case()
     h = typical_hyperprior().mean
     numeric = []
     for k in range(len(h)):
@@ -223,10 +223,9 @@ def test_prior_slopes() -> None:
 
 def test_evidence_is_that_of_the_linear_model() -> None:
     """-ln p of a Gaussian linear model, by the covariance of the data, up to a constant; and it is a maximum."""
-    K, g, c, families = linear_case()
-    h, _, variance, loss = maximize_evidence(
-        standing(Quadratic(K, g, c, 400.0, torch.zeros_like(g))), families, typical_hyperprior().mean, 0.09
-    )
+    data, families = linear_case()
+    K, g, c = data.K, data.g, data.c
+    h, _, variance, loss = maximize_evidence(standing(data), families, typical_hyperprior().mean, 0.09)
 
     def value(h: Tensor, variance: float) -> float:
         d = families.deviation(h)
@@ -249,7 +248,7 @@ def test_evidence_is_that_of_the_linear_model() -> None:
 
 def test_evidence_is_found_where_a_trial_cannot_be_factorized() -> None:
     """Data that determine few directions very well: at the bounds the matrix cannot be factorized."""
-    _, _, _, families = linear_case()
+    _, families = linear_case()
     h = typical_hyperprior().mean
     generator = torch.Generator().manual_seed(2)
     wide = families.deviation(h)
@@ -257,7 +256,7 @@ def test_evidence_is_found_where_a_trial_cannot_be_factorized() -> None:
     rows = few @ torch.randn(5, len(wide), generator=generator, dtype=torch.float64) / wide
     truth = 30.0 * wide * torch.randn(len(wide), generator=generator, dtype=torch.float64)
     noise = 0.3 * torch.randn(400, generator=generator, dtype=torch.float64)
-    data = Quadratic(rows.T @ rows, rows.T @ noise, float(noise @ noise), 400.0, truth)
+    data = quadratic(rows, noise, truth)
     prior = typical_hyperprior()
     mean, sd = prior.mean.numpy(), prior.sd.numpy()
     far = families.deviation(torch.from_numpy(mean + 5 * sd)) / 1e-3
@@ -285,7 +284,7 @@ def test_evidence_is_found_where_a_trial_cannot_be_factorized() -> None:
 
 def test_evidence_has_no_rounding_of_squares() -> None:
     """Residuals of 1e-7 of what the unknowns explain: value and slope agree with the linear model's, solved by QR."""
-    _, _, _, families = linear_case()
+    _, families = linear_case()
     generator = torch.Generator().manual_seed(4)
     size = len(families.mean)
     rows = torch.randn(400, size, generator=generator, dtype=torch.float64) / families.deviation(
@@ -293,7 +292,7 @@ def test_evidence_has_no_rounding_of_squares() -> None:
     )
     at = torch.full((size,), 1e4, dtype=torch.float64) / rows.sum(1).std()
     noise = 1e-3 * torch.randn(400, generator=generator, dtype=torch.float64)
-    data = Quadratic(rows.T @ rows, rows.T @ noise, float(noise @ noise), 400.0, at)
+    data = quadratic(rows, noise, at)
     v = np.append(typical_hyperprior().mean.numpy(), 2.0 * math.log(1e-3))
     slope = negative_log_evidence(data, families, v)[1]
     for k in range(len(v)):

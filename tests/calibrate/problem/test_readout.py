@@ -13,9 +13,10 @@ from torch import Tensor
 from kcal.calibrate.hybrid.base_fit import fit_base
 from kcal.calibrate.hybrid.board_modes import board_modes
 from kcal.calibrate.hybrid.evidence import maximize_evidence
-from kcal.calibrate.hybrid.evidence_rounds import FittedViews, motion_is_worth, run_rounds
+from kcal.calibrate.hybrid.evidence_rounds import motion_is_worth, run_rounds
 from kcal.calibrate.hybrid.families import prior_families, typical_hyperprior
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
+from kcal.calibrate.hybrid.fitted_views import FittedViews
 from kcal.calibrate.hybrid.quadratic import Quadratic, ViewData, view_data
 from kcal.calibrate.hybrid.unknowns import hybrid_problem
 from kcal.calibrate.problem.board_problem import BoardProblem
@@ -215,7 +216,8 @@ def test_deviations_of_motions_by_evidence() -> None:
 
     def value(h: Tensor, ratio: np.ndarray, variance: float) -> float:
         integrated = data.integrated(ratio)
-        K, g, c, freedom, _ = integrated.data
+        form = integrated.data
+        K, g, c, freedom = form.K, form.g, form.c, form.freedom
         d = families.deviation(h)
         A = K * d[:, None] * d / variance + torch.eye(len(d), dtype=F64)
         b = d * g / variance
@@ -341,10 +343,18 @@ def test_limits_of_motions() -> None:
 def test_motion_is_looked_for_beside_a_fit_of_views_that_stand_still(rate: float, worth: bool) -> None:
     pixels, points = capture(rate, 8), BOARD.points
     weights, board, hyperprior = torch.ones_like(pixels[..., 0]), board_modes(BOARD.points), typical_hyperprior(MODES)
-    estimate, _ = fit_base(points, pixels, SIZE, weights, MODES, board, True, None, False, hyperprior.mean, None)
     views = FittedViews(
-        points=points, board=board, pixels=pixels, weights=weights, readout=None, square=True, robust=False, exact=False
+        points=points,
+        board=board,
+        pixels=pixels,
+        size=SIZE,
+        weights=weights,
+        readout=None,
+        square=True,
+        robust=False,
+        exact=False,
     )
+    estimate, _ = fit_base(views, MODES, None, hyperprior.mean, None)
     never = torch.zeros_like(estimate.families.mean, dtype=torch.bool)
     rounds = run_rounds(views, estimate, hyperprior, never, cold=True, spent=0, rough=True, progress=lambda _: None)
     distance = float(estimate.state.translation.norm(dim=-1).median())

@@ -111,7 +111,7 @@ def test_rows_taken_out_and_put_back() -> None:
     whole = known(cameras("hybrid", tuple(f"{i}.png" for i in range(14)))[0])
     part = torch.cat([whole.rows[::3], whole.residuals[::3, None]], 1)
     rest = less(whole, part)
-    scale = torch.linalg.vector_norm(whole.all_rows()[:, :-1], dim=0)
+    scale = torch.linalg.vector_norm(whole.whole.rows[:, :-1], dim=0)
     together = rest.rows.T @ rest.rows + part[:, :-1].T @ part[:, :-1]
     unit = (together - whole.rows.T @ whole.rows) / scale / scale[:, None]
     assert float(unit.abs().max()) < 1e-9
@@ -123,7 +123,7 @@ def test_rows_taken_out_and_put_back() -> None:
 def test_unknowns_have_the_cameras_covariance() -> None:
     """Unit variances of the unknowns are the calibrations' covariances."""
     both = cameras("opencv14", tuple(f"{i}.png" for i in range(14)))
-    found, deviation = joint_unknowns(both, gathered(both, [known(camera) for camera in both], None), None)
+    found, deviation = joint_unknowns(both, gathered(both, [known(camera) for camera in both], None)[0], None)
     assert deviation is None
     assert bool(found.known.all())
     for camera, by_unknown in zip(both, found.cameras, strict=True):
@@ -131,21 +131,34 @@ def test_unknowns_have_the_cameras_covariance() -> None:
         torch.testing.assert_close(by_unknown.square().sum(1).sqrt(), sigma, rtol=1e-6, atol=1e-12)
 
 
+def sharing(both: tuple[Camera, Camera], known: list[CameraInformation], board: Board) -> tuple[bool, ...]:
+    return tuple(part is not None and part.board_size > 0 for part in gathered(both, known, board)[0])
+
+
 def test_one_board_is_shared_and_two_are_not() -> None:
     """By the evidence: both cameras saw this board; the same pattern printed again is another board."""
     names = tuple(f"{i}.png" for i in range(14))
     left, right = cameras("hybrid", names)
     informations = [known(left), known(right)]
-    assert gathered((left, right), informations, BOARD).board == (True, True)
+    assert sharing((left, right), informations, BOARD) == (True, True)
     # A board that differs by 20 of its standard deviations.
     own = informations[1]
     sigma = own.half()[:, own.lens_size :].norm(dim=0)
     moved = own.estimate.clone()
     moved[own.lens_size :] += 20.0 * sigma
     other = dataclasses.replace(own, estimate=moved)
-    assert gathered((left, right), [informations[0], other], BOARD).board == (True, False)
+    assert sharing((left, right), [informations[0], other], BOARD) == (True, False)
+    assert gathered((left, right), [informations[0], other], BOARD)[1] == ((0, 1),)
+    changed = Camera(right.params.detach(), size=SIZE, model=right.model)
+    assert right.calibration is not None
+    changed.calibration = dataclasses.replace(right.calibration, information=other)
+    views = pairs(14)[0].names[:6]
+    for camera, said in ((right, False), (changed, True)):
+        found = calibrate_rig(left, camera, *pairs(14), [(n, n) for n in views], RigOptions(reject=False))
+        text = f"the calibrations of left and right contradict each other about their board ({BOARD}): two prints"
+        assert any(warning.startswith(text) for warning in found.warnings) == said
     # A rig's board of another size is nobody's.
-    assert gathered((left, right), informations, Board(columns=9, rows=6, square=0.1)).board == (False, False)
+    assert sharing((left, right), informations, Board(columns=9, rows=6, square=0.1)) == (False, False)
 
 
 def test_a_board_that_no_camera_knows() -> None:
@@ -154,8 +167,8 @@ def test_a_board_that_no_camera_knows() -> None:
     other = Board(columns=9, rows=6, square=0.1)
     for model, measured, modes in (("hybrid", False, 28), ("hybrid", True, 0), ("opencv5", False, 0)):
         both = cameras(model, names)
-        knowledge = gathered(both, [known(camera) for camera in both], other)
-        found, deviation = joint_unknowns(both, knowledge, other, measured=measured)
+        parts = gathered(both, [known(camera) for camera in both], other)[0]
+        found, deviation = joint_unknowns(both, parts, other, measured=measured)
         assert len(found.shapes) == modes
         assert (deviation is None) == (modes == 0)
         if modes:

@@ -1,0 +1,119 @@
+"""Views to which a hybrid camera is fitted, where a fit stands, and the least squares of both."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kcal.calibrate.hybrid.board_modes import BoardModes
+from kcal.calibrate.hybrid.families import PriorFamilies
+from kcal.calibrate.hybrid.quadratic import ViewData, view_data
+from kcal.calibrate.hybrid.unknowns import hybrid_problem
+from kcal.calibrate.problem.board_problem import BoardProblem
+from kcal.calibrate.problem.readout import Readout, stillness
+from kcal.calibrate.problem.state import BoardState
+from kcal.calibrate.problem.views import LEAST_NOISE
+from kcal.lens.model import LensModel
+from kcal.solve.lm import LMOptions, minimize
+from kcal.solve.robust import RobustLoss
+
+# The logarithms of motions' standard deviations over the noise, of views that stand still.
+NO_MOTION = np.zeros(0)
+
+
+class Estimate(NamedTuple):
+    """Where a fit stands."""
+
+    model: LensModel
+    families: PriorFamilies
+    state: BoardState
+    hyperparameters: Tensor
+    log_ratio: np.ndarray
+    variance: float
+    tempering: float
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class FittedViews:
+    """What a camera is fitted to.
+
+    Args:
+        points: (N, 3) the board as it was before, meters.
+        board: how it may differ.
+        pixels: (V, N, 2), NaN where not seen.
+        size: (width, height) of the image.
+        weights: (V, N) by which residuals are multiplied.
+        readout: how views move while they are read; None: they stand still.
+        square: whether pixels are square.
+        robust: bound the weight of corners that are far off.
+        exact: the board does not differ.
+    """
+
+    points: Tensor
+    board: BoardModes
+    pixels: Tensor
+    size: tuple[int, int]
+    weights: Tensor
+    readout: Readout | None
+    square: bool
+    robust: bool
+    exact: bool
+
+    @property
+    def seen(self) -> Tensor:
+        """(V, N)."""
+        return torch.isfinite(self.pixels).all(-1) & (self.weights > 0)
+
+    @property
+    def freedom(self) -> int:
+        """Residuals without those that poses take up."""
+        return 2 * int(self.seen.sum()) - 6 * len(self.pixels)
+
+    def problem(self, estimate: Estimate, never: Tensor) -> BoardProblem:
+        """The least squares at amplitudes of an estimate; unknowns of which `never` is true are held."""
+        deviation = estimate.families.deviation(estimate.hyperparameters)
+        precision = torch.where(never, torch.inf, estimate.variance / deviation.square())
+        problem = hybrid_problem(
+            self.points,
+            self.board.shapes,
+            self.pixels,
+            self.weights,
+            estimate.model,
+            estimate.families.mean,
+            precision,
+            self.readout,
+            stillness(estimate.log_ratio),
+            self.square,
+        )
+        if self.robust:
+            return problem.with_weights(_cauchy_weights(problem, estimate.state, self.weights))
+        return problem
+
+    def solved(
+        self, estimate: Estimate, never: Tensor, effort: tuple[int, float]
+    ) -> tuple[BoardProblem, Estimate, int]:
+        """The problem, the estimate with its solution, and the trial steps."""
+        problem = self.problem(estimate, never)
+        steps, gain = effort
+        options = LMOptions(max_iterations=steps, tolerance=gain / self.freedom, initial_damping=1e-6)
+        result = minimize(problem, estimate.state, options)
+        return problem, estimate._replace(state=result.state), int(result.iterations)
+
+    def data(self, problem: BoardProblem, estimate: Estimate, never: Tensor) -> ViewData:
+        """What the views say near an estimate."""
+        off, motion = problem.motion_off_poses(estimate.state), estimate.state.motion
+        off[:, motion.shape[1] : -1][:, never] = 0.0
+        return view_data(off, problem.unknowns(estimate.state) - estimate.families.mean, motion, self.freedom)
+
+
+def _cauchy_weights(problem: BoardProblem, state: BoardState, weights: Tensor) -> Tensor:
+    """(V, N) weights of a Cauchy loss at a state, its scale three robust standard deviations; 0 without an image."""
+    length = (problem.pixel_errors(state) * weights[:, None]).norm(dim=1)
+    shown = torch.isfinite(length) & problem.seen
+    # Of two normal components, the median length is 1.18 standard deviations.
+    scale = max(3.0 * float(length[shown].median()) / 1.18, LEAST_NOISE)
+    return torch.where(shown, weights * RobustLoss(kind="cauchy", scale=scale).weight(length.square()).sqrt(), 0.0)

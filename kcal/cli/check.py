@@ -1,0 +1,296 @@
+"""`kcal check`: are the error bars of a camera true at my site?"""
+
+from __future__ import annotations
+
+import io
+import math
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from kcal.cli.console import err, out, print_table, print_wrote, steps, tell, warn
+from kcal.cli.inputs import CALIBRATED, OBSERVATIONS
+from kcal.cli.report import NO
+from kcal.cli.sides import check_views_of
+from kcal.errors import FileError, InputError
+from kcal.files import check_picture, check_writable, read_bytes, write_atomic
+
+if TYPE_CHECKING:
+    from kcal.calibrate.camera.interval_check import IntervalCheck, Refit
+    from kcal.calibrate.camera.options import CalibrationOptions
+    from kcal.calibrate.camera.result import CameraCalibrationResult
+    from kcal.lens.camera import Camera
+
+# Exit code of a run that was interrupted, as in all commands.
+_INTERRUPTED = 130
+# Of a file of refits: 100 of them over an image take 3 MiB.
+_LARGEST_RUN = 2**28
+# Seconds between two writes of what is done.
+_OFTEN = 5.0
+
+
+def check_command(
+    camera: Annotated[Path, typer.Argument(help="Camera file from `kcal calibrate`.", show_default=False), CALIBRATED],
+    observations: Annotated[
+        Path | None,
+        typer.Option(metavar="OBS", help="What it was calibrated from; found beside the camera if not given."),
+        OBSERVATIONS,
+    ] = None,
+    ranges: Annotated[
+        list[float] | None,
+        typer.Option("--range", metavar="M", min=1e-3, help="Distance of what you look at; far away if not given."),
+    ] = None,
+    against: Annotated[
+        Path | None,
+        typer.Option(metavar="OBS", help="A second capture of this camera: is it where the first one says?"),
+        OBSERVATIONS,
+    ] = None,
+    refits: Annotated[int, typer.Option(min=10, max=100_000, help="Captures to simulate.")] = 100,
+    picture: Annotated[Path | None, typer.Option(metavar="PNG", help="Map of where the intervals hold.")] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="NPZ", help="Refits that are done; CAMERA.check.npz if not given."),
+    ] = None,
+) -> None:
+    """Are the error bars of a camera true, here and at my ranges? Yes or no.
+
+    Simulates the camera's own capture again and again: its poses, corners, noise and motion, with true cameras and
+    boards drawn from what the calibration leaves open. Each is calibrated, and its error is compared with what the
+    camera file states, over the image and at each range. A hundred take about a minute.
+
+    That supposes that the model can describe lens and board. Two tests do not: halves of the views, and the default
+    lens where another was chosen, must agree with the camera; and so must a second capture (--against), which is
+    calibrated, too.
+
+    What is done is kept: after an interruption the same command continues.
+
+    The exit code is 0 if the intervals are true, 3 if they are not, 1 if that could not be measured, 130 if it was
+    interrupted.
+
+    **Examples**
+
+    `kcal check left.camera.json --range 1000 --picture check.png`
+
+    `kcal check left.camera.json --against december.obs.json`
+    """
+    name = camera.name.removesuffix(".json").removesuffix(".camera")
+    kept = check_writable(output or camera.with_name(f"{name}.check.npz"), camera)
+    if picture is not None:
+        check_picture(picture)
+
+    from kcal.calibrate.camera.interval_check import FEWEST, interval_check
+
+    at = [float(one) for one in ranges] if ranges else [math.inf]
+    result, options, fingerprint = _calibration_of(camera, observations)
+    done, whole = _all_refits(result, options, at, refits, fingerprint, kept)
+    if len(done) < FEWEST:
+        err.print(f"interrupted after {len(done)} of {refits} refits: too few to tell; {kept} has them", markup=False)
+        raise typer.Exit(_INTERRUPTED)
+    found = interval_check(result, at, done)
+    fine = _told_refits(found, len(done))
+    if whole:
+        fine = _told_views(result, options) and fine
+        if against is not None:
+            fine = _told_against(result, against, options, at) and fine
+    if picture is not None:
+        from kcal.report.interval_map import save_interval_picture
+
+        print_wrote(save_interval_picture(picture, found, result.observations, camera.name))
+    print_wrote(kept)
+    if not whole:
+        err.print(f"interrupted after {len(done)} of {refits} refits; the same command continues", markup=False)
+        raise typer.Exit(_INTERRUPTED)
+    if not fine:
+        raise typer.Exit(NO)
+
+
+def _calibration_of(path: Path, observations: Path | None) -> tuple[CameraCalibrationResult, CalibrationOptions, str]:
+    """The calibration, with residuals and poses, which a camera file does not have; and the file's fingerprint."""
+    from kcal.calibrate.camera.calibrate import calibrate_camera
+    from kcal.calibrate.camera.trust import stored_options
+    from kcal.corners.observations import Observations
+    from kcal.io.camera_file import load_camera
+    from kcal.report.judge_camera import other_views
+
+    camera = load_camera(path)
+    if camera.calibration is None or camera.calibration.known(camera.params.detach()) is None:
+        raise InputError(
+            f"{path}: the camera has no error bars that could be checked; calibrate it with kcal calibrate"
+        )
+    file = observations or _observations_beside(path, camera)
+    seen, options = Observations.load(file), stored_options(camera)
+    check_views_of([camera], [seen], [file])
+    with steps("calibrating", None) as advance:
+        result = calibrate_camera(seen, options, advance)
+    others, _ = other_views(camera, result)
+    if others:
+        raise InputError(f"{file}: {others[0].text}; {others[0].action}")
+    return result, options, camera.fingerprint
+
+
+def _observations_beside(path: Path, camera: Camera) -> Path:
+    record = camera.calibration.record if camera.calibration else None
+    name = record.observations if record else None
+    if name is None or not path.with_name(Path(name).name).exists():
+        wanted = f" ({name})" if name else ""
+        raise InputError(f"{path}: its observations{wanted} are not beside it; name them with --observations")
+    return path.with_name(Path(name).name)
+
+
+def _all_refits(
+    result: CameraCalibrationResult,
+    options: CalibrationOptions,
+    ranges: list[float],
+    count: int,
+    fingerprint: str,
+    path: Path,
+) -> tuple[list[Refit], bool]:
+    """So many refits, those of an earlier run included; and whether these are all."""
+    from kcal.calibrate.camera.interval_check import GRID, simulated_refits
+
+    # That of the file: a calibration that is made again differs in the last digits.
+    key = repr((fingerprint, [view.pixels for view in result.observations.views], ranges, GRID))
+    done = _kept_refits(path, key)[:count]
+    if done:
+        out.print(f"{len(done)} refits are done already ({path})", markup=False)
+    seen = {refit.seed for refit in done}
+    todo = [seed for seed in range(count) if seed not in seen]
+    saved, whole = time.monotonic(), True
+    try:
+        with steps("refits", count) as advance:
+            advance("", len(done))
+            for refit in simulated_refits(result, options, ranges, todo):
+                done.append(refit)
+                advance(f"{len(done)} of {count}")
+                if time.monotonic() - saved > _OFTEN:
+                    _keep_refits(path, key, done)
+                    saved = time.monotonic()
+    except KeyboardInterrupt:
+        whole = False
+    if todo and done:
+        _keep_refits(path, key, done)
+    return done, whole
+
+
+def _run_digest(key: str) -> str:
+    import hashlib
+
+    from kcal import __version__
+
+    return hashlib.sha256(f"{__version__}{key}".encode()).hexdigest()[:16]
+
+
+def _keep_refits(path: Path, key: str, refits: list[Refit]) -> None:
+    import numpy as np
+
+    data = io.BytesIO()
+    parts = {name: np.stack([np.asarray(getattr(one, name)) for one in refits]) for name in ("seed", "errors", "own")}
+    np.savez_compressed(data, allow_pickle=False, kcal=np.array("check"), key=np.array(_run_digest(key)), **parts)
+    write_atomic(path, data.getvalue())
+
+
+def _kept_refits(path: Path, key: str) -> list[Refit]:
+    """The refits of an earlier run; none where the file is of another camera, other ranges or another version."""
+    import torch
+
+    from kcal.calibrate.camera.interval_check import Refit
+    from kcal.strict_npz import read_npz
+
+    if not path.exists():
+        return []
+    arrays = read_npz(read_bytes(path, _LARGEST_RUN), str(path), _LARGEST_RUN, "run of kcal check")
+    if str(arrays.get("kcal")) != "check":
+        raise FileError(f"{path}: not a file of kcal check; choose another name with -o")
+    if str(arrays.get("key")) != _run_digest(key):
+        warn(f"{path} has refits of another camera, capture, range or version of kcal; they are made anew")
+        return []
+    try:
+        parts = zip(
+            arrays["seed"].tolist(), *(torch.from_numpy(arrays[name]) for name in ("errors", "own")), strict=True
+        )
+        return [Refit(seed, errors, own) for seed, errors, own in parts]
+    except (KeyError, TypeError, ValueError) as error:
+        raise FileError(f"{path}: damaged; remove it and start again") from error
+
+
+def _told_refits(found: IntervalCheck, count: int) -> bool:
+    """Print the answer."""
+    from kcal.report.interval_map import range_label
+
+    rows = [["range", "refits inside, %", "±", "lowest place, %", "error px, RMS", "stated px, RMS", "σ should be"]]
+    parts = zip(found.ranges, found.shares, found.coverage, found.rms, found.factors, strict=True)
+    for at, (share, error), places, (seen, told), factor in parts:
+        lowest = float(places[places.isfinite()].min())
+        rows.append([
+            range_label(at), f"{100 * share:.1f}", f"{100 * error:.1f}", f"{100 * lowest:.0f}", f"{seen:.3g}",
+            f"{told:.3g}", f"x {factor:.2f}",
+        ])  # fmt: skip
+    print_table(rows)
+    if found.failed:
+        warn(f"{found.failed} of {count} simulated captures could not be calibrated; they are not counted")
+    worst = min(range(len(rows) - 1), key=lambda i: found.shares[i][0])
+    share, where = 100 * found.shares[worst][0], range_label(found.ranges[worst])
+    if found.true:
+        text = f"the stated 95 % intervals are true: they contain {share:.0f} % of {count} refits, {where}"
+    else:
+        text = (
+            f"the stated 95 % intervals are too narrow: they contain {share:.0f} % of {count} refits, {where}; "
+            f"multiply σ by {found.factors[worst]:.2f}, or take more views"
+        )
+    out.print(f"[bold]{'YES' if found.true else 'NO'}[/]:", end=" ")
+    out.print(text, markup=False)
+    tell(
+        true=found.true,
+        refits=count,
+        failed=found.failed,
+        ranges_m=[None if math.isinf(at) else at for at in found.ranges],
+        shares=[share for share, _ in found.shares],
+        share_errors=[error for _, error in found.shares],
+        factors=found.factors,
+    )
+    return found.true
+
+
+def _told_views(result: CameraCalibrationResult, options: CalibrationOptions) -> bool:
+    """Print whether the capture's own views contradict the intervals: by their halves, and by the default lens."""
+    from kcal.report.model_findings import fault_of_views
+
+    with steps("examining the views", None) as advance:
+        fault = fault_of_views(result, options, advance)
+    out.print(f"[bold]{'YES' if fault is None else 'NO'}[/]:", end=" ")
+    if fault is None:
+        out.print("its own views say nothing against lens model and board", markup=False)
+    else:
+        out.print(f"its own views contradict the stated intervals: {fault.text}; {fault.action}", markup=False)
+    tell(fault=None if fault is None else fault.text)
+    return fault is None
+
+
+def _told_against(
+    result: CameraCalibrationResult, path: Path, options: CalibrationOptions, ranges: list[float]
+) -> bool:
+    """Print whether a second capture gives the same camera."""
+    from kcal.calibrate.camera.interval_check import against_capture
+    from kcal.corners.observations import Observations
+    from kcal.report.interval_map import range_label
+
+    second = Observations.load(path)
+    check_views_of([result.camera], [second], [path])
+    with steps(f"calibrating {path.name}", None):
+        found = against_capture(result, second, options, ranges)
+    rows = [["range", "seen px, RMS", "predicted px, RMS", "seen / predicted", "probability"]]
+    for at, one in zip(ranges, found, strict=True):
+        ratio, chance = one.ratio or math.nan, one.probability if one.probability is not None else math.nan
+        rows.append([range_label(at), f"{one.rms:.3g}", f"{one.rms / ratio:.3g}", f"{ratio:.2f}", f"{chance:.2g}"])
+    print_table(rows)
+    same = all(bool(one.same) for one in found)
+    verdict = "agrees with" if same else "contradicts"
+    more = "" if same else ": a lens or board that the model does not describe, or a camera that changed"
+    out.print(f"[bold]{'YES' if same else 'NO'}[/]:", end=" ")
+    out.print(f"the second capture {verdict} the stated intervals{more}", markup=False)
+    tell(
+        against={"same": same, "ratios": [one.ratio for one in found], "probabilities": [o.probability for o in found]}
+    )
+    return same

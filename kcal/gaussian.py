@@ -1,0 +1,239 @@
+"""Gaussians as square roots of information, over unknowns that have names.
+
+What is known of a camera, a board, a rig or a type of lens is one `Gaussian`: rows of whitened derivatives. Rows of
+other data are stacked below them, what is not asked for is integrated out by QR, and all is inverted once, at the end
+(Bierman, Factorization Methods for Discrete Sequential Estimation, 1977). So covariances of rich lenses, which are
+nearly singular, and unknowns that nothing determines, which have none, are no trouble.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Hashable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+# Singular values of scaled rows below this share of the largest are rounding, not information.
+_ROUNDING = 1e-13
+
+Slots = tuple[Hashable, ...]
+
+
+def numbered(name: Hashable, count: int) -> Slots:
+    """Names of unknowns of one kind: (name, 0), (name, 1), ..."""
+    return tuple((name, number) for number in range(count))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Gaussian:
+    """exp(-½ ‖A (x - at) + r‖²) of unknowns x with names; not normalized, and nothing need be determined.
+
+    Args:
+        slots: (U,) the names of the unknowns, each once.
+        at: (U,) the place about which the rows are stated.
+        rows: (R, U + 1): A, and as the last column r, the residuals there, in standard deviations.
+
+    Raises:
+        ValueError: shapes that do not fit each other, or a name that occurs twice.
+
+    Example:
+        >>> one = Gaussian.independent(("x", "y"), torch.tensor([3.0, 0.0]), torch.tensor([0.5, 1.0]))
+        >>> other = Gaussian(("y", "x"), torch.zeros(2), torch.tensor([[1.0, -1.0, 2.0]]))  # y = x - 2 ± 1
+        >>> both = one + other
+        >>> both.slots, [round(value, 3) for value in both.mean.tolist()]
+        (('x', 'y'), [2.889, 0.444])
+    """
+
+    slots: Slots
+    at: Tensor
+    rows: Tensor
+
+    def __post_init__(self) -> None:
+        if self.at.shape != (len(self.slots),) or self.rows.shape[1:] != (len(self.slots) + 1,):
+            raise ValueError(f"{len(self.slots)} unknowns at {tuple(self.at.shape)} with rows {tuple(self.rows.shape)}")
+        if len(set(self.slots)) < len(self.slots):
+            raise ValueError("an unknown occurs twice")
+
+    @classmethod
+    def independent(cls, slots: Slots, mean: Tensor, sigma: Tensor) -> Gaussian:
+        """Of independent unknowns with these means and standard deviations."""
+        return cls(slots, mean, torch.nn.functional.pad(torch.diag(1.0 / sigma), (0, 1)))
+
+    @classmethod
+    def from_covariance(cls, slots: Slots, mean: Tensor, covariance: Tensor) -> Gaussian:
+        """Of a covariance (U, U) whose diagonal is positive."""
+        spread = covariance.diagonal().sqrt()
+        values, vectors = torch.linalg.eigh(covariance / spread[:, None] / spread)
+        # A variance that is zero to rounding would weigh infinitely much.
+        roots = (vectors / values.clamp_min(_ROUNDING).sqrt()) @ vectors.T
+        return cls(slots, mean, torch.nn.functional.pad(roots / spread, (0, 1)))
+
+    def __add__(self, other: Gaussian) -> Gaussian:
+        """What both say, stacked: the product of the densities, about the place of the first where it has one."""
+        new = [number for number, slot in enumerate(other.slots) if slot not in set(self.slots)]
+        slots = (*self.slots, *(other.slots[number] for number in new))
+        at = torch.cat([self.at, other.at[new]])
+        return Gaussian(slots, at, torch.cat([self.placed(slots, at).rows, other.placed(slots, at).rows]))
+
+    def placed(self, slots: Slots, at: Tensor) -> Gaussian:
+        """The same about another place (U',), with columns in another order; of further unknowns it says nothing."""
+        number = {slot: column for column, slot in enumerate(slots)}
+        where = [number[slot] for slot in self.slots]
+        rows = self.rows.new_zeros(len(self.rows), len(slots) + 1)
+        rows[:, where] = self.rows[:, :-1]
+        rows[:, -1] = self.rows[:, -1] + self.rows[:, :-1] @ (at[where] - self.at)
+        return Gaussian(slots, at, rows)
+
+    def marginal(self, slots: Slots) -> Gaussian:
+        """What is said of some unknowns, whatever the others are, in as many rows as there are unknowns at most."""
+        others = tuple(slot for slot in self.slots if slot not in set(slots))
+        number = {slot: column for column, slot in enumerate(self.slots)}
+        order = [number[slot] for slot in (*others, *slots)]
+        count, triangle = len(others), triangular(self.rows[:, [*order, len(order)]])
+        kept = triangle[count:-1, count:]
+        corner = triangle[:count, :count]
+        length = torch.linalg.vector_norm(corner, dim=0)
+        if bool((corner.diagonal().abs() <= _ROUNDING * length).any()):
+            # Rows of unknowns that nothing determines say something of the rest.
+            left, values, _ = torch.linalg.svd(corner * unit_scale(corner))
+            free = left[:, values <= _ROUNDING * values[:1].sum()]
+            kept = triangular(torch.cat([free.T @ triangle[:count, count:], kept]))[:-1]
+        return Gaussian(slots, self.at[order[count:]], kept)
+
+    def conditioned(self, slots: Slots) -> Gaussian:
+        """What is said of the others while some unknowns are held where they are."""
+        others = [number for number, slot in enumerate(self.slots) if slot not in set(slots)]
+        names = tuple(self.slots[number] for number in others)
+        return Gaussian(names, self.at[others], self.rows[:, [*others, len(self.slots)]])
+
+    def replaced(self, old: Slots, begin: Tensor, change: Tensor, new: Slots) -> Gaussian:
+        """In other variables z (Z,) about zero, after all others: the old ones are begin + change z; change (U', Z)."""
+        gone = {slot: number for number, slot in enumerate(self.slots)}
+        columns = [gone.pop(slot) for slot in old]
+        rest, moved = list(gone.values()), self.rows[:, columns]
+        residual = self.rows[:, -1] + moved @ (begin - self.at[columns])
+        rows = torch.cat([self.rows[:, rest], moved @ change, residual[:, None]], 1)
+        return Gaussian((*gone, *new), torch.cat([self.at[rest], change.new_zeros(len(new))]), rows)
+
+    def named(self, slots: Slots) -> Gaussian:
+        """The same under other names."""
+        return dataclasses.replace(self, slots=slots)
+
+    def weighted(self, weight: float) -> Gaussian:
+        """Rows times a weight: one over the noise of rows in pixels, or less than one for data that count less."""
+        return dataclasses.replace(self, rows=self.rows * weight)
+
+    def compressed(self) -> Gaussian:
+        """The same in U rows, an upper triangle; what is one already stays as it is, to the last bit."""
+        if len(self.rows) == len(self.slots) and not bool(self.rows.tril(-1).any()):
+            return self
+        return dataclasses.replace(self, rows=triangular(self.rows)[:-1])
+
+    @property
+    def products(self) -> Tensor:
+        """(U + 1, U + 1) of the rows: the normal equations, and χ² at the place."""
+        return self.rows.T @ self.rows
+
+    @property
+    def mean(self) -> Tensor:
+        """(U,) of rows that determine all unknowns."""
+        return self.mean_and_half()[0]
+
+    def mean_and_half(self) -> tuple[Tensor, Tensor]:
+        """(U,), and the lower triangle (U, U) whose halfᵀ half is the covariance, of rows that determine everything."""
+        triangle = self.compressed().rows
+        eye = torch.eye(len(self.slots), dtype=triangle.dtype)
+        half = torch.linalg.solve_triangular(triangle[:, :-1], eye, upper=True).T
+        return self.at - half.T @ triangle[:, -1], half
+
+    def half(self) -> Tensor:
+        """(U, U): halfᵀ half is the covariance of the unknowns; what nothing determines has a very large one."""
+        return posterior_half(self.rows[:, :-1])
+
+    def log_integral(self) -> float:
+        """Logarithm of ∫ dx, less ½ U ln 2π, of rows that determine all unknowns.
+
+        That of a prior and data together less that of the prior alone is the logarithm of the data's evidence.
+        """
+        diagonal = triangular(self.rows).diagonal()
+        return float(-diagonal[:-1].abs().log().sum() - 0.5 * diagonal[-1].square())
+
+
+def stacked(gaussians: Sequence[Gaussian]) -> Gaussian:
+    """All of them together; one at least."""
+    first, *others = gaussians
+    return sum(others, first)
+
+
+def triangular(rows: Tensor) -> Tensor:
+    """(C, C) upper triangle with the same products as rows (R, C)."""
+    missing = max(0, rows.shape[1] - len(rows))
+    padded = torch.cat([rows, rows.new_zeros(missing, rows.shape[1])])
+    return torch.linalg.qr(padded, mode="r")[1]
+
+
+def unit_scale(rows: Tensor) -> Tensor:
+    """(C,) factors that make the columns of rows (R, C) unit vectors; 1 for columns of zeros."""
+    length = torch.linalg.vector_norm(rows, dim=0)
+    return torch.where(length > 0, 1.0 / torch.where(length > 0, length, 1.0), 1.0)
+
+
+def posterior_half(rows: Tensor) -> Tensor:
+    """(U, U) whose product halfᵀ half is the inverse of rowsᵀ rows, from rows (R, U).
+
+    Directions that the rows do not determine get a very large variance, which only rounding limits.
+
+    Example:
+        >>> posterior_half(torch.tensor([[2.0, 0], [0, 4.0]]).double()).abs().sum(0)
+        tensor([0.5000, 0.2500], dtype=torch.float64)
+    """
+    change, _, known = whitened(rows, rows.new_zeros(len(rows)))
+    return torch.where(known, change, change / _ROUNDING).T
+
+
+def inverse_root(information: Tensor, scale: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
+    """Invert scaled normal equations as far as they determine anything.
+
+    Args:
+        information: (S, S) of unknowns over their scale.
+        scale: (S,).
+        tolerance: eigenvalues below this share of the largest are rounding.
+
+    Returns:
+        a root (S, R) of the covariance of the unknowns, and orthonormal directions (S, O) that are open, of the scaled
+        unknowns.
+    """
+    values, vectors = torch.linalg.eigh(information)
+    known = values > tolerance * values[-1:].sum()
+    return (scale[:, None] * vectors)[:, known] * values[known].rsqrt(), vectors[:, ~known]
+
+
+class Whitened(NamedTuple):
+    """Unknowns y in place of x: x = change (y - begin).
+
+    Attributes:
+        change: (U, U).
+        begin: (U,) what y is at x = 0.
+        known: (U,) whether y is a standard normal; nothing is known of the others.
+    """
+
+    change: Tensor
+    begin: Tensor
+    known: Tensor
+
+
+def whitened(rows: Tensor, residuals: Tensor) -> Whitened:
+    """Change variables so that ‖rows x + residuals‖² = Σ y² over the known y, and a constant; rows (R, U).
+
+    Example:
+        >>> whitened(torch.tensor([[2.0, 0.0]]).double(), torch.tensor([6.0]).double()).known
+        tensor([ True, False])
+    """
+    triangle = triangular(torch.cat([rows, residuals[:, None]], 1))[: rows.shape[1]]
+    scale = unit_scale(triangle[:, :-1])
+    left, values, right = torch.linalg.svd(triangle[:, :-1] * scale)
+    known = values > _ROUNDING * values[:1].sum()
+    change = scale[:, None] * right.T / torch.where(known, values, 1.0)
+    return Whitened(change, torch.where(known, left.T @ triangle[:, -1], 0.0), known)

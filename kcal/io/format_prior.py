@@ -1,0 +1,207 @@
+"""Priors for the bundle adjustment of other programs: a program's own parameters and their square-root information.
+
+A JSON file (or a numpy archive) says for each camera that the program's parameters x have the density
+exp(-½ ‖R (x - mean)‖²). R is upper triangular: `NormalPrior(A, b)` of Ceres takes A = R and b = mean, GTSAM
+`noiseModel.Gaussian.SqrtInformation(R)`. R is in pixels as they are; a program whose
+reprojection errors are not divided by their standard deviation σ needs σR.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from kcal.files import read_bytes, write_atomic
+from kcal.io.foreign import (
+    MOST_BYTES,
+    CameraPose,
+    Hints,
+    ImportedCameras,
+    camera_name,
+    named_camera,
+    numbers,
+    plain,
+    whole_size,
+)
+from kcal.io.format_colmap import WRITTEN
+from kcal.lens.calibration import CameraCalibration
+from kcal.lens.camera import Camera
+from kcal.lens.carry_over import square_root_information
+from kcal.lens.model import LensModel
+from kcal.lens.projection import parameter_names
+from kcal.strict_json import read_json
+from kcal.strict_npz import read_npz
+
+# More parameters than any lens of another program has.
+_MOST_PARAMETERS, _MOST_CAMERAS = 64, 10_000
+KEYS = ("name", "model", "size", "parameters", "mean", "sqrt_information", "held", "misfit_px", "kcal")
+_GTSAM = {"pinhole": "Cal3_S2", "opencv4": "Cal3DS2", "fisheye4": "Cal3Fisheye"}
+GTSAM_MODELS, PLAIN_MODELS = tuple(_GTSAM), ("pinhole", "opencv4", "opencv5", "opencv8", "opencv12", "opencv14",
+                                              "fisheye4")  # fmt: skip
+
+
+class Parameter(NamedTuple):
+    """A parameter of another program: its name there, kcal's, and value = scale · kcal's + offset."""
+
+    name: str
+    kcal: str
+    scale: float = 1.0
+    offset: float = 0.0
+
+
+def arranged(program: str, camera: Camera) -> tuple[str, list[Parameter]]:
+    """The program's name of a camera's lens model, and its parameters in the program's order."""
+    model, lens = str(camera.model), list(camera.model.names)
+    width, height = camera.size
+    core, half = ["fx", "fy", "cx", "cy"], {"cx": 0.5, "cy": 0.5}
+    if program == "gtsam":
+        names = dict(zip(["fx", "fy", "s", "u0", "v0"], ["fx", "fy", "skew", "cx", "cy"], strict=True))
+        return _GTSAM[model], [Parameter(name, own) for name, own in names.items()] + [Parameter(k, k) for k in lens]
+    if program == "colmap":
+        return WRITTEN[model], [Parameter(name, name, 1.0, half.get(name, 0.0)) for name in core + lens]
+    if program == "nerfstudio":
+        kind = "OPENCV_FISHEYE" if camera.model.fisheye else "OPENCV"
+        return kind, [Parameter(name.replace("fx", "fl_x").replace("fy", "fl_y"), name, 1.0, half.get(name, 0.0))
+                      for name in core + lens]  # fmt: skip
+    if program == "kalibr":
+        kind = {"pinhole": "pinhole-none", "opencv4": "pinhole-radtan", "fisheye4": "pinhole-equi"}[model]
+        own = ["fu", "fv", "pu", "pv", *(name.replace("p", "r") for name in lens)]
+        return kind, [Parameter(*pair) for pair in zip(own, core + lens, strict=True)]
+    if program == "matlab":
+        there = {"fx": "FocalLength(1)", "fy": "FocalLength(2)", "cx": "PrincipalPoint(1)", "cy": "PrincipalPoint(2)",
+                 "skew": "Skew", "k1": "RadialDistortion(1)", "k2": "RadialDistortion(2)", "k3": "RadialDistortion(3)",
+                 "p1": "TangentialDistortion(1)", "p2": "TangentialDistortion(2)"}  # fmt: skip
+        one = {"cx": 1.0, "cy": 1.0}
+        return "cameraIntrinsics", [
+            Parameter(there[name], name, 1.0, one.get(name, 0.0)) for name in [*core, "skew", *lens]
+        ]
+    if program == "opensfm":
+        size = float(max(width, height))
+        there = {"fx": "focal_x", "fy": "focal_y", "cx": "c_x", "cy": "c_y"}
+        middle = {"cx": -(width - 1) / 2.0 / size, "cy": -(height - 1) / 2.0 / size}
+        kind = "fisheye_opencv" if camera.model.fisheye else "brown"
+        return kind, [
+            *(Parameter(there[name], name, 1.0 / size, middle.get(name, 0.0)) for name in core),
+            *(Parameter(name, name) for name in lens),
+        ]
+    if program == "mrcal":
+        model = f"LENSMODEL_{'PINHOLE' if not lens else f'OPENCV{len(lens)}'}"
+    return model, [Parameter(name, name) for name in core + lens]
+
+
+def prior_of(program: str, camera: Camera, misfit: tuple[float, float] | None = None) -> dict[str, Any]:
+    """What the file says of one camera.
+
+    Args:
+        program: whose parameters are meant, a name of `kcal.io.formats.FORMATS`.
+        camera: of a model that the program has, with a covariance.
+        misfit: RMS and maximum over the image of the distance to the lens that it stands for, pixels.
+    """
+    model, order = arranged(program, camera)
+    names = camera.names
+    chosen = [names.index(parameter.kcal) for parameter in order]
+    scale = torch.tensor([parameter.scale for parameter in order], dtype=torch.float64)
+    offset = torch.tensor([parameter.offset for parameter in order], dtype=torch.float64)
+    found = square_root_information(camera, chosen)
+    root, held = (None, ()) if found is None else found
+    values = (
+        camera_name(camera, "camera"),
+        model,
+        list(camera.size),
+        [parameter.name for parameter in order],
+        plain(camera.params[chosen] * scale + offset),
+        None if root is None else plain(root / scale),
+        [parameter.name for parameter in order if parameter.kcal in held],
+        None if misfit is None else dict(zip(("rms", "largest"), misfit, strict=True)),
+        {"model": str(camera.model), "parameters": [list(parameter[1:]) for parameter in order]},
+    )
+    return dict(zip(KEYS, values, strict=True))
+
+
+def write_priors(program: str, priors: Sequence[dict[str, Any]], path: Path) -> Path:
+    """Write what `prior_of` found: a numpy archive for the suffix .npz, otherwise JSON."""
+    if path.suffix.lower() == ".npz":
+        data = io.BytesIO()
+        arrays: dict[str, Any] = {"kcal_prior": 1, "program": program, "cameras": len(priors)}
+        for index, prior in enumerate(priors):
+            texts = ("kcal", "misfit_px")
+            arrays |= {f"{key}_{index}": json.dumps(value) if key in texts else value
+                       for key, value in prior.items() if value is not None}  # fmt: skip
+        np.savez(data, allow_pickle=False, **{key: np.asarray(value) for key, value in arrays.items()})
+        return write_atomic(path, data.getvalue())
+    content = {"kcal_prior": 1, "program": program, "cameras": list(priors)}
+    return write_atomic(path, json.dumps(content, indent=1) + "\n")
+
+
+def prior_writer(program: str) -> Any:
+    """A writer of cameras as `CameraFormat.write` is one, for programs without a file format of cameras."""
+
+    def write(cameras: Sequence[Camera], poses: Sequence[CameraPose], path: Path) -> list[Path]:
+        return [write_priors(program, [prior_of(program, camera) for camera in cameras], path)]
+
+    return write
+
+
+def read_prior(path: Path, hints: Hints) -> ImportedCameras:
+    """Read the cameras of such a file, with their covariances."""
+    data = read_bytes(path, MOST_BYTES)
+    content = _from_archive(data, path) if data[:2] == b"PK" else read_json(data, str(path))
+    if not isinstance(content, dict) or content.get("kcal_prior") != 1 or not isinstance(content.get("cameras"), list):
+        raise ValueError("no prior that kcal wrote: kcal_prior must be 1")
+    if len(content["cameras"]) > _MOST_CAMERAS:
+        raise ValueError(f"more than {_MOST_CAMERAS} cameras")
+    program = str(content["program"])
+    cameras = tuple(_camera_of(part) for part in content["cameras"])
+    fitted = [
+        f"{camera_name(camera, 'camera')}: a fit to another lens, RMS {float(part['misfit_px']['rms']):.2g} px"
+        for camera, part in zip(cameras, content["cameras"], strict=True)
+        if part.get("misfit_px")
+    ]
+    return ImportedCameras(format=program, cameras=cameras, notes=tuple(fitted))
+
+
+def _from_archive(data: bytes, path: Path) -> dict[str, Any]:
+    stored = read_npz(data, str(path), MOST_BYTES, "prior")
+    count = int(stored["cameras"])
+    if count > _MOST_CAMERAS:
+        raise ValueError(f"more than {_MOST_CAMERAS} cameras")
+    cameras = []
+    for index in range(count):
+        part = {key: stored[f"{key}_{index}"].tolist() for key in KEYS if f"{key}_{index}" in stored}
+        cameras.append(part | {key: read_json(str(part[key]).encode(), str(path)) for key in ("kcal", "misfit_px")
+                               if key in part})  # fmt: skip
+    return {"kcal_prior": int(stored["kcal_prior"]), "program": str(stored["program"]), "cameras": cameras}
+
+
+def _camera_of(part: dict[str, Any]) -> Camera:
+    model = LensModel.named(str(part["kcal"]["model"]))
+    order = [Parameter("", str(own), *numbers(rest, 2, "kcal")) for own, *rest in part["kcal"]["parameters"]]
+    count, names = len(order), parameter_names(model)
+    if count > _MOST_PARAMETERS or len({each.kcal for each in order}) != count:
+        raise ValueError("kcal names a parameter twice, or too many")
+    mean = numbers(part["mean"], count, "mean")
+    given = {each.kcal: (value - each.offset) / each.scale for each, value in zip(order, mean, strict=True)}
+    values = [given.pop(name, 0.0) for name in names]
+    if given:
+        raise ValueError(f"{model} has no parameter {next(iter(given))}")
+    (fx, fy, cx, cy, skew, *lens), size = values, whole_size(*part["size"])
+    camera = named_camera(str(part["name"]), (fx, fy, cx, cy), size, model, lens, skew)
+    if part.get("sqrt_information") is not None:
+        root = np.array(numbers(part["sqrt_information"], count * count, "sqrt_information")).reshape(count, count)
+        scale = np.array([each.scale for each in order])
+        half = np.linalg.inv(root).T / scale
+        held = {str(name) for name in part.get("held", [])}
+        half[:, [name in held for name in part["parameters"]]] = 0.0
+        places = [names.index(each.kcal) for each in order]
+        covariance = torch.zeros(len(names), len(names), dtype=torch.float64)
+        covariance[torch.tensor(places)[:, None], torch.tensor(places)] = torch.from_numpy(half.T @ half)
+        camera.calibration = CameraCalibration(name=str(part["name"]), covariance=covariance)
+        assert camera.calibration is not None
+        camera.calibration.check(len(names))
+    return camera

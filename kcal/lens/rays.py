@@ -1,0 +1,130 @@
+"""The ray of every pixel, for renderers that take rays in place of a camera model: gsplat, splatting and NeRFs.
+
+gsplat from 1.6 on takes `rays` (..., C, H, W, 6) in the world's frame: where each pixel's ray starts, and its direction
+(gsplat issues 718, 801 and 1035; `rasterization(..., rays=..., with_eval3d=True, with_ut=True, packed=False)`). So any
+lens can be rendered, an entrance pupil that moves included. Pixels without a ray have zeros.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from kcal.errors import InputError
+from kcal.lens.camera import Camera
+from kcal.lens.pupil import FAR
+
+# Pixels computed at a time, so that temporary values stay small for any image.
+_BAND = 1 << 18
+
+
+class CameraRays(nn.Module):
+    """Rays of all pixels of one or several cameras, in the cameras' frames or in the world's.
+
+    Row v and column u of the result are the ray through the center of pixel (u, v).
+
+    Args:
+        cameras: one camera, or several with images of one size.
+
+    Raises:
+        InputError: no camera, batches of cameras, or images of several sizes.
+
+    Example:
+        >>> camera = Camera.build(focal=(50, 50), center=(31.5, 23.5), size=(64, 48), coefficients=[-0.1])
+        >>> rays = CameraRays(camera)()
+        >>> rays.shape, rays.dtype
+        (torch.Size([1, 48, 64, 6]), torch.float32)
+        >>> viewmats = torch.eye(4).repeat(5, 1, 1, 1)  # five poses of the camera, world to camera
+        >>> CameraRays(camera)(viewmats).shape
+        torch.Size([5, 1, 48, 64, 6])
+    """
+
+    depths: Tensor
+    directions: Tensor
+    mask: Tensor
+
+    def __init__(self, cameras: Camera | Sequence[Camera]) -> None:
+        super().__init__()
+        several = [cameras] if isinstance(cameras, Camera) else list(cameras)
+        if not several or any(camera.params.ndim != 1 for camera in several):
+            raise InputError("rays: one or several single cameras are needed, no batch")
+        if len({camera.size for camera in several}) > 1:
+            sizes = ", ".join(f"{width}x{height}" for width, height in (camera.size for camera in several))
+            raise InputError(f"rays: images of one size are needed in one array, got {sizes} px; write one file each")
+        self.cameras = nn.ModuleList(several)
+        for name, value in zip(
+            ("depths", "directions", "mask"),
+            map(torch.stack, zip(*map(_pixel_rays, several), strict=True)),
+            strict=True,
+        ):
+            self.register_buffer(name, value, persistent=False)
+
+    @torch.no_grad()
+    def forward(self, viewmats: Tensor | None = None, dtype: torch.dtype = torch.float32) -> Tensor:
+        """Rays as (..., C, H, W, 6): origin, then direction of length one.
+
+        Args:
+            viewmats: (..., C, 4, 4) camera_from_world, as gsplat has it; the cameras' own frames if not given.
+            dtype: of the result; moved to the world in float64 and rounded once.
+
+        Raises:
+            InputError: matrices of another shape, or whose left part is no rotation.
+        """
+        zero = torch.zeros_like(self.depths)
+        origins = torch.stack([zero, zero, self.depths], -1)
+        rays = torch.cat([origins, self.directions], -1)
+        if viewmats is not None:
+            count = len(self.cameras)
+            if viewmats.shape[-3:] != (count, 4, 4):
+                raise InputError(f"viewmats: shape (..., {count}, 4, 4) is needed, got {tuple(viewmats.shape)}")
+            rotation, translation = viewmats[..., :3, :3].double(), viewmats[..., :3, 3].double()
+            if not torch.allclose(rotation @ rotation.mT, torch.eye(3).to(rotation), atol=1e-5):
+                raise InputError("viewmats: the left part of a matrix is no rotation; scales belong into the scene")
+            turn, shift = rotation[..., None, None, :, :], translation[..., None, None, :]
+            # Row vectors times R are Rᵀ v: from the camera to the world.
+            moved = (
+                ((origins - shift)[..., None, :] @ turn)[..., 0, :],
+                (self.directions[..., None, :] @ turn)[..., 0, :],
+            )
+            rays = torch.cat(moved, -1)
+        return torch.where(self.mask[..., None], rays, 0.0).to(dtype)
+
+
+@torch.no_grad()
+def ray_error(camera: Camera, rays: Tensor, near: float = 1.0) -> float:
+    """Largest distance in pixels between a pixel and the image of its ray, at `near` meters and far away.
+
+    Args:
+        camera: a single camera.
+        rays: (H, W, 6) in its frame, of any precision; zeros for pixels without a ray.
+        near: meters.
+
+    Example:
+        >>> camera = Camera.build(focal=(50, 50), center=(31.5, 23.5), size=(64, 48), coefficients=[-0.1])
+        >>> ray_error(camera, CameraRays(camera)()[0]) < 1e-5
+        True
+    """
+    flat, pixels = rays.double().reshape(-1, 6), camera.grid(*camera.size).reshape(-1, 2)
+    origin, direction = flat.split(3, -1)
+    there = direction.abs().sum(-1) > 0
+    worst = 0.0
+    for at in (near, FAR):
+        seen, valid = camera.project(origin + at * direction)
+        apart = torch.where(valid, (seen - pixels).norm(dim=-1), math.inf)[there]
+        worst = max(worst, float(apart.max()) if len(apart) else 0.0)
+    return worst
+
+
+def _pixel_rays(camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
+    """Depth of the start (H, W), direction (H, W, 3) and mask (H, W)."""
+    width, height = camera.size
+    parts = []
+    with torch.no_grad():
+        for pixels in camera.grid(width, height).flatten(0, 1).split(_BAND):
+            rays, valid = camera.unproject(pixels)
+            parts.append((camera.ray_origins(rays)[:, 2], rays, valid))
+    depth, rays, valid = (torch.cat(each) for each in zip(*parts, strict=True))
+    return depth.reshape(height, width), rays.reshape(height, width, 3), valid.reshape(height, width)

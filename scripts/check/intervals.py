@@ -1,0 +1,179 @@
+"""Does `kcal check` judge right? Its verdict on calibrations whose truth is known; writes a section of ordinary.md.
+
+    python -m scripts.check.intervals --out FILE --seeds 0-19 --refits 100     # all of it
+    python -m scripts.check.intervals --out FILE --seeds 0-9 --refits 30       # a fifth of the time
+    python -m scripts.check.intervals --out FILE [OTHER ...] --write           # the table in docs/measured
+    python -m scripts.check.intervals --cold 8 [--write]                       # warm refits beside cold ones
+
+Calibrations that FILE has are not made again, so that a run can be interrupted, and split over several files.
+
+Captures are those of `scripts.check.handheld`: three traced lenses in turn, printed boards, noise of 0.08 px; 5, 8, 12
+and 20 views in turn, every other one by hand. Each is calibrated with the default lens, whose intervals should be true,
+and with opencv5, which describes neither lens nor board, so that they should not. A second capture of the same lens
+and board, with as many views, is what `--against` gets. Truth: the share of the image in which the true lens lies in
+the stated 95 % ellipses, at infinity and after the best turn. Intervals count as true where that is more than half:
+places of one calibration go together, so that true intervals have all of the image inside or, seldom, little of it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import math
+import statistics
+import time
+from pathlib import Path
+
+import torch
+
+from kcal.calibrate.camera.calibrate import calibrate_camera
+from kcal.calibrate.camera.interval_check import (
+    against_capture,
+    interval_check,
+    simulated_capture,
+    simulated_refits,
+)
+from kcal.calibrate.camera.options import CalibrationOptions
+from kcal.errors import KcalError
+from kcal.lens.uncertainty import pixel_covariance, pixel_errors
+from kcal.report.model_findings import fault_of_views
+from scripts.shared.infinity import error_at_infinity
+from scripts.shared.page import table, write_section
+from scripts.shared.records import Record, finish, read, seeds
+from scripts.shared.simulated import figures, simulated
+from scripts.shared.timing import show
+
+PAGE, SECTION = "ordinary.md", "intervals"
+SIGMA, VIEWS, MODELS = 0.08, (5, 8, 12, 20), ("hybrid", "opencv5")
+AT = [math.inf]
+HALF = 0.5
+
+
+def judged(model: str, seed: int, refits: int) -> Record:
+    """One calibration, its truth, and the verdicts on it."""
+    views, by_hand = VIEWS[seed // 2 % len(VIEWS)], bool(seed % 2)
+    case, second = (simulated(seed, views, SIGMA, by_hand, take=take) for take in (0, 1))
+    options = CalibrationOptions(model=model)
+    try:
+        result = calibrate_camera(case.seen, options)
+        error = error_at_infinity(result.camera, case.lens)
+        truth = figures(result, case, error.pixels, error.errors)
+        start = time.process_time()
+        check = interval_check(result, AT, simulated_refits(result, options, AT, range(refits)))
+        spent = time.process_time() - start
+        fault = fault_of_views(result, options)
+        found = against_capture(result, second.seen, options, AT)[0]
+    except KcalError as refusal:
+        return {"refused": str(refusal)}
+    return {
+        "views": views,
+        "by_hand": by_hand,
+        "truth": truth["everywhere"],
+        "share": check.shares[0][0],
+        "own": check.own_shares[0],
+        "factor": check.factors[0],
+        "true": check.true,
+        "fault": None if fault is None else fault.text,
+        "same": found.same,
+        "probability": found.probability,
+        "cpu_s": spent,
+    }
+
+
+def line(record: Record) -> str:
+    """One line to print."""
+    if "refused" in record:
+        return f"refused: {record['refused'][:90]}"
+    return (
+        f"truth {record['truth']:.2f} inside; check {record['share']:.3f} (own ellipses {record['own']:.3f}), factor "
+        f"{record['factor']:.2f}, {'true' if record['true'] else 'FALSE'}; views {record['fault']}; against "
+        f"p {record['probability']:.2g}; "
+        f"{record['cpu_s']:.0f} s"
+    )
+
+
+def lines(records: list[Record]) -> list[str]:
+    """One row for each lens model."""
+    rows = []
+    for model in MODELS:
+        some = [one for one in records if one["key"][0] == model and "refused" not in one]
+        if not some:
+            continue
+        true = [one["truth"] > HALF for one in some]
+        alone = [one["true"] and one["fault"] is None for one in some]
+        both = [ok and one["same"] for ok, one in zip(alone, some, strict=True)]
+        agree = [sum(a == b for a, b in zip(said, true, strict=True)) for said in (alone, both)]
+        rows.append([
+            "default" if model == MODELS[0] else model,
+            len(some),
+            sum(true),
+            f"{100 * statistics.fmean(one['truth'] for one in some):.0f} %",
+            f"{100 * statistics.fmean(one['share'] for one in some):.1f} %",
+            sum(one["true"] for one in some),
+            sum(one["fault"] is None for one in some),
+            sum(bool(one["same"]) for one in some),
+            f"{agree[0]} of {len(some)}",
+            f"{agree[1]} of {len(some)}",
+            f"{statistics.median(one['cpu_s'] / one['key'][2] for one in some) * 100:.0f}",
+        ])  # fmt: skip
+    heads = (
+        "lens", "calibrations", "truly true", "truth inside, of the image", "refits inside", "refits say true",
+        "views say true", "second capture says true", "check agrees", "check with --against agrees",
+        "CPU s, 100 refits",
+    )  # fmt: skip
+    return table(heads, rows)
+
+
+def cold_and_warm(count: int) -> list[str]:
+    """How far refits that begin at the found camera end from those that begin with nothing."""
+    rows = []
+    options = CalibrationOptions()
+    for seed in (0, 1, 5, 6):
+        views, by_hand = VIEWS[seed // 2 % len(VIEWS)], bool(seed % 2)
+        result = calibrate_camera(simulated(seed, views, SIGMA, by_hand).seen, options)
+        places = result.camera.grid(25, 17).reshape(-1, 2)
+        sigma = pixel_covariance(result.camera, places).diagonal(dim1=-2, dim2=-1).sum(-1)
+        apart, took = [], [0.0, 0.0]
+        for number in range(count):
+            drawn, cameras = simulated_capture(result, options, number), []
+            for which, warm in enumerate((True, False)):
+                start = time.process_time()
+                cameras.append(drawn.calibrated(options, warm=warm))
+                took[which] += time.process_time() - start
+            apart.append(
+                float((pixel_errors(cameras[0], cameras[1], places).square().sum(-1) / sigma).nanmean().sqrt())
+            )
+        kind = f"{views} views {'by hand' if by_hand else 'on a stand'}"
+        rows.append([kind, count, f"{statistics.median(apart):.3f}", f"{max(apart):.3f}",
+                     *(f"{spent / count:.2f}" for spent in took)])  # fmt: skip
+    heads = ("capture", "refits", "apart, σ (median)", "(largest)", "CPU s warm", "CPU s cold")
+    return table(heads, rows)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, nargs="+", help="JSON lines; the first file is continued")
+    parser.add_argument("--seeds", type=seeds, default=range(20))
+    parser.add_argument("--refits", type=int, default=100)
+    parser.add_argument("--models", nargs="+", default=MODELS, choices=MODELS)
+    parser.add_argument("--cold", type=int, default=0, metavar="REFITS", help="only compare warm and cold refits")
+    parser.add_argument("--write", action="store_true", help="write the table in docs/measured, and stop")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    if arguments.cold:
+        text = show(cold_and_warm(arguments.cold))
+        if arguments.write:
+            write_section(PAGE, "warm refits", "\n".join(text))
+        return
+    if not arguments.out:
+        parser.error("--out is needed")
+    if not arguments.write:
+        keys = itertools.product(arguments.models, arguments.seeds, [arguments.refits])
+        finish(arguments.out[0], keys, judged, line)
+    text = show(lines(read(arguments.out)))
+    if arguments.write:
+        write_section(PAGE, SECTION, "\n".join(text))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,63 @@
+"""Run a command in a process of its own and interrupt it, as Ctrl-C of a terminal does, at a moment that is exact.
+
+`python interrupted.py KIND:VALUE COMMAND...`, where the moment is
+
+* `import:NAME`: when that module is imported;
+* `step:N`: at the N-th step of a progress bar;
+* `write:N`, `written:N`: right before and right after the N-th file comes into its place.
+"""
+
+from __future__ import annotations
+
+import builtins
+import os
+import runpy
+import signal
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import rich.progress
+
+
+def interrupt_at(moment: str) -> None:
+    """Send SIGINT to all processes of this command at that moment."""
+    kind, _, value = moment.partition(":")
+    left = [1 if kind == "import" else int(value)]
+
+    def strike() -> None:
+        left[0] -= 1
+        if left[0] == 0:
+            os.killpg(0, signal.SIGINT)
+
+    def struck(call: Callable[..., Any], *, after: bool = False) -> Callable[..., Any]:
+        def run(*arguments: Any, **options: Any) -> Any:
+            if not after:
+                strike()
+            found = call(*arguments, **options)
+            if after:
+                strike()
+            return found
+
+        return run
+
+    if kind == "import":
+        load = builtins.__import__
+
+        def imported(name: str, *arguments: Any, **options: Any) -> Any:
+            if name == value:
+                strike()
+            return load(name, *arguments, **options)
+
+        builtins.__import__ = imported
+    elif kind == "step":
+        rich.progress.Progress.update = struck(rich.progress.Progress.update)  # type: ignore[method-assign]
+    else:
+        os.replace = struck(os.replace, after=kind == "written")
+
+
+# Processes that the command starts run this file again.
+if __name__ == "__main__":
+    interrupt_at(sys.argv.pop(1))
+    sys.argv[0] = "kcal"
+    runpy.run_module("kcal", run_name="__main__")
