@@ -16,8 +16,8 @@ from kcal.io.foreign import rig_poses
 from kcal.io.format_matlab import write_matlab
 from kcal.io.formats import import_cameras
 from kcal.io.lookup_file import load_lookup, save_lookup
-from kcal.lens.camera import Camera
 from kcal.lens.baking import bake
+from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
 
 
