@@ -48,7 +48,7 @@ def session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> CaptureSession:
             camera=len(seen.views), hybrid=SimpleNamespace(sigma=1.0), cam_from_board_rotation=rotation, warnings=("w",)
         )
 
-    def proposal(camera: Any, board: Any, sigma: float) -> NextView:
+    def proposal(*_: Any) -> NextView:
         return NextView(torch.eye(3), torch.zeros(3), place(1), "somewhere", math.inf)
 
     monkeypatch.setattr(module, "detect_board", detect)
