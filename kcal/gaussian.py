@@ -9,6 +9,7 @@ nearly singular, and unknowns that nothing determines, which have none, are no t
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Hashable, Sequence
 from typing import NamedTuple
 
@@ -71,14 +72,13 @@ class Gaussian:
         return cls(slots, mean, torch.nn.functional.pad(roots / spread, (0, 1)))
 
     def __add__(self, other: Gaussian) -> Gaussian:
-        """What both say, stacked: the product of the densities, about the place of the first where it has one."""
-        new = [number for number, slot in enumerate(other.slots) if slot not in set(self.slots)]
-        slots = (*self.slots, *(other.slots[number] for number in new))
-        at = torch.cat([self.at, other.at[new]])
-        return Gaussian(slots, at, torch.cat([self.placed(slots, at).rows, other.placed(slots, at).rows]))
+        """What both say, see `stacked`."""
+        return stacked([self, other])
 
     def placed(self, slots: Slots, at: Tensor) -> Gaussian:
         """The same about another place (U',), with columns in another order; of further unknowns it says nothing."""
+        if slots == self.slots and at is self.at:
+            return self
         number = {slot: column for column, slot in enumerate(slots)}
         where = [number[slot] for slot in self.slots]
         rows = self.rows.new_zeros(len(self.rows), len(slots) + 1)
@@ -129,7 +129,11 @@ class Gaussian:
         """The same in U rows, an upper triangle; what is one already stays as it is, to the last bit."""
         if len(self.rows) == len(self.slots) and not bool(self.rows.tril(-1).any()):
             return self
-        return dataclasses.replace(self, rows=triangular(self.rows)[:-1])
+        return dataclasses.replace(self, rows=self._triangle[:-1])
+
+    @functools.cached_property
+    def _triangle(self) -> Tensor:
+        return triangular(self.rows)
 
     @property
     def products(self) -> Tensor:
@@ -157,14 +161,19 @@ class Gaussian:
 
         That of a prior and data together less that of the prior alone is the logarithm of the data's evidence.
         """
-        diagonal = triangular(self.rows).diagonal()
+        diagonal = self._triangle.diagonal()
         return float(-diagonal[:-1].abs().log().sum() - 0.5 * diagonal[-1].square())
 
 
 def stacked(gaussians: Sequence[Gaussian]) -> Gaussian:
-    """All of them together; one at least."""
-    first, *others = gaussians
-    return sum(others, first)
+    """What all of them say: the product of the densities, each unknown about its place in the first that has it."""
+    places: dict[Hashable, Tensor] = {}
+    for one in gaussians:
+        if not places.keys() >= set(one.slots):
+            places |= {slot: at for slot, at in zip(one.slots, one.at, strict=True) if slot not in places}
+    slots, first = tuple(places), gaussians[0]
+    at = first.at if len(slots) == len(first.slots) else torch.stack(list(places.values()))
+    return Gaussian(slots, at, torch.cat([one.placed(slots, at).rows for one in gaussians]))
 
 
 def triangular(rows: Tensor) -> Tensor:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 # Exit code of a run that was interrupted, as in all commands.
 _INTERRUPTED = 130
-# Of a file of refits: 100 of them over an image take 3 MiB.
+# Bytes of a file of refits that is read.
 _LARGEST_RUN = 2**28
 # Seconds between two writes of what is done.
 _OFTEN = 5.0

@@ -22,7 +22,8 @@ SUFFIXES = {
     "mrcal": (".cameramodel",),
     "matlab": (".mat",),
     "toml": (".toml",),
-    **dict.fromkeys(("nerfstudio", "opensfm"), (".json",)),
+    **dict.fromkeys(("nerfstudio", "opensfm", "gtsam", "ceres"), (".json",)),
+    "numpy": (".npz",),
     **dict.fromkeys(("ros", "kalibr"), (".yaml",)),
 }
 
@@ -49,7 +50,7 @@ CASES = [
     (name, suffix, model)
     for name, known in FORMATS.items()
     if known.write
-    for suffix, model in itertools.product(SUFFIXES.get(name, known.suffixes or (".txt",)), known.models)
+    for suffix, model in itertools.product(SUFFIXES[name], known.models)
 ]
 
 
@@ -69,11 +70,7 @@ def test_a_pair(name: str, tmp_path: Path) -> None:
     model = "opencv5" if "opencv5" in FORMATS[name].models else "opencv4"
     turn = rotation_from_vector(torch.tensor([0.02, -0.05, 0.03]).double())
     rig = StereoRig(camera(model), camera(model, 5), turn, torch.tensor([-0.52, 0.013, -0.021]).double())
-    paths = FORMATS[name].write(
-        [rig.left, rig.right],
-        rig_poses(rig),
-        tmp_path / f"two{SUFFIXES.get(name, FORMATS[name].suffixes or ('.txt',))[0]}",
-    )
+    paths = FORMATS[name].write([rig.left, rig.right], rig_poses(rig), tmp_path / f"two{SUFFIXES[name][0]}")
     found = [import_cameras(path, format=name) for path in paths]
     cameras = [one for part in found for one in part.cameras]
     for got, wanted in zip(cameras, (rig.left, rig.right), strict=True):
@@ -88,11 +85,9 @@ def test_a_pair(name: str, tmp_path: Path) -> None:
 
 def test_a_skew_where_it_can_be_held(tmp_path: Path) -> None:
     for name, known in FORMATS.items():
-        if known.skew and known.write:
-            wanted = camera("opencv5" if "opencv5" in known.models else "opencv4", skew=1.25)
-            (path,) = known.write(
-                [wanted], [], tmp_path / f"skewed{SUFFIXES.get(name, FORMATS[name].suffixes or ('.txt',))[0]}"
-            )
+        if known.skew and known.write and "opencv5" in known.models:
+            wanted = camera("opencv5", skew=1.25)
+            (path,) = known.write([wanted], [], tmp_path / f"skewed{SUFFIXES[name][0]}")
             same(import_cameras(path, format=name).cameras[0], wanted)
 
 
