@@ -18,8 +18,16 @@ import pytest
 from kcal.errors import FileError, InputError
 from kcal.files import check_writable, dump_json, read_bytes, write_atomic
 from kcal.lens.calibration import Exclusion
-from kcal.native_file import NativeFile
+from kcal.native_file import NativeFile, digest
 from kcal.strict_json import read_json
+
+
+def test_a_digest_is_of_the_values_and_not_of_their_order() -> None:
+    content = {"kcal": "note", "version": 1, "b": 2.0, "a": {"d": 1, "c": [1, 2]}, "summary": {"of": "x"}}
+    turned = {"a": {"c": [1, 2], "d": 1}, "b": 2.0}
+    assert digest(content) == digest(turned)
+    assert len(digest(content)) == 16
+    assert digest({**turned, "b": 3.0}) != digest(turned)
 
 
 class Note(NativeFile):

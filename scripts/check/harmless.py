@@ -30,5 +30,12 @@ HARMLESS = {
     "e0ea7adc7be67053": "how many steps a search may take that ends long before",
     "919fd48b3143c8b7": "a number, from the same factors in another order",
     "0596630b21cb4ec2": "a number, from the same factors in another order",
+    "ab8b1729821ccfe0": "a first focal length, from which a fit begins",
+    "02a20fa8d7b5185d": "where a thing stands on a site that is made up",
+    "96a90b97a1771eed": "a variance that is zero to the last bit",
+    "921b63f435eb9d99": "whether two texts are equal, whichever comes first",
+    "3b10bbfa613c0d36": "lines of a log below the level that is shown",
+    "ed7dec0d6447abef": "when stopped elements are dropped from a batch: only time",
+    "e7fec4571310adb3": "what happens when no port is free, and there always is one",
     "9d350f625c8848c9": "a negative number, which means none whatever its size",
 }

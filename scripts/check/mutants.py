@@ -176,7 +176,15 @@ def judge(files: list[dict], path: str, number: int, site: Site, budget: float, 
     """Plant one mistake and run tests."""
     tests, left, seconds = chosen(files, path, site, budget)
     by = forked(lambda: with_mistake(path, number, tests), AT_LEAST + SLOWER * seconds) if tests else ""
-    entry = {"key": site.key, "seed": seed, "noticed": bool(by), "by": by, "tests": len(tests), "left": left}
+    entry = {
+        "key": site.key,
+        "path": path,
+        "seed": seed,
+        "noticed": bool(by),
+        "by": by,
+        "tests": len(tests),
+        "left": left,
+    }
     with (STATE / "results.jsonl").open("a") as file:
         file.write(json.dumps(entry) + "\n")
     verdict = f"noticed by {by}" if by else f"NOT NOTICED by {len(tests)} tests ({left} too slow)"
@@ -211,9 +219,12 @@ def report() -> tuple[str, str]:
     total = noticed = 0
     for room in ROOMS:
         judged = [(path, site, kept[site.key]) for path, _, site in draws(room, 0) if site.key in kept]
+        folder = Path("kcal", "" if room == TOP else room)
+        # Those in code that was changed since count, too.
+        every = [entry for entry in kept.values() if Path(entry["path"]).parent == folder]
         by_seed: dict[int, Draw] = {}
-        for seed in sorted({entry["seed"] for _, _, entry in judged}):
-            own = [(site.key, entry["noticed"]) for _, site, entry in judged if entry["seed"] == seed]
+        for seed in sorted({entry["seed"] for entry in every}):
+            own = [(entry["key"], entry["noticed"]) for entry in every if entry["seed"] == seed]
             matter = [found for key, found in own if key not in HARMLESS]
             by_seed[seed] = Draw(len(own), len(own) - len(matter), sum(matter))
         if not by_seed:

@@ -48,7 +48,7 @@ def session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> CaptureSession:
             camera=len(seen.views), hybrid=SimpleNamespace(sigma=1.0), cam_from_board_rotation=rotation, warnings=("w",)
         )
 
-    def proposal(camera: Any, board: Any, sigma: float) -> NextView:
+    def proposal(*_: Any) -> NextView:
         return NextView(torch.eye(3), torch.zeros(3), place(1), "somewhere", math.inf)
 
     monkeypatch.setattr(module, "detect_board", detect)
@@ -92,6 +92,14 @@ def test_a_frame_without_a_board_gives_the_size_and_a_first_proposal(session: Ca
     assert np.allclose(outline.mean(0), [160, 120], atol=25)
     assert np.ptp(outline[:, 0]) > 100
     assert ((outline > 0) & (outline < SIZE)).all()
+    suggestion = session.suggestion
+    assert suggestion is not None
+    upper = suggestion.pixels[: BOARD.columns] if "left" in suggestion.words else suggestion.pixels
+    seen = suggestion.rotation @ BOARD.points.T + suggestion.translation[:, None]
+    focal = (upper - upper.mean(0)).norm() / (seen[:2] / seen[2])[:, : len(upper)].sub(
+        (seen[:2] / seen[2])[:, : len(upper)].mean(1, keepdim=True)
+    ).norm()
+    assert float(focal) == pytest.approx(0.9 * 320, rel=1e-6)
     assert state["next"]["first"] == [state["next"]["outline"][0]]
 
 
@@ -150,6 +158,7 @@ def test_a_board_must_rest_and_be_somewhere_new(session: CaptureSession) -> None
     assert session.message == "hold still"
     assert session.offer(frame(1), "b/c.png", moving=True)
     assert session.message == "kept b/c.png"
+    assert session.frames == session.output.parent / "left.frames"
     assert {path.name for path in session.frames.iterdir()} == {"a.png", "b_c.png"}
     assert not session.offer(frame(0), "d", moving=False)
     assert session.message.startswith("kept one like this already")

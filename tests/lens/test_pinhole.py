@@ -45,7 +45,7 @@ class TestNewPinhole:
         for alpha in (0.0, 0.4, 1.0):
             assert (new_pinhole(camera, alpha).params - camera.params[:5]).abs().max() < 1e-10
 
-    @settings(max_examples=50)
+    @settings(max_examples=20)
     @given(
         st.lists(st.floats(-0.4, 0.4), min_size=2, max_size=2),
         st.lists(st.floats(-0.01, 0.01), min_size=2, max_size=2),
@@ -69,7 +69,7 @@ class TestNewPinhole:
         wider = Camera.build(focal=focal_new.tolist(), center=center_new.tolist(), size=size, model="pinhole")
         assert not undistort_maps(camera, wider).mask.all()
 
-    @settings(max_examples=50)
+    @settings(max_examples=20)
     @given(st.lists(st.floats(-0.3, 0.3), min_size=2, max_size=2), st.floats(60, 400))
     def test_alpha_1_shows_every_source_pixel_with_a_ray(self, radial: list[float], focal: float) -> None:
         camera = build(focal, (64, 48), radial)

@@ -136,3 +136,10 @@ def test_pixels_are_square_or_have_two_focal_lengths() -> None:
 def test_rounds_that_run_out_are_said(rounds: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(evidence_rounds, "_ROUNDS", rounds)
     assert fit_hybrid(BOARD.points, capture(6), SIZE).converged == (rounds == 12)
+
+
+def test_pixels_are_square_where_that_is_said() -> None:
+    """Although these are not: rows are 1 % higher than columns are wide."""
+    pixels = capture(5) * torch.tensor([1.0, 1.01])
+    found = fit_hybrid(BOARD.points, pixels, SIZE, square=True).camera.params
+    assert float(found[0]) == float(found[1])
