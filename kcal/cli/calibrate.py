@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import typer
 from rich.markup import escape
@@ -12,15 +12,13 @@ from rich.markup import escape
 from kcal.cli.calibrate_result import calibration_numbers, print_calibration
 from kcal.cli.calibrate_stars import by_night, joined_by_stars
 from kcal.cli.console import out, print_wrote, steps, tell, warn
+from kcal.cli.cures import ending_with, views_cure, with_command
 from kcal.cli.inputs import BOARD, CAMERA, OBSERVATIONS, check_file
 from kcal.cli.night_images import TIME_HELP
 from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_of
 from kcal.cli.report import NO, REQUIRE_HELP, judged, required, told_usable
 from kcal.errors import DegenerateError, InputError, KcalError
 from kcal.files import check_picture, check_writable, make_folder
-
-if TYPE_CHECKING:
-    from kcal.corners.board import Board
 
 _PARAMETRIC, _USE = "Options of parametric models", "May it be used?"
 
@@ -261,16 +259,19 @@ def calibrate_command(
         reject=OutlierRejection(limit=reject_limit) if reject else None,
     )
     sets = [Observations.load(place.observations) for place in places]
+
+    def cure(error: object, i: int) -> str:
+        # Where options name parameters, the views are not to blame.
+        named = isinstance(error, InputError) and (fix or tie or prior or free)
+        return "" if named else views_cure(error, sets[i], places[i].observations)
+
     with steps("calibrating", None) as advance:
-        try:
-            outcomes = (
-                calibrate_cameras(sets, options, advance, one_type=one_type)
-                if len(sets) > 1
-                else [calibrate_camera(sets[0], options, advance)]
-            )
-        except DegenerateError as error:
-            raise DegenerateError(f"{error}. {more_views(sets[0].board, places[0].observations)}") from error
-    if stars:
+        if len(sets) > 1:
+            outcomes = calibrate_cameras(sets, options, advance, one_type=one_type)
+        else:
+            with ending_with(lambda error: cure(error, 0)):
+                outcomes = [calibrate_camera(sets[0], options, advance)]
+    if stars and not isinstance(outcomes[0], KcalError):
         outcomes = [joined_by_stars(outcomes[0], stars, star_time, star_place, places[0].output)]
     failed = [place.name for place, result in zip(places, outcomes, strict=True) if isinstance(result, KcalError)]
     usable = True
@@ -279,9 +280,7 @@ def calibrate_command(
         if len(places) > 1:
             out.print(f"[bold]{escape(place.name)}[/]")
         if isinstance(result, KcalError):
-            seen = sets[places.index(place)]
-            more = f". {more_views(seen.board, place.observations)}" if isinstance(result, DegenerateError) else ""
-            warn(f"{place.name}: {result}{more}")
+            warn(f"{place.name}: {with_command(str(result), cure(result, places.index(place)))}")
             continue
         result.save(place.output, name=place.name, source=place.observations.name, temperature=temperature)
         if place.picture is not None:
@@ -307,21 +306,6 @@ def calibrate_command(
         raise typer.Exit(NO)
 
 
-def more_views(board: Board, observations: Path) -> str:
-    """The command that adds views to an observations file.
-
-    Example:
-        >>> from kcal import Board
-        >>> more_views(Board(columns=9, rows=6, square=0.025), Path("left.obs.json"))
-        'To add views: kcal capture camera:0 --board 9x6 --square 25mm -o left.obs.json'
-    """
-    size = f"{board.columns}x{board.rows}"
-    if board.dictionary is not None and board.marker is not None:
-        size = f"charuco:{size}:{board.dictionary}:{1e3 * board.marker:g}mm"
-    path = shlex.quote(str(observations))
-    return f"To add views: kcal capture camera:0 --board {size} --square {1e3 * board.square:g}mm -o {path}"
-
-
 class _CameraFiles(NamedTuple):
     """Where the files of one camera are."""
 
@@ -344,7 +328,12 @@ def _camera_files(
         names = [path.name.split(".")[0] for path in observations]
         if len(set(names)) < len(names):
             twice = next(name for name in names if names.count(name) > 1)
-            raise InputError(f"two observations files are named {twice}: their cameras would overwrite each other")
+            same = [path for path in observations if path.name.split(".")[0] == twice]
+            copy = same[1].with_name(f"{same[1].parent.name or 'other'}-{same[1].name}")
+            raise InputError(
+                f"{same[0]} and {same[1]} are both named {twice}: their cameras would overwrite each other. "
+                f"To tell them apart: {shlex.join(['mv', str(same[1]), str(copy)])}"
+            )
         for folder in (output, picture, report):
             if folder is not None:
                 make_folder(folder)

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
 
 from kcal.cli.board_options import BoardSize, Refine, RefineMethod, SquareSide
 from kcal.cli.console import err, out, steps, tell, warn
-from kcal.cli.inputs import IMAGES
+from kcal.cli.cures import board_words, ending_with
+from kcal.cli.inputs import IMAGES, typed, typed_with
 from kcal.errors import FileError, InputError
 from kcal.files import check_picture, check_writable
+
+if TYPE_CHECKING:
+    from kcal.corners.board import Board
 
 
 def detect_command(
@@ -107,7 +112,10 @@ def detect_command(
     else:
         paths = expand_images(images)
         check_writable(output, *paths)
-        with steps("detecting", len(paths)) as advance:
+        with (
+            ending_with(lambda error: _right_board(str(error), size, board)),
+            steps("detecting", len(paths)) as advance,
+        ):
             observations = detect(
                 paths,
                 board,
@@ -145,3 +153,10 @@ def detect_command(
         out.print(f"  [yellow]failed[/] {escape(failure.name)}: {escape(failure.reason)}")
     if not board.unambiguous:
         out.print(f"note: this board looks the same turned by 180°; for stereo {board.stereo_advice}")
+
+
+def _right_board(refusal: str, size: str, board: Board) -> str:
+    """The command with the board that was found instead, or one that draws the board that was asked for."""
+    if (found := re.search(r"a board of (\d+x\d+)", refusal)) and size in typed:
+        return f"Perhaps: {typed_with({size: found[1]})}"
+    return f"To see what this board looks like: kcal board {board_words(board)} -o board.svg"

@@ -204,8 +204,8 @@ def check_kinds(found: Sequence[_Given]) -> None:
     raise FileError(f"{text}. To make one: {wrong.wanted.cure(wrong.path, kind)}")
 
 
-def typed_with(exchange: dict[str, str]) -> str:
-    """The command as it was typed, with other files: it can be pasted."""
+def typed_with(exchange: dict[str, str], *more: str) -> str:
+    """The command as it was typed, with other files and with more words: it can be pasted."""
     words = []
     for word in typed:
         option, equals, value = word.partition("=")
@@ -213,7 +213,7 @@ def typed_with(exchange: dict[str, str]) -> str:
             words.append(f"{option}={exchange.get(value, value)}")
         else:
             words.append(exchange.get(word, word))
-    return f"kcal {shlex.join(words)}"
+    return f"kcal {shlex.join([*words, *more])}"
 
 
 def _candidates(wrong: _Given, kind: str) -> Iterator[str]:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from kcal.cli.console import err, out, print_table, print_wrote, steps, warn
-from kcal.cli.inputs import MARKS, RIG, SURVEY
+from kcal.cli.cures import mark_again, with_command
+from kcal.cli.inputs import MARKS, RIG, SURVEY, typed_with
 from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_and_source
 from kcal.cli.settings import taken
 from kcal.errors import DegenerateError, InputError
@@ -228,8 +229,9 @@ def locate_command(
     if place is None or heading is None:
         if solved.mounting is None:
             raise InputError(
-                f"{rig}: the file has no position of the rig; give --origin and --heading (or --origin 0,0,0 "
-                "--heading 0, if you only need meters from the left camera: the columns east_m, north_m and up_m)"
+                f"{rig}: the file has no position of the rig; give --origin and --heading. If you only need meters "
+                "from the left camera, the columns east_m, north_m and up_m: "
+                + typed_with({}, "--origin", "0,0,0", "--heading", "0")
             )
     elif grid is not None:
         heading = true_from_grid(heading, place, grid)
@@ -293,7 +295,8 @@ def locate_command(
         _print_positions(located, true, sample.statuses, stated=stated)
         print_wrote(*written)
     if "ok" not in sample.statuses:
-        raise DegenerateError(f"{points}: none of the {sample.count} pairs could be located; see the table")
+        text = f"{points}: none of the {sample.count} pairs could be located; see the table"
+        raise DegenerateError(with_command(text, mark_again(None, None, rig=rig)))
 
 
 def _counts(rows: int, statuses: dict[str, int]) -> str:

@@ -192,9 +192,11 @@ def solve_command(
     """
     from kcal.calibrate.rig.solve import RigOptions, solve_rig
     from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
+    from kcal.cli.cures import ending_with, look_at_views, mark_again
     from kcal.cli.rig_sources import Sources, read_sources
     from kcal.cli.rig_stars import NightOptions
     from kcal.cli.sides import check_sides
+    from kcal.corners.observations import Observations
     from kcal.files import check_picture, check_writable
     from kcal.io.camera_file import load_camera
     from kcal.io.rig_file import save_rig
@@ -228,9 +230,16 @@ def solve_command(
     )  # fmt: skip
     calibrated = load_camera(left), load_camera(right)
     check_sides(calibrated, (left, right))
-    data, frame, unpaired, notes, stated = read_sources(calibrated, sources)
-    with steps("solving the rig", None) as advance:
-        result = solve_rig(data, options, advance)
+
+    def cure(error: object) -> str:
+        if pairs is not None and landmarks is None and isinstance(error, InputError):
+            return look_at_views(Observations.load(pairs[0]), pairs[0])
+        return mark_again(landmarks, marks, cameras=(left, right))
+
+    with ending_with(cure):
+        data, frame, unpaired, notes, stated = read_sources(calibrated, sources)
+        with steps("solving the rig", None) as advance:
+            result = solve_rig(data, options, advance)
     rig = result.stereo() if frame is None else placed_rig(result, frame)
     known = stated if pixel_sigma is None else pixel_sigma
     if rig.calibration is not None and known is not None:

@@ -87,7 +87,10 @@ def read_sources(cameras: tuple[Camera, Camera], sources: Sources) -> RigInput:
     if (sources.landmarks is None) != (sources.marks is None):
         raise InputError("--landmarks and --marks belong together: places by name, and where they are in the images")
     if cameras[0].fingerprint == cameras[1].fingerprint:
-        raise InputError("both camera files hold the same camera: this is the same camera twice; give two cameras")
+        raise InputError(
+            "both files contain one camera: this is the same camera twice; give two. To calibrate both: "
+            "kcal calibrate left.obs.json right.obs.json -o cameras"
+        )
     origin = None if sources.origin is None else Origin.parse(sources.origin)
     boards, landmarks, unpaired, pixel_sigma = None, None, 0, None
     positions: tuple[MeasuredPosition, ...] = ()

@@ -13,7 +13,7 @@ from calibrate_scenes import camera, motions, observe, pixels_of
 from typer.testing import CliRunner
 
 from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.cli.calibrate import more_views
+from kcal.cli.cures import more_views
 from kcal.cli.main import app
 from kcal.corners.board import Board
 from kcal.errors import DegenerateError
@@ -43,7 +43,8 @@ def test_too_few_views_end_with_the_command_that_adds_some(tmp_path: Path) -> No
 
 
 def test_the_command_names_the_same_board() -> None:
-    for size in ("9x6", "charuco:9x6:5x5_100:15mm"):
+    sizes = ["9x6", "charuco:9x6:5x5_100:15mm", "charuco:9x6:5x5_100:15mm:id3", "circles:7x6", "circles:7x6:10mm"]
+    for size in (*sizes, "asymmetric:4x11", "aprilgrid:6x6:0.3", "aprilgrid:6x5:2mm:id7"):
         board = Board.parse(size, "24.23mm")
         words = shlex.split(more_views(board, Path("a.obs.json")))
         assert Board.parse(words[words.index("--board") + 1], words[words.index("--square") + 1]) == board
