@@ -38,6 +38,8 @@ LOOKS = {
     "calibrate/camera": (2.8, "one camera"),
     "calibrate/rig": (1.0, "several cameras"),
     "nets": (4.55, "learned inverse"),
+    "stars": (3.95, "stars of the night"),
+    "scene": (2.4, "matches of the scene"),
     "sim": (0.0, "simulated truth"),
     "io": (1.0, "files"),
     "corners": (2.15, "boards, detection"),

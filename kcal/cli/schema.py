@@ -8,13 +8,14 @@ from typing import Annotated, Any
 import orjson
 import typer
 
-from kcal.cli.console import out, print_table
+from kcal.cli.console import out, print_table, tell
 from kcal.errors import InputError
 
 # Kind, class, and which command writes it.
 FILES = {
     "camera": ("kcal.io.camera_file", "CameraFile", "kcal calibrate"),
     "rig": ("kcal.io.rig_file", "RigFile", "kcal rig"),
+    "camera-rig": ("kcal.io.camera_rig_file", "CameraRigFile", "kcal rig of three cameras and more, kcal station"),
     "observations": ("kcal.corners.observations", "Observations", "kcal detect"),
     "board": ("kcal.calibrate.hybrid.measured_board", "BoardFile", "kcal board measure"),
 }
@@ -40,7 +41,7 @@ def file_schema(kind: str) -> dict[str, Any]:
     schema["required"] = list(schema["properties"])
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "title": f"kcal {kind} file, version {file.VERSION}",
+        "title": f"kcal {file.KIND} file, version {file.VERSION}",
         **{key: value for key, value in schema.items() if key != "title"},
     }
 
@@ -48,7 +49,9 @@ def file_schema(kind: str) -> dict[str, Any]:
 def schema_command(
     kind: Annotated[
         str | None,
-        typer.Argument(metavar="KIND", help="camera, rig, observations or board; a list of them if not given."),
+        typer.Argument(
+            metavar="KIND", help="camera, rig, camera-rig, observations or board; a list of them if not given."
+        ),
     ] = None,
 ) -> None:
     """Print the JSON schema of a kind of file, for programs that read or check kcal's files.
@@ -64,4 +67,5 @@ def schema_command(
         return
     if kind not in FILES:
         raise InputError(f"kcal schema: no kind of file is called {kind!r}; kinds: {', '.join(FILES)}")
+    tell(schema=file_schema(kind))
     out.print(orjson.dumps(file_schema(kind), option=orjson.OPT_INDENT_2).decode(), markup=False)

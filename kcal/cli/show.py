@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 # Parameters of hybrid lenses that are shown; their hundreds of weights say nothing one by one.
 _SHOWN = 26
+# Of rig files of any number of cameras.
+CAMERA_RIG_VERSION = 3
 _INTRINSICS = ("fx", "fy", "cx", "cy", "skew")
 
 
@@ -76,6 +78,9 @@ def show_command(
     out.print(f"{file}: kcal {content['kcal']} file, version {content.get('version')}", markup=False)
     if content["kcal"] == "observations":
         _show_observations(file)
+        return
+    if content["kcal"] == "rig" and content.get("version") == CAMERA_RIG_VERSION:
+        _show_stations(file)
         return
     cameras, pose = _stored_facts(content) or _computed(file, content["kcal"])
     for camera in cameras:
@@ -255,6 +260,25 @@ def _show_pose(pose: _PoseFacts) -> None:
             out.print(f"noise of marks {record['pixel_sigma']:g} px along each axis")
         for text in record["warnings"]:
             out.print(f"warning: {text}", markup=False)
+
+
+def _show_stations(file: Path) -> None:
+    from kcal.cli.stations import station_rows
+    from kcal.io.camera_rig_file import CameraRigFile
+
+    rig = CameraRigFile.load(file).rig()
+    for camera in rig.each:
+        _show_camera(_facts_of(camera))
+    out.print("")
+    print_table(station_rows(rig))
+    out.print("error bars of cameras and poses together" if rig.root is not None else "no error bars of the poses")
+    if (solved := rig.calibration) is not None:
+        out.print(f"solved {_when(_fields(solved) or {})}: RMS {solved.rms:.4f} px", markup=False)
+        for text in (
+            *(f"open: {what}" for what in solved.undetermined),
+            *(f"warning: {why}" for why in solved.warnings),
+        ):
+            out.print(text, markup=False)
 
 
 def _show_observations(file: Path) -> None:

@@ -115,15 +115,26 @@ def _read_stations(
 
 def _print_stations(result: RigResult, rig: CameraRig) -> None:
     from kcal.cli.rig_text import print_rig, source_lines
+
+    print_rig(result, source_lines(result))
+    print_table(station_rows(rig))
+    if rig.root is None:
+        err.print("[yellow]warning:[/] the data leave something open, so that the rig has no error bars")
+    if rig.origin is None:
+        out.print("No latitudes were given: positions are meters of the local frame. --origin anchors it on the Earth.")
+
+
+def station_rows(rig: CameraRig) -> list[list[str]]:
+    """A table of how each camera stands, heads first: on the Earth with error bars, or in the rig's own frame."""
     from kcal.locate.stations import station_mounting
     from kcal.quantities import length_text, measured_text, number_text
 
-    print_rig(result, source_lines(result))
     rows = [["camera", "RMS px", "lat", "lon", "height m", "± level", "± up", "heading °", "pitch °", "roll °"]]
     if rig.origin is None:
         rows = [["camera", "RMS px", "east m", "north m", "up m"]]
-    for c, name in enumerate(rig.names):
-        rms = "" if math.isnan(result.rms_px[c]) else f"{result.rms_px[c]:.3f}"
+    residuals = rig.calibration.rms_px if rig.calibration else (None,) * len(rig)
+    for c, (name, residual) in enumerate(zip(rig.names, residuals, strict=True)):
+        rms = "" if residual is None else f"{residual:.3f}"
         if rig.origin is None:
             rows.append([name, rms, *(f"{value:.3f}" for value in rig.center[c].tolist())])
             continue
@@ -140,11 +151,7 @@ def _print_stations(result: RigResult, rig: CameraRig) -> None:
              length_text(sigma[2], digits=2), measured_text(angles[0], math.degrees(sigma[5])),
              measured_text(angles[1], level), number_text(angles[2], level)]
         )  # fmt: skip
-    print_table(rows)
-    if rig.root is None:
-        err.print("[yellow]warning:[/] the data leave something open, so that the rig has no error bars")
-    if rig.origin is None:
-        out.print("No latitudes were given: positions are meters of the local frame. --origin anchors it on the Earth.")
+    return rows
 
 
 def _stands(rig: CameraRig) -> dict[str, dict[str, float]]:

@@ -130,3 +130,15 @@ def test_two_cameras_take_the_long_table_too(folder: Path) -> None:
     given = ["--landmarks", "survey.csv", "--marks", "two.csv", "-o", "two.json"]
     run(folder, "rig", "mill.camera.json", "mast.camera.json", *given)
     assert json.loads((folder / "two.json").read_text())["version"] == 2
+
+
+def test_show_says_how_each_camera_stands() -> None:
+    stored = Path(__file__).parents[1] / "promises" / "files" / "0.2-camera-rig" / "camera-rig.json"
+    text = CliRunner().invoke(app, ["show", str(stored)]).stdout
+    assert text.count("\ncamera ") == 4  # three cameras and the head of the table
+    (line,) = [line for line in text.splitlines() if line.startswith("fisheye4 ")]
+    rig = load_camera_rig(stored)
+    lat, lon = (float(word) for word in line.split()[1:3])
+    there = enu_to_geodetic(rig.center[1], rig.origin).tolist()
+    assert (lat, lon) == pytest.approx(there[:2], abs=1e-7)
+    assert "20 mm  50 mm" in line

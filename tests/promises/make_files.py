@@ -66,6 +66,34 @@ def computed(camera: Camera) -> dict[str, object]:
     }
 
 
+def camera_rig(folder: Path, out: dict[str, object]) -> None:
+    """A rig of three cameras with error bars, from the version that has such rigs on."""
+    try:
+        from kcal.io.camera_rig_file import save_camera_rig
+        from kcal.lens.camera_rig import CameraRig
+        from kcal.lens.mounting import Origin
+    except ImportError:
+        return
+    lens = {"opencv5": [-0.2, 0.05, 1e-3, -5e-4, 0.01], "fisheye4": [0.02, -0.003], "pinhole": []}
+    cameras = [
+        Camera.build(focal=(520 + i, 521), center=(322, 238), size=SIZE, coefficients=values, model=model)
+        for i, (model, values) in enumerate(lens.items())
+    ]
+    north = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
+    turns = rotation_from_vector(torch.tensor([[0.0, 0, 0], [0, 0.3, 0], [0.02, -0.2, 0.01]], dtype=torch.float64))
+    centers = torch.tensor([[0.0, 0, 0], [12_000.5, 300, 45], [-8_000, 9_000.25, 120]], dtype=torch.float64)
+    site = Origin(lat=19.07, lon=72.87, height=14.0)
+    rig = CameraRig(cameras, [*lens], turns @ north, centers, origin=site, refraction=0.14)
+    rig.root = rig.with_errors(position_m=(0.02, 0.02, 0.05), attitude_deg=0.01, refraction=0.05)
+    save_camera_rig(rig, folder / "camera-rig.json")
+    out["camera-rig.json"] = {
+        "rotation": rig.rotation.tolist(),
+        "center": rig.center.tolist(),
+        "variance": rig.root.square().sum(0).tolist(),
+        "cameras": [computed(camera) for camera in cameras],
+    }
+
+
 def main(folder: Path) -> None:
     """Files and `computed.json`."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -103,6 +131,7 @@ def main(folder: Path) -> None:
     save_lookup(bake(cameras["opencv5"], 0.05), folder / "lookup.npz")
     pixels = load_lookup(folder / "lookup.npz").project(torch.tensor(POINTS[3:], dtype=torch.float64))[0]
     out["lookup.npz"] = {"pixels": pixels.tolist()}
+    camera_rig(folder, out)
     (folder / "computed.json").write_text(json.dumps(out, indent=1) + "\n", encoding="utf-8")
 
 

@@ -10,14 +10,16 @@ import torch
 
 from kcal.calibrate.hybrid.measured_board import load_measured_board
 from kcal.corners.observations import Observations
-from kcal.io.camera_file import load_camera, save_camera
+from kcal.io.camera_file import CameraFile, load_camera, save_camera
+from kcal.io.camera_rig_file import CameraRigFile, save_camera_rig
 from kcal.io.file_summary import sigma_of
 from kcal.io.lookup_file import load_lookup
-from kcal.io.rig_file import load_rig
+from kcal.io.rig_file import RigFile, load_rig
 from kcal.lens.camera import Camera
+from kcal.locate.stations import load_camera_rig
 
 FILES = Path(__file__).parent / "files"
-VERSIONS = sorted(path.name for path in FILES.iterdir())
+VERSIONS = sorted(path.parent.name for path in FILES.glob("*/rig.json"))
 CAMERAS = sorted(f"{path.parent.name}/{path.name}" for path in FILES.glob("*/*.camera.json"))
 
 
@@ -69,12 +71,24 @@ def test_other_files(version: str) -> None:
         close(load_measured_board(folder / "board.json").points, whole["board.json"]["points"])
 
 
+@pytest.mark.parametrize(
+    "folder", sorted(path.parent for path in FILES.glob("*/camera-rig.json")), ids=lambda f: f.name
+)
+def test_rigs_of_several_cameras(folder: Path, tmp_path: Path) -> None:
+    whole = computed(folder.name)
+    known = whole["camera-rig.json"]
+    first = load_camera_rig(folder / "camera-rig.json")
+    for rig in (first, load_camera_rig(save_camera_rig(first, tmp_path / "again.json"))):
+        close(rig.rotation, known["rotation"])
+        close(rig.center, known["center"])
+        close(rig.root.square().sum(0), known["variance"])
+        for camera, numbers in zip(rig.each, known["cameras"], strict=True):
+            same_camera(camera, numbers, whole)
+
+
 def test_each_format_that_is_read_has_files() -> None:
     """A new version of a format brings its files with it."""
-    from kcal.io.camera_file import CameraFile
-    from kcal.io.rig_file import RigFile
-
-    for kind in (CameraFile, RigFile):
-        name = {CameraFile: "opencv5.camera.json", RigFile: "rig.json"}[kind]
-        there = {json.loads((FILES / version / name).read_text(encoding="utf-8"))["version"] for version in VERSIONS}
+    files = {CameraFile: "opencv5.camera.json", RigFile: "rig.json", CameraRigFile: "camera-rig.json"}
+    for kind, name in files.items():
+        there = {json.loads(path.read_text(encoding="utf-8"))["version"] for path in FILES.glob(f"*/{name}")}
         assert there == {kind.VERSION, *kind.OLDER}

@@ -14,26 +14,31 @@ from kcal.cli.main import app
 from kcal.cli.schema import FILES, file_schema
 from kcal.corners.observations import Observations
 from kcal.io.camera_file import load_camera, save_camera
+from kcal.io.camera_rig_file import save_camera_rig
 from kcal.io.rig_file import load_rig, save_rig
+from kcal.locate.stations import load_camera_rig
 
-NEWEST = Path(__file__).parent / "files" / "0.1-format2"
+STORED = Path(__file__).parent / "files"
 WRITTEN = {
-    "camera": "hybrid.camera.json",
-    "rig": "rig.json",
-    "observations": "observations.json",
-    "board": "board.json",
+    "camera": "0.1-format2/hybrid.camera.json",
+    "rig": "0.1-format2/rig.json",
+    "camera-rig": "0.2-camera-rig/camera-rig.json",
+    "observations": "0.1-format2/observations.json",
+    "board": "0.1-format2/board.json",
 }
 
 
 def content(kind: str, folder: Path) -> dict[str, Any]:
     """A file as the present version writes it."""
-    path = NEWEST / WRITTEN[kind]
+    path = STORED / WRITTEN[kind]
     if kind == "camera":
         path = save_camera(load_camera(path), folder / "camera.json")
     elif kind == "rig":
         path = save_rig(load_rig(path), folder / "rig.json")
     elif kind == "observations":
         path = Observations.load(path).save(folder / "seen.json")
+    elif kind == "camera-rig":
+        path = save_camera_rig(load_camera_rig(path), folder / "stations.json")
     return json.loads(path.read_text(encoding="utf-8"))
 
 
@@ -52,6 +57,8 @@ def test_what_is_written_fits(kind: str, tmp_path: Path) -> None:
 
 
 def test_command() -> None:
+    told = json.loads(CliRunner().invoke(app, ["schema", "board", "--json"]).stdout)
+    assert told["schema"] == file_schema("board")
     done = CliRunner().invoke(app, ["schema", "rig"])
     assert json.loads(done.stdout) == file_schema("rig")
     assert [line.split()[0] for line in CliRunner().invoke(app, ["schema"]).stdout.splitlines()[1:]] == [*FILES]
