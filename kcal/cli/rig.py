@@ -79,6 +79,7 @@ def solve_command(
             metavar="CSV",
             help="Far things matched between the images: left_u,left_v,right_u,right_v and range,range_sigma or "
             "beyond (meters), if known.",
+            hidden=True,
         ),
         MARKS,
     ] = None,

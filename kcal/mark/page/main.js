@@ -1,5 +1,5 @@
 // The page: what is selected, what a click, a drag and a key do. The server knows everything that lasts.
-import {Actions, get, latest, post} from "/page/api.js";
+import {Actions, AWAY, Refused, get, latest, post} from "/page/api.js";
 import {followOthers} from "/page/windows.js";
 import {View} from "/page/view.js";
 import {listen} from "/page/keys.js";
@@ -145,7 +145,8 @@ class App {
   }
 
   // The epipolar curve and the proposal for the side that has no mark yet; for the reference, both.
-  async guide() {
+  guide() { return this.askGuide().catch((error) => this.unanswered(error)); }
+  async askGuide() {
     const item = this.item(), key = this.key();
     if (!item) return;
     if (this.about.reference.includes(item.name)) {
@@ -168,6 +169,8 @@ class App {
     const found = await post("proposal", {side: from, frame: this.frame, u: mark.u, v: mark.v, how: mark.how});
     if (key === this.key() && !this.item()[other(from)]) this.proposed(other(from), found);
   }
+  // A question without an answer is said; what was marked is kept by the actions.
+  unanswered(error) { this.say(error instanceof Refused ? error.message : AWAY, true); }
   proposed(side, found) {
     this.proposals[side] = found;
     document.documentElement.dataset.proposal = found.refusal ? "refused" : "there";
@@ -237,7 +240,10 @@ class App {
     const hand = this.about.hand_sigma ** 2;
     let mark = {u, v, cov: [hand, 0, hand], how: "hand", frame: this.frameName()};
     if (snapping) {
-      const found = await post("snap", {side, frame: this.frame, u, v});
+      let found;
+      try { found = await post("snap", {side, frame: this.frame, u, v}); } catch (error) {
+        found = {refusal: error instanceof Refused ? error.message : AWAY};
+      }
       if (found.refusal) this.say(`${found.refusal} (kept as clicked, σ ${this.about.hand_sigma} px)`);
       else {
         mark = {...mark, u: found.u, v: found.v, cov: found.cov, how: found.how};

@@ -113,9 +113,17 @@ export class View {
   async fetchEnlarged(key, u, v) {
     const frame = this.app.frame;
     this.enlarged = {...(this.enlarged || {}), key};
-    const answer = await raw("enlarged", {side: this.side, frame, u: Math.max(u, 0), v: Math.max(v, 0)});
+    let answer, gray;
+    try {
+      answer = await raw("enlarged", {side: this.side, frame, u: Math.max(u, 0), v: Math.max(v, 0)});
+      gray = new Uint8Array(await answer.arrayBuffer());
+    } catch (error) {
+      // Asked for again when the view is drawn next.
+      if (this.enlarged.key === key) this.enlarged.key = null;
+      return;
+    }
     const size = (name) => Number(answer.headers.get(name));
-    const tile = {width: size("X-Width"), height: size("X-Height"), gray: new Uint8Array(await answer.arrayBuffer()), canvas: null};
+    const tile = {width: size("X-Width"), height: size("X-Height"), gray, canvas: null};
     this.tiles.paint(tile);
     if (this.enlarged.key === key) this.enlarged = {key, frame, canvas: tile.canvas, left: size("X-Left"), top: size("X-Top"), factor: size("X-Factor")};
     this.draw();

@@ -173,7 +173,7 @@ def test_a_fleet_knows_its_lens() -> None:
     assert fleet.boards == ()
     assert fleet.lens is not None
     # Focal lengths scatter by 10 px; five cameras say that coarsely.
-    assert 5.0 < float(fleet.lens.sd[0]) < 25.0
+    assert 5.0 < float(fleet.lens.unknowns.sd[0]) < 25.0
     errors = []
     for seed in (31, 32, 33, 34):
         pixels = seen_by(camera(seed), flat, 5, seed).pixels()
