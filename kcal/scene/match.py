@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -114,7 +115,8 @@ def scene_features(cameras: tuple[Camera, Camera], pairs: Sequence[ImagePair], m
         most: matches of all pairs together, evenly spread over the image.
 
     Raises:
-        InputError: no pairs, images of another size than the cameras', or too little in common.
+        InputError: no pairs, a picture that is in two pairs, images of another size than the cameras', or too little
+            in common.
 
     Example:
         >>> from kcal import Camera
@@ -134,6 +136,7 @@ def scene_of(
     """As `scene_features`, from matches of each pair (`match_scene`)."""
     if not pairs:
         raise InputError("scene: no pair of images")
+    _refuse_repeated(pairs)
     if len(pairs) > 1:
         found = [_still(pairs, found, k) for k in range(len(pairs))]
     each = math.ceil(most / len(pairs))
@@ -141,6 +144,19 @@ def scene_of(
     names = tuple(f"{pair.name} {i}" for pair, one in zip(pairs, found, strict=True) for i in range(len(one.pixels)))
     features = _features(names, torch.cat([one.pixels for one in found]), torch.cat([one.covariance for one in found]))
     return SceneMatches(features, tuple(one.counts for one in found))
+
+
+def _refuse_repeated(pairs: Sequence[ImagePair]) -> None:
+    """Raise `InputError` for a picture that is in two pairs: its errors would count as independent."""
+    for side in ("left", "right"):
+        names: dict[bytes, str] = {}
+        for pair in pairs:
+            picture = np.ascontiguousarray(getattr(pair, side)).tobytes()
+            first = names.setdefault(hashlib.sha256(picture).digest(), pair.name)
+            if first != pair.name:
+                raise InputError(
+                    f"{pair.name}: the {side} image is that of {first}; each pair must be of another moment: remove one"
+                )
 
 
 def _features(names: tuple[str, ...], pixels: Tensor, covariance: Tensor) -> Features:

@@ -114,3 +114,11 @@ def test_images_of_another_size_are_refused() -> None:
         scene_features(CAMERAS, [ImagePair("small", one.left[::2], one.right)])
     with pytest.raises(InputError, match="no pair"):
         scene_features(CAMERAS, [])
+
+
+def test_a_picture_in_two_pairs() -> None:
+    """Its errors would count twice, as if they were independent."""
+    one = ImagePair("first", np.zeros((4, 6), np.uint8), np.ones((4, 6), np.uint8))
+    for again in (one._replace(name="copy"), one._replace(name="copy", left=one.left + 7)):
+        with pytest.raises(InputError, match=r"copy: the (left|right) image is that of first"):
+            scene_of(CAMERAS, [one, again], [])
