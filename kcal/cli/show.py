@@ -16,7 +16,7 @@ import typer
 from kcal.cli.console import out, print_table
 from kcal.cli.inputs import SHOWN
 from kcal.errors import FileError
-from kcal.file_kind import file_kind
+from kcal.file_kind import CAMERA_RIG_VERSION, file_kind
 from kcal.files import read_bytes
 from kcal.native_file import digest
 from kcal.quantities import number_text
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 
 # Parameters of hybrid lenses that are shown; their hundreds of weights say nothing one by one.
 _SHOWN = 26
-# Of rig files of any number of cameras.
-CAMERA_RIG_VERSION = 3
 _INTRINSICS = ("fx", "fy", "cx", "cy", "skew")
 
 
@@ -273,12 +271,11 @@ def _show_stations(file: Path) -> None:
     print_table(station_rows(rig))
     out.print("error bars of cameras and poses together" if rig.root is not None else "no error bars of the poses")
     if (solved := rig.calibration) is not None:
-        out.print(f"solved {_when(_fields(solved) or {})}: RMS {solved.rms:.4f} px", markup=False)
-        for text in (
-            *(f"open: {what}" for what in solved.undetermined),
-            *(f"warning: {why}" for why in solved.warnings),
-        ):
-            out.print(text, markup=False)
+        out.print(f"solved {_when({'created': solved.created})}: RMS {solved.rms:.4f} px", markup=False)
+        for text in solved.undetermined:
+            out.print(f"open: {text}", markup=False)
+        for text in solved.warnings:
+            out.print(f"warning: {text}", markup=False)
 
 
 def _show_observations(file: Path) -> None:

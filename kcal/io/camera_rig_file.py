@@ -14,6 +14,7 @@ import pydantic
 import torch
 
 from kcal.errors import InputError
+from kcal.file_kind import CAMERA_RIG_VERSION
 from kcal.io.camera_file import RETIRED_FIELDS, CameraFile, camera_to_file
 from kcal.io.record import Packed, Record
 from kcal.lens.calibration import CameraCalibration
@@ -60,7 +61,7 @@ class CameraRigFile(NativeFile):
     """
 
     KIND: ClassVar[str] = "rig"
-    VERSION: ClassVar[int] = 3
+    VERSION: ClassVar[int] = CAMERA_RIG_VERSION
     RETIRED: ClassVar[Mapping[str, str]] = RETIRED_FIELDS
 
     names: tuple[str, ...]

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from kcal.checks import as_covariance
 from kcal.errors import FileError, InputError
+from kcal.file_kind import CAMERA_RIG_VERSION
 from kcal.io.camera_file import RETIRED_FIELDS, CameraFile, camera_to_file
 from kcal.io.file_summary import RigSummary
 from kcal.io.record import Packed, Record
@@ -191,7 +192,8 @@ class RigFile(NativeFile):
     @classmethod
     def parse(cls, content: Any, source: str) -> Self:
         """See `NativeFile.parse`."""
-        if isinstance(content, dict) and content.get("kcal") == cls.KIND and content.get("version") == 3:
+        head = (content.get("kcal"), content.get("version")) if isinstance(content, dict) else None
+        if head == (cls.KIND, CAMERA_RIG_VERSION):
             many = len(content["names"]) if isinstance(content.get("names"), list) else "many"
             raise FileError(
                 f"{source}: a rig of {many} cameras; a rig of two is needed here (kcal locate and kcal show take both)"

@@ -17,6 +17,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.pose import nearest_rotation, rotation_from_vector, step_rows
 from kcal.lens.projection import project_components
 from kcal.lens.pupil import FAR
+from kcal.lens.shift import PixelShift
 from kcal.lens.uncertainty import pixel_covariance, pixel_slopes
 
 # Cameras that agree differ by more than this in 5 % of cases, like the intervals of `kcal.locate`.
@@ -27,7 +28,7 @@ _MOST_STEPS, _SETTLED = 50, 1e-13
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class CameraDifference:
+class CameraDifference(PixelShift):
     """Where a second camera sees things that a first camera sees at `pixels`.
 
     Args:
@@ -50,8 +51,6 @@ class CameraDifference:
         (0.1, 0.06)
     """
 
-    pixels: Tensor
-    shift: Tensor
     sigma: Tensor | None
     known: tuple[bool, bool]
     rotation: Tensor
@@ -59,21 +58,6 @@ class CameraDifference:
     at: float
     ratio: float | None
     probability: float | None
-
-    @property
-    def length(self) -> Tensor:
-        """(rows, columns) length of the shift, pixels."""
-        return torch.linalg.vector_norm(self.shift, dim=-1)
-
-    @property
-    def rms(self) -> float:
-        """Root mean square of the length over the image, pixels."""
-        return float(self.length[self.length.isfinite()].square().mean().sqrt())
-
-    @property
-    def largest(self) -> float:
-        """Largest length, pixels."""
-        return float(self.length[self.length.isfinite()].max())
 
     @property
     def same(self) -> bool | None:

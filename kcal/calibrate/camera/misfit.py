@@ -10,13 +10,14 @@ from torch import Tensor
 
 from kcal.errors import DegenerateError
 from kcal.lens.camera import Camera
+from kcal.lens.shift import PixelShift
 
 # Columns and rows on which a misfit is measured: four times as dense as the fit's, reaching to the image's edge.
 _DENSE = (129, 97)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class Misfit:
+class Misfit(PixelShift):
     """What is written instead of a lens, and how far it is from it, over the image and at infinity.
 
     Args:
@@ -27,25 +28,13 @@ class Misfit:
     """
 
     model: str
-    pixels: Tensor
-    shift: Tensor
-
-    @property
-    def length(self) -> Tensor:
-        """(rows, columns) length of the shift, pixels."""
-        return torch.linalg.vector_norm(self.shift, dim=-1)
-
-    @property
-    def rms(self) -> float:
-        """Root mean square of the length, pixels."""
-        return float(self.length[self.length.isfinite()].square().mean().sqrt())
 
     @property
     def largest(self) -> float:
         """Bound of the length: its maximum on the grid, and what it can be more between the grid's points."""
         bends = [torch.diff(self.shift, n=2, dim=axis).abs() for axis in (0, 1)]
         most = [float(torch.nan_to_num(bend).max()) for bend in bends]
-        return float(self.length[self.length.isfinite()].max()) + sum(most) / 4.0
+        return super().largest + sum(most) / 4.0
 
 
 def measured_misfit(camera: Camera, model: str, project: Callable[[Tensor], tuple[Tensor, Tensor]]) -> Misfit:
