@@ -1,0 +1,137 @@
+"""`Watched`: a rig and the history of its attitude; the rig of any moment, with the errors of that moment."""
+
+from __future__ import annotations
+
+import bisect
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from kcal.calibrate.rig.drift import Drift, drift_of_turns
+from kcal.errors import InputError
+from kcal.lens.rig import StereoRig
+from kcal.locate.geodesy import enu_from_cam
+from kcal.locate.relock import relocked
+from kcal.watch.history import HistoryRow, read_history
+from kcal.watch.model import AngleSeries, TurnModel, learned
+from kcal.watch.state import Turns, TurnState, between_rows, first_state, passed, smoothed, taken, turns_of
+
+# Seconds of a history before and after the moments that are asked for: longer ago tells nothing more.
+_BEFORE, _AFTER = 2 * 86400.0, 2 * 3600.0
+
+
+class Watched:
+    """A rig whose attitude was watched.
+
+    Args:
+        rig: as it was solved and watched.
+        rows: of its history, in the order of time.
+        model: how it turns; learned from the rows if left out.
+
+    Example:
+        >>> from kcal.locate.budget import planned_rig
+        >>> from kcal.watch.history import no_look
+        >>> rig = planned_rig()
+        >>> watched = Watched(rig, [HistoryRow(0.0, no_look())])
+        >>> float(watched.rig_at(60.0).baseline)  # nothing was seen: the same rig, less well known
+        10.0
+    """
+
+    def __init__(self, rig: StereoRig, rows: Sequence[HistoryRow] = (), model: TurnModel | None = None) -> None:
+        self.rig, self.model = rig, model or model_of(rows)
+        self.between = between_rows(rig)
+        self.times: list[float] = []
+        self.states: list[TurnState] = []
+        self._smooth: list[TurnState] | None = None
+        for row in rows:
+            self.take(row)
+
+    @classmethod
+    def read(cls, path: str | Path, rig: StereoRig, *, since: float = -math.inf, until: float = math.inf) -> Self:
+        """Read the history that `kcal watch` wrote, as far as it tells of moments between two times.
+
+        Raises:
+            FileError: no history, or one of another rig.
+        """
+        return cls(rig, read_history(path, rig.fingerprint, since=since - _BEFORE, until=until + _AFTER))
+
+    def take(self, row: HistoryRow, most: int | None = None) -> None:
+        """Take in a further look; of more than `most` the oldest are forgotten.
+
+        Raises:
+            InputError: it is not later than the last one.
+        """
+        if self.times and not row.time > self.times[-1]:
+            raise InputError(f"time {row.time:g}: not after that of the last look, {self.times[-1]:g}")
+        if self.times:
+            state, _ = passed(self.states[-1], torch.tensor(row.time - self.times[-1]).double(), self.model)
+        else:
+            state = first_state(self.model)
+        self.times.append(row.time)
+        self.states.append(taken(state, row.look, self.model, self.between))
+        self._smooth = None
+        if most is not None and len(self.times) > most:
+            del self.times[: most // 2], self.states[: most // 2]
+
+    def turns_at(self, time: float, *, gusts: bool = True) -> Turns:
+        """The turn of both cameras at a moment, from the looks before and after it.
+
+        Raises:
+            InputError: before the first look.
+        """
+        k = bisect.bisect_right(self.times, time) - 1
+        if k < 0:
+            begin = f"it begins at {self.times[0]:.0f}" if self.times else "it has no rows"
+            raise InputError(f"time {time:.0f} s: the history of the rig tells nothing of that moment; {begin}")
+        if self._smooth is None and k + 1 < len(self.times):
+            self._smooth = smoothed(self.states, self.times, self.model)
+        state, _ = passed(self.states[k], torch.tensor(time - self.times[k]).double(), self.model)
+        if self._smooth is not None and k + 1 < len(self.times):
+            state = smoothed([state, self._smooth[k + 1]], [time, self.times[k + 1]], self.model)[0]
+        return turns_of(state, self.model, gusts=gusts)
+
+    def drift_at(self, time: float, *, gusts: bool = True) -> Drift:
+        """How the cameras have turned since the reference; see `turns_at`."""
+        pose, stands = None, self.rig.mounting
+        if stands is not None:
+            pose = enu_from_cam(stands.heading_deg, stands.pitch_deg, stands.roll_deg).T
+        return drift_of_turns(self.rig, *self.turns_at(time, gusts=gusts), pose)
+
+    def rig_at(self, time: float) -> StereoRig:
+        """The rig as it stood at a moment: attitudes corrected, with the covariance of that moment on top.
+
+        Args:
+            time: seconds, as in the history.
+
+        Raises:
+            InputError: before the first look.
+        """
+        return relocked(self.rig, self.drift_at(time), f"at {time:.3f} s, from the history of the watched rig")
+
+
+def model_of(rows: Sequence[HistoryRow]) -> TurnModel:
+    """How a rig turns, as its history tells."""
+    if not rows:
+        return TurnModel.usual()
+    looks = [row.look for row in rows]
+    seen = torch.stack([look.seen for look in looks]).repeat_interleave(3, -1)
+    own = torch.stack([look.covariance.diagonal() for look in looks])
+    share = torch.stack([look.lasting for look in looks])[:, None]
+
+    def array(values: Tensor) -> NDArray[np.float64]:
+        found: NDArray[np.float64] = values.numpy()
+        return found
+
+    return learned(AngleSeries(
+        time=np.array([row.time for row in rows]),
+        angle=array(torch.where(seen, torch.stack([look.turn for look in looks]), math.nan)),
+        variance=array((1.0 - share) * own),
+        lasting=array(share * own),
+        kelvin=array(torch.stack([look.kelvin for look in looks])[:, None].expand(-1, 6)),
+    ))  # fmt: skip
