@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -91,36 +91,62 @@ def history_head() -> str:
     return csv_line(COLUMNS)
 
 
-def read_history(
-    path: str | Path, fingerprint: str, *, since: float = -math.inf, until: float = math.inf
-) -> list[HistoryRow]:
-    """The last `MOST_ROWS` rows between two times; a line that is still being written is left out.
+class HistoryTail:
+    """The rows of a history that grows, as far as they are whole.
 
     Args:
         path: of the file.
         fingerprint: of the rig that was watched.
-        since: seconds.
-        until: seconds.
-
-    Raises:
-        FileError: no such file, no history, one of another rig, or a damaged line.
     """
-    rows: deque[HistoryRow] = deque(maxlen=MOST_ROWS)
-    first = math.nan
-    for number, line in _lines(path):
-        cells = next(csv.reader([line]))
-        if number == 1:
+
+    def __init__(self, path: str | Path, fingerprint: str) -> None:
+        self.path, self._fingerprint = path, fingerprint
+        self._offset, self._number, self._first = 0, 0, math.nan
+        self._kelvin: Tensor | None = None
+
+    def rows(self, since: float = -math.inf, until: float = math.inf) -> list[HistoryRow]:
+        """The rows that have come since the last call: the last `MOST_ROWS` between two times.
+
+        Raises:
+            FileError: no such file, no history, one of another rig, or a damaged line.
+        """
+        rows: deque[HistoryRow] = deque(maxlen=MOST_ROWS)
+        try:
+            with open(self.path, "rb") as file:
+                file.seek(self._offset)
+                for line in file:
+                    # One that is still being written is left out.
+                    if not line.endswith(b"\n"):
+                        break
+                    self._offset += len(line)
+                    self._number += 1
+                    row = self._row(line.decode("utf-8", "replace").rstrip("\r\n"))
+                    if row is not None and since <= row.time <= until:
+                        rows.append(row)
+        except OSError as error:
+            raise FileError(f"{self.path}: cannot read: {error.strerror or error}") from error
+        if self._number == 0:
+            raise FileError(f"{self.path}: no rows yet: let `kcal watch` look at the scene first")
+        return list(rows)
+
+    def _row(self, line: str) -> HistoryRow | None:
+        cells = next(csv.reader([line]), [])
+        if self._number == 1:
             if tuple(cells) != COLUMNS:
-                raise FileError(f"{path}: not a history of this version of `kcal watch`")
-            continue
-        row = parsed_row(f"{path}: line {number}", cells, fingerprint)
-        if math.isnan(first):
-            first = row.temperature
-        if since <= row.time <= until:
-            rows.append(warmed(row, first, rows[-1].look.kelvin if rows else None))
-    if math.isnan(first) and not rows and since == -math.inf and until == math.inf:
-        raise FileError(f"{path}: no rows yet: let `kcal watch` look at the scene first")
-    return list(rows)
+                raise FileError(f"{self.path}: not a history of this version of `kcal watch`")
+            return None
+        row = parsed_row(f"{self.path}: line {self._number}", cells, self._fingerprint)
+        self._first = row.temperature if math.isnan(self._first) else self._first
+        row = warmed(row, self._first, self._kelvin)
+        self._kelvin = row.look.kelvin
+        return row
+
+
+def read_history(
+    path: str | Path, fingerprint: str, *, since: float = -math.inf, until: float = math.inf
+) -> list[HistoryRow]:
+    """The rows between two times; see `HistoryTail`."""
+    return HistoryTail(path, fingerprint).rows(since, until)
 
 
 def warmed(row: HistoryRow, first: float, before: Tensor | None) -> HistoryRow:
@@ -184,13 +210,3 @@ def _matrix(upper: Tensor, size: int) -> Tensor:
     if not bool(torch.linalg.eigvalsh(matrix)[0] > 0):
         raise ValueError("a covariance is not positive definite")
     return matrix
-
-
-def _lines(path: str | Path) -> Iterator[tuple[int, str]]:
-    try:
-        with open(path, "rb") as file:
-            for number, line in enumerate(file, 1):
-                if line.endswith(b"\n"):
-                    yield number, line.decode("utf-8", "replace").rstrip("\r\n")
-    except OSError as error:
-        raise FileError(f"{path}: cannot read: {error.strerror or error}") from error

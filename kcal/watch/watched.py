@@ -15,13 +15,15 @@ from torch import Tensor
 
 from kcal.calibrate.rig.drift import Drift, drift_of_turns
 from kcal.errors import InputError
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.relock import relocked
 from kcal.watch.history import HistoryRow, read_history
 from kcal.watch.model import AngleSeries, TurnModel, learned
 from kcal.watch.state import Turns, TurnState, between_rows, first_state, passed, smoothed, taken, turns_of
 
+# Shared errors that a moment has beside those of the rig file.
+MORE_ERRORS = 6
 # Seconds of a history before and after the moments that are asked for: longer ago tells nothing more.
 _BEFORE, _AFTER = 2 * 86400.0, 2 * 3600.0
 
@@ -46,8 +48,11 @@ class Watched:
     def __init__(self, rig: StereoRig, rows: Sequence[HistoryRow] = (), model: TurnModel | None = None) -> None:
         self.rig, self.model = rig, model or model_of(rows)
         self.between = between_rows(rig)
+        # Of which moments the rows tell all that the history does.
+        self.since, self.until = -math.inf, math.inf
         self.times: list[float] = []
         self.states: list[TurnState] = []
+        self.seen: list[bool] = []
         self._smooth: list[TurnState] | None = None
         for row in rows:
             self.take(row)
@@ -59,7 +64,9 @@ class Watched:
         Raises:
             FileError: no history, or one of another rig.
         """
-        return cls(rig, read_history(path, rig.fingerprint, since=since - _BEFORE, until=until + _AFTER))
+        found = cls(rig, read_history(path, rig.fingerprint, since=since - _BEFORE, until=until + _AFTER))
+        found.since, found.until = since, until
+        return found
 
     def take(self, row: HistoryRow, most: int | None = None) -> None:
         """Take in a further look; of more than `most` the oldest are forgotten.
@@ -75,9 +82,16 @@ class Watched:
             state = first_state(self.model)
         self.times.append(row.time)
         self.states.append(taken(state, row.look, self.model, self.between))
+        self.seen.append(bool(row.look.seen.all()))
         self._smooth = None
         if most is not None and len(self.times) > most:
-            del self.times[: most // 2], self.states[: most // 2]
+            del self.times[: most // 2], self.states[: most // 2], self.seen[: most // 2]
+
+    @property
+    def cam_from_local(self) -> Tensor | None:
+        """(3, 3) of the left camera, as the rig file says."""
+        stands = self.rig.mounting
+        return None if stands is None else enu_from_cam(stands.heading_deg, stands.pitch_deg, stands.roll_deg).T
 
     def turns_at(self, time: float, *, gusts: bool = True) -> Turns:
         """The turn of both cameras at a moment, from the looks before and after it.
@@ -98,10 +112,7 @@ class Watched:
 
     def drift_at(self, time: float, *, gusts: bool = True) -> Drift:
         """How the cameras have turned since the reference; see `turns_at`."""
-        pose, stands = None, self.rig.mounting
-        if stands is not None:
-            pose = enu_from_cam(stands.heading_deg, stands.pitch_deg, stands.roll_deg).T
-        return drift_of_turns(self.rig, *self.turns_at(time, gusts=gusts), pose)
+        return drift_of_turns(self.rig, *self.turns_at(time, gusts=gusts), self.cam_from_local)
 
     def rig_at(self, time: float) -> StereoRig:
         """The rig as it stood at a moment: attitudes corrected, with the covariance of that moment on top.
@@ -112,7 +123,13 @@ class Watched:
         Raises:
             InputError: before the first look.
         """
-        return relocked(self.rig, self.drift_at(time), f"at {time:.3f} s, from the history of the watched rig")
+        rig = relocked(self.rig, self.drift_at(time), f"at {time:.3f} s, from the history of the watched rig")
+        # The same number of shared errors at every moment, for filters.
+        known = rig.covariance
+        if known is not None:
+            more = len(self.rig.covariance.half if self.rig.covariance else []) + MORE_ERRORS - len(known.half)
+            rig.covariance = RigCovariance(half=torch.nn.functional.pad(known.half, (0, 0, 0, more)))
+        return rig
 
 
 def model_of(rows: Sequence[HistoryRow]) -> TurnModel:

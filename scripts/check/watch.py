@@ -2,7 +2,7 @@
 
     python -m scripts.check.watch [--chains 200] [--days 5] [--every 120] [--write]
 
-Nothing is rendered. Looks have the errors that were measured of patches (docs/measured/scene.md): 0.1 px each, 150 of
+Nothing is rendered. Looks have the errors that were measured of patches (docs/measured/scene.md): 0.1 px each, 300 of
 them in a camera of f 1600 px, a third of the variance lasting for hours; 0.5 % of the looks are wrong by 0.05°. Masts
 follow the air and the sun, each camera in its own way: a relative swing (below the limit of the alarm, or
 beyond) that is no process of the model. Wind turns both at every look, by 0.0002 to 0.0008°. Three of five rigs see nothing at night, the others an
@@ -37,7 +37,7 @@ RIG = planned_rig()
 ROWS = between_rows(RIG)
 # Radians of one feature of 0.1 px then and now: pitch, yaw, roll (an image is some 0.3 wide at the middle).
 FEATURE = 0.1 * math.sqrt(2.0) / 1600.0 * torch.tensor([1.0, 1.0, 3.5], dtype=torch.float64).repeat(2)
-FEATURES, LASTING, LASTING_S = 150, 0.33, 7200.0
+FEATURES, LASTING, LASTING_S = 300, 0.33, 7200.0
 DRIFT = math.radians(0.01)
 RIG_YAW = 0.001  # degrees, of the rig file
 MARK = 0.02  # px, of targets: means of many frames
