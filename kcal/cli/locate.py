@@ -200,6 +200,7 @@ def locate_command(
     from kcal.cli.watched_rows import located_at
     from kcal.io.rig_file import load_rig
     from kcal.lens.mounting import Origin
+    from kcal.lens.rig import RigCovariance
     from kcal.locate.aging import parse_aging
     from kcal.locate.datum import find_geoid, true_from_grid
     from kcal.locate.export import STREAM, check_format, open_writers
@@ -300,6 +301,9 @@ def locate_command(
             refraction=refraction, refraction_sigma=refraction_sigma,
         )  # fmt: skip
 
+    if watch is not None and solved.covariance is None:
+        # Not exact: moments add what is not known of them.
+        solved.covariance = RigCovariance.of(solved)
     locate = locator(solved)
     at_moments = None if watch is None else located_at(watch, solved, locator)
     survey = None if truth is None else read_survey(truth, locate.localize.origin, measured=False)

@@ -36,7 +36,7 @@ def watch_command(
         list[str] | None,
         typer.Argument(
             metavar="[LEFT RIGHT]",
-            help="Two folders of images, videos or addresses (rtsp://...); without them the history is only shown.",
+            help="Two folders of images, videos or addresses (rtsp://...); without them the history is shown.",
         ),
     ] = None,
     every: Annotated[float, typer.Option(metavar="S", help="Seconds between looks.", min=1.0)] = 60.0,
@@ -65,8 +65,9 @@ def watch_command(
     """Watch how the cameras of a rig turn, from what they see, and keep a history with the sigma of every moment.
 
     Fixed features of the first images are found again in each camera at every look, and matched between the cameras
-    once an hour. What moves is learned out. How the rig turns (sun, wind, temperature) is learned by maximum likelihood,
-    so that gaps and nights have honest sigmas. Few features, by fog or a dirty lens, make them larger, and are told.
+    once an hour. What moves is learned out. How the rig turns (sun, wind, temperature) is learned by maximum
+    likelihood, so that gaps and nights have honest sigmas. Few features, by fog or a dirty lens, make them larger, and
+    are told.
 
     `kcal locate --watch HISTORY` and `kcal live --watch HISTORY` use the attitude and the sigma of each moment.
 
@@ -135,9 +136,7 @@ def watch_command(
         raise typer.Exit(DRIFTED)
 
 
-def _follow(
-    watcher: Watcher, rig: StereoRig, sources: tuple[str, str], hooks: list[Webhook], *, ends: bool
-) -> None:
+def _follow(watcher: Watcher, rig: StereoRig, sources: tuple[str, str], hooks: list[Webhook], *, ends: bool) -> None:
     """Look until the sources end, it is stopped, or an alarm ends it."""
     frames = None if Path(sources[0]).is_dir() else _frame_pairs(rig, sources)
     stopped = False
@@ -205,7 +204,8 @@ def _relative(noticed: Noticed) -> str:
 
     angles = zip(("pitch", "yaw", "roll"), noticed.turn.tolist(), noticed.sigma.tolist(), strict=True)
     return ", ".join(
-        f"{name} {measured_text(math.degrees(turn), math.degrees(sigma), '°', sign=True)}" for name, turn, sigma in angles
+        f"{name} {measured_text(math.degrees(turn), math.degrees(sigma), '°', sign=True)}"
+        for name, turn, sigma in angles
     )
 
 
@@ -236,7 +236,8 @@ def _tell(watched: Watched, limit: float) -> None:
         ("left camera", drift.left, drift.left_covariance), ("right camera", drift.right, drift.right_covariance),
         ("right from left", drift.relative, drift.relative_covariance),
     ):  # fmt: skip
-        assert turn is not None and covariance is not None
+        assert turn is not None
+        assert covariance is not None
         both = zip((degrees * turn).tolist(), (degrees * covariance.diagonal().sqrt()).tolist(), strict=True)
         rows.append([name, *(f"{value:+z.5f} ± {sigma:.5f}" for value, sigma in both)])
     print_table(rows, left=range(4))

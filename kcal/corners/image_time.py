@@ -7,8 +7,7 @@ import io
 import re
 from pathlib import Path
 
-from PIL import ExifTags, UnidentifiedImageError
-from PIL import Image as pillow
+from PIL import ExifTags, Image, UnidentifiedImageError
 
 from kcal.errors import FileError
 from kcal.files import read_head
@@ -42,8 +41,11 @@ def image_time(path: Path) -> float:
     if unix := _UNIX.search(path.name):
         return float(unix.group(1))
     try:
-        tags = pillow.open(io.BytesIO(read_head(path, _HEAD))).getexif().get_ifd(ExifTags.IFD.Exif)
-        text, zone = str(tags.get(ExifTags.Base.DateTimeOriginal, "")), str(tags.get(ExifTags.Base.OffsetTimeOriginal, ""))
+        tags = Image.open(io.BytesIO(read_head(path, _HEAD))).getexif().get_ifd(ExifTags.IFD.Exif)
+        text, zone = (
+            str(tags.get(ExifTags.Base.DateTimeOriginal, "")),
+            str(tags.get(ExifTags.Base.OffsetTimeOriginal, "")),
+        )
         moment = datetime.datetime.strptime(f"{text} {zone or '+00:00'}", "%Y:%m:%d %H:%M:%S %z")
     except (UnidentifiedImageError, OSError, ValueError, SyntaxError):
         raise FileError(

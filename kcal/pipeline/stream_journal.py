@@ -19,7 +19,6 @@ from kcal.file_lock import FileLock
 from kcal.files import read_bytes, write_atomic
 
 
-
 class StreamPlace(NamedTuple):
     """How far a stream has come.
 

@@ -71,7 +71,7 @@ class Webhook:
         """Try to send what waits."""
         if not self._waiting:
             return
-        request = urllib.request.Request(  # noqa: S310 - http and https only, see above
+        request = urllib.request.Request(
             self.address, self._waiting, {"Content-Type": "application/json"}, method="POST"
         )
         try:

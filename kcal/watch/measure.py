@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from typing import NamedTuple
 
@@ -35,7 +34,7 @@ _WIDE = 40
 FEWEST = 8
 # px: light, shade and bilinear samples leave that much in the best patch.
 _FLOOR = 0.03
-# A lens whose images are larger or smaller by this share, so surely, is another one: 20 K change a focal length by 2e-4.
+# A lens whose images are larger or smaller by this share, so surely, is another one: 20 K change them by 2e-4.
 _OTHER_LENS, _SURELY = 1e-3, 8.0
 # Keypoints of an image that shows a scene, whatever scene that is.
 _SOME = 150
@@ -49,11 +48,11 @@ class Seen(NamedTuple):
     Attributes:
         turn: (3,) radians since the reference; zeros if nothing was found.
         covariance: (3, 3).
-        found: features that were found and stand still.
+        found: features that were found and stand still; 0 where they make no turn.
         lasting: share of the covariance that lasts, None if it cannot be told yet.
         reference: with the records of this look.
         note: what is wrong, if anything is.
-        lost: an image full of things of which none is what was there.
+        lost: an image full of things that are not what was there.
     """
 
     turn: Tensor
@@ -94,11 +93,11 @@ def seen_by(camera: Camera, reference: Reference, image: Gray, turn: Tensor, nam
         if int(wide[2].sum()) > 2 * int(good.sum()):
             now, sigma, good = wide
     count = int(good.sum())
-    nothing = Seen(torch.zeros(3).double(), torch.eye(3).double(), count, None, reference)
+    nothing = Seen(torch.zeros(3).double(), torch.eye(3).double(), 0, None, reference)
     if count < FEWEST:
-        full = len(keypoints(image, 2 * _SOME).pixels) >= _SOME
-        why = "nothing of the reference is there" if full and not count else "dark, fog, or a dirty lens?"
-        return nothing._replace(note=f"{name}: {count} features ({why})", lost=full and not count)
+        full = _is_full(image)
+        why = "nothing of the reference is there" if full else "dark, fog, or a dirty lens?"
+        return nothing._replace(note=f"{name}: {count} features ({why})", lost=full)
     then = torch.where(good[:, None], reference.pixels, math.nan)
     features = Features(
         names=tuple(map(str, range(len(good)))),
@@ -112,7 +111,7 @@ def seen_by(camera: Camera, reference: Reference, image: Gray, turn: Tensor, nam
         (found,), items, _ = camera_turns([camera], [name], features)
     except (InputError, DegenerateError) as error:
         _check_lens(camera, reference.pixels[good], now[good], name)
-        return nothing._replace(note=f"{name}: {str(error).removeprefix('drift: ')}")
+        return nothing._replace(note=f"{name}: {str(error).removeprefix('drift: ')}", lost=_is_full(image))
     used = torch.tensor([item.used for item in items]) & good
     _check_lens(camera, reference.pixels[used], now[used], name)
     off = torch.where(good[:, None], found.off, 0.0)
@@ -125,6 +124,10 @@ def seen_by(camera: Camera, reference: Reference, image: Gray, turn: Tensor, nam
     return Seen(
         found.vector, found.covariance + reference.variance, int(used.sum()), lasting, judged(reference, good, off), few
     )
+
+
+def _is_full(image: Gray) -> bool:
+    return len(keypoints(image, 2 * _SOME).pixels) >= _SOME
 
 
 def _found_again(
@@ -168,9 +171,10 @@ def _check_lens(camera: Camera, then: Tensor, now: Tensor, name: str) -> None:
     sigma = math.sqrt(float(scale) * float(torch.linalg.inv(normal)[2, 2]))
     larger = float(found[2])
     if abs(larger) > max(_OTHER_LENS, _SURELY * sigma):
+        word = "larger" if larger > 0 else "smaller"
         raise AnotherCameraError(
-            f"{name}: images are {100 * abs(larger):.2f} % {'larger' if larger > 0 else 'smaller'} than the lens of the "
-            "rig makes them: another camera, lens, zoom or focus; calibrate it, solve the rig anew and begin a new history"
+            f"{name}: images are {100 * abs(larger):.2f} % {word} than the lens of the "
+            "rig makes them: another camera, lens, zoom or focus; calibrate it, solve the rig and begin a new history"
         )
 
 
@@ -246,7 +250,7 @@ def measured(
         )
     ]
     told = [side.lasting for side in sides if side.lasting is not None]
-    seen = torch.tensor([bool(side.turn.any() or side.covariance[0, 0] < 1.0) for side in sides])
+    seen = torch.tensor([side.found > 0 for side in sides])
     look = no_look()._replace(
         turn=torch.cat([side.turn for side in sides]),
         covariance=torch.block_diag(*(side.covariance for side in sides)),

@@ -48,7 +48,8 @@ class TurnModel:
     @classmethod
     def usual(cls) -> TurnModel:
         """What is assumed before enough was measured."""
-        return cls(**dict(zip(("swing", "return_s", "gust"), torch.tensor(_USUAL).double()[:, None].expand(3, 6))))
+        swing, back, gust = torch.tensor(_USUAL, dtype=torch.float64)[:, None].expand(3, 6)
+        return cls(swing=swing, return_s=back, gust=gust)
 
 
 class AngleSeries(NamedTuple):

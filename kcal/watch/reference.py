@@ -96,7 +96,7 @@ def _features(image: Gray, taken: Tensor, most: int) -> Reference:
     inside = ((pixels.round() >= REACH) & (pixels.round() <= size - 1 - REACH)).all(-1)
     pixels = pixels[inside]
     cell = (pixels / size * torch.tensor(_CELLS)).long()
-    number, kept, counts = cell[:, 1] * _CELLS[0] + cell[:, 0], [], dict[int, int]()
+    number, kept, counts = cell[:, 1] * _CELLS[0] + cell[:, 0], list[int](), dict[int, int]()
     places, limit = taken, -(-2 * _MOST // (_CELLS[0] * _CELLS[1]))
     for i, place in enumerate(number.tolist()):
         if len(kept) == most:
@@ -172,7 +172,7 @@ def save_references(path: str | Path, rig: StereoRig, sides: tuple[Reference, Re
         for word, side in zip(("left", "right"), sides, strict=True) for name in _FIELDS
     }  # fmt: skip
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, rig=np.array(rig.fingerprint), **arrays)  # type: ignore[arg-type]
+    np.savez_compressed(buffer, rig=np.array(rig.fingerprint), **arrays)
     return write_atomic(path, buffer.getvalue())
 
 

@@ -124,7 +124,9 @@ def taken(state: TurnState, look: Look, model: TurnModel, rows: Tensor) -> TurnS
     variance = state.covariance.diagonal(dim1=-2, dim2=-1).clone()
     # The first look tells how much may last.
     variance[..., _LASTING] = torch.where(first, share * own, variance[..., _LASTING])
-    spread = state.covariance - torch.diag_embed(state.covariance.diagonal(dim1=-2, dim2=-1)) + torch.diag_embed(variance)
+    spread = (
+        state.covariance - torch.diag_embed(state.covariance.diagonal(dim1=-2, dim2=-1)) + torch.diag_embed(variance)
+    )
     design, noise, wanted, there = _rows_of(look, model, rows)
     off = torch.where(there, wanted - (design @ state.mean[..., None])[..., 0], 0.0)
 

@@ -17,7 +17,7 @@ from kcal.lens.rig import StereoRig
 from kcal.pipeline.stream_journal import Ledger
 from kcal.watch.alarm import LIMIT, exceeded
 from kcal.watch.history import HistoryRow, history_head, history_line, read_history, warmed
-from kcal.watch.measure import AnotherCameraError, Measured, measured
+from kcal.watch.measure import Measured, measured
 from kcal.watch.reference import Reference, load_references, new_reference, renewed, save_references
 from kcal.watch.temperature import Temperatures
 from kcal.watch.watched import Watched, model_of
@@ -86,7 +86,9 @@ class Watcher:
         self._lost = [0, 0]
         self._notes = ""
         if history.exists() and not history.with_name(history.name + ".journal").exists() and history.stat().st_size:
-            raise FileError(f"{history}: there is no journal beside it; give another name, or restore {history}.journal")
+            raise FileError(
+                f"{history}: there is no journal beside it; give another name, or restore {history}.journal"
+            )
         self._ledger = Ledger(history.with_name(history.name + ".journal"), [history], "watch")
         try:
             if self._ledger.place.sequence:
@@ -139,7 +141,7 @@ class Watcher:
         """Look at images of a moment, and write a row.
 
         Raises:
-            InputError: too few features for a reference, or another camera (`AnotherCameraError`).
+            InputError: too few features for a reference, or another lens (`AnotherCameraError`).
         """
         if self._sides is None:
             self.refer_to(left, right)
@@ -199,10 +201,11 @@ class Watcher:
     def _check_lost(self, found: Measured) -> None:
         for k, (side, name) in enumerate(zip(found.sides, ("left", "right"), strict=True)):
             self._lost[k] = self._lost[k] + 1 if side.lost else 0
-            if self._lost[k] >= _LOST:
-                raise AnotherCameraError(
-                    f"{name}: {_LOST} images in a row show a scene of which nothing is in the reference: was the camera "
-                    "replaced or turned by more than 40 px? Solve the rig anew and begin a new history"
+            if self._lost[k] == _LOST:
+                self.tell(
+                    f"{name}: {_LOST} images in a row show a scene of which nothing is in the reference, and tell no "
+                    "attitude: was the camera replaced or turned by more than 40 px, or is there snow? If so, solve "
+                    "the rig anew and begin a new history"
                 )
 
     def _renew(self, left: Gray, right: Gray) -> None:
@@ -212,7 +215,12 @@ class Watcher:
         sides = [
             renewed(side, camera, image, turns.mean[part], turns.covariance[part, part]) if there else side
             for side, camera, image, there, part in zip(
-                self._sides, (self.rig.left, self.rig.right), (left, right), seen, (slice(0, 3), slice(3, 6)), strict=True
+                self._sides,
+                (self.rig.left, self.rig.right),
+                (left, right),
+                seen,
+                (slice(0, 3), slice(3, 6)),
+                strict=True,
             )
         ]
         self._sides = sides[0], sides[1]

@@ -5,7 +5,8 @@
 Nothing is rendered. Looks have the errors that were measured of patches (docs/measured/scene.md): 0.1 px each, 300 of
 them in a camera of f 1600 px, a third of the variance lasting for hours; 0.5 % of the looks are wrong by 0.05°. Masts
 follow the air and the sun, each camera in its own way: a relative swing (below the limit of the alarm, or
-beyond) that is no process of the model. Wind turns both at every look, by 0.0002 to 0.0008°. Three of five rigs see nothing at night, the others an
+beyond) that is no process of the model. Wind turns both at every look, by 0.0002 to 0.0008°.
+Three of five rigs see nothing at night, the others an
 eighth of the features; there are gaps of half an hour. Each rig's model is learned from
 three days before those that count.
 With --write docs/measured/watch.md is made.
@@ -21,10 +22,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.calibrate.rig.drift import drift_of_turns
 from kcal.lens.mounting import Mounting, Origin
+from kcal.lens.pose import rotation_from_vector
+from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.budget import planned_rig
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.relock import relocked
@@ -194,7 +195,7 @@ def in_interval(watched: StereoRig, standing: StereoRig, seed: int) -> bool:
 
 
 def coverage(true: Truth, told: Told, number: int) -> dict[str, Tensor]:
-    """Of `number` targets at random moments of all rigs: (number,) in the interval with the watch and without, night."""
+    """Of targets at random moments of all rigs: (number,) in the interval with the watch, without, in the dark."""
     random = torch.Generator().manual_seed(7)
     count, chains = true.seen.shape
     pose = torch.zeros(6, 6, dtype=torch.float64)
@@ -211,7 +212,9 @@ def coverage(true: Truth, told: Told, number: int) -> dict[str, Tensor]:
         error = error * torch.randn(1, generator=random, dtype=torch.float64)
         bent = true.slow[k, c] + true.wind[c] * torch.randn(6, generator=random, dtype=torch.float64)
         then = rotation_from_vector(error)
-        solved = StereoRig(file.left, file.right, then @ file.right_from_left_rotation, file.right_from_left_translation)
+        solved = StereoRig(
+            file.left, file.right, then @ file.right_from_left_rotation, file.right_from_left_translation
+        )
         standing = drift_of_turns(solved, bent, torch.eye(6, dtype=torch.float64)).rig
         watched = relocked(file, drift_of_turns(file, told.later[k, c], told.covariance[k, c]), "")
         inside["watch"].append(in_interval(watched, standing, n))
@@ -244,7 +247,8 @@ def day_and_night(
     inside = coverage(true, told, targets)
     night = inside["night"]
     return [
-        f"{peaks[0]} to {peaks[1]}°", "yes" if heat else "no", f"{chains * days:.0f}", begins, f"{begins / (chains * days / 30.0):.2f}",
+        f"{peaks[0]} to {peaks[1]}°", "yes" if heat else "no", f"{chains * days:.0f}", begins,
+        f"{begins / (chains * days / 30.0):.2f}",
         *(f"{100 * share:.1f} %" for share in swing), percent(inside["watch"][~night]), percent(inside["watch"][night]),
         percent(inside["file"]),
     ], model  # fmt: skip
@@ -292,8 +296,9 @@ def main() -> None:
             rows.append(row)
             print(*row, f"{time.process_time() - begun:.0f} s", sep=" | ", flush=True)
         found = drifts(given.chains, given.every, model)
-    swing = table(["swing", "temperature", "days and nights", "false alarms", "a month", "of the swing removed by day", "in dark and gaps",
-                   "inside 95 % by day", "inside, dark and gaps", "inside, rig file"], rows)  # fmt: skip
+    swing = table(["swing", "temperature", "days and nights", "false alarms", "a month", "of the swing removed by day",
+                   "in dark and gaps", "inside 95 % by day", "inside, dark and gaps",
+                   "inside, rig file"], rows)  # fmt: skip
     drift = table(["drift of 0.01°", "rigs", "found in 10 minutes of its end", "median", "in an hour"], found)
     print(*swing, *drift, sep="\n")
     if given.write:

@@ -12,7 +12,6 @@ import torch
 
 from kcal.corners.image_time import image_time
 from kcal.errors import FileError, InputError
-from kcal.io.rig_file import save_rig
 from kcal.locate.budget import planned_rig
 from kcal.watch.alarm import alarm_sigmas, exceeded
 from kcal.watch.history import HistoryRow, HistoryTail, history_head, history_line, read_history
@@ -179,13 +178,14 @@ def test_relock_never_makes_a_good_rig_worse() -> None:
 
 def test_relock_needs_the_last_looks() -> None:
     watched = day(0.03, 0.0)
-    for k in range(22):
+    for _ in range(22):
         watched.take(row_of(watched.times[-1] + 600.0, yaw_turn(0.0)))
     assert relock(watched).rig is None
 
 
 def test_times_of_images(tmp_path: Path) -> None:
     assert image_time(Path("cam_2026-01-01T00-00-00.250.png")) == 1767225600.25
+    (tmp_path / "left.png").write_bytes(b"no image")
     with pytest.raises(FileError, match="no time of capture"):
         image_time(tmp_path / "left.png")
 
@@ -196,4 +196,3 @@ def test_few_features_make_no_reference(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="left: 0 features"):
         watcher.look(0.0, one.left * 0, one.right)
     watcher.close()
-    save_rig(small_rig(), tmp_path / "rig.json")
