@@ -96,6 +96,7 @@ NAMESPACES = {door.removeprefix("kcal.") for door in PUBLIC} - {"kcal"}
 # Names that were not in `kcal` itself before there were namespaces.
 NEW_NAMES = (
     {
+        "Watched",
         "ImagePair",
         "PairCounts",
         "SceneMatches",
@@ -114,7 +115,7 @@ NEW_NAMES = (
     | set(PUBLIC["kcal.stars"].split())
 )
 # Types of attributes in which only those look who work on kcal.
-INSIDE = {"FieldModes", "HybridFit", "BoardState", "Spline"}
+INSIDE = {"FieldModes", "HybridFit", "BoardState", "Spline", "HistoryRow", "TurnModel"}
 # What functions return, and blocks of files: examples are those of the functions.
 RECORDS = {
     "CameraRigCalibration",

@@ -123,9 +123,9 @@ def watch_command(
         if not watcher.last_time > -math.inf:
             raise InputError("no pair of images was looked at")
     watched = Watched.read(history, known)
-    _tell(watched, limit)
+    _tell_turns(watched, limit)
     if picture is not None:
-        _draw(watched, picture, limit, history.name)
+        _draw_turns(watched, picture, limit, history.name)
     if relock is not None:
         better = relocked_by(watched)
         out.print(("re-locked: " if better.rig else "not re-locked: ") + better.reason, markup=False)
@@ -155,10 +155,10 @@ def _follow(watcher: Watcher, rig: StereoRig, sources: tuple[str, str], hooks: l
             for hook in hooks:
                 hook.send(_message(noticed, watcher)) if noticed.begins else hook.again()
             if noticed.begins:
-                warn(f"{_relative(noticed)}: beyond the limit of {watcher.limit_deg:g}°")
+                warn(f"{_turn_text(noticed)}: beyond the limit of {watcher.limit_deg:g}°")
             if clocks.monotonic() >= next_word:
                 next_word = clocks.monotonic() + 10.0
-                err.print(f"{time:.0f} s: {_relative(noticed)}", markup=False)
+                err.print(f"{time:.0f} s: {_turn_text(noticed)}", markup=False)
             if stopped or (ends and noticed.begins):
                 break
     finally:
@@ -199,7 +199,7 @@ def _folder_pairs(watcher: Watcher, folders: tuple[str, str]) -> Iterator[tuple[
             yield time, read_gray(files[0][left]), read_gray(files[1][right])
 
 
-def _relative(noticed: Noticed) -> str:
+def _turn_text(noticed: Noticed) -> str:
     from kcal.quantities import measured_text
 
     angles = zip(("pitch", "yaw", "roll"), noticed.turn.tolist(), noticed.sigma.tolist(), strict=True)
@@ -227,7 +227,7 @@ def _summary(watcher: Watcher, hooks: list[Webhook]) -> str:
     return "; ".join(parts)
 
 
-def _tell(watched: Watched, limit: float) -> None:
+def _tell_turns(watched: Watched, limit: float) -> None:
     """The attitude now, and how the rig turns."""
     drift = watched.drift_at(watched.times[-1])
     model, degrees = watched.model, math.degrees(1.0)
@@ -252,7 +252,7 @@ def _tell(watched: Watched, limit: float) -> None:
     )
 
 
-def _draw(watched: Watched, picture: Path, limit: float, title: str) -> None:
+def _draw_turns(watched: Watched, picture: Path, limit: float, title: str) -> None:
     import numpy as np
 
     from kcal.report.attitude import draw_attitude

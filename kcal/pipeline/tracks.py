@@ -168,8 +168,7 @@ class Tracker:
     ) -> None:
         if moments is not None and (compiled or record):
             raise InputError("a rig that moves: neither compiled filters nor records are possible")
-        self.localize = self.solved = localize
-        self.options, self.moments = options or TrackOptions(), moments
+        self.localize, self.solved, self.moments, self.options = localize, localize, moments, options or TrackOptions()
         factor = localize.calibration_factor
         # What lasts of the marks' errors behaves as the calibration's errors do, though each track has its own.
         self.calibration = (0 if factor is None else factor.shape[1]) + moving + (2 if self.options.lasting_px else 0)
@@ -377,8 +376,8 @@ class Tracker:
 
     def _recognized(self, new: int) -> int | None:
         """The lost track that a new one continues, if there is one and only one."""
-        first = self.records[new].first
-        lost = [i for i, t in enumerate(self.records) if t.number and not self._is_told(t) and t.last < first]
+        first, tracks = self.records[new].first, enumerate(self.records)
+        lost = [i for i, track in tracks if track.number and not self._is_told(track) and track.last < first]
         if not lost:
             return None
         which = torch.tensor(lost, device=self.frame.device)

@@ -22,7 +22,7 @@ from kcal.lens.rig import StereoRig
 from kcal.scene.match import ImagePair, MatchedPair, match_scene
 from kcal.scene.still import SAME, SWAY, whole_shifts
 from kcal.watch.history import no_look
-from kcal.watch.reference import Reference, judged
+from kcal.watch.reference import FixedFeatures, with_look
 from kcal.watch.state import Look, between_rows
 
 # Steps of a patch from its middle; px that a fit may go, and along the worst axis that it may be unsure.
@@ -59,7 +59,7 @@ class Seen(NamedTuple):
     covariance: Tensor
     found: int
     lasting: float | None
-    reference: Reference
+    reference: FixedFeatures
     note: str = ""
     lost: bool = False
 
@@ -68,7 +68,7 @@ class AnotherCameraError(InputError):
     """An image that no turn of the camera explains, and that another lens does."""
 
 
-def seen_by(camera: Camera, reference: Reference, image: Gray, turn: Tensor, name: str) -> Seen:
+def seen_by(camera: Camera, reference: FixedFeatures, image: Gray, turn: Tensor, name: str) -> Seen:
     """Find the features of a reference in an image, and how the camera has turned since.
 
     Args:
@@ -87,9 +87,9 @@ def seen_by(camera: Camera, reference: Reference, image: Gray, turn: Tensor, nam
             f"{camera.size[1]}: was the camera replaced?"
         )
     gray = torch.from_numpy(to_8bit(image).astype(np.float32))
-    now, sigma, good = _found_again(camera, reference, gray, turn, SWAY)
+    now, sigma, good = _patches_again(camera, reference, gray, turn, SWAY)
     if int(good.sum()) < FEWEST:
-        wide = _found_again(camera, reference, gray, turn, _WIDE)
+        wide = _patches_again(camera, reference, gray, turn, _WIDE)
         if int(wide[2].sum()) > 2 * int(good.sum()):
             now, sigma, good = wide
     count = int(good.sum())
@@ -122,7 +122,12 @@ def seen_by(camera: Camera, reference: Reference, image: Gray, turn: Tensor, nam
         lasting = min(0.95, max(0.05, both[0] / both[1]))
     few = f"{name}: only {int(used.sum())} features" if 4 * int(used.sum()) < len(good) else ""
     return Seen(
-        found.vector, found.covariance + reference.variance, int(used.sum()), lasting, judged(reference, good, off), few
+        found.vector,
+        found.covariance + reference.variance,
+        int(used.sum()),
+        lasting,
+        with_look(reference, good, off),
+        few,
     )
 
 
@@ -130,8 +135,8 @@ def _is_full(image: Gray) -> bool:
     return len(keypoints(image, 2 * _SOME).pixels) >= _SOME
 
 
-def _found_again(
-    camera: Camera, reference: Reference, image: Tensor, turn: Tensor, sway: int
+def _patches_again(
+    camera: Camera, reference: FixedFeatures, image: Tensor, turn: Tensor, sway: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Pixels (F, 2) of the features now, their sigma (F,) along the worst axis, and which (F,) were found."""
     mosaic, here = reference.mosaic
@@ -218,7 +223,7 @@ def between_turn(rig: StereoRig, matched: MatchedPair) -> tuple[Tensor, Tensor]:
     return values, max(1.0, variance) * torch.linalg.inv(normal)
 
 
-class Measured(NamedTuple):
+class TwoViews(NamedTuple):
     """A look, both cameras, and the number of matches between them."""
 
     look: Look
@@ -229,8 +234,13 @@ class Measured(NamedTuple):
 
 @torch.no_grad()
 def measured(
-    rig: StereoRig, references: tuple[Reference, Reference], images: tuple[Gray, Gray], turns: Tensor, *, between: bool
-) -> Measured:
+    rig: StereoRig,
+    references: tuple[FixedFeatures, FixedFeatures],
+    images: tuple[Gray, Gray],
+    turns: Tensor,
+    *,
+    between: bool,
+) -> TwoViews:
     """Look at both images of a moment.
 
     Args:
@@ -267,4 +277,4 @@ def measured(
             values, covariance = between_turn(rig, matched)
             matches = len(matched.pixels)
             look = look._replace(between=values, between_covariance=covariance, matched=torch.tensor(True))
-    return Measured(look, (sides[0], sides[1]), matches, "; ".join(notes))
+    return TwoViews(look, (sides[0], sides[1]), matches, "; ".join(notes))

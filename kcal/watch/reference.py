@@ -38,7 +38,7 @@ _FIELDS = ("pixels", "middle", "patches", "looks", "found", "off", "variance")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class Reference:
+class FixedFeatures:
     """Features of one camera, F of them.
 
     Args:
@@ -66,19 +66,19 @@ class Reference:
         down = side * torch.arange(len(self.middle)).double()
         return self.patches.reshape(-1, side).float(), self.middle + torch.stack([torch.zeros_like(down), down], -1)
 
-    def at(self, which: Tensor) -> Reference:
+    def at(self, which: Tensor) -> FixedFeatures:
         """Some of the features."""
         own = {name: getattr(self, name)[which] for name in _FIELDS[:-1]}
         return dataclasses.replace(self, **own)
 
 
-def new_reference(image: Gray, name: str) -> Reference:
+def new_reference(image: Gray, name: str) -> FixedFeatures:
     """The features of an image.
 
     Raises:
         InputError: it has too few.
     """
-    made = _features(image, torch.zeros(0, 2, dtype=torch.float64), _MOST)
+    made = _spread_features(image, torch.zeros(0, 2, dtype=torch.float64), _MOST)
     if len(made.pixels) < _FEWEST:
         raise InputError(
             f"{name}: {len(made.pixels)} features; a reference needs {_FEWEST}: begin by daylight, with a clean lens, "
@@ -87,7 +87,7 @@ def new_reference(image: Gray, name: str) -> Reference:
     return made
 
 
-def _features(image: Gray, taken: Tensor, most: int) -> Reference:
+def _spread_features(image: Gray, taken: Tensor, most: int) -> FixedFeatures:
     """Up to `most` strong keypoints, spread over the image, not near those that are taken."""
     gray = to_8bit(image)
     height, width = gray.shape
@@ -112,7 +112,7 @@ def _features(image: Gray, taken: Tensor, most: int) -> Reference:
     corners = pixels.round().long().tolist()
     patches = [whole[y - REACH : y + REACH + 1, x - REACH : x + REACH + 1] for x, y in corners]
     side, count = 2 * REACH + 1, len(pixels)
-    return Reference(
+    return FixedFeatures(
         pixels=pixels, middle=pixels - pixels.round() + REACH,
         patches=torch.stack(patches) if patches else torch.zeros(0, side, side, dtype=torch.uint8),
         looks=torch.zeros(count, dtype=torch.float64), found=torch.ones(count, dtype=torch.float64),
@@ -120,7 +120,7 @@ def _features(image: Gray, taken: Tensor, most: int) -> Reference:
     )  # fmt: skip
 
 
-def judged(reference: Reference, seen: Tensor, off: Tensor) -> Reference:
+def with_look(reference: FixedFeatures, seen: Tensor, off: Tensor) -> FixedFeatures:
     """The reference after a look.
 
     Args:
@@ -138,7 +138,7 @@ def judged(reference: Reference, seen: Tensor, off: Tensor) -> Reference:
     )
 
 
-def renewed(reference: Reference, camera: Camera, image: Gray, turn: Tensor, covariance: Tensor) -> Reference:
+def renewed(reference: FixedFeatures, camera: Camera, image: Gray, turn: Tensor, covariance: Tensor) -> FixedFeatures:
     """Without what moves or has changed; with new features where half of them are gone.
 
     Args:
@@ -154,7 +154,7 @@ def renewed(reference: Reference, camera: Camera, image: Gray, turn: Tensor, cov
     if len(kept.pixels) >= _MOST // 2 or not bool(old.any()):
         return kept
     rays, _ = camera.unproject(kept.pixels)
-    more = _features(image, camera.project(rays @ rotation_from_vector(turn).T)[0], _MOST - len(kept.pixels))
+    more = _spread_features(image, camera.project(rays @ rotation_from_vector(turn).T)[0], _MOST - len(kept.pixels))
     if not len(more.pixels):
         return kept
     rays, valid = camera.unproject(more.pixels)
@@ -162,10 +162,10 @@ def renewed(reference: Reference, camera: Camera, image: Gray, turn: Tensor, cov
     more = dataclasses.replace(more, pixels=back).at(valid & there)
     share = len(more.pixels) / (len(more.pixels) + len(kept.pixels))
     both = {name: torch.cat([getattr(kept, name), getattr(more, name)]) for name in _FIELDS[:-1]}
-    return Reference(**both, variance=kept.variance + share**2 * covariance)
+    return FixedFeatures(**both, variance=kept.variance + share**2 * covariance)
 
 
-def save_references(path: str | Path, rig: StereoRig, sides: tuple[Reference, Reference]) -> Path:
+def save_references(path: str | Path, rig: StereoRig, sides: tuple[FixedFeatures, FixedFeatures]) -> Path:
     """Write the references of both cameras to an .npz file."""
     arrays = {
         f"{word}_{name}": getattr(side, name).numpy()
@@ -176,7 +176,7 @@ def save_references(path: str | Path, rig: StereoRig, sides: tuple[Reference, Re
     return write_atomic(path, buffer.getvalue())
 
 
-def load_references(path: str | Path, rig: StereoRig) -> tuple[Reference, Reference]:
+def load_references(path: str | Path, rig: StereoRig) -> tuple[FixedFeatures, FixedFeatures]:
     """Read what `save_references` wrote.
 
     Raises:
@@ -190,7 +190,7 @@ def load_references(path: str | Path, rig: StereoRig) -> tuple[Reference, Refere
                 f"{path}: the reference is of another rig ({named}, not {rig.fingerprint}): were cameras replaced or "
                 "the rig solved again? Begin a new history"
             )
-        sides = [Reference(**{name: torch.from_numpy(arrays[f"{word}_{name}"]) for name in _FIELDS})
+        sides = [FixedFeatures(**{name: torch.from_numpy(arrays[f"{word}_{name}"]) for name in _FIELDS})
                  for word in ("left", "right")]  # fmt: skip
         for side in sides:
             count, wide = len(side.pixels), 2 * REACH + 1

@@ -17,8 +17,8 @@ from kcal.lens.rig import StereoRig
 from kcal.pipeline.stream_journal import Ledger
 from kcal.watch.alarm import LIMIT, exceeded
 from kcal.watch.history import HistoryRow, history_head, history_line, read_history, warmed
-from kcal.watch.measure import Measured, measured
-from kcal.watch.reference import Reference, load_references, new_reference, renewed, save_references
+from kcal.watch.measure import TwoViews, measured
+from kcal.watch.reference import FixedFeatures, load_references, new_reference, renewed, save_references
 from kcal.watch.temperature import Temperatures
 from kcal.watch.watched import Watched, model_of
 
@@ -81,7 +81,7 @@ class Watcher:
         self.skipped, self.looks, self.alarms = 0, 0, 0
         self._temperatures, self._warmth = temperatures, math.nan
         self._rows: deque[HistoryRow] = deque(maxlen=_KEPT)
-        self._sides: tuple[Reference, Reference] | None = None
+        self._sides: tuple[FixedFeatures, FixedFeatures] | None = None
         self._matched, self._learned, self._alarm = -math.inf, -math.inf, False
         self._lost = [0, 0]
         self._notes = ""
@@ -198,7 +198,7 @@ class Watcher:
         self.alarms += begins
         return Noticed(row, steady.relative, sigma, alarm, begins)
 
-    def _check_lost(self, found: Measured) -> None:
+    def _check_lost(self, found: TwoViews) -> None:
         for k, (side, name) in enumerate(zip(found.sides, ("left", "right"), strict=True)):
             self._lost[k] = self._lost[k] + 1 if side.lost else 0
             if self._lost[k] == _LOST:

@@ -10,7 +10,15 @@ import torch
 from kcal.errors import FileError, InputError
 from kcal.scene.match import ImagePair, match_scene
 from kcal.watch.measure import AnotherCameraError, between_turn, measured, seen_by
-from kcal.watch.reference import MEMORY, Reference, judged, load_references, new_reference, renewed, save_references
+from kcal.watch.reference import (
+    MEMORY,
+    FixedFeatures,
+    load_references,
+    new_reference,
+    renewed,
+    save_references,
+    with_look,
+)
 from kcal.watch.state import between_rows
 from tests.helpers.scene_pairs import pair, small_rig
 
@@ -20,7 +28,7 @@ NOTHING = torch.zeros(6, dtype=torch.float64)
 
 
 @pytest.fixture(scope="module")
-def then() -> tuple[Reference, Reference]:
+def then() -> tuple[FixedFeatures, FixedFeatures]:
     one = pair(1)
     return new_reference(one.left, "left"), new_reference(one.right, "right")
 
@@ -30,7 +38,7 @@ def now() -> ImagePair:
     return pair(2, turns=TURNS)
 
 
-def test_turns_of_both_cameras_are_found(then: tuple[Reference, Reference], now: ImagePair) -> None:
+def test_turns_of_both_cameras_are_found(then: tuple[FixedFeatures, FixedFeatures], now: ImagePair) -> None:
     found = measured(RIG, then, (now.left, now.right), NOTHING, between=False)
     off = (found.look.turn - TURNS)[:, None]
     assert float(off.T @ torch.linalg.solve(found.look.covariance, off)) < 22.5  # χ² of six angles, once in a thousand
@@ -48,7 +56,7 @@ def test_matches_between_the_cameras_tell_the_relative_turn(now: ImagePair) -> N
     assert math.degrees(float(covariance[0, 0].sqrt())) < 0.003
 
 
-def test_a_dirty_lens_makes_it_unsure_and_is_said(then: tuple[Reference, Reference], now: ImagePair) -> None:
+def test_a_dirty_lens_makes_it_unsure_and_is_said(then: tuple[FixedFeatures, FixedFeatures], now: ImagePair) -> None:
     clean = seen_by(RIG.left, then[0], now.left, NOTHING[:3], "left")
     dirty = now.left.copy()
     dirty[:, 70:] = 100
@@ -64,13 +72,13 @@ def test_a_dirty_lens_makes_it_unsure_and_is_said(then: tuple[Reference, Referen
     assert not dark.lost
 
 
-def test_a_jump_beyond_the_near_search_is_found(then: tuple[Reference, Reference]) -> None:
+def test_a_jump_beyond_the_near_search_is_found(then: tuple[FixedFeatures, FixedFeatures]) -> None:
     turns = torch.tensor([0.0, 0.03, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64)  # 15 px
     there = seen_by(RIG.left, then[0], pair(3, turns=turns).left, NOTHING[:3], "left")
     assert float(there.turn[1]) == pytest.approx(0.03, abs=2e-4)
 
 
-def test_another_lens_is_refused(then: tuple[Reference, Reference], now: ImagePair) -> None:
+def test_another_lens_is_refused(then: tuple[FixedFeatures, FixedFeatures], now: ImagePair) -> None:
     import cv2
 
     grown = cv2.warpAffine(now.left, np.array([[1.005, 0, -1.2], [0, 1.005, -0.8]]), now.left.shape[::-1])
@@ -80,21 +88,21 @@ def test_another_lens_is_refused(then: tuple[Reference, Reference], now: ImagePa
         seen_by(RIG.left, then[0], now.left[:-1], NOTHING[:3], "left")
 
 
-def test_another_view_is_lost(then: tuple[Reference, Reference]) -> None:
+def test_another_view_is_lost(then: tuple[FixedFeatures, FixedFeatures]) -> None:
     other = seen_by(RIG.left, then[0], pair(5, texture=0.37).right[::-1].copy(), NOTHING[:3], "left")
     assert other.lost
     assert other.found == 0
     assert float(other.covariance[0, 0]) == 1.0
 
 
-def test_what_moves_is_learned_out_and_made_up_for(then: tuple[Reference, Reference]) -> None:
+def test_what_moves_is_learned_out_and_made_up_for(then: tuple[FixedFeatures, FixedFeatures]) -> None:
     image, reference = pair(1).left, then[0]
     count = len(reference.pixels)
     moving = torch.zeros(count, dtype=torch.bool)
     moving[: 3 * count // 5] = True
     off = torch.where(moving[:, None], 0.8, 0.0) * torch.ones(count, 2, dtype=torch.float64)
     for _ in range(MEMORY + 5):
-        reference = judged(reference, torch.ones(count, dtype=torch.bool), off)
+        reference = with_look(reference, torch.ones(count, dtype=torch.bool), off)
     turn, covariance = torch.tensor([0.0, 2e-4, 0.0]).double(), 1e-10 * torch.eye(3).double()
     after = renewed(reference, RIG.left, image, turn, covariance)
     kept = count - int(moving.sum())
@@ -107,11 +115,11 @@ def test_what_moves_is_learned_out_and_made_up_for(then: tuple[Reference, Refere
     assert float(seen.turn[1]) == pytest.approx(2e-4, abs=5e-6)
 
 
-def test_features_seldom_found_are_learned_out(then: tuple[Reference, Reference]) -> None:
+def test_features_seldom_found_are_learned_out(then: tuple[FixedFeatures, FixedFeatures]) -> None:
     reference, count = then[0], len(then[0].pixels)
     seen = torch.arange(count) >= 20
     for _ in range(MEMORY + 60):
-        reference = judged(reference, seen, torch.zeros(count, 2, dtype=torch.float64))
+        reference = with_look(reference, seen, torch.zeros(count, 2, dtype=torch.float64))
     after = renewed(reference, RIG.left, pair(1).left, NOTHING[:3], torch.eye(3).double())
     assert len(after.pixels) == count - 20
 
@@ -121,7 +129,7 @@ def test_an_image_without_features_makes_no_reference() -> None:
         new_reference(np.zeros((320, 480), np.uint8), "right")
 
 
-def test_references_are_stored(tmp_path: Path, then: tuple[Reference, Reference]) -> None:
+def test_references_are_stored(tmp_path: Path, then: tuple[FixedFeatures, FixedFeatures]) -> None:
     path = save_references(tmp_path / "a.reference.npz", RIG, then)
     back = load_references(path, RIG)
     assert torch.equal(back[1].patches, then[1].patches)

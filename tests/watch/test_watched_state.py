@@ -87,9 +87,10 @@ def test_swing_and_wind_are_learned() -> None:
     found = learned(AngleSeries(time.numpy(), angle, ((1 - SHARE) * flat).numpy(), (SHARE * flat).numpy(),
                                 (0.0 * flat).numpy()))  # fmt: skip
     assert float((found.gust / model.gust).log().abs().max()) < 0.1
-    # Half a day tells how fast it moves, not how far it goes.
+    # Half a day tells how fast it moves, and how far it has gone; not slower and not nearer than it was.
     rates = [one.swing / one.return_s.sqrt() for one in (found, model)]
-    assert float((rates[0] / rates[1]).log().abs().max()) < 0.4
+    assert float((rates[0] / rates[1]).min()) > 0.7
+    assert float((rates[0] / rates[1]).max()) < 3.0
 
 
 def test_temperatures_tell_the_swing_of_the_night() -> None:
