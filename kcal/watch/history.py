@@ -185,13 +185,13 @@ def parsed_row(where: str, cells: Sequence[str], fingerprint: str) -> HistoryRow
             if by_name[_TURN[3 * side]]:
                 part = slice(3 * side, 3 * side + 3)
                 turn[part] = radian * numbers(_TURN[part])
-                covariance[part, part] = radian**2 * _symmetric(numbers(_TURN_COVARIANCE[6 * side : 6 * side + 6]), 3)
+                covariance[part, part] = radian**2 * _from_upper(numbers(_TURN_COVARIANCE[6 * side : 6 * side + 6]), 3)
                 seen[side] = True
         look = look._replace(turn=turn, covariance=covariance, seen=seen, lasting=numbers(["lasting"])[0])
         if by_name[_BETWEEN[0]]:
             look = look._replace(
                 between=radian * numbers(_BETWEEN),
-                between_covariance=radian**2 * _symmetric(numbers(_BETWEEN_COVARIANCE), 5),
+                between_covariance=radian**2 * _from_upper(numbers(_BETWEEN_COVARIANCE), 5),
                 matched=torch.tensor(True),
             )
         warm = by_name["temperature_c"]
@@ -203,7 +203,7 @@ def parsed_row(where: str, cells: Sequence[str], fingerprint: str) -> HistoryRow
         raise FileError(f"{where}: a number is damaged ({error}); remove that line") from error
 
 
-def _symmetric(upper: Tensor, size: int) -> Tensor:
+def _from_upper(upper: Tensor, size: int) -> Tensor:
     matrix = torch.zeros(size, size, dtype=torch.float64)
     for (i, j), value in zip(_upper(size), upper, strict=True):
         matrix[i, j] = matrix[j, i] = value
