@@ -113,8 +113,9 @@ def relocked(rig: StereoRig, drift: Drift, note: str) -> StereoRig:
     if rig.mounting is not None and drift.cam_from_local is not None and drift.left_covariance is not None:
         rotation, covariance = drift.cam_from_local, rig.mounting.covariance
         heading, pitch, roll = attitude(rotation.T)
-        covariance = torch.zeros(6, 6, dtype=torch.float64) if covariance is None else covariance.clone()
-        covariance[3:6, 3:6] += rotation.T @ drift.left_covariance @ rotation
+        if covariance is not None:
+            covariance = covariance.clone()
+            covariance[3:6, 3:6] += rotation.T @ drift.left_covariance @ rotation
         new.mounting = dataclasses.replace(
             rig.mounting, heading_deg=heading, pitch_deg=pitch, roll_deg=roll, covariance=covariance
         )

@@ -28,7 +28,7 @@ def alarm_sigmas(every_s: float) -> float:
 
     Example:
         >>> round(alarm_sigmas(60.0), 2)
-        4.48
+        4.47
     """
     tries = 6.0 * _MONTH / every_s
     return math.sqrt(2.0) * float(torch.erfinv(torch.tensor(1.0 - 2.0 / tries, dtype=torch.float64)))

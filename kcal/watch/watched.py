@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+import dataclasses
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -123,13 +124,26 @@ class Watched:
         Raises:
             InputError: before the first look.
         """
-        rig = relocked(self.rig, self.drift_at(time), f"at {time:.3f} s, from the history of the watched rig")
+        rig = relocked(
+            _uncertain(self.rig), self.drift_at(time), f"at {time:.3f} s, from the history of the watched rig"
+        )
         # The same number of shared errors at every moment, for filters.
         known = rig.covariance
         if known is not None:
             more = len(self.rig.covariance.half if self.rig.covariance else []) + MORE_ERRORS - len(known.half)
             rig.covariance = RigCovariance(half=torch.nn.functional.pad(known.half, (0, 0, 0, more)))
         return rig
+
+
+def _uncertain(rig: StereoRig) -> StereoRig:
+    """The rig, with an exact mounting as one whose covariance is zero: a moment adds to it."""
+    stands = rig.mounting
+    if stands is None or stands.covariance is not None:
+        return rig
+    same = StereoRig(rig.left, rig.right, rig.right_from_left_rotation, rig.right_from_left_translation)
+    same.covariance, same.calibration = rig.covariance, rig.calibration
+    same.mounting = dataclasses.replace(stands, covariance=torch.zeros(6, 6, dtype=torch.float64))
+    return same
 
 
 def model_of(rows: Sequence[HistoryRow]) -> TurnModel:

@@ -117,6 +117,11 @@ def test_the_rig_of_a_moment() -> None:
     # The left camera looks elsewhere, too: a yaw to the left is a smaller heading.
     assert there.mounting is not None
     assert abs(there.mounting.heading_deg - 35.0) == pytest.approx(math.degrees(1e-4), rel=0.05)
+    assert there.mounting.covariance is not None
+    assert float(there.mounting.covariance[5, 5]) == pytest.approx(
+        float(watched.turns_at(3000.0).covariance[1, 1]), rel=1e-6
+    )
+    assert rig.mounting.covariance is None
     assert there.covariance is not None
     assert float(there.covariance.matrix[-5, -5]) == pytest.approx(float(expected.relative_covariance[1, 1]), rel=1e-6)
     later = watched.rig_at(9000.0)
