@@ -186,3 +186,21 @@ def test_wrong_words(tmp_path: Path, words: list[str], message: str, monkeypatch
     found = RUNNER.invoke(app, ["watch", "rig.json", *words])
     assert found.exit_code in (1, 2)
     assert message in " ".join((found.output + str(found.exception)).split())
+
+
+def test_videos_are_watched_too_and_continue(tmp_path: Path) -> None:
+    pytest.importorskip("av")
+    from tests.helpers.video_scenes import write_video
+
+    save_rig(small_rig(), tmp_path / "rig.json")
+    times = [0.0, 1.0, 2.0, 3.0]
+    pairs = [pair(k + 1) for k in range(4)]
+    for side in ("left", "right"):
+        write_video(tmp_path / f"{side}.mp4", [getattr(one, side) for one in pairs], times)
+    words = ["watch", *(str(tmp_path / name) for name in ("rig.json", "left.mp4", "right.mp4"))]
+    words += ["-o", str(tmp_path / "h.csv"), "--every", "2"]
+    for _ in range(2):
+        found = RUNNER.invoke(app, words)
+        assert found.exit_code == 0, found.output
+        with (tmp_path / "h.csv").open() as file:
+            assert [float(row["time"]) for row in csv.DictReader(file)] == [0.0, 2.0]
