@@ -57,7 +57,7 @@ PUBLIC = {
     "kcal.rig": """
         CameraRig CameraRigCalibration load_camera_rig save_camera_rig station_mounting stations_of
         Drift DriftEffect ImagePair ItemResidual MarkedLandmarks Mounting PairCounts RigCalibration RigCovariance
-        RigSource SceneMatches Sides SourceResidual Survey TurnedBoard camera_positions check_rig drift_effect
+        RigSource SceneMatches Sides SourceResidual Survey TurnedBoard Watched camera_positions check_rig drift_effect
         import_survey match_landmarks measure_drift mounting_covariance pair_by_name paired_boards placed_rig
         planned_rig read_features read_pairs read_survey relocked scene_features triangulated_sides
     """,
@@ -96,6 +96,7 @@ NAMESPACES = {door.removeprefix("kcal.") for door in PUBLIC} - {"kcal"}
 # Names that were not in `kcal` itself before there were namespaces.
 NEW_NAMES = (
     {
+        "Watched",
         "ImagePair",
         "PairCounts",
         "SceneMatches",
@@ -114,7 +115,7 @@ NEW_NAMES = (
     | set(PUBLIC["kcal.stars"].split())
 )
 # Types of attributes in which only those look who work on kcal.
-INSIDE = {"FieldModes", "HybridFit", "BoardState", "Spline"}
+INSIDE = {"FieldModes", "HybridFit", "BoardState", "Spline", "HistoryRow", "TurnModel"}
 # What functions return, and blocks of files: examples are those of the functions.
 RECORDS = {
     "CameraRigCalibration",

@@ -22,6 +22,7 @@ from kcal.quantities import measured_text
 
 if TYPE_CHECKING:
     from kcal.locate.columns import PositionColumns
+    from kcal.locate.localizer import StereoLocalizer
     from kcal.locate.positions import Located
     from kcal.pipeline.association import AssociationOptions
     from kcal.pipeline.live_map import LiveMap
@@ -102,6 +103,12 @@ def live_command(
             "--compile", help="Translate the filter to C++ first, which takes minutes; for many targets.", hidden=True
         ),
     ] = False,
+    watch: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="HISTORY", help="History that `kcal watch` writes meanwhile: attitudes and sigmas of each moment."
+        ),
+    ] = None,
     start: Annotated[
         str | None,
         typer.Option(
@@ -170,7 +177,8 @@ def live_command(
     if compiled:
         err.print("compiling: some three minutes the first time")
     follow = TrackOptions.for_video(match_sigma) if videos else None
-    tracker = Tracker(locate.localize, follow, clock=clock, compiled=compiled)
+    moments, moving = (None, 0) if watch is None else _moments(watch, locate.localize)
+    tracker = Tracker(locate.localize, follow, clock=clock, compiled=compiled, moments=moments, moving=moving)
     pairs = _video_pairs(videos, detector, tracker, options, match_sigma) if videos and detector else None
     source = pairs or lines_of(lines, lambda line: read_moment(line, solved, options, noise))
     log = journal if journal is not None else output[0].with_name(output[0].name + ".journal")
@@ -219,6 +227,14 @@ def live_command(
         offset, sigma = stream.tracker.clock_estimate().offset(stream.tracker.time)
         late = measured_text(1e3 * offset, 1e3 * sigma, "ms")
         err.print(f"the right camera's images are {late} later than their times say")
+
+
+def _moments(history: Path, localize: StereoLocalizer) -> tuple[Callable[[float], StereoLocalizer], int]:
+    """The rig as it stands at each second, by a history that grows; and how many errors more that has."""
+    from kcal.watch.followed import Followed
+    from kcal.watch.watched import MORE_ERRORS
+
+    return Followed(history, localize), MORE_ERRORS
 
 
 def summary(counts: StreamCounts) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -15,6 +15,9 @@ from kcal.cli.pixel_sigma import ASSUMED, PixelSigma, pixel_sigma_and_source
 from kcal.cli.settings import taken
 from kcal.errors import InputError
 from kcal.files import check_picture, check_writable, written_files
+
+if TYPE_CHECKING:
+    from kcal.lens.rig import StereoRig
 
 
 def locate_command(
@@ -67,6 +70,13 @@ def locate_command(
             metavar="9h:DEG,8K:DEG",
             help="Hours since the rig was solved, and degrees of yaw that it loses in one; the same for kelvin.",
             hidden=True,
+        ),
+    ] = None,
+    watch: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="HISTORY",
+            help="History of `kcal watch`: each row, with its column time, is located by the rig as it stood then.",
         ),
     ] = None,
     heading_sigma: Annotated[
@@ -165,6 +175,9 @@ def locate_command(
     Of several cameras (one line for each mark: name,camera,u,v) any may have seen a thing; with three or more, a mark
     that contradicts the others is left out and named. One camera alone gives a bearing, or a position at --height.
 
+    A rig that was watched is known better: with `--watch`, attitude and its sigma are those of each row's time (Unix
+    seconds or ISO). Without a history, `--aged` says what is lost since the rig was solved.
+
     A table may have any length: rows are read, located and written in turn. Beyond 1,000 rows the screen shows counts
     only, and pictures and maps show evenly spaced rows and those that have a true position.
 
@@ -184,8 +197,10 @@ def locate_command(
     `kcal locate towers.rig.json smoke.csv --height 240±30 --map map.html`
     """
     from kcal.cli.stations import parse_height
+    from kcal.cli.watched_rows import located_at
     from kcal.io.rig_file import load_rig
     from kcal.lens.mounting import Origin
+    from kcal.lens.rig import RigCovariance
     from kcal.locate.aging import parse_aging
     from kcal.locate.datum import find_geoid, true_from_grid
     from kcal.locate.export import STREAM, check_format, open_writers
@@ -226,11 +241,11 @@ def locate_command(
     place = None if origin is None else Origin.parse(origin)
     stated_height = None if height is None else parse_height(height)
     if stated_height is not None or is_long(points) or len(names_of_rig(rig)) != 2:
-        elsewhere = any((place, yaw_sigma, heading_sigma, origin_sigma, refraction, refraction_sigma, aged))
+        elsewhere = any((place, yaw_sigma, heading_sigma, origin_sigma, refraction, refraction_sigma, aged, watch))
         if elsewhere and not {"origin", "heading"} & taken:
             raise typer.BadParameter(
                 "of several cameras position, attitude and their errors come from the rig file: leave out --origin, "
-                "--heading, --yaw-sigma, --heading-sigma, --origin-sigma, --refraction and --aged"
+                "--heading, --yaw-sigma, --heading-sigma, --origin-sigma, --refraction, --aged and --watch"
             )
         stations = load_camera_rig(rig)
         views = read_views(points, stations.names)
@@ -254,6 +269,8 @@ def locate_command(
             stated=bool(views.sigma.isfinite().any()), doubts=doubts,
         )  # fmt: skip
         return
+    if aged and watch:
+        raise typer.BadParameter("--aged guesses what the history of --watch tells: give either")
     yaw_sigma = math.hypot(yaw_sigma, parse_aging(aged))
     solved = load_rig(rig)
     noise, note = pixel_sigma_and_source(pixel_sigma, solved)
@@ -273,14 +290,22 @@ def locate_command(
             )
     elif grid is not None:
         heading = true_from_grid(heading, place, grid)
-    errors = run_errors(
-        solved, yaw_deg=yaw_sigma, heading_deg=heading_sigma, origin_m=origin_sigma, elsewhere=place is not None
-    )
-    locate = Locator(
-        solved, geoid=find_geoid(geoid), origin=place, heading_deg=heading, pitch_deg=pitch, roll_deg=roll,
-        pixel_sigma=noise, calibration=errors.calibration, mounting=errors.mounting, link=errors.link,
-        refraction=refraction, refraction_sigma=refraction_sigma,
-    )  # fmt: skip
+
+    def locator(standing: StereoRig) -> Locator:
+        errors = run_errors(
+            standing, yaw_deg=yaw_sigma, heading_deg=heading_sigma, origin_m=origin_sigma, elsewhere=place is not None
+        )
+        return Locator(
+            standing, geoid=find_geoid(geoid), origin=place, heading_deg=heading, pitch_deg=pitch, roll_deg=roll,
+            pixel_sigma=noise, calibration=errors.calibration, mounting=errors.mounting, link=errors.link,
+            refraction=refraction, refraction_sigma=refraction_sigma,
+        )  # fmt: skip
+
+    if watch is not None and solved.covariance is None:
+        # Not exact: moments add what is not known of them.
+        solved.covariance = RigCovariance.of(solved)
+    locate = locator(solved)
+    at_moments = None if watch is None else located_at(watch, solved, locator)
     survey = None if truth is None else read_survey(truth, locate.localize.origin, measured=False)
     sample = PositionSample(frozenset(survey.names if survey else ()))
     with written_files() as written:
@@ -291,7 +316,7 @@ def locate_command(
                 for chunk in read_mark_chunks(points):
                     cov = filled(chunk.covariance, noise)
                     stated = stated or cov is not None
-                    columns = locate(chunk.names, chunk.pixels, cov, chunk.extras)
+                    columns = (at_moments or locate)(chunk.names, chunk.pixels, cov, chunk.extras)
                     for writer in writers:
                         writer.add(columns)
                     sample.add(columns)

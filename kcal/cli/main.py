@@ -43,6 +43,7 @@ from kcal.cli.settings import defaults_of, read_settings
 from kcal.cli.show import show_command
 from kcal.cli.stars import stars_command
 from kcal.cli.stations import station_command
+from kcal.cli.watch import watch_command
 from kcal.errors import KcalError
 from kcal.files import written_files
 from kcal.texts import visible
@@ -130,6 +131,7 @@ app.command("station", cls=Command)(with_json(with_inputs(station_command)))
 app.command("stars", cls=Command)(with_json(with_inputs(stars_command)))
 app.command("locate", cls=Command)(with_inputs(locate_command))
 app.command("live", cls=Command)(with_inputs(live_command))
+app.command("watch", cls=Command)(with_inputs(watch_command))
 app.command("budget", cls=Command)(with_json(with_inputs(budget_command)))
 app.command("rectify", cls=Command)(with_json(with_inputs(rectify_command)))
 app.command("undistort", cls=Command, hidden=True)(with_json(with_inputs(undistort_command)))

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from kcal.locate.marks import Marks
 
 # The exit code of a rig that has turned, apart from errors (1) and wrong usage (2).
-_DRIFTED = 3
+DRIFTED = 3
 
 
 def check(
@@ -97,7 +97,7 @@ def check(
         kept = _relock(rig, old, drift, marks)
         out.print(f"kept the old rig as {kept}", markup=False)
         print_wrote(rig)
-    raise typer.Exit(_DRIFTED)
+    raise typer.Exit(DRIFTED)
 
 
 def _landmarks(rig: StereoRig, path: Path, now: Marks, sigma: float) -> Landmarks:

@@ -11,7 +11,7 @@ from kcal.calibrate.rig.drift import Drift, measure_drift
 from kcal.calibrate.rig.sources import Features, Landmarks
 from kcal.errors import InputError
 from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.marks import Marks
 from kcal.locate.mounting import attitude
@@ -90,7 +90,7 @@ def relocked(rig: StereoRig, drift: Drift, note: str) -> StereoRig:
     """The rig with the attitudes that `check_rig` found; cameras and their places stay.
 
     The covariance of the drift is added to that of the rig: the errors of the first solution are still in it, and those
-    of the check come on top.
+    of the check come on top. A rig that counted as exact has the latter alone.
 
     Args:
         rig: the rig as it was solved.
@@ -108,8 +108,7 @@ def relocked(rig: StereoRig, drift: Drift, note: str) -> StereoRig:
         True
     """
     new = StereoRig(rig.left, rig.right, drift.rig.right_from_left_rotation, drift.rig.right_from_left_translation)
-    if rig.covariance is not None:
-        new.covariance = rig.covariance.with_pose(drift.pose_covariance)
+    new.covariance = (rig.covariance or RigCovariance.of(rig)).with_pose(drift.pose_covariance)
     new.mounting = rig.mounting
     if rig.mounting is not None and drift.cam_from_local is not None and drift.left_covariance is not None:
         rotation, covariance = drift.cam_from_local, rig.mounting.covariance

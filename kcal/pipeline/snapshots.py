@@ -23,7 +23,7 @@ _SHARED = ("information", "score", "values", "root")
 
 def settings_of(tracker: Tracker) -> str:
     """Hex digits that change with the rig, its errors and all options."""
-    localize, shared = tracker.localize, tracker.shared
+    localize, shared = tracker.solved, tracker.shared
     parts = [
         _LAYOUT,
         localize.rig.fingerprint,
@@ -36,6 +36,7 @@ def settings_of(tracker: Tracker) -> str:
         "none" if value is None else _packed(value)["data"]
         for value in (localize.calibration_factor, localize.mounting, localize.link)
     ]
+    parts += [] if tracker.moments is None else ["watched"]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
 

@@ -18,8 +18,6 @@ from kcal.errors import FileError
 from kcal.file_lock import FileLock
 from kcal.files import read_bytes, write_atomic
 
-_HEAD = {"kcal": "live journal", "version": 1}
-
 
 class StreamPlace(NamedTuple):
     """How far a stream has come.
@@ -43,19 +41,21 @@ class Ledger:
     Args:
         path: of the journal; made if it is missing.
         outputs: files; they are made, or cut to what the journal says.
+        work: the command that writes them.
 
     Raises:
         FileError: a file that another process writes or that cannot be opened, a damaged journal, one of other outputs,
             or an output that has lost what the journal says it has.
     """
 
-    def __init__(self, path: Path, outputs: Sequence[Path]) -> None:
+    def __init__(self, path: Path, outputs: Sequence[Path], work: str = "live") -> None:
+        self._head = {"kcal": f"{work} journal", "version": 1}
         self.path, self.outputs = path, tuple(outputs)
         self.state: dict[str, Any] | None = None
         self.checkpoint_at = self.place = StreamPlace(0, None, 0, (0,) * len(self.outputs))
         self._files: list[BinaryIO] = []
         self._log: BinaryIO | None = None
-        self._lock = FileLock((*self.outputs, path), "kcal live")
+        self._lock = FileLock((*self.outputs, path), f"kcal {work}")
         try:
             if path.exists():
                 self._read()
@@ -82,7 +82,7 @@ class Ledger:
         for file in self._files:
             os.fsync(file.fileno())
         names = [str(path.resolve()) for path in self.outputs]
-        head = {**_HEAD, "outputs": names, "place": list(self.place), "state": state}
+        head = {**self._head, "outputs": names, "place": list(self.place), "state": state}
         if self._log is not None:
             self._log.close()
         write_atomic(self.path, orjson.dumps(head) + b"\n")
@@ -100,8 +100,9 @@ class Ledger:
         try:
             head = orjson.loads(lines[0])
             places = [StreamPlace(*head["place"]), *(StreamPlace(*orjson.loads(line)) for line in lines[1:])]
-            if {name: head[name] for name in _HEAD} != _HEAD:
-                raise FileError(f"{self.path}: not a journal of this version of `kcal live`")
+            if {name: head[name] for name in self._head} != self._head:
+                kind = str(self._head["kcal"]).split()[0]
+                raise FileError(f"{self.path}: not a journal of this version of `kcal {kind}`")
             if head["outputs"] != [str(path.resolve()) for path in self.outputs]:
                 raise FileError(f"{self.path}: a journal of other outputs, {head['outputs']}; delete it to begin anew")
             self.state = head["state"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import NamedTuple, Self
 
 import torch
@@ -137,6 +138,7 @@ class Tracker:
         record: keep what `smoothed` needs; memory then grows with time.
         compiled: translate the filter to C++ first, which takes three minutes, or one where torch remembers;
             each moment of many tracks then takes about half the time.
+        moments: `localize` as it stands at a time, with `moving` more errors; neither compiled nor recorded.
 
     Example:
         >>> from kcal import Origin
@@ -161,11 +163,15 @@ class Tracker:
         clock: ClockPrior | None = None,
         record: bool = False,
         compiled: bool = False,
+        moments: Callable[[float], StereoLocalizer] | None = None,
+        moving: int = 0,
     ) -> None:
-        self.localize, self.options = localize, options or TrackOptions()
+        if moments is not None and (compiled or record):
+            raise InputError("a rig that moves: neither compiled filters nor records are possible")
+        self.localize, self.solved, self.moments, self.options = localize, localize, moments, options or TrackOptions()
         factor = localize.calibration_factor
         # What lasts of the marks' errors behaves as the calibration's errors do, though each track has its own.
-        self.calibration = (0 if factor is None else factor.shape[1]) + (2 if self.options.lasting_px else 0)
+        self.calibration = (0 if factor is None else factor.shape[1]) + moving + (2 if self.options.lasting_px else 0)
         device = localize.enu_from_rig.device
         self.shared = SharedErrors(self.calibration, clock or ClockPrior(), device)
         self.time = -math.inf
@@ -200,6 +206,8 @@ class Tracker:
             raise InputError(f"time {time}: it must be finite and not before the last one, {self.time}")
         if self.shared.start is None:
             self.shared.start = time
+        if self.moments is not None and (stands := self.moments(time)) is not self.localize:
+            self.localize, self.steps = stands, track_steps(stands, self.options.lasting_px)
         self._predict(time)
         if len(pairs):
             self._take(pairs, self.steps.measure(pairs.left, pairs.right, pairs.covariance, pairs.time))
@@ -368,10 +376,8 @@ class Tracker:
 
     def _recognized(self, new: int) -> int | None:
         """The lost track that a new one continues, if there is one and only one."""
-        lost = [
-            i for i, track in enumerate(self.records)
-            if track.number and not self._is_told(track) and track.last < self.records[new].first
-        ]  # fmt: skip
+        first, tracks = self.records[new].first, enumerate(self.records)
+        lost = [i for i, track in tracks if track.number and not self._is_told(track) and track.last < first]
         if not lost:
             return None
         which = torch.tensor(lost, device=self.frame.device)

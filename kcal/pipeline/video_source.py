@@ -3,67 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
-import threading
-from collections.abc import Callable, Iterable, Iterator
-from pathlib import Path
+from collections.abc import Callable, Iterator
 
 import torch
 
-from kcal.errors import FileError, InputError
+from kcal.errors import InputError
 from kcal.lens.rig import StereoRig
 from kcal.pipeline.association import AssociationOptions
 from kcal.pipeline.detector_call import Detector, detect_in
 from kcal.pipeline.disparity import ObjectDisparity
-from kcal.pipeline.frame_pairs import paired_by_time
-from kcal.pipeline.handover import Handover
 from kcal.pipeline.lines import Moment
-from kcal.pipeline.live_frames import live_frames
+from kcal.pipeline.paired_frames import FramePairs
 from kcal.pipeline.pairing import pair_objects
 from kcal.pipeline.stream import SourceItem
-from kcal.pipeline.video_frames import TimedFrame, file_frames
-from kcal.sources import is_stream, source_name
-
-# Decoded frames that wait for their partners: a third of a second of video.
-_FRAMES = 8
-# Frames of one live stream after which a lack of partners is told: some seconds.
-_ALONE = 100
-
-
-@dataclasses.dataclass(kw_only=True)
-class VideoCounts:
-    """What became of frames so far.
-
-    Attributes:
-        left: decoded frames of the left video.
-        right: of the right one.
-        paired: pairs of frames that the detector saw.
-        undecoded: frames that were damaged or out of order.
-        dropped: pairs of a live source for which there was no time.
-    """
-
-    left: int = 0
-    right: int = 0
-    paired: int = 0
-    undecoded: int = 0
-    dropped: int = 0
-
-    def __str__(self) -> str:
-        parts = [f"videos: {self.left:,} and {self.right:,} frames, {self.paired:,} pairs"]
-        for count, what in (
-            (self.undecoded, "damaged or out of order, left out"),
-            (self.dropped, "pairs dropped for lack of time"),
-        ):
-            parts += [f"{count:,} {what}"] if count else []
-        return "; ".join(parts)
+from kcal.pipeline.video_frames import TimedFrame
 
 
 class VideoPairs:
     """Detect in the frames of two videos that belong together, and match the images inside the boxes.
 
-    Call it with the offset of the last moment that is not wanted any more: it is a source for `Stream.follow`. Files
-    wait until there is time for the next frames; of live streams the newest ones are taken, the others counted.
+    Call it with the offset of the last moment that is not wanted any more: it is a source for `Stream.follow`, of
+    `FramePairs`.
 
     Args:
         left: file or address of the left camera.
@@ -98,71 +59,20 @@ class VideoPairs:
         if not 0 <= match_sigma < math.inf:
             raise InputError(f"match_sigma: pixels, not negative, are needed, got {match_sigma}")
         self._compression = match_sigma**2 * torch.diag(torch.tensor([0.0, 0.0, 1.0, 1.0], dtype=torch.float64))
-        self.counts = VideoCounts()
-        self.live = is_stream(left)
-        if self.live != is_stream(right):
-            raise InputError(f"{source_name(left)} and {source_name(right)}: two files or two live streams are needed")
-        self._videos, self._rig, self._detector, self._options = (left, right), rig, detector, options
-        self._late, self._apart, self._tell = late, apart_s, tell
+        sizes = rig.left.size, rig.right.size
+        self._frames = FramePairs(left, right, sizes, late=late, apart_s=apart_s, tell=tell)
+        self.counts, self.live = self._frames.counts, self._frames.live
+        self._rig, self._detector, self._options = rig, detector, options
         self._match = ObjectDisparity(rig)
-        self._ended, self._met = threading.Event(), False
-        self._running: list[Handover[TimedFrame]] = []
-        self._newest: Handover[tuple[TimedFrame, TimedFrame]] | None = None
 
     def __call__(self, offset: int) -> Iterator[SourceItem]:
         """The moments after an offset: microseconds of the left frame, from 1."""
-        # Somewhat earlier frames decide which frames belong together.
-        left = self._frames(0, 1e-6 * offset - self._apart)
-        right = self._frames(1, 1e-6 * offset - 2 * self._apart - self._late())
-        pairs: Iterable[tuple[TimedFrame, TimedFrame]] = self._noted(
-            paired_by_time(left, right, self._late, self._apart)
-        )
-        if self.live:
-            pairs = self._newest = Handover(pairs, 1, waits=False)
-        for one, other in pairs:
-            if one.place > offset:
-                yield SourceItem(self._moment(one, other), one.place)
-            if self._newest is not None:
-                self.counts.dropped = self._newest.dropped
-        if not (self._met or offset or self.live or self._ended.is_set()):
-            raise FileError(
-                f"{self._videos[0]} and {self._videos[1]}: no frames within {self._apart:g} s of each other; if the "
-                "recordings began at different times, say so with --clock-offset"
-            )
-
-    def _noted(self, pairs: Iterator[tuple[TimedFrame, TimedFrame]]) -> Iterator[tuple[TimedFrame, TimedFrame]]:
-        for pair in pairs:
-            self._met = True
-            yield pair
+        for one, other in self._frames(offset):
+            yield SourceItem(self._moment(one, other), one.place)
 
     def close(self) -> None:
         """End the threads that decode."""
-        self._ended.set()
-        for running in self._running:
-            running.close()
-        if self._newest is not None:
-            self._newest.close()
-
-    def _frames(self, side: int, since: float) -> Iterator[TimedFrame]:
-        size, name = ((self._rig.left, self._rig.right)[side].size, ("left", "right")[side])
-        video, undecoded = self._videos[side], functools.partial(self._count, "undecoded")
-        if self.live:
-            frames = live_frames(video, size, self._ended, self._tell, undecoded)
-        else:
-            frames = file_frames(Path(video), size, since, undecoded, self._tell)
-        running = Handover(frames, _FRAMES, waits=not self.live)
-        self._running.append(running)
-        for frame in running:
-            self._count(name)
-            if self.live and getattr(self.counts, name) == _ALONE and not self._met:
-                self._tell(
-                    f"{_ALONE} frames of the {name} camera came, none within {self._apart:g} s of one of the other: do"
-                    " the clocks of both cameras agree? --clock-offset corrects a known difference"
-                )
-            yield frame
-
-    def _count(self, name: str) -> None:
-        setattr(self.counts, name, getattr(self.counts, name) + 1)
+        self._frames.close()
 
     def _moment(self, one: TimedFrame, other: TimedFrame) -> Moment | InputError:
         left, right = (
@@ -175,5 +85,5 @@ class VideoPairs:
         except InputError as error:
             # Too many boxes: one frame, and not the end.
             return error
-        self._count("paired")
+        self.counts.paired += 1
         return Moment(one.time, dataclasses.replace(pairs, covariance=pairs.covariance + self._compression))

@@ -14,9 +14,9 @@ from kcal.lens.rig import StereoRig
 from kcal.scene.refine import refine_matches
 
 # Steps of a patch from its middle, and pixels by which masts may have swayed.
-_HALF, _SWAY = 7, 6
+_HALF, SWAY = 7, 6
 # Correlation of the same thing in other light; of waves and of what came or went it is below.
-_SAME = 0.6
+SAME = 0.6
 # Standard deviations, and px, by which the disparity of one thing may differ between two times.
 _SIGMAS, _SLACK = 5.0, 0.15
 
@@ -43,8 +43,8 @@ def still_there(
         covariance: (M, 2, 2) px² of the right one.
     """
     status = torch.full((len(pixels),), int(Stillness.NOT_THERE))
-    moved, score = _again(image, others[0], pixels[:, 0])
-    there = (score > _SAME).nonzero()[:, 0]
+    moved, score = whole_shifts(image, others[0], pixels[:, 0], pixels[:, 0])
+    there = (score > SAME).nonzero()[:, 0]
     if not len(there):
         return status
     left = pixels[there, 0] + moved[there]
@@ -60,16 +60,24 @@ def still_there(
     return status
 
 
-def _again(before: Tensor, after: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor]:
-    """Whole pixels (M, 2) by which patches around pixels (M, 2) have moved, and their correlation (M,)."""
+def whole_shifts(before: Tensor, after: Tensor, here: Tensor, there: Tensor, sway: int = SWAY) -> tuple[Tensor, Tensor]:
+    """Whole pixels (M, 2) by which patches of an image are off from where they are looked for, and their correlation.
+
+    Args:
+        before: (H, W) gray levels with the patches.
+        after: (H, W) those of another time.
+        here: (M, 2) middles of the patches.
+        there: (M, 2) where they are looked for.
+        sway: px to each side.
+    """
     moves, scores = [], []
-    small, wide = grid_of((_HALF, _HALF), before.device), grid_of((_HALF + _SWAY,) * 2, before.device)
-    for some in pixels.split(1000):
-        here, there = some[:, None, None] + small, some[:, None, None] + wide
-        first, second = image_windows(before, here, 0, math.inf), image_windows(after, there, 0, math.inf)
-        weight = has_samples(first, here).double()
-        found = weighted_correlation(sample(first, here), weight, sample(second, there), has_samples(second, there))
-        peak = highest_peak(found, grid_of((_SWAY, _SWAY), before.device))
+    small, wide = grid_of((_HALF, _HALF), before.device), grid_of((_HALF + sway,) * 2, before.device)
+    for some, others in zip(here.split(1000), there.split(1000), strict=True):
+        first, second = some[:, None, None] + small, others[:, None, None] + wide
+        one, two = image_windows(before, first, 0, math.inf), image_windows(after, second, 0, math.inf)
+        weight = has_samples(one, first).double()
+        found = weighted_correlation(sample(one, first), weight, sample(two, second), has_samples(two, second))
+        peak = highest_peak(found, grid_of((sway, sway), before.device))
         moves.append(peak.place)
         scores.append(peak.score)
     return torch.cat(moves), torch.cat(scores)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import datetime
-import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from kcal.corners.image_time import DATE_IN_NAME
 from kcal.corners.images import expand_images, read_gray
 from kcal.corners.video import VIDEO_SUFFIXES, read_frames
 from kcal.errors import FileError, InputError
@@ -19,7 +19,6 @@ from kcal.stars.sky import parse_time
 FITS_SUFFIXES = frozenset({".fits", ".fit", ".fts"})
 # Of a video: more frames show no more stars than drift blurs.
 _MOST_FRAMES = 100
-_TIME_IN_NAME = re.compile(r"(\d{4})-?(\d{2})-?(\d{2})[T_ -](\d{2})[-_:]?(\d{2})[-_:]?(\d{2})")
 
 
 def read_night(path: str | Path) -> NDArray[Any]:
@@ -92,8 +91,8 @@ def time_of(text: str | None, path: Path) -> datetime.datetime | None:
         return parse_time(text)
     if not zone:
         raise InputError("--time name: say the zone of the times in the names, name:Z for UTC or name:+02:00")
-    found = _TIME_IN_NAME.search(path.name)
+    found = DATE_IN_NAME.search(path.name)
     if found is None:
         raise InputError(f"{path.name}: no time in this name; it should be like 2026-11-24T204726")
-    year, month, day, hour, minute, second = found.groups()
+    year, month, day, hour, minute, second = found.groups()[:6]
     return parse_time(f"{year}-{month}-{day}T{hour}:{minute}:{second}{zone}")

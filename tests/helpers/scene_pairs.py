@@ -32,15 +32,23 @@ def small_rig() -> StereoRig:
     return StereoRig(left, right, turn, turn @ torch.tensor([-2.0, 0.05, 0.1], dtype=torch.float64))
 
 
-def pair(seed: int, *, van: float | None = None, noise: float = 1.5, texture: float = 0.0) -> ImagePair:
-    """Both images; a van drives along the scene if it is given where, meters."""
+def pair(
+    seed: int,
+    *,
+    van: float | None = None,
+    noise: float = 1.5,
+    texture: float = 0.0,
+    turns: torch.Tensor | None = None,
+) -> ImagePair:
+    """Both images; a van drives along the scene if it is given where, meters; `turns` (6,) of the cameras, radians."""
     planes = list(STILL)
     if van is not None:
         distance, low, high, top, bottom = VAN
         planes.append((distance, low + van, high + van, top, bottom))
     rig, random, images = small_rig(), np.random.default_rng(seed), []
     for side in (0, 1):
-        images.append(exposed(_light(rig, side, planes, texture), 0.7, noise, random))
+        turn = None if turns is None else turns[3 * side : 3 * side + 3]
+        images.append(exposed(_light(rig, side, planes, texture, turn), 0.7, noise, random))
     return ImagePair(f"pair {seed}", *images)
 
 
@@ -56,9 +64,13 @@ def true_right(left: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     return rig(depth[:, None] * rays)[1], depth
 
 
-def _light(rig: StereoRig, side: int, planes: list[tuple[float, ...]], texture: float) -> NDArray[np.float64]:
+def _light(
+    rig: StereoRig, side: int, planes: list[tuple[float, ...]], texture: float, turn: torch.Tensor | None
+) -> NDArray[np.float64]:
     grid = torch.stack(torch.meshgrid(*(torch.arange(n).double() for n in SIZE), indexing="xy"), -1).reshape(-1, 2)
     rays, _ = (rig.right if side else rig.left).unproject(grid)
+    if turn is not None:
+        rays = rays @ rotation_from_vector(turn)
     center = torch.zeros(3, dtype=torch.float64)
     if side:
         rays = rays @ rig.right_from_left_rotation

@@ -146,26 +146,57 @@ def measure_drift(
 def _since(rig: StereoRig, features: Features, cam_from_local: Tensor | None) -> Drift:
     """How the cameras have turned since the marks of then, with the left camera's attitude then, if it is known."""
     (left, right), items, variance = camera_turns((rig.left, rig.right), _NAMES, features)
+    both = torch.cat([left.vector, right.vector])
+    return drift_of_turns(rig, both, torch.block_diag(left.covariance, right.covariance), cam_from_local,
+                          items=items, variance=variance)  # fmt: skip
+
+
+def drift_of_turns(
+    rig: StereoRig,
+    turns: Tensor,
+    covariance: Tensor,
+    cam_from_local: Tensor | None = None,
+    *,
+    items: tuple[ItemResidual, ...] = (),
+    variance: float = 1.0,
+) -> Drift:
+    """The drift of a rig whose cameras have turned where they stand.
+
+    Args:
+        rig: as it was solved.
+        turns: (6,) radians of the left and the right camera about their own axes.
+        covariance: (6, 6).
+        cam_from_local: (3, 3) of the left camera when the rig was solved, if it is known.
+        items: see `Drift`.
+        variance: see `Drift`.
+
+    Example:
+        >>> from kcal.locate.budget import planned_rig
+        >>> turns = torch.tensor([0.0, 1e-4, 0.0, 0.0, 3e-4, 0.0], dtype=torch.float64)
+        >>> round(float(drift_of_turns(planned_rig(), turns, 1e-10 * torch.eye(6).double()).relative[1]), 9)
+        0.0002
+    """
+    left, right = turns[:3], turns[3:]
     relative, shift = rig.right_from_left_rotation, rig.right_from_left_translation
-    turn = rotation_from_vector(right.vector)
-    change = turn @ rotation_from_vector(-(relative @ left.vector))
-    # By turns of the right and of the left camera, the change and the shift of the relative pose.
+    turn = rotation_from_vector(right)
+    change = turn @ rotation_from_vector(-(relative @ left))
+    # By turns of the left and of the right camera, the change and the shift of the relative pose.
     identity = torch.eye(3, dtype=torch.float64)
     taken_along = torch.linalg.cross(identity, shift.expand(3, 3)).T
-    slope = torch.cat([torch.cat([identity, -relative], 1), torch.cat([taken_along, torch.zeros_like(identity)], 1)])
-    covariance = slope @ torch.block_diag(right.covariance, left.covariance) @ slope.T
+    slope = torch.cat([torch.cat([-relative, identity], 1), torch.cat([torch.zeros_like(identity), taken_along], 1)])
+    pose = slope @ covariance @ slope.T
     drift = vector_from_rotation(change)
     return Drift(
-        left=left.vector,
-        right=right.vector,
+        left=left,
+        right=right,
         relative=drift,
-        left_covariance=left.covariance,
-        right_covariance=right.covariance,
-        relative_covariance=covariance[:3, :3],
-        chi2=float(drift @ torch.linalg.solve(covariance[:3, :3], drift)),
+        left_covariance=covariance[:3, :3],
+        right_covariance=covariance[3:, 3:],
+        relative_covariance=pose[:3, :3],
+        chi2=float(drift @ torch.linalg.solve(pose[:3, :3], drift)),
         rig=StereoRig(rig.left, rig.right, change @ relative, turn @ shift),
-        pose_covariance=covariance,
-        cam_from_local=None if cam_from_local is None else rotation_from_vector(left.vector) @ cam_from_local,
+        pose_covariance=pose,
+        cam_from_local=None if cam_from_local is None else rotation_from_vector(left) @ cam_from_local,
         items=items,
         variance=variance,
     )

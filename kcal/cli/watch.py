@@ -1,0 +1,266 @@
+"""`kcal watch`: the attitude of a rig over time, from what its cameras see."""
+
+from __future__ import annotations
+
+import math
+import signal
+import time as clocks
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from kcal.cli.console import err, out, print_table, print_wrote, warn
+from kcal.cli.inputs import RIG
+from kcal.cli.rig_check import DRIFTED
+from kcal.errors import InputError
+
+if TYPE_CHECKING:
+    from kcal.corners.images import Gray
+    from kcal.lens.rig import StereoRig
+    from kcal.pipeline.paired_frames import FramePairs
+    from kcal.watch.alarm import Webhook
+    from kcal.watch.watched import Watched
+    from kcal.watch.watcher import Noticed, Watcher
+
+_EXIT = "exit"
+# Points of a picture.
+_DRAWN = 2000
+
+
+def watch_command(
+    rig: Annotated[Path, typer.Argument(help="Rig file from `kcal rig`."), RIG],
+    history: Annotated[Path, typer.Option("-o", "--history", help="CSV file that grows, a row for each look.")],
+    images: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[LEFT RIGHT]",
+            help="Two folders of images, videos or addresses (rtsp://...); without them the history is shown.",
+        ),
+    ] = None,
+    every: Annotated[float, typer.Option(metavar="S", help="Seconds between looks.", min=1.0)] = 60.0,
+    reference: Annotated[
+        tuple[Path, Path] | None,
+        typer.Option(metavar="LEFT RIGHT", help="Images of when the rig was solved; else the first ones count."),
+    ] = None,
+    temperature: Annotated[
+        Path | None, typer.Option(metavar="CSV", help="Columns time,temperature (°C); it may grow meanwhile.")
+    ] = None,
+    limit: Annotated[
+        float, typer.Option(metavar="DEG", help="Relative turn beyond which there is an alarm.", min=1e-4)
+    ] = 0.005,
+    alarm: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="URL|exit", help="Where an alarm is sent as JSON (POST); exit: end then. May be repeated."
+        ),
+    ] = None,
+    relock: Annotated[
+        Path | None,
+        typer.Option(metavar="JSON", help="Rig file to write at the end, if the history proves the old one wrong."),
+    ] = None,
+    picture: Annotated[Path | None, typer.Option(help="PNG file to write at the end: attitudes with bands.")] = None,
+) -> None:
+    """Watch how the cameras of a rig turn, from what they see, and keep a history with the sigma of every moment.
+
+    Fixed features of the first images are found again in each camera at every look, and matched between the cameras
+    once an hour. What moves is learned out. How the rig turns (sun, wind, temperature) is learned by maximum
+    likelihood, so that gaps and nights have honest sigmas. Few features, by fog or a dirty lens, make them larger, and
+    are told.
+
+    `kcal locate --watch HISTORY` and `kcal live --watch HISTORY` use the attitude and the sigma of each moment.
+
+    Images of folders need a time in their names (20260501T120000Z.png, UTC) or in EXIF, and pair by their names.
+
+    An alarm tells that the relative attitude is beyond `--limit` so surely that chance does so less than once a month.
+    The exit code is 3 if there was one, else 0; 1 if an image is of another camera or lens. Stop it with Ctrl-C or
+    SIGTERM; started again with the same history, it continues, after a crash too.
+
+    **Examples**
+
+    `kcal watch rig.json left/ right/ -o history.csv --picture attitude.png`
+
+    `kcal watch rig.json rtsp://10.0.0.7/main rtsp://10.0.0.8/main -o history.csv --alarm https://example.org/rig`
+    """
+    from kcal.corners.images import read_gray
+    from kcal.files import check_picture, check_writable
+    from kcal.io.rig_file import load_rig, save_rig
+    from kcal.watch.alarm import Webhook
+    from kcal.watch.relock import relock as relocked_by
+    from kcal.watch.temperature import Temperatures
+    from kcal.watch.watched import Watched
+    from kcal.watch.watcher import Watcher
+
+    if images and len(images) != 2:
+        raise typer.BadParameter("two folders, videos or addresses, of the left and the right camera, are needed")
+    if history.suffix.lower() != ".csv":
+        raise typer.BadParameter(f"--history {history}: a name that ends with .csv is needed")
+    check_writable(history, rig)
+    if picture is not None:
+        check_picture(picture)
+    if relock is not None:
+        check_writable(relock, rig, history)
+    hooks = [Webhook(address) for address in alarm or [] if address != _EXIT]
+    known = load_rig(rig)
+    raised = 0
+    if images:
+        air = None if temperature is None else Temperatures(temperature)
+        watcher = Watcher(
+            known, history, every_s=every, limit_deg=limit, temperatures=air,
+            tell=lambda text: err.print(text, markup=False),
+        )  # fmt: skip
+        try:
+            if reference is not None and watcher.looks == 0 and watcher.last_time == -math.inf:
+                watcher.refer_to(*(read_gray(path) for path in reference))
+            if watcher.offset:
+                err.print(f"continuing after {watcher.last_time:.3f} s of {history}", markup=False)
+            _follow(watcher, known, (images[0], images[1]), hooks, ends=_EXIT in (alarm or []))
+        finally:
+            watcher.close()
+        raised = watcher.alarms
+        err.print(_summary(watcher, hooks), markup=False)
+        if not watcher.last_time > -math.inf:
+            raise InputError("no pair of images was looked at")
+    watched = Watched.read(history, known)
+    _tell_turns(watched, limit)
+    if picture is not None:
+        _draw_turns(watched, picture, limit, history.name)
+    if relock is not None:
+        better = relocked_by(watched)
+        out.print(("re-locked: " if better.rig else "not re-locked: ") + better.reason, markup=False)
+        if better.rig is not None:
+            save_rig(better.rig, relock)
+            print_wrote(relock)
+    if raised:
+        raise typer.Exit(DRIFTED)
+
+
+def _follow(watcher: Watcher, rig: StereoRig, sources: tuple[str, str], hooks: list[Webhook], *, ends: bool) -> None:
+    """Look until the sources end, it is stopped, or an alarm ends it."""
+    frames = None if Path(sources[0]).is_dir() else _frame_pairs(rig, sources)
+    stopped = False
+
+    def stop(*_: object) -> None:
+        nonlocal stopped
+        stopped = True
+        if frames is not None:
+            frames.close()
+
+    before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
+    next_word = 0.0
+    try:
+        for time, left, right in _folder_pairs(watcher, sources) if frames is None else _of_frames(watcher, frames):
+            noticed = watcher.look(time, left, right)
+            for hook in hooks:
+                hook.send(_message(noticed, watcher)) if noticed.begins else hook.again()
+            if noticed.begins:
+                warn(f"{_turn_text(noticed)}: beyond the limit of {watcher.limit_deg:g}°")
+            if clocks.monotonic() >= next_word:
+                next_word = clocks.monotonic() + 10.0
+                err.print(f"{time:.0f} s: {_turn_text(noticed)}", markup=False)
+            if stopped or (ends and noticed.begins):
+                break
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        if frames is not None:
+            frames.close()
+
+
+def _frame_pairs(rig: StereoRig, sources: tuple[str, str]) -> FramePairs:
+    try:
+        from kcal.pipeline.paired_frames import FramePairs
+    except ImportError as error:
+        raise InputError(f"videos need {error.name}; install it with: pip install 'kcal[video]'") from error
+
+    sizes = rig.left.size, rig.right.size
+    return FramePairs(*sources, sizes, tell=lambda text: err.print(text, markup=False))
+
+
+def _of_frames(watcher: Watcher, frames: FramePairs) -> Iterator[tuple[float, Gray, Gray]]:
+    for one, other in frames(0 if frames.live else watcher.offset):
+        if watcher.due(one.time):
+            yield one.time, one.gray().numpy(), other.gray().numpy()
+
+
+def _folder_pairs(watcher: Watcher, folders: tuple[str, str]) -> Iterator[tuple[float, Gray, Gray]]:
+    from kcal.calibrate.rig.pairs import pair_by_name
+    from kcal.corners.image_time import image_time
+    from kcal.corners.images import expand_images, read_gray
+
+    files = [{path.name: path for path in expand_images([folder])} for folder in folders]
+    pairs = pair_by_name(*(list(own) for own in files))
+    if not pairs:
+        raise InputError(f"no image of {folders[0]} belongs to one of {folders[1]}; name pairs alike")
+    timed = sorted((image_time(files[0][left]), left, right) for left, right in pairs)
+    for time, left, right in timed:
+        if watcher.due(time):
+            yield time, read_gray(files[0][left]), read_gray(files[1][right])
+
+
+def _turn_text(noticed: Noticed) -> str:
+    from kcal.quantities import measured_text
+
+    angles = zip(("pitch", "yaw", "roll"), noticed.turn.tolist(), noticed.sigma.tolist(), strict=True)
+    return ", ".join(
+        f"{name} {measured_text(math.degrees(turn), math.degrees(sigma), '°', sign=True)}"
+        for name, turn, sigma in angles
+    )
+
+
+def _message(noticed: Noticed, watcher: Watcher) -> dict[str, object]:
+    degrees = [[math.degrees(value) for value in values.tolist()] for values in (noticed.turn, noticed.sigma)]
+    return {
+        "kcal": "watch alarm", "rig": watcher.rig.fingerprint, "time": noticed.row.time,
+        "relative_pitch_yaw_roll_deg": degrees[0], "sigma_deg": degrees[1], "limit_deg": watcher.limit_deg,
+    }  # fmt: skip
+
+
+def _summary(watcher: Watcher, hooks: list[Webhook]) -> str:
+    parts = [f"{watcher.looks:,} looks, {watcher.alarms:,} alarms"]
+    if watcher.skipped:
+        parts.append(f"{watcher.skipped:,} images not after the last look, left out")
+    failed = sum(hook.failed for hook in hooks)
+    if failed:
+        parts.append(f"{failed:,} times a webhook did not answer")
+    return "; ".join(parts)
+
+
+def _tell_turns(watched: Watched, limit: float) -> None:
+    """The attitude now, and how the rig turns."""
+    drift = watched.drift_at(watched.times[-1])
+    model, degrees = watched.model, math.degrees(1.0)
+    rows = [["turn of", "pitch °", "yaw °", "roll °"]]
+    for name, turn, covariance in (
+        ("left camera", drift.left, drift.left_covariance), ("right camera", drift.right, drift.right_covariance),
+        ("right from left", drift.relative, drift.relative_covariance),
+    ):  # fmt: skip
+        assert turn is not None
+        assert covariance is not None
+        both = zip((degrees * turn).tolist(), (degrees * covariance.diagonal().sqrt()).tolist(), strict=True)
+        rows.append([name, *(f"{value:+z.5f} ± {sigma:.5f}" for value, sigma in both)])
+    print_table(rows, left=range(4))
+    # What the yaw of both cameras does in an hour without a look.
+    hour = [float(model.swing[k]) ** 2 * (1.0 - math.exp(-7200.0 / float(model.return_s[k]))) for k in (1, 4)]
+    swing = degrees * math.hypot(float(model.swing[1]), float(model.swing[4]))
+    gust = degrees * math.hypot(float(model.gust[1]), float(model.gust[4]))
+    out.print(
+        f"relative yaw swings by {swing:.5f}° and moves by {gust:.5f}° in the wind; without looks an hour costs "
+        f"{degrees * math.sqrt(sum(hour)):.5f}°: `kcal locate --aged` needs that number where there is no history",
+        markup=False,
+    )
+
+
+def _draw_turns(watched: Watched, picture: Path, limit: float, title: str) -> None:
+    import numpy as np
+
+    from kcal.report.attitude import draw_attitude
+
+    step = -(-len(watched.times) // _DRAWN)
+    times = watched.times[::step]
+    drifts = [watched.drift_at(time) for time in times]
+    angle = np.degrees(np.stack([drift.relative.numpy() for drift in drifts]))
+    sigma = np.degrees(np.stack([drift.relative_covariance.diagonal().sqrt().numpy() for drift in drifts]))
+    seen = np.array(watched.seen[::step], bool)
+    print_wrote(draw_attitude(picture, np.array(times), angle, sigma, seen, limit, title))
