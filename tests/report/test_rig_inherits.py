@@ -125,7 +125,7 @@ def test_faults_of_the_cameras_count_in_the_ranges() -> None:
     verdict = rig_verdict(solved(record(CLEAN)), NEED, mark_sigma=0.1, cameras=cameras)
     # 2 px of disparity at 1 km are Z² / (f B) = 125 m.
     assert verdict.answers[0].parts[FAULTS] == pytest.approx(125.0, rel=0.01)
-    assert (verdict.reason, verdict.next_step) == ("left: the board bends by 2 mm", "left: measure it")
+    assert (verdict.reason, verdict.next_step) == ("left: the board bends by 2 mm", "measure it, for left")
     borne = [dataclasses.replace(cameras[0], unexplained=0.1), cameras[1]]
     assert rig_verdict(solved(record(CLEAN)), NEED, mark_sigma=0.1, cameras=borne).usable
 
