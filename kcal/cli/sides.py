@@ -48,7 +48,7 @@ def check_views_of(cameras: Sequence[Camera], seen: Sequence[Observations], path
     sizes = [camera.size for camera in cameras]
     views_sizes = [views.image_size for views in seen]
     exchanged = sizes != views_sizes and sizes == views_sizes[::-1]
-    if exchanged or _crossed(cameras, paths, _by_file) or _crossed(cameras, seen, _by_images):
+    if exchanged or _are_exchanged(cameras, paths, _by_file) or _are_exchanged(cameras, seen, _by_images):
         raise InputError(
             f"{paths[0]}: these are views of the right camera, and {paths[1]} has those of the left one: they are "
             f"exchanged. Perhaps: {_exchanged(paths)}"
@@ -67,7 +67,7 @@ def _other_size(camera: Camera, views: Observations, path: Path) -> str:
     )
 
 
-def _crossed(
+def _are_exchanged(
     cameras: Sequence[Camera], given: Sequence[_Given], of: Callable[[CalibrationRecord, _Given], bool]
 ) -> bool:
     """Whether each camera was calibrated from what the other was given, and neither from its own."""
