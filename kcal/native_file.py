@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import copy
+import functools
 import hashlib
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -19,6 +23,53 @@ def digest(content: Mapping[str, Any]) -> str:
     """Sixteen hex digits that change with any value in a file's content; its head and its `summary` do not count."""
     rest = {key: value for key, value in content.items() if key not in ("kcal", "version", "summary")}
     return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()[:16]
+
+
+# Derived from the rest when a file is written, see `kcal.io.file_summary`: a wrong one counts as missing.
+_DERIVED = "summary"
+
+
+class Record(pydantic.BaseModel):
+    """Base of the blocks inside kcal's files: unknown fields, NaN and infinity are refused."""
+
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+def _underived(content: Any, places: Iterable[tuple[int | str, ...]]) -> Any:
+    """The content without what is derived, in the blocks at these places."""
+    rest: Any = copy.deepcopy(content)
+    for place in places:
+        functools.reduce(lambda block, key: block[key], place, rest).pop(_DERIVED)
+    return rest
+
+
+@contextmanager
+def storing(kind: str) -> Iterator[None]:
+    """While a camera or rig is put in the form of its file: what does not fit there is refused with its field.
+
+    Raises:
+        InputError: values that do not fit together.
+    """
+    try:
+        yield
+    except pydantic.ValidationError as error:
+        where, what = _first_fault(error.errors(include_input=False)[0])
+        raise InputError(": ".join(filter(None, [f"this {kind} cannot be stored", where, what]))) from error
+
+
+def _first_fault(found: Any) -> tuple[str, str]:
+    return ".".join(map(str, found["loc"])), found["msg"].removeprefix("Value error, ")
+
+
+def _not_finite(value: Any) -> list[str] | None:
+    """The keys that lead to a number of a decoded JSON value that is not finite; None where all are."""
+    if isinstance(value, float):
+        return None if math.isfinite(value) else []
+    pairs = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, inside in pairs:
+        if (found := _not_finite(inside)) is not None:
+            return [str(key), *found]
+    return None
 
 
 class NativeFile(pydantic.BaseModel):
@@ -61,15 +112,17 @@ class NativeFile(pydantic.BaseModel):
             checked = cls.model_validate_json(text, strict=True)
         except pydantic.ValidationError as error:
             found = error.errors(include_input=False)
+            wrong = {one["loc"][: one["loc"].index(_DERIVED)] for one in found if _DERIVED in one["loc"]}
+            if wrong:
+                return cls.parse({"kcal": kind, "version": version, **_underived(content, wrong)}, source)
             retired = [one for one in found if one["type"] == "extra_forbidden" and one["loc"][-1] in cls.RETIRED]
-            first = (retired or found)[0]
-            where = ".".join(str(part) for part in (first["loc"][:-1] if retired else first["loc"]))
-            what = cls.RETIRED[str(first["loc"][-1])] if retired else first["msg"].removeprefix("Value error, ")
+            where, what = _first_fault((retired or found)[0])
+            if retired:
+                where, _, name = where.rpartition(".")
+                what = cls.RETIRED[name]
             raise FileError(": ".join(filter(None, [source, f"bad {kind} file", where, what]))) from error
-        try:
-            dump_json(content)
-        except InputError as error:
-            raise FileError(f"{source}: bad {kind} file: {error}") from error
+        if (place := _not_finite(content)) is not None:
+            raise FileError(f"{source}: bad {kind} file: {'.'.join(place)}: NaN and infinity are no numbers of JSON")
         return checked
 
     @classmethod

@@ -210,7 +210,9 @@ def judged_rig(
     from kcal.report.judge_rig import rig_verdict
 
     cameras = judged_sides(rig, observations, mark_sigma)
-    pairs, unpaired = _pairs(rig, observations) if observations else (None, "")
+    # Views of a rig that was solved without pairs may be of different moments, though their images are named alike.
+    paired = observations and (rig.calibration is None or rig.calibration.pairs > 0)
+    pairs, unpaired = _pairs(rig, observations) if paired else (None, "")
     verdict = rig_verdict(
         rig, needs, mark_sigma=mark_sigma, pairs=pairs, unpaired=unpaired, cameras=[found[0] for found in cameras],
         subject=name,

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import pydantic
 import typer
 
 from kcal.cli.console import out, print_table
@@ -105,47 +107,51 @@ def _show_foreign(file: Path) -> None:
 
 def _stored_facts(content: dict[str, Any]) -> tuple[list[_CameraFacts], _PoseFacts | None] | None:
     """What a file says of itself; None where it has no summary, or was changed after that was written."""
+    from kcal.io.file_summary import RigSummary
+
     try:
         if content["kcal"] == "camera":
-            camera = _stored_camera(content)
+            camera = _stored_camera(content, content["summary"])
             return None if camera is None else ([camera], None)
-        brief = content["summary"]
-        # The rig knows more of its cameras than each of them knew before it was solved.
-        cameras = [_stored_camera(content[side] | {"summary": brief[side]}) for side in ("left", "right")]
+        brief = RigSummary.model_validate_json(json.dumps(content["summary"]), strict=True)
         rest = {key: value for key, value in content.items() if key not in ("left", "right")}
-        if brief is None or brief["of"] != digest(rest) or None in cameras:
+        # The rig knows more of its cameras than each of them knew before it was solved.
+        cameras = [_stored_camera(content[side], content["summary"][side]) for side in ("left", "right")]
+        if brief.of != digest(rest) or None in cameras:
             return None
         pose = _PoseFacts(
-            baseline=brief["baseline_m"],
+            baseline=brief.baseline_m,
             translation=content["right_from_left"]["translation"],
-            turn=brief["rotation_vector_deg"],
-            sigma_m=brief["sigma_m"],
-            sigma_deg=brief["sigma_deg"],
+            turn=brief.rotation_vector_deg,
+            sigma_m=brief.sigma_m,
+            sigma_deg=brief.sigma_deg,
             mounting=content["mounting"],
             record=content["calibration"],
         )
         return [camera for camera in cameras if camera is not None], pose
-    except (KeyError, TypeError, AttributeError):
+    except (KeyError, TypeError, AttributeError, pydantic.ValidationError):
         # No such file was written by kcal: its reader says what is wrong.
         return None
 
 
-def _stored_camera(content: dict[str, Any]) -> _CameraFacts | None:
-    brief = content["summary"]
-    if brief is None or brief["of"] != digest(content):
-        return None
+def _stored_camera(content: dict[str, Any], summary: Any) -> _CameraFacts | None:
+    from kcal.io.file_summary import CameraSummary
+
+    brief = CameraSummary.model_validate_json(json.dumps(summary), strict=True)
     record = content["calibration"]
+    if brief.of != digest(content) or (brief.board is None) != (record is None):
+        return None
     return _CameraFacts(
         name=content["name"],
         size=content["image_size"],
-        model=brief["model"],
-        covers_image=brief["covers_image"],
+        model=brief.model,
+        covers_image=brief.covers_image,
         hybrid=content["model"].get("hybrid") is not None,
-        focal_length=brief["focal_length"],
+        focal_length=brief.focal_length,
         values={name: content["intrinsics"][name] for name in _INTRINSICS} | content["coefficients"],
-        sigma=brief["sigma"],
-        sigma_px=brief["sigma_px"],
-        record=record and record | {"board": brief["board"]},
+        sigma=brief.sigma,
+        sigma_px=brief.sigma_px,
+        record=record and record | {"board": brief.board},
     )
 
 

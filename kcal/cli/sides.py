@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from kcal.cli.inputs import typed_with
 from kcal.errors import InputError
 
 if TYPE_CHECKING:
     from kcal.corners.observations import Observations
+    from kcal.lens.calibration import CalibrationRecord
     from kcal.lens.camera import Camera
 
+_Given = TypeVar("_Given")
 _SIDE = re.compile(r"(?<![a-z])(left|right)(?![a-z])", re.IGNORECASE)
 
 
@@ -46,7 +48,7 @@ def check_views_of(cameras: Sequence[Camera], seen: Sequence[Observations], path
     sizes = [camera.size for camera in cameras]
     views_sizes = [views.image_size for views in seen]
     exchanged = sizes != views_sizes and sizes == views_sizes[::-1]
-    if exchanged or (_of(cameras[0], seen[1], paths[1]) and _of(cameras[1], seen[0], paths[0])):
+    if exchanged or _are_exchanged(cameras, paths, _by_file) or _are_exchanged(cameras, seen, _by_images):
         raise InputError(
             f"{paths[0]}: these are views of the right camera, and {paths[1]} has those of the left one: they are "
             f"exchanged. Perhaps: {_exchanged(paths)}"
@@ -65,12 +67,21 @@ def _other_size(camera: Camera, views: Observations, path: Path) -> str:
     )
 
 
-def _of(camera: Camera, views: Observations, path: Path) -> bool:
-    """Whether the camera was calibrated from these views alone, by their names or by the name of their file."""
-    record = camera.calibration.record if camera.calibration else None
-    if record is None:
-        return False
-    return record.observations == path.name or set(record.per_view_rms) <= set(views.names)
+def _are_exchanged(
+    cameras: Sequence[Camera], given: Sequence[_Given], of: Callable[[CalibrationRecord, _Given], bool]
+) -> bool:
+    """Whether each camera was calibrated from what the other was given, and neither from its own."""
+    known = [camera.calibration.record if camera.calibration else None for camera in cameras]
+    first, second = ([record is not None and of(record, one) for one in given] for record in known)
+    return [first, second] == [[False, True], [True, False]]
+
+
+def _by_file(record: CalibrationRecord, path: Path) -> bool:
+    return record.observations == path.name
+
+
+def _by_images(record: CalibrationRecord, views: Observations) -> bool:
+    return set(record.per_view_rms) <= set(views.names)
 
 
 def _exchanged(paths: Sequence[Path]) -> str:

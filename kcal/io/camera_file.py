@@ -21,11 +21,11 @@ from kcal.image_size import ImageSize
 from kcal.io.file_summary import CameraSummary
 from kcal.io.information_record import InformationRecord
 from kcal.io.lens_record import LensOrders
-from kcal.io.record import CovarianceRecord, Record
+from kcal.io.record import CovarianceRecord
 from kcal.lens.calibration import CalibrationRecord, CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.projection import INTRINSICS
-from kcal.native_file import NativeFile
+from kcal.native_file import NativeFile, Record, storing
 
 
 class IntrinsicsRecord(Record):
@@ -234,7 +234,7 @@ def camera_to_file(
         if unknown:
             raise InputError(f"standard deviation of {unknown[0]!r}: the camera has {', '.join(camera.names)}")
     stored = dict(zip(camera.names, values.tolist(), strict=True))
-    try:
+    with storing("camera"):
         file = CameraFile(
             name=known.name if name is None else name,
             image_size=camera.size,
@@ -250,10 +250,6 @@ def camera_to_file(
             ),
             calibration=known.record if calibration is None else calibration,
         )
-    except pydantic.ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise InputError(f"this camera cannot be stored: {where}: {first['msg']}") from error
     return file.model_copy(update={"summary": CameraSummary.made(camera, file.model_dump(mode="json"))})
 
 

@@ -13,15 +13,14 @@ from typing import ClassVar
 import pydantic
 import torch
 
-from kcal.errors import InputError
 from kcal.file_kind import CAMERA_RIG_VERSION
 from kcal.io.camera_file import RETIRED_FIELDS, CameraFile, camera_to_file
-from kcal.io.record import Packed, Record
+from kcal.io.record import Packed
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.camera_rig import CameraRig, CameraRigCalibration
 from kcal.lens.mounting import Origin
-from kcal.native_file import NativeFile
+from kcal.native_file import NativeFile, Record, storing
 
 Triple = tuple[float, float, float]
 
@@ -101,7 +100,7 @@ def camera_rig_to_file(rig: CameraRig) -> CameraRigFile:
         InputError: values that do not fit together.
     """
     root, origin = rig.root, rig.origin
-    try:
+    with storing("rig"):
         return CameraRigFile(
             names=rig.names,
             cameras=tuple(_named_file(camera, name) for camera, name in zip(rig.each, rig.names, strict=True)),
@@ -114,8 +113,6 @@ def camera_rig_to_file(rig: CameraRig) -> CameraRigFile:
             root=None if root is None else Packed.of(root),
             calibration=rig.calibration,
         )
-    except pydantic.ValidationError as error:
-        raise InputError(f"this rig cannot be stored: {error.errors()[0]['msg']}") from error
 
 
 def _named_file(camera: Camera, name: str) -> CameraFile:

@@ -13,9 +13,8 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, Self
 
 from kcal.errors import KcalError
-from kcal.io.record import Record
 from kcal.lens.calibration import CameraCalibration
-from kcal.native_file import digest
+from kcal.native_file import Record, digest
 
 if TYPE_CHECKING:
     from kcal.lens.camera import Camera

@@ -7,8 +7,9 @@ import math
 import pydantic
 import torch
 
-from kcal.io.record import Packed, Record
+from kcal.io.record import Packed
 from kcal.lens.information import CameraInformation
+from kcal.native_file import Record
 
 
 class InformationRecord(Record):

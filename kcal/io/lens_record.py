@@ -6,12 +6,12 @@ from typing import Any
 
 import pydantic
 
-from kcal.io.record import Record
 from kcal.lens.gaussian_modes import GaussianModes
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.model import LensModel
 from kcal.lens.network_modes import NetworkModes
 from kcal.lens.zernike import ZernikeModes
+from kcal.native_file import Record
 
 
 class ZernikeRecord(Record):

@@ -11,12 +11,7 @@ import pydantic
 import torch
 
 from kcal.checks import as_covariance
-
-
-class Record(pydantic.BaseModel):
-    """Base of the blocks inside kcal's files: unknown fields, NaN and infinity are refused."""
-
-    model_config = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+from kcal.native_file import Record
 
 
 class Packed(Record):

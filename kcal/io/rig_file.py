@@ -18,17 +18,17 @@ import torch
 from torch import Tensor
 
 from kcal.checks import as_covariance
-from kcal.errors import FileError, InputError
+from kcal.errors import FileError
 from kcal.file_kind import CAMERA_RIG_VERSION
 from kcal.io.camera_file import RETIRED_FIELDS, CameraFile, camera_to_file
 from kcal.io.file_summary import RigSummary
-from kcal.io.record import Packed, Record
+from kcal.io.record import Packed
 from kcal.lens.calibration import RigCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.mounting import Mounting, Origin
 from kcal.lens.projection import INTRINSICS
 from kcal.lens.rig import RigCovariance, StereoRig, half_of_covariance
-from kcal.native_file import NativeFile
+from kcal.native_file import NativeFile, Record, storing
 
 Triple = tuple[float, float, float]
 
@@ -102,6 +102,8 @@ class RigMounting(Record):
             size = 7 if len(self.covariance) == 7 else 6
             matrix = _tensor(self.covariance, size, size, "the mounting's covariance")
             as_covariance("the mounting's covariance", matrix, size)
+            if self.link is not None:
+                _tensor(self.link, len(self.link), size, "the mounting's link")
         self.mounting()
         return self
 
@@ -235,7 +237,7 @@ def rig_to_file(rig: StereoRig) -> RigFile:
         (-1.0, 0.0, 0.0)
     """
     covariance, mounting = rig.covariance, rig.mounting
-    try:
+    with storing("rig"):
         file = RigFile(
             left=_camera_to_file(rig.left, "left"),
             right=_camera_to_file(rig.right, "right"),
@@ -249,9 +251,6 @@ def rig_to_file(rig: StereoRig) -> RigFile:
             mounting=None if mounting is None else RigMounting.of(mounting),
             calibration=rig.calibration,
         )
-    except pydantic.ValidationError as error:
-        first = error.errors()[0]
-        raise InputError(f"this rig cannot be stored: {first['msg']}") from error
     return file.model_copy(update={"summary": RigSummary.made(rig, file.model_dump(mode="json"))})
 
 

@@ -13,17 +13,11 @@ import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
 from typing import IO
 
 from kcal.errors import FileError, InputError
+from kcal.file_lock import try_lock
 from kcal.mark.items import ACTION, Add, Change, MarkingState, Places, Put, Step, applied
-
-_fcntl: ModuleType | None
-try:
-    import fcntl as _fcntl
-except ImportError:  # Windows has no such locks: two servers on one file are not noticed there
-    _fcntl = None
 
 _HEAD = {"kcal": "marking log", "version": 1}
 
@@ -151,11 +145,8 @@ class Journal:
         return file
 
     def _read(self, file: IO[bytes]) -> None:
-        if _fcntl is not None:
-            try:
-                _fcntl.flock(file, _fcntl.LOCK_EX | _fcntl.LOCK_NB)
-            except OSError as error:
-                raise FileError(f"{self.path}: another `kcal mark` has these marks open; end it first") from error
+        if not try_lock(file.fileno()):
+            raise FileError(f"{self.path}: another `kcal mark` has these marks open; end it first")
         file.seek(0)
         whole = file.read()
         # A line without its end was being written when the server was killed.

@@ -145,8 +145,8 @@ def stored_findings(camera: Camera) -> list[Finding]:
     unseen = Finding(
         name="halves",
         severity="doubt",
-        text="the views were not looked at: a wrong lens model or board cannot be noticed in a camera file",
-        action="give the observations too (--observations)",
+        text="the views were not looked at, and a camera file alone cannot show that its lens model or board is wrong",
+        action="give the observations too (--observations FILE, for a rig twice: left, then right)",
         part="lenses",
     )
     return [unseen, *([] if record is None else record_findings(record))]

@@ -95,7 +95,7 @@ def _inherited(rig: StereoRig, cameras: Sequence[Verdict]) -> list[Finding]:
         dataclasses.replace(
             finding,
             text=f"{' and '.join(names)}: {finding.text}",
-            action=finding.action and f"{' and '.join(names)}: {finding.action}",
+            action=finding.action and f"{finding.action}, for {' and '.join(names)}",
             picture=finding.picture and f"{names[0]}-{finding.picture}",
         )
         for finding, names in found.items()

@@ -18,7 +18,7 @@ from kcal.cli.main import app
 LARGE = ("torch", "kornia", "cv2", "scipy", "scipy.stats", "skimage", "matplotlib", "pyproj", "jinja2")
 ROOT = Path(kcal.__file__).parents[1]
 SAMPLE = ROOT / "assets" / "sample-rig.json"
-_BEGIN = "import sys; from kcal.cli.main import app, main\n"
+_BEGIN = "import sys; from kcal.__main__ import main\n"
 _END = "\nprint(*{names} & sys.modules.keys(), file=sys.stderr)"
 
 

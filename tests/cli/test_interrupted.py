@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
-import interrupted
 import numpy as np
 import pytest
 import torch
 from board_render import render
 from calibrate_scenes import BOARD, camera, motions, observe, pixels_of
+from interrupted import interrupt
 
 from kcal import load_rig, save_camera
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
@@ -25,17 +23,6 @@ POINTS = SAMPLE.with_name("sample-points.csv")
 def folder(tmp_path: Path) -> Path:
     save_camera(load_rig(SAMPLE).left, tmp_path / "left.camera.json")
     return tmp_path
-
-
-def interrupt(folder: Path, moment: str, line: str) -> str:
-    """The last line on the error stream of a command that was interrupted; nothing else may have been said."""
-    before = set(folder.iterdir())
-    words = [sys.executable, interrupted.__file__, moment, *line.split()]
-    done = subprocess.run(words, cwd=folder, capture_output=True, text=True, start_new_session=True, timeout=300)
-    assert done.returncode == 130, done.stderr
-    assert "Traceback" not in done.stderr
-    assert not [path for path in set(folder.rglob("*")) - before if path.name.startswith(".kcal-")]
-    return done.stderr.splitlines()[-1]
 
 
 @pytest.mark.parametrize("module", ["kcal.cli.main", "torch"])

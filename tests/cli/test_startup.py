@@ -33,6 +33,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_help_loads_no_large_library(tmp_path: Path) -> None:
     assert len(helps()) > 20
     code = """import contextlib, io
+from kcal.cli.main import app
 for words in {}:
     with contextlib.suppress(SystemExit), contextlib.redirect_stdout(io.StringIO()):
         app(words)"""

@@ -13,8 +13,10 @@ import builtins
 import os
 import runpy
 import signal
+import subprocess
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import rich.progress
@@ -54,6 +56,18 @@ def interrupt_at(moment: str) -> None:
         rich.progress.Progress.update = struck(rich.progress.Progress.update)  # type: ignore[method-assign]
     else:
         os.replace = struck(os.replace, after=kind == "written")
+
+
+def interrupt(folder: Path, moment: str, line: str) -> str:
+    """The last line on the error stream of a command that was interrupted; nothing else may have been said."""
+    before = set(folder.rglob("*"))
+    words = [sys.executable, __file__, moment, *line.split()]
+    done = subprocess.run(words, cwd=folder, capture_output=True, text=True, start_new_session=True, timeout=300)
+    assert done.returncode == 130, done.stdout + done.stderr
+    assert "Traceback" not in done.stderr
+    left = [path.name for path in set(folder.rglob("*")) - before]
+    assert not [name for name in left if name.startswith(".kcal-") or name.endswith((".part", ".lock"))]
+    return done.stderr.splitlines()[-1]
 
 
 # Processes that the command starts run this file again.

@@ -10,8 +10,10 @@ from typing import Any
 
 import pytest
 import torch
+from typer.testing import CliRunner
 from wrong_files import assert_refused
 
+from kcal.cli.main import app
 from kcal.errors import FileError, InputError
 from kcal.io.camera_file import (
     CameraFile,
@@ -324,15 +326,47 @@ class TestRig:
         content = rig_to_file(rig).dump()
         assert_refused(load_rig, tmp_path, content, path_in_file, value, message)
 
+    def test_a_ragged_link_is_refused_by_its_name(self, tmp_path: Path, rig: StereoRig) -> None:
+        content = rig_to_file(rig).dump()
+        content["mounting"] = {"lat": 1, "lon": 2, "height": 3, "heading_deg": 4, "pitch_deg": 5, "roll_deg": 6}
+        content["mounting"]["covariance"] = [[float(i == j) for j in range(6)] for i in range(6)]
+        content["mounting"]["link"] = [[0.0] * 6, [0.0] * 5]
+        assert_refused(load_rig, tmp_path, content, ["mounting", "roll_deg"], 6, "the mounting's link must be 2 x 6")
+
     def test_old_file_survives_a_refused_save(self, tmp_path: Path, rig: StereoRig) -> None:
         path = save_rig(rig, tmp_path / "rig.json")
         text = path.read_text()
         broken = copy.deepcopy(rig)
         broken.right_from_left_translation[0] = math.nan
-        with pytest.raises(InputError, match="cannot be stored"):
+        with pytest.raises(InputError, match=r"this rig cannot be stored: translation\.0: .*finite"):
             save_rig(broken, path)
         assert path.read_text() == text
         assert [file.name for file in tmp_path.iterdir()] == ["rig.json"]
+
+
+@pytest.mark.parametrize("at", [["summary"], ["summary", "left"], ["left", "summary"]])
+@pytest.mark.parametrize("damage", ["none", "text", "without a field", "with one more", "wrong type"])
+def test_a_wrong_summary_counts_as_none(damage: str, at: list[str], rig: StereoRig, tmp_path: Path) -> None:
+    content = rig_to_file(rig).dump()
+    paths = (tmp_path / "good.json", tmp_path / "damaged.json")
+    paths[0].write_text(json.dumps(content))
+    block = content
+    for key in at[:-1]:
+        block = block[key]
+    known = block[at[-1]]
+    field = "baseline_m" if at == ["summary"] else "sigma"
+    block[at[-1]] = {
+        "none": None,
+        "text": "text",
+        "without a field": {key: value for key, value in known.items() if key != "of"},
+        "with one more": known | {"new": 1},
+        "wrong type": known | {field: ["a"]},
+    }[damage]
+    paths[1].write_text(json.dumps(content))
+    assert load_rig(paths[1]).fingerprint == rig.fingerprint
+    shown = [CliRunner().invoke(app, ["show", str(path)]).output.splitlines()[1:] for path in paths]
+    assert shown[0] == shown[1]
+    assert len(shown[0]) > 10
 
 
 # A camera with a residual field as kcal 0.1 stored it.

@@ -11,7 +11,11 @@ import torch
 from locate_rigs import pinhole_rig
 from typer.testing import CliRunner
 
+from kcal import Board, Observations, View
+from kcal.cli import report
 from kcal.cli.main import app
+from kcal.cli.sides import check_views_of
+from kcal.errors import InputError
 from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.calibration import BoardRecord, CalibrationRecord, CameraCalibration, RigCalibration, RigSource
 from kcal.lens.rig import RigCovariance, StereoRig
@@ -125,7 +129,7 @@ def test_faults_of_the_cameras_count_in_the_ranges() -> None:
     verdict = rig_verdict(solved(record(CLEAN)), NEED, mark_sigma=0.1, cameras=cameras)
     # 2 px of disparity at 1 km are Z² / (f B) = 125 m.
     assert verdict.answers[0].parts[FAULTS] == pytest.approx(125.0, rel=0.01)
-    assert (verdict.reason, verdict.next_step) == ("left: the board bends by 2 mm", "left: measure it")
+    assert (verdict.reason, verdict.next_step) == ("left: the board bends by 2 mm", "measure it, for left")
     borne = [dataclasses.replace(cameras[0], unexplained=0.1), cameras[1]]
     assert rig_verdict(solved(record(CLEAN)), NEED, mark_sigma=0.1, cameras=borne).usable
 
@@ -138,3 +142,24 @@ def test_the_command_ends_with_3_and_names_the_camera(tmp_path: Path) -> None:
     assert "NO: left: 20 of 20 views are named like pairs" in found.stdout
     assert "its geometry is weak" in found.stdout
     assert "the views were not looked at" in found.stdout
+
+
+def test_images_named_alike_tell_neither_an_exchange_nor_a_moment(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each camera was photographed alone, into a folder of its own, and the rig was solved from landmarks."""
+    files = [Path("left.obs.json"), Path("right.obs.json")]
+    rig = solved(*(dataclasses.replace(record(CLEAN), observations=file.name) for file in files))
+    board, view = Board(columns=9, rows=6, square=0.025), tuple((10.0 + i % 9, 10.0 + i // 9) for i in range(54))
+    views = tuple(View(name=name, pixels=view) for name in CLEAN)
+    seen = [Observations(board=board, image_size=rig.left.size, views=views)] * 2
+    cameras = (rig.left, rig.right)
+    check_views_of(cameras, seen, files)
+    with pytest.raises(InputError, match="they are exchanged"):
+        check_views_of(cameras, seen, files[::-1])
+    monkeypatch.setattr(report, "judged_sides", lambda *_: [])
+    monkeypatch.setattr(report, "_pairs", lambda *_: (None, "looked for pairs"))
+    told = [text.text for text in report.judged_rig(rig, files, (), mark_sigma=0.1, name="rig")[0].findings]
+    assert "looked for pairs" not in " ".join(told)
+    assert rig.calibration is not None
+    rig.calibration = dataclasses.replace(rig.calibration, pairs=20, per_pair_rms=dict.fromkeys(CLEAN, 0.1))
+    told = [text.text for text in report.judged_rig(rig, files, (), mark_sigma=0.1, name="rig")[0].findings]
+    assert "looked for pairs" in " ".join(told)
