@@ -8,12 +8,63 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from typing import Generic
+from collections.abc import Sequence
+from typing import Generic, NamedTuple
 
 import torch
 from torch import Tensor
 
 from kcal.solve.result import S, State, blend
+
+# Added to local matrices of unit diagonal before unknowns are eliminated for good: some 50 roundings.
+_OPEN = 1e-14
+
+
+class Products(NamedTuple):
+    """Products of derivatives and residuals: of L local unknowns of each view, and of S shared ones.
+
+    Attributes:
+        local: (..., V, L, L).
+        right: (..., V, L, S + 1) of local with shared ones, and last with the residuals.
+        score: (..., V, S + 1) of the shared ones, and last of the residuals, with the residuals of each view.
+        total: (..., S + 1, S + 1) of the shared ones and the residuals, over all views.
+    """
+
+    local: Tensor
+    right: Tensor
+    score: Tensor
+    total: Tensor
+
+    @classmethod
+    def of_rows(cls, local: Tensor, shared: Tensor) -> Products:
+        """From derivatives (..., V, L, R) by the local unknowns and (..., V, S + 1, R) by the shared ones; last r."""
+        flat, across = shared.transpose(-3, -2).flatten(-2), shared.transpose(-1, -2)
+        score = (shared @ shared[..., -1, :, None])[..., 0]
+        return cls(local @ local.transpose(-1, -2), local @ across, score, flat @ flat.transpose(-1, -2))
+
+    @classmethod
+    def together(cls, parts: Sequence[Products]) -> Products:
+        """Of all views, from those of some each."""
+        if len(parts) == 1:
+            return parts[0]
+        local, right, score, total = zip(*parts, strict=True)
+        return cls(torch.cat(local, -3), torch.cat(right, -3), torch.cat(score, -2), sum(total[1:], start=total[0]))
+
+    def off(self, count: int) -> Products:
+        """The same with the first local unknowns eliminated: what these cannot explain."""
+        own, beside = self.local[..., :count, :count], self.local[..., :count, count:]
+        scale = column_scale(own.diagonal(dim1=-2, dim2=-1))[..., None]
+        # A view that leaves its pose open loses a direction to rounding, and no more.
+        root = torch.linalg.cholesky(_damped(own * scale * scale.transpose(-1, -2), own.new_tensor(_OPEN)[None]))
+        half = torch.linalg.solve_triangular(root, torch.cat([beside, self.right[..., :count, :]], -1) * scale, upper=False)
+        by_local, by_shared = half[..., : beside.shape[-1]], half[..., beside.shape[-1] :]
+        flat = by_shared.flatten(-3, -2)
+        return Products(
+            self.local[..., count:, count:] - by_local.transpose(-1, -2) @ by_local,
+            self.right[..., count:, :] - by_local.transpose(-1, -2) @ by_shared,
+            self.score - (by_shared.transpose(-1, -2) @ by_shared[..., -1:])[..., 0],
+            self.total - flat.transpose(-1, -2) @ flat,
+        )
 
 
 class SchurLinearization:

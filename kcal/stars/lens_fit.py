@@ -16,7 +16,7 @@ from torch import Tensor
 from kcal.calibrate.hybrid.board_modes import BoardModes
 from kcal.calibrate.hybrid.evidence import maximize_evidence
 from kcal.calibrate.hybrid.families import PriorFamilies, prior_families, typical_hyperprior
-from kcal.calibrate.hybrid.quadratic import view_data
+from kcal.calibrate.hybrid.quadratic import still_data
 from kcal.calibrate.hybrid.unknowns import hybrid_unknowns
 from kcal.errors import InputError
 from kcal.gaussian import posterior_half
@@ -115,7 +115,7 @@ def fit_star_lens(
         rows = fit.reduced(parameters, model, unknowns)[0]
         rows[:-1][_PUPIL] = 0.0
         freedom = sum(2.0 * float((w > 0).sum()) - 3.0 for w in fit.weights)
-        data = view_data(rows[None], parameters[leading] - families.mean, torch.zeros(1, 0).double(), freedom)
+        data = still_data(rows[None], parameters[leading] - families.mean, freedom)
         before = h
         best = maximize_evidence(data, families, h, fit.variance, hyperprior)
         h, variance = best.h, best.variance

@@ -15,7 +15,7 @@ from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.hybrid.evidence import maximize_evidence
 from kcal.calibrate.hybrid.families import PriorFamilies, typical_hyperprior
 from kcal.calibrate.hybrid.fit import HybridFit
-from kcal.calibrate.hybrid.quadratic import view_data
+from kcal.calibrate.hybrid.quadratic import still_data
 from kcal.calibrate.hybrid.unknowns import hybrid_unknowns
 from kcal.calibrate.problem.parameters import FreeParameters
 from kcal.errors import InputError
@@ -164,7 +164,7 @@ def _by_evidence(
     # The noise is known already, which the last row says.
     noise = torch.nn.functional.pad(x.new_tensor([[math.sqrt(_SURE)]]), (len(x), 0))
     rows = torch.cat([boards, stars, noise]).T[None]
-    data = view_data(rows, x - families.mean, torch.zeros(1, 0).double(), _SURE)
+    data = still_data(rows, x - families.mean, _SURE)
     assert hybrid.model.hybrid is not None
     hyperprior = typical_hyperprior(hybrid.model.hybrid.modes)
     best = maximize_evidence(data, families, hybrid.hyperparameters, 1.0, hyperprior)

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.problem.readout import AMPLITUDES, MOTION, stillness
+from kcal.solve.schur import Products
 
 Array = npt.NDArray[np.float64]
 
@@ -65,14 +66,12 @@ class ViewData(NamedTuple):
         own: (V, M, M) UᵀU of each view.
         cross: (V, M, S + 1) Uᵀ [A, r], A being the rows and r their residuals as if all views had stood still.
         score: (V, S) Aᵀ r of each view.
-        residual: (V, M) Uᵀ r of each view.
     """
 
     still: Quadratic
     own: Tensor
     cross: Tensor
     score: Tensor
-    residual: Tensor
 
     @property
     def moving(self) -> bool:
@@ -99,7 +98,7 @@ class ViewData(NamedTuple):
         if not self.moving:
             return self.score
         matrix = self.own + torch.diag(stillness(log_ratio))
-        best = torch.linalg.solve(matrix, self.residual[..., None])
+        best = torch.linalg.solve(matrix, self.cross[..., -1:])
         return self.score - (self.cross[..., :-1].transpose(1, 2) @ best)[..., 0]
 
 
@@ -142,25 +141,26 @@ class Integrated(NamedTuple):
         return by_motion.view(AMPLITUDES, -1).sum(1).numpy()
 
 
-def quadratic_of(off: Tensor, x: Tensor, freedom: float) -> Quadratic:
-    """From rows (V, S + 1, R) off the poses at x, the residuals last."""
-    flat = off.transpose(0, 1).flatten(1)
-    return Quadratic(flat @ flat.T, freedom, x)
+def view_data(products: Products, x: Tensor, motion: Tensor, freedom: float) -> ViewData:
+    """From products off the poses, by motions and by lens and board, at lens and board x and motions (V, M)."""
+    own, cross, score, total = products
+    if motion.shape[1]:
+        # As if all views had stood still: motions are unknowns whose prior is about zero.
+        along = (motion[:, None] @ cross)[:, 0]
+        moved = (motion[:, None] @ own)[:, 0]
+        total, cross = total.clone(), cross.clone()
+        change = along.sum(0)
+        total[-1] -= change
+        total[:, -1] -= change
+        total[-1, -1] += (moved * motion).sum()
+        cross[..., -1] -= moved
+        score = score - along
+    return ViewData(still=Quadratic(total, freedom, x), own=own, cross=cross, score=score[:, :-1])
 
 
-def view_data(off: Tensor, x: Tensor, motion: Tensor, freedom: float) -> ViewData:
-    """From rows (V, M + S + 1, R) off the poses, at lens and board x and motions (V, M); the residuals last."""
-    own, others = off[:, : motion.shape[1]], off[:, motion.shape[1] :]
-    # As if all views had stood still: motions are unknowns whose prior is about zero.
-    still = others[:, -1] - torch.einsum("vm,vmr->vr", motion, own)
-    others = torch.cat([others[:, :-1], still[:, None]], 1)
-    return ViewData(
-        still=quadratic_of(others, x, freedom),
-        own=own @ own.transpose(1, 2),
-        cross=own @ others.transpose(1, 2),
-        score=(others[:, :-1] @ still[..., None])[..., 0],
-        residual=(own @ still[..., None])[..., 0],
-    )
+def still_data(rows: Tensor, x: Tensor, freedom: float) -> ViewData:
+    """From rows (V, S + 1, R) of views without poses and motions, at lens and board x; the residuals last."""
+    return view_data(Products.of_rows(rows[:, :0], rows), x, rows.new_zeros(len(rows), 0), freedom)
 
 
 def overdispersion(score: Tensor, K: Tensor, deviation: Tensor, variance: float) -> float:
