@@ -295,7 +295,7 @@ class BoardProblem(SchurProblem[BoardState]):
             rows = self.corner_rows(part, views)
             parts.append(Products.of_rows(rows[..., :L, :], rows[..., L:, :] if self._all_move else rows[..., columns, :]))
         found = Products.together(parts)
-        if not torch.is_grad_enabled():
+        if not found.total.requires_grad:
             self._kept[:] = [(state, found)]
         return found
 
