@@ -40,7 +40,7 @@ class Products(NamedTuple):
         """From derivatives (..., V, L, R) by the local unknowns and (..., V, S + 1, R) by the shared ones; last r."""
         flat, across = shared.transpose(-3, -2).flatten(-2), shared.transpose(-1, -2)
         score = (shared @ shared[..., -1, :, None])[..., 0]
-        return cls(local @ local.transpose(-1, -2), local @ across, score, flat @ flat.transpose(-1, -2))
+        return cls(local @ local.transpose(-1, -2), local @ across, score, _gram(flat))
 
     @classmethod
     def together(cls, parts: Sequence[Products]) -> Products:
@@ -58,12 +58,12 @@ class Products(NamedTuple):
         root = torch.linalg.cholesky(_damped(own * scale * scale.transpose(-1, -2), own.new_tensor(_OPEN)[None]))
         half = torch.linalg.solve_triangular(root, torch.cat([beside, self.right[..., :count, :]], -1) * scale, upper=False)
         by_local, by_shared = half[..., : beside.shape[-1]], half[..., beside.shape[-1] :]
-        flat = by_shared.flatten(-3, -2)
+        flat = by_shared.flatten(-3, -2).transpose(-1, -2)
         return Products(
             self.local[..., count:, count:] - by_local.transpose(-1, -2) @ by_local,
             self.right[..., count:, :] - by_local.transpose(-1, -2) @ by_shared,
             self.score - (by_shared.transpose(-1, -2) @ by_shared[..., -1:])[..., 0],
-            self.total - flat.transpose(-1, -2) @ flat,
+            self.total - _gram(flat),
         )
 
 
@@ -178,6 +178,15 @@ def without_local(rows: Tensor, local_size: int) -> Tensor:
 def column_scale(diagonal: Tensor) -> Tensor:
     """Scale of each column; the parameter of a zero column never moves."""
     return torch.where(diagonal > 0, diagonal, 1.0).rsqrt()
+
+
+def _gram(rows: Tensor) -> Tensor:
+    """(..., S, S) products of rows (..., S, R) with each other."""
+    if rows.ndim == 2 and rows.device.type == "cpu" and not rows.requires_grad:
+        # NumPy makes one half and mirrors it.
+        own = rows.numpy()
+        return torch.from_numpy(own @ own.T)
+    return rows @ rows.transpose(-1, -2)
 
 
 def _damped(matrix: Tensor, damping: Tensor) -> Tensor:

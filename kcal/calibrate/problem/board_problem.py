@@ -242,7 +242,7 @@ class BoardProblem(SchurProblem[BoardState]):
         parts = [step_rows(projected.by_point, rotated)]
         if self.readout is not None:
             parts.append(self.readout.columns_of(projected.by_point, state.rotation, self._time[views], flat))
-        parts.append(self.free.collapse(projected.by_camera, -3))
+        parts.extend(self.free.collapsed(projected.by_camera, -3))
         if self.free_board:
             by_board = torch.einsum("...vkun,...vkl->...vlun", projected.by_point, state.rotation)
             if turn is not None:
