@@ -56,7 +56,9 @@ class Products(NamedTuple):
         scale = column_scale(own.diagonal(dim1=-2, dim2=-1))[..., None]
         # A view that leaves its pose open loses a direction to rounding, and no more.
         root = torch.linalg.cholesky(_damped(own * scale * scale.transpose(-1, -2), own.new_tensor(_OPEN)[None]))
-        half = torch.linalg.solve_triangular(root, torch.cat([beside, self.right[..., :count, :]], -1) * scale, upper=False)
+        half = torch.linalg.solve_triangular(
+            root, torch.cat([beside, self.right[..., :count, :]], -1) * scale, upper=False
+        )
         by_local, by_shared = half[..., : beside.shape[-1]], half[..., beside.shape[-1] :]
         flat = by_shared.flatten(-3, -2).transpose(-1, -2)
         return Products(
@@ -149,22 +151,6 @@ class SchurLinearization:
         """
         matrix, _, _, _ = self._reduce(torch.zeros_like(self.cost))
         return matrix, self._shared_scale
-
-    def local_response(self) -> tuple[Tensor, Tensor]:
-        """How the best local parameters of each view depend on the shared ones.
-
-        Returns:
-            Derivatives A (..., V, L, S) of the best local parameters by the shared ones, and the inverse (..., V, L, L)
-            of each local normal matrix, both in the parameters' own units. With Σ the covariance of the shared
-            parameters, that of the local ones of views v and w is A_v Σ A_wᵀ, plus that inverse times the noise
-            variance where v = w. A local block that is singular to rounding gives NaN.
-        """
-        factor, info = torch.linalg.cholesky_ex(self._local)
-        factor = torch.where((info == 0)[..., None, None], factor, torch.nan)
-        along = torch.cholesky_solve(self._right[..., :-1], factor)
-        column, row = self._local_scale[..., :, None], self._local_scale[..., None, :]
-        inverse = torch.cholesky_inverse(factor) * column * row
-        return -along * column / self._shared_scale[..., None, None, :], inverse
 
 
 def without_local(rows: Tensor, local_size: int) -> Tensor:

@@ -162,7 +162,9 @@ def maximize_evidence(
     log_variance = math.log(variance)
     bounds = hyper_bounds(prior, len(ratios), log_variance)
     start = np.concatenate([h.numpy(), ratios, [log_variance]])
-    at, value = _minimum(EvidenceLoss(data, families, prior, tempering), start, bounds, *(_ROUGHLY if rough else _EXACTLY))
+    at, value = _minimum(
+        EvidenceLoss(data, families, prior, tempering), start, bounds, *(_ROUGHLY if rough else _EXACTLY)
+    )
     return Maximum(torch.from_numpy(at[:count].copy()), at[count:-1].copy(), math.exp(at[-1]), value)
 
 

@@ -151,16 +151,18 @@ class Integrated(NamedTuple):
         within.diagonal().add_((0.5 * kept / tempering + 0.5 * E.square().sum(-1)).sum(0))
         second = 4.0 * within.view(*by_order, *by_order).sum((1, 3))
         orders = E[..., 1:].unflatten(1, by_order).transpose(0, 1).flatten(1, 2)
-        along = (orders.transpose(1, 2) @ mean.unflatten(1, by_order).transpose(0, 1).reshape(AMPLITUDES, -1, 1))[..., 0]
+        along = (orders.transpose(1, 2) @ mean.unflatten(1, by_order).transpose(0, 1).reshape(AMPLITUDES, -1, 1))[
+            ..., 0
+        ]
         spread = (orders.transpose(1, 2) @ orders).flatten(1)
         second -= 4.0 * (along @ along.T) + 2.0 * (spread @ spread.T)
         squared, mixed = P.square().sum(0), (P * mean[..., None]).sum(0)
         Y = torch.from_numpy(y)
         by_variance = -(2.0 * mixed * Y + squared)
         by_noise = mean.square().sum(0) + 2.0 * mixed @ Y + squared.sum(-1)
-        return Slopes(
-            first.numpy(), second.numpy(), by_variance.view(*by_order, len(step)).sum(1).numpy(), by_noise.view(by_order).sum(1).numpy()
-        )  # fmt: skip
+        by_variance = by_variance.view(*by_order, len(step)).sum(1)
+        by_noise = by_noise.view(by_order).sum(1)
+        return Slopes(first.numpy(), second.numpy(), by_variance.numpy(), by_noise.numpy())
 
 
 class Slopes(NamedTuple):

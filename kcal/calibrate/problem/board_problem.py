@@ -293,7 +293,9 @@ class BoardProblem(SchurProblem[BoardState]):
         parts = []
         for part, views in self._chunks(state):
             rows = self.corner_rows(part, views)
-            parts.append(Products.of_rows(rows[..., :L, :], rows[..., L:, :] if self._all_move else rows[..., columns, :]))
+            parts.append(
+                Products.of_rows(rows[..., :L, :], rows[..., L:, :] if self._all_move else rows[..., columns, :])
+            )
         found = Products.together(parts)
         if not found.total.requires_grad:
             self._kept[:] = [(state, found)]
