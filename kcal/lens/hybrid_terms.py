@@ -108,7 +108,6 @@ def hybrid_terms(
         f_x, f_y, g_x, g_y = (slope * to_disc for slope in by_place)
         cross = rate * x * y
         point = (scale + rate * x * x + f_x, cross + f_y, cross + g_x, scale + rate * y * y + g_y)
-    columns = x.new_zeros((*x.shape[:-1], len(wanted), 2, x.shape[-1]))
     if wanted:
         # The entrance pupil acts before this plane.
         by_bend = square * growth
@@ -118,4 +117,6 @@ def hybrid_terms(
         columns = torch.cat([leading, fields], -3)
         if list(wanted) != list(range(offset + len(form.modes))):
             columns = columns[..., list(wanted), :, :]
+    else:
+        columns = x.new_zeros((*x.shape[:-1], 0, 2, x.shape[-1]))
     return x * scale + f, y * scale + g, point, columns, square <= form.reach**2

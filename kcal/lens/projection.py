@@ -16,6 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kcal.lens.dispatch import may_overwrite
 from kcal.lens.distortion import as_columns, distort_components
 from kcal.lens.model import LensModel
 from kcal.lens.plane import plane_with_slopes
@@ -120,9 +121,14 @@ def project_components(
 
     zero, one = torch.zeros_like(lens.x), torch.ones_like(lens.x)
     intrinsic = [(lens.x, zero), (zero, lens.y), (one, zero), (zero, one), (lens.y, zero)]
-    du, dv = lens.coefficients.unbind(-2)
     across, along, down = (value[..., None] if value.ndim else value for value in (fx, skew, fy))
-    by_lens = torch.stack([torch.addcmul(across * du, along, dv), down * dv], -2)
+    if may_overwrite(skew) and not bool(skew.any()):
+        # In one pass, because there may be hundreds of columns.
+        focal = torch.stack([across, down], -2) if across.ndim else torch.stack([across, down])[:, None]
+        by_lens = lens.coefficients * focal
+    else:
+        du, dv = lens.coefficients.unbind(-2)
+        by_lens = torch.stack([torch.addcmul(across * du, along, dv), down * dv], -2)
     # In the order of `wanted`: intrinsics come first as a rule.
     first = as_columns([intrinsic[i] for i in wanted if i < offset], pixels[..., 0, :])
     whole = pixels.shape[:-2]

@@ -121,12 +121,6 @@ class TruthLens:
         """(2,) paraxial focal length in pixels, along x and y."""
         return torch.full((2,), self._focal, dtype=torch.float64)
 
-    @property
-    def pupil_wander(self) -> float:
-        """Largest distance of any line of sight from the origin, meters."""
-        at, heading = self.lines(self._probe(33)).spatial()
-        return float(torch.linalg.vector_norm(torch.linalg.cross(at, heading), dim=-1).max())
-
     def inside(self, pixels: Tensor) -> Tensor:
         """Whether pixels (..., N, 2) lie on the image, whose edges are half a pixel beyond the outer centers."""
         pixels = as_points("pixels", pixels, 2)

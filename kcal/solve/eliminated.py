@@ -53,7 +53,13 @@ class EliminatedItems:
         return step * self._scale, 0.5 * (before.square().sum() - left.square().sum())
 
     def response(self) -> tuple[Tensor, Tensor]:
-        """See `SchurLinearization.local_response`: (V, L, S) and (V, L, L)."""
+        """How the best local unknowns of each view follow the shared ones.
+
+        Returns:
+            Derivatives A (V, L, S) of the best local unknowns by the shared ones, and the inverse (V, L, L) of each
+            local normal matrix. With Σ the covariance of the shared unknowns, that of the local ones of views v and w
+            is A_v Σ A_wᵀ, plus that inverse times the noise variance where v = w.
+        """
         eye = torch.eye(self._factor.shape[-1], dtype=self._factor.dtype).expand_as(self._factor)
         inverse = torch.linalg.solve_triangular(self._factor, eye, upper=True) * self._scale[..., None]
         return -inverse @ self._inside[:, :-1].mT, inverse @ inverse.mT

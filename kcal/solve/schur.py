@@ -8,12 +8,65 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from typing import Generic
+from collections.abc import Sequence
+from typing import Generic, NamedTuple
 
 import torch
 from torch import Tensor
 
 from kcal.solve.result import S, State, blend
+
+# Added to local matrices of unit diagonal before unknowns are eliminated for good: some 50 roundings.
+_OPEN = 1e-14
+
+
+class Products(NamedTuple):
+    """Products of derivatives and residuals: of L local unknowns of each view, and of S shared ones.
+
+    Attributes:
+        local: (..., V, L, L).
+        right: (..., V, L, S + 1) of local with shared ones, and last with the residuals.
+        score: (..., V, S + 1) of the shared ones, and last of the residuals, with the residuals of each view.
+        total: (..., S + 1, S + 1) of the shared ones and the residuals, over all views.
+    """
+
+    local: Tensor
+    right: Tensor
+    score: Tensor
+    total: Tensor
+
+    @classmethod
+    def of_rows(cls, local: Tensor, shared: Tensor) -> Products:
+        """From derivatives (..., V, L, R) by the local unknowns and (..., V, S + 1, R) by the shared ones; last r."""
+        flat, across = shared.transpose(-3, -2).flatten(-2), shared.transpose(-1, -2)
+        score = (shared @ shared[..., -1, :, None])[..., 0]
+        return cls(local @ local.transpose(-1, -2), local @ across, score, _gram(flat))
+
+    @classmethod
+    def together(cls, parts: Sequence[Products]) -> Products:
+        """Of all views, from those of some each."""
+        if len(parts) == 1:
+            return parts[0]
+        local, right, score, total = zip(*parts, strict=True)
+        return cls(torch.cat(local, -3), torch.cat(right, -3), torch.cat(score, -2), sum(total[1:], start=total[0]))
+
+    def off(self, count: int) -> Products:
+        """The same with the first local unknowns eliminated: what these cannot explain."""
+        own, beside = self.local[..., :count, :count], self.local[..., :count, count:]
+        scale = column_scale(own.diagonal(dim1=-2, dim2=-1))[..., None]
+        # A view that leaves its pose open loses a direction to rounding, and no more.
+        root = torch.linalg.cholesky(_damped(own * scale * scale.transpose(-1, -2), own.new_tensor(_OPEN)[None]))
+        half = torch.linalg.solve_triangular(
+            root, torch.cat([beside, self.right[..., :count, :]], -1) * scale, upper=False
+        )
+        by_local, by_shared = half[..., : beside.shape[-1]], half[..., beside.shape[-1] :]
+        flat = by_shared.flatten(-3, -2).transpose(-1, -2)
+        return Products(
+            self.local[..., count:, count:] - by_local.transpose(-1, -2) @ by_local,
+            self.right[..., count:, :] - by_local.transpose(-1, -2) @ by_shared,
+            self.score - (by_shared.transpose(-1, -2) @ by_shared[..., -1:])[..., 0],
+            self.total - _gram(flat),
+        )
 
 
 class SchurLinearization:
@@ -99,22 +152,6 @@ class SchurLinearization:
         matrix, _, _, _ = self._reduce(torch.zeros_like(self.cost))
         return matrix, self._shared_scale
 
-    def local_response(self) -> tuple[Tensor, Tensor]:
-        """How the best local parameters of each view depend on the shared ones.
-
-        Returns:
-            Derivatives A (..., V, L, S) of the best local parameters by the shared ones, and the inverse (..., V, L, L)
-            of each local normal matrix, both in the parameters' own units. With Σ the covariance of the shared
-            parameters, that of the local ones of views v and w is A_v Σ A_wᵀ, plus that inverse times the noise
-            variance where v = w. A local block that is singular to rounding gives NaN.
-        """
-        factor, info = torch.linalg.cholesky_ex(self._local)
-        factor = torch.where((info == 0)[..., None, None], factor, torch.nan)
-        along = torch.cholesky_solve(self._right[..., :-1], factor)
-        column, row = self._local_scale[..., :, None], self._local_scale[..., None, :]
-        inverse = torch.cholesky_inverse(factor) * column * row
-        return -along * column / self._shared_scale[..., None, None, :], inverse
-
 
 def without_local(rows: Tensor, local_size: int) -> Tensor:
     """(V, S + 1, R): rows (V, L + S + 1, R) off what each view's L local parameters can do, by QR."""
@@ -127,6 +164,15 @@ def without_local(rows: Tensor, local_size: int) -> Tensor:
 def column_scale(diagonal: Tensor) -> Tensor:
     """Scale of each column; the parameter of a zero column never moves."""
     return torch.where(diagonal > 0, diagonal, 1.0).rsqrt()
+
+
+def _gram(rows: Tensor) -> Tensor:
+    """(..., S, S) products of rows (..., S, R) with each other."""
+    if rows.ndim == 2 and rows.device.type == "cpu" and not rows.requires_grad:
+        # NumPy makes one half and mirrors it.
+        own = rows.numpy()
+        return torch.from_numpy(own @ own.T)
+    return rows @ rows.transpose(-1, -2)
 
 
 def _damped(matrix: Tensor, damping: Tensor) -> Tensor:

@@ -16,17 +16,17 @@ from torch import Tensor
 from kcal.calibrate.hybrid.board_modes import BoardModes
 from kcal.calibrate.hybrid.evidence import maximize_evidence
 from kcal.calibrate.hybrid.families import PriorFamilies, prior_families, typical_hyperprior
-from kcal.calibrate.hybrid.quadratic import view_data
+from kcal.calibrate.hybrid.quadratic import still_data
 from kcal.calibrate.hybrid.unknowns import hybrid_unknowns
 from kcal.errors import InputError
-from kcal.gaussian import posterior_half
+from kcal.gaussian import Gaussian, posterior_half
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.information import CameraInformation
 from kcal.lens.model import LensModel
 from kcal.lens.zernike import ZernikeModes
-from kcal.stars.star_problem import KnownLens, StarField, StarProblem
+from kcal.stars.star_problem import StarField, StarProblem, free_unknowns, independent_lens
 
 # Of the field's disc over the image's half diagonal.
 _REACH = 1.08
@@ -100,7 +100,7 @@ def fit_star_lens(
         model, families = model_of(shape), _families(model_of(shape), focal, nothing, size)
         base = torch.zeros(len(families.mean), dtype=torch.float64)
         base[:4] = families.deviation(h)[:4]
-        known = KnownLens.normal(families.mean, base)
+        known = independent_lens(families.mean, base)
         parameters = fit.minimize(parameters, model, hybrid_unknowns(model), known, 15)
         fit.leave_out(parameters, model, 7.0)
         focal, shape = float(parameters[0]), shape + min(max(float(parameters[5]), -1.0), 1.0)
@@ -110,12 +110,12 @@ def fit_star_lens(
     families, unknowns = _families(model, focal, nothing, size), hybrid_unknowns(model)
     leading = list(unknowns.leading)
     for turn in range(_ROUNDS):
-        known = KnownLens.normal(families.mean, _without_pupil(families.deviation(h)))
+        known = independent_lens(families.mean, _without_pupil(families.deviation(h)))
         parameters = fit.minimize(parameters, model, unknowns, known, 10)
         rows = fit.reduced(parameters, model, unknowns)[0]
         rows[:-1][_PUPIL] = 0.0
         freedom = sum(2.0 * float((w > 0).sum()) - 3.0 for w in fit.weights)
-        data = view_data(rows[None], parameters[leading] - families.mean, torch.zeros(1, 0).double(), freedom)
+        data = still_data(rows[None], parameters[leading] - families.mean, freedom)
         before = h
         best = maximize_evidence(data, families, h, fit.variance, hyperprior)
         h, variance = best.h, best.variance
@@ -125,10 +125,10 @@ def fit_star_lens(
         if float((h - before).abs().max()) < 0.05:
             break
     deviation = _without_pupil(families.deviation(h))
-    known = KnownLens.normal(families.mean, deviation)
+    known = independent_lens(families.mean, deviation)
     parameters = fit.minimize(parameters, model, unknowns, known, 10)
     rows = fit.whitened(parameters, model, unknowns)
-    kept = known.free.nonzero()[:, 0].tolist()
+    kept = free_unknowns(known, len(unknowns))
     slots = dict(zip(unknowns.indices, unknowns.slots, strict=True))
     information = CameraInformation(
         slots=tuple(kept.index(slots[index]) if slots.get(index) in kept else -1 for index in range(len(parameters))),
@@ -167,7 +167,7 @@ def _without_pupil(deviation: Tensor) -> Tensor:
 
 
 def star_lens(
-    fit: StarProblem, camera: Camera, known: KnownLens, rows: Tensor, information: CameraInformation
+    fit: StarProblem, camera: Camera, known: Gaussian, rows: Tensor, information: CameraInformation
 ) -> StarLens:
     """What a fit found, and the camera with what is known of it.
 
@@ -184,9 +184,9 @@ def star_lens(
     errors = fit.errors(camera.params.detach(), camera.model)
     used = tuple(weight > 0 for weight in fit.weights)
     good = torch.cat([error[:, use] for error, use in zip(errors, used, strict=True)], 1)
-    by_stars = rows[:, :-1][:, known.free]
+    by_stars = rows[:, free_unknowns(known, rows.shape[1] - 1)]
     # Of all that is known, the share that stars tell.
-    told = by_stars @ posterior_half(torch.cat([by_stars, known.rows[:, known.free]])).T
+    told = by_stars @ posterior_half(torch.cat([by_stars, known.rows[:, :-1]])).T
     return StarLens(
         camera=camera,
         rotations=tuple(fit.rotations),

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.problem.parameters import FreeParameters
-from kcal.gaussian import triangular
+from kcal.gaussian import Gaussian, numbered, triangular
+from kcal.lens.information import LENS_SLOT
 from kcal.lens.model import LensModel
 from kcal.lens.pose import rotation_from_vector, step_rows
 from kcal.lens.projection import project_components
@@ -25,31 +26,16 @@ class StarField(NamedTuple):
     sigma: Tensor
 
 
-class KnownLens(NamedTuple):
-    """What is known of the unknowns x of a lens beforehand: ‖rows (x - at) + residuals‖², in standard deviations.
+def independent_lens(mean: Tensor, deviation: Tensor) -> Gaussian:
+    """What is known beforehand of the unknowns (S,) of a lens, each by itself; those without a deviation are held."""
+    free = [i for i, value in enumerate(deviation.tolist()) if value > 0]
+    return Gaussian.independent(tuple((LENS_SLOT, i) for i in free), mean[free], deviation[free])
 
-    Attributes:
-        at: (S,).
-        rows: (Q, S).
-        residuals: (Q,).
-        free: (S,) bool: which unknowns are not held.
-    """
 
-    at: Tensor
-    rows: Tensor
-    residuals: Tensor
-    free: Tensor
-
-    @classmethod
-    def normal(cls, mean: Tensor, deviation: Tensor) -> KnownLens:
-        """Each unknown by itself; those without a deviation are held."""
-        free = deviation > 0
-        weight = torch.where(free, 1.0 / deviation, 0.0)
-        return cls(mean, torch.diag(weight), torch.zeros_like(mean), free)
-
-    def whole(self, x: Tensor) -> Tensor:
-        """(Q, S + 1) rows, and their residuals at x (S,)."""
-        return torch.cat([self.rows, (self.rows @ (x - self.at) + self.residuals)[:, None]], 1)
+def free_unknowns(known: Gaussian, count: int) -> list[int]:
+    """Numbers of the lens's unknowns, of so many, that are not held."""
+    every = numbered(LENS_SLOT, count)
+    return [every.index(slot) for slot in known.slots]
 
 
 class StarProblem:
@@ -118,27 +104,28 @@ class StarProblem:
         return float(torch.where(weight > 0, error * weight, 0.0).square().sum())
 
     def minimize(
-        self, parameters: Tensor, model: LensModel, unknowns: FreeParameters, known: KnownLens, steps: int
+        self, parameters: Tensor, model: LensModel, unknowns: FreeParameters, known: Gaussian, steps: int
     ) -> Tensor:
-        """The parameters of least squares; the rotations follow."""
-        leading, index, free = list(unknowns.leading), list(unknowns.indices), known.free
+        """The parameters of least squares; the rotations follow. Unknowns of which nothing is known are held."""
+        leading, index, every = list(unknowns.leading), list(unknowns.indices), numbered(LENS_SLOT, len(unknowns))
+        free = free_unknowns(known, len(unknowns))
         damping, spread = 0.0, math.sqrt(self.variance)
 
         def objective(values: Tensor, rotations: Sequence[Tensor]) -> float:
-            prior = known.whole(values[leading])[:, -1].square().sum()
+            prior = known.placed(every, values[leading]).rows[:, -1].square().sum()
             return self.cost(values, model, rotations) + self.variance * float(prior)
 
         now = objective(parameters, self.rotations)
         for _ in range(steps):
             rows, back = self.reduced(parameters, model, unknowns)
-            stacked = torch.cat([rows.T, spread * known.whole(parameters[leading])])
-            triangle = torch.linalg.qr(stacked[:, [*free.nonzero()[:, 0].tolist(), -1]], mode="r").R
+            stacked = torch.cat([rows.T, spread * known.placed(every, parameters[leading]).rows])
+            triangle = torch.linalg.qr(stacked[:, [*free, -1]], mode="r").R
             scale = torch.linalg.vector_norm(triangle[:, :-1], dim=0)
             better = False
             for _ in range(8):
                 damped = torch.cat([triangle[:, :-1] / scale, math.sqrt(damping) * torch.eye(len(scale)).double()])
                 aim = torch.nn.functional.pad(triangle[:, -1], (0, len(scale)))
-                step = torch.zeros_like(known.at)
+                step = parameters.new_zeros(len(every))
                 step[free] = -torch.linalg.lstsq(damped, aim[:, None]).solution[:, 0] / scale
                 trial = parameters.clone()
                 trial[index] += unknowns.expand(step)

@@ -15,14 +15,15 @@ from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.hybrid.evidence import maximize_evidence
 from kcal.calibrate.hybrid.families import PriorFamilies, typical_hyperprior
 from kcal.calibrate.hybrid.fit import HybridFit
-from kcal.calibrate.hybrid.quadratic import view_data
+from kcal.calibrate.hybrid.quadratic import still_data
 from kcal.calibrate.hybrid.unknowns import hybrid_unknowns
 from kcal.calibrate.problem.parameters import FreeParameters
 from kcal.errors import InputError
+from kcal.gaussian import Gaussian, numbered
 from kcal.lens.camera import Camera
-from kcal.lens.information import CameraInformation
+from kcal.lens.information import LENS_SLOT, CameraInformation
 from kcal.stars.lens_fit import CUT, StarLens, require_stars, star_lens
-from kcal.stars.star_problem import KnownLens, StarField, StarProblem
+from kcal.stars.star_problem import StarField, StarProblem
 
 _ROUNDS = 3
 # While the lens is that of the boards alone, stars farther off than so many typical sigmas are left out.
@@ -138,10 +139,10 @@ def joint_calibration(
     )
 
 
-def _known_lens(lens: CameraInformation, sigma: Tensor) -> KnownLens:
+def _known_lens(lens: CameraInformation, sigma: Tensor) -> Gaussian:
     """What boards say of the lens, under a prior of standard deviations (S,)."""
     rows = dataclasses.replace(lens, sigma=sigma).all_rows()
-    return KnownLens(lens.estimate, rows[:, :-1], rows[:, -1], torch.ones_like(sigma, dtype=torch.bool))
+    return Gaussian(numbered(LENS_SLOT, len(sigma)), lens.estimate, rows)
 
 
 def _by_evidence(
@@ -164,7 +165,7 @@ def _by_evidence(
     # The noise is known already, which the last row says.
     noise = torch.nn.functional.pad(x.new_tensor([[math.sqrt(_SURE)]]), (len(x), 0))
     rows = torch.cat([boards, stars, noise]).T[None]
-    data = view_data(rows, x - families.mean, torch.zeros(1, 0).double(), _SURE)
+    data = still_data(rows, x - families.mean, _SURE)
     assert hybrid.model.hybrid is not None
     hyperprior = typical_hyperprior(hybrid.model.hybrid.modes)
     best = maximize_evidence(data, families, hybrid.hyperparameters, 1.0, hyperprior)

@@ -19,4 +19,4 @@ def standing(data: Quadratic) -> ViewData:
     """A single view without motion that says this."""
     size = len(data.g)
     none = torch.zeros(1, 0, size + 1, dtype=data.K.dtype)
-    return ViewData(data, none[..., :0], none, torch.zeros(1, size, dtype=data.K.dtype), none[..., 0])
+    return ViewData(data, none[..., :0], none, torch.zeros(1, size, dtype=data.K.dtype))

@@ -208,18 +208,3 @@ def test_batch_of_starts_is_one_by_one() -> None:
         torch.testing.assert_close(together.cost[i], alone.cost, rtol=1e-12, atol=0)
         # Both stop where the cost is flat to 1e-12 of itself.
         torch.testing.assert_close(together.state[0][i], alone.state[0], rtol=0, atol=1e-8)
-
-
-@pytest.mark.parametrize("size", [size for size in SIZES if size[3]], ids=str)
-def test_local_parameters_follow_the_shared_ones(size: tuple) -> None:
-    """-D⁻¹ B and D⁻¹ of each view, in the parameters' own units, whose columns differ in size by far."""
-    rows, local = random_rows(*size), size[2]
-    own, shared = rows[..., :local, :], rows[..., local:-1, :]
-    # Scaled by the columns' lengths, so that the dense inverse keeps its digits.
-    by_own, by_shared = (part.norm(dim=-1) for part in (own, shared))
-    own, shared = own / by_own[..., None], shared / by_shared[..., None]
-    inverse = torch.linalg.inv(own @ own.mT)
-    follow, spread = SchurLinearization.of_gram(rows @ rows.mT, local).local_response()
-    expected = -inverse @ (own @ shared.mT)
-    torch.testing.assert_close(follow * by_own[..., None] / by_shared[..., None, :], expected, rtol=1e-9, atol=1e-9)
-    torch.testing.assert_close(spread * by_own[..., None] * by_own[..., None, :], inverse, rtol=1e-9, atol=1e-9)

@@ -20,10 +20,6 @@ from kcal.calibrate.hybrid.evidence import EvidenceLoss, Maximum, hyper_bounds
 from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies
 from kcal.calibrate.hybrid.quadratic import ViewData
 
-Loss = Callable[[np.ndarray], tuple[float, np.ndarray]]
-
-# For differences of the gradient, in ln A.
-_STEP = 0.02
 # Where -ln p is taken, in standard deviations: the upper side has the long tail of <A²>.
 _PLACES = np.arange(-2.25, 4.0, 0.75)
 # Directions in which -ln p does not bend are followed by no more than this standard deviation.
@@ -46,10 +42,11 @@ def expected_maximum(
     used = families.amplitude
     which = [*used[used >= 0].unique().tolist(), *range(count, count + len(best.log_ratio))]
     loss = EvidenceLoss(data, families, hyperprior, tempering)
+    at = np.concatenate([best.h.numpy(), best.log_ratio, [log_variance]])
     found = expected_amplitudes(
-        loss,
+        loss(at)[2],
         loss.value,
-        np.concatenate([best.h.numpy(), best.log_ratio, [log_variance]]),
+        at,
         which,
         hyper_bounds(hyperprior, len(best.log_ratio), log_variance),
     )
@@ -57,7 +54,7 @@ def expected_maximum(
 
 
 def expected_amplitudes(
-    loss: Loss,
+    bend: np.ndarray,
     value: Callable[[np.ndarray], float],
     at: np.ndarray,
     which: list[int],
@@ -66,7 +63,7 @@ def expected_amplitudes(
     """½ ln <A²> of some hyperparameters, and the others as they are.
 
     Args:
-        loss: -ln p and its gradient.
+        bend: (H, H) the Hessian of -ln p.
         value: -ln p alone.
         at: (H,) where it is smallest.
         which: numbers of the ln A.
@@ -74,12 +71,12 @@ def expected_amplitudes(
 
     Example:
         >>> def loss(v):  # ln A is normal, with a standard deviation of a half: <A²> = exp(2 · ¼)
-        ...     return float(2.0 * (v @ v)), 4.0 * v
-        >>> found = expected_amplitudes(loss, lambda v: loss(v)[0], np.zeros(2), [0], [(-9.0, 9.0), (-9.0, None)])
+        ...     return float(2.0 * (v @ v))
+        >>> found = expected_amplitudes(4.0 * np.eye(2), loss, np.zeros(2), [0], [(-9.0, 9.0), (-9.0, None)])
         >>> [round(float(value), 2) for value in found]
         [0.25, 0.0]
     """
-    covariance = _inverse_hessian(loss, at)
+    covariance = _inverse(bend)
     found = at.copy()
     for i in which:
         sigma = math.sqrt(covariance[i, i])
@@ -92,9 +89,7 @@ def expected_amplitudes(
     return found
 
 
-def _inverse_hessian(loss: Loss, at: np.ndarray) -> np.ndarray:
+def _inverse(bend: np.ndarray) -> np.ndarray:
     """The inverse of the Hessian; where it does not bend upward, the widest."""
-    steps = _STEP * np.eye(len(at))
-    bend = np.stack([loss(at + step)[1] - loss(at - step)[1] for step in steps]) / (2.0 * _STEP)
-    values, vectors = np.linalg.eigh(0.5 * (bend + bend.T))
+    values, vectors = np.linalg.eigh(bend)
     return np.asarray((vectors / np.maximum(values, _WIDEST**-2)) @ vectors.T)

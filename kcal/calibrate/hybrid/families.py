@@ -81,13 +81,16 @@ class PriorFamilies(NamedTuple):
         out = self.log_unit + torch.where(self.amplitude >= 0, h[self.amplitude], 0.0)
         return torch.exp(out - torch.where(self.decay >= 0, torch.exp(h[self.decay]), 0.0) * self.degree)
 
-    def pulled(self, h: Tensor, by_variance: Tensor) -> Tensor:
-        """(H,) derivatives by h of what has the derivatives `by_variance` (S,) by 2 ln sd."""
+    def log_variance_slopes(self, h: Tensor) -> tuple[np.ndarray, np.ndarray]:
+        """(S, H) first derivatives of 2 ln sd by h, and second ones, each by the same hyperparameter twice."""
+        first = h.new_zeros(len(self.mean), len(h) + 1)
         # The last place takes what no hyperparameter sets.
-        out, count = h.new_zeros(len(h) + 1), len(h) + 1
-        decays = torch.exp(torch.cat([h, h.new_zeros(1)]))[self.decay]
-        out.index_add_(0, self.amplitude % count, 2.0 * by_variance)
-        return out.index_add_(0, self.decay % count, -2.0 * decays * self.degree * by_variance)[:-1]
+        rows, count = torch.arange(len(self.mean)), len(h) + 1
+        decays = -2.0 * torch.exp(torch.cat([h, h.new_zeros(1)]))[self.decay] * self.degree
+        second = torch.zeros_like(first)
+        second[rows, self.decay % count] = decays
+        first[rows, self.amplitude % count] = 2.0
+        return (first + second)[:, :-1].numpy(), second[:, :-1].numpy()
 
 
 def prior_families(

@@ -28,7 +28,7 @@ from kcal.calibrate.hybrid.families import LEADING_UNKNOWNS, Hyperprior, PriorFa
 from kcal.calibrate.hybrid.fitted_views import Estimate, FittedViews
 from kcal.calibrate.hybrid.fleet import LensPrior
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard
-from kcal.calibrate.hybrid.quadratic import posterior_root, quadratic_of
+from kcal.calibrate.hybrid.quadratic import posterior_root
 from kcal.calibrate.hybrid.unknowns import hybrid_problem, hybrid_unknowns
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.information import information_of
@@ -42,6 +42,7 @@ from kcal.lens.hybrid_terms import LEADING
 from kcal.lens.information import CameraInformation
 from kcal.lens.model import LensModel
 from kcal.lens.zernike import ZernikeModes
+from kcal.solve.schur import Products
 
 # Pixels that a mode can move any point by, below which it is left out.
 _UNFELT = 1e-6
@@ -296,15 +297,16 @@ def fit_hybrid(
     field = slice(LEADING_UNKNOWNS, LEADING_UNKNOWNS + len(modes))
     unfelt = families.deviation(h)[field] * float(state.parameters[0]) * peaks < _UNFELT
     never[field] |= unfelt
-    state.parameters[5 + len(LEADING) :] = torch.where(
-        unfelt, families.mean[field], state.parameters[5 + len(LEADING) :]
-    )
+    if bool(unfelt.any()):
+        parameters = state.parameters.clone()
+        parameters[5 + len(LEADING) :][unfelt] = families.mean[field][unfelt]
+        estimate = estimate._replace(state=state._replace(parameters=parameters))
     # A fit that drifts stays where its evidence was largest.
     drifts = capture.readout is not None and not rounds.converged
     problem, estimate, steps = capture.solved(estimate, never, (1, LAST[1]) if drifts else LAST)
     state = estimate.state
-    off, x = problem.off_poses(state), problem.unknowns(state)
-    K = quadratic_of(off, x - families.mean, capture.freedom).K
+    off = problem.off_poses(state)
+    K = Products.of_rows(off[:, :0], off).total[:-1, :-1]
     deviation = torch.where(never, 0.0, families.deviation(h))
     inverse = posterior_root(K, deviation, variance)
     errors, weighted = problem.pixel_errors(state), problem.corner_residuals(state, weighted=True)

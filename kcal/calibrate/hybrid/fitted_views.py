@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import NamedTuple
 
 import numpy as np
@@ -12,8 +13,8 @@ from torch import Tensor
 from kcal.calibrate.hybrid.board_modes import BoardModes
 from kcal.calibrate.hybrid.families import PriorFamilies
 from kcal.calibrate.hybrid.quadratic import ViewData, view_data
-from kcal.calibrate.hybrid.unknowns import hybrid_problem
-from kcal.calibrate.problem.board_problem import BoardProblem
+from kcal.calibrate.hybrid.unknowns import hybrid_prior, hybrid_problem
+from kcal.calibrate.problem.board_problem import POSE, BoardProblem
 from kcal.calibrate.problem.readout import Readout, stillness
 from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.views import LEAST_NOISE
@@ -63,6 +64,11 @@ class FittedViews:
     robust: bool
     exact: bool
 
+    @functools.cached_property
+    def _kept(self) -> list[tuple[LensModel, Tensor, BoardProblem]]:
+        """The last problem, with its lens and what was held."""
+        return []
+
     @property
     def seen(self) -> Tensor:
         """(V, N)."""
@@ -77,18 +83,25 @@ class FittedViews:
         """The least squares at amplitudes of an estimate; unknowns of which `never` is true are held."""
         deviation = estimate.families.deviation(estimate.hyperparameters)
         precision = torch.where(never, torch.inf, estimate.variance / deviation.square())
-        problem = hybrid_problem(
-            self.points,
-            self.board.shapes,
-            self.pixels,
-            self.weights,
-            estimate.model,
-            estimate.families.mean,
-            precision,
-            self.readout,
-            stillness(estimate.log_ratio),
-            self.square,
-        )
+        held, still, kept = torch.isinf(precision), stillness(estimate.log_ratio), self._kept
+        if kept and kept[0][0] is estimate.model and torch.equal(kept[0][1], held):
+            # What corners say at the last state serves under other priors, too.
+            prior = hybrid_prior(estimate.model, len(self.board.shapes), estimate.families.mean, precision, self.square)
+            problem = kept[0][2].with_priors([prior], still)
+        else:
+            problem = hybrid_problem(
+                self.points,
+                self.board.shapes,
+                self.pixels,
+                self.weights,
+                estimate.model,
+                estimate.families.mean,
+                precision,
+                self.readout,
+                still,
+                self.square,
+            )
+            kept[:] = [(estimate.model, held, problem)]
         if self.robust:
             return problem.with_weights(_cauchy_weights(problem, estimate.state, self.weights))
         return problem
@@ -99,15 +112,24 @@ class FittedViews:
         """The problem, the estimate with its solution, and the trial steps."""
         problem = self.problem(estimate, never)
         steps, gain = effort
-        options = LMOptions(max_iterations=steps, tolerance=gain / self.freedom, initial_damping=1e-6)
+        options = LMOptions(max_iterations=steps, tolerance=gain / self.freedom, initial_damping=1e-10)
         result = minimize(problem, estimate.state, options)
         return problem, estimate._replace(state=result.state), int(result.iterations)
 
     def data(self, problem: BoardProblem, estimate: Estimate, never: Tensor) -> ViewData:
         """What the views say near an estimate."""
-        off, motion = problem.motion_off_poses(estimate.state), estimate.state.motion
-        off[:, motion.shape[1] : -1][:, never] = 0.0
-        return view_data(off, problem.unknowns(estimate.state) - estimate.families.mean, motion, self.freedom)
+        state, products = estimate.state, problem.products(estimate.state).off(POSE)
+        if bool(never.any()):
+            # Unknowns that are held are among the others, of which nothing is said.
+            place, size = torch.cat([problem.moving, torch.tensor([len(never)])]), len(never) + 1
+            total = products.total.new_zeros(size, size)
+            total[place[:, None], place] = products.total
+            right, score = (
+                part.new_zeros(*part.shape[:-1], size).index_copy_(-1, place, part)
+                for part in (products.right, products.score)
+            )
+            products = products._replace(right=right, score=score, total=total)
+        return view_data(products, problem.unknowns(state) - estimate.families.mean, state.motion, self.freedom)
 
 
 def _cauchy_weights(problem: BoardProblem, state: BoardState, weights: Tensor) -> Tensor:

@@ -67,16 +67,10 @@ def hyper_likelihood(data: Quadratic, families: PriorFamilies, h: Tensor, varian
         h: of largest evidence.
         variance: of the noise there.
     """
-    at = np.append(h.numpy(), math.log(variance))
-    step = 0.02
-    steps = step * np.eye(len(at))
-    up, down = (
-        np.stack([negative_log_evidence(data, families, at + sign * row)[1] for row in steps]) for sign in (1, -1)
-    )
-    hessian = torch.from_numpy((up - down) / (2 * step))
-    hessian = 0.5 * (hessian + hessian.T)
+    _, gradient, bend = negative_log_evidence(data, families, np.append(h.numpy(), math.log(variance)))
+    hessian = torch.from_numpy(bend)
     information = hessian[:-1, :-1] - torch.outer(hessian[:-1, -1], hessian[-1, :-1]) / hessian[-1, -1]
-    slope = torch.from_numpy(negative_log_evidence(data, families, at)[1][:-1])
+    slope = torch.from_numpy(gradient[:-1])
     # Far from where the data say anything the likelihood bends the wrong way: nothing is known there.
     values, vectors = torch.linalg.eigh(information)
     root, vectors = values[values > 0].sqrt()[:, None], vectors[:, values > 0].T

@@ -9,6 +9,7 @@ ln det(R UᵀU R + I) is added to -2 ln p.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.problem.readout import AMPLITUDES, MOTION, stillness
+from kcal.solve.schur import Products
 
 Array = npt.NDArray[np.float64]
 
@@ -65,14 +67,12 @@ class ViewData(NamedTuple):
         own: (V, M, M) UᵀU of each view.
         cross: (V, M, S + 1) Uᵀ [A, r], A being the rows and r their residuals as if all views had stood still.
         score: (V, S) Aᵀ r of each view.
-        residual: (V, M) Uᵀ r of each view.
     """
 
     still: Quadratic
     own: Tensor
     cross: Tensor
     score: Tensor
-    residual: Tensor
 
     @property
     def moving(self) -> bool:
@@ -99,7 +99,7 @@ class ViewData(NamedTuple):
         if not self.moving:
             return self.score
         matrix = self.own + torch.diag(stillness(log_ratio))
-        best = torch.linalg.solve(matrix, self.residual[..., None])
+        best = torch.linalg.solve(matrix, self.cross[..., -1:])
         return self.score - (self.cross[..., :-1].transpose(1, 2) @ best)[..., 0]
 
 
@@ -118,49 +118,82 @@ class Integrated(NamedTuple):
     root: Tensor
     half: Tensor
 
-    def slopes(self, step: Array, factor: Tensor, variance: float, tempering: float) -> Array:
-        """(4,) derivatives of -ln p by the logarithms of the ratios; () where views stand still.
+    def slopes(
+        self, step: Array, inverse: Tensor, deviation: Array, y: Array, variance: float, tempering: float
+    ) -> Slopes:
+        """Derivatives of -ln p by the logarithms of the ratios.
 
-        Each is the sum over motions of 1 less the posterior's second moment in units of the prior.
+        Each first one is the sum over motions of 1 less the posterior's second moment in units of the prior. The
+        second ones are those of any Gaussian amplitudes (`kcal.calibrate.hybrid.evidence`), motions among them.
 
         Args:
             step: (S,) δ of the best lens and board.
-            factor: (S, S), factorᵀ factor being their posterior covariance.
+            inverse: (S, S) Q, QᵀQ being their posterior covariance in units of their priors.
+            deviation: (S,) standard deviations of these.
+            y: (S,) the best lens and board in the same units.
             variance: of the noise.
             tempering: by which the data count less.
         """
-        if not self.root.shape[-1]:
-            return np.zeros(0)
         _, ones, _ = torch.broadcast_tensors(self.root, torch.eye(MOTION, dtype=self.root.dtype), self.root)
-        inverse = torch.linalg.solve_triangular(self.root, ones, upper=False)
-        kept = inverse.square().sum(1)
-        direction = torch.cat([torch.from_numpy(step)[:, None], factor.T], 1)
+        root = torch.linalg.solve_triangular(self.root, ones, upper=False)
+        own = root.transpose(1, 2) @ root  # of motions whose lens and board are known
+        direction = torch.cat([torch.from_numpy(step)[:, None], (inverse * torch.from_numpy(deviation)).T], 1)
         reach = self.half[..., :-1] @ direction
         reach[..., 0] += self.half[..., -1]
-        moments = (inverse.transpose(1, 2) @ reach).square().sum(-1) / variance
-        by_motion = ((1.0 - kept) - moments).sum(0) / tempering
-        return by_motion.view(AMPLITUDES, -1).sum(1).numpy()
+        E = (root.transpose(1, 2) @ reach) / math.sqrt(variance * tempering)
+        P = E[..., 1:] @ inverse
+        mean, kept = E[..., 0], own.diagonal(dim1=1, dim2=2)
+        by_order = (AMPLITUDES, MOTION // AMPLITUDES)
+        first = ((1.0 - kept) / tempering - E.square().sum(-1)).sum(0).view(by_order).sum(1)
+        # By pairs of orders: within a view, and across all views.
+        G = E[..., 1:] @ E[..., 1:].transpose(1, 2)
+        within = (-0.5 * own.square() / tempering - own * (mean[:, :, None] * mean[:, None]) - own * G).sum(0)
+        within.diagonal().add_((0.5 * kept / tempering + 0.5 * E.square().sum(-1)).sum(0))
+        second = 4.0 * within.view(*by_order, *by_order).sum((1, 3))
+        orders = E[..., 1:].unflatten(1, by_order).transpose(0, 1).flatten(1, 2)
+        along = (orders.transpose(1, 2) @ mean.unflatten(1, by_order).transpose(0, 1).reshape(AMPLITUDES, -1, 1))[
+            ..., 0
+        ]
+        spread = (orders.transpose(1, 2) @ orders).flatten(1)
+        second -= 4.0 * (along @ along.T) + 2.0 * (spread @ spread.T)
+        squared, mixed = P.square().sum(0), (P * mean[..., None]).sum(0)
+        Y = torch.from_numpy(y)
+        by_variance = -(2.0 * mixed * Y + squared)
+        by_noise = mean.square().sum(0) + 2.0 * mixed @ Y + squared.sum(-1)
+        by_variance = by_variance.view(*by_order, len(step)).sum(1)
+        by_noise = by_noise.view(by_order).sum(1)
+        return Slopes(first.numpy(), second.numpy(), by_variance.numpy(), by_noise.numpy())
 
 
-def quadratic_of(off: Tensor, x: Tensor, freedom: float) -> Quadratic:
-    """From rows (V, S + 1, R) off the poses at x, the residuals last."""
-    flat = off.transpose(0, 1).flatten(1)
-    return Quadratic(flat @ flat.T, freedom, x)
+class Slopes(NamedTuple):
+    """Derivatives of -ln p by the logarithms of the ratios: first; second; mixed, by 2 ln of priors' sds and ln σ²."""
+
+    first: Array
+    second: Array
+    by_variance: Array
+    by_noise: Array
 
 
-def view_data(off: Tensor, x: Tensor, motion: Tensor, freedom: float) -> ViewData:
-    """From rows (V, M + S + 1, R) off the poses, at lens and board x and motions (V, M); the residuals last."""
-    own, others = off[:, : motion.shape[1]], off[:, motion.shape[1] :]
-    # As if all views had stood still: motions are unknowns whose prior is about zero.
-    still = others[:, -1] - torch.einsum("vm,vmr->vr", motion, own)
-    others = torch.cat([others[:, :-1], still[:, None]], 1)
-    return ViewData(
-        still=quadratic_of(others, x, freedom),
-        own=own @ own.transpose(1, 2),
-        cross=own @ others.transpose(1, 2),
-        score=(others[:, :-1] @ still[..., None])[..., 0],
-        residual=(own @ still[..., None])[..., 0],
-    )
+def view_data(products: Products, x: Tensor, motion: Tensor, freedom: float) -> ViewData:
+    """From products off the poses, by motions and by lens and board, at lens and board x and motions (V, M)."""
+    own, cross, score, total = products
+    if motion.shape[1]:
+        # As if all views had stood still: motions are unknowns whose prior is about zero.
+        along = (motion[:, None] @ cross)[:, 0]
+        moved = (motion[:, None] @ own)[:, 0]
+        total, cross = total.clone(), cross.clone()
+        change = along.sum(0)
+        total[-1] -= change
+        total[:, -1] -= change
+        total[-1, -1] += (moved * motion).sum()
+        cross[..., -1] -= moved
+        score = score - along
+    return ViewData(still=Quadratic(total, freedom, x), own=own, cross=cross, score=score[:, :-1])
+
+
+def still_data(rows: Tensor, x: Tensor, freedom: float) -> ViewData:
+    """From rows (V, S + 1, R) of views without poses and motions, at lens and board x; the residuals last."""
+    return view_data(Products.of_rows(rows[:, :0], rows), x, rows.new_zeros(len(rows), 0), freedom)
 
 
 def overdispersion(score: Tensor, K: Tensor, deviation: Tensor, variance: float) -> float:

@@ -48,19 +48,24 @@ def hybrid_problem(
         stillness: (12,) the squared noise over the variance of each number of a motion.
         square: whether pixels are square; others have two focal lengths.
     """
-    free, count = hybrid_unknowns(model, square), 5 + model.size
     held = torch.isinf(precision)
-    index = torch.cat([torch.tensor(free.leading), torch.arange(count, count + len(shapes))])[~held]
     return BoardProblem(
         points,
         pixels,
         model,
-        free,
+        hybrid_unknowns(model, square),
         shapes=shapes,
         free_board=True,
         held=held,
         weights=weights,
-        terms=[GaussianPrior(index, mean[~held], precision[~held].sqrt())],
+        terms=[hybrid_prior(model, len(shapes), mean, precision, square)],
         readout=readout,
         stillness=stillness,
     )
+
+
+def hybrid_prior(model: LensModel, shapes: int, mean: Tensor, precision: Tensor, square: bool = True) -> GaussianPrior:
+    """The prior of `hybrid_problem`, with so many modes of the board."""
+    leading, count, held = hybrid_unknowns(model, square).leading, 5 + model.size, torch.isinf(precision)
+    index = torch.cat([torch.tensor(leading), torch.arange(count, count + shapes)])[~held]
+    return GaussianPrior(index, mean[~held], precision[~held].sqrt())

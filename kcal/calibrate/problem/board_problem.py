@@ -24,7 +24,7 @@ from kcal.lens.pose import nearest_rotation, step_rows
 from kcal.lens.projection import INTRINSICS, project_components
 from kcal.solve.result import State
 from kcal.solve.robust import RobustLoss
-from kcal.solve.schur import SchurLinearization, SchurProblem, without_local
+from kcal.solve.schur import Products, SchurLinearization, SchurProblem, without_local
 
 _ALL = slice(None)
 POSE = 6
@@ -109,6 +109,7 @@ class BoardProblem(SchurProblem[BoardState]):
         self._all_move = self.shared_size == self.unknown_count
         # With hundreds of columns a linearization costs far more than the cost alone.
         self.joint = not model.hybrid
+        self._kept: list[tuple[BoardState, Products]] = []
         self.slots = self._places(model.size)
 
     def _weigh(self, weights: Tensor | None) -> None:
@@ -136,6 +137,13 @@ class BoardProblem(SchurProblem[BoardState]):
         """The same problem with other weights (V, N) of its corners."""
         changed = copy.copy(self)
         changed._weigh(weights)
+        changed._kept = []
+        return changed
+
+    def with_priors(self, terms: Sequence[Term], stillness: Tensor) -> BoardProblem:
+        """The same corners and unknowns under other priors of these; both keep what corners say."""
+        changed = copy.copy(self)
+        changed.terms, changed._still = tuple(terms), stillness
         return changed
 
     @property
@@ -153,6 +161,7 @@ class BoardProblem(SchurProblem[BoardState]):
         if len(self.batch) != 1:
             return None
         part = copy.copy(self)
+        part._kept = []
         part.batch = (len(elements),)
         if self.seen.ndim > 2:
             part.seen, part._target, part._counts = self.seen[elements], self._target[elements], self._counts[elements]
@@ -233,7 +242,7 @@ class BoardProblem(SchurProblem[BoardState]):
         parts = [step_rows(projected.by_point, rotated)]
         if self.readout is not None:
             parts.append(self.readout.columns_of(projected.by_point, state.rotation, self._time[views], flat))
-        parts.append(self.free.collapse(projected.by_camera, -3))
+        parts.extend(self.free.collapsed(projected.by_camera, -3))
         if self.free_board:
             by_board = torch.einsum("...vkun,...vkl->...vlun", projected.by_point, state.rotation)
             if turn is not None:
@@ -275,22 +284,31 @@ class BoardProblem(SchurProblem[BoardState]):
             views = slice(start, start + size)
             yield (state if size >= count else state.views(views)), views
 
-    def linearize(self, state: BoardState) -> SchurLinearization:
-        """See `Problem.linearize`; by the unknowns that are not held."""
+    def products(self, state: BoardState) -> Products:
+        """What the corners alone say near a state, by the unknowns that are not held; the last ones are kept."""
+        if self._kept and self._kept[0][0] is state:
+            return self._kept[0][1]
         L = self.local_size
         columns = [*(L + self.moving).tolist(), -1]
-        local, right, total = [], [], self.shared_gram(state)
+        parts = []
         for part, views in self._chunks(state):
             rows = self.corner_rows(part, views)
-            own, others = rows[..., :L, :], rows[..., L:, :] if self._all_move else rows[..., columns, :]
-            local.append(own @ own.transpose(-1, -2))
-            right.append(own @ others.transpose(-1, -2))
-            flat = others.transpose(-3, -2).flatten(-2)
-            total = total + flat @ flat.transpose(-1, -2)
-        by_pose, by_both = torch.cat(local, -3), torch.cat(right, -3)
+            parts.append(
+                Products.of_rows(rows[..., :L, :], rows[..., L:, :] if self._all_move else rows[..., columns, :])
+            )
+        found = Products.together(parts)
+        if not found.total.requires_grad:
+            self._kept[:] = [(state, found)]
+        return found
+
+    def linearize(self, state: BoardState) -> SchurLinearization:
+        """See `Problem.linearize`; by the unknowns that are not held."""
+        by_pose, by_both, _, by_corners = self.products(state)
+        total = self.shared_gram(state) + by_corners
         if self.readout is not None:
             # The prior of motions.
             pull = self._still * state.motion
+            by_pose, by_both = by_pose.clone(), by_both.clone()
             by_pose.diagonal(dim1=-2, dim2=-1)[..., POSE:] += self._still
             by_both[..., POSE:, -1] += pull
             total[..., -1, -1] += (pull * state.motion).sum((-2, -1))
@@ -302,10 +320,6 @@ class BoardProblem(SchurProblem[BoardState]):
     def off_poses(self, state: BoardState) -> Tensor:
         """(V, S + 1, R) derivatives by the shared unknowns, and residuals, off what poses and motions can do (QR)."""
         return torch.cat([without_local(self.rows(part, v), self.local_size) for part, v in self._chunks(state)])
-
-    def motion_off_poses(self, state: BoardState) -> Tensor:
-        """(V, 12 + S + 1, 2 N) derivatives by motion and the shared unknowns, and residuals, off what poses can do."""
-        return torch.cat([without_local(self.corner_rows(part, v), POSE) for part, v in self._chunks(state)])
 
     def shared_gram(self, state: BoardState) -> Tensor:
         """See `SchurProblem.shared_gram`: of the terms."""

@@ -22,7 +22,7 @@ from kcal.calibrate.hybrid.quadratic import ViewData, view_data
 from kcal.calibrate.problem.readout import AMPLITUDES, FELT, MEDIAN, MOTION, MotionSigma, Readout, motion_sigma
 from kcal.lens.model import LensModel
 from kcal.lens.projection import project_components
-from kcal.solve.schur import without_local
+from kcal.solve.schur import Products, without_local
 
 # Nats by which motions must raise the evidence without the board that tells most of them.
 _WORTH_OF_OTHERS = 1.0
@@ -104,7 +104,8 @@ def board_motion(seen: SeenBoards, rows: Tensor, start: int, good: Tensor) -> Bo
     zero = torch.zeros_like(shared)
 
     def told_by(views: Tensor) -> ViewData:
-        return view_data(off[views], zero, off.new_zeros(int(views.sum()), MOTION), float(counts[views].sum()))
+        products = Products.of_rows(off[views, :MOTION], off[views, MOTION:])
+        return view_data(products, zero, off.new_zeros(len(products.local), MOTION), float(counts[views].sum()))
 
     every = torch.ones(len(off), dtype=torch.bool)
     data = told_by(every)

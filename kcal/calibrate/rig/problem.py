@@ -209,7 +209,7 @@ class RigProblem:
         return [_summed(self._without_own(block, rows)) for block, rows in zip(self.blocks, found, strict=True)]
 
     def response(self, state: RigState, block: Block) -> tuple[Tensor, Tensor]:
-        """How the best unknowns of a block's items depend on the shared ones; see `SchurLinearization.local_response`.
+        """How the best unknowns of a block's items depend on the shared ones; see `EliminatedItems.response`.
 
         Returns:
             (V, L, S) and (V, L, L).

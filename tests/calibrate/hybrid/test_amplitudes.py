@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 from scipy import integrate
 
-from kcal.calibrate.hybrid.amplitudes import Loss, expected_amplitudes
+from kcal.calibrate.hybrid.amplitudes import expected_amplitudes
 
 WIDE: list[tuple[float, float | None]] = [(-12.0, 12.0), (-12.0, 12.0), (-40.0, None)]
+
+
+Loss = Callable[[np.ndarray], tuple[float, np.ndarray]]
+
+
+def bend(loss: Loss, at: np.ndarray) -> np.ndarray:
+    """The Hessian."""
+    steps = 1e-4 * np.eye(len(at))
+    return np.stack([loss(at + step)[1] - loss(at - step)[1] for step in steps]) / 2e-4
 
 
 def weights_seen(sizes: list[float], sigma: float) -> Loss:
@@ -38,7 +48,7 @@ def test_mean_square_is_that_of_the_integral(sizes: list[float]) -> None:
     """Where the amplitude is well determined, where it is not, and where nothing but an upper bound is known."""
     loss = weights_seen(sizes, 0.2)
     at = smallest(loss)
-    found = expected_amplitudes(loss, lambda v: loss(v)[0], at, [0], WIDE)
+    found = expected_amplitudes(bend(loss, at), lambda v: loss(v)[0], at, [0], WIDE)
 
     def density(x: float, power: float) -> float:
         return math.exp(loss(at)[0] - loss(np.array([x, 0.0, 0.0]))[0] + power * x)
@@ -57,7 +67,7 @@ def test_others_follow() -> None:
     def loss(v: np.ndarray) -> tuple[float, np.ndarray]:
         return 0.5 * float(v @ precision @ v), precision @ v
 
-    found = expected_amplitudes(loss, lambda v: loss(v)[0], np.zeros(2), [0, 1], WIDE[:2])
+    found = expected_amplitudes(precision, lambda v: loss(v)[0], np.zeros(2), [0, 1], WIDE[:2])
     # ln A has a variance of 1 each: ½ ln <A²> = 1.
     assert found == pytest.approx([1.0, 1.0], abs=0.02)
 
@@ -66,5 +76,5 @@ def test_bounds_hold() -> None:
     loss = weights_seen([0.01, 0.02], 0.2)
     at = smallest(loss)
     top = float(at[0]) + 0.4
-    found = expected_amplitudes(loss, lambda v: loss(v)[0], at, [0], [(-12.0, top), *WIDE[1:]])
+    found = expected_amplitudes(bend(loss, at), lambda v: loss(v)[0], at, [0], [(-12.0, top), *WIDE[1:]])
     assert at[0] - 1.0 < found[0] <= top

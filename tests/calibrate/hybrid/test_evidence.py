@@ -9,10 +9,11 @@ import pytest
 import torch
 from scipy import stats
 
-from kcal.calibrate.hybrid.evidence import EvidenceLoss, Maximum, evidence_of_motion, hyper_bounds
+from kcal.calibrate.hybrid.evidence import EvidenceLoss, Maximum, evidence_of_motion, hyper_bounds, maximize_evidence
 from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies
 from kcal.calibrate.hybrid.quadratic import ViewData, view_data
 from kcal.calibrate.problem.readout import AMPLITUDES, MEDIAN, MOTION, SPREAD
+from kcal.solve.schur import Products
 
 F64 = torch.float64
 VIEWS, ROWS, UNKNOWNS = 3, 20, 5
@@ -39,7 +40,8 @@ def rows(moving: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, 
 
 def data(moving: bool) -> ViewData:
     U, A, residual, x, motion = (torch.from_numpy(part) for part in rows(moving))
-    return view_data(torch.cat([U, A, residual[:, None]], 1), x, motion, float(VIEWS * ROWS))
+    products = Products.of_rows(U, torch.cat([A, residual[:, None]], 1))
+    return view_data(products, x, motion, float(VIEWS * ROWS))
 
 
 def density(moving: bool, still: bool = False) -> float:
@@ -74,21 +76,36 @@ def test_value_is_the_density_of_the_residuals(moving: bool) -> None:
 
 @pytest.mark.parametrize("tempering", [1.0, 1.7])
 @pytest.mark.parametrize("moving", [False, True])
-def test_gradient(moving: bool, tempering: float) -> None:
+def test_derivatives(moving: bool, tempering: float) -> None:
     loss, at = EvidenceLoss(data(moving), FAMILIES, PRIOR, tempering), vector(moving)
-    slopes = [(loss.value(at + step) - loss.value(at - step)) / 2e-5 for step in 1e-5 * np.eye(len(at))]
-    np.testing.assert_allclose(loss(at)[1], slopes, rtol=1e-6, atol=1e-6)
+    steps = 1e-5 * np.eye(len(at))
+    slopes = [(loss.value(at + step) - loss.value(at - step)) / 2e-5 for step in steps]
+    _, found, bend = loss(at)
+    np.testing.assert_allclose(found, slopes, rtol=1e-6, atol=1e-6)
+    bends = [(loss(at + step)[1] - loss(at - step)[1]) / 2e-5 for step in steps]
+    np.testing.assert_allclose(bend, bends, rtol=1e-6, atol=1e-6)
 
 
-def test_beyond_numbers_is_worse_than_before() -> None:
+def test_beyond_numbers_is_worse_than_anything() -> None:
     loss, at = EvidenceLoss(data(False), FAMILIES, PRIOR, 1.0), vector(False)
     beyond = at + np.array([0.0, 0.0, 400.0])
     assert loss.value(beyond) == math.inf
-    assert loss(beyond)[0] == 1e30
-    value = loss(at)[0]
-    worse, slope = loss(beyond)
-    assert worse == value + 1.0
-    assert not slope.any()
+    assert loss(beyond)[0] == math.inf
+
+
+@pytest.mark.parametrize("noise", [-6.0, -1.0, 5.0])
+def test_maximum_is_found_from_afar(noise: float) -> None:
+    """Where the gradient is zero and the Hessian positive."""
+    at = data(True)
+    start = torch.tensor([-4.0, 4.0], dtype=F64), math.exp(noise)
+    best = maximize_evidence(at, FAMILIES, *start, PRIOR, np.zeros(AMPLITUDES))
+    v = np.concatenate([best.h.numpy(), best.log_ratio, [math.log(best.variance)]])
+    value, slope, bend = EvidenceLoss(at, FAMILIES, PRIOR, 1.0)(v)
+    bounds = hyper_bounds(PRIOR, AMPLITUDES, noise)
+    inside = [high is None or low < x < high for x, (low, high) in zip(v, bounds, strict=True)]
+    assert value == best.loss
+    assert float(np.abs(slope[inside]).max()) < 1e-3
+    assert float(np.linalg.eigvalsh(bend[np.ix_(inside, inside)]).min()) > 0.0
 
 
 def test_worth_of_motions() -> None:

@@ -19,7 +19,7 @@ from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.fitted_views import FittedViews
 from kcal.calibrate.hybrid.quadratic import Quadratic, ViewData, view_data
 from kcal.calibrate.hybrid.unknowns import hybrid_problem
-from kcal.calibrate.problem.board_problem import BoardProblem
+from kcal.calibrate.problem.board_problem import POSE, BoardProblem
 from kcal.calibrate.problem.readout import (
     AMPLITUDES,
     LARGEST,
@@ -39,6 +39,7 @@ from kcal.lens.model import LensModel
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.zernike import ZernikeModes
 from kcal.solve.lm import LMOptions, minimize
+from kcal.solve.schur import Products, without_local
 
 F64 = torch.float64
 BOARD = Board(columns=9, rows=7, square=0.04)
@@ -149,12 +150,12 @@ def test_motions_are_eliminated_like_poses() -> None:
     matrix, scale = problem.linearize(state).information()
     reduced = matrix / scale[:, None] / scale
     torch.testing.assert_close(flat[:-1] @ flat[:-1].T, reduced, rtol=1e-6, atol=1e-6 * float(reduced.max()))
-    data = view_data(problem.motion_off_poses(state), x, state.motion, 100.0)
+    data = view_data(problem.products(state).off(POSE), x, state.motion, 100.0)
     ratio = np.array([-3.0, -2.0, -4.0, -2.5])
     found = data.integrated(ratio)
     torch.testing.assert_close(found.data.K, reduced, rtol=1e-6, atol=1e-6 * float(reduced.max()))
     # Chi² at any x is that of residuals whose covariance contains the motions.
-    each = problem.motion_off_poses(state)
+    each = without_local(problem.corner_rows(state), POSE)
     there = x + 1e-3 * torch.randn(len(x), generator=torch.Generator().manual_seed(3), dtype=F64) / scale
     spread = torch.exp(torch.from_numpy(ratio)).repeat_interleave(3)
     chi2 = logdet = 0.0
@@ -183,6 +184,24 @@ def test_motions_are_eliminated_like_poses() -> None:
     torch.testing.assert_close(data.scores(ratio), own, rtol=1e-6, atol=1e-8 * float(data.score.abs().max()))
 
 
+def test_products_serve_under_other_priors() -> None:
+    """Of the last state, for problems with other priors; not with other weights."""
+    problem, state = moving_problem(True)
+    first = problem.products(state)
+    other = problem.with_priors([], torch.ones(MOTION, dtype=F64))
+    assert other.products(state) is first
+    assert other.with_weights(torch.full((4, BOARD.corners), 0.5, dtype=F64)).products(state) is not first
+    other.products(state._replace(board=0.0 * state.board))
+    assert other.products(state) is not first
+    torch.testing.assert_close(other.products(state).total, first.total, rtol=1e-13, atol=0.0)
+    fresh = BoardProblem(
+        BOARD.points, problem.pixels, problem.model, problem.free, shapes=problem.shapes, free_board=True,
+        readout=problem.readout, stillness=torch.ones(MOTION, dtype=F64),
+    )  # fmt: skip
+    for mine, its in zip(vars(other.linearize(state)).values(), vars(fresh.linearize(state)).values(), strict=True):
+        torch.testing.assert_close(mine, its)
+
+
 def linear_views() -> tuple[ViewData, object]:
     """Views of a Gaussian linear model whose motions are drawn with known deviations."""
     generator = torch.Generator().manual_seed(7)
@@ -198,9 +217,8 @@ def linear_views() -> tuple[ViewData, object]:
     error = torch.einsum("s,vsr->vr", x, lens) + torch.einsum("vm,vmr->vr", m, motion)
     error = -error + 0.3 * torch.randn(views, residuals, generator=generator, dtype=F64)
     rows = torch.cat([motion, lens, error[:, None]], 1)
-    return view_data(rows, torch.zeros(size, dtype=F64), torch.zeros(views, MOTION, dtype=F64), views * residuals), (
-        families, form.modes,
-    )  # fmt: skip
+    products, still = Products.of_rows(rows[:, :MOTION], rows[:, MOTION:]), torch.zeros(views, MOTION, dtype=F64)
+    return view_data(products, torch.zeros(size, dtype=F64), still, views * residuals), (families, form.modes)
 
 
 def test_deviations_of_motions_by_evidence() -> None:
@@ -331,7 +349,7 @@ def test_unknowns_of_two_focal_lengths() -> None:
 def test_limits_of_motions() -> None:
     data, (families, modes) = linear_views()
     prior = typical_hyperprior(modes)
-    wild = ViewData(data.still, data.own * 1e-6, data.cross * 1e-3, data.score, data.residual * 1e-3)
+    wild = ViewData(data.still, data.own * 1e-6, data.cross * 1e-3, data.score)
     best = maximize_evidence(wild, families, prior.mean, 0.09, prior, np.full(AMPLITUDES, math.log(MEDIAN / 0.3)))
     # Motions a thousand times as large come to the limit, which refers to the noise before.
     assert float((np.exp(best.log_ratio) * 0.3).max()) <= LARGEST * (1 + 1e-9)
