@@ -66,6 +66,7 @@ class Lines:
         self.coverage = coverage.Coverage(data_file=None, include=[f"{ROOT}/kcal/*"], config_file=False)
         self.seconds: dict[str, float] = {}
         self.failed: set[str] = set()
+        self.unseen: list[str] = []
         self.end = time.process_time() + FILE
 
     @pytest.hookimpl(hookwrapper=True)
@@ -80,7 +81,10 @@ class Lines:
     def pytest_runtest_setup(self, item: pytest.Item) -> None:
         """Leave out the rest of a file that takes too long, and what needs a browser, whose time is not counted."""
         browser = any("Chromium" in mark.kwargs.get("reason", "") for mark in item.iter_markers("skipif"))
-        if browser or time.process_time() > self.end:
+        if browser:
+            pytest.skip("browser")
+        if time.process_time() > self.end:
+            self.unseen.append(item.nodeid)
             pytest.skip("too long")
 
     @pytest.hookimpl(hookwrapper=True)
@@ -136,4 +140,4 @@ def observed(file: str) -> dict:
     lines.coverage.start()
     run_tests([file], lines)
     lines.coverage.stop()
-    return {"seconds": lines.seconds, "failed": sorted(lines.failed), "lines": lines.executed()}
+    return {"seconds": lines.seconds, "failed": sorted(lines.failed), "unseen": lines.unseen, "lines": lines.executed()}
