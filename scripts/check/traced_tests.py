@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[2]
 CLOCK = 100.0
 MEMORY = 6 << 30
 # Seconds of processor time after which the rest of a file of tests does not count.
-FILE = 15.0
+FILE = 8.0
 
 
 def forked(work: Callable[[], object], seconds: float) -> Any:
