@@ -38,4 +38,13 @@ HARMLESS = {
     "ed7dec0d6447abef": "when stopped elements are dropped from a batch: only time",
     "e7fec4571310adb3": "what happens when no port is free, and there always is one",
     "9d350f625c8848c9": "a negative number, which means none whatever its size",
+    "00831ec1d5c8d5b9": "a factor of three in limits of rounding",
+    "687fb8c6ef964857": "when stopped elements are dropped from a batch: only time",
+    "70f90a90996024bd": "zero, or the cube of zero",
+    "4c0100bb1d58a305": "which focal lengths below a millionth of a pixel are refused",
+    "3082889367ad8c91": "which way the two axes across the baseline point",
+    "6c6214b58c56f43b": "pixels of which one coordinate is NaN: no lens has a ray for them either",
+    "5de44679f2cc6387": "rays that have length one",
+    "868ad6314f05f253": "the angle between two rays, whichever comes first",
+    "4f7ded21d6d6f9ec": "a first principal point, from which a fit begins",
 }

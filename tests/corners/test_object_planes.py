@@ -13,7 +13,7 @@ from torch import Tensor
 from kcal.corners.keypoints import Keypoints, keypoints, pose_between
 from kcal.corners.match import MatchOptions, MatchStatus
 from kcal.corners.object_planes import object_planes, plane_pixels, plane_places
-from kcal.corners.patch_windows import grid_of, image_windows
+from kcal.corners.patch_windows import grid_of, image_windows, sample
 from kcal.corners.refind import find_again
 from kcal.corners.shift_fit import ShiftFit, fit_shifts
 from kcal.errors import InputError
@@ -34,11 +34,11 @@ class TestPlanes:
             planes.axes @ planes.axes.mT, torch.eye(3).double().expand(4, 3, 3), rtol=0, atol=1e-14
         )
         torch.testing.assert_close(torch.linalg.det(planes.axes), torch.ones(4).double())
-        shown, seen = plane_pixels(RIG.left, planes, planes.left)
+        shown, seen = plane_pixels(RIG.left, planes, planes.left[:, None])
         assert bool(seen.all())
-        torch.testing.assert_close(shown, left, rtol=0, atol=1e-8)
-        beside, _ = plane_pixels(RIG.right, planes, planes.right, RIG.right_from_left_rotation)
-        torch.testing.assert_close(beside, right, rtol=0, atol=1e-8)
+        torch.testing.assert_close(shown[:, 0], left, rtol=0, atol=1e-8)
+        beside, _ = plane_pixels(RIG.right, planes, planes.right[:, None], RIG.right_from_left_rotation)
+        torch.testing.assert_close(beside[:, 0], right, rtol=0, atol=1e-8)
         torch.testing.assert_close(planes.left[:, 1], torch.zeros(4).double())
         torch.testing.assert_close(planes.right[:, 1], planes.left[:, 1], rtol=0, atol=1e-10)
         # Baseline over distance across it: z is what the plane's third axis sees.
@@ -58,8 +58,8 @@ class TestPlanes:
         left, right, _ = RIG(self.POINTS)
         planes = object_planes(RIG, left, right, torch.zeros(4))
         places = planes.left + tensor([0.01, 0.02], [-0.03, 0.0], [0.0, 0.05], [0.02, -0.02])
-        pixels, _ = plane_pixels(RIG.left, planes, places)
-        found, seen = plane_places(RIG.left, planes, pixels)
+        pixels, _ = plane_pixels(RIG.left, planes, places[:, None])
+        found, seen = plane_places(RIG.left, planes, pixels[:, 0])
         assert bool(seen.all())
         torch.testing.assert_close(found, places, rtol=0, atol=1e-10)
 
@@ -83,8 +83,6 @@ def patches(shift: tuple[float, float], gain: float = 1.0, half: int = 8) -> tup
     places = middle[:, None, None] + grid_of((half, half), image.device)[None]
     slopes = torch.eye(2, dtype=torch.float64).expand(1, 2 * half + 1, 2 * half + 1, 2, 2)
     windows = image_windows(image, places, 0, math.inf)
-    from kcal.corners.patch_windows import sample
-
     template = (sample(windows, places + tensor(*shift)) - 10.0) / gain
     return template, image, places, slopes
 
@@ -236,18 +234,16 @@ class TestAgain:
 
     def test_what_went_farther_than_the_reach_is_not_found(self) -> None:
         after = self.IMAGE.roll((0, 9), (0, 1))
-        far = find_again(self.IMAGE, after, tensor([[80.0, 60.0]]), reach=6)
+        far = find_again(self.IMAGE, after, tensor([80.0, 60.0]), reach=6)
         assert int(far.status[0]) != MatchStatus.GOOD
-        assert find_again(self.IMAGE, after, tensor([[80.0, 60.0]]), reach=10).status.tolist() == [MatchStatus.GOOD]
+        assert find_again(self.IMAGE, after, tensor([80.0, 60.0]), reach=10).status.tolist() == [MatchStatus.GOOD]
 
     def test_refusals_and_what_has_no_texture(self) -> None:
         options = MatchOptions(half=6)
         flat = torch.full_like(self.IMAGE, 90.0)
-        pixels = tensor([[80.0, 60.0]])
+        pixels, edge = tensor([80.0, 60.0]), tensor([3.0, 60.0])
         assert find_again(flat, self.IMAGE, pixels, 5, options).status.tolist() == [MatchStatus.FLAT]
-        assert find_again(self.IMAGE, self.IMAGE, tensor([[3.0, 60.0]]), 5, options).status.tolist() == [
-            MatchStatus.OUTSIDE
-        ]
+        assert find_again(self.IMAGE, self.IMAGE, edge, 5, options).status.tolist() == [MatchStatus.OUTSIDE]
         for before, after, places in ((self.IMAGE[None], self.IMAGE, pixels), (self.IMAGE, self.IMAGE[:90], pixels),
                                       (self.IMAGE, self.IMAGE, pixels[0])):  # fmt: skip
             with pytest.raises(InputError, match="one size are needed"):
