@@ -47,4 +47,6 @@ HARMLESS = {
     "5de44679f2cc6387": "rays that have length one",
     "868ad6314f05f253": "the angle between two rays, whichever comes first",
     "4f7ded21d6d6f9ec": "a first principal point, from which a fit begins",
+    "43745dfb24530793": "a share that equals a limit to the last bit",
+    "41ec4fe6054bc787": "how many matches are worked on at a time: only memory",
 }

@@ -10,7 +10,8 @@ observed. A line that no test executes is not noticed. Each mistake costs a fork
 First, every test file runs once, to see which lines each test executes and what time it takes; `--times` prints the
 rooms and tests that take long. All results are kept in .mutants/, and another run goes on where the last one stopped.
 Another seed draws afresh: what was drawn with one seed is not drawn with the next. `--again` repeats mistakes that went
-unnoticed, with the tests as they are now; `--write` writes the table of all seeds into docs/measured/mutants.md.
+unnoticed, with the tests as they are now; `--write` writes the table of all seeds into docs/measured/mutants.md, where
+rooms without results in .mutants/ keep their rows.
 
 Neither mutmut (8 hours for one run of each mistake; it rewrites every function, which `torch.compile` refuses) nor
 cosmic-ray (a new process and the whole suite for each mistake) draws samples or chooses tests by what they execute.
@@ -38,7 +39,7 @@ import pytest
 from scripts.check.harmless import HARMLESS
 from scripts.check.mutations import Site, sites
 from scripts.check.traced_tests import FILE, ROOT, First, forked, observed, run_tests
-from scripts.shared.page import table, write_section
+from scripts.shared.page import read_section, table, write_section
 
 STATE = ROOT / ".mutants"
 # The modules at the top, beside the rooms.
@@ -138,7 +139,8 @@ def chosen(files: list[dict], path: str, site: Site, budget: float) -> tuple[lis
 
     Outside of functions, all tests that execute any line of the module: they may read a constant.
     """
-    found, unseen = [], []
+    found: list[tuple[bool, float, str]] = []
+    unseen: list[str] = []
     for file in files:
         unseen += file["unseen"] if path in file["lines"] else []
         lines: dict[str, list[str]] = file["lines"].get(path, {})
@@ -174,10 +176,17 @@ def draws(room: str, seed: int) -> list[tuple[str, int, Site]]:
     return sorted(found, key=lambda draw: hashlib.sha256(f"{seed} {draw[2].key}".encode()).digest())
 
 
-def results() -> dict[str, dict]:
+def results(*, first: bool = False) -> dict[str, dict]:
+    """What became of each mistake, the last time; or `first`."""
     kept = STATE / "results.jsonl"
     lines = kept.read_text().splitlines() if kept.exists() else []
-    return {entry["key"]: entry for entry in map(json.loads, lines)}
+    return {entry["key"]: entry for entry in map(json.loads, lines[::-1] if first else lines)}
+
+
+def rows_of_page() -> dict[str, tuple[str, ...]]:
+    """The rows of the table as it is, by room."""
+    rows = [line.strip("| ").split(" | ") for line in read_section("mutants.md", "mutants").splitlines()]
+    return {row[0].strip("`"): tuple(row) for row in rows if row[0].strip("`") in ROOMS}
 
 
 def judge(files: list[dict], path: str, number: int, site: Site, budget: float, seed: int) -> None:
@@ -225,7 +234,8 @@ class Draw(NamedTuple):
 
 def report() -> tuple[str, str]:
     """A table of the rooms, the first and the last draw of each; and what was not noticed, or is harmless, by line."""
-    kept, rows = results(), []
+    kept, at_first, known = results(), results(first=True), rows_of_page()
+    rows: list[tuple[object, ...]] = []
     missed: list[tuple[object, ...]] = []
     idle: list[tuple[object, ...]] = []
     total = noticed = 0
@@ -237,9 +247,17 @@ def report() -> tuple[str, str]:
         by_seed: dict[int, Draw] = {}
         for seed in sorted({entry["seed"] for entry in every}):
             own = [(entry["key"], entry["noticed"]) for entry in every if entry["seed"] == seed]
+            if seed == min(entry["seed"] for entry in every):
+                # Before anything was mended.
+                own = [(key, at_first[key]["noticed"]) for key, _ in own]
             matter = [found for key, found in own if key not in HARMLESS]
             by_seed[seed] = Draw(len(own), len(own) - len(matter), sum(matter))
         if not by_seed:
+            # Drawn elsewhere: the page knows.
+            if room in known:
+                rows.append(known[room])
+                hits, count = map(int, known[room][-1].split(" of "))
+                total, noticed = total + count, noticed + hits
             continue
         first, last = min(by_seed), max(by_seed)
         for path, site, entry in sorted(judged, key=lambda row: (row[0], row[1].line)):
