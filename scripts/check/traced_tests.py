@@ -106,7 +106,9 @@ class Lines:
         data = self.coverage.get_data()
         return {
             str(Path(path).relative_to(ROOT)): {
-                line: [name for name in names if name] for line, names in data.contexts_by_lineno(path).items()
+                # What a file of tests executes when it is imported counts for all of its tests.
+                line: [name or "*" for name in names]
+                for line, names in data.contexts_by_lineno(path).items()
             }
             for path in data.measured_files()
         }

@@ -36,12 +36,12 @@ from kcal.io.camera_file import load_camera
 NAMES = ("east", "west", "lone")
 
 
-def seen_by(name: str) -> Observations:
-    return observe(pixels_of(camera(), motions(camera(), 5, NAMES.index(name)), noise=0.1, seed=NAMES.index(name)))
-
-
-RESULTS = {name: calibrate_camera(seen_by(name), CalibrationOptions(model="opencv4")) for name in NAMES}
-TOGETHER = {name: calibrate_camera(seen_by(name), CalibrationOptions(model="pinhole")) for name in NAMES}
+SEEN = {
+    name: observe(pixels_of(camera(), motions(camera(), 5, seed), noise=0.1, seed=seed))
+    for seed, name in enumerate(NAMES)
+}
+RESULTS = {name: calibrate_camera(SEEN[name], CalibrationOptions(model="opencv4")) for name in NAMES}
+TOGETHER = {name: calibrate_camera(SEEN[name], CalibrationOptions(model="pinhole")) for name in NAMES}
 
 
 class Here:
@@ -63,7 +63,7 @@ class Here:
 
 
 def name_of(seen: Observations) -> str:
-    return next(name for name in NAMES if seen_by(name).views[0].pixels == seen.views[0].pixels)
+    return next(name for name in NAMES if SEEN[name].views[0].pixels == seen.views[0].pixels)
 
 
 @pytest.fixture
@@ -71,8 +71,8 @@ def jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[CameraJob]:
     """Three cameras of five images; the first two may share a board."""
 
     def detect(path: str, board: Board, options: BatchOptions) -> Detected:
-        view = seen_by(Path(path).parent.name).views[int(Path(path).stem)]
-        return Detected(size=seen_by("east").image_size, pixels=view.pixels)
+        view = SEEN[Path(path).parent.name].views[int(Path(path).stem)]
+        return Detected(size=SEEN["east"].image_size, pixels=view.pixels)
 
     def calibrate(seen: Observations, name: str, model: str, options: BatchOptions) -> Calibrated:
         return calibrated(RESULTS[name], name)
@@ -181,7 +181,7 @@ def test_a_whole_batch(jobs: list[CameraJob], tmp_path: Path, monkeypatch: pytes
     for column, number in (("fx", 0), ("fy", 1), ("cx", 2), ("cy", 3)):
         assert float(table[2][column]) == pytest.approx(float(lone.camera.params[number]), rel=1e-5)
     assert float(table[2]["sigma_fx"]) == pytest.approx(lone.sigma["fx"], rel=1e-5)  # type: ignore[arg-type]
-    assert (table[2]["width"], table[2]["height"]) == tuple(map(str, seen_by("lone").image_size))
+    assert (table[2]["width"], table[2]["height"]) == tuple(map(str, SEEN["lone"].image_size))
 
 
 def test_an_image_that_is_gone_is_a_failure_of_its_own(jobs: list[CameraJob], tmp_path: Path) -> None:
