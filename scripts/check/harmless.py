@@ -49,4 +49,6 @@ HARMLESS = {
     "4f7ded21d6d6f9ec": "a first principal point, from which a fit begins",
     "43745dfb24530793": "a share that equals a limit to the last bit",
     "41ec4fe6054bc787": "how many matches are worked on at a time: only memory",
+    "47e93b395d9a2442": "the size of letters",
+    "d3166586025778b5": "the size of letters",
 }

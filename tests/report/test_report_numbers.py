@@ -22,7 +22,8 @@ from kcal.report.difference import difference_figure
 from kcal.report.difference_text import difference_text
 from kcal.report.practice_score import score_lens, score_rig
 from kcal.report.tables import chance_text
-from kcal.report.verdict_page import _correlations, _percent, _sentence
+from kcal.report.verdict import RangeAnswer, Requirement, Verdict
+from kcal.report.verdict_page import _correlations, _percent, _sentence, range_rows
 
 CAMERA = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480), model="pinhole")
 
@@ -131,6 +132,18 @@ class TestSentences:
         assert rows[1:4] == [["fx, cx", "-0.500"], ["fy, cx", "-0.500"], ["cx, cy", "+0.250"]]
         assert len(rows) == 6
         assert not any("skew" in row[0] for row in rows)
+
+    def test_what_is_required_and_what_was_found(self) -> None:
+        need = Requirement(distance=1000.0, meters=50.0), Requirement(distance=5000.0, meters=10.0)
+        parts = {"lenses": 30.0, "marks": 40.0}, {"lenses": math.inf, "marks": 40.0}
+        answers = tuple(RangeAnswer(requirement=a, parts=b) for a, b in zip(need, parts, strict=True))
+        assert range_rows(Verdict(subject="left", answers=answers)) == [
+            ["range", "answer", "required σ", "σ", "lenses", "marks"],
+            ["1 km", "yes", "50 m", "50 m", "30 m", "40 m"],
+            ["5 km", "no", "10 m", "not known", "not known", "40 m"],
+        ]
+        smaller = RangeAnswer(requirement=need[0], parts={"lenses": 30.0, "marks": 0.0})
+        assert range_rows(Verdict(subject="left", answers=(smaller,)))[1][2:4] == ["50 m", "30 m"]
 
     def test_texts(self) -> None:
         assert [_percent(value) for value in (0.123, 12.34, 99.6, 100.0, 1234.4)] == [
