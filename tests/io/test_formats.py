@@ -218,6 +218,8 @@ class TestRefusals:
             ("a.yaml", ROS.replace("BASE", "0").replace("plumb_bob", "double_sphere"), "distortion_model"),
             ("a.yaml", ROS.replace("BASE", "0").replace("[-0.2, 0.05,", "["), "3 numbers; 4 or 5"),
             ("a.yaml", KALIBR.replace("pinhole", "omni"), "omni"),
+            ("a.yaml", ROS.replace("BASE", "0").replace("data: [400, 0, 320", "data: [0, 0, 320"), "no focal length"),
+            ("a.yaml", ROS.replace("BASE", "0").replace("0, 400, 240", "0, 0, 240"), "no focal length"),
             ("a.yaml", KALIBR.replace("[0, -1, 0, -0.1]", "[2, -1, 0, -0.1]"), "no rotation matrix"),
             ("a.cameramodel", MRCAL.replace("OPENCV5", "CAHVOR"), "LENSMODEL_CAHVOR"),
             ("a.cameramodel", MRCAL.replace("640, 480", "640.5, 480"), "positive whole numbers"),

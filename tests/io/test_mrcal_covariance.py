@@ -75,8 +75,12 @@ def inputs(**changes: Any) -> dict[str, Any]:
 
 
 def written(path: Path, **changes: Any) -> Path:
+    return written_as(inputs(**changes), path)
+
+
+def written_as(stored: dict[str, Any], path: Path) -> Path:
     data = io.BytesIO()
-    np.savez_compressed(data, **inputs(**changes))
+    np.savez_compressed(data, **stored)
     values = [*CAMERA.params[:4].tolist(), *CAMERA.coefficients.tolist()]
     content = {"lensmodel": "LENSMODEL_OPENCV4", "intrinsics": values, "extrinsics": [0.0] * 6,
                "imagersize": [1280, 720], "icam_intrinsics": 0,
@@ -127,6 +131,24 @@ def test_it_is_that_of_a_dense_problem(tmp_path: Path) -> None:
     spread = np.sqrt(np.diag(wanted))
     assert np.abs((found - wanted) / (spread[:, None] * spread)).max() < 1e-6
     assert noise == pytest.approx(NOISE**2, rel=0.1)
+
+
+def test_what_is_not_stored_is_mrcals_default_and_what_was_held_is_certain(tmp_path: Path) -> None:
+    """Poses, center, focal lengths and lens are estimated unless the file says otherwise."""
+    whole = covariance_of(written(tmp_path / "a.cameramodel"))
+    stored = inputs()
+    for key in ("do_optimize_frames", "do_optimize_intrinsics_core", "do_optimize_intrinsics_distortions"):
+        del stored[key]
+    assert np.allclose(covariance_of(written_as(stored, tmp_path / "b.cameramodel")), whole, rtol=1e-12)
+    for held, lens in (("core", False), ("distortions", True)):
+        found = covariance_of(written(tmp_path / "c.cameramodel", **{f"do_optimize_intrinsics_{held}": False}))
+        zero = np.diag(found) == 0
+        assert zero.tolist() == [not lens] * 4 + [lens] * 4
+        # The others are known better than where all were estimated.
+        assert bool((np.diag(found)[~zero] < np.diag(whole)[~zero]).all())
+    both = {"do_optimize_intrinsics_core": False, "do_optimize_intrinsics_distortions": False}
+    found = import_cameras(written(tmp_path / "d.cameramodel", **both))
+    assert "the camera was held" in found.notes[0]
 
 
 def test_it_is_mrcals_own(tmp_path: Path) -> None:

@@ -7,8 +7,10 @@ import torch
 from torch import Tensor
 
 from kcal.errors import DegenerateError
-from kcal.solve.hessian import HessianSolve, implicit_step
-from kcal.solve.schur import SchurLinearization
+from kcal.solve.hessian import HessianSolve, implicit_step, newton_minimum
+from kcal.solve.lm import LMOptions
+from kcal.solve.result import State
+from kcal.solve.schur import SchurLinearization, SchurProblem
 
 
 def quadratic(shared: int, views: int, local: int) -> tuple[Tensor, Tensor]:
@@ -97,3 +99,77 @@ def test_a_minimum_follows_its_data() -> None:
     weight = torch.arange(1.0, len(slope) + 1, dtype=torch.float64)
     (by_data,) = torch.autograd.grad(weight @ step, data)
     torch.testing.assert_close(by_data, -torch.linalg.solve(matrix, weight), rtol=1e-9, atol=1e-9)
+
+
+class Decays(SchurProblem[State]):
+    """Curves a_v exp(-s x), one a view, with their own heights: large residuals, so that their curvature counts."""
+
+    batch, local_size = (), 1
+    x = torch.linspace(0.0, 2.0, 15, dtype=torch.float64)
+
+    def __init__(self, y: Tensor) -> None:
+        self.y, self.residual_count = y, y.numel()
+
+    def residuals(self, state: State) -> Tensor:
+        shared, local = state
+        return local * torch.exp(-shared.sum() * self.x) - self.y
+
+    def rows(self, state: State) -> Tensor:
+        shared, local = state
+        shape = torch.exp(-shared.sum() * self.x).expand_as(self.y)
+        slope = -local * self.x * shape
+        return torch.stack([shape, *[slope] * len(shared), local * shape - self.y], -2)
+
+    def retract(self, state: State, step: State) -> State:
+        return state[0] + step[0], state[1] + step[1]
+
+
+def decays(noise: float, views: int = 4) -> tuple[Decays, State]:
+    """The problem, and a state that a few steps bring near its minimum."""
+    draw = torch.randn(views, 15, generator=torch.Generator().manual_seed(8), dtype=torch.float64)
+    height = torch.arange(1.0, views + 1, dtype=torch.float64)[:, None]
+    y = height * torch.exp(-0.9 * Decays.x) + noise * draw
+    return Decays(y), (torch.tensor([0.7]).double(), torch.ones(views, 1).double())
+
+
+@pytest.mark.parametrize("noise", [0.3, 1e-3])
+def test_newton_ends_at_the_minimum_to_rounding(noise: float) -> None:
+    """After a solver that stops early; and the systems are those of the Hessian there."""
+    problem, start = decays(noise)
+    rough = LMOptions(max_iterations=4, tolerance=0.1)
+    (shared, local), solve = newton_minimum(problem, start, rough)
+    flat = torch.cat([shared, local.flatten()])
+
+    def cost(x: Tensor) -> Tensor:
+        return problem.cost((x[:1], x[1:, None]))
+
+    gradient, hessian = torch.func.grad(cost)(flat), torch.func.hessian(cost)(flat)
+    away = torch.linalg.solve(hessian, gradient)
+    # Of steps against standard deviations: rounding alone.
+    assert float((away.abs() / (noise * torch.linalg.inv(hessian).diagonal().sqrt())).max()) < 1e-9
+    right = torch.arange(1.0, len(flat) + 1, dtype=torch.float64)
+    found = solve((right[:1], right[1:, None]))
+    expected = torch.linalg.solve(hessian, right)
+    torch.testing.assert_close(torch.cat([found[0], found[1].flatten()]), expected, rtol=1e-9, atol=1e-12)
+
+
+def test_newton_accepts_data_without_noise() -> None:
+    problem, start = decays(0.0)
+    (shared, local), _ = newton_minimum(problem, start, LMOptions(max_iterations=30))
+    assert float(shared[0]) == pytest.approx(0.9, abs=1e-12)
+    torch.testing.assert_close(local[:, 0], torch.arange(1.0, 5.0).double(), rtol=1e-12, atol=0)
+
+
+def test_newton_refuses_a_flat_cost() -> None:
+    """Two shared unknowns of which only the sum counts."""
+    problem, start = decays(0.1)
+    with pytest.raises(DegenerateError, match="no minimum"):
+        newton_minimum(problem, (torch.tensor([0.3, 0.4]).double(), start[1]), LMOptions(max_iterations=30))
+
+
+def test_newton_refuses_a_start_far_from_a_minimum() -> None:
+    """A cost whose curvature is negative there: no step of Newton's leads to a minimum."""
+    problem, _ = decays(0.1)
+    far = torch.tensor([60.0]).double(), torch.full((4, 1), 1e-3).double()
+    with pytest.raises(DegenerateError, match="no minimum"):
+        newton_minimum(problem, far, LMOptions(max_iterations=1))

@@ -102,11 +102,50 @@ def test_whose_worker_dies_is_tried_once_more_alone() -> None:
     assert crew.tried.count(1) == 2
 
 
+class KilledWorker(Exception):  # noqa: N818
+    """What Dask says of a task that ended several workers."""
+
+
+def test_a_task_that_dask_gave_up_is_not_tried_again() -> None:
+    """Dask tried several times itself; the others go on."""
+
+    def killed(tag: int) -> int:
+        if tag == 1:
+            raise KilledWorker
+        return tag
+
+    crew, found = Crew(2), {}
+
+    def done(task: Task, outcome: Any) -> list[Task]:
+        found[task.tag] = outcome
+        return []
+
+    run_tasks((Task(i, killed, (i,)) for i in range(4)), done, crew)  # type: ignore[arg-type]
+    assert isinstance(found.pop(1), WorkerDiedError)
+    assert found == {0: 0, 2: 2, 3: 3}
+    assert crew.restarts == 0
+    assert crew.tried.count(1) == 1
+
+
+def test_a_pool_forgets_its_workers(client: Client) -> None:
+    crew = Pool(2, "tcp://x")
+    crew.submit(Task(0, abs, (-4,)))
+    first = crew._executor
+    assert first is client
+    crew.submit(Task(0, abs, (-4,)))
+    assert crew._executor is first
+    crew.restart()
+    assert client.shut == 1
+    assert crew._executor is None
+    crew.restart()
+    assert client.shut == 1
+
+
 class Client:
     """A Dask client that is as told."""
 
     def __init__(self) -> None:
-        self.status, self.threads, self.closed = "running", {"a": 3, "b": 2}, 0.0
+        self.status, self.threads, self.closed, self.shut = "running", {"a": 3, "b": 2}, 0.0, 0
 
     def nthreads(self) -> dict[str, int]:
         if self.threads is None:
@@ -126,6 +165,7 @@ class Client:
 
     def shutdown(self, wait: bool) -> None:
         assert not wait
+        self.shut += 1
 
     def close(self, timeout: float) -> None:
         self.closed = timeout
@@ -186,10 +226,6 @@ def test_what_a_lost_scheduler_leaves_is_an_error() -> None:
     cancelled.cancel()
     with pytest.raises(FileError, match="the Dask scheduler"):
         module._result_of(cancelled)
-
-    class KilledWorker(Exception):  # noqa: N818
-        pass
-
     killed: Future[Any] = Future()
     killed.set_exception(KilledWorker())
     assert isinstance(module._result_of(killed), WorkerDiedError)

@@ -8,7 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from kcal.calibrate.problem import board_problem
 from kcal.calibrate.problem.board_problem import BoardProblem
+from kcal.calibrate.problem.priors import GaussianPrior
 from kcal.calibrate.problem.state import BoardState, warp_modes
 from kcal.corners.board import Board
 from kcal.lens.camera import Camera
@@ -17,6 +19,8 @@ from kcal.lens.pose import rotation_from_vector
 from kcal.lens.projection import parameter_names
 from kcal.solve.lm import LevenbergMarquardt, LMOptions, minimize
 from kcal.solve.result import SolverStatus, map_state
+from kcal.solve.robust import RobustLoss
+from kcal.solve.schur import SchurLinearization
 
 BOARD = Board(columns=4, rows=3, square=0.1)
 VIEWS = 3
@@ -257,3 +261,122 @@ def test_same_optimum_as_dense(name: str) -> None:
     parameters = start.parameters.clone()
     parameters[free] += dense.x[: len(free)]
     torch.testing.assert_close(schur.state.parameters, parameters, rtol=0, atol=1e-7)
+
+
+def corner_weights(count: int = 1) -> Tensor:
+    """(V, N), of which some are zero; of `count` elements."""
+    generator = torch.Generator().manual_seed(7)
+    weights = 0.3 + 2.0 * torch.rand(count, VIEWS, BOARD.corners, generator=generator, dtype=torch.float64)
+    weights[:, 0, ::4] = 0.0
+    return weights if count > 1 else weights[0]
+
+
+def priors() -> tuple[GaussianPrior, ...]:
+    one = torch.ones(2, dtype=torch.float64)
+    return GaussianPrior(torch.tensor([0, 5]), 1.5 * one, 3.0 * one), GaussianPrior(torch.tensor([2]), one[:1], one[:1])
+
+
+def test_a_weight_multiplies_its_corner() -> None:
+    pixels, model, state = scene("opencv5", missing=True)
+    weights, free = corner_weights(), free_all(model)
+    plain, weighed = (BoardProblem(BOARD.points, pixels, model, free, weights=w) for w in (None, weights))
+    seen = torch.isfinite(pixels[..., 0]) & (weights > 0)
+    factor = torch.where(seen, weights, 0.0)
+    expected = plain.residuals(state).unflatten(-1, (2, -1)) * factor[:, None]
+    torch.testing.assert_close(weighed.residuals(state), expected.flatten(-2), rtol=1e-14, atol=0)
+    expected = plain.rows(state).unflatten(-1, (2, -1)) * factor[:, None, None]
+    torch.testing.assert_close(weighed.rows(state), expected.flatten(-2), rtol=1e-14, atol=0)
+    assert weighed.residual_count == 2 * int(seen.sum())
+    assert torch.equal(weighed.pixels.isnan()[..., 0], ~seen)
+    torch.testing.assert_close(weighed.pixels[seen], pixels[seen])
+    later = plain.with_weights(weights)
+    torch.testing.assert_close(later.rows(state), weighed.rows(state), rtol=0, atol=0)
+    torch.testing.assert_close(later.cost(state), weighed.cost(state), rtol=0, atol=0)
+    # Residuals of corners in pixels are not weighted unless it is asked for.
+    own = torch.where(seen[:, None], plain.residuals(state).unflatten(-1, (2, -1)), torch.nan).mT
+    torch.testing.assert_close(weighed.corner_residuals(state), own, equal_nan=True, rtol=1e-14, atol=0)
+    own = own * weights[..., None]
+    torch.testing.assert_close(weighed.corner_residuals(state, weighted=True), own, equal_nan=True, rtol=1e-14, atol=0)
+
+
+@pytest.mark.parametrize("chunk", [1_200_000, 1])
+@pytest.mark.parametrize("loss", [None, RobustLoss(kind="huber", scale=1.0)], ids=["squares", "huber"])
+@pytest.mark.parametrize("held", [False, True])
+def test_normal_equations_are_products_of_the_rows(
+    chunk: int, loss: RobustLoss | None, held: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of corners and priors, view by view or all at once; unknowns that are held take no part and do not move."""
+    monkeypatch.setattr(board_problem, "_CHUNK", chunk)
+    pixels, model, state = scene("opencv5", missing=True)
+    free = free_all(model)
+    still = torch.zeros(len(free) + 2, dtype=torch.bool)
+    still[[1, 6]] = held
+    problem = BoardProblem(
+        BOARD.points, pixels, model, free, free_board=True, held=still if held else None, weights=corner_weights(),
+        loss=loss, terms=priors(),
+    )  # fmt: skip
+    whole = problem.rows(state)
+    moving = [i for i in range(len(still)) if not bool(still[i])]
+    assert problem.moving.tolist() == moving
+    rows = whole[:, [*range(6), *(6 + i for i in moving), -1]]
+    assert bool((whole[:, 6:-1][:, still] == 0).all())
+    values, size = problem.values(state), len(moving) + 1
+    assert problem.slots.tolist() == [moving.index(i) if i in moving else -1 for i in range(len(still))]
+    gram = torch.zeros(size, size, dtype=torch.float64)
+    for prior in priors():
+        there = prior.rows(values)[[*moving, -1]]
+        gram += there @ there.T
+    torch.testing.assert_close(problem.shared_gram(state), gram)
+    assert float(problem.shared_cost(state)) == pytest.approx(0.5 * float(gram[-1, -1]))
+    assert problem.prior_count == 3
+    expected = SchurLinearization.of_gram(rows @ rows.mT, 6, gram)
+    linear = problem.linearize(state)
+    if loss is None:
+        torch.testing.assert_close(linear.cost, expected.cost)
+        torch.testing.assert_close(problem.view_cost(state), 0.5 * rows[:, -1].square().sum(-1))
+    torch.testing.assert_close(linear.cost, problem.cost(state))
+    lam = torch.tensor(0.1, dtype=torch.float64)
+    for own, other in zip(linear.step(lam)[0], expected.step(lam)[0], strict=True):
+        torch.testing.assert_close(own, other, rtol=1e-8, atol=1e-10)
+    off = whole[:, 6:] - whole[:, 6:] @ torch.linalg.pinv(whole[:, :6]) @ whole[:, :6]
+    torch.testing.assert_close(problem.off_poses(state), off, rtol=1e-8, atol=1e-10)
+    torch.testing.assert_close(problem.motion_off_poses(state), off, rtol=1e-8, atol=1e-10)
+    step = torch.arange(1.0, size, dtype=torch.float64), torch.zeros(VIEWS, 6, dtype=torch.float64)
+    after = problem.retract(state, step)
+    moved = torch.cat([after.parameters - state.parameters, after.board - state.board])
+    torch.testing.assert_close(moved[moving], step[0])
+    assert bool((moved[still] == 0).all())
+    torch.testing.assert_close(problem.unknowns(after) - problem.unknowns(state), moved)
+
+
+def test_a_robust_cost_is_by_corner() -> None:
+    """ρ of the squared length of each corner's weighted residual, and its gradient in the rows."""
+    pixels, model, state = scene("opencv5", missing=True)
+    loss = RobustLoss(kind="huber", scale=1.0)
+    problem = BoardProblem(BOARD.points, pixels, model, free_all(model), weights=corner_weights(), loss=loss)
+    squared = problem.residuals(state).unflatten(-1, (2, -1)).square().sum(-2)
+    assert bool((squared > 1.0).any())
+    assert bool(((squared < 1.0) & (squared > 0)).any())
+    torch.testing.assert_close(problem.view_cost(state), 0.5 * loss.value(squared).sum(-1))
+    rows = problem.rows(state)
+    shared, local = zero_step(problem)
+    slope = torch.func.grad(lambda *step: problem.cost(problem.retract(state, step)), (0, 1))(shared, local)
+    torch.testing.assert_close((rows[:, 6:-1] @ rows[:, -1:].mT).sum(0)[:, 0], slope[0], rtol=1e-9, atol=1e-10)
+    torch.testing.assert_close((rows[:, :6] @ rows[:, -1:].mT)[..., 0], slope[1], rtol=1e-9, atol=1e-10)
+
+
+@pytest.mark.parametrize("own_pixels", [False, True])
+def test_selected_elements_are_their_own_problem(own_pixels: bool) -> None:
+    pixels, model, state = scene("opencv5", missing=True, batch=(3,))
+    own = torch.stack([pixels, pixels + 0.1, pixels - 0.2])
+    weights = corner_weights(3) if own_pixels else corner_weights()
+    target = own if own_pixels else pixels
+    together = BoardProblem(BOARD.points, target, model, free_all(model), weights=weights, batch=(3,))
+    chosen = torch.tensor([2, 0])
+    part = together.select(chosen)
+    assert part is not None
+    assert part.batch == (2,)
+    some = map_state(lambda tensor: tensor[chosen], state)
+    torch.testing.assert_close(part.rows(some), together.rows(state)[chosen], rtol=1e-13, atol=1e-14)
+    torch.testing.assert_close(part.cost(some), together.cost(state)[chosen])
+    assert BoardProblem(BOARD.points, pixels, model).select(chosen) is None

@@ -28,6 +28,7 @@ from kcal.calibrate.problem.readout import (
     SMALLEST,
     SPREAD,
     Readout,
+    motion_sigma,
     stillness,
     widening,
 )
@@ -344,6 +345,17 @@ def test_unknowns_of_two_focal_lengths() -> None:
     assert float(moved[0].abs().max()) == 0.0
     result = minimize(problem.with_weights(0.0 * weights), state, LMOptions(max_iterations=3))
     assert float(result.state[4].abs().max()) < 1e-9
+
+
+def test_numbers_of_a_motion() -> None:
+    """Standard deviations from ratios, and how many pixels they move a corner, first and second order together."""
+    sigma = motion_sigma(np.log([2.0, 3.0, 4.0, 5.0]), 0.25)
+    assert sigma == pytest.approx((1.0, 1.5, 2.0, 2.5))
+    # The second order covers a quarter: turns of hypot(1, .5), shifts of hypot(1.5, .625), at half a distance.
+    expected = 800.0 * math.hypot(math.hypot(1.5, 0.625), 0.5 * math.hypot(1.0, 0.5))
+    assert sigma.moved(800.0, 0.5) == pytest.approx(expected)
+    readout = Readout(center=torch.tensor([1.0, 0.0, 0.0]), distance=2.0, size=SIZE)
+    assert readout.reach(torch.tensor([[1.0, 1.0, 0.0], [4.0, 4.0, 0.0], [1.5, 0.0, 0.0]])) == pytest.approx(2.5)
 
 
 def test_limits_of_motions() -> None:

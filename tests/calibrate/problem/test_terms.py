@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal.calibrate.problem.priors import FoldBarrier, GaussianPrior
+from kcal.calibrate.problem.priors import FoldBarrier, GaussianPrior, Term
 from kcal.calibrate.problem.twist import apply_twist
 from kcal.lens.model import LensModel
 from kcal.lens.pose import rotation_from_vector
@@ -74,3 +74,65 @@ def test_prior_rows() -> None:
     rows = prior.rows(torch.tensor([[510.0, 0.0, 0.0, 2.0]], dtype=torch.float64))
     assert rows[0, -1].tolist() == [1.0, 2.0]
     assert rows[0, :-1].tolist() == [[0.1, 0.0], [0.0, 0.0], [0.0, 0.0], [0.0, 2.0]]
+
+
+# Two of five values share an unknown, one is held.
+SLOTS = torch.tensor([0, 0, -1, 2, 1])
+
+
+def gaussian(batch: bool) -> GaussianPrior:
+    weight = torch.tensor([[0.5, 2.0, 3.0, 0.1]] * 2, dtype=torch.float64)
+    weight[1] *= 2.0
+    mean = torch.tensor([1.0, -2.0, 0.5, 0.3], dtype=torch.float64)
+    return GaussianPrior(torch.tensor([0, 2, 1, 3]), mean, weight if batch else weight[0])
+
+
+@pytest.mark.parametrize("term", [gaussian(False), gaussian(True)], ids=["one", "batch"])
+def test_cost_and_products_of_a_prior_are_those_of_its_rows(term: Term) -> None:
+    """Priors have shortcuts of their own; products are added to what is there, and tied values to one unknown."""
+    values = torch.tensor([[0.3, 0.4, -1.0, 2.0, 5.0], [-0.3, 0.7, 1.5, -2.0, 1.0]], dtype=torch.float64)
+    residual = term.rows(values)[:, -1]
+    assert float(residual.abs().min()) > 0
+    torch.testing.assert_close(term.cost(values), 0.5 * residual.square().sum(-1))
+    assert bool((term.cost(values) > 0).all())
+    torch.testing.assert_close(Term.cost(term, values), term.cost(values))
+    unknowns = torch.zeros(2, 4, term.rows(values).shape[-1], dtype=torch.float64)
+    for value, slot in enumerate(SLOTS.tolist()):
+        if slot >= 0:
+            unknowns[:, slot] += term.rows(values)[:, value]
+    unknowns[:, -1] = residual
+    before = torch.arange(32.0, dtype=torch.float64).reshape(2, 4, 4)
+    for add in (term.add_to, lambda *rest: Term.add_to(term, *rest)):
+        total = before.clone()
+        add(total, values, SLOTS)
+        torch.testing.assert_close(total, before + unknowns @ unknowns.mT, rtol=1e-13, atol=1e-13)
+
+
+@pytest.mark.parametrize("radial", [{"k1": -0.32}, {"k1": 40.0, "k4": 45.0, "k5": -0.3}, {"k1": -0.2}])
+def test_cost_and_products_of_a_barrier_are_those_of_its_rows(radial: dict[str, float]) -> None:
+    model = LensModel.named("opencv8")
+    barrier, values = FoldBarrier(model, 1.0, 0.1), barrier_values(model, radial)
+    rows = barrier.rows(values)
+    assert float(barrier.cost(values)) == pytest.approx(0.5 * float(rows[-1].square().sum()))
+    slots = torch.arange(len(values)) - 2
+    total = torch.ones(len(values) - 1, len(values) - 1, dtype=torch.float64)
+    barrier.add_to(total, values, slots.clamp_min(-1))
+    free = torch.cat([rows[2:-1], rows[-1:]])
+    torch.testing.assert_close(total, 1.0 + free @ free.mT, rtol=1e-12, atol=1e-12)
+
+
+def test_a_barrier_counts_in_proportion_to_its_weight_and_grows_towards_the_fold() -> None:
+    model = LensModel.named("opencv8")
+
+    def cost(k1: float, weight: float = 0.1, radius: float = 1.0) -> float:
+        return float(FoldBarrier(model, radius, weight).cost(barrier_values(model, {"k1": k1})))
+
+    # q = 1 + 2 k1 r² / (1 + k1 r²) is least at r = 1, where it reaches the bound of 0.1 at k1 = -0.9 / 2.9.
+    assert cost(-0.310) == 0.0
+    assert 0.0 < cost(-0.311) < cost(-0.32) < cost(-0.33)
+    assert cost(-0.32, weight=0.3) == pytest.approx(9.0 * cost(-0.32))
+    # A lens is regular or not within a radius: k1 r² decides.
+    assert cost(-0.32 / 4.0, radius=2.0) == pytest.approx(cost(-0.32))
+    q = 1.0 + 2.0 * -0.32 / (1.0 - 0.32)
+    rows = FoldBarrier(model, 1.0, 0.1).rows(barrier_values(model, {"k1": -0.32}))
+    assert float(rows[-1].max()) == pytest.approx(0.1 * torch.log(torch.tensor(0.1 / q)).item(), rel=1e-5)

@@ -1,0 +1,98 @@
+"""Rig files of any number of cameras: everything comes back to the last bit, and what does not fit is refused."""
+
+from __future__ import annotations
+
+import datetime
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from kcal.errors import FileError
+from kcal.io.camera_rig_file import CameraRigFile, camera_rig_to_file, save_camera_rig
+from kcal.lens.calibration import CameraCalibration
+from kcal.lens.camera import Camera
+from kcal.lens.camera_rig import CameraRig, CameraRigCalibration
+from kcal.lens.mounting import Origin
+from kcal.lens.pose import rotation_from_vector
+
+
+def rig() -> CameraRig:
+    cameras = [
+        Camera.build(focal=(800 + i, 805), center=(321, 238 - i), size=(640, 480), coefficients=[-0.1, 0.02 * i])
+        for i in range(3)
+    ]
+    cameras[1].calibration = CameraCalibration(name="own name")
+    turn = rotation_from_vector(torch.tensor([[0.0, 0.0, 0.0], [0.1, -0.2, 0.3], [1.0, 0.5, 0.2]], dtype=torch.float64))
+    center = torch.tensor([[0.0, 0, 0], [10, 1 / 3, 0], [-5, 2, 7]], dtype=torch.float64)
+    origin = Origin(lat=19.07, lon=-72.87, height=14.5)
+    found = CameraRig(cameras, ("a", "b", "c"), turn, center, origin=origin, refraction=0.13)
+    found.root = torch.randn(2, found.quantities, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    found.calibration = CameraRigCalibration(
+        rms=0.3, rms_px=(0.2, None, 0.4), warnings=("doubt",), kcal_version="0.2",
+        created=datetime.datetime(2026, 1, 2, tzinfo=datetime.UTC),
+    )  # fmt: skip
+    return found
+
+
+def test_everything_comes_back(tmp_path: Path) -> None:
+    wanted = rig()
+    found = CameraRigFile.load(save_camera_rig(wanted, tmp_path / "rig.json")).rig()
+    assert found.names == wanted.names
+    for a, b in zip(found.each, wanted.each, strict=True):
+        assert torch.equal(a.params, b.params)
+    assert torch.equal(found.rotation, wanted.rotation)
+    assert torch.equal(found.center, wanted.center)
+    assert found.origin == wanted.origin
+    assert found.refraction == 0.13
+    assert found.root is not None
+    assert torch.equal(found.root, wanted.root)
+    assert found.calibration == wanted.calibration
+    # A camera without a name of its own gets the rig's.
+    assert [camera.calibration.name for camera in found.each if camera.calibration] == ["a", "own name", "c"]
+
+
+def test_what_is_not_known_stays_unknown(tmp_path: Path) -> None:
+    plain = rig()
+    bare = CameraRig(list(plain.each), plain.names, plain.rotation, plain.center)
+    found = CameraRigFile.load(save_camera_rig(bare, tmp_path / "rig.json")).rig()
+    assert found.origin is None
+    assert found.refraction == bare.refraction
+    assert found.root is None
+    assert found.calibration is None
+
+
+def spoil(content: dict[str, Any], which: str) -> None:
+    if which == "names":
+        content["names"].pop()
+    elif which == "cameras":
+        content["cameras"].pop()
+    elif which == "poses":
+        content["poses"].pop()
+    elif which == "latitude":
+        content["origin"]["lat"] = 91.0
+    elif which == "longitude":
+        content["origin"]["lon"] = -181.0
+    elif which == "refraction":
+        content["refraction"] = 2.5
+    else:
+        content["poses"][1]["rotation"][0][0] = 0.5
+
+
+@pytest.mark.parametrize("which", ["names", "cameras", "poses", "latitude", "longitude", "refraction", "rotation"])
+def test_what_does_not_fit_is_refused(which: str, tmp_path: Path) -> None:
+    path = save_camera_rig(rig(), tmp_path / "rig.json")
+    content = json.loads(path.read_text())
+    spoil(content, which)
+    path.write_text(json.dumps(content))
+    with pytest.raises(FileError, match=r"rig\.json"):
+        CameraRigFile.load(path)
+
+
+def test_the_file_holds_a_copy() -> None:
+    wanted = rig()
+    stored = camera_rig_to_file(wanted)
+    assert stored.poses[2].center == (-5.0, 2.0, 7.0)
+    assert stored.names == ("a", "b", "c")

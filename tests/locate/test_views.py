@@ -1,0 +1,207 @@
+"""Marks of any number of cameras: long tables as they are read, and the positions and texts that come of them."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from locate_rigs import tensor
+
+from kcal.errors import FileError, InputError
+from kcal.lens.camera_rig import CameraRig
+from kcal.locate.geodesy import enu_to_geodetic
+from kcal.locate.marks import Marks
+from kcal.locate.relock import seen_again
+from kcal.locate.station_positions import locate_views
+from kcal.locate.stereo import PositionStatus
+from kcal.locate.survey import Survey
+from kcal.locate.view_marks import ViewMarks, is_long, match_views, read_feature_views, read_views
+from scripts.shared.station_scenes import ORIGIN, marks, ring, targets
+
+NAMES = ("a", "b", "c")
+
+
+def table(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "marks.csv"
+    path.write_text(text)
+    return path
+
+
+class TestTables:
+    def test_lines_of_one_name_and_time_belong_together(self, tmp_path: Path) -> None:
+        text = ("name,camera,u,v,time,sigma,kind\nmast,a,10,20,0,0.5,steel\nmast,c,30,40,0,,wood\nmast,b,1,2,1,0.25,\n"
+                "mill,b,5,6,1,2,x\n")  # fmt: skip
+        path = table(tmp_path, text)
+        assert is_long(path)
+        views = read_views(path, NAMES)
+        # A name that is seen at two moments needs its time, another does not.
+        assert views.names == ("mast 0", "mast 1", "mill")
+        nan = math.nan
+        wanted = tensor(
+            [[10, 20], [nan, nan], [30, 40]], [[nan, nan], [1, 2], [nan, nan]], [[nan, nan], [5, 6], [nan, nan]]
+        )
+        torch.testing.assert_close(views.pixels, wanted, equal_nan=True, rtol=0, atol=0)
+        sigma = tensor([0.5, nan, nan], [nan, 0.25, nan], [nan, 2.0, nan])
+        torch.testing.assert_close(views.sigma, sigma, equal_nan=True, rtol=0, atol=0)
+        stated = views.sigmas(0.3)
+        assert stated[0].tolist() == [0.5, 0.3, 0.3]
+        assert views.extras == {"time": ["0", "1", "1"], "kind": ["steel", "", "x"]}
+
+    def test_a_name_twice_without_times_is_one_thing(self, tmp_path: Path) -> None:
+        views = read_views(table(tmp_path, "name,camera,u,v\nmast,a,10,20\nmast,b,1,2\n"), NAMES)
+        assert views.names == ("mast",)
+        assert views.extras == {}
+        assert views.pixels[0, :2].tolist() == [[10.0, 20.0], [1.0, 2.0]]
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ("name,camera,u,v\nmast,d,1,2\n", r"no camera is named 'd'; they are a, b, c"),
+            ("name,camera,u,v\nmast,a,1,2\nmill,a,1,2\nmast,a,1,2\n", r"line 4.*'mast' was marked in a before"),
+            ("name,camera,u,v\nmast,a,1,x\n", "pixel coordinate"),
+            ("name,camera,u,v,sigma\nmast,a,1,2,-1\n", "sigma"),
+            ("name,left_u,left_v,right_u,right_v\nmast,1,2,3,4\n", "marks of 3 cameras need the columns"),
+        ],
+    )
+    def test_refused(self, text: str, message: str, tmp_path: Path) -> None:
+        with pytest.raises(FileError, match=message):
+            read_views(table(tmp_path, text), NAMES)
+
+    def test_marks_of_other_cameras_are_skipped_on_request(self, tmp_path: Path) -> None:
+        path = table(tmp_path, "name,camera,u,v\nmast,d,1,2\nmast,a,3,4\n")
+        assert read_views(path, NAMES, others=True).pixels[0, 0].tolist() == [3.0, 4.0]
+        with pytest.raises(FileError, match="no mark of b"):
+            read_views(path, ("b",), others=True)
+
+    def test_a_table_of_pairs(self, tmp_path: Path) -> None:
+        path = table(tmp_path, "name,left_u,left_v,right_u,right_v\nmast,1,2,3,4\nmill,5,6,7,8\n")
+        assert not is_long(path)
+        views = read_views(path, ("left", "right"))
+        assert views.names == ("mast", "mill")
+        assert views.pixels.tolist() == [[[1, 2], [3, 4]], [[5, 6], [7, 8]]]
+
+    def test_features_have_ranges(self, tmp_path: Path) -> None:
+        text = ("name,camera,u,v,range,range_sigma,beyond\nmast,a,1,2,500,10,\nmast,b,3,4,,,\nmill,a,5,6,,,\n"
+                "hill,a,5,6,,,inf\n")  # fmt: skip
+        found = read_feature_views(table(tmp_path, text), NAMES, 0.4)
+        assert found.names == ("mast", "mill", "hill")
+        assert found.pixel_sigma == 0.4
+        assert found.inverse_range.tolist() == [1 / 500, 0.0, 0.0]
+        assert found.inverse_range_sigma[:2].tolist() == [10 / 500**2, math.inf]
+        assert 0.0 < float(found.inverse_range_sigma[2]) < 1e-6
+
+    def test_places_are_matched_by_name(self) -> None:
+        pixels = torch.arange(12.0).double().reshape(3, 2, 2)
+        sigma = tensor([0.5, math.nan], [math.nan, math.nan], [1.0, 2.0])
+        views = ViewMarks(("mast", "mill", "post"), pixels, sigma, {})
+        survey = Survey(
+            ("post", "lone", "mast"), torch.arange(9.0).double().reshape(3, 3), torch.ones(3, 3).double(), None
+        )
+        found = match_views(survey, views, 0.3)
+        landmarks = found.landmarks
+        assert landmarks.names == ("post", "mast")
+        assert landmarks.points.tolist() == [[0, 1, 2], [6, 7, 8]]
+        assert torch.equal(landmarks.pixels, pixels[[2, 0]])
+        assert torch.as_tensor(landmarks.pixel_sigma).tolist() == [[1.0, 2.0], [0.5, 0.3]]
+        assert found[1:] == (("lone",), ("mill",))
+        with pytest.raises(InputError, match="must be the same in both files"):
+            match_views(Survey(("x",), torch.zeros(1, 3).double(), torch.ones(1, 3).double(), None), views, 0.3)
+
+
+class TestPositions:
+    RIG = ring(4, 5000.0)
+
+    def views(self, **changes: object) -> tuple[torch.Tensor, ViewMarks]:
+        points = targets(5, torch.Generator().manual_seed(1))
+        pixels = marks(self.RIG, points)
+        pixels[1, 3] = math.nan
+        pixels[2, :3] = math.nan
+        # Forty pixels: what a wrong mark is.
+        pixels[3, 1, 0] += 40.0
+        pixels[4] = math.nan
+        names = tuple(f"thing {i}" for i in range(5))
+        return points, ViewMarks(names, pixels, torch.full((5, 4), math.nan).double(), {"time": list("01234")})
+
+    def test_positions_and_what_is_said_of_them(self) -> None:
+        points, views = self.views()
+        found = locate_views(self.RIG, views)
+        status = [position.status for position in found.positions]
+        assert status == [
+            PositionStatus.OK, PositionStatus.OK, PositionStatus.BEARING_ONLY, PositionStatus.OK,
+            PositionStatus.NOT_FINITE,
+        ]  # fmt: skip
+        enu = torch.tensor([found.positions[i].enu for i in (0, 1, 3)], dtype=torch.float64)
+        assert float((enu - points[[0, 1, 3]]).norm(dim=-1).max()) < 0.05
+        extras = found.columns.extras
+        names = self.RIG.names
+        assert extras["time"] == list("01234")
+        assert extras["cameras"][0] == " ".join(names)
+        assert extras["cameras"][1] == " ".join(names[:3])
+        assert extras["cameras"][3] == " ".join((names[0], *names[2:]))
+        assert extras["left_out"] == ["", "", "", names[1], ""]
+        reason = found.columns.reasons[3]
+        assert reason.startswith(f"left out: the mark in {names[1]} contradicts the others (")
+        assert not reason.endswith("; ")
+        # 40 px against .3 px, shared with the others.
+        assert 50 < float(reason.split("(")[1].split(" ")[0]) < 134
+        assert "only the bearing is known" in found.columns.reasons[2]
+        assert found.columns.reasons[4] == "no camera has a mark"
+        misfits = dict(part.split("=") for part in extras["misfit_sigmas"][3].replace("tower ", "tower").split())
+        assert max(misfits, key=lambda name: float(misfits[name])) == "tower2"
+        assert found.included == ("marks",)
+        assert found.origin == ORIGIN
+        assert found.geoid is None
+
+    def test_ranges_and_bearings_are_from_the_first_camera_at_its_own_vertical(self) -> None:
+        points, views = self.views()
+        position = locate_views(self.RIG, views).positions[1]
+        center = self.RIG.center[0]
+        assert position.range_m == pytest.approx(float((points[1] - center).norm()), rel=1e-4)
+        # Azimuths at the station and here differ by the convergence of meridians, 5 km · tan 45° / 6371 km.
+        east, north, _ = (points[1] - center).tolist()
+        flat = math.degrees(math.atan2(east, north)) % 360.0
+        lon = float(enu_to_geodetic(center, ORIGIN)[1]) - ORIGIN.lon
+        assert position.azimuth_deg == pytest.approx(flat + lon * math.sin(math.radians(45.0)), abs=2e-3)
+
+    def test_noise_of_marks_by_table_and_by_default(self) -> None:
+        _, views = self.views()
+        plain = locate_views(self.RIG, views, pixel_sigma=0.3)
+        twice = locate_views(self.RIG, views, pixel_sigma=0.6)
+        stated = views._replace(sigma=torch.full((5, 4), 0.6).double())
+        tabled = locate_views(self.RIG, stated, pixel_sigma=0.3)
+        sigma = [found.positions[0].cep50_m for found in (plain, twice, tabled)]
+        assert sigma[1] == pytest.approx(2.0 * sigma[0], rel=1e-3)  # type: ignore[operator]
+        assert sigma[2] == pytest.approx(sigma[1], rel=1e-6)
+
+    def test_a_height_places_what_one_camera_saw(self) -> None:
+        points, views = self.views()
+        height = float(enu_to_geodetic(points[2], ORIGIN)[2])
+        found = locate_views(self.RIG, views, height=(height, 0.5)).positions[2]
+        assert found.status == PositionStatus.OK
+        assert found.enu is not None
+        assert float((torch.tensor(found.enu).double() - points[2]).norm()) < 1.0
+        wider = locate_views(self.RIG, views, height=(height, 5.0)).positions[2]
+        assert wider.cep95_m is not None
+        assert found.cep95_m is not None
+        assert wider.cep95_m > 2.0 * found.cep95_m
+
+    def test_a_rig_without_a_place_is_refused(self) -> None:
+        bare = CameraRig(list(self.RIG.each), self.RIG.names, self.RIG.rotation, self.RIG.center)
+        with pytest.raises(InputError, match="no place on the Earth"):
+            locate_views(bare, self.views()[1])
+
+
+def test_things_that_are_marked_again() -> None:
+    then = Marks(("a", "b", "d"), tensor([1, 2], [3, 4], [5, 6]), tensor([7, 8], [9, 10], [11, 12]))
+    now = Marks(("d", "c", "a"), tensor([21, 22], [23, 24], [25, 26]), tensor([27, 28], [29, 30], [31, 32]))
+    found = seen_again(then, now, 0.4)
+    assert found.names == ("a", "d")
+    assert found.pixels[0].tolist() == [[1, 2], [7, 8], [25, 26], [31, 32]]
+    assert found.pixels[1].tolist() == [[5, 6], [11, 12], [21, 22], [27, 28]]
+    assert found.inverse_range.tolist() == [0.0, 0.0]
+    assert found.inverse_range_sigma.tolist() == [math.inf] * 2
+    assert found.pixel_sigma == 0.4
+    with pytest.raises(InputError, match="no name is in both"):
+        seen_again(then, Marks(("x",), tensor([1, 2]), tensor([1, 2])), 0.4)

@@ -1,0 +1,131 @@
+"""Keypoints along epipolar lines against a search by hand, and matches refined from where they roughly are."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from kcal.corners.keypoints import Keypoints
+from kcal.errors import InputError
+from kcal.scene.guided import BAND, guided_matches, rough_rig
+from kcal.scene.refine import refine_matches
+from tests.helpers.scene_pairs import pair, small_rig, true_right
+
+RIG = small_rig()
+FOCAL = float(RIG.left.focal[0])
+
+
+def descriptors(count: int, seed: int) -> Tensor:
+    draw = torch.rand(count, 128, generator=torch.Generator().manual_seed(seed)) ** 4
+    return torch.nn.functional.normalize(draw, dim=1)
+
+
+def scene(count: int = 400) -> tuple[Keypoints, Keypoints]:
+    """Keypoints of things at 4 to 600 m, with noise, others that have no partner, and gaps."""
+    generator = torch.Generator().manual_seed(3)
+    share = torch.rand(count, 3, generator=generator, dtype=torch.float64)
+    points = 4.0 * 150.0 ** share[:, :1] * torch.cat([share[:, 1:] - 0.5, torch.ones(count, 1)], 1)
+    left, right, _ = RIG(points)
+    noise = torch.randn(2, count, 2, generator=generator, dtype=torch.float64)
+    kinds = descriptors(count, 1)
+    other = torch.nn.functional.normalize(kinds + 0.03 * torch.randn(kinds.shape, generator=generator).abs(), dim=1)
+    # A third of the right ones are something else; some look like two things at once.
+    other[::3] = descriptors(len(other[::3]), 2)
+    other[1::30] = other[2::30][: len(other[1::30])]
+    left, right = left + noise[0], right + noise[1]
+    left[5], right[7] = math.nan, math.nan
+    order = torch.randperm(count, generator=generator)
+    return Keypoints(left, kinds), Keypoints(right[order], other[order])
+
+
+def by_hand(points: tuple[Keypoints, Keypoints]) -> set[tuple[int, int]]:
+    """Every left keypoint against every right one: near its epipolar line, not nearer than a third of a baseline."""
+    turn, shift = RIG.right_from_left_rotation, RIG.right_from_left_translation
+    axis = -(turn.T @ shift) / shift.norm()
+    rays = [RIG.left.unproject(points[0].pixels), RIG.right.unproject(points[1].pixels)]
+    first, second = rays[0][0], rays[1][0] @ turn
+    normals = [torch.nn.functional.normalize(torch.linalg.cross(axis.expand_as(r), r), dim=1) for r in (first, second)]
+    apart = torch.acos((normals[0] @ normals[1].T).clamp(-1, 1))
+    along = [torch.acos(r @ axis) for r in (first, second)]
+    parallax = along[1] - along[0][:, None]
+    band = BAND / FOCAL
+    near = (apart < band) & (parallax > -band) & (parallax < 1 / 3) & rays[0][1][:, None] & rays[1][1]
+    score = torch.where(near, points[0].descriptors @ points[1].descriptors.T, -1.0)
+    best = score.topk(2, dim=1)
+    distance = (2.0 - 2.0 * best.values).clamp_min(0).sqrt()
+    back = score.argmax(0)
+    return {
+        (i, int(best.indices[i, 0]))
+        for i in range(len(score))
+        if best.values[i, 0] > -0.5 and distance[i, 0] < 0.9 * distance[i, 1] and int(back[best.indices[i, 0]]) == i
+    }
+
+
+def test_matches_are_those_of_a_search_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = scene()
+    wanted = by_hand(points)
+    assert len(wanted) > 100
+    for size in (1024, 37):
+        monkeypatch.setattr("kcal.scene.guided._AT_ONCE", size)
+        found = {(int(i), int(j)) for i, j in guided_matches(RIG, points)}
+        assert found == wanted
+    none = Keypoints(torch.zeros(0, 2, dtype=torch.float64), torch.zeros(0, 128))
+    assert guided_matches(RIG, (points[0], none)).shape == (0, 2)
+    assert guided_matches(RIG, (none, points[1])).shape == (0, 2)
+
+
+def test_the_pose_comes_from_keypoints_with_gaps() -> None:
+    points = scene(600)
+    found = rough_rig((RIG.left, RIG.right), points, "pair")
+    turn = found.right_from_left_rotation @ RIG.right_from_left_rotation.T
+    # A pixel of noise.
+    assert math.degrees(math.acos(min(1.0, (float(turn.trace()) - 1) / 2))) < 0.5
+    shift = torch.nn.functional.normalize(RIG.right_from_left_translation, dim=0)
+    assert float(found.right_from_left_translation @ shift) > 0.99
+    few = tuple(Keypoints(one.pixels[:25], one.descriptors[:25]) for one in points)
+    with pytest.raises(InputError, match="pair: both images have only"):
+        rough_rig((RIG.left, RIG.right), few, "pair")  # type: ignore[arg-type]
+
+
+def grays() -> tuple[Tensor, Tensor]:
+    one = pair(1)
+    return torch.from_numpy(one.left).float(), torch.from_numpy(one.right).float()
+
+
+class TestRefine:
+    LEFT = torch.tensor([[300.0, 200.0], [345.0, 215.0], [280.0, 190.0]], dtype=torch.float64)
+
+    def test_from_two_pixels_away(self) -> None:
+        truth, _ = true_right(self.LEFT)
+        found = refine_matches(RIG, grays(), self.LEFT, truth + torch.tensor([1.5, -0.8]))
+        assert found.good.tolist() == [True] * 3
+        off = found.right - truth
+        assert float(off.abs().max()) < 0.25
+        sigma = found.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+        assert bool(((off / sigma).abs() < 5.0).all())
+        assert bool((sigma > 0.005).all())
+
+    def test_what_is_no_match_is_not_good(self) -> None:
+        """Too far away, at the edge of either image, without texture, without a ray: each alone."""
+        truth, _ = true_right(self.LEFT)
+        images = grays()
+        far = refine_matches(RIG, images, self.LEFT, truth + torch.tensor([25.0, 0.0]))
+        assert not bool(far.good.any())
+        edge = torch.tensor([[-3.0, 160.0], [240.0, -3.0]], dtype=torch.float64)
+        beside = true_right(edge)[0]
+        assert not bool(refine_matches(RIG, images, edge, beside).good.any())
+        inside = self.LEFT[:1].expand(2, 2)
+        assert not bool(
+            refine_matches(RIG, images, inside, torch.tensor([[-3.0, 150.0], [479.0, 3.0]]).double()).good.any()
+        )
+        flat = torch.full_like(images[0], 90.0)
+        assert not bool(refine_matches(RIG, (flat, flat), self.LEFT, truth).good.any())
+        lost = self.LEFT.clone()
+        lost[1] = math.nan
+        assert refine_matches(RIG, images, lost, truth).good.tolist() == [True, False, True]
+        lost = truth.clone()
+        lost[0] = math.nan
+        assert refine_matches(RIG, images, self.LEFT, lost).good.tolist() == [False, True, True]

@@ -1,0 +1,221 @@
+"""Parts of reading a night: the sky's level, what is a star, names beside other stars, times, moments and plans."""
+
+from __future__ import annotations
+
+import datetime
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from kcal.errors import InputError
+from kcal.io.images import write_png
+from kcal.io.video_file import write_video
+from kcal.lens.camera import Camera
+from kcal.stars.attitude import _names_at, field_angle
+from kcal.stars.budget import NightPlan, PlannedStars, planned_stars
+from kcal.stars.catalog import StarCatalog
+from kcal.stars.detect import _night_sky, detect_stars
+from kcal.stars.identification import Identification
+from kcal.stars.night_image import expand_nights, read_night, time_of
+from kcal.stars.rig_stars import moments_of
+
+CAMERA = Camera.build(focal=(1000, 1000), center=(319.5, 239.5), size=(640, 480), model="pinhole")
+ROWS, COLUMNS = np.mgrid[0:240, 0:320].astype(float)
+
+
+class TestSky:
+    def test_light_that_grows_across_the_image_is_followed(self) -> None:
+        """A gradient of the sky is its level, tile by tile, but at the rim, where the outermost tile's level holds."""
+        level, noise = _night_sky(100.0 + 0.2 * COLUMNS + 0.1 * ROWS, quantum=0.0)
+        inside = level[60:180, 60:260] - (100.0 + 0.2 * COLUMNS + 0.1 * ROWS)[60:180, 60:260]
+        assert np.abs(inside).max() < 1.5
+        assert level.shape == noise.shape == (240, 320)
+
+    def test_noise_of_the_sky(self) -> None:
+        draw = np.random.default_rng(1).normal(100.0, 4.0, (240, 320))
+        level, noise = _night_sky(draw, quantum=0.0)
+        assert abs(level.mean() - 100.0) < 0.2
+        assert noise.mean() == pytest.approx(4.0, rel=0.05)
+        # Steps of gray levels are noise of their own.
+        assert _night_sky(np.full((64, 64), 7.0), quantum=1.0)[1].mean() == pytest.approx(1.0 / math.sqrt(12.0))
+
+
+def sky_of(*stars: tuple[float, float, float, float]) -> np.ndarray[Any, Any]:
+    """An image with Gaussian stars (x, y, length along x, height)."""
+    image = 50 + np.random.default_rng(0).normal(0, 2, COLUMNS.shape)
+    for x, y, long, height in stars:
+        image += height * np.exp(-((COLUMNS - x) ** 2) / (2 * long**2) - (ROWS - y) ** 2 / (2 * 1.2**2))
+    return image
+
+
+PLACES = [(40.0 + 60 * (i % 5) + 0.3, 30.0 + 55 * (i // 5) + 0.2) for i in range(20)]
+
+
+class TestStars:
+    def test_a_streak_among_stars_is_left_out(self) -> None:
+        found = detect_stars(sky_of(*((x, y, 1.2, 300.0) for x, y in PLACES[:-1]), (*PLACES[-1], 8.0, 600.0)))
+        assert len(found.pixels) == 19
+        assert found.left_out == {"streaks": 1}
+
+    def test_in_a_long_exposure_all_stars_are_streaks(self) -> None:
+        found = detect_stars(sky_of(*((x, y, 2.4, 300.0) for x, y in PLACES)))
+        assert len(found.pixels) == 20
+        assert np.abs(found.pixels[np.lexsort(found.pixels.round().T)] - np.array(PLACES)).max() < 0.2
+
+    def test_the_brightest_come_first_and_no_more_than_asked(self) -> None:
+        heights = [100.0 + 10 * i for i in range(20)]
+        image = sky_of(*((x, y, 1.2, height) for (x, y), height in zip(PLACES, heights, strict=True)))
+        found = detect_stars(image, most=5)
+        assert len(found.pixels) == 5
+        torch.testing.assert_close(torch.from_numpy(found.pixels), torch.tensor(PLACES[:14:-1]), rtol=0, atol=0.2,
+                                   check_dtype=False)  # fmt: skip
+        assert bool((np.diff(found.flux) < 0).all())
+        # What is in three widths of a Gaussian of 1.2 px.
+        assert found.flux[0] == pytest.approx(290.0 * 2 * math.pi * 1.2**2, rel=0.05)
+
+
+class TestNames:
+    def names(self, magnitude: list[float], apart: float) -> list[int]:
+        """Of two stars, so many pixels apart, at the first one's pixel and far from both."""
+        x = torch.tensor([0.0, apart / 1000.0], dtype=torch.float64)
+        directions = torch.nn.functional.normalize(torch.stack([x, 0 * x, 1 + 0 * x], 1), dim=1)
+        pixels, reach = np.array([[319.8, 239.5], [100.0, 100.0]]), np.array([2.0, 2.0])
+        found = _names_at(pixels, reach, directions, np.array(magnitude), CAMERA, torch.eye(3).double(), 0.8)
+        return [int(star) for star in found]
+
+    def test_the_nearest_star_of_the_catalogue(self) -> None:
+        assert self.names([3.0, 3.0], 50.0) == [0, -1]
+
+    def test_a_neighbor_of_like_brightness_takes_the_name_away(self) -> None:
+        """It pulls the center; one that is 2.5 magnitudes fainter does not, and one that is too far neither."""
+        assert self.names([3.0, 4.0], 5.0) == [-1, -1]
+        assert self.names([3.0, 1.0], 5.0) == [-1, -1]
+        assert self.names([3.0, 5.6], 5.0) == [0, -1]
+        assert self.names([3.0, 3.0], 6.5) == [0, -1]
+
+    def test_stars_behind_have_no_name(self) -> None:
+        behind = torch.tensor([[0.0, 0.0, -1.0]], dtype=torch.float64)
+        found = _names_at(np.array([[319.5, 239.5]]), np.array([9.0]), behind, np.array([1.0]), CAMERA,
+                          torch.eye(3).double(), 0.8)  # fmt: skip
+        assert found.tolist() == [-1]
+
+
+def test_how_wide_a_camera_sees() -> None:
+    assert field_angle(CAMERA) == pytest.approx(2.0 * math.atan(math.hypot(319.5, 239.5) / 1000.0))
+    # A fisheye whose lens does not reach the image's corners: as far as it goes, not the whole sphere.
+    fisheye = Camera.build(
+        focal=(200, 200), center=(319.5, 239.5), size=(640, 480), coefficients=[0.0] * 4, model="fisheye4"
+    )
+    assert 2.0 < field_angle(fisheye) < 2.0 * math.pi
+
+
+def test_how_many_have_a_name() -> None:
+    assert Identification(np.eye(3), np.array([3, -1, 0, -1, 7]), 0.0).matches == 3
+
+
+class TestFiles:
+    def test_a_video_is_its_mean_frame(self, tmp_path: Path) -> None:
+        frames = [np.full((32, 48), level, np.uint8) for level in (10, 20, 60)]
+        path = write_video(tmp_path / "a.mp4", iter(frames), 5, quality=0)
+        night = read_night(path)
+        assert night.shape == (32, 48)
+        assert np.abs(night - 30.0).max() < 1.0
+        gray = np.arange(768, dtype=np.uint16).reshape(24, 32) * 80
+        assert np.array_equal(read_night(write_png(tmp_path / "b.png", gray)), gray)
+
+    def test_files_folders_and_wildcards(self, tmp_path: Path) -> None:
+        for name in ("b.png", "a.png", "c.fits", "d.mp4"):
+            (tmp_path / name).touch()
+        own = [str(tmp_path / name) for name in ("d.mp4", "c.fits", "b.png")]
+        found = expand_nights([*own, str(tmp_path / "*.png")])
+        assert [path.name for path in found] == ["d.mp4", "c.fits", "b.png", "a.png"]
+
+    def test_times(self) -> None:
+        image = Path("2019-07-29T204726_Alt40.png")
+        assert time_of(None, image) is None
+        assert time_of("name:+02:00", image) == datetime.datetime(2019, 7, 29, 18, 47, 26, tzinfo=datetime.UTC)
+        assert time_of("2020-01-02T03:04:05Z", image) == datetime.datetime(2020, 1, 2, 3, 4, 5, tzinfo=datetime.UTC)
+        assert time_of("name:Z", Path("20260102-030405.png")) == datetime.datetime(
+            2026, 1, 2, 3, 4, 5, tzinfo=datetime.UTC
+        )
+        for text, path, message in (("name", image, "zone"), ("name:Z", Path("a.png"), "no time in this name")):
+            with pytest.raises(InputError, match=message):
+                time_of(text, path)
+
+
+class Image:
+    """As much of a named image as is put together by its time."""
+
+    def __init__(self, second: float | None, on_earth: bool) -> None:
+        start = datetime.datetime(2026, 1, 1, tzinfo=datetime.UTC)
+        time = None if second is None else start + datetime.timedelta(seconds=second)
+        self.view, self.on_earth = type("View", (), {"time": time}), on_earth
+
+
+class TestMoments:
+    def of(self, *cameras: list[float | None], on_earth: bool = False) -> tuple[list[dict[int, int]], int]:
+        images = [[Image(second, on_earth) for second in own] for own in cameras]
+        found, alone = moments_of(images, tolerance=1.0)  # type: ignore[arg-type]
+        return [{c: images[c].index(one) for c, one in moment.items()} for moment in found], alone  # type: ignore[arg-type]
+
+    def test_by_their_times(self) -> None:
+        assert self.of([0.0, 10.0, 20.0], [10.5, 1.0, 30.0]) == ([{0: 0, 1: 1}, {0: 1, 1: 0}], 2)
+        # On the Earth an image alone is a moment, too; in the order of times.
+        moments = [{0: 0, 1: 1}, {0: 1, 1: 0}, {0: 2}, {1: 2}]
+        assert self.of([0.0, 10.0, 20.0], [10.5, 1.0, 30.0], on_earth=True) == (moments, 2)
+        # Two images of one camera are two moments, however near.
+        assert self.of([0.0, 0.5], [0.2]) == ([{0: 0, 1: 0}], 1)
+
+    def test_in_their_order(self) -> None:
+        assert self.of([None, None], [None, 3.0]) == ([{0: 0, 1: 0}, {0: 1, 1: 1}], 0)
+        with pytest.raises(InputError, match="as many are needed"):
+            self.of([None, None], [3.0])
+
+
+class TestPlans:
+    @pytest.mark.parametrize(
+        "wrong",
+        [
+            {"size": (1920, 0)}, {"focal_px": 0.0}, {"aperture_mm": 0.0}, {"seconds": 0.0}, {"altitude_deg": 91.0},
+            {"altitude_deg": -1.0}, {"sky_magnitude": 9.0}, {"sky_magnitude": 24.0},
+        ],
+    )  # fmt: skip
+    def test_refused(self, wrong: dict[str, Any]) -> None:
+        with pytest.raises(InputError, match="night"):
+            NightPlan(**{"focal_px": 1600.0, "size": (1920, 1080), "aperture_mm": 2.9} | wrong)
+
+    def test_where_all_stars_are_seen_they_are_the_image_s_share_of_the_sky(self) -> None:
+        plan = NightPlan(focal_px=1600, size=(1920, 1080), aperture_mm=400.0, seconds=1.0, altitude_deg=45.0)
+        x, y = np.meshgrid((np.arange(1920) - 959.5) / 1600, (np.arange(1080) - 539.5) / 1600)
+        solid = float(((1 + x * x + y * y) ** -1.5).sum()) / 1600**2
+        found = planned_stars(plan)
+        catalog = StarCatalog.bundled().magnitude
+        assert found.stars == pytest.approx(len(catalog) * solid / (4 * math.pi), rel=1e-3)
+        assert found.faintest == pytest.approx(float(catalog.max()))
+        # 15.04 seconds of arc in a second of time.
+        assert found.trail_px == pytest.approx(15.04 / (math.degrees(1 / 1600) * 3600))
+
+    def test_what_they_tell(self) -> None:
+        found = PlannedStars(30.0, 5.0, 0.1, 0.2, 1e-5)
+        assert found.range_share(5000.0, 10.0) == pytest.approx(5e-3)
+        assert found.range_share(5000.0, 10.0, 4) == pytest.approx(2.5e-3)
+        # The Earth turns by 7.3e-5 rad in a second.
+        assert found.range_share(5000.0, 10.0, 4, 0.1) == pytest.approx(500.0 * math.hypot(5e-6, 7.292e-6), rel=1e-3)
+
+    def test_a_narrow_field_tells_as_much_as_its_stars_do(self) -> None:
+        """A level camera sees no stars below the horizon; behind a bright sky none at all."""
+        level = planned_stars(NightPlan(focal_px=1600, size=(1920, 1080), aperture_mm=400.0))
+        up = planned_stars(NightPlan(focal_px=1600, size=(1920, 1080), aperture_mm=400.0, altitude_deg=45.0))
+        # Of the upper half, what is higher than 5 degrees; the sky is summed in nine strips.
+        share = 0.5 * (1.0 - math.tan(math.radians(5.0)) * 1600 / 540)
+        assert level.stars == pytest.approx(share * up.stars, rel=0.15)
+        none = planned_stars(NightPlan(focal_px=1600, size=(1920, 1080), aperture_mm=0.01, sky_magnitude=10.0))
+        assert (none.stars, none.yaw_sigma) == (0.0, math.inf)
+        one = planned_stars(NightPlan(focal_px=1600, size=(1920, 1080), aperture_mm=3.0, altitude_deg=45.0))
+        # Both cameras' noise of all stars, whose centers are about as good as the median one.
+        by_hand = math.sqrt(2.0 / one.stars) * one.sigma_px / 1600
+        assert 0.4 * by_hand < one.yaw_sigma < 1.2 * by_hand
