@@ -53,7 +53,7 @@ def with_common_errors(
     pair = torch.repeat_interleave(torch.tensor([len(own) for own in pixels]))
     error = _without_lenses(error, sigma, places[:, 0])
     good = error.abs() < _WRONG * sigma
-    scale, floor = _variance(error[good], sigma[good])
+    scale, floor = _error_variance(error[good], sigma[good])
     total = scale * stated + floor * torch.eye(2, dtype=torch.float64)
     z = torch.where(good, error / (scale * sigma.square() + floor).sqrt(), torch.nan)
     still = places[:, 0] - _shifts(places, pair)[pair]
@@ -103,7 +103,7 @@ def _without_lenses(error: Tensor, sigma: Tensor, pixels: Tensor) -> Tensor:
     return error - (columns @ fit)[:, 0]
 
 
-def _variance(error: Tensor, sigma: Tensor) -> tuple[float, float]:
+def _error_variance(error: Tensor, sigma: Tensor) -> tuple[float, float]:
     """Scale and floor of variances scale σ² + floor, not below σ²: the likeliest for Gaussian errors."""
     if len(error) < _FEWEST:
         return 1.0, 0.0
