@@ -2,13 +2,14 @@
 
     python -m scripts.check.scene yaw --scale 0.5 --seeds 0-29 --out build/yaw.jsonl [--write]
     python -m scripts.check.scene ranges --seeds 0-29 --out build/ranges.jsonl [--write]
-    python -m scripts.check.scene matches speed picture [--write]
+    python -m scripts.check.scene matches common speed picture [--write]
 
 Pictures of a terrain (`kcal.sim.terrain`) by two traced lenses 10 m apart. `yaw`: each seed is another terrain, and its
 ten pairs of a minute and of a day are rendered and matched; --scale makes the pictures smaller (1: 1920 x 1080, f 1600
-px) and so affordable. `matches`: what is found under several conditions, beside OpenCV's SIFT and USAC. `ranges`:
-places and covariances are those of one rendered pair, and errors are drawn anew for each seed. `speed`: CPU seconds of
-the adjustment. Runs of `yaw` and `ranges` go on where they stopped. With --write docs/measured/scene.md is made.
+px) and so affordable. `matches`: what is found under several conditions, beside OpenCV's SIFT and USAC. `common`:
+errors that matches share. `ranges`: places and covariances are those of one rendered pair, and errors are drawn anew
+for each seed. `speed`: CPU seconds of the adjustment. Runs of `yaw` and `ranges` go on where they stopped. With --write
+docs/measured/scene.md is made.
 """
 
 from __future__ import annotations
@@ -37,7 +38,10 @@ from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import vector_from_rotation
 from kcal.locate.localizer import StereoLocalizer
+from kcal.scene.common_errors import _off_line as off_line
+from kcal.scene.common_errors import with_common_errors
 from kcal.scene.match import ImagePair, MatchedPair, match_scene, scene_of
+from kcal.scene.match import _posed as posed
 from kcal.sim.scene import FOCAL_MM
 from kcal.sim.terrain import Terrain, Weather
 from kcal.sim.true_rig import TrueRig, drawn_rig
@@ -295,6 +299,47 @@ def yaw_rows(records: list[Record]) -> list[list[str]]:
     return rows
 
 
+BLOCK = 120.0  # px
+
+
+@torch.no_grad()
+def common() -> list[str]:
+    """Whether means of matches' errors over parts of the image are as large as stated, before and now.
+
+    The scene stands still, and pairs differ by noise alone and by vehicles. Each part's weighted mean of
+    distances from epipolar lines is compared with its standard deviation.
+    """
+    terrain = Terrain(rig_of(HALF), 2)
+    pairs = [photographed(terrain, moment) for moment in range(6)]
+    found = [match_scene(exact(HALF), pair) for pair in pairs]
+    rows = []
+    for count in (1, 3, 6):
+        z: tuple[list[float], list[float]] = [], []
+        for first in range(0, 7 - count, count):
+            some = found[first : first + count]
+            parts = [one.rig for one in some], [one.pixels for one in some], [one.covariance for one in some]
+            pixels, stated = torch.cat(parts[1]), torch.cat(parts[2])
+            rig, _ = posed(found[0].rig, pixels, stated)
+            place = (pixels[:, 0] / BLOCK).long()
+            block = 100 * place[:, 1] + place[:, 0]
+            off, by_noise = off_line(rig, pixels, stated)
+            good = off.abs() < 5.0 * by_noise
+            for own, covariance in zip(z, (stated, torch.cat(with_common_errors(*parts))), strict=True):
+                error, sigma = off_line(rig, pixels, covariance)
+                for which in block.unique():
+                    here = (block == which) & good
+                    if int(here.sum()) >= 4 * count:
+                        weight = sigma[here] ** -2
+                        own.append(float((weight * error[here]).sum() / weight.sum().sqrt()))
+        cells = [f"{count}", f"{len(z[0])}"]
+        for values in map(np.array, z):
+            cells += [f"{np.sqrt(np.square(values).mean()):.2f}", f"{100 * (np.abs(values) < 1.96).mean():.0f} %"]
+        rows.append(cells)
+    return table(
+        ("pairs", "parts of the image", "before: RMS over σ", "inside 95 %", "RMS over σ", "inside 95 %"), rows
+    )
+
+
 def landmarks(draw: torch.Generator) -> Landmarks:
     """Twelve surveyed landmarks 100 m to 2.6 km away, in the left camera's frame turned to east, north, up."""
     count = 12
@@ -434,7 +479,7 @@ def repeated(part: str, given: argparse.Namespace) -> list[str]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="+", choices=("matches", "yaw", "ranges", "speed", "picture"))
+    parser.add_argument("parts", nargs="+", choices=("matches", "common", "yaw", "ranges", "speed", "picture"))
     parser.add_argument("--seeds", default="0-29")
     parser.add_argument("--scale", type=float, default=0.5, help="of the pictures of yaw")
     parser.add_argument("--pairs", type=int, default=10, help="of a minute and of a day, for yaw")
@@ -450,7 +495,12 @@ def main() -> None:
         elif part == "speed":
             speed(given.write)
         else:
-            lines = show(matches() if part == "matches" else repeated(part, given))
+            lines = (
+                {"matches": matches, "common": common}[part]()
+                if part in ("matches", "common")
+                else repeated(part, given)
+            )
+            show(lines)
             if given.write:
                 write_section("scene.md", part, "\n".join(lines))
 
