@@ -23,6 +23,7 @@ from kcal.corners.keypoints import Keypoints, keypoints
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
+from kcal.scene.common_errors import with_common_errors
 from kcal.scene.guided import guided_matches, rough_rig
 from kcal.scene.refine import refine_matches
 from kcal.scene.still import Stillness, still_there
@@ -106,8 +107,9 @@ def scene_features(cameras: tuple[Camera, Camera], pairs: Sequence[ImagePair], m
     """Find and match what both cameras see, and check it: along epipolar lines, both ways, and in time.
 
     Nothing is known of how the cameras stand but what the images tell; lenses are taken as calibrated. Each match has
-    the covariance of its least-squares fit. Where there are several pairs, what is not there in the others, or is
-    there at another range, is left out: vehicles, waves, clouds, leaves.
+    the covariance of its least-squares fit, widened by what its error has in common with others
+    (`kcal.scene.common_errors`). Where there are several pairs, what is not there in the others, or is there at another
+    range, is left out: vehicles, waves, clouds, leaves.
 
     Args:
         cameras: left and right, calibrated.
@@ -142,7 +144,9 @@ def scene_of(
     each = math.ceil(most / len(pairs))
     found = [_thinned(one, cameras[0].size, each) for one in found]
     names = tuple(f"{pair.name} {i}" for pair, one in zip(pairs, found, strict=True) for i in range(len(one.pixels)))
-    features = _features(names, torch.cat([one.pixels for one in found]), torch.cat([one.covariance for one in found]))
+    pixels = [one.pixels for one in found]
+    covariance = with_common_errors([one.rig for one in found], pixels, [one.covariance for one in found])
+    features = _features(names, torch.cat(pixels), torch.cat(covariance))
     return SceneMatches(features, tuple(one.counts for one in found))
 
 

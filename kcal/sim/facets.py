@@ -22,7 +22,7 @@ from kcal.sim.truth import TruthLens
 from kcal.sim.window import invert_window
 
 Floats = NDArray[np.float64]
-Color = tuple[float, float, float]
+Color = tuple[float, ...]
 _EDGE = 3  # pixels around the corners of a piece that are painted too
 _FAR = 8.0  # times the distance of a piece: nothing of it is farther away
 _COARSE = 8  # pixels between those that tell roughly where a large piece is
@@ -38,12 +38,14 @@ class Facet:
         along: (3,) unit vector of the first coordinate on the piece.
         up: (3,) unit vector of the second one, at right angles.
         outline: (K, 2) its corners on the piece in order, meters.
-        color: gray levels of red, green and blue.
+        color: gray levels of red, green and blue, or one for an image in gray.
         texture: share by which the color varies.
         grain: meters, size of what varies.
         windows: width and height of a field with one window in its middle, meters; None for a plain wall.
         glass: color of these windows.
         top: height of the upper edge above the outline's, for positions along it in meters; None for a straight edge.
+        pattern: factor of the color where lines of sight meet the piece; None for what `texture` says.
+        shadow: share of the light that is left on what is already there, in place of a color; None for a piece.
     """
 
     origin: Floats
@@ -56,6 +58,8 @@ class Facet:
     windows: tuple[float, float] | None = None
     glass: Color = (62.0, 72.0, 84.0)
     top: Callable[[Floats], Floats] | None = None
+    pattern: Callable[[Cut], Floats] | None = None
+    shadow: float | None = None
 
     @functools.cached_property
     def corners(self) -> Floats:
@@ -221,11 +225,19 @@ def cut(camera: Eye, facet: Facet, window: tuple[slice, slice], *, small: bool =
     return Cut(a, b, far, (down, across, up_down, up_across))
 
 
-def paint(part: Floats, facet: Facet, at: Cut, haze: Haze) -> None:
-    """Paint a piece over a part (H, W, 3) of an image, whose lines of sight were cut with its plane."""
+def paint(part: Floats, facet: Facet, at: Cut, haze: Haze) -> Floats:
+    """Paint a piece over a part (H, W, 3) of an image, whose lines of sight were cut with its plane.
+
+    Returns:
+        share (H, W) of each pixel that it covers.
+    """
     share = _covered(facet, at)
     if not share.any():
-        return
+        return share
+    if facet.shadow is not None:
+        # The light of the air in front of it stays.
+        part -= share[..., None] * (1.0 - facet.shadow) * (part - haze.seen(np.zeros(part.shape[-1]), at.far))
+        return share
     color = np.array(facet.color)
     if facet.windows is not None:
         color = color + _windows(facet, at)[..., None] * (np.array(facet.glass) - color)
@@ -234,7 +246,10 @@ def paint(part: Floats, facet: Facet, at: Cut, haze: Haze) -> None:
         fine = np.clip(facet.grain / at.slope(1.0, 0.0), 0.0, 1.0)
         waves = smooth_noise(at.along / facet.grain, at.up / facet.grain)
         color = color * (1 + facet.texture * fine * waves)[..., None]
+    if facet.pattern is not None:
+        color = color * facet.pattern(at)[..., None]
     part += share[..., None] * (haze.seen(color, at.far) - part)
+    return share
 
 
 def _covered(facet: Facet, at: Cut) -> Floats:

@@ -1,23 +1,28 @@
 """Rigs from the scene itself: matches against the truth, yaw from one and ten pairs, ranges at 5 km.
 
-    python -m scripts.check.scene matches yaw ranges speed picture [--seeds 30] [--write]
+    python -m scripts.check.scene yaw --scale 0.5 --seeds 0-29 --out build/yaw.jsonl [--write]
+    python -m scripts.check.scene ranges --seeds 0-29 --out build/ranges.jsonl [--write]
+    python -m scripts.check.scene matches common speed picture [--write]
 
-Pictures of one terrain by two traced lenses 10 m apart are rendered once (`scripts.shared.terrain_scene`), 1920 x 1080,
-f 1600 px; noise, haze, blur and light come on top. `matches` compares what is found in them with the truth, beside
-OpenCV's SIFT and USAC. `yaw` and `ranges` repeat the adjustment with many seeds: they take the places and covariances
-of the matches of the rendered pair and draw the noise anew, since 30 renderings would take an hour. `speed`: CPU
-seconds of the adjustment. With --write docs/measured/scene.md is made.
+Pictures of a terrain (`kcal.sim.terrain`) by two traced lenses 10 m apart. `yaw`: each seed is another terrain, and its
+ten pairs of a minute and of a day are rendered and matched; --scale makes the pictures smaller (1: 1920 x 1080, f 1600
+px) and so affordable. `matches`: what is found under several conditions, beside OpenCV's SIFT and USAC. `common`:
+errors that matches share. `ranges`: places and covariances are those of one rendered pair, and errors are drawn anew
+for each seed. `speed`: CPU seconds of the adjustment. Runs of `yaw` and `ranges` go on where they stopped. With --write
+docs/measured/scene.md is made.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import functools
 import math
 import time
-from collections.abc import Callable
+from pathlib import Path
 from typing import NamedTuple
+from unittest import mock
 
 import cv2
 import numpy as np
@@ -33,12 +38,16 @@ from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import vector_from_rotation
 from kcal.locate.localizer import StereoLocalizer
+from kcal.scene.common_errors import _off_line as off_line
+from kcal.scene.common_errors import with_common_errors
 from kcal.scene.match import ImagePair, MatchedPair, match_scene, scene_of
-from kcal.sim.backdrop import exposed
-from kcal.sim.scene import demo_rig
+from kcal.scene.match import _posed as posed
+from kcal.sim.scene import FOCAL_MM
+from kcal.sim.terrain import Terrain, Weather
+from kcal.sim.true_rig import TrueRig, drawn_rig
 from scripts.shared.long_range import ORIGIN
-from scripts.shared.page import DOCS, write_section
-from scripts.shared.terrain_scene import SKY, TerrainScene
+from scripts.shared.page import DOCS, table, write_row, write_section
+from scripts.shared.records import Record, finish, read, seeds
 from scripts.shared.timing import show
 from scripts.shared.traced import as_camera, capture
 
@@ -46,26 +55,40 @@ TAPE = 0.005  # meters
 MARK = 0.1  # px, of targets
 WRONG = 2.0  # px
 NAMES = ("left", "right")
-CONDITIONS = {
-    "clear": {},
-    "haze, 4 km": {"haze": 4000.0},
-    "dusk: a third of the light, noise 4": {"gain": 0.33, "noise": 4.0},
-    "blur 1.4 px": {"blur": 1.4},
+NOON = Weather()
+# Three moments each.
+CONDITIONS: dict[str, tuple[Weather, ...]] = {
+    "clear noon": (NOON,) * 3,
+    "haze, 4 km": (Weather(haze=4000.0),) * 3,
+    "low sun, 17 h": (Weather(hour=17.0),) * 3,
+    "dusk, 18.5 h, noise 4": (Weather(hour=18.5, noise=4.0),) * 3,
+    "blur 1.4 px": (Weather(blur=1.4),) * 3,
+    "masts turn by 1 mrad in a rolling shutter": (Weather(shutter=1e-3),) * 3,
+    "12, 9 and 16 h": (NOON, Weather(hour=9.0), Weather(hour=16.0)),
+    "two seasons": (NOON, Weather(season=0.5), Weather(season=1.0)),
 }
-SCENE = TerrainScene(demo_rig(), 1)
-RIG = SCENE.rig
-EXACT = as_camera(RIG.left), as_camera(RIG.right)
 
 
-def photographed(
-    moment: int, *, haze: float = 1e12, gain: float = 1.0, noise: float = 1.5, blur: float = 0.7
-) -> ImagePair:
+@functools.cache
+def rig_of(scale: float) -> TrueRig:
+    return drawn_rig("surveillance", 1.0, 1, focal_mm=FOCAL_MM, wander=1.0, scale=scale)
+
+
+@functools.cache
+def exact(scale: float) -> tuple[Camera, Camera]:
+    rig = rig_of(scale)
+    return as_camera(rig.left), as_camera(rig.right)
+
+
+RIG = rig_of(1.0)
+# Pictures of `matches`.
+HALF = 0.5
+SCENE = Terrain(rig_of(HALF), 1)
+
+
+def photographed(terrain: Terrain, moment: int, weather: Weather = NOON) -> ImagePair:
     """A pair of images of a moment."""
-    random, images = np.random.default_rng([1, moment]), []
-    for picture in SCENE.pictures(moment):
-        clear = np.exp(-np.minimum(picture.depth, 1e6) / haze)
-        images.append(exposed(gain * (clear * picture.light + (1.0 - clear) * SKY), blur, noise, random))
-    return ImagePair(f"{moment}", *images)
+    return ImagePair(f"{moment}", *terrain.images(moment, weather))
 
 
 class Judged(NamedTuple):
@@ -88,12 +111,12 @@ class Judged(NamedTuple):
     recall: float
 
 
-def judged(pixels: Tensor, covariance: Tensor | None, moment: int, visible: int) -> Judged:
+def judged(pixels: Tensor, covariance: Tensor | None, moment: int, weather: Weather, visible: int) -> Judged:
     """Compare matches (M, 2, 2) with the truth."""
-    truth, _ = SCENE.true_right(pixels[:, 0], moment)
+    truth, _ = SCENE.true_right(pixels[:, 0], moment, weather)
     off = pixels[:, 1] - truth
     near = pixels[:, 0].round().long()
-    moving = torch.from_numpy(SCENE.pictures(moment)[0].moving)[near[:, 1], near[:, 0]]
+    moving = torch.from_numpy(SCENE.picture(0, moment, weather).moving)[near[:, 1], near[:, 0]]
     wrong = ~(torch.linalg.vector_norm(off, dim=-1) < WRONG) | moving
     good = off[~wrong, 1]
     sigmas = math.nan if covariance is None else float((good / covariance[~wrong, 1, 1].sqrt()).square().mean().sqrt())
@@ -110,20 +133,20 @@ def opencv_matches(pair: ImagePair) -> Tensor:
     forth, back = matcher.knnMatch(one, two, k=2), matcher.knnMatch(two, one, k=1)
     kept = [m for m, n in forth if m.distance < 0.75 * n.distance and back[m.trainIdx][0].trainIdx == m.queryIdx]
     pixels = torch.tensor([[first[m.queryIdx].pt, second[m.trainIdx].pt] for m in kept], dtype=torch.float64)
-    rays = [camera.unproject(pixels[:, k])[0] for k, camera in enumerate(EXACT)]
-    flat = [(1600.0 * ray[:, :2] / ray[:, 2:]).numpy() for ray in rays]
+    rays = [camera.unproject(pixels[:, k])[0] for k, camera in enumerate(exact(HALF))]
+    flat = [(1600.0 * HALF * ray[:, :2] / ray[:, 2:]).numpy() for ray in rays]
     _, inside = cv2.findFundamentalMat(flat[0], flat[1], cv2.USAC_MAGSAC, 1.0, 0.9999, 10_000)
     return pixels[torch.from_numpy(np.asarray(inside)[:, 0] > 0)]
 
 
-def visible_keypoints(pair: ImagePair, moment: int) -> int:
+def visible_keypoints(pair: ImagePair, moment: int, weather: Weather) -> int:
     """Keypoints of the left image that stand still and that the right camera sees."""
     left = keypoints(pair.left, 8000).pixels
-    truth, _ = SCENE.true_right(left, moment)
+    truth, _ = SCENE.true_right(left, moment, weather)
     near, there = left.round().long(), truth.nan_to_num(-9.0).round().long()
-    pictures = SCENE.pictures(moment)
+    pictures = [SCENE.picture(side, moment, weather) for side in (0, 1)]
     depth = [torch.from_numpy(picture.depth) for picture in pictures]
-    width, height = RIG.right.size
+    width, height = SCENE.rig.right.size
     inside = (there >= 0).all(-1) & (there < torch.tensor([width, height])).all(-1)
     there = torch.where(inside[:, None], there, 0)
     same = (depth[1][there[:, 1], there[:, 0]] / depth[0][near[:, 1], near[:, 0]] - 1.0).abs() < 0.05
@@ -132,7 +155,7 @@ def visible_keypoints(pair: ImagePair, moment: int) -> int:
 
 
 @torch.no_grad()
-def matches(_: int = 0) -> list[str]:
+def matches() -> list[str]:
     """Matches under several conditions against the truth."""
     lines = show(
         [
@@ -149,38 +172,46 @@ def matches(_: int = 0) -> list[str]:
             f"| {found.across:.3f} | {sigmas} | {seconds:.1f} |"
         ]))  # fmt: skip
 
-    for condition, how in CONDITIONS.items():
-        pairs = [photographed(moment, **how) for moment in (1, 2, 3)]
-        visible = visible_keypoints(pairs[0], 1)
+    for condition, weathers in CONDITIONS.items():
+        # The first last: its pictures are then at hand.
+        pairs = [photographed(SCENE, moment, weathers[moment - 1]) for moment in (3, 2, 1)][::-1]
+        visible = visible_keypoints(pairs[0], 1, weathers[0])
         start = time.process_time()
         try:
-            found = [match_scene(EXACT, pair) for pair in pairs]
+            found = [match_scene(exact(HALF), pair) for pair in pairs]
         except InputError:
             lines.extend(show([f"| {condition} | kcal | refused | | | | | | |"]))
         else:
             seconds = (time.process_time() - start) / 3
-            told(condition, "kcal, one pair", judged(found[0].pixels, found[0].covariance, 1, visible), seconds)
-            scene = scene_of(EXACT, pairs, found)
+            told(
+                condition,
+                "kcal, one pair",
+                judged(found[0].pixels, found[0].covariance, 1, weathers[0], visible),
+                seconds,
+            )
+            scene = scene_of(exact(HALF), pairs, found)
             seconds = (time.process_time() - start) / 3
             own = slice(0, scene.counts[0].used)
-            assert scene.features.covariance is not None
-            of_three = judged(scene.features.pixels[own], 2.0 * scene.features.covariance[own, 0], 1, visible)
+            of_three = judged(scene.features.pixels[own], None, 1, weathers[0], visible)
             told(condition, "kcal, three pairs", of_three, seconds)
         start = time.process_time()
         pixels = opencv_matches(pairs[0])
-        told(condition, "OpenCV SIFT + USAC", judged(pixels, None, 1, visible), time.process_time() - start)
+        told(
+            condition, "OpenCV SIFT + USAC", judged(pixels, None, 1, weathers[0], visible), time.process_time() - start
+        )
     return lines
 
 
 @functools.cache
 def measured() -> tuple[Tensor, Tensor, Tensor]:
     """Left pixels (M, 2), true right pixels and covariances (M, 2, 2) of a rendered pair's still matches."""
-    pairs = [photographed(moment) for moment in (1, 2)]
-    found: list[MatchedPair] = [match_scene(EXACT, pair) for pair in pairs]
-    scene = scene_of(EXACT, pairs, found)
+    terrain = Terrain(RIG, 1)
+    pairs = [photographed(terrain, moment) for moment in (2, 1)][::-1]
+    found: list[MatchedPair] = [match_scene(exact(1.0), pair) for pair in pairs]
+    scene = scene_of(exact(1.0), pairs, found)
     own = slice(0, scene.counts[0].used)
     left = scene.features.pixels[own, 0]
-    truth, _ = SCENE.true_right(left, 1)
+    truth, _ = terrain.true_right(left, 1)
     assert scene.features.covariance is not None
     good = torch.linalg.vector_norm(truth - scene.features.pixels[own, 1], dim=-1) < WRONG
     return left[good], truth[good], 2.0 * scene.features.covariance[own, 0][good]
@@ -207,36 +238,106 @@ def rig_data(cameras: tuple[Camera, Camera], features: Features, draw: torch.Gen
     return RigData(cameras=cameras, names=NAMES, features=features, baselines=(tape,))
 
 
+YAW_HEADS = (
+    "pictures, px", "pairs", "matches", "terrains", "σ of yaw", "RMS error", "over σ", "inside 95 %", "pose χ² of 3",
+    "before: σ", "over σ", "inside 95 %", "pose χ² of 3",
+)  # fmt: skip
+WHICH = {"one": "1", "minute": "{} of a minute", "day": "{} of a day"}
+
+
 @torch.no_grad()
-def yaw(seeds: int) -> list[str]:
-    """Yaw from one and ten pairs with exact lenses, whose σ is the Cramér-Rao bound of these matches."""
-    places = measured()
-    lines = show(
-        [
-            "| pairs | matches | σ of yaw (the bound) | RMS error | over σ | inside 95 % | CPU s |",
-            "|---|---|---|---|---|---|---|",
-        ]
+def yaw_of(scale: float, count: int, times: str, seed: int) -> Record:
+    """Yaw from rendered pairs of one terrain with exact lenses: error and σ in degrees, χ² of the relative rotation."""
+    rig, cameras, terrain = rig_of(scale), exact(scale), Terrain(rig_of(scale), 100 + seed)
+    tape = Baseline(first=0, second=1, length=float(rig.baseline), sigma=TAPE)
+    hours = [12.0] * count if times == "minute" else np.linspace(8.0, 17.0, count).tolist()
+    pairs, matched = [], []
+    for moment, hour in enumerate(hours):
+        # Pairs that are refused are left out, as `kcal rig` does.
+        with contextlib.suppress(InputError):
+            pair = photographed(terrain, moment, Weather(hour=hour))
+            matched.append(match_scene(cameras, pair))
+            pairs.append(pair)
+    record: Record = {}
+    for which in ("one", "minute") if times == "minute" else ("day",):
+        some = slice(0, 1 if which == "one" else None)
+        for when in ("now", "before"):
+            # Before, errors in common counted as independent.
+            plain = mock.patch("kcal.scene.match.with_common_errors", lambda rigs, pixels, covariance: list(covariance))
+            with plain if when == "before" else contextlib.nullcontext():
+                features = scene_of(cameras, pairs[some], matched[some]).features
+            data = RigData(cameras=cameras, names=NAMES, features=features, baselines=(tape,))
+            result = solve_rig(data, RigOptions(intrinsics="fixed"))
+            turn = vector_from_rotation(result.rotation[1] @ result.rotation[0].T @ rig.right_from_left_rotation.T)
+            covariance = result.relative_covariance(0, 1)[:3, :3]
+            record[f"{which} {when}"] = {
+                "error": math.degrees(float(turn[1])), "sigma": math.degrees(float(covariance[1, 1].sqrt())),
+                "chi2": float(turn @ torch.linalg.solve(covariance, turn)), "matches": len(features.names),
+            }  # fmt: skip
+    return record
+
+
+def yaw_rows(records: list[Record]) -> list[list[str]]:
+    """Rows of the table, of all records of a scale."""
+    rows = []
+    for scale, number in sorted({tuple(record["key"][:2]) for record in records}):
+        for which, name in WHICH.items():
+            own = [one for one in records if one["key"][:2] == [scale, number] and f"{which} now" in one]
+            if not own:
+                continue
+            count = np.mean([one[f"{which} now"]["matches"] for one in own])
+            cells = [f"{1920 * scale:.0f} x {1080 * scale:.0f}", name.format(number), f"{count:.0f}", f"{len(own)}"]
+            for when in ("now", "before"):
+                error, sigma, chi2 = (
+                    np.array([one[f"{which} {when}"][part] for one in own]) for part in ("error", "sigma", "chi2")
+                )
+                z = error / sigma
+                cells += [f"{sigma.mean():.5f}°"] + [f"{np.sqrt(np.square(error).mean()):.5f}°"] * (when == "now")
+                cells += [f"{np.sqrt(np.square(z).mean()):.2f}", f"{100 * (np.abs(z) < 1.96).mean():.0f} %"]
+                cells += [f"{chi2.mean():.1f}"]
+            rows.append(cells)
+    return rows
+
+
+BLOCK = 120.0  # px
+
+
+@torch.no_grad()
+def common() -> list[str]:
+    """Whether means of matches' errors over parts of the image are as large as stated, before and now.
+
+    The scene stands still, and pairs differ by noise alone and by vehicles. Each part's weighted mean of
+    distances from epipolar lines is compared with its standard deviation.
+    """
+    terrain = Terrain(rig_of(HALF), 2)
+    pairs = [photographed(terrain, moment) for moment in range(6)]
+    found = [match_scene(exact(HALF), pair) for pair in pairs]
+    rows = []
+    for count in (1, 3, 6):
+        z: tuple[list[float], list[float]] = [], []
+        for first in range(0, 7 - count, count):
+            some = found[first : first + count]
+            parts = [one.rig for one in some], [one.pixels for one in some], [one.covariance for one in some]
+            pixels, stated = torch.cat(parts[1]), torch.cat(parts[2])
+            rig, _ = posed(found[0].rig, pixels, stated)
+            place = (pixels[:, 0] / BLOCK).long()
+            block = 100 * place[:, 1] + place[:, 0]
+            off, by_noise = off_line(rig, pixels, stated)
+            good = off.abs() < 5.0 * by_noise
+            for own, covariance in zip(z, (stated, torch.cat(with_common_errors(*parts))), strict=True):
+                error, sigma = off_line(rig, pixels, covariance)
+                for which in block.unique():
+                    here = (block == which) & good
+                    if int(here.sum()) >= 4 * count:
+                        weight = sigma[here] ** -2
+                        own.append(float((weight * error[here]).sum() / weight.sum().sqrt()))
+        cells = [f"{count}", f"{len(z[0])}"]
+        for values in map(np.array, z):
+            cells += [f"{np.sqrt(np.square(values).mean()):.2f}", f"{100 * (np.abs(values) < 1.96).mean():.0f} %"]
+        rows.append(cells)
+    return table(
+        ("pairs", "parts of the image", "before: RMS over σ", "inside 95 %", "RMS over σ", "inside 95 %"), rows
     )
-    for pairs in (1, 10):
-        errors, sigmas, seconds, count = [], [], 0.0, 0
-        for seed in range(seeds if pairs == 1 else max(seeds // 2, 1)):
-            draw = torch.Generator().manual_seed(seed)
-            features = drawn(places, pairs, draw)
-            start = time.process_time()
-            found = solve_rig(rig_data(EXACT, features, draw), RigOptions(intrinsics="fixed"))
-            seconds += time.process_time() - start
-            relative = found.rotation[1] @ found.rotation[0].T @ RIG.right_from_left_rotation.T
-            errors.append(math.degrees(float(vector_from_rotation(relative)[1])))
-            sigmas.append(math.degrees(float(found.relative_covariance(0, 1)[1, 1].sqrt())))
-            count = len(features.names)
-        error, sigma = torch.tensor(errors), torch.tensor(sigmas)
-        inside = float(((error / sigma).abs() < 1.96).double().mean())
-        lines += show([
-            f"| {pairs} | {count} | {float(sigma.mean()):.5f}° | {float(error.square().mean().sqrt()):.5f}° "
-            f"| {float((error / sigma).square().mean().sqrt()):.2f} | {100 * inside:.0f} % of {len(errors)} "
-            f"| {seconds / len(errors):.1f} |"
-        ])  # fmt: skip
-    return lines
 
 
 def landmarks(draw: torch.Generator) -> Landmarks:
@@ -271,46 +372,49 @@ def at_five_km(found: RigResult, draw: torch.Generator) -> tuple[Tensor, Tensor]
     return 5000.0 * where.inverse_range - 1.0, 5000.0 * where.inverse_range_sigma
 
 
+RANGE_HEADS = ("corners, px", "from", "rigs", "RMS error at 5 km", "mean σ", "over σ", "inside 95 %")
+
+
 @torch.no_grad()
-def ranges(seeds: int) -> list[str]:
-    """Ranges at 5 km with calibrated lenses: from landmarks, from the scene, from both."""
-    places = measured()
-    lines = show(
-        ["| corners, px | from | RMS error at 5 km | mean σ | over σ | inside 95 % |", "|---|---|---|---|---|---|"]
-    )
+def ranges_of(corner: float, seed: int) -> Record:
+    """Relative errors at 5 km and their σ with calibrated lenses: from landmarks, from the scene, from both."""
     straight = RigOptions(refraction=0.0, refraction_sigma=0.0)
-    for corner in (0.05, 0.2):
-        rows: dict[str, list[tuple[Tensor, Tensor]]] = {}
-        for seed in range(seeds):
-            draw = torch.Generator().manual_seed(1000 + seed)
-            cameras = tuple(
-                calibrate_camera(capture(lens, 30, corner, 2 * seed + k)).camera
-                for k, lens in enumerate((RIG.left, RIG.right))
-            )
-            scene = rig_data((cameras[0], cameras[1]), drawn(places, 1, draw), draw)
-            survey = landmarks(draw)
-            alone = RigData(cameras=scene.cameras, names=NAMES, landmarks=survey)
-            both = dataclasses.replace(scene, landmarks=survey)
-            for name, data in (("12 landmarks", alone), ("one pair and a tape", scene), ("both", both)):
-                rows.setdefault(name, []).append(at_five_km(solve_rig(data, straight), draw))
-        for name, found in rows.items():
-            error, sigma = (torch.cat(part) for part in zip(*found, strict=True))
-            z = error / sigma
-            each = torch.stack([(e / s).abs() < 1.96 for e, s in found]).double().mean(1)
-            spread = float(each.std() / math.sqrt(len(each))) if len(each) > 1 else math.nan
-            lines += show([
-                f"| {corner} | {name} | {100 * float(error.square().mean().sqrt()):.1f} % "
-                f"| {100 * float(sigma.mean()):.1f} % | {float(z.square().mean().sqrt()):.2f} "
-                f"| {100 * float((z.abs() < 1.96).double().mean()):.0f} ± {100 * spread:.0f} % |"
+    draw = torch.Generator().manual_seed(1000 + seed)
+    cameras = tuple(
+        calibrate_camera(capture(lens, 30, corner, 2 * seed + k)).camera for k, lens in enumerate((RIG.left, RIG.right))
+    )
+    scene = rig_data((cameras[0], cameras[1]), drawn(measured(), 1, draw), draw)
+    survey = landmarks(draw)
+    alone = RigData(cameras=scene.cameras, names=NAMES, landmarks=survey)
+    both = dataclasses.replace(scene, landmarks=survey)
+    record: Record = {}
+    for name, data in (("12 landmarks", alone), ("one pair and a tape", scene), ("both", both)):
+        error, sigma = at_five_km(solve_rig(data, straight), draw)
+        record[name] = {"error": error.tolist(), "sigma": sigma.tolist()}
+    return record
+
+
+def range_rows(records: list[Record]) -> list[list[str]]:
+    """Rows of the table."""
+    rows = []
+    for corner in sorted({record["key"][0] for record in records}):
+        own = [record for record in records if record["key"][0] == corner]
+        for name in ("12 landmarks", "one pair and a tape", "both"):
+            error, sigma = (np.array([record[name][part] for record in own]) for part in ("error", "sigma"))
+            inside = (np.abs(error / sigma) < 1.96).mean(1)
+            spread = inside.std(ddof=1) / math.sqrt(len(own)) if len(own) > 1 else math.nan
+            rows.append([
+                f"{corner}", name, f"{len(own)}", f"{100 * np.sqrt(np.square(error).mean()):.1f} %",
+                f"{100 * sigma.mean():.1f} %", f"{np.sqrt(np.square(error / sigma).mean()):.2f}",
+                f"{100 * inside.mean():.0f} ± {100 * spread:.0f} %",
             ])  # fmt: skip
-    return lines
+    return rows
 
 
 @torch.no_grad()
-def speed(_: int = 0) -> list[str]:
+def speed(write: bool) -> None:
     """CPU seconds of the adjustment with calibrated lenses."""
     cameras = tuple(calibrate_camera(capture(lens, 20, 0.05, k)).camera for k, lens in enumerate((RIG.left, RIG.right)))
-    lines = show(["| matches | CPU s |", "|---|---|"])
     for count in (2000, 20_000):
         draw = torch.Generator().manual_seed(1)
         share = torch.rand(6 * count, 3, dtype=torch.float64, generator=draw)
@@ -323,8 +427,10 @@ def speed(_: int = 0) -> list[str]:
         data = rig_data((cameras[0], cameras[1]), drawn(places, 1, draw, 0.03), draw)
         start = time.process_time()
         solve_rig(data)
-        lines += show([f"| {count} | {time.process_time() - start:.1f} |"])
-    return lines
+        cells = (count, None, f"{time.process_time() - start:.1f}")
+        print(*cells, flush=True)
+        if write:
+            write_row("scene.md", "speed", ("matches", "CPU s before", "CPU s"), cells)
 
 
 def picture() -> None:
@@ -334,10 +440,11 @@ def picture() -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    pairs = [photographed(moment) for moment in (1, 2)]
-    scene = scene_of(EXACT, pairs, [match_scene(EXACT, pair) for pair in pairs])
+    terrain = Terrain(RIG, 1)
+    pairs = [photographed(terrain, moment) for moment in (2, 1)][::-1]
+    scene = scene_of(exact(1.0), pairs, [match_scene(exact(1.0), pair) for pair in pairs])
     left = scene.features.pixels[: scene.counts[0].used, 0]
-    _, distance = SCENE.true_right(left, 1)
+    _, distance = terrain.true_right(left, 1)
     figure, axes = plt.subplots(figsize=(9.6, 5.6), layout="constrained")
     axes.imshow(pairs[0].left, cmap="gray", vmin=0, vmax=255)
     dots = axes.scatter(
@@ -354,23 +461,48 @@ def picture() -> None:
     figure.savefig(DOCS.parent / "howto" / "scene.png", dpi=100)
 
 
-_PARTS: dict[str, Callable[[int], list[str]]] = {"matches": matches, "yaw": yaw, "ranges": ranges, "speed": speed}
+def repeated(part: str, given: argparse.Namespace) -> list[str]:
+    """The table of a simulation of many seeds, which goes on where it stopped."""
+    if given.out is None:
+        raise SystemExit(f"{part}: --out FILE is needed")
+    work, rows, heads = (yaw_of, yaw_rows, YAW_HEADS) if part == "yaw" else (ranges_of, range_rows, RANGE_HEADS)
+    first: list[tuple[object, ...]] = [(0.05,), (0.2,)]
+    if part == "yaw":
+        first = [(given.scale, given.pairs, times) for times in given.times]
+
+    def brief(record: Record) -> str:
+        return " ".join(f"{name} {np.mean(value['sigma']):.2g}" for name, value in record.items() if name != "key")
+
+    finish(given.out, [(*one, seed) for seed in seeds(given.seeds) for one in first], work, brief)
+    return table(heads, rows(read([given.out, *given.more])))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="+", choices=("matches", "yaw", "ranges", "speed", "picture"))
-    parser.add_argument("--seeds", type=int, default=30)
+    parser.add_argument("parts", nargs="+", choices=("matches", "common", "yaw", "ranges", "speed", "picture"))
+    parser.add_argument("--seeds", default="0-29")
+    parser.add_argument("--scale", type=float, default=0.5, help="of the pictures of yaw")
+    parser.add_argument("--pairs", type=int, default=10, help="of a minute and of a day, for yaw")
+    parser.add_argument("--times", nargs="+", choices=("minute", "day"), default=["minute", "day"], help="of yaw")
+    parser.add_argument("--out", type=Path, help="records of yaw or of ranges")
+    parser.add_argument("--more", type=Path, nargs="*", default=[], help="records of other runs for the same table")
     parser.add_argument("--write", action="store_true")
     given = parser.parse_args()
     torch.set_num_threads(1)
     for part in given.parts:
         if part == "picture":
             picture()
-            continue
-        lines = _PARTS[part](given.seeds)
-        if given.write:
-            write_section("scene.md", part, "\n".join(lines))
+        elif part == "speed":
+            speed(given.write)
+        else:
+            lines = (
+                {"matches": matches, "common": common}[part]()
+                if part in ("matches", "common")
+                else repeated(part, given)
+            )
+            show(lines)
+            if given.write:
+                write_section("scene.md", part, "\n".join(lines))
 
 
 if __name__ == "__main__":
