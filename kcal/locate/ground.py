@@ -8,16 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from kcal.checks import as_points
-from kcal.errors import FileError, InputError
-from kcal.files import read_head
+from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA, Mounting
 from kcal.locate.ellipsoid import mean_radius
@@ -34,8 +31,6 @@ _STEPS, _HALVINGS = 512, 50
 _STEP_M = 0.5
 # A place whose range is not known to a third is told as a bearing only.
 _BEARING_SIGMAS = 3.0
-# Of a raster, 1.6 GB as they are kept.
-_MOST_CELLS = 200_000_000
 
 
 class GroundPlaces(NamedTuple):
@@ -71,57 +66,6 @@ def level_ground(height: float) -> Ground:
     if not math.isfinite(height):
         raise InputError(f"ground height {height}: finite meters above the ellipsoid are needed")
     return lambda lat, lon: torch.full_like(lat, height)
-
-
-def terrain(path: str | Path, geoid_height: float = 0.0) -> Ground:
-    """Ground from a raster of heights, for example a GeoTIFF, interpolated between the middles of its cells.
-
-    Args:
-        path: a raster that rasterio reads, with a coordinate system; the extra `terrain` is needed.
-        geoid_height: meters that are added, for a raster of heights above the sea: the height of the geoid there.
-
-    Raises:
-        InputError: rasterio is missing, or a height that is not finite.
-        FileError: not a raster, one without coordinate system, or of more than 200 million cells.
-    """
-    try:
-        import rasterio
-    except ImportError as error:
-        raise InputError("terrain needs rasterio; install it with: pip install 'kcal[terrain]'") from error
-    import pyproj
-
-    if not math.isfinite(geoid_height):
-        raise InputError(f"geoid height {geoid_height}: finite meters are needed")
-    read_head(path, 0)
-    try:
-        with rasterio.open(path) as raster:
-            if raster.width * raster.height > _MOST_CELLS:
-                size = f"{raster.width} x {raster.height}"
-                raise FileError(f"{path}: {size} cells; at most {_MOST_CELLS:,} are read: cut out what is needed")
-            heights = raster.read(1, masked=True).astype(np.float64).filled(np.nan)
-            system, to_cell = raster.crs, ~raster.transform
-    except rasterio.errors.RasterioError as error:
-        raise FileError(f"{path}: cannot be read as a raster: {error}") from error
-    if system is None:
-        raise FileError(f"{path}: the raster has no coordinate system")
-    into = pyproj.Transformer.from_crs("EPSG:4326", system.to_wkt(), always_xy=True)
-    rows, columns = heights.shape
-
-    def height(lat: Tensor, lon: Tensor) -> Tensor:
-        x, y = into.transform(lon.numpy(), lat.numpy())
-        x, y = np.asarray(x), np.asarray(y)
-        column = to_cell.a * x + to_cell.b * y + to_cell.c - 0.5
-        row = to_cell.d * x + to_cell.e * y + to_cell.f - 0.5
-        left, top = np.floor(column), np.floor(row)
-        with np.errstate(invalid="ignore"):
-            inside = (left >= 0) & (top >= 0) & (left < columns - 1) & (top < rows - 1)
-        i, j = np.where(inside, top, 0).astype(int), np.where(inside, left, 0).astype(int)
-        a, b = column - left, row - top
-        found = (1 - b) * ((1 - a) * heights[i, j] + a * heights[i, j + 1])
-        found = found + b * ((1 - a) * heights[i + 1, j] + a * heights[i + 1, j + 1])
-        return torch.from_numpy(np.where(inside, found + geoid_height, np.nan))
-
-    return height
 
 
 @torch.no_grad()

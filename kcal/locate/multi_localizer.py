@@ -149,7 +149,7 @@ class MultiViewLocalizer(Float64Module):
         self.register_buffer("ecef_of_origin", None if place is None else place[1])
         zero = torch.zeros(3, dtype=torch.float64) if rig.origin is None else rig.origin.geodetic
         self.register_buffer("geodetic_of_origin", zero.to(device))
-        errors, bending, self.lens = _errors_by_camera(rig, root)
+        errors, bending, self.lens = errors_by_camera(rig, root)
         self.register_buffer("errors", errors)
         self.register_buffer("bending_errors", None if bending is None else bending * self.half_curvature)
         freedom = 2.0 * torch.arange(len(rig) + 1, dtype=torch.float64) - 3.0
@@ -338,7 +338,7 @@ class MultiViewLocalizer(Float64Module):
         return StatedHeight(point, up + 2.0 * self.half_curvature * level, torch.full_like(height, sigma), reached)
 
 
-def _errors_by_camera(
+def errors_by_camera(
     rig: CameraRig, root: Tensor | None
 ) -> tuple[Tensor | None, Tensor | None, tuple[tuple[int, ...], ...]]:
     """What `CommonErrors` contains: `half`, `bending` per unit of k, and `lens`."""

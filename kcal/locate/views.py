@@ -254,7 +254,7 @@ def fit_views(
     around = posed.around._replace(present=used.mT, held=held)
     weight, variance = None, noise**2
     if cov is not None or shared is not None:
-        moved = None if shared is None else _shared_pixels(posed, shared, (place, ahead, inverse), used, scale)
+        moved = None if shared is None else shared_pixels(posed, shared, (place, ahead, inverse), used, scale)
         weight, variance = _weight(cov, noise, used, moved), 1.0
     apart = place.detach()[..., None, :] - center
     lines = [
@@ -285,7 +285,7 @@ def _height_row(ahead: Tensor, inverse: Tensor, scale: Tensor, stated: StatedHei
     return torch.stack([climb[0], climb[1], -climb[2] * range_ / scale], -2)
 
 
-def _shared_pixels(
+def shared_pixels(
     posed: PosedCameras, shared: CommonErrors, at: tuple[Tensor, Tensor, Tensor], used: Tensor, scale: Tensor
 ) -> Tensor:
     """(K, 2 C, N) what each shared error moves in the pixels of points: anchor (N, 3), direction, inverse distance."""

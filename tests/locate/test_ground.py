@@ -14,7 +14,8 @@ from kcal.errors import FileError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.mounting import Mounting, Origin
 from kcal.locate.geodesy import enu_from_cam, geodetic_to_enu
-from kcal.locate.ground import level_ground, locate_on_ground, terrain
+from kcal.locate.ground import level_ground, locate_on_ground
+from kcal.locate.raster import terrain
 from kcal.locate.mounting import mounting_covariance
 
 CAMERA = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
