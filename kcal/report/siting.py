@@ -22,7 +22,7 @@ from kcal.report.figures import HALO, new_figure, save_picture
 
 # From good to poor; blind and single are told apart by the blind eye too.
 _RAMP = LinearSegmentedColormap.from_list("sigma", ["#0b5d4f", "#3aa17e", "#a6d69b", "#f3e79b", "#e9a857", "#c8553d"])
-_HIDDEN, _SINGLE = "#2f2b3a", "#b9b4c7"
+_HIDDEN, _SINGLE, _NEW = "#2f2b3a", "#b9b4c7", "#f8d568"
 
 
 def siting_figure(
@@ -57,10 +57,10 @@ def siting_figure(
     for number, (axes, (title, found)) in enumerate(zip(panels, maps, strict=True)):
         colored = _draw_area(axes, area, found, levels)
         later = [] if number else list(ranked)
-        _draw_sites(axes, area, [*sites, *(one.site for one in built if number)], later)
+        _draw_sites(axes, area, sites, [one.site for one in built if number], later)
         axes.set_title(
             f"{title}\n{100 * found.covered:.0f} % of the area seen by two or more, "
-            f"σ there {_typical(found)}",
+            f"median σ there {_typical(found)}",
             fontsize=10.5, loc="left",
         )  # fmt: skip
     figure.subplots_adjust(left=0.07, right=0.9, bottom=0.17, top=0.91, wspace=0.14)
@@ -70,7 +70,7 @@ def siting_figure(
     patches = [Patch(color=_SINGLE, label="one site sees it: a bearing only"), Patch(color=_HIDDEN, label="hidden")]
     marks = [axes.plot([], [], "^", color="white", markeredgecolor="black", markersize=9, label="site")[0]]
     if ranked:
-        marks.append(axes.plot([], [], "o", color="#f8d568", markeredgecolor="black", label="candidate, by rank")[0])
+        marks.append(axes.plot([], [], "o", color=_NEW, markeredgecolor="black", label="candidate, by rank; new site")[0])
     figure.legend(handles=[*patches, *marks], loc="lower left", bbox_to_anchor=(0.06, 0.045), ncols=4, frameon=False,
                   fontsize=9)  # fmt: skip
     figure.text(0.07, 0.02, _footer(maps[0][1], ranked), fontsize=9, color="#374151")
@@ -141,14 +141,17 @@ def _draw_area(axes: Axes, area: Area, found: SitingMap, levels: Sequence[float]
     return colored
 
 
-def _draw_sites(axes: Axes, area: Area, sites: Sequence[Site], ranked: Sequence[RankedSite]) -> None:
-    for site in sites:
+def _draw_sites(
+    axes: Axes, area: Area, sites: Sequence[Site], new: Sequence[Site], ranked: Sequence[RankedSite]
+) -> None:
+    for number, site in enumerate([*sites, *new]):
         x, y = _draw_field(axes, area, site)
-        axes.plot([x], [y], "^", color="white", markeredgecolor="black", markersize=9, zorder=5)
+        color = "white" if number < len(sites) else _NEW
+        axes.plot([x], [y], "^", color=color, markeredgecolor="black", markersize=9, zorder=5)
         axes.annotate(site.name, (x, y), (7, 6), textcoords="offset points", fontsize=9, path_effects=HALO, zorder=6)
     for rank, one in enumerate(ranked, start=1):
         x, y = _place(area, one.site)
-        axes.plot([x], [y], "o", color="#f8d568", markeredgecolor="black", markersize=13, zorder=5)
+        axes.plot([x], [y], "o", color=_NEW, markeredgecolor="black", markersize=13, zorder=5)
         axes.text(x, y, str(rank), ha="center", va="center", fontsize=8, zorder=6)
         axes.annotate(
             one.site.name, (x, y), (9, -10), textcoords="offset points", fontsize=8, path_effects=HALO, zorder=6
