@@ -146,9 +146,9 @@ def _bounds(text: str) -> list[float]:
 def _print_towers(now: SitingMap) -> None:
     from kcal.quantities import length_text
 
-    two = now.count > 1
+    two = now.seen_by > 1
     some = length_text(float(now.sigma[two].median()), digits=2) if bool(two.any()) else "nowhere known"
-    one = float((now.count == 1).double().mean())
+    one = float((now.seen_by == 1).double().mean())
     out.print(
         f"two towers or more see {100 * now.covered:.0f} % of the area, one {100 * one:.0f} %; median standard "
         f"deviation of positions where two do: {some}; root mean variance over all of it: "
@@ -178,7 +178,7 @@ def _map_text(area: Area, now: SitingMap, later: SitingMap | None) -> str:
     head, layout = ["lat", "lon", "height"], ["%.7f", "%.7f", "%.2f"]
     for found, word in ((now, ""), (later, "_after")):
         if found is not None:
-            columns += [found.count.double(), found.sigma]
+            columns += [found.seen_by.double(), found.sigma]
             head, layout = [*head, f"seen_by{word}", f"sigma_m{word}"], [*layout, "%.0f", "%.4g"]
     form = ",".join(layout)
     rows = torch.stack([column[area.known] for column in columns], -1).tolist()

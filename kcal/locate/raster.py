@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pyproj
@@ -22,10 +22,11 @@ _MOST_TEXT = 1 << 31
 _GRID_KEYS = {"ncols", "nrows", "xllcorner", "yllcorner", "xllcenter", "yllcenter", "cellsize", "nodata_value"}
 
 
-class Raster(NamedTuple):
+@dataclasses.dataclass(frozen=True, eq=False)
+class Raster:
     """Heights of the ground in cells, interpolated between their middles: a function of latitudes and longitudes.
 
-    Attributes:
+    Args:
         heights: (rows, columns) meters above the ellipsoid, NaN where they are not known.
         to_cell: a, b, c, d, e, f: column a x + b y + c and row d x + e y + f, counted from the first cell's corner.
         into: latitude and longitude (degrees) to x, y of the raster's coordinate system; None where these are degrees.
@@ -38,7 +39,7 @@ class Raster(NamedTuple):
     cell_m: float
 
     def __call__(self, lat: Tensor, lon: Tensor) -> Tensor:
-        """Height above the ellipsoid, meters, of latitudes and longitudes (degrees, of one shape); NaN where unknown."""
+        """Meters above the ellipsoid at latitudes and longitudes (degrees, of one shape); NaN where unknown."""
         x, y = lon.numpy(), lat.numpy()
         if self.into is not None:
             x, y = map(np.asarray, self.into.transform(x, y))
@@ -106,9 +107,7 @@ _Read = tuple[NDArray[np.float64], tuple[float, float, float, float, float, floa
 
 def _check_cells(path: Path, columns: int, rows: int) -> None:
     if columns * rows > _MOST_CELLS:
-        raise FileError(
-            f"{path}: {columns} x {rows} cells; at most {_MOST_CELLS:,} are read: cut out what is needed"
-        )
+        raise FileError(f"{path}: {columns} x {rows} cells; at most {_MOST_CELLS:,} are read: cut out what is needed")
 
 
 def _read_raster(path: Path) -> _Read:
@@ -161,7 +160,7 @@ def _read_grid(path: Path) -> _Read:
             system = pyproj.CRS.from_wkt(read_text(projection, 1 << 20))
         except pyproj.exceptions.CRSError as error:
             raise FileError(f"{projection}: not a coordinate system: {error}") from error
-    elif -180.0 <= x and x + columns * cell <= 180.0 and -90.0 <= y and y + rows * cell <= 90.0:
+    elif x >= -180.0 and x + columns * cell <= 180.0 and y >= -90.0 and y + rows * cell <= 90.0:
         system = pyproj.CRS("EPSG:4326")
     else:
         raise FileError(f"{path}: its numbers are not degrees; put the coordinate system beside it as {projection}")

@@ -103,12 +103,16 @@ def sites_of(rig: CameraRig, pixel_sigma: float = 0.3) -> list[Site]:
     for c, (name, camera) in enumerate(zip(rig.names, rig.each, strict=True)):
         stands = station_mounting(rig, c)
         width, height = camera.size
-        across, down = (torch.linspace(0.25, 0.75, _PLACES, dtype=torch.float64) * (side - 1) for side in (width, height))
+        across, down = (
+            torch.linspace(0.25, 0.75, _PLACES, dtype=torch.float64) * (side - 1) for side in (width, height)
+        )
         pixels = torch.cartesian_prod(across, down)
         rays, valid = camera.unproject(pixels)
         pixels, rays = pixels[valid], rays[valid]
         # Degrees that a pixel is wide and high there.
-        steps = [torch.rad2deg((camera.unproject(pixels + step)[0] - rays).norm(dim=-1)) for step in torch.eye(2).double()]
+        steps = [
+            torch.rad2deg((camera.unproject(pixels + step)[0] - rays).norm(dim=-1)) for step in torch.eye(2).double()
+        ]
         spread = torch.full((len(rays), 2), pixel_sigma**2, dtype=torch.float64)
         position = 0.0
         if rig.root is not None:

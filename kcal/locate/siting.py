@@ -124,7 +124,7 @@ class SitingMap(NamedTuple):
     covered: float
 
     @property
-    def count(self) -> Tensor:
+    def seen_by(self) -> Tensor:
         """(rows, columns) how many sites see it."""
         return self.sees.sum(0)
 

@@ -40,9 +40,7 @@ class Surface(NamedTuple):
         x = 2.0 * (east - self.corner[0]) / (self.step * (columns - 1)) - 1.0
         y = 2.0 * (north - self.corner[1]) / (self.step * (rows - 1)) - 1.0
         table = (self.below if heights else self.up)[None, None]
-        found = torch.nn.functional.grid_sample(
-            table, torch.stack([x, y], -1).reshape(1, 1, -1, 2), align_corners=True
-        )
+        found = torch.nn.functional.grid_sample(table, torch.stack([x, y], -1).reshape(1, 1, -1, 2), align_corners=True)
         inside = (x.abs() <= 1.0) & (y.abs() <= 1.0)
         return torch.where(inside, found.reshape(x.shape), math.nan)
 
@@ -66,7 +64,7 @@ def surface_of(ground: Ground, origin: Origin, low: Tensor, high: Tensor, step: 
     """
     span = (high - low).double()
     step = max(step, math.sqrt(float(span.prod()) / _MOST_SAMPLES))
-    columns, rows = (int(math.ceil(float(side) / step)) + 1 for side in span)
+    columns, rows = (math.ceil(float(side) / step) + 1 for side in span)
     east = float(low[0]) + step * torch.arange(columns, dtype=torch.float64)
     north = float(low[1]) + step * torch.arange(rows, dtype=torch.float64)
     y, x = torch.meshgrid(north, east, indexing="ij")
@@ -97,7 +95,7 @@ def visible(surface: Surface, eye: Tensor, points: Tensor, bending: float) -> Te
     step = max(surface.step, math.sqrt(2.0 * math.pi / _MOST_SAMPLES) * farthest)
     if farthest <= step:
         return torch.ones_like(distance, dtype=torch.bool)
-    rays = int(math.ceil(2.0 * math.pi * farthest / step))
+    rays = math.ceil(2.0 * math.pi * farthest / step)
     angle = 2.0 * math.pi / rays * torch.arange(rays, dtype=torch.float64)
     reach = step * torch.arange(1, int(farthest / step) + 1, dtype=torch.float64)
     up = surface.at(eye[0] + angle.sin()[:, None] * reach, eye[1] + angle.cos()[:, None] * reach)

@@ -70,7 +70,9 @@ def siting_figure(
     patches = [Patch(color=_SINGLE, label="one site sees it: a bearing only"), Patch(color=_HIDDEN, label="hidden")]
     marks = [axes.plot([], [], "^", color="white", markeredgecolor="black", markersize=9, label="site")[0]]
     if ranked:
-        marks.append(axes.plot([], [], "o", color=_NEW, markeredgecolor="black", label="candidate, by rank; new site")[0])
+        marks.append(
+            axes.plot([], [], "o", color=_NEW, markeredgecolor="black", label="candidate, by rank; new site")[0]
+        )
     figure.legend(handles=[*patches, *marks], loc="lower left", bbox_to_anchor=(0.06, 0.045), ncols=4, frameon=False,
                   fontsize=9)  # fmt: skip
     figure.text(0.07, 0.02, _footer(maps[0][1], ranked), fontsize=9, color="#374151")
@@ -92,7 +94,7 @@ def save_siting_picture(
 
 def _located(found: SitingMap) -> NDArray[np.float64]:
     """(rows, columns) standard deviations where two sites or more see a thing."""
-    return np.where((found.count > 1).numpy(), found.sigma.numpy(), np.nan)
+    return np.where((found.seen_by > 1).numpy(), found.sigma.numpy(), np.nan)
 
 
 def _typical(found: SitingMap) -> str:
@@ -120,7 +122,7 @@ def _flat(area: Area) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 def _draw_area(axes: Axes, area: Area, found: SitingMap, levels: Sequence[float]) -> Any:
     east, north = _flat(area)
-    count = np.where(area.known.numpy(), found.count.numpy(), np.nan).astype(float)
+    count = np.where(area.known.numpy(), found.seen_by.numpy(), np.nan).astype(float)
     blind = np.where(count == 0, 0.0, np.where(count == 1, 1.0, np.nan))
     axes.pcolormesh(east, north, blind, cmap=ListedColormap([_HIDDEN, _SINGLE]), vmin=0, vmax=1, rasterized=True)
     norm, sigma = BoundaryNorm(levels, 256, extend="both"), _located(found)

@@ -15,8 +15,8 @@ from kcal.lens.camera import Camera
 from kcal.lens.mounting import Mounting, Origin
 from kcal.locate.geodesy import enu_from_cam, geodetic_to_enu
 from kcal.locate.ground import level_ground, locate_on_ground
-from kcal.locate.raster import terrain
 from kcal.locate.mounting import mounting_covariance
+from kcal.locate.raster import terrain
 
 CAMERA = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
 ORIGIN = Origin(lat=19.07, lon=72.87, height=60.0)

@@ -150,7 +150,7 @@ def test_an_open_heading_is_turned_to_what_counts() -> None:
 
 
 def test_a_site_in_the_ground_is_refused() -> None:
-    with pytest.raises(InputError, match="site cellar: it stands 5.0 m below the ground"):
+    with pytest.raises(InputError, match=r"site cellar: it stands 5\.0 m below the ground"):
         area_of(BOUNDS, hills, [site("cellar", 45.0, 6.0, mast=-5.0)], cells=50, step=20.0)
 
 
@@ -219,7 +219,7 @@ def test_ascii_grids_in_meters_need_their_coordinate_system(tmp_path: Path) -> N
 
     head = "ncols 2\nnrows 3\nxllcorner 275000\nyllcorner 2110000\ncellsize 10\n"
     path = grid(tmp_path, head)
-    with pytest.raises(FileError, match="its numbers are not degrees; put the coordinate system beside it as .*grid.prj"):
+    with pytest.raises(FileError, match="put the coordinate system beside it as"):
         terrain(path)
     (tmp_path / "grid.prj").write_text(pyproj.CRS("EPSG:32643").to_wkt("WKT1_ESRI"))
     ground = terrain(path)
