@@ -37,6 +37,7 @@ class EarthFrame(NamedTuple):
     half_curvature: float
 
 
+@torch.no_grad()
 def ground_ahead(
     frame: EarthFrame, place: Tensor, ray: Tensor, first: Tensor, alone: Tensor, ground: Ground, sigma: float
 ) -> StatedHeight:
@@ -66,9 +67,10 @@ def ground_ahead(
 
 
 def height_ahead(
-    frame: EarthFrame, place: Tensor, ray: Tensor, first: Tensor, _: Tensor, height: Tensor, sigma: float
+    frame: EarthFrame, place: Tensor, ray: Tensor, first: Tensor, alone: Tensor, height: Tensor, sigma: float
 ) -> StatedHeight:
     """Where rays (N, 3) from places of cameras reach heights (N,) above the ellipsoid for the first time."""
+    del alone  # what several cameras saw is computed too, and not used
     one = first.to(torch.float64)
     up, own = one @ frame.up, one @ frame.heights
     target = torch.where(torch.isfinite(height), height, own)

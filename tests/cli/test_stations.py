@@ -225,8 +225,9 @@ def test_a_rig_of_four_is_judged(folder: Path) -> None:
     worst = station_sigmas(rig, 5000.0)
     assert worst is not None
     assert answer["sigma_m"] == pytest.approx(float(worst.total))
-    # Hundreds of kilometers apart no two see the same.
-    apart = CameraRig(rig.each, NAMES, rig.rotation[[0, 0, 0, 0]], 100 * rig.center, origin=rig.origin)
+    # Turned away from each other, no two see the same.
+    away = rig.rotation @ torch.diag(torch.tensor([-1.0, -1, 1], dtype=torch.float64))
+    apart = CameraRig(rig.each, NAMES, away, rig.center, origin=rig.origin)
     save_camera_rig(apart, folder / "apart.json")
     result = CliRunner().invoke(app, ["report", str(folder / "apart.json"), "--require", "1km:5%"])
     assert result.exit_code == 3
