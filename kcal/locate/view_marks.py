@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from kcal.calibrate.rig.sources import Features, Landmarks
@@ -118,13 +119,21 @@ def read_view_chunks(path: str | Path, cameras: Sequence[str]) -> Iterator[tuple
         done, reader = reader, _Gather(cameras)
         if open_key is not None:
             done.move(open_key, reader)
-        hashes = np.fromiter(map(hash, done.rows), np.int64, len(done.rows))
-        if len(seen) and bool((again := np.isin(hashes, seen)).any()):
-            raise FileError(_apart(done.first[int(again.argmax())]))
-        seen = np.concatenate([seen, hashes])
         if done.first:
+            seen = _once(done, seen)
             yield done.marks(more, timed=True), chunk.bytes_read
+    _once(reader, seen)
     yield reader.marks(more, timed=True), path.stat().st_size
+
+
+def _once(done: _Gather, seen: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Raise if a thing was there before; return the sorted hashes of all so far, eight bytes each."""
+    hashes = np.fromiter(map(hash, done.rows), np.int64, len(done.rows))
+    place = np.searchsorted(seen, hashes)
+    again = (seen[np.minimum(place, len(seen) - 1)] == hashes) if len(seen) else np.zeros(len(hashes), bool)
+    if again.any():
+        raise FileError(_apart(done.first[int(again.argmax())]))
+    return np.sort(np.concatenate([seen, hashes]), kind="stable")
 
 
 def _apart(row: TableRow) -> str:
