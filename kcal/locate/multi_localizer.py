@@ -250,14 +250,13 @@ class MultiViewLocalizer(Float64Module):
         )
         shared = None if self.errors is None else CommonErrors(self.lens, self.errors, self.bending_errors)
         reach = None
-        if self.up is not None and self.ecef_from_enu is not None and (height is not None or ground is not None):
+        if self.up is not None and self.ecef_from_enu is not None:
             bending = self.rig.refraction, self.half_curvature
             frame = EarthFrame(self.up, self.heights, self.ecef_from_enu, self.ecef_of_origin, *bending)
-            reach = (
-                partial(ground_ahead, frame, ground=ground, sigma=sigma)
-                if ground is not None
-                else partial(height_ahead, frame, height=height, sigma=sigma)
-            )
+            if ground is not None:
+                reach = partial(ground_ahead, frame, ground=ground, sigma=sigma)
+            elif height is not None:
+                reach = partial(height_ahead, frame, height=height, sigma=sigma)
         views = fit_views(
             posed, pixels, seen, noise=self.pixel_sigma, cov=cov, shared=shared, height=reach,
             differentiated=differentiated,

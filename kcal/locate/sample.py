@@ -65,6 +65,8 @@ class PositionSample:
 
     def located(self, locate: Locator | ViewsLocator) -> Located:
         """What was kept, in the order of the table."""
-        by_views = isinstance(locate, ViewsLocator)
-        found = locate.located(self._kept, self._feet) if by_views else located_by(locate, self._kept)
+        if isinstance(locate, ViewsLocator):
+            found = locate.located(self._kept, self._feet)
+        else:
+            found = located_by(locate, self._kept)
         return found if len(self._numbers) == self.count else dataclasses.replace(found, rows=self.count)
