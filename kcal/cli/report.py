@@ -192,7 +192,7 @@ def _judged_again(
 
 
 def _of_rig(path: Path, observations: list[Path], needs: tuple[Requirement, ...], pixel_sigma: float | None) -> Judged:
-    from kcal.cli.rig_sources import numbered
+    from kcal.cli.rig_sources import cameras_of_files
     from kcal.corners.observations import Observations
     from kcal.io.rig_file import load_rig
     from kcal.locate.stations import load_camera_rig, names_of_rig
@@ -205,7 +205,7 @@ def _of_rig(path: Path, observations: list[Path], needs: tuple[Requirement, ...]
     if pair and observations and len(observations) != 2:
         raise InputError("a rig needs --observations twice: left, then right")
     if not pair and observations:
-        cameras = [cameras[number] for number in numbered(observations, [name for name, _ in cameras])]
+        cameras = [cameras[number] for number in cameras_of_files(observations, [name for name, _ in cameras])]
     if observations:
         check_views_of(
             [camera for _, camera in cameras], [Observations.load(file) for file in observations], observations

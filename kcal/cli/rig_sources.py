@@ -182,11 +182,11 @@ def _read_boards(cameras: Sequence[Camera], sources: Sources) -> tuple[Boards | 
         return boards, len(views[0]) + len(views[1]) - 2 * len(matched)
     if not sources.observations:
         return None, 0
-    own = dict(zip(numbered(sources.observations, sources.names), sources.observations, strict=True))
+    own = dict(zip(cameras_of_files(sources.observations, sources.names), sources.observations, strict=True))
     return boards_of_several(cameras, sources.names, {number: Observations.load(own[number]) for number in own}), 0
 
 
-def numbered(paths: Sequence[Path], names: Sequence[str]) -> list[int]:
+def cameras_of_files(paths: Sequence[Path], names: Sequence[str]) -> list[int]:
     """Numbers of the cameras that files are named after, up to the first dot.
 
     Raises:

@@ -46,10 +46,10 @@ def read_sites(path: str | Path, ground: Ground | None = None) -> list[Site]:
         >>> site.name, site.heading_deg, site.field_deg
         ('mill', 90.0, 60.0)
     """
-    return [_site_of(row, ground) for row in read_rows(path, _HEADER, _COLUMNS, ("name", "lat", "lon"))]
+    return [_table_site(row, ground) for row in read_rows(path, _HEADER, _COLUMNS, ("name", "lat", "lon"))]
 
 
-def _site_of(row: TableRow, ground: Ground | None) -> Site:
+def _table_site(row: TableRow, ground: Ground | None) -> Site:
     stated = {column: row.number(column) for column in _COLUMNS[1:] if row.cells.get(column)}
     if ("height" in stated) == ("mast" in stated):
         raise FileError(
@@ -123,7 +123,7 @@ def sites_of(rig: CameraRig, pixel_sigma: float = 0.3) -> list[Site]:
             root = torch.nn.functional.pad(columns, (0, 1))
             half, bending, lens = errors_by_camera(alone, root)
             if half is not None and bending is not None:
-                spread = spread + _moved(alone, CommonErrors(lens, half, bending), rays @ rig.rotation[c])
+                spread = spread + _common_variance(alone, CommonErrors(lens, half, bending), rays @ rig.rotation[c])
         sigma = [float((spread[:, axis].sqrt() * steps[axis]).median()) for axis in (0, 1)]
         sites.append(Site(
             name=name, origin=stands.origin, heading_deg=stands.heading_deg, pitch_deg=stands.pitch_deg,
@@ -133,7 +133,7 @@ def sites_of(rig: CameraRig, pixel_sigma: float = 0.3) -> list[Site]:
     return sites
 
 
-def _moved(alone: CameraRig, common: CommonErrors, rays: Tensor) -> Tensor:
+def _common_variance(alone: CameraRig, common: CommonErrors, rays: Tensor) -> Tensor:
     """(N, 2) variance that common errors of one camera give its pixels of things far away, in px²."""
     posed = PosedCameras(alone.each, alone.rotation, alone.center)
     used = torch.ones(len(rays), 1, dtype=torch.bool)

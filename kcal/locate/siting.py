@@ -21,7 +21,7 @@ from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA, Origin
 from kcal.locate.ellipsoid import ecef_from_enu_rotation, mean_radius
 from kcal.locate.geodesy import anchor, enu_from_cam, geodetic_to_enu
 from kcal.locate.ground import Ground
-from kcal.locate.viewshed import Surface, eye_height, surface_of, visible
+from kcal.locate.viewshed import GroundSurface, eye_height, seen_over, surface_of
 
 # Headings that are tried for a candidate that does not look all around and has none.
 _HEADINGS = 36
@@ -47,6 +47,10 @@ class Site:
 
     Raises:
         InputError: a value out of range.
+
+    Example:
+        >>> Site(name="mill", origin=Origin(lat=45.0, lon=6.0, height=812.0), heading_deg=90.0).sigma_deg
+        0.05
     """
 
     name: str
@@ -93,7 +97,7 @@ class Area(NamedTuple):
     lon: Tensor
     points: Tensor
     ground: Tensor
-    surface: Surface
+    surface: GroundSurface
 
     @property
     def known(self) -> Tensor:
@@ -324,7 +328,7 @@ def _seen_by(area: Area, site: Site) -> _View:
     eye = geodetic_to_enu(site.origin.geodetic, area.origin)
     points = area.points[area.known]
     curve = 0.5 / mean_radius(site.origin.lat)
-    clear = visible(area.surface, eye, points, REFRACTION * curve)
+    clear = seen_over(area.surface, eye, points, REFRACTION * curve)
     to_own = ecef_from_enu_rotation(site.origin.lat, site.origin.lon).T @ anchor(area.origin)[0]
     own = (points - eye) @ to_own.T
     level = own[:, :2].square().sum(-1)

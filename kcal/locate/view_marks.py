@@ -83,7 +83,7 @@ def read_views(path: str | Path, cameras: Sequence[str], *, ranges: bool = False
         return ViewMarks(pairs.names, pairs.pixels, pairs.sigmas(math.nan), {})
     reader = _Gather(cameras, others)
     more: list[str] = []
-    for chunk in _chunks(path, ranges):
+    for chunk in _view_chunks(path, ranges):
         more = [column for column in chunk.columns if column not in _KNOWN]
         for row in chunk.rows():
             reader.add(row)
@@ -107,12 +107,12 @@ def read_view_chunks(path: str | Path, cameras: Sequence[str]) -> Iterator[tuple
         return
     reader, more, seen = _Gather(cameras), list[str](), np.empty(0, np.int64)
     open_key: tuple[str, str] | None = None
-    for chunk in _chunks(path, False):
+    for chunk in _view_chunks(path, False):
         more = [column for column in chunk.columns if column not in _KNOWN]
         for row in chunk.rows():
             key = row.name, row.cells.get("time", "")
             if key != open_key and key in reader.rows:
-                raise FileError(_apart(row))
+                raise FileError(_not_together(row))
             reader.add(row)
             open_key = key
         # The last thing may go on.
@@ -120,30 +120,30 @@ def read_view_chunks(path: str | Path, cameras: Sequence[str]) -> Iterator[tuple
         if open_key is not None:
             done.move(open_key, reader)
         if done.first:
-            seen = _once(done, seen)
+            seen = _things_once(done, seen)
             yield done.marks(more, timed=True), chunk.bytes_read
-    _once(reader, seen)
+    _things_once(reader, seen)
     yield reader.marks(more, timed=True), path.stat().st_size
 
 
-def _once(done: _Gather, seen: NDArray[np.int64]) -> NDArray[np.int64]:
+def _things_once(done: _Gather, seen: NDArray[np.int64]) -> NDArray[np.int64]:
     """Raise if a thing was there before; return the sorted hashes of all so far, eight bytes each."""
     hashes = np.fromiter(map(hash, done.rows), np.int64, len(done.rows))
     place = np.searchsorted(seen, hashes)
     again = (seen[np.minimum(place, len(seen) - 1)] == hashes) if len(seen) else np.zeros(len(hashes), bool)
     if again.any():
-        raise FileError(_apart(done.first[int(again.argmax())]))
+        raise FileError(_not_together(done.first[int(again.argmax())]))
     return np.sort(np.concatenate([seen, hashes]), kind="stable")
 
 
-def _apart(row: TableRow) -> str:
+def _not_together(row: TableRow) -> str:
     return (
         f"{row.where}: lines of {row.name!r} stand at several places; in a table this long they must stand together: "
         "sort it by name and time"
     )
 
 
-def _chunks(path: str | Path, ranges: bool) -> Iterator[TableChunk]:
+def _view_chunks(path: str | Path, ranges: bool) -> Iterator[TableChunk]:
     known = (*_KNOWN, *(_RANGES if ranges else ()))
     return read_chunks(path, _HEADER, known, _LONG, extras=not ranges, unique=False)
 

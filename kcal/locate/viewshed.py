@@ -19,7 +19,7 @@ _MOST_SAMPLES = 16_000_000
 _STEPS = 2
 
 
-class Surface(NamedTuple):
+class GroundSurface(NamedTuple):
     """Ground in the axes east, north, up of an origin, on a grid of equal steps.
 
     Attributes:
@@ -45,7 +45,7 @@ class Surface(NamedTuple):
         return torch.where(inside, found.reshape(x.shape), math.nan)
 
 
-def surface_of(ground: Ground, origin: Origin, low: Tensor, high: Tensor, step: float) -> Surface:
+def surface_of(ground: Ground, origin: Origin, low: Tensor, high: Tensor, step: float) -> GroundSurface:
     """Sample ground over a rectangle.
 
     Args:
@@ -73,11 +73,11 @@ def surface_of(ground: Ground, origin: Origin, low: Tensor, high: Tensor, step: 
         lat, lon, height = place_enu(torch.stack([x, y, up], -1), *place).unbind(-1)
         below = ground(lat, lon)
         up = torch.where(below.isfinite(), up + below - height, up)
-    return Surface(torch.where(below.isfinite(), up, math.nan), (float(low[0]), float(low[1])), step, below)
+    return GroundSurface(torch.where(below.isfinite(), up, math.nan), (float(low[0]), float(low[1])), step, below)
 
 
 @torch.no_grad()
-def visible(surface: Surface, eye: Tensor, points: Tensor, bending: float) -> Tensor:
+def seen_over(surface: GroundSurface, eye: Tensor, points: Tensor, bending: float) -> Tensor:
     """(N,) whether points are seen from an eye over the ground; unknown ground hides nothing.
 
     The highest slope up to each distance is found along rays in all directions, as far apart as the grid's points;
@@ -110,7 +110,7 @@ def visible(surface: Surface, eye: Tensor, points: Tensor, bending: float) -> Te
     return known & ((before < 0) | (own >= horizon))
 
 
-def eye_height(surface: Surface, name: str, eye: Tensor) -> None:
+def eye_height(surface: GroundSurface, name: str, eye: Tensor) -> None:
     """Raise `InputError` if an eye (3,) is below the ground."""
     ground = float(surface.at(eye[:1], eye[1:2])[0])
     if float(eye[2]) < ground:

@@ -51,16 +51,16 @@ def siting_figure(
     if built:
         names = ", ".join(one.site.name for one in built)
         maps.append((f"With {names}", siting_map(area, [*sites, *(one.site for one in built)], weights)))
-    levels = _levels([found for _, found in maps])
+    levels = _sigma_levels([found for _, found in maps])
     figure = new_figure(6.4 * len(maps) + 1.0, 7.4)
     panels = figure.subplots(1, len(maps), squeeze=False)[0]
     for number, (axes, (title, found)) in enumerate(zip(panels, maps, strict=True)):
-        colored = _draw_area(axes, area, found, levels)
+        colored = _siting_area(axes, area, found, levels)
         later = [] if number else list(ranked)
-        _draw_sites(axes, area, sites, [one.site for one in built if number], later)
+        _siting_marks(axes, area, sites, [one.site for one in built if number], later)
         axes.set_title(
             f"{title}\n{100 * found.covered:.0f} % of the area seen by two or more, "
-            f"median σ there {_typical(found)}",
+            f"median σ there {_median_sigma(found)}",
             fontsize=10.5, loc="left",
         )  # fmt: skip
     figure.subplots_adjust(left=0.07, right=0.9, bottom=0.17, top=0.91, wspace=0.14)
@@ -75,7 +75,7 @@ def siting_figure(
         )
     figure.legend(handles=[*patches, *marks], loc="lower left", bbox_to_anchor=(0.06, 0.045), ncols=4, frameon=False,
                   fontsize=9)  # fmt: skip
-    figure.text(0.07, 0.02, _footer(maps[0][1], ranked), fontsize=9, color="#374151")
+    figure.text(0.07, 0.02, _siting_footer(maps[0][1], ranked), fontsize=9, color="#374151")
     return figure
 
 
@@ -88,24 +88,35 @@ def save_siting_picture(
     Raises:
         InputError: another suffix.
         FileError: the file cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> from kcal.lens.mounting import Origin
+        >>> from kcal.locate.ground import level_ground
+        >>> from kcal.locate.siting import area_of
+        >>> mill = Site(name="mill", origin=Origin(lat=45.0, lon=6.0, height=99.0))
+        >>> area = area_of((45.05, 5.95, 45.15, 6.05), level_ground(0.0), [mill], cells=10)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     save_siting_picture(Path(folder, "sites.png"), area, [mill]).name
+        'sites.png'
     """
     return save_picture(path, siting_figure(area, sites, ranked, weights))
 
 
-def _located(found: SitingMap) -> NDArray[np.float64]:
+def _map_sigma(found: SitingMap) -> NDArray[np.float64]:
     """(rows, columns) standard deviations where two sites or more see a thing."""
     return np.where((found.seen_by > 1).numpy(), found.sigma.numpy(), np.nan)
 
 
-def _typical(found: SitingMap) -> str:
-    there = _located(found)
+def _median_sigma(found: SitingMap) -> str:
+    there = _map_sigma(found)
     there = there[np.isfinite(there)]
     return length_text(float(np.median(there)), digits=2) if len(there) else "nowhere known"
 
 
-def _levels(maps: Sequence[SitingMap]) -> list[float]:
+def _sigma_levels(maps: Sequence[SitingMap]) -> list[float]:
     """Steps of 1, 2, 5 from what the best twentieth of the area has to what the worst twentieth has."""
-    values = np.concatenate([_located(found).ravel() for found in maps])
+    values = np.concatenate([_map_sigma(found).ravel() for found in maps])
     values = values[np.isfinite(values)]
     low, high = np.quantile(values, [0.02, 0.95]) if len(values) else (1.0, 10.0)
     steps = [step * 10.0**power for power in range(-3, 6) for step in (1.0, 2.0, 5.0)]
@@ -114,18 +125,18 @@ def _levels(maps: Sequence[SitingMap]) -> list[float]:
     return steps[first : max(last, first + 2) + 1]
 
 
-def _flat(area: Area) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _map_grid(area: Area) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     lats, lons = torch.meshgrid(area.lat, (area.lon + 180.0) % 360.0 - 180.0, indexing="ij")
     east, north, _ = geodetic_to_enu(torch.stack([lats, lons, torch.zeros_like(lats)], -1), area.origin).unbind(-1)
     return east.numpy() / 1e3, north.numpy() / 1e3
 
 
-def _draw_area(axes: Axes, area: Area, found: SitingMap, levels: Sequence[float]) -> Any:
-    east, north = _flat(area)
+def _siting_area(axes: Axes, area: Area, found: SitingMap, levels: Sequence[float]) -> Any:
+    east, north = _map_grid(area)
     count = np.where(area.known.numpy(), found.seen_by.numpy(), np.nan).astype(float)
     blind = np.where(count == 0, 0.0, np.where(count == 1, 1.0, np.nan))
     axes.pcolormesh(east, north, blind, cmap=ListedColormap([_HIDDEN, _SINGLE]), vmin=0, vmax=1, rasterized=True)
-    norm, sigma = BoundaryNorm(levels, 256, extend="both"), _located(found)
+    norm, sigma = BoundaryNorm(levels, 256, extend="both"), _map_sigma(found)
     colored = axes.pcolormesh(east, north, sigma, cmap=_RAMP, norm=norm, rasterized=True)
     if np.isfinite(sigma).any():
         lines = axes.contour(east, north, sigma, levels=levels, colors="white", linewidths=0.7, alpha=0.8)
@@ -143,16 +154,16 @@ def _draw_area(axes: Axes, area: Area, found: SitingMap, levels: Sequence[float]
     return colored
 
 
-def _draw_sites(
+def _siting_marks(
     axes: Axes, area: Area, sites: Sequence[Site], new: Sequence[Site], ranked: Sequence[RankedSite]
 ) -> None:
     for number, site in enumerate([*sites, *new]):
-        x, y = _draw_field(axes, area, site)
+        x, y = _site_field(axes, area, site)
         color = "white" if number < len(sites) else _NEW
         axes.plot([x], [y], "^", color=color, markeredgecolor="black", markersize=9, zorder=5)
         axes.annotate(site.name, (x, y), (7, 6), textcoords="offset points", fontsize=9, path_effects=HALO, zorder=6)
     for rank, one in enumerate(ranked, start=1):
-        x, y = _place(area, one.site)
+        x, y = _site_place(area, one.site)
         axes.plot([x], [y], "o", color=_NEW, markeredgecolor="black", markersize=13, zorder=5)
         axes.text(x, y, str(rank), ha="center", va="center", fontsize=8, zorder=6)
         axes.annotate(
@@ -160,14 +171,14 @@ def _draw_sites(
         )
 
 
-def _place(area: Area, site: Site) -> tuple[float, float]:
+def _site_place(area: Area, site: Site) -> tuple[float, float]:
     east, north, _ = (geodetic_to_enu(site.origin.geodetic, area.origin) / 1e3).tolist()
     return east, north
 
 
-def _draw_field(axes: Axes, area: Area, site: Site) -> tuple[float, float]:
+def _site_field(axes: Axes, area: Area, site: Site) -> tuple[float, float]:
     """A short wedge where a site does not look all around."""
-    x, y = _place(area, site)
+    x, y = _site_place(area, site)
     if site.heading_deg is not None and (site.field_deg < 360.0 or site.camera is not None):
         half = 0.5 * site.field_deg
         if site.camera is not None:
@@ -185,7 +196,7 @@ def _draw_field(axes: Axes, area: Area, site: Site) -> tuple[float, float]:
     return x, y
 
 
-def _footer(today: SitingMap, ranked: Sequence[RankedSite]) -> str:
+def _siting_footer(today: SitingMap, ranked: Sequence[RankedSite]) -> str:
     if not ranked:
         return ""
     best = [f"{i}. {one.site.name}: {length_text(one.mean_sigma, digits=3)}" for i, one in enumerate(ranked[:5], 1)]

@@ -218,7 +218,7 @@ def many(cameras: int, views: int) -> list[str]:
     toward = torch.stack([-(aim - centers)[:, 1], (aim - centers)[:, 0], torch.zeros(cameras)], -1).double() / 4.2
     turns = rotation_from_vector(-toward + 0.02 * draw(cameras, 3))
     rig = CameraRig(lenses, [f"c{c}" for c in range(cameras)], turns, centers, refraction=0.0)
-    board, moments = Board(columns=9, rows=6, square=0.1), []
+    board, moments = Board(columns=9, rows=6, square=0.1), list[Tensor]()
     while len(moments) < views:
         shift = aim + draw(3) * torch.tensor([0.35, 0.2, 0.4]).double()
         points = (board.points - board.points.mean(0)) @ rotation_from_vector(0.35 * draw(3)).T + shift
@@ -230,7 +230,7 @@ def many(cameras: int, views: int) -> list[str]:
     start = time.process_time()
     observed = {
         c: Observations(board=board, image_size=(1920, 1080), views=tuple(
-            View(name=f"{i:03d}.png", pixels=[(u, v) for u, v in corners[i, c].tolist()]) for i in range(views)))
+            View(name=f"{i:03d}.png", pixels=tuple((u, v) for u, v in corners[i, c].tolist())) for i in range(views)))
         for c in range(cameras)
     }  # fmt: skip
     calibrated = tuple(calibrate_camera(one).camera for one in observed.values())

@@ -20,7 +20,7 @@ from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.locate.raster import terrain
 from kcal.locate.site_tables import read_sites, sites_of
 from kcal.locate.siting import Area, Site, area_of, rank_sites, siting_map
-from kcal.locate.viewshed import surface_of, visible
+from kcal.locate.viewshed import seen_over, surface_of
 from scripts.shared.station_scenes import ORIGIN, marks, ring
 
 BOUNDS = (44.96, 5.95, 45.04, 6.05)
@@ -43,7 +43,7 @@ def test_hidden_ground_is_that_which_a_ray_by_itself_does_not_reach() -> None:
     area = area_of(BOUNDS, hills, [tower], cells=60, step=30.0)
     eye = geodetic_to_enu(tower.origin.geodetic, area.origin)
     points, curve = area.points.reshape(-1, 3), 0.5 / mean_radius(45.0)
-    found = visible(area.surface, eye, points, k * curve)
+    found = seen_over(area.surface, eye, points, k * curve)
     share = torch.linspace(0.002, 0.998, 997, dtype=torch.float64)
     lines = eye + share[:, None] * (points - eye)[:, None]
     level = (points - eye)[:, :2].square().sum(-1)[:, None]
@@ -65,7 +65,7 @@ def test_the_sea_ends_at_the_horizon(refraction: float, horizon: float) -> None:
     surface = surface_of(level_ground(0.0), origin, torch.tensor([-500.0, -500]), torch.tensor([500.0, 45_000]), 50.0)
     there = torch.stack([torch.zeros_like(far), far, surface.at(torch.zeros_like(far), far)], -1)
     eye = torch.tensor([0.0, 0.0, 100.0], dtype=torch.float64)
-    seen = visible(surface, eye, there, refraction * 0.5 / mean_radius(45.0))
+    seen = seen_over(surface, eye, there, refraction * 0.5 / mean_radius(45.0))
     assert float(far[seen].max()) == pytest.approx(horizon, rel=0.01)
     assert bool((seen == (far <= far[seen].max())).all())
 
