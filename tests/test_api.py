@@ -63,6 +63,7 @@ PUBLIC = {
     """,
     "kcal.locate": """
         MultiViewLocalizer ViewMarks ViewsLocalization locate_views read_views
+        Area RankedSite Raster Site SitingMap area_of rank_sites read_sites siting_map sites_of
         BudgetErrors DisparityRanges Geoid GroundPlaces Localization Marks RangeImage Position PositionColumns
         RangeError Sensitivity Triangulate TriangulateViews Triangulation Viewpoint ViewsResult
         circular_error enu_from_cam enu_to_geodetic
@@ -78,7 +79,7 @@ PUBLIC = {
         FailedImage Finding RangeAnswer Requirement Verdict calibration_figure camera_verdict positions_figure
         rig_figure rig_verdict save_board_picture save_budget_picture save_calibration_picture save_coverage
         save_difference_picture save_gallery save_interval_picture save_map save_positions_picture
-        save_rig_picture save_verdict_page
+        save_rig_picture save_siting_picture save_verdict_page siting_figure
         stored_verdict
     """,
     "kcal.stars": """
@@ -112,12 +113,29 @@ NEW_NAMES = (
     | {"DisparityRanges", "RangeImage", "forgotten_yaw", "save_interval_picture"}
     | {"CameraRig", "CameraRigCalibration", "load_camera_rig", "save_camera_rig", "station_mounting", "stations_of"}
     | {"MultiViewLocalizer", "ViewMarks", "ViewsLocalization", "locate_views", "read_views"}
+    | {
+        "Area",
+        "RankedSite",
+        "Raster",
+        "Site",
+        "SitingMap",
+        "area_of",
+        "rank_sites",
+        "read_sites",
+        "siting_map",
+        "sites_of",
+    }
+    | {"save_siting_picture", "siting_figure"}
     | set(PUBLIC["kcal.stars"].split())
 )
 # Types of attributes in which only those look who work on kcal.
-INSIDE = {"FieldModes", "HybridFit", "BoardState", "Spline", "HistoryRow", "TurnModel"}
+INSIDE = {"GroundSurface", "FieldModes", "HybridFit", "BoardState", "Spline", "HistoryRow", "TurnModel"}
 # What functions return, and blocks of files: examples are those of the functions.
 RECORDS = {
+    "Area",
+    "RankedSite",
+    "Raster",
+    "SitingMap",
     "CameraRigCalibration",
     "ViewMarks",
     "ViewsLocalization",

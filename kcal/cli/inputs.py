@@ -101,6 +101,11 @@ SURVEY = Wanted(
     frozenset({"survey", "table", "geojson", "gpx", "json"}),
     "kcal import places.gpx --sigma 0.02 --geoid -67.3 -o survey.csv",
 )
+SITES = Wanted(
+    "a table of sites (name,lat,lon,height) or a kcal rig file",
+    frozenset({"survey", "table", "rig"}),
+    "kcal sites --help",
+)
 TABLE = Wanted("a table (CSV)", frozenset({"table", "marks", "survey"}), _MARK)
 IMAGES = Wanted(
     "an image, a folder of images or a video",

@@ -1,23 +1,17 @@
-"""`kcal locate`: pixel pairs to positions on the Earth."""
+"""`kcal locate`: pixels of two cameras or more to positions on the Earth."""
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from kcal.cli.console import err, steps, warn
-from kcal.cli.inputs import MARKS, RIG, SURVEY, typed_with
+from kcal.cli.console import err, steps
+from kcal.cli.inputs import MARKS, RIG, SURVEY
 from kcal.cli.located_text import draw_positions, tell_located
-from kcal.cli.pixel_sigma import ASSUMED, PixelSigma, pixel_sigma_and_source
-from kcal.cli.settings import taken
-from kcal.errors import InputError
+from kcal.cli.pixel_sigma import PixelSigma
 from kcal.files import check_picture, check_writable, written_files
-
-if TYPE_CHECKING:
-    from kcal.lens.rig import StereoRig
 
 
 def locate_command(
@@ -119,6 +113,23 @@ def locate_command(
             help="Height above the ellipsoid of what one camera alone saw; otherwise that has a bearing only.",
         ),
     ] = None,
+    terrain: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RASTER",
+            help="In place of --height: heights of the ground on which it stands, an ESRI ASCII grid (.asc), or a "
+            "GeoTIFF (needs 'kcal\\[terrain]').",
+            hidden=True,
+        ),
+    ] = None,
+    terrain_sigma: Annotated[
+        float,
+        typer.Option(metavar="M", help="Standard deviation of the terrain's heights.", min=0.01, hidden=True),
+    ] = 3.0,
+    geoid_height: Annotated[
+        float,
+        typer.Option(metavar="M", help="Added to the terrain's heights if they are above the sea.", hidden=True),
+    ] = 0.0,
     geoid: Annotated[
         Path | None, typer.Option(help="Geoid grid file (.tif, .gtx); one that PROJ finds if not given.", hidden=True)
     ] = None,
@@ -173,7 +184,8 @@ def locate_command(
     needed.
 
     Of several cameras (one line for each mark: name,camera,u,v) any may have seen a thing; with three or more, a mark
-    that contradicts the others is left out and named. One camera alone gives a bearing, or a position at --height.
+    that contradicts the others is left out and named. One camera alone gives a bearing, or a position at --height or
+    where its line of sight meets the --terrain.
 
     A rig that was watched is known better: with `--watch`, attitude and its sigma are those of each row's time (Unix
     seconds or ISO). Without a history, `--aged` says what is lost since the rig was solved.
@@ -196,24 +208,13 @@ def locate_command(
 
     `kcal locate towers.rig.json smoke.csv --height 240±30 --map map.html`
     """
+    from kcal.cli.locate_runs import LocateOptions, locate_run
     from kcal.cli.stations import parse_height
-    from kcal.cli.watched_rows import located_at
-    from kcal.io.rig_file import load_rig
     from kcal.lens.mounting import Origin
-    from kcal.lens.rig import RigCovariance
-    from kcal.locate.aging import parse_aging
-    from kcal.locate.datum import find_geoid, true_from_grid
     from kcal.locate.export import STREAM, check_format, open_writers
-    from kcal.locate.marks import filled, read_mark_chunks
-    from kcal.locate.mounting import run_errors
-    from kcal.locate.positions import located_by
     from kcal.locate.sample import PositionSample
-    from kcal.locate.station_positions import locate_views
-    from kcal.locate.stations import load_camera_rig, names_of_rig
     from kcal.locate.survey import read_survey
-    from kcal.locate.tabulate import Locator
     from kcal.locate.truth import read_truth
-    from kcal.locate.view_marks import is_long, read_views
 
     outputs = output or []
     streamed = STREAM in outputs
@@ -239,92 +240,34 @@ def locate_command(
         raise typer.BadParameter("--pitch, --roll and --grid belong to --heading; the rig file has its own attitude")
     # Parsed before the rig is read, so that a wrong option is reported first.
     place = None if origin is None else Origin.parse(origin)
-    stated_height = None if height is None else parse_height(height)
-    if stated_height is not None or is_long(points) or len(names_of_rig(rig)) != 2:
-        elsewhere = any((place, yaw_sigma, heading_sigma, origin_sigma, refraction, refraction_sigma, aged, watch))
-        if elsewhere and not {"origin", "heading"} & taken:
-            raise typer.BadParameter(
-                "of several cameras position, attitude and their errors come from the rig file: leave out --origin, "
-                "--heading, --yaw-sigma, --heading-sigma, --origin-sigma, --refraction, --aged and --watch"
-            )
-        stations = load_camera_rig(rig)
-        views = read_views(points, stations.names)
-        doubts = stations.calibration.warnings if stations.calibration else ()
-        for text in doubts:
-            warn(f"{rig}: {text}")
-        told = stations.calibration.pixel_sigma if stations.calibration else None
-        located = locate_views(
-            stations, views, pixel_sigma=pixel_sigma or told or ASSUMED, height=stated_height, geoid=find_geoid(geoid)
-        )
-        with written_files() as written:
-            with open_writers(outputs, located, suffix) as writers:
-                for writer in writers:
-                    writer.add(located.columns)
-            true = None if truth is None else read_truth(truth, located)
-            draw_positions(located, true, picture, web_map, tiles=tiles, image=image, online=online)
-        sample = PositionSample()
-        sample.add(located.columns)
-        tell_located(
-            rig, points, located, true, sample, written, as_json=as_json, streamed=streamed,
-            stated=bool(views.sigma.isfinite().any()), doubts=doubts,
-        )  # fmt: skip
-        return
-    if aged and watch:
-        raise typer.BadParameter("--aged guesses what the history of --watch tells: give either")
-    yaw_sigma = math.hypot(yaw_sigma, parse_aging(aged))
-    solved = load_rig(rig)
-    noise, note = pixel_sigma_and_source(pixel_sigma, solved)
-    if solved.mounting is not None and {"origin", "heading"} <= taken:
-        # What the rig was solved with is better known.
-        place = heading = None
-        err.print("the position of the rig is that in its file, not that in kcal.toml")
-    doubts = solved.calibration.warnings if solved.calibration else ()
-    for text in doubts:
-        warn(f"{rig}: {text}")
-    if place is None or heading is None:
-        if solved.mounting is None:
-            raise InputError(
-                f"{rig}: the file has no position of the rig; give --origin and --heading. If you only need meters "
-                "from the left camera, the columns east_m, north_m and up_m: "
-                + typed_with({}, "--origin", "0,0,0", "--heading", "0")
-            )
-    elif grid is not None:
-        heading = true_from_grid(heading, place, grid)
-
-    def locator(standing: StereoRig) -> Locator:
-        errors = run_errors(
-            standing, yaw_deg=yaw_sigma, heading_deg=heading_sigma, origin_m=origin_sigma, elsewhere=place is not None
-        )
-        return Locator(
-            standing, geoid=find_geoid(geoid), origin=place, heading_deg=heading, pitch_deg=pitch, roll_deg=roll,
-            pixel_sigma=noise, calibration=errors.calibration, mounting=errors.mounting, link=errors.link,
+    run = locate_run(
+        rig,
+        points,
+        LocateOptions(
+            pixel_sigma=pixel_sigma, place=place, heading=heading, pitch=pitch, roll=roll, grid=grid,
+            yaw_sigma=yaw_sigma, aged=aged, watch=watch, heading_sigma=heading_sigma, origin_sigma=origin_sigma,
             refraction=refraction, refraction_sigma=refraction_sigma,
-        )  # fmt: skip
-
-    if watch is not None and solved.covariance is None:
-        # Not exact: moments add what is not known of them.
-        solved.covariance = RigCovariance.of(solved)
-    locate = locator(solved)
-    at_moments = None if watch is None else located_at(watch, solved, locator)
-    survey = None if truth is None else read_survey(truth, locate.localize.origin, measured=False)
+            height=None if height is None else parse_height(height), terrain=terrain, terrain_sigma=terrain_sigma,
+            geoid_height=geoid_height, geoid=geoid,
+        ),
+    )  # fmt: skip
+    survey = None if truth is None else read_survey(truth, run.empty.origin, measured=False)
     sample = PositionSample(frozenset(survey.names if survey else ()))
     with written_files() as written:
         try:
             size = points.stat().st_size if points.is_file() else None
-            with open_writers(outputs, located_by(locate), suffix) as writers, steps("locating", size) as advance:
+            with open_writers(outputs, run.empty, suffix) as writers, steps("locating", size) as advance:
                 read, stated = 0, False
-                for chunk in read_mark_chunks(points):
-                    cov = filled(chunk.covariance, noise)
-                    stated = stated or cov is not None
-                    columns = (at_moments or locate)(chunk.names, chunk.pixels, cov, chunk.extras)
+                for part in run.parts:
+                    stated = stated or part.stated
                     for writer in writers:
-                        writer.add(columns)
-                    sample.add(columns)
-                    advance(f"{sample.count:,} rows", chunk.bytes_read - read)
-                    read = chunk.bytes_read
-                if note and not stated:
-                    err.print(note)
-                located = sample.located(locate)
+                        writer.add(part.columns)
+                    sample.add(part.columns, part.feet)
+                    advance(f"{sample.count:,} rows", part.bytes_read - read)
+                    read = part.bytes_read
+                if run.note and not stated:
+                    err.print(run.note)
+                located = sample.located(run.locate)
                 true = None if truth is None else read_truth(truth, located)
             draw_positions(located, true, picture, web_map, tiles=tiles, image=image, online=online)
         except KeyboardInterrupt:
@@ -334,5 +277,6 @@ def locate_command(
             )
             raise typer.Exit(130) from None
     tell_located(
-        rig, points, located, true, sample, written, as_json=as_json, streamed=streamed, stated=stated, doubts=doubts
-    )
+        rig, points, located, true, sample, written, as_json=as_json, streamed=streamed, stated=stated,
+        doubts=run.doubts,
+    )  # fmt: skip

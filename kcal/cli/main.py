@@ -41,6 +41,7 @@ from kcal.cli.rig import app as rig
 from kcal.cli.schema import schema_command
 from kcal.cli.settings import defaults_of, read_settings
 from kcal.cli.show import show_command
+from kcal.cli.sites import sites_command
 from kcal.cli.stars import stars_command
 from kcal.cli.stations import station_command
 from kcal.cli.watch import watch_command
@@ -133,6 +134,7 @@ app.command("locate", cls=Command)(with_inputs(locate_command))
 app.command("live", cls=Command)(with_inputs(live_command))
 app.command("watch", cls=Command)(with_inputs(watch_command))
 app.command("budget", cls=Command)(with_json(with_inputs(budget_command)))
+app.command("sites", cls=Command)(with_json(with_inputs(sites_command)))
 app.command("rectify", cls=Command)(with_json(with_inputs(rectify_command)))
 app.command("undistort", cls=Command, hidden=True)(with_json(with_inputs(undistort_command)))
 app.command("rays", cls=Command)(with_json(with_inputs(rays_command)))

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from kcal.calibrate.camera.options import CalibrationOptions
     from kcal.calibrate.camera.result import CameraCalibrationResult
     from kcal.lens.camera import Camera
+    from kcal.lens.camera_rig import CameraRig
     from kcal.lens.rig import StereoRig
     from kcal.report.verdict import Requirement, Verdict
 
@@ -40,7 +41,8 @@ def report_command(
         typer.Option(
             "--observations",
             metavar="OBS",
-            help="Views that it was calibrated from; for a rig once for left, once for right. Faults of lens model and "
+            help="Views that it was calibrated from; for a rig once for left, once for right; for one of more "
+            "cameras once for each, named as it is. Faults of lens model and "
             "board can only be found with them.",
         ),
         OBSERVATIONS,
@@ -190,51 +192,65 @@ def _judged_again(
 
 
 def _of_rig(path: Path, observations: list[Path], needs: tuple[Requirement, ...], pixel_sigma: float | None) -> Judged:
+    from kcal.cli.rig_sources import cameras_of_files
+    from kcal.corners.observations import Observations
     from kcal.io.rig_file import load_rig
+    from kcal.locate.stations import load_camera_rig, names_of_rig
+    from kcal.report.judge_rig import named_cameras
 
-    rig = load_rig(path)
+    pair = names_of_rig(path) == ("left", "right")
+    rig: StereoRig | CameraRig = load_rig(path) if pair else load_camera_rig(path)
     mark_sigma = pixel_sigma_of(pixel_sigma, rig)
-    if observations and len(observations) != 2:
+    cameras = named_cameras(rig)
+    if pair and observations and len(observations) != 2:
         raise InputError("a rig needs --observations twice: left, then right")
+    if not pair and observations:
+        cameras = [cameras[number] for number in cameras_of_files(observations, [name for name, _ in cameras])]
     if observations:
-        from kcal.corners.observations import Observations
-
-        check_views_of((rig.left, rig.right), [Observations.load(file) for file in observations], observations)
-    return judged_rig(rig, observations, needs, mark_sigma=mark_sigma, name=path.name.split(".")[0])
+        check_views_of(
+            [camera for _, camera in cameras], [Observations.load(file) for file in observations], observations
+        )
+    return judged_rig(rig, observations, needs, mark_sigma=mark_sigma, name=path.name.split(".")[0], cameras=cameras)
 
 
 def judged_rig(
-    rig: StereoRig, observations: Sequence[Path], needs: tuple[Requirement, ...], *, mark_sigma: float, name: str
-) -> Judged:
-    """The verdict on a rig and, with the observations of its left and right camera, on these as well."""
+    rig: StereoRig | CameraRig, observations: Sequence[Path], needs: tuple[Requirement, ...], *, mark_sigma: float,
+    name: str, cameras: Sequence[tuple[str, Camera]],
+) -> Judged:  # fmt: skip
+    """The verdict on a rig and, with the observations of `cameras`, each with its name, on these as well."""
+    from kcal.lens.rig import StereoRig
     from kcal.report.judge_rig import rig_verdict
 
-    cameras = judged_sides(rig, observations, mark_sigma)
+    found = judged_sides(cameras, observations, mark_sigma)
     # Views of a rig that was solved without pairs may be of different moments, though their images are named alike.
-    paired = observations and (rig.calibration is None or rig.calibration.pairs > 0)
-    pairs, unpaired = _pairs(rig, observations) if paired else (None, "")
+    if observations and isinstance(rig, StereoRig) and (rig.calibration is None or rig.calibration.pairs > 0):
+        pairs, unpaired = _pairs(rig, observations)
+    else:
+        pairs, unpaired = None, ""
     verdict = rig_verdict(
-        rig, needs, mark_sigma=mark_sigma, pairs=pairs, unpaired=unpaired, cameras=[found[0] for found in cameras],
+        rig, needs, mark_sigma=mark_sigma, pairs=pairs, unpaired=unpaired, cameras=[one[0] for one in found],
         subject=name,
     )  # fmt: skip
-    tables = [table for found in cameras for table in found[2]]
-    return verdict, lambda: side_pictures(cameras), tables or stored_tables(rig)
+    tables = [table for one in found for table in one[2]]
+    return verdict, lambda: side_pictures(found), tables or stored_tables(rig)
 
 
-def judged_sides(rig: StereoRig, observations: Sequence[Path], mark_sigma: float) -> list[Judged]:
-    """The verdicts on both cameras of a rig, calibrated again from their observations; none without these."""
-    sides = (("left", rig.left), ("right", rig.right))
+def judged_sides(
+    cameras: Sequence[tuple[str, Camera]], observations: Sequence[Path], mark_sigma: float
+) -> list[Judged]:
+    """The verdicts on cameras of a rig, calibrated again from their observations; none without these."""
     return [
         _judged_again(camera, file, (), mark_sigma=mark_sigma, name=side)
-        for (side, camera), file in zip(sides, observations, strict=False)
+        for (side, camera), file in zip(cameras, observations, strict=False)
     ]
 
 
-def stored_tables(rig: StereoRig) -> list[list[list[str]]]:
-    """Tables of both cameras, as the rig's file has them."""
+def stored_tables(rig: StereoRig | CameraRig) -> list[list[list[str]]]:
+    """Tables of all cameras, as the rig's file has them."""
+    from kcal.report.judge_rig import named_cameras
     from kcal.report.verdict_page import camera_tables
 
-    return [*camera_tables(rig.left, name="left"), *camera_tables(rig.right, name="right")]
+    return [table for name, camera in named_cameras(rig) for table in camera_tables(camera, name=name)]
 
 
 def side_pictures(cameras: Sequence[Judged]) -> dict[str, bytes]:

@@ -85,11 +85,17 @@ def solve_command(
     ] = None,
     positions: Annotated[
         Path | None,
-        typer.Option(metavar="CSV", help="Measured camera positions (GNSS): as --landmarks, names left and right."),
+        typer.Option(
+            metavar="CSV", help="Measured camera positions (GNSS): as --landmarks, names left and right, or of files."
+        ),
         SURVEY,
     ] = None,
     baseline: Annotated[
-        str | None, typer.Option(metavar="M±SIGMA", help="Measured distance between the cameras, e.g. 10.02±0.005.")
+        str | None,
+        typer.Option(
+            metavar="M±SIGMA",
+            help="Measured distance between the cameras, e.g. 10.02±0.005; of three and more mill:mast=812.4±0.1,...",
+        ),
     ] = None,
     origin: Annotated[
         str | None,
@@ -123,6 +129,14 @@ def solve_command(
             metavar="LEFT RIGHT",
             help="Images of the scene by each camera at the same moments (file, folder or quoted wildcard): features "
             "seen by both determine how the cameras are turned; a length must come from elsewhere (--baseline).",
+        ),
+    ] = None,
+    night: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=IMAGES",
+            help="Of three cameras and more, in place of --stars: the night images of one of them, once for each.",
+            hidden=True,
         ),
     ] = None,
     star_time: Annotated[str | None, typer.Option("--star-time", metavar="TIME", help=TIME_HELP, hidden=True)] = None,
@@ -215,7 +229,7 @@ def solve_command(
     from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
     from kcal.cli.cures import ending_with, look_at_views, mark_again
     from kcal.cli.rig_sources import Sources, read_sources
-    from kcal.cli.rig_stars import NightOptions
+    from kcal.cli.rig_stars import NightOptions, images_of_nights
     from kcal.cli.sides import check_sides
     from kcal.corners.observations import Observations
     from kcal.files import check_picture, check_writable
@@ -226,16 +240,17 @@ def solve_command(
     from kcal.report.tables import range_sigma_rows
 
     noise, _ = pixel_sigma_and_source(pixel_sigma)
-    night = None
-    if stars is not None:
-        night = NightOptions(
-            images=stars, time=star_time, clock_sigma=clock_sigma, drift_sigma=clock_drift, celsius=celsius,
-            hectopascal=hectopascal, dut1=dut1,
+    nights = None
+    if stars is not None or night:
+        nights = NightOptions(
+            images=images_of_nights(stars, night or ()), time=star_time, clock_sigma=clock_sigma,
+            drift_sigma=clock_drift, celsius=celsius, hectopascal=hectopascal, dut1=dut1,
         )  # fmt: skip
     sources = Sources(
         pairs=pairs, match=match, landmarks=landmarks, marks=marks, features=features, positions=positions,
         baseline=baseline, origin=origin, mark_sigma=noise, survey_sigma=survey_sigma, geoid=geoid,
-        stars=night, scene=scene, names=tuple(path.name.split(".")[0] for path in (left, right)),
+        stars=nights, scene=scene, observations=tuple(observations or ()),
+        names=tuple(path.name.split(".")[0] for path in (left, right)),
     )  # fmt: skip
     check_writable(output, left, right, *sources.files)
     needs = required(require)
@@ -243,7 +258,7 @@ def solve_command(
         check_writable(report, left, right, *sources.files)
     if picture is not None:
         check_picture(picture)
-    if not any((pairs, landmarks, marks, features, positions, baseline, stars, scene, observations)):
+    if not any((pairs, landmarks, marks, features, positions, baseline, stars, scene, observations, night)):
         raise typer.BadParameter("give boards (--pairs), landmarks (--landmarks and --marks) or features (--features)")
     options = RigOptions(
         intrinsics=intrinsics, board_warp=board_warp, reject=not keep_all, refraction=refraction,
@@ -252,11 +267,10 @@ def solve_command(
     if others:
         from kcal.cli.stations import solve_stations
 
-        for given, option in ((require, "--require"), (report, "--report"), (picture, "--picture"), (match, "--match")):
-            if given:
-                raise typer.BadParameter(f"{option} is for rigs of two cameras")
-        solve_stations([left, right, *others], sources, options, output, observations or ())
+        solve_stations([left, right, *others], sources, options, output, needs=needs, report=report, picture=picture)
         return
+    if night:
+        raise typer.BadParameter("--night is for three cameras and more; give --stars LEFT RIGHT")
     if observations:
         raise typer.BadParameter("--observations is for three cameras and more; give --pairs LEFT RIGHT")
     calibrated = load_camera(left), load_camera(right)
@@ -301,11 +315,12 @@ def solve_command(
     print_wrote(output, picture)
     if needs or report is not None:
         from kcal.cli.report import judged_sides, side_pictures, stored_tables
-        from kcal.report.judge_rig import rig_verdict
+        from kcal.report.judge_rig import named_cameras, rig_verdict
         from kcal.report.rig import rig_figure
         from kcal.report.verdict_pictures import png_bytes
 
-        cameras = judged_sides(rig, pairs, noise) if pairs is not None and _calibrated_from(rig, pairs) else []
+        sides = pairs if pairs is not None and _calibrated_from(rig, pairs) else ()
+        cameras = judged_sides(named_cameras(rig), sides, noise)
         verdict = rig_verdict(
             rig, needs, mark_sigma=noise, result=result, cameras=[found[0] for found in cameras],
             subject=output.name.split(".")[0],

@@ -1,9 +1,10 @@
-"""Night images of both cameras of a rig, for `kcal rig --stars`."""
+"""Night images of the cameras of a rig, for `kcal rig --stars`."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from kcal.errors import InputError, KcalError
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from kcal.lens.mounting import Origin
     from kcal.stars.night import NamedStars
 
-# m: how well the place of `--origin` is known to be that of the left camera, along each axis.
+# m: how well the place of `--origin` is known to be that of the first camera, along each axis.
 _PLACE_SIGMA = 3.0
 
 
@@ -23,7 +24,7 @@ _PLACE_SIGMA = 3.0
 class NightOptions:
     """What the user gave of night images, as on the command line."""
 
-    images: tuple[str, str]
+    images: tuple[str, str] | Mapping[str, str]
     time: str | None = None
     clock_sigma: float = 0.1
     drift_sigma: float = 0.05
@@ -33,17 +34,17 @@ class NightOptions:
 
 
 def read_stars(
-    cameras: tuple[Camera, Camera],
+    cameras: Mapping[str, Camera],
     night: NightOptions,
     origin: Origin | None,
     positions: tuple[MeasuredPosition, ...],
     *,
     placed: bool,
 ) -> tuple[StarSource, tuple[MeasuredPosition, ...], list[str]]:
-    """The stars of both cameras' images, the positions with that of the left camera, and lines that say what was found.
+    """The stars of all images, the positions with that of the first camera, and lines that say what was found.
 
     Args:
-        cameras: left and right.
+        cameras: by their names, in order.
         night: what the user gave.
         origin: of the rig's frame; None if nothing is known on the Earth.
         positions: measured ones.
@@ -54,19 +55,24 @@ def read_stars(
     from kcal.calibrate.rig.sources import MeasuredPosition
     from kcal.stars.rig_stars import moments_of, star_source
 
-    images = [_named_images(side, given, camera, night, origin)
-              for side, given, camera in zip(("left", "right"), night.images, cameras, strict=True)]  # fmt: skip
+    given = _images_by_camera(cameras, night.images)
+    images = [_named_images(name, given[name], camera, night, origin) if name in given else []
+              for name, camera in cameras.items()]  # fmt: skip
     moments, alone = moments_of(images)
-    if not any(len(moment) == 2 for moment in moments):
-        raise InputError(
-            "--stars: no image of the left camera was taken at the time of one of the right; pairs are of one moment"
-        )
     on_earth = all(image.on_earth for own in images for image in own)
+    if not any(len(moment) > 1 for moment in moments) and not (on_earth and len(cameras) > 2):
+        first, *_, last = cameras
+        raise InputError(
+            f"--stars: no image of the {first} camera was taken at the time of one of the {last}; "
+            "pairs are of one moment"
+        )
     if on_earth and not placed and not positions:
         there = torch.zeros(3, dtype=torch.float64)
         positions = (MeasuredPosition(camera=0, point=there, sigma=torch.full_like(there, _PLACE_SIGMA)),)
     frame = origin if placed or positions else None
-    source = star_source(moments, cameras, clock_sigma=night.clock_sigma, drift_sigma=night.drift_sigma, origin=frame)
+    source = star_source(
+        moments, list(cameras.values()), clock_sigma=night.clock_sigma, drift_sigma=night.drift_sigma, origin=frame
+    )
     named = int(source.named.sum())
     lines = [
         f"stars: {len(moments)} moments, {len(source.names)} stars, {named} with a direction on the Earth"
@@ -82,6 +88,33 @@ def read_stars(
     if on_earth and night.dut1 is None:
         lines.append("UT1 - UTC is not known (--dut1): 8″ of heading, part of its σ")
     return source, positions, lines
+
+
+def images_of_nights(pair: tuple[str, str] | None, named: Sequence[str]) -> tuple[str, str] | dict[str, str]:
+    """Where night images are: LEFT RIGHT of two cameras, or NAME=IMAGES, one for each of more.
+
+    Raises:
+        InputError: both, no name, or a name twice.
+    """
+    if pair is not None and not named:
+        return pair
+    found = {}
+    for text in named:
+        name, equals, images = text.partition("=")
+        if pair is not None or not (name and equals and images) or name in found:
+            raise InputError(f"--night {text!r}: write NAME=IMAGES, once for each camera, and no --stars")
+        found[name] = images
+    return found
+
+
+def _images_by_camera(cameras: Mapping[str, Camera], images: tuple[str, str] | Mapping[str, str]) -> dict[str, str]:
+    if isinstance(images, tuple):
+        if len(cameras) != 2:
+            raise InputError("--stars LEFT RIGHT is for rigs of two cameras; give --night NAME=IMAGES for each")
+        return dict(zip(cameras, images, strict=True))
+    if not set(images) <= set(cameras):
+        raise InputError(f"--night: the cameras are {', '.join(cameras)}, got {', '.join(images)}")
+    return dict(images)
 
 
 def _named_images(

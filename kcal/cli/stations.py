@@ -19,10 +19,9 @@ from kcal.files import check_writable
 if TYPE_CHECKING:
     from kcal.calibrate.rig.result import RigResult
     from kcal.calibrate.rig.solve import RigOptions
-    from kcal.calibrate.rig.sources import MeasuredPosition, RigData
     from kcal.cli.rig_sources import Sources
     from kcal.lens.camera_rig import CameraRig
-    from kcal.lens.mounting import Origin
+    from kcal.report.verdict import Requirement
 
 
 def camera_names(paths: Sequence[Path]) -> tuple[str, ...]:
@@ -39,84 +38,59 @@ def camera_names(paths: Sequence[Path]) -> tuple[str, ...]:
 
 
 def solve_stations(
-    paths: Sequence[Path], sources: Sources, options: RigOptions, output: Path, observations: Sequence[Path] = ()
-) -> None:
-    """Solve one camera, or three and more, write the rig and print how each stands."""
+    paths: Sequence[Path], sources: Sources, options: RigOptions, output: Path, *, needs: tuple[Requirement, ...] = (),
+    report: Path | None = None, picture: Path | None = None,
+) -> None:  # fmt: skip
+    """Solve one camera, or three and more, write the rig, print how each stands and whether it may be used."""
     from kcal.calibrate.rig.solve import solve_rig
+    from kcal.cli.rig_sources import read_sources
     from kcal.io.camera_file import load_camera
     from kcal.io.camera_rig_file import save_camera_rig
 
     names = camera_names(paths)
-    for given, option in ((sources.pairs, "--pairs"), (sources.stars, "--stars"), (sources.baseline, "--baseline")):
+    for given, option, instead in (
+        (sources.pairs, "--pairs", "give boards by --observations"),
+        (sources.match, "--match", "views belong together by their names"),
+        (sources.scene, "--scene", "give matches as a table by --features"),
+    ):
         if given is not None:
-            instead = "; give boards by --observations" if option == "--pairs" else ""
-            raise InputError(f"{option} is for rigs of two cameras{instead}")
-    check_writable(output, *paths, *sources.files, *observations)
-    data, origin = _read_stations(tuple(map(load_camera, paths)), names, sources, observations)
-    with steps("solving the stations", 1) as advance:
-        result = solve_rig(data, options)
-        advance("done")
+            raise InputError(f"{option} is for rigs of two cameras; {instead}")
+    check_writable(output, *paths, *sources.files)
+    sources = dataclasses.replace(sources, names=names)
+    data, origin, _, notes, _ = read_sources(tuple(map(load_camera, paths)), sources)
+    with steps("solving the stations", None) as advance:
+        result = solve_rig(data, options, advance)
     rig = result.stations(origin)
     assert rig.calibration is not None
     rig.calibration = dataclasses.replace(rig.calibration, pixel_sigma=sources.mark_sigma)
-    save_camera_rig(rig, output)
     tell(
-        rms_px=result.rms, cameras=_stands(rig), warnings=list(result.warnings), undetermined=list(result.undetermined)
-    )
-    _print_stations(result, rig)
-    print_wrote(output)
+        rms_px=result.rms, cameras=_stands(rig), warnings=list(result.warnings), undetermined=list(result.undetermined),
+        left_out={item.label: item.reason for item in result.left_out},
+    )  # fmt: skip
+    save_camera_rig(rig, output)
+    if picture is not None:
+        from kcal.report.rig import save_rig_picture
+
+        save_rig_picture(picture, result)
+    _print_stations(result, rig, notes)
+    print_wrote(output, picture)
+    if needs or report is not None:
+        from kcal.cli.report import NO, stored_tables, told_usable
+        from kcal.report.judge_rig import rig_verdict
+        from kcal.report.rig import rig_figure
+        from kcal.report.verdict_pictures import png_bytes
+
+        subject = output.name.split(".")[0]
+        verdict = rig_verdict(rig, needs, mark_sigma=sources.mark_sigma, result=result, subject=subject)
+        tell(verdict=verdict.to_dict())
+        if not told_usable(verdict, lambda: {"rig": png_bytes(rig_figure(result))}, stored_tables(rig), report):
+            raise typer.Exit(NO)
 
 
-def _read_stations(
-    cameras: tuple, names: tuple[str, ...], sources: Sources, observations: Sequence[Path]
-) -> tuple[RigData, Origin | None]:
-    from kcal.calibrate.rig.pairs import boards_of_several
-    from kcal.calibrate.rig.sources import RigData
-    from kcal.corners.observations import Observations
-    from kcal.lens.mounting import Origin
-    from kcal.locate.survey import camera_positions
-    from kcal.locate.survey_files import import_survey
-    from kcal.locate.view_marks import match_views, read_feature_views, read_views
-
-    if (sources.landmarks is None) != (sources.marks is None):
-        raise InputError("--landmarks and --marks belong together: places by name, and where they are in the images")
-    origin = None if sources.origin is None else Origin.parse(sources.origin)
-    positions: tuple[MeasuredPosition, ...] = ()
-    if sources.positions is not None:
-        placed = import_survey(sources.positions, origin, sigma=sources.survey_sigma, geoid=sources.geoid)
-        origin, positions = placed.origin, camera_positions(placed, names)
-    landmarks = None
-    if sources.landmarks is not None and sources.marks is not None:
-        survey = import_survey(sources.landmarks, origin, sigma=sources.survey_sigma, geoid=sources.geoid)
-        if sources.positions is not None and survey.origin != origin:
-            raise InputError("landmarks and positions: one has latitudes, the other local meters; give an --origin")
-        origin = survey.origin
-        found = match_views(survey, read_views(sources.marks, names, others=len(names) == 1), sources.mark_sigma)
-        landmarks = found.landmarks
-        for some, text in ((found.unmarked, "surveyed, but not marked"), (found.unsurveyed, "marked, not surveyed")):
-            if some:
-                err.print(f"[yellow]warning:[/] {text}:", ", ".join(some), markup=True)
-    views = {}
-    for path in observations:
-        name = path.name.split(".")[0]
-        if name not in names:
-            raise InputError(f"{path}: no camera is named {name!r}; they are {', '.join(names)}")
-        views[names.index(name)] = Observations.load(path)
-    data = RigData(
-        cameras=cameras,
-        names=names,
-        boards=boards_of_several(cameras, names, views) if views else None,
-        landmarks=landmarks,
-        features=None if sources.features is None else read_feature_views(sources.features, names, sources.mark_sigma),
-        positions=positions,
-    )
-    return data, origin
-
-
-def _print_stations(result: RigResult, rig: CameraRig) -> None:
+def _print_stations(result: RigResult, rig: CameraRig, notes: Sequence[str]) -> None:
     from kcal.cli.rig_text import print_rig, source_lines
 
-    print_rig(result, source_lines(result))
+    print_rig(result, [*source_lines(result), *notes])
     print_table(station_rows(rig))
     if rig.root is None:
         err.print("[yellow]warning:[/] the data leave something open, so that the rig has no error bars")

@@ -29,6 +29,7 @@ class CameraRigCalibration:
         excluded: what was left out, with the reason.
         undetermined: what the data leave open, camera by camera.
         warnings: what should be doubted, a sentence each.
+        contradictions: which source contradicts the others, a sentence each; such a rig should not be used.
         pixel_sigma: noise of marks along each axis, px, as stated; None if nobody did.
         kcal_version: the version that solved.
         created: when, with its time zone.
@@ -40,6 +41,7 @@ class CameraRigCalibration:
     excluded: tuple[Exclusion, ...] = ()
     undetermined: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    contradictions: tuple[str, ...] = ()
     pixel_sigma: float | None = None
     kcal_version: str
     created: datetime.datetime

@@ -33,7 +33,19 @@ from kcal.locate.view_marks import ViewMarks as ViewMarks
 from kcal.locate.ground import locate_on_ground as locate_on_ground
 from kcal.locate.ground import GroundPlaces as GroundPlaces
 from kcal.locate.ground import level_ground as level_ground
-from kcal.locate.ground import terrain as terrain
+from kcal.locate.raster import terrain as terrain
+from kcal.locate.raster import Raster as Raster
+
+# Where to put the next camera
+from kcal.locate.siting import area_of as area_of
+from kcal.locate.siting import Area as Area
+from kcal.locate.siting import Site as Site
+from kcal.locate.site_tables import read_sites as read_sites
+from kcal.locate.site_tables import sites_of as sites_of
+from kcal.locate.siting import siting_map as siting_map
+from kcal.locate.siting import SitingMap as SitingMap
+from kcal.locate.siting import rank_sites as rank_sites
+from kcal.locate.siting import RankedSite as RankedSite
 
 # Geodesy
 from kcal.locate.geodesy import enu_from_cam as enu_from_cam

@@ -8,16 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from kcal.checks import as_points
-from kcal.errors import FileError, InputError
-from kcal.files import read_head
+from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA, Mounting
 from kcal.locate.ellipsoid import mean_radius
@@ -28,14 +25,14 @@ from kcal.locate.stereo import PositionStatus
 
 # Height above the ellipsoid, meters, of latitudes and longitudes (degrees, of one shape); NaN where it is not known.
 Ground = Callable[[Tensor, Tensor], Tensor]
+# Rows of one search, so that steps along all lines fit into memory.
+_ROWS = 512
 # Steps of the search along a line of sight over a level surface, of equal ratio; then each is halved this often.
 _STEPS, _HALVINGS = 512, 50
 # Of a tangent that is found by differences, meters.
 _STEP_M = 0.5
 # A place whose range is not known to a third is told as a bearing only.
 _BEARING_SIGMAS = 3.0
-# Of a raster, 1.6 GB as they are kept.
-_MOST_CELLS = 200_000_000
 
 
 class GroundPlaces(NamedTuple):
@@ -73,55 +70,66 @@ def level_ground(height: float) -> Ground:
     return lambda lat, lon: torch.full_like(lat, height)
 
 
-def terrain(path: str | Path, geoid_height: float = 0.0) -> Ground:
-    """Ground from a raster of heights, for example a GeoTIFF, interpolated between the middles of its cells.
+class Meeting(NamedTuple):
+    """Where lines of sight meet the ground for the first time.
+
+    Attributes:
+        distance: (N,) along each line.
+        point: (N, 3) there.
+        normal: (N, 3) slope of the height above the ground by the place.
+        tangent: (N, 3) of the line.
+        approach: (N,) slope of the height above the ground along the line; -1 unless `met`.
+        met: (N,) bool.
+    """
+
+    distance: Tensor
+    point: Tensor
+    normal: Tensor
+    tangent: Tensor
+    approach: Tensor
+    met: Tensor
+
+
+def search_distances(farthest: float, step: float | None) -> Tensor:
+    """Where a line of sight is looked at: in equal steps, or in growing ones over level ground."""
+    if step is None:
+        return torch.logspace(0.0, math.log10(farthest), _STEPS, dtype=torch.float64)
+    return torch.arange(step, farthest + step, step, dtype=torch.float64)
+
+
+def first_meeting(
+    along: Callable[[Tensor, Tensor], Tensor], above: Callable[[Tensor], Tensor], count: int, distances: Tensor
+) -> Meeting:
+    """Follow lines of sight outward until they are below the ground, or over ground that is not known.
 
     Args:
-        path: a raster that rasterio reads, with a coordinate system; the extra `terrain` is needed.
-        geoid_height: meters that are added, for a raster of heights above the sea: the height of the geoid there.
-
-    Raises:
-        InputError: rasterio is missing, or a height that is not finite.
-        FileError: not a raster, one without coordinate system, or of more than 200 million cells.
+        along: of distances (M, K) or (M,) and the numbers (M,) of lines: the places (..., 3) on these.
+        above: height of places (..., 3) above the ground; NaN where that is not known.
+        count: N lines.
+        distances: (K,) increasing.
     """
-    try:
-        import rasterio
-    except ImportError as error:
-        raise InputError("terrain needs rasterio; install it with: pip install 'kcal[terrain]'") from error
-    import pyproj
-
-    if not math.isfinite(geoid_height):
-        raise InputError(f"geoid height {geoid_height}: finite meters are needed")
-    read_head(path, 0)
-    try:
-        with rasterio.open(path) as raster:
-            if raster.width * raster.height > _MOST_CELLS:
-                size = f"{raster.width} x {raster.height}"
-                raise FileError(f"{path}: {size} cells; at most {_MOST_CELLS:,} are read: cut out what is needed")
-            heights = raster.read(1, masked=True).astype(np.float64).filled(np.nan)
-            system, to_cell = raster.crs, ~raster.transform
-    except rasterio.errors.RasterioError as error:
-        raise FileError(f"{path}: cannot be read as a raster: {error}") from error
-    if system is None:
-        raise FileError(f"{path}: the raster has no coordinate system")
-    into = pyproj.Transformer.from_crs("EPSG:4326", system.to_wkt(), always_xy=True)
-    rows, columns = heights.shape
-
-    def height(lat: Tensor, lon: Tensor) -> Tensor:
-        x, y = into.transform(lon.numpy(), lat.numpy())
-        x, y = np.asarray(x), np.asarray(y)
-        column = to_cell.a * x + to_cell.b * y + to_cell.c - 0.5
-        row = to_cell.d * x + to_cell.e * y + to_cell.f - 0.5
-        left, top = np.floor(column), np.floor(row)
-        with np.errstate(invalid="ignore"):
-            inside = (left >= 0) & (top >= 0) & (left < columns - 1) & (top < rows - 1)
-        i, j = np.where(inside, top, 0).astype(int), np.where(inside, left, 0).astype(int)
-        a, b = column - left, row - top
-        found = (1 - b) * ((1 - a) * heights[i, j] + a * heights[i, j + 1])
-        found = found + b * ((1 - a) * heights[i + 1, j] + a * heights[i + 1, j + 1])
-        return torch.from_numpy(np.where(inside, found + geoid_height, np.nan))
-
-    return height
+    parts = []
+    for rows in torch.arange(count).split(_ROWS):
+        heights = above(along(distances.expand(len(rows), -1), rows))
+        # The first place that is not above known ground ends the search.
+        ended = ~(heights > 0)
+        first = torch.where(ended.any(1), ended.to(torch.int8).argmax(1), 0)
+        met = ended.any(1) & torch.isfinite(heights.gather(1, first[:, None])[:, 0]) & (first > 0)
+        parts.append((distances[first], distances[(first - 1).clamp_min(0)], met))
+    far, near, met = (torch.cat(part) for part in zip(*parts, strict=True)) if parts else (torch.zeros(0),) * 3
+    rows, met = torch.arange(count), met.bool()
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (near + far)
+        high = above(along(middle, rows)) > 0
+        near, far = torch.where(high, middle, near), torch.where(high, far, middle)
+    distance = 0.5 * (near + far)
+    point = along(distance, rows)
+    steps = _STEP_M * torch.eye(3, dtype=torch.float64)
+    normal = (above(point[:, None] + steps) - above(point[:, None] - steps)) / (2 * _STEP_M)
+    tangent = along(distance + 0.5, rows) - along(distance - 0.5, rows)
+    approach = (normal * tangent).sum(-1)
+    met = met & torch.isfinite(normal).all(-1) & (approach < 0)
+    return Meeting(distance, point, normal, tangent, torch.where(met, approach, -1.0), met)
 
 
 @torch.no_grad()
@@ -173,7 +181,8 @@ def locate_on_ground(
     sight, place = rays @ turn.T, anchor(origin)
     seen = seen & torch.isfinite(pixels).all(-1)
 
-    def along(distance: Tensor, ray: Tensor) -> Tensor:
+    def along(distance: Tensor, rows: Tensor) -> Tensor:
+        ray = sight[rows] if distance.ndim == 1 else sight[rows][:, None]
         straight = distance[..., None] * ray
         lower = torch.nn.functional.pad(straight[..., :2].square().sum(-1, keepdim=True), (2, 0))
         return straight - bend * lower
@@ -182,28 +191,9 @@ def locate_on_ground(
         lat, lon, height = place_enu(enu, *place).unbind(-1)
         return height - ground(lat, lon)
 
-    if step is None:
-        distances = torch.logspace(0.0, math.log10(farthest), _STEPS, dtype=torch.float64)
-    else:
-        distances = torch.arange(step, farthest + step, step, dtype=torch.float64)
-    heights = above(along(distances[None], sight[:, None]))
-    # The first place that is not above known ground ends the search.
-    ended = ~(heights > 0)
-    first = torch.where(ended.any(1), ended.to(torch.int8).argmax(1), 0)
-    met = seen & ended.any(1) & torch.isfinite(heights.gather(1, first[:, None])[:, 0]) & (first > 0)
-    far, near = distances[first], distances[(first - 1).clamp_min(0)]
-    for _ in range(_HALVINGS):
-        middle = 0.5 * (near + far)
-        high = above(along(middle, sight)) > 0
-        near, far = torch.where(high, middle, near), torch.where(high, far, middle)
-    distance = 0.5 * (near + far)
-    enu = along(distance, sight)
-    steps = _STEP_M * torch.eye(3, dtype=torch.float64)
-    normal = (above(enu[:, None] + steps) - above(enu[:, None] - steps)) / (2 * _STEP_M)
-    tangent = along(distance + 0.5, sight) - along(distance - 0.5, sight)
-    approach = (normal * tangent).sum(-1)
-    met = met & torch.isfinite(normal).all(-1) & (approach < 0)
-    approach = torch.where(met, approach, -1.0)
+    meeting = first_meeting(along, above, len(sight), search_distances(farthest, step))
+    distance, enu, normal, tangent, approach, met = meeting
+    met = met & seen
 
     # How the place moves: by the four errors, and then along the line of sight back to the ground.
     ends = [camera.unproject(pixels + shift)[0] for shift in 0.5 * torch.eye(2, dtype=torch.float64)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
@@ -15,15 +15,17 @@ from kcal.lens.camera_rig import CameraRig
 from kcal.lens.dispatch import is_differentiated, is_traced, known_true
 from kcal.locate.ellipsoid import ecef_from_enu_rotation, mean_radius
 from kcal.locate.geodesy import anchor, enu_to_geodetic, place_enu
+from kcal.locate.ground import Ground
+from kcal.locate.ground_ahead import EarthFrame, ground_ahead, height_ahead
 from kcal.locate.multiview import checked_views_covariance
 from kcal.locate.ranges import BEARING_SIGMAS, range_interval
 from kcal.locate.stereo import PositionStatus, flag_positions, piece_by_piece, reprojection_errors
-from kcal.locate.views import CommonErrors, PosedCameras, StatedHeight, ViewsFit, fit_views
+from kcal.locate.views import CommonErrors, PosedCameras, ViewsFit, fit_views
 
 # How seldom good views are taken for bad ones.
 _BAD, _DOUBTFUL = 1e-4, 1e-2
-# Steps to a stated height; each leaves a thousandth.
-_HEIGHT_STEPS = 3
+# Sigma of a height, whether there are derivatives, and the ground.
+_Options: TypeAlias = "tuple[float, bool, Ground | None]"
 
 
 class ViewsLocalization(NamedTuple):
@@ -149,7 +151,7 @@ class MultiViewLocalizer(Float64Module):
         self.register_buffer("ecef_of_origin", None if place is None else place[1])
         zero = torch.zeros(3, dtype=torch.float64) if rig.origin is None else rig.origin.geodetic
         self.register_buffer("geodetic_of_origin", zero.to(device))
-        errors, bending, self.lens = _errors_by_camera(rig, root)
+        errors, bending, self.lens = errors_by_camera(rig, root)
         self.register_buffer("errors", errors)
         self.register_buffer("bending_errors", None if bending is None else bending * self.half_curvature)
         freedom = 2.0 * torch.arange(len(rig) + 1, dtype=torch.float64) - 3.0
@@ -163,7 +165,7 @@ class MultiViewLocalizer(Float64Module):
         cov: Tensor | None = None,
         *,
         velocity: Tensor | None = None,
-        height: Tensor | None = None,
+        height: Tensor | Ground | None = None,
         height_sigma: float = 1.0,
     ) -> ViewsLocalization:
         """Locate rows of pixels.
@@ -173,7 +175,9 @@ class MultiViewLocalizer(Float64Module):
             seen: (..., V) bool; what is False is neither read nor differentiated, and what is NaN was not seen.
             cov: (..., V, 2, 2) covariance of each pixel, or broadcastable to it.
             velocity: (..., V, 2) motion in the images, px/s, with which errors of the clocks move the pixels.
-            height: (...) meters above the ellipsoid of what one camera alone saw, NaN where it is not known.
+            height: (...) meters above the ellipsoid of what one camera alone saw, NaN where it is not known; or the
+                ground on which it stands, from `level_ground` or `terrain`: its line of sight is followed for 60 km
+                until it meets that for the first time, in steps of a raster's cells.
             height_sigma: its standard deviation, meters.
 
         Raises:
@@ -199,19 +203,23 @@ class MultiViewLocalizer(Float64Module):
                 raise InputError("height: this rig has no place on the Earth; give its origin")
             if not 0.0 < height_sigma < math.inf:
                 raise InputError(f"height_sigma: a positive number of meters is needed, got {height_sigma}")
-            height = height.to(torch.float64).expand(lead).reshape(-1)
+            if isinstance(height, Tensor):
+                height = height.to(torch.float64).expand(lead).reshape(-1)
         pixels = pixels.reshape(-1, count, 2)
         differentiated = is_differentiated(pixels, *([] if cov is None else [cov]), *self.parameters())
 
+        ground = None if isinstance(height, Tensor) else height
+        heights = height if isinstance(height, Tensor) else None
+
         def locate(pixels: Tensor, seen: Tensor, cov: Tensor | None, height: Tensor | None) -> ViewsLocalization:
-            return self._checked(pixels, seen, cov, height, (height_sigma, differentiated))
+            return self._checked(pixels, seen, cov, height, (height_sigma, differentiated, ground))
 
         share = 1 if self.errors is None else max(1, count * self.errors.shape[0] // 8)
-        found = piece_by_piece(locate, pixels, seen, cov, height, differentiated=differentiated, axis=-3, share=share)
+        found = piece_by_piece(locate, pixels, seen, cov, heights, differentiated=differentiated, axis=-3, share=share)
         return ViewsLocalization(*(value.reshape(*lead, *value.shape[1:]) for value in found))
 
     def _checked(
-        self, pixels: Tensor, seen: Tensor, cov: Tensor | None, height: Tensor | None, options: tuple[float, bool]
+        self, pixels: Tensor, seen: Tensor, cov: Tensor | None, height: Tensor | None, options: _Options
     ) -> ViewsLocalization:
         """All rows, those with a bad view again without it."""
         once, bad, torn = self._located(pixels, seen, cov, height, options)
@@ -233,15 +241,22 @@ class MultiViewLocalizer(Float64Module):
         return ViewsLocalization(*(old.index_copy(0, rows, new) for old, new in zip(whole, left, strict=True)))
 
     def _located(
-        self, pixels: Tensor, seen: Tensor, cov: Tensor | None, height: Tensor | None, options: tuple[float, bool]
+        self, pixels: Tensor, seen: Tensor, cov: Tensor | None, height: Tensor | None, options: _Options
     ) -> tuple[ViewsLocalization, Tensor, Tensor]:
         """All rows; (N, V) the view that should be left out; (N,) rows whose views contradict each other for good."""
-        sigma, differentiated = options
+        sigma, differentiated, ground = options
         posed = PosedCameras(
             self.rig.each, self.rig.rotation, self.rig.center, self.up, self.rig.refraction * self.half_curvature
         )
         shared = None if self.errors is None else CommonErrors(self.lens, self.errors, self.bending_errors)
-        reach = None if height is None else partial(self._at_height, height=height, sigma=sigma)
+        reach = None
+        if self.up is not None and self.ecef_from_enu is not None:
+            bending = self.rig.refraction, self.half_curvature
+            frame = EarthFrame(self.up, self.heights, self.ecef_from_enu, self.ecef_of_origin, *bending)
+            if ground is not None:
+                reach = partial(ground_ahead, frame, ground=ground, sigma=sigma)
+            elif height is not None:
+                reach = partial(height_ahead, frame, height=height, sigma=sigma)
         views = fit_views(
             posed, pixels, seen, noise=self.pixel_sigma, cov=cov, shared=shared, height=reach,
             differentiated=differentiated,
@@ -313,32 +328,8 @@ class MultiViewLocalizer(Float64Module):
             status=flag_positions(found.status, torn, PositionStatus.CONTRADICTION),
         )
 
-    def _at_height(self, place: Tensor, ray: Tensor, first: Tensor, height: Tensor, sigma: float) -> StatedHeight:
-        """Where rays (N, 3) from places of cameras reach heights (N,) above the ellipsoid for the first time."""
-        assert self.up is not None
-        assert self.ecef_from_enu is not None
-        one = first.to(torch.float64)
-        up, own = one @ self.up, one @ self.heights
-        target = torch.where(torch.isfinite(height), height, own)
-        climb = (ray * up).sum(-1)
-        # Above the ellipsoid, a line of sight rises by the distance's square over twice the radius of its curve.
-        curve = self.half_curvature * (1.0 - self.rig.refraction) * (1.0 - climb * climb)
-        drop = own - target
-        root = climb * climb - 4.0 * curve * drop
-        reached = torch.isfinite(height) & (drop > 0) & (climb < 0) & (root > 0)
-        far = torch.where(reached, 2.0 * drop / (torch.sqrt(torch.where(reached, root, 1.0)) - climb), 1.0)
-        for _ in range(_HEIGHT_STEPS):
-            bent = self.rig.refraction * self.half_curvature * (1.0 - climb * climb) * far * far
-            point = place + far[..., None] * ray - bent[..., None] * up
-            off = place_enu(point, self.ecef_from_enu, self.ecef_of_origin)[..., 2] - target
-            slope = torch.where(reached, climb + 2.0 * curve * far, -1.0)
-            far = far - torch.where(reached, off, 0.0) / slope
-        away = point - place
-        level = away - (away * up).sum(-1, keepdim=True) * up
-        return StatedHeight(point, up + 2.0 * self.half_curvature * level, torch.full_like(height, sigma), reached)
 
-
-def _errors_by_camera(
+def errors_by_camera(
     rig: CameraRig, root: Tensor | None
 ) -> tuple[Tensor | None, Tensor | None, tuple[tuple[int, ...], ...]]:
     """What `CommonErrors` contains: `half`, `bending` per unit of k, and `lens`."""

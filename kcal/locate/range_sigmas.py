@@ -103,7 +103,7 @@ def range_sigmas(
         if rig.covariance is not None:
             factor = rig.covariance.half.T
             effect = slope[:, None] * calibration_effect(found.fit, found.scale, factor)[2].mT
-            by_lenses = effect @ _row_space(factor[:-6])
+            by_lenses = effect @ row_space(factor[:-6])
             lenses = by_lenses.norm(dim=-1)
             pose = (effect.square().sum(-1) - lenses.square()).clamp_min(0.0).sqrt()
         stands = rig.mounting
@@ -117,7 +117,7 @@ def range_sigmas(
     return RangeSigmas(far, marks, lenses, pose, total, total * BEARING_SIGMAS <= far, sideways)
 
 
-def _row_space(matrix: Tensor) -> Tensor:
+def row_space(matrix: Tensor) -> Tensor:
     """(K, R) orthonormal basis of the rows of a matrix (P, K), whose rows may have any units."""
     length = matrix.norm(dim=-1, keepdim=True)
     _, values, rows = torch.linalg.svd(matrix / torch.where(length > 0, length, 1.0), full_matrices=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from kcal.locate.columns import PositionColumns
 from kcal.locate.datum import Geoid, geoid_column
 from kcal.locate.ellipsoid import ecef_from_enu_rotation
 from kcal.locate.geodesy import anchor, enu_to_geodetic
+from kcal.locate.ground import Ground
 from kcal.locate.localizer import Localization
 from kcal.locate.multi_localizer import MultiViewLocalizer, ViewsLocalization
 from kcal.locate.positions import Located
@@ -40,6 +41,7 @@ def locate_views(
     *,
     pixel_sigma: float = 0.3,
     height: tuple[float, float] | None = None,
+    ground: Ground | None = None,
     geoid: Geoid | None = None,
 ) -> Located:
     """Positions of things that any of a rig's cameras saw.
@@ -52,7 +54,9 @@ def locate_views(
         rig: with an origin.
         views: marks, in the order of the rig's cameras.
         pixel_sigma: of a mark along each axis, px, where the table does not say.
-        height: meters above the ellipsoid, and its sigma, of what one camera alone saw.
+        height: meters above the ellipsoid, and its sigma, of what one camera alone saw; with `ground` the first is not
+            read, and the second is the ground's.
+        ground: on which such things stand, from `level_ground` or `terrain`.
         geoid: a grid from `kcal.locate.datum.find_geoid`.
 
     Raises:
@@ -71,72 +75,103 @@ def locate_views(
         >>> [round(value) for value in located.enu], located.status.name
         ([100, 5000, 60], 'OK')
     """
-    origin = rig.origin
-    if origin is None:
-        raise InputError("this rig has no place on the Earth: solve it with landmarks or positions that have latitudes")
-    localize = MultiViewLocalizer(rig, pixel_sigma=pixel_sigma)
-    sigma = views.sigmas(pixel_sigma)
-    cov = sigma.square()[..., None, None] * torch.eye(2, dtype=torch.float64)
-    stated = None if height is None else torch.full((len(views.names),), height[0], dtype=torch.float64)
-    found = localize(
-        views.pixels,
-        cov=cov if bool(views.sigma.isfinite().any()) else None,
-        height=stated,
-        height_sigma=1.0 if height is None else height[1],
-    )
-    base = anchor(origin)[0]
-    geodetic = enu_to_geodetic(rig.center, origin)
-    to_own = torch.stack([ecef_from_enu_rotation(lat, lon).T @ base for lat, lon, _ in geodetic.tolist()])
-    bearing = (to_own[found.anchor] @ found.bearing[..., None])[..., 0]
-    as_pairs = Localization(
-        enu=found.enu, covariance=found.covariance, geodetic=found.geodetic, range_low=found.range_low,
-        range_high=found.range_high, status=found.status, bearing=bearing, inverse_range=found.inverse_range,
-        inverse_range_sigma=found.inverse_range_sigma, reprojection=found.reprojection[:, :2],
-    )  # fmt: skip
-    ok = (found.status == int(PositionStatus.OK)).numpy()
-    heights = np.full(len(ok), np.nan)
-    if geoid is not None:
-        heights[ok] = geoid_column(geoid, found.geodetic[ok, 0].numpy(), found.geodetic[ok, 1].numpy())
-    numbers = number_table(as_pairs, (("geoid_height_m", ok, heights[None]),))
-    extras = views.extras | {
-        "cameras": [_camera_list(rig, row) for row in found.used],
-        "left_out": [_camera_list(rig, row) for row in found.bad],
-        "misfit_sigmas": [_misfits(rig, row) for row in found.misfit],
-    }
-    first = station_mounting(rig, 0)
-    return Located(
-        columns=PositionColumns(views.names, found.status.numpy(), _row_reasons(rig, found), numbers, extras),
-        cameras=tuple(
-            viewpoint(name, camera, center, turn.T, tuple(place))
-            for name, camera, center, turn, place in zip(
-                rig.names, rig.each, rig.center, rig.rotation, geodetic.tolist(), strict=True
+    locate = ViewsLocator(rig, pixel_sigma=pixel_sigma, height=height, ground=ground, geoid=geoid)
+    return locate.located(*locate(views))
+
+
+class ViewsLocator:
+    """`locate_views` for one part of a long table after the other; the arguments are the same."""
+
+    def __init__(
+        self,
+        rig: CameraRig,
+        *,
+        pixel_sigma: float = 0.3,
+        height: tuple[float, float] | None = None,
+        ground: Ground | None = None,
+        geoid: Geoid | None = None,
+    ) -> None:
+        if rig.origin is None:
+            raise InputError(
+                "this rig has no place on the Earth: solve it with landmarks or positions that have latitudes"
             )
-        ),
-        origin=origin,
-        heading_deg=first.heading_deg,
-        pitch_deg=first.pitch_deg,
-        roll_deg=first.roll_deg,
-        pixel_sigma=pixel_sigma,
-        included=("marks",) if localize.errors is None else ("marks", "calibration", "mounting"),
-        geoid=None if geoid is None else geoid.name,
-        feet=rig.center[found.anchor],
-    )
+        self.rig, self.origin, self.geoid = rig, rig.origin, geoid
+        self.localize = MultiViewLocalizer(rig, pixel_sigma=pixel_sigma)
+        self.height, self.ground = height, ground
+        self.places = enu_to_geodetic(rig.center, rig.origin).tolist()
+        base = anchor(rig.origin)[0]
+        self.to_own = torch.stack([ecef_from_enu_rotation(lat, lon).T @ base for lat, lon, _ in self.places])
+
+    @torch.no_grad()
+    def __call__(self, views: ViewMarks) -> tuple[PositionColumns, Tensor]:
+        """The columns of some rows, and (N, 3) where their bearings and ranges count from."""
+        rig, sigma = self.rig, views.sigmas(self.localize.pixel_sigma)
+        cov = sigma.square()[..., None, None] * torch.eye(2, dtype=torch.float64)
+        stated: Tensor | Ground | None = self.ground
+        if self.ground is None and self.height is not None:
+            stated = torch.full((len(views.names),), self.height[0], dtype=torch.float64)
+        found = self.localize(
+            views.pixels,
+            cov=cov if bool(views.sigma.isfinite().any()) else None,
+            height=stated,
+            height_sigma=1.0 if self.height is None else self.height[1],
+        )
+        bearing = (self.to_own[found.anchor] @ found.bearing[..., None])[..., 0]
+        as_pairs = Localization(
+            enu=found.enu, covariance=found.covariance, geodetic=found.geodetic, range_low=found.range_low,
+            range_high=found.range_high, status=found.status, bearing=bearing, inverse_range=found.inverse_range,
+            inverse_range_sigma=found.inverse_range_sigma, reprojection=found.reprojection[:, :2],
+        )  # fmt: skip
+        ok = (found.status == int(PositionStatus.OK)).numpy()
+        heights = np.full(len(ok), np.nan)
+        if self.geoid is not None:
+            heights[ok] = geoid_column(self.geoid, found.geodetic[ok, 0].numpy(), found.geodetic[ok, 1].numpy())
+        numbers = number_table(as_pairs, (("geoid_height_m", ok, heights[None]),))
+        extras = views.extras | {
+            "cameras": [_camera_list(rig, row) for row in found.used.tolist()],
+            "left_out": [_camera_list(rig, row) for row in found.bad.tolist()],
+            "misfit_sigmas": [_misfits(rig, row) for row in found.misfit.tolist()],
+        }
+        columns = PositionColumns(views.names, found.status.numpy(), _row_reasons(rig, found), numbers, extras)
+        return columns, rig.center[found.anchor]
+
+    def located(self, columns: PositionColumns | None = None, feet: Tensor | None = None) -> Located:
+        """Positions with what they were located by; none where only that is asked for."""
+        first, rig = station_mounting(self.rig, 0), self.rig
+        return Located(
+            columns=PositionColumns.joined([]) if columns is None else columns,
+            cameras=tuple(
+                viewpoint(name, camera, center, turn.T, tuple(place))
+                for name, camera, center, turn, place in zip(
+                    rig.names, rig.each, rig.center, rig.rotation, self.places, strict=True
+                )
+            ),
+            origin=self.origin,
+            heading_deg=first.heading_deg,
+            pitch_deg=first.pitch_deg,
+            roll_deg=first.roll_deg,
+            pixel_sigma=self.localize.pixel_sigma,
+            included=("marks",) if self.localize.errors is None else ("marks", "calibration", "mounting"),
+            geoid=None if self.geoid is None else self.geoid.name,
+            feet=torch.zeros(0, 3, dtype=torch.float64) if feet is None else feet,
+        )
 
 
-def _camera_list(rig: CameraRig, which: Tensor) -> str:
-    return " ".join(name for name, one in zip(rig.names, which.tolist(), strict=True) if one)
+def _camera_list(rig: CameraRig, which: Sequence[bool]) -> str:
+    return " ".join(name for name, one in zip(rig.names, which, strict=True) if one)
 
 
-def _misfits(rig: CameraRig, row: Tensor) -> str:
-    return " ".join(f"{name}={value:.1f}" for name, value in zip(rig.names, row.tolist(), strict=True) if value > 0)
+def _misfits(rig: CameraRig, row: Sequence[float]) -> str:
+    return " ".join(f"{name}={value:.1f}" for name, value in zip(rig.names, row, strict=True) if value > 0)
 
 
 def _row_reasons(rig: CameraRig, found: ViewsLocalization) -> list[str]:
     reasons = []
-    for status, bad, misfit in zip(found.status.tolist(), found.bad, found.misfit, strict=True):
+    rows = zip(found.status.tolist(), found.bad.tolist(), found.misfit.tolist(), strict=True)
+    for status, bad, misfit in rows:
         text = _TEXTS.get(PositionStatus(status), "")
-        if bool(bad.any()):
-            worst = float(torch.where(bad, misfit, -math.inf).max())
+        if any(bad):
+            worst = max(value for value, one in zip(misfit, bad, strict=True) if one)
             text = f"left out: the mark in {_camera_list(rig, bad)} contradicts the others ({worst:.0f} sigma); {text}"
         reasons.append(text.removesuffix("; "))
     return reasons

@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from kcal.calibrate.rig.sources import Features, Landmarks
 from kcal.errors import FileError, InputError
 from kcal.locate.marks import read_marks
 from kcal.locate.survey import MarkedLandmarks, Survey, inverse_range_of
-from kcal.locate.tables import TableRow, header_of, read_chunks
+from kcal.locate.tables import TableChunk, TableRow, header_of, read_chunks
 
 _LONG = ("name", "camera", "u", "v")
 _HEADER = ",".join(_LONG)
 _KNOWN = (*_LONG, "time", "sigma", "note")
 _RANGES = ("range", "range_sigma", "beyond")
+# Bytes of a table that is read whole: some 500,000 lines.
+_WHOLE = 1 << 24
 
 
 class ViewMarks(NamedTuple):
@@ -76,43 +81,121 @@ def read_views(path: str | Path, cameras: Sequence[str], *, ranges: bool = False
             raise FileError(f"{path}: marks of {len(cameras)} cameras need the columns {_HEADER}, one line each")
         pairs = read_marks(path, single=True)
         return ViewMarks(pairs.names, pairs.pixels, pairs.sigmas(math.nan), {})
-    number: Mapping[str, int] = {name: c for c, name in enumerate(cameras)}
-    rows: dict[tuple[str, str], int] = {}
-    placed: dict[tuple[int, int], tuple[float, float, float]] = {}
-    first: list[TableRow] = []
+    reader = _Gather(cameras, others)
     more: list[str] = []
-    known = (*_KNOWN, *(_RANGES if ranges else ()))
-    for chunk in read_chunks(path, _HEADER, known, _LONG, extras=not ranges, unique=False):
+    for chunk in _view_chunks(path, ranges):
         more = [column for column in chunk.columns if column not in _KNOWN]
         for row in chunk.rows():
-            camera = row.cells["camera"]
-            if camera not in number and others:
-                continue
-            if camera not in number:
-                raise FileError(f"{row.where}: no camera is named {camera!r}; they are {', '.join(cameras)}")
-            key = row.name, row.cells.get("time", "")
-            place = rows.setdefault(key, len(rows)), number[camera]
-            if place[0] == len(first):
-                first.append(row)
-            if place in placed:
-                raise FileError(f"{row.where}: {row.name!r} was marked in {camera} before; one mark each is needed")
-            sigma = row.positive("sigma") or math.nan
-            placed[place] = row.number("u", "a pixel coordinate"), row.number("v", "a pixel coordinate"), sigma
-    if not rows:
+            reader.add(row)
+    if not reader.first:
         raise FileError(f"{path}: no mark of {', '.join(cameras)}; the column camera needs its file's name")
-    table = torch.full((len(rows), len(cameras), 3), math.nan, dtype=torch.float64)
-    for (i, c), values in placed.items():
-        table[i, c] = torch.tensor(values, dtype=torch.float64)
-    times = [time for _, time in rows]
-    names = [name for name, _ in rows]
-    several = {name for name in names if names.count(name) > 1} if any(times) else set()
-    extras = {column: [row.cells[column] for row in first] for column in more}
-    if any(times):
-        extras = {"time": times, **extras}
-    return ViewMarks(
-        tuple(f"{name} {time}" if name in several else name for name, time in rows), table[..., :2], table[..., 2],
-        extras,
-    )  # fmt: skip
+    return reader.marks(more)
+
+
+def read_view_chunks(path: str | Path, cameras: Sequence[str]) -> Iterator[tuple[ViewMarks, int]]:
+    """The same for a table that may be longer than memory: some things at a time, and how many bytes were read.
+
+    Tables of up to 16 MB are read whole, in any order of their lines. In longer ones the lines of one thing, and one
+    time, stand together; names come with their time, if there is one.
+
+    Raises:
+        FileError: as `read_views`; a thing whose lines do not stand together.
+    """
+    path = Path(path)
+    if not is_long(path) or path.stat().st_size <= _WHOLE:
+        yield read_views(path, cameras, others=False), path.stat().st_size
+        return
+    reader, more, seen = _Gather(cameras), list[str](), np.empty(0, np.int64)
+    open_key: tuple[str, str] | None = None
+    for chunk in _view_chunks(path, False):
+        more = [column for column in chunk.columns if column not in _KNOWN]
+        for row in chunk.rows():
+            key = row.name, row.cells.get("time", "")
+            if key != open_key and key in reader.rows:
+                raise FileError(_not_together(row))
+            reader.add(row)
+            open_key = key
+        # The last thing may go on.
+        done, reader = reader, _Gather(cameras)
+        if open_key is not None:
+            done.move(open_key, reader)
+        if done.first:
+            seen = _things_once(done, seen)
+            yield done.marks(more, timed=True), chunk.bytes_read
+    _things_once(reader, seen)
+    yield reader.marks(more, timed=True), path.stat().st_size
+
+
+def _things_once(done: _Gather, seen: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Raise if a thing was there before; return the sorted hashes of all so far, eight bytes each."""
+    hashes = np.fromiter(map(hash, done.rows), np.int64, len(done.rows))
+    place = np.searchsorted(seen, hashes)
+    again = (seen[np.minimum(place, len(seen) - 1)] == hashes) if len(seen) else np.zeros(len(hashes), bool)
+    if again.any():
+        raise FileError(_not_together(done.first[int(again.argmax())]))
+    return np.sort(np.concatenate([seen, hashes]), kind="stable")
+
+
+def _not_together(row: TableRow) -> str:
+    return (
+        f"{row.where}: lines of {row.name!r} stand at several places; in a table this long they must stand together: "
+        "sort it by name and time"
+    )
+
+
+def _view_chunks(path: str | Path, ranges: bool) -> Iterator[TableChunk]:
+    known = (*_KNOWN, *(_RANGES if ranges else ()))
+    return read_chunks(path, _HEADER, known, _LONG, extras=not ranges, unique=False)
+
+
+class _Gather:
+    """Lines of one thing at one time, put together into rows."""
+
+    def __init__(self, cameras: Sequence[str], others: bool = False) -> None:
+        self.number: Mapping[str, int] = {name: c for c, name in enumerate(cameras)}
+        self.others, self.cameras = others, cameras
+        self.rows: dict[tuple[str, str], int] = {}
+        self.placed: dict[tuple[int, int], tuple[float, float, float]] = {}
+        self.first: list[TableRow] = []
+
+    def add(self, row: TableRow) -> None:
+        camera = row.cells["camera"]
+        if camera not in self.number:
+            if self.others:
+                return
+            raise FileError(f"{row.where}: no camera is named {camera!r}; they are {', '.join(self.cameras)}")
+        key = row.name, row.cells.get("time", "")
+        place = self.rows.setdefault(key, len(self.rows)), self.number[camera]
+        if place[0] == len(self.first):
+            self.first.append(row)
+        if place in self.placed:
+            raise FileError(f"{row.where}: {row.name!r} was marked in {camera} before; one mark each is needed")
+        sigma = row.positive("sigma") or math.nan
+        self.placed[place] = row.number("u", "a pixel coordinate"), row.number("v", "a pixel coordinate"), sigma
+
+    def move(self, key: tuple[str, str], other: _Gather) -> None:
+        """Take the last thing away, and give it to another."""
+        last = self.rows.pop(key)
+        other.rows[key], other.first = 0, [self.first.pop()]
+        for camera in range(len(self.cameras)):
+            if (found := self.placed.pop((last, camera), None)) is not None:
+                other.placed[0, camera] = found
+
+    def marks(self, more: Sequence[str], timed: bool = False) -> ViewMarks:
+        table = torch.full((len(self.rows), len(self.cameras), 3), math.nan, dtype=torch.float64)
+        if self.placed:
+            at, values = torch.tensor(list(self.placed)), torch.tensor(list(self.placed.values()), dtype=torch.float64)
+            table[at[:, 0], at[:, 1]] = values
+        times = [time for _, time in self.rows]
+        names = [name for name, _ in self.rows]
+        several = {name for name, count in Counter(names).items() if timed or count > 1} if any(times) else set()
+        extras = {column: [row.cells[column] for row in self.first] for column in more}
+        if any(times):
+            extras = {"time": times, **extras}
+        return ViewMarks(
+            tuple(f"{name} {time}" if name in several else name for name, time in self.rows), table[..., :2],
+            table[..., 2], extras,
+        )  # fmt: skip
 
 
 def match_views(survey: Survey, views: ViewMarks, pixel_sigma: float) -> MarkedLandmarks:

@@ -89,7 +89,7 @@ class StatedHeight(NamedTuple):
 
     Attributes:
         point: (N, 3) in the frame.
-        up: (N, 3) the vertical there.
+        up: (N, 3) the vertical there; over terrain the slope of the height above the ground.
         sigma: (N,) of the height, meters.
         reached: (N,) bool.
     """
@@ -188,7 +188,7 @@ def fit_views(
     noise: float,
     cov: Tensor | None = None,
     shared: CommonErrors | None = None,
-    height: Callable[[Tensor, Tensor, Tensor], StatedHeight] | None = None,
+    height: Callable[[Tensor, Tensor, Tensor, Tensor], StatedHeight] | None = None,
     differentiated: bool = False,
 ) -> ViewsFit:
     """The most likely point of each row of views: in closed form first, then by `most_likely`.
@@ -200,7 +200,7 @@ def fit_views(
         noise: standard deviation of a pixel along each axis where there is no covariance, px.
         cov: (N, C, 2, 2) covariance of each pixel.
         shared: what marks of a camera have in common.
-        height: of places, rays and anchors of points that one camera saw: where their height is known.
+        height: of places, rays, anchors, and which points one camera alone saw: where their height is known.
         differentiated: see `most_likely`.
     """
     finite = torch.isfinite(pixels).all(-1)
@@ -241,7 +241,7 @@ def fit_views(
         away = found.points + center[0] - place
         held = None
         if height is not None:
-            stated = height(place, ray, anchor)
+            stated = height(place, ray, anchor, count == 1)
             alone = (count == 1) & stated.reached
             away, met = torch.where(alone[..., None], stated.point - place, away), met | alone
             code = flag_positions(code, alone, PositionStatus.OK)
@@ -254,7 +254,7 @@ def fit_views(
     around = posed.around._replace(present=used.mT, held=held)
     weight, variance = None, noise**2
     if cov is not None or shared is not None:
-        moved = None if shared is None else _shared_pixels(posed, shared, (place, ahead, inverse), used, scale)
+        moved = None if shared is None else shared_pixels(posed, shared, (place, ahead, inverse), used, scale)
         weight, variance = _weight(cov, noise, used, moved), 1.0
     apart = place.detach()[..., None, :] - center
     lines = [
@@ -285,7 +285,7 @@ def _height_row(ahead: Tensor, inverse: Tensor, scale: Tensor, stated: StatedHei
     return torch.stack([climb[0], climb[1], -climb[2] * range_ / scale], -2)
 
 
-def _shared_pixels(
+def shared_pixels(
     posed: PosedCameras, shared: CommonErrors, at: tuple[Tensor, Tensor, Tensor], used: Tensor, scale: Tensor
 ) -> Tensor:
     """(K, 2 C, N) what each shared error moves in the pixels of points: anchor (N, 3), direction, inverse distance."""

@@ -26,3 +26,5 @@ from kcal.report.board import save_board_picture as save_board_picture
 from kcal.report.difference import save_difference_picture as save_difference_picture
 from kcal.report.interval_map import save_interval_picture as save_interval_picture
 from kcal.report.budget import save_budget_picture as save_budget_picture
+from kcal.report.siting import siting_figure as siting_figure
+from kcal.report.siting import save_siting_picture as save_siting_picture

@@ -13,8 +13,12 @@ from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.synchrony import Synchrony, synchrony
 from kcal.errors import InputError
 from kcal.lens.calibration import RigCalibration
+from kcal.lens.camera import Camera
+from kcal.lens.camera_rig import CameraRig, CameraRigCalibration
 from kcal.lens.rig import StereoRig
 from kcal.locate.range_sigmas import RangeSigmas, range_sigmas
+from kcal.locate.station_sigmas import station_sigmas
+from kcal.quantities import range_text
 from kcal.report.judge_camera import stored_findings
 from kcal.report.verdict import FAULTS, Finding, RangeAnswer, Requirement, Verdict, weighed_findings
 
@@ -22,12 +26,13 @@ from kcal.report.verdict import FAULTS, Finding, RangeAnswer, Requirement, Verdi
 _APART = 2.5
 _LATE_SIGMAS, _LATE = 5.0, 0.02
 _MOST_LEFT_OUT = 0.2
+_LOOK = {False: "both cameras look", True: "two cameras or more look"}
 # Residuals of a whole rig in their sigmas: more, and something does not fit.
 _MOST_VARIANCE = 9.0
 
 
 def rig_verdict(
-    rig: StereoRig,
+    rig: StereoRig | CameraRig,
     requirements: Sequence[Requirement] = (),
     *,
     mark_sigma: float = 0.3,
@@ -43,13 +48,14 @@ def rig_verdict(
     counts in the ranges.
 
     Args:
-        rig: with its covariance.
+        rig: with its covariance; of two cameras, or of any number with its `root`: then ranges are those from each
+            camera to things that another one sees, where they are worst.
         requirements: ranges, and how well they must be known.
         mark_sigma: noise of a mark along each axis, px.
         result: as it was solved, for its warnings and its pairs of boards.
         pairs: otherwise, corners of the board (N, 3) in meters, and pixels (P, 2, N, 2) of pairs of views.
         unpaired: why there are no pairs, where there should be.
-        cameras: verdicts on its left and right camera, whose findings count; what the rig's file tells of them if left
+        cameras: verdicts on its cameras, whose findings count; what the rig's file tells of them if left
             out.
         subject: its name.
 
@@ -63,24 +69,39 @@ def rig_verdict(
         ([True, False], 'at 5 km the range is known to ±6.8 %; 5 % are required; most of it is from relative pose')
     """
     findings = [*_inherited(rig, cameras), *_own_findings(rig, result)]
-    compared = _pairs_compared(rig, result, pairs)
-    if compared is not None and compared.pairs:
-        findings.append(_synchrony_finding(compared))
-    elif unpaired or (result is None and rig.calibration is not None and rig.calibration.pairs):
-        findings.append(_unpaired_finding(unpaired or "no pairs of views were given"))
+    if isinstance(rig, StereoRig):
+        compared = _pairs_compared(rig, result, pairs)
+        if compared is not None and compared.pairs:
+            findings.append(_synchrony_finding(compared))
+        elif unpaired or (result is None and rig.calibration is not None and rig.calibration.pairs):
+            findings.append(_unpaired_finding(unpaired or "no pairs of views were given"))
     beyond = [verdict.unexplained for verdict in cameras]
+    if isinstance(rig, CameraRig):
+        findings += [
+            _unseen_finding(requirement.distance)
+            for requirement in requirements
+            if station_sigmas(rig, requirement.distance, pixel_sigma=mark_sigma) is None
+        ]
     answers = tuple(_rig_answer(rig, requirement, mark_sigma, beyond) for requirement in requirements)
     return Verdict(
         subject=subject,
         answers=answers,
         findings=weighed_findings(findings, answers),
         advice=tuple(f"{verdict.subject}: {text}" for verdict in cameras for text in verdict.advice),
-        basis=f"from the rig's own covariance, where both cameras look, with marks to {mark_sigma:g} px",
+        basis=f"from the rig's own covariance, where {_LOOK[isinstance(rig, CameraRig)]}, with marks to "
+        f"{mark_sigma:g} px",
         unexplained=max(beyond, default=0.0),
     )
 
 
-def _inherited(rig: StereoRig, cameras: Sequence[Verdict]) -> list[Finding]:
+def named_cameras(rig: StereoRig | CameraRig) -> list[tuple[str, Camera]]:
+    """The cameras of a rig with their names: left and right of a rig of two."""
+    if isinstance(rig, StereoRig):
+        return [("left", rig.left), ("right", rig.right)]
+    return list(zip(rig.names, rig.each, strict=True))
+
+
+def _inherited(rig: StereoRig | CameraRig, cameras: Sequence[Verdict]) -> list[Finding]:
     """Findings about the cameras, each named; what is the same of several is said once."""
     found: dict[Finding, list[str]] = {}
     if cameras:
@@ -88,7 +109,7 @@ def _inherited(rig: StereoRig, cameras: Sequence[Verdict]) -> list[Finding]:
             for finding in verdict.findings:
                 found.setdefault(finding, []).append(verdict.subject)
     else:
-        for word, camera in (("left", rig.left), ("right", rig.right)):
+        for word, camera in named_cameras(rig):
             for finding in stored_findings(camera):
                 found.setdefault(finding, []).append(word)
     return [
@@ -103,8 +124,10 @@ def _inherited(rig: StereoRig, cameras: Sequence[Verdict]) -> list[Finding]:
     ]
 
 
-def _rig_answer(rig: StereoRig, requirement: Requirement, mark_sigma: float, beyond: Sequence[float]) -> RangeAnswer:
-    """The worst of several places along the middle row of the left image that both cameras see.
+def _rig_answer(
+    rig: StereoRig | CameraRig, requirement: Requirement, mark_sigma: float, beyond: Sequence[float]
+) -> RangeAnswer:
+    """The worst of several places that two cameras see.
 
     Args:
         rig: with its covariance.
@@ -112,12 +135,32 @@ def _rig_answer(rig: StereoRig, requirement: Requirement, mark_sigma: float, bey
         mark_sigma: noise of a mark along each axis, px.
         beyond: px by which each camera is wrong beyond its error bars.
     """
+    if isinstance(rig, CameraRig):
+        worst = station_sigmas(rig, requirement.distance, pixel_sigma=mark_sigma)
+        if worst is None:
+            return RangeAnswer(requirement=requirement, parts={"marks": math.inf, "lenses": 0.0, "relative pose": 0.0})
+        unknown = rig.root is None
+    else:
+        worst, unknown = _worst_of_pair(rig, requirement.distance, mark_sigma), rig.covariance is None
+    parts = {
+        "marks": float(worst.marks),
+        "lenses": math.inf if unknown else float(worst.lenses),
+        "relative pose": math.inf if unknown else float(worst.pose),
+    }
+    if any(beyond):
+        # Each camera's errors spoil a range as the noise of its marks does.
+        parts[FAULTS] = float(worst.marks) / mark_sigma * math.hypot(*beyond) / math.sqrt(len(beyond))
+    return RangeAnswer(requirement=requirement, parts=parts)
+
+
+def _worst_of_pair(rig: StereoRig, distance: float, mark_sigma: float) -> RangeSigmas:
+    """The worst of several places along the middle row of the left image that both cameras see."""
     width, height = rig.left.size
     worst: RangeSigmas | None = None
     places = [None, *([0.5 * width + share * width, 0.5 * height] for share in (-0.3, 0.3))]
     for place in places:
         try:
-            found = range_sigmas(rig, [requirement.distance], pixel_sigma=mark_sigma, pixel=place)
+            found = range_sigmas(rig, [distance], pixel_sigma=mark_sigma, pixel=place)
         except InputError:
             if place is None:
                 raise
@@ -125,20 +168,10 @@ def _rig_answer(rig: StereoRig, requirement: Requirement, mark_sigma: float, bey
         if worst is None or not float(found.total) <= float(worst.total):
             worst = found
     assert worst is not None
-    unknown = rig.covariance is None
-    parts = {
-        "marks": float(worst.marks),
-        "lenses": math.inf if unknown else float(worst.lenses),
-        "relative pose": math.inf if unknown else float(worst.pose),
-    }
-    if any(beyond):
-        # Both cameras' errors spoil the disparity as the noise of both marks does.
-        by_pixel = float(range_sigmas(rig, [requirement.distance], pixel_sigma=1.0).marks)
-        parts[FAULTS] = by_pixel * math.hypot(*beyond) / math.sqrt(2.0)
-    return RangeAnswer(requirement=requirement, parts=parts)
+    return worst
 
 
-def _own_findings(rig: StereoRig, result: RigResult | None) -> list[Finding]:
+def _own_findings(rig: StereoRig | CameraRig, result: RigResult | None) -> list[Finding]:
     """What the rig's own solution says, and what could not be checked."""
     found = _doubts(rig, result)
     record = rig.calibration
@@ -150,9 +183,9 @@ def _own_findings(rig: StereoRig, result: RigResult | None) -> list[Finding]:
     return found
 
 
-def _doubts(rig: StereoRig, result: RigResult | None) -> list[Finding]:
+def _doubts(rig: StereoRig | CameraRig, result: RigResult | None) -> list[Finding]:
     found = []
-    if rig.covariance is None:
+    if (rig.root if isinstance(rig, CameraRig) else rig.covariance) is None:
         found.append(
             Finding(
                 name="error-bars",
@@ -213,16 +246,20 @@ def _doubts(rig: StereoRig, result: RigResult | None) -> list[Finding]:
     return found
 
 
-def _exact_lenses(rig: StereoRig, result: RigResult | None) -> tuple[str, ...]:
+def _exact_lenses(rig: StereoRig | CameraRig, result: RigResult | None) -> tuple[str, ...]:
     """Names of the cameras whose parameters have no error in the rig's covariance."""
-    if result is not None or rig.covariance is None:
-        return () if result is None else result.exact
-    first, second = (camera.values.shape[-1] for camera in (rig.left, rig.right))
-    parts = zip(("left", "right"), rig.covariance.half[:, : first + second].split([first, second], 1), strict=True)
-    return tuple(name for name, part in parts if not bool(part.any()))
+    if result is not None:
+        return result.exact
+    root = rig.root if isinstance(rig, CameraRig) else None if rig.covariance is None else rig.covariance.half
+    if root is None:
+        return ()
+    named = named_cameras(rig)
+    sizes = [camera.values.shape[-1] for _, camera in named]
+    parts = zip(named, root[:, : sum(sizes)].split(sizes, 1), strict=True)
+    return tuple(name for (name, _), part in parts if not bool(part.any()))
 
 
-def _stored_variance(record: RigCalibration | None) -> float:
+def _stored_variance(record: RigCalibration | CameraRigCalibration | None) -> float:
     """Largest mean square of a source's residuals in their sigmas."""
     sources = () if record is None else record.sources
     return max((source.sigmas**2 for source in sources if source.sigmas is not None), default=0.0)
@@ -237,6 +274,16 @@ def _pairs_compared(rig: StereoRig, result: RigResult | None, pairs: tuple[Tenso
     # Turned boards are in the data as they were turned; pairs that were left out count too.
     order = torch.tensor(sorted(range(len(boards.names)), key=lambda i: boards.names[i]), dtype=torch.long)
     return synchrony(rig, boards.points, boards.pixels[order])
+
+
+def _unseen_finding(distance: float) -> Finding:
+    return Finding(
+        name="view",
+        severity="stop",
+        text=f"at {range_text(distance)} from a camera, along the middle rows of the images, no two cameras see one "
+        "thing: no range can be told",
+        action="turn the cameras so that their views overlap, or add one (kcal sites says where)",
+    )
 
 
 def _unpaired_finding(why: str) -> Finding:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,12 +33,15 @@ _WRONG, _FAINT = "#c02a6b", "#9aa3af"
 _CAMERAS = ("#2b6cb0", "#dd7a1f", "#0f766e", "#7c3aed")
 _HALO = [patheffects.withStroke(linewidth=2.5, foreground="white")]
 _ROWS = 45
+# Of what is shown: cameras farther from their middle stand around it.
+_WIDE = 0.1
 
 
 def rig_figure(result: RigResult) -> Figure:
     """Draw a rig on the map, with what it was solved from, and each item's residual in sigmas.
 
-    Distances from the rig are drawn as log(1 + range / r0), directions as they are. What was left out is magenta.
+    Distances from the rig are drawn as log(1 + range / r0), directions as they are; to scale where the cameras stand as
+    far apart as what they saw. What was left out is magenta.
 
     Args:
         result: from `solve_rig` or `calibrate_rig`.
@@ -64,9 +68,12 @@ def rig_figure(result: RigResult) -> Figure:
     plan, bars = figure.subplots(1, 2, width_ratios=[1.25, 1.0])
     _draw_plan(plan, result)
     _draw_items(bars, result)
-    baseline = float(torch.linalg.vector_norm(result.center[1] - result.center[0]))
+    apart = torch.cdist(result.center, result.center)
+    size = f"up to {length_text(float(apart.max()))} apart"
+    if len(result.names) == 2:
+        size = f"baseline {measured_length(float(apart[0, 1]), result.sigma_baseline)}"
     figure.suptitle(
-        f"Rig of {len(result.names)} cameras, baseline {measured_length(baseline, result.sigma_baseline)}",
+        f"Rig of {len(result.names)} cameras, {size}",
         x=0.015,
         ha="left",
         fontsize=14,
@@ -111,11 +118,16 @@ def _draw_plan(axes: Axes, result: RigResult) -> None:
     reach = max(float(np.max(span)) for span in spans) * 1.15
     nearest = min((float(np.min(span)) for span in spans[1:]), default=reach)
     unit = max(nearest / 2.0, reach / 1000.0)
+    # Stations around what they see are drawn to scale.
+    wide = float(np.max(spans[0])) > _WIDE * reach
+
+    def length(distance: Any) -> Any:
+        return distance / reach if wide else np.log1p(distance / unit) / math.log1p(reach / unit)
 
     def place(points: Array) -> Array:
         offset = points - middle
         distance = np.maximum(np.hypot(offset[..., 0], offset[..., 1]), 1e-9)[..., None]
-        return np.asarray(offset / distance * np.log1p(distance / unit) / math.log1p(reach / unit))
+        return np.asarray(offset / distance * length(distance))
 
     extent = []
     for c, camera in enumerate(result.cameras):
@@ -133,7 +145,7 @@ def _draw_plan(axes: Axes, result: RigResult) -> None:
     circle = np.linspace(0.0, 2.0 * math.pi, 200)
     for radius in (step * 10.0**power for power in range(-3, 7) for step in (1.0, 5.0)):
         if nearest / 4 <= radius <= reach:
-            ring = np.log1p(radius / unit) / math.log1p(reach / unit)
+            ring = length(radius)
             axes.plot(ring * np.sin(circle), ring * np.cos(circle), color=_FAINT, linewidth=0.7, linestyle=":")
             axes.text(
                 0.0, ring, range_text(radius), fontsize=8, color="#4b5563", ha="center", va="bottom", path_effects=_HALO
@@ -172,7 +184,8 @@ def _draw_plan(axes: Axes, result: RigResult) -> None:
         axes.annotate("", (0.04, 1.0), (0.04, 0.89), xycoords="axes fraction", arrowprops=arrow)
         axes.text(0.04, 0.88, "N", transform=axes.transAxes, ha="center", va="top", fontsize=11, color="#374151")
     where = "north up" if result.absolute else "first camera's axis up"
-    axes.set_title(f"From above, {where}, ranges on a logarithmic scale", fontsize=10.5, color="#374151")
+    scale = "to scale" if wide else "ranges on a logarithmic scale"
+    axes.set_title(f"From above, {where}, {scale}", fontsize=10.5, color="#374151")
 
 
 def _edges(result: RigResult, c: int, camera: Camera) -> tuple[float, float] | None:

@@ -102,7 +102,7 @@ def moments_of(
     """Images of each camera put together by their times; without times, in their order.
 
     Args:
-        images: of each camera.
+        images: of each camera; none of some.
         tolerance: seconds.
 
     Returns:
@@ -113,9 +113,11 @@ def moments_of(
     """
     timed = all(image.view.time is not None for own in images for image in own)
     if not timed:
-        if len({len(own) for own in images}) > 1:
+        some = [camera for camera, own in enumerate(images) if own]
+        if len({len(images[camera]) for camera in some}) > 1:
             raise InputError("images without times are paired in their order: as many are needed for each camera")
-        return [dict(enumerate(pair)) for pair in zip(*images, strict=True)], 0
+        together = zip(*(images[camera] for camera in some), strict=True)
+        return [dict(zip(some, moment, strict=True)) for moment in together], 0
     found: list[tuple[datetime.datetime, dict[int, NamedStars]]] = []
     for camera, own in enumerate(images):
         for image in own:
@@ -231,7 +233,10 @@ def _effects(
         pole = torch.from_numpy(pole_in_enu(origin.lat))
     else:
         # In the first camera's frame, which is that of the rig; the pole of J2000 is near enough.
-        pole = (moments[0].get(0, some)).attitude.rotation[:, 2]
+        first = next((moment[0] for moment in moments if 0 in moment), None)
+        if first is None:
+            raise InputError("stars without a place on the Earth: images of the first camera are needed")
+        pole = first.attitude.rotation[:, 2]
     found = []
     # An hour later the sky has turned from east to west: against the axis that points north.
     second = -EARTH_RATE * pole

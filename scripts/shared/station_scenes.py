@@ -64,3 +64,13 @@ def targets(count: int, generator: torch.Generator, spread: float = 300.0) -> Te
     """(N, 3) points about the middle."""
     flat = spread * torch.randn(count, 3, dtype=torch.float64, generator=generator)
     return flat * torch.tensor([1.0, 1.0, 0.1]) + torch.tensor([0.0, 0.0, 120.0])
+
+
+def hills(side: int = 400, seed: int = 4, mean: float = 400.0, spread: float = 180.0) -> Tensor:
+    """(side, side) heights of rolling ground, rougher the larger the scale, meters."""
+    generator = torch.Generator().manual_seed(seed)
+    frequency = torch.fft.fftfreq(side, dtype=torch.float64)
+    power = (frequency[:, None].square() + frequency.square()).clamp_min(1e-5) ** -1.05
+    noise = torch.randn(side, side, 2, generator=generator, dtype=torch.float64)
+    ground = torch.fft.ifft2(torch.view_as_complex(noise) * power).real
+    return mean + spread * (ground - ground.mean()) / ground.std()

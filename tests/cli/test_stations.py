@@ -11,15 +11,21 @@ import torch
 from typer.testing import CliRunner
 
 from kcal.cli.main import app
+from kcal.corners.board import Board
+from kcal.corners.observations import Observations, View
 from kcal.errors import FileError, InputError
 from kcal.io.camera_file import save_camera
+from kcal.io.camera_rig_file import save_camera_rig
 from kcal.lens.camera import Camera
+from kcal.lens.camera_rig import CameraRig
+from kcal.lens.pose import rotation_from_vector
 from kcal.locate.geodesy import enu_to_geodetic
+from kcal.locate.station_sigmas import station_sigmas
 from kcal.locate.stations import load_camera_rig
 from scripts.shared.station_scenes import ORIGIN, marks, ring, targets
 
 NAMES = ("mill", "mast", "church", "hill")
-FILES = (".json", ".csv", ".png", ".geojson")
+FILES = (".json", ".csv", ".png", ".geojson", ".html")
 SMOKE = torch.tensor([[300.0, 500, 200], [-900, -300, 180], [1200, -800, 150], [0, 0, -400]], dtype=torch.float64)
 
 
@@ -142,3 +148,87 @@ def test_show_says_how_each_camera_stands() -> None:
     there = enu_to_geodetic(rig.center[1], rig.origin).tolist()
     assert (lat, lon) == pytest.approx(there[:2], abs=1e-7)
     assert "20 mm  50 mm" in line
+
+
+def boards_of(rig: CameraRig, folder: Path) -> list[str]:
+    """Observations of a board shown to three cameras of one mast, each to two or three of them; names of the files."""
+    board = Board(columns=8, rows=6, square=0.25)
+    generator, files = torch.Generator().manual_seed(1), []
+    poses = [
+        (rotation_from_vector(0.3 * torch.randn(3, generator=generator).double()),
+         torch.tensor([-3.0 + 0.5 * i, 0.2 * (i % 3) - 0.4, 9.0 + i % 4]).double())
+        for i in range(14)
+    ]  # fmt: skip
+    for c, name in enumerate(NAMES[:3]):
+        views = []
+        for i, (turn, shift) in enumerate(poses):
+            points = board.points @ turn.T + shift
+            pixels, seen = rig(points)
+            if i % 4 != c and bool(seen[:, c].all()):
+                noise = 0.1 * torch.randn(len(points), 2, generator=generator).double()
+                views.append(View(name=f"{name}_{i:02d}.png", pixels=[*map(tuple, (pixels[:, c] + noise).tolist())]))
+        files.append(f"{name}.obs.json")
+        Observations(board=board, image_size=(1920, 1080), views=tuple(views)).save(folder / files[-1])
+    return files
+
+
+def test_boards_seen_by_any_two_of_three_and_distances_of_named_pairs(tmp_path: Path) -> None:
+    camera = [
+        Camera.build(focal=(1600 + c, 1600), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
+        for c in range(3)
+    ]
+    centers = torch.tensor([[0.0, 0, 0], [1.5, 0.1, 0], [3.0, -0.1, 0.2]], dtype=torch.float64)
+    turns = torch.stack([rotation_from_vector(torch.tensor([0.0, -0.1 * c, 0.02 * c]).double()) for c in range(3)])
+    rig = CameraRig(camera, NAMES[:3], turns, centers, refraction=0.0)
+    for one, name in zip(camera, NAMES, strict=False):
+        save_camera(one, tmp_path / f"{name}.camera.json")
+    three = [f"{name}.camera.json" for name in NAMES[:3]]
+    boards = [word for name in boards_of(rig, tmp_path) for word in ("--observations", name)]
+    run(tmp_path, "rig", *three, *boards, "-o", "rig.json")
+    found = load_camera_rig(tmp_path / "rig.json")
+    assert float((found.center - centers).norm(dim=-1).max()) < 0.01
+    assert found.root is not None
+    # A distance that is known better than by boards moves the cameras to it, and only those two by all of it.
+    far = float((centers[0] - centers[2]).norm()) * 1.01
+    run(
+        tmp_path, "rig", *three, *boards, "--baseline", f"mill:church={far:.5f}±0.00001", "--keep-all", "-o", "rig.json"
+    )
+    held = load_camera_rig(tmp_path / "rig.json")
+    assert float((held.center[0] - held.center[2]).norm()) == pytest.approx(far, abs=1e-4)
+    with pytest.raises(InputError, match="of 3 cameras write FIRST:SECOND=LENGTH±SIGMA, the names being mill, mast"):
+        run(tmp_path, "rig", *three, *boards, "--baseline", "3.0±0.1", "-o", "rig.json")
+    with pytest.raises(InputError, match="of 3 cameras write FIRST:SECOND"):
+        run(tmp_path, "rig", *three, *boards, "--baseline", "mill:hill=3.0±0.1", "-o", "rig.json")
+    with pytest.raises(InputError, match=r"a second file of camera 'mill'"):
+        run(tmp_path, "rig", *three, *boards, *boards[:2], "-o", "rig.json")
+    with pytest.raises(InputError, match=r"give boards by --observations"):
+        run(tmp_path, "rig", *three, "--pairs", "mill.obs.json", "mast.obs.json", "-o", "rig.json")
+
+
+def test_a_rig_of_four_is_judged(folder: Path) -> None:
+    cameras = [f"{name}.camera.json" for name in NAMES]
+    given = ["--landmarks", "survey.csv", "--marks", "marks.csv", "-o", "rig.json"]
+    more = ["--report", "rig.html", "--picture", "rig.png"]
+    text = run(folder, "rig", *cameras, *given, "--require", "5km:2%", *more)
+    assert "YES" in text
+    page = (folder / "rig.html").read_text()
+    assert "mill" in page
+    assert "data:image/png" in page
+    assert (folder / "rig.png").stat().st_size > 10_000
+    result = CliRunner().invoke(app, ["report", str(folder / "rig.json"), "--require", "5km:0.001%"])
+    assert result.exit_code == 3
+    assert "at 5 km the range is known to ±" in result.output
+    stated = ["--require", "5km:2%", "--pixel-sigma", "0.3", "--json"]
+    told = json.loads(run(folder, "report", "rig.json", *stated))["verdict"]
+    rig = load_camera_rig(folder / "rig.json")
+    answer = told["ranges"][0]
+    worst = station_sigmas(rig, 5000.0)
+    assert worst is not None
+    assert answer["sigma_m"] == pytest.approx(float(worst.total))
+    # Turned away from each other, no two see the same.
+    away = rig.rotation @ torch.diag(torch.tensor([-1.0, -1, 1], dtype=torch.float64))
+    apart = CameraRig(rig.each, NAMES, away, rig.center, origin=rig.origin)
+    save_camera_rig(apart, folder / "apart.json")
+    result = CliRunner().invoke(app, ["report", str(folder / "apart.json"), "--require", "1km:5%"])
+    assert result.exit_code == 3
+    assert "no two cameras see one" in result.output

@@ -218,7 +218,6 @@ class RigResult:
             pairs=len(self.pairs),
             per_pair_rms=dict(zip(self.pairs, self.pair_rms.tolist(), strict=True)),
             flipped=tuple(dict.fromkeys(turned.board for turned in self.flipped)),
-            contradictions=self.contradictions,
             baseline_m=float(rig.baseline),
             **self._history(),
         )
@@ -265,6 +264,7 @@ class RigResult:
                 for source in self.sources
             ),
             "warnings": self.warnings,
+            "contradictions": self.contradictions,
             **self._provenance,
         }
 

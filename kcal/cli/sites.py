@@ -1,0 +1,185 @@
+"""`kcal sites`: what camera towers see and how well they locate it, and where to put the next one."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
+from kcal.cli.inputs import SITES
+from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_of
+from kcal.errors import InputError
+from kcal.files import check_picture, check_writable, write_atomic
+
+if TYPE_CHECKING:
+    from kcal.locate.siting import Area, RankedSite, SitingMap
+
+
+def sites_command(
+    towers: Annotated[
+        Path,
+        typer.Argument(
+            help="Towers that stand: CSV with name,lat,lon and height or mast (meters above the ground), and heading, "
+            "field, sigma, elevation_sigma (degrees), position_sigma, reach (meters); or a rig file."
+        ),
+        SITES,
+    ],
+    area: Annotated[
+        str, typer.Option(metavar="S,W,N,E", help="What they should see: south, west, north, east, in degrees.")
+    ],
+    candidates: Annotated[
+        Path | None, typer.Option(metavar="CSV", help="Sites for the next tower, in such a table."), SITES
+    ] = None,
+    build: Annotated[
+        int, typer.Option(metavar="N", help="How many of them are to be built, one after the other.", min=1)
+    ] = 1,
+    terrain: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RASTER",
+            help="Heights of the ground that hides things: an ESRI ASCII grid (.asc), or a GeoTIFF (needs "
+            "'kcal\\[terrain]'). Level ground if not given.",
+        ),
+    ] = None,
+    geoid_height: Annotated[
+        float, typer.Option(metavar="M", help="Added to the terrain's heights if they are above the sea.")
+    ] = 0.0,
+    ground: Annotated[
+        float | None, typer.Option(metavar="M", help="Without a terrain: height of the ground above the ellipsoid.")
+    ] = None,
+    above: Annotated[
+        float, typer.Option(metavar="M", help="Height above the ground of what should be seen: smoke, drones.")
+    ] = 0.0,
+    cells: Annotated[int, typer.Option(metavar="N", help="Points of the map along its longer side.", min=10)] = 200,
+    pixel_sigma: PixelSigma = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="CSV file to write: the map, one line for each point.")
+    ] = None,
+    picture: Annotated[Path | None, typer.Option(help="A .png or .svg file: the map.")] = None,
+) -> None:
+    """Where to put the next camera: a map of what towers see and how well they locate it, and candidates in order.
+
+    The ground hides what is behind it, the Earth curves and light bends. A bearing is off by `sigma` (0.05° if not
+    given: marks and heading together); a tower without `heading` looks all around, a candidate with a `field` and
+    without `heading` is turned to where it gives most. The best candidate is the one with the smallest mean variance of
+    positions over the area (A-optimality); what nobody sees counts with the size of the area.
+
+    **Examples**
+
+    `kcal sites towers.csv --area 44.8,5.8,45.2,6.3 --terrain hills.tif --candidates hilltops.csv --picture sites.png`
+
+    `kcal sites towers.rig.json --area 44.8,5.8,45.2,6.3 --ground 240 --above 50 -o map.csv`
+    """
+    from kcal.file_kind import file_kind
+    from kcal.locate.ground import level_ground
+    from kcal.locate.raster import terrain as raster_of
+    from kcal.locate.site_tables import read_sites, sites_of
+    from kcal.locate.siting import area_of, rank_sites, siting_map
+    from kcal.locate.stations import load_camera_rig
+    from kcal.quantities import length_text
+
+    inputs = [path for path in (towers, candidates, terrain) if path is not None]
+    if output is not None:
+        check_writable(output, *inputs)
+    if picture is not None:
+        check_picture(picture)
+        check_writable(picture, *inputs)
+    if (terrain is None) == (ground is None):
+        raise InputError("give --terrain, or --ground with the height of level ground above the ellipsoid; one of them")
+    surface = level_ground(ground) if terrain is None and ground is not None else raster_of(terrain or "", geoid_height)
+    if file_kind(towers) == "rig":
+        rig = load_camera_rig(towers)
+        standing = sites_of(rig, pixel_sigma_of(pixel_sigma, rig))
+        if rig.root is None:
+            warn(f"{towers}: the rig has no error bars: bearings count as exact but for the noise of marks")
+    else:
+        standing = read_sites(towers, surface)
+    proposed = [] if candidates is None else read_sites(candidates, surface)
+    names = [site.name for site in (*standing, *proposed)]
+    if twice := {name for name in names if names.count(name) > 1}:
+        raise InputError(f"{candidates}: {min(twice)!r} is a tower and a candidate; names must differ")
+    with steps("looking from each site", None):
+        field = area_of(_bounds(area), surface, (*standing, *proposed), cells=cells, above=above)
+        now = siting_map(field, standing)
+        ranked = rank_sites(field, standing, proposed, build=build)
+        later = siting_map(field, [*standing, *(one.site for one in ranked if one.order)]) if ranked else None
+    if unknown := 1.0 - float(field.known.double().mean()):
+        warn(f"the terrain has no heights in {100 * unknown:.1f} % of the area, which is left out")
+    if bool(field.surface.up.isnan().any()):
+        warn("the terrain has no heights in some places between sites and area: nothing is taken to be hidden by them")
+    _print_towers(now)
+    if ranked:
+        print_table(_ranked_rows(ranked))
+    tell(
+        mean_sigma_m=now.mean_sigma, covered=now.covered,
+        candidates=[
+            dataclasses.asdict(one.site.origin)
+            | {"name": one.site.name, "heading_deg": one.site.heading_deg, "order": one.order, "covered": one.covered,
+               "mean_sigma_m": one.mean_sigma, "mean_sigma_after_m": one.after}
+            for one in ranked
+        ],
+    )  # fmt: skip
+    if later is not None:
+        out.print(f"with the chosen: {length_text(later.mean_sigma, digits=3)}, {100 * later.covered:.0f} % covered")
+    if output is not None:
+        write_atomic(output, _map_text(field, now, later))
+    if picture is not None:
+        from kcal.report.siting import save_siting_picture
+
+        save_siting_picture(picture, field, standing, ranked)
+    print_wrote(output, picture)
+
+
+def _bounds(text: str) -> list[float]:
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != 4:
+        raise InputError(f"area {text!r}: write SOUTH,WEST,NORTH,EAST in degrees, for example 44.8,5.8,45.2,6.3")
+    return values
+
+
+def _print_towers(now: SitingMap) -> None:
+    from kcal.quantities import length_text
+
+    two = now.seen_by > 1
+    some = length_text(float(now.sigma[two].median()), digits=2) if bool(two.any()) else "nowhere known"
+    one = float((now.seen_by == 1).double().mean())
+    out.print(
+        f"two towers or more see {100 * now.covered:.0f} % of the area, one {100 * one:.0f} %; median standard "
+        f"deviation of positions where two do: {some}; root mean variance over all of it: "
+        f"{length_text(now.mean_sigma, digits=3)}"
+    )
+
+
+def _ranked_rows(ranked: list[RankedSite]) -> list[list[str]]:
+    from kcal.quantities import length_text
+
+    rows = [["candidate", "build", "heading °", "alone", "covered", "after"]]
+    for one in ranked:
+        heading = "" if one.site.heading_deg is None else f"{one.site.heading_deg:.0f}"
+        rows.append([
+            one.site.name, "" if one.order is None else str(one.order), heading,
+            length_text(one.mean_sigma, digits=3), f"{100 * one.covered:.0f} %",
+            "" if one.after is None else length_text(one.after, digits=3),
+        ])  # fmt: skip
+    return rows
+
+
+def _map_text(area: Area, now: SitingMap, later: SitingMap | None) -> str:
+    """One line for each point whose ground is known."""
+    import torch
+
+    columns = [*torch.meshgrid(area.lat, (area.lon + 180.0) % 360.0 - 180.0, indexing="ij"), area.ground]
+    head, layout = ["lat", "lon", "height"], ["%.7f", "%.7f", "%.2f"]
+    for found, word in ((now, ""), (later, "_after")):
+        if found is not None:
+            columns += [found.seen_by.double(), found.sigma]
+            head, layout = [*head, f"seen_by{word}", f"sigma_m{word}"], [*layout, "%.0f", "%.4g"]
+    form = ",".join(layout)
+    rows = torch.stack([column[area.known] for column in columns], -1).tolist()
+    return "\n".join([",".join(head), *(form % tuple(row) for row in rows)]) + "\n"

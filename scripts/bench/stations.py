@@ -1,0 +1,300 @@
+"""Stations: time and memory of siting, of a frame of detections, of long tables, and of many cameras at once.
+
+    python -m scripts.bench.stations sites              # 200 x 200 points, 5 towers, 10 candidates; sites.png
+    python -m scripts.bench.stations frame [ROUNDS]     # 1,000 detections in 8 cameras
+    python -m scripts.bench.stations table [ROWS ...]   # kcal locate of long tables: CPU seconds and peak memory
+    python -m scripts.bench.stations two [PAIRS]        # StereoLocalizer beside MultiViewLocalizer
+    python -m scripts.bench.stations many [CAMERAS VIEWS]  # cameras and views calibrated together, 16 and 60
+
+`--write` puts a part into docs/measured/stations.md. CPU seconds on one core (time.process_time). `many` runs mrcal in
+the same loop where KCAL_MRCAL names an interpreter that has it: cameras in rows of four, 0.5 m apart, look at a board
+4 m away, which all of them see; corners have 0.1 px of noise; lenses have five coefficients, kcal fits its default.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kcal.calibrate.camera.calibrate import calibrate_camera
+from kcal.calibrate.rig.pairs import boards_of_several
+from kcal.calibrate.rig.solve import solve_rig
+from kcal.calibrate.rig.sources import RigData
+from kcal.corners.board import Board
+from kcal.corners.observations import Observations, View
+from kcal.io.camera_rig_file import save_camera_rig
+from kcal.lens.camera import Camera
+from kcal.lens.camera_rig import CameraRig
+from kcal.lens.mounting import Mounting, Origin
+from kcal.lens.pose import rotation_from_vector
+from kcal.lens.rig import RigCovariance
+from kcal.locate.budget import planned_rig
+from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.multi_localizer import MultiViewLocalizer
+from kcal.locate.raster import terrain
+from kcal.locate.siting import Site, area_of, rank_sites, siting_map
+from kcal.locate.stations import stations_of
+from scripts.shared.memory import peak_megabytes
+from scripts.shared.page import table, write_section
+from scripts.shared.station_scenes import drawn_errors, hills, marks, ring, targets
+from scripts.shared.timing import show
+
+_CORNER, _CELL = (44.75, 5.72), 0.0014
+_TOWERS = (("mill", 44.9, 5.85), ("church", 45.1, 5.9), ("mast", 45.15, 6.15), ("hill", 44.87, 6.1), ("dam", 45.0, 6.0))
+_CANDIDATES = (
+    (44.83, 5.8), (44.83, 5.97), (44.85, 6.2), (44.95, 6.2), (45.05, 6.22), (45.22, 6.2), (45.22, 6.0), (45.22, 5.82),
+    (45.0, 5.8), (45.05, 6.1),
+)  # fmt: skip
+_NOISE_PX = 0.1
+
+
+def _hilltop(ground: Tensor, name: str, lat: float, lon: float) -> Site:
+    """A mast of 30 m on the highest ground within some 1.5 km."""
+    row, column = len(ground) - 1 - int((lat - _CORNER[0]) / _CELL), int((lon - _CORNER[1]) / _CELL)
+    near = ground[row - 12 : row + 12, column - 12 : column + 12]
+    i, j = divmod(int(near.argmax()), near.shape[1])
+    place = _CORNER[0] + (len(ground) - row + 12 - i - 0.5) * _CELL, _CORNER[1] + (column - 12 + j + 0.5) * _CELL
+    return Site(name=name, origin=Origin(lat=place[0], lon=place[1], height=float(near[i, j]) + 30.0))
+
+
+def sites() -> list[str]:
+    """Time of a map and of the order of candidates, and the picture of the how-to page."""
+    from kcal.report.siting import save_siting_picture
+
+    raster = hills(460)
+    head = (
+        f"ncols {len(raster)}\nnrows {len(raster)}\nxllcorner {_CORNER[1]}\nyllcorner {_CORNER[0]}\ncellsize {_CELL}\n"
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "hills.asc")
+        path.write_text(head + "\n".join(" ".join(f"{height:.1f}" for height in row) for row in raster.tolist()) + "\n")
+        ground = terrain(path)
+    towers = [_hilltop(raster, *one) for one in _TOWERS]
+    candidates = [_hilltop(raster, f"site {i}", *one) for i, one in enumerate(_CANDIDATES, start=1)]
+    rows, start = [], time.process_time()
+
+    def lap(what: str) -> None:
+        nonlocal start
+        rows.append([what, f"{time.process_time() - start:.2f}"])
+        start = time.process_time()
+
+    area = area_of((44.8, 5.73, 45.25, 6.36), ground, [*towers, *candidates], cells=200, above=30.0)
+    lap(f"ground and {math.prod(area.known.shape):,} points, raster of {ground.cell_m:.0f} m")
+    siting_map(area, towers)
+    lap("map of 5 towers")
+    ranked = rank_sites(area, towers, candidates, build=2)
+    lap("10 candidates, two of them chosen")
+    rank_sites(area, towers, candidates)
+    lap("10 candidates, all in order")
+    folder = str(Path(__file__).parents[2] / "docs" / "howto")
+    show([str(save_siting_picture(Path(folder, "sites.png"), area, towers, ranked))])
+    return [*table(["step", "CPU s"], rows), "", f"Peak memory {peak_megabytes():.0f} MB, libraries included."]
+
+
+def frame(rounds: int) -> list[str]:
+    """Milliseconds of 1,000 detections in 8 cameras."""
+    rig, generator = ring(8, 5000.0), torch.Generator().manual_seed(0)
+    root = rig.with_errors(position_m=0.3, attitude_deg=(0.004, 0.004, 0.02), refraction=0.1)
+    seen = marks(rig, targets(1000, generator), drawn_errors(root, 1000, generator))
+    seen = seen + 0.3 * torch.randn(seen.shape, generator=generator, dtype=torch.float64)
+    spoiled = seen.clone()
+    spoiled[torch.rand(1000, 8, generator=generator) < 0.1] = math.nan
+    spoiled[torch.rand(1000, 8, generator=generator) < 0.05] += 60.0
+    rows = []
+    for name, pixels in (("all seen, none wrong", seen), ("10 % missing, 5 % wrong", spoiled)):
+        for errors, known in (("marks alone", torch.zeros(1, rig.quantities).double()), ("all errors", root)):
+            localize = MultiViewLocalizer(rig, root=known, pixel_sigma=0.3)
+            spent = []
+            with torch.no_grad():
+                for _ in range(rounds + 1):
+                    start = time.process_time()
+                    localize(pixels)
+                    spent.append(time.process_time() - start)
+            rows.append([name, errors, f"{1e3 * float(np.median(spent[1:])):.0f}"])
+    return table(["marks", "errors", "CPU ms a frame"], rows)
+
+
+def two(count: int) -> list[str]:
+    """`StereoLocalizer` beside `MultiViewLocalizer` on the same pairs of marks."""
+    rows, generator = [], torch.Generator().manual_seed(0)
+    for name, pose in (("marks alone", None), ("and lenses and pose", 1e-10 * torch.eye(6).double())):
+        rig = planned_rig()
+        rig.mounting = Mounting(origin=Origin(lat=45.0, lon=6.0, height=800.0), heading_deg=35.0, pitch_deg=-1.0)
+        if pose is not None:
+            lens = 1e-4 * torch.eye(len(rig.left.names), dtype=torch.float64)
+            rig.covariance = RigCovariance.of(rig, left=lens, right=lens, pose=pose)
+        far = 200.0 + 2800.0 * torch.rand(count, 1, generator=generator).double()
+        side = torch.randn(count, 2, generator=generator).double() * torch.tensor([0.15, 0.05]).double()
+        left, right, _ = rig(far * torch.cat([side, torch.ones(count, 1).double()], 1))
+        marked = torch.stack([left, right], 1) + 0.2 * torch.randn(count, 2, 2, generator=generator).double()
+        with torch.no_grad():
+            (ours, by_pair), (theirs, by_views) = (
+                _timed(StereoLocalizer(rig, pixel_sigma=0.2, refraction_sigma=0.0), marked[:, 0], marked[:, 1]),
+                _timed(MultiViewLocalizer(stations_of(rig), pixel_sigma=0.2), marked),
+            )
+        both = (ours.status == 0) & (theirs.status == 0)
+        sigma = ours.covariance[both].diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
+        off = (ours.enu - theirs.enu)[both].norm(dim=-1) / sigma
+        each = 1e6 / count
+        rows.append([
+            name, f"{by_pair * each:.2f}", f"{by_views * each:.1f}", f"{by_views / by_pair:.1f}",
+            f"{float(off.median()):.1e}",
+        ])  # fmt: skip
+    return table(
+        ["errors", "`StereoLocalizer`, CPU s per million", "`MultiViewLocalizer`", "times", "median difference in σ"],
+        rows,
+    )
+
+
+def _timed(localize: torch.nn.Module, *marked: Tensor) -> tuple[Any, float]:
+    """The result, and CPU seconds of the second call."""
+    localize(*marked)
+    start = time.process_time()
+    return localize(*marked), time.process_time() - start
+
+
+def long_tables(sizes: Sequence[int]) -> list[str]:
+    """CPU seconds and peak memory of `kcal locate` of marks of three cameras, in a process of its own."""
+    rig, rows = ring(3, 5000.0), []
+    rig.root = rig.with_errors(attitude_deg=0.01)
+    for size in sizes:
+        with tempfile.TemporaryDirectory() as folder:
+            save_camera_rig(rig, Path(folder, "rig.json"))
+            generator, things = torch.Generator().manual_seed(0), size // 3
+            with Path(folder, "marks.csv").open("w") as file:
+                file.write("name,camera,u,v\n")
+                for first in range(0, things, 50_000):
+                    pixels = marks(rig, targets(min(50_000, things - first), generator)).tolist()
+                    for i, thing in enumerate(pixels, start=first):
+                        for name, (u, v) in zip(rig.names, thing, strict=True):
+                            file.write(f"t{i},{name},{u:.2f},{v:.2f}\n")
+            code = (
+                "import sys; from kcal.cli.main import app; from scripts.shared.memory import peak_megabytes\n"
+                "try: app(sys.argv[1:])\nexcept SystemExit: pass\nprint('peak', peak_megabytes(), file=sys.stderr)"
+            )
+            words = ["locate", "rig.json", "marks.csv", "-o", "out.csv", "--json"]
+            before = resource.getrusage(resource.RUSAGE_CHILDREN)
+            done = subprocess.run([sys.executable, "-c", code, *words], cwd=folder, capture_output=True, text=True)
+            after = resource.getrusage(resource.RUSAGE_CHILDREN)
+            spent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+            peak = float(done.stderr.split("peak ")[-1])
+            with Path(folder, "out.csv").open() as file:
+                lines = sum(1 for _ in file) - 1
+            rows.append([f"{3 * things:,}", f"{lines:,}", f"{spent:.0f}", f"{peak:.0f}"])
+            show([str(rows[-1])])
+    return table(["lines", "positions", "CPU s", "peak MB"], rows)
+
+
+def many(cameras: int, views: int) -> list[str]:
+    """Cameras calibrated together, beside mrcal where it is."""
+    generator = torch.Generator().manual_seed(0)
+
+    def draw(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    lenses = [
+        Camera.build(
+            focal=(1400 + 10 * c, 1402 + 10 * c), center=(955.0 + c, 542.0), size=(1920, 1080),
+            coefficients=[-0.2 + 0.002 * c, 0.06, 5e-4, -3e-4, -0.01],
+        )
+        for c in range(cameras)
+    ]  # fmt: skip
+    centers = torch.tensor([[0.5 * (c % 4), 0.5 * (c // 4), 0.0] for c in range(cameras)], dtype=torch.float64)
+    aim = torch.tensor([0.75, 0.75, 4.0], dtype=torch.float64)
+    toward = torch.stack([-(aim - centers)[:, 1], (aim - centers)[:, 0], torch.zeros(cameras)], -1).double() / 4.2
+    turns = rotation_from_vector(-toward + 0.02 * draw(cameras, 3))
+    rig = CameraRig(lenses, [f"c{c}" for c in range(cameras)], turns, centers, refraction=0.0)
+    board, moments = Board(columns=9, rows=6, square=0.1), list[Tensor]()
+    while len(moments) < views:
+        shift = aim + draw(3) * torch.tensor([0.35, 0.2, 0.4]).double()
+        points = (board.points - board.points.mean(0)) @ rotation_from_vector(0.35 * draw(3)).T + shift
+        pixels, seen = rig(points)
+        if bool(seen.all()):
+            moments.append((pixels + _NOISE_PX * draw(*pixels.shape)).movedim(1, 0))
+    corners = torch.stack(moments)  # (V, C, N, 2)
+    rows = []
+    start = time.process_time()
+    observed = {
+        c: Observations(board=board, image_size=(1920, 1080), views=tuple(
+            View(name=f"{i:03d}.png", pixels=tuple((u, v) for u, v in corners[i, c].tolist())) for i in range(views)))
+        for c in range(cameras)
+    }  # fmt: skip
+    calibrated = tuple(calibrate_camera(one).camera for one in observed.values())
+    alone = time.process_time() - start
+    show([f"one by one: {alone:.0f} s"])
+    data = RigData(cameras=calibrated, names=rig.names, boards=boards_of_several(calibrated, rig.names, observed))
+    found = solve_rig(data)
+    spent = time.process_time() - start
+    rows.append(
+        ["kcal", f"{spent:.0f}", f"{alone:.0f}", f"{peak_megabytes():.0f}", *_errors(rig, found.rotation, found.center)]
+    )
+    show([str(rows[-1])])
+    if python := os.environ.get("KCAL_MRCAL"):
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, "problem.npz")
+            np.savez(
+                path, corners=corners.numpy(), image_size=[1920, 1080], board_size=[9, 6], square_m=0.1, focal=1400.0
+            )
+            script = Path(__file__).with_name("peer_mrcal_many.py")
+            environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+            done = subprocess.run([python, script, path], capture_output=True, text=True, env=environment)
+            if done.returncode:
+                show([done.stderr[-500:]])
+            else:
+                other = json.loads(done.stdout.splitlines()[-1])
+                poses = (torch.tensor(other[name], dtype=torch.float64) for name in ("rotation", "center"))
+                rows.append(
+                    ["mrcal, OPENCV8", f"{other['cpu']:.0f}", "", f"{other['peak']:.0f}", *_errors(rig, *poses)]
+                )
+    heads = ["program", "CPU s", "of it one by one", "peak MB", "RMS error of centers mm", "of attitudes °"]
+    return [f"{cameras} cameras x {views} views, {corners.shape[2]} corners each.", "", *table(heads, rows)]
+
+
+def _errors(rig: CameraRig, rotation: Tensor, center: Tensor) -> list[str]:
+    """Against the truth, in the first camera's frame."""
+    true_turn = rig.rotation @ rig.rotation[0].T
+    true_center = (rig.center - rig.center[0]) @ rig.rotation[0].T
+    own_turn, own_center = rotation @ rotation[0].T, (center - center[0]) @ rotation[0].T
+    off = (own_center - true_center)[1:].norm(dim=-1).square().mean().sqrt()
+    turned = own_turn @ true_turn.mT
+    angle = ((turned.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1).arccos()[1:].square().mean().sqrt()
+    return [f"{1e3 * float(off):.3f}", f"{math.degrees(float(angle)):.5f}"]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run one part."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("part", choices=("sites", "frame", "table", "two", "many"))
+    parser.add_argument("counts", nargs="*", type=int)
+    parser.add_argument("--write", action="store_true")
+    given = parser.parse_args(arguments)
+    torch.set_num_threads(1)
+    parts: dict[str, Callable[[], list[str]]] = {
+        "sites": sites,
+        "frame": lambda: frame(*(given.counts or [20])),
+        "table": lambda: long_tables(given.counts or [100_000, 1_000_000]),
+        "two": lambda: two(*(given.counts or [200_000])),
+        "many": lambda: many(*(given.counts or [16, 60])),
+    }
+    lines = parts[given.part]()
+    show(lines)
+    if given.write:
+        write_section("stations.md", given.part, "\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,211 @@
+"""Long tables of marks: any order, any subset of cameras, times, in parts as in one, and features of many cameras."""
+
+from __future__ import annotations
+
+import csv
+import math
+import random
+from pathlib import Path
+
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from kcal.cli.main import app
+from kcal.cli.rig_stars import images_of_nights
+from kcal.errors import FileError, InputError
+from kcal.io.camera_rig_file import save_camera_rig
+from kcal.locate import view_marks
+from kcal.locate.geodesy import enu_to_geodetic, geodetic_to_enu
+from kcal.locate.range_sigmas import range_sigmas
+from kcal.locate.sample import PositionSample
+from kcal.locate.station_positions import ViewsLocator
+from kcal.locate.station_sigmas import station_sigmas
+from kcal.locate.stations import stations_of
+from kcal.locate.tables import read_chunks
+from kcal.locate.view_marks import ViewMarks, read_feature_views, read_view_chunks, read_views
+from kcal.rig import RigCovariance, planned_rig
+from scripts.shared.station_scenes import ORIGIN, marks, ring, targets
+
+CAMERAS = ("a", "b", "c")
+
+
+def table(path: Path, things: int, times: int = 1) -> list[str]:
+    """Lines of things at several times, each seen by one to three cameras."""
+    draw, lines = random.Random(3), []
+    for i in range(things):
+        for t in range(times):
+            seen = [camera for camera in CAMERAS if draw.random() < 0.7] or ["b"]
+            moment = f",{t}" if times > 1 else ""
+            lines += [f"thing {i},{camera},{draw.random() * 900:.2f},{100 + i},{i % 3}{moment}" for camera in seen]
+    head = "name,camera,u,v,kind" + (",time" if times > 1 else "")
+    path.write_text("\n".join([head, *lines]) + "\n")
+    return lines
+
+
+def joined(path: Path) -> ViewMarks:
+    parts = [views for views, _ in read_view_chunks(path, CAMERAS)]
+    assert len(parts) > 3
+    extras = {name: [cell for part in parts for cell in part.extras[name]] for name in parts[0].extras}
+    names = tuple(name for part in parts for name in part.names)
+    return ViewMarks(names, torch.cat([p.pixels for p in parts]), torch.cat([p.sigma for p in parts]), extras)
+
+
+def small_parts(monkeypatch: pytest.MonkeyPatch, rows: int) -> None:
+    monkeypatch.setattr(view_marks, "_WHOLE", 0)
+    monkeypatch.setattr(view_marks, "read_chunks", lambda *given, **more: read_chunks(*given, **more, at_once=rows))
+
+
+@pytest.mark.parametrize("times", [1, 3])
+@pytest.mark.parametrize("rows", [1, 2, 7, 50])
+def test_parts_are_the_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rows: int, times: int) -> None:
+    path = tmp_path / "long.csv"
+    table(path, 80, times)
+    whole = read_views(path, CAMERAS)
+    small_parts(monkeypatch, rows)
+    parts = joined(path)
+    assert parts.names == whole.names
+    torch.testing.assert_close(parts.pixels, whole.pixels, equal_nan=True, rtol=0, atol=0)
+    assert parts.extras == whole.extras
+
+
+def test_a_long_table_must_be_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "long.csv"
+    lines = table(path, 80)
+    head = "name,camera,u,v,kind"
+    own = [line for line in lines if line.startswith("thing 0,")]
+    lines.remove(own[-1])
+    other = own[-1].split(",")[1]
+    path.write_text("\n".join([head, *lines, f"thing 0,{other},1,2,0"]) + "\n")
+    found = read_views(path, CAMERAS)  # in any order, if it is short
+    assert bool(found.pixels[0, CAMERAS.index(other)].isfinite().all())
+    small_parts(monkeypatch, 7)
+    with pytest.raises(FileError, match="lines of 'thing 0' stand at several places"):
+        list(read_view_chunks(path, CAMERAS))
+    path.write_text("\n".join([head, *lines[:2], lines[-1], f"thing 0,{other},1,2,0", *lines[2:]]) + "\n")
+    with pytest.raises(FileError, match="lines of 'thing 0' stand at several places"):
+        list(read_view_chunks(path, CAMERAS))
+
+
+def test_times_keep_things_apart(tmp_path: Path) -> None:
+    path = tmp_path / "times.csv"
+    path.write_text(
+        "name,camera,u,v,time\nboat,a,1,2,10.0\nboat,b,3,4,10.0\nboat,a,5,6,11.0\nbuoy,c,7,8,10.0\n", encoding="utf-8"
+    )
+    views = read_views(path, CAMERAS)
+    assert views.names == ("boat 10.0", "boat 11.0", "buoy")
+    assert views.extras["time"] == ["10.0", "11.0", "10.0"]
+    assert views.pixels[0].nan_to_num(nan=-1).tolist() == [[1, 2], [3, 4], [-1, -1]]
+    path.write_text("name,camera,u,v,time\nboat,a,1,2,10.0\nboat,a,3,4,10.0\n")
+    with pytest.raises(FileError, match="line 3: 'boat' was marked in a before"):
+        read_views(path, CAMERAS)
+
+
+def test_features_of_any_two_cameras(tmp_path: Path) -> None:
+    path = tmp_path / "far.csv"
+    rows = ["summit,a,1,2,20000,2000,", "summit,c,3,4,20000,2000,", "cloud,b,5,6,,,5000", "cloud,c,7,8,,,5000"]
+    path.write_text("\n".join(["name,camera,u,v,range,range_sigma,beyond", *rows, "rock,a,9,9,,,", "rock,b,9,9,,,"]))
+    found = read_feature_views(path, CAMERAS, 0.4)
+    assert found.names == ("summit", "cloud", "rock")
+    assert found.pixels[:, :, 0].isnan().tolist() == [[False, True, False], [True, False, False], [False, False, True]]
+    assert found.inverse_range.tolist() == pytest.approx([1 / 20_000, 0.5 / 5000, 0.0], rel=0.02)
+    assert found.inverse_range_sigma[0] == pytest.approx(2000 / 20_000**2, rel=0.02)
+    assert math.isinf(float(found.inverse_range_sigma[2]))
+    assert found.pixel_sigma == 0.4
+
+
+def test_a_long_table_is_located_as_a_short_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In parts as in one, and the sample remembers from where bearings count."""
+    rig, generator = ring(3, 4000.0), torch.Generator().manual_seed(0)
+    rig.root = rig.with_errors(attitude_deg=0.01)
+    save_camera_rig(rig, tmp_path / "rig.json")
+    pixels = marks(rig, targets(60, generator))
+    lines = [
+        f"t{i},{name},{pixels[i, c, 0]:.3f},{pixels[i, c, 1]:.3f}"
+        for i in range(60) for c, name in enumerate(rig.names) if (i + c) % 4
+    ]  # fmt: skip
+    (tmp_path / "marks.csv").write_text("\n".join(["name,camera,u,v", *lines]) + "\n")
+    words = ["locate", str(tmp_path / "rig.json"), str(tmp_path / "marks.csv"), "--picture", str(tmp_path / "p.png")]
+    outputs, samples = [], []
+    for number, rows in enumerate((10_000, 5)):
+        if number:
+            small_parts(monkeypatch, rows)
+        out = [tmp_path / f"out{number}{suffix}" for suffix in (".csv", ".geojson")]
+        result = CliRunner().invoke(app, [*words, *(word for path in out for word in ("-o", str(path)))])
+        assert result.exit_code == 0, result.output
+        outputs.append([cell for row in csv.reader(out[0].read_text().splitlines()) for cell in row])
+        locate, sample = ViewsLocator(rig), PositionSample(most=20)
+        for views, _ in read_view_chunks(tmp_path / "marks.csv", rig.names):
+            sample.add(*locate(views))
+        samples.append(sample.located(locate))
+    for whole, part in zip(*outputs, strict=True):
+        assert whole == part or float(whole) == pytest.approx(float(part), rel=1e-6, abs=1e-9)
+    assert samples[0].columns.names == samples[1].columns.names
+    assert 10 <= len(samples[0].columns.names) <= 20
+    numbers = [int(name[1:]) for name in samples[0].columns.names]
+    feet = torch.stack([rig.center[next(c for c in range(3) if (i + c) % 4)] for i in numbers])
+    for sample in samples:
+        torch.testing.assert_close(sample.feet, feet)
+
+
+def test_one_camera_and_a_terrain(tmp_path: Path) -> None:
+    rig = ring(3, 4000.0)
+    rig.root = rig.with_errors(attitude_deg=0.01)
+    save_camera_rig(rig, tmp_path / "rig.json")
+    # A plain that rises to the north, far below the towers.
+    rows = [" ".join(f"{600 + i}" for _ in range(90)) for i in range(60, 0, -1)]
+    head = "ncols 90\nnrows 60\nxllcorner 5.955\nyllcorner 44.97\ncellsize 0.001\n"
+    (tmp_path / "hills.asc").write_text(head + "\n".join(rows) + "\n")
+    spot = torch.tensor([45.0 + 0.0005, 6.0, 631.0], dtype=torch.float64)  # in the middle of the 31st row
+
+    pixel = marks(rig, geodetic_to_enu(spot, ORIGIN)[None])[0, 0]
+    (tmp_path / "smoke.csv").write_text(f"name,camera,u,v\nsmoke,tower 1,{pixel[0]:.4f},{pixel[1]:.4f}\n")
+    words = ["locate", str(tmp_path / "rig.json"), str(tmp_path / "smoke.csv"), "-o", str(tmp_path / "out.csv")]
+    assert CliRunner().invoke(app, words).exit_code != 0, "a bearing is no position"
+    given = ["--terrain", str(tmp_path / "hills.asc"), "--terrain-sigma", "2"]
+    result = CliRunner().invoke(app, [*words, *given])
+    assert result.exit_code == 0, result.output
+    with (tmp_path / "out.csv").open() as file:
+        (row,) = csv.DictReader(file)
+    there = enu_to_geodetic(geodetic_to_enu(spot, ORIGIN), ORIGIN)
+    assert float(row["lat"]) == pytest.approx(float(there[0]), abs=2e-5)
+    assert float(row["height_ellipsoidal_m"]) == pytest.approx(631.0, abs=0.5)
+    # A level error of two meters of height over the slope of the line of sight, 270 m over 4 km.
+    assert 15 < math.sqrt(float(row["cov_ee_m2"]) + float(row["cov_nn_m2"])) < 60
+    both = CliRunner().invoke(app, [*words, *given, "--height", "631"])
+    assert both.exit_code == 2
+
+
+def test_range_errors_of_many_cameras_are_those_of_a_pair() -> None:
+    """Of the same two cameras, correlated errors of lenses and pose included."""
+    pair = planned_rig()
+    size = len(pair.left.names)
+    together = torch.zeros(3, 2 * size + 6, dtype=torch.float64)
+    together[0, pair.left.names.index("cx")], together[0, 2 * size + 1] = 1.0, 0.8 / 1600
+    together[1, 2 * size + 1], together[2, size + pair.left.names.index("fx")] = 0.1 / 1600, 2.0
+    pair.covariance = RigCovariance.of(pair, joint=together.T @ together)
+    many = stations_of(pair)
+    for distance in (500.0, 2000.0):
+        found = station_sigmas(many, distance, pixel_sigma=0.1)
+        assert found is not None
+        places = [
+            range_sigmas(pair, [distance], pixel_sigma=0.1, pixel=[share * pair.left.size[0], 0.5 * pair.left.size[1]])
+            for share in (0.2, 0.35, 0.5, 0.65, 0.8)
+        ]
+        worst = max(places, key=lambda place: float(place.total))
+        for name in ("marks", "lenses", "pose", "total"):
+            torch.testing.assert_close(getattr(found, name), getattr(worst, name), rtol=0.05, atol=0.0, msg=name)
+        parts = found.marks.square() + found.lenses.square() + found.pose.square()
+        torch.testing.assert_close(parts.sqrt(), found.total)
+    with pytest.raises(InputError, match="distance 0"):
+        station_sigmas(many, 0.0)
+
+
+def test_nights_are_given_by_name() -> None:
+    assert images_of_nights(("l", "r"), ()) == ("l", "r")
+    assert images_of_nights(None, ["mill=a/*.png", "mast=b"]) == {"mill": "a/*.png", "mast": "b"}
+    for named in (["mill"], ["mill=a", "mill=b"], ["=a"]):
+        with pytest.raises(InputError, match="write NAME=IMAGES"):
+            images_of_nights(None, named)
+    with pytest.raises(InputError, match="no --stars"):
+        images_of_nights(("l", "r"), ["mill=a"])
