@@ -12,10 +12,12 @@ from kcal.files import read_bytes
 from kcal.io.camera_rig_file import CameraRigFile
 from kcal.io.rig_file import RigFile
 from kcal.lens.camera_rig import CameraRig
-from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA, Mounting
+from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA, Mounting, Origin
 from kcal.lens.rig import StereoRig, half_of_covariance
 from kcal.locate.geodesy import enu_from_cam
+from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.mounting import mounting_of
+from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.strict_json import MOST_BYTES, read_json
 
 
@@ -63,17 +65,49 @@ def stations_of(rig: StereoRig) -> CameraRig:
     left = torch.eye(3, dtype=torch.float64)
     if stands is not None:
         left = enu_from_cam(stands.heading_deg, stands.pitch_deg, stands.roll_deg).T
+    bent = (REFRACTION if stands.refraction is None else stands.refraction) if stands else 0.0
+    return _two_stations(rig, left, None if stands is None else stands.origin, bent, _joint_covariance(rig))
+
+
+def stations_at(localize: StereoLocalizer) -> MultiViewLocalizer:
+    """The rig of a `StereoLocalizer` as a rig of two cameras, with where it stands and all that it includes.
+
+    Example:
+        >>> from kcal import Origin
+        >>> from kcal.rig import planned_rig
+        >>> localize = StereoLocalizer(planned_rig(), origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
+        >>> stations_at(localize).rig.names
+        ('left', 'right')
+    """
+    rig, factor, stands = localize.rig, localize.calibration_factor, localize.mounting
+    size, joint = rig.left.values.shape[-1] + rig.right.values.shape[-1] + 6, None
+    if factor is not None or stands is not None:
+        joint = torch.zeros(size + 7, size + 7, dtype=torch.float64)
+        if factor is not None:
+            joint[:size, :size] = factor @ factor.T
+        if stands is not None:
+            joint[size:, size:] = stands
+        if localize.link is not None:
+            joint[:size, size:], joint[size:, :size] = localize.link, localize.link.T
+    left = localize.enu_from_rig.T
+    stations = _two_stations(rig, left, localize.origin, localize.drop / localize.half_curvature, joint)
+    return MultiViewLocalizer(stations, pixel_sigma=localize.pixel_sigma)
+
+
+@torch.no_grad()
+def _two_stations(
+    rig: StereoRig, left: Tensor, origin: Origin | None, refraction: float, joint: Tensor | None
+) -> CameraRig:
+    """A stereo rig whose left camera is turned by `left` from the frame; `joint` as in `_joint_covariance`."""
     shift = rig.right_from_left_translation
     left = left.to(shift)
     right = rig.right_from_left_rotation @ left
     apart = -right.T @ shift
     centers = torch.stack([torch.zeros_like(apart), apart])
     stations = CameraRig(
-        [rig.left, rig.right], ("left", "right"), torch.stack([left, right]), centers,
-        origin=None if stands is None else stands.origin,
-        refraction=(REFRACTION if stands.refraction is None else stands.refraction) if stands else 0.0,
+        [rig.left, rig.right], ("left", "right"), torch.stack([left, right]), centers, origin=origin,
+        refraction=refraction,
     )  # fmt: skip
-    joint = _joint_covariance(rig)
     if joint is None:
         return stations
     size = len(joint) - 7

@@ -13,13 +13,16 @@ import torch
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.locate.localizer import StereoLocalizer
-from kcal.pipeline.assignment import Scores, nearby
+from kcal.locate.multi_localizer import MultiViewLocalizer
+from kcal.pipeline.assignment import Looks, Scores, SeenFrom, looks_of, nearby
 from kcal.pipeline.estimates import TrackStates, track_states
 from kcal.pipeline.imm_filter import Beliefs, Timing, fit_of, innovations, no_beliefs, predicted, updated
 from kcal.pipeline.measurements import Anchored, Sightings, anchored, sightings
 from kcal.pipeline.motion import transition
+from kcal.pipeline.object_views import ObjectViews
 
+# What a match gains for each mark that it explains: half the squared distance at which marks are no more taken.
+_EXPLAINED = 12.0
 # Of stand-ins from which graphs are made: sizes that no other axis has, so that none seem to belong together.
 _STAND_INS = _PAIRS, _TRACKS, _MATCHES, _TAKEN, _TOLD = 1009, 1013, 1019, 1021, 1031
 
@@ -28,20 +31,22 @@ class TrackSteps(NamedTuple):
     """The steps, in their order.
 
     Attributes:
-        measure: pixels (N, 2) of both cameras, covariances (N, 4, 4) and times (N, 2) as sightings.
+        measure: objects of a moment as sightings.
         move: beliefs to another time; see `moved_on`.
         look: see `looked_at`, with beliefs that have come to the same moment.
+        near: see `nearby`.
         score: see `scored`.
         take: see `taken_in`.
-        place: tracks of these numbers on the Earth, from beliefs, frames and a root as in `track_states`.
+        place: tracks of these numbers on the Earth, from beliefs, frames, homes and a root as in `track_states`.
     """
 
-    measure: Callable[[Tensor, Tensor, Tensor, Tensor], Sightings]
+    measure: Callable[[ObjectViews], Sightings]
     move: Callable[[Beliefs, Tensor, Tensor, Tensor], Beliefs]
-    look: Callable[[Beliefs, Tensor, Sightings, Timing, Tensor, Tensor], tuple[Beliefs, Tensor]]
-    score: Callable[[Beliefs, Tensor, Sightings, Timing, Tensor, Tensor, Tensor], Scores]
-    take: Callable[[Beliefs, Anchored, Timing, Tensor], Beliefs]
-    place: Callable[[Beliefs, Tensor, Tensor, Tensor], TrackStates]
+    look: Callable[[Beliefs, Tensor, Tensor, Tensor | None], tuple[Beliefs, Looks]]
+    near: Callable[[Looks, Sightings, Timing, Tensor], Tensor]
+    score: Callable[[Beliefs, Tensor, Tensor, Sightings, Timing, Tensor | None, Tensor, Tensor], Scores]
+    take: Callable[[Beliefs, Anchored, Timing, Tensor | None], Beliefs]
+    place: Callable[[Beliefs, Tensor, Tensor, Tensor | None, Tensor], TrackStates]
 
 
 def moved_on(beliefs: Beliefs, up: Tensor, numbers: Tensor, stay: Tensor) -> Beliefs:
@@ -49,42 +54,46 @@ def moved_on(beliefs: Beliefs, up: Tensor, numbers: Tensor, stay: Tensor) -> Bel
     return predicted(beliefs.mixed(stay), transition(numbers, up))
 
 
-def looked_at(
-    beliefs: Beliefs, frame: Tensor, seen: Sightings, timing: Timing, root: Tensor, gate: Tensor
-) -> tuple[Beliefs, Tensor]:
-    """The merged beliefs, and (T, N) which pairs are roughly in their directions."""
-    merged = beliefs.merged()
-    return merged, nearby(merged, frame, seen, timing, root, gate)
-
-
-def scored(
-    merged: Beliefs, frame: Tensor, seen: Sightings, timing: Timing, root: Tensor, track: Tensor, pair: Tensor
-) -> Scores:
-    """Pairs (L,) against tracks (L,), whose beliefs are merged."""
-    local = anchored(seen.at(pair), frame[..., track])
-    found = innovations(merged.at(track), local, timing.at(pair))
-    fit = fit_of(found, root)
-    return Scores(
-        local, found.effect[..., 0, :], found.value[:, 0], found.noise[..., 0, :], fit.squared[0], fit.log_density[0]
-    )
-
-
-def taken_in(beliefs: Beliefs, seen: Anchored, timing: Timing, root: Tensor) -> Beliefs:
+def taken_in(beliefs: Beliefs, seen: Anchored, timing: Timing, root: Tensor | None) -> Beliefs:
     """Beliefs with sightings, one for each track."""
     found = innovations(beliefs, seen, timing)
     return updated(beliefs, found, fit_of(found, root))
 
 
-def track_steps(localize: StereoLocalizer, lasting_px: float) -> TrackSteps:
+def track_steps(localize: MultiViewLocalizer, lasting_px: float) -> TrackSteps:
     """The steps as they are."""
+    centers, errors, bending = localize.rig.center, localize.errors, localize.bending_errors
+    turned = None if errors is None else errors[:, :, 3:6].movedim(-1, 0)
+    cameras, k = SeenFrom(centers, turned), localize.posed.bending
 
-    def measure(left: Tensor, right: Tensor, covariance: Tensor, time: Tensor) -> Sightings:
-        return sightings(localize, left, right, covariance, time, lasting_px)
+    def measure(views: ObjectViews) -> Sightings:
+        return sightings(localize, views, lasting_px)
 
-    def place(beliefs: Beliefs, frame: Tensor, root: Tensor, which: Tensor) -> TrackStates:
-        return track_states(localize, frame[..., which].movedim(-1, 0), beliefs.at(which).summary(), root)
+    def looked_at(beliefs: Beliefs, frame: Tensor, home: Tensor, root: Tensor | None) -> tuple[Beliefs, Looks]:
+        merged = beliefs.merged()
+        return merged, looks_of(merged, frame, centers[home].T, cameras, root)
 
-    return TrackSteps(measure, moved_on, looked_at, scored, taken_in, place)
+    def scored(
+        merged: Beliefs, frame: Tensor, home: Tensor, seen: Sightings, timing: Timing, root: Tensor | None,
+        track: Tensor, which: Tensor,
+    ) -> Scores:  # fmt: skip
+        """Sightings (L,) against tracks (L,), whose beliefs are merged."""
+        beliefs, local = merged.at(track), seen.at(which)
+        known = bending if errors is not None else None
+        origin = centers[home[track]].T
+        there = anchored(local, frame[..., track], origin, beliefs.mean[:3, 0], known, k)
+        found = innovations(beliefs, there, timing.at(which))
+        fit = fit_of(found, root)
+        density = fit.log_density[0] + _EXPLAINED * local.seen.sum(0)
+        return Scores(
+            there, found.effect[..., 0, :], found.value[:, 0], found.noise[..., 0, :], fit.squared[0], density
+        )
+
+    def place(beliefs: Beliefs, frame: Tensor, home: Tensor, root: Tensor | None, which: Tensor) -> TrackStates:
+        summary = beliefs.at(which).summary()
+        return track_states(localize, frame[..., which].movedim(-1, 0), home[which], summary, root)
+
+    return TrackSteps(measure, moved_on, looked_at, nearby, scored, taken_in, place)
 
 
 @torch.no_grad()

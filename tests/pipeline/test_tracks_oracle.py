@@ -95,7 +95,7 @@ def test_filter_and_smoother_are_those_of_stone_soup() -> None:
         if frame == 0:
             first = belief.mean[0][:, None].numpy(), belief.noise[0].numpy()
             track.append(GaussianState(*first, timestamp=when))
-            frame_axes = tracker.frame[..., 0]
+            frame_axes = tracker.frame[..., 0] @ localize.enu_from_rig
             continue
         # The position and its covariance from the localizer, by numpy into the filter's coordinates.
         place = (frame_axes @ (localize.enu_from_rig.T @ found.enu[0])).numpy()
