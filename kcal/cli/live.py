@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from kcal.pipeline.association import AssociationOptions
     from kcal.pipeline.live_map import LiveMap
     from kcal.pipeline.stream import StreamCounts
-    from kcal.pipeline.tracks import Tracker, Tracks
+    from kcal.pipeline.track_options import Tracks
+    from kcal.pipeline.tracks import Tracker
     from kcal.pipeline.video_source import VideoPairs
 
 
@@ -144,7 +145,8 @@ def live_command(
     from kcal.pipeline.senders import sender_to
     from kcal.pipeline.shared_errors import ClockPrior
     from kcal.pipeline.stream import Stream, lines_of
-    from kcal.pipeline.tracks import Tracker, TrackOptions
+    from kcal.pipeline.track_options import TrackOptions
+    from kcal.pipeline.tracks import Tracker
 
     if (origin is None) != (heading is None):
         raise typer.BadParameter("--origin and --heading belong together")

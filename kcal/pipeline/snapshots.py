@@ -14,7 +14,8 @@ from torch import Tensor
 
 from kcal.errors import FileError
 from kcal.pipeline.imm_filter import Beliefs
-from kcal.pipeline.tracks import Tracker, TrackRecord
+from kcal.pipeline.track_options import TrackRecord
+from kcal.pipeline.tracks import Tracker
 
 # Of the tensors: a journal of another one is of no use.
 _LAYOUT = "tracks last, of any cameras"

@@ -27,7 +27,8 @@ from kcal.pipeline.senders import Sender
 from kcal.pipeline.snapshots import restore, snapshot
 from kcal.pipeline.stream_journal import Ledger
 from kcal.pipeline.track_columns import track_columns
-from kcal.pipeline.tracks import Tracker, Tracks
+from kcal.pipeline.track_options import Tracks
+from kcal.pipeline.tracks import Tracker
 
 # Moments that wait, and moments between checkpoints: about ten seconds of video.
 _WAITING, _CHECKPOINT = 32, 250

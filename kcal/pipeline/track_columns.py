@@ -9,7 +9,7 @@ from kcal.locate.localizer import Localization
 from kcal.locate.stereo import PositionStatus
 from kcal.locate.tabulate import number_table
 from kcal.pipeline.estimates import TrackStates
-from kcal.pipeline.tracks import Tracks
+from kcal.pipeline.track_options import Tracks
 
 _REASONS = {
     int(PositionStatus.OK): "",

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, Self
 
 import numpy as np
 import torch
@@ -18,7 +16,6 @@ from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.locate.stations import stations_at
 from kcal.pipeline.assignment import Candidates, assigned, within
-from kcal.pipeline.estimates import TrackStates
 from kcal.pipeline.imm_filter import (
     Beliefs,
     Timing,
@@ -28,109 +25,19 @@ from kcal.pipeline.imm_filter import (
     predicted,
 )
 from kcal.pipeline.measurements import Sightings, anchored
-from kcal.pipeline.motion import MOTIONS, Motion, step_numbers, transition
+from kcal.pipeline.motion import Motion, step_numbers, transition
 from kcal.pipeline.object_views import ObjectViews, mark_numbers
 from kcal.pipeline.pairs import ObjectPairs
 from kcal.pipeline.shared_errors import ClockEstimate, ClockPrior, SharedErrors
 from kcal.pipeline.small_matrices import mahalanobis, product, rooted, squared
 from kcal.pipeline.smoothing import History, SmoothedTrack
+from kcal.pipeline.track_options import TrackOptions, TrackRecord, Tracks
 from kcal.pipeline.track_steps import compiled_steps, track_steps
 
 # Of the gate: nearer sightings tell of the clocks. One in a hundred is left out where the gate loses one in 10,000.
 _SURE = 13.3 / 23.5
 # A frame is turned toward its target when that is farther from the axis than this tangent: 17°.
 _TURN = 0.3
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class TrackOptions:
-    """When tracks begin and end, and how targets move.
-
-    Args:
-        motions: models among which each track may switch.
-        switch_s: mean time between switches, seconds.
-        speed_mps: standard deviation of a new target's velocity along each axis.
-        confirm_hits: sightings after which a track is told of; twice as many if its pairs are ambiguous.
-        lose_after_s: seconds without a sighting after which a track is told of no more.
-        forget_after_s: seconds without a sighting in which it may still be recognized by its motion.
-        gate: largest squared Mahalanobis distance of a sighting by two cameras from its track; 23.5 loses one in
-            10,000. Of one camera, or of more, it is the distance that loses as many.
-        recognize: the same of a new track from a lost one, in place and velocity; 16.8 loses one in 100.
-        lasting_px: standard deviation of the part of a mark's error that stays the same as long as a target is seen,
-            along each axis of all images but the first camera's, pixels. Matched images have 0.01 px of it, compressed ones 0.02 px
-            (`scripts/check/compression.py`).
-
-    Raises:
-        InputError: a value that is not positive (`lasting_px` may be zero), or a forgetting before the losing.
-    """
-
-    motions: tuple[Motion, ...] = MOTIONS
-    switch_s: float = 20.0
-    speed_mps: float = 15.0
-    confirm_hits: int = 4
-    lose_after_s: float = 1.5
-    forget_after_s: float = 15.0
-    gate: float = 23.5
-    recognize: float = 16.8
-    lasting_px: float = 0.01
-
-    def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            zero = field.name == "lasting_px" and value == 0
-            if field.name != "motions" and not zero and not 0 < value < math.inf:
-                raise InputError(f"{field.name} {value}: a positive number is needed")
-        if not self.motions or self.forget_after_s < self.lose_after_s:
-            raise InputError("tracks: at least one motion is needed, and forget_after_s not below lose_after_s")
-
-    @classmethod
-    def for_video(cls, match_sigma: float) -> Self:
-        """Options for matches in compressed video; `match_sigma` is as in `kcal live`.
-
-        A third of what compression adds to a match lasts (`scripts/check/compression.py`).
-        """
-        return cls(lasting_px=math.hypot(cls.lasting_px, match_sigma / 3.0))
-
-
-@dataclasses.dataclass
-class TrackRecord:
-    """What is remembered of a track besides its state; `number` is 0 until it is confirmed."""
-
-    number: int
-    key: int
-    first: float
-    last: float
-    hits: int
-    needed: int
-    evidence: float
-    categories: dict[str, float]
-
-    @property
-    def category(self) -> str:
-        """The one with the highest sum of scores."""
-        return max(self.categories, key=lambda name: self.categories[name])
-
-
-class Tracks(NamedTuple):
-    """The confirmed tracks at one moment.
-
-    Attributes:
-        time: seconds.
-        number: T numbers, from 1; a track keeps its number after an occlusion if its motion recognizes it.
-        category: T names.
-        hits: (T,) sightings so far.
-        unseen_s: (T,) seconds since the last one; zero if seen now.
-        state: places and velocities.
-        models: (T, J) probabilities of `TrackOptions.motions`.
-    """
-
-    time: float
-    number: tuple[int, ...]
-    category: tuple[str, ...]
-    hits: Tensor
-    unseen_s: Tensor
-    state: TrackStates
-    models: Tensor
 
 
 class Tracker:
@@ -325,6 +232,8 @@ class Tracker:
         several = views.seen.sum(1) > 1
         numbers = torch.arange(len(views))
         used: set[tuple[int, int]] = set()
+        # Places of tracks and cameras that have seen them at this moment.
+        self._seen_now: set[tuple[int, int]] = set()
         # Cameras that see a track together, and then, one after the other, those that see one alone.
         groups = [numbers[several], *(numbers[~several & views.seen[:, c]] for c in range(views.cameras))]
         for camera, rows in enumerate(groups, -1):
@@ -351,11 +260,7 @@ class Tracker:
         part, when = (seen, timing) if len(rows) == len(views) else (seen.at(rows), timing.at(rows))
         merged, looks = self.steps.look(self.beliefs, frame, home, root)
         close = self.steps.near(looks, part, when, self.gates[-1])
-        if camera < 0:
-            self._seen_now = set()
-        else:
-            closed = [i for i, c in self._seen_now if c == camera]
-            close[closed] = False
+        close[[i for i, c in self._seen_now if c == camera]] = False
         track, which = close.nonzero(as_tuple=True)
         found = self.steps.score(merged, frame, home, part, when, root, track, which)
         possible = within(found, track, which, self.gates[part.seen.sum(0)[which]])

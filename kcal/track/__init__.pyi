@@ -14,9 +14,9 @@ from kcal.pipeline.disparity import DisparityOptions as DisparityOptions
 
 # Tracks
 from kcal.pipeline.tracks import Tracker as Tracker
-from kcal.pipeline.tracks import TrackOptions as TrackOptions
+from kcal.pipeline.track_options import TrackOptions as TrackOptions
 from kcal.pipeline.motion import Motion as Motion
-from kcal.pipeline.tracks import Tracks as Tracks
+from kcal.pipeline.track_options import Tracks as Tracks
 from kcal.pipeline.estimates import TrackStates as TrackStates
 from kcal.pipeline.smoothing import SmoothedTrack as SmoothedTrack
 from kcal.pipeline.shared_errors import ClockPrior as ClockPrior

@@ -18,7 +18,7 @@ from kcal.errors import FileError, InputError
 from kcal.io.rig_file import save_rig
 from kcal.lens.mounting import Mounting
 from kcal.pipeline.stream import Stream
-from kcal.pipeline.tracks import TrackOptions
+from kcal.pipeline.track_options import TrackOptions
 
 
 @pytest.fixture

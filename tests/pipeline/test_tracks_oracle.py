@@ -10,7 +10,8 @@ import torch
 from track_scenes import pairs_of, seen_by, tracked_site
 
 from kcal.pipeline.motion import Motion
-from kcal.pipeline.tracks import Tracker, TrackOptions
+from kcal.pipeline.track_options import TrackOptions
+from kcal.pipeline.tracks import Tracker
 
 pytest.importorskip("stonesoup", reason="an oracle of the tests only")
 from stonesoup.models.measurement.linear import LinearGaussian
