@@ -10,6 +10,7 @@ from kcal.cli.console import err
 from kcal.errors import InputError
 
 if TYPE_CHECKING:
+    from kcal.lens.camera_rig import CameraRig
     from kcal.lens.rig import StereoRig
 
 # Of marks on sharp images, where nobody said.
@@ -24,7 +25,7 @@ PixelSigma: TypeAlias = Annotated[
 ]
 
 
-def pixel_sigma_of(given: float | None, rig: StereoRig | None = None) -> float:
+def pixel_sigma_of(given: float | None, rig: StereoRig | CameraRig | None = None) -> float:
     """The noise of marks, px: as given, or as the rig's file states, or assumed; the last two are said."""
     sigma, note = pixel_sigma_and_source(given, rig)
     if note:
@@ -32,7 +33,7 @@ def pixel_sigma_of(given: float | None, rig: StereoRig | None = None) -> float:
     return sigma
 
 
-def pixel_sigma_and_source(given: float | None, rig: StereoRig | None = None) -> tuple[float, str]:
+def pixel_sigma_and_source(given: float | None, rig: StereoRig | CameraRig | None = None) -> tuple[float, str]:
     """The same, and what there is to say of it.
 
     Raises:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -10,7 +11,7 @@ from torch import Tensor
 
 from kcal.errors import InputError
 from kcal.lens.camera_rig import CameraRig
-from kcal.locate.columns import PositionColumns
+from kcal.locate.columns import NUMBERS, PositionColumns
 from kcal.locate.datum import Geoid, geoid_column
 from kcal.locate.ellipsoid import ecef_from_enu_rotation
 from kcal.locate.geodesy import anchor, enu_to_geodetic
@@ -84,10 +85,7 @@ def locate_views(
         height=stated,
         height_sigma=1.0 if height is None else height[1],
     )
-    base = anchor(origin)[0]
-    geodetic = enu_to_geodetic(rig.center, origin)
-    to_own = torch.stack([ecef_from_enu_rotation(lat, lon).T @ base for lat, lon, _ in geodetic.tolist()])
-    bearing = (to_own[found.anchor] @ found.bearing[..., None])[..., 0]
+    bearing = (own_axes(rig)[found.anchor] @ found.bearing[..., None])[..., 0]
     as_pairs = Localization(
         enu=found.enu, covariance=found.covariance, geodetic=found.geodetic, range_low=found.range_low,
         range_high=found.range_high, status=found.status, bearing=bearing, inverse_range=found.inverse_range,
@@ -103,23 +101,41 @@ def locate_views(
         "left_out": [_camera_list(rig, row) for row in found.bad],
         "misfit_sigmas": [_misfits(rig, row) for row in found.misfit],
     }
-    first = station_mounting(rig, 0)
+    columns = PositionColumns(views.names, found.status.numpy(), _row_reasons(rig, found), numbers, extras)
+    return dataclasses.replace(
+        stations_head(localize), columns=columns, geoid=None if geoid is None else geoid.name,
+        feet=rig.center[found.anchor],
+    )  # fmt: skip
+
+
+def own_axes(rig: CameraRig) -> Tensor:
+    """(V, 3, 3) from the frame of a rig that has an origin to east, north, up of each camera."""
+    assert rig.origin is not None
+    base = anchor(rig.origin)[0]
+    geodetic = enu_to_geodetic(rig.center, rig.origin).tolist()
+    return torch.stack([ecef_from_enu_rotation(lat, lon).T @ base for lat, lon, _ in geodetic])
+
+
+def stations_head(localize: MultiViewLocalizer) -> Located:
+    """No positions, and where the cameras of a rig stand that has an origin."""
+    rig, empty = localize.rig, torch.zeros(0, dtype=torch.int8)
+    assert rig.origin is not None
+    first, geodetic = station_mounting(rig, 0), enu_to_geodetic(rig.center, rig.origin)
     return Located(
-        columns=PositionColumns(views.names, found.status.numpy(), _row_reasons(rig, found), numbers, extras),
+        columns=PositionColumns((), empty.numpy(), [], np.zeros((0, len(NUMBERS))), {}),
         cameras=tuple(
             viewpoint(name, camera, center, turn.T, tuple(place))
             for name, camera, center, turn, place in zip(
                 rig.names, rig.each, rig.center, rig.rotation, geodetic.tolist(), strict=True
             )
         ),
-        origin=origin,
+        origin=rig.origin,
         heading_deg=first.heading_deg,
         pitch_deg=first.pitch_deg,
         roll_deg=first.roll_deg,
-        pixel_sigma=pixel_sigma,
+        pixel_sigma=localize.pixel_sigma,
         included=("marks",) if localize.errors is None else ("marks", "calibration", "mounting"),
-        geoid=None if geoid is None else geoid.name,
-        feet=rig.center[found.anchor],
+        feet=torch.zeros(0, 3, dtype=torch.float64),
     )
 
 

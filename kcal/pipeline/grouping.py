@@ -147,7 +147,9 @@ class _Scene:
         for group in candidates:
             for mark in group.marks:
                 by_mark.setdefault(mark, []).append(group)
-        groups, doubts, used = [], [], set()
+        groups: list[tuple[int, ...]] = []
+        doubts: list[bool] = []
+        used: set[int] = set()
         for group in sorted(candidates, key=lambda group: -group.saved):
             marks = {mark for mark in group.marks if mark >= 0}
             if marks & used:
@@ -230,8 +232,8 @@ class _Scene:
         before = (inverse - 1.0 / options.nearest).clamp_min(0.0) if options.nearest else torch.zeros_like(inverse)
         total = total + (torch.maximum(beyond, before) / sigma).square()
         parallax = torch.linalg.vector_norm(torch.linalg.cross(found.rays[:, 0], found.rays[:, 1]), dim=-1)
-        boxes = self.boxes[both].unbind(1)
-        total = total + size_cost(fit.projections, *boxes, options.box_sigma, parallax)
+        first, second = self.boxes[both].unbind(1)
+        total = total + size_cost(fit.projections, first, second, options.box_sigma, parallax)
         good = found.fitted & (sigma > 0) & (found.used.sum(-1) == both.shape[1])
         return tuple(v.numpy() for v in (torch.where(good, total, torch.inf), inverse, sigma))
 

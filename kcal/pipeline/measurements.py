@@ -17,7 +17,6 @@ from kcal.lens.dispatch import known_true
 from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.locate.stereo import PositionStatus
 from kcal.locate.views import StatedHeight, fit_views, shared_pixels
-from kcal.pipeline.object_views import ObjectViews
 from kcal.pipeline.small_matrices import outer, product
 
 # Meters at which a bearing of one camera is taken at first; what light bends elsewhere follows from it.
@@ -74,20 +73,28 @@ def _far_away(place: Tensor, ray: Tensor, _: Tensor) -> StatedHeight:
 
 
 @torch.no_grad()
-def sightings(localize: MultiViewLocalizer, views: ObjectViews, lasting_px: float = 0.0) -> Sightings:
+def sightings(
+    localize: MultiViewLocalizer,
+    pixels: Tensor,
+    seen: Tensor,
+    covariance: Tensor,
+    time: Tensor,
+    lasting_px: float = 0.0,
+) -> Sightings:
     """Measure objects of one moment; the calibration's errors are those that `localize` includes.
 
     Args:
         localize: the rig and how well it is known.
-        views: of its cameras.
+        pixels: (N, V, 2), and what follows: as in `ObjectViews`.
+        seen: (N, V) bool.
+        covariance: (N, 2 V, 2 V).
+        time: (N, V) seconds.
         lasting_px: standard deviation along each axis of errors that stay as long as a target, in the marks of all
             cameras but the first.
     """
-    rig, posed, cameras = localize.rig, localize.posed, views.cameras
+    rig, posed, cameras = localize.rig, localize.posed, len(localize.rig)
     common = localize.common or localize.exact
-    found = fit_views(
-        posed, views.pixels, views.seen, noise=1.0, cov=views.covariance, height=_far_away, rows_of=common
-    )
+    found = fit_views(posed, pixels, seen, noise=1.0, cov=covariance, height=_far_away, rows_of=common)
     fit, scale, used, weight = found.fit, found.scale, found.used, found.weight
     assert weight is not None
     white = torch.linalg.cholesky(weight.movedim(-1, 0)).movedim(0, -1).transpose(0, 1)
@@ -111,7 +118,7 @@ def sightings(localize: MultiViewLocalizer, views: ObjectViews, lasting_px: floa
     a, b = (first * fit.direction).sum(0), (second * fit.direction).sum(0)
     base = fit.direction - a * first - b * second
     anchor = found.anchor.to(torch.int64).argmax(-1)
-    time = torch.where(used, views.time, views.time.gather(1, anchor[:, None]))
+    time = torch.where(used, time, time.gather(1, anchor[:, None]))
     heights = rig.center.new_tensor([camera.size[1] for camera in rig.each])
     return Sightings(
         anchor=anchor,
@@ -124,7 +131,7 @@ def sightings(localize: MultiViewLocalizer, views: ObjectViews, lasting_px: floa
         shared=shared,
         bent=bent,
         time=time.T,
-        row=torch.where(used, views.pixels[..., 1] / heights - 0.5, 0.0).T,
+        row=torch.where(used, pixels[..., 1] / heights - 0.5, 0.0).T,
         seen=used.T,
         alone=alone,
         usable=found.fitted & (found.status == int(PositionStatus.OK)),

@@ -227,7 +227,9 @@ class Stream:
     def _write(self, moment: Moment, offset: int, sequence: int) -> None:
         when = self._calendar(moment.time)
         tracks = self.tracker(moment.pairs, moment.time)
-        columns = track_columns(tracks, sequence)
+        # Files of two cameras of one mast tell all from the left one.
+        stations = None if self.run.feet is None else self.tracker.localize.rig
+        columns = track_columns(tracks, sequence, stations)
         parts = [
             appended(path.suffix.lower(), self.run, columns, when, first=size == 0)
             for path, size in zip(self.ledger.outputs, self.ledger.place.sizes, strict=True)

@@ -93,6 +93,7 @@ class Tracks(NamedTuple):
         unseen_s: (T,) seconds since the last one; zero if seen now.
         state: places and velocities.
         models: (T, J) probabilities of `TrackOptions.motions`.
+        seen: (T, V) bool: which cameras see it at this moment.
     """
 
     time: float
@@ -102,3 +103,4 @@ class Tracks(NamedTuple):
     unseen_s: Tensor
     state: TrackStates
     models: Tensor
+    seen: Tensor

@@ -16,10 +16,9 @@ from kcal.errors import InputError
 from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.pipeline.assignment import Looks, Scores, SeenFrom, looks_of, nearby
 from kcal.pipeline.estimates import TrackStates, track_states
-from kcal.pipeline.imm_filter import Beliefs, Timing, fit_of, innovations, no_beliefs, predicted, updated
+from kcal.pipeline.imm_filter import Beliefs, Timing, fit_of, innovations, predicted, updated
 from kcal.pipeline.measurements import Anchored, Sightings, anchored, sightings
 from kcal.pipeline.motion import transition
-from kcal.pipeline.object_views import ObjectViews
 
 # What a match gains for each mark that it explains: half the squared distance at which marks are no more taken.
 _EXPLAINED = 12.0
@@ -31,7 +30,7 @@ class TrackSteps(NamedTuple):
     """The steps, in their order.
 
     Attributes:
-        measure: objects of a moment as sightings.
+        measure: pixels, which are seen, covariances and times of a moment as sightings; see `sightings`.
         move: beliefs to another time; see `moved_on`.
         look: see `looked_at`, with beliefs that have come to the same moment.
         near: see `nearby`.
@@ -40,7 +39,7 @@ class TrackSteps(NamedTuple):
         place: tracks of these numbers on the Earth, from beliefs, frames, homes and a root as in `track_states`.
     """
 
-    measure: Callable[[ObjectViews], Sightings]
+    measure: Callable[[Tensor, Tensor, Tensor, Tensor], Sightings]
     move: Callable[[Beliefs, Tensor, Tensor, Tensor], Beliefs]
     look: Callable[[Beliefs, Tensor, Tensor, Tensor | None], tuple[Beliefs, Looks]]
     near: Callable[[Looks, Sightings, Timing, Tensor], Tensor]
@@ -66,8 +65,8 @@ def track_steps(localize: MultiViewLocalizer, lasting_px: float) -> TrackSteps:
     turned = None if errors is None else errors[:, :, 3:6].movedim(-1, 0)
     cameras, k = SeenFrom(centers, turned), localize.posed.bending
 
-    def measure(views: ObjectViews) -> Sightings:
-        return sightings(localize, views, lasting_px)
+    def measure(pixels: Tensor, seen: Tensor, covariance: Tensor, time: Tensor) -> Sightings:
+        return sightings(localize, pixels, seen, covariance, time, lasting_px)
 
     def looked_at(beliefs: Beliefs, frame: Tensor, home: Tensor, root: Tensor | None) -> tuple[Beliefs, Looks]:
         merged = beliefs.merged()
@@ -97,14 +96,14 @@ def track_steps(localize: MultiViewLocalizer, lasting_px: float) -> TrackSteps:
 
 
 @torch.no_grad()
-def compiled_steps(steps: TrackSteps, errors: int, models: int, root: Tensor) -> TrackSteps:
-    """The steps in C++ for any numbers of tracks and pairs: this takes three minutes, less where torch remembers.
+def compiled_steps(steps: TrackSteps, cameras: int, nothing: Beliefs, root: Tensor | None) -> TrackSteps:
+    """The steps in C++ for any numbers of tracks and sightings: this takes three minutes, less where torch remembers.
 
     Args:
         steps: from `track_steps`.
-        errors: K, independent errors of the calibration and those that last.
-        models: J.
-        root: (K + 3, R) of the covariance of the shared errors.
+        cameras: V.
+        nothing: beliefs of no tracks.
+        root: (K + Q, R) of the covariance of the shared errors; None: the identity.
 
     Raises:
         InputError: torch could not compile, for want of a C++ compiler for instance.
@@ -115,30 +114,33 @@ def compiled_steps(steps: TrackSteps, errors: int, models: int, root: Tensor) ->
     try:
         # Torch warns of itself.
         with warnings.catch_warnings(action="ignore", category=FutureWarning):
-            _compile_all(made, errors, models, root)
+            _compile_all(made, cameras, nothing, root)
     except RuntimeError as error:
         raise InputError(f"tracks cannot be compiled here; without compiling they work ({error})") from error
     return made
 
 
-def _compile_all(made: TrackSteps, errors: int, models: int, root: Tensor) -> None:
+def _compile_all(made: TrackSteps, cameras: int, nothing: Beliefs, root: Tensor | None) -> None:
     """Call each step with stand-ins."""
-    new = root.new_zeros
-    unit = torch.eye(4).to(root).expand(_PAIRS, 4, 4)
-    seen = made.measure(new(_PAIRS, 2), new(_PAIRS, 2), unit, new(_PAIRS, 2))
-    timing = Timing(new(2, _PAIRS), new(3, _PAIRS), new(_PAIRS))
-    empty = no_beliefs(errors, models, root.device)
-    beliefs = Beliefs(*(torch.nn.functional.pad(value, (0, _TRACKS), value=1.0) for value in empty))
-    frame = torch.eye(3).to(root)[..., None].expand(3, 3, _TRACKS)
+    new, models = nothing.mean.new_zeros, nothing.mean.shape[1]
+    unit = torch.eye(2 * cameras).to(nothing.mean).expand(_PAIRS, 2 * cameras, 2 * cameras)
+    there = torch.ones(_PAIRS, cameras, dtype=torch.bool, device=unit.device)
+    seen = made.measure(new(_PAIRS, cameras, 2), there, unit, new(_PAIRS, cameras))
+    clocks = nothing.late.shape[1] // 3
+    timing = Timing(new(cameras, _PAIRS), new(clocks, 3, _PAIRS), new(clocks, _PAIRS))
+    beliefs = Beliefs(*(torch.nn.functional.pad(value, (0, _TRACKS), value=1.0) for value in nothing))
+    frame = torch.eye(3).to(unit)[..., None].expand(3, 3, _TRACKS)
+    home = torch.zeros(_TRACKS, dtype=torch.long, device=unit.device)
     beliefs = made.move(beliefs, frame[2], new(9, models), new(()))
-    merged, _ = made.look(beliefs, frame, seen, timing, root, new(()))
+    merged, looks = made.look(beliefs, frame, home, root)
+    made.near(looks, seen, timing, new(()))
     # Each its own tensor: the same one twice would become a rule.
     track, pair, taken, told = (
-        torch.zeros(size, dtype=torch.long, device=root.device) for size in (_MATCHES, _MATCHES, _TAKEN, _TOLD)
+        torch.zeros(size, dtype=torch.long, device=unit.device) for size in (_MATCHES, _MATCHES, _TAKEN, _TOLD)
     )
-    scores = made.score(merged, frame, seen, timing, root, track, pair)
+    scores = made.score(merged, frame, home, seen, timing, root, track, pair)
     made.take(beliefs.at(taken), scores.seen.at(taken), timing.at(taken), root)
-    made.place(beliefs, frame, root, told)
+    made.place(beliefs, frame, home, root, told)
 
 
 class _Compiled:
@@ -152,7 +154,7 @@ class _Compiled:
     def __call__(self, *arguments: Any) -> Any:
         # Other strides would need other code.
         given = [_contiguous(argument) for argument in arguments]
-        tensors = [tensor for argument in given for tensor in _tensors(argument)]
+        tensors = [tensor for argument in given for tensor in _tensors_in(argument)]
         if self.free is None:
             every = [(i, axis) for i, tensor in enumerate(tensors) for axis in range(tensor.ndim)]
             self.free = [(i, axis) for i, axis in every if tensors[i].shape[axis] in _STAND_INS]
@@ -163,11 +165,13 @@ class _Compiled:
         return self.made(*given)
 
 
-def _tensors(value: Any) -> tuple[Tensor, ...]:
+def _tensors_in(value: Any) -> tuple[Tensor, ...]:
+    if value is None:
+        return ()
     return (value,) if isinstance(value, Tensor) else value
 
 
 def _contiguous(value: Any) -> Any:
-    if isinstance(value, Tensor):
-        return value.contiguous()
+    if value is None or isinstance(value, Tensor):
+        return value if value is None else value.contiguous()
     return type(value)(*(part.contiguous() for part in value))

@@ -112,9 +112,11 @@ class Tracker:
         self.frame, self.home = empty.reshape(3, 3, 0), empty.long()
         self.beliefs = self._nothing()
         self.next_number = self.next_key = 1
+        # By key of a track and camera: the row of the last objects that it has its mark from.
+        self.seen_now: dict[tuple[int, int], int] = {}
         self.steps = track_steps(self.localize, self.options.lasting_px)
         if compiled:
-            self.steps = compiled_steps(self.steps, self.localize, self.beliefs, self.shared.mixing)
+            self.steps = compiled_steps(self.steps, len(rig), self.beliefs, self.shared.mixing)
 
     @torch.no_grad()
     def __call__(self, objects: ObjectViews | ObjectPairs, time: float | None = None) -> Tracks:
@@ -141,8 +143,9 @@ class Tracker:
         if self.shared.start is None:
             self.shared.start = time
         self._predict(time)
+        self.seen_now = {}
         if len(views):
-            self._take(views, self.steps.measure(views))
+            self._take(views, self.steps.measure(views.pixels, views.seen, views.covariance, views.time))
         self._sort_out()
         if self.history is not None:
             keys = [track.key for track in self.records]
@@ -176,6 +179,10 @@ class Tracker:
             unseen_s=torch.tensor([self.time - track.last for track in records], dtype=torch.float64),
             state=self.steps.place(self.beliefs, self.frame, self.home, self.shared.mixing, which),
             models=self.beliefs.weight[:, which].T,
+            seen=torch.tensor(
+                [[(track.key, c) in self.seen_now for c in range(len(self.localize.rig))] for track in records],
+                dtype=torch.bool,
+            ).reshape(len(records), len(self.localize.rig)),
         )
 
     def clock_estimate(self, camera: int = 1) -> ClockEstimate:
@@ -232,8 +239,6 @@ class Tracker:
         several = views.seen.sum(1) > 1
         numbers = torch.arange(len(views))
         used: set[tuple[int, int]] = set()
-        # Places of tracks and cameras that have seen them at this moment.
-        self._seen_now: set[tuple[int, int]] = set()
         # Cameras that see a track together, and then, one after the other, those that see one alone.
         groups = [numbers[several], *(numbers[~several & views.seen[:, c]] for c in range(views.cameras))]
         for camera, rows in enumerate(groups, -1):
@@ -260,7 +265,7 @@ class Tracker:
         part, when = (seen, timing) if len(rows) == len(views) else (seen.at(rows), timing.at(rows))
         merged, looks = self.steps.look(self.beliefs, frame, home, root)
         close = self.steps.near(looks, part, when, self.gates[-1])
-        close[[i for i, c in self._seen_now if c == camera]] = False
+        close[[i for i, record in enumerate(self.records) if (record.key, camera) in self.seen_now]] = False
         track, which = close.nonzero(as_tuple=True)
         found = self.steps.score(merged, frame, home, part, when, root, track, which)
         possible = within(found, track, which, self.gates[part.seen.sum(0)[which]])
@@ -269,9 +274,11 @@ class Tracker:
         if not accepted:
             return set()
         taken = rows[possible.pair[accepted].cpu()].tolist()
-        self._update(possible, torch.tensor(accepted), part, when, [views.category[i] for i in taken], views.score[taken])
-        both = list(zip(possible.track[accepted].tolist(), taken, strict=True))
-        self._seen_now |= {(t, c) for t, i in both for c, _ in _mark_set(marks[i])}
+        self._update(
+            possible, torch.tensor(accepted), part, when, [views.category[i] for i in taken], views.score[taken]
+        )
+        for t, i in zip(possible.track[accepted].tolist(), taken, strict=True):
+            self.seen_now |= {(self.records[t].key, c): i for c, _ in _mark_set(marks[i])}
         return {mark for i in taken for mark in _mark_set(marks[i])}
 
     def _delays(self, seen: Sightings) -> Timing:

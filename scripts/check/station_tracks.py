@@ -8,7 +8,7 @@ stated. Marks are rendered in each station's own east, north, up (`scripts/share
 computes them. A camera misses a target in view with probability 0.15, and has one false detection an image. Halfway,
 each station is blind for ten seconds, one after the other.
 
-right: groups whose marks are all of one target. ghosts: told tracks that are of none. breaks: a target's track has
+right: groups whose marks are all of one target; marks that tracks took which are of the target they follow. ghosts: told tracks that are of none. breaks: a target's track has
 another number than before. inside: 95 % ellipsoids (chi-squared, 3) of tracks with a position, every tenth second.
 """
 
@@ -128,7 +128,8 @@ class Sums:
     """Counts and values over seeds."""
 
     def __init__(self) -> None:
-        self.groups = self.right = self.doubtful = self.told = self.ghosts = self.breaks = self.moments = 0
+        self.groups = self.right = self.doubtful = self.told = self.ghosts = self.breaks = 0
+        self.given = self.well_given = 0
         self.followed = self.visible = 0.0
         self.nees: list[float] = []
         self.clocks: list[tuple[float, float]] = []
@@ -164,6 +165,11 @@ def run_seed(seed: int, count: int, seconds: float, sums: Sums) -> None:
                 continue
             followed.add(target)
             number = tracks.number[row]
+            key = next(record.key for record in tracker.records if record.number == number)
+            for c in tracks.seen[row].nonzero()[:, 0].tolist():
+                mark = views.pixels[tracker.seen_now[key, c], c]
+                sums.given += 1
+                sums.well_given += _owner(seen[c], owners[c], mark) == target
             if names.setdefault(target, number) != number:
                 sums.breaks += 1
                 names[target] = number
@@ -173,6 +179,12 @@ def run_seed(seed: int, count: int, seconds: float, sums: Sums) -> None:
     for c in range(1, count):
         offset, sigma = tracker.clock_estimate(c).offset(seconds)
         sums.clocks.append((offset - float(site.clocks[c] @ torch.tensor([1.0, seconds]).double()), sigma))
+
+
+def _owner(seen: Detections | None, owners: Tensor, mark: Tensor) -> int:
+    """The target of a mark."""
+    assert seen is not None
+    return int(owners[(seen.anchors() - mark).abs().sum(-1).argmin()])
 
 
 def _seen_by(site: Site, places: Tensor) -> Tensor:
@@ -190,8 +202,7 @@ def _judge_groups(views: ObjectViews, seen: list[Detections | None], owners: lis
         found = set()
         for c, each in enumerate(seen):
             if each is not None and bool(views.seen[row, c]):
-                place = (each.anchors() - views.pixels[row, c]).abs().sum(-1).argmin()
-                found.add(int(owners[c][place]))
+                found.add(_owner(each, owners[c], views.pixels[row, c]))
         sums.groups += 1
         sums.right += len(found) == 1 and -1 not in found
 
@@ -204,6 +215,7 @@ def report(counts: list[int], all_sums: list[Sums], seeds: int, seconds: float) 
         rows.append([
             count,
             f"{100 * s.right / max(s.groups, 1):.1f} % of {s.groups:,}; {s.doubtful:,} doubtful",
+            f"{100 * s.well_given / max(s.given, 1):.1f} % of {s.given:,}",
             f"{100 * s.followed / max(s.visible, 1):.1f} %",
             f"{s.breaks / max(hours, 1e-9):.1f}",
             f"{100 * s.ghosts / max(s.told, 1):.1f} %",
@@ -213,14 +225,15 @@ def report(counts: list[int], all_sums: list[Sums], seeds: int, seconds: float) 
             f"{np.median(s.milliseconds):.0f} ms",
         ])  # fmt: skip
     heads = [
-        "stations", "groups that are right", "followed while two see it", "breaks a target and hour", "ghosts among tracks",
+        "stations", "groups that are right", "marks of tracks that are right", "followed while two see it", "breaks a target and hour",
+        "ghosts among tracks",
         "inside 95 %; median of χ² over its own", "clock at the end: RMS, inside 95 %", "CPU a moment",
     ]  # fmt: skip
     return "\n".join([
-        f"12 targets (smokes, ships at 8 m/s, drones at 25 m/s) in 12 by 16 km, all of one category, once a second for "
-        f"{seconds:g} s, {seeds} draws; boxes {BOX_PX:g} px, {100 * MISSED:g} % missed, {FALSE:g} false an image; attitude "
-        f"known to {ATTITUDE_DEG[0]}° and heading to {ATTITUDE_DEG[2]}°, clocks to {OFFSET_S} s and {1e6 * RATE:g} ppm. Made "
-        "by `scripts/check/station_tracks.py`.",
+        "12 targets (smokes, ships at 8 m/s, drones at 25 m/s) in 12 by 16 km, all of one category, once a second for "
+        f"{seconds:g} s, {seeds} draws; boxes {BOX_PX:g} px, {100 * MISSED:g} % missed, {FALSE:g} false an image; "
+        f"attitude known to {ATTITUDE_DEG[0]}° and heading to {ATTITUDE_DEG[2]}°, clocks to {OFFSET_S} s and "
+        f"{1e6 * RATE:g} ppm. Made by `scripts/check/station_tracks.py`.",
         "",
         *table(heads, rows),
     ])  # fmt: skip

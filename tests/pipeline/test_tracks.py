@@ -18,7 +18,6 @@ from kcal.pipeline.estimates import track_states
 from kcal.pipeline.imm_filter import Timing, born
 from kcal.pipeline.measurements import anchored, sightings
 from kcal.pipeline.motion import Motion
-from kcal.pipeline.shared_errors import ClockPrior
 from kcal.pipeline.track_options import TrackOptions, Tracks
 from kcal.pipeline.tracks import Tracker
 
@@ -40,7 +39,8 @@ def test_one_sighting_is_what_the_localizer_says() -> None:
     pairs = pairs_of(left, right + tensor([0.0, 0.4]), 7.0)
     expected = localize(pairs.left, pairs.right, pairs.covariance)
     stations = stations_at(localize)
-    seen = sightings(stations, pairs.views)
+    views = pairs.views
+    seen = sightings(stations, views.pixels, views.seen, views.covariance, views.time)
     turned = torch.linalg.qr(torch.eye(3).double() + 0.2 * mix[:3, :3])[0]
     frame = ((turned * torch.sign(turned.diagonal())).T @ localize.enu_from_rig.T).expand(4, 3, 3)
     timing = Timing(torch.zeros(2, 4).double(), torch.zeros(0, 3, 4).double(), torch.zeros(0, 4).double())
@@ -57,11 +57,13 @@ def test_one_sighting_is_what_the_localizer_says() -> None:
     # A track's bearing is where the target is, and not where light makes it seem to be.
     ahead = torch.nn.functional.normalize(expected.enu[:3], dim=-1)
     torch.testing.assert_close(found.bearing[:3], ahead, rtol=0, atol=1e-7)
+    # The point sinks as its range grows, which one of the two neglects.
     unit = expected.covariance[:3].diagonal(dim1=-2, dim2=-1).sqrt()
     off = (found.covariance - expected.covariance)[:3] / unit[:, :, None] / unit[:, None, :]
-    assert float(off.abs().max()) < 1e-3
+    assert float(off.abs().max()) < 2e-3
     # What no point explains: 0.4 px between two marks of 0.3 px each.
-    miss = seen.value.square().sum(0).sqrt()
+    slope, value = seen.late.sum(0).movedim(-1, 0), seen.value.T[..., None]
+    miss = (value - slope @ torch.linalg.lstsq(slope, value).solution).square().sum((1, 2)).sqrt()
     torch.testing.assert_close(miss, torch.full((4,), 0.4 / 0.3 / math.sqrt(2)).double(), rtol=0.02, atol=0)
 
 
