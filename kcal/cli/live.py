@@ -120,7 +120,7 @@ def live_command(
         ),
     ] = None,
 ) -> None:
-    """Follow what two cameras or more see: tracks with latitude, longitude, velocity and honest errors, written as they come.
+    """Follow what cameras see: tracks with latitude, longitude, velocity and honest errors, written as they come.
 
     Of two videos, frames belong together by their own times, and the images inside the boxes are matched to a fraction
     of a pixel. The detector returns what `kcal.track.Detections.read` takes: an array of x1, y1, x2, y2, score, class,
@@ -129,8 +129,8 @@ def live_command(
     A line of `--detections` is one moment: `{"left": {"time": T, "boxes": [[x1,y1,x2,y2], ...]}, "right": {...}}`, or
     pairs that are matched already: `{"time": T, "left": [[u,v], ...], "right": [[u,v], ...], "sigma": PX}`.
 
-    Of a rig of many cameras, a line names those that have an image:
-    `{"cameras": {"mill": {"time": T, "boxes": [...]}, "mast": {...}}}`. Two cameras begin a track, any one continues it.
+    Of a rig of many cameras, a line names those that have an image: `{"cameras": {"mill": {"time": T, "boxes": [...]},
+    "mast": {...}}}`. Two cameras begin a track, and any one of them continues it.
 
     Frames reduce the noise of the marks, never what calibration, mounting and clocks contribute. With `--clock-sigma`
     the offset between the cameras' clocks is estimated from targets that move.

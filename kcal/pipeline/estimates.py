@@ -20,7 +20,8 @@ class TrackStates(NamedTuple):
     """Places of T tracks at one moment; nothing is NaN. Look at `status` before anything else.
 
     Attributes:
-        enu: (T, 3) meters east, north, up in the rig's frame (of two cameras: from the left one); zeros unless the status is OK.
+        enu: (T, 3) meters east, north, up in the rig's frame (of two cameras: from the left one); zeros unless the
+            status is OK.
         covariance: (T, 3, 3) of `enu`; an infinite diagonal unless OK.
         systematic: (T, 3, 3) the part of it that more frames do not reduce: calibration, mounting, clocks,
             refraction, and what lasts of errors in the marks.

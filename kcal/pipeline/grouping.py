@@ -106,13 +106,14 @@ def group_objects(
     pixels = torch.where(there[..., None], scene.pixels[numbers.clamp_min(0)], torch.nan)
     stamps = [math.nan if each is None else float(each.time or 0.0) for each in seen]
     known = [stamp for stamp in stamps if math.isfinite(stamp)]
-    time = torch.tensor([stamp if math.isfinite(stamp) else min(known, default=0.0) for stamp in stamps])
+    filled = [stamp if math.isfinite(stamp) else min(known, default=0.0) for stamp in stamps]
+    time = torch.tensor(filled, dtype=torch.float64)
     firsts = [next(mark for mark in row if mark >= 0) for row in rows]
     return ObjectViews(
         pixels=pixels,
         seen=there,
         covariance=options.box_sigma**2 * torch.eye(2 * count, dtype=torch.float64).expand(len(rows), -1, -1),
-        time=time.double().expand(len(rows), count),
+        time=time.expand(len(rows), count),
         score=torch.where(there, scene.score[numbers.clamp_min(0)], torch.inf).amin(-1) if rows else scene.score[:0],
         category=tuple(scene.category[mark] for mark in firsts),
         ambiguous=torch.tensor([*ambiguous, *[False] * len(alone)], dtype=torch.bool),

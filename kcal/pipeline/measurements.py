@@ -1,8 +1,8 @@
 """Turn pixels of one moment into what a filter measures: rows of unit noise, with every error's effect on them.
 
-Where the lines of sight of the cameras that saw an object meet (`kcal.locate.views`) is told by three numbers: two across
-the line of sight of the first of them, and the inverse range from it. The pixels are nearly linear in them at any
-range. They are rows, whitened, so that those of cameras that saw nothing are zeros beside a noise of one and change
+Where the lines of sight of the cameras that saw an object meet (`kcal.locate.views`) is told by three numbers: two
+across the line of sight of the first of them, and the inverse range from it. The pixels are nearly linear in them at
+any range. They are rows, whitened, so that those of cameras that saw nothing are zeros beside a noise of one and change
 nothing. One camera alone gives two rows: its inverse range is then that of the track.
 """
 

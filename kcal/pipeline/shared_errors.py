@@ -1,9 +1,10 @@
 """What all tracks share: errors of calibration, mounting and clocks, which more frames do not average away.
 
 A state's error is noise plus `shared @ b`, with the same unknown b for every track and frame: K independent errors of
-the calibration, and three of each clock but the first camera's. The filter's gain follows the noise alone, and the effect of b is carried along
-exactly. Two things follow: the covariance, noise + shared cov(b) sharedᵀ, never falls below the systematic part; and
-innovations tell what they know of b, the calibration included, which `SharedErrors` collects to estimate the clock.
+the calibration, and three of each clock but the first's. The filter's gain follows the noise alone, and the effect of b
+is carried along exactly. Two things follow: the covariance, noise + shared cov(b) sharedᵀ, never falls below the
+systematic part; and innovations tell what they know of b, the calibration included, which `SharedErrors` collects to
+estimate the clock.
 
 Source: Friedland, "Treatment of bias in recursive filtering" (1969); Schmidt (1966) for considered states.
 """
@@ -27,11 +28,10 @@ CLOCK_TERMS = 3
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ClockPrior:
-    """What is known of a camera's clock before any target moved: its images are later than their times say, as the first
-    camera (the left one) counts.
+    """What is known of a camera's clock before any target moved, beside the clock of the first camera (the left one).
 
     Args:
-        offset_s: seconds by which they are later.
+        offset_s: seconds by which its images are later than their times say.
         offset_sigma_s: its standard deviation.
         drift_sigma: of the change of the offset, seconds per second.
         slope_sigma_s: of the difference between the bottom and the top row: two rolling shutters that are unlike.

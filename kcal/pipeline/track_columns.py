@@ -26,8 +26,8 @@ def track_columns(tracks: Tracks, sequence: int, stations: CameraRig | None = No
     Args:
         tracks: of one moment.
         sequence: number of the moment, which together with the name is never used twice.
-        stations: cameras far apart: bearings are then those at the anchor's own vertical, and two more columns tell from
-            which camera a track is told, and which see it now.
+        stations: cameras far apart: bearings are then those at the anchor's own vertical, and two more columns tell
+            from which camera a track is told, and which see it now.
     """
     state = TrackStates(*(value.cpu() for value in tracks.state))
     ok = state.status == int(PositionStatus.OK)

@@ -28,8 +28,8 @@ class TrackOptions:
             10,000. Of one camera, or of more, it is the distance that loses as many.
         recognize: the same of a new track from a lost one, in place and velocity; 16.8 loses one in 100.
         lasting_px: standard deviation of the part of a mark's error that stays the same as long as a target is seen,
-            along each axis of all images but the first camera's, pixels. Matched images have 0.01 px of it, compressed ones 0.02 px
-            (`scripts/check/compression.py`).
+            along each axis of all images but the first camera's, pixels. Matched images have 0.01 px of it, compressed
+            ones 0.02 px (`scripts/check/compression.py`).
 
     Raises:
         InputError: a value that is not positive (`lasting_px` may be zero), or a forgetting before the losing.

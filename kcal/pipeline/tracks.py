@@ -106,7 +106,6 @@ class Tracker:
         self.time = -math.inf
         self.records: list[TrackRecord] = []
         self.history: History | None = History() if record else None
-        models = len(self.options.motions)
         empty = torch.zeros(0, dtype=torch.float64, device=device)
         # (3, 3, T) rotations from the rig's axes, and (T,) cameras from which tracks are told.
         self.frame, self.home = empty.reshape(3, 3, 0), empty.long()
@@ -186,7 +185,7 @@ class Tracker:
         )
 
     def clock_estimate(self, camera: int = 1) -> ClockEstimate:
-        """What the tracks have told so far of the clock of a camera, from 1; the first camera's (0) is the one that counts.
+        """What the tracks have told so far of the clock of a camera, from 1: beside that of the first camera (0).
 
         Raises:
             InputError: no such camera.

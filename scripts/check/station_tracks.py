@@ -8,8 +8,9 @@ stated. Marks are rendered in each station's own east, north, up (`scripts/share
 computes them. A camera misses a target in view with probability 0.15, and has one false detection an image. Halfway,
 each station is blind for ten seconds, one after the other.
 
-right: groups whose marks are all of one target; marks that tracks took which are of the target they follow. ghosts: told tracks that are of none. breaks: a target's track has
-another number than before. inside: 95 % ellipsoids (chi-squared, 3) of tracks with a position, every tenth second.
+right: groups that are not doubtful and whose marks are all of one target; marks that tracks took and that are of the
+target they follow. ghosts: told tracks that are of none. breaks: a target's track has another number than before.
+inside: 95 % ellipsoids (chi-squared, 3) of tracks with a position, every tenth second.
 """
 
 from __future__ import annotations
@@ -212,6 +213,8 @@ def report(counts: list[int], all_sums: list[Sums], seeds: int, seconds: float) 
     for count, s in zip(counts, all_sums, strict=True):
         nees, clocks = np.array(s.nees), np.array(s.clocks).reshape(-1, 2)
         hours = s.followed / 3600.0
+        rms, stated = (1e3 * np.sqrt((clocks[:, i] ** 2).mean()) for i in (0, 1))
+        good = int((np.abs(clocks[:, 0]) < 1.96 * clocks[:, 1]).sum())
         rows.append([
             count,
             f"{100 * s.right / max(s.groups, 1):.1f} % of {s.groups:,}; {s.doubtful:,} doubtful",
@@ -220,12 +223,12 @@ def report(counts: list[int], all_sums: list[Sums], seeds: int, seconds: float) 
             f"{s.breaks / max(hours, 1e-9):.1f}",
             f"{100 * s.ghosts / max(s.told, 1):.1f} %",
             f"{100 * (nees < INSIDE_95).mean():.1f} % of {len(nees)}; {np.median(nees) / 2.366:.2f}",
-            f"{1e3 * np.sqrt((clocks[:, 0] ** 2).mean()):.0f} ms, stated {1e3 * np.sqrt((clocks[:, 1] ** 2).mean()):.0f}"
-            f"; {int((np.abs(clocks[:, 0]) < 1.96 * clocks[:, 1]).sum())} of {len(clocks)}",
+            f"{rms:.0f} ms, stated {stated:.0f}; {good} of {len(clocks)}",
             f"{np.median(s.milliseconds):.0f} ms",
         ])  # fmt: skip
     heads = [
-        "stations", "groups that are right", "marks of tracks that are right", "followed while two see it", "breaks a target and hour",
+        "stations", "groups that are right", "marks of tracks that are right", "followed while two see it",
+        "breaks a target and hour",
         "ghosts among tracks",
         "inside 95 %; median of χ² over its own", "clock at the end: RMS, inside 95 %", "CPU a moment",
     ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Tracks over stations far apart: who saw what, names that stay at a hand-over, bearings of one alone, clocks of each."""
+"""Tracks over stations far apart: who saw what, names that stay at a hand-over, bearings of one, clocks of each."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from torch import Tensor
 
 from kcal.errors import InputError
 from kcal.lens.camera_rig import CameraRig
+from kcal.lens.mounting import Mounting
 from kcal.locate.budget import planned_rig
 from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.locate.stations import stations_of
-from kcal.lens.mounting import Mounting
 from kcal.pipeline.association import AssociationOptions, associate
 from kcal.pipeline.detections import Detections
 from kcal.pipeline.grouping import group_objects
@@ -39,7 +39,7 @@ def boxes(pixels: Tensor, time: float = 0.0) -> Detections:
 def views_of(pixels: Tensor, seen: Tensor, time: Tensor | float, sigma: float = 1.0) -> ObjectViews:
     count, cameras = seen.shape
     return ObjectViews(
-        pixels=pixels, seen=seen, time=torch.as_tensor(time).double().expand(count, cameras).clone(),
+        pixels=pixels, seen=seen, time=torch.as_tensor(time, dtype=torch.float64).expand(count, cameras).clone(),
         covariance=sigma**2 * torch.eye(2 * cameras).double().expand(count, -1, -1), score=torch.ones(count),
         category=("object",) * count, ambiguous=torch.zeros(count, dtype=torch.bool),
     )  # fmt: skip
@@ -71,7 +71,9 @@ def test_two_cameras_of_one_mast_are_paired_as_ever() -> None:
     expected = associate(rig, *seen, options)
     found = group_objects(MultiViewLocalizer(stations_of(rig)), seen, options)
     both = found.seen.all(1)
-    pairs = {tuple(p.flatten().tolist()): bool(a) for p, a in zip(found.pixels[both], found.ambiguous[both], strict=True)}
+    pairs = {
+        tuple(p.flatten().tolist()): bool(a) for p, a in zip(found.pixels[both], found.ambiguous[both], strict=True)
+    }
     wanted = torch.cat([seen[0].anchors()[expected.left], seen[1].anchors()[expected.right]], -1).tolist()
     assert pairs == {tuple(p): bool(a) for p, a in zip(wanted, expected.ambiguous, strict=True)}
     assert len(pairs) > 25
@@ -85,7 +87,9 @@ def test_detections_of_one_thing_come_together(count: int) -> None:
     g, seen, owners = torch.Generator().manual_seed(4), [], []
     for c in range(count):
         order = torch.randperm(12, generator=g)[: 12 - c]
-        owners.append({tuple(p.tolist()): int(i) for p, i in zip(boxes(pixels[order, c]).anchors(), order, strict=True)})
+        owners.append(
+            {tuple(p.tolist()): int(i) for p, i in zip(boxes(pixels[order, c]).anchors(), order, strict=True)}
+        )
         seen.append(boxes(pixels[order, c]))
     found = group_objects(MultiViewLocalizer(rig), seen, AssociationOptions(box_sigma=1.0))
     right = 0
@@ -126,7 +130,7 @@ def test_errors_of_tracks_are_as_large_as_stated() -> None:
 
 
 def test_a_name_lives_through_bearings_and_a_hand_over() -> None:
-    """Cameras 1 and 2 see it, then 2 alone, then 2 and 3, then 3 alone: one track, and its errors grow while one sees."""
+    """Cameras 1 and 2 see it, then 2 alone, then 2 and 3, then 3 alone: one track; errors grow while one sees it."""
     rig = stations()
     g = torch.Generator().manual_seed(7)
     start, velocity = torch.tensor([[-400.0, 300.0, 200.0]]).double(), torch.tensor([[12.0, -5.0, 0.0]]).double()
@@ -192,7 +196,9 @@ def test_the_clock_of_each_camera_is_found() -> None:
     for frame in range(30):
         time = frame / 3.0
         pixels = torch.stack([marks(rig, start + (time + float(d)) * velocity)[:, c] for c, d in enumerate(late)], 1)
-        tracker(views_of(pixels + 0.5 * torch.randn(4, 3, 2, generator=g).double(), torch.ones(4, 3) > 0, time, 0.5), time)
+        tracker(
+            views_of(pixels + 0.5 * torch.randn(4, 3, 2, generator=g).double(), torch.ones(4, 3) > 0, time, 0.5), time
+        )
     for camera in (1, 2):
         offset, sigma = tracker.clock_estimate(camera).offset(5.0)
         assert abs(offset - float(late[camera])) < 3 * sigma < 0.15
