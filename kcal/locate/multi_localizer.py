@@ -156,29 +156,6 @@ class MultiViewLocalizer(Float64Module):
         limits = [[float(chdtri(max(float(f), 1.0), p)) for f in freedom] for p in (_BAD, _DOUBTFUL)]
         self.register_buffer("limits", torch.tensor(limits, dtype=torch.float64, device=device))
 
-    @property
-    def posed(self) -> PosedCameras:
-        """The cameras as they stand."""
-        bending = self.rig.refraction * self.half_curvature
-        return PosedCameras(self.rig.each, self.rig.rotation, self.rig.center, self.up, bending)
-
-    @property
-    def common(self) -> CommonErrors | None:
-        """What marks of a camera have in common; None where all is exact."""
-        return None if self.errors is None else CommonErrors(self.lens, self.errors, self.bending_errors)
-
-    @property
-    def exact(self) -> CommonErrors:
-        """No errors."""
-        none = self.rig.center.new_zeros(0)
-        return CommonErrors(tuple(() for _ in self.rig.names), none.reshape(0, len(self.rig), 6), none)
-
-    @property
-    def bending(self) -> CommonErrors:
-        """One error: k / 2R is larger by one."""
-        one = self.rig.center.new_ones(1)
-        return self.exact._replace(half=one.new_zeros(1, len(self.rig), 6), bending=one)
-
     def forward(
         self,
         pixels: Tensor,
@@ -260,7 +237,7 @@ class MultiViewLocalizer(Float64Module):
     ) -> tuple[ViewsLocalization, Tensor, Tensor]:
         """All rows; (N, V) the view that should be left out; (N,) rows whose views contradict each other for good."""
         sigma, differentiated = options
-        posed, shared = self.posed, self.common
+        posed, shared = posed_cameras(self), common_errors(self)
         reach = None if height is None else partial(self._at_height, height=height, sigma=sigma)
         views = fit_views(
             posed, pixels, seen, noise=self.pixel_sigma, cov=cov, shared=shared, height=reach,
@@ -356,6 +333,19 @@ class MultiViewLocalizer(Float64Module):
         away = point - place
         level = away - (away * up).sum(-1, keepdim=True) * up
         return StatedHeight(point, up + 2.0 * self.half_curvature * level, torch.full_like(height, sigma), reached)
+
+
+def posed_cameras(localize: MultiViewLocalizer) -> PosedCameras:
+    """The cameras as they stand."""
+    rig, bending = localize.rig, localize.rig.refraction * localize.half_curvature
+    return PosedCameras(rig.each, rig.rotation, rig.center, localize.up, bending)
+
+
+def common_errors(localize: MultiViewLocalizer) -> CommonErrors | None:
+    """What marks of a camera have in common; None where all is exact."""
+    if localize.errors is None:
+        return None
+    return CommonErrors(localize.lens, localize.errors, localize.bending_errors)
 
 
 def _errors_by_camera(

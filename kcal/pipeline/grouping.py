@@ -19,7 +19,7 @@ from torch import Tensor
 
 from kcal.errors import InputError
 from kcal.lens.rig import StereoRig
-from kcal.locate.multi_localizer import MultiViewLocalizer
+from kcal.locate.multi_localizer import MultiViewLocalizer, common_errors, posed_cameras
 from kcal.locate.views import CommonErrors, ViewsFit, fit_views
 from kcal.pipeline.association import MOST_BOXES, AssociationOptions, size_cost
 from kcal.pipeline.detections import Detections
@@ -126,7 +126,7 @@ class _Scene:
     def __init__(
         self, localize: MultiViewLocalizer, seen: Sequence[Detections | None], options: AssociationOptions
     ) -> None:
-        self.localize, self.options, self.posed = localize, options, localize.posed
+        self.localize, self.options, self.posed = localize, options, posed_cameras(localize)
         there = [(c, each) for c, each in enumerate(seen) if each is not None]
         none = torch.zeros(0, dtype=torch.float64)
         self.camera = np.repeat([c for c, _ in there], [len(each) for _, each in there]).astype(np.int64)
@@ -142,7 +142,7 @@ class _Scene:
         """Groups of two views and more, each detection once, and which are ambiguous."""
         cameras = range(len(self.own))
         edges = {(i, j): self._edges(i, j) for i, j in itertools.combinations(cameras, 2)}
-        candidates = self._fitted(_agreeing(list(edges.values()), self.camera, len(self.own), self.options.gate))
+        candidates = self._fitted(_with_one_range(list(edges.values()), self.camera, len(self.own), self.options.gate))
         near = 2.0 * math.log(self.options.odds)
         by_mark: dict[int, list[_Group]] = {}
         for group in candidates:
@@ -201,7 +201,7 @@ class _Scene:
 
     def _wide(self, i: int, j: int) -> float:
         """Pixels: noise of a box and all that is not known of attitudes and air; a first look only."""
-        common, most = self.localize.common, 0.0
+        common, most = common_errors(self.localize), 0.0
         for c in (i, j):
             angle = 2.0 * self.posed.bending * _FAR_M
             if common is not None:
@@ -217,7 +217,7 @@ class _Scene:
             cameras=[posed.cameras[c] for c in chosen], rotation=posed.rotation[chosen], center=posed.center[chosen],
             up=None if posed.up is None else posed.up[chosen],
         )  # fmt: skip
-        common = self.localize.common
+        common = common_errors(self.localize)
         if common is not None:
             common = CommonErrors(tuple(common.lens[c] for c in chosen), common.half[:, chosen], common.bending)
         return fit_views(part, pixels, seen, noise=self.options.box_sigma, shared=common)
@@ -264,7 +264,7 @@ class _Scene:
         return good
 
 
-def _agreeing(edges: list[_Edges], camera: NDArray[np.int64], cameras: int, gate: float) -> list[tuple[int, ...]]:
+def _with_one_range(edges: list[_Edges], camera: NDArray[np.int64], cameras: int, gate: float) -> list[tuple[int, ...]]:
     """Groups of three detections and more whose inverse ranges from the first one agree."""
     if cameras < 3:
         return []

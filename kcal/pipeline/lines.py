@@ -67,7 +67,7 @@ def read_moment(
     except orjson.JSONDecodeError as error:
         raise InputError(f"not a line of JSON ({error})") from error
     if isinstance(rig, MultiViewLocalizer):
-        return _grouped(content, rig, options)
+        return _named_cameras(content, rig, options)
     if not isinstance(content, dict) or not {"left", "right"} <= set(content):
         raise InputError("a JSON object with left and right is needed")
     if isinstance(content["left"], dict) and isinstance(content["right"], dict):
@@ -83,7 +83,7 @@ def read_moment(
     return _pairs_of_line(content, pixel_sigma)
 
 
-def _grouped(content: Any, localize: MultiViewLocalizer, options: AssociationOptions) -> Moment:
+def _named_cameras(content: Any, localize: MultiViewLocalizer, options: AssociationOptions) -> Moment:
     names = localize.rig.names
     each = content.get("cameras") if isinstance(content, dict) else None
     if not isinstance(each, dict) or set(content) != {"cameras"} or not each or not set(each) <= set(names):

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from kcal.lens.dispatch import known_true
-from kcal.locate.multi_localizer import MultiViewLocalizer
+from kcal.locate.multi_localizer import MultiViewLocalizer, common_errors, posed_cameras
 from kcal.locate.stereo import PositionStatus
-from kcal.locate.views import StatedHeight, fit_views, shared_pixels
+from kcal.locate.views import CommonErrors, StatedHeight, fit_views, shared_pixels
 from kcal.pipeline.small_matrices import outer, product
 
 # Meters at which a bearing of one camera is taken at first; what light bends elsewhere follows from it.
@@ -92,8 +92,10 @@ def sightings(
         lasting_px: standard deviation along each axis of errors that stay as long as a target, in the marks of all
             cameras but the first.
     """
-    rig, posed, cameras = localize.rig, localize.posed, len(localize.rig)
-    common = localize.common or localize.exact
+    rig, posed, cameras = localize.rig, posed_cameras(localize), len(localize.rig)
+    none = rig.center.new_zeros(0)
+    exact = CommonErrors(tuple(() for _ in rig.names), none.reshape(0, cameras, 6), none)
+    common = common_errors(localize) or exact
     found = fit_views(posed, pixels, seen, noise=1.0, cov=covariance, height=_far_away, rows_of=common)
     fit, scale, used, weight = found.fit, found.scale, found.used, found.weight
     assert weight is not None
@@ -109,7 +111,14 @@ def sightings(
         moved = shared_pixels(posed, common, at, used, scale, fit.projections)
         shared = -product(white, moved.transpose(0, 1))
     if posed.up is not None and not known_true(~alone):
-        moved = shared_pixels(posed, localize.bending, at, used, scale, fit.projections)
+        moved = shared_pixels(
+            posed,
+            CommonErrors(exact.lens, none.new_zeros(1, cameras, 6), none.new_ones(1)),
+            at,
+            used,
+            scale,
+            fit.projections,
+        )
         bent = torch.where(alone, product(white, moved.transpose(0, 1))[:, 0] / _ALONE_M, 0.0)
     if lasting_px:
         shared = torch.cat([shared, lasting_px * white[:, 2:]], 1)

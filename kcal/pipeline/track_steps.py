@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.locate.multi_localizer import MultiViewLocalizer
+from kcal.locate.multi_localizer import MultiViewLocalizer, posed_cameras
 from kcal.pipeline.assignment import Looks, Scores, SeenFrom, looks_of, nearby
 from kcal.pipeline.estimates import TrackStates, track_states
 from kcal.pipeline.imm_filter import Beliefs, Timing, fit_of, innovations, predicted, updated
@@ -63,7 +63,7 @@ def track_steps(localize: MultiViewLocalizer, lasting_px: float) -> TrackSteps:
     """The steps as they are."""
     centers, errors, bending = localize.rig.center, localize.errors, localize.bending_errors
     turned = None if errors is None else errors[:, :, 3:6].movedim(-1, 0)
-    cameras, k = SeenFrom(centers, turned), localize.posed.bending
+    cameras, k = SeenFrom(centers, turned), posed_cameras(localize).bending
 
     def measure(pixels: Tensor, seen: Tensor, covariance: Tensor, time: Tensor) -> Sightings:
         return sightings(localize, pixels, seen, covariance, time, lasting_px)

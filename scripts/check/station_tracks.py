@@ -1,7 +1,7 @@
 """Tracks over stations: five of them 11 to 60 km apart on the round Earth, smokes, ships and drones, unlike clocks.
 
     python -m scripts.check.station_tracks --seeds 24 --seconds 60 --write
-    python -m scripts.check.station_tracks --speed --write    # 1,000 things in 8 cameras, and what a track costs
+    python -m scripts.check.station_tracks --speed --things 100 --write    # grouping, positions, tracks in 8 cameras
 
 Each seed draws position, attitude and refraction errors, clocks (offset and rate) and targets anew, from what is
 stated. Marks are rendered in each station's own east, north, up (`scripts/shared/station_scenes.py`), not as kcal
@@ -242,16 +242,16 @@ def report(counts: list[int], all_sums: list[Sums], seeds: int, seconds: float) 
     ])  # fmt: skip
 
 
-def speed() -> str:
-    """1,000 things in 8 cameras: CPU of grouping, of positions, and of tracking them."""
+def speed(things: int) -> str:
+    """Things in 8 cameras: CPU of grouping, of positions, and of tracking them."""
     rig, g = ring(8, 8000.0), torch.Generator().manual_seed(0)
     rig.root = rig.with_errors(position_m=POSITION_M, attitude_deg=ATTITUDE_DEG, refraction=REFRACTION)
     spread = torch.tensor([2500.0, 2500.0, 400.0]).double()
-    points = (torch.rand(1000, 3, generator=g).double() - 0.5) * 2 * spread + torch.tensor([0.0, 0.0, 700.0])
+    points = (torch.rand(things, 3, generator=g).double() - 0.5) * 2 * spread + torch.tensor([0.0, 0.0, 700.0])
     localize, rows = MultiViewLocalizer(rig), []
     tracker = Tracker(localize, OPTIONS)
-    for number in range(3):
-        pixels = marks(rig, points) + BOX_PX * torch.randn(1000, 8, 2, generator=g).double()
+    for number in range(2):
+        pixels = marks(rig, points) + BOX_PX * torch.randn(things, 8, 2, generator=g).double()
         inside = torch.stack([camera.inside(pixels[:, c]) for c, camera in enumerate(rig.each)], 1)
         seen = [
             Detections.read(torch.cat([p - 6, p + 6], -1)[there], size=SIZE, time=float(number), first_pixel=0.0)
@@ -268,7 +268,7 @@ def speed() -> str:
         several = views.seen.sum(1) > 1
     middle = rows[-1]
     return "\n".join([
-        f"1,000 things in 8 cameras, {int(inside.sum()):,} detections: grouping {middle[0]:,.0f} ms of CPU (into "
+        f"{things:,} things in 8 cameras, {int(inside.sum()):,} detections: grouping {middle[0]:,.0f} ms of CPU (into "
         f"{int(several.sum()):,} groups), their positions with `MultiViewLocalizer` {middle[1]:,.0f} ms, the tracker "
         f"{middle[2]:,.0f} ms a moment. Made by `scripts/check/station_tracks.py --speed`.",
     ])  # fmt: skip
@@ -280,11 +280,12 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--counts", type=int, nargs="+", default=[2, 3, 5])
     parser.add_argument("--speed", action="store_true")
+    parser.add_argument("--things", type=int, default=100, help="of --speed")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     torch.set_num_threads(1)
     if options.speed:
-        text = speed()
+        text = speed(options.things)
         print(text)
     else:
         sums = [Sums() for _ in options.counts]

@@ -182,9 +182,7 @@ def test_stations_into_files(tmp_path: Path) -> None:
         for second in range(16):
             pixels = marks(rig, start + second * velocity) + torch.randn(2, 3, 2, generator=generator).double()
             boxes = torch.cat([pixels - 5.5, pixels + 6.5], -1)  # of a detector that counts from the edge
-            each = {
-                name: {"time": 1.7e9 + second, "boxes": boxes[:, c].tolist()} for c, name in enumerate(rig.names)
-            }
+            each = {name: {"time": 1.7e9 + second, "boxes": boxes[:, c].tolist()} for c, name in enumerate(rig.names)}
             if 6 <= second < 12:
                 del each["tower 1"]
             file.write(json.dumps({"cameras": each}) + "\n")
