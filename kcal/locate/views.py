@@ -324,7 +324,7 @@ def shared_pixels(
         turned = step_rows(found.by_point, seen[c])[:3]
         by_center = torch.einsum("ij,iun->jun", -turn, found.by_point) * (inverse / scale)
         by_turn = torch.einsum("ij,iun->jun", -turn, turned)
-        rows = torch.cat([by_center, by_turn, found.by_camera])
+        rows = torch.cat([by_center, by_turn, found.by_camera[: len(shared.lens[c])]])
         pixels = torch.einsum("kq,qun->kun", shared.half[:, c, : len(rows)], rows)
         if higher is not None:
             by_air = (found.by_point * higher[c, :, None]).sum(0)
