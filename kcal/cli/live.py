@@ -1,4 +1,4 @@
-"""`kcal live`: detections of two cameras to tracks on the map, as they come."""
+"""`kcal live`: detections of two cameras or more to tracks on the map, as they come."""
 
 from __future__ import annotations
 
@@ -21,14 +21,17 @@ from kcal.errors import InputError
 from kcal.quantities import measured_text
 
 if TYPE_CHECKING:
+    from kcal.lens.rig import StereoRig
     from kcal.locate.columns import PositionColumns
     from kcal.locate.localizer import StereoLocalizer
+    from kcal.locate.multi_localizer import MultiViewLocalizer
     from kcal.locate.positions import Located
     from kcal.pipeline.association import AssociationOptions
     from kcal.pipeline.live_map import LiveMap
     from kcal.pipeline.stream import StreamCounts
-    from kcal.pipeline.tracks import Tracker, Tracks
-    from kcal.pipeline.video_source import VideoPairs
+    from kcal.pipeline.track_options import Tracks
+    from kcal.pipeline.tracks import Tracker
+    from kcal.pipeline.video_source import Videos
 
 
 def live_command(
@@ -38,7 +41,10 @@ def live_command(
     ],
     videos: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[LEFT RIGHT]", help="Two video files or addresses (rtsp://...), with --detector."),
+        typer.Argument(
+            metavar="[LEFT RIGHT]",
+            help="Video files or addresses (rtsp://...), with --detector: one for each camera, in the rig's order.",
+        ),
         VIDEO,
     ] = None,
     detector: Annotated[
@@ -89,7 +95,11 @@ def live_command(
     ] = 0.06,
     clock_offset: Annotated[
         float,
-        typer.Option(metavar="S", help="Seconds by which the right images are later than their times.", hidden=True),
+        typer.Option(
+            metavar="S",
+            help="Seconds by which the right images are later than their times; of two cameras.",
+            hidden=True,
+        ),
     ] = 0.0,
     clock_sigma: Annotated[
         float,
@@ -116,7 +126,7 @@ def live_command(
         ),
     ] = None,
 ) -> None:
-    """Follow what two cameras see: tracks with latitude, longitude, velocity and honest errors, written as they come.
+    """Follow what cameras see: tracks with latitude, longitude, velocity and honest errors, written as they come.
 
     Of two videos, frames belong together by their own times, and the images inside the boxes are matched to a fraction
     of a pixel. The detector returns what `kcal.track.Detections.read` takes: an array of x1, y1, x2, y2, score, class,
@@ -124,6 +134,9 @@ def live_command(
 
     A line of `--detections` is one moment: `{"left": {"time": T, "boxes": [[x1,y1,x2,y2], ...]}, "right": {...}}`, or
     pairs that are matched already: `{"time": T, "left": [[u,v], ...], "right": [[u,v], ...], "sigma": PX}`.
+
+    Of a rig of many cameras, a line names those that have an image: `{"cameras": {"mill": {"time": T, "boxes": [...]},
+    "mast": {...}}}`. Two cameras begin a track, and any one of them continues it.
 
     Frames reduce the noise of the marks, never what calibration, mounting and clocks contribute. With `--clock-sigma`
     the offset between the cameras' clocks is estimated from targets that move.
@@ -142,49 +155,48 @@ def live_command(
     `detector | kcal live rig.json --detections - -o tracks.csv --to udp://239.2.3.1:6969`
     """
     from kcal.files import check_writable
-    from kcal.io.rig_file import load_rig
-    from kcal.lens.mounting import Origin
-    from kcal.locate.positions import located_by
-    from kcal.locate.tabulate import Locator
+    from kcal.locate.multi_localizer import MultiViewLocalizer
+    from kcal.locate.stations import names_of_rig
     from kcal.pipeline.association import AssociationOptions
     from kcal.pipeline.lines import read_moment
     from kcal.pipeline.senders import sender_to
     from kcal.pipeline.shared_errors import ClockPrior
     from kcal.pipeline.stream import Stream, lines_of
-    from kcal.pipeline.tracks import Tracker, TrackOptions
+    from kcal.pipeline.track_options import TrackOptions
+    from kcal.pipeline.tracks import Tracker
 
     if (origin is None) != (heading is None):
         raise typer.BadParameter("--origin and --heading belong together")
     if (detections is None) == (not videos):
-        raise typer.BadParameter("give two videos and --detector, or --detections")
-    if videos and (len(videos) != 2 or detector is None):
-        raise typer.BadParameter("two videos, of the left and the right camera, and --detector are needed")
+        raise typer.BadParameter("give videos and --detector, or --detections")
+    names = names_of_rig(rig)
+    if videos and (len(videos) != len(names) or detector is None):
+        raise typer.BadParameter(f"{len(names)} videos, of the cameras {', '.join(names)}, and --detector are needed")
+    many = names != ("left", "right")
+    if many and (clock_offset or {"origin", "heading", "match_sigma"} & taken or heading is not None):
+        raise typer.BadParameter("--origin, --heading, --clock-offset and --match-sigma are of rigs of two cameras")
+    if many and watch is not None:
+        raise typer.BadParameter("--watch is for rigs of two cameras")
     lines = Path(detections) if detections not in (None, "-") else None
     for path in output:
         check_writable(path, rig, *([lines] if lines else []), *(videos or []))
     moment_zero = None if start is None else _calendar_time(start)
     clock = ClockPrior(offset_s=clock_offset, offset_sigma_s=clock_sigma, drift_sigma=clock_sigma / 3600.0)
     options = AssociationOptions(box_sigma=box_sigma)
-    place = None if origin is None else Origin.parse(origin)
-    known = load_rig(rig)
-    noise = pixel_sigma_of(pixel_sigma, known)
-    if known.mounting is not None and {"origin", "heading"} <= taken:
-        place = heading = None
-        err.print("the position of the rig is that in its file, not that in kcal.toml")
-    locate = Locator(known, origin=place, heading_deg=heading, pixel_sigma=noise)
-    solved = locate.localize.rig
+    localize, run = _stations(rig, pixel_sigma) if many else _mast(rig, origin, heading, pixel_sigma)
+    solved = localize if isinstance(localize, MultiViewLocalizer) else localize.rig
 
     if compiled:
         err.print("compiling: some three minutes the first time")
     follow = TrackOptions.for_video(match_sigma) if videos else None
-    moments, moving = (None, 0) if watch is None else _moments(watch, locate.localize)
-    tracker = Tracker(locate.localize, follow, clock=clock, compiled=compiled, moments=moments, moving=moving)
-    pairs = _video_pairs(videos, detector, tracker, options, match_sigma) if videos and detector else None
-    source = pairs or lines_of(lines, lambda line: read_moment(line, solved, options, noise))
+    moments, moving = (None, 0) if watch is None else _moments(watch, localize)
+    tracker = Tracker(localize, follow, clock=clock, compiled=compiled, moments=moments, moving=moving)
+    frames = _videos(videos, detector, solved, tracker, options, match_sigma) if videos and detector else None
+    source = frames or lines_of(lines, lambda line: read_moment(line, solved, options, localize.pixel_sigma))
     log = journal if journal is not None else output[0].with_name(output[0].name + ".journal")
     with steps("live", lines.stat().st_size if lines is not None and lines.is_file() else None) as advance:
         stream = Stream(
-            tracker, located_by(locate), output, log,
+            tracker, run, output, log,
             senders=[sender_to(address) for address in to or []], start=moment_zero, shown=None,
         )  # fmt: skip
         page = None if port is None else _live_map(stream.run, port)
@@ -200,7 +212,7 @@ def live_command(
 
         before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
         try:
-            live = pairs is not None and pairs.live
+            live = frames is not None and frames.live
             counts = stream.follow(source, waits=not live, resumes=not live and detections != "-")
         except BaseException:
             ending = "ended by an error: see the terminal"
@@ -217,23 +229,29 @@ def live_command(
             f"times jumped {counts.jumps:,} times and stayed: followed, with new tracks; the last jump was "
             f"{abs(counts.last_jump_s):,.1f} s {ahead}"
         )
-    if pairs is not None:
-        err.print(str(pairs.counts), markup=False)
+    if frames is not None:
+        err.print(str(frames.counts), markup=False)
     if counts.malformed:
         if not (counts.moments or counts.repeated or counts.waiting or stream.ledger.place.sequence):
             raise InputError(f"none of {counts.malformed:,} lines could be read; the last one: {counts.last_error}")
         err.print(f"last malformed line: {counts.last_error}", markup=False)
     if clock_sigma:
-        offset, sigma = stream.tracker.clock_estimate().offset(stream.tracker.time)
-        late = measured_text(1e3 * offset, 1e3 * sigma, "ms")
-        err.print(f"the right camera's images are {late} later than their times say")
+        for camera, name in enumerate(names[1:], 1):
+            offset, sigma = stream.tracker.clock_estimate(camera).offset(stream.tracker.time)
+            late = measured_text(1e3 * offset, 1e3 * sigma, "ms")
+            whose = f"{name}'s" if many else f"the {name} camera's"
+            err.print(f"{whose} images are {late} later than their times say", markup=False)
 
 
-def _moments(history: Path, localize: StereoLocalizer) -> tuple[Callable[[float], StereoLocalizer], int]:
+def _moments(
+    history: Path, localize: StereoLocalizer | MultiViewLocalizer
+) -> tuple[Callable[[float], StereoLocalizer], int]:
     """The rig as it stands at each second, by a history that grows; and how many errors more that has."""
+    from kcal.locate.localizer import StereoLocalizer
     from kcal.watch.followed import Followed
     from kcal.watch.watched import MORE_ERRORS
 
+    assert isinstance(localize, StereoLocalizer)
     return Followed(history, localize), MORE_ERRORS
 
 
@@ -252,11 +270,49 @@ def summary(counts: StreamCounts) -> str:
     return "; ".join(parts)
 
 
-def _video_pairs(
-    videos: list[str], detector: str, tracker: Tracker, options: AssociationOptions, match_sigma: float
-) -> VideoPairs:
+def _mast(
+    rig: Path, origin: str | None, heading: float | None, pixel_sigma: float | None
+) -> tuple[StereoLocalizer, Located]:
+    """Two cameras, and how positions of them are told."""
+    from kcal.io.rig_file import load_rig
+    from kcal.lens.mounting import Origin
+    from kcal.locate.positions import located_by
+    from kcal.locate.tabulate import Locator
+
+    known, place = load_rig(rig), None if origin is None else Origin.parse(origin)
+    if known.mounting is not None and {"origin", "heading"} <= taken:
+        place = heading = None
+        err.print("the position of the rig is that in its file, not that in kcal.toml")
+    noise = pixel_sigma_of(pixel_sigma, known)
+    locate = Locator(known, origin=place, heading_deg=heading, pixel_sigma=noise)
+    return locate.localize, located_by(locate)
+
+
+def _stations(rig: Path, pixel_sigma: float | None) -> tuple[MultiViewLocalizer, Located]:
+    """Many cameras, and how positions of them are told."""
+    from kcal.locate.multi_localizer import MultiViewLocalizer
+    from kcal.locate.station_positions import stations_head
+    from kcal.locate.stations import load_camera_rig
+
+    known = load_camera_rig(rig)
+    if known.origin is None:
+        raise InputError(
+            f"{rig}: this rig has no place on the Earth; solve it with landmarks or positions with latitudes"
+        )
+    localize = MultiViewLocalizer(known, pixel_sigma=pixel_sigma_of(pixel_sigma, known))
+    return localize, stations_head(localize)
+
+
+def _videos(
+    videos: list[str],
+    detector: str,
+    rig: StereoRig | MultiViewLocalizer,
+    tracker: Tracker,
+    options: AssociationOptions,
+    match_sigma: float,
+) -> Videos:
     try:
-        from kcal.pipeline.video_source import VideoPairs
+        from kcal.pipeline.video_source import Videos
     except ImportError as error:
         raise InputError(f"videos need {error.name}; install it with: pip install 'kcal[video]'") from error
     from kcal.pipeline.detector_call import load_detector
@@ -264,17 +320,14 @@ def _video_pairs(
     # As `python -m` does: a detector beside which the command is run is found.
     sys.path.insert(0, os.getcwd())
 
-    def late() -> float:
+    def late(camera: int) -> float:
         # Before the first moment the estimate is the prior.
-        return tracker.clock_estimate().offset(max(tracker.time, tracker.shared.start or 0.0))[0]
+        return tracker.clock_estimate(camera).offset(max(tracker.time, tracker.shared.start or 0.0))[0]
 
     def tell(text: str) -> None:
         err.print(text, markup=False)
 
-    return VideoPairs(
-        videos[0], videos[1], tracker.localize.rig, load_detector(detector), options,
-        late=late, match_sigma=match_sigma, tell=tell,
-    )  # fmt: skip
+    return Videos(videos, rig, load_detector(detector), options, late=late, match_sigma=match_sigma, tell=tell)
 
 
 def _live_map(run: Located, port: int) -> LiveMap:

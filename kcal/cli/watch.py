@@ -19,7 +19,7 @@ from kcal.errors import InputError
 if TYPE_CHECKING:
     from kcal.corners.images import Gray
     from kcal.lens.rig import StereoRig
-    from kcal.pipeline.paired_frames import FramePairs
+    from kcal.pipeline.paired_frames import FramesTogether
     from kcal.watch.alarm import Webhook
     from kcal.watch.watched import Watched
     from kcal.watch.watcher import Noticed, Watcher
@@ -168,19 +168,20 @@ def _follow(watcher: Watcher, rig: StereoRig, sources: tuple[str, str], hooks: l
             frames.close()
 
 
-def _frame_pairs(rig: StereoRig, sources: tuple[str, str]) -> FramePairs:
+def _frame_pairs(rig: StereoRig, sources: tuple[str, str]) -> FramesTogether:
     try:
-        from kcal.pipeline.paired_frames import FramePairs
+        from kcal.pipeline.paired_frames import FramesTogether
     except ImportError as error:
         raise InputError(f"videos need {error.name}; install it with: pip install 'kcal[video]'") from error
 
-    sizes = rig.left.size, rig.right.size
-    return FramePairs(*sources, sizes, tell=lambda text: err.print(text, markup=False))
+    sizes = {"left": rig.left.size, "right": rig.right.size}
+    return FramesTogether(sources, sizes, pairs=True, tell=lambda text: err.print(text, markup=False))
 
 
-def _of_frames(watcher: Watcher, frames: FramePairs) -> Iterator[tuple[float, Gray, Gray]]:
-    for one, other in frames(0 if frames.live else watcher.offset):
-        if watcher.due(one.time):
+def _of_frames(watcher: Watcher, frames: FramesTogether) -> Iterator[tuple[float, Gray, Gray]]:
+    for _, (_, group) in frames(0 if frames.live else watcher.offset):
+        one, other = group
+        if one is not None and other is not None and watcher.due(one.time):
             yield one.time, one.gray().numpy(), other.gray().numpy()
 
 

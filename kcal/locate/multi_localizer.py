@@ -245,10 +245,7 @@ class MultiViewLocalizer(Float64Module):
     ) -> tuple[ViewsLocalization, Tensor, Tensor]:
         """All rows; (N, V) the view that should be left out; (N,) rows whose views contradict each other for good."""
         sigma, differentiated, ground = options
-        posed = PosedCameras(
-            self.rig.each, self.rig.rotation, self.rig.center, self.up, self.rig.refraction * self.half_curvature
-        )
-        shared = None if self.errors is None else CommonErrors(self.lens, self.errors, self.bending_errors)
+        posed, shared = posed_cameras(self), common_errors(self)
         reach = None
         if self.up is not None and self.ecef_from_enu is not None:
             bending = self.rig.refraction, self.half_curvature
@@ -327,6 +324,19 @@ class MultiViewLocalizer(Float64Module):
             geodetic=torch.where(torn[..., None], self.geodetic_of_origin, found.geodetic),
             status=flag_positions(found.status, torn, PositionStatus.CONTRADICTION),
         )
+
+
+def posed_cameras(localize: MultiViewLocalizer) -> PosedCameras:
+    """The cameras as they stand."""
+    rig, bending = localize.rig, localize.rig.refraction * localize.half_curvature
+    return PosedCameras(rig.each, rig.rotation, rig.center, localize.up, bending)
+
+
+def common_errors(localize: MultiViewLocalizer) -> CommonErrors | None:
+    """What marks of a camera have in common; None where all is exact."""
+    if localize.errors is None:
+        return None
+    return CommonErrors(localize.lens, localize.errors, localize.bending_errors)
 
 
 def errors_by_camera(

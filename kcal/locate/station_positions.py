@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -10,7 +11,7 @@ from torch import Tensor
 
 from kcal.errors import InputError
 from kcal.lens.camera_rig import CameraRig
-from kcal.locate.columns import PositionColumns
+from kcal.locate.columns import NUMBERS, PositionColumns
 from kcal.locate.datum import Geoid, geoid_column
 from kcal.locate.ellipsoid import ecef_from_enu_rotation
 from kcal.locate.geodesy import anchor, enu_to_geodetic
@@ -97,10 +98,7 @@ class ViewsLocator:
             )
         self.rig, self.origin, self.geoid = rig, rig.origin, geoid
         self.localize = MultiViewLocalizer(rig, pixel_sigma=pixel_sigma)
-        self.height, self.ground = height, ground
-        self.places = enu_to_geodetic(rig.center, rig.origin).tolist()
-        base = anchor(rig.origin)[0]
-        self.to_own = torch.stack([ecef_from_enu_rotation(lat, lon).T @ base for lat, lon, _ in self.places])
+        self.height, self.ground, self.to_own = height, ground, own_axes(rig)
 
     @torch.no_grad()
     def __call__(self, views: ViewMarks) -> tuple[PositionColumns, Tensor]:
@@ -137,24 +135,42 @@ class ViewsLocator:
 
     def located(self, columns: PositionColumns | None = None, feet: Tensor | None = None) -> Located:
         """Positions with what they were located by; none where only that is asked for."""
-        first, rig = station_mounting(self.rig, 0), self.rig
-        return Located(
-            columns=PositionColumns.joined([]) if columns is None else columns,
-            cameras=tuple(
-                viewpoint(name, camera, center, turn.T, tuple(place))
-                for name, camera, center, turn, place in zip(
-                    rig.names, rig.each, rig.center, rig.rotation, self.places, strict=True
-                )
-            ),
-            origin=self.origin,
-            heading_deg=first.heading_deg,
-            pitch_deg=first.pitch_deg,
-            roll_deg=first.roll_deg,
-            pixel_sigma=self.localize.pixel_sigma,
-            included=("marks",) if self.localize.errors is None else ("marks", "calibration", "mounting"),
-            geoid=None if self.geoid is None else self.geoid.name,
-            feet=torch.zeros(0, 3, dtype=torch.float64) if feet is None else feet,
-        )
+        none = torch.zeros(0, 3, dtype=torch.float64)
+        return dataclasses.replace(
+            stations_head(self.localize), columns=PositionColumns.joined([]) if columns is None else columns,
+            geoid=None if self.geoid is None else self.geoid.name, feet=none if feet is None else feet,
+        )  # fmt: skip
+
+
+def own_axes(rig: CameraRig) -> Tensor:
+    """(V, 3, 3) from the frame of a rig that has an origin to east, north, up of each camera."""
+    assert rig.origin is not None
+    base = anchor(rig.origin)[0]
+    geodetic = enu_to_geodetic(rig.center, rig.origin).tolist()
+    return torch.stack([ecef_from_enu_rotation(lat, lon).T @ base for lat, lon, _ in geodetic])
+
+
+def stations_head(localize: MultiViewLocalizer) -> Located:
+    """No positions, and where the cameras of a rig stand that has an origin."""
+    rig, empty = localize.rig, torch.zeros(0, dtype=torch.int8)
+    assert rig.origin is not None
+    first, geodetic = station_mounting(rig, 0), enu_to_geodetic(rig.center, rig.origin)
+    return Located(
+        columns=PositionColumns((), empty.numpy(), [], np.zeros((0, len(NUMBERS))), {}),
+        cameras=tuple(
+            viewpoint(name, camera, center, turn.T, tuple(place))
+            for name, camera, center, turn, place in zip(
+                rig.names, rig.each, rig.center, rig.rotation, geodetic.tolist(), strict=True
+            )
+        ),
+        origin=rig.origin,
+        heading_deg=first.heading_deg,
+        pitch_deg=first.pitch_deg,
+        roll_deg=first.roll_deg,
+        pixel_sigma=localize.pixel_sigma,
+        included=("marks",) if localize.errors is None else ("marks", "calibration", "mounting"),
+        feet=torch.zeros(0, 3, dtype=torch.float64),
+    )
 
 
 def _camera_list(rig: CameraRig, which: Sequence[bool]) -> str:

@@ -12,11 +12,16 @@ from kcal.files import read_bytes
 from kcal.io.camera_rig_file import CameraRigFile
 from kcal.io.rig_file import RigFile
 from kcal.lens.camera_rig import CameraRig
-from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA, Mounting
+from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA, Mounting, Origin
 from kcal.lens.rig import StereoRig, half_of_covariance
 from kcal.locate.geodesy import enu_from_cam
+from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.mounting import mounting_of
+from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.strict_json import MOST_BYTES, read_json
+
+# Errors of where a rig stands at most: place, attitude, refraction.
+MOUNTING_ERRORS = 7
 
 
 def load_camera_rig(path: str | Path) -> CameraRig:
@@ -63,21 +68,66 @@ def stations_of(rig: StereoRig) -> CameraRig:
     left = torch.eye(3, dtype=torch.float64)
     if stands is not None:
         left = enu_from_cam(stands.heading_deg, stands.pitch_deg, stands.roll_deg).T
+    bent = (REFRACTION if stands.refraction is None else stands.refraction) if stands else 0.0
+    joint = _joint_covariance(rig)
+    half = None if joint is None else half_of_covariance(joint)
+    return _two_stations(rig, left, None if stands is None else stands.origin, bent, half)
+
+
+def stations_at(localize: StereoLocalizer, *, errors: int | None = None) -> MultiViewLocalizer:
+    """The rig of a `StereoLocalizer` as a rig of two cameras, with where it stands and all that it includes.
+
+    Args:
+        localize: the rig, where it stands, and how well both are known.
+        errors: how many shared errors the result has, some of them zero: a filter needs as many at every moment, and
+            those of the calibration in the same order.
+
+    Example:
+        >>> from kcal import Origin
+        >>> from kcal.rig import planned_rig
+        >>> localize = StereoLocalizer(planned_rig(), origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
+        >>> stations_at(localize).rig.names
+        ('left', 'right')
+    """
+    rig, factor, stands = localize.rig, localize.calibration_factor, localize.mounting
+    size, half = rig.left.values.shape[-1] + rig.right.values.shape[-1] + 6, None
+    if factor is not None or stands is not None:
+        half = torch.zeros(0, size + 7, dtype=torch.float64)
+        left_over = torch.zeros(7, 7, dtype=torch.float64) if stands is None else stands
+        if factor is not None:
+            # What the mounting owes to the calibration's errors: factor · ofᵀ = link.
+            of = torch.zeros(7, factor.shape[1], dtype=torch.float64)
+            if localize.link is not None:
+                scale = torch.linalg.vector_norm(factor, dim=1, keepdim=True)
+                unit = torch.where(scale > 0, scale, 1.0)
+                of = torch.linalg.lstsq(factor / unit, localize.link / unit, driver="gelsd").solution.T
+            half, left_over = torch.cat([factor, of]).T, left_over - of @ of.T
+        own = half_of_covariance(left_over)
+        half = torch.cat([half, torch.nn.functional.pad(own, (size, 0))])
+        half = torch.nn.functional.pad(half, (0, 0, 0, max((errors or 0) - len(half), 0)))
+    left = localize.enu_from_rig.T
+    stations = _two_stations(rig, left, localize.origin, localize.drop / localize.half_curvature, half)
+    return MultiViewLocalizer(stations, pixel_sigma=localize.pixel_sigma)
+
+
+@torch.no_grad()
+def _two_stations(
+    rig: StereoRig, left: Tensor, origin: Origin | None, refraction: float, half: Tensor | None
+) -> CameraRig:
+    """A stereo rig whose left camera is turned by `left` from the frame; halfᵀ half as in `_joint_covariance`."""
     shift = rig.right_from_left_translation
     left = left.to(shift)
     right = rig.right_from_left_rotation @ left
     apart = -right.T @ shift
     centers = torch.stack([torch.zeros_like(apart), apart])
     stations = CameraRig(
-        [rig.left, rig.right], ("left", "right"), torch.stack([left, right]), centers,
-        origin=None if stands is None else stands.origin,
-        refraction=(REFRACTION if stands.refraction is None else stands.refraction) if stands else 0.0,
+        [rig.left, rig.right], ("left", "right"), torch.stack([left, right]), centers, origin=origin,
+        refraction=refraction,
     )  # fmt: skip
-    joint = _joint_covariance(rig)
-    if joint is None:
+    if half is None:
         return stations
-    size = len(joint) - 7
-    by = torch.zeros(stations.quantities, len(joint), dtype=torch.float64)
+    size = half.shape[1] - 7
+    by = torch.zeros(stations.quantities, half.shape[1], dtype=torch.float64)
     lenses = size - 6
     by[:lenses, :lenses] = torch.eye(lenses, dtype=torch.float64)
     turn, move, center, attitude = (slice(size + at, size + at + 3) for at in (-6, -3, 0, 3))
@@ -90,7 +140,7 @@ def stations_of(rig: StereoRig) -> CameraRig:
     by[second : second + 3, move] = -right.T
     by[second + 3 : second + 6, attitude], by[second + 3 : second + 6, turn] = still, -right.T
     by[-1, -1] = 1.0
-    stations.root = half_of_covariance(joint) @ by.T
+    stations.root = half @ by.T
     return stations
 
 

@@ -1,4 +1,4 @@
-"""Which pair belongs to which track: gates, one-to-one assignment, and marks that several pairs claim."""
+"""Which sighting belongs to which track: gates, one-to-one assignment, and marks that several sightings claim."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from kcal.pipeline.imm_filter import Beliefs, Timing
 from kcal.pipeline.measurements import Anchored, Sightings
-from kcal.pipeline.small_matrices import product
+from kcal.pipeline.small_matrices import outer, product, rooted
 
 
 class Scores(NamedTuple):
@@ -21,9 +21,9 @@ class Scores(NamedTuple):
 
     Attributes:
         seen: the sightings in the tracks' frames.
-        effect: (4, K + 3, L) of the shared errors on the innovation.
-        innovation: (4, L).
-        covariance: (4, 4, L) of its noise.
+        effect: (M, K + Q, L) of the shared errors on the innovation.
+        innovation: (M, L).
+        covariance: (M, M, L) of its noise.
         squared: (L,) squared Mahalanobis distance.
         log_density: (L,).
     """
@@ -40,12 +40,24 @@ class Scores(NamedTuple):
         return type(self)(self.seen.at(which), *(value[..., which] for value in self[1:]))
 
 
+class SeenFrom(NamedTuple):
+    """Where V cameras stand, and what shared errors make of their attitude.
+
+    Attributes:
+        center: (V, 3) in the rig's frame.
+        turned: (3, K, V) turn of a camera by each of the first K shared errors, radians; None: attitudes are exact.
+    """
+
+    center: Tensor
+    turned: Tensor | None
+
+
 class Candidates(NamedTuple):
     """L possible matches within the gate.
 
     Attributes:
         track: (L,) numbers of tracks.
-        pair: (L,) numbers of pairs.
+        pair: (L,) numbers of sightings.
         scores: how well they match.
     """
 
@@ -54,33 +66,78 @@ class Candidates(NamedTuple):
     scores: Scores
 
 
-def nearby(beliefs: Beliefs, frame: Tensor, seen: Sightings, timing: Timing, root: Tensor, gate: Tensor) -> Tensor:
-    """(T, N) bool: pairs that are roughly in the direction of a track.
+class Looks(NamedTuple):
+    """How each of V cameras should see T tracks.
+
+    Attributes:
+        ray: (3, V, T) unit vectors in the rig's frame.
+        spread: (V, T) squared radians: variance of both components across it.
+        pace: (V, T) squared radians per second.
+    """
+
+    ray: Tensor
+    spread: Tensor
+    pace: Tensor
+
+
+def looks_of(beliefs: Beliefs, frame: Tensor, home: Tensor, cameras: SeenFrom, root: Tensor | None) -> Looks:
+    """Where cameras should see tracks.
 
     Args:
         beliefs: merged, (..., 1, T), predicted.
         frame: (3, 3, T).
-        seen: N pairs.
-        timing: of the pairs.
-        root: of the covariance of the shared errors.
-        gate: largest squared Mahalanobis distance.
+        home: (3, T) origins of the frames.
+        cameras: V of them.
+        root: of the covariance of the shared errors; None: the identity.
     """
     mean, noise = beliefs.mean[:, 0], beliefs.noise[:, :, 0]
-    ray = torch.cat([mean[:2], torch.ones_like(mean[:1])])
-    ray = product(frame.transpose(0, 1), ray[:, None])[:, 0]
-    ray, other = (value / value.square().sum(0).sqrt() for value in (ray, seen.direction))
-    apart = (ray[:, :, None] - other[:, None]).square().sum(0)
-    spread = product(beliefs.effect[:2, :, 0], root[..., None]).square().sum((0, 1))
-    # A mark that is late has moved on.
-    pace = mean[3:5].square().sum(0) + noise[3, 3] + noise[4, 4]
-    late = timing.delay.abs().amax(0) + timing.unsure
-    reach = (noise[0, 0] + noise[1, 1] + spread)[:, None] + seen.noise[0, 0] + seen.noise[1, 1]
-    reach = reach + seen.shared[:2].square().sum((0, 1)) + pace[:, None] * late.square()
-    return (apart <= 2.0 * gate * reach) & seen.usable
+    back = frame.transpose(0, 1)
+    apart = home[:, None] - cameras.center.T[..., None]  # (3, V, T)
+    ray = product(back, torch.cat([mean[:2], torch.ones_like(mean[:1])])[:, None])[:, 0]
+    line = ray[:, None] + mean[2] * apart
+    length = line.square().sum(0).sqrt()
+    unit = line / length
+    # By x / z, y / z and 1 / z, in the frame of the rig: (3, 3, V, T).
+    slope = torch.cat([back[:, :2, None].expand(-1, -1, *length.shape), apart[:, None]], 1)
+    slope = (slope - outer(unit, (unit[:, None] * slope).sum(0))) / length
+    random = (product(slope, noise[:3, :3, None]) * slope).sum((0, 1))
+    moved = product(slope, beliefs.effect[:3, :, 0][:, :, None])
+    if cameras.turned is not None:
+        # A camera that is turned sees sightings and tracks turned alike: only what differs counts.
+        turn = cameras.turned[..., None]  # (3, K, V, 1)
+        turned = torch.linalg.cross(
+            turn.expand(-1, -1, -1, length.shape[1]), unit[:, None].expand_as(turn * unit[:, None]), dim=0
+        )
+        rest = moved.shape[1] - turn.shape[1]
+        moved = moved - torch.nn.functional.pad(turned, (0, 0, 0, 0, 0, rest))
+    spread = random + rooted(moved, root).square().sum((0, 1))
+    pace = (mean[3:].square().sum(0) + noise[3, 3] + noise[4, 4]) / length.square()
+    return Looks(unit, spread, pace)
 
 
-def within(scores: Scores, track: Tensor, pair: Tensor, gate: float) -> Candidates:
-    """Those in front of the track and within the gate."""
+def nearby(looks: Looks, seen: Sightings, timing: Timing, gate: Tensor) -> Tensor:
+    """(T, N) bool: sightings that are roughly where their first camera should see a track.
+
+    Args:
+        looks: at tracks.
+        seen: N sightings.
+        timing: of them.
+        gate: largest squared Mahalanobis distance.
+    """
+    other = seen.direction / seen.direction.square().sum(0).sqrt()
+    ray, spread, pace = (value[..., seen.anchor, :] for value in looks)  # (3, N, T), (N, T), (N, T)
+    apart = (ray - other[..., None]).square().sum(0)
+    late = timing.delay.abs().amax(0)
+    if len(timing.unsure):
+        late = late + timing.unsure.amax(0)
+    # Rows of unit noise: the inverse of their squares is the variance across.
+    both = seen.late.sum(0)[:, :2].square().sum(0)
+    own = 2.0 / both.amin(0).clamp_min(1e-12)
+    return ((apart <= 2.0 * gate * (spread + own[:, None] + pace * late.square()[:, None])) & seen.usable[:, None]).T
+
+
+def within(scores: Scores, track: Tensor, pair: Tensor, gate: Tensor) -> Candidates:
+    """Those in front of the track and within the gate (L,)."""
     good = scores.seen.ahead & (scores.squared <= gate)
     which = good.nonzero()[:, 0]
     if len(which) < len(good):
@@ -88,52 +145,34 @@ def within(scores: Scores, track: Tensor, pair: Tensor, gate: float) -> Candidat
     return Candidates(track, pair, scores)
 
 
-def mark_numbers(left: Tensor, right: Tensor) -> NDArray[np.int64]:
-    """(N, 2) numbers of the left and right marks: pairs with the same number share a mark.
-
-    Example:
-        >>> left = torch.tensor([[1.0, 2.0], [1.0, 2.0]])
-        >>> mark_numbers(left, left + torch.tensor([[0.0], [1.0]])).tolist()
-        [[0, 0], [0, 1]]
-    """
-    numbers = []
-    for marks in (left, right):
-        known: dict[tuple[float, ...], int] = {}
-        numbers.append([known.setdefault(tuple(mark), len(known)) for mark in marks.tolist()])
-    return np.array(numbers, dtype=np.int64).T
-
-
 def assigned(
     possible: Candidates, marks: NDArray[np.int64], evidence: Sequence[float], tiers: Sequence[int]
 ) -> list[int]:
-    """Rows of `possible` to accept: each track, pair and mark at most once, with the largest sum of log densities.
+    """Rows of `possible` to accept: each track, sighting and mark at most once, with the largest sum of log densities.
 
     Args:
         possible: all matches inside the gates.
-        marks: from `mark_numbers`.
-        evidence: (T,) of each track so far: settles between tracks that want the same mark by different pairs.
+        marks: (N, V) from `mark_numbers`.
+        evidence: (T,) of each track so far: settles between tracks that want the same mark by different sightings.
         tiers: (T,) tracks of tier 0 choose before those of tier 1; tracks of a negative tier do not choose.
     """
     track, pair, density = possible.track.tolist(), possible.pair.tolist(), possible.scores.log_density.tolist()
-    ends = [tuple(both) for both in marks.tolist()]
-    left: set[int] = set()
-    right: set[int] = set()
+    ends = [{(camera, mark) for camera, mark in enumerate(row) if mark >= 0} for row in marks.tolist()]
+    used: set[tuple[int, int]] = set()
     done: set[int] = set()
     accepted: list[int] = []
     for tier in (0, 1):
         rows = [i for i, t in enumerate(track) if tiers[t] == tier]
         while rows := [
             i for i in rows
-            if track[i] not in done and ends[pair[i]][0] not in left and ends[pair[i]][1] not in right
+            if track[i] not in done and not ends[pair[i]] & used
         ]:  # fmt: skip
             chosen = _best_rows(rows, track, pair, density)
             for i in sorted(chosen, key=lambda i: -(evidence[track[i]] + density[i])):
-                first, second = ends[pair[i]]
-                if first not in left and second not in right:
+                if not ends[pair[i]] & used:
                     accepted.append(i)
                     done.add(track[i])
-                    left.add(first)
-                    right.add(second)
+                    used |= ends[pair[i]]
     return accepted
 
 

@@ -8,6 +8,7 @@ assignment with the least sum of costs is exact (`kcal.pipeline.one_to_one`); a 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -17,6 +18,7 @@ from torch import Tensor
 
 from kcal.corners.filters import as_gray
 from kcal.errors import InputError
+from kcal.lens.projection import Projection
 from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.max_likelihood import calibration_effect, unreached_direction
 from kcal.locate.stereo import PairFit, PositionStatus, fit_pairs, inverse_range
@@ -184,7 +186,7 @@ def _some_costs(
     beyond = (1.0 / options.farthest - reach.value).clamp_min(0.0)
     before = (reach.value - 1.0 / _nearest(rig, options)).clamp_min(0.0)
     total = epipolar_cost(found, variance, rig.covariance) + (torch.maximum(beyond, before) / reach.sigma).square()
-    total = total + _size_cost(found, left.boxes[rows], right.boxes[columns], options.box_sigma)
+    total = total + size_cost(found.fit.projections, left.boxes[rows], right.boxes[columns], options.box_sigma)
     return torch.where(found.usable & (reach.sigma > 0), total, torch.inf)
 
 
@@ -202,11 +204,17 @@ def epipolar_cost(found: PairFit, variance: float, covariance: RigCovariance | N
     return error.square() / spread
 
 
-def _size_cost(found: PairFit, left: Tensor, right: Tensor, box_sigma: float) -> Tensor:
-    """(L,) squared standard deviations between the sizes of boxes, given how much each lens magnifies there."""
+def size_cost(
+    projections: Sequence[Projection], left: Tensor, right: Tensor, box_sigma: float, parallax: Tensor | float = 0.0
+) -> Tensor:
+    """(L,) squared standard deviations between the sizes of boxes, given how much each camera magnifies there.
+
+    `parallax` (L,): sine of the angle between the lines of sight. From another side, an object may have another size.
+    """
     sizes = [boxes[:, 2:] - boxes[:, :2] for boxes in (left, right)]
-    near, far = (torch.linalg.vector_norm(p.by_point, dim=(-3, -2)).log() for p in found.fit.projections)
+    near, far = (torch.linalg.vector_norm(p.by_point, dim=(-3, -2)).log() for p in projections)
     ratio = (sizes[0] / sizes[1]).log() - (near - far)[:, None]
     # Middles of boxes err by box_sigma, so edges by √2 and sizes by twice as much.
-    spread = sum((2.0 * box_sigma / size).square() for size in sizes) + _SIZE_SPREAD**2
+    side = torch.as_tensor(parallax).reshape(-1, 1)
+    spread = sum((2.0 * box_sigma / size).square() for size in sizes) + _SIZE_SPREAD**2 + side.square()
     return (ratio.square() / spread).sum(-1)

@@ -9,31 +9,32 @@ import torch
 from torch import Tensor
 
 from kcal.locate.geodesy import place_enu
-from kcal.locate.localizer import StereoLocalizer
-from kcal.locate.mounting import by_mounting
+from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.locate.ranges import BEARING_SIGMAS, range_interval
 from kcal.locate.stereo import PositionStatus, flag_positions
 from kcal.pipeline.imm_filter import Summary
-from kcal.pipeline.small_matrices import congruent, product, squared
+from kcal.pipeline.small_matrices import congruent, product, rooted, squared
 
 
 class TrackStates(NamedTuple):
     """Places of T tracks at one moment; nothing is NaN. Look at `status` before anything else.
 
     Attributes:
-        enu: (T, 3) meters east, north, up of the left camera; zeros unless the status is OK.
+        enu: (T, 3) meters east, north, up in the rig's frame (of two cameras: from the left one); zeros unless the
+            status is OK.
         covariance: (T, 3, 3) of `enu`; an infinite diagonal unless OK.
         systematic: (T, 3, 3) the part of it that more frames do not reduce: calibration, mounting, clocks,
             refraction, and what lasts of errors in the marks.
         velocity: (T, 3) m/s east, north, up; zeros unless OK.
         velocity_covariance: (T, 3, 3); an infinite diagonal unless OK.
         geodetic: (T, 3) latitude, longitude (degrees), ellipsoidal height (meters); the origin unless OK.
-        range_low: (T,) meters from the left camera, lower end of the 95 % interval.
+        range_low: (T,) meters from the anchor, lower end of the 95 % interval.
         range_high: (T,) its upper end, infinite where the target may be at infinity.
         status: (T,) int8 codes of `PositionStatus`: OK, BEARING_ONLY or PARALLEL.
-        bearing: (T, 3) unit vector east, north, up.
+        bearing: (T, 3) unit vector east, north, up, from the anchor to the target; light bends beside it.
         inverse_range: (T,) one over meters: the quantity whose errors are Gaussian.
         inverse_range_sigma: (T,).
+        anchor: (T,) int64, number of the camera from which bearing and range count: the first that saw the target.
     """
 
     enu: Tensor
@@ -48,20 +49,24 @@ class TrackStates(NamedTuple):
     bearing: Tensor
     inverse_range: Tensor
     inverse_range_sigma: Tensor
+    anchor: Tensor
 
 
-def track_states(localize: StereoLocalizer, frame: Tensor, beliefs: Summary, root: Tensor) -> TrackStates:
+def track_states(
+    localize: MultiViewLocalizer, frame: Tensor, home: Tensor, beliefs: Summary, root: Tensor | None
+) -> TrackStates:
     """Place beliefs on the Earth.
 
     Args:
         localize: the rig and where it stands.
         frame: (T, 3, 3) rotations from the rig's axes into the tracks' frames.
+        home: (T,) cameras from which the tracks are told.
         beliefs: of T tracks.
-        root: (B, R) of the covariance of the shared errors.
+        root: (B, R) of the covariance of the shared errors; None: the identity.
     """
     mean, noise, effect = (value.movedim(0, -1) for value in beliefs)
-    spread = product(effect, root[..., None])
-    axes = product(localize.enu_from_rig[..., None], frame.movedim(0, -1).transpose(0, 1))
+    spread = rooted(effect, root)
+    axes = frame.movedim(0, -1).transpose(0, 1)
     ray = torch.cat([mean[:2], torch.ones_like(mean[:1])])
     squares = ray.square().sum(0)
     length = squares.sqrt()
@@ -83,23 +88,11 @@ def track_states(localize: StereoLocalizer, frame: Tensor, beliefs: Summary, roo
     by_place = torch.cat([axes[:, :2], -straight[:, None], none], 1)
     by_state = torch.cat([by_place, torch.cat([none[:, :2], -velocity[:, None], axes], 1)]) * depth
     random, systematic = congruent(by_state, noise), squared(product(by_state, spread))
-    level = straight[:2].square().sum(0)
-    up = torch.eye(3).to(mean)[2, :, None]
-    enu = (straight - localize.drop * level * up).T
-    if localize.mounting is not None:
-        bent = (-localize.half_curvature * level * up)[:, None]
-        by_place, by_velocity = (by_mounting(value).movedim(0, -1) for value in (enu, velocity.T))
-        lower = torch.cat([torch.zeros_like(by_place[:, :3]), by_velocity[:, 3:], torch.zeros_like(bent)], 1)
-        turn = torch.cat([torch.cat([by_place, bent], 1), lower])
-        systematic = systematic + congruent(turn, localize.mounting[..., None])
-        if localize.link is not None and localize.calibration_factor is not None:
-            link = (torch.linalg.pinv(localize.calibration_factor) @ localize.link)[..., None]
-            own = product(by_state, effect[:, : len(link)])
-            mixed = -product(product(own, link), turn.transpose(0, 1))
-            systematic = systematic + mixed + mixed.transpose(0, 1)
+    enu = localize.rig.center[home] + straight.T
     whole, systematic = (value.movedim(-1, 0) for value in (random + systematic, systematic))
     nowhere = torch.diag(mean.new_full((3,), math.inf))
     there = ok[:, None, None]
+    assert localize.ecef_from_enu is not None
     geodetic = place_enu(enu, localize.ecef_from_enu, localize.ecef_of_origin)
     return TrackStates(
         enu=torch.where(ok[:, None], enu, 0.0),
@@ -114,4 +107,5 @@ def track_states(localize: StereoLocalizer, frame: Tensor, beliefs: Summary, roo
         bearing=(bearing / length).T,
         inverse_range=inverse_range,
         inverse_range_sigma=sigma,
+        anchor=home,
     )

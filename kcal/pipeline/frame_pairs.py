@@ -1,9 +1,9 @@
-"""Which frame of the right video belongs to which of the left one: the nearest in time, each frame once."""
+"""Which frames of videos belong together: the nearest in time, each frame once."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Protocol, TypeVar
 
 
@@ -57,3 +57,39 @@ def paired_by_time(
             used = partner.time
             yield now, partner
         now = upcoming
+
+
+def frames_together(
+    cameras: Sequence[Iterator[F]], late: Callable[[int], float], apart_s: float
+) -> Iterator[tuple[float, list[F | None]]]:
+    """Groups of frames in the order of their times, each with the time of its first one; None where there is no frame.
+
+    A frame waits for the next group if that is nearer. Frame rates may differ and vary, and a video may end earlier.
+
+    Args:
+        cameras: frames of each in the order of their times.
+        late: seconds by which the images of a camera (its number) are later than their times say, as known at present.
+        apart_s: frames that are later than the first one of a group by more are not in it.
+
+    Example:
+        >>> from collections import namedtuple
+        >>> Frame = namedtuple("Frame", "time")
+        >>> slow, fast = (map(Frame, times) for times in ([0.0, 0.1], [0.01, 0.05, 0.09, 0.13]))
+        >>> [[f and f.time for f in group] for _, group in frames_together([slow, fast], lambda _: 0.0, 0.05)]
+        [[0.0, 0.01], [None, 0.05], [0.1, 0.09], [None, 0.13]]
+    """
+    now = [next(frames, None) for frames in cameras]
+    upcoming = [None if frame is None else next(frames, None) for frame, frames in zip(now, cameras, strict=True)]
+    while any(frame is not None for frame in now):
+        times, following = (
+            [math.inf if frame is None else frame.time + late(c) for c, frame in enumerate(frames)]
+            for frames in (now, upcoming)
+        )
+        begin = min(times)
+        leader = times.index(begin)
+        taken = [time - begin <= min(apart_s, abs(following[leader] - time)) for time in times]
+        taken[leader] = True
+        yield begin, [frame if there else None for frame, there in zip(now, taken, strict=True)]
+        for c, there in enumerate(taken):
+            if there:
+                now[c], upcoming[c] = upcoming[c], None if upcoming[c] is None else next(cameras[c], None)

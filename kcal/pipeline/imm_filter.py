@@ -9,11 +9,7 @@ from torch import Tensor
 
 from kcal.pipeline.measurements import Anchored
 from kcal.pipeline.motion import Transition, moved, rates
-from kcal.pipeline.shared_errors import CLOCK_TERMS
-from kcal.pipeline.small_matrices import congruent, eliminate, mahalanobis, outer, product, solved, squared
-
-# The clock's errors times the components of a velocity.
-_CLOCK_COLUMNS = 3 * CLOCK_TERMS
+from kcal.pipeline.small_matrices import congruent, eliminate, mahalanobis, outer, product, rooted, solved, squared
 
 
 class Summary(NamedTuple):
@@ -22,7 +18,7 @@ class Summary(NamedTuple):
     Attributes:
         mean: (T, 6) as if b were zero.
         noise: (T, 6, 6) covariance from marks and motion alone.
-        effect: (T, 6, K + 3) of the calibration's errors and the clock's.
+        effect: (T, 6, K + Q) of the calibration's errors and the clocks'.
     """
 
     mean: Tensor
@@ -37,16 +33,17 @@ class Summary(NamedTuple):
 class Beliefs(NamedTuple):
     """T tracks under J models; see `kcal.pipeline.motion` for the state and `kcal.pipeline.shared_errors` for b.
 
-    The errors of a state have 6 + K + 9 columns: of `noise`, `shared` and `late`.
-
     Attributes:
         mean: (6, J, T) as if b were zero.
-        columns: (6, 6 + K + 9, J, T).
+        columns: (6, 6 + K, J, T): `noise` and `shared`.
+        late: (6, Q, 3, J, T) effect of the clocks' Q errors, for each component of the velocity in the state. What was
+            seen before a velocity was known counts with the velocity that is known now.
         weight: (J, T) probabilities of the models.
     """
 
     mean: Tensor
     columns: Tensor
+    late: Tensor
     weight: Tensor
 
     @property
@@ -57,20 +54,12 @@ class Beliefs(NamedTuple):
     @property
     def shared(self) -> Tensor:
         """(6, K, J, T) effect of the calibration's errors."""
-        return self.columns[:, 6:-_CLOCK_COLUMNS]
-
-    @property
-    def late(self) -> Tensor:
-        """(6, 3, 3, J, T) effect of the clock's three errors, for each component of the velocity in the state.
-
-        What was seen before a velocity was known counts with the velocity that is known now.
-        """
-        return _late(self.columns)
+        return self.columns[:, 6:]
 
     @property
     def effect(self) -> Tensor:
-        """(6, K + 3, J, T): the true state is mean + effect b + noise."""
-        return _effect(self.columns[:, 6:], self.mean[3:])
+        """(6, K + Q, J, T): the true state is mean + effect b + noise."""
+        return _effect(self.shared, self.late, self.mean[3:])
 
     def at(self, which: Tensor) -> Self:
         """The tracks at some places."""
@@ -86,8 +75,8 @@ class Beliefs(NamedTuple):
         mean = self.middle
         apart = self.mean - mean
         between = outer(self.weight * apart, apart).sum(-2, keepdim=True)
-        columns = (self.weight * self.columns).sum(-2, keepdim=True)
-        return type(self)(mean, _with_noise(columns, between), torch.ones_like(self.weight[:1]))
+        columns, late = ((self.weight * value).sum(-2, keepdim=True) for value in (self.columns, self.late))
+        return type(self)(mean, _with_noise(columns, between), late, torch.ones_like(self.weight[:1]))
 
     def summary(self) -> Summary:
         """The same without the axis of models."""
@@ -106,24 +95,19 @@ class Beliefs(NamedTuple):
         share = joint / weight[:, None]
         mean = (share * self.mean[:, None]).sum(2)
         apart = self.mean[:, None] - mean[:, :, None]  # (6, to, from, T)
-        columns = (share * self.columns[:, :, None]).sum(3)
-        return type(self)(mean, _with_noise(columns, outer(share * apart, apart).sum(-2)), weight)
+        columns, late = ((share * value.unsqueeze(-3)).sum(-2) for value in (self.columns, self.late))
+        return type(self)(mean, _with_noise(columns, outer(share * apart, apart).sum(-2)), late, weight)
 
 
-def no_beliefs(errors: int, models: int, device: torch.device) -> Beliefs:
-    """Of no tracks, with `errors` K of the calibration."""
-    shapes = ((6, models, 0), (6, 6 + errors + _CLOCK_COLUMNS, models, 0), (models, 0))
+def no_beliefs(errors: int, clock_errors: int, models: int, device: torch.device) -> Beliefs:
+    """Of no tracks, with K errors of the calibration and Q of clocks."""
+    shapes = ((6, models, 0), (6, 6 + errors, models, 0), (6, clock_errors, 3, models, 0), (models, 0))
     return Beliefs(*(torch.zeros(shape, dtype=torch.float64, device=device) for shape in shapes))
 
 
-def _late(columns: Tensor) -> Tensor:
-    """(R, 3, 3, ...) of columns (R, C, ...), the last of which are the clock's."""
-    return columns[:, -_CLOCK_COLUMNS:].unflatten(1, (CLOCK_TERMS, 3))
-
-
-def _effect(columns: Tensor, pace: Tensor) -> Tensor:
-    """(R, K + 3, ...) of columns (R, K + 9, ...), with a velocity (3, ...)."""
-    return torch.cat([columns[:, :-_CLOCK_COLUMNS], (_late(columns) * pace).sum(2)], 1)
+def _effect(shared: Tensor, late: Tensor, pace: Tensor) -> Tensor:
+    """(R, K + Q, ...) of effects (R, K, ...) and (R, Q, 3, ...), the latter with a velocity (3, ...)."""
+    return torch.cat([shared, (late * pace).sum(2)], 1)
 
 
 def _with_noise(columns: Tensor, noise: Tensor) -> Tensor:
@@ -131,18 +115,19 @@ def _with_noise(columns: Tensor, noise: Tensor) -> Tensor:
     return torch.cat([columns[:, :6] + noise, columns[:, 6:]], 1)
 
 
-def predicted(beliefs: Beliefs, step: Transition, turn: Tensor | None = None) -> Beliefs:
+def predicted(beliefs: Beliefs, step: Transition, turn: Tensor | None = None, shift: Tensor | None = None) -> Beliefs:
     """Move all by a step; see `moved`."""
-    found = moved(beliefs.mean, step, turn)
-    columns = found.through(beliefs.columns)
+    found = moved(beliefs.mean, step, turn, shift)
+    width = beliefs.columns.shape[1]
+    columns = found.through(torch.cat([beliefs.columns, beliefs.late.flatten(1, 2)], 1))
     noise = found.through(columns[:, :6].transpose(0, 1)) + found.noise
     # Velocities of earlier moments are today's, turned back; a memory that fades would let them grow without end. The
     # velocity in the state is divided by z, and z has changed by `ahead`.
     keep = step.keep if turn is None else product(turn[:, :, None], step.keep)
     back = keep.transpose(0, 1) * (found.ahead / step.left)
-    late = (_late(columns)[:, :, :, None] * back).sum(2).flatten(1, 2)
-    columns = torch.cat([noise, columns[:, 6:-_CLOCK_COLUMNS], late], 1)
-    return Beliefs(found.state, columns, beliefs.weight)
+    late = columns[:, width:].unflatten(1, beliefs.late.shape[1:3])
+    late = (late[:, :, :, None] * back).sum(2)
+    return Beliefs(found.state, torch.cat([noise, columns[:, 6:width]], 1), late, beliefs.weight)
 
 
 def cross_covariance(before: Beliefs, after: Beliefs, step: Transition, turn: Tensor | None = None) -> Tensor:
@@ -156,9 +141,10 @@ class Timing(NamedTuple):
     """How late the marks of N sightings are.
 
     Attributes:
-        delay: (2, N) seconds by which the left and the right mark are later than the beliefs' time, as far as known.
-        clock: (3, N) seconds by which a unit of each of the clock's errors makes the right mark late.
-        unsure: (N,) standard deviation of what they make together, seconds.
+        delay: (V, N) seconds by which the mark of each camera is later than the beliefs' time, as far as known.
+        clock: (V - 1, 3, N) seconds by which a unit of each error of a clock makes the marks of its camera late; the
+            first camera's clock is the one that counts. (0, 3, N) where clocks are exact.
+        unsure: (V - 1, N) standard deviation of what they make together, seconds; (0, N) where clocks are exact.
     """
 
     delay: Tensor
@@ -174,18 +160,20 @@ class Innovations(NamedTuple):
     """Measured minus predicted: innovation = effect b + noise, (..., J, N).
 
     Attributes:
-        value: (4, J, N).
-        slope: (4, 6, J, N) of the measurement by the state.
-        own: (4, K + 9, J, N) what the sightings themselves add to the columns of b.
-        effect: (4, K + 3, J, N) of b, with the velocity as predicted.
-        crossed: (4, 6, J, N) covariance of the prediction with the state.
-        noise: (4, 4, J, N) of innovations.
-        marks: (4, 4, J, N) the part of it that does not come from the belief.
+        value: (M, J, N).
+        slope: (M, 6, J, N) of the measurement by the state.
+        shared: (M, K, 1, N) what the sightings themselves add to the effects of the calibration's errors.
+        late: (M, Q, 3, J, N) what they add to those of the clocks'.
+        effect: (M, K + Q, J, N) of b, with the velocity as predicted.
+        crossed: (M, 6, J, N) covariance of the prediction with the state.
+        noise: (M, M, J, N) of innovations.
+        marks: (M, M, J, N) the part of it that does not come from the belief.
     """
 
     value: Tensor
     slope: Tensor
-    own: Tensor
+    shared: Tensor
+    late: Tensor
     effect: Tensor
     crossed: Tensor
     noise: Tensor
@@ -201,21 +189,28 @@ def innovations(beliefs: Beliefs, seen: Anchored, timing: Timing) -> Innovations
         timing: of the sightings.
     """
     rate, by_state = rates(beliefs.mean)
-    late = (seen.late * timing.delay[:, None, None]).sum(0)[:, :, None]  # (4, 3, 1, N)
-    direct = torch.eye(4, 6, dtype=late.dtype, device=late.device)[..., None, None]
-    still = torch.cat([direct[:3], torch.zeros_like(direct[:1])])
-    slope = still + product(late, by_state)
-    value = seen.value[:, None] - (still * beliefs.mean).sum(1) - (late * rate).sum(1)
-    by_right = product(seen.late[1][:, :, None], by_state)
-    by_clock = (by_right[:, None, 3:] * timing.clock[:, None, None]).flatten(1, 2)
-    own = torch.cat([seen.shared[:, :, None].expand(-1, -1, *by_clock.shape[2:]), by_clock], 1)
+    by_place = seen.late.sum(0)[:, :, None]  # (M, 3, 1, N)
+    moving = (seen.late * timing.delay[:, None, None]).sum(0)[:, :, None]
+    slope = torch.nn.functional.pad(by_place, (0, 0, 0, 0, 0, 3)) + product(moving, by_state)
+    apart = seen.place[:, None] - beliefs.mean[:3]
+    value = seen.value[:, None] + (by_place * apart).sum(1) - (moving * rate).sum(1)
+    marks = torch.eye(len(value), dtype=value.dtype, device=value.device)[..., None, None]
+    late, own = [], seen.late[1:, :, :, None]
+    for which in range(len(timing.clock)):
+        by_camera = product(own[which], by_state)
+        late.append(by_camera[:, None, 3:] * timing.clock[which, :, None, None])
+        # The product of two unknowns, a rate and a delay, is noise of second order.
+        marks = marks + congruent(timing.unsure[which] * by_camera, beliefs.noise)
+    shared = seen.shared[:, :, None]
+    all_late = torch.cat(late, 1) if late else slope.new_zeros(len(value), 0, 3, *slope.shape[2:])
     carried = product(slope, beliefs.columns)
-    crossed, after = carried[:, :6], own + carried[:, 6:]
-    effect = _effect(after, beliefs.mean[3:])
-    # The product of two unknowns, a rate and a delay, is noise of second order.
-    marks = seen.noise[:, :, None] + congruent(timing.unsure * by_right, beliefs.noise)
+    crossed = carried[:, :6]
+    by_clock = all_late
+    if late:
+        by_clock = all_late + product(slope, beliefs.late.flatten(1, 2)).unflatten(1, all_late.shape[1:3])
+    effect = _effect(shared + carried[:, 6:], by_clock, beliefs.mean[3:])
     noise = product(crossed, slope.transpose(0, 1)) + marks
-    return Innovations(value, slope, own, effect, crossed, noise, marks)
+    return Innovations(value, slope, shared, all_late, effect, crossed, noise, marks.expand_as(noise))
 
 
 class Fit(NamedTuple):
@@ -225,9 +220,9 @@ class Fit(NamedTuple):
     log_density: Tensor
 
 
-def fit_of(found: Innovations, root: Tensor) -> Fit:
-    """Judge innovations with all errors: the covariance of b is root rootᵀ."""
-    covariance = found.noise + squared(product(found.effect, root[..., None, None]))
+def fit_of(found: Innovations, root: Tensor | None) -> Fit:
+    """Judge innovations with all errors: the covariance of b is root rootᵀ, or the identity."""
+    covariance = found.noise + squared(rooted(found.effect, root))
     distance, volume = mahalanobis(covariance, found.value)
     return Fit(distance, -0.5 * (distance + volume))
 
@@ -240,26 +235,36 @@ def updated(beliefs: Beliefs, found: Innovations, fit: Fit) -> Beliefs:
     columns = product(rest, beliefs.columns)
     # Joseph's form: symmetric and positive whatever the rounding.
     noise = product(columns[:, :6], rest.transpose(0, 1)) + congruent(gain, found.marks)
-    columns = torch.cat([noise, columns[:, 6:] - product(gain, found.own)], 1)
+    columns = torch.cat([noise, columns[:, 6:] - product(gain, found.shared)], 1)
+    late = product(rest, beliefs.late.flatten(1, 2)) - product(gain, found.late.flatten(1, 2))
     log = beliefs.weight.log() + fit.log_density
-    return Beliefs(mean, columns, torch.softmax(log, 0).clamp_min(1e-12))
+    weight = torch.softmax(log, 0).clamp_min(1e-12)
+    return Beliefs(mean, columns, late.unflatten(1, beliefs.late.shape[1:3]), weight)
 
 
 def born(seen: Anchored, timing: Timing, speed: float, models: int) -> Beliefs:
     """Beliefs from one sighting each, with velocities of zero and a standard deviation of `speed` along each axis."""
-    place = seen.value[:3]
+    slope = seen.late.sum(0)
+    normal = product(slope.transpose(0, 1), slope)
+    still = torch.eye(3, dtype=slope.dtype, device=slope.device)[..., None]
+    spread = solved(eliminate(normal, still.expand_as(normal)))
+    gain = product(spread, slope.transpose(0, 1))  # (3, M, N)
+    place = seen.place + (gain * seen.value).sum(1)
     state = torch.cat([place, torch.zeros_like(place)])
     by_pace = rates(state)[1][:, 3:]
-    late = product((seen.late[:, :3] * timing.delay[:, None, None]).sum(0), by_pace)
-    by_right = product(seen.late[1, :3], by_pace)
+    late = product(product(gain, (seen.late * timing.delay[:, None, None]).sum(0)), by_pace)
     # The range is hardly known at first, but a speed per meter of range must not vanish.
-    drift = speed**2 * (place[2].square() + seen.noise[2, 2])
-    here = seen.noise[:3, :3] + drift * (timing.unsure.square() * squared(by_right) + squared(late))
-    pace = torch.eye(3, dtype=state.dtype, device=state.device)[..., None] * drift
-    both = -drift * late
+    drift = speed**2 * (place[2].square() + spread[2, 2])
+    here, by_clock = spread + drift * squared(late), []
+    for which in range(len(timing.clock)):
+        by_camera = product(product(gain, seen.late[1 + which]), by_pace)
+        here = here + drift * timing.unsure[which].square() * squared(by_camera)
+        by_clock.append(by_camera[:, None] * timing.clock[which, :, None])
+    pace, both = still * drift, -drift * late
     noise = torch.cat([torch.cat([here, both], 1), torch.cat([both.transpose(0, 1), pace], 1)])
-    by_clock = (by_right[:, None] * timing.clock[:, None]).flatten(1, 2)
-    own = torch.nn.functional.pad(torch.cat([seen.shared[:3], by_clock], 1), (0, 0, 0, 0, 0, 3))
-    columns = torch.cat([noise, -own], 1)
-    state, columns = (value[..., None, :].repeat_interleave(models, -2) for value in (state, columns))
-    return Beliefs(state, columns, state.new_full((models, place.shape[-1]), 1.0 / models))
+    shared = torch.nn.functional.pad(product(gain, seen.shared), (0, 0, 0, 0, 0, 3))
+    clocks = torch.cat(by_clock, 1) if by_clock else state.new_zeros(3, 0, *by_pace.shape[1:])
+    clocks = torch.nn.functional.pad(-clocks, (0, 0, 0, 0, 0, 0, 0, 3))
+    columns = torch.cat([noise, -shared], 1)
+    state, columns, clocks = (value[..., None, :].repeat_interleave(models, -2) for value in (state, columns, clocks))
+    return Beliefs(state, columns, clocks, state.new_full((models, place.shape[-1]), 1.0 / models))

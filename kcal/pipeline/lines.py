@@ -5,6 +5,10 @@ A line has the detections of both images, or pairs that are matched already:
     {"left": {"time": 12.50, "boxes": [[x1, y1, x2, y2], ...], ...}, "right": {...}}
     {"time": [12.50, 12.51], "left": [[u, v], ...], "right": [[u, v], ...], "sigma": 0.2, "categories": [...], ...}
 
+Of a rig of many cameras, those that have an image are named:
+
+    {"cameras": {"mill": {"time": 12.50, "boxes": [...], ...}, "mast": {...}}}
+
 Detections are those of `kcal.pipeline.detectors`. In lines of pairs, `time` may be one number for both; `sigma` (px) or
 `covariance` (N x 4 x 4), `scores`, `categories` and `ambiguous` may be left out, and pixel (0, 0) is the center of the
 first pixel.
@@ -20,8 +24,11 @@ from torch import Tensor
 
 from kcal.errors import InputError
 from kcal.lens.rig import StereoRig
+from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.pipeline.association import AssociationOptions
 from kcal.pipeline.detections import Detections
+from kcal.pipeline.grouping import group_objects
+from kcal.pipeline.object_views import ObjectViews
 from kcal.pipeline.pairing import pair_objects
 from kcal.pipeline.pairs import ObjectPairs
 
@@ -29,18 +36,20 @@ _PAIR_KEYS = {"time", "left", "right", "sigma", "covariance", "scores", "categor
 
 
 class Moment(NamedTuple):
-    """What both cameras saw at one moment: seconds of the left image, and pairs, possibly none."""
+    """What cameras saw at one moment: seconds of the first camera's image, and pairs or views, possibly none."""
 
     time: float
-    pairs: ObjectPairs
+    pairs: ObjectPairs | ObjectViews
 
 
-def read_moment(line: str | bytes, rig: StereoRig, options: AssociationOptions, pixel_sigma: float) -> Moment:
+def read_moment(
+    line: str | bytes, rig: StereoRig | MultiViewLocalizer, options: AssociationOptions, pixel_sigma: float
+) -> Moment:
     """Read one line.
 
     Args:
         line: see the module.
-        rig: pairs the detections.
+        rig: pairs the detections, or groups those of many cameras.
         options: of the pairing; its `box_sigma` is the noise of the anchors.
         pixel_sigma: of pairs that state none, px.
 
@@ -57,6 +66,8 @@ def read_moment(line: str | bytes, rig: StereoRig, options: AssociationOptions, 
         content = orjson.loads(line)
     except orjson.JSONDecodeError as error:
         raise InputError(f"not a line of JSON ({error})") from error
+    if isinstance(rig, MultiViewLocalizer):
+        return _named_cameras(content, rig, options)
     if not isinstance(content, dict) or not {"left", "right"} <= set(content):
         raise InputError("a JSON object with left and right is needed")
     if isinstance(content["left"], dict) and isinstance(content["right"], dict):
@@ -70,6 +81,21 @@ def read_moment(line: str | bytes, rig: StereoRig, options: AssociationOptions, 
             raise InputError("detections of both images need a time")
         return Moment(left.time, pair_objects(rig, left, right, options=options))
     return _pairs_of_line(content, pixel_sigma)
+
+
+def _named_cameras(content: Any, localize: MultiViewLocalizer, options: AssociationOptions) -> Moment:
+    names = localize.rig.names
+    each = content.get("cameras") if isinstance(content, dict) else None
+    if not isinstance(each, dict) or set(content) != {"cameras"} or not each or not set(each) <= set(names):
+        raise InputError(f'{{"cameras": {{NAME: detections, ...}}}} is needed, with names of {", ".join(names)}')
+    seen = [
+        Detections.read(orjson.dumps(each[name]), size=camera.size) if name in each else None
+        for name, camera in zip(names, localize.rig.each, strict=True)
+    ]
+    times = [found.time for found in seen if found is not None]
+    if times[0] is None:
+        raise InputError("detections of all cameras need a time")
+    return Moment(times[0], group_objects(localize, seen, options))
 
 
 def _pairs_of_line(content: dict[str, Any], pixel_sigma: float) -> Moment:

@@ -20,7 +20,6 @@ from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
 
-from kcal.lens.mounting import Origin
 from kcal.locate.columns import PositionColumns
 from kcal.locate.map_places import camera_place, field_of_view
 from kcal.locate.positions import Located
@@ -49,7 +48,7 @@ class LiveMap:
     def __init__(self, run: Located, port: int) -> None:
         cameras = [
             {
-                "name": f"{camera.name} camera",
+                "name": camera.name if run.feet is not None else f"{camera.name} camera",
                 "place": camera_place(camera, run.origin),
                 "field": field_of_view(camera, run.origin, _FIELD_REACH_M),
             }
@@ -115,14 +114,15 @@ class LiveMap:
     def _text(self, number: int, columns: PositionColumns, sequence: int) -> bytes:
         """News as JSON, written once for all pages."""
         if self._written[0] != number:
-            self._written = number, _tracks_text(columns, sequence, self.run.origin)
+            self._written = number, _tracks_text(columns, sequence, self.run)
         return self._written[1]
 
 
-def _tracks_text(columns: PositionColumns, sequence: int, origin: Origin) -> bytes:
+def _tracks_text(columns: PositionColumns, sequence: int, run: Located) -> bytes:
     """The tracks with a position: name, place, 95 % region, and what is said of each."""
+    origin = run.origin
     located = np.flatnonzero(columns.located)
-    rings = itertools.chain.from_iterable(ring_blocks(columns, origin))
+    rings = itertools.chain.from_iterable(ring_blocks(columns, origin, plain=run.feet is not None))
     distances = columns.column("range_m")
     # Of an interval of 95 %; one without end tells no digits.
     sigmas = (columns.column("range_high_m") - columns.column("range_low_m")) / 3.92

@@ -1,8 +1,9 @@
-"""Turn pairs of pixels into what a filter measures: direction and inverse range, with every error's effect on them.
+"""Turn pixels of one moment into what a filter measures: rows of unit noise, with every error's effect on them.
 
-The maximum-likelihood point of a pair (`kcal.locate.max_likelihood`) has three numbers: two across the line of sight
-and the inverse range. They are nearly linear in the pixels at any range. Four pixel coordinates leave a fourth number,
-the miss of the two rays in units of its sigma, which says nothing of the place, but of clocks and pairings.
+Where the lines of sight of the cameras that saw an object meet (`kcal.locate.views`) is told by three numbers: two
+across the line of sight of the first of them, and the inverse range from it. The pixels are nearly linear in them at
+any range. They are rows, whitened, so that those of cameras that saw nothing are zeros beside a noise of one and change
+nothing. One camera alone gives two rows: its inverse range is then that of the track.
 """
 
 from __future__ import annotations
@@ -12,40 +13,52 @@ from typing import NamedTuple, Self
 import torch
 from torch import Tensor
 
-from kcal.locate.localizer import StereoLocalizer
-from kcal.locate.max_likelihood import PointFit, calibration_effect, symmetric, unreached_direction
-from kcal.locate.stereo import PositionStatus, fit_pairs
-from kcal.pipeline.small_matrices import congruent, eliminate, outer, product, solved
+from kcal.lens.dispatch import known_true
+from kcal.locate.multi_localizer import MultiViewLocalizer, common_errors, posed_cameras
+from kcal.locate.stereo import PositionStatus
+from kcal.locate.views import CommonErrors, StatedHeight, fit_views, shared_pixels
+from kcal.pipeline.small_matrices import outer, product
+
+# Meters at which a bearing of one camera is taken at first; what light bends elsewhere follows from it.
+_ALONE_M = 20_000.0
 
 
 class Sightings(NamedTuple):
-    """N pairs of one moment, in the rig frame; the last axis of all counts them.
+    """N objects of one moment, seen by some of V cameras; the last axis of all counts them. M = 2 V rows of unit noise.
 
-    The four measured numbers are a, b (shares of `direction` along `sides`), the inverse range and the miss; the point
-    is (direction + a * sides[0] + b * sides[1]) / inverse at a = b = 0.
+    The point is place + direction / inverse, in the rig's frame.
 
     Attributes:
+        anchor: (N,) number of the first camera that saw it.
+        place: (3, N) where that camera stands.
         direction: (3, N), of unit length to first order.
-        sides: (2, 3, N) across it.
         inverse: (N,) one over meters; may be negative.
-        noise: (4, 4, N) covariance of the four from noise in the pixels; that of the miss is one.
-        miss: (N,) how far the rays miss each other, in sigmas.
-        shared: (4, K, N) effect of K independent unit errors on the four: of the calibration, and the two that last.
-        late: (2, 4, 3, N) how the four move by rates of (a, b, inverse) if the left or the right mark is a second late.
-        time: (2, N) seconds.
-        row: (N,) row of the right mark, -0.5 at the top of the image to 0.5 at its bottom.
-        usable: (N,) bool: the rays exist and are not along the baseline.
+        by_ray: (3, 3, N) rows: change of (a, b, inverse) by a change of the ray that is proportional to `direction`.
+        value: (M, N) measured minus predicted at that point.
+        late: (V, M, 3, N) change of the rows by (a, b, inverse), for the pixels of each camera: how they move by rates
+            of these if its mark is a second late.
+        shared: (M, K, N) effect of K independent unit errors on the rows: of the calibration, and those that last.
+        bent: (M, N) change of the predicted rows by a larger k / 2R, for each meter; of one camera alone.
+        time: (V, N) seconds; that of the anchor where nothing was seen.
+        row: (V, N) row of the mark, -0.5 at the top of the image to 0.5 at its bottom.
+        seen: (V, N) bool.
+        alone: (N,) bool: one camera saw it.
+        usable: (N,) bool: the rays exist.
     """
 
+    anchor: Tensor
+    place: Tensor
     direction: Tensor
-    sides: Tensor
     inverse: Tensor
-    noise: Tensor
-    miss: Tensor
-    shared: Tensor
+    by_ray: Tensor
+    value: Tensor
     late: Tensor
+    shared: Tensor
+    bent: Tensor
     time: Tensor
     row: Tensor
+    seen: Tensor
+    alone: Tensor
     usable: Tensor
 
     def at(self, which: Tensor) -> Self:
@@ -53,83 +66,102 @@ class Sightings(NamedTuple):
         return type(self)(*(value[..., which] for value in self))
 
 
+def _far_away(place: Tensor, ray: Tensor, _: Tensor, alone: Tensor) -> StatedHeight:
+    """What holds one camera's point at `_ALONE_M`."""
+    ones = torch.ones_like(ray[:, 0])
+    return StatedHeight(place + _ALONE_M * ray, ray, ones, ones.to(torch.bool))
+
+
 @torch.no_grad()
 def sightings(
-    localize: StereoLocalizer,
-    left: Tensor,
-    right: Tensor,
+    localize: MultiViewLocalizer,
+    pixels: Tensor,
+    seen: Tensor,
     covariance: Tensor,
     time: Tensor,
     lasting_px: float = 0.0,
 ) -> Sightings:
-    """Measure N pairs of one moment; the calibration's errors are those that `localize` includes.
+    """Measure objects of one moment; the calibration's errors are those that `localize` includes.
 
     Args:
         localize: the rig and how well it is known.
-        left: (N, 2) pixels.
-        right: (N, 2).
-        covariance: (N, 4, 4) of the four coordinates.
-        time: (N, 2) seconds.
-        lasting_px: standard deviation along each axis of errors of the right marks that stay as long as a target.
+        pixels: (N, V, 2), and what follows: as in `ObjectViews`.
+        seen: (N, V) bool.
+        covariance: (N, 2 V, 2 V).
+        time: (N, V) seconds.
+        lasting_px: standard deviation along each axis of errors that stay as long as a target, in the marks of all
+            cameras but the first.
     """
-    rig = localize.rig
-    found = fit_pairs(rig, left, right, covariance, by_camera=True)
-    fit, scale = found.fit, found.scale
-    across = _miss_direction(fit, covariance.movedim(0, -1))
-    gain = torch.cat([fit.gain, across[None]])  # (4, 4 pixels, N)
-    shared = gain[:, :0]
-    if localize.calibration_factor is not None:
-        shared = calibration_effect(fit._replace(gain=gain), scale, localize.calibration_factor)
+    rig, posed, cameras = localize.rig, posed_cameras(localize), len(localize.rig)
+    none = rig.center.new_zeros(0)
+    exact = CommonErrors(tuple(() for _ in rig.names), none.reshape(0, cameras, 6), none)
+    common = common_errors(localize) or exact
+    found = fit_views(posed, pixels, seen, noise=1.0, cov=covariance, height=_far_away, rows_of=common)
+    fit, scale, used, weight = found.fit, found.scale, found.used, found.weight
+    assert weight is not None
+    white = torch.linalg.cholesky(weight.movedim(-1, 0)).movedim(0, -1).transpose(0, 1)
+    meters = torch.stack([torch.ones_like(scale), torch.ones_like(scale), scale])[:, None]
+    rows = (fit.jacobian * meters[..., None]).transpose(0, 1)  # (2 V, 3, N)
+    each = white.unflatten(1, (cameras, 2)).movedim(1, 0)  # (V, M, 2, N)
+    late = (each[:, :, :, None] * rows.unflatten(0, (cameras, 2))[:, None]).sum(2)
+    alone = found.fitted & (used.sum(-1) == 1)
+    shared, bent = white[:, :0], torch.zeros_like(fit.residual)
+    at = (found.place, fit.direction.T, fit.inverse)
+    if len(common.half):
+        moved = shared_pixels(posed, common, at, used, scale, fit.projections)
+        shared = -product(white, moved.transpose(0, 1))
+    if posed.up is not None and not known_true(~alone):
+        moved = shared_pixels(
+            posed,
+            CommonErrors(exact.lens, none.new_zeros(1, cameras, 6), none.new_ones(1)),
+            at,
+            used,
+            scale,
+            fit.projections,
+        )
+        bent = torch.where(alone, product(white, moved.transpose(0, 1))[:, 0] / _ALONE_M, 0.0)
     if lasting_px:
-        shared = torch.cat([shared, lasting_px * gain[:, 2:]], 1)
-    by_left = product(gain[:, :2], fit.jacobian[:, :2].transpose(0, 1))
-    # Where both marks are late, the point is: its three numbers move as they do, and the miss does not.
-    both = torch.eye(4, 3, dtype=gain.dtype, device=gain.device)[..., None]
-    # From ρ in units of the rig's size to one over meters.
-    unit = torch.stack([torch.ones_like(scale), torch.ones_like(scale), 1.0 / scale])[:, None]
-    four = torch.cat([unit, torch.ones_like(unit[:1])])[:, None]
-    noise = symmetric(fit.covariance).movedim(0, -1) * four[:3] * unit
-    last = torch.eye(4, dtype=gain.dtype, device=gain.device)[3]
-    usable = found.usable & (found.status != int(PositionStatus.BAD_COVARIANCE))
+        shared = torch.cat([shared, lasting_px * white[:, 2:]], 1)
+    inverse = fit.inverse / scale
+    first, second = fit.sides.unbind(0)
+    a, b = (first * fit.direction).sum(0), (second * fit.direction).sum(0)
+    base = fit.direction - a * first - b * second
+    anchor = found.anchor.to(torch.int64).argmax(-1)
+    time = torch.where(used, time, time.gather(1, anchor[:, None]))
+    heights = rig.center.new_tensor([camera.size[1] for camera in rig.each])
     return Sightings(
+        anchor=anchor,
+        place=found.place.T,
         direction=fit.direction,
-        sides=fit.sides,
-        inverse=fit.inverse / scale,
-        noise=torch.nn.functional.pad(noise, (0, 0, 0, 1, 0, 1)) + outer(last, last)[..., None],
-        miss=-(across * fit.residual).sum(0),
-        shared=shared * four,
-        late=torch.stack([by_left, both - by_left]) * four / unit,
+        inverse=inverse,
+        by_ray=torch.stack([first - a * base, second - b * base, -inverse * base]),
+        value=-(white * fit.residual).sum(1),
+        late=late,
+        shared=shared,
+        bent=bent,
         time=time.T,
-        row=right[:, 1] / rig.right.size[1] - 0.5,
-        usable=usable,
+        row=torch.where(used, pixels[..., 1] / heights - 0.5, 0.0).T,
+        seen=used.T,
+        alone=alone,
+        usable=found.fitted & (found.status == int(PositionStatus.OK)),
     )
 
 
-def _miss_direction(fit: PointFit, covariance: Tensor) -> Tensor:
-    """(4, N) the combination of pixels with unit variance that the point cannot explain.
-
-    The gain (3, 4, N) is (Jᵀ W J)⁻¹ Jᵀ W: what it maps to zero is W⁻¹ times what J does not reach.
-    """
-    kernel = unreached_direction(fit)
-    white = solved(eliminate(covariance, kernel[:, None]))[:, 0]
-    return white / (kernel * white).sum(0).clamp_min(1e-300).sqrt()
-
-
 class Anchored(NamedTuple):
-    """Sightings in frames of tracks: x / z, y / z and 1 / z there, and the miss.
+    """Sightings in frames of tracks: x / z, y / z and 1 / z there.
 
     Attributes:
-        value: (4, N).
-        noise: (4, 4, N).
-        shared: (4, K, N).
-        late: (2, 4, 3, N), by rates of the first three.
+        place: (3, N) of the point around which rows are linear.
+        value: (M, N) measured minus predicted there.
+        late: (V, M, 3, N) rows by the three.
+        shared: (M, K, N).
         ahead: (N,) bool: in front of the frame's plane.
     """
 
+    place: Tensor
     value: Tensor
-    noise: Tensor
-    shared: Tensor
     late: Tensor
+    shared: Tensor
     ahead: Tensor
 
     def at(self, which: Tensor) -> Self:
@@ -137,29 +169,48 @@ class Anchored(NamedTuple):
         return type(self)(*(value[..., which] for value in self))
 
 
-def anchored(seen: Sightings, frame: Tensor) -> Anchored:
-    """Express sightings in frames (3, 3, N): rotations from the rig's axes."""
-    ray = (frame * seen.direction).sum(1)
-    ahead = seen.usable & (ray[2] > 0.1)
+def anchored(
+    seen: Sightings,
+    frame: Tensor,
+    home: Tensor,
+    predicted: Tensor | None = None,
+    bending: Tensor | None = None,
+    k: float = 0.0,
+) -> Anchored:
+    """Express sightings in frames.
+
+    Args:
+        seen: N of them.
+        frame: (3, 3, N) rotations from the rig's axes.
+        home: (3, N) where the frames have their origins, in the rig's frame.
+        predicted: (3, N) x / z, y / z, 1 / z of tracks: where one camera alone saw something, its range is theirs.
+        bending: (K,) change of k / 2R by the first K shared errors.
+        k: k / 2R.
+    """
+    apart = seen.place - home
+    inverse, value, shared, direction = seen.inverse, seen.value, seen.shared, seen.direction
+    if predicted is not None:
+        ray = torch.cat([predicted[:2], torch.ones_like(predicted[:1])])
+        line = (frame * ray[:, None]).sum(0) - predicted[2] * apart
+        along = (line * direction).sum(0)
+        there = torch.where(along > 0, predicted[2] / along.clamp_min(1e-12), 0.0).clamp_min(2e-6)
+        inverse = torch.where(seen.alone, there, inverse)
+        # Light bends more on a longer way.
+        more = seen.bent * (torch.where(seen.alone, 1.0 / inverse, _ALONE_M) - _ALONE_M)
+        value = value - k * more
+        if bending is not None:
+            rest = len(shared[0]) - len(bending)
+            shared = shared - torch.nn.functional.pad(outer(more, bending[:, None]), (0, 0, 0, rest))
+    ray = (frame * (direction + inverse * apart)).sum(1)
+    length = ray.square().sum(0).sqrt()
+    ahead = seen.usable & (ray[2] > 0.1 * length)
     axis = torch.eye(3, dtype=ray.dtype, device=ray.device)[2, :, None]
     ray = torch.where(ahead, ray, axis)
-    along, inverse = ray[2], seen.inverse / ray[2]
-    place = torch.cat([ray[:2] / along, inverse[None]])
-    sides = product(frame, seen.sides.transpose(0, 1)) / along  # (3, 2, N), columns a and b
-    # x / z, y / z, 1 / z by a, b and the inverse range along `direction`.
-    by_sides = torch.cat([sides[:2], torch.zeros_like(sides[:1])]) - place[:, None] * sides[2]
-    unit = torch.eye(4, dtype=ray.dtype, device=ray.device)
-    turn = torch.cat([by_sides, (axis / along)[:, None]], 1)
-    turn = torch.nn.functional.pad(turn, (0, 0, 0, 1, 0, 1)) + outer(unit[3], unit[3])[..., None]
-    # And back: the matrix is [A 0; r d], whose inverse is [A⁻¹ 0; -r A⁻¹ / d, 1 / d].
-    (a, b), (c, d) = by_sides[:2]
-    inverse_sides = torch.stack([d, -b, -c, a]).unflatten(0, (2, 2)) / (a * d - b * c)
-    last = torch.cat([-along * (by_sides[2, :, None] * inverse_sides).sum(0), along[None]])
-    back = torch.cat([torch.nn.functional.pad(inverse_sides, (0, 0, 0, 1)), last[None]])
-    return Anchored(
-        value=torch.cat([place, seen.miss[None]]),
-        noise=congruent(turn, seen.noise),
-        shared=product(turn, seen.shared),
-        late=torch.stack([product(product(turn, late), back) for late in seen.late]),
-        ahead=ahead,
-    )
+    depth = ray[2]
+    # What a change of (x, y, 1 / z) makes of the ray, times z; and of (a, b, inverse).
+    by_ray = product(seen.by_ray, torch.cat([frame[:2].transpose(0, 1), -apart[:, None]], 1))
+    last = torch.zeros_like(by_ray)
+    last[2, 2] = 1.0
+    turn = depth * (by_ray + last)
+    late = (seen.late[:, :, :, None] * turn).sum(2)
+    return Anchored(torch.cat([ray[:2], inverse[None]]) / depth, value, late, shared, ahead)

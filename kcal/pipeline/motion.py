@@ -127,6 +127,7 @@ class Moved(NamedTuple):
         noise: (6, 6, J, T) what the step adds.
         by_pace: (6, 3, J, T) derivatives of ray and velocity by the old velocity, before the division.
         turn: (3, 3, 1, T) what turns rays, or None.
+        shift: (3, 1, T) what another origin adds to a ray for each unit of 1 / z, or None.
     """
 
     state: Tensor
@@ -134,25 +135,29 @@ class Moved(NamedTuple):
     noise: Tensor
     by_pace: Tensor
     turn: Tensor | None
+    shift: Tensor | None
 
     def through(self, columns: Tensor) -> Tensor:
         """The derivatives (6, 6, J, T) of the new state by the old one, times columns (6, C, J, T)."""
         ray = torch.cat([columns[:2], torch.zeros_like(columns[:1])])
         if self.turn is not None:
             ray = product(self.turn, ray)
+        if self.shift is not None:
+            ray = ray + outer(self.shift, columns[2])
         carried = product(self.by_pace, columns[3:])
         ray = ray + carried[:3]
         new = torch.cat([ray[:2], columns[2:3], carried[3:]])
         return (new - outer(self.state, ray[2])) / self.ahead
 
 
-def moved(state: Tensor, step: Transition, turn: Tensor | None = None) -> Moved:
-    """Move states (6, J, T) by a step, and turn their frames.
+def moved(state: Tensor, step: Transition, turn: Tensor | None = None, shift: Tensor | None = None) -> Moved:
+    """Move states (6, J, T) by a step, turn their frames, and count from other origins.
 
     Args:
         state: see the module.
         step: from `transition`.
         turn: (3, 3, T) rotations from the old frames into new ones; None: the frames stay.
+        shift: (3, T) the old origins as seen from the new ones, meters, in the new frames; None: they stay.
     """
     reach, keep, rotation = step.reach, step.keep, None
     ray = torch.cat([state[:2], torch.ones_like(state[:1])])
@@ -162,8 +167,11 @@ def moved(state: Tensor, step: Transition, turn: Tensor | None = None) -> Moved:
     by_pace = torch.cat([reach, keep])
     carried = (by_pace * state[3:]).sum(1)
     ray = ray + carried[:3]
+    origin = None if shift is None else shift[:, None]
+    if origin is not None:
+        ray = ray + origin * state[2]
     new = torch.cat([ray[:2], state[2:3], carried[3:]]) / ray[2]
-    return Moved(new, ray[2], (state[2] / ray[2]).square() * _step_noise(new, step.noise), by_pace, rotation)
+    return Moved(new, ray[2], (state[2] / ray[2]).square() * _step_noise(new, step.noise), by_pace, rotation, origin)
 
 
 def _step_noise(new: Tensor, noise: Tensor) -> Tensor:

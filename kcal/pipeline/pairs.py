@@ -11,6 +11,7 @@ from torch import Tensor
 
 from kcal.checks import as_points, require_finite
 from kcal.errors import InputError
+from kcal.pipeline.object_views import ObjectViews
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -68,6 +69,19 @@ class ObjectPairs:
 
     def __len__(self) -> int:
         return len(self.category)
+
+    @property
+    def views(self) -> ObjectViews:
+        """The same as objects of a rig of two cameras."""
+        return ObjectViews(
+            pixels=torch.stack([self.left, self.right], 1),
+            seen=torch.ones(len(self), 2, dtype=torch.bool, device=self.left.device),
+            covariance=self.covariance,
+            time=self.time,
+            score=self.score,
+            category=self.category,
+            ambiguous=self.ambiguous,
+        )
 
     @classmethod
     def from_matches(

@@ -38,6 +38,11 @@ def squared(root: Tensor) -> Tensor:
     return product(root, root.transpose(0, 1))
 
 
+def rooted(effect: Tensor, root: Tensor | None) -> Tensor:
+    """Effect root: (R, M, ...) from (R, K, ...) and one root (K, M) for all; None: the identity."""
+    return effect if root is None else torch.tensordot(effect, root, ([1], [0])).movedim(-1, 1)
+
+
 class Eliminated(NamedTuple):
     """Gauss's elimination of symmetric positive S (R, R, ...) beside columns B (R, C, ...): S = L D Lᵀ.
 

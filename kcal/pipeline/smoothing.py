@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.pipeline.estimates import TrackStates, track_states
 from kcal.pipeline.imm_filter import Summary
 
@@ -39,6 +39,7 @@ class _Moment(NamedTuple):
 
     time: float
     frame: Tensor
+    home: Tensor
     belief: Summary
     prior: Summary | None
     cross: Tensor | None
@@ -60,7 +61,9 @@ class History:
         self._clock = clock
         self._priors = {key: (prior.at(i), cross[i]) for key, i in zip(keys, places, strict=True)}
 
-    def filtered(self, time: float, keys: Sequence[int], frame: Tensor, beliefs: Summary, clock: Tensor) -> None:
+    def filtered(
+        self, time: float, keys: Sequence[int], frame: Tensor, home: Tensor, beliefs: Summary, clock: Tensor
+    ) -> None:
         """Note what is believed after them; tracks that are gone may be missing."""
         for place, key in enumerate(keys):
             which = torch.tensor([place], device=frame.device)
@@ -68,7 +71,7 @@ class History:
             if prior is not None:
                 # The sightings of this moment told something of the clock.
                 prior = _moved(prior, clock - self._clock)
-            moment = _Moment(time, frame[which], beliefs.at(which), prior, cross, clock)
+            moment = _Moment(time, frame[which], home[which], beliefs.at(which), prior, cross, clock)
             self._moments.setdefault(key, []).append(moment)
         self._priors = {}
 
@@ -76,7 +79,7 @@ class History:
         """A track got its number; several may share one, if motion recognized the target."""
         self.numbers[key] = number
 
-    def smoothed(self, localize: StereoLocalizer, clock: Tensor, root: Tensor) -> list[SmoothedTrack]:
+    def smoothed(self, localize: MultiViewLocalizer, clock: Tensor, root: Tensor | None) -> list[SmoothedTrack]:
         """All confirmed tracks, with the clock as now known and a root of the covariance of the shared errors."""
         by_number: dict[int, list[tuple[_Moment, Summary]]] = {}
         for key, number in self.numbers.items():
@@ -86,15 +89,16 @@ class History:
         for number, pairs in sorted(by_number.items()):
             pairs.sort(key=lambda pair: pair[0].time)
             beliefs = Summary(*(torch.cat(values) for values in zip(*(belief for _, belief in pairs), strict=True)))
-            frame = torch.cat([moment.frame for moment, _ in pairs])
+            frame, home = (torch.cat([getattr(moment, name) for moment, _ in pairs]) for name in ("frame", "home"))
             time = torch.tensor([moment.time for moment, _ in pairs], dtype=torch.float64)
-            found.append(SmoothedTrack(number, time, track_states(localize, frame, beliefs, root)))
+            found.append(SmoothedTrack(number, time, track_states(localize, frame, home, beliefs, root)))
         return found
 
 
 def _moved(belief: Summary, clock: Tensor) -> Summary:
     """The belief after the clock's errors became known to be larger by `clock`."""
-    return belief._replace(mean=belief.mean + belief.effect[..., -len(clock) :] @ clock)
+    first = belief.effect.shape[-1] - len(clock)
+    return belief._replace(mean=belief.mean + belief.effect[..., first:] @ clock)
 
 
 def _with_clock(moment: _Moment, clock: Tensor) -> _Moment:

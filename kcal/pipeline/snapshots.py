@@ -14,10 +14,11 @@ from torch import Tensor
 
 from kcal.errors import FileError
 from kcal.pipeline.imm_filter import Beliefs
-from kcal.pipeline.tracks import Tracker, TrackRecord
+from kcal.pipeline.track_options import TrackRecord
+from kcal.pipeline.tracks import Tracker
 
 # Of the tensors: a journal of another one is of no use.
-_LAYOUT = "tracks last"
+_LAYOUT = "tracks last, of any cameras"
 _SHARED = ("information", "score", "values", "root")
 
 
@@ -29,13 +30,9 @@ def settings_of(tracker: Tracker) -> str:
         localize.rig.fingerprint,
         repr(tracker.options),
         repr(shared.scale.tolist()),
-        repr(localize.attitude_deg),
     ]
-    parts += [repr(localize.origin), repr(localize.drop)]
-    parts += [
-        "none" if value is None else _packed(value)["data"]
-        for value in (localize.calibration_factor, localize.mounting, localize.link)
-    ]
+    known = (localize.errors, localize.bending_errors)
+    parts += ["none" if value is None else _packed(value)["data"] for value in known]
     parts += [] if tracker.moments is None else ["watched"]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
@@ -50,6 +47,7 @@ def snapshot(tracker: Tracker) -> dict[str, Any]:
         "records": [dataclasses.asdict(record) for record in tracker.records],
         "beliefs": [_packed(value) for value in tracker.beliefs],
         "frame": _packed(tracker.frame),
+        "home": tracker.home.tolist(),
         "shared": {name: _packed(getattr(tracker.shared, name)) for name in _SHARED},
     }
 
@@ -69,6 +67,7 @@ def restore(tracker: Tracker, state: dict[str, Any]) -> None:
         tracker.records = [TrackRecord(**record) for record in state["records"]]
         tracker.beliefs = Beliefs(*(_unpacked(value) for value in state["beliefs"]))
         tracker.frame = _unpacked(state["frame"])
+        tracker.home = torch.tensor(state["home"], dtype=torch.long)
         for name in _SHARED:
             setattr(tracker.shared, name, _unpacked(state["shared"][name]))
     except (KeyError, TypeError, ValueError) as error:

@@ -27,7 +27,8 @@ from kcal.pipeline.senders import Sender
 from kcal.pipeline.snapshots import restore, snapshot
 from kcal.pipeline.stream_journal import Ledger
 from kcal.pipeline.track_columns import track_columns
-from kcal.pipeline.tracks import Tracker, Tracks
+from kcal.pipeline.track_options import Tracks
+from kcal.pipeline.tracks import Tracker
 
 # Moments that wait, and moments between checkpoints: about ten seconds of video.
 _WAITING, _CHECKPOINT = 32, 250
@@ -226,7 +227,9 @@ class Stream:
     def _write(self, moment: Moment, offset: int, sequence: int) -> None:
         when = self._calendar(moment.time)
         tracks = self.tracker(moment.pairs, moment.time)
-        columns = track_columns(tracks, sequence)
+        # Files of two cameras of one mast tell all from the left one.
+        stations = None if self.run.feet is None else self.tracker.localize.rig
+        columns = track_columns(tracks, sequence, stations)
         parts = [
             appended(path.suffix.lower(), self.run, columns, when, first=size == 0)
             for path, size in zip(self.ledger.outputs, self.ledger.place.sizes, strict=True)

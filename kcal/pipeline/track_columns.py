@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import torch
 
+from kcal.lens.camera_rig import CameraRig
 from kcal.locate.columns import PositionColumns
 from kcal.locate.localizer import Localization
+from kcal.locate.station_positions import own_axes
 from kcal.locate.stereo import PositionStatus
 from kcal.locate.tabulate import number_table
 from kcal.pipeline.estimates import TrackStates
-from kcal.pipeline.tracks import Tracks
+from kcal.pipeline.track_options import Tracks
 
 _REASONS = {
     int(PositionStatus.OK): "",
@@ -18,16 +20,20 @@ _REASONS = {
 }
 
 
-def track_columns(tracks: Tracks, sequence: int) -> PositionColumns:
+def track_columns(tracks: Tracks, sequence: int, stations: CameraRig | None = None) -> PositionColumns:
     """One row for each track; velocities, hits and times are further columns.
 
     Args:
         tracks: of one moment.
         sequence: number of the moment, which together with the name is never used twice.
+        stations: cameras far apart: bearings are then those at the anchor's own vertical, and two more columns tell
+            from which camera a track is told, and which see it now.
     """
     state = TrackStates(*(value.cpu() for value in tracks.state))
     ok = state.status == int(PositionStatus.OK)
     count = len(tracks.number)
+    if stations is not None:
+        state = state._replace(bearing=(own_axes(stations).cpu()[state.anchor] @ state.bearing[..., None])[..., 0])
     shared = {name: value for name, value in state._asdict().items() if name in Localization._fields}
     numbers = number_table(Localization(**shared, reprojection=torch.zeros(count, 2)))
     velocity = [_texts(state.velocity[:, i], ok) for i in range(3)]
@@ -45,6 +51,11 @@ def track_columns(tracks: Tracks, sequence: int) -> PositionColumns:
         "velocity_north_sigma_mps": _texts(sigma[:, 1], ok),
         "velocity_up_sigma_mps": _texts(sigma[:, 2], ok),
     }
+    if stations is not None:
+        extras["told_from"] = [stations.names[camera] for camera in state.anchor.tolist()]
+        extras["cameras"] = [
+            " ".join(name for name, one in zip(stations.names, row, strict=True) if one) for row in tracks.seen.tolist()
+        ]
     names, status = [f"track {number}" for number in tracks.number], state.status.numpy()
     return PositionColumns(names, status, [_REASONS[int(code)] for code in status], numbers, extras)
 

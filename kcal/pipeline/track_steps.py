@@ -13,13 +13,15 @@ import torch
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.locate.localizer import StereoLocalizer
-from kcal.pipeline.assignment import Scores, nearby
+from kcal.locate.multi_localizer import MultiViewLocalizer, posed_cameras
+from kcal.pipeline.assignment import Looks, Scores, SeenFrom, looks_of, nearby
 from kcal.pipeline.estimates import TrackStates, track_states
-from kcal.pipeline.imm_filter import Beliefs, Timing, fit_of, innovations, no_beliefs, predicted, updated
+from kcal.pipeline.imm_filter import Beliefs, Timing, fit_of, innovations, predicted, updated
 from kcal.pipeline.measurements import Anchored, Sightings, anchored, sightings
 from kcal.pipeline.motion import transition
 
+# What a match gains for each mark that it explains: half the squared distance at which marks are no more taken.
+_EXPLAINED = 12.0
 # Of stand-ins from which graphs are made: sizes that no other axis has, so that none seem to belong together.
 _STAND_INS = _PAIRS, _TRACKS, _MATCHES, _TAKEN, _TOLD = 1009, 1013, 1019, 1021, 1031
 
@@ -28,20 +30,22 @@ class TrackSteps(NamedTuple):
     """The steps, in their order.
 
     Attributes:
-        measure: pixels (N, 2) of both cameras, covariances (N, 4, 4) and times (N, 2) as sightings.
+        measure: pixels, which are seen, covariances and times of a moment as sightings; see `sightings`.
         move: beliefs to another time; see `moved_on`.
         look: see `looked_at`, with beliefs that have come to the same moment.
+        near: see `nearby`.
         score: see `scored`.
         take: see `taken_in`.
-        place: tracks of these numbers on the Earth, from beliefs, frames and a root as in `track_states`.
+        place: tracks of these numbers on the Earth, from beliefs, frames, homes and a root as in `track_states`.
     """
 
     measure: Callable[[Tensor, Tensor, Tensor, Tensor], Sightings]
     move: Callable[[Beliefs, Tensor, Tensor, Tensor], Beliefs]
-    look: Callable[[Beliefs, Tensor, Sightings, Timing, Tensor, Tensor], tuple[Beliefs, Tensor]]
-    score: Callable[[Beliefs, Tensor, Sightings, Timing, Tensor, Tensor, Tensor], Scores]
-    take: Callable[[Beliefs, Anchored, Timing, Tensor], Beliefs]
-    place: Callable[[Beliefs, Tensor, Tensor, Tensor], TrackStates]
+    look: Callable[[Beliefs, Tensor, Tensor, Tensor | None], tuple[Beliefs, Looks]]
+    near: Callable[[Looks, Sightings, Timing, Tensor], Tensor]
+    score: Callable[[Beliefs, Tensor, Tensor, Sightings, Timing, Tensor | None, Tensor, Tensor], Scores]
+    take: Callable[[Beliefs, Anchored, Timing, Tensor | None], Beliefs]
+    place: Callable[[Beliefs, Tensor, Tensor, Tensor | None, Tensor], TrackStates]
 
 
 def moved_on(beliefs: Beliefs, up: Tensor, numbers: Tensor, stay: Tensor) -> Beliefs:
@@ -49,53 +53,57 @@ def moved_on(beliefs: Beliefs, up: Tensor, numbers: Tensor, stay: Tensor) -> Bel
     return predicted(beliefs.mixed(stay), transition(numbers, up))
 
 
-def looked_at(
-    beliefs: Beliefs, frame: Tensor, seen: Sightings, timing: Timing, root: Tensor, gate: Tensor
-) -> tuple[Beliefs, Tensor]:
-    """The merged beliefs, and (T, N) which pairs are roughly in their directions."""
-    merged = beliefs.merged()
-    return merged, nearby(merged, frame, seen, timing, root, gate)
-
-
-def scored(
-    merged: Beliefs, frame: Tensor, seen: Sightings, timing: Timing, root: Tensor, track: Tensor, pair: Tensor
-) -> Scores:
-    """Pairs (L,) against tracks (L,), whose beliefs are merged."""
-    local = anchored(seen.at(pair), frame[..., track])
-    found = innovations(merged.at(track), local, timing.at(pair))
-    fit = fit_of(found, root)
-    return Scores(
-        local, found.effect[..., 0, :], found.value[:, 0], found.noise[..., 0, :], fit.squared[0], fit.log_density[0]
-    )
-
-
-def taken_in(beliefs: Beliefs, seen: Anchored, timing: Timing, root: Tensor) -> Beliefs:
+def taken_in(beliefs: Beliefs, seen: Anchored, timing: Timing, root: Tensor | None) -> Beliefs:
     """Beliefs with sightings, one for each track."""
     found = innovations(beliefs, seen, timing)
     return updated(beliefs, found, fit_of(found, root))
 
 
-def track_steps(localize: StereoLocalizer, lasting_px: float) -> TrackSteps:
+def track_steps(localize: MultiViewLocalizer, lasting_px: float) -> TrackSteps:
     """The steps as they are."""
+    centers, errors, bending = localize.rig.center, localize.errors, localize.bending_errors
+    turned = None if errors is None else errors[:, :, 3:6].movedim(-1, 0)
+    cameras, k = SeenFrom(centers, turned), posed_cameras(localize).bending
 
-    def measure(left: Tensor, right: Tensor, covariance: Tensor, time: Tensor) -> Sightings:
-        return sightings(localize, left, right, covariance, time, lasting_px)
+    def measure(pixels: Tensor, seen: Tensor, covariance: Tensor, time: Tensor) -> Sightings:
+        return sightings(localize, pixels, seen, covariance, time, lasting_px)
 
-    def place(beliefs: Beliefs, frame: Tensor, root: Tensor, which: Tensor) -> TrackStates:
-        return track_states(localize, frame[..., which].movedim(-1, 0), beliefs.at(which).summary(), root)
+    def looked_at(beliefs: Beliefs, frame: Tensor, home: Tensor, root: Tensor | None) -> tuple[Beliefs, Looks]:
+        merged = beliefs.merged()
+        return merged, looks_of(merged, frame, centers[home].T, cameras, root)
 
-    return TrackSteps(measure, moved_on, looked_at, scored, taken_in, place)
+    def scored(
+        merged: Beliefs, frame: Tensor, home: Tensor, seen: Sightings, timing: Timing, root: Tensor | None,
+        track: Tensor, which: Tensor,
+    ) -> Scores:  # fmt: skip
+        """Sightings (L,) against tracks (L,), whose beliefs are merged."""
+        beliefs, local = merged.at(track), seen.at(which)
+        known = bending if errors is not None else None
+        origin = centers[home[track]].T
+        there = anchored(local, frame[..., track], origin, beliefs.mean[:3, 0], known, k)
+        found = innovations(beliefs, there, timing.at(which))
+        fit = fit_of(found, root)
+        density = fit.log_density[0] + _EXPLAINED * local.seen.sum(0)
+        return Scores(
+            there, found.effect[..., 0, :], found.value[:, 0], found.noise[..., 0, :], fit.squared[0], density
+        )
+
+    def place(beliefs: Beliefs, frame: Tensor, home: Tensor, root: Tensor | None, which: Tensor) -> TrackStates:
+        summary = beliefs.at(which).summary()
+        return track_states(localize, frame[..., which].movedim(-1, 0), home[which], summary, root)
+
+    return TrackSteps(measure, moved_on, looked_at, nearby, scored, taken_in, place)
 
 
 @torch.no_grad()
-def compiled_steps(steps: TrackSteps, errors: int, models: int, root: Tensor) -> TrackSteps:
-    """The steps in C++ for any numbers of tracks and pairs: this takes three minutes, less where torch remembers.
+def compiled_steps(steps: TrackSteps, cameras: int, nothing: Beliefs, root: Tensor | None) -> TrackSteps:
+    """The steps in C++ for any numbers of tracks and sightings: this takes three minutes, less where torch remembers.
 
     Args:
         steps: from `track_steps`.
-        errors: K, independent errors of the calibration and those that last.
-        models: J.
-        root: (K + 3, R) of the covariance of the shared errors.
+        cameras: V.
+        nothing: beliefs of no tracks.
+        root: (K + Q, R) of the covariance of the shared errors; None: the identity.
 
     Raises:
         InputError: torch could not compile, for want of a C++ compiler for instance.
@@ -106,30 +114,33 @@ def compiled_steps(steps: TrackSteps, errors: int, models: int, root: Tensor) ->
     try:
         # Torch warns of itself.
         with warnings.catch_warnings(action="ignore", category=FutureWarning):
-            _compile_all(made, errors, models, root)
+            _compile_all(made, cameras, nothing, root)
     except RuntimeError as error:
         raise InputError(f"tracks cannot be compiled here; without compiling they work ({error})") from error
     return made
 
 
-def _compile_all(made: TrackSteps, errors: int, models: int, root: Tensor) -> None:
+def _compile_all(made: TrackSteps, cameras: int, nothing: Beliefs, root: Tensor | None) -> None:
     """Call each step with stand-ins."""
-    new = root.new_zeros
-    unit = torch.eye(4).to(root).expand(_PAIRS, 4, 4)
-    seen = made.measure(new(_PAIRS, 2), new(_PAIRS, 2), unit, new(_PAIRS, 2))
-    timing = Timing(new(2, _PAIRS), new(3, _PAIRS), new(_PAIRS))
-    empty = no_beliefs(errors, models, root.device)
-    beliefs = Beliefs(*(torch.nn.functional.pad(value, (0, _TRACKS), value=1.0) for value in empty))
-    frame = torch.eye(3).to(root)[..., None].expand(3, 3, _TRACKS)
+    new, models = nothing.mean.new_zeros, nothing.mean.shape[1]
+    unit = torch.eye(2 * cameras).to(nothing.mean).expand(_PAIRS, 2 * cameras, 2 * cameras)
+    there = torch.ones(_PAIRS, cameras, dtype=torch.bool, device=unit.device)
+    seen = made.measure(new(_PAIRS, cameras, 2), there, unit, new(_PAIRS, cameras))
+    clocks = nothing.late.shape[1] // 3
+    timing = Timing(new(cameras, _PAIRS), new(clocks, 3, _PAIRS), new(clocks, _PAIRS))
+    beliefs = Beliefs(*(torch.nn.functional.pad(value, (0, _TRACKS), value=1.0) for value in nothing))
+    frame = torch.eye(3).to(unit)[..., None].expand(3, 3, _TRACKS)
+    home = torch.zeros(_TRACKS, dtype=torch.long, device=unit.device)
     beliefs = made.move(beliefs, frame[2], new(9, models), new(()))
-    merged, _ = made.look(beliefs, frame, seen, timing, root, new(()))
+    merged, looks = made.look(beliefs, frame, home, root)
+    made.near(looks, seen, timing, new(()))
     # Each its own tensor: the same one twice would become a rule.
     track, pair, taken, told = (
-        torch.zeros(size, dtype=torch.long, device=root.device) for size in (_MATCHES, _MATCHES, _TAKEN, _TOLD)
+        torch.zeros(size, dtype=torch.long, device=unit.device) for size in (_MATCHES, _MATCHES, _TAKEN, _TOLD)
     )
-    scores = made.score(merged, frame, seen, timing, root, track, pair)
+    scores = made.score(merged, frame, home, seen, timing, root, track, pair)
     made.take(beliefs.at(taken), scores.seen.at(taken), timing.at(taken), root)
-    made.place(beliefs, frame, root, told)
+    made.place(beliefs, frame, home, root, told)
 
 
 class _Compiled:
@@ -143,7 +154,7 @@ class _Compiled:
     def __call__(self, *arguments: Any) -> Any:
         # Other strides would need other code.
         given = [_contiguous(argument) for argument in arguments]
-        tensors = [tensor for argument in given for tensor in _tensors(argument)]
+        tensors = [tensor for argument in given for tensor in _tensors_in(argument)]
         if self.free is None:
             every = [(i, axis) for i, tensor in enumerate(tensors) for axis in range(tensor.ndim)]
             self.free = [(i, axis) for i, axis in every if tensors[i].shape[axis] in _STAND_INS]
@@ -154,11 +165,13 @@ class _Compiled:
         return self.made(*given)
 
 
-def _tensors(value: Any) -> tuple[Tensor, ...]:
+def _tensors_in(value: Any) -> tuple[Tensor, ...]:
+    if value is None:
+        return ()
     return (value,) if isinstance(value, Tensor) else value
 
 
 def _contiguous(value: Any) -> Any:
-    if isinstance(value, Tensor):
-        return value.contiguous()
+    if value is None or isinstance(value, Tensor):
+        return value if value is None else value.contiguous()
     return type(value)(*(part.contiguous() for part in value))

@@ -1,20 +1,21 @@
-"""`Tracker`: pairs of one moment after another become tracks with places, velocities and honest errors."""
+"""`Tracker`: objects of one moment after another become tracks with places, velocities and honest errors."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections.abc import Callable
-from typing import NamedTuple, Self
+from collections.abc import Callable, Sequence
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from kcal.errors import InputError
 from kcal.lens.pose import side_axes
 from kcal.locate.localizer import StereoLocalizer
-from kcal.pipeline.assignment import Candidates, assigned, mark_numbers, within
-from kcal.pipeline.estimates import TrackStates
+from kcal.locate.multi_localizer import MultiViewLocalizer
+from kcal.locate.stations import MOUNTING_ERRORS, stations_at
+from kcal.pipeline.assignment import Candidates, assigned, within
 from kcal.pipeline.imm_filter import (
     Beliefs,
     Timing,
@@ -24,117 +25,35 @@ from kcal.pipeline.imm_filter import (
     predicted,
 )
 from kcal.pipeline.measurements import Sightings, anchored
-from kcal.pipeline.motion import MOTIONS, Motion, step_numbers, transition
+from kcal.pipeline.motion import Motion, step_numbers, transition
+from kcal.pipeline.object_views import ObjectViews, mark_numbers
 from kcal.pipeline.pairs import ObjectPairs
 from kcal.pipeline.shared_errors import ClockEstimate, ClockPrior, SharedErrors
-from kcal.pipeline.small_matrices import mahalanobis, product, squared
+from kcal.pipeline.small_matrices import mahalanobis, product, rooted, squared
 from kcal.pipeline.smoothing import History, SmoothedTrack
+from kcal.pipeline.track_options import TrackOptions, TrackRecord, Tracks
 from kcal.pipeline.track_steps import compiled_steps, track_steps
 
+# Of the gate: nearer sightings tell of the clocks. One in a hundred is left out where the gate loses one in 10,000.
+_SURE = 13.3 / 23.5
 # A frame is turned toward its target when that is farther from the axis than this tangent: 17°.
 _TURN = 0.3
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class TrackOptions:
-    """When tracks begin and end, and how targets move.
-
-    Args:
-        motions: models among which each track may switch.
-        switch_s: mean time between switches, seconds.
-        speed_mps: standard deviation of a new target's velocity along each axis.
-        confirm_hits: sightings after which a track is told of; twice as many if its pairs are ambiguous.
-        lose_after_s: seconds without a sighting after which a track is told of no more.
-        forget_after_s: seconds without a sighting in which it may still be recognized by its motion.
-        gate: largest squared Mahalanobis distance of a sighting from its track; 23.5 loses one in 10,000.
-        recognize: the same of a new track from a lost one, in place and velocity; 16.8 loses one in 100.
-        lasting_px: standard deviation of the part of a mark's error that stays the same as long as a target is seen,
-            along each axis of the right image, pixels. Matched images have 0.01 px of it, compressed ones 0.02 px
-            (`scripts/check/compression.py`).
-
-    Raises:
-        InputError: a value that is not positive (`lasting_px` may be zero), or a forgetting before the losing.
-    """
-
-    motions: tuple[Motion, ...] = MOTIONS
-    switch_s: float = 20.0
-    speed_mps: float = 15.0
-    confirm_hits: int = 4
-    lose_after_s: float = 1.5
-    forget_after_s: float = 15.0
-    gate: float = 23.5
-    recognize: float = 16.8
-    lasting_px: float = 0.01
-
-    def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            zero = field.name == "lasting_px" and value == 0
-            if field.name != "motions" and not zero and not 0 < value < math.inf:
-                raise InputError(f"{field.name} {value}: a positive number is needed")
-        if not self.motions or self.forget_after_s < self.lose_after_s:
-            raise InputError("tracks: at least one motion is needed, and forget_after_s not below lose_after_s")
-
-    @classmethod
-    def for_video(cls, match_sigma: float) -> Self:
-        """Options for matches in compressed video; `match_sigma` is as in `kcal live`.
-
-        A third of what compression adds to a match lasts (`scripts/check/compression.py`).
-        """
-        return cls(lasting_px=math.hypot(cls.lasting_px, match_sigma / 3.0))
-
-
-@dataclasses.dataclass
-class TrackRecord:
-    """What is remembered of a track besides its state; `number` is 0 until it is confirmed."""
-
-    number: int
-    key: int
-    first: float
-    last: float
-    hits: int
-    needed: int
-    evidence: float
-    categories: dict[str, float]
-
-    @property
-    def category(self) -> str:
-        """The one with the highest sum of scores."""
-        return max(self.categories, key=lambda name: self.categories[name])
-
-
-class Tracks(NamedTuple):
-    """The confirmed tracks at one moment.
-
-    Attributes:
-        time: seconds.
-        number: T numbers, from 1; a track keeps its number after an occlusion if its motion recognizes it.
-        category: T names.
-        hits: (T,) sightings so far.
-        unseen_s: (T,) seconds since the last one; zero if seen now.
-        state: places and velocities.
-        models: (T, J) probabilities of `TrackOptions.motions`.
-    """
-
-    time: float
-    number: tuple[int, ...]
-    category: tuple[str, ...]
-    hits: Tensor
-    unseen_s: Tensor
-    state: TrackStates
-    models: Tensor
-
-
 class Tracker:
-    """Follow targets through pairs of marks; call it with the pairs of each moment in turn.
+    """Follow targets through marks of two cameras or more; call it with the objects of each moment in turn.
+
+    Two cameras that see a target begin a track. It keeps its number while any camera sees it: one alone tells its
+    bearing, and other cameras may take over. A target is told from the camera that saw it first.
 
     Errors of calibration, mounting and clocks are shared by all tracks and frames, and a part of each target's errors
     in the marks lasts: frames reduce the noise of the marks, and never what these contribute.
 
     Args:
-        localize: the rig, where it stands, and how well both are known.
+        localize: the rig, where it stands, and how well both are known; `StereoLocalizer` for two cameras of one mast.
         options: when tracks begin and end.
-        clock: what is known of the clocks; with sigmas above zero they are estimated from the tracks.
+        clock: what is known of the clock of each camera but the first, or one for all of them; with sigmas above zero
+            they are estimated from the tracks.
         record: keep what `smoothed` needs; memory then grows with time.
         compiled: translate the filter to C++ first, which takes three minutes, or one where torch remembers;
             each moment of many tracks then takes about half the time.
@@ -157,10 +76,10 @@ class Tracker:
 
     def __init__(
         self,
-        localize: StereoLocalizer,
+        localize: MultiViewLocalizer | StereoLocalizer,
         options: TrackOptions | None = None,
         *,
-        clock: ClockPrior | None = None,
+        clock: ClockPrior | Sequence[ClockPrior] | None = None,
         record: bool = False,
         compiled: bool = False,
         moments: Callable[[float], StereoLocalizer] | None = None,
@@ -168,53 +87,79 @@ class Tracker:
     ) -> None:
         if moments is not None and (compiled or record):
             raise InputError("a rig that moves: neither compiled filters nor records are possible")
-        self.localize, self.solved, self.moments, self.options = localize, localize, moments, options or TrackOptions()
-        factor = localize.calibration_factor
+        # SciPy takes long to load.
+        from scipy.special import chdtrc, chdtri
+
+        self.localize = localize if isinstance(localize, MultiViewLocalizer) else stations_at(localize)
+        self.solved, self.moments, self.options = self.localize, moments, options or TrackOptions()
+        rig, errors = self.localize.rig, self.localize.errors
+        others = len(rig) - 1
+        if rig.origin is None or not others:
+            raise InputError("tracks: a rig of two cameras or more with a place on the Earth is needed")
+        priors = [clock or ClockPrior()] * others if clock is None or isinstance(clock, ClockPrior) else list(clock)
+        if len(priors) != others:
+            raise InputError(f"clock: one, or one for each of {others} cameras beside the first, is needed")
         # What lasts of the marks' errors behaves as the calibration's errors do, though each track has its own.
-        self.calibration = (0 if factor is None else factor.shape[1]) + moving + (2 if self.options.lasting_px else 0)
-        device = localize.enu_from_rig.device
-        self.shared = SharedErrors(self.calibration, clock or ClockPrior(), device)
+        lasting = 2 * others if self.options.lasting_px else 0
+        self.errors = (0 if errors is None else len(errors)) + (moving + MOUNTING_ERRORS if moments else 0)
+        self.calibration = self.errors + lasting
+        device = rig.center.device
+        self.shared = SharedErrors(self.calibration, priors, device)
+        # By the number of cameras: squared distances that lose as many sightings as `gate` does of two.
+        loss = chdtrc(4, self.options.gate)
+        limits = [float(chdtri(2 * max(count, 1), loss)) for count in range(len(rig) + 1)]
+        self.gates = torch.tensor(limits, dtype=torch.float64, device=device)
+        self._stands: StereoLocalizer | None = None
         self.time = -math.inf
         self.records: list[TrackRecord] = []
         self.history: History | None = History() if record else None
-        models = len(self.options.motions)
         empty = torch.zeros(0, dtype=torch.float64, device=device)
-        # (3, 3, T) rotations from the rig's axes.
-        self.frame = empty.reshape(3, 3, 0)
-        self.beliefs = no_beliefs(self.calibration, models, device)
+        # (3, 3, T) rotations from the rig's axes, and (T,) cameras from which tracks are told.
+        self.frame, self.home = empty.reshape(3, 3, 0), empty.long()
+        self.beliefs = self._nothing()
         self.next_number = self.next_key = 1
-        self.steps = track_steps(localize, self.options.lasting_px)
+        # By key of a track and camera: the row of the last objects that it has its mark from.
+        self.seen_now: dict[tuple[int, int], int] = {}
+        self.steps = track_steps(self.localize, self.options.lasting_px)
         if compiled:
-            self.steps = compiled_steps(self.steps, self.calibration, models, self.shared.root)
+            self.steps = compiled_steps(self.steps, len(rig), self.beliefs, self.shared.mixing)
 
     @torch.no_grad()
-    def __call__(self, pairs: ObjectPairs, time: float | None = None) -> Tracks:
-        """Take in the pairs of one moment; moments must not go back in time.
+    def __call__(self, objects: ObjectViews | ObjectPairs, time: float | None = None) -> Tracks:
+        """Take in the objects of one moment; moments must not go back in time.
 
         Args:
-            pairs: may be empty if `time` is given.
-            time: seconds to which tracks are moved; the latest exposure of the left camera if left out.
+            objects: may be empty if `time` is given.
+            time: seconds to which tracks are moved; if left out, the latest exposure of the first camera (of any, where
+                that saw nothing).
 
         Raises:
             InputError: a time before that of the last call, or none.
         """
+        views = objects.views if isinstance(objects, ObjectPairs) else objects
+        if views.cameras != len(self.localize.rig):
+            raise InputError(f"objects of {views.cameras} cameras, and the rig has {len(self.localize.rig)}")
         if time is None:
-            if not len(pairs):
-                raise InputError("no pairs: give the time to which the tracks are to be moved")
-            time = float(pairs.time[:, 0].max())
+            if not bool(views.seen.any()):
+                raise InputError("no objects: give the time to which the tracks are to be moved")
+            first = views.seen[:, 0]
+            time = float(views.time[:, 0][first].max() if bool(first.any()) else views.time[views.seen].max())
         if not self.time <= time < math.inf:
             raise InputError(f"time {time}: it must be finite and not before the last one, {self.time}")
         if self.shared.start is None:
             self.shared.start = time
-        if self.moments is not None and (stands := self.moments(time)) is not self.localize:
-            self.localize, self.steps = stands, track_steps(stands, self.options.lasting_px)
+        if self.moments is not None and (stands := self.moments(time)) is not self._stands:
+            self._stands, self.localize = stands, stations_at(stands, errors=self.errors)
+            self.steps = track_steps(self.localize, self.options.lasting_px)
         self._predict(time)
-        if len(pairs):
-            self._take(pairs, self.steps.measure(pairs.left, pairs.right, pairs.covariance, pairs.time))
+        self.seen_now = {}
+        if len(views):
+            self._take(views, self.steps.measure(views.pixels, views.seen, views.covariance, views.time))
         self._sort_out()
         if self.history is not None:
             keys = [track.key for track in self.records]
-            self.history.filtered(time, keys, self.frame.movedim(-1, 0), self.beliefs.summary(), self.shared.values)
+            beliefs, frame = self.beliefs.summary(), self.frame.movedim(-1, 0)
+            self.history.filtered(time, keys, frame, self.home, beliefs, self.shared.corrected)
         return self.tracks()
 
     def set_clock(self, time: float) -> None:
@@ -228,8 +173,7 @@ class Tracker:
             self.shared.start += time - self.time
         self.time = -math.inf
         self.records = []
-        self.frame = self.frame[..., :0]
-        self.beliefs = no_beliefs(self.calibration, len(self.options.motions), self.frame.device)
+        self.frame, self.home, self.beliefs = self.frame[..., :0], self.home[:0], self._nothing()
 
     def tracks(self) -> Tracks:
         """The confirmed tracks as they are now."""
@@ -242,13 +186,23 @@ class Tracker:
             category=tuple(track.category for track in records),
             hits=torch.tensor([track.hits for track in records], dtype=torch.long),
             unseen_s=torch.tensor([self.time - track.last for track in records], dtype=torch.float64),
-            state=self.steps.place(self.beliefs, self.frame, self.shared.root, which),
+            state=self.steps.place(self.beliefs, self.frame, self.home, self.shared.mixing, which),
             models=self.beliefs.weight[:, which].T,
+            seen=torch.tensor(
+                [[(track.key, c) in self.seen_now for c in range(len(self.localize.rig))] for track in records],
+                dtype=torch.bool,
+            ).reshape(len(records), len(self.localize.rig)),
         )
 
-    def clock_estimate(self) -> ClockEstimate:
-        """What the tracks have told of the clocks so far."""
-        return self.shared.clock_estimate()
+    def clock_estimate(self, camera: int = 1) -> ClockEstimate:
+        """What the tracks have told so far of the clock of a camera, from 1: beside that of the first camera (0).
+
+        Raises:
+            InputError: no such camera.
+        """
+        if not 0 < camera < len(self.localize.rig):
+            raise InputError(f"camera {camera}: a number from 1 to {len(self.localize.rig) - 1} is needed")
+        return self.shared.clock_estimate(camera)
 
     def smoothed(self) -> list[SmoothedTrack]:
         """Every confirmed track with the knowledge of all moments, if `record` was set; it may be called at any time.
@@ -258,7 +212,12 @@ class Tracker:
         """
         if self.history is None:
             raise InputError("nothing was recorded; make the tracker with record=True")
-        return self.history.smoothed(self.localize, self.shared.values, self.shared.root)
+        return self.history.smoothed(self.localize, self.shared.corrected, self.shared.mixing)
+
+    def _nothing(self) -> Beliefs:
+        """Beliefs of no tracks."""
+        clocks = len(self.shared.corrected)
+        return no_beliefs(self.calibration, clocks, len(self.options.motions), self.frame.device)
 
     def _is_told(self, track: TrackRecord) -> bool:
         return track.number > 0 and self.time - track.last <= self.options.lose_after_s
@@ -269,7 +228,7 @@ class Tracker:
             return
         numbers = self.frame.new_tensor(step_numbers(self.options.motions, dt))
         stay = self.frame.new_tensor(math.exp(-dt / self.options.switch_s))
-        up = (self.frame * self.localize.enu_from_rig[2, :, None]).sum(1)
+        up = self.frame[:, 2]
         aim, turn = self.beliefs.middle[:2, 0], None
         if bool((aim.abs() > _TURN).any()):
             turn = _toward(aim)
@@ -282,73 +241,105 @@ class Tracker:
         if self.history is not None:
             keys = [track.key for track in self.records]
             cross = cross_covariance(beliefs, self.beliefs, step, turn)
-            self.history.predicted(keys, self.beliefs.summary(), cross, self.shared.values)
+            self.history.predicted(keys, self.beliefs.summary(), cross, self.shared.corrected)
 
-    def _take(self, pairs: ObjectPairs, seen: Sightings) -> None:
-        timing = self._delays(seen)
-        marks = mark_numbers(pairs.left, pairs.right)
-        taken = [False] * len(pairs)
-        if self.records:
-            frame, root, gate = self.frame, self.shared.root, self.options.gate
-            merged, close = self.steps.look(self.beliefs, frame, seen, timing, root, root.new_tensor(gate))
-            track, pair = close.nonzero(as_tuple=True)
-            found = self.steps.score(merged, frame, seen, timing, root, track, pair)
-            possible = within(found, track, pair, gate)
-            evidence = [track.evidence for track in self.records]
-            accepted = assigned(possible, marks, evidence, [self._tier(track) for track in self.records])
-            if accepted:
-                self._update(possible, torch.tensor(accepted), pairs, timing)
-                used = marks[possible.pair[accepted].cpu().numpy()]
-                left, right = (set(column) for column in used.T.tolist())
-                taken = [first in left or second in right for first, second in marks.tolist()]
-        fresh = [i for i, usable in enumerate(seen.usable.tolist()) if usable and not taken[i]]
+    def _take(self, views: ObjectViews, seen: Sightings) -> None:
+        timing, marks = self._delays(seen), mark_numbers(views.pixels, views.seen)
+        several = views.seen.sum(1) > 1
+        numbers = torch.arange(len(views))
+        used: set[tuple[int, int]] = set()
+        # Cameras that see a track together, and then, one after the other, those that see one alone.
+        groups = [numbers[several], *(numbers[~several & views.seen[:, c]] for c in range(views.cameras))]
+        for camera, rows in enumerate(groups, -1):
+            rows = rows[[not _mark_set(marks[i]) & used for i in rows.tolist()]]
+            if len(rows) and self.records:
+                used |= self._match(views, seen, timing, marks, rows, camera)
+        usable = seen.usable.tolist()
+        fresh = [i for i in numbers[several].tolist() if usable[i] and not _mark_set(marks[i]) & used]
         if fresh:
-            self._begin(torch.tensor(fresh), pairs, seen, timing)
+            self._begin(torch.tensor(fresh), views, seen, timing)
         if self.shared.estimated:
             move = self.shared.settle()
             shift = (self.beliefs.effect[:, self.calibration :] * move[:, None, None]).sum(1)
             self.beliefs = self.beliefs._replace(mean=self.beliefs.mean + shift)
 
+    def _match(
+        self, views: ObjectViews, seen: Sightings, timing: Timing, marks: NDArray[np.int64], rows: Tensor, camera: int
+    ) -> set[tuple[int, int]]:
+        """Give tracks the sightings of some rows; those of one `camera` (not -1) go to tracks that it has not seen yet.
+
+        Returns the marks that are used up.
+        """
+        root, frame, home = self.shared.mixing, self.frame, self.home
+        part, when = (seen, timing) if len(rows) == len(views) else (seen.at(rows), timing.at(rows))
+        merged, looks = self.steps.look(self.beliefs, frame, home, root)
+        close = self.steps.near(looks, part, when, self.gates[-1])
+        close[[i for i, record in enumerate(self.records) if (record.key, camera) in self.seen_now]] = False
+        track, which = close.nonzero(as_tuple=True)
+        found = self.steps.score(merged, frame, home, part, when, root, track, which)
+        possible = within(found, track, which, self.gates[part.seen.sum(0)[which]])
+        evidence = [track.evidence for track in self.records]
+        accepted = assigned(possible, marks[rows.numpy()], evidence, [self._tier(track) for track in self.records])
+        if not accepted:
+            return set()
+        taken = rows[possible.pair[accepted].cpu()].tolist()
+        self._update(
+            possible, torch.tensor(accepted), part, when, [views.category[i] for i in taken], views.score[taken]
+        )
+        for t, i in zip(possible.track[accepted].tolist(), taken, strict=True):
+            self.seen_now |= {(self.records[t].key, c): i for c, _ in _mark_set(marks[i])}
+        return {mark for i in taken for mark in _mark_set(marks[i])}
+
     def _delays(self, seen: Sightings) -> Timing:
-        since = seen.time[1] - (self.shared.start or 0.0)
-        clock = torch.stack([torch.ones_like(since), since, seen.row])
-        known = torch.stack([torch.zeros_like(since), self.shared.values @ clock])
-        unsure = (self.shared.root[self.calibration :].T @ clock).square().sum(0).sqrt()
-        return Timing(seen.time - self.time + known, clock, unsure)
+        since = seen.time[1:] - (self.shared.start or 0.0)
+        clock = torch.stack([torch.ones_like(since), since, seen.row[1:]], 1)  # (V - 1, 3, N)
+        values = self.shared.values.unflatten(0, clock.shape[:2])
+        delay = seen.time - self.time + torch.nn.functional.pad((values[..., None] * clock).sum(1), (0, 0, 1, 0))
+        if not self.shared.estimated:
+            return Timing(delay, clock[:0], since[:0])
+        root = self.shared.root[self.calibration :].unflatten(0, clock.shape[:2])
+        unsure = (root[..., None] * clock[:, :, None]).sum(1).square().sum(1).sqrt()
+        return Timing(delay, clock, unsure)
 
     def _tier(self, track: TrackRecord) -> int:
         if track.number == 0:
             return 1
         return 0 if self.time - track.last <= self.options.lose_after_s else -1
 
-    def _update(self, possible: Candidates, rows: Tensor, pairs: ObjectPairs, timing: Timing) -> None:
-        track, pair, scores = possible.track[rows], possible.pair[rows], possible.scores
+    def _update(
+        self, possible: Candidates, rows: Tensor, seen: Sightings, timing: Timing, categories: list[str], score: Tensor
+    ) -> None:
+        track, which, scores = possible.track[rows], possible.pair[rows], possible.scores
+        count = seen.seen.sum(0)[which]
         if self.shared.estimated:
             known = torch.tensor([self.records[i].number > 0 for i in track.tolist()])
-            sure = scores.at(rows[known & (scores.squared[rows] < 13.3)])
+            sure = scores.at(rows[known & (scores.squared[rows] < _SURE * self.gates[count])])
             self.shared.add(sure.effect, sure.innovation, sure.covariance)
-        old, seen = self.beliefs.at(track), scores.seen.at(rows)
-        new = self.steps.take(old, seen, timing.at(pair), self.shared.root)
+        old, local = self.beliefs.at(track), scores.seen.at(rows)
+        new = self.steps.take(old, local, timing.at(which), self.shared.mixing)
         both = zip(self.beliefs, new, strict=True)
         self.beliefs = Beliefs(*(value.index_copy(-1, track, part) for value, part in both))
-        densities, weights = scores.log_density[rows].tolist(), pairs.score.tolist()
-        for t, p, density in zip(track.tolist(), pair.tolist(), densities, strict=True):
+        columns = track.tolist(), scores.log_density[rows].tolist(), categories, score.tolist(), count.tolist()
+        for t, density, name, weight, cameras in zip(*columns, strict=True):
             record = self.records[t]
-            record.last, record.hits = self.time, record.hits + 1
+            # One camera alone confirms nothing, and no moment counts twice.
+            if record.last < self.time and (cameras > 1 or record.number):
+                record.hits += 1
+            record.last = self.time
             record.evidence += density
-            name = pairs.category[p]
-            record.categories[name] = record.categories.get(name, 0.0) + weights[p]
+            record.categories[name] = record.categories.get(name, 0.0) + weight
 
-    def _begin(self, which: Tensor, pairs: ObjectPairs, seen: Sightings, timing: Timing) -> None:
+    def _begin(self, which: Tensor, views: ObjectViews, seen: Sightings, timing: Timing) -> None:
         seen = seen.at(which)
         ray = torch.nn.functional.normalize(seen.direction.T, dim=-1)
         frame = torch.stack([*side_axes(ray), ray]).movedim(-1, 1)
-        new = born(anchored(seen, frame), timing.at(which), self.options.speed_mps, len(self.options.motions))
+        local = anchored(seen, frame, seen.place)
+        new = born(local, timing.at(which), self.options.speed_mps, len(self.options.motions))
         self.beliefs = Beliefs(*(torch.cat(both, -1) for both in zip(self.beliefs, new, strict=True)))
-        self.frame = torch.cat([self.frame, frame], -1)
+        self.frame, self.home = torch.cat([self.frame, frame], -1), torch.cat([self.home, seen.anchor])
         for i in which.tolist():
-            needed = self.options.confirm_hits * (2 if bool(pairs.ambiguous[i]) else 1)
-            scores = {pairs.category[i]: float(pairs.score[i])}
+            needed = self.options.confirm_hits * (2 if bool(views.ambiguous[i]) else 1)
+            scores = {views.category[i]: float(views.score[i])}
             self.records.append(TrackRecord(0, self.next_key, self.time, self.time, 1, needed, 0.0, scores))
             self.next_key += 1
 
@@ -371,25 +362,34 @@ class Tracker:
         kept = [i for i, track in enumerate(self.records) if self.time - track.last <= limits[i]]
         if len(kept) < len(self.records):
             which = torch.tensor(kept, dtype=torch.long, device=self.frame.device)
-            self.beliefs, self.frame = self.beliefs.at(which), self.frame[..., which]
+            self.beliefs, self.frame, self.home = self.beliefs.at(which), self.frame[..., which], self.home[which]
             self.records = [self.records[i] for i in kept]
 
     def _recognized(self, new: int) -> int | None:
         """The lost track that a new one continues, if there is one and only one."""
-        first, tracks = self.records[new].first, enumerate(self.records)
-        lost = [i for i, track in tracks if track.number and not self._is_told(track) and track.last < first]
+        lost = [
+            i for i, track in enumerate(self.records)
+            if track.number and not self._is_told(track) and track.last < self.records[new].first
+        ]  # fmt: skip
         if not lost:
             return None
         which = torch.tensor(lost, device=self.frame.device)
         old, here = self.beliefs.at(which).merged(), self.beliefs.at(torch.tensor([new])).merged()
         frame, to = self.frame[..., which], self.frame[..., new, None]
-        up = (frame * self.localize.enu_from_rig[2, :, None]).sum(1)
-        still = transition(frame.new_tensor(step_numbers((Motion(acceleration=0.0),), 0.0)), up)
-        old = predicted(old, still, product(to, frame.transpose(0, 1)))
-        spread = product(here.effect - old.effect, self.shared.root[..., None, None])
+        still = transition(frame.new_tensor(step_numbers((Motion(acceleration=0.0),), 0.0)), frame[:, 2])
+        centers = self.localize.rig.center
+        apart = centers[self.home[which]] - centers[self.home[new]]
+        shift = None if not bool(apart.any()) else product(to, apart.T[:, None])[:, 0]
+        old = predicted(old, still, product(to, frame.transpose(0, 1)), shift)
+        spread = rooted(here.effect - old.effect, self.shared.mixing)
         distance = mahalanobis(here.noise + old.noise + squared(spread), here.mean - old.mean)[0][0]
         near = [i for i, value in zip(lost, distance.tolist(), strict=True) if value <= self.options.recognize]
         return near[0] if len(near) == 1 else None
+
+
+def _mark_set(row: NDArray[np.int64]) -> set[tuple[int, int]]:
+    """Numbers of cameras and their marks."""
+    return {(camera, mark) for camera, mark in enumerate(row.tolist()) if mark >= 0}
 
 
 def _toward(aim: Tensor) -> Tensor:

@@ -5,6 +5,8 @@
 from kcal.pipeline.detections import Detections as Detections
 from kcal.pipeline.pairing import pair_objects as pair_objects
 from kcal.pipeline.pairs import ObjectPairs as ObjectPairs
+from kcal.pipeline.grouping import group_objects as group_objects
+from kcal.pipeline.object_views import ObjectViews as ObjectViews
 from kcal.pipeline.association import associate as associate
 from kcal.pipeline.association import Association as Association
 from kcal.pipeline.association import AssociationOptions as AssociationOptions
@@ -14,9 +16,9 @@ from kcal.pipeline.disparity import DisparityOptions as DisparityOptions
 
 # Tracks
 from kcal.pipeline.tracks import Tracker as Tracker
-from kcal.pipeline.tracks import TrackOptions as TrackOptions
+from kcal.pipeline.track_options import TrackOptions as TrackOptions
 from kcal.pipeline.motion import Motion as Motion
-from kcal.pipeline.tracks import Tracks as Tracks
+from kcal.pipeline.track_options import Tracks as Tracks
 from kcal.pipeline.estimates import TrackStates as TrackStates
 from kcal.pipeline.smoothing import SmoothedTrack as SmoothedTrack
 from kcal.pipeline.shared_errors import ClockPrior as ClockPrior

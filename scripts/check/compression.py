@@ -25,7 +25,8 @@ from torch import Tensor
 from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
 from kcal.pipeline.association import AssociationOptions
-from kcal.pipeline.video_source import VideoPairs
+from kcal.pipeline.pairs import ObjectPairs
+from kcal.pipeline.video_source import Videos
 from scripts.shared.object_scene import Floats, exposed, paint_plate, plate, true_box
 from scripts.shared.page import table, write_section
 
@@ -87,13 +88,14 @@ def errors_of(rig: StereoRig, films: list[list[Tensor]], boxes: list[list[Floats
             write(video, film, crf)
         # The detector is asked for the left and the right image in turn, and knows the answers.
         turns = itertools.chain.from_iterable(zip(*boxes, strict=True))
-        source = VideoPairs(
-            videos[0], videos[1], rig, functools.partial(next_of, turns), AssociationOptions(),
-            late=lambda: 0.0, match_sigma=0.0,
+        source = Videos(
+            videos, rig, functools.partial(next_of, turns), AssociationOptions(),
+            late=lambda _: 0.0, match_sigma=0.0,
         )  # fmt: skip
         for frame, item in enumerate(source(0)):
             assert not isinstance(item.moment, Exception)
             pairs = item.moment.pairs
+            assert isinstance(pairs, ObjectPairs)
             left, right, _ = rig(places(item.moment.time, pace))
             which = torch.cdist(pairs.left, left).argmin(-1)
             c = pairs.covariance

@@ -25,7 +25,8 @@ from kcal.locate.localizer import StereoLocalizer
 from kcal.pipeline.motion import Motion
 from kcal.pipeline.pairs import ObjectPairs
 from kcal.pipeline.shared_errors import ClockPrior
-from kcal.pipeline.tracks import Tracker, TrackOptions, Tracks
+from kcal.pipeline.track_options import TrackOptions, Tracks
+from kcal.pipeline.tracks import Tracker
 from scripts.check.track_rivals import CartesianFilters, OfPixels, OfPositions
 from scripts.shared.page import table, write_section
 

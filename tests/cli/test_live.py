@@ -15,10 +15,12 @@ from typer.testing import CliRunner
 
 from kcal.cli.main import app
 from kcal.errors import FileError, InputError
+from kcal.io.camera_rig_file import save_camera_rig
 from kcal.io.rig_file import save_rig
 from kcal.lens.mounting import Mounting
 from kcal.pipeline.stream import Stream
-from kcal.pipeline.tracks import TrackOptions
+from kcal.pipeline.track_options import TrackOptions
+from scripts.shared.station_scenes import marks, ring
 
 
 @pytest.fixture
@@ -166,3 +168,41 @@ def test_what_compression_leaves_lasts_in_tracks() -> None:
     """Pairs that come matched keep the default; of what compression adds to matches, a third lasts."""
     assert TrackOptions.for_video(0.0) == TrackOptions()
     assert TrackOptions.for_video(0.06).lasting_px == pytest.approx((0.01**2 + 0.02**2) ** 0.5, rel=1e-12)
+
+
+def test_stations_into_files(tmp_path: Path) -> None:
+    """Three towers, one of which is blind for a while: one line names the cameras that have an image."""
+    rig = ring(3, 6000.0)
+    rig.root = rig.with_errors(position_m=0.3, attitude_deg=0.004)
+    save_camera_rig(rig, tmp_path / "towers.json")
+    generator = torch.Generator().manual_seed(0)
+    start = torch.tensor([[-400.0, 300.0, 200.0], [700.0, -500.0, 150.0]]).double()
+    velocity = torch.tensor([[12.0, -5.0, 0.0], [0.0, 9.0, 0.0]]).double()
+    with open(tmp_path / "lines.jsonl", "w", encoding="utf-8") as file:
+        for second in range(16):
+            pixels = marks(rig, start + second * velocity) + torch.randn(2, 3, 2, generator=generator).double()
+            boxes = torch.cat([pixels - 5.5, pixels + 6.5], -1)  # of a detector that counts from the edge
+            each = {name: {"time": 1.7e9 + second, "boxes": boxes[:, c].tolist()} for c, name in enumerate(rig.names)}
+            if 6 <= second < 12:
+                del each["tower 1"]
+            file.write(json.dumps({"cameras": each}) + "\n")
+        file.write('{"cameras": {"tower 9": {"time": 1700000099, "boxes": []}}}\n')
+    command = ["live", str(tmp_path / "towers.json"), "--detections", str(tmp_path / "lines.jsonl")]
+    outputs = ["-o", str(tmp_path / "tracks.csv"), "-o", str(tmp_path / "tracks.geojsonl"), "--clock-sigma", "0.1"]
+    done = CliRunner().invoke(app, [*command, *outputs], catch_exceptions=False)
+    assert done.exit_code == 0
+    assert "with names of tower 1, tower 2, tower 3" in done.output
+    assert "tower 3's images are" in done.output
+    with open(tmp_path / "tracks.csv", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert {row["name"] for row in rows} == {"track 1", "track 2"}
+    assert {row["cameras"] for row in rows if row["sequence"] == "9"} == {"tower 2 tower 3"}
+    assert {row["told_from"] for row in rows} == {"tower 1"}
+    last = sorted((float(row["east_m"]), float(row["north_m"])) for row in rows if row["sequence"] == "16")
+    true = sorted((start + 15.0 * velocity)[:, :2].tolist())
+    for found, wanted in zip(last, true, strict=True):
+        assert found == pytest.approx(wanted, abs=15.0)
+    # Azimuths count from the tower: the first one stands east of the target, at its own vertical.
+    assert 180.0 < float(rows[-1]["azimuth_deg"]) < 360.0
+    refused = CliRunner().invoke(app, [*command, *outputs, "--heading", "3", "--origin", "1,2,3"])
+    assert refused.exit_code == 2

@@ -35,7 +35,8 @@ from kcal.mark.server import marking_app
 from kcal.mark.session import Session
 from kcal.pipeline.live_map import LiveMap
 from kcal.pipeline.track_columns import track_columns
-from kcal.pipeline.tracks import Tracker, TrackOptions
+from kcal.pipeline.track_options import TrackOptions
+from kcal.pipeline.tracks import Tracker
 from kcal.report.map_page import save_map
 from kcal.report.summary import Part, save_summary
 from kcal.web.serving import LocalServer

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from kcal.pipeline.assignment import Candidates, Scores, assigned, mark_numbers
+from kcal.pipeline.assignment import Candidates, Scores, assigned
 from kcal.pipeline.measurements import Anchored
+from kcal.pipeline.object_views import mark_numbers
 
 
 def candidates(track: list[int], pair: list[int], density: list[float]) -> Candidates:
@@ -39,7 +40,7 @@ def test_the_best_of_all(seed: int) -> None:
 def test_a_mark_goes_to_the_track_of_more_evidence() -> None:
     """Two tracks, each with its own pair; the pairs share their left mark."""
     left, right = torch.tensor([[5.0, 5.0], [5.0, 5.0]]), torch.tensor([[1.0, 5.0], [2.0, 5.0]])
-    marks = mark_numbers(left, right)
+    marks = mark_numbers(torch.stack([left, right], 1), torch.ones(2, 2, dtype=torch.bool))
     possible = candidates([0, 1], [0, 1], [-1.0, -2.0])
     assert assigned(possible, marks, [0.0, 0.0], [0, 0]) == [0]
     assert assigned(possible, marks, [0.0, 10.0], [0, 0]) == [1]

@@ -11,7 +11,8 @@ from track_scenes import pairs_of, seen_by, tracked_site
 from kcal.errors import InputError
 from kcal.pipeline.motion import Motion
 from kcal.pipeline.shared_errors import ClockPrior
-from kcal.pipeline.tracks import Tracker, TrackOptions
+from kcal.pipeline.track_options import TrackOptions
+from kcal.pipeline.tracks import Tracker
 
 OPTIONS = TrackOptions(motions=(Motion(acceleration=0.02),), speed_mps=8.0)
 

@@ -8,6 +8,8 @@ from track_scenes import pairs_of, seen_by, tracked_site
 
 from kcal.errors import InputError
 from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.stations import stations_at
+from kcal.pipeline.imm_filter import no_beliefs
 from kcal.pipeline.shared_errors import ClockPrior
 from kcal.pipeline.track_steps import compiled_steps, track_steps
 from kcal.pipeline.tracks import Tracker
@@ -53,7 +55,7 @@ def test_steps_that_cannot_be_compiled_are_an_error(monkeypatch: pytest.MonkeyPa
         return call
 
     monkeypatch.setattr(torch, "compile", fails)
-    localize = tracked_site()
-    root = torch.eye(4, dtype=torch.float64)
+    localize = stations_at(tracked_site())
+    nothing = no_beliefs(1, 0, 4, torch.device("cpu"))
     with pytest.raises(InputError, match="no compiler"):
-        compiled_steps(track_steps(localize, 0.01), 1, 4, root)
+        compiled_steps(track_steps(localize, 0.01), 2, nothing, None)

@@ -29,7 +29,8 @@ from kcal.locate.positions import located_by
 from kcal.locate.tabulate import Locator
 from kcal.pipeline.live_map import LiveMap
 from kcal.pipeline.track_columns import track_columns
-from kcal.pipeline.tracks import Tracker, TrackOptions
+from kcal.pipeline.track_options import TrackOptions
+from kcal.pipeline.tracks import Tracker
 
 SITE = tracked_site()
 

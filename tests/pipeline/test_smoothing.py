@@ -9,7 +9,8 @@ from track_scenes import pairs_of, seen_by, tracked_site, yawed_rig
 
 from kcal.pipeline.motion import Motion
 from kcal.pipeline.shared_errors import ClockPrior
-from kcal.pipeline.tracks import Tracker, TrackOptions
+from kcal.pipeline.track_options import TrackOptions
+from kcal.pipeline.tracks import Tracker
 
 
 def test_smoothed_states_are_consistent_and_sharper() -> None:

@@ -10,7 +10,8 @@ import torch
 from track_scenes import pairs_of, seen_by, tracked_site
 
 from kcal.pipeline.motion import Motion
-from kcal.pipeline.tracks import Tracker, TrackOptions
+from kcal.pipeline.track_options import TrackOptions
+from kcal.pipeline.tracks import Tracker
 
 pytest.importorskip("stonesoup", reason="an oracle of the tests only")
 from stonesoup.models.measurement.linear import LinearGaussian
@@ -95,7 +96,7 @@ def test_filter_and_smoother_are_those_of_stone_soup() -> None:
         if frame == 0:
             first = belief.mean[0][:, None].numpy(), belief.noise[0].numpy()
             track.append(GaussianState(*first, timestamp=when))
-            frame_axes = tracker.frame[..., 0]
+            frame_axes = tracker.frame[..., 0] @ localize.enu_from_rig
             continue
         # The position and its covariance from the localizer, by numpy into the filter's coordinates.
         place = (frame_axes @ (localize.enu_from_rig.T @ found.enu[0])).numpy()

@@ -1,0 +1,292 @@
+"""`group_objects`: which detections of any number of cameras are of one thing, by where their lines of sight meet.
+
+Two lines of sight that come close are a possible pair, with an inverse range from the first of them. Pairs of one
+detection with others whose inverse ranges agree are a possible group; all its views are then fitted together, with
+every error that the cameras share. The likeliest groups are taken first; what remains is paired as `associate` pairs.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from kcal.errors import InputError
+from kcal.lens.rig import StereoRig
+from kcal.locate.multi_localizer import MultiViewLocalizer, common_errors, posed_cameras
+from kcal.locate.views import CommonErrors, ViewsFit, fit_views
+from kcal.pipeline.association import MOST_BOXES, AssociationOptions, size_cost
+from kcal.pipeline.detections import Detections
+from kcal.pipeline.epipolar_band import near_epipolar_lines
+from kcal.pipeline.object_views import ObjectViews
+from kcal.pipeline.one_to_one import assign_groups
+
+# Rows of fits that are done at once.
+_AT_ONCE = 4096
+# Meters: light from the farthest targets bends by no more than on such a way.
+_FAR_M = 1e5
+
+
+class _Edges(NamedTuple):
+    """Possible pairs: numbers of two detections (all cameras counted through), cost, inverse range and its sigma."""
+
+    first: NDArray[np.int64]
+    second: NDArray[np.int64]
+    cost: NDArray[np.float64]
+    inverse: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+
+
+class _Group(NamedTuple):
+    """Numbers of detections, -1 for cameras that have none, and what the group saves beside staying alone."""
+
+    marks: tuple[int, ...]
+    saved: float
+
+
+@torch.no_grad()
+def group_objects(
+    localize: MultiViewLocalizer, seen: Sequence[Detections | None], options: AssociationOptions | None = None
+) -> ObjectViews:
+    """Group the detections that the cameras of a rig have at one moment.
+
+    Rows of one camera alone are those that no group has, and those of ambiguous groups once more: a tracker gives them
+    to the track that they continue.
+
+    Args:
+        localize: the rig and how well it is known.
+        seen: detections of each camera in turn, with times; None: this camera has no image.
+        options: of the association; without `nearest` there is no smallest range.
+
+    Raises:
+        InputError: detections that are not of a camera's size, or without a time; more than 2,000 boxes in an image.
+
+    Example:
+        >>> from kcal import Camera, Origin
+        >>> from kcal.lens.camera_rig import CameraRig
+        >>> from kcal.locate import enu_from_cam
+        >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
+        >>> look = torch.stack([enu_from_cam(heading).T for heading in (0.0, 315.0, 45.0)])
+        >>> places = torch.tensor([[0.0, 0, 30], [5000.0, 0, 40], [-5000.0, 0, 35]])
+        >>> rig = CameraRig([camera] * 3, ["mill", "church", "mast"], look, places, refraction=0.0,
+        ...                 origin=Origin(lat=45.0, lon=6.0, height=0.0))
+        >>> pixels, _ = rig(torch.tensor([[0.0, 5000, 100], [400.0, 5500, 100]]))
+        >>> boxes = [torch.cat([p - 5, p + 5], -1) for p in pixels.unbind(1)]
+        >>> seen = [Detections.read(b, size=(1920, 1080), time=7.0) for b in (boxes[0], boxes[1].flip(0), boxes[2][:1])]
+        >>> views = group_objects(MultiViewLocalizer(rig), seen)
+        >>> views.seen.tolist(), views.ambiguous.tolist()
+        ([[True, True, True], [True, True, False]], [False, False])
+    """
+    options, rig = options or AssociationOptions(), localize.rig
+    if len(seen) != len(rig):
+        raise InputError(f"detections of {len(rig)} cameras are needed, got {len(seen)}")
+    for name, camera, each in zip(rig.names, rig.each, seen, strict=True):
+        if each is None:
+            continue
+        if each.size != camera.size:
+            raise InputError(f"the detections of {name} are of an image {each.size}, the camera has {camera.size}")
+        if each.time is None:
+            raise InputError(f"the detections of {name} need a time")
+        if len(each) > MOST_BOXES:
+            raise InputError(f"{len(each):,} detections of {name} in one image; at most {MOST_BOXES:,} can be grouped")
+    scene = _Scene(localize, seen, options)
+    groups, ambiguous = scene.chosen()
+    taken = {mark for group, doubt in zip(groups, ambiguous, strict=True) if not doubt for mark in group}
+    alone = [mark for mark in range(len(scene.camera)) if mark not in taken]
+    count = len(rig)
+    rows = [*groups, *(tuple(mark if c == scene.camera[mark] else -1 for c in range(count)) for mark in alone)]
+    numbers = torch.tensor(rows, dtype=torch.long).reshape(-1, count)
+    there = numbers >= 0
+    pixels = torch.where(there[..., None], scene.pixels[numbers.clamp_min(0)], torch.nan)
+    stamps = [math.nan if each is None else float(each.time or 0.0) for each in seen]
+    known = [stamp for stamp in stamps if math.isfinite(stamp)]
+    filled = [stamp if math.isfinite(stamp) else min(known, default=0.0) for stamp in stamps]
+    time = torch.tensor(filled, dtype=torch.float64)
+    firsts = [next(mark for mark in row if mark >= 0) for row in rows]
+    return ObjectViews(
+        pixels=pixels,
+        seen=there,
+        covariance=options.box_sigma**2 * torch.eye(2 * count, dtype=torch.float64).expand(len(rows), -1, -1),
+        time=time.expand(len(rows), count),
+        score=torch.where(there, scene.score[numbers.clamp_min(0)], torch.inf).amin(-1) if rows else scene.score[:0],
+        category=tuple(scene.category[mark] for mark in firsts),
+        ambiguous=torch.tensor([*ambiguous, *[False] * len(alone)], dtype=torch.bool),
+    )
+
+
+class _Scene:
+    """Detections of all cameras, counted through."""
+
+    def __init__(
+        self, localize: MultiViewLocalizer, seen: Sequence[Detections | None], options: AssociationOptions
+    ) -> None:
+        self.localize, self.options, self.posed = localize, options, posed_cameras(localize)
+        there = [(c, each) for c, each in enumerate(seen) if each is not None]
+        none = torch.zeros(0, dtype=torch.float64)
+        self.camera = np.repeat([c for c, _ in there], [len(each) for _, each in there]).astype(np.int64)
+        self.pixels = torch.cat([none.reshape(0, 2), *(each.anchors(options.anchor) for _, each in there)])
+        self.boxes = torch.cat([none.reshape(0, 4), *(each.boxes for _, each in there)])
+        self.score = torch.cat([none, *(each.score for _, each in there)])
+        self.category = [name for _, each in there for name in each.category]
+        names = {name: number for number, name in enumerate(dict.fromkeys(self.category))}
+        self.kind = np.array([names[name] for name in self.category], dtype=np.int64)
+        self.own = [np.flatnonzero(self.camera == c) for c in range(len(localize.rig))]
+
+    def chosen(self) -> tuple[list[tuple[int, ...]], list[bool]]:
+        """Groups of two views and more, each detection once, and which are ambiguous."""
+        cameras = range(len(self.own))
+        edges = {(i, j): self._edges(i, j) for i, j in itertools.combinations(cameras, 2)}
+        candidates = self._fitted(_with_one_range(list(edges.values()), self.camera, len(self.own), self.options.gate))
+        near = 2.0 * math.log(self.options.odds)
+        by_mark: dict[int, list[_Group]] = {}
+        for group in candidates:
+            for mark in group.marks:
+                by_mark.setdefault(mark, []).append(group)
+        groups: list[tuple[int, ...]] = []
+        doubts: list[bool] = []
+        used: set[int] = set()
+        for group in sorted(candidates, key=lambda group: -group.saved):
+            marks = {mark for mark in group.marks if mark >= 0}
+            if marks & used:
+                continue
+            used |= marks
+            rivals = (other for mark in marks for other in by_mark[mark] if not {*other.marks} <= {*group.marks, -1})
+            groups.append(group.marks)
+            doubts.append(any(group.saved - other.saved < near for other in rivals))
+        alone = self.options.gate**2
+        for (i, j), found in edges.items():
+            rows, columns = (np.array([m for m in self.own[c] if m not in used], dtype=np.int64) for c in (i, j))
+            if not len(rows) or not len(columns):
+                continue
+            place = {int(mark): number for number, mark in enumerate([*rows, *columns])}
+            cost = np.full((len(rows), len(columns)), np.inf)
+            for first, second, value in zip(found.first.tolist(), found.second.tolist(), found.cost, strict=True):
+                if first in place and second in place:
+                    cost[place[first], place[second] - len(rows)] = value
+            best, rival = assign_groups(cost, alone, near)
+            for row in np.flatnonzero(best >= 0):
+                pair = {i: int(rows[row]), j: int(columns[best[row]])}
+                groups.append(tuple(pair.get(c, -1) for c in cameras))
+                doubts.append(bool(rival[row]))
+                used |= set(pair.values())
+        return groups, doubts
+
+    def _edges(self, i: int, j: int) -> _Edges:
+        """Possible pairs of two cameras."""
+        rig, options = self.localize.rig, self.options
+        rows, columns = self.own[i], self.own[j]
+        turn = rig.rotation[j] @ rig.rotation[i].T
+        shift = rig.rotation[j] @ (rig.center[i] - rig.center[j])
+        near = torch.zeros(len(rows), len(columns), dtype=torch.bool)
+        if len(rows) and len(columns) and bool(shift.any()):
+            pair = StereoRig(rig.each[i], rig.each[j], turn, shift)
+            near = near_epipolar_lines(pair, self.pixels[rows], self.pixels[columns], self._wide(i, j), options.gate)
+        if options.same_category:
+            near &= torch.from_numpy(self.kind[rows][:, None] == self.kind[columns])
+        at = near.nonzero().numpy()
+        first, second = rows[at[:, 0]], columns[at[:, 1]]
+        cost, inverse, sigma = (np.zeros(len(at)) for _ in range(3))
+        for part in np.split(np.arange(len(at)), range(_AT_ONCE, len(at), _AT_ONCE)):
+            both = np.stack([first[part], second[part]], 1)
+            found = self._fit((i, j), self.pixels[both], torch.ones(both.shape, dtype=torch.bool))
+            cost[part], inverse[part], sigma[part] = self._pair_costs(found, both)
+        kept = cost < options.gate**2
+        return _Edges(first[kept], second[kept], cost[kept], inverse[kept], sigma[kept])
+
+    def _wide(self, i: int, j: int) -> float:
+        """Pixels: noise of a box and all that is not known of attitudes and air; a first look only."""
+        common, most = common_errors(self.localize), 0.0
+        for c in (i, j):
+            angle = 2.0 * self.posed.bending * _FAR_M
+            if common is not None:
+                moved = common.half[:, c, :6].square().sum(0).sqrt()
+                angle += float(moved[3:].max() + common.bending.square().sum().sqrt() * _FAR_M)
+                angle += float(moved[:3].max() / (self.options.nearest or 1000.0))
+            most = max(most, angle * float(self.localize.rig.each[c].focal.max()))
+        return math.hypot(self.options.box_sigma, most)
+
+    def _fit(self, cameras: Sequence[int], pixels: Tensor, seen: Tensor) -> ViewsFit:
+        chosen, posed = list(cameras), self.posed
+        part = posed._replace(
+            cameras=[posed.cameras[c] for c in chosen], rotation=posed.rotation[chosen], center=posed.center[chosen],
+            up=None if posed.up is None else posed.up[chosen],
+        )  # fmt: skip
+        common = common_errors(self.localize)
+        if common is not None:
+            common = CommonErrors(tuple(common.lens[c] for c in chosen), common.half[:, chosen], common.bending)
+        return fit_views(part, pixels, seen, noise=self.options.box_sigma, shared=common)
+
+    def _pair_costs(self, found: ViewsFit, both: NDArray[np.int64]) -> tuple[NDArray[np.float64], ...]:
+        """Squared sigmas of what no point explains, of range and of size; inverse range and its sigma."""
+        options, fit = self.options, found.fit
+        total, _ = found.misfits()
+        length = fit.direction.square().sum(0).sqrt()
+        inverse = fit.inverse / (found.scale * length)
+        sigma = (found.variance * fit.covariance[5]).clamp_min(0.0).sqrt() / (found.scale * length)
+        beyond = (1.0 / options.farthest - inverse).clamp_min(0.0)
+        before = (inverse - 1.0 / options.nearest).clamp_min(0.0) if options.nearest else torch.zeros_like(inverse)
+        total = total + (torch.maximum(beyond, before) / sigma).square()
+        parallax = torch.linalg.vector_norm(torch.linalg.cross(found.rays[:, 0], found.rays[:, 1]), dim=-1)
+        first, second = self.boxes[both].unbind(1)
+        total = total + size_cost(fit.projections, first, second, options.box_sigma, parallax)
+        good = found.fitted & (sigma > 0) & (found.used.sum(-1) == both.shape[1])
+        return tuple(v.numpy() for v in (torch.where(good, total, torch.inf), inverse, sigma))
+
+    def _fitted(self, groups: list[tuple[int, ...]]) -> list[_Group]:
+        """Groups of three views and more, fitted; one view that contradicts is left out."""
+        from scipy.special import chdtri
+
+        good, gate = [], self.options.gate**2
+        for _ in range(2):
+            again: set[tuple[int, ...]] = set()
+            for start in range(0, len(groups), _AT_ONCE):
+                part = groups[start : start + _AT_ONCE]
+                numbers = torch.tensor(part)
+                found = self._fit(range(len(self.own)), self.pixels[numbers.clamp_min(0)], numbers >= 0)
+                chi2, falls = found.misfits()
+                views = found.used.sum(-1)
+                ahead = found.fitted & (found.fit.inverse > 0) & ~found.behind(self.posed.center)
+                worst = falls.argmax(-1).tolist()
+                for group, value, count, there, one in zip(
+                    part, chi2.tolist(), views.tolist(), ahead.tolist(), worst, strict=True
+                ):
+                    if there and count > 2 and value < chdtri(2 * count - 3, 1e-4):
+                        good.append(_Group(group, (count - 1) * gate - value))
+                    elif count > 3:
+                        again.add(tuple(-1 if c == one else mark for c, mark in enumerate(group)))
+            groups = sorted(again - {group.marks for group in good})
+        return good
+
+
+def _with_one_range(edges: list[_Edges], camera: NDArray[np.int64], cameras: int, gate: float) -> list[tuple[int, ...]]:
+    """Groups of three detections and more whose inverse ranges from the first one agree."""
+    if cameras < 3:
+        return []
+    first, second, _, inverse, sigma = (np.concatenate(values) for values in zip(*edges, strict=True))
+    order = np.argsort(first, kind="stable")
+    first, second, inverse, sigma = first[order], second[order], inverse[order], sigma[order]
+    bounds = np.flatnonzero(np.diff(first)) + 1
+    found: set[tuple[int, ...]] = set()
+    for at in np.split(np.arange(len(first)), bounds):
+        if len(at) < 2:
+            continue
+        apart = np.abs(inverse[at, None] - inverse[at]) / np.hypot(sigma[at, None], sigma[at])
+        apart[camera[second[at]][:, None] == camera[second[at]]] = np.inf
+        for row, other in zip(*np.nonzero(apart < gate), strict=True):
+            # The nearest of each camera beside these two.
+            marks = [-1] * cameras
+            marks[camera[first[at[0]]]] = int(first[at[0]])
+            both = apart[row] + apart[other]
+            for place in np.argsort(both, kind="stable")[::-1]:
+                if both[place] < 2 * gate:
+                    marks[camera[second[at[place]]]] = int(second[at[place]])
+            for place in (row, other):
+                marks[camera[second[at[place]]]] = int(second[at[place]])
+            found.add(tuple(marks))
+    return sorted(found)
