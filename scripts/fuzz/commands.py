@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import torch
+from hypothesis import strategies
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard, load_measured_board, save_measured_board
@@ -29,6 +30,7 @@ from kcal.cli.main import main as command_line
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.errors import KcalError
+from kcal.files import make_folder
 from kcal.io.lookup_file import load_lookup, save_lookup
 from kcal.io.rig_file import save_rig
 from kcal.lens.baking import bake
@@ -36,7 +38,9 @@ from kcal.lens.camera import Camera
 from kcal.lens.mounting import Mounting, Origin
 from kcal.lens.rig import StereoRig
 from scripts.fuzz.damage import damage_bytes, damage_json, damage_table
+from scripts.fuzz.hunt import Prepared
 
+_SECONDS = 30.0  # for one command
 BOARD = Board(columns=6, rows=5, square=0.02)
 
 
@@ -204,3 +208,14 @@ def run_case(case: int, whole: dict[str, bytes], seconds: float) -> list[Finding
             if detail:
                 found.append(Finding(case, "silent number", shown, done, detail))
     return found
+
+
+def commands(folder: Path) -> Prepared:
+    """The harness: a case is its number as text."""
+    whole = make_files(make_folder(folder / "whole"))
+
+    def check(case: bytes) -> None:
+        found = run_case(int(case), whole, _SECONDS)
+        assert not found, f"{found[0].what} in `{found[0].kind}`: {found}"
+
+    return Prepared(strategies.integers(0, 2**40).map(lambda number: str(number).encode()), check, 3 * _SECONDS)

@@ -27,15 +27,17 @@ from hypothesis.strategies import SearchStrategy
 
 # What one case may take: seconds, and bytes beyond what the process has when it begins.
 SECONDS, MEMORY = 10, 2 * 2**30
+_STUCK = 90  # seconds after which a child that does not hear its alarm is ended
 _EXAMPLES = 200  # of one seed of Hypothesis, which thinks about earlier ones
 _RESTARTS = 8
 
 
 class Prepared(NamedTuple):
-    """A harness that is ready: its cases, and what raises for one that breaks an invariant."""
+    """A harness that is ready: its cases, what raises for one that breaks an invariant, and the limit of one."""
 
     cases: SearchStrategy[bytes]
     check: Callable[[bytes], object]
+    seconds: float = SECONDS
 
 
 Write = Callable[[str, "Finding"], None]
@@ -78,10 +80,10 @@ def replay(harness: Harness, folder: Path, cases: list[bytes]) -> list[Finding]:
     """Findings of cases that were kept, all in one child."""
 
     def run(write: Write) -> int:
-        check = harness(folder).check
+        prepared = harness(folder)
         for case in cases:
             (folder / "now").write_bytes(case)
-            key, text = _outcome(check, case)
+            key, text = _outcome(prepared, case)
             if key:
                 write(key, Finding(text, case))
         return len(cases)
@@ -100,7 +102,7 @@ def _search(harness: Harness, folder: Path, seed: int, seconds: float, known: se
             return
         now.write_bytes(case)
         count += 1
-        key, text = _outcome(prepared.check, case)
+        key, text = _outcome(prepared, case)
         if key and key not in known:
             if key not in smallest or len(case) <= len(smallest[key].case):
                 smallest[key] = Finding(text, case)
@@ -124,12 +126,12 @@ def _search(harness: Harness, folder: Path, seed: int, seconds: float, known: se
     return count
 
 
-def _outcome(check: Callable[[bytes], object], case: bytes) -> tuple[str, str]:
+def _outcome(prepared: Prepared, case: bytes) -> tuple[str, str]:
     """What a case breaks, as a key that is the same for the same fault, and with all that is known; or nothing."""
     begin = time.monotonic()
-    signal.setitimer(signal.ITIMER_REAL, SECONDS)
+    signal.setitimer(signal.ITIMER_REAL, prepared.seconds)
     try:
-        check(case)
+        prepared.check(case)
     except BaseException as error:
         frames = traceback.extract_tb(error.__traceback__)
         inside = [frame for frame in frames if f"{os.sep}kcal{os.sep}" in frame.filename] or frames
@@ -140,8 +142,8 @@ def _outcome(check: Callable[[bytes], object], case: bytes) -> tuple[str, str]:
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
     taken = time.monotonic() - begin
-    # A clock that others disturb: half of the limit is not yet a finding.
-    return (f"{SECONDS} s", f"took {taken:.0f} s") if taken > SECONDS else ("", "")
+    # What caught the alarm, or ran in a library until its end.
+    return ("too long", f"took {taken:.0f} s") if taken > prepared.seconds else ("", "")
 
 
 def _child(work: Callable[[Write], int], folder: Path, seconds: float) -> tuple[dict[str, Finding], int]:
@@ -197,11 +199,11 @@ def _waited(child: int, now: Path, seconds: float) -> str:
         if done:
             code = os.waitstatus_to_exitcode(status)
             return "" if code == 0 else f"code {code}"
-        stuck = time.time() - now.stat().st_mtime > 3 * SECONDS and now.stat().st_size
+        stuck = time.time() - now.stat().st_mtime > _STUCK and now.stat().st_size
         if stuck or time.monotonic() > until:
             os.kill(child, signal.SIGKILL)
             os.waitpid(child, 0)
-            return f"a hang of more than {3 * SECONDS} s"
+            return f"a hang of more than {_STUCK} s"
         time.sleep(0.05)
 
 
@@ -216,7 +218,7 @@ def limit_memory(most: int = MEMORY) -> None:
 
 
 def _overtime(*_: object) -> None:
-    raise Overtime(f"longer than {SECONDS} s")
+    raise Overtime("longer than its limit")
 
 
 def corpus(folder: Path) -> Iterator[tuple[str, list[bytes]]]:

@@ -106,6 +106,7 @@ def _journal(path: Path) -> Any:
 def _live_journal(path: Path) -> Any:
     output = path.with_name("out.csv")
     output.write_bytes(b"x" * 100)
+    read_bytes(path)  # a journal that is missing is begun
     ledger = Ledger(path, [output])
     try:
         return ledger.place, ledger.checkpoint_at, ledger.state
@@ -129,7 +130,7 @@ def _positions(path: Path) -> None:
 
 def _fits(path: Path) -> None:
     fits = pytest.importorskip("astropy.io.fits")
-    fits.writeto(path, np.arange(48, dtype=np.uint16).reshape(6, 8))
+    fits.writeto(path, overwrite=True, data=np.arange(48, dtype=np.float32).reshape(6, 8))
 
 
 # Of parameters of which nothing was known before the calibration.
