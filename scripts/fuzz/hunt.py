@@ -59,19 +59,21 @@ class Overtime(BaseException):
     """A case took longer than its limit. No `Exception`: readers catch those."""
 
 
-def hunt(harness: Harness, folder: Path, seed: int, seconds: float) -> tuple[list[Finding], int]:
-    """Findings of a harness, and how many cases were run."""
+def hunt(
+    harness: Harness, folder: Path, seed: int, seconds: float, *, most: int | None = None
+) -> tuple[list[Finding], int]:
+    """Findings of a harness, and how many cases were run; the search ends early once there are `most` findings."""
     found: dict[str, Finding] = {}
     total, until = 0, time.monotonic() + seconds
     for start in range(_RESTARTS):
         left = until - time.monotonic()
         if start and left < 1:
             break
-        work = functools.partial(_search, harness, folder, seed + start, left, set(found))
+        work = functools.partial(_search, harness, folder, seed + start, left, set(found), most)
         more, count = _child(work, folder, left)
         total += count
         found.update(more)
-        if not any(key.startswith("ended") for key in more):
+        if not any(key.startswith("ended") for key in more) or (most and len(found) >= most):
             break
     return list(found.values()), total
 
@@ -91,7 +93,9 @@ def replay(harness: Harness, folder: Path, cases: list[bytes]) -> list[Finding]:
     return list(_child(run, folder, SECONDS * (1 + len(cases)))[0].values())
 
 
-def _search(harness: Harness, folder: Path, seed: int, seconds: float, known: set[str], write: Write) -> int:
+def _search(
+    harness: Harness, folder: Path, seed: int, seconds: float, known: set[str], most: int | None, write: Write
+) -> int:
     until, count = time.monotonic() + seconds, 0
     now, prepared = folder / "now", harness(folder)
     smallest: dict[str, Finding] = {}
@@ -114,7 +118,7 @@ def _search(harness: Harness, folder: Path, seed: int, seconds: float, known: se
         phases=[hypothesis.Phase.generate, hypothesis.Phase.shrink],
     )  # fmt: skip
     for batch in itertools.count():
-        if time.monotonic() > until:
+        if time.monotonic() > until or (most and len(known) >= most):
             break
         run = hypothesis.seed(seed * 100_003 + batch)(quiet(hypothesis.given(prepared.cases)(body)))
         # Beside the finding: that it came only once, when the time ended while it was made smaller.

@@ -96,8 +96,7 @@ def test_what_is_planted_is_found(reader: Reader, what: str, tmp_path: Path) -> 
     def harness(folder: Path) -> hunt.Prepared:
         return reader.prepared(folder)._replace(seconds=0.3)
 
-    found, count = hunt.hunt(harness, tmp_path, 1, 3.0)
-    assert count > 5
-    assert any(re.search(what, finding.what) for finding in found), found
-    assert [finding.what for finding in hunt.replay(harness, tmp_path, [found[0].case])], "a case that is kept fails"
+    found, _ = hunt.hunt(harness, tmp_path, 1, 60.0, most=1)
+    assert re.search(what, found[0].what), found
+    assert hunt.replay(harness, tmp_path, [found[0].case])
     assert hunt.replay(harness, tmp_path, [b"15"]) == []
