@@ -165,7 +165,8 @@ READERS: dict[str, Reader] = {
     "observations": Reader(Observations.load, ".json", _observations, lambda found, path: found.save(path),
                            more="*/observations.json"),
     "settings": Reader(_settings, ".toml", whole_text('size = "9x6"\npixel_sigma = 0.2\nbaseline = 10\n'), named=False,
-                       save=lambda found, path: path.write_text(toml_text(found))),
+                       save=lambda found, path: path.write_text(toml_text(found)),
+                       kept=lambda found: sorted(found.items())),
     "pairs": Reader(lambda path: read_pairs(path, ["a1", "a2"], ["b1", "b2"]), ".csv",
                     whole_text("left,right\na1,b1\na2,b2\n")),
     "jobs": Reader(lambda path: read_jobs(path, BOARD, "hybrid"), ".csv", whole_text(
