@@ -99,12 +99,17 @@ def terrain(path: str | Path, geoid_height: float = 0.0) -> Ground:
                 size = f"{raster.width} x {raster.height}"
                 raise FileError(f"{path}: {size} cells; at most {_MOST_CELLS:,} are read: cut out what is needed")
             heights = raster.read(1, masked=True).astype(np.float64).filled(np.nan)
+            if raster.transform.is_degenerate:
+                raise FileError(f"{path}: its cells have no size on the ground")
             system, to_cell = raster.crs, ~raster.transform
     except rasterio.errors.RasterioError as error:
         raise FileError(f"{path}: cannot be read as a raster: {error}") from error
     if system is None:
         raise FileError(f"{path}: the raster has no coordinate system")
-    into = pyproj.Transformer.from_crs("EPSG:4326", system.to_wkt(), always_xy=True)
+    try:
+        into = pyproj.Transformer.from_crs("EPSG:4326", system.to_wkt(), always_xy=True)
+    except pyproj.exceptions.ProjError as error:
+        raise FileError(f"{path}: its coordinate system cannot be used: {error}") from error
     rows, columns = heights.shape
 
     def height(lat: Tensor, lon: Tensor) -> Tensor:
