@@ -63,7 +63,7 @@ def _foreign(name: str, suffix: str) -> Reader:
 
     return Reader(
         lambda path: import_cameras(path, format=name), suffix,
-        lambda path: known.write([CAMERA if "opencv5" in known.models else _four()], [], path),
+        lambda path: known.write and known.write([CAMERA if "opencv5" in known.models else _four()], [], path),
         save, 1e-9, kept=_kept,
     )  # fmt: skip
 
@@ -138,7 +138,8 @@ READERS: dict[str, Reader] = {
     "Kalibr's results": Reader(lambda path: import_cameras(path, size=(320, 240)), ".txt", whole_text(_RESULTS)),
     "qualisys": Reader(lambda path: import_cameras(path, format="qualisys"), ".txt", whole_text(_QUALISYS)),
     "agisoft": Reader(lambda path: import_cameras(path, format="agisoft"), ".xml", whole_text(_AGISOFT)),
-    "any camera": Reader(import_cameras, ".yml", lambda path: FORMATS["opencv"].write([CAMERA], [], path)),
+    "any camera": Reader(import_cameras, ".yml",
+                         lambda path: export_cameras(CAMERA, path, format="opencv", model="opencv5")),
     "target": Reader(target_fields, ".yaml", whole_text(
         "target_type: aprilgrid\ntagCols: 6\ntagRows: 4\ntagSize: 0.08\ntagSpacing: 0.25\n")),
     "corners .vnl": Reader(_corners, ".vnl", whole_text(

@@ -87,7 +87,9 @@ def require_status(value: Any) -> None:
     if isinstance(value, StereoRig):
         left, right, _ = value(torch.tensor([[1.0, 1.0, 60.0]], dtype=torch.float64))
         if bool((left.isfinite() & right.isfinite()).all()):
-            place = {} if value.mounting else {"origin": Origin(lat=0.0, lon=0.0, height=0.0), "heading_deg": 0.0}
+            place: dict[str, Any] = (
+                {} if value.mounting else {"origin": Origin(lat=0.0, lon=0.0, height=0.0), "heading_deg": 0.0}
+            )
             found = StereoLocalizer(value, pixel_sigma=0.3, **place)(left, right)
             good = found.status == PositionStatus.OK
             assert bool(found.enu[good].isfinite().all()), "a good position is not finite"

@@ -90,6 +90,7 @@ class Reader(NamedTuple):
 
         for whole in wholes:
             check(whole)
+            self.read(path)  # which is accepted
         return Prepared(cases(), check)
 
 

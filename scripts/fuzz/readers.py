@@ -32,7 +32,7 @@ from kcal.lens.mounting import Mounting, Origin
 from kcal.lens.rig import StereoRig
 from kcal.locate.export import write_positions
 from kcal.locate.ground import terrain
-from kcal.locate.marks import read_marks, write_marks
+from kcal.locate.marks import COVARIANCE, read_marks, write_marks
 from kcal.locate.positions import locate_points
 from kcal.locate.stations import load_camera_rig
 from kcal.locate.survey import read_features, read_survey
@@ -59,7 +59,7 @@ def _observations(path: Path) -> None:
 
 
 def _video(path: Path) -> None:
-    video = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10.0, (64, 48))
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (64, 48))
     for k in range(3):
         video.write(np.full((48, 64, 3), 40 * k, np.uint8))
     video.release()
@@ -164,14 +164,15 @@ READERS: dict[str, Reader] = {
     "lookup": Reader(load_lookup, ".npz", lambda path: save_lookup(bake(CAMERA, 0.1), path), save_lookup),
     "observations": Reader(Observations.load, ".json", _observations, lambda found, path: found.save(path),
                            more="*/observations.json"),
-    "settings": Reader(_settings, ".toml", whole_text('size = "9x6"\npixel_sigma = 0.2\nbaseline = 10\n'), named=False,
+    "settings": Reader(_settings, ".toml", whole_text('board = "9x6"\npixel_sigma = 0.2\nbaseline = 10\n'), named=False,
                        save=lambda found, path: path.write_text(toml_text(found)),
                        kept=lambda found: sorted(found.items())),
     "pairs": Reader(lambda path: read_pairs(path, ["a1", "a2"], ["b1", "b2"]), ".csv",
                     whole_text("left,right\na1,b1\na2,b2\n")),
     "jobs": Reader(lambda path: read_jobs(path, BOARD, "hybrid"), ".csv", whole_text(
         "camera,images,board,square,model\na,good.csv,9x6,25mm,hybrid\nb,*.csv,charuco:9x6,2cm,opencv5\n")),
-    "marking log": Reader(_journal, ".jsonl", whole_text("".join(json.dumps(line) + "\n" for line in ACTIONS))),
+    "marking log": Reader(_journal, ".jsonl", whole_text("".join(
+        json.dumps(line) + "\n" for line in ({"kcal": "marking log", "version": 1}, *ACTIONS)))),
     "live journal": Reader(_live_journal, ".journal", _whole_journal),
     "live line": Reader(lambda path: read_moment(read_bytes(path), RIG, AssociationOptions(), 0.3), ".json",
                         whole_text(_PAIRS_LINE), named=False),
@@ -200,8 +201,11 @@ READERS: dict[str, Reader] = {
         "<gpx>" + "".join(f'<wpt lat="{b}" lon="{a}"><ele>{h}</ele><name>{n}</name></wpt>' for n, a, b, h in _PLACES)
         + "</gpx>")),
     "marks": Reader(read_marks, ".csv", whole_text(
-        "name,left_u,left_v,right_u,right_v,left_cov_uu,left_cov_uv,left_cov_vv,right_cov_uu,right_cov_uv,right_cov_vv\n"
-        "a,40,50,30,50,0.1,0,0.1,0.1,0,0.1\nb,60,70,50,70,,,,,,\n"), write_marks, unknown=("covariance",)),
+        f"name,left_u,left_v,right_u,right_v,{','.join(COVARIANCE)}\n"
+        "a,40,50,30,50,0.1,0,0,0,0.1,0,0,0.1,0,0.1\nb,60,70,50,70,,,,,,,,,,\n"),
+        lambda found, path: write_marks(path, found), unknown=("covariance",),
+        # Control characters in names are written in words.
+        kept=lambda found: (len(found.names), found.left, found.right, found.covariance)),
     "view marks": Reader(lambda path: read_views(path, ["a", "b"]), ".csv", whole_text(
         "name,camera,u,v,time,sigma\np,a,1,2,0.5,0.1\np,b,3,4,0.5,\nq,b,5,6,1.5,0.3\n"), unknown=("pixels", "sigma")),
     "features": Reader(lambda path: read_features(path, 0.3), ".csv", infinite=("inverse_range_sigma",),

@@ -22,7 +22,8 @@ def test_a_signal_while_it_waits_for_a_line(sent: signal.Signals, tmp_path: Path
     rig.mounting = Mounting(origin=Origin(lat=10.0, lon=20.0, height=3.0), heading_deg=30.0)
     save_rig(rig, tmp_path / "rig.json")
     command = [sys.executable, "-m", "kcal", "live", "rig.json", "--detections", "-", "-o", "tracks.csv"]
-    live = subprocess.Popen(command, cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    pipe = subprocess.PIPE
+    live = subprocess.Popen(command, cwd=tmp_path, stdin=pipe, stdout=pipe, stderr=pipe)
     try:
         live.stdin.write(b'{"time": 1.0, "left": [[960, 540]], "right": [[944, 540]]}\n')
         live.stdin.flush()
