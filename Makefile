@@ -38,7 +38,10 @@ test: check
 	$(BIN)/python -m pytest -n 2 -m "not slow" kcal tests
 	@echo "left out: $$(grep -rh '^ *@pytest.mark.slow' tests | wc -l) slow tests; make test-all runs them, too"
 
+# Seeds of fuzzing are fresh; KCAL_FUZZ_SEED=... repeats those that were printed.
+test-all: export KCAL_FUZZ_SEED := $(or $(KCAL_FUZZ_SEED),$(shell date +%s))
 test-all: check
+	@echo "fuzzing: KCAL_FUZZ_SEED=$(KCAL_FUZZ_SEED)"
 	$(BIN)/python -m pytest -n 2 kcal tests
 
 test-cpus: $(VENV)/.installed-dev

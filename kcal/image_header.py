@@ -61,6 +61,12 @@ def _png(data: bytes) -> Size:
     # Deflate makes a byte of 1032 at most: a larger image is damaged, and would be decoded for long.
     if MOST_PIXELS >= width * height > 8 * 1032 * len(data):
         raise ValueError("more pixels than its bytes can have")
+    # The decoder takes memory for a chunk by the length that it states, up to 2 GiB, before it reads it.
+    place = 8
+    while place + 12 <= len(data) and data[place + 4 : place + 8] != b"IEND":
+        place += 12 + int(struct.unpack_from(">I", data, place)[0])
+        if place > len(data):
+            raise ValueError("a chunk is longer than the file")
     return width, height
 
 

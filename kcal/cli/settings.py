@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-import math
+import sys
 import tomllib
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -84,7 +84,8 @@ def _checked_setting(key: str, value: Any) -> Any:
         near = difflib.get_close_matches(key, SETTINGS, 1, 0.0)[0]
         raise FileError(f"{NAME}: unknown key {key[:40]!r}; did you mean {near}? Known are {', '.join(SETTINGS)}")
     wanted = SETTINGS[key].kind
-    number = wanted is float and type(value) in (int, float) and math.isfinite(value)
+    # An integer of TOML may be larger than any float.
+    number = wanted is float and type(value) in (int, float) and abs(value) <= sys.float_info.max
     if not number and (wanted is float or not isinstance(value, str)):
         what = "a number" if wanted is float else "a text in quotation marks"
         raise FileError(f"{NAME}: {key} must be {what}, for example {key} = {SETTINGS[key].example}")

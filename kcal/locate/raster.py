@@ -119,12 +119,24 @@ def _read_raster(path: Path) -> _Read:
         with rasterio.open(path) as raster:
             _check_cells(path, raster.width, raster.height)
             heights = raster.read(1, masked=True).astype(np.float64).filled(np.nan)
+            if raster.transform.is_degenerate:
+                raise FileError(f"{path}: its cells have no size on the ground")
             system, to_cell = raster.crs, ~raster.transform
     except rasterio.errors.RasterioError as error:
         raise FileError(f"{path}: cannot be read as a raster: {error}") from error
     if system is None:
         raise FileError(f"{path}: the raster has no coordinate system")
-    return heights, tuple(to_cell)[:6], pyproj.CRS.from_wkt(system.to_wkt())
+    return heights, tuple(to_cell)[:6], _system(path, system.to_wkt())
+
+
+def _system(path: Path, text: str) -> pyproj.CRS:
+    """A coordinate system that positions can be turned into."""
+    try:
+        system = pyproj.CRS.from_wkt(text)
+        pyproj.Transformer.from_crs("EPSG:4326", system, always_xy=True)
+    except pyproj.exceptions.ProjError as error:
+        raise FileError(f"{path}: its coordinate system cannot be used: {error}") from error
+    return system
 
 
 def _read_grid(path: Path) -> _Read:
@@ -134,7 +146,9 @@ def _read_grid(path: Path) -> _Read:
     while (line := text.split("\n", 1))[0].split()[:1] and line[0].split()[0].lower() in _GRID_KEYS:
         words = line[0].split()
         try:
-            head[words[0].lower()] = float(words[1])
+            head[words[0].lower()] = value = float(words[1])
+            if not math.isfinite(value):
+                raise ValueError(words[1])
         except (ValueError, IndexError):
             raise FileError(f"{path}: {line[0].strip()!r} is no line of an ESRI ASCII grid's head") from None
         text = line[1] if len(line) > 1 else ""
@@ -151,15 +165,14 @@ def _read_grid(path: Path) -> _Read:
         heights = np.array(text.split(), dtype=np.float64)
     except ValueError as error:
         raise FileError(f"{path}: {error}; heights must be numbers") from None
+    if np.isinf(heights).any():
+        raise FileError(f"{path}: a height is infinite")
     if len(heights) != columns * rows:
         raise FileError(f"{path}: {len(heights)} heights, ncols x nrows are {columns} x {rows}")
     heights = np.where(heights == head.get("nodata_value", -9999.0), np.nan, heights).reshape(rows, columns)
     projection = path.with_suffix(".prj")
     if projection.is_file():
-        try:
-            system = pyproj.CRS.from_wkt(read_text(projection, 1 << 20))
-        except pyproj.exceptions.CRSError as error:
-            raise FileError(f"{projection}: not a coordinate system: {error}") from error
+        system = _system(projection, read_text(projection, 1 << 20))
     elif x >= -180.0 and x + columns * cell <= 180.0 and y >= -90.0 and y + rows * cell <= 90.0:
         system = pyproj.CRS("EPSG:4326")
     else:

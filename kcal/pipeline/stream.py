@@ -266,7 +266,8 @@ def lines_of(path: Path | None, read: Callable[[bytes], Moment]) -> Callable[[in
 
     def items(offset: int) -> Iterator[SourceItem]:
         try:
-            file = sys.stdin.buffer if path is None else open(path, "rb")  # noqa: SIM115
+            # A reader of its own: a thread that waits in `sys.stdin` when Python ends makes that a fatal error.
+            file = open(os.dup(sys.stdin.fileno()) if path is None else path, "rb")  # noqa: SIM115
         except OSError as error:
             raise FileError(f"{path}: cannot read: {error.strerror or error}") from error
         with file:

@@ -266,9 +266,11 @@ def located_rows(path: Path, truth: dict[str, Any]) -> list[PositionRow]:
             high_m = math.inf if high in (None, "") else float(high)
             time = row.get("time_s")
             name = str(row["name"])
-        except (KeyError, TypeError, ValueError) as error:
+            enu = geodetic_to_enu(torch.tensor(numbers[:3], dtype=torch.float64), origin).numpy()
+            if not all(map(math.isfinite, numbers)) or math.isnan(high_m):
+                raise ValueError(f"finite numbers, of {name}")
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise FileError(f"{path}: a row without {error}; kcal locate and kcal live write other files") from error
-        enu = geodetic_to_enu(torch.tensor(numbers[:3], dtype=torch.float64), origin).numpy()
         found.append(PositionRow(name, enu, numbers[3], numbers[4], high_m, None if time is None else float(time)))
     return found
 
@@ -283,6 +285,6 @@ def _records(path: Path) -> Iterator[dict[str, Any]]:
         for line in lines:
             content = orjson.loads(line)
             for feature in content.get("features", [content]):
-                yield feature["properties"]
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+                yield dict(feature["properties"])
+    except (ValueError, KeyError, TypeError, AttributeError, csv.Error) as error:
         raise FileError(f"{path}: no positions of kcal: {error}") from error

@@ -57,10 +57,12 @@ def _read_fits(path: Path) -> NDArray[Any]:
     try:
         with fits.open(io.BytesIO(read_bytes(path))) as parts:
             image = next((part.data for part in parts if part.data is not None and part.data.ndim == 2), None)
-    except (OSError, ValueError, TypeError) as error:
+    except (OSError, ValueError, TypeError, LookupError, AttributeError, OverflowError) as error:  # of a damaged header
         raise FileError(f"{path}: not a FITS file that can be read: {error}") from error
     if image is None:
         raise FileError(f"{path}: no image (H, W) in this FITS file")
+    if bad := int((~np.isfinite(image)).sum()):
+        raise FileError(f"{path}: {bad} pixels are no finite numbers; fill them with the gray level around them")
     # Row 0 of a FITS image is the lowest.
     return np.asarray(image[::-1], np.float64)
 

@@ -1,4 +1,4 @@
-"""A short seeded run of `scripts/check/fuzz.py`, and that it sees what it is there for."""
+"""A short seeded run of `scripts/fuzz/commands.py`, and that it sees what it is there for."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from scripts.check import fuzz
+from scripts.fuzz import commands as fuzz
+from scripts.fuzz.damage import damage_json
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +43,7 @@ def _case(whole: dict[str, bytes], kind: str, damage: str) -> int:
     for case in range(20_000):
         rng = random.Random(case)
         right = rng.choice(sorted(whole)) == kind and rng.random() < 0.85
-        if right and damage in fuzz.damage_json(whole[kind], rng)[1]:
+        if right and damage in damage_json(whole[kind], rng)[1]:
             return case
     raise AssertionError("no such case")
 

@@ -149,14 +149,19 @@ def _read_table(path: Path) -> list[dict[str, str]]:
     except UnicodeDecodeError as error:
         raise FileError(f"{path}: not UTF-8 text; save it as CSV in UTF-8") from error
     reader = csv.DictReader(io.StringIO(text, newline=""), skipinitialspace=True)
-    header = reader.fieldnames or []
-    if not {"camera", "images"} <= set(header) <= set(_COLUMNS):
-        raise FileError(f"{path}: the first line must name the columns camera,images and may name board,square,model")
     rows = []
-    for row in reader:
-        if None in row or None in row.values():
-            raise FileError(f"{path}: line {reader.line_num}: {len(header)} fields are needed")
-        rows.append({key: value.strip() for key, value in row.items()})
+    try:
+        header = reader.fieldnames or []
+        if not {"camera", "images"} <= set(header) <= set(_COLUMNS):
+            raise FileError(
+                f"{path}: the first line must name the columns camera,images and may name board,square,model"
+            )
+        for row in reader:
+            if None in row or None in row.values():
+                raise FileError(f"{path}: line {reader.line_num}: {len(header)} fields are needed")
+            rows.append({key: value.strip() for key, value in row.items()})
+    except csv.Error as error:
+        raise FileError(f"{path}: line {reader.line_num}: {error}") from error
     if not rows:
         raise FileError(f"{path}: no camera under the header")
     return rows

@@ -1,15 +1,10 @@
-"""Damage every kind of file and run every command on it: no traceback, no hang, no wrong number in silence.
+"""Run every command on one damaged file of every kind: no traceback, no hang, no wrong number in silence.
 
-    python -m scripts.check.fuzz --seconds 60
-    python -m scripts.check.fuzz --first 123 --cases 1      one case again, the number is in the report
-
-Each case damages one file in one place by its own seed: JSON by its structure (values of other types, numbers out of
-range, keys twice, deep nesting, hostile names), tables by their cells, images and archives by their bytes.
+Each case damages one file in one place by its own seed.
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
 import json
@@ -18,10 +13,8 @@ import random
 import signal
 import sys
 import tempfile
-import time
 import traceback
 import warnings
-from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,6 +22,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import torch
+from hypothesis import strategies
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard, load_measured_board, save_measured_board
@@ -36,19 +30,18 @@ from kcal.cli.main import main as command_line
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.errors import KcalError
+from kcal.files import make_folder
 from kcal.io.lookup_file import load_lookup, save_lookup
 from kcal.io.rig_file import save_rig
 from kcal.lens.baking import bake
 from kcal.lens.camera import Camera
 from kcal.lens.mounting import Mounting, Origin
 from kcal.lens.rig import StereoRig
+from scripts.fuzz.damage import damage_bytes, damage_json, damage_table
+from scripts.fuzz.hunt import Prepared
 
+_SECONDS = 30.0  # for one command
 BOARD = Board(columns=6, rows=5, square=0.02)
-# None of these is a number of JSON in the range of float64: a file with one in a number's place must be refused.
-NO_NUMBERS = ("true", "false", '"1"', "null", "NaN", "Infinity", "-Infinity", "1e999", "1" + "0" * 400, "[1]", "{}")
-ODD_NUMBERS = ("0", "-1", "1e308", "-1e308", "1e-308", "5e-324", "-0.0", "9007199254740993", "1e18", "0.1")
-ODD_TEXTS = ("<!--<script>", "=1+1", "\x1b[2J", "\ufffe", "$\\frac{", "\ud800", "a" * 100_000, "", "../../x", "\0")
-SLOT = "\ue000"
 
 
 class Hang(Exception):  # noqa: N818
@@ -99,71 +92,6 @@ def make_files(folder: Path) -> dict[str, bytes]:
     for suffix in ("png", "jpg", "tif"):
         cv2.imwrite(str(folder / f"image.{suffix}"), image)
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
-
-
-def _places(value: Any, found: list[tuple[Any, Any]]) -> list[tuple[Any, Any]]:
-    pairs = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    for key, inside in pairs:
-        found.append((value, key))
-        _places(inside, found)
-    return found
-
-
-def damage_json(data: bytes, rng: random.Random) -> tuple[bytes, str, bool]:
-    """Change one place of a JSON text; also what was done, and whether the text must now be refused."""
-    content = json.loads(data)
-    holder, key = rng.choice(_places(content, []))
-    old = holder[key]
-    number = isinstance(old, int | float) and not isinstance(old, bool)
-    raw, refused = rng.choice(NO_NUMBERS if rng.random() < 0.5 else ODD_NUMBERS), False
-    way = rng.choice(["value", "value", "value", "text", "drop", "repeat", "nest", "twice"])
-    if way == "value":
-        refused = number and raw in NO_NUMBERS and raw != "null"
-    elif way == "text":
-        raw = json.dumps(rng.choice(ODD_TEXTS))
-        refused = number
-    elif way == "nest":
-        raw, refused = "[" * 100 + "]" * 100, True
-    elif way == "repeat" and isinstance(old, list):
-        raw = json.dumps(old + old)
-    elif way == "drop":
-        del holder[key]
-        return json.dumps(content).encode(), f"{way} {key}", False
-    elif way == "twice" and isinstance(holder, dict):
-        raw, refused = f"{json.dumps(old)}, {json.dumps(key)}: {json.dumps(old)}", True
-    holder[key] = SLOT
-    text = json.dumps(content, ensure_ascii=False).replace(json.dumps(SLOT, ensure_ascii=False), raw)
-    return text.encode("utf-8", "surrogatepass"), f"{way} {key}: {raw[:40]}", refused
-
-
-def damage_table(data: bytes, rng: random.Random) -> tuple[bytes, str, bool]:
-    """Change one cell of a table below its header."""
-    lines = [line.split(",") for line in data.decode().splitlines()]
-    row, column = rng.randrange(len(lines)), rng.randrange(len(lines[0]))
-    text = rng.choice([*ODD_TEXTS, *ODD_NUMBERS, "nan", "inf", '"', "1_0", "1;2", "\r", "'"])
-    lines[row][column] = text
-    refused = row > 0 and column > 0 and text in ("nan", "inf", "1_0", "1;2", "'", *ODD_TEXTS)
-    return (
-        "\n".join(map(",".join, lines)).encode("utf-8", "surrogatepass"),
-        f"cell {row},{column}: {text[:40]}",
-        refused,
-    )
-
-
-def damage_bytes(data: bytes, rng: random.Random) -> tuple[bytes, str, bool]:
-    """Flip, cut, repeat or overwrite bytes."""
-    damaged, way = bytearray(data), rng.choice(["flip", "flip", "cut", "repeat", "fill", "head"])
-    at = rng.randrange(64 if way == "head" else len(data))
-    if way in ("flip", "head"):
-        for _ in range(rng.randint(1, 8)):
-            damaged[min(len(data) - 1, at + rng.randrange(8))] ^= 1 << rng.randrange(8)
-    elif way == "cut":
-        del damaged[at:]
-    elif way == "repeat":
-        damaged[at:at] = data[at : at + 1000]
-    else:
-        damaged[at : at + 16] = bytes([rng.choice([0, 255])]) * 16
-    return bytes(damaged), f"{way} at {at}", False
 
 
 def _project(path: Path) -> None:
@@ -282,30 +210,12 @@ def run_case(case: int, whole: dict[str, bytes], seconds: float) -> list[Finding
     return found
 
 
-def fuzz(first: int, cases: int | None, seconds: float, limit: float) -> tuple[list[Finding], int]:
-    """Run cases from number `first` on, until so many are done or the time is over."""
-    with tempfile.TemporaryDirectory() as folder:
-        whole = make_files(Path(folder))
-    until, found, case = time.monotonic() + seconds, [], first
-    while time.monotonic() < until and (cases is None or case < first + cases):
-        found += run_case(case, whole, limit)
-        case += 1
-    return found, case - first
+def commands(folder: Path) -> Prepared:
+    """The harness: a case is its number as text."""
+    whole = make_files(make_folder(folder / "whole"))
 
+    def check(case: bytes) -> None:
+        found = run_case(int(case), whole, _SECONDS)
+        assert not found, f"{found[0].what} in `{found[0].kind}`: {found}"
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=60.0, help="for all cases")
-    parser.add_argument("--first", type=int, default=0, help="number of the first case")
-    parser.add_argument("--cases", type=int, help="how many; until the time is over if not given")
-    parser.add_argument("--limit", type=float, default=30.0, help="seconds for one command, after which it hangs")
-    chosen = parser.parse_args()
-    found, done = fuzz(chosen.first, chosen.cases, chosen.seconds, chosen.limit)
-    for finding in found:
-        print(f"case {finding.case}: {finding.what} in `{finding.kind}`: {finding.damage}\n{finding.detail}\n")
-    print(f"{done} cases: {dict(Counter(finding.what for finding in found)) or 'nothing found'}")
-    sys.exit(bool(found))
-
-
-if __name__ == "__main__":
-    main()
+    return Prepared(strategies.integers(0, 2**40).map(lambda number: str(number).encode()), check, 3 * _SECONDS)

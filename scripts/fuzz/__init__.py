@@ -1,0 +1,1 @@
+"""Fuzzing: damaged files and messages for every reader and server; see `python -m scripts.fuzz --help`."""

@@ -1,0 +1,214 @@
+"""Readers of kcal's own files, tables, images and lines, with a whole file of each."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from kcal.calibrate.batch.jobs import read_jobs
+from kcal.calibrate.hybrid.measured_board import load_measured_board, save_measured_board
+from kcal.calibrate.rig.pairs import read_pairs
+from kcal.cli.settings import read_settings, toml_text
+from kcal.corners.images import read_gray
+from kcal.corners.observations import Observations, View
+from kcal.corners.orientation import turned_images
+from kcal.corners.video import VideoFrames, read_frames
+from kcal.file_kind import file_kind
+from kcal.files import read_bytes
+from kcal.io.camera_file import load_camera, save_camera
+from kcal.io.camera_rig_file import save_camera_rig
+from kcal.io.lookup_file import load_lookup, save_lookup
+from kcal.io.rig_file import load_rig, save_rig
+from kcal.lens.baking import bake
+from kcal.lens.mounting import Mounting, Origin
+from kcal.lens.rig import StereoRig
+from kcal.locate.export import write_positions
+from kcal.locate.ground import terrain
+from kcal.locate.marks import COVARIANCE, read_marks, write_marks
+from kcal.locate.positions import locate_points
+from kcal.locate.stations import load_camera_rig
+from kcal.locate.survey import read_features, read_survey
+from kcal.locate.survey_files import import_survey
+from kcal.locate.view_marks import read_views
+from kcal.mark.journal import Journal
+from kcal.pipeline.association import AssociationOptions
+from kcal.pipeline.detections import Detections
+from kcal.pipeline.lines import read_moment
+from kcal.pipeline.stream_journal import Ledger
+from kcal.report.backdrop import local_image
+from kcal.report.practice_score import located_rows
+from kcal.stars.night_image import read_night
+from scripts.fuzz import foreign_readers
+from scripts.fuzz.foreign_readers import BOARD, CAMERA, board_points
+from scripts.fuzz.reader import PROMISED, Reader, whole_text
+
+RIG = StereoRig(CAMERA, CAMERA, torch.eye(3), torch.tensor([-2.0, 0.0, 0.0]))
+
+
+def _observations(path: Path) -> None:
+    views = [View(name=f"{k}.png", pixels=tuple(map(tuple, view.tolist()))) for k, view in enumerate(board_points())]
+    Observations(board=BOARD, image_size=(320, 240), views=tuple(views)).save(path)
+
+
+def _video(path: Path) -> None:
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (64, 48))
+    for k in range(3):
+        video.write(np.full((48, 64, 3), 40 * k, np.uint8))
+    video.release()
+
+
+def _raster(path: Path) -> None:
+    rasterio = pytest.importorskip("rasterio")
+    with warnings.catch_warnings(action="ignore"), rasterio.open(
+        path, "w", driver="GTiff", width=8, height=8, count=1, dtype="float32", crs="EPSG:4326",
+        transform=rasterio.transform.from_origin(20.0, 10.0, 0.01, 0.01),
+    ) as raster:  # fmt: skip
+        raster.write(np.ones((1, 8, 8), np.float32))
+
+
+def placed_rig() -> StereoRig:
+    """A rig that says where it stands."""
+    rig = StereoRig(CAMERA, CAMERA, torch.eye(3), torch.tensor([-2.0, 0.0, 0.0]))
+    rig.mounting = Mounting(origin=Origin(lat=10.0, lon=20.0, height=3.0), heading_deg=30.0)
+    return rig
+
+
+def _promised(name: str) -> Callable[[Path], object]:
+    return lambda path: path.write_bytes((PROMISED / name).read_bytes())
+
+
+def _settings(path: Path) -> Any:
+    own = path.parent / "settings" / "kcal.toml"
+    own.parent.mkdir(exist_ok=True)
+    own.write_bytes(read_bytes(path))
+    return read_settings(own.parent)
+
+
+def _journal(path: Path) -> Any:
+    # It is repaired in place, which a later case must not see.
+    own = path.with_suffix(".own")
+    own.write_bytes(read_bytes(path))
+    journal = Journal(own)
+    try:
+        return journal.state
+    finally:
+        journal.close()
+
+
+def _live_journal(path: Path) -> Any:
+    output = path.with_name("out.csv")
+    output.write_bytes(b"x" * 100)
+    read_bytes(path)  # a journal that is missing is begun
+    ledger = Ledger(path, [output])
+    try:
+        return ledger.place, ledger.checkpoint_at, ledger.state
+    finally:
+        ledger.close()
+
+
+def _whole_journal(path: Path) -> None:
+    output = path.with_name("out.csv")
+    ledger = Ledger(path, [output])
+    ledger.checkpoint({"tracks": [1, 2.5]})
+    ledger.append([b"abc"], 1.5, 10)
+    ledger.append([b"def"], 2.5, 20)
+    ledger.close()
+
+
+def _positions(path: Path) -> None:
+    left, right, _ = RIG(torch.tensor([[0.0, 0.0, 50.0], [5.0, 1.0, 100.0]], dtype=torch.float64))
+    write_positions(path, locate_points(placed_rig(), left, right, names=["a", "b"]))
+
+
+def _fits(path: Path) -> None:
+    fits = pytest.importorskip("astropy.io.fits")
+    fits.writeto(path, overwrite=True, data=np.arange(48, dtype=np.float32).reshape(6, 8))
+
+
+# Of parameters of which nothing was known before the calibration.
+_PRIOR = ("information.sigma",)
+_MARK = {"u": 10.5, "v": 20.0, "cov": [0.01, 0.0, 0.01], "frame": "1"}
+ACTIONS = [
+    {"key": "key-number-1", "action": {"do": "add", "name": "mast", "kind": "target"}},
+    {"key": "key-number-2", "action": {"do": "put", "name": "mast", "side": "left", "mark": _MARK}},
+    {"key": "key-number-3", "action": {"do": "put", "name": "mast", "side": "right", "mark": _MARK, "matched": True}},
+    {"key": "key-number-4", "action": {"do": "undo"}},
+    {"key": "key-number-5", "action": {"do": "rename", "name": "mast", "to": "mill", "kind": "landmark"}},
+    {"key": "key-number-6", "action": {"do": "survey", "name": "hill", "place": {"at": [1, 2, 3], "sigma": 0.1}}},
+]
+_BOXES = {"time": 2.5, "size": [320, 240], "boxes": [[10, 10, 20, 20], [50, 60, 70, 80.5]], "scores": [0.9, 0.5],
+          "categories": ["ship", "car"], "tracks": ["7", None]}  # fmt: skip
+_PAIRS_LINE = json.dumps({"time": [1.5, 1.6], "left": [[40, 50]], "right": [[30, 50]], "sigma": 0.2,
+                          "covariance": [np.eye(4).tolist()], "categories": ["car"], "scores": [0.5],
+                          "ambiguous": [False]})  # fmt: skip
+_TRUTH = {"origin": {"lat": 10.0, "lon": 20.0, "height": 3.0}}
+_ROWS = "0,40,50,30,50\n1,60,70,50,70\n"
+_PLACES = [(f"p{k}", 20.0 + 0.1 * k, 10.0, 3.0) for k in range(3)]
+READERS: dict[str, Reader] = {
+    **foreign_readers.READERS,
+    "camera": Reader(load_camera, ".json", lambda path: save_camera(CAMERA, path), save_camera,
+                     infinite=_PRIOR, more="*/*.camera.json"),
+    "rig": Reader(load_rig, ".json", lambda path: save_rig(placed_rig(), path), save_rig,
+                  infinite=_PRIOR, more="*/rig.json"),
+    "camera rig": Reader(load_camera_rig, ".json", _promised("0.2-camera-rig/camera-rig.json"), save_camera_rig,
+                         infinite=_PRIOR),
+    "board": Reader(load_measured_board, ".json", _promised("0.1-format2/board.json"), save_measured_board),
+    "lookup": Reader(load_lookup, ".npz", lambda path: save_lookup(bake(CAMERA, 0.1), path), save_lookup),
+    "observations": Reader(Observations.load, ".json", _observations, lambda found, path: found.save(path),
+                           more="*/observations.json"),
+    "settings": Reader(_settings, ".toml", whole_text('board = "9x6"\npixel_sigma = 0.2\nbaseline = 10\n'), named=False,
+                       save=lambda found, path: path.write_text(toml_text(found)),
+                       kept=lambda found: sorted(found.items())),
+    "pairs": Reader(lambda path: read_pairs(path, ["a1", "a2"], ["b1", "b2"]), ".csv",
+                    whole_text("left,right\na1,b1\na2,b2\n")),
+    "jobs": Reader(lambda path: read_jobs(path, BOARD, "hybrid"), ".csv", whole_text(
+        "camera,images,board,square,model\na,good.csv,9x6,25mm,hybrid\nb,*.csv,charuco:9x6,2cm,opencv5\n")),
+    "marking log": Reader(_journal, ".jsonl", whole_text("".join(
+        json.dumps(line) + "\n" for line in ({"kcal": "marking log", "version": 1}, *ACTIONS)))),
+    "live journal": Reader(_live_journal, ".journal", _whole_journal),
+    "live line": Reader(lambda path: read_moment(read_bytes(path), RIG, AssociationOptions(), 0.3), ".json",
+                        whole_text(_PAIRS_LINE), named=False),
+    "live boxes": Reader(lambda path: read_moment(read_bytes(path), RIG, AssociationOptions(), 0.3), ".json",
+                         whole_text(json.dumps({"left": _BOXES, "right": _BOXES})), named=False),
+    "detections": Reader(lambda path: Detections.read(read_bytes(path)), ".json",
+                         whole_text(json.dumps({**_BOXES, "keypoints": [[[1, 2]], [[3, 4]]]})), named=False),
+    "positions .csv": Reader(lambda path: located_rows(path, _TRUTH), ".csv", _positions, infinite=("range_high_m",)),
+    "positions .geojson": Reader(lambda path: located_rows(path, _TRUTH), ".geojson", _positions,
+                                 infinite=("range_high_m",)),
+    "file kind": Reader(file_kind, ".json", lambda path: save_camera(CAMERA, path), named=False),
+    "image .png": Reader(read_gray, ".png", lambda path: cv2.imwrite(str(path), np.eye(40, dtype=np.uint8) * 200)),
+    "image .jpg": Reader(lambda path: (turned_images([path]), read_gray(path)), ".jpg",
+                         lambda path: cv2.imwrite(str(path), np.eye(40, dtype=np.uint8) * 200)),
+    "video": Reader(lambda path: (list(read_frames(path)), VideoFrames(path).count), ".avi", _video),
+    "FITS": Reader(read_night, ".fits", _fits),
+    "map picture": Reader(local_image, ".tif", _raster),
+    "terrain": Reader(terrain, ".tif", _raster),
+    "survey .csv": Reader(read_survey, ".csv", whole_text(
+        "name,lat,lon,height,sigma\n" + "".join(f"{n},{b},{a},{h},0.1\n" for n, a, b, h in _PLACES))),
+    "survey .geojson": Reader(lambda path: import_survey(path, Origin(lat=10.0, lon=20.0, height=0.0)), ".geojson",
+                              whole_text(json.dumps({"type": "FeatureCollection", "features": [
+                                  {"type": "Feature", "properties": {"name": n, "sigma": 0.1},
+                                   "geometry": {"type": "Point", "coordinates": at}} for n, *at in _PLACES]}))),
+    "survey .gpx": Reader(lambda path: import_survey(path, sigma=0.1, geoid=0.0), ".gpx", whole_text(
+        "<gpx>" + "".join(f'<wpt lat="{b}" lon="{a}"><ele>{h}</ele><name>{n}</name></wpt>' for n, a, b, h in _PLACES)
+        + "</gpx>")),
+    "marks": Reader(read_marks, ".csv", whole_text(
+        f"name,left_u,left_v,right_u,right_v,{','.join(COVARIANCE)}\n"
+        "a,40,50,30,50,0.1,0,0,0,0.1,0,0,0.1,0,0.1\nb,60,70,50,70,,,,,,,,,,\n"),
+        lambda found, path: write_marks(path, found), unknown=("covariance",),
+        # Control characters in names are written in words.
+        kept=lambda found: (len(found.names), found.left, found.right, found.covariance)),
+    "view marks": Reader(lambda path: read_views(path, ["a", "b"]), ".csv", whole_text(
+        "name,camera,u,v,time,sigma\np,a,1,2,0.5,0.1\np,b,3,4,0.5,\nq,b,5,6,1.5,0.3\n"), unknown=("pixels", "sigma")),
+    "features": Reader(lambda path: read_features(path, 0.3), ".csv", infinite=("inverse_range_sigma",),
+                       write=whole_text(
+        "name,left_u,left_v,right_u,right_v\n" + _ROWS)),
+}  # fmt: skip

@@ -1,0 +1,42 @@
+"""`kcal live --detections -` ends by a signal while its input stays open."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from kcal.io.rig_file import save_rig
+from kcal.lens.mounting import Mounting, Origin
+from kcal.rig import planned_rig
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sent", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_while_it_waits_for_a_line(sent: signal.Signals, tmp_path: Path) -> None:
+    rig = planned_rig()
+    rig.mounting = Mounting(origin=Origin(lat=10.0, lon=20.0, height=3.0), heading_deg=30.0)
+    save_rig(rig, tmp_path / "rig.json")
+    command = [sys.executable, "-m", "kcal", "live", "rig.json", "--detections", "-", "-o", "tracks.csv"]
+    pipe = subprocess.PIPE
+    live = subprocess.Popen(command, cwd=tmp_path, stdin=pipe, stdout=pipe, stderr=pipe)
+    try:
+        live.stdin.write(b'{"time": 1.0, "left": [[960, 540]], "right": [[944, 540]]}\n')
+        live.stdin.flush()
+        written, until = tmp_path / "tracks.csv", time.monotonic() + 120
+        while not (written.exists() and written.stat().st_size) and time.monotonic() < until:
+            time.sleep(0.1)
+        live.send_signal(sent)
+        # Its input stays open until it has ended.
+        live.wait(60)
+        said = live.stderr.read().decode()
+    finally:
+        live.kill()
+        live.communicate()
+    assert "Fatal" not in said
+    assert "Traceback" not in said
+    assert live.returncode == 0
