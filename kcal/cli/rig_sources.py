@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from kcal.errors import InputError
 
 if TYPE_CHECKING:
-    from kcal.calibrate.rig.sources import Baseline, MeasuredPosition, RigData
+    from kcal.calibrate.rig.result import RigResult
+    from kcal.calibrate.rig.sources import Baseline, Landmarks, MeasuredPosition, RigData
     from kcal.cli.rig_stars import NightOptions
     from kcal.lens.camera import Camera
     from kcal.lens.mounting import Origin
@@ -34,13 +36,20 @@ class Sources:
     geoid: float | None = None
     stars: NightOptions | None = None
     scene: tuple[str, str] | None = None
+    tracks: tuple[Path, Path] | None = None
+    tracks_clock: float = 2.0
+    clock_sigma: float = 0.1
     names: tuple[str, ...] = CAMERAS
 
     @property
     def files(self) -> list[Path]:
         """All files that are read."""
         single = (self.match, self.landmarks, self.marks, self.features, self.positions)
-        return [*(self.pairs or ()), *(path for path in single if path is not None)]
+        return [*(self.pairs or ()), *(self.tracks or ()), *(path for path in single if path is not None)]
+
+
+def _nothing(_: RigResult) -> list[str]:
+    return []
 
 
 class RigInput(NamedTuple):
@@ -52,6 +61,7 @@ class RigInput(NamedTuple):
         unpaired: how many views of the boards have no partner.
         notes: what else there is to say of the sources.
         pixel_sigma: px, the typical noise of marks along an axis, where the file of the marks states it.
+        told: what there is to say of the sources once the rig is solved.
     """
 
     data: RigData
@@ -59,6 +69,7 @@ class RigInput(NamedTuple):
     unpaired: int
     notes: tuple[str, ...] = ()
     pixel_sigma: float | None = None
+    told: Callable[[RigResult], list[str]] = _nothing
 
 
 def parse_baseline(text: str) -> Baseline:
@@ -135,6 +146,10 @@ def read_sources(cameras: tuple[Camera, Camera], sources: Sources) -> RigInput:
         seen_by_both, more = read_scene(cameras, sources.scene, scaled=scaled)
         features = seen_by_both if features is None else features + seen_by_both
         notes = [*notes, *more]
+    told: Callable[[RigResult], list[str]] = _nothing
+    if sources.tracks is not None:
+        landmarks, origin, more, told = _with_tracks(cameras, sources, origin, positions, landmarks)
+        notes = [*notes, *more]
     data = RigData(
         cameras=cameras,
         names=CAMERAS,
@@ -145,4 +160,25 @@ def read_sources(cameras: tuple[Camera, Camera], sources: Sources) -> RigInput:
         positions=positions,
         stars=stars,
     )
-    return RigInput(data, origin, unpaired, tuple(notes), pixel_sigma)
+    return RigInput(data, origin, unpaired, tuple(notes), pixel_sigma, told)
+
+
+def _with_tracks(
+    cameras: tuple[Camera, Camera],
+    sources: Sources,
+    origin: Origin | None,
+    positions: tuple[MeasuredPosition, ...],
+    landmarks: Landmarks | None,
+) -> tuple[Landmarks, Origin | None, list[str], Callable[[RigResult], list[str]]]:
+    """Landmarks with those that move, the origin, what to say of them, and what to say once the rig is solved."""
+    from kcal.cli.rig_moving import clock_line, read_moving
+    from kcal.locate.moving_match import MovingOptions
+
+    assert sources.tracks is not None
+    options = MovingOptions(
+        clock_sigma=sources.tracks_clock, between_sigma=sources.clock_sigma, pixel_sigma=sources.mark_sigma
+    )
+    placed = landmarks is not None or bool(positions)
+    moving, origin, lines = read_moving(cameras, CAMERAS, sources.tracks, origin, positions, options, placed=placed)
+    both = moving.landmarks if landmarks is None else landmarks + moving.landmarks
+    return both, origin, lines, lambda result: clock_line(result, moving, options)

@@ -144,6 +144,10 @@ class Block(ABC):
         """
         return None
 
+    def _seen_by(self, state: RigState, offset: Tensor, camera: int) -> Tensor:
+        """Where things stand (V, 3, N) for a camera, for which they may be elsewhere than `offset` from it."""
+        return offset
+
     def _bent(self, state: RigState, offset: Tensor, camera: int) -> Tensor:
         """Where things are seen (V, 3, N) that stand at `offset` from the camera."""
         return offset
@@ -165,7 +169,7 @@ class Block(ABC):
     ) -> Iterator[tuple[int, PosedCamera, Tensor, Tensor, Tensor, Projection, Tensor]]:
         y, w = self._place(state)
         for c, posed in enumerate(cameras):
-            offset = y - w * posed.center[:, None]
+            offset = self._seen_by(state, y - w * posed.center[:, None], c)
             q = posed.rotation @ self._bent(state, offset, c)
             wanted = posed.by_unknown.any(1).nonzero()[:, 0].tolist() if derivatives else None
             found = project_components(q, posed.parameters, posed.camera.model, wanted, w[..., 0])
@@ -289,22 +293,40 @@ class LandmarkBlock(Block):
         points: (V, 3) meters, as surveyed; the third axis is up.
         sigma: (V, 3) meters.
         by_refraction: (K,) of the coefficient of refraction by the unknowns; None: it is held.
+        shifts: (E, V, C, 3) see `LandmarkEffect`; none if left out.
+        effects: (E, K) by which the amounts of the effects are found among the unknowns of the state.
+        by_effects: (E, K) likewise of a step; None: they are held.
     """
 
     kind: Kind = "landmarks"
     size = 3
 
     def __init__(
-        self, pixels: Tensor, whitening: Tensor, points: Tensor, sigma: Tensor, by_refraction: Tensor | None = None
+        self,
+        pixels: Tensor,
+        whitening: Tensor,
+        points: Tensor,
+        sigma: Tensor,
+        by_refraction: Tensor | None = None,
+        shifts: Tensor | None = None,
+        effects: Tensor | None = None,
+        by_effects: Tensor | None = None,
     ) -> None:
         super().__init__(pixels[:, :, None], whitening[:, :, None])
         self._surveyed, self._sigma, self._by_refraction = points, sigma, by_refraction
+        self._shifts = None if shifts is None or not len(shifts) else shifts
+        self._effects, self._by_effects = effects, by_effects
 
     def _prior_count(self) -> Tensor:
         return torch.full((len(self),), 3)
 
     def _place(self, state: RigState) -> tuple[Tensor, Tensor]:
         return state.points[..., None], state.points.new_ones(len(self), 1, 1)
+
+    def _seen_by(self, state: RigState, offset: Tensor, camera: int) -> Tensor:
+        if self._shifts is None or self._effects is None:
+            return offset
+        return offset + torch.einsum("e,evk->vk", self._effects @ state.unknown, self._shifts[:, :, camera])[..., None]
 
     def _bent(self, state: RigState, offset: Tensor, camera: int) -> Tensor:
         level, up = offset[:, :_UP], offset[:, _UP:]
@@ -315,10 +337,16 @@ class LandmarkBlock(Block):
         return torch.cat([by_q[:, :_UP] + slope * by_q[:, _UP:], by_q[:, _UP:]], 1)
 
     def _by_board_or_air(self, state: RigState, by_q: Tensor, offset: Tensor, camera: int) -> Tensor | None:
-        if self._by_refraction is None:
-            return None
-        lift = _HALF_CURVATURE * offset[:, :_UP, None].square().sum(1, keepdim=True)
-        return self._by_refraction[:, None, None] * (lift * by_q[:, _UP:])
+        found = None
+        if self._by_refraction is not None:
+            lift = _HALF_CURVATURE * offset[:, :_UP, None].square().sum(1, keepdim=True)
+            found = self._by_refraction[:, None, None] * (lift * by_q[:, _UP:])
+        if self._shifts is not None and self._by_effects is not None:
+            by_offset = self._by_offset(state, by_q, offset)
+            by_effect = torch.einsum("vjun,evj->veun", by_offset, self._shifts[:, :, camera])
+            moved = torch.einsum("ek,veun->vkun", self._by_effects, by_effect)
+            found = moved if found is None else found + moved
+        return found
 
     def _by_local(self, state: RigState, by_q: Tensor, center: Tensor, by_w: Tensor | None) -> Tensor:
         return by_q
