@@ -219,20 +219,30 @@ def read_tracks(path: str | Path, origin: Origin | None = None) -> tuple[tuple[M
     for name, own in of.items():
         own.sort(key=times.__getitem__)
         first_row = rows[min(own)]
-        level = first_row.positive("constant_sigma") or 0.0
+        level = _amount(first_row, "constant_sigma", 0.0)
         try:
             track = MovingTrack(
                 name=name,
                 times=torch.tensor([times[i] for i in own], dtype=torch.float64),
                 points=values[own],
                 sigma=torch.tensor([_sigma(rows[i]) for i in own], dtype=torch.float64),
-                constant=(level, level, first_row.positive("constant_sigma_up") or level),
-                latency=first_row.positive("latency_sigma") or 0.0,
+                constant=(level, level, _amount(first_row, "constant_sigma_up", level)),
+                latency=_amount(first_row, "latency_sigma", 0.0),
             )
         except InputError as error:
             raise FileError(f"{path}: {error}") from error
         found.append(track)
     return tuple(found), origin
+
+
+def _amount(row: TableRow, column: str, default: float) -> float:
+    """A number that is not negative; the default where the column is absent or the cell is empty."""
+    if not row.cells.get(column):
+        return default
+    value = row.number(column)
+    if value < 0:
+        raise FileError(f"{row.where}: {column} is {value:g}; zero or a positive number is needed")
+    return value
 
 
 def _sigma(row: TableRow) -> tuple[float, float, float]:

@@ -106,8 +106,19 @@ class Outcome(NamedTuple):
     cpu: float
 
 
-def one_draw(name: str, seed: int) -> Outcome:
-    """Errors of a rig from one simulated site."""
+class Site(NamedTuple):
+    """What a simulated site gives, and its truth: attitudes, and names of sightings."""
+
+    tracks: list[MovingTrack]
+    sightings: list[Sighting]
+    positions: tuple[MeasuredPosition, ...]
+    tape: Baseline
+    attitude: list[Tensor]
+    truth: list[str]
+
+
+def simulated(name: str, seed: int) -> Site:
+    """One site."""
     kind, random = KINDS[name], torch.Generator().manual_seed(seed)
 
     def noise(*shape: int) -> Tensor:
@@ -152,9 +163,15 @@ def one_draw(name: str, seed: int) -> Outcome:
         MeasuredPosition(camera=c, point=CENTERS[c] + PLACE * noise(3), sigma=torch.full((3,), PLACE).double())
         for c in range(2)
     )
+    tape = Baseline(first=0, second=1, length=10.0 + TAPE * float(noise(1)), sigma=TAPE)
+    return Site(tracks, sightings, positions, tape, attitude, truth)
+
+
+def one_draw(name: str, seed: int) -> Outcome:
+    """Errors of a rig from one simulated site."""
+    tracks, sightings, positions, tape, attitude, truth = simulated(name, seed)
     begin = time.process_time()
     found = match_moving(tracks, sightings, (CAMERA, CAMERA), NAMES, positions)
-    tape = Baseline(first=0, second=1, length=10.0 + TAPE * float(noise(1)), sigma=TAPE)
     rig = solve_rig(
         RigData(
             cameras=(CAMERA, CAMERA), names=NAMES, landmarks=found.landmarks, positions=positions, baselines=(tape,)
