@@ -97,6 +97,15 @@ NAMESPACES = {door.removeprefix("kcal.") for door in PUBLIC} - {"kcal"}
 # Names that were not in `kcal` itself before there were namespaces.
 NEW_NAMES = (
     {
+        "Identity",
+        "LandmarkEffect",
+        "MovingControl",
+        "MovingOptions",
+        "MovingTrack",
+        "Sighting",
+        "match_moving",
+        "read_sightings",
+        "read_tracks",
         "ImagePair",
         "PairCounts",
         "SceneMatches",

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.interpolate import Akima1DInterpolator, make_smoothing_spline
+from scipy.interpolate import Akima1DInterpolator, BSpline, make_smoothing_spline
 from torch import Tensor
 
 from kcal.errors import FileError, InputError
@@ -33,8 +33,8 @@ _TRACK_COLUMNS = (
 _SEEN = ("name", "camera", "time", "u", "v")
 # Fixes that a track needs: two to interpolate between, two to check that with.
 _FEWEST = 4
-# Fixes that a smoothing spline needs.
-_SMOOTH = 5
+# Fixes that a smoothing spline needs; by how many powers of ten it may be softer than a line.
+_SMOOTH, _DECADES = 5, 16
 # An interval that is so many times the typical one is a gap.
 _GAP = 3.0
 
@@ -122,15 +122,11 @@ class MovingTrack:
 
     @functools.cached_property
     def _velocity(self) -> list[Callable[[NDArray[np.float64]], NDArray[np.float64]]]:
-        """Of a smooth path along each axis: the noise of fixes in it would tell a clock, which it cannot.
-
-        Source: smoothing spline with generalized cross-validation, Wahba (1990).
-        """
-        own, points = self.times.numpy(), self.points.numpy()
-        begin, weight = own[0], 1.0 / np.square(self.sigma.numpy())
+        """Along each axis: the noise of fixes in it would tell a clock, which it cannot."""
+        own, points, sigma = self.times.numpy(), self.points.numpy(), self.sigma.numpy()
         if len(own) < _SMOOTH:
-            return [np.polynomial.Polynomial.fit(own - begin, points[:, axis], 1).deriv() for axis in range(3)]
-        return [make_smoothing_spline(own - begin, points[:, i], weight[:, i]).derivative() for i in range(3)]
+            return [np.polynomial.Polynomial.fit(own - own[0], points[:, i], 1).deriv() for i in range(3)]
+        return [_smoothest(own - own[0], points[:, i], sigma[:, i]).derivative() for i in range(3)]
 
     @functools.cached_property
     def _interpolation(self) -> NDArray[np.float64]:
@@ -146,6 +142,19 @@ class MovingTrack:
         else:
             error = Akima1DInterpolator(own[used], points[used], method="makima")(own[left])
         return np.asarray(np.sqrt(np.square(error - points[left]).mean(0)) / 2.0**1.5)
+
+
+def _smoothest(times: NDArray[np.float64], values: NDArray[np.float64], sigma: NDArray[np.float64]) -> BSpline:
+    """The smoothest path that fixes allow by their sigmas (the discrepancy principle, Morozov 1966)."""
+    weight = 1.0 / np.square(sigma)
+    allowed = len(times) + 2.0 * math.sqrt(2.0 * len(times))
+    # From a straight line: bending over the whole duration would cost more than all fixes.
+    stiff = float(weight.sum() * (times[-1] - times[0]) ** 3)
+    for decade in range(_DECADES):
+        path = make_smoothing_spline(times, values, weight, lam=stiff * 10.0**-decade)
+        if float(weight @ np.square(path(times) - values)) <= allowed:
+            break
+    return path
 
 
 def seconds_of(row: TableRow) -> float:
@@ -192,8 +201,8 @@ def read_tracks(path: str | Path, origin: Origin | None = None) -> tuple[tuple[M
         ...     _ = path.write_text("name,time,east,north,up,sigma\n" + "".join(
         ...         f"drone,{t},{3 * t},100,50,0.02\n" for t in range(5)))
         ...     tracks, _ = read_tracks(path)
-        >>> tracks[0].at(torch.tensor([1.5])).velocity[0].tolist()
-        [3.0, 0.0, 0.0]
+        >>> tracks[0].at(torch.tensor([1.5])).points[0].tolist()
+        [4.5, 100.0, 50.0]
     """
     chunks = read_chunks(path, _TRACK, _TRACK_COLUMNS, ("name", "time", "sigma"), unique=False)
     rows = [row for chunk in chunks for row in chunk.rows()]
@@ -262,6 +271,11 @@ class Sighting:
         times: (N,) seconds, of the camera's clock, rising.
         pixels: (N, 2).
         sigma: (N,) px along an axis; NaN where it is not stated.
+
+    Example:
+        >>> t = torch.arange(3.0)
+        >>> Sighting(label="blob", camera=0, times=t, pixels=torch.stack([t, t], 1), sigma=0.3 + 0 * t).label
+        'blob'
     """
 
     label: str
@@ -272,7 +286,7 @@ class Sighting:
 
 
 def read_sightings(path: str | Path, cameras: Sequence[str]) -> tuple[Sighting, ...]:
-    """Read `name,camera,time,u,v` and, if they are there, `sigma` (px) and `note`: what each camera followed.
+    r"""Read `name,camera,time,u,v` and, if they are there, `sigma` (px) and `note`: what each camera followed.
 
     Lines with one name and one camera are one thing. The name is that of a track, where somebody says so; any other
     name is a thing that nobody named.
@@ -283,6 +297,14 @@ def read_sightings(path: str | Path, cameras: Sequence[str]) -> tuple[Sighting, 
 
     Raises:
         FileError: see `kcal.locate.tables.read_rows`; a camera that is not there; a thing seen twice at one moment.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder, "sightings.csv")
+        ...     _ = path.write_text("name,camera,time,u,v\nblob,left,0.0,10,20\nblob,left,0.5,12,20\n")
+        ...     read_sightings(path, ("left", "right"))[0].times.tolist()
+        [0.0, 0.5]
     """
     number: Mapping[str, int] = {name: c for c, name in enumerate(cameras)}
     of: dict[tuple[int, str], dict[float, tuple[float, float, float]]] = {}

@@ -57,6 +57,10 @@ class Identity(NamedTuple):
         label: as it was called.
         track: name of its track; None if it is none of them, or if that is not clear.
         sigmas: how far from the track that fits best, in sigmas of the search.
+
+    Example:
+        >>> Identity(0, "blob17", "ship", 0.4).track
+        'ship'
     """
 
     camera: int
@@ -72,6 +76,10 @@ class MovingControl(NamedTuple):
         landmarks: with clocks, latencies and constant offsets as effects.
         identities: one for each sighting.
         clock: seconds to be added to the cameras' times, as found by the search; the effects correct it.
+
+    Example:
+        >>> MovingControl._fields  # what `match_moving` returns
+        ('landmarks', 'identities', 'clock')
     """
 
     landmarks: Landmarks
@@ -111,9 +119,22 @@ def match_moving(
 
     Raises:
         InputError: no sighting can be matched; tracks and sightings that have no time in common.
+
+    Example:
+        >>> camera = Camera.build(focal=(800, 800), center=(640, 360), size=(1280, 720), model="pinhole")
+        >>> t = torch.arange(0.0, 30.0, dtype=torch.float64)
+        >>> points = torch.stack([8 * torch.sin(t / 4), 20 + 0.1 * t, 4 * torch.cos(t / 3)], 1)
+        >>> drone = MovingTrack(name="drone", times=t, points=points, sigma=torch.full((30, 3), 0.02).double())
+        >>> seen = points[3:28] @ torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
+        >>> blob = Sighting(label="blob", camera=0, times=t[3:28] - 0.5, pixels=camera.project(seen)[0],
+        ...                 sigma=torch.full((25,), 0.3).double())
+        >>> there = MeasuredPosition(camera=0, point=torch.zeros(3).double(), sigma=torch.ones(3).double())
+        >>> found = match_moving([drone], [blob], [camera], ["mast"], [there])
+        >>> found.identities[0].track, round(found.clock, 1), len(found.landmarks.names)
+        ('drone', 0.5, 25)
     """
     options = options or MovingOptions()
-    seen = [_rays(sighting, cameras[sighting.camera]) for sighting in sightings]
+    seen = [_searched(sighting, cameras[sighting.camera]) for sighting in sightings]
     seen = [one for one in seen if len(one.times)]
     near = {p.camera: p.point for p in positions}
     clock = _clock(tracks, seen, near, options.clock_sigma)
@@ -121,25 +142,25 @@ def match_moving(
     for camera in sorted({one.sighting.camera for one in seen}):
         own = [one for one in seen if one.sighting.camera == camera]
         identities += _identities(tracks, own, near.get(camera), clock, names[camera])
-    matched = [(one, name.track) for one, name in zip(_by_camera(seen), identities, strict=True) if name.track]
+    matched = [(one, name.track) for one, name in zip(_camera_by_camera(seen), identities, strict=True) if name.track]
     if not matched:
         raise InputError("none of the sightings follows a track: check times, names and the cameras' positions")
-    landmarks = _landmarks(tracks, matched, len(cameras), names, clock, options)
+    landmarks = _moving_landmarks(tracks, matched, len(cameras), names, clock, options)
     return MovingControl(landmarks, tuple(identities), clock)
 
 
-def _by_camera(seen: Sequence[_Seen]) -> list[_Seen]:
+def _camera_by_camera(seen: Sequence[_Seen]) -> list[_Seen]:
     return sorted(seen, key=lambda one: one.sighting.camera)
 
 
-def _rays(sighting: Sighting, camera: Camera) -> _Seen:
+def _searched(sighting: Sighting, camera: Camera) -> _Seen:
     rays, valid = camera.unproject(sighting.pixels)
     some = valid.nonzero()[:, 0]
     some = some[torch.linspace(0, len(some) - 1, min(_MOMENTS, len(some))).round().long()] if len(some) else some
     return _Seen(sighting, sighting.times[some], rays[some])
 
 
-def _common(track: MovingTrack, seen: _Seen, clock: float) -> tuple[Tensor, Tensor]:
+def _in_common(track: MovingTrack, seen: _Seen, clock: float) -> tuple[Tensor, Tensor]:
     """Rays (M, 3) and points (M, 3) at the moments that the track knows."""
     points = track.at(seen.times + clock).points
     known = torch.isfinite(points).all(-1)
@@ -155,11 +176,11 @@ def _claims(tracks: Sequence[MovingTrack], seen: Sequence[_Seen]) -> list[tuple[
     return claimed
 
 
-def _pose(
+def _agreed_pose(
     pairs: Sequence[tuple[_Seen, MovingTrack]], near: Tensor | None, clock: float
 ) -> tuple[Tensor, Tensor, float] | None:
     """Rotation, center and mean score of the pose that most of the pairs agree on."""
-    parts = [_common(track, one, clock) for one, track in pairs]
+    parts = [_in_common(track, one, clock) for one, track in pairs]
     if not parts:
         return None
     rays, points = (torch.cat(part) for part in zip(*parts, strict=True))
@@ -188,7 +209,7 @@ def _clock(tracks: Sequence[MovingTrack], seen: Sequence[_Seen], near: dict[int,
         return 0.0
 
     def score(clock: float) -> float:
-        poses = [_pose(own, near.get(c), clock) for c, own in pairs.items()]
+        poses = [_agreed_pose(own, near.get(c), clock) for c, own in pairs.items()]
         return sum(math.inf if pose is None else pose[2] for pose in poses)
 
     if not sigma:
@@ -218,9 +239,9 @@ def _identities(
     tracks: Sequence[MovingTrack], own: Sequence[_Seen], near: Tensor | None, clock: float, camera: str
 ) -> list[Identity]:
     """The track of each sighting of one camera."""
-    pose = _pose(_claims(tracks, own), near, clock)
+    pose = _agreed_pose(_claims(tracks, own), near, clock)
     tried = [] if near is None else [
-        _pose([(one, track)], near, clock)
+        _agreed_pose([(one, track)], near, clock)
         for one in sorted(own, key=lambda one: -float(one.times[-1] - one.times[0]))[:_TRIED] for track in tracks
     ]  # fmt: skip
     poses = [found for found in (pose, *tried) if found is not None]
@@ -237,7 +258,7 @@ def _identities(
         table = misfits(found)
         chosen = [_chosen(row, tracks, one) for row, one in zip(table, own, strict=True)]
         pairs = [(one, tracks[k]) for one, k in zip(own, chosen, strict=True) if k is not None]
-        found = _pose(pairs, near, clock) or found
+        found = _agreed_pose(pairs, near, clock) or found
     table = misfits(found)
     return [
         Identity(
@@ -275,7 +296,7 @@ def _chosen(row: Tensor, tracks: Sequence[MovingTrack], one: _Seen) -> int | Non
     return next((k for k in rivals if tracks[k].name == one.sighting.label), None)
 
 
-def _landmarks(
+def _moving_landmarks(
     tracks: Sequence[MovingTrack],
     matched: Sequence[tuple[_Seen, str]],
     count: int,
@@ -323,11 +344,11 @@ def _landmarks(
         sigma=torch.stack(sigma),
         pixels=torch.stack(pixels),
         pixel_sigma=torch.stack(noise),
-        effects=_effects(tracks, torch.tensor(of), torch.stack(velocity), torch.stack(pixels), names, options),
+        effects=_shared_shifts(tracks, torch.tensor(of), torch.stack(velocity), torch.stack(pixels), names, options),
     )
 
 
-def _effects(
+def _shared_shifts(
     tracks: Sequence[MovingTrack],
     of: Tensor,
     velocity: Tensor,

@@ -9,8 +9,9 @@ from statistics import NormalDist
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.blocks import Block, BoardBlock, FeatureBlock, Kind, LandmarkBlock, PerKind, RigState
+from kcal.calibrate.rig.blocks import Block, BoardBlock, FeatureBlock, Kind, PerKind, RigState
 from kcal.calibrate.rig.initial_poses import Start
+from kcal.calibrate.rig.landmark_block import LandmarkBlock
 from kcal.calibrate.rig.motion import BoardMotion, SeenBoards, board_motion
 from kcal.calibrate.rig.problem import DistanceTerm, PlaceTerm, RigProblem, SharedTerm
 from kcal.calibrate.rig.sources import Features, Landmarks, RigData

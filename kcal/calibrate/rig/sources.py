@@ -105,6 +105,11 @@ class LandmarkEffect:
     Args:
         name: what it is, for messages.
         shift: (L, C, 3) meters by which each camera sees each landmark elsewhere at one sigma of it.
+
+    Example:
+        >>> velocity = torch.tensor([[5.0, 0.0, 0.0]], dtype=torch.float64)  # of one landmark, seen by two cameras
+        >>> LandmarkEffect(name="the clock, 0.1 s", shift=0.1 * velocity[:, None].expand(1, 2, 3)).shift[0, 0].tolist()
+        [0.5, 0.0, 0.0]
     """
 
     name: str
