@@ -42,7 +42,7 @@ HALF_CURVATURE, REFRACTION = 0.5 / 6_371_008.8, 0.13
 class Kind(NamedTuple):
     """What moves, and what its receiver tells."""
 
-    count: int
+    things: int
     interval: float
     duration: float
     sigma: tuple[float, float]
@@ -75,7 +75,7 @@ def path_of(kind: str, random: torch.Generator) -> Callable[[Tensor], Tensor]:
         return circling
     if kind == "ships":
         begin = torch.stack([1600 * draw[0] - 800, 2500 + 1500 * draw[1], torch.tensor(-20.0, dtype=torch.float64)])
-        speed, course, rate, climb = 3 + 5 * draw[2], 6.28 * draw[3], 2e-3 * (draw[4] - 0.5), 0.0
+        speed, course, rate, climb = 3 + 5 * draw[2], 6.28 * draw[3], 2e-3 * (draw[4] - 0.5), 0.0 * draw[0]
     else:
         begin = torch.stack([8000 * (draw[0] - 0.5), 8000 + 12000 * draw[1], 1500 + 3000 * draw[5]])
         speed, course, rate, climb = 70 + 60 * draw[2], 6.28 * draw[3], 6e-3 * (draw[4] - 0.5), 8 * (draw[0] - 0.5)
@@ -131,7 +131,7 @@ def simulated(name: str, seed: int) -> Site:
         torch.tensor([level, level, up], dtype=torch.float64) for level, up in (kind.sigma, kind.constant)
     )
     step = torch.tensor([kind.rounding[0], kind.rounding[0], kind.rounding[1]], dtype=torch.float64)
-    for i in range(kind.count):
+    for i in range(kind.things):
         path = path_of(name, random)
         late, antenna = float(kind.latency * noise(1)), constant * noise(3)
         fixes = path(times) + sigma * noise(len(times), 3)
@@ -157,8 +157,8 @@ def simulated(name: str, seed: int) -> Site:
                 )
     truth = [one.label for one in sightings]
     for i in torch.randperm(len(sightings), generator=random)[: round(kind.wrong * len(sightings))].tolist():
-        other = int(truth[i].removeprefix(name)) + 1 + int(torch.randint(kind.count - 1, (1,), generator=random))
-        sightings[i] = dataclasses.replace(sightings[i], label=f"{name}{other % kind.count}")
+        other = int(truth[i].removeprefix(name)) + 1 + int(torch.randint(kind.things - 1, (1,), generator=random))
+        sightings[i] = dataclasses.replace(sightings[i], label=f"{name}{other % kind.things}")
     positions = tuple(
         MeasuredPosition(camera=c, point=CENTERS[c] + PLACE * noise(3), sigma=torch.full((3,), PLACE).double())
         for c in range(2)
