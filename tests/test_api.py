@@ -55,7 +55,8 @@ PUBLIC = {
         save_measured_board summarize
     """,
     "kcal.rig": """
-        CameraRig CameraRigCalibration load_camera_rig save_camera_rig station_mounting stations_of
+        Identity LandmarkEffect MovingControl MovingOptions MovingTrack Sighting match_moving read_sightings
+        read_tracks CameraRig CameraRigCalibration load_camera_rig save_camera_rig station_mounting stations_of
         Drift DriftEffect ImagePair ItemResidual MarkedLandmarks Mounting PairCounts RigCalibration RigCovariance
         RigSource SceneMatches Sides SourceResidual Survey TurnedBoard Watched camera_positions check_rig drift_effect
         import_survey match_landmarks measure_drift mounting_covariance pair_by_name paired_boards placed_rig
@@ -98,6 +99,15 @@ NAMESPACES = {door.removeprefix("kcal.") for door in PUBLIC} - {"kcal"}
 NEW_NAMES = (
     {
         "Watched",
+        "Identity",
+        "LandmarkEffect",
+        "MovingControl",
+        "MovingOptions",
+        "MovingTrack",
+        "Sighting",
+        "match_moving",
+        "read_sightings",
+        "read_tracks",
         "ImagePair",
         "PairCounts",
         "SceneMatches",

@@ -139,6 +139,25 @@ def solve_command(
             hidden=True,
         ),
     ] = None,
+    tracks: Annotated[
+        tuple[Path, Path] | None,
+        typer.Option(
+            metavar="TRACKS.csv SIGHTINGS.csv",
+            help="Where drones, ships or aircraft were (name,time,lat,lon,height,sigma), and what the cameras followed "
+            "(name,camera,time,u,v): landmarks that move.",
+            hidden=True,
+        ),
+        TABLE,
+    ] = None,
+    tracks_clock: Annotated[
+        float,
+        typer.Option(
+            metavar="S",
+            help="Of the cameras' clocks against that of --tracks; found within three of it.",
+            min=0,
+            hidden=True,
+        ),
+    ] = 2.0,
     star_time: Annotated[str | None, typer.Option("--star-time", metavar="TIME", help=TIME_HELP, hidden=True)] = None,
     clock_sigma: Annotated[
         float,
@@ -209,7 +228,8 @@ def solve_command(
     Stars (--stars) need no survey: pairs of night images and a taped baseline determine ranges once matches of unknown
     range (--features) or measured positions tell the baseline's direction.
 
-    So does the scene itself (--scene): pairs of images, best of several days, and a taped baseline.
+    So does the scene itself (--scene): pairs of images, best of several days, and a taped baseline. Drones with RTK,
+    ships with AIS and aircraft with ADS-B (--tracks) are landmarks that move.
 
     `kcal rig check` tells later whether the cameras have turned since.
 
@@ -249,7 +269,8 @@ def solve_command(
     sources = Sources(
         pairs=pairs, match=match, landmarks=landmarks, marks=marks, features=features, positions=positions,
         baseline=baseline, origin=origin, mark_sigma=noise, survey_sigma=survey_sigma, geoid=geoid,
-        stars=nights, scene=scene, observations=tuple(observations or ()),
+        stars=nights, scene=scene, observations=tuple(observations or ()), tracks=tracks, tracks_clock=tracks_clock,
+        clock_sigma=clock_sigma,
         names=tuple(path.name.split(".")[0] for path in (left, right)),
     )  # fmt: skip
     check_writable(output, left, right, *sources.files)
@@ -258,7 +279,7 @@ def solve_command(
         check_writable(report, left, right, *sources.files)
     if picture is not None:
         check_picture(picture)
-    if not any((pairs, landmarks, marks, features, positions, baseline, stars, scene, observations, night)):
+    if not any((pairs, landmarks, marks, features, positions, baseline, stars, scene, tracks, observations, night)):
         raise typer.BadParameter("give boards (--pairs), landmarks (--landmarks and --marks) or features (--features)")
     options = RigOptions(
         intrinsics=intrinsics, board_warp=board_warp, reject=not keep_all, refraction=refraction,
@@ -282,9 +303,10 @@ def solve_command(
         return mark_again(landmarks, marks, cameras=(left, right))
 
     with ending_with(cure):
-        data, frame, unpaired, notes, stated = read_sources(calibrated, sources)
+        data, frame, unpaired, notes, stated, told = read_sources(calibrated, sources)
         with steps("solving the rig", None) as advance:
             result = solve_rig(data, options, advance)
+        notes = (*notes, *told(result))
     rig = result.stereo() if frame is None else placed_rig(result, frame)
     known = stated if pixel_sigma is None else pixel_sigma
     if rig.calibration is not None and known is not None:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from kcal.errors import InputError
 
 if TYPE_CHECKING:
-    from kcal.calibrate.rig.sources import Baseline, Boards, MeasuredPosition, RigData
+    from kcal.calibrate.rig.result import RigResult
+    from kcal.calibrate.rig.sources import Baseline, Boards, Landmarks, MeasuredPosition, RigData
     from kcal.cli.rig_stars import NightOptions
     from kcal.lens.camera import Camera
     from kcal.lens.mounting import Origin
@@ -36,13 +37,21 @@ class Sources:
     stars: NightOptions | None = None
     scene: tuple[str, str] | None = None
     observations: tuple[Path, ...] = ()
+    tracks: tuple[Path, Path] | None = None
+    tracks_clock: float = 2.0
+    clock_sigma: float = 0.1
     names: tuple[str, ...] = CAMERAS
 
     @property
     def files(self) -> list[Path]:
         """All files that are read."""
         single = (self.match, self.landmarks, self.marks, self.features, self.positions)
-        return [*(self.pairs or ()), *self.observations, *(path for path in single if path is not None)]
+        more = (*(self.pairs or ()), *(self.tracks or ()), *self.observations)
+        return [*more, *(path for path in single if path is not None)]
+
+
+def _nothing(_: RigResult) -> list[str]:
+    return []
 
 
 class RigInput(NamedTuple):
@@ -54,6 +63,7 @@ class RigInput(NamedTuple):
         unpaired: how many views of the boards have no partner.
         notes: what else there is to say of the sources.
         pixel_sigma: px, the typical noise of marks along an axis, where the file of the marks states it.
+        told: what there is to say of the sources once the rig is solved.
     """
 
     data: RigData
@@ -61,6 +71,7 @@ class RigInput(NamedTuple):
     unpaired: int
     notes: tuple[str, ...] = ()
     pixel_sigma: float | None = None
+    told: Callable[[RigResult], list[str]] = _nothing
 
 
 def parse_baselines(text: str, names: Sequence[str] = CAMERAS) -> tuple[Baseline, ...]:
@@ -153,6 +164,10 @@ def read_sources(cameras: Sequence[Camera], sources: Sources) -> RigInput:
         seen_by_both, more = read_scene((cameras[0], cameras[1]), sources.scene, scaled=scaled)
         features = seen_by_both if features is None else features + seen_by_both
         notes = [*notes, *more]
+    told: Callable[[RigResult], list[str]] = _nothing
+    if sources.tracks is not None:
+        landmarks, origin, more, told = _with_tracks(cameras, sources, origin, positions, landmarks)
+        notes = [*notes, *more]
     data = RigData(
         cameras=tuple(cameras),
         names=names,
@@ -163,7 +178,7 @@ def read_sources(cameras: Sequence[Camera], sources: Sources) -> RigInput:
         positions=positions,
         stars=stars,
     )
-    return RigInput(data, origin, unpaired, tuple(notes), pixel_sigma)
+    return RigInput(data, origin, unpaired, tuple(notes), pixel_sigma, told)
 
 
 def _read_boards(cameras: Sequence[Camera], sources: Sources) -> tuple[Boards | None, int]:
@@ -201,3 +216,25 @@ def cameras_of_files(paths: Sequence[Path], names: Sequence[str]) -> list[int]:
             raise InputError(f"{path}: a second file of camera {name!r}; give one for each")
         found.append(names.index(name))
     return found
+
+
+def _with_tracks(
+    cameras: Sequence[Camera],
+    sources: Sources,
+    origin: Origin | None,
+    positions: tuple[MeasuredPosition, ...],
+    landmarks: Landmarks | None,
+) -> tuple[Landmarks, Origin | None, list[str], Callable[[RigResult], list[str]]]:
+    """Landmarks with those that move, the origin, what to say of them, and what to say once the rig is solved."""
+    from kcal.cli.rig_moving import clock_line, read_moving
+    from kcal.locate.moving_match import MovingOptions
+
+    assert sources.tracks is not None
+    names = CAMERAS if len(cameras) == 2 else sources.names
+    options = MovingOptions(
+        clock_sigma=sources.tracks_clock, between_sigma=sources.clock_sigma, pixel_sigma=sources.mark_sigma
+    )
+    placed = landmarks is not None or bool(positions)
+    moving, origin, lines = read_moving(cameras, names, sources.tracks, origin, positions, options, placed=placed)
+    both = moving.landmarks if landmarks is None else landmarks + moving.landmarks
+    return both, origin, lines, lambda result: clock_line(result, moving, options)

@@ -57,7 +57,7 @@ def solve_stations(
             raise InputError(f"{option} is for rigs of two cameras; {instead}")
     check_writable(output, *paths, *sources.files)
     sources = dataclasses.replace(sources, names=names)
-    data, origin, _, notes, _ = read_sources(tuple(map(load_camera, paths)), sources)
+    data, origin, _, notes, _, told = read_sources(tuple(map(load_camera, paths)), sources)
     with steps("solving the stations", None) as advance:
         result = solve_rig(data, options, advance)
     rig = result.stations(origin)
@@ -72,7 +72,7 @@ def solve_stations(
         from kcal.report.rig import save_rig_picture
 
         save_rig_picture(picture, result)
-    _print_stations(result, rig, notes)
+    _print_stations(result, rig, [*notes, *told(result)])
     print_wrote(output, picture)
     if needs or report is not None:
         from kcal.cli.report import NO, stored_tables, told_usable

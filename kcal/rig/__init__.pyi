@@ -17,6 +17,16 @@ from kcal.scene.match import scene_features as scene_features
 from kcal.scene.match import SceneMatches as SceneMatches
 from kcal.scene.match import PairCounts as PairCounts
 
+from kcal.locate.moving import MovingTrack as MovingTrack
+from kcal.locate.moving import read_tracks as read_tracks
+from kcal.locate.moving import Sighting as Sighting
+from kcal.locate.moving import read_sightings as read_sightings
+from kcal.locate.moving_match import MovingOptions as MovingOptions
+from kcal.locate.moving_match import match_moving as match_moving
+from kcal.locate.moving_match import MovingControl as MovingControl
+from kcal.locate.moving_match import Identity as Identity
+from kcal.calibrate.rig.sources import LandmarkEffect as LandmarkEffect
+
 # Results
 from kcal.calibrate.rig.result import ItemResidual as ItemResidual
 from kcal.calibrate.rig.result import SourceResidual as SourceResidual

@@ -31,9 +31,9 @@ from kcal.lens.baking import bake
 from kcal.lens.mounting import Mounting, Origin
 from kcal.lens.rig import StereoRig
 from kcal.locate.export import write_positions
-from kcal.locate.ground import terrain
 from kcal.locate.marks import COVARIANCE, read_marks, write_marks
 from kcal.locate.positions import locate_points
+from kcal.locate.raster import terrain
 from kcal.locate.stations import load_camera_rig
 from kcal.locate.survey import read_features, read_survey
 from kcal.locate.survey_files import import_survey

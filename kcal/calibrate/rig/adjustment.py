@@ -9,8 +9,9 @@ from statistics import NormalDist
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.blocks import Block, BoardBlock, FeatureBlock, Kind, LandmarkBlock, PerKind, RigState
+from kcal.calibrate.rig.blocks import Block, BoardBlock, FeatureBlock, Kind, PerKind, RigState
 from kcal.calibrate.rig.initial_poses import Start
+from kcal.calibrate.rig.landmark_block import LandmarkBlock
 from kcal.calibrate.rig.motion import BoardMotion, SeenBoards, board_motion
 from kcal.calibrate.rig.problem import DistanceTerm, PlaceTerm, RigProblem, SharedTerm
 from kcal.calibrate.rig.sources import Features, Landmarks, RigData
@@ -108,7 +109,10 @@ class Adjustment:
         if data.landmarks and masks.landmarks.any():
             surveyed = data.landmarks.points[masks.landmarks], data.landmarks.sigma[masks.landmarks]
             marks = _weighted(data.landmarks, masks.landmarks)
-            found.append(LandmarkBlock(*marks, *surveyed, unknowns.by_refraction))
+            stars = 0 if data.stars is None else len(data.stars.effects)
+            shifts = data.landmarks.shifts()[:, masks.landmarks]
+            effects, steps = (None if one is None else one[stars:] for one in (self._effects, unknowns.by_effects))
+            found.append(LandmarkBlock(*marks, *surveyed, unknowns.by_refraction, shifts, effects, steps))
         if data.features and masks.features.any():
             known = data.features.inverse_range[masks.features], data.features.inverse_range_sigma[masks.features]
             found.append(FeatureBlock(*_weighted(data.features, masks.features), *known, self.anchor))
@@ -121,11 +125,12 @@ class Adjustment:
         assert stars is not None
         white = torch.eye(2, dtype=torch.float64) / stars.pixel_sigma[mask][..., None, None]
         known = stars.direction[mask], stars.direction_sigma[mask]
-        effects = (
-            self._effects if self._effects is not None else self.state.unknown.new_zeros(0, len(self.state.unknown))
-        )
+        count = len(stars.effects)
+        effects = self.state.unknown.new_zeros(0, len(self.state.unknown))
+        effects = effects if self._effects is None else self._effects[:count]
+        steps = None if unknowns.by_effects is None else unknowns.by_effects[:count]
         moves = stars.by_effects(), stars.factors()[:, mask], stars.shifts()[:, mask]
-        return StarBlock(stars.pixels[mask], white, *known, *moves, effects, unknowns.by_effects)
+        return StarBlock(stars.pixels[mask], white, *known, *moves, effects, steps)
 
     @property
     def term_labels(self) -> list[str]:

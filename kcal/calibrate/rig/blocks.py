@@ -1,12 +1,9 @@
-"""What the cameras of a rig see, as blocks of least squares: boards, landmarks, and features of unknown position.
+"""What the cameras of a rig see, as blocks of least squares: boards, and features of unknown position.
 
 A camera with rotation R and center c sees the pixel of R q, q = y - w c. For points, w = 1 and y is the point. A
 feature in direction d at inverse range ρ from a place a near the rig has y = d + ρ a and w = ρ, so that
 q = d + ρ (a - c) is as regular at infinity as anywhere (Civera, Davison, Montiel 2008). In its units a meter is w,
 which entrance pupils that move depend on.
-
-Light bends downward: a landmark at the level distance d is seen k d² / 2R higher than it stands, k being the
-coefficient of refraction and R the Earth's radius.
 
 Residuals are divided by their standard deviations: their squares add up to χ².
 """
@@ -30,9 +27,6 @@ Kind = Literal["boards", "landmarks", "features", "stars"]
 KINDS: tuple[Kind, ...] = ("boards", "landmarks", "features", "stars")
 # Unknowns of the largest block, a board's pose.
 LOCAL_SIZE = 6
-# 1/m: half the curvature of the Earth, of the mean radius (IUGG) everywhere: a third of a percent of the bending.
-_HALF_CURVATURE = 0.5 / 6_371_008.8
-_UP = 2
 
 
 class PerKind(NamedTuple):
@@ -144,6 +138,10 @@ class Block(ABC):
         """
         return None
 
+    def _seen_by(self, state: RigState, offset: Tensor, camera: int) -> Tensor:
+        """Where things stand (V, 3, N) for a camera, for which they may be elsewhere than `offset` from it."""
+        return offset
+
     def _bent(self, state: RigState, offset: Tensor, camera: int) -> Tensor:
         """Where things are seen (V, 3, N) that stand at `offset` from the camera."""
         return offset
@@ -165,7 +163,7 @@ class Block(ABC):
     ) -> Iterator[tuple[int, PosedCamera, Tensor, Tensor, Tensor, Projection, Tensor]]:
         y, w = self._place(state)
         for c, posed in enumerate(cameras):
-            offset = y - w * posed.center[:, None]
+            offset = self._seen_by(state, y - w * posed.center[:, None], c)
             q = posed.rotation @ self._bent(state, offset, c)
             wanted = posed.by_unknown.any(1).nonzero()[:, 0].tolist() if derivatives else None
             found = project_components(q, posed.parameters, posed.camera.model, wanted, w[..., 0])
@@ -278,59 +276,6 @@ class BoardBlock(Block):
         """See `Block.retract`."""
         rotation, translation = apply_twist(state.board_rotation, state.board_translation, step)
         return state._replace(board_rotation=rotation, board_translation=translation)
-
-
-class LandmarkBlock(Block):
-    """Surveyed points, whose adjusted positions are the unknowns.
-
-    Args:
-        pixels: (V, C, 2), see `Block`.
-        whitening: (V, C, 2, 2), see `Block`.
-        points: (V, 3) meters, as surveyed; the third axis is up.
-        sigma: (V, 3) meters.
-        by_refraction: (K,) of the coefficient of refraction by the unknowns; None: it is held.
-    """
-
-    kind: Kind = "landmarks"
-    size = 3
-
-    def __init__(
-        self, pixels: Tensor, whitening: Tensor, points: Tensor, sigma: Tensor, by_refraction: Tensor | None = None
-    ) -> None:
-        super().__init__(pixels[:, :, None], whitening[:, :, None])
-        self._surveyed, self._sigma, self._by_refraction = points, sigma, by_refraction
-
-    def _prior_count(self) -> Tensor:
-        return torch.full((len(self),), 3)
-
-    def _place(self, state: RigState) -> tuple[Tensor, Tensor]:
-        return state.points[..., None], state.points.new_ones(len(self), 1, 1)
-
-    def _bent(self, state: RigState, offset: Tensor, camera: int) -> Tensor:
-        level, up = offset[:, :_UP], offset[:, _UP:]
-        return torch.cat([level, up + state.refraction * _HALF_CURVATURE * level.square().sum(1, keepdim=True)], 1)
-
-    def _by_offset(self, state: RigState, by_q: Tensor, offset: Tensor) -> Tensor:
-        slope = 2.0 * state.refraction * _HALF_CURVATURE * offset[:, :_UP, None]
-        return torch.cat([by_q[:, :_UP] + slope * by_q[:, _UP:], by_q[:, _UP:]], 1)
-
-    def _by_board_or_air(self, state: RigState, by_q: Tensor, offset: Tensor, camera: int) -> Tensor | None:
-        if self._by_refraction is None:
-            return None
-        lift = _HALF_CURVATURE * offset[:, :_UP, None].square().sum(1, keepdim=True)
-        return self._by_refraction[:, None, None] * (lift * by_q[:, _UP:])
-
-    def _by_local(self, state: RigState, by_q: Tensor, center: Tensor, by_w: Tensor | None) -> Tensor:
-        return by_q
-
-    def _prior(self, state: RigState) -> Tensor | None:
-        # The survey.
-        error = (state.points - self._surveyed) / self._sigma
-        return torch.cat([torch.diag_embed(1.0 / self._sigma), error[:, None]], 1)
-
-    def retract(self, state: RigState, step: Tensor) -> RigState:
-        """See `Block.retract`."""
-        return state._replace(points=state.points + step)
 
 
 class FeatureBlock(Block):

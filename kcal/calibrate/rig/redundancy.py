@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import torch
 
-from kcal.calibrate.rig.blocks import Block, FeatureBlock, LandmarkBlock
+from kcal.calibrate.rig.blocks import Block, FeatureBlock
+from kcal.calibrate.rig.landmark_block import LandmarkBlock
 from kcal.calibrate.rig.problem import RigProblem
 from kcal.errors import DegenerateError
 

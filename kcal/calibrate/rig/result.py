@@ -292,6 +292,15 @@ class RigResult:
         """Coefficient of refraction of the light from landmarks; its variance is the last of `mounting_covariance`."""
         return float(self._state.refraction)
 
+    def effects(self) -> dict[str, tuple[float, float]]:
+        """What shifts stars or landmarks together: its amount and standard deviation, in sigmas stated beforehand."""
+        maps = self._problem.unknowns.by_effects
+        if maps is None:
+            return {}
+        rows = torch.nn.functional.pad(maps, (0, self._problem.shared_size - maps.shape[1]))
+        sigma, amount = self._covariance.variances(rows).sqrt(), maps @ self._state.unknown
+        return dict(zip(self.data.effects, zip(amount.tolist(), sigma.tolist(), strict=True), strict=True))
+
     def mounting_link(self, first: int = 0, second: int = 1) -> Tensor:
         """(P, 7) covariance of `joint_covariance`'s P quantities with `mounting_covariance`'s of the first camera."""
         rows = [self._joint_rows(first, second), mounting_rows(self._problem, self._state, first)]

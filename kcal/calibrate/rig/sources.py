@@ -99,6 +99,24 @@ class Boards:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class LandmarkEffect:
+    """Something that shifts many landmarks together and is known only roughly: a clock, an antenna's place.
+
+    Args:
+        name: what it is, for messages.
+        shift: (L, C, 3) meters by which each camera sees each landmark elsewhere at one sigma of it.
+
+    Example:
+        >>> velocity = torch.tensor([[5.0, 0.0, 0.0]], dtype=torch.float64)  # of one landmark, seen by two cameras
+        >>> LandmarkEffect(name="the clock, 0.1 s", shift=0.1 * velocity[:, None].expand(1, 2, 3)).shift[0, 0].tolist()
+        [0.5, 0.0, 0.0]
+    """
+
+    name: str
+    shift: Tensor
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Landmarks:
     """Surveyed points, marked in the images.
 
@@ -108,6 +126,7 @@ class Landmarks:
         sigma: (L, 3) meters along the frame's axes, of the survey; independent from point to point.
         pixels: (L, C, 2) marks.
         pixel_sigma: of a mark along an axis, px; one number for all, or (L, C) for each mark.
+        effects: what shifts many of them together, beyond `sigma`.
     """
 
     names: tuple[str, ...]
@@ -115,6 +134,7 @@ class Landmarks:
     sigma: Tensor
     pixels: Tensor
     pixel_sigma: float | Tensor = 0.3
+    effects: tuple[LandmarkEffect, ...] = ()
 
     def __post_init__(self) -> None:
         count = len(self.names)
@@ -127,6 +147,9 @@ class Landmarks:
         require_finite("landmarks: points", as_points("landmarks: points", self.points, 3))
         if not bool((torch.isfinite(self.sigma) & (self.sigma > 0)).all()):
             raise InputError("landmarks: every sigma must be a positive number of meters; nothing is surveyed exactly")
+        for effect in self.effects:
+            if effect.shift.shape != (*self.pixels.shape[:2], 3) or not bool(torch.isfinite(effect.shift).all()):
+                raise InputError(f"landmarks: the effect of {effect.name} needs finite shifts (L, C, 3)")
         if not isinstance(self.pixel_sigma, Tensor):
             _positive("landmarks: pixel_sigma", self.pixel_sigma)
             return
@@ -135,6 +158,34 @@ class Landmarks:
         sigma = self.pixel_sigma[torch.isfinite(self.pixels).all(-1)]
         if not bool((torch.isfinite(sigma) & (sigma > 0)).all()):
             raise InputError("landmarks: pixel_sigma must be a positive number of pixels wherever there is a mark")
+
+    def shifts(self) -> Tensor:
+        """(E, L, C, 3) of all effects."""
+        shifts = [effect.shift for effect in self.effects]
+        return torch.stack(shifts) if shifts else self.pixels.new_zeros(0, *self.pixels.shape[:2], 3)
+
+    def __add__(self, other: Landmarks) -> Landmarks:
+        """Both, with a sigma for each mark; effects shift only those whose they are."""
+        counts = len(self.names), len(other.names)
+        return Landmarks(
+            names=self.names + other.names,
+            points=torch.cat([self.points, other.points]),
+            sigma=torch.cat([self.sigma, other.sigma]),
+            pixels=torch.cat([self.pixels, other.pixels]),
+            pixel_sigma=torch.cat([self._each(), other._each()]),
+            effects=(
+                *(_padded(effect, 0, counts[1]) for effect in self.effects),
+                *(_padded(effect, counts[0], 0) for effect in other.effects),
+            ),
+        )
+
+    def _each(self) -> Tensor:
+        return torch.as_tensor(self.pixel_sigma, dtype=torch.float64).expand(self.pixels.shape[:2])
+
+
+def _padded(effect: LandmarkEffect, before: int, after: int) -> LandmarkEffect:
+    shift = torch.nn.functional.pad(effect.shift, (0, 0, 0, 0, before, after))
+    return LandmarkEffect(name=effect.name, shift=shift)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -286,6 +337,14 @@ class RigData:
         numbers = [n for b in self.baselines for n in (b.first, b.second)] + [p.camera for p in self.positions]
         if any(not 0 <= number < count for number in numbers):
             raise InputError(f"baselines and positions name cameras 0 to {count - 1}")
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Names of what shifts stars, and then of what shifts landmarks, together."""
+        return (
+            *(effect.name for effect in (self.stars.effects if self.stars else ())),
+            *(effect.name for effect in (self.landmarks.effects if self.landmarks else ())),
+        )
 
     @property
     def absolute(self) -> bool:

@@ -16,7 +16,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.blocks import FeatureBlock, LandmarkBlock, RigState
+from kcal.calibrate.rig.blocks import FeatureBlock, RigState
+from kcal.calibrate.rig.landmark_block import LandmarkBlock
 from kcal.calibrate.rig.problem import RigProblem
 from kcal.calibrate.rig.uncertainty import SharedCovariance, relative_rows
 from kcal.errors import DegenerateError

@@ -27,8 +27,9 @@ from rig_scenes import (
 from torch import Tensor
 
 from kcal.calibrate.rig import initial_poses, limits, solve
-from kcal.calibrate.rig.blocks import BoardBlock, FeatureBlock, LandmarkBlock, PosedCamera, RigState
+from kcal.calibrate.rig.blocks import BoardBlock, FeatureBlock, PosedCamera, RigState
 from kcal.calibrate.rig.initial_poses import Start
+from kcal.calibrate.rig.landmark_block import LandmarkBlock
 from kcal.calibrate.rig.prior_information import joint_unknowns
 from kcal.calibrate.rig.problem import DistanceTerm, PlaceTerm, RigProblem
 from kcal.calibrate.rig.resection import consensus_pose, poses_from_three

@@ -1,0 +1,93 @@
+"""Surveyed landmarks as a block of least squares: positions that the survey knows, light that bends, shared effects.
+
+Light bends downward: a landmark at the level distance d is seen k d² / 2R higher than it stands, k being the
+coefficient of refraction and R the Earth's radius.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from kcal.calibrate.rig.blocks import Block, Kind, RigState
+
+# 1/m: half the curvature of the Earth, of the mean radius (IUGG) everywhere: a third of a percent of the bending.
+_HALF_CURVATURE = 0.5 / 6_371_008.8
+_UP = 2
+
+
+class LandmarkBlock(Block):
+    """Surveyed points, whose adjusted positions are the unknowns.
+
+    Args:
+        pixels: (V, C, 2), see `Block`.
+        whitening: (V, C, 2, 2), see `Block`.
+        points: (V, 3) meters, as surveyed; the third axis is up.
+        sigma: (V, 3) meters.
+        by_refraction: (K,) of the coefficient of refraction by the unknowns; None: it is held.
+        shifts: (E, V, C, 3) see `LandmarkEffect`; none if left out.
+        effects: (E, K) by which the amounts of the effects are found among the unknowns of the state.
+        by_effects: (E, K) likewise of a step; None: they are held.
+    """
+
+    kind: Kind = "landmarks"
+    size = 3
+
+    def __init__(
+        self,
+        pixels: Tensor,
+        whitening: Tensor,
+        points: Tensor,
+        sigma: Tensor,
+        by_refraction: Tensor | None = None,
+        shifts: Tensor | None = None,
+        effects: Tensor | None = None,
+        by_effects: Tensor | None = None,
+    ) -> None:
+        super().__init__(pixels[:, :, None], whitening[:, :, None])
+        self._surveyed, self._sigma, self._by_refraction = points, sigma, by_refraction
+        self._shifts = None if shifts is None or not len(shifts) else shifts
+        self._effects, self._by_effects = effects, by_effects
+
+    def _prior_count(self) -> Tensor:
+        return torch.full((len(self),), 3)
+
+    def _place(self, state: RigState) -> tuple[Tensor, Tensor]:
+        return state.points[..., None], state.points.new_ones(len(self), 1, 1)
+
+    def _seen_by(self, state: RigState, offset: Tensor, camera: int) -> Tensor:
+        if self._shifts is None or self._effects is None:
+            return offset
+        return offset + torch.einsum("e,evk->vk", self._effects @ state.unknown, self._shifts[:, :, camera])[..., None]
+
+    def _bent(self, state: RigState, offset: Tensor, camera: int) -> Tensor:
+        level, up = offset[:, :_UP], offset[:, _UP:]
+        return torch.cat([level, up + state.refraction * _HALF_CURVATURE * level.square().sum(1, keepdim=True)], 1)
+
+    def _by_offset(self, state: RigState, by_q: Tensor, offset: Tensor) -> Tensor:
+        slope = 2.0 * state.refraction * _HALF_CURVATURE * offset[:, :_UP, None]
+        return torch.cat([by_q[:, :_UP] + slope * by_q[:, _UP:], by_q[:, _UP:]], 1)
+
+    def _by_board_or_air(self, state: RigState, by_q: Tensor, offset: Tensor, camera: int) -> Tensor | None:
+        found = None
+        if self._by_refraction is not None:
+            lift = _HALF_CURVATURE * offset[:, :_UP, None].square().sum(1, keepdim=True)
+            found = self._by_refraction[:, None, None] * (lift * by_q[:, _UP:])
+        if self._shifts is not None and self._by_effects is not None:
+            by_offset = self._by_offset(state, by_q, offset)
+            by_effect = torch.einsum("vjun,evj->veun", by_offset, self._shifts[:, :, camera])
+            moved = torch.einsum("ek,veun->vkun", self._by_effects, by_effect)
+            found = moved if found is None else found + moved
+        return found
+
+    def _by_local(self, state: RigState, by_q: Tensor, center: Tensor, by_w: Tensor | None) -> Tensor:
+        return by_q
+
+    def _prior(self, state: RigState) -> Tensor | None:
+        # The survey.
+        error = (state.points - self._surveyed) / self._sigma
+        return torch.cat([torch.diag_embed(1.0 / self._sigma), error[:, None]], 1)
+
+    def retract(self, state: RigState, step: Tensor) -> RigState:
+        """See `Block.retract`."""
+        return state._replace(points=state.points + step)
