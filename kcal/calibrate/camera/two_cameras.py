@@ -185,8 +185,8 @@ def two_cameras(
         change = theta[1] - theta[0]
         # What a view would gain in the other group.
         clear = 0.5 * views.change(torch.where(second[:, None], -change, change))
-        tempering = _counted(fit, current)
-        gain = _evidence(current, tempering) - _evidence(fit, tempering) - needed
+        tempering = _common_tempering(fit, current)
+        gain = _evidence_at(current, tempering) - _evidence_at(fit, tempering) - needed
         if best is None or gain > best.nats:
             best = TwoCameras(second=second, clear=clear, log_scale=float(change[0]), shift=change[1:], nats=gain)
         theta = theta + views.best(second)
@@ -198,13 +198,13 @@ def two_cameras(
     return best
 
 
-def _counted(fit: HybridFit, other: HybridFit) -> float:
+def _common_tempering(fit: HybridFit, other: HybridFit) -> float:
     """The tempering at which two fits are compared: how far residuals repeat in the other one."""
     # Evidence of views that move is found before they are tempered.
     return other.tempering if fit.readout is None and other.readout is None else 1.0
 
 
-def _evidence(fit: HybridFit, tempering: float) -> float:
+def _evidence_at(fit: HybridFit, tempering: float) -> float:
     """Logarithm of a fit's evidence were its data to count as this tempering says."""
     own = fit.tempering if fit.readout is None else 1.0
     freedom = 2.0 * float(fit.residuals[..., 0].isfinite().sum()) - POSE * len(fit.residuals)
