@@ -22,8 +22,9 @@ from torch import Tensor
 
 from kcal.calibrate.camera.options import CalibrationOptions, Progress
 from kcal.calibrate.camera.result import CameraCalibrationResult
+from kcal.calibrate.hybrid.evidence import with_tempering
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
-from kcal.calibrate.problem.board_problem import BoardProblem
+from kcal.calibrate.problem.board_problem import POSE, BoardProblem
 from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.views import LEAST_NOISE
 from kcal.errors import DegenerateError, InputError
@@ -184,7 +185,8 @@ def two_cameras(
         change = theta[1] - theta[0]
         # What a view would gain in the other group.
         clear = 0.5 * views.change(torch.where(second[:, None], -change, change))
-        gain = current.log_evidence - fit.log_evidence - needed
+        tempering = _common_tempering(fit, current)
+        gain = _evidence_at(current, tempering) - _evidence_at(fit, tempering) - needed
         if best is None or gain > best.nats:
             best = TwoCameras(second=second, clear=clear, log_scale=float(change[0]), shift=change[1:], nats=gain)
         theta = theta + views.best(second)
@@ -194,6 +196,19 @@ def two_cameras(
     if 2 * int(best.second.sum()) > len(second):
         return dataclasses.replace(best, second=~best.second, log_scale=-best.log_scale, shift=-best.shift)
     return best
+
+
+def _common_tempering(fit: HybridFit, other: HybridFit) -> float:
+    """The tempering at which two fits are compared: how far residuals repeat in the other one."""
+    # Evidence of views that move is found before they are tempered.
+    return other.tempering if fit.readout is None and other.readout is None else 1.0
+
+
+def _evidence_at(fit: HybridFit, tempering: float) -> float:
+    """Logarithm of a fit's evidence were its data to count as this tempering says."""
+    own = fit.tempering if fit.readout is None else 1.0
+    freedom = 2.0 * float(fit.residuals[..., 0].isfinite().sum()) - POSE * len(fit.residuals)
+    return -with_tempering(-fit.log_evidence, freedom, fit.sigma**2 / fit.tempering, own, tempering)
 
 
 def _of_fit(fit: HybridFit, pixels: Tensor, held: float = 1.0) -> _ByView:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.hybrid.amplitudes import expected_maximum
-from kcal.calibrate.hybrid.evidence import WORTH, Maximum, evidence_of_motion, maximize_evidence
+from kcal.calibrate.hybrid.evidence import WORTH, Maximum, evidence_of_motion, maximize_evidence, with_tempering
 from kcal.calibrate.hybrid.families import Hyperprior
 from kcal.calibrate.hybrid.fitted_views import NO_MOTION, Estimate, FittedViews
 from kcal.calibrate.hybrid.quadratic import ViewData, overdispersion
@@ -45,7 +45,7 @@ class Rounds(NamedTuple):
         readout: with which they began.
         estimate: camera, board, poses and amplitudes.
         data: near it.
-        loss: the negative logarithm of the evidence.
+        loss: the negative logarithm of the evidence; of data that count less by the tempering, where views stand still.
         steps: trial steps of the solver.
         converged: whether the hyperparameters came to rest.
     """
@@ -57,6 +57,13 @@ class Rounds(NamedTuple):
     loss: float
     steps: int
     converged: bool
+
+    @property
+    def untempered_loss(self) -> float:
+        """The same of data that count fully, so that it compares with that of other rounds."""
+        tempering = self.estimate.tempering
+        own, variance = 1.0 if self.data.moving else tempering, self.estimate.variance / tempering
+        return with_tempering(self.loss, self.data.still.freedom, variance, own, 1.0)
 
 
 def begin_motion(capture: FittedViews, estimate: Estimate) -> Estimate:

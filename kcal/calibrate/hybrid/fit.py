@@ -64,7 +64,7 @@ class HybridFit:
         hyperparameters: (H,) of largest evidence.
         expected: (H,) the same with the mean squares of amplitudes, which set the priors.
         families: the priors that these set; of a board with a prior of its own, those after the change of variables.
-        log_evidence: of the last round.
+        log_evidence: of the last round, of data that count less by the tempering where views stand still.
         effective: number of parameters that the data determine.
         square: whether pixels are square.
         readout: how views move while they are read; None: they stand still.
@@ -287,7 +287,7 @@ def fit_hybrid(
         if capture.readout is not None and columns_may_be_read(rounds, hyperprior, never):
             by_columns = dataclasses.replace(capture.readout, columns=True)
             other = begin(dataclasses.replace(capture, square=rounds.capture.square, readout=by_columns))
-            if other[0].loss < rounds.loss:
+            if other[0].untempered_loss < rounds.untempered_loss:
                 rounds, never = other
     capture, likely = rounds.capture, rounds.estimate
     estimate = expected_estimate(rounds, hyperprior) if expected and not robust else likely

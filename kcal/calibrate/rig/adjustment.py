@@ -12,7 +12,7 @@ from torch import Tensor
 from kcal.calibrate.rig.blocks import Block, BoardBlock, FeatureBlock, Kind, PerKind, RigState
 from kcal.calibrate.rig.initial_poses import Start
 from kcal.calibrate.rig.landmark_block import LandmarkBlock
-from kcal.calibrate.rig.motion import BoardMotion, SeenBoards, board_motion
+from kcal.calibrate.rig.motion import BoardMotion, SeenBoards, WithoutMotion, board_motion
 from kcal.calibrate.rig.problem import DistanceTerm, PlaceTerm, RigProblem, SharedTerm
 from kcal.calibrate.rig.sources import Features, Landmarks, RigData
 from kcal.calibrate.rig.star_block import StarBlock
@@ -209,12 +209,16 @@ class Adjustment:
         # Boards that are off by far are wrong, not moved.
         square = self.squares(masks).boards / self.freedom(masks).boards.clamp_min(1)
         good = masks.boards & (square <= _WRONG * square[masks.boards].median())
+        problem = self.problem(everything)
+        block = next(block for block in problem.blocks if isinstance(block, BoardBlock))
+        posed, pixels = problem.posed(state), 2 * boards.pixels.shape[2]
+        rows = block.rows(posed, state, problem.shared_size)
+        # Rows of cameras whose motions are taken out of `rows`, as they were before.
+        before: dict[int, Tensor] = {}
         for c in trusted * _TURNS:
-            self.motion[c] = None
-            problem = self.problem(everything)
-            block = next(block for block in problem.blocks if isinstance(block, BoardBlock))
-            posed = problem.posed(state)
-            rows = block.rows(posed, state, problem.shared_size)
+            own = rows[..., pixels * c : pixels * (c + 1)]
+            if c in before:
+                own.copy_(before.pop(c))
             seen = SeenBoards(
                 model=posed[c].camera.model,
                 parameters=posed[c].parameters,
@@ -225,7 +229,10 @@ class Adjustment:
                 whitening=block.whitening[:, c],
                 size=posed[c].camera.size,
             )
-            self.motion[c] = board_motion(seen, rows, 2 * c * boards.pixels.shape[2], good)
+            found = self.motion[c] = board_motion(seen, rows, pixels * c, good)
+            if found is not None:
+                before[c] = own.clone()
+                own.copy_(WithoutMotion(found.columns, block.whitening[:, c])(before[c]))
 
     def fit_corners(self, masks: PerKind, *, robust: bool = False) -> None:
         """Set the corners' sigma from the boards' residuals, unless it was given.

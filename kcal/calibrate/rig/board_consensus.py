@@ -88,11 +88,13 @@ def check_cameras(data: RigData, good: Tensor, rms: Sequence[float], solver: LMO
         one, other = pair
         if data.cameras[one].size != data.cameras[other].size or not bool(good[:, pair].any(0).all()):
             continue
-        points = boards.points
-        swapped = [
-            pose_alone(points, boards.pixels[good[:, a], a], data.cameras[b], solver)[1] for a, b in (pair, pair[::-1])
-        ]
-        if swapped[0] < _CLEARLY * rms[one] and swapped[1] < _CLEARLY * rms[other]:
+        swapped = []
+        # The second of the two is seldom needed.
+        for own, a, b in ((rms[one], one, other), (rms[other], other, one)):
+            swapped.append(pose_alone(boards.points, boards.pixels[good[:, a], a], data.cameras[b], solver)[1])
+            if swapped[-1] >= _CLEARLY * own:
+                break
+        else:
             first, second = data.names[one], data.names[other]
             raise InputError(
                 f"the {first} observations fit the {second} camera better (RMS {swapped[0]:.2f} against "

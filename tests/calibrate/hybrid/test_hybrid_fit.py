@@ -12,7 +12,7 @@ from standing_views import quadratic, standing
 from torch import Tensor
 
 from kcal.calibrate.hybrid.board_modes import BENDING, PRINT, STRETCH, TRAPEZOID, board_modes
-from kcal.calibrate.hybrid.evidence import maximize_evidence, negative_log_evidence
+from kcal.calibrate.hybrid.evidence import maximize_evidence, negative_log_evidence, with_tempering
 from kcal.calibrate.hybrid.families import PriorFamilies, prior_families, typical_hyperprior
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.quadratic import Quadratic
@@ -280,6 +280,24 @@ def test_evidence_is_found_where_a_trial_cannot_be_factorized() -> None:
     assert variance == pytest.approx(0.3**2, rel=0.2)
     again = maximize_evidence(standing(data), families, found, variance).loss
     assert loss == pytest.approx(again, abs=rounding)
+
+
+@pytest.mark.parametrize("unit", [1.0, 100.0])
+def test_losses_of_unequal_tempering_are_brought_to_one(unit: float) -> None:
+    """Whatever the unit of residuals, as if the maximum had been looked for at the other tempering."""
+    (_, families), generator = linear_case(), torch.Generator().manual_seed(7)
+    h = typical_hyperprior().mean
+    wide = families.deviation(typical_hyperprior().mean)
+    rows = 1e3 * torch.randn(2000, len(wide), generator=generator, dtype=torch.float64)
+    noise = 0.1 * torch.randn(2000, generator=generator, dtype=torch.float64)
+    truth = wide * torch.randn(len(wide), generator=generator, dtype=torch.float64)
+    data = standing(quadratic(unit * rows, unit * noise, truth))
+    one, other = (
+        maximize_evidence(data, families, h, (0.1 * unit) ** 2, tempering=tempering) for tempering in (1.1, 1.0)
+    )
+    found = with_tempering(one.loss, data.still.freedom, one.variance, 1.1, 1.0)
+    assert abs(one.loss - other.loss) > 100.0
+    assert found == pytest.approx(other.loss, abs=0.5)
 
 
 def test_evidence_has_no_rounding_of_squares() -> None:
