@@ -223,7 +223,7 @@ def main() -> None:
                 rows.append(measured(step, size))
                 show([str(rows[-1])])
         if given.write:
-            write_section("precision.md", f"memory {name}", "\n".join(table(head, rows)))
+            write_section("precision.md", name, "\n".join(table(head, rows)))
 
 
 if __name__ == "__main__":
