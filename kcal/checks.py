@@ -18,15 +18,22 @@ def as_points(name: str, value: Tensor, last: int) -> Tensor:
     """Return `value` as float64 after checking that it is a real floating tensor of shape (..., last).
 
     Integers are refused: a pixel rounded to an integer is a measurement thrown away, and whoever passes one should
-    say so with `.double()`. float16 to float32 are promoted.
+    say so with `.double()`. float16 and bfloat16 are refused for the same reason: near 1000 px they have steps of 0.5
+    and 4 px. float32 is promoted.
 
     Raises:
-        InputError: not a tensor, not floating point, or another last dimension.
+        InputError: not a tensor, not floating point, less than float32, or another last dimension.
     """
     if not isinstance(value, Tensor):
         raise InputError(f"{name}: a torch tensor is needed, got {type(value).__name__}")
     if not value.is_floating_point():
         raise InputError(f"{name}: floating point is needed, got {value.dtype}; convert with .double()")
+    if torch.finfo(value.dtype).bits < 32:
+        step = 512 * torch.finfo(value.dtype).eps
+        raise InputError(
+            f"{name}: {value.dtype} has steps of {step:g} near 1000; compute it in float32 or float64, or accept the "
+            "rounding with .double()"
+        )
     if value.ndim < 1 or value.shape[-1] != last:
         raise InputError(f"{name}: shape (..., {last}) is needed, got {tuple(value.shape)}")
     return value.to(torch.float64)

@@ -15,12 +15,14 @@ F64 = torch.float64
 
 
 def test_points_are_float64_of_the_right_shape() -> None:
-    found = as_points("x", torch.ones(3, 2, dtype=torch.float16), 2)
+    found = as_points("x", torch.ones(3, 2, dtype=torch.float32), 2)
     assert found.dtype == F64
     assert as_points("x", torch.ones(2, dtype=F64), 2).shape == (2,)
     for value, message in (
         ([1.0, 2.0], "x: a torch tensor is needed, got list"),
         (torch.ones(3, 2, dtype=torch.int64), r"floating point is needed, got torch.int64"),
+        (torch.ones(3, 2, dtype=torch.float16), r"torch.float16 has steps of 0.5 near 1000"),
+        (torch.ones(3, 2, dtype=torch.bfloat16), r"torch.bfloat16 has steps of 4 near 1000"),
         (torch.tensor(1.0), r"shape \(..., 2\) is needed, got \(\)"),
         (torch.ones(2, 3), r"shape \(..., 2\) is needed, got \(2, 3\)"),
     ):

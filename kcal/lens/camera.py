@@ -31,7 +31,8 @@ class Camera(ConvertibleCamera):
     Make one from plain numbers with `Camera.build`, or load one with `kcal.load_camera`.
 
     Convention: camera frame x right, y down, z forward; pixel (0, 0) is the center of the first pixel; meters. All
-    geometry is float64: inputs of lower precision are promoted, and `.half()` or `.float()` do not round the camera.
+    geometry is float64: float32 inputs are promoted, float16 and bfloat16 are refused (near 1000 px they have steps of
+    0.5 and 4 px), and `.half()` or `.float()` do not round the camera.
 
     The parameters do not require gradients until asked (`camera.free("fx", "k1")`), so that training a network around a
     camera does not change its calibration. The region where the lens is valid is computed when the camera is made and

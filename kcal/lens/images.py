@@ -205,8 +205,11 @@ class Undistort(nn.Module):
     def _grid(self, precision: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
         """Positions for `grid_sample`, -1 and 1 at the centers of the outer pixels, rounded once."""
         pixels, mask = _source_positions(self.camera, self.new_camera, self.rotation, self.at)
-        last = torch.tensor(self.camera.size, dtype=pixels.dtype, device=pixels.device) - 1
-        x, y = (2 * pixels / last - 1).to(precision).unbind(-1)
+        # One axis at a time: fewer copies of the whole image's positions in float64.
+        x, y = (
+            (2 * part / (size - 1) - 1).to(precision)
+            for part, size in zip(pixels.unbind(-1), self.camera.size, strict=True)
+        )
         return x.contiguous(), y.contiguous(), mask
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:
@@ -265,11 +268,13 @@ def _source_positions(
         torch.broadcast_shapes(*shapes)
     except RuntimeError as error:
         raise InputError(f"batches of {shapes[0]} cameras and {shapes[1]} new cameras do not fit") from error
-    bands = []
-    for pixels in new_camera.grid(width, height).flatten(0, 1).split(_BAND):
+    bands, grid = [], new_camera.grid(width, height).flatten(0, 1)
+    for pixels in grid.split(_BAND):
         rays, valid = new_camera.unproject(pixels)
         source, seen = source_pixels(source_camera, rays)
-        bands.append((source, seen & valid))
+        mask = seen & valid
+        bands.append((torch.where(mask[..., None], source, NOWHERE), mask))
+    # 1.6 GB of an image of 100 megapixels, as are the bands together.
+    del grid, pixels
     source, mask = torch.cat([band[0] for band in bands], -2), torch.cat([band[1] for band in bands], -1)
-    source = torch.where(mask[..., None], source, NOWHERE)
     return source.unflatten(-2, (height, width)), mask.unflatten(-1, (height, width))

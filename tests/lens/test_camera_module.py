@@ -60,13 +60,20 @@ class TestPrecision:
         assert network[1].params.dtype == torch.float64
 
     @pytest.mark.parametrize("model", ["opencv14", HYBRID], ids=str)
-    @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32])
-    def test_inputs_are_promoted(self, dtype: torch.dtype, model: str | LensModel) -> None:
+    def test_float32_is_promoted(self, model: str | LensModel) -> None:
         camera = make_camera(model)
-        low = POINTS.to(dtype)
+        low = POINTS.float()
         assert torch.equal(camera.project(low)[0], camera.project(low.double())[0])
-        pixels = torch.tensor([[5.0, 3.0]], dtype=dtype)
+        pixels = torch.tensor([[5.0, 3.0]])
         assert torch.equal(camera.unproject(pixels)[0], camera.unproject(pixels.double())[0])
+
+    @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+    def test_less_is_refused(self, dtype: torch.dtype) -> None:
+        """1023.5 px is 1024 in bfloat16, and half a pixel is what float16 has left there."""
+        camera = make_camera()
+        for call, value in ((camera.project, POINTS), (camera.unproject, POINTS[..., :2]), (camera, POINTS)):
+            with pytest.raises(InputError, match=rf"{dtype} has steps of .*\.double\(\)"):
+                call(value.to(dtype))
 
     def test_a_point_alone_is_refused(self) -> None:
         camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="opencv5")
