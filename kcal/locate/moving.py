@@ -157,7 +157,7 @@ def _smoothest(times: NDArray[np.float64], values: NDArray[np.float64], sigma: N
     return path
 
 
-def seconds_of(row: TableRow) -> float:
+def time_of_row(row: TableRow) -> float:
     """The `time` of a row: seconds, or a date with its zone (`2026-11-24T20:47:26Z`), then seconds since 1970.
 
     Raises:
@@ -221,7 +221,7 @@ def read_tracks(path: str | Path, origin: Origin | None = None) -> tuple[tuple[M
         assert origin is not None
         values = geodetic_to_enu(values, origin)
     of: dict[str, list[int]] = {}
-    times = [seconds_of(row) for row in rows]
+    times = [time_of_row(row) for row in rows]
     for i, row in enumerate(rows):
         of.setdefault(row.name, []).append(i)
     found = []
@@ -314,7 +314,7 @@ def read_sightings(path: str | Path, cameras: Sequence[str]) -> tuple[Sighting, 
             if camera not in number:
                 raise FileError(f"{row.where}: no camera is named {camera!r}; they are {', '.join(cameras)}")
             own = of.setdefault((number[camera], row.name), {})
-            time = seconds_of(row)
+            time = time_of_row(row)
             if time in own:
                 raise FileError(f"{row.where}: {row.name!r} was seen by {camera} at that time before; once is needed")
             pixel = row.number("u", "a pixel coordinate"), row.number("v", "a pixel coordinate")

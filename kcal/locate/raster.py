@@ -126,10 +126,10 @@ def _read_raster(path: Path) -> _Read:
         raise FileError(f"{path}: cannot be read as a raster: {error}") from error
     if system is None:
         raise FileError(f"{path}: the raster has no coordinate system")
-    return heights, tuple(to_cell)[:6], _system(path, system.to_wkt())
+    return heights, tuple(to_cell)[:6], _coordinate_system(path, system.to_wkt())
 
 
-def _system(path: Path, text: str) -> pyproj.CRS:
+def _coordinate_system(path: Path, text: str) -> pyproj.CRS:
     """A coordinate system that positions can be turned into."""
     try:
         system = pyproj.CRS.from_wkt(text)
@@ -172,7 +172,7 @@ def _read_grid(path: Path) -> _Read:
     heights = np.where(heights == head.get("nodata_value", -9999.0), np.nan, heights).reshape(rows, columns)
     projection = path.with_suffix(".prj")
     if projection.is_file():
-        system = _system(projection, read_text(projection, 1 << 20))
+        system = _coordinate_system(projection, read_text(projection, 1 << 20))
     elif x >= -180.0 and x + columns * cell <= 180.0 and y >= -90.0 and y + rows * cell <= 90.0:
         system = pyproj.CRS("EPSG:4326")
     else:
