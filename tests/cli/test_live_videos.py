@@ -224,7 +224,7 @@ def test_two_rtsp_streams_whose_newest_frames_are_taken(folder: Path, monkeypatc
 
 
 def test_a_file_beside_a_stream(folder: Path) -> None:
-    with pytest.raises(InputError, match="two files or two live streams"):
+    with pytest.raises(InputError, match="files alone or live streams alone"):
         CliRunner().invoke(
             app,
             ["live", str(folder / "rig.json"), str(folder / "left.mp4"), "rtsp://user:secret@127.0.0.1/main",
