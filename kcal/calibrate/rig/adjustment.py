@@ -9,7 +9,7 @@ from statistics import NormalDist
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.blocks import Block, BoardBlock, FeatureBlock, Kind, PerKind, RigState
+from kcal.calibrate.rig.blocks import Block, BoardBlock, Effects, FeatureBlock, Kind, PerKind, RigState
 from kcal.calibrate.rig.initial_poses import Start
 from kcal.calibrate.rig.landmark_block import LandmarkBlock
 from kcal.calibrate.rig.motion import BoardMotion, SeenBoards, WithoutMotion, board_motion
@@ -87,7 +87,6 @@ class Adjustment:
             inverse_range=inverse_range,
             star=_star_start(data, start),
         )
-        self._effects = unknowns.by_effects
 
     def problem(self, masks: PerKind, loss: RobustLoss | None = None, *, held: bool = False) -> RigProblem:
         """The problem of the items in the masks; `held`: of these alone, with cameras and board as they are."""
@@ -109,10 +108,10 @@ class Adjustment:
         if data.landmarks and masks.landmarks.any():
             surveyed = data.landmarks.points[masks.landmarks], data.landmarks.sigma[masks.landmarks]
             marks = _weighted(data.landmarks, masks.landmarks)
-            stars = 0 if data.stars is None else len(data.stars.effects)
+            before = 0 if data.stars is None else len(data.stars.effects)
+            effects = self._effects(slice(before, None), unknowns)
             shifts = data.landmarks.shifts()[:, masks.landmarks]
-            effects, steps = (None if one is None else one[stars:] for one in (self._effects, unknowns.by_effects))
-            found.append(LandmarkBlock(*marks, *surveyed, unknowns.by_refraction, shifts, effects, steps))
+            found.append(LandmarkBlock(*marks, *surveyed, unknowns.by_refraction, effects, shifts))
         if data.features and masks.features.any():
             known = data.features.inverse_range[masks.features], data.features.inverse_range_sigma[masks.features]
             found.append(FeatureBlock(*_weighted(data.features, masks.features), *known, self.anchor))
@@ -125,12 +124,16 @@ class Adjustment:
         assert stars is not None
         white = torch.eye(2, dtype=torch.float64) / stars.pixel_sigma[mask][..., None, None]
         known = stars.direction[mask], stars.direction_sigma[mask]
-        count = len(stars.effects)
-        effects = self.state.unknown.new_zeros(0, len(self.state.unknown))
-        effects = effects if self._effects is None else self._effects[:count]
-        steps = None if unknowns.by_effects is None else unknowns.by_effects[:count]
         moves = stars.by_effects(), stars.factors()[:, mask], stars.shifts()[:, mask]
-        return StarBlock(stars.pixels[mask], white, *known, *moves, effects, steps)
+        effects = self._effects(slice(len(stars.effects)), unknowns)
+        return StarBlock(stars.pixels[mask], white, *known, *moves, effects)
+
+    def _effects(self, part: slice, unknowns: SharedUnknowns) -> Effects | None:
+        """What shifts items together, of all unknowns in the state and of those of a step; None where nothing does."""
+        whole = self.unknowns.by_effects
+        if whole is None or not len(whole[part]):
+            return None
+        return Effects(whole[part], None if unknowns.by_effects is None else unknowns.by_effects[part])
 
     @property
     def term_labels(self) -> list[str]:

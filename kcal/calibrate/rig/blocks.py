@@ -86,18 +86,32 @@ class PosedCamera(NamedTuple):
     shift: slice | None
 
 
+class Effects(NamedTuple):
+    """Amounts u of E effects that shift many items together, as clocks and the air do.
+
+    Attributes:
+        of_state: (E, K) by which they are found among the unknowns of the state.
+        of_step: (E, K) likewise of a step; None: they are held.
+    """
+
+    of_state: Tensor
+    of_step: Tensor | None
+
+
 class Block(ABC):
     """V items of one kind, each with its own unknowns that no other item shares.
 
     Args:
         pixels: (V, C, N, 2), NaN where not seen.
         whitening: (V, C, N, 2, 2) by which pixel residuals are multiplied.
+        effects: that shift points by Σ_e u_e `_moves`; None: there are none.
     """
 
     kind: Kind
     size: int
 
-    def __init__(self, pixels: Tensor, whitening: Tensor) -> None:
+    def __init__(self, pixels: Tensor, whitening: Tensor, effects: Effects | None = None) -> None:
+        self._effects = effects
         self.seen = torch.isfinite(pixels).all(-1)
         self.target = torch.where(self.seen[..., None], pixels, 0.0).transpose(-1, -2).contiguous()
         self.whitening = torch.where(self.seen[..., None, None], whitening, 0.0).movedim(-3, -1).contiguous()
@@ -138,9 +152,9 @@ class Block(ABC):
         """
         return None
 
-    def _seen_by(self, state: RigState, offset: Tensor, camera: int) -> Tensor:
-        """Where things stand (V, 3, N) for a camera, for which they may be elsewhere than `offset` from it."""
-        return offset
+    def _moves(self, state: RigState, camera: int) -> Tensor:
+        """(E, V, 3) by which one sigma of each effect shifts the items for a camera."""
+        return state.unknown.new_zeros(0, len(self), 3)
 
     def _bent(self, state: RigState, offset: Tensor, camera: int) -> Tensor:
         """Where things are seen (V, 3, N) that stand at `offset` from the camera."""
@@ -163,7 +177,10 @@ class Block(ABC):
     ) -> Iterator[tuple[int, PosedCamera, Tensor, Tensor, Tensor, Projection, Tensor]]:
         y, w = self._place(state)
         for c, posed in enumerate(cameras):
-            offset = self._seen_by(state, y - w * posed.center[:, None], c)
+            offset = y - w * posed.center[:, None]
+            if self._effects is not None:
+                amounts = self._effects.of_state @ state.unknown
+                offset = offset + torch.einsum("e,evk->vk", amounts, self._moves(state, c))[..., None]
             q = posed.rotation @ self._bent(state, offset, c)
             wanted = posed.by_unknown.any(1).nonzero()[:, 0].tolist() if derivatives else None
             found = project_components(q, posed.parameters, posed.camera.model, wanted, w[..., 0])
@@ -201,6 +218,9 @@ class Block(ABC):
                 besides = self._by_board_or_air(state, by_q, offset, c)
                 if besides is not None:
                     shared[:, :count] += besides
+                if self._effects is not None and self._effects.of_step is not None:
+                    by_effect = torch.einsum("vjun,evj->veun", by_offset, self._moves(state, c))
+                    shared[:, :count] += torch.einsum("ek,veun->vkun", self._effects.of_step, by_effect)
             if posed.turn is not None:
                 shared[:, posed.turn] = step_rows(found.by_point, q)[:, :3]
             if posed.shift is not None:

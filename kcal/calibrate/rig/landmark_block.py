@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.blocks import Block, Kind, RigState
+from kcal.calibrate.rig.blocks import Block, Effects, Kind, RigState
 
 # 1/m: half the curvature of the Earth, of the mean radius (IUGG) everywhere: a third of a percent of the bending.
 _HALF_CURVATURE = 0.5 / 6_371_008.8
@@ -25,9 +25,8 @@ class LandmarkBlock(Block):
         points: (V, 3) meters, as surveyed; the third axis is up.
         sigma: (V, 3) meters.
         by_refraction: (K,) of the coefficient of refraction by the unknowns; None: it is held.
-        shifts: (E, V, C, 3) see `LandmarkEffect`; none if left out.
-        effects: (E, K) by which the amounts of the effects are found among the unknowns of the state.
-        by_effects: (E, K) likewise of a step; None: they are held.
+        effects: see `Block`.
+        shifts: (E, V, C, 3) see `LandmarkEffect`; needed with effects.
     """
 
     kind: Kind = "landmarks"
@@ -40,14 +39,11 @@ class LandmarkBlock(Block):
         points: Tensor,
         sigma: Tensor,
         by_refraction: Tensor | None = None,
+        effects: Effects | None = None,
         shifts: Tensor | None = None,
-        effects: Tensor | None = None,
-        by_effects: Tensor | None = None,
     ) -> None:
-        super().__init__(pixels[:, :, None], whitening[:, :, None])
-        self._surveyed, self._sigma, self._by_refraction = points, sigma, by_refraction
-        self._shifts = None if shifts is None or not len(shifts) else shifts
-        self._effects, self._by_effects = effects, by_effects
+        super().__init__(pixels[:, :, None], whitening[:, :, None], effects)
+        self._surveyed, self._sigma, self._by_refraction, self._shifts = points, sigma, by_refraction, shifts
 
     def _prior_count(self) -> Tensor:
         return torch.full((len(self),), 3)
@@ -55,10 +51,8 @@ class LandmarkBlock(Block):
     def _place(self, state: RigState) -> tuple[Tensor, Tensor]:
         return state.points[..., None], state.points.new_ones(len(self), 1, 1)
 
-    def _seen_by(self, state: RigState, offset: Tensor, camera: int) -> Tensor:
-        if self._shifts is None or self._effects is None:
-            return offset
-        return offset + torch.einsum("e,evk->vk", self._effects @ state.unknown, self._shifts[:, :, camera])[..., None]
+    def _moves(self, state: RigState, camera: int) -> Tensor:
+        return super()._moves(state, camera) if self._shifts is None else self._shifts[:, :, camera]
 
     def _bent(self, state: RigState, offset: Tensor, camera: int) -> Tensor:
         level, up = offset[:, :_UP], offset[:, _UP:]
@@ -69,16 +63,10 @@ class LandmarkBlock(Block):
         return torch.cat([by_q[:, :_UP] + slope * by_q[:, _UP:], by_q[:, _UP:]], 1)
 
     def _by_board_or_air(self, state: RigState, by_q: Tensor, offset: Tensor, camera: int) -> Tensor | None:
-        found = None
-        if self._by_refraction is not None:
-            lift = _HALF_CURVATURE * offset[:, :_UP, None].square().sum(1, keepdim=True)
-            found = self._by_refraction[:, None, None] * (lift * by_q[:, _UP:])
-        if self._shifts is not None and self._by_effects is not None:
-            by_offset = self._by_offset(state, by_q, offset)
-            by_effect = torch.einsum("vjun,evj->veun", by_offset, self._shifts[:, :, camera])
-            moved = torch.einsum("ek,veun->vkun", self._by_effects, by_effect)
-            found = moved if found is None else found + moved
-        return found
+        if self._by_refraction is None:
+            return None
+        lift = _HALF_CURVATURE * offset[:, :_UP, None].square().sum(1, keepdim=True)
+        return self._by_refraction[:, None, None] * (lift * by_q[:, _UP:])
 
     def _by_local(self, state: RigState, by_q: Tensor, center: Tensor, by_w: Tensor | None) -> Tensor:
         return by_q

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.blocks import Block, Kind, RigState
+from kcal.calibrate.rig.blocks import Block, Effects, Kind, RigState
 from kcal.lens.pose import side_axes
 
 
@@ -23,8 +23,7 @@ class StarBlock(Block):
         turns: (E, C, 3), see `StarSource.by_effects`.
         factors: (E, V), see `StarSource.factors`.
         shifts: (E, V, 3), see `StarSource.shifts`.
-        effects: (E, K) by which u is found among the unknowns of the state.
-        by_unknown: (E, K) likewise of a step; None: they are held.
+        effects: see `Block`; its amounts are the u_e.
     """
 
     kind: Kind = "stars"
@@ -39,16 +38,15 @@ class StarBlock(Block):
         turns: Tensor,
         factors: Tensor,
         shifts: Tensor,
-        effects: Tensor,
-        by_unknown: Tensor | None,
+        effects: Effects | None = None,
     ) -> None:
-        super().__init__(pixels[:, :, None], whitening[:, :, None])
+        super().__init__(pixels[:, :, None], whitening[:, :, None], effects)
         named = torch.isfinite(sigma)
         self._weight = torch.where(named, 1.0 / sigma, 0.0)
         self._known = torch.where(named[:, None], direction, 0.0)
         # (E, C, V, 3).
         self._turns = turns[:, :, None] * factors[:, None, :, None]
-        self._shifts, self._effects, self._by_unknown = shifts, effects, by_unknown
+        self._shifts = shifts
 
     def _prior_count(self) -> Tensor:
         return 2 * (self._weight > 0).long()
@@ -57,21 +55,8 @@ class StarBlock(Block):
         return state.star[..., None], state.star.new_zeros(len(self), 1, 1)
 
     def _moves(self, state: RigState, camera: int) -> Tensor:
-        """(E, V, 3) by which one sigma of each effect shifts the stars for a camera."""
         turned = torch.linalg.cross(self._turns[:, camera], state.star.expand(len(self._turns), -1, -1))
         return turned + self._shifts
-
-    def _bent(self, state: RigState, offset: Tensor, camera: int) -> Tensor:
-        if not len(self._turns):
-            return offset
-        moved = torch.einsum("e,evk->vk", self._effects @ state.unknown, self._moves(state, camera))
-        return offset + moved[..., None]
-
-    def _by_board_or_air(self, state: RigState, by_q: Tensor, offset: Tensor, camera: int) -> Tensor | None:
-        if self._by_unknown is None or not len(self._turns):
-            return None
-        by_effect = torch.einsum("vjun,evj->veun", by_q, self._moves(state, camera))
-        return torch.einsum("ek,veun->vkun", self._by_unknown, by_effect)
 
     def _by_local(self, state: RigState, by_q: Tensor, center: Tensor, by_w: Tensor | None) -> Tensor:
         return torch.einsum("vjun,vlj->vlun", by_q, torch.stack(side_axes(state.star), 1))
