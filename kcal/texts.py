@@ -8,9 +8,11 @@ mathematics.
 from __future__ import annotations
 
 import base64
+import datetime
 import hashlib
 import html
 import json
+import math
 import re
 from collections.abc import Iterable
 from typing import Any
@@ -48,6 +50,33 @@ def one_line(text: str) -> str:
         'gate\\n2'
     """
     return visible(text).replace("\t", r"\t").replace("\n", r"\n")
+
+
+def unix_seconds(text: str, *, zone: datetime.tzinfo | None) -> float:
+    """Seconds of a number, or since 1970 of an ISO time; NaN or infinity where a text is neither.
+
+    Args:
+        text: of a table's cell.
+        zone: of a time that names none; None: such a time is none.
+
+    Example:
+        >>> unix_seconds("12.5", zone=None), unix_seconds("1970-01-01T00:01:00Z", zone=None)
+        (12.5, 60.0)
+    """
+    try:
+        # Python also reads "1_000", which is more likely a slip than a number.
+        return math.nan if "_" in text else float(text)
+    except ValueError:
+        pass
+    try:
+        moment = datetime.datetime.fromisoformat(text.strip())
+    except ValueError:
+        return math.nan
+    if moment.tzinfo is None:
+        if zone is None:
+            return math.nan
+        moment = moment.replace(tzinfo=zone)
+    return moment.timestamp()
 
 
 def csv_line(cells: Iterable[Any]) -> str:

@@ -7,7 +7,6 @@ interpolated, and how well is learned from the track itself: from fixes that are
 from __future__ import annotations
 
 import dataclasses
-import datetime
 import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -22,9 +21,9 @@ from torch import Tensor
 
 from kcal.errors import FileError, InputError
 from kcal.lens.mounting import Origin
-from kcal.locate.geodesy import geodetic_to_enu
-from kcal.locate.survey import EARTH, LOCAL
+from kcal.locate.survey import EARTH, LOCAL, place_sigma, places_of
 from kcal.locate.tables import TableRow, read_chunks
+from kcal.texts import unix_seconds
 
 _TRACK = "name,time,lat,lon,height,sigma"
 _TRACK_COLUMNS = (
@@ -163,18 +162,12 @@ def time_of_row(row: TableRow) -> float:
     Raises:
         FileError: neither.
     """
-    cell = row.cells["time"]
-    try:
-        return row.number("time")
-    except FileError:
-        pass
-    try:
-        time = datetime.datetime.fromisoformat(cell)
-    except ValueError:
-        time = None
-    if time is None or time.tzinfo is None:
-        raise FileError(f"{row.where}: time is {cell!r}; write seconds, or a date with its zone: 2026-11-24T20:47:26Z")
-    return time.timestamp()
+    seconds = unix_seconds(row.cells["time"], zone=None)
+    if not math.isfinite(seconds):
+        raise FileError(
+            f"{row.where}: time is {row.cells['time']!r}; write seconds, or a date with its zone: 2026-11-24T20:47:26Z"
+        )
+    return seconds
 
 
 def read_tracks(path: str | Path, origin: Origin | None = None) -> tuple[tuple[MovingTrack, ...], Origin | None]:
@@ -206,20 +199,7 @@ def read_tracks(path: str | Path, origin: Origin | None = None) -> tuple[tuple[M
     """
     chunks = read_chunks(path, _TRACK, _TRACK_COLUMNS, ("name", "time", "sigma"), unique=False)
     rows = [row for chunk in chunks for row in chunk.rows()]
-    local = all(column in rows[0].cells for column in LOCAL)
-    columns = LOCAL if local else EARTH
-    if any(column not in rows[0].cells for column in columns):
-        raise FileError(f"{path}: the columns lat, lon, height or east, north, up are needed")
-    values = torch.tensor([[row.number(column) for column in columns] for row in rows], dtype=torch.float64)
-    if not local:
-        for row, place in zip(rows, values.tolist(), strict=True):
-            try:
-                first = Origin(lat=place[0], lon=place[1], height=place[2])
-            except InputError as error:
-                raise FileError(f"{row.where}: {str(error).removeprefix('origin: ')}") from error
-            origin = origin or first
-        assert origin is not None
-        values = geodetic_to_enu(values, origin)
+    values, origin = places_of(rows, path, origin)
     of: dict[str, list[int]] = {}
     times = [time_of_row(row) for row in rows]
     for i, row in enumerate(rows):
@@ -234,7 +214,7 @@ def read_tracks(path: str | Path, origin: Origin | None = None) -> tuple[tuple[M
                 name=name,
                 times=torch.tensor([times[i] for i in own], dtype=torch.float64),
                 points=values[own],
-                sigma=torch.tensor([_sigma(rows[i]) for i in own], dtype=torch.float64),
+                sigma=torch.tensor([place_sigma(rows[i], "fix") for i in own], dtype=torch.float64),
                 constant=(level, level, _amount(first_row, "constant_sigma_up", level)),
                 latency=_amount(first_row, "latency_sigma", 0.0),
             )
@@ -252,13 +232,6 @@ def _amount(row: TableRow, column: str, default: float) -> float:
     if value < 0:
         raise FileError(f"{row.where}: {column} is {value:g}; zero or a positive number is needed")
     return value
-
-
-def _sigma(row: TableRow) -> tuple[float, float, float]:
-    level = row.positive("sigma")
-    if level is None or not math.isfinite(level):
-        raise FileError(f"{row.where}: sigma is empty; write how well the fix is known, meters")
-    return level, level, row.positive("sigma_up") or level
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)

@@ -68,19 +68,29 @@ def read_survey(path: str | Path, origin: Origin | None = None, *, measured: boo
         [1001.88, 0.0, 9.92]
     """
     rows = read_rows(path, "name,lat,lon,height,sigma", PLACE_COLUMNS, ("sigma",) if measured else ())
+    values, origin = places_of(rows, path, origin)
+    sigma = [place_sigma(row, "place") if measured or row.cells.get("sigma") else (0.0, 0.0, 0.0) for row in rows]
+    return Survey(tuple(row.name for row in rows), values, torch.tensor(sigma, dtype=torch.float64), origin)
+
+
+def places_of(rows: Sequence[TableRow], path: str | Path, origin: Origin | None) -> tuple[Tensor, Origin | None]:
+    """(N, 3) meters of the places in rows, and the origin: the first place if None is given and there are latitudes.
+
+    Raises:
+        FileError: neither latitudes nor local meters, or both; a number that is none, a latitude out of range.
+    """
     columns = _coordinates(rows[0], path)
     values = torch.tensor([[row.number(column) for column in columns] for row in rows], dtype=torch.float64)
-    if columns == EARTH:
-        for row, (lat, lon, height) in zip(rows, values.tolist(), strict=True):
-            try:
-                place = Origin(lat=lat, lon=lon, height=height)
-            except InputError as error:
-                raise FileError(f"{row.where}: {str(error).removeprefix('origin: ')}") from error
-            origin = origin or place
-        assert origin is not None
-        values = geodetic_to_enu(values, origin)
-    sigma = [_survey_sigma(row) if measured or row.cells.get("sigma") else (0.0, 0.0, 0.0) for row in rows]
-    return Survey(tuple(row.name for row in rows), values, torch.tensor(sigma, dtype=torch.float64), origin)
+    if columns == LOCAL:
+        return values, origin
+    for row, (lat, lon, height) in zip(rows, values.tolist(), strict=True):
+        try:
+            place = Origin(lat=lat, lon=lon, height=height)
+        except InputError as error:
+            raise FileError(f"{row.where}: {str(error).removeprefix('origin: ')}") from error
+        origin = origin or place
+    assert origin is not None
+    return geodetic_to_enu(values, origin), origin
 
 
 def _coordinates(row: TableRow, path: str | Path) -> tuple[str, str, str]:
@@ -93,10 +103,11 @@ def _coordinates(row: TableRow, path: str | Path) -> tuple[str, str, str]:
     raise FileError(f"{path}: the columns lat, lon, height or east, north, up are needed")
 
 
-def _survey_sigma(row: TableRow) -> tuple[float, float, float]:
+def place_sigma(row: TableRow, what: str) -> tuple[float, float, float]:
+    """How well a place or fix is known along each axis, meters: the cells sigma and, if it is there, sigma_up."""
     level = row.positive("sigma")
     if level is None or not math.isfinite(level):
-        raise FileError(f"{row.where}: sigma is empty; write how well the place is known, meters")
+        raise FileError(f"{row.where}: sigma is empty; write how well the {what} is known, meters")
     up = row.positive("sigma_up") or level
     return level, level, up
 

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from kcal.errors import FileError
 from kcal.texts import csv_line
+from kcal.watch.growing_file import GrowingFile
 from kcal.watch.state import Look
 
 _ANGLES = ("pitch", "yaw", "roll")
@@ -100,8 +101,7 @@ class HistoryTail:
     """
 
     def __init__(self, path: str | Path, fingerprint: str) -> None:
-        self.path, self._fingerprint = path, fingerprint
-        self._offset, self._number, self._first = 0, 0, math.nan
+        self._file, self._fingerprint, self._first = GrowingFile(path), fingerprint, math.nan
         self._kelvin: Tensor | None = None
 
     def rows(self, since: float = -math.inf, until: float = math.inf) -> list[HistoryRow]:
@@ -111,31 +111,21 @@ class HistoryTail:
             FileError: no such file, no history, one of another rig, or a damaged line.
         """
         rows: deque[HistoryRow] = deque(maxlen=MOST_ROWS)
-        try:
-            with open(self.path, "rb") as file:
-                file.seek(self._offset)
-                for line in file:
-                    # One that is still being written is left out.
-                    if not line.endswith(b"\n"):
-                        break
-                    self._offset += len(line)
-                    self._number += 1
-                    row = self._row(line.decode("utf-8", "replace").rstrip("\r\n"))
-                    if row is not None and since <= row.time <= until:
-                        rows.append(row)
-        except OSError as error:
-            raise FileError(f"{self.path}: cannot read: {error.strerror or error}") from error
-        if self._number == 0:
-            raise FileError(f"{self.path}: no rows yet: let `kcal watch` look at the scene first")
+        for line in self._file.lines():
+            row = self._row(line)
+            if row is not None and since <= row.time <= until:
+                rows.append(row)
+        if self._file.number == 0:
+            raise FileError(f"{self._file.path}: no rows yet: let `kcal watch` look at the scene first")
         return list(rows)
 
     def _row(self, line: str) -> HistoryRow | None:
         cells = next(csv.reader([line]), [])
-        if self._number == 1:
+        if self._file.number == 1:
             if tuple(cells) != COLUMNS:
-                raise FileError(f"{self.path}: not a history of this version of `kcal watch`")
+                raise FileError(f"{self._file.path}: not a history of this version of `kcal watch`")
             return None
-        row = parsed_row(f"{self.path}: line {self._number}", cells, self._fingerprint)
+        row = parsed_row(f"{self._file.path}: line {self._file.number}", cells, self._fingerprint)
         self._first = row.temperature if math.isnan(self._first) else self._first
         row = warmed(row, self._first, self._kelvin)
         self._kelvin = row.look.kelvin

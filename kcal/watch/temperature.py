@@ -8,6 +8,8 @@ import math
 from pathlib import Path
 
 from kcal.errors import FileError, InputError
+from kcal.texts import unix_seconds
+from kcal.watch.growing_file import GrowingFile
 
 # Seconds beyond which the nearest temperature is not that of a moment.
 _NEAR = 3600.0
@@ -24,16 +26,9 @@ def seconds_of(text: str) -> float:
         >>> seconds_of("12.5"), seconds_of("1970-01-01T00:01:00Z")
         (12.5, 60.0)
     """
-    try:
-        value = float(text)
-    except ValueError:
-        try:
-            moment = datetime.datetime.fromisoformat(text.strip())
-        except ValueError:
-            raise InputError(f"time {text!r}: seconds or a time such as 2026-05-01T12:00:00Z is needed") from None
-        value = (moment if moment.tzinfo else moment.replace(tzinfo=datetime.UTC)).timestamp()
+    value = unix_seconds(text, zone=datetime.UTC)
     if not math.isfinite(value):
-        raise InputError(f"time {text!r}: a finite number is needed")
+        raise InputError(f"time {text!r}: seconds or a time such as 2026-05-01T12:00:00Z is needed")
     return value
 
 
@@ -48,11 +43,11 @@ class Temperatures:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path, self._offset, self._line = path, 0, 0
+        self._file = GrowingFile(path)
         self._times: list[float] = []
         self._values: list[float] = []
         self._columns: list[str] = []
-        self._read()
+        self._take_all()
         if not {"time", "temperature"} <= set(self._columns):
             raise FileError(f"{path}: the columns time and temperature are needed")
 
@@ -62,7 +57,7 @@ class Temperatures:
         Raises:
             FileError: a damaged line.
         """
-        self._read()
+        self._take_all()
         k = bisect.bisect_right(self._times, time)
         around = [i for i in (k - 1, k) if 0 <= i < len(self._times) and abs(self._times[i] - time) <= _NEAR]
         if len(around) < 2:
@@ -71,18 +66,9 @@ class Temperatures:
         share = (time - self._times[first]) / (self._times[second] - self._times[first])
         return (1.0 - share) * self._values[first] + share * self._values[second]
 
-    def _read(self) -> None:
-        try:
-            with open(self.path, "rb") as file:
-                file.seek(self._offset)
-                for line in file:
-                    if not line.endswith(b"\n"):
-                        break
-                    self._offset += len(line)
-                    self._line += 1
-                    self._take(line.decode("utf-8-sig", "replace").strip())
-        except OSError as error:
-            raise FileError(f"{self.path}: cannot read: {error.strerror or error}") from error
+    def _take_all(self) -> None:
+        for line in self._file.lines():
+            self._take(line.strip())
 
     def _take(self, line: str) -> None:
         cells = [cell.strip() for cell in line.split(",")]
@@ -97,7 +83,7 @@ class Temperatures:
             if not -100.0 < value < 150.0:
                 raise InputError(f"temperature {value:g}: °C are needed")
         except (ValueError, InputError) as error:
-            raise FileError(f"{self.path}: line {self._line}: {error}") from error
+            raise FileError(f"{self._file.path}: line {self._file.number}: {error}") from error
         if self._times and time <= self._times[-1]:
             return
         self._times.append(time)
