@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -131,8 +132,6 @@ def _of_stations(rig: Path, points: Path, options: LocateOptions) -> LocateRun:
 
 
 def _of_pairs(rig: Path, points: Path, options: LocateOptions) -> LocateRun:
-    import math
-
     from kcal.cli.watched_rows import located_at
     from kcal.io.rig_file import load_rig
     from kcal.lens.rig import RigCovariance

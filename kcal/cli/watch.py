@@ -256,7 +256,8 @@ def _tell_turns(watched: Watched, limit: float) -> None:
 def _draw_turns(watched: Watched, picture: Path, limit: float, title: str) -> None:
     import numpy as np
 
-    from kcal.report.attitude import draw_attitude
+    from kcal.report.attitude import attitude_figure
+    from kcal.report.figures import save_picture
 
     step = -(-len(watched.times) // _DRAWN)
     times = watched.times[::step]
@@ -264,4 +265,4 @@ def _draw_turns(watched: Watched, picture: Path, limit: float, title: str) -> No
     angle = np.degrees(np.stack([drift.relative.numpy() for drift in drifts]))
     sigma = np.degrees(np.stack([drift.relative_covariance.diagonal().sqrt().numpy() for drift in drifts]))
     seen = np.array(watched.seen[::step], bool)
-    print_wrote(draw_attitude(picture, np.array(times), angle, sigma, seen, limit, title))
+    print_wrote(save_picture(picture, attitude_figure(np.array(times), angle, sigma, seen, limit, title)))

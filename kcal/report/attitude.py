@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from kcal.report.colors import ACCENT, INK, WARN
-from kcal.report.figures import new_figure, save_picture
+from kcal.report.figures import new_figure
 
 _ANGLES = ("pitch", "yaw", "roll")
 _SPANS = ((86400.0 * 3, 86400.0, "days"), (7200.0, 3600.0, "hours"), (0.0, 60.0, "minutes"))
@@ -56,20 +54,3 @@ def attitude_figure(
         if k == 2:
             axes.set_xlabel(word, color=INK, fontsize=9)
     return figure
-
-
-def draw_attitude(
-    path: Path,
-    time: NDArray[np.float64],
-    angle: NDArray[np.float64],
-    sigma: NDArray[np.float64],
-    seen: NDArray[np.bool_],
-    limit: float,
-    title: str = "",
-) -> Path:
-    """Write `attitude_figure` to a file.
-
-    Raises:
-        FileError: the file cannot be written, or is no picture's.
-    """
-    return save_picture(path, attitude_figure(time, angle, sigma, seen, limit, title))
