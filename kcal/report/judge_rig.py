@@ -76,13 +76,11 @@ def rig_verdict(
         elif unpaired or (result is None and rig.calibration is not None and rig.calibration.pairs):
             findings.append(_unpaired_finding(unpaired or "no pairs of views were given"))
     beyond = [verdict.unexplained for verdict in cameras]
-    if isinstance(rig, CameraRig):
-        findings += [
-            _unseen_finding(requirement.distance)
-            for requirement in requirements
-            if station_sigmas(rig, requirement.distance, pixel_sigma=mark_sigma) is None
-        ]
-    answers = tuple(_rig_answer(rig, requirement, mark_sigma, beyond) for requirement in requirements)
+    worst = [_worst_sigmas(rig, requirement.distance, mark_sigma) for requirement in requirements]
+    both = list(zip(requirements, worst, strict=True))
+    findings += [_unseen_finding(requirement.distance) for requirement, one in both if one is None]
+    known = (rig.covariance if isinstance(rig, StereoRig) else rig.root) is not None
+    answers = tuple(_rig_answer(requirement, one, known, mark_sigma, beyond) for requirement, one in both)
     return Verdict(
         subject=subject,
         answers=answers,
@@ -125,32 +123,35 @@ def _inherited(rig: StereoRig | CameraRig, cameras: Sequence[Verdict]) -> list[F
 
 
 def _rig_answer(
-    rig: StereoRig | CameraRig, requirement: Requirement, mark_sigma: float, beyond: Sequence[float]
+    requirement: Requirement, worst: RangeSigmas | None, known: bool, mark_sigma: float, beyond: Sequence[float]
 ) -> RangeAnswer:
-    """The worst of several places that two cameras see.
+    """How well a range is known where that is worst.
 
     Args:
-        rig: with its covariance.
-        requirement: what is asked.
+        requirement: a range, and how well it must be known.
+        worst: of `_worst_sigmas`.
+        known: whether anything is known of the errors of lenses and pose.
         mark_sigma: noise of a mark along each axis, px.
         beyond: px by which each camera is wrong beyond its error bars.
     """
-    if isinstance(rig, CameraRig):
-        worst = station_sigmas(rig, requirement.distance, pixel_sigma=mark_sigma)
-        if worst is None:
-            return RangeAnswer(requirement=requirement, parts={"marks": math.inf, "lenses": 0.0, "relative pose": 0.0})
-        unknown = rig.root is None
-    else:
-        worst, unknown = _worst_of_pair(rig, requirement.distance, mark_sigma), rig.covariance is None
+    if worst is None:
+        return RangeAnswer(requirement=requirement, parts={"marks": math.inf, "lenses": 0.0, "relative pose": 0.0})
     parts = {
         "marks": float(worst.marks),
-        "lenses": math.inf if unknown else float(worst.lenses),
-        "relative pose": math.inf if unknown else float(worst.pose),
+        "lenses": float(worst.lenses) if known else math.inf,
+        "relative pose": float(worst.pose) if known else math.inf,
     }
     if any(beyond):
         # Each camera's errors spoil a range as the noise of its marks does.
         parts[FAULTS] = float(worst.marks) / mark_sigma * math.hypot(*beyond) / math.sqrt(len(beyond))
     return RangeAnswer(requirement=requirement, parts=parts)
+
+
+def _worst_sigmas(rig: StereoRig | CameraRig, distance: float, mark_sigma: float) -> RangeSigmas | None:
+    """The worst of several places that two cameras see; None where there is none."""
+    if isinstance(rig, StereoRig):
+        return _worst_of_pair(rig, distance, mark_sigma)
+    return station_sigmas(rig, distance, pixel_sigma=mark_sigma)
 
 
 def _worst_of_pair(rig: StereoRig, distance: float, mark_sigma: float) -> RangeSigmas:
