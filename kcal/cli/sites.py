@@ -151,8 +151,8 @@ def _print_towers(now: SitingMap) -> None:
     one = float((now.seen_by == 1).double().mean())
     out.print(
         f"two towers or more see {100 * now.covered:.0f} % of the area, one {100 * one:.0f} %; median standard "
-        f"deviation of positions where two do: {some}; root mean variance over all of it: "
-        f"{length_text(now.mean_sigma, digits=3)}"
+        f"deviation of positions where two do: {some}; over the whole area, where what nobody sees may be anywhere in "
+        f"it: {length_text(now.mean_sigma, digits=3)}"
     )
 
 

@@ -199,8 +199,8 @@ def _site_field(axes: Axes, area: Area, site: Site) -> tuple[float, float]:
 def _siting_footer(today: SitingMap, ranked: Sequence[RankedSite]) -> str:
     if not ranked:
         return ""
-    best = [f"{i}. {one.site.name}: {length_text(one.mean_sigma, digits=3)}" for i, one in enumerate(ranked[:5], 1)]
-    return (
-        f"root mean variance of a position, hidden parts as large as the area: today "
-        f"{length_text(today.mean_sigma, digits=3)}; with one more: {', '.join(best)}"
+    built = sorted((one for one in ranked if one.after is not None), key=lambda one: one.order or 0)[:5]
+    steps = [f"{length_text(one.after or 0.0, digits=3)} with {one.site.name}" for one in built]
+    return "standard deviation over the whole area, where what nobody sees may be anywhere in it: " + ", then ".join(
+        [f"{length_text(today.mean_sigma, digits=3)} today", *steps]
     )
