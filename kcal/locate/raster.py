@@ -85,6 +85,10 @@ def terrain(path: str | Path, geoid_height: float = 0.0) -> Raster:
     read_head(path, 0)
     read = _read_grid if Path(path).suffix.lower() == ".asc" else _read_raster
     heights, to_cell, system = read(Path(path))
+    if not all(map(math.isfinite, to_cell)):
+        raise FileError(f"{path}: its cells have no size on the ground")
+    if np.isinf(heights).any():
+        raise FileError(f"{path}: a height is infinite")
     heights = heights + geoid_height
     into = None
     if not (system.is_geographic and pyproj.CRS("EPSG:4326").datum == system.datum):
@@ -165,8 +169,6 @@ def _read_grid(path: Path) -> _Read:
         heights = np.array(text.split(), dtype=np.float64)
     except ValueError as error:
         raise FileError(f"{path}: {error}; heights must be numbers") from None
-    if np.isinf(heights).any():
-        raise FileError(f"{path}: a height is infinite")
     if len(heights) != columns * rows:
         raise FileError(f"{path}: {len(heights)} heights, ncols x nrows are {columns} x {rows}")
     heights = np.where(heights == head.get("nodata_value", -9999.0), np.nan, heights).reshape(rows, columns)

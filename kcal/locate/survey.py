@@ -105,8 +105,8 @@ def _coordinates(row: TableRow, path: str | Path) -> tuple[str, str, str]:
 
 def place_sigma(row: TableRow, what: str) -> tuple[float, float, float]:
     """How well a place or fix is known along each axis, meters: the cells sigma and, if it is there, sigma_up."""
-    level = row.positive("sigma")
-    if level is None or not math.isfinite(level):
+    level = row.positive("sigma", infinite=True)
+    if level is None or math.isinf(level):
         raise FileError(f"{row.where}: sigma is empty; write how well the {what} is known, meters")
     up = row.positive("sigma_up") or level
     return level, level, up
@@ -189,7 +189,7 @@ def read_features(path: str | Path, pixel_sigma: float) -> Features:
 
 def inverse_range_of(row: TableRow) -> tuple[float, float]:
     """Inverse range and its sigma, 1/m, by the cells range, range_sigma and beyond of a row."""
-    distance, sigma, beyond = (row.positive(column) for column in ("range", "range_sigma", "beyond"))
+    distance, sigma, beyond = (row.positive(column, infinite=True) for column in ("range", "range_sigma", "beyond"))
     if beyond is not None and distance is not None:
         raise FileError(f"{row.where}: range or beyond is needed, not both")
     if beyond is not None:

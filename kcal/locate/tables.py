@@ -54,13 +54,21 @@ class TableRow(NamedTuple):
             raise FileError(f"{self.where}: {column} is {cell!r}; {what} is needed, for example 960.5")
         return value
 
-    def positive(self, column: str) -> float | None:
-        """The positive number in a column, `inf` counts; None where the column is absent or the cell is empty."""
+    def positive(self, column: str, *, infinite: bool = False) -> float | None:
+        """The positive number in a column; None where the column is absent or the cell is empty.
+
+        Args:
+            column: its name.
+            infinite: whether `inf` counts.
+
+        Raises:
+            FileError: another number, or none; the line is named.
+        """
         cell = self.cells.get(column)
         if not cell:
             return None
         value = _float(cell)
-        if not value > 0:
+        if not value > 0 or (math.isinf(value) and not infinite):
             raise FileError(f"{self.where}: {column} is {cell!r}; a positive number is needed")
         return value
 

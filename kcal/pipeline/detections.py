@@ -29,7 +29,7 @@ class Detections:
         score: (N,) confidence.
         category: N names.
         track: N names of the detector's own tracker, or None.
-        keypoints: (N, K, 2) pixels, or None.
+        keypoints: (N, K, 2) pixels, or None; what is not finite was not found.
         masks: (N, H, W) bool in the image's size, or None.
         size: (width, height) of the image.
         time: seconds at which the image was exposed; None for a single image.

@@ -7,6 +7,7 @@ the outputs at the next start, and the moment is done again.
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -99,18 +100,19 @@ class Ledger:
         lines = read_bytes(self.path).split(b"\n")[:-1]  # what is cut off was not complete
         try:
             head = orjson.loads(lines[0])
-            places = [StreamPlace(*head["place"]), *(StreamPlace(*orjson.loads(line)) for line in lines[1:])]
             if {name: head[name] for name in self._head} != self._head:
                 kind = str(self._head["kcal"]).split()[0]
                 raise FileError(f"{self.path}: not a journal of this version of `kcal {kind}`")
             if head["outputs"] != [str(path.resolve()) for path in self.outputs]:
                 raise FileError(f"{self.path}: a journal of other outputs, {head['outputs']}; delete it to begin anew")
+            stored = [head["place"], *map(orjson.loads, lines[1:])]
+            places = [_stored_place(values, len(self.outputs)) for values in stored]
             self.state = head["state"]
-            if any(len(place.sizes) != len(self.outputs) for place in places) or not isinstance(self.state, dict):
-                raise TypeError("a place does not fit its outputs")
-        except (orjson.JSONDecodeError, KeyError, TypeError, IndexError) as error:
+            if not isinstance(self.state, dict):
+                raise TypeError("no state")
+        except (ValueError, KeyError, TypeError, IndexError) as error:
             raise FileError(f"{self.path}: the journal is damaged ({error}); delete it to begin anew") from error
-        self.checkpoint_at, self.place = places[0], places[-1]._replace(sizes=tuple(places[-1].sizes))
+        self.checkpoint_at, self.place = places[0], places[-1]
 
     def _opened(self, path: Path, size: int) -> BinaryIO:
         try:
@@ -123,3 +125,18 @@ class Ledger:
         except OSError as error:
             raise FileError(f"{path}: cannot write: {error.strerror or error}") from error
         return file
+
+
+def _stored_place(values: Any, outputs: int) -> StreamPlace:
+    """A place as it was stored.
+
+    Raises:
+        TypeError: not that of so many outputs.
+    """
+    sequence, time, offset, sizes = values
+    counts = [sequence, offset, *sizes]
+    if len(sizes) != outputs or any(type(count) is not int or not 0 <= count < 2**63 for count in counts):
+        raise TypeError("a place does not fit its outputs")
+    if time is not None and (type(time) not in (int, float) or not math.isfinite(time)):
+        raise TypeError("a place has no time")
+    return StreamPlace(sequence, time, offset, tuple(sizes))

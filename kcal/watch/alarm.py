@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-import urllib.error
 import urllib.request
+from http.client import HTTPException
 from typing import NamedTuple
 from urllib.parse import urlsplit
 
@@ -77,5 +77,5 @@ class Webhook:
         try:
             with urllib.request.urlopen(request, timeout=_PATIENCE):
                 self._waiting = b""
-        except (urllib.error.URLError, OSError, ValueError):
+        except (OSError, ValueError, HTTPException):
             self.failed += 1

@@ -179,7 +179,8 @@ READERS: dict[str, Reader] = {
     "live boxes": Reader(lambda path: read_moment(read_bytes(path), RIG, AssociationOptions(), 0.3), ".json",
                          whole_text(json.dumps({"left": _BOXES, "right": _BOXES})), named=False),
     "detections": Reader(lambda path: Detections.read(read_bytes(path)), ".json",
-                         whole_text(json.dumps({**_BOXES, "keypoints": [[[1, 2]], [[3, 4]]]})), named=False),
+                         whole_text(json.dumps({**_BOXES, "keypoints": [[[1, 2]], [[3, 4]]]})), named=False,
+                         infinite=("keypoints",), unknown=("keypoints",)),
     "positions .csv": Reader(lambda path: located_rows(path, _TRUTH), ".csv", _positions, infinite=("range_high_m",)),
     "positions .geojson": Reader(lambda path: located_rows(path, _TRUTH), ".geojson", _positions,
                                  infinite=("range_high_m",)),
@@ -190,7 +191,7 @@ READERS: dict[str, Reader] = {
     "video": Reader(lambda path: (list(read_frames(path)), VideoFrames(path).count), ".avi", _video),
     "FITS": Reader(read_night, ".fits", _fits),
     "map picture": Reader(local_image, ".tif", _raster),
-    "terrain": Reader(terrain, ".tif", _raster),
+    "terrain": Reader(terrain, ".tif", _raster, unknown=("heights",)),
     "survey .csv": Reader(read_survey, ".csv", whole_text(
         "name,lat,lon,height,sigma\n" + "".join(f"{n},{b},{a},{h},0.1\n" for n, a, b, h in _PLACES))),
     "survey .geojson": Reader(lambda path: import_survey(path, Origin(lat=10.0, lon=20.0, height=0.0)), ".geojson",

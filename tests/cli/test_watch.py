@@ -6,6 +6,7 @@ import math
 import threading
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
+from socketserver import StreamRequestHandler, TCPServer
 
 import orjson
 import pytest
@@ -170,6 +171,19 @@ def test_a_webhook_gets_the_alarm_and_is_tried_again() -> None:
     hook.again()
     server.shutdown()
     assert (hook.failed, got) == (1, [{"time": 1.0}])
+
+
+def test_a_webhook_that_speaks_no_http_ends_nothing() -> None:
+    class Babble(StreamRequestHandler):
+        def handle(self) -> None:
+            self.rfile.readline()
+            self.wfile.write(b"no protocol at all\r\n")
+
+    with TCPServer(("127.0.0.1", 0), Babble) as server:
+        threading.Thread(target=server.handle_request, daemon=True).start()
+        hook = Webhook(f"http://127.0.0.1:{server.server_address[1]}/x")
+        hook.send({"time": 1.0})
+    assert hook.failed == 1
 
 
 @pytest.mark.parametrize(

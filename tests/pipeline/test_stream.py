@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import datetime
 import io
+import json
 import os
 import random
 import signal
@@ -27,6 +28,7 @@ from kcal.pipeline.lines import Moment, read_moment
 from kcal.pipeline.senders import CotSender, sender_to
 from kcal.pipeline.shared_errors import ClockPrior
 from kcal.pipeline.stream import SourceItem, Stream, lines_of
+from kcal.pipeline.stream_journal import Ledger
 from kcal.pipeline.tracks import Tracker
 
 SITE = tracked_site(0.002)
@@ -207,6 +209,26 @@ def test_a_journal_of_something_else(whole: tuple[Path, dict[str, bytes]], tmp_p
     (tmp_path / "journal").write_bytes(b"{}\n")
     with pytest.raises(FileError, match="damaged"):
         new_stream(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "place",
+    [[1, 1.5, 10, [-3]], [1, 1.5, 10, [3.5]], [1, 1.5, 10, [None]], [1, "1", 10, [3]], [True, 1.5, 10, [3]],
+     [1, 1.5, -1, [3]], [1, 1.5, 10, [3, 3]], [1, 1.5, 10]],
+)  # fmt: skip
+def test_a_journal_of_damaged_places(place: list[object], tmp_path: Path) -> None:
+    output, journal = tmp_path / "out.csv", tmp_path / "journal"
+    ledger = Ledger(journal, [output])
+    ledger.checkpoint({})
+    ledger.append([b"abc"], 1.5, 10)
+    ledger.close()
+    whole = journal.read_bytes()
+    journal.write_bytes(whole.replace(b"[1,1.5,10,[3]]", json.dumps(place).encode()))
+    with pytest.raises(FileError, match=r"journal: the journal is damaged"):
+        Ledger(journal, [output])
+    assert output.read_bytes() == b"abc"
+    journal.write_bytes(whole)
+    Ledger(journal, [output]).close()
 
 
 def test_a_shorter_input(whole: tuple[Path, dict[str, bytes]], tmp_path: Path) -> None:
