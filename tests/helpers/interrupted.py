@@ -24,6 +24,8 @@ import rich.progress
 
 def interrupt_at(moment: str) -> None:
     """Send SIGINT to all processes of this command at that moment."""
+    # Where tests run in the background of a shell, it was ignored.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     kind, _, value = moment.partition(":")
     left = [1 if kind == "import" else int(value)]
 
