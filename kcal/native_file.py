@@ -122,7 +122,9 @@ class NativeFile(pydantic.BaseModel):
                 what = cls.RETIRED[name]
             raise FileError(": ".join(filter(None, [source, f"bad {kind} file", where, what]))) from error
         if (place := _not_finite(content)) is not None:
-            raise FileError(f"{source}: bad {kind} file: {'.'.join(place)}: NaN and infinity are no numbers of JSON")
+            raise FileError(
+                f"{source}: bad {kind} file: {'.'.join(place)}: not finite: JSON has neither NaN nor infinity"
+            )
         return checked
 
     @classmethod

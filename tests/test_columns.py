@@ -41,7 +41,7 @@ def test_places() -> None:
 def test_positions_and_tracks() -> None:
     positions, tracks = tables("Positions")
     assert positions == [*TEXTS, *NUMBERS]
-    assert tracks == re.findall(r'^        "(\w+)": ', TRACKS, re.MULTILINE)
+    assert tracks == re.findall(r'^        (?:extras\[)?"(\w+)"(?:: |\] = )', TRACKS, re.MULTILINE)
 
 
 def test_batches() -> None:

@@ -2,6 +2,7 @@
 
     python -m scripts.fuzz --minutes 60                       all harnesses, each for its share of the time
     python -m scripts.fuzz --minutes 5 --seed 7 camera rig    two of them, again with the seed that a report names
+    python -m scripts.fuzz --replay tests/fuzz/corpus         the cases that are kept there, and no others
     python -m scripts.fuzz --list
 
 Invariants of a reader: a file is refused by one of kcal's errors that names it, or what was read has finite numbers, a
@@ -22,7 +23,7 @@ from pathlib import Path
 
 from kcal.files import make_folder
 from scripts.fuzz.harnesses import HARNESSES
-from scripts.fuzz.hunt import hunt
+from scripts.fuzz.hunt import corpus, hunt, replay
 
 
 def main() -> None:
@@ -31,6 +32,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=5.0, help="for all harnesses together")
     parser.add_argument("--seed", type=int, default=int(time.time()), help="a new one if left out")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="for the smallest case of each finding")
+    parser.add_argument("--replay", type=Path, metavar="FOLDER", help="run the cases that are kept there, once")
     parser.add_argument("--list", action="store_true", help="print the names of all harnesses")
     chosen = parser.parse_args()
     names = chosen.harness or list(HARNESSES)
@@ -39,11 +41,17 @@ def main() -> None:
     if chosen.list:
         print("\n".join(names))
         return
+    kept = None if chosen.replay is None else dict(corpus(chosen.replay))
+    if kept is not None:
+        names = [name for name in names if name in kept]
     print(f"seed {chosen.seed}", flush=True)
     total = 0
     for name in names:
         with tempfile.TemporaryDirectory() as folder:
-            found, count = hunt(HARNESSES[name], Path(folder), chosen.seed, 60.0 * chosen.minutes / len(names))
+            if kept is not None:
+                found, count = replay(HARNESSES[name], Path(folder), kept[name]), len(kept[name])
+            else:
+                found, count = hunt(HARNESSES[name], Path(folder), chosen.seed, 60.0 * chosen.minutes / len(names))
         total += len(found)
         print(f"{name}: {count} cases, {len(found)} findings", flush=True)
         for number, finding in enumerate(found):
