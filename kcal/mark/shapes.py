@@ -13,13 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import convolve1d
 from scipy.special import ndtr
 
 Floats = NDArray[np.float64]
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
+SEEN = 0.01  # of the largest weight: pixels that count less are left out
 _CONVERGED = 5e-4  # pixels: the last step of a converged point is shorter
-_ALIKE = 4  # pixels within which what is not explained counts as alike
 _STEEPEST = 0.985  # correlation: lines that meet at less than 10° are one edge
 
 
@@ -164,24 +163,51 @@ def fit_shape(
     Returns:
         The fit; None if the pixels determine nothing.
     """
-    used = weight > 0.01
+    used = weight > SEEN
     where, levels, weight = where[used], levels[used], weight[used]
     root = np.sqrt(weight)
-    # What stands behind may be brighter on one side.
-    slope = where / np.abs(where).max()
-    target = root * levels
 
+    def whiten(columns: Floats) -> Floats:
+        return root[:, None] * columns
+
+    residual = _residual(shape, where, levels, whiten)
+    costs = [0.0] if len(starts) == 1 else [float(np.square(residual(p)).sum()) for p in starts]
+    return improve(shape, starts[int(np.argmin(costs))], where, levels, weight, whiten, iterations)
+
+
+def improve(
+    shape: ShapeModel,
+    start: Floats,
+    where: Floats,
+    levels: Floats,
+    weight: Floats,
+    whiten: Callable[[Floats], Floats],
+    iterations: int = 15,
+) -> ShapeFit | None:
+    """Least squares from one start (P,), `whiten` making the errors of columns (N, K) alike and independent."""
+    residual = _residual(shape, where, levels, whiten)
+    low, high = np.array([-6.0, -6.0, *shape.low]), np.array([6.0, 6.0, *shape.high])
+    _, best = _minimized(residual, start, low, high, iterations)
+    return _described(shape, best, residual, weight, whiten(levels[:, None])[:, 0])
+
+
+def design_of(shape: ShapeModel, where: Floats, p: Floats) -> Floats:
+    """Patterns (N, K) of a shape, and two for what stands behind, which may be brighter on one side."""
+    return np.concatenate([shape.patterns(where, p), where / np.abs(where).max()], 1)
+
+
+def _residual(
+    shape: ShapeModel, where: Floats, levels: Floats, whiten: Callable[[Floats], Floats]
+) -> Callable[[Floats], Floats]:
     def residual(p: Floats) -> Floats:
-        design = root[:, None] * np.concatenate([shape.patterns(where, p), slope], 1)
+        columns = whiten(np.concatenate([design_of(shape, where, p), levels[:, None]], 1))
+        design, target = columns[:, :-1], columns[:, -1]
         normal = design.T @ design
         normal[np.diag_indices_from(normal)] *= 1 + 1e-10  # patterns may be equal far from the point
         result: Floats = target - design @ np.linalg.solve(normal + 1e-12 * np.eye(len(normal)), design.T @ target)
         return result
 
-    low, high = np.array([-6.0, -6.0, *shape.low]), np.array([6.0, 6.0, *shape.high])
-    costs = [0.0] if len(starts) == 1 else [float(np.square(residual(p)).sum()) for p in starts]
-    _, best = _minimized(residual, starts[int(np.argmin(costs))], low, high, iterations)
-    return _described(shape, best, residual, weight, target, where)
+    return residual
 
 
 def starts_at(shape: ShapeModel, points: Floats) -> Floats:
@@ -229,7 +255,7 @@ def slopes(residual: Callable[[Floats], Floats], p: Floats, r: Floats) -> Floats
 
 
 def _described(
-    shape: ShapeModel, p: Floats, residual: Callable[[Floats], Floats], weight: Floats, target: Floats, where: Floats
+    shape: ShapeModel, p: Floats, residual: Callable[[Floats], Floats], weight: Floats, target: Floats
 ) -> ShapeFit | None:
     r = residual(p)
     jacobian = slopes(residual, p, r)
@@ -245,36 +271,12 @@ def _described(
     if values[-1] <= 0:
         return None
     inverse = (vectors / np.maximum(values, 1e-9 * values[-1])) @ vectors.T
-    # Weights shape the window and are not inverse variances: the noise is that of single pixels. It is white, or what
-    # the model does not explain, which is alike in neighboring pixels: the larger of the two counts.
-    white = noise2 * (scaled * weight[:, None]).T @ scaled
-    alike = count / freedom * _with_neighbors(scaled * r[:, None], where)
-    covariance = _larger(*(inverse @ part @ inverse for part in (white, alike)))[:2, :2] / np.outer(
-        length[:2], length[:2]
-    )
+    # Weights shape the window and are not inverse variances: the noise is that of single pixels.
+    middle = noise2 * (scaled * weight[:, None]).T @ scaled
+    covariance = (inverse @ middle @ inverse)[:2, :2] / np.outer(length[:2], length[:2])
     root = np.sqrt(weight)
     mean = float((root * target).sum()) / count
     total = float(np.square(target - root * mean).sum())
     explained = 1 - float(r @ r) / max(total, 1e-12)
     score = count * math.log(max(noise2, 1e-3) * freedom / count) + (len(p) + patterns) * math.log(count)
     return ShapeFit(shape.name, p, p[:2], covariance, math.sqrt(noise2), explained, score)
-
-
-def _with_neighbors(scores: Floats, where: Floats) -> Floats:
-    """Sum of products of scores (N, P) of pixels with those of their neighbors, weighted by a pyramid of distance.
-
-    The covariance of a sum whose terms are alike in space: T. G. Conley, "GMM estimation with cross sectional
-    dependence", 1999.
-    """
-    columns, rows = (np.rint(where - where.min(0))).astype(int).T
-    image = np.zeros((rows.max() + 1, columns.max() + 1, scores.shape[1]))
-    image[rows, columns] = scores
-    tent = 1 - np.abs(np.arange(-_ALIKE, _ALIKE + 1)) / (_ALIKE + 1)
-    spread = convolve1d(convolve1d(image, tent, axis=0, mode="constant"), tent, axis=1, mode="constant")
-    result: Floats = np.einsum("yxp,yxq->pq", image, spread)
-    return 0.5 * (result + result.T)
-
-
-def _larger(first: Floats, second: Floats) -> Floats:
-    """The covariance whose part for the point is larger."""
-    return first if np.trace(first[:2, :2]) > np.trace(second[:2, :2]) else second

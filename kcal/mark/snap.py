@@ -11,7 +11,8 @@ import torch
 from kcal.corners.images import Gray
 from kcal.corners.point import refine_point
 from kcal.errors import InputError
-from kcal.mark.shapes import SHAPES, Floats, ShapeFit, fit_shape, starts_at
+from kcal.mark.shapes import SEEN, SHAPES, Floats, ShapeFit, fit_shape, starts_at
+from kcal.mark.texture import fit_before_texture
 
 REACH = 3.5  # pixels that a click may be away from what it means
 _HALF = 18  # pixels on each side of the click that take part at most
@@ -98,16 +99,22 @@ def _best_shape(levels: Floats, click: Floats) -> ShapeFit | None:
     fits = []
     for shape, first in [found for found in rough[:2] if found[1].score < rough[0][1].score + _SURE]:
         # Again with windows around the point, so that the result does not depend on the click.
-        fit, previous = None, first
+        fit, previous, seen = None, first, np.zeros(len(where), dtype=bool)
         for sigma in _WINDOWS:
             wider = fit_shape(shape, where, gray, window(previous.point, sigma), previous.parameters[None])
             # A larger window is better as long as the shape explains it as well.
             if wider is None or (fit is not None and wider.noise > _NOISIER * fit.noise):
                 break
-            fit = previous = wider
+            # Around a whole pixel, so that a click elsewhere does not change which pixels at the rim take part.
+            fit, previous, seen = wider, wider, window(np.rint(wider.point), sigma) > SEEN
         if fit is not None and _is_determined(fit, click):
-            fits.append((first.score, fit))
-    return min(fits, key=lambda found: found[0])[1] if fits else None
+            fits.append((first.score, shape, fit, seen))
+    # The shape that explains the pixels best is the one, unless it determines no point.
+    for _, shape, fit, seen in sorted(fits, key=lambda found: found[0]):
+        final = fit_before_texture(shape, fit, where[seen], gray[seen])
+        if _is_determined(final, click):
+            return final
+    return None
 
 
 def _is_determined(fit: ShapeFit, click: Floats) -> bool:

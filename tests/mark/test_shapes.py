@@ -12,7 +12,7 @@ from scipy.special import ndtr
 
 from kcal.errors import FileError
 from kcal.mark.places import places_text, read_places
-from kcal.mark.shapes import SHAPES, ShapeFit, _both_positive, _with_neighbors, fit_shape, slopes, starts_at
+from kcal.mark.shapes import SHAPES, ShapeFit, _both_positive, fit_shape, slopes, starts_at
 
 AXIS = np.arange(-9.0, 10.0)
 WHERE = np.stack([part.ravel() for part in np.meshgrid(AXIS, AXIS)], -1)
@@ -105,17 +105,9 @@ def test_errors_are_as_large_as_stated(kind: str) -> None:
     fits = [fitted(kind, DRAW.normal(0, 2.0, len(WHERE))) for _ in range(40)]
     off = np.array([fit.point for fit in fits]) - [0.3, -0.2]
     share = [float(d @ np.linalg.solve(fit.covariance, d)) for d, fit in zip(off, fits, strict=True)]
-    # Two degrees of freedom; the larger of two covariances is stated, which is some tenths too wide.
-    assert 0.8 < float(np.mean(share)) < 2.6
+    # Two degrees of freedom; of 40 draws the mean is within a quarter.
+    assert 1.4 < float(np.mean(share)) < 2.6
     assert float(np.mean([fit.noise for fit in fits])) == pytest.approx(2.0, rel=0.1)
-
-
-def test_products_with_neighbors() -> None:
-    """A pyramid of five pixels each way, summed pair by pair."""
-    scores = DRAW.normal(size=(len(WHERE), 3))
-    distance = np.abs(WHERE[:, None] - WHERE)
-    kernel = np.clip(1 - distance / 5, 0, None).prod(-1)
-    np.testing.assert_allclose(_with_neighbors(scores, WHERE), scores.T @ kernel @ scores, rtol=1e-9)
 
 
 def test_the_criterion_prefers_the_fewer_parameters() -> None:
