@@ -118,9 +118,7 @@ class TestRefraction:
         star = np.arange(40)
         star[3] = -1
         residual = np.where(star[:, None] >= 0, at - seen, np.nan)
-        looked = Attitude(
-            rotation=TURN, covariance=torch.eye(3), star=star, residual=residual, rms_px=0.1, widened=1.0
-        )
+        looked = Attitude(rotation=TURN, covariance=torch.eye(3), star=star, residual=residual, rms_px=0.1, widened=1.0)
         used = star >= 0
         return refraction_doubt(looked, np.full(39, sigma), refracted[used], straight[used], CAMERA)
 
@@ -179,7 +177,12 @@ class TestClocks:
         assert self.turned(3600.0, on_earth=False) == []
         pole = torch.from_numpy(pole_in_enu(PLACE.lat))
         turn = rotation_from_vector(EARTH_RATE * 600.0 * pole)
-        images = [image_of(torch.eye(3).double(), on_earth=False), image_of(TURN), image_of(TURN), image_of(TURN @ turn)]
+        images = [
+            image_of(torch.eye(3).double(), on_earth=False),
+            image_of(TURN),
+            image_of(TURN),
+            image_of(TURN @ turn),
+        ]
         assert [number for number, _ in clock_doubts(images)] == [3]
 
 
@@ -455,4 +458,6 @@ def test_a_view_needs_a_time_for_its_place() -> None:
     assert SkyView(time_sigma=0.4).clock_sigma == pytest.approx(math.hypot(0.4, 0.9 / math.sqrt(3.0)))
     later = SkyView(time=TIME + datetime.timedelta(seconds=1), origin=PLACE, dut1=-1.0)
     # A second later with UT1 a second behind, the sky stands as it did.
-    np.testing.assert_allclose(later.directions(CATALOG), SkyView(time=TIME, origin=PLACE, dut1=0.0).directions(CATALOG), atol=1e-8)
+    np.testing.assert_allclose(
+        later.directions(CATALOG), SkyView(time=TIME, origin=PLACE, dut1=0.0).directions(CATALOG), atol=1e-8
+    )
