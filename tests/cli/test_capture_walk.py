@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 
 import pytest
@@ -35,12 +34,12 @@ def test_files_that_follow_one_option_are_refused_with_the_command(tmp_path: Pat
 
 @pytest.mark.slow
 def test_a_stereo_capture_from_observations_to_the_verdict_on_its_rig(kcal_data: Path, tmp_path: Path) -> None:
-    """Sixteen of the pairs of a wobbling webcam rig, of which nobody knows the truth: what must agree, agrees."""
+    """Ten of the pairs of a webcam rig, of which nobody knows the truth: what must agree, agrees."""
     seen, cameras = [], []
     for side in ("left", "right"):
         file, camera = tmp_path / f"{side}.obs.json", tmp_path / f"{side}.camera.json"
         whole = Observations.load(kcal_data / "captures" / f"st1_{side[0]}.obs.json")
-        whole.model_copy(update={"views": whole.views[:16]}).save(file)
+        whole.model_copy(update={"views": whole.views[:10]}).save(file)
         code, text = kcal("calibrate", file, "-o", camera)
         assert code == 0, text
         seen.append(file)
@@ -49,24 +48,19 @@ def test_a_stereo_capture_from_observations_to_the_verdict_on_its_rig(kcal_data:
         assert lens.calibration is not None
         assert lens.calibration.record is not None
         assert lens.calibration.record.rms < 0.5
-        code, text = kcal("report", camera, "--observations", file, "-o", tmp_path / f"{side}.html", "--json")
-        told = json.loads(text[text.index("{") :])
-        assert code == (0 if told["verdict"]["usable"] else 3)
-        assert (tmp_path / f"{side}.html").stat().st_size > 100_000
+    code, text = kcal("report", cameras[0], "--observations", seen[0], "-o", tmp_path / "left.html", "--json")
+    told = json.loads(text[text.index("{") :])
+    assert code == (0 if told["verdict"]["usable"] else 3)
+    assert (tmp_path / "left.html").stat().st_size > 100_000
     code, text = kcal("rig", *cameras, "--pairs", *seen, "-o", tmp_path / "rig.json")
     assert code == 0, text
     rig = load_rig(tmp_path / "rig.json")
     assert rig.calibration is not None
-    assert rig.calibration.pairs >= 12
+    assert rig.calibration.pairs >= 7
     assert rig.covariance is not None
-    # A rig for the hand: its baseline is known to a hundredth.
-    baseline = float(rig.baseline)
-    assert 0.02 < baseline < 0.5
+    assert 0.02 < float(rig.baseline) < 0.5
     code, text = kcal("report", tmp_path / "rig.json", *(word for file in seen for word in ("--observations", file)))
     assert code in (0, 3)
     assert ("YES" if code == 0 else "NO") in text
     # Each finding in words, none by its internal name.
     assert not any(name in text for name in ("\n  halves:", "\n  unsteady:", "\n  other-views:", "\n  exact-lenses:"))
-    exchanged = kcal("report", tmp_path / "rig.json", *(w for file in seen[::-1] for w in ("--observations", file)))
-    assert exchanged[0] == 1
-    assert math.isfinite(baseline)
