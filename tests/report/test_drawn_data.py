@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import re
 from typing import Any
@@ -26,7 +27,9 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 
+from kcal.calibrate.camera.advice import board_tilts
 from kcal.lens.camera import Camera
+from kcal.lens.difference import camera_difference
 from kcal.lens.mounting import Origin
 from kcal.locate.geodesy import geodetic_to_enu
 from kcal.locate.siting import Site, siting_map
@@ -34,11 +37,14 @@ from kcal.report import siting as siting_module
 from kcal.report.attitude import attitude_figure
 from kcal.report.budget import budget_figure
 from kcal.report.colors import WARN
+from kcal.report.difference import difference_figure
 from kcal.report.positions import positions_figure
 from kcal.report.rig import _edges, _places, rig_figure
 from kcal.report.siting import _siting_footer, _siting_marks, siting_figure
 from kcal.report.stars import _above_sky, stars_figure
 from kcal.report.stations import stations_figure
+from kcal.report.verdict import RangeAnswer, Requirement
+from kcal.report.verdict_pictures import _difference_figure, camera_pictures, range_picture
 
 
 def lines(axes: Axes, marker: str) -> np.ndarray[Any, Any]:
@@ -362,8 +368,6 @@ class TestRig:
         assert "landmarks: 9 used, 1 left out" in told
 
     def test_the_worst_of_many(self) -> None:
-        import dataclasses
-
         result = landmarks_rig()
         good = next(item for item in result.items if item.used)
         many = [dataclasses.replace(good, name=f"p{k}", sigmas=0.01 * k) for k in range(60)]
@@ -485,3 +489,73 @@ class TestOthers:
 def test_origin_of_the_scenes() -> None:
     east, north, _ = geodetic_to_enu(PLACE.geodetic, PLACE).tolist()
     assert (east, north) == pytest.approx((0.0, 0.0), abs=1e-6)
+
+
+class TestVerdictPictures:
+    @pytest.fixture(autouse=True)
+    def _figures(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Figures in place of their PNG."""
+        monkeypatch.setattr("kcal.report.verdict_pictures.png_bytes", lambda figure: figure)
+
+    def test_bars_are_shares_of_the_variance(self) -> None:
+        needs = (Requirement(distance=1000.0, meters=50.0), Requirement(distance=5000.0, meters=500.0))
+        parts = ({"marks": 30.0, "lenses": 40.0}, {"marks": 0.0, "lenses": math.inf})
+        answers = [RangeAnswer(requirement=one, parts=both) for one, both in zip(needs, parts, strict=True)]
+        axes = range_picture(answers).axes[0]  # type: ignore[attr-defined]
+        bars = [(bar.get_x(), bar.get_width(), bar.get_y() + 0.5 * bar.get_height()) for bar in axes.patches]
+        # 50 m of 1 km are 5 %: 0.36 of them marks, 0.64 lenses; nothing is drawn where nothing is known.
+        assert bars[:2] == [pytest.approx((0.0, 1.8, 0.0)), pytest.approx((1.8, 3.2, 0.0))]
+        assert [bar[1] for bar in bars[2:]] == [0.0, 0.0]
+        required = [line.get_xdata()[0] for line in axes.lines if len(line.get_xdata()) == 2]
+        assert required == [5.0, 10.0]
+        assert [list(line.get_ydata()) for line in axes.lines[:2]] == [[-0.4, 0.4], [0.6, 1.4]]
+        assert [text.get_text() for text in axes.get_yticklabels()] == ["1 km", "5 km"]
+        assert {text.get_text() for text in axes.get_legend().get_texts()} == {"marks", "lenses", "required"}
+        assert axes.get_xlim()[0] == 0.0
+        assert axes.get_ylim()[0] > axes.get_ylim()[1]
+
+    def test_poses_and_differences(self) -> None:
+        result = calibrated()
+        drawn = camera_pictures(result)
+        assert set(drawn) == {"coverage", "uncertainty", "residuals", "views", "poses"}
+        axes = drawn["poses"].axes[0]  # type: ignore[attr-defined]
+        rolls = arrows(axes)
+        distance = result.cam_from_board_translation.norm(dim=-1)
+        np.testing.assert_allclose(rolls.XY, torch.stack([distance, board_tilts(result.cam_from_board_rotation)], -1))
+        np.testing.assert_allclose(np.hypot(rolls.U, rolls.V), 1.0)
+        # A board that is rolled clockwise in the image points down.
+        rotation = torch.eye(3).double().repeat(2, 1, 1)
+        rotation[0, :2, :2] = torch.tensor([[0.8, -0.6], [0.6, 0.8]])
+        turned = dataclasses.replace(
+            result, cam_from_board_rotation=rotation, cam_from_board_translation=torch.ones(2, 3).double()
+        )
+        rolls = arrows(camera_pictures(turned)["poses"].axes[0])  # type: ignore[attr-defined]
+        np.testing.assert_allclose([rolls.U[0], rolls.V[0]], [0.8, -0.6])
+        other = result.camera.with_parameters(
+            result.camera.params + torch.tensor([4.0, 4.0, 0, 0, 0] + [0.0] * 4).double()
+        )
+        found = camera_difference(result.camera, other)
+        axes = _difference_figure(found, "halves").axes[0]
+        some = found.shift.numpy()[::3, ::3]
+        longest = np.linalg.norm(some, axis=-1).max()
+        scale = np.hypot(arrows(axes).U, arrows(axes).V).max() / longest
+        assert 0.4 * 640 / 14 < scale * longest <= 640 / 14
+        np.testing.assert_allclose(arrows(axes).U, scale * some[..., 0].ravel())
+        assert axes.get_title(loc="left") == "halves, px"
+        assert axes.get_xlim() == (-0.5, 639.5)
+
+
+def test_arrows_of_a_difference_are_as_long_as_there_is_room() -> None:
+    found = camera_difference(
+        Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480)),
+        Camera.build(focal=(810, 800), center=(321, 240), size=(640, 480)),
+    )
+    axes = difference_figure(found, "", []).axes[0]
+    drawn = arrows(axes)
+    # Every other place of 33, from the second on; one and a half of its steps at most.
+    shift = np.nan_to_num(found.shift.numpy())[1::2, 1::2]
+    room = 1.5 * 2 * 640 / 33
+    assert 0.4 * room < np.hypot(drawn.U, drawn.V).max() <= room
+    scale = float(axes.get_title(loc="left").removeprefix("arrows x "))
+    np.testing.assert_allclose(drawn.U, scale * shift[..., 0].ravel())
+    np.testing.assert_array_equal(drawn.XY, found.pixels.numpy()[1::2, 1::2].reshape(-1, 2))
