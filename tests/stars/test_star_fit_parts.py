@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
 import math
 from typing import Any
@@ -18,12 +19,12 @@ from kcal.lens.pose import rotation_from_vector
 from kcal.locate.geodesy import enu_from_cam
 from kcal.stars.attitude import Attitude, fit_attitude, refraction_doubt, star_rows
 from kcal.stars.budget import NightPlan, _signal
-from kcal.stars.catalog import StarCatalog
+from kcal.stars.catalog import StarCatalog, unit_vectors
 from kcal.stars.contradictions import clock_doubts
 from kcal.stars.detect import DetectedStars
 from kcal.stars.identification import _triangles, turn_between
 from kcal.stars.lens import _ahead, _by_camera, _directions, _near_middle, _rays, _search
-from kcal.stars.night import NamedStars, SkyView
+from kcal.stars.night import NamedStars, SkyView, _by_air, _by_clock, _part, _reach
 from kcal.stars.pair_table import pair_table
 from kcal.stars.sky import EARTH_RATE, celestial_directions, observed_directions, pole_in_enu
 from kcal.stars.star_problem import StarField, StarProblem, free_unknowns, independent_lens
@@ -461,3 +462,47 @@ def test_a_view_needs_a_time_for_its_place() -> None:
     np.testing.assert_allclose(
         later.directions(CATALOG), SkyView(time=TIME, origin=PLACE, dut1=0.0).directions(CATALOG), atol=1e-8
     )
+
+
+class TestAttitudeOnEarth:
+    def test_clock_and_air_widen_the_attitude(self) -> None:
+        """By the outer products of the turns that a sigma of each makes."""
+        view = SkyView(time=TIME, origin=PLACE, dut1=0.0, time_sigma=0.5)
+        turn = torch.from_numpy(pole_in_enu(PLACE.lat)) * EARTH_RATE * 0.5
+        torch.testing.assert_close(_by_clock(view), torch.outer(turn, turn))
+        there = observed_directions(CATALOG, TIME, PLACE)
+        index = np.flatnonzero((there[:, 2] > 0.3) & (there[:, 2] < 0.6))[:40]
+        known, by_hand = there[index], torch.zeros(3, 3).double()
+        shifts = view.by_air(CATALOG, index)
+        assert [name for name, _ in shifts] == ["the air's temperature", "the air's pressure"]
+        for _, shift in shifts:
+            # The turn w of smallest |shift - w x known|.
+            rows = np.concatenate([-np.cross(known, axis) for axis in np.eye(3)]).reshape(3, -1).T
+            small = torch.from_numpy(np.linalg.lstsq(rows, shift.ravel(), rcond=None)[0])
+            by_hand = by_hand + torch.outer(small, small)
+        found = _by_air(view, CATALOG, index)
+        assert float(found.trace()) > 1e-12
+        torch.testing.assert_close(found, by_hand, rtol=1e-3, atol=0.0)
+        # Warmer air bends less, denser air more.
+        (_, warm), (_, dense) = shifts
+        assert (warm[:, 2] < 0).all()
+        assert (dense[:, 2] > 0).all()
+
+    def test_how_it_is_told(self) -> None:
+        image = image_of(TURN)
+        found = dataclasses.replace(image, covariance=torch.diag(torch.tensor([1e-6, 4e-6, 9e-6])).double())
+        assert found.sigma_deg == pytest.approx([math.degrees(1e-3 * k) for k in (1, 2, 3)])
+        assert found.heading_pitch_roll == pytest.approx(LOOK)
+        assert found.right_ascension_declination is None
+        # A camera that looks towards 6h 45m, -16.7°.
+        ahead = unit_vectors(np.array([math.radians(101.3)]), np.array([math.radians(-16.7)]))[0]
+        side = np.cross(ahead, [0.0, 0.0, 1.0]) / np.linalg.norm(np.cross(ahead, [0.0, 0.0, 1.0]))
+        sky = image_of(torch.from_numpy(np.stack([side, np.cross(ahead, side), ahead])), on_earth=False)
+        assert sky.right_ascension_declination == pytest.approx((101.3, -16.7))
+        assert sky.heading_pitch_roll is None
+
+    def test_a_reach_of_pixels(self) -> None:
+        assert _reach(CAMERA) == pytest.approx(2.5 / 900.0, rel=1e-4)
+        part = _part(CATALOG, np.array([5, 3]))
+        assert part.number.tolist() == CATALOG.number[[5, 3]].tolist()
+        assert part.magnitude.tolist() == CATALOG.magnitude[[5, 3]].tolist()
