@@ -26,10 +26,10 @@ _NEXT = {
 _TITLES = {
     "halves": "check by halves of the views", "model": "lens model", "changed": "two cameras", "names": "two cameras",
     "prediction": "prediction of other views", "pupil": "entrance pupil", "views": "number of views",
-    "mirrored": "mirrored board", "tilt": "tilts", "roll": "rolls", "depth": "distances", "unsteady": "repeating residuals",
+    "mirrored": "mirrored board", "tilt": "tilts", "roll": "rolls", "depth": "distances", "record": "no record",
     "calibration": "warning when it was calibrated", "rig": "warning when it was solved", "error-bars": "error bars",
-    "other-views": "other views", "record": "no record", "left-out": "left out", "exact-lenses": "exact lenses",
-    "misfit": "residuals", "view": "common view", "synchronization": "same moment",
+    "unsteady": "repeating residuals", "other-views": "other views", "left-out": "left out", "view": "common view",
+    "misfit": "residuals", "exact-lenses": "exact lenses", "synchronization": "same moment",
 }  # fmt: skip
 
 
