@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -90,6 +90,23 @@ def mark_again(
     words += [] if cameras is None else ["--cameras", *map(str, cameras)]
     words += [] if rig is not None else ["--landmarks", str(survey or "survey.csv")]
     return f"To mark in the images: {shlex.join([*words, '-o', str(marks or 'marks.csv')])}"
+
+
+def option_for_each(words: Sequence[str], option: str) -> str:
+    """The command that was typed with an option once for all of the files after it, with it before each of them.
+
+    Example:
+        >>> option_for_each(["report", "rig.json", "--observations", "a.json", "b.json"], "--observations")
+        'kcal report rig.json --observations a.json --observations b.json'
+    """
+    found, follows = ["kcal"], False
+    for word in words:
+        if word.startswith("-"):
+            follows = word == option
+            found += [] if follows else [word]
+        else:
+            found += [option, word] if follows else [word]
+    return shlex.join(found)
 
 
 def _millimeters(meters: float) -> str:

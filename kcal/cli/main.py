@@ -24,6 +24,7 @@ from kcal.cli.check import check_command
 from kcal.cli.commands import Command
 from kcal.cli.compare import compare_command
 from kcal.cli.console import err, warn, with_json
+from kcal.cli.cures import option_for_each
 from kcal.cli.demo import demo_command
 from kcal.cli.detect import detect_command
 from kcal.cli.diff import diff_command
@@ -58,6 +59,9 @@ def usage_errors_shown() -> Iterator[None]:
     except Exception as error:
         if format_message := getattr(error, "format_message", None):
             shown = visible(format_message())
+            if "unexpected extra argument" in shown and "--observations" in inputs.typed:
+                again = option_for_each(inputs.typed, "--observations")
+                shown = f"{shown.rstrip('.')}. --observations takes one file; give it before each: {visible(again)}"
             setattr(error, "format_message", lambda: shown)  # noqa: B010
         raise
 

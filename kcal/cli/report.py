@@ -131,7 +131,7 @@ def print_verdict(verdict: Verdict, warned: tuple[str, ...] = ()) -> None:
     for finding in verdict.findings:
         if finding.severity == "fine" or finding.name in warned:
             continue
-        out.print(f"  {finding.name}: {finding.text}{f'; {finding.action}' if finding.action else ''}", markup=False)
+        out.print(f"  {finding.title}: {finding.text}{f'; {finding.action}' if finding.action else ''}", markup=False)
 
 
 def _of_camera(

@@ -166,7 +166,8 @@ def _worst_of_pair(rig: StereoRig, distance: float, mark_sigma: float) -> RangeS
             if place is None:
                 raise
             continue
-        if worst is None or not float(found.total) <= float(worst.total):
+        # What is not known is worse than anything.
+        if worst is None or not (math.isnan(worst.total) or float(found.total) <= float(worst.total)):
             worst = found
     assert worst is not None
     return worst

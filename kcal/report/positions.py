@@ -285,6 +285,9 @@ def _draw_ranges(axes: Axes, located: Located, true_enu: Array | None, shown: li
     # Linear up to 1 %, logarithmic beyond: intervals at 100 m and at 5 km differ by a factor of fifty.
     axes.set_xscale("symlog", linthresh=0.01, linscale=1.0)
     ticks = [tick for tick in _PERCENT if abs(tick) < limit]
+    if len(ticks) > 9:
+        # Those at 3, 30 and .3 % would meet their neighbors.
+        ticks = ticks[len(ticks) // 2 % 2 :: 2]
     axes.set_xticks(ticks, [f"{100 * tick:+g} %" if tick else "0" for tick in ticks], fontsize=9)
     axes.set_xticks([], minor=True)
     axes.set(xlim=(-limit, limit), ylim=(len(order) - 0.3, -0.7))

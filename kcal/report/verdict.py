@@ -22,6 +22,15 @@ _NEXT = {
     "relative pose": "mark more far features or surveyed landmarks in both images: they determine the relative yaw",
     FAULTS: "look at the doubts below, and calibrate again without them",
 }
+# What findings are called where people read them, if not by their names.
+_TITLES = {
+    "halves": "check by halves of the views", "model": "lens model", "changed": "two cameras", "names": "two cameras",
+    "prediction": "prediction of other views", "pupil": "entrance pupil", "views": "number of views",
+    "mirrored": "mirrored board", "tilt": "tilts", "roll": "rolls", "depth": "distances", "record": "no record",
+    "calibration": "warning when it was calibrated", "rig": "warning when it was solved", "error-bars": "error bars",
+    "unsteady": "repeating residuals", "other-views": "other views", "left-out": "left out", "view": "common view",
+    "misfit": "residuals", "exact-lenses": "exact lenses", "synchronization": "same moment",
+}  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -135,6 +144,11 @@ class Finding:
     action: str = ""
     picture: str = ""
     part: str = ""
+
+    @property
+    def title(self) -> str:
+        """What it is about, in words."""
+        return _TITLES.get(self.name, self.name)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -51,4 +51,8 @@ HARMLESS = {
     "41ec4fe6054bc787": "how many matches are worked on at a time: only memory",
     "47e93b395d9a2442": "the size of letters",
     "d3166586025778b5": "the size of letters",
+    "991f7ae90849076e": "a circle, drawn from another of its points on",
+    "de07024734379c68": "by how many points a name stands beside its mark",
+    "2d9fdadb75d7d0e3": "the size of letters",
+    "1e51aa8f523d671c": "whether nothing is searched for what is missing of one camera alone, of which nothing is kept",
 }

@@ -95,6 +95,18 @@ def test_arrows_lead_from_truth_to_estimate_only_where_they_differ() -> None:
     assert head > tail
 
 
+@pytest.mark.parametrize(("count", "named"), [(40, True), (41, False)])
+def test_no_more_than_forty_points_have_names(count: int, named: bool) -> None:
+    points = torch.linspace(80, 6000, count, dtype=torch.float64)[:, None] * tensor([0.1, 0.0, 1.0])
+    left, right, _ = pinhole_rig()(points)
+    names = [f"p{i}" for i in range(count)]
+    origin = Origin(lat=10.0, lon=20.0, height=0.0)
+    figure = positions_figure(locate_points(pinhole_rig(), left, right, origin=origin, heading_deg=0.0, names=names))
+    assert ("p7" in [text.get_text() for text in figure.axes[0].texts]) is named
+    rows = [text.get_text().split()[0] for text in figure.axes[1].get_yticklabels()]
+    assert rows == (names if named else [])
+
+
 @pytest.mark.parametrize("count", [1, 60])
 def test_one_point_and_many_points(tmp_path: Path, count: int) -> None:
     rig = pinhole_rig()

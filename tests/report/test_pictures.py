@@ -62,6 +62,15 @@ def test_a_misfit_has_its_whole_title_and_fills_its_page(size: tuple[int, int]) 
     assert wide / tall == pytest.approx(size[0] / size[1], rel=0.01)
 
 
+def test_places_up_to_the_edges_are_of_an_image_of_that_size() -> None:
+    """Half a pixel beyond the centers of the outermost pixels: the image is no pixel larger."""
+    x, y = torch.linspace(-0.5, 639.5, 33).double(), torch.linspace(-0.5, 479.5, 25).double()
+    pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
+    figure = difference_figure(Misfit(model="opencv4", pixels=pixels, shift=torch.full_like(pixels, 0.3)), "", [])
+    assert figure.axes[0].get_xlim() == (-0.5, 639.5)
+    assert figure.axes[0].get_ylim() == (479.5, -0.5)
+
+
 def test_a_difference_fills_its_page() -> None:
     left = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480))
     right = Camera.build(focal=(810, 800), center=(321, 240), size=(640, 480))

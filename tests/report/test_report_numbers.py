@@ -118,6 +118,8 @@ class TestSentences:
             figure = difference_figure(drawn, "title", ["line"])
             box = figure.axes[0].get_window_extent()
             assert box.width / box.height == pytest.approx(ratio, rel=0.02)
+            assert figure.axes[0].get_xlim() == (-0.5, 639.5)
+            assert figure.axes[0].get_ylim() == (479.5, -0.5)
             plt.close(figure)
 
     def test_correlations(self) -> None:

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import math
+import re
+from pathlib import Path
 
+import kcal.report
 from kcal.report.verdict import FAULTS, Finding, RangeAnswer, Requirement, Verdict, weighed_findings
+from kcal.report.verdict_page import verdict_page
 
 MARKS = "mark targets more accurately"
 STRUCTURE = Finding(
@@ -86,3 +90,24 @@ def test_what_would_improve_a_yes_is_against_most_of_its_error() -> None:
     assert verdict(answer(500.0, marks=100.0, lenses=20.0), advice=advice).improvement.startswith(MARKS)
     assert verdict(answer(500.0, marks=10.0, lenses=20.0), advice=advice).improvement == advice[0]
     assert Verdict(subject="left", advice=advice).improvement == advice[0]
+
+
+def test_findings_are_called_by_words() -> None:
+    """Names are for programs: people read what a finding is about, on the screen and on the page."""
+    folder = Path(kcal.report.__file__).parent
+    names = {
+        name
+        for module in folder.glob("*_findings.py")
+        for name in re.findall(r'Finding\(\s*name="([\w-]+)"', module.read_text(encoding="utf-8"))
+    }
+    assert {"halves", "tilt", "unsteady", "coverage"} <= names
+    names |= {"other-views", "left-out", "exact-lenses", "error-bars", "misfit", "synchronization"}
+    titles = {name: Finding(name=name, severity="fine", text="").title for name in names}
+    assert not any("-" in title for title in titles.values())
+    assert titles["halves"] == "check by halves of the views"
+    assert titles["coverage"] == "coverage"
+    # Each about another thing, but two ways to find out that there are two cameras.
+    assert len(set(titles.values())) == len(titles) - 1
+    assert titles["names"] == titles["changed"] == "two cameras"
+    page = verdict_page(Verdict(subject="left", findings=(Finding(name="halves", severity="doubt", text="t"),)))
+    assert "<b>check by halves of the views</b>" in page

@@ -250,3 +250,16 @@ def test_fits(night: Any, tmp_path: Path) -> None:
     (tmp_path / "no.fits").write_bytes(b"nothing")
     with pytest.raises(FileError, match=r"no\.fits: not a FITS file"):
         read_night(tmp_path / "no.fits")
+
+
+@pytest.mark.parametrize("field", [0.15, 2.0])
+def test_narrow_and_wide_fields_have_names(field: float) -> None:
+    """Triangles may be as small as the field asks: within 4 degrees all sides are short, of 115 degrees few are."""
+    seen = CATALOG.directions()[np.argsort(CATALOG.magnitude, kind="stable")]
+    axis = np.array([0.35, -0.6, 0.2]) / np.linalg.norm([0.35, -0.6, 0.2]) if field > 1 else seen[2000]
+    ahead = seen[seen @ axis > np.cos(0.5 * field)][:25]
+    turn = enu_from_cam(40.0, 10.0, 5.0).numpy()
+    found = identify(ahead @ turn, 1e-4, field=field)
+    assert found is not None
+    assert found.matches >= 0.8 * len(ahead)
+    np.testing.assert_allclose(found.rotation, turn.T, atol=1e-4)

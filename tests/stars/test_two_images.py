@@ -16,7 +16,12 @@ from scripts.shared.star_lenses import SIZE, lens_difference, star_images, true_
 @pytest.fixture(scope="module")
 def found() -> StarCamera:
     images, views = star_images(35.0, 2, seed=1)
-    return calibrate_by_stars(images, views, SIZE, focal=1100.0)
+    told: list[str] = []
+    made = calibrate_by_stars(images, views, SIZE, focal=1100.0, progress=told.append)
+    # The image of most stars comes first; images are counted from one.
+    most = max(range(2), key=lambda number: len(images[number].pixels))
+    assert told == [f"field of view of image {most + 1}", "names", "lens", "lens", "lens"]
+    return made
 
 
 def test_the_lens_is_found(found: StarCamera) -> None:

@@ -220,7 +220,7 @@ class Results:
         everything = hash_of("together", self.options, [self._views[i].dump() for i in good])
         keys = {i: hash_of("shared", everything, self.jobs[i].name) for i in good}
         kept = {i: self._load(Calibrated, key) for i, key in keys.items()} if len(good) > 1 else {}
-        if len(good) > 1 and any(piece is None for piece in kept.values()):
+        if any(piece is None for piece in kept.values()):
             try:
                 alone = self._each(calibrate_again, {i: (self._views[i], self.options) for i in good}, crew)
                 found = sharing(

@@ -1,0 +1,478 @@
+"""Limits of findings, ranges of rigs by hand, popups of the map, tables of a page."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import io
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from drawn_scenes import FIGURES, calibrated, landmarks_rig, located, stations
+from locate_rigs import pinhole_rig
+from PIL import Image, TiffImagePlugin
+
+from kcal.calibrate.camera.trust import Examination, HalvesDifference, ResidualStructure
+from kcal.calibrate.rig.synchrony import Synchrony
+from kcal.corners.board import Board
+from kcal.corners.observations import Observations, View
+from kcal.errors import InputError
+from kcal.lens.calibration import CameraCalibration
+from kcal.lens.camera import Camera
+from kcal.lens.difference import camera_difference
+from kcal.lens.pose import rotation_from_vector
+from kcal.lens.rig import RigCovariance
+from kcal.locate.geodesy import geodetic_to_enu
+from kcal.locate.map_places import map_places
+from kcal.locate.range_sigmas import range_sigmas
+from kcal.report.backdrop import _placing, _tile, _warp, local_image
+from kcal.report.judge_camera import _camera_answer, _image_rms, other_views
+from kcal.report.judge_rig import _pairs_compared, _synchrony_finding, _worst_of_pair, named_cameras, rig_verdict
+from kcal.report.map_page import _box, _content, arcs_within
+from kcal.report.model_findings import _changed, _prediction_finding, model_findings
+from kcal.report.verdict import FAULTS, Requirement
+from kcal.report.verdict_page import _caption, _correlations, camera_tables
+from kcal.report.verdict_pictures import _PART_COLORS
+from kcal.report.view_findings import (
+    _blur_finding,
+    _blurred_share,
+    _coverage_finding,
+    _pose_findings,
+    _repetition_finding,
+    _sides_finding,
+)
+
+CAMERA = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480), model="pinhole")
+
+
+def turns(*angles: tuple[float, float, float]) -> torch.Tensor:
+    return rotation_from_vector(torch.deg2rad(torch.tensor(angles, dtype=torch.float64)))
+
+
+class TestPoses:
+    def found(self, tilts: list[float], rolls: list[float], distances: list[float]) -> dict[str, str]:
+        rotation = torch.stack([
+            turns((tilt, 0.0, 0.0))[0] @ turns((0.0, 0.0, roll))[0] for tilt, roll in zip(tilts, rolls, strict=True)
+        ])  # fmt: skip
+        shift = torch.tensor([[0.0, 0.0, far] for far in distances], dtype=torch.float64)
+        return {finding.name: finding.text for finding in _pose_findings(rotation, shift)}
+
+    def test_three_tilted_views_are_needed(self) -> None:
+        rolls, far = [0.0, 40.0, 80.0, 20.0], [1.0, 2.0, 1.5, 1.2]
+        assert set(self.found([16.0, 20.0, -17.0, 3.0], rolls, far)) == {"poses"}
+        text = self.found([16.0, 20.0, 14.0, 3.0], rolls, far)["tilt"]
+        assert "in 2 of 4 views" in text
+
+    def test_rolls_and_distances(self) -> None:
+        tilts = [30.0, -30.0, 25.0, 40.0]
+        good = self.found(tilts, [0.0, 61.0, 30.0, 10.0], [1.0, 1.31, 1.1, 1.2])
+        assert set(good) == {"poses"}
+        assert good["poses"].startswith("tilts up to 40°, rolls within 61°, distances 1 to 1.3 m")
+        assert set(self.found(tilts, [0.0, 58.0, 30.0, 10.0], [1.0, 1.31, 1.1, 1.2])) == {"roll"}
+        close = self.found(tilts, [0.0, 61.0, 30.0, 10.0], [1.0, 1.29, 1.1, 1.2])
+        assert "(1 to 1.3 m)" in close["depth"]
+
+
+class TestViews:
+    def test_blur_by_noise_and_by_share(self) -> None:
+        def severity(noise: float, share: float) -> str | None:
+            found = _blur_finding(noise, share)
+            return None if found is None else found.severity
+
+        assert severity(0.35, 0.25) is None
+        assert severity(0.36, 0.0) == "doubt"
+        assert severity(0.70, 0.0) == "doubt"
+        assert severity(0.71, 0.0) == "stop"
+        assert severity(0.1, 0.26) == "stop"
+        blurred, scattered = _blur_finding(0.1, 0.5), _blur_finding(0.8, 0.1)
+        assert blurred is not None
+        assert scattered is not None
+        assert blurred.text.startswith("50 % of the views are blurred")
+        assert scattered.text.startswith("corners scatter by 0.8 px")
+
+    def test_share_of_blurred_views(self) -> None:
+        board = Board(columns=3, rows=2, square=0.1)
+        pixels = tuple((float(i), 0.0) for i in range(6))
+        # Along both axes on average: 0.5 (sx² + sy²) = 0.72² for the first.
+        wide, thin = (0.9, 0.0, 2 * 0.72**2 - 0.9), (0.9, 0.0, 2 * 0.68**2 - 0.9)
+        views = [
+            View(name=str(i), pixels=pixels, covariance=(one,) * 6) for i, one in enumerate((wide, thin, thin, thin))
+        ]
+        seen = Observations(board=board, image_size=(640, 480), views=tuple(views))
+        assert _blurred_share(seen) == pytest.approx(0.25)
+        bare = [View(name="a", pixels=pixels)]
+        assert _blurred_share(seen.model_copy(update={"views": tuple(bare)})) == 0.0
+
+    def test_repetition(self) -> None:
+        assert _repetition_finding(5.0) is None
+        found = _repetition_finding(5.2)
+        assert found is not None
+        assert "(5.2 times as much as noise)" in found.text
+
+    def test_names_of_two_cameras(self) -> None:
+        pairs = [f"{side}{i:02}.png" for side in ("left", "right") for i in range(3)]
+        others = [f"x{i}.png" for i in range(6)]
+        assert _sides_finding([*pairs, *others], "stop") is None  # a half of them
+        found = _sides_finding([*pairs, *others[:5]], "stop")
+        assert found is not None
+        assert found.severity == "stop"
+        assert found.text.startswith("6 of 11 views are named like pairs of two cameras, left00.png and right00.png")
+
+    def coverage(self, low: float, high: float) -> tuple[str, str]:
+        """Of a board whose corners span these shares of both sides of the image."""
+        corners = tuple((low * 640 + (high - low) * 640 * x, low * 480 + (high - low) * 480 * y)
+                        for y in (0.0, 1.0) for x in (0.0, 1.0))  # fmt: skip
+        seen = Observations(board=Board(columns=2, rows=2, square=0.1), image_size=(640, 480),
+                            views=(View(name="a", pixels=corners),))  # fmt: skip
+        found = _coverage_finding(seen)
+        return found.severity, found.text
+
+    def test_coverage_of_the_image_and_of_its_border(self) -> None:
+        assert self.coverage(0.0, 1.0)[0] == "fine"
+        severity, text = self.coverage(0.04, 0.96)
+        # 0.92² of the image; the border ring is 6 of 64 rows and 9 of 96 columns on each side.
+        ring = 1.0 - (78 / 96) * (52 / 64)
+        inside = (0.92**2 - (78 / 96) * (52 / 64)) / ring
+        assert severity == "doubt" if 1 - inside > 0.5 else "fine"
+        numbers = [float(word) for word in text.replace("%", " ").split() if word.replace(".", "").isdigit()]
+        assert numbers[0] == pytest.approx(100 * (1 - 0.92**2), abs=2)
+        assert numbers[1] == pytest.approx(100 * (1 - inside), abs=4)
+        assert self.coverage(0.1, 0.9)[0] == "doubt"
+
+
+class TestModel:
+    def half(self, **more: Any) -> HalvesDifference:
+        same = camera_difference(CAMERA, CAMERA.with_parameters(CAMERA.params + 0.1))
+        same = dataclasses.replace(same, ratio=more.pop("ratio", 3.0), probability=more.pop("probability", 0.5))
+        given = {"label": "first and second half", "alike": False, "held_out": 0.1, "own": 0.1} | more
+        return HalvesDifference(difference=same, **given)
+
+    def findings(self, halves: tuple[HalvesDifference, ...], failures: tuple[str, ...] = (), neighbors: float = 0.0,
+                 image: float = 1.0) -> tuple[dict[str, str], float]:  # fmt: skip
+        structure = ResidualStructure(image=image, board=1.0, neighbors=neighbors, neighbors_sigma=0.01)
+        given = Examination(halves=halves, reference=None, model=None, structure=structure, failures=failures)
+        from kcal.calibrate.camera.calibrate import CalibrationOptions
+
+        found, beyond = model_findings(calibrated(), CalibrationOptions(model="opencv4"), given)
+        return {finding.name: finding.severity for finding in found}, beyond
+
+    def test_limits_of_structure(self) -> None:
+        halves = (self.half(alike=True),)
+        assert self.findings(halves)[0]["halves"] == "fine"
+        assert self.findings(halves, neighbors=0.12, image=2.5)[0]["halves"] == "fine"
+        assert self.findings(halves, neighbors=0.13)[0] == {"model": "stop", "prediction": "fine"}
+        assert self.findings(halves, image=2.6)[0]["model"] == "stop"
+
+    def test_halves_that_differ_by_more_than_chance(self) -> None:
+        one, two = self.half(alike=True, probability=1e-7), self.half(alike=True, probability=1e-5)
+        found, beyond = self.findings((one,))
+        assert found["model"] == "doubt"
+        assert beyond == pytest.approx(one.difference.rms * math.sqrt(1 - 1 / 9))
+        assert self.findings((two,)) == ({"prediction": "fine", "halves": "fine"}, 0.0)
+
+    def test_what_could_not_be_checked(self) -> None:
+        assert self.findings((), ("too few views",))[0]["halves"] == "doubt"
+        assert self.findings((self.half(alike=True),), ("one fit failed",))[0]["halves"] == "doubt"
+
+    def test_halves_of_two_cameras(self) -> None:
+        result = dataclasses.replace(calibrated(), hybrid=None)
+        own = 0.79 * result.rms
+        apart = self.half(own=own)
+        assert _changed(result, [apart], {apart.label: 1.0}) is apart
+        assert _changed(result, [apart], {apart.label: 0.0}) is None
+        assert _changed(result, [self.half(own=0.81 * result.rms)], {apart.label: 1.0}) is None
+        assert _changed(result, [self.half(own=own, alike=True)], {apart.label: 1.0}) is None
+
+    def test_prediction(self) -> None:
+        assert _prediction_finding(self.half(held_out=0.125, own=0.1)).severity == "fine"
+        doubt = _prediction_finding(self.half(held_out=0.126, own=0.1))
+        assert doubt.severity == "doubt"
+        assert "to 0.13 px RMS, 1.26 times" in doubt.text
+
+
+class TestAnswers:
+    def test_a_range_by_two_cameras(self) -> None:
+        """√2 Z² / (f B) for each pixel of either camera."""
+        need = Requirement(distance=1000.0, meters=50.0)
+        parts = _camera_answer(CAMERA, need, 0.2, 0.5, 8.0, 0.3).parts
+        slope = math.sqrt(2) * 1e6 / (800 * 8)
+        assert parts == pytest.approx({"marks": 0.3 * slope, "lenses": 0.2 * slope, FAULTS: 0.5 * slope})
+
+    def test_rms_of_error_bars_over_the_image(self) -> None:
+        camera = Camera(CAMERA.params, size=CAMERA.size, model=CAMERA.model)
+        assert _image_rms(camera) == math.inf
+        covariance = torch.zeros(5, 5).double()
+        covariance[2, 2] = covariance[3, 3] = 0.04
+        camera.calibration = CameraCalibration(covariance=covariance)
+        # A shift of the principal point looks like a turn, but for how the image is stretched: less than its sigma.
+        assert 0.0 < _image_rms(camera) < 0.2 * math.sqrt(2)
+        focal = torch.zeros(5, 5).double()
+        focal[0, 0] = focal[1, 1] = focal[0, 1] = focal[1, 0] = 16.0
+        camera.calibration = CameraCalibration(covariance=focal)
+        pixels = CAMERA.grid(65, 49).reshape(-1, 2) - CAMERA.params[2:4]
+        by_hand = float((4.0 / 800 * pixels).square().sum(-1).mean().sqrt())
+        assert _image_rms(camera) == pytest.approx(by_hand, rel=0.75)
+
+    def test_the_worst_place_of_a_pair(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Of the middle, and of three tenths of the width to both sides; what is not known is worse than anything."""
+        rig = pinhole_rig()
+        rig.covariance = RigCovariance.of(rig, pose=torch.diag(torch.tensor([0, 1e-8, 0, 0, 0, 0]).double()))
+        real = range_sigmas(rig, [1000.0], pixel_sigma=0.3)
+        asked: list[Any] = []
+        totals: dict[float, float] = {}
+
+        def given(*_: Any, pixel: Any, **__: Any) -> Any:
+            asked.append(pixel)
+            if pixel is not None and pixel[0] not in totals:
+                raise InputError("the right camera does not see it")
+            return real._replace(total=torch.tensor([1.0 if pixel is None else totals[pixel[0]]]))
+
+        monkeypatch.setattr("kcal.report.judge_rig.range_sigmas", given)
+        places = [pytest.approx(0.2 * 1920), pytest.approx(0.8 * 1920)]
+        for left, right, worst in ((3.0, 2.0, 3.0), (0.5, 0.4, 1.0), (0.5, 2.0, 2.0), (math.nan, 2.0, math.nan)):
+            asked.clear()
+            totals.update({0.5 * 1920 - 0.3 * 1920: left, 0.5 * 1920 + 0.3 * 1920: right})
+            found = float(_worst_of_pair(rig, 1000.0, 0.3).total)
+            assert found == pytest.approx(worst, nan_ok=True)
+            assert [None if place is None else place[0] for place in asked] == [None, *places]
+            assert asked[1][1] == 540
+        totals.clear()
+        assert float(_worst_of_pair(rig, 1000.0, 0.3).total) == 1.0
+
+    def test_stations_have_names(self) -> None:
+        result = landmarks_rig()
+        assert [name for name, _ in named_cameras(result.stations())] == ["left", "right"]
+        assert [name for name, _ in named_cameras(result.stereo())] == ["left", "right"]
+        assert _pairs_compared(result.stereo(), result, None) is None
+
+    def synchrony(self, ratio: float, delay: float | None = None, sigma: float | None = 0.01) -> Any:
+        return _synchrony_finding(Synchrony(pairs=9, ratio=ratio, shift=0.0123, delay=delay, delay_sigma=sigma))
+
+    def test_cameras_that_were_not_triggered_together(self) -> None:
+        assert self.synchrony(2.5).severity == "fine"
+        assert "in 9 pairs (2.4 times" in self.synchrony(2.4).text
+        found = self.synchrony(2.6)
+        assert found.severity == "stop"
+        assert "12 mm elsewhere" in found.text
+        assert "steps" not in found.text
+        late = self.synchrony(1.0, 0.06)
+        assert late.severity == "doubt"
+        assert "0.06 ± 0.01 steps after" in late.text
+        assert "steps before" in self.synchrony(1.0, -0.06).text
+        # Five sigmas, and a fiftieth of a step at least.
+        assert self.synchrony(1.0, 0.049).severity == "fine"
+        assert self.synchrony(1.0, 0.019, 0.001).severity == "fine"
+        assert self.synchrony(1.0, 0.021, 0.001).severity == "doubt"
+        assert self.synchrony(1.0, 0.5, None).severity == "fine"
+
+    def test_what_contradicts_is_a_stop_and_a_fifth_may_be_left_out(self) -> None:
+        rig = landmarks_rig().stereo()
+        names = {one.name for one in rig_verdict(rig).findings}
+        assert "left-out" not in names
+        assert rig.calibration is not None
+        (source,) = rig.calibration.sources
+        for out, severity in ((2, None), (3, "stop")):
+            changed = dataclasses.replace(source, used=10 - out, left_out=out, sigmas=3.0)
+            rig.calibration = dataclasses.replace(
+                rig.calibration, sources=(changed,), contradictions=("a contradicts b",)
+            )
+            found = {one.name: one for one in rig_verdict(rig).findings}
+            assert (found["left-out"].severity if "left-out" in found else None) == severity
+            assert "misfit" not in found
+            assert found["contradiction"].severity == "stop"
+        assert found["left-out"].text.startswith("30 % of what was seen")
+        changed = dataclasses.replace(source, sigmas=3.1)
+        rig.calibration = dataclasses.replace(rig.calibration, sources=(changed,))
+        assert {one.name: one for one in rig_verdict(rig).findings}["misfit"].severity == "stop"
+
+    def test_a_camera_that_differs_by_its_error_bars(self) -> None:
+        result = calibrated()
+        assert other_views(result.camera, result) == ([], 0.0)
+        bare = Camera(result.camera.params + 0.0, size=result.camera.size, model=result.camera.model)
+        found, _ = other_views(bare, result)
+        assert [one.name for one in found] in ([], ["other-views"])
+
+
+class TestMap:
+    def test_bearings_reach_beyond_the_farthest(self) -> None:
+        found, truth = located()
+        content = _content(found, truth)
+        far = max(p.range_m or p.range_low_m or 0.0 for p in found.positions)
+        (line,) = content["bearings"]
+        ends = geodetic_to_enu(torch.tensor([[*place, 0.0] for place in line], dtype=torch.float64), found.origin)
+        lost = found.positions[3]
+        assert float(ends[0, :2].norm()) == pytest.approx(lost.range_low_m, rel=1e-4)
+        assert float(ends[1, :2].norm()) == pytest.approx(1.15 * far, rel=1e-4)
+        for end in ends:
+            assert math.degrees(math.atan2(float(end[0]), float(end[1]))) % 360 == pytest.approx(
+                lost.azimuth_deg, abs=0.01
+            )
+        # An arrow leads from the true place to the estimate.
+        for arrow, position, true in zip(content["arrows"], found.positions, truth, strict=False):
+            assert arrow["line"][1] == (position.lat, position.lon)
+            miss = np.array(position.enu) - true.numpy()
+            assert arrow["azimuth"] == pytest.approx(math.degrees(math.atan2(miss[0], miss[1])))
+            assert arrow["line"][0] == map_places(true[None], found.origin)[0]
+        first = content["cameras"][0]
+        rim = geodetic_to_enu(
+            torch.tensor([[*place, 0.0] for place in first["field"]], dtype=torch.float64), found.origin
+        )
+        assert float(rim[30, :2].norm()) == pytest.approx(1.15 * far, rel=1e-3)
+
+    def test_arcs_sweep_what_the_cameras_see(self) -> None:
+        found, _ = located()
+        for arc in _content(found, None)["arcs"]:
+            ends = geodetic_to_enu(
+                torch.tensor([[*arc["line"][k], 0.0] for k in (0, -1)], dtype=torch.float64), found.origin
+            )
+            azimuths = [math.degrees(math.atan2(float(x), float(y))) % 360 for x, y, _ in ends]
+            # Half of 1920 px at a focal length of 1600 px on each side of a heading of 300 degrees.
+            half = math.degrees(math.atan(960 / 1600))
+            assert azimuths == pytest.approx([300 - half, 300 + half], abs=0.1)
+        assert _content(stations(), None)["arcs"] == []
+
+    def test_popups(self) -> None:
+        found, _ = located()
+        first = found.positions[0]
+        rows = dict(_content(found, None)["points"][0]["rows"])
+        assert rows["latitude"] == f"{first.lat:.7f}°"
+        assert first.range_m is not None
+        # In the unit of the farthest.
+        assert rows["range"] == f"{first.range_m / 1e3:.5f} km"
+        assert rows["95 % interval"].endswith(" km")
+        assert first.cep50_m is not None
+        assert first.cep95_m is not None
+        assert first.meters_per_degree is not None
+        half, most = (float(text.split()[0]) * (1e-3 if text.endswith("mm") else 1.0)
+                      for text in rows["CEP50, CEP95"].split(", "))  # fmt: skip
+        assert (half, most) == (pytest.approx(first.cep50_m, rel=0.05), pytest.approx(first.cep95_m, rel=0.05))
+        number, unit = rows["0.01° of yaw is"].split()
+        assert float(number) * (1e-3 if unit == "mm" else 1.0) == pytest.approx(
+            0.01 * first.meters_per_degree, rel=0.05
+        )
+        height = float(rows["ellipsoidal height"].split()[0])
+        if first.geoid_height is not None:
+            assert float(rows["above the geoid"].split()[0]) == pytest.approx(height - first.geoid_height, abs=0.1)
+
+    def test_the_view_holds_everything(self) -> None:
+        content = {"truth": [(1.0, 2.0)], "points": [{"place": (3.0, -1.0)}], "cameras": [{"place": (0.5, 0.0)}],
+                   "regions": [[(9.0, 4.0), (8.0, 7.0)]], "bearings": [[(-2.0, 0.0)]]}  # fmt: skip
+        assert _box(content) == (-2.0, -1.0, 9.0, 7.0)
+
+    def test_arcs_of_a_bench(self) -> None:
+        # A twelfth of the reach is too near.
+        assert arcs_within(1.21) == [0.25, 0.5, 1.0]
+        assert arcs_within(1.19) == [0.1, 0.25, 0.5, 1.0]
+        assert arcs_within(250.0) == [25.0, 50.0, 100.0]
+        assert arcs_within(251.0) == [250.0]
+
+
+class TestBackdrop:
+    def test_numbers_of_tiles(self) -> None:
+        """OpenStreetMap, Slippy map tilenames: the example there, and both ends of the map."""
+        assert _tile(0.0, 0.0, 1) == (1, 1)
+        assert _tile(19.07, 72.87, 13) == (5754, 3653)
+        assert _tile(51.5, -0.1, 10) == (511, 340)
+        assert _tile(89.0, -180.0, 4) == _tile(85.0, -180.0, 4) == (0, 0)
+        assert _tile(-89.0, 179.9, 4) == (15, 15)
+
+    def tags(self, **more: Any) -> dict[int, Any]:
+        keys = more.pop("keys", (1, 1, 0, 1, 3072, 0, 1, 32643))
+        return {34735: keys, **more.pop("tags", {33550: (2.0, 3.0, 0.0), 33922: (4.0, 5.0, 0.0, 100.0, 200.0, 0.0)})}
+
+    def test_places_of_pixels(self) -> None:
+        matrix, system = _placing(Path("a.tif"), self.tags())
+        # The tie point of pixel (4, 5) lies at (100, 200); rows run to the south.
+        np.testing.assert_allclose(matrix @ [4.0, 5.0, 1.0], [100.0, 200.0])
+        np.testing.assert_allclose(matrix @ [6.0, 9.0, 1.0], [104.0, 188.0])
+        assert system.to_epsg() == 32643
+        points, _ = _placing(Path("a.tif"), self.tags(keys=(1, 1, 0, 2, 3072, 0, 1, 32643, 1025, 0, 1, 2)))
+        np.testing.assert_allclose(points @ [4.5, 5.5, 1.0], [100.0, 200.0])
+        whole = {34264: (2, 0.5, 0, 7, 0.25, -3, 0, 9, 0, 0, 0, 0, 0, 0, 0, 1)}
+        full, degrees = _placing(Path("a.tif"), self.tags(tags=whole, keys=(1, 1, 0, 1, 2048, 0, 1, 4326)))
+        np.testing.assert_allclose(full, [[2, 0.5, 7], [0.25, -3, 9]])
+        assert degrees.to_epsg() == 4326
+        with pytest.raises(InputError, match="no GeoTIFF with an EPSG"):
+            _placing(Path("a.tif"), self.tags(keys=(1, 1, 0, 1, 3072, 0, 1, 32767)))
+        with pytest.raises(InputError, match="does not know EPSG:9999"):
+            _placing(Path("a.tif"), self.tags(keys=(1, 1, 0, 1, 3072, 0, 1, 9999)))
+
+    def test_warped_pixels(self) -> None:
+        class Same:
+            def transform(self, x: Any, y: Any, direction: str = "") -> Any:
+                return x, y
+
+        pixels = np.arange(24, dtype=np.uint8).reshape(4, 6, 1) + 1
+        matrix = np.array([[1.0, 0.0, 10.0], [0.0, -1.0, 20.0]])
+        same = _warp(pixels, matrix, Same(), (10.0, 16.0, 16.0, 20.0))  # type: ignore[arg-type]
+        np.testing.assert_array_equal(same, pixels)
+        # A unit farther to the west and to the south: what is not in the image is empty.
+        moved = _warp(pixels, matrix, Same(), (9.0, 15.0, 15.0, 19.0))  # type: ignore[arg-type]
+        np.testing.assert_array_equal(moved[:3, 1:], pixels[1:, :5])
+        assert not moved[3].any()
+        assert not moved[:, 0].any()
+
+    def test_a_picture_of_a_square_of_degrees(self, tmp_path: Path) -> None:
+        """Bounds in degrees of an image in degrees: its own."""
+        tags = TiffImagePlugin.ImageFileDirectory_v2()
+        tags[33550], tags[33922] = (0.01, 0.01, 0.0), (0.0, 0.0, 0.0, 10.0, 50.0, 0.0)
+        tags[34735] = (1, 1, 0, 1, 2048, 0, 1, 4326)
+        tags.tagtype[33550] = tags.tagtype[33922] = 12
+        tags.tagtype[34735] = 3
+        Image.fromarray(np.full((20, 30, 3), 90, np.uint8)).save(tmp_path / "a.tif", tiffinfo=tags)
+        found = local_image(tmp_path / "a.tif")
+        np.testing.assert_allclose(found["bounds"], [[49.8, 10.0], [50.0, 10.3]], atol=1e-9)
+        assert found["name"] == "a.tif"
+        picture = Image.open(io.BytesIO(base64.b64decode(found["uri"].split(",")[1])))
+        # A degree of latitude is longer on this map by 1 / cos 49.9°.
+        assert picture.size == (29, 30)
+        assert picture.size[0] / 30 == pytest.approx(30 * math.cos(math.radians(49.9)) / 20, rel=0.02)
+
+
+class TestPage:
+    def test_correlations_of_what_is_held_equal_say_nothing(self) -> None:
+        camera = Camera(CAMERA.params, size=CAMERA.size, model=CAMERA.model)
+        covariance = torch.diag(torch.tensor([4.0, 4.0, 1.0, 9.0, 0.0])).double()
+        covariance[0, 1] = covariance[1, 0] = -4.0
+        covariance[2, 3] = covariance[3, 2] = -2.4
+        covariance[0, 2] = covariance[2, 0] = 1.0
+        covariance[1, 2] = covariance[2, 1] = -1.0
+        camera.calibration = CameraCalibration(covariance=covariance)
+        assert _correlations(camera)[1:3] == [["cx, cy", "-0.800"], ["fx, cx", "+0.500"]]
+
+    def test_tables_of_a_camera(self) -> None:
+        result = calibrated()
+        facts, rows, correlations = camera_tables(result.camera, result, "left")
+        told = dict(facts)  # type: ignore[arg-type]
+        assert facts[0] == ["left", ""]
+        assert told["image"] == "640 x 480 px"
+        assert told["views, corners"] == "8, 336; 0 left out"
+        assert told["RMS"] == f"{result.rms:.4f} px"
+        assert told["solver"] == result.status.message
+        by_name = {row[0]: row for row in rows[1:]}
+        assert float(by_name["fx"][1]) == pytest.approx(float(result.camera.params[0]), abs=0.01)
+        assert float(by_name["fx"][2]) == pytest.approx(result.sigma["fx"], rel=0.05)
+        assert len(correlations) == 6
+        assert camera_tables(CAMERA)[0][0] == ["camera", ""]
+        assert len(camera_tables(CAMERA)) == 2
+
+    def test_captions(self) -> None:
+        assert _caption("left-views").startswith("Left camera. RMS of each view.")
+        assert _caption("views").startswith("RMS of each view.")
+
+
+def test_cells_of_a_gallery_have_the_image_s_shape() -> None:
+    figure = FIGURES["gallery"]()
+    figure.canvas.draw()
+    for axes in figure.axes:
+        given, used = axes.get_position(original=True), axes.get_position()
+        assert used.width * used.height > 0.9 * given.width * given.height
+    places = [(round(axes.get_position().y0, 2), round(axes.get_position().x0, 2)) for axes in figure.axes]
+    # Two rows of four, the first above.
+    assert len({y for y, _ in places}) == 2
+    assert places == sorted(places, key=lambda place: (-place[0], place[1]))
+    assert set(_PART_COLORS) == {"marks", "lenses", "relative pose", FAULTS}
