@@ -94,6 +94,7 @@ class Cluster:
         return 0
 
     def close(self) -> None:
+        """End all processes."""
         for part in self.parts.values():
             part.send_signal(signal.SIGINT)
         for part in self.parts.values():
@@ -234,7 +235,8 @@ def main() -> None:
         half = len(names) * (given.views + 1) // 2
         with cluster(folder, given.workers) as dask:
             first = batch(source, folder / "resumed", *options, on=dask, every=given.every, stop_after=half)
-        assert first.code == 1 and "the same command" in first.said, first
+        assert first.code == 1, first
+        assert "the same command" in first.said, first
         with cluster(folder, given.workers) as dask:
             second = batch(source, folder / "resumed", *options, on=dask, every=given.every)
         add(
@@ -245,8 +247,9 @@ def main() -> None:
         )
     if given.write:
         size = f"{given.cameras:,} cameras of {given.views} images of {WIDTH} x {HEIGHT}, {given.model}"
-        how = f"`python -m scripts.check.fleet --cameras {given.cameras} --views {given.views} --every {given.every:g} --write`"
-        lines = [*table(HEAD, rows), "", f"{how}: {size}, {given.workers} workers of one thread."]
+        sizes = f"--cameras {given.cameras} --views {given.views} --every {given.every:g}"
+        how = f"`python -m scripts.check.fleet {sizes} --write`: {size}, {given.workers} workers of one thread,"
+        lines = [*table(HEAD, rows), "", f"{how} a kill each {given.every:g} s."]
         write_section("precision.md", "fleet", "\n".join(lines))
     sys.exit(failed)
 
