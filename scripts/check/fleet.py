@@ -1,11 +1,11 @@
 """A fleet on Dask while its workers are killed, and its scheduler once: the results of an undisturbed run.
 
-    python -m scripts.check.fleet [--cameras 1000] [--views 6] [--every 60] [--workers 2] [--write]
+    python -m scripts.check.fleet [--cameras 1000] [--views 6] [--every 100] [--workers 2] [--write]
 
 Photographs of a board are drawn for each camera, which has a focal length, center and distortion of its own. The same
 `kcal batch` is run three times on them: by processes of this machine; by a Dask cluster of this machine, of which a
-worker is killed (SIGKILL) every so many seconds; and by one whose scheduler is killed as well, after half of the work,
-and which a new cluster continues. Shown for each: how many camera files, observations and lines of the table differ
+worker is killed (SIGKILL) after every so many finished pieces of work; and by one whose scheduler is killed as well,
+after half of the work, and which a new cluster continues. A piece is an image or a camera. Shown for each: how many camera files, observations and lines of the table differ
 from the first run in any byte, cameras that are missing or there twice, pieces of work that were kept, processor time
 of all processes, and the largest peak of memory of one process: the command, the scheduler, a worker (Linux).
 """
@@ -125,24 +125,25 @@ def cluster(folder: Path, workers: int) -> Iterator[Cluster]:
 
 
 def batch(
-    source: Path, output: Path, *options: str, on: Cluster | None = None, every: float = 0.0, stop_after: int = 0
+    source: Path, output: Path, *options: str, on: Cluster | None = None, every: int = 0, stop_after: int = 0
 ) -> Run:
-    """`kcal batch`, while workers are killed; the scheduler is, too, once `stop_after` pieces are kept."""
+    """`kcal batch`, while a worker is killed after `every` pieces, and the scheduler after `stop_after`."""
     command = [sys.executable, "-m", "kcal", "batch", str(source), "--board", f"{COLUMNS}x{ROWS}", "--square", "20mm",
                "-o", str(output), *options]  # fmt: skip
     if on is not None:
         command += ["--scheduler", on.address]
     before, peaks, kills = _children_seconds(), Counter[str](), 0
-    next_kill = time.monotonic() + every
+    next_kill = pieces_kept(output) + every
     with tempfile.TemporaryFile("w+") as said:
         running = subprocess.Popen(command, stdout=said, stderr=said, env=_environment())
         while running.poll() is None:
             time.sleep(0.2)
             _note_peaks(peaks, running.pid, on)
-            if on is not None and every and time.monotonic() > next_kill:
+            kept = pieces_kept(output)
+            if on is not None and every and kept >= next_kill:
                 kills += on.kill_worker()
-                next_kill = time.monotonic() + every
-            if on is not None and stop_after and pieces_kept(output) >= stop_after:
+                next_kill = kept + every
+            if on is not None and stop_after and kept >= stop_after:
                 on.parts["scheduler"].kill()
                 stop_after = 0
         said.seek(0)
@@ -199,7 +200,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cameras", type=int, default=1000)
     parser.add_argument("--views", type=int, default=6)
-    parser.add_argument("--every", type=float, default=60.0, metavar="S", help="seconds from one kill to the next")
+    parser.add_argument("--every", type=int, default=100, metavar="N", help="pieces of work from one kill to the next")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--model", default="opencv5", help="lens model")
     parser.add_argument("--refine", default="saddle", help="how corners are refined")
@@ -247,9 +248,9 @@ def main() -> None:
         )
     if given.write:
         size = f"{given.cameras:,} cameras of {given.views} images of {WIDTH} x {HEIGHT}, {given.model}"
-        sizes = f"--cameras {given.cameras} --views {given.views} --every {given.every:g}"
+        sizes = f"--cameras {given.cameras} --views {given.views} --every {given.every}"
         how = f"`python -m scripts.check.fleet {sizes} --write`: {size}, {given.workers} workers of one thread,"
-        lines = [*table(HEAD, rows), "", f"{how} a kill each {given.every:g} s."]
+        lines = [*table(HEAD, rows), "", f"{how} a kill after every {given.every} pieces of work."]
         write_section("precision.md", "fleet", "\n".join(lines))
     sys.exit(failed)
 
