@@ -2,8 +2,8 @@
 
     python -m scripts.bench.memory [STEP ...] [--largest] [--write]
 
-Steps: table, points, image, detect, fleet, views. Each size is a process of its own with one thread, whose input is made
-before by this one; processor time and the memory's peak are those of that whole process, start included. `--largest`
+Steps: table, points, image, detect, fleet, views. Each size is a process of its own with one thread, whose input is
+made before by this one; processor time and the memory's peak are those of that whole process, start included. `--largest`
 adds the sizes that take minutes. Peaks are of `/proc/self/status`, so Linux is needed.
 """
 

@@ -5,9 +5,10 @@
 Photographs of a board are drawn for each camera, which has a focal length, center and distortion of its own. The same
 `kcal batch` is run three times on them: by processes of this machine; by a Dask cluster of this machine, of which a
 worker is killed (SIGKILL) after every so many finished pieces of work; and by one whose scheduler is killed as well,
-after half of the work, and which a new cluster continues. A piece is an image or a camera. Shown for each: how many camera files, observations and lines of the table differ
-from the first run in any byte, cameras that are missing or there twice, pieces of work that were kept, processor time
-of all processes, and the largest peak of memory of one process: the command, the scheduler, a worker (Linux).
+after half of the work, and which a new cluster continues. A piece is an image or a camera. Shown for each: how many
+camera files, observations and tables differ from the first run in any byte, cameras that are missing or there twice,
+pieces of work that were kept, processor time of all processes, and the largest peak of memory of one process: the
+command, the scheduler, a worker (Linux).
 """
 
 from __future__ import annotations
