@@ -1,10 +1,10 @@
 """Processor time and peak memory at steps of ten: long tables, large images, many points, many views.
 
-    python -m scripts.bench.memory [STEP ...] [--largest] [--write]
+    python -m scripts.bench.memory [STEP ...] [--largest | --sizes N ...] [--write]
 
 Steps: table, points, image, detect, fleet, views. Each size is a process of its own with one thread, whose input is
-made before by this one; processor time and the memory's peak are those of that whole process, start included. `--largest`
-adds the sizes that take minutes. Peaks are of `/proc/self/status`, so Linux is needed.
+made before by this one; processor time and the memory's peak are those of that whole process, start included.
+`--largest` adds the sizes that take minutes. Peaks are of `/proc/self/status`, so Linux is needed.
 """
 
 from __future__ import annotations
@@ -243,13 +243,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("steps", nargs="*", metavar="STEP", help=f"{', '.join(STEPS)}; all if none is given")
     parser.add_argument("--largest", action="store_true", help="also the sizes that take minutes")
+    parser.add_argument("--sizes", type=int, nargs="+", metavar="N", help="in place of those of the steps")
     parser.add_argument("--write", action="store_true", help="write the tables into docs/measured/precision.md")
     given = parser.parse_args()
     head = ["what", "size", "CPU s", "peak MB", "result"]
     for name in given.steps or STEPS:
         rows = []
         for step in STEPS[name]:
-            for size in (*step.sizes, *(step.largest if given.largest else ())):
+            for size in given.sizes or (*step.sizes, *(step.largest if given.largest else ())):
                 rows.append(measured(step, size))
                 show([str(rows[-1])])
         if given.write:

@@ -24,7 +24,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -133,7 +133,7 @@ def batch(
                "-o", str(output), *options]  # fmt: skip
     if on is not None:
         command += ["--scheduler", on.address]
-    before, peaks, kills = _children_seconds(), Counter[str](), 0
+    before, peaks, kills = _children_seconds(), defaultdict[str, float](float), 0
     next_kill = pieces_kept(output) + every
     with tempfile.TemporaryFile("w+") as said:
         running = subprocess.Popen(command, stdout=said, stderr=said, env=_environment())
@@ -158,7 +158,7 @@ def pieces_kept(output: Path) -> int:
     return sum(1 for path in work.iterdir() if path.suffix == ".json") if work.exists() else 0
 
 
-def _note_peaks(peaks: Counter[str], command: int, on: Cluster | None) -> None:
+def _note_peaks(peaks: dict[str, float], command: int, on: Cluster | None) -> None:
     pids = {"command": [command]}
     if on is None:
         with contextlib.suppress(psutil.Error):

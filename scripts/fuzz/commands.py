@@ -28,6 +28,7 @@ from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard, load_measured_board, save_measured_board
 from kcal.cli.main import main as command_line
 from kcal.corners.board import Board
+from kcal.corners.images import read_gray
 from kcal.corners.observations import Observations, View
 from kcal.errors import KcalError
 from kcal.files import make_folder
@@ -90,7 +91,7 @@ def make_files(folder: Path) -> dict[str, bytes]:
     rows = [f"p{i},{a},{b},{c},{d}" for i, (a, b, c, d) in enumerate(torch.cat([left, right], 1).tolist())]
     (folder / "marks.csv").write_text("\n".join(["name,left_u,left_v,right_u,right_v", *rows]) + "\n")
     photographs(folder / "photographs", 0, 1)
-    image = cv2.imread(str(folder / "photographs" / "0.png"), cv2.IMREAD_GRAYSCALE)
+    image = read_gray(folder / "photographs" / "0.png")
     for suffix in ("png", "jpg", "tif"):
         cv2.imwrite(str(folder / f"image.{suffix}"), image)
     shutil.rmtree(folder / "photographs")
