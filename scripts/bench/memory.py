@@ -1,10 +1,10 @@
 """Processor time and peak memory at steps of ten: long tables, large images, many points, many views.
 
-    python -m scripts.bench.memory [STEP ...] [--largest] [--write]
+    python -m scripts.bench.memory [STEP ...] [--largest | --sizes N ...] [--write]
 
-Steps: table, points, image, detect, views. Each size is a process of its own with one thread, whose input is made
-before by this one; processor time and the memory's peak are those of that whole process, start included. `--largest`
-adds the sizes that take minutes. Peaks are of `/proc/self/status`, so Linux is needed.
+Steps: table, points, image, detect, fleet, views. Each size is a process of its own with one thread, whose input is
+made before by this one; processor time and the memory's peak are those of that whole process, start included.
+`--largest` adds the sizes that take minutes. Peaks are of `/proc/self/status`, so Linux is needed.
 """
 
 from __future__ import annotations
@@ -102,6 +102,28 @@ options = CalibrationOptions() if "MODEL" == "default" else CalibrationOptions(m
 found = calibrate_camera(observed(np.load(folder / "views.npy").tolist()), options)
 said = f"RMS {found.rms:.4f} px; the noise is 0.2828"
 """
+_FLEET = """
+import dataclasses
+from kcal.calibrate.batch.jobs import BatchOptions, Calibrated, CameraJob, Detected
+from kcal.calibrate.batch.results import Results
+from kcal.calibrate.batch.workers import Task
+from kcal.corners.board import Board
+from kcal.io.camera_file import CameraFile
+board = Board(columns=9, rows=6, square=0.03)
+images = tuple(folder / f"{i}.png" for i in range(6))
+jobs = [CameraJob(name=f"camera-{n}", images=images, board=board, model="opencv5") for n in range(size)]
+results = Results(folder, jobs, BatchOptions())
+for _ in results.tasks(lambda text: None):
+    break
+camera = CameraFile.load(folder / "camera.json")
+for n in range(size):
+    for i in range(6):
+        pixels = tuple((float(u), float(v)) for u, v in torch.rand(54, 2).tolist())
+        found = Detected(size=(640, 480), pixels=pixels, covariance=tuple((u, 0.0, v) for u, v in pixels))
+        for task in results.done(Task(("image", n, i, f"{n}-{i}"), None, ()), found):
+            results.done(task, Calibrated(camera=camera))
+said = f"{len(results.rows()):,} lines of the table"
+"""
 
 
 class Step(NamedTuple):
@@ -165,6 +187,13 @@ def _views(folder: Path, count: int) -> None:
     np.save(folder / "views.npy", pixels + np.random.default_rng(1).normal(0, 0.2, pixels.shape))
 
 
+def _fleet(folder: Path, _: int) -> None:
+    """A camera file, and what stands for images."""
+    save_camera(large_camera(1), folder / "camera.json")
+    for i in range(6):
+        (folder / f"{i}.png").write_bytes(b"")
+
+
 def _default_camera(folder: Path, _: int) -> None:
     save_camera(load_rig(SAMPLE).left, folder / "camera.json")
 
@@ -182,6 +211,7 @@ STEPS = {
     ],
     "image": [Step("`Undistort`, megapixels, uint8", _IMAGE, _image, (1, 10, 100))],
     "detect": [Step("`detect`, megapixels, 9x6 board", _DETECT, _image, (1, 10, 100))],
+    "fleet": [Step("what `kcal batch` keeps, cameras of 6 views", _FLEET, _fleet, (100, 1_000), (10_000,))],
     "views": [
         Step(
             "`calibrate_camera`, views, default lens",
@@ -213,17 +243,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("steps", nargs="*", metavar="STEP", help=f"{', '.join(STEPS)}; all if none is given")
     parser.add_argument("--largest", action="store_true", help="also the sizes that take minutes")
+    parser.add_argument("--sizes", type=int, nargs="+", metavar="N", help="in place of those of the steps")
     parser.add_argument("--write", action="store_true", help="write the tables into docs/measured/precision.md")
     given = parser.parse_args()
     head = ["what", "size", "CPU s", "peak MB", "result"]
     for name in given.steps or STEPS:
         rows = []
         for step in STEPS[name]:
-            for size in (*step.sizes, *(step.largest if given.largest else ())):
+            for size in given.sizes or (*step.sizes, *(step.largest if given.largest else ())):
                 rows.append(measured(step, size))
                 show([str(rows[-1])])
         if given.write:
-            write_section("precision.md", name, "\n".join(table(head, rows)))
+            write_section("precision.md", "fleet memory" if name == "fleet" else name, "\n".join(table(head, rows)))
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ import time
 from pathlib import Path
 
 from kcal.files import make_folder
-from scripts.fuzz.harnesses import HARNESSES
+from scripts.fuzz.harnesses import HARNESSES, missing
 from scripts.fuzz.hunt import corpus, hunt, replay
 
 
@@ -47,6 +47,9 @@ def main() -> None:
     print(f"seed {chosen.seed}", flush=True)
     total = 0
     for name in names:
+        if package := missing(name):
+            print(f"{name}: left out, {package} is not installed", flush=True)
+            continue
         with tempfile.TemporaryDirectory() as folder:
             if kept is not None:
                 found, count = replay(HARNESSES[name], Path(folder), kept[name]), len(kept[name])

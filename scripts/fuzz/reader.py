@@ -75,22 +75,23 @@ class Reader(NamedTuple):
         """The harness of this reader."""
         wholes, path = self.wholes(folder), folder / f"bad{self.suffix}"
 
-        # Large ones seldom: a case of them takes as long as a hundred others.
+        # Large ones seldom: a case of them takes as long as a hundred others. The first, which is made here, is quick.
         small = [whole for whole in wholes if len(whole) < _SMALL] or wholes
 
         @strategies.composite
         def cases(draw: Any) -> bytes:
             rng = draw(strategies.randoms(use_true_random=False))
-            few = wholes if rng.random() < 0.1 else small
+            draw_of = rng.random()
+            few = wholes if draw_of < 0.1 else small if draw_of < 0.4 else wholes[:1]
             return damaged(rng.choice(few), self.suffix, rng)
 
         def check(case: bytes) -> None:
             path.write_bytes(case)
             self.check(path)
 
-        for whole in wholes:
-            check(whole)
-            self.read(path)  # which is accepted
+        # That files of earlier versions are accepted is tested with them.
+        check(wholes[0])
+        self.read(path)
         return Prepared(cases(), check)
 
 

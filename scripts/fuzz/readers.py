@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import warnings
 from collections.abc import Callable
@@ -10,7 +11,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import pytest
 import torch
 
 from kcal.calibrate.batch.jobs import read_jobs
@@ -66,7 +66,7 @@ def _video(path: Path) -> None:
 
 
 def _raster(path: Path) -> None:
-    rasterio = pytest.importorskip("rasterio")
+    rasterio = importlib.import_module("rasterio")
     with warnings.catch_warnings(action="ignore"), rasterio.open(
         path, "w", driver="GTiff", width=8, height=8, count=1, dtype="float32", crs="EPSG:4326",
         transform=rasterio.transform.from_origin(20.0, 10.0, 0.01, 0.01),
@@ -129,7 +129,7 @@ def _positions(path: Path) -> None:
 
 
 def _fits(path: Path) -> None:
-    fits = pytest.importorskip("astropy.io.fits")
+    fits = importlib.import_module("astropy.io.fits")
     fits.writeto(path, overwrite=True, data=np.arange(48, dtype=np.float32).reshape(6, 8))
 
 

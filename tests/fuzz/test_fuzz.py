@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import re
 import signal
@@ -21,7 +20,7 @@ pytest.importorskip("starlette", reason="the extra `mark` is not installed")
 
 from kcal.errors import FileError
 from scripts.fuzz import hunt
-from scripts.fuzz.harnesses import HARNESSES
+from scripts.fuzz.harnesses import HARNESSES, missing
 from scripts.fuzz.reader import Reader, whole_text
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="cases run in child processes")
@@ -32,7 +31,6 @@ CORPUS = Path(__file__).parent / "corpus"
 ROOT = CORPUS.parents[2]
 # Processes for all harnesses, which two workers share.
 GROUPS = 6
-NEEDED = {"terrain": "rasterio", "FITS": "astropy"}
 
 
 def counts(names: list[str], *options: str) -> dict[str, int]:
@@ -40,8 +38,8 @@ def counts(names: list[str], *options: str) -> dict[str, int]:
 
     In a process of its own: the children are forked, and other tests have left threads in this one.
     """
-    there = [name for name in names if importlib.util.find_spec(NEEDED.get(name, "kcal"))]
-    command = [sys.executable, "-m", "scripts.fuzz", *options, *there]
+    there = [name for name in names if not missing(name)]
+    command = [sys.executable, "-m", "scripts.fuzz", *options, *names]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, f"{command}\n{done.stdout}{done.stderr}"
     told = re.findall(r"^(.+): (\d+) cases, 0 findings$", done.stdout, re.MULTILINE)

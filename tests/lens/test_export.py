@@ -10,6 +10,7 @@ import safetensors.torch
 import torch
 from lenses import HYBRID, strong
 from torch import Tensor, nn
+from whole_graphs import traced_whole
 
 from kcal.errors import FileError, InputError
 from kcal.io.onnx_file import save_onnx
@@ -147,6 +148,7 @@ def test_onnx_refuses_what_it_cannot_write(tmp_path: Path) -> None:
         save_onnx(make_camera("opencv5"), POINTS[None], tmp_path / "camera.onnx")
 
 
+@traced_whole
 @pytest.mark.parametrize("direction", DIRECTIONS)
 def test_code_is_generated(direction: str) -> None:
     """With the real compiler, not only the tracer; one model, because it takes long."""
@@ -154,6 +156,7 @@ def test_code_is_generated(direction: str) -> None:
     assert_same(torch.compile(module, fullgraph=True)(points), module(points))
 
 
+@traced_whole
 def test_graphs_flag_pixels_without_a_ray() -> None:
     """Corners beyond the fold (kornia issue 3273), where the number of steps is fixed."""
     camera = Camera.build(

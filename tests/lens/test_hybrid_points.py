@@ -10,6 +10,7 @@ import pytest
 import torch
 from lenses import FEW_MODES, KINDS, hybrid_camera
 from torch import Tensor
+from whole_graphs import traced_whole
 
 from kcal.lens.camera import Camera
 from kcal.lens.hybrid_points import FEWEST, PIECE, Forward
@@ -205,6 +206,7 @@ class TestDerivatives:
         mapped = torch.func.vmap(lambda p: camera.project(p)[0])(torch.stack([points, points]))
         assert distance(mapped[1], plain) < 1e-9
 
+    @traced_whole
     def test_compiled(self) -> None:
         camera = hybrid_camera("webcam", modes=FEW_MODES)
         points = random_points(camera, count=FEWEST)

@@ -6,6 +6,7 @@ import pytest
 import torch
 from kornia.geometry.subpix import spatial_soft_argmax2d
 from locate_rigs import SIZE, pinhole_rig, real_rig, spread_points, tensor, turned
+from whole_graphs import traced_whole
 
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
@@ -334,6 +335,7 @@ def test_sensitivities() -> None:
     assert moved.abs().tolist() == pytest.approx([4.3633, 0.17453], rel=2e-3)
 
 
+@traced_whole
 def test_compiles_as_one_graph_with_its_gradients() -> None:
     module = StereoLocalizer(pinhole_rig(), origin=ORIGIN, heading_deg=0.0)
     left, right = tensor([980.0, 540.0], [960.0, 540.0], [1.0, 1.0]), tensor([970.0, 540.2], [970.0, 540.0], [1.0, 1.0])

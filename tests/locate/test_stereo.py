@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from lenses import hybrid_camera
 from locate_rigs import SIZE, pinhole_rig, real_rig, spread_points, tensor, turned
+from whole_graphs import traced_whole
 
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
@@ -233,6 +234,7 @@ class ClosedForm(Camera):
         return (pixels - self.center) / self.focal, torch.isfinite(pixels).all(-1)
 
 
+@traced_whole
 def test_compiles_as_one_graph() -> None:
     camera = ClosedForm.build(focal=(1600, 1600), center=(959.5, 539.5), size=SIZE, model="pinhole")
     triangulate = Triangulate(StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0])))

@@ -12,6 +12,7 @@ import faulthandler
 import hashlib
 import io
 import os
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -106,9 +107,8 @@ def read_jobs(source: Path, board: Board | None, model: str) -> list[CameraJob]:
             raise FileError(f"{source}: no folders in it; make one folder of images for each camera, or give a CSV")
     else:
         rows = _read_table(source)
-    names = [row["camera"] for row in rows]
-    for name in names:
-        if names.count(name) > 1:
+    for name, times in Counter(row["camera"] for row in rows).items():
+        if times > 1:
             raise InputError(f"{source}: two cameras are named {name!r}")
         if not name or Path(name).name != name or name.startswith("."):
             raise InputError(f"{source}: {name!r} cannot name a camera: it becomes a file name")
@@ -123,7 +123,9 @@ def pieces(jobs: Sequence[CameraJob]) -> int:
 def sharing_jobs(jobs: Sequence[CameraJob]) -> list[list[int]]:
     """Which cameras may have seen one board: those with the hybrid lens and boards of one kind."""
     hybrid = [i for i, job in enumerate(jobs) if not job.error and job.model == HYBRID]
-    kinds = {str(jobs[i].board): [j for j in hybrid if jobs[j].board == jobs[i].board] for i in hybrid}
+    kinds: dict[str, list[int]] = {}
+    for i in hybrid:
+        kinds.setdefault(repr(jobs[i].board), []).append(i)
     return [numbers for numbers in kinds.values() if len(numbers) > 1]
 
 

@@ -143,6 +143,9 @@ class Results:
         # What was done about images of several sizes.
         self._notes: dict[int, str] = {}
         self._calibrated: dict[int, Calibrated] = {}
+        # Cameras whose views are needed once more when all are done; of the others only their line is kept.
+        self._share = {number for numbers in sharing_jobs(jobs) for number in numbers}
+        self._rows: dict[int, SummaryRow] = {}
 
     def tasks(self, advance: Callable[[str], None]) -> Iterator[Task]:
         """Yield what is left to do, image after image; `advance` is called after each piece of work."""
@@ -212,6 +215,11 @@ class Results:
             result.camera.save(path)
         else:
             path.unlink(missing_ok=True)  # of an earlier run with other images: not this one's result
+        self._pieces[number].clear()
+        if number not in self._share:
+            self._rows[number] = self._row(number, self.jobs[number])
+            del self._calibrated[number]
+            self._views.pop(number, None)
         self._advance(self.jobs[number].name)
 
     def share(self, numbers: Sequence[int], crew: Pool) -> None:
@@ -258,7 +266,7 @@ class Results:
 
     def rows(self) -> list[SummaryRow]:
         """The table, in the order of the cameras."""
-        return [self._row(number, job) for number, job in enumerate(self.jobs)]
+        return [self._rows.get(number) or self._row(number, job) for number, job in enumerate(self.jobs)]
 
     def _row(self, number: int, job: CameraJob) -> SummaryRow:
         result = self._calibrated.get(number, Calibrated(error=job.error))

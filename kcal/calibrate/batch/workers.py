@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import os
 import signal
@@ -64,11 +65,18 @@ class Pool:
         self._alone_since: float | None = None
         if scheduler is not None:
             self._client = _connect(scheduler)
-            self.workers = max(1, sum(self._client.nthreads().values()))
+            self.workers, self._counted_at = 1, -math.inf
 
     @property
     def ahead(self) -> int:
-        """How many tasks to hand out at a time: enough to keep workers busy, few enough to hold in memory."""
+        """How many tasks to hand out at a time: enough to keep workers busy, few enough to hold in memory.
+
+        Workers of a scheduler come and go, so they are counted again from time to time.
+        """
+        if self._client is not None and time.monotonic() - self._counted_at > _LOOK:
+            self._counted_at = time.monotonic()
+            with suppress(OSError, TimeoutError, CancelledError):  # `check` tells what is missing
+                self.workers = max(1, sum(self._client.nthreads().values()))
         return 3 * self.workers
 
     def submit(self, task: Task) -> Future[Any]:
@@ -83,6 +91,8 @@ class Pool:
                 self._executor = ProcessPoolExecutor(self.workers, mp_context=context, initializer=_begin)
         try:
             with deaf_to_interrupts():
+                if self._client is not None:
+                    return self._executor.submit(_in_one_thread, task.function, *task.arguments)
                 return self._executor.submit(task.function, *task.arguments)
         except (RuntimeError, OSError, ValueError) as error:
             # What a closed Dask client raises; a broken pool of processes is the caller's to mend.
@@ -216,14 +226,18 @@ def _one_thread() -> None:
     limit_threads(1)
 
 
+def _in_one_thread(function: Callable[..., Any], *arguments: Any) -> Any:
+    """A task on a worker of a scheduler, which may have been started a moment ago, after another one died."""
+    _one_thread()
+    return function(*arguments)
+
+
 def _connect(address: str) -> Any:
     try:
         from distributed import Client
     except ImportError:
         raise InputError('--scheduler needs Dask: pip install "kcal[dask]"') from None
     try:
-        client = Client(address, timeout=15, set_as_default=False)
-        client.run(_one_thread)
+        return Client(address, timeout=15, set_as_default=False)
     except (OSError, ValueError) as error:
         raise FileError(f"{address}: no Dask scheduler answers here: {error}") from error
-    return client

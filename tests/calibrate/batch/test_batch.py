@@ -376,6 +376,17 @@ def test_command_line(folder, tmp_path, monkeypatch):
     assert not (tmp_path / "none").exists()
 
 
+def test_only_the_lines_of_finished_cameras_are_kept(folder, tmp_path):
+    """Unless they measure a board together."""
+    for model, kept in (("pinhole", 0), ("hybrid", 2)):
+        jobs = read_jobs(folder, BOARD, model)
+        results = Results(tmp_path / model, jobs, BatchOptions())
+        run_tasks(results.tasks(lambda _: None), results.done, Here())
+        assert (len(results._views), len(results._calibrated)) == (kept, kept)
+        assert not any(results._pieces)
+        assert [(row.camera, row.status, row.views) for row in results.rows()] == [("east", "ok", 4), ("west", "ok", 4)]
+
+
 @pytest.mark.slow
 def test_dask(folder, tmp_path):
     distributed = pytest.importorskip("distributed")

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import time
 from concurrent.futures import BrokenExecutor, Future
 from typing import Any
 
+import cv2
 import pytest
+import torch
 
 from kcal.calibrate.batch import workers as module
 from kcal.calibrate.batch.workers import WORKERS_BACK, Pool, Task, WorkerDiedError, pool, run_tasks
@@ -181,16 +184,36 @@ def client(monkeypatch: pytest.MonkeyPatch) -> Client:
 
 def test_a_scheduler_counts_its_threads(client: Client) -> None:
     with pool(7, "tcp://x") as crew:
-        assert crew.workers == 5
         assert crew.ahead == 15
+        client.threads = {"a": 1, "b": 1, "c": 1}
+        assert crew.ahead == 15  # not asked every time
+        time.sleep(0.02)
+        assert crew.ahead == 9
+        client.threads = None
+        time.sleep(0.02)
+        assert crew.ahead == 9  # as it was
+        client.threads = {"a": 3}
         assert crew.submit(Task(0, abs, (-4,))).result() == 4
         client.status = "closed"
         with pytest.raises(FileError, match="the Dask scheduler or its last worker is gone"):
             crew.submit(Task(0, abs, (-4,)))
     assert client.closed == 5
     client.threads = {}
-    assert Pool(7, "tcp://x").workers == 1
+    assert Pool(7, "tcp://x").ahead == 3
     assert Pool(7).ahead == 21
+
+
+def test_each_task_of_a_scheduler_has_one_thread(client: Client) -> None:
+    """Also on a worker that was started after the connection."""
+    before = torch.get_num_threads(), cv2.getNumThreads()
+    torch.set_num_threads(2)
+    cv2.setNumThreads(2)
+    try:
+        crew = Pool(1, "tcp://x")
+        assert crew.submit(Task(0, lambda: (torch.get_num_threads(), cv2.getNumThreads()), ())).result() == (1, 1)
+    finally:
+        torch.set_num_threads(before[0])
+        cv2.setNumThreads(before[1])
 
 
 def test_workers_have_a_minute_to_come_back(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,278 @@
+"""A fleet on Dask while its workers are killed, and its scheduler once: the results of an undisturbed run.
+
+    python -m scripts.check.fleet [--cameras 1000] [--views 6] [--every 100] [--workers 2] [--write]
+
+Photographs of a board are drawn for each camera, which has a focal length, center and distortion of its own. The same
+`kcal batch` is run three times on them: by processes of this machine; by a Dask cluster of this machine, of which a
+worker is killed (SIGKILL) after every so many finished pieces of work; and by one whose scheduler is killed as well,
+after half of the work, and which a new cluster continues. A piece is an image or a camera. Shown for each: how many
+observations differ from the first run in any byte, how far cameras differ, cameras that are missing or there twice,
+pieces of work that were kept, processor time of all processes, and the largest peak of memory of one process: the
+command, the scheduler, a worker (Linux).
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import csv
+import itertools
+import os
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import psutil
+
+from scripts.shared.page import table, write_section
+from scripts.shared.small_photographs import COLUMNS, HEIGHT, ROWS, WIDTH, photographs
+from scripts.shared.timing import show
+
+# In σ: fits of the same corners in two processes can differ in their last digits.
+_SAME = 1e-4
+_BEGINS = 60.0  # seconds that a scheduler and its workers have to begin
+HEAD = [
+    "run", "workers killed", "observations that differ", "largest difference, σ", "missing or twice", "pieces kept",
+    "CPU s", "peak MB: command", "scheduler", "worker",
+]  # fmt: skip
+
+
+class Run(NamedTuple):
+    """What is known of one run of the command: exit code, what it said, processor time, peaks of memory by role."""
+
+    code: int
+    said: str
+    seconds: float
+    peaks: dict[str, float]
+    kills: int
+
+
+class Cluster:
+    """A Dask scheduler and workers under nannies, each a process; `kill_worker` ends one worker, not its nanny."""
+
+    def __init__(self, folder: Path, workers: int) -> None:
+        self._where = folder / f"scheduler-{time.time_ns()}.json"
+        self._turn = itertools.count()
+        self.parts = {"scheduler": self._start("scheduler", "--port", "0")}
+        until = time.monotonic() + _BEGINS
+        while not self._where.exists() and time.monotonic() < until:
+            time.sleep(0.1)
+        for number in range(workers):
+            self.parts[f"nanny {number}"] = self._start(
+                "worker", "--nthreads", "1", "--nworkers", "1", "--local-directory", str(folder)
+            )
+
+    def _start(self, kind: str, *options: str) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", f"distributed.cli.dask_{kind}", *options, "--host", "127.0.0.1",
+                   "--no-dashboard", "--scheduler-file", str(self._where)]  # fmt: skip
+        return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=_environment())
+
+    @property
+    def address(self) -> str:
+        """Of the scheduler."""
+        return next(word for word in self._where.read_text().split('"') if word.startswith("tcp://"))
+
+    def workers(self) -> list[psutil.Process]:
+        """The processes that do the work."""
+        found = []
+        for name, nanny in self.parts.items():
+            if name != "scheduler":
+                with contextlib.suppress(psutil.Error):
+                    found += [child for child in psutil.Process(nanny.pid).children(recursive=True) if _works(child)]
+        return found
+
+    def kill_worker(self) -> int:
+        """How many workers were killed: one, in turn, or none where none is there."""
+        there = self.workers()
+        if not there:
+            return 0
+        with contextlib.suppress(psutil.Error):
+            there[next(self._turn) % len(there)].kill()
+            return 1
+        return 0
+
+    def close(self) -> None:
+        """End all processes."""
+        for part in self.parts.values():
+            part.send_signal(signal.SIGINT)
+        for part in self.parts.values():
+            try:
+                part.wait(20)
+            except subprocess.TimeoutExpired:
+                part.kill()
+                part.wait()
+
+
+def _works(process: psutil.Process) -> bool:
+    with contextlib.suppress(psutil.Error):
+        return "spawn_main" in " ".join(process.cmdline())
+    return False
+
+
+def _environment() -> dict[str, str]:
+    return os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+
+
+@contextlib.contextmanager
+def cluster(folder: Path, workers: int) -> Iterator[Cluster]:
+    started = Cluster(folder, workers)
+    try:
+        yield started
+    finally:
+        started.close()
+
+
+def batch(
+    source: Path, output: Path, *options: str, on: Cluster | None = None, every: int = 0, stop_after: int = 0
+) -> Run:
+    """`kcal batch`, while a worker is killed after `every` pieces, and the scheduler after `stop_after`."""
+    command = [sys.executable, "-m", "kcal", "batch", str(source), "--board", f"{COLUMNS}x{ROWS}", "--square", "20mm",
+               "-o", str(output), *options]  # fmt: skip
+    if on is not None:
+        command += ["--scheduler", on.address]
+    before, peaks, kills = _children_seconds(), defaultdict[str, float](float), 0
+    next_kill = pieces_kept(output) + every
+    with tempfile.TemporaryFile("w+") as said:
+        running = subprocess.Popen(command, stdout=said, stderr=said, env=_environment())
+        while running.poll() is None:
+            time.sleep(0.2)
+            _note_peaks(peaks, running.pid, on)
+            kept = pieces_kept(output)
+            if on is not None and every and kept >= next_kill:
+                kills += on.kill_worker()
+                next_kill = kept + every
+            if on is not None and stop_after and kept >= stop_after:
+                on.parts["scheduler"].kill()
+                stop_after = 0
+        said.seek(0)
+        text = said.read()
+    return Run(running.returncode, text, _children_seconds() - before, dict(peaks), kills)
+
+
+def pieces_kept(output: Path) -> int:
+    """Finished pieces of work in a batch's folder."""
+    work = output / ".work"
+    return sum(1 for path in work.iterdir() if path.suffix == ".json") if work.exists() else 0
+
+
+def _note_peaks(peaks: dict[str, float], command: int, on: Cluster | None) -> None:
+    pids = {"command": [command]}
+    if on is None:
+        with contextlib.suppress(psutil.Error):
+            pids["worker"] = [child.pid for child in psutil.Process(command).children() if _works(child)]
+    else:
+        pids |= {"scheduler": [on.parts["scheduler"].pid], "worker": [process.pid for process in on.workers()]}
+    for role, of_role in pids.items():
+        for pid in of_role:
+            with contextlib.suppress(OSError, StopIteration):
+                lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+                peak = int(next(line.split()[1] for line in lines if line.startswith("VmHWM"))) / 1024.0
+                peaks[role] = max(peaks[role], peak)
+
+
+def _children_seconds() -> float:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def differing(found: Path, expected: Path) -> int:
+    """How many files of observations differ in any byte from those of another run, or are in one of both only."""
+    names = {path.name for folder in (found, expected) for path in folder.glob("*.obs.json")}
+    return sum(1 for name in names if _bytes(found / name) != _bytes(expected / name))
+
+
+def farthest(found: Path, expected: Path) -> float:
+    """Largest difference of focal lengths and centers in the tables of two runs, in σ of the focal length."""
+    if not (found / "summary.csv").exists():
+        return float("inf")
+    one, two = (list(csv.DictReader((folder / "summary.csv").open())) for folder in (found, expected))
+    return max(
+        abs(float(a[name] or "nan") - float(b[name] or "nan")) / float(b["sigma_fx"] or "nan")
+        for a, b in zip(one, two, strict=True)
+        for name in ("fx", "fy", "cx", "cy", "focal")
+    )
+
+
+def _bytes(path: Path) -> bytes | None:
+    return path.read_bytes() if path.exists() else None
+
+
+def missing_or_twice(output: Path, names: list[str]) -> int:
+    """Cameras that are not exactly once, and calibrated, in the table."""
+    if not (output / "summary.csv").exists():
+        return len(names)
+    with (output / "summary.csv").open() as file:
+        rows = Counter(row["camera"] for row in csv.DictReader(file) if row["status"] == "ok")
+    return sum(rows[name] != 1 for name in names) + sum(name not in names for name in rows)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cameras", type=int, default=1000)
+    parser.add_argument("--views", type=int, default=6)
+    parser.add_argument("--every", type=int, default=100, metavar="N", help="pieces of work from one kill to the next")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--model", default="opencv5", help="lens model")
+    parser.add_argument("--refine", default="saddle", help="how corners are refined")
+    parser.add_argument("--write", action="store_true", help="write the table into docs/measured/precision.md")
+    given = parser.parse_args()
+    rows, failed = [], False
+    with tempfile.TemporaryDirectory(prefix="kcal-fleet-") as name:
+        folder = Path(name)
+        names = [f"camera-{number:05d}" for number in range(given.cameras)]
+        for number, camera in enumerate(names):
+            photographs(folder / "images" / camera, number, given.views)
+        source, options = folder / "images", ("--model", given.model, "--refine", given.refine)
+
+        def add(title: str, output: Path, runs: list[Run], seconds: float) -> None:
+            nonlocal failed
+            differ, wrong = differing(output, folder / "whole"), missing_or_twice(output, names)
+            away = farthest(output, folder / "whole")
+            failed |= bool(differ or wrong or runs[-1].code) or not away < _SAME
+            peaks = {role: max(run.peaks.get(role, 0.0) for run in runs) for role in ("command", "scheduler", "worker")}
+            kills = str(sum(run.kills for run in runs))
+            memory = [f"{peak:.0f}" if peak else "–" for peak in peaks.values()]
+            counts = [f"{differ:,} of {len(names):,}", f"{away:.0e}", f"{wrong}", f"{pieces_kept(output):,}"]
+            rows.append([title, kills, *counts, f"{seconds:.0f}", *memory])
+            show([" | ".join(rows[-1]), *(run.said.strip().splitlines()[-1] for run in runs)])
+
+        whole = batch(source, folder / "whole", "--workers", str(given.workers), *options)
+        add("processes, undisturbed", folder / "whole", [whole], whole.seconds)
+
+        before = _children_seconds()
+        with cluster(folder, given.workers) as dask:
+            run = batch(source, folder / "killed", *options, on=dask, every=given.every)
+        add("Dask, workers killed", folder / "killed", [run], _children_seconds() - before)
+
+        before = _children_seconds()
+        half = len(names) * (given.views + 1) // 2
+        with cluster(folder, given.workers) as dask:
+            first = batch(source, folder / "resumed", *options, on=dask, every=given.every, stop_after=half)
+        assert first.code == 1, first
+        assert "the same command" in first.said, first
+        with cluster(folder, given.workers) as dask:
+            second = batch(source, folder / "resumed", *options, on=dask, every=given.every)
+        add(
+            "Dask, also its scheduler, then continued",
+            folder / "resumed",
+            [first, second],
+            _children_seconds() - before,
+        )
+    if given.write:
+        size = f"{given.cameras:,} cameras of {given.views} images of {WIDTH} x {HEIGHT}, {given.model}"
+        sizes = f"--cameras {given.cameras} --views {given.views} --every {given.every}"
+        how = f"`python -m scripts.check.fleet {sizes} --write`: {size}, {given.workers} workers of one thread,"
+        lines = [*table(HEAD, rows), "", f"{how} a kill after every {given.every} pieces of work."]
+        write_section("precision.md", "fleet", "\n".join(lines))
+    sys.exit(failed)
+
+
+if __name__ == "__main__":
+    main()
