@@ -54,10 +54,19 @@ def with_common_errors(
     if not len(places):
         return list(covariance)
     found = [off_line(*one) for one in zip(rigs, pixels, covariance, strict=True)]
-    error, sigma = (torch.cat(part) for part in zip(*found, strict=True))
+    off, sigma = (torch.cat(part) for part in zip(*found, strict=True))
     pair = torch.repeat_interleave(torch.tensor([len(own) for own in pixels]))
-    error = _without_lenses(error, sigma, places[:, 0])
-    good = error.abs() < _WRONG * sigma
+    kind = _classes(torch.cat(list(slant)), len(pixels))
+    scale, floor, common = (torch.zeros(len(places), dtype=torch.float64) for _ in range(3))
+    variance = sigma.square()
+    # What is smooth over the image is told best by those that turn out to be good.
+    for _ in range(2):
+        error = _without_lenses(off, variance.sqrt(), places[:, 0])
+        good = error.abs() < _WRONG * sigma
+        for one in kind.unique():
+            own = kind == one
+            scale[own], floor[own] = _error_variance(error[own & good], sigma[own & good])
+        variance = scale * sigma.square() + floor
     still = places[:, 0] - _shifts(places, pair)[pair]
     near = torch.from_numpy(cKDTree(still.numpy()).query_pairs(PATCH, p=math.inf, output_type="ndarray")).long()
     same_time = pair[near[:, 0]] == pair[near[:, 1]]
@@ -67,12 +76,6 @@ def with_common_errors(
     disparity = places[:, 1] - places[:, 0]
     alike = (disparity[near[:, 0]] - disparity[near[:, 1]]).abs().amax(1) < _SAME_DISPARITY
     same = ~same_time & alike & (apart < _SAME_PLACE).all(1) & good[near].all(1)
-    kind = _classes(torch.cat(list(slant)), len(pixels))
-    scale, floor, common = (torch.zeros(len(places), dtype=torch.float64) for _ in range(3))
-    for one in kind.unique():
-        own = kind == one
-        scale[own], floor[own] = _error_variance(error[own & good], sigma[own & good])
-    variance = scale * sigma.square() + floor
     for one in kind.unique():
         own = kind == one
         common[own] = _common_share(error, variance, near[same & own[near].all(1)], overlap[same & own[near].all(1)])
@@ -121,7 +124,7 @@ def _without_lenses(error: Tensor, sigma: Tensor, pixels: Tensor) -> Tensor:
     good = (error.abs() < _WRONG * sigma).nonzero()[:, 0]
     if len(good) < 4 * len(powers):
         return error
-    weight = 1.0 / (sigma[good] + sigma.median())
+    weight = 1.0 / sigma[good]
     fit = torch.linalg.lstsq(columns[good] * weight[:, None], (error[good] * weight)[:, None], driver="gelsd").solution
     return error - (columns @ fit)[:, 0]
 

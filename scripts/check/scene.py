@@ -21,8 +21,9 @@ import functools
 import math
 import pickle
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -242,25 +243,35 @@ YAW_HEADS = (
     "pictures, px", "pairs", "matches", "terrains", "bound of noise", "σ of yaw", "RMS error", "over σ", "inside 95 %",
     "pose χ² of 3",
 )  # fmt: skip
-# Pairs of which the first ones are also solved alone.
-PARTS = (1, 3, 10)
+T = TypeVar("T")
 
 
-def matched_pair(terrain: Terrain, scale: float, moment: int, hour: float, folder: Path) -> tuple[ImagePair, MatchedPair]:
-    """A pair and its matches, from the folder if they are there.
-
-    Raises:
-        InputError: too little in common, as `match_scene`.
-    """
-    file = folder / f"{scale}-{terrain.seed}-{moment}-{hour:.2f}.pickle"
-    if file.exists():
-        found: tuple[ImagePair, MatchedPair] = pickle.loads(file.read_bytes())
-        return found
-    pair = photographed(terrain, moment, Weather(hour=hour))
-    found = pair, match_scene(exact(scale), pair)
-    folder.mkdir(parents=True, exist_ok=True)
-    file.write_bytes(pickle.dumps(found))
+def kept(file: Path, make: Callable[[], T]) -> T:
+    """What a file holds, or what is made and then kept there."""
+    if not file.exists():
+        made = make()
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(pickle.dumps(made))
+    found: T = pickle.loads(file.read_bytes())
     return found
+
+
+def all_matches(scale: float, count: int, times: str, seed: int, folder: Path) -> tuple[MatchedPair, list[MatchedPair]]:
+    """Matches of the first pair, and those of all pairs that stand still in the others; pictures are kept as well."""
+    terrain = Terrain(rig_of(scale), seed)
+
+    def matched(moment: int, hour: float) -> tuple[ImagePair, MatchedPair]:
+        pair = photographed(terrain, moment, Weather(hour=hour))
+        return pair, match_scene(exact(scale), pair)
+
+    found = []
+    for moment, hour in enumerate([12.0] * count if times == "minute" else np.linspace(8.0, 17.0, count).tolist()):
+        # Pairs that are refused are left out, as `kcal rig` does.
+        with contextlib.suppress(InputError):
+            file = folder / f"{scale}-{seed}-{moment}-{hour:.2f}.pickle"
+            found.append(kept(file, functools.partial(matched, moment, hour)))
+    pairs, matches = map(list, zip(*found, strict=True))
+    return matches[0], still_matches(pairs, matches)
 
 
 def noise_bound(rig: TrueRig, cameras: tuple[Camera, Camera], found: list[MatchedPair]) -> float:
@@ -283,22 +294,14 @@ def noise_bound(rig: TrueRig, cameras: tuple[Camera, Camera], found: list[Matche
 @torch.no_grad()
 def yaw_of(scale: float, count: int, times: str, seed: int, folder: Path) -> Record:
     """Yaw from rendered pairs of one terrain with exact lenses: error and σ in degrees, χ² of the relative rotation."""
-    rig, cameras, terrain = rig_of(scale), exact(scale), Terrain(rig_of(scale), 100 + seed)
+    rig, cameras = rig_of(scale), exact(scale)
     tape = Baseline(first=0, second=1, length=float(rig.baseline), sigma=TAPE)
-    hours = [12.0] * count if times == "minute" else np.linspace(8.0, 17.0, count).tolist()
-    pairs, matched = [], []
-    for moment, hour in enumerate(hours):
-        # Pairs that are refused are left out, as `kcal rig` does.
-        with contextlib.suppress(InputError):
-            pair, one = matched_pair(terrain, scale, moment, hour, folder)
-            pairs.append(pair)
-            matched.append(one)
+    file = folder / f"{scale}-{100 + seed}-{count}-{times}.pickle"
+    first, still = kept(file, lambda: all_matches(scale, count, times, 100 + seed, folder))
     record: Record = {}
-    for some in (*(part for part in PARTS if part < count), count):
-        if times == "day" and some < count:
-            continue
-        still = still_matches(pairs[:some], matched[:some])
-        features = counted(still, rig.left.size).features
+    for some in {1, 3, count} if times == "minute" else {count}:
+        found = [first] if some == 1 else still[:some]
+        features = counted(found, rig.left.size).features
         data = RigData(cameras=cameras, names=NAMES, features=features, baselines=(tape,))
         result = solve_rig(data, RigOptions(intrinsics="fixed"))
         turn = vector_from_rotation(result.rotation[1] @ result.rotation[0].T @ rig.right_from_left_rotation.T)
@@ -306,7 +309,7 @@ def yaw_of(scale: float, count: int, times: str, seed: int, folder: Path) -> Rec
         record[f"{some} of a {times}"] = {
             "error": math.degrees(float(turn[1])), "sigma": math.degrees(float(covariance[1, 1].sqrt())),
             "chi2": float(turn @ torch.linalg.solve(covariance, turn)), "matches": len(features.names),
-            "bound": noise_bound(rig, cameras, still),
+            "bound": noise_bound(rig, cameras, found),
         }  # fmt: skip
     return record
 
