@@ -1,8 +1,9 @@
 """What errors of matches have in common: overlapping patches, and one thing in several pairs.
 
-The fit of a match tells what noise does to it. What remains, of interpolation and of edges that are no plane, shows in
-how far matches lie off their epipolar lines, and most of it is the same whenever the same thing is seen in the same
-light: it is no smaller after a hundred pairs. Both parts are learned from the matches themselves.
+The fit of a match tells what noise does to it. What remains shows in how far matches lie off their epipolar lines, and
+most of it is the same whenever the same thing is seen in the same light: it is no smaller after a hundred pairs. It
+comes from patches that look different in both images: ground at a slant, whose blur is another one in each, and edges
+before something farther away. Both parts are learned from the matches themselves, for classes of slant.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ _SWAY, _SAME_DISPARITY, _SAME_PLACE = 8.0, 1.5, 1.5
 _WRONG = 5.0
 # Pairs of matches of one thing without which nothing is learned: then all that is not noise counts as common.
 _FEWEST = 50
-# Classes of slant.
+# Classes of slant: with four, yaw from three pairs of a minute was 4 % better than with one.
 _CLASSES = 4
 # Degree of the polynomial that takes errors of lenses out, which are known from elsewhere and smooth.
 _DEGREE = 4
@@ -81,7 +82,7 @@ def with_common_errors(
         common[own] = _common_share(error, variance, near[same & own[near].all(1)], overlap[same & own[near].all(1)])
     common = common * variance
     weight = 1.0 / (common + (variance - common) / len(pixels))
-    part = torch.where(same_time, *(overlap * one[near].prod(1).sqrt() for one in (variance, common)))
+    part = overlap * torch.where(same_time[:, None], variance[near], common[near]).prod(1).sqrt()
     total = variance * weight
     for side in (0, 1):
         total.index_add_(0, near[:, side], part * weight[near[:, 1 - side]])

@@ -351,7 +351,7 @@ def common() -> list[str]:
         z: tuple[list[float], list[float]] = [], []
         for first in range(0, 7 - count, count):
             some = found[first : first + count]
-            parts = [one.rig for one in some], [one.pixels for one in some], [one.covariance for one in some]
+            parts = [[getattr(one, part) for one in some] for part in ("rig", "pixels", "covariance", "slant")]
             pixels, stated = torch.cat(parts[1]), torch.cat(parts[2])
             rig, _ = posed(found[0].rig, pixels, stated)
             place = (pixels[:, 0] / BLOCK).long()
