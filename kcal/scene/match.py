@@ -88,19 +88,22 @@ class MatchedPair(NamedTuple):
     Attributes:
         pixels: (M, 2, 2) left and right.
         covariance: (M, 2, 2) px² of the right one, the left one being given.
+        slant: (M,) see `kcal.scene.refine.RefinedMatches`.
         counts: what became of the others.
         rig: with a baseline of one, as these matches make it.
     """
 
     pixels: Tensor
     covariance: Tensor
+    slant: Tensor
     counts: PairCounts
     rig: StereoRig
 
     def at(self, which: Tensor, **counts: Any) -> MatchedPair:
         """Those at some places."""
         counted = dataclasses.replace(self.counts, **counts)
-        return self._replace(pixels=self.pixels[which], covariance=self.covariance[which], counts=counted)
+        pixels, covariance, slant = self.pixels[which], self.covariance[which], self.slant[which]
+        return MatchedPair(pixels, covariance, slant, counted, self.rig)
 
 
 def scene_features(cameras: tuple[Camera, Camera], pairs: Sequence[ImagePair], most: int = MOST) -> SceneMatches:
@@ -139,14 +142,28 @@ def scene_of(
     if not pairs:
         raise InputError("scene: no pair of images")
     _refuse_repeated(pairs)
-    if len(pairs) > 1:
-        found = [_still(pairs, found, k) for k in range(len(pairs))]
-    each = math.ceil(most / len(pairs))
-    found = [_thinned(one, cameras[0].size, each) for one in found]
-    names = tuple(f"{pair.name} {i}" for pair, one in zip(pairs, found, strict=True) for i in range(len(one.pixels)))
-    pixels = [one.pixels for one in found]
-    covariance = with_common_errors([one.rig for one in found], pixels, [one.covariance for one in found])
-    features = _features(names, torch.cat(pixels), torch.cat(covariance))
+    return counted(still_matches(pairs, found), cameras[0].size, most)
+
+
+@torch.no_grad()
+def still_matches(pairs: Sequence[ImagePair], found: Sequence[MatchedPair]) -> list[MatchedPair]:
+    """The matches of some pairs without what is not still in the others."""
+    return [_still(pairs, found, k) for k in range(len(pairs))] if len(pairs) > 1 else list(found)
+
+
+@torch.no_grad()
+def counted(found: Sequence[MatchedPair], size: tuple[int, int], most: int = MOST) -> SceneMatches:
+    """Matches of some pairs, spread over the image, as features with what their errors have in common."""
+    each = math.ceil(most / len(found))
+    found = [_thinned(one, size, each) for one in found]
+    names = tuple(f"{one.counts.name} {i}" for one in found for i in range(len(one.pixels)))
+    covariance = with_common_errors(
+        [one.rig for one in found],
+        [one.pixels for one in found],
+        [one.covariance for one in found],
+        [one.slant for one in found],
+    )
+    features = _features(names, torch.cat([one.pixels for one in found]), torch.cat(covariance))
     return SceneMatches(features, tuple(one.counts for one in found))
 
 
@@ -204,14 +221,14 @@ def match_scene(cameras: tuple[Camera, Camera], pair: ImagePair) -> MatchedPair:
             "image blurred, or is there fog?"
         )
     pixels = torch.stack([pixels[:, 0], refined.right], 1)[refined.good]
-    covariance = refined.covariance[refined.good]
+    covariance, slant = refined.covariance[refined.good], refined.slant[refined.good]
     rig, over = _posed(rig, pixels, covariance)
     good = over <= 1.0
     counts = PairCounts(
         name=pair.name, matched=matched, untextured=matched - fine, off_line=int((~good).sum()), moved=0, thinned=0,
         used=int(good.sum()),
     )  # fmt: skip
-    return MatchedPair(pixels[good], covariance[good], counts, rig)
+    return MatchedPair(pixels[good], covariance[good], slant[good], counts, rig)
 
 
 def _guided(rig: StereoRig, points: tuple[Keypoints, Keypoints]) -> Tensor:

@@ -37,11 +37,14 @@ class RefinedMatches(NamedTuple):
         right: (M, 2) px.
         covariance: (M, 2, 2) px² of it.
         good: (M,) whether it was found.
+        slant: (M,) by how much a step of a patch is longer, or goes sideways, in the other image: 0 for what is seen
+            alike.
     """
 
     right: Tensor
     covariance: Tensor
     good: Tensor
+    slant: Tensor
 
 
 @torch.no_grad()
@@ -80,7 +83,7 @@ def _refined_part(rig: StereoRig, images: tuple[Tensor, Tensor], left: Tensor, r
     worst = torch.linalg.eigvalsh(covariance.nan_to_num(1e6))[:, -1].sqrt()
     near = torch.linalg.vector_norm(pixels[:, 0] - right, dim=-1) < _FARTHEST
     good = valid & fit.converged & again[:, 0] & near & (worst < _FAINTEST) & (fit.share > _LEAST_SHARE)
-    return RefinedMatches(pixels[:, 0], covariance, good)
+    return RefinedMatches(pixels[:, 0], covariance, good, fit.slant)
 
 
 def _patch(

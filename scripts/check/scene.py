@@ -19,10 +19,11 @@ import contextlib
 import dataclasses
 import functools
 import math
+import pickle
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
-from unittest import mock
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -36,11 +37,11 @@ from kcal.calibrate.rig.sources import Baseline, Features, Landmarks, RigData
 from kcal.corners.keypoints import keypoints
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.lens.pose import vector_from_rotation
+from kcal.lens.pose import rotation_from_vector, side_axes, vector_from_rotation
+from kcal.lens.rig import StereoRig
 from kcal.locate.localizer import StereoLocalizer
-from kcal.scene.common_errors import _off_line as off_line
-from kcal.scene.common_errors import with_common_errors
-from kcal.scene.match import ImagePair, MatchedPair, match_scene, scene_of
+from kcal.scene.common_errors import off_line, with_common_errors
+from kcal.scene.match import ImagePair, MatchedPair, counted, match_scene, scene_of, still_matches
 from kcal.scene.match import _posed as posed
 from kcal.sim.scene import FOCAL_MM
 from kcal.sim.terrain import Terrain, Weather
@@ -239,63 +240,96 @@ def rig_data(cameras: tuple[Camera, Camera], features: Features, draw: torch.Gen
 
 
 YAW_HEADS = (
-    "pictures, px", "pairs", "matches", "terrains", "σ of yaw", "RMS error", "over σ", "inside 95 %", "pose χ² of 3",
-    "before: σ", "over σ", "inside 95 %", "pose χ² of 3",
+    "pictures, px", "pairs", "matches", "terrains", "bound of noise", "σ of yaw", "RMS error", "over σ", "inside 95 %",
+    "pose χ² of 3",
 )  # fmt: skip
-WHICH = {"one": "1", "minute": "{} of a minute", "day": "{} of a day"}
+T = TypeVar("T")
+
+
+def kept(file: Path, make: Callable[[], T]) -> T:
+    """What a file holds, or what is made and then kept there."""
+    if not file.exists():
+        made = make()
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(pickle.dumps(made))
+    found: T = pickle.loads(file.read_bytes())
+    return found
+
+
+def all_matches(scale: float, count: int, times: str, seed: int, folder: Path) -> tuple[MatchedPair, list[MatchedPair]]:
+    """Matches of the first pair, and those of all pairs that stand still in the others; pictures are kept as well."""
+    terrain = Terrain(rig_of(scale), seed)
+
+    def matched(moment: int, hour: float) -> tuple[ImagePair, MatchedPair]:
+        pair = photographed(terrain, moment, Weather(hour=hour))
+        return pair, match_scene(exact(scale), pair)
+
+    found = []
+    for moment, hour in enumerate([12.0] * count if times == "minute" else np.linspace(8.0, 17.0, count).tolist()):
+        # Pairs that are refused are left out, as `kcal rig` does.
+        with contextlib.suppress(InputError):
+            file = folder / f"{scale}-{seed}-{moment}-{hour:.2f}.pickle"
+            found.append(kept(file, functools.partial(matched, moment, hour)))
+    pairs, matches = map(list, zip(*found, strict=True))
+    return matches[0], still_matches(pairs, matches)
+
+
+def noise_bound(rig: TrueRig, cameras: tuple[Camera, Camera], found: list[MatchedPair]) -> float:
+    """Cramér-Rao bound of yaw in degrees from matches with unknown ranges whose errors are noise alone, independent."""
+    turn, shift = rig.right_from_left_rotation, rig.right_from_left_translation
+    across = torch.cat(side_axes(shift[None] / rig.baseline))
+    step = 1e-5
+    steps = [*(rotation_from_vector(step * axis) for axis in torch.eye(3, dtype=torch.float64))]
+    moved = [StereoRig(*cameras, one @ turn, shift) for one in steps]
+    moved += [StereoRig(*cameras, turn, shift + step * rig.baseline * axis) for axis in across]
+    total = torch.zeros(5, 5, dtype=torch.float64)
+    for one in found:
+        here, sigma = off_line(StereoRig(*cameras, turn, shift), one.pixels, one.covariance)
+        slope = torch.stack([off_line(at, one.pixels, one.covariance)[0] - here for at in moved], -1) / step
+        slope = slope / sigma[:, None]
+        total += slope.T @ slope
+    return math.degrees(float(torch.linalg.inv(total)[1, 1].sqrt()))
 
 
 @torch.no_grad()
-def yaw_of(scale: float, count: int, times: str, seed: int) -> Record:
+def yaw_of(scale: float, count: int, times: str, seed: int, folder: Path) -> Record:
     """Yaw from rendered pairs of one terrain with exact lenses: error and σ in degrees, χ² of the relative rotation."""
-    rig, cameras, terrain = rig_of(scale), exact(scale), Terrain(rig_of(scale), 100 + seed)
+    rig, cameras = rig_of(scale), exact(scale)
     tape = Baseline(first=0, second=1, length=float(rig.baseline), sigma=TAPE)
-    hours = [12.0] * count if times == "minute" else np.linspace(8.0, 17.0, count).tolist()
-    pairs, matched = [], []
-    for moment, hour in enumerate(hours):
-        # Pairs that are refused are left out, as `kcal rig` does.
-        with contextlib.suppress(InputError):
-            pair = photographed(terrain, moment, Weather(hour=hour))
-            matched.append(match_scene(cameras, pair))
-            pairs.append(pair)
+    file = folder / f"{scale}-{100 + seed}-{count}-{times}.pickle"
+    first, still = kept(file, lambda: all_matches(scale, count, times, 100 + seed, folder))
     record: Record = {}
-    for which in ("one", "minute") if times == "minute" else ("day",):
-        some = slice(0, 1 if which == "one" else None)
-        for when in ("now", "before"):
-            # Before, errors in common counted as independent.
-            plain = mock.patch("kcal.scene.match.with_common_errors", lambda rigs, pixels, covariance: list(covariance))
-            with plain if when == "before" else contextlib.nullcontext():
-                features = scene_of(cameras, pairs[some], matched[some]).features
-            data = RigData(cameras=cameras, names=NAMES, features=features, baselines=(tape,))
-            result = solve_rig(data, RigOptions(intrinsics="fixed"))
-            turn = vector_from_rotation(result.rotation[1] @ result.rotation[0].T @ rig.right_from_left_rotation.T)
-            covariance = result.relative_covariance(0, 1)[:3, :3]
-            record[f"{which} {when}"] = {
-                "error": math.degrees(float(turn[1])), "sigma": math.degrees(float(covariance[1, 1].sqrt())),
-                "chi2": float(turn @ torch.linalg.solve(covariance, turn)), "matches": len(features.names),
-            }  # fmt: skip
+    for some in {1, 3, count} if times == "minute" else {count}:
+        found = [first] if some == 1 else still[:some]
+        features = counted(found, rig.left.size).features
+        data = RigData(cameras=cameras, names=NAMES, features=features, baselines=(tape,))
+        result = solve_rig(data, RigOptions(intrinsics="fixed"))
+        turn = vector_from_rotation(result.rotation[1] @ result.rotation[0].T @ rig.right_from_left_rotation.T)
+        covariance = result.relative_covariance(0, 1)[:3, :3]
+        record[f"{some} of a {times}"] = {
+            "error": math.degrees(float(turn[1])), "sigma": math.degrees(float(covariance[1, 1].sqrt())),
+            "chi2": float(turn @ torch.linalg.solve(covariance, turn)), "matches": len(features.names),
+            "bound": noise_bound(rig, cameras, found),
+        }  # fmt: skip
     return record
 
 
 def yaw_rows(records: list[Record]) -> list[list[str]]:
-    """Rows of the table, of all records of a scale."""
+    """Rows of the table, of all records."""
     rows = []
-    for scale, number in sorted({tuple(record["key"][:2]) for record in records}):
-        for which, name in WHICH.items():
-            own = [one for one in records if one["key"][:2] == [scale, number] and f"{which} now" in one]
-            if not own:
-                continue
-            count = np.mean([one[f"{which} now"]["matches"] for one in own])
-            cells = [f"{1920 * scale:.0f} x {1080 * scale:.0f}", name.format(number), f"{count:.0f}", f"{len(own)}"]
-            for when in ("now", "before"):
-                error, sigma, chi2 = (
-                    np.array([one[f"{which} {when}"][part] for one in own]) for part in ("error", "sigma", "chi2")
-                )
-                z = error / sigma
-                cells += [f"{sigma.mean():.5f}°"] + [f"{np.sqrt(np.square(error).mean()):.5f}°"] * (when == "now")
-                cells += [f"{np.sqrt(np.square(z).mean()):.2f}", f"{100 * (np.abs(z) < 1.96).mean():.0f} %"]
-                cells += [f"{chi2.mean():.1f}"]
-            rows.append(cells)
+    found = {(one["key"][0], name) for one in records for name in one if name != "key"}
+    for scale, name in sorted(found, key=lambda each: (each[0], each[1][-3:] == "day", int(each[1].split()[0]))):
+        # A terrain may be in runs of few and of many pairs.
+        own = [*{one["key"][3]: one[name] for one in records if one["key"][0] == scale and name in one}.values()]
+        error, sigma, chi2, count, bound = (
+            np.array([one[part] for one in own]) for part in ("error", "sigma", "chi2", "matches", "bound")
+        )
+        z = error / sigma
+        rows.append([
+            f"{1920 * scale:.0f} x {1080 * scale:.0f}", name, f"{count.mean():.0f}", f"{len(own)}",
+            f"{bound.mean():.5f}°", f"{sigma.mean():.5f}°", f"{np.sqrt(np.square(error).mean()):.5f}°",
+            f"{np.sqrt(np.square(z).mean()):.2f}", f"{100 * (np.abs(z) < 1.96).mean():.0f} %", f"{chi2.mean():.1f}",
+        ])  # fmt: skip
     return rows
 
 
@@ -317,7 +351,7 @@ def common() -> list[str]:
         z: tuple[list[float], list[float]] = [], []
         for first in range(0, 7 - count, count):
             some = found[first : first + count]
-            parts = [one.rig for one in some], [one.pixels for one in some], [one.covariance for one in some]
+            parts = [[getattr(one, part) for one in some] for part in ("rig", "pixels", "covariance", "slant")]
             pixels, stated = torch.cat(parts[1]), torch.cat(parts[2])
             rig, _ = posed(found[0].rig, pixels, stated)
             place = (pixels[:, 0] / BLOCK).long()
@@ -469,6 +503,7 @@ def repeated(part: str, given: argparse.Namespace) -> list[str]:
     first: list[tuple[object, ...]] = [(0.05,), (0.2,)]
     if part == "yaw":
         first = [(given.scale, given.pairs, times) for times in given.times]
+        work = functools.partial(yaw_of, folder=given.cache)
 
     def brief(record: Record) -> str:
         return " ".join(f"{name} {np.mean(value['sigma']):.2g}" for name, value in record.items() if name != "key")
@@ -485,6 +520,7 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=10, help="of a minute and of a day, for yaw")
     parser.add_argument("--times", nargs="+", choices=("minute", "day"), default=["minute", "day"], help="of yaw")
     parser.add_argument("--out", type=Path, help="records of yaw or of ranges")
+    parser.add_argument("--cache", type=Path, default=Path("build/scene"), help="folder of yaw's pictures and matches")
     parser.add_argument("--more", type=Path, nargs="*", default=[], help="records of other runs for the same table")
     parser.add_argument("--write", action="store_true")
     given = parser.parse_args()
