@@ -1,0 +1,359 @@
+"""A camera at a setting of zoom or focus between those at which its lens was calibrated.
+
+What is interpolated is the image itself: for each pixel of a grid, the ray that it sees and where on the axis that ray
+starts, whatever lens models the calibrations have. A lens is fitted to the rays, and errors go the same way: those of
+the calibrations, that of the curve between them (`kcal.calibrate.camera.setting_spline`), and that of the motor.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kcal.calibrate.camera.setting_spline import SettingSpline
+from kcal.errors import InputError
+from kcal.gaussian import triangular
+from kcal.lens.calibration import CameraCalibration, LensSetting
+from kcal.lens.camera import Camera
+from kcal.lens.carry_over import FIT_PX, fitted_errors, inverse_half
+from kcal.lens.information import CameraInformation
+from kcal.lens.projection import INTRINSICS, project_components
+from kcal.lens.pupil import FAR
+from kcal.lens.uncertainty import pixel_covariance
+
+_GRID = (41, 25)
+# Steps of the fit, and the one in pixels below which it has converged.
+_STEPS, _SMALL = 20, 1e-7
+# Calibrations whose weights differ from 0 and 1 by less: a setting that was calibrated.
+_ROUNDING = 1e-9
+_PUPIL = ("pupil1", "pupil2")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class InterpolatedCamera:
+    """A camera between settings, and where its error bars come from.
+
+    Args:
+        camera: with its covariance; `camera.calibration.setting` names its sources.
+        weights: of the cameras that were given; their sum is 1.
+        calibration_px: median over the image of the standard deviation of a far direction that comes from the
+            calibrations (as `kcal.lens.projection_sigma`).
+        interpolation_px: likewise of the curve between the settings.
+        setting_px: likewise of the settings themselves.
+        misfit_px: root mean square of what the lens model cannot follow of the interpolated rays; part of the
+            covariance.
+    """
+
+    camera: Camera
+    weights: tuple[float, ...]
+    calibration_px: float
+    interpolation_px: float
+    setting_px: float
+    misfit_px: float
+
+
+def camera_at_setting(
+    cameras: Sequence[Camera],
+    setting: Mapping[str, float],
+    *,
+    setting_sigma: Mapping[str, float] | None = None,
+    names: Sequence[str] | None = None,
+) -> InterpolatedCamera:
+    """Interpolate a camera between calibrations of one lens at several settings of its zoom or focus.
+
+    Rays are interpolated by a cubic spline, each pixel by itself. The error of the spline is stated from how the
+    calibrations curve (Student's distribution, so few settings give wide error bars), and added to that of the
+    calibrations. Where these saw a board of the same kind, its errors count as the same board's. A setting that was
+    calibrated gives the calibration itself.
+
+    Args:
+        cameras: of the same image size, with their covariance and setting (`CameraCalibration.setting`); one more
+            than a line through them needs, so three for one kind of setting, four for two. Five are better.
+        setting: name -> number, within the range of the calibrations (for two kinds their convex hull).
+        setting_sigma: standard deviation with which the motor comes back to a setting, by name: the lens's position
+            now, and also those in which it was calibrated, are that uncertain.
+        names: of the cameras, for messages and the record; their own names if not given.
+
+    Raises:
+        InputError: a setting outside those that were calibrated, too few of them, two cameras at one setting, or
+            cameras that do not fit together.
+
+    Example:
+        >>> from kcal.lens import CameraCalibration, LensSetting
+        >>> def calibrated(focus: float) -> Camera:
+        ...     camera = Camera.build(focal=(800 + focus**2,) * 2, center=(320, 240), size=(640, 480), model="pinhole")
+        ...     covariance = torch.diag(torch.tensor([1.0, 1, 1, 1, 0]).double())
+        ...     camera.calibration = CameraCalibration(covariance=covariance, setting=LensSetting(values={"focus": focus}))
+        ...     return camera
+        >>> found = camera_at_setting([calibrated(float(focus)) for focus in range(6)], {"focus": 2.5})
+        >>> [round(float(value), 2) for value in found.camera.focal]
+        [806.25, 806.25]
+    """
+    names = [_name(camera, i) for i, camera in enumerate(cameras)] if names is None else list(names)
+    known = [_known(camera, cameras[0], name, names[0]) for camera, name in zip(cameras, names, strict=True)]
+    axes, places = _settings(cameras, setting, names)
+    at = torch.tensor([float(setting[axis]) for axis in axes], dtype=torch.float64)
+    spread = _spread(axes, setting, setting_sigma or {})
+    same = (places == at).all(1).nonzero()[:, 0]
+    if len(same) == 1 and not bool(spread.any()):
+        return _calibrated(cameras, int(same[0]))
+    spline = _spline(axes, places, at, names)
+    weights = spline.weights(at)
+    pixels = cameras[0].grid(*_GRID).reshape(-1, 2)
+    free = [[i for i, slot in enumerate(one.slots) if slot >= 0] for one in known]
+    seen = [_Seen.by(camera, pixels, own) for camera, own in zip(cameras, free, strict=True)]
+    lines = torch.stack([one.lines for one in seen])
+    good = torch.stack([one.valid for one in seen]).all(0)
+    nearest = int(weights.argmax())
+    fit = _Fit.of(cameras, nearest, known[nearest], pixels[good], torch.einsum("i,inc->nc", weights, lines)[good])
+
+    def by_settings(factors: Tensor) -> Tensor:
+        """Changes (K, N, 3) of the lines, from factors (K, n) of those at the settings."""
+        return torch.einsum("ki,inc->knc", factors, lines)
+
+    calibrations = []
+    alone, boards = zip(*map(_errors, known), strict=True)
+    for halves, together in ((alone, False), (boards, _one_board(cameras, boards))):
+        parts = [
+            weight * one.changes(half[:, own])
+            for weight, one, half, own in zip(weights, seen, halves, free, strict=True)
+        ]
+        calibrations.append(torch.stack(parts).sum(0) if together else torch.cat(parts))
+    # The motor is wrong now, and was at each calibration.
+    here = [spline.slopes(at), *(weight * spline.slopes(place) for weight, place in zip(weights, places, strict=True))]
+    motor = by_settings((torch.cat(here, 1) * spread.repeat(len(here))).T)
+    groups = [torch.cat(calibrations), by_settings(spline.errors(at)), motor]
+    half = fit.errors(torch.cat(groups)[:, good])
+    calibration, curve, setting_error, _ = half.split([*map(len, groups), len(half) - sum(map(len, groups))])
+    fit.camera.calibration = CameraCalibration(
+        name=_name(cameras[0], 0),
+        covariance=half.T @ half,
+        setting=LensSetting(values=dict(setting), interpolated_from=tuple(names)),
+    )
+    return InterpolatedCamera(
+        camera=fit.camera,
+        weights=tuple(weights.tolist()),
+        calibration_px=_median_sigma(fit.camera, calibration),
+        interpolation_px=_median_sigma(fit.camera, curve),
+        setting_px=_median_sigma(fit.camera, setting_error),
+        misfit_px=fit.misfit,
+    )
+
+
+class _Seen(NamedTuple):
+    """What a camera sees at N pixels.
+
+    Attributes:
+        lines: (N, 3) the ray in the stereographic chart (x, y) / (1 + z), and where on the axis it starts, meters.
+        by_camera: (N, 3, C) their derivatives by the camera's parameters.
+        valid: (N,) which pixels have a ray.
+    """
+
+    lines: Tensor
+    by_camera: Tensor
+    valid: Tensor
+
+    @classmethod
+    def by(cls, camera: Camera, pixels: Tensor, wanted: list[int]) -> _Seen:
+        rays, valid = camera.unproject(pixels)
+        chart = rays[:, :2] / (1.0 + rays[:, 2:])
+        _, by_chart, by_camera = _image(chart, camera.params.detach(), camera, wanted)
+        angle = 2.0 * torch.atan(chart.norm(dim=-1))
+        powers = {name: angle ** (2 * i) for i, name in enumerate(_PUPIL, 1)}
+        zero = torch.zeros_like(angle)
+        starts = torch.stack([powers.get(camera.names[i], zero) for i in wanted], -1)
+        return cls(
+            torch.cat([chart, camera.ray_origins(rays)[:, 2:]], 1),
+            torch.cat([-torch.linalg.solve(by_chart, by_camera), starts[:, None]], 1),
+            valid,
+        )
+
+    def changes(self, half: Tensor) -> Tensor:
+        """(K, N, 3) of the lines with changes (K, C) of the parameters."""
+        return torch.einsum("kp,ncp->knc", half, self.by_camera)
+
+
+def _image(chart: Tensor, params: Tensor, camera: Camera, wanted: list[int]) -> tuple[Tensor, Tensor, Tensor]:
+    """Pixels (N, 2) of rays in the chart, and their derivatives by it (N, 2, 2) and by parameters (N, 2, C)."""
+    size = 1.0 + chart.square().sum(-1, keepdim=True)
+    rays = torch.cat([2.0 * chart / size, 2.0 / size - 1.0], 1)
+    seen = project_components(FAR * rays.T, params, camera.model, wanted)
+    outer = chart[:, :, None] * chart[:, None] / size[..., None]
+    across = 2.0 * (torch.eye(2, dtype=chart.dtype) - 2.0 * outer) / size[..., None]
+    ray_by_chart = torch.cat([across, -4.0 * (chart / size.square())[:, None]], 1)
+    by_chart = FAR * seen.by_point.permute(2, 1, 0) @ ray_by_chart
+    return seen.pixels.T, by_chart, seen.by_camera.permute(2, 1, 0)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Fit:
+    """The lens that shows given lines at given pixels, and how its parameters follow theirs."""
+
+    camera: Camera
+    misfit: float
+    by_chart: Tensor
+    slopes: Tensor
+    selection: Tensor
+    limits: Tensor
+    starts: Tensor
+
+    @classmethod
+    def of(
+        cls, cameras: Sequence[Camera], nearest: int, known: CameraInformation, pixels: Tensor, lines: Tensor
+    ) -> _Fit:
+        """Of the kind of the nearest calibration, from which what the image does not show is taken over."""
+        first, (chart, start) = cameras[nearest], lines.split((2, 1), 1)
+        if len(pixels) < len(first.names):
+            raise InputError(f"the cameras have rays in common at only {len(pixels)} places of the image")
+        params, names = first.params.detach().clone(), first.names
+        # The focal length of the base that shows the image as large as the nearest calibration does.
+        rays, _ = first.unproject(pixels)
+        own = rays[:, :2] / (1.0 + rays[:, 2:])
+        params[:2] *= (own.square().sum() / chart.square().sum()).sqrt()
+        form = first.model.hybrid
+        if form is not None:
+            disc = max(float(one.params[0]) * one.model.hybrid.radius for one in cameras if one.model.hybrid)
+            form = dataclasses.replace(form, radius=disc / float(params[0]))
+        shape = Camera(params, size=first.size, model=dataclasses.replace(first.model, hybrid=form))
+        pupil = [i for i, name in enumerate(names) if name in _PUPIL]
+        chosen = [slot for slot in range(known.lens_size) if not any(known.slots[i] == slot for i in pupil)]
+        selection = known.selection()[:, chosen]
+        free = selection.any(1).nonzero()[:, 0].tolist()
+        limits, begin = 1.0 / known.sigma[chosen], params.clone()
+        for _ in range(_STEPS):
+            image, by_chart, by_camera = _image(chart, params, shape, free)
+            slopes, off = (by_camera @ selection[free]).flatten(0, 1), (pixels - image).flatten()
+            half, _ = inverse_half(slopes, FIT_PX * limits)
+            moved = torch.linalg.lstsq(selection, (begin - params)[:, None]).solution[:, 0]
+            step = half.T @ (half @ (slopes.T @ off + (FIT_PX * limits).square() * moved))
+            params = params + selection @ step
+            if float((slopes @ step).abs().max()) < _SMALL:
+                break
+        powers = (2.0 * torch.atan(chart.norm(dim=-1)))[:, None] ** chart.new_tensor([2.0, 4.0][: len(pupil)])
+        starts = first.params.new_zeros(len(names), len(pixels))
+        if pupil and all(known.slots[i] >= 0 for i in pupil):
+            starts[pupil] = torch.linalg.pinv(powers)
+            params = torch.where(starts.any(1), starts @ start[:, 0], params)
+        camera = Camera(params, size=first.size, model=shape.model)
+        image, by_chart, _ = _image(chart, params, camera, [])
+        misfit = float((pixels - image).square().sum(-1).mean().sqrt())
+        return cls(camera, misfit, by_chart, slopes, selection, limits, starts)
+
+    def errors(self, changes: Tensor) -> Tensor:
+        """(K', 5 + P) of the parameters, of changes (K, N, 3) of the lines; the last rows are of the misfit."""
+        by_image = -torch.einsum("nab,knb->kna", self.by_chart, changes[..., :2]).flatten(1)
+        half = fitted_errors(by_image, self.slopes, self.limits, self.misfit, len(self.by_chart)) @ self.selection.T
+        half[: len(changes)] += changes[..., 2] @ self.starts.T
+        return half
+
+
+def _errors(known: CameraInformation) -> tuple[Tensor, Tensor]:
+    """Errors of a camera's parameters, one sigma each: its own (K, 5 + P), and those by its board (B, 5 + P)."""
+    count, board = known.lens_size, known.board_size
+    half = triangular(known.half().roll(board, 1))
+    by_parameter = half[:, board:] @ known.selection()[:, :count].T
+    return by_parameter[board:], by_parameter[:board]
+
+
+def _one_board(cameras: Sequence[Camera], errors: Sequence[Tensor]) -> bool:
+    """Whether all cameras may have seen the same board."""
+    records = [camera.calibration.record if camera.calibration else None for camera in cameras]
+    boards = {None if record is None else record.board for record in records}
+    return len(boards) == 1 and len({len(one) for one in errors}) == 1
+
+
+def _median_sigma(camera: Camera, half: Tensor) -> float:
+    if not bool(half.any()):
+        return 0.0
+    found = pixel_covariance(camera, camera.grid(17, 13).reshape(-1, 2), half.T @ half)
+    found = found[found.isfinite().all(-1).all(-1)]
+    return float(torch.linalg.eigvalsh(found)[:, -1].clamp_min(0.0).sqrt().median())
+
+
+def _calibrated(cameras: Sequence[Camera], number: int) -> InterpolatedCamera:
+    """A setting that was calibrated."""
+    camera = cameras[number]
+    known = camera.calibration.known(camera.params.detach()) if camera.calibration else None
+    assert known is not None
+    return InterpolatedCamera(
+        camera=camera,
+        weights=tuple(float(i == number) for i in range(len(cameras))),
+        calibration_px=_median_sigma(camera, known.by_parameter(known.half())),
+        interpolation_px=0.0,
+        setting_px=0.0,
+        misfit_px=0.0,
+    )
+
+
+def _name(camera: Camera, number: int) -> str:
+    return (camera.calibration.name if camera.calibration else "") or f"camera {number + 1}"
+
+
+def _known(camera: Camera, first: Camera, name: str, first_name: str) -> CameraInformation:
+    """What is known of a camera that can be used."""
+    if camera.params.ndim != 1:
+        raise InputError(f"{name}: a batch of cameras; a single one is needed")
+    if camera.size != first.size:
+        sizes = [f"{width}x{height} px" for width, height in (camera.size, first.size)]
+        raise InputError(f"{name}: its image is {sizes[0]}, that of {first_name} {sizes[1]}: not one camera")
+    known = camera.calibration
+    if known is None or known.setting is None:
+        raise InputError(f"{name}: it does not say at which setting it was calibrated: kcal calibrate OBS --setting ...")
+    if known.setting.interpolated_from:
+        raise InputError(f"{name}: it is interpolated itself; use the cameras that it came from")
+    information = known.known(camera.params.detach())
+    if information is None:
+        raise InputError(f"{name}: it has no error bars: calibrate it with kcal calibrate OBS --setting {known.setting}")
+    return information
+
+
+def _settings(
+    cameras: Sequence[Camera], setting: Mapping[str, float], names: Sequence[str]
+) -> tuple[list[str], Tensor]:
+    """Which kinds of settings vary, and the settings of the cameras (n, D)."""
+    LensSetting(values=dict(setting))
+    stated = [camera.calibration.setting.values for camera in cameras if camera.calibration and camera.calibration.setting]
+    for name, values in zip(names, stated, strict=True):
+        if values.keys() != setting.keys():
+            raise InputError(f"{name}: it states {', '.join(values)}, but {', '.join(setting)} is asked for")
+    axes = [axis for axis in setting if len({values[axis] for values in stated} | {setting[axis]}) > 1]
+    return axes, torch.tensor([[values[axis] for axis in axes] for values in stated], dtype=torch.float64)
+
+
+def _spread(axes: list[str], setting: Mapping[str, float], sigma: Mapping[str, float]) -> Tensor:
+    for name, value in sigma.items():
+        if name not in setting or not 0 <= value < float("inf"):
+            raise InputError(f"setting sigma {name}={value:g}: a number, not negative, of one of {', '.join(setting)}")
+        if value and name not in axes:
+            raise InputError(f"setting sigma {name}={value:g}: all cameras have one {name}, so its effect is unknown")
+    return torch.tensor([sigma.get(axis, 0.0) for axis in axes], dtype=torch.float64)
+
+
+def _spline(axes: list[str], places: Tensor, at: Tensor, names: Sequence[str]) -> SettingSpline:
+    """Refuse what cannot be interpolated."""
+    if len(places) < len(axes) + 2:
+        raise InputError(
+            f"{len(places)} cameras do not tell how the lens changes between settings of {' and '.join(axes)}: "
+            f"{len(axes) + 2} are needed, 5 are better"
+        )
+    for i, place in enumerate(places):
+        if len(again := (places[:i] == place).all(1).nonzero()):
+            raise InputError(f"{names[i]} and {names[int(again[0])]} are at one setting: leave one of them out")
+    lowest, highest = places.amin(0).tolist(), places.amax(0).tolist()
+    for axis, low, high, value in zip(axes, lowest, highest, at.tolist(), strict=True):
+        if not low <= value <= high:
+            raise InputError(
+                f"{axis}={value:g} is outside the calibrated {axis} of {low:g} to {high:g}: a lens is not "
+                f"extrapolated; calibrate it at {axis}={value:g} or beyond"
+            )
+    if SettingSpline.flat(places):
+        raise InputError(f"{' and '.join(axes)} change together in these cameras: calibrate other combinations as well")
+    spline = SettingSpline(places)
+    if not spline.inside(at):
+        text = " ".join(f"{axis}={value:g}" for axis, value in zip(axes, at.tolist(), strict=True))
+        raise InputError(f"{text} does not lie between these calibrations (in their convex hull): calibrate near it")
+    return spline
