@@ -9,28 +9,19 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from kcal.calibrate.camera.setting_spline import SettingSpline
-from kcal.errors import InputError
+from kcal.calibrate.camera.fitted_lines import FittedLines, LinesSeen
+from kcal.calibrate.camera.setting_checks import setting_sigmas, spline_between, usable_information, varied_settings
 from kcal.gaussian import triangular
 from kcal.lens.calibration import CameraCalibration, LensSetting
 from kcal.lens.camera import Camera
-from kcal.lens.carry_over import FIT_PX, fitted_errors, inverse_half
 from kcal.lens.information import CameraInformation
-from kcal.lens.projection import INTRINSICS, project_components
-from kcal.lens.pupil import FAR
 from kcal.lens.uncertainty import pixel_covariance
 
 _GRID = (41, 25)
-# Steps of the fit, and the one in pixels below which it has converged.
-_STEPS, _SMALL = 20, 1e-7
-# Calibrations whose weights differ from 0 and 1 by less: a setting that was calibrated.
-_ROUNDING = 1e-9
-_PUPIL = ("pupil1", "pupil2")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -84,32 +75,37 @@ def camera_at_setting(
 
     Example:
         >>> from kcal.lens import CameraCalibration, LensSetting
-        >>> def calibrated(focus: float) -> Camera:
+        >>> cameras, known = [], torch.diag(torch.tensor([1.0, 1, 1, 1, 0])).double()
+        >>> for focus in (0.0, 1.0, 2.0, 3.0, 4.0, 5.0):
         ...     camera = Camera.build(focal=(800 + focus**2,) * 2, center=(320, 240), size=(640, 480), model="pinhole")
-        ...     covariance = torch.diag(torch.tensor([1.0, 1, 1, 1, 0]).double())
-        ...     camera.calibration = CameraCalibration(covariance=covariance, setting=LensSetting(values={"focus": focus}))
-        ...     return camera
-        >>> found = camera_at_setting([calibrated(float(focus)) for focus in range(6)], {"focus": 2.5})
+        ...     stood = LensSetting(values={"focus": focus})
+        ...     camera.calibration = CameraCalibration(covariance=known, setting=stood)
+        ...     cameras.append(camera)
+        >>> found = camera_at_setting(cameras, {"focus": 2.5})
         >>> [round(float(value), 2) for value in found.camera.focal]
         [806.25, 806.25]
     """
     names = [_name(camera, i) for i, camera in enumerate(cameras)] if names is None else list(names)
-    known = [_known(camera, cameras[0], name, names[0]) for camera, name in zip(cameras, names, strict=True)]
-    axes, places = _settings(cameras, setting, names)
+    known = [
+        usable_information(camera, cameras[0], name, names[0]) for camera, name in zip(cameras, names, strict=True)
+    ]
+    axes, places = varied_settings(cameras, setting, names)
     at = torch.tensor([float(setting[axis]) for axis in axes], dtype=torch.float64)
-    spread = _spread(axes, setting, setting_sigma or {})
+    spread = setting_sigmas(axes, setting, setting_sigma or {})
     same = (places == at).all(1).nonzero()[:, 0]
     if len(same) == 1 and not bool(spread.any()):
         return _calibrated(cameras, int(same[0]))
-    spline = _spline(axes, places, at, names)
+    spline = spline_between(axes, places, at, names)
     weights = spline.weights(at)
     pixels = cameras[0].grid(*_GRID).reshape(-1, 2)
     free = [[i for i, slot in enumerate(one.slots) if slot >= 0] for one in known]
-    seen = [_Seen.by(camera, pixels, own) for camera, own in zip(cameras, free, strict=True)]
+    seen = [LinesSeen.by(camera, pixels, own) for camera, own in zip(cameras, free, strict=True)]
     lines = torch.stack([one.lines for one in seen])
     good = torch.stack([one.valid for one in seen]).all(0)
     nearest = int(weights.argmax())
-    fit = _Fit.of(cameras, nearest, known[nearest], pixels[good], torch.einsum("i,inc->nc", weights, lines)[good])
+    fit = FittedLines.of(
+        cameras, nearest, known[nearest], pixels[good], torch.einsum("i,inc->nc", weights, lines)[good]
+    )
 
     def by_settings(factors: Tensor) -> Tensor:
         """Changes (K, N, 3) of the lines, from factors (K, n) of those at the settings."""
@@ -144,117 +140,12 @@ def camera_at_setting(
     )
 
 
-class _Seen(NamedTuple):
-    """What a camera sees at N pixels.
-
-    Attributes:
-        lines: (N, 3) the ray in the stereographic chart (x, y) / (1 + z), and where on the axis it starts, meters.
-        by_camera: (N, 3, C) their derivatives by the camera's parameters.
-        valid: (N,) which pixels have a ray.
-    """
-
-    lines: Tensor
-    by_camera: Tensor
-    valid: Tensor
-
-    @classmethod
-    def by(cls, camera: Camera, pixels: Tensor, wanted: list[int]) -> _Seen:
-        rays, valid = camera.unproject(pixels)
-        chart = rays[:, :2] / (1.0 + rays[:, 2:])
-        _, by_chart, by_camera = _image(chart, camera.params.detach(), camera, wanted)
-        angle = 2.0 * torch.atan(chart.norm(dim=-1))
-        powers = {name: angle ** (2 * i) for i, name in enumerate(_PUPIL, 1)}
-        zero = torch.zeros_like(angle)
-        starts = torch.stack([powers.get(camera.names[i], zero) for i in wanted], -1)
-        return cls(
-            torch.cat([chart, camera.ray_origins(rays)[:, 2:]], 1),
-            torch.cat([-torch.linalg.solve(by_chart, by_camera), starts[:, None]], 1),
-            valid,
-        )
-
-    def changes(self, half: Tensor) -> Tensor:
-        """(K, N, 3) of the lines with changes (K, C) of the parameters."""
-        return torch.einsum("kp,ncp->knc", half, self.by_camera)
-
-
-def _image(chart: Tensor, params: Tensor, camera: Camera, wanted: list[int]) -> tuple[Tensor, Tensor, Tensor]:
-    """Pixels (N, 2) of rays in the chart, and their derivatives by it (N, 2, 2) and by parameters (N, 2, C)."""
-    size = 1.0 + chart.square().sum(-1, keepdim=True)
-    rays = torch.cat([2.0 * chart / size, 2.0 / size - 1.0], 1)
-    seen = project_components(FAR * rays.T, params, camera.model, wanted)
-    outer = chart[:, :, None] * chart[:, None] / size[..., None]
-    across = 2.0 * (torch.eye(2, dtype=chart.dtype) - 2.0 * outer) / size[..., None]
-    ray_by_chart = torch.cat([across, -4.0 * (chart / size.square())[:, None]], 1)
-    by_chart = FAR * seen.by_point.permute(2, 1, 0) @ ray_by_chart
-    return seen.pixels.T, by_chart, seen.by_camera.permute(2, 1, 0)
-
-
-@dataclasses.dataclass(frozen=True)
-class _Fit:
-    """The lens that shows given lines at given pixels, and how its parameters follow theirs."""
-
-    camera: Camera
-    misfit: float
-    by_chart: Tensor
-    slopes: Tensor
-    selection: Tensor
-    limits: Tensor
-    starts: Tensor
-
-    @classmethod
-    def of(
-        cls, cameras: Sequence[Camera], nearest: int, known: CameraInformation, pixels: Tensor, lines: Tensor
-    ) -> _Fit:
-        """Of the kind of the nearest calibration, from which what the image does not show is taken over."""
-        first, (chart, start) = cameras[nearest], lines.split((2, 1), 1)
-        if len(pixels) < len(first.names):
-            raise InputError(f"the cameras have rays in common at only {len(pixels)} places of the image")
-        params, names = first.params.detach().clone(), first.names
-        # The focal length of the base that shows the image as large as the nearest calibration does.
-        rays, _ = first.unproject(pixels)
-        own = rays[:, :2] / (1.0 + rays[:, 2:])
-        params[:2] *= (own.square().sum() / chart.square().sum()).sqrt()
-        form = first.model.hybrid
-        if form is not None:
-            disc = max(float(one.params[0]) * one.model.hybrid.radius for one in cameras if one.model.hybrid)
-            form = dataclasses.replace(form, radius=disc / float(params[0]))
-        shape = Camera(params, size=first.size, model=dataclasses.replace(first.model, hybrid=form))
-        pupil = [i for i, name in enumerate(names) if name in _PUPIL]
-        chosen = [slot for slot in range(known.lens_size) if not any(known.slots[i] == slot for i in pupil)]
-        selection = known.selection()[:, chosen]
-        free = selection.any(1).nonzero()[:, 0].tolist()
-        limits, begin = 1.0 / known.sigma[chosen], params.clone()
-        for _ in range(_STEPS):
-            image, by_chart, by_camera = _image(chart, params, shape, free)
-            slopes, off = (by_camera @ selection[free]).flatten(0, 1), (pixels - image).flatten()
-            half, _ = inverse_half(slopes, FIT_PX * limits)
-            moved = torch.linalg.lstsq(selection, (begin - params)[:, None]).solution[:, 0]
-            step = half.T @ (half @ (slopes.T @ off + (FIT_PX * limits).square() * moved))
-            params = params + selection @ step
-            if float((slopes @ step).abs().max()) < _SMALL:
-                break
-        powers = (2.0 * torch.atan(chart.norm(dim=-1)))[:, None] ** chart.new_tensor([2.0, 4.0][: len(pupil)])
-        starts = first.params.new_zeros(len(names), len(pixels))
-        if pupil and all(known.slots[i] >= 0 for i in pupil):
-            starts[pupil] = torch.linalg.pinv(powers)
-            params = torch.where(starts.any(1), starts @ start[:, 0], params)
-        camera = Camera(params, size=first.size, model=shape.model)
-        image, by_chart, _ = _image(chart, params, camera, [])
-        misfit = float((pixels - image).square().sum(-1).mean().sqrt())
-        return cls(camera, misfit, by_chart, slopes, selection, limits, starts)
-
-    def errors(self, changes: Tensor) -> Tensor:
-        """(K', 5 + P) of the parameters, of changes (K, N, 3) of the lines; the last rows are of the misfit."""
-        by_image = -torch.einsum("nab,knb->kna", self.by_chart, changes[..., :2]).flatten(1)
-        half = fitted_errors(by_image, self.slopes, self.limits, self.misfit, len(self.by_chart)) @ self.selection.T
-        half[: len(changes)] += changes[..., 2] @ self.starts.T
-        return half
-
-
 def _errors(known: CameraInformation) -> tuple[Tensor, Tensor]:
     """Errors of a camera's parameters, one sigma each: its own (K, 5 + P), and those by its board (B, 5 + P)."""
     count, board = known.lens_size, known.board_size
     half = triangular(known.half().roll(board, 1))
+    # Of one sign, so that the same error of a board is the same row for each camera.
+    half = torch.where(half.diagonal() < 0, -1.0, 1.0)[:, None] * half
     by_parameter = half[:, board:] @ known.selection()[:, :count].T
     return by_parameter[board:], by_parameter[:board]
 
@@ -291,69 +182,3 @@ def _calibrated(cameras: Sequence[Camera], number: int) -> InterpolatedCamera:
 
 def _name(camera: Camera, number: int) -> str:
     return (camera.calibration.name if camera.calibration else "") or f"camera {number + 1}"
-
-
-def _known(camera: Camera, first: Camera, name: str, first_name: str) -> CameraInformation:
-    """What is known of a camera that can be used."""
-    if camera.params.ndim != 1:
-        raise InputError(f"{name}: a batch of cameras; a single one is needed")
-    if camera.size != first.size:
-        sizes = [f"{width}x{height} px" for width, height in (camera.size, first.size)]
-        raise InputError(f"{name}: its image is {sizes[0]}, that of {first_name} {sizes[1]}: not one camera")
-    known = camera.calibration
-    if known is None or known.setting is None:
-        raise InputError(f"{name}: it does not say at which setting it was calibrated: kcal calibrate OBS --setting ...")
-    if known.setting.interpolated_from:
-        raise InputError(f"{name}: it is interpolated itself; use the cameras that it came from")
-    information = known.known(camera.params.detach())
-    if information is None:
-        raise InputError(f"{name}: it has no error bars: calibrate it with kcal calibrate OBS --setting {known.setting}")
-    return information
-
-
-def _settings(
-    cameras: Sequence[Camera], setting: Mapping[str, float], names: Sequence[str]
-) -> tuple[list[str], Tensor]:
-    """Which kinds of settings vary, and the settings of the cameras (n, D)."""
-    LensSetting(values=dict(setting))
-    stated = [camera.calibration.setting.values for camera in cameras if camera.calibration and camera.calibration.setting]
-    for name, values in zip(names, stated, strict=True):
-        if values.keys() != setting.keys():
-            raise InputError(f"{name}: it states {', '.join(values)}, but {', '.join(setting)} is asked for")
-    axes = [axis for axis in setting if len({values[axis] for values in stated} | {setting[axis]}) > 1]
-    return axes, torch.tensor([[values[axis] for axis in axes] for values in stated], dtype=torch.float64)
-
-
-def _spread(axes: list[str], setting: Mapping[str, float], sigma: Mapping[str, float]) -> Tensor:
-    for name, value in sigma.items():
-        if name not in setting or not 0 <= value < float("inf"):
-            raise InputError(f"setting sigma {name}={value:g}: a number, not negative, of one of {', '.join(setting)}")
-        if value and name not in axes:
-            raise InputError(f"setting sigma {name}={value:g}: all cameras have one {name}, so its effect is unknown")
-    return torch.tensor([sigma.get(axis, 0.0) for axis in axes], dtype=torch.float64)
-
-
-def _spline(axes: list[str], places: Tensor, at: Tensor, names: Sequence[str]) -> SettingSpline:
-    """Refuse what cannot be interpolated."""
-    if len(places) < len(axes) + 2:
-        raise InputError(
-            f"{len(places)} cameras do not tell how the lens changes between settings of {' and '.join(axes)}: "
-            f"{len(axes) + 2} are needed, 5 are better"
-        )
-    for i, place in enumerate(places):
-        if len(again := (places[:i] == place).all(1).nonzero()):
-            raise InputError(f"{names[i]} and {names[int(again[0])]} are at one setting: leave one of them out")
-    lowest, highest = places.amin(0).tolist(), places.amax(0).tolist()
-    for axis, low, high, value in zip(axes, lowest, highest, at.tolist(), strict=True):
-        if not low <= value <= high:
-            raise InputError(
-                f"{axis}={value:g} is outside the calibrated {axis} of {low:g} to {high:g}: a lens is not "
-                f"extrapolated; calibrate it at {axis}={value:g} or beyond"
-            )
-    if SettingSpline.flat(places):
-        raise InputError(f"{' and '.join(axes)} change together in these cameras: calibrate other combinations as well")
-    spline = SettingSpline(places)
-    if not spline.inside(at):
-        text = " ".join(f"{axis}={value:g}" for axis, value in zip(axes, at.tolist(), strict=True))
-        raise InputError(f"{text} does not lie between these calibrations (in their convex hull): calibrate near it")
-    return spline

@@ -70,7 +70,10 @@ class SettingSpline:
 
     def slopes(self, at: Tensor) -> Tensor:
         """(n, D) derivatives of the weights by the setting."""
-        return torch.func.jacrev(self.weights)(at)
+        apart = (at - self._low) / self._width - self._places
+        rates = apart.norm(dim=1, keepdim=True) * apart / 4.0
+        plane = torch.cat([torch.zeros_like(apart[:1]), torch.eye(len(at), dtype=at.dtype)])
+        return torch.linalg.solve(self._system, torch.cat([rates, plane]))[: len(apart)] / self._width
 
     def errors(self, at: Tensor) -> Tensor:
         """(m, n) of the values at the settings: independent errors of the value there, one sigma each.
