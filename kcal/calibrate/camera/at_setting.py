@@ -83,7 +83,7 @@ def camera_at_setting(
         ...     cameras.append(camera)
         >>> found = camera_at_setting(cameras, {"focus": 2.5})
         >>> [round(float(value), 2) for value in found.camera.focal]
-        [806.25, 806.25]
+        [806.26, 806.26]
     """
     names = [_name(camera, i) for i, camera in enumerate(cameras)] if names is None else list(names)
     known = [
@@ -103,9 +103,8 @@ def camera_at_setting(
     lines = torch.stack([one.lines for one in seen])
     good = torch.stack([one.valid for one in seen]).all(0)
     nearest = int(weights.argmax())
-    fit = FittedLines.of(
-        cameras, nearest, known[nearest], pixels[good], torch.einsum("i,inc->nc", weights, lines)[good]
-    )
+    between = torch.einsum("i,inc->nc", weights, lines)
+    fit = FittedLines.of(cameras[nearest], known[nearest], pixels[good], between[good])
 
     def by_settings(factors: Tensor) -> Tensor:
         """Changes (K, N, 3) of the lines, from factors (K, n) of those at the settings."""

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from kcal.errors import InputError
+from kcal.lens.base_map import radius_over_angle
 from kcal.lens.camera import Camera
 from kcal.lens.carry_over import FIT_PX, fitted_errors, inverse_half
 from kcal.lens.information import CameraInformation
@@ -81,22 +81,23 @@ class FittedLines:
     starts: Tensor
 
     @classmethod
-    def of(
-        cls, cameras: Sequence[Camera], nearest: int, known: CameraInformation, pixels: Tensor, lines: Tensor
-    ) -> FittedLines:
-        """Of the kind of the nearest calibration, from which what the image does not show is taken over."""
-        first, (chart, start) = cameras[nearest], lines.split((2, 1), 1)
+    def of(cls, first: Camera, known: CameraInformation, pixels: Tensor, lines: Tensor) -> FittedLines:
+        """Of the kind of a similar camera, from which what the image does not show is taken over."""
+        chart, start = lines.split((2, 1), 1)
         if len(pixels) < len(first.names):
             raise InputError(f"the cameras have rays in common at only {len(pixels)} places of the image")
         params, names = first.params.detach().clone(), first.names
-        # The focal length of the base that shows the image as large as the nearest calibration does.
+        # The focal length of the base that shows the image as large.
         rays, _ = first.unproject(pixels)
         own = rays[:, :2] / (1.0 + rays[:, 2:])
         params[:2] *= (own.square().sum() / chart.square().sum()).sqrt()
         form = first.model.hybrid
         if form is not None:
-            disc = max(float(one.params[0]) * one.model.hybrid.radius for one in cameras if one.model.hybrid)
-            form = dataclasses.replace(form, radius=disc / float(params[0]))
+            # The disc of the nearest calibration, or as much more as the image needs.
+            angle = 2.0 * torch.atan(chart.norm(dim=-1))
+            needed = float((angle * radius_over_angle(form.shape * angle.square())).max())
+            scaled = form.radius * float(first.params[0] / params[0])
+            form = dataclasses.replace(form, radius=max(scaled, needed))
         model = dataclasses.replace(first.model, hybrid=form)
         pupil = [i for i, name in enumerate(names) if name in _PUPIL]
         chosen = [slot for slot in range(known.lens_size) if not any(known.slots[i] == slot for i in pupil)]

@@ -29,7 +29,7 @@ class SettingSpline:
     Example:
         >>> spline = SettingSpline(torch.tensor([[0.0], [1.0], [2.0], [4.0]]).double())
         >>> [round(value, 3) for value in spline.weights(torch.tensor([1.5]).double()).tolist()]
-        [-0.094, 0.607, 0.524, -0.037]
+        [-0.082, 0.614, 0.492, -0.024]
         >>> spline.inside(torch.tensor([4.1]).double()), spline.degrees
         (False, 2)
     """
