@@ -14,7 +14,7 @@ from kcal.cli.calibrate_stars import by_night, joined_by_stars
 from kcal.cli.console import out, print_wrote, steps, tell, warn
 from kcal.cli.cures import ending_with, views_cure, with_command
 from kcal.cli.inputs import BOARD, CAMERA, OBSERVATIONS, check_file
-from kcal.cli.lens_setting import option_number, settings_of
+from kcal.cli.lens_setting import option_number, stated_settings
 from kcal.cli.night_images import TIME_HELP
 from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_of
 from kcal.cli.report import NO, REQUIRE_HELP, judged, required, told_usable
@@ -231,7 +231,7 @@ def calibrate_command(
     """
     from kcal.lens.model import LensModel
 
-    stood = settings_of(setting, len(observations or [output]))
+    stood = stated_settings(setting, len(observations or [output]))
     if observations is None and any(stood):
         raise InputError("--setting: cameras of stars alone do not keep it; give observations of a board as well")
     if by_night(stars, observations, star_time, star_place, output, name) or observations is None:

@@ -9,7 +9,7 @@ import typer
 
 from kcal.cli.console import out, print_table, print_wrote, tell
 from kcal.cli.inputs import CALIBRATED
-from kcal.cli.lens_setting import named_numbers, settings_of
+from kcal.cli.lens_setting import named_numbers, stated_settings
 from kcal.errors import InputError
 from kcal.files import check_writable
 from kcal.quantities import number_text
@@ -47,7 +47,7 @@ def interpolate_command(
     `kcal interpolate near.camera.json middle.camera.json far.camera.json --setting focus=4 -o now.camera.json`
     """
     check_writable(output, *cameras)
-    (wanted,) = settings_of(setting, 1)
+    (wanted,) = stated_settings(setting, 1)
     spread = {}
     for name, values in named_numbers(setting_sigma, "--setting-sigma").items():
         if len(values) > 1:

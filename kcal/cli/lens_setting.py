@@ -26,7 +26,7 @@ def named_numbers(texts: list[str] | None, option: str) -> dict[str, list[float]
     return found
 
 
-def settings_of(texts: list[str] | None, count: int) -> list[dict[str, float]]:
+def stated_settings(texts: list[str] | None, count: int) -> list[dict[str, float]]:
     """The setting of each of some cameras, by `--setting`; empty if not given."""
     found = named_numbers(texts, "--setting")
     for name, values in found.items():

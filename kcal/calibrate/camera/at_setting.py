@@ -85,7 +85,7 @@ def camera_at_setting(
         >>> [round(float(value), 2) for value in found.camera.focal]
         [806.26, 806.26]
     """
-    names = [_name(camera, i) for i, camera in enumerate(cameras)] if names is None else list(names)
+    names = [_own_name(camera, i) for i, camera in enumerate(cameras)] if names is None else list(names)
     known = [
         usable_information(camera, cameras[0], name, names[0]) for camera, name in zip(cameras, names, strict=True)
     ]
@@ -125,16 +125,16 @@ def camera_at_setting(
     half = fit.errors(torch.cat(groups)[:, good])
     calibration, curve, setting_error, _ = half.split([*map(len, groups), len(half) - sum(map(len, groups))])
     fit.camera.calibration = CameraCalibration(
-        name=_name(cameras[0], 0),
+        name=_own_name(cameras[0], 0),
         covariance=half.T @ half,
         setting=LensSetting(values=dict(setting), interpolated_from=tuple(names)),
     )
     return InterpolatedCamera(
         camera=fit.camera,
         weights=tuple(weights.tolist()),
-        calibration_px=_median_sigma(fit.camera, calibration),
-        interpolation_px=_median_sigma(fit.camera, curve),
-        setting_px=_median_sigma(fit.camera, setting_error),
+        calibration_px=_far_sigma(fit.camera, calibration),
+        interpolation_px=_far_sigma(fit.camera, curve),
+        setting_px=_far_sigma(fit.camera, setting_error),
         misfit_px=fit.misfit,
     )
 
@@ -156,7 +156,7 @@ def _one_board(cameras: Sequence[Camera], errors: Sequence[Tensor]) -> bool:
     return len(boards) == 1 and len({len(one) for one in errors}) == 1
 
 
-def _median_sigma(camera: Camera, half: Tensor) -> float:
+def _far_sigma(camera: Camera, half: Tensor) -> float:
     if not bool(half.any()):
         return 0.0
     found = pixel_covariance(camera, camera.grid(17, 13).reshape(-1, 2), half.T @ half)
@@ -172,12 +172,12 @@ def _calibrated(cameras: Sequence[Camera], number: int) -> InterpolatedCamera:
     return InterpolatedCamera(
         camera=camera,
         weights=tuple(float(i == number) for i in range(len(cameras))),
-        calibration_px=_median_sigma(camera, known.by_parameter(known.half())),
+        calibration_px=_far_sigma(camera, known.by_parameter(known.half())),
         interpolation_px=0.0,
         setting_px=0.0,
         misfit_px=0.0,
     )
 
 
-def _name(camera: Camera, number: int) -> str:
+def _own_name(camera: Camera, number: int) -> str:
     return (camera.calibration.name if camera.calibration else "") or f"camera {number + 1}"
