@@ -53,6 +53,12 @@ def restated(made: Camera, **values: float) -> Camera:
     return made
 
 
+def covariance_of(made: Camera) -> Tensor:
+    assert made.calibration is not None
+    assert made.calibration.covariance is not None
+    return made.calibration.covariance
+
+
 def places(made: Camera) -> Tensor:
     return made.grid(7, 5).reshape(-1, 2)
 
@@ -80,9 +86,7 @@ def test_beside_a_setting_nothing_jumps() -> None:
     assert torch.allclose(own, other, rtol=2e-3)
     index = first.names.index("pupil1")
     assert float(found.params[index]) == pytest.approx(float(first.params[index]), rel=1e-4)
-    assert found.calibration is not None
-    assert first.calibration is not None
-    variances = [one.covariance[index, index] for one in (found.calibration, first.calibration)]
+    variances = [covariance_of(one)[index, index] for one in (found, first)]
     assert float(variances[0] / variances[1]) == pytest.approx(1.0, rel=0.02)
 
 
@@ -122,7 +126,7 @@ def test_errors_go_through_as_they_do_by_differences() -> None:
     exact = camera_at_setting(
         [calibrated(f, covariance=1e-12 * torch.diag(SIGMA**2)) for f in settings], {"focus": 2.6}
     )
-    covariances = [one.camera.calibration.covariance for one in (found, alone, exact)]  # type: ignore[union-attr]
+    covariances = [covariance_of(one.camera) for one in (found, alone, exact)]
     by_calibrations, by_motor = covariances[1] - covariances[2], covariances[0] - covariances[1]
     expected = torch.zeros(10, 10, dtype=torch.float64)
     for i in range(len(settings)):
@@ -265,7 +269,7 @@ def test_files_keep_the_setting(tmp_path: Path) -> None:
     assert read.calibration.setting == LensSetting(
         values={"focus": 2.5}, interpolated_from=("f0", "f1", "f2", "f3.5", "f5")
     )
-    assert torch.allclose(read.calibration.covariance, found.calibration.covariance)  # type: ignore[arg-type]
+    assert torch.allclose(covariance_of(read), covariance_of(found))
     rig = StereoRig(found, calibrated(1.0), torch.eye(3), torch.tensor([-10.0, 0, 0]))
     both = load_rig(save_rig(rig, tmp_path / "rig.json"))
     assert [one.calibration.setting.values for one in (both.left, both.right)] == [{"focus": 2.5}, {"focus": 1.0}]  # type: ignore[union-attr]
