@@ -15,6 +15,7 @@ from torch import Tensor
 
 from kcal.calibrate.camera.fitted_lines import FittedLines, LinesSeen
 from kcal.calibrate.camera.setting_checks import setting_sigmas, spline_between, usable_information, varied_settings
+from kcal.errors import InputError
 from kcal.gaussian import triangular
 from kcal.lens.calibration import CameraCalibration, LensSetting
 from kcal.lens.camera import Camera
@@ -85,6 +86,8 @@ def camera_at_setting(
         >>> [round(float(value), 2) for value in found.camera.focal]
         [806.26, 806.26]
     """
+    if not cameras:
+        raise InputError("camera_at_setting: no camera")
     names = [_own_name(camera, i) for i, camera in enumerate(cameras)] if names is None else list(names)
     known = [
         usable_information(camera, cameras[0], name, names[0]) for camera, name in zip(cameras, names, strict=True)
