@@ -146,6 +146,7 @@ NEW_NAMES = (
 INSIDE = {"GroundSurface", "FieldModes", "HybridFit", "BoardState", "Spline", "HistoryRow", "TurnModel"}
 # What functions return, and blocks of files: examples are those of the functions.
 RECORDS = {
+    "InterpolatedCamera",
     "Area",
     "RankedSite",
     "Raster",
