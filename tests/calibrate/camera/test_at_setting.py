@@ -15,7 +15,7 @@ from calibrate_scenes import camera, motions, observe, pixels_of
 from scipy.interpolate import CubicSpline
 from torch import Tensor
 
-from kcal.calibrate.camera.at_setting import camera_at_setting
+from kcal.calibrate.camera.at_setting import _errors, camera_at_setting
 from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.camera.setting_spline import SettingSpline
 from kcal.errors import InputError
@@ -190,6 +190,8 @@ def test_one_board_is_wrong_at_all_settings_alike() -> None:
         assert found.covariance is not None
         return float(found.covariance[0, 0].sqrt())
 
+    # A larger board makes the focal length smaller, whatever signs a decomposition has.
+    assert float(_errors(known(0.0))[1][0, 0]) == pytest.approx(-1.0)
     assert at(1.5, (7, 7, 7, 7)) == pytest.approx(1.0, rel=1e-3)
     assert at(1.5, (7, 7, 7, 8)) == pytest.approx(math.sqrt(2 * 0.575**2 + 2 * 0.075**2), rel=1e-3)
 
