@@ -41,7 +41,7 @@ PUBLIC = {
         UndistortMaps Unproject ZernikeModes bake camera_difference export_cameras image_sigma import_cameras
         load_lookup new_pinhole paraxial_focal pixel_covariance projection_sigma
         refit_camera rotation_from_vector save_lookup save_onnx train_inverse undistort_maps
-        vector_from_rotation
+        vector_from_rotation LensSetting
     """,
     "kcal.corners": """
         Detection Failure MatchOptions MatchStatus Matches RefinedPoint detect_board detect_video expand_images
@@ -52,7 +52,7 @@ PUBLIC = {
         IntervalCheck Refit against_capture interval_check simulated_refits
         MeasuredBoard OutlierRejection RejectedCorner RejectedView ResidualStructure SharedBoard
         calibrate_cameras calibrate_views compare_models examine load_measured_board measure_board
-        save_measured_board summarize
+        save_measured_board summarize camera_at_setting InterpolatedCamera
     """,
     "kcal.rig": """
         Identity LandmarkEffect MovingControl MovingOptions MovingTrack Sighting match_moving read_sightings
@@ -99,6 +99,9 @@ NAMESPACES = {door.removeprefix("kcal.") for door in PUBLIC} - {"kcal"}
 NEW_NAMES = (
     {
         "Watched",
+        "LensSetting",
+        "InterpolatedCamera",
+        "camera_at_setting",
         "Identity",
         "LandmarkEffect",
         "MovingControl",
@@ -143,6 +146,7 @@ NEW_NAMES = (
 INSIDE = {"GroundSurface", "FieldModes", "HybridFit", "BoardState", "Spline", "HistoryRow", "TurnModel"}
 # What functions return, and blocks of files: examples are those of the functions.
 RECORDS = {
+    "InterpolatedCamera",
     "Area",
     "RankedSite",
     "Raster",

@@ -7,6 +7,10 @@ from kcal.calibrate.camera.result import SharedBoard as SharedBoard
 from kcal.calibrate.camera.compare import compare_models as compare_models
 from kcal.calibrate.camera.compare import ComparisonResult as ComparisonResult
 
+# Zoom and focus
+from kcal.calibrate.camera.at_setting import camera_at_setting as camera_at_setting
+from kcal.calibrate.camera.at_setting import InterpolatedCamera as InterpolatedCamera
+
 # Outliers
 from kcal.calibrate.camera.options import OutlierRejection as OutlierRejection
 from kcal.calibrate.camera.result import RejectedCorner as RejectedCorner

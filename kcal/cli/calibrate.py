@@ -14,6 +14,7 @@ from kcal.cli.calibrate_stars import by_night, joined_by_stars
 from kcal.cli.console import out, print_wrote, steps, tell, warn
 from kcal.cli.cures import ending_with, views_cure, with_command
 from kcal.cli.inputs import BOARD, CAMERA, OBSERVATIONS, check_file
+from kcal.cli.lens_setting import option_number, stated_settings
 from kcal.cli.night_images import TIME_HELP
 from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_of
 from kcal.cli.report import NO, REQUIRE_HELP, judged, required, told_usable
@@ -76,6 +77,14 @@ def calibrate_command(
     temperature: Annotated[
         float | None,
         typer.Option(metavar="°C", help="Of the camera when the views were taken; kept in its file.", hidden=True),
+    ] = None,
+    setting: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=NUMBER",
+            help="Where zoom or focus of the lens stood, for `kcal interpolate`; may be repeated. Of several cameras "
+            "one number for all, or focus=1,2.5,4 for each.",
+        ),
     ] = None,
     name: Annotated[
         str, typer.Option(help="Name of the camera; the name of the observations file if not given.", hidden=True)
@@ -222,6 +231,9 @@ def calibrate_command(
     """
     from kcal.lens.model import LensModel
 
+    stood = stated_settings(setting, len(observations or [output]))
+    if observations is None and any(stood):
+        raise InputError("--setting: cameras of stars alone do not keep it; give observations of a board as well")
     if by_night(stars, observations, star_time, star_place, output, name) or observations is None:
         return
     needs = required(require)
@@ -240,6 +252,7 @@ def calibrate_command(
     from kcal.calibrate.camera.outliers import OutlierRejection
     from kcal.calibrate.hybrid.measured_board import load_measured_board
     from kcal.corners.observations import Observations
+    from kcal.lens.calibration import LensSetting
     from kcal.solve.robust import RobustLoss
 
     options = CalibrationOptions(
@@ -282,7 +295,9 @@ def calibrate_command(
         if isinstance(result, KcalError):
             warn(f"{place.name}: {with_command(str(result), cure(result, places.index(place)))}")
             continue
-        result.save(place.output, name=place.name, source=place.observations.name, temperature=temperature)
+        stated = LensSetting(values=stood[places.index(place)]) if setting else None
+        source = place.observations.name
+        result.save(place.output, name=place.name, source=source, temperature=temperature, setting=stated)
         if place.picture is not None:
             from kcal.report.calibration import save_calibration_picture
 
@@ -356,13 +371,6 @@ def _camera_files(
     return places
 
 
-def _option_number(text: str, option: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise InputError(f"{option}: {text.strip()!r} is not a number") from None
-
-
 def _fixed(texts: list[str]) -> dict[str, float | None]:
     """Parse `--fix` NAME or NAME=VALUE."""
     found: dict[str, float | None] = {}
@@ -370,7 +378,7 @@ def _fixed(texts: list[str]) -> dict[str, float | None]:
         name, equals, value = (part.strip() for part in text.partition("="))
         if name in found:
             raise InputError(f"--fix {text}: {name} is fixed twice")
-        found[name] = _option_number(value, f"--fix {text}") if equals else None
+        found[name] = option_number(value, f"--fix {text}") if equals else None
     return found
 
 
@@ -384,5 +392,5 @@ def _priors(texts: list[str]) -> dict[str, tuple[float, float]]:
             raise InputError(f"--prior {text}: write NAME=VALUE±SIGMA, for example fx=1600±5")
         if name in found:
             raise InputError(f"--prior {text}: {name} has a prior already")
-        found[name] = _option_number(mean, f"--prior {text}"), _option_number(sigma, f"--prior {text}")
+        found[name] = option_number(mean, f"--prior {text}"), option_number(sigma, f"--prior {text}")
     return found

@@ -89,6 +89,8 @@ def _history(camera: Camera) -> str:
     when = ""
     if record:
         when = f", {record.created:%Y-%m-%d %H:%M}, RMS {number_text(record.rms)} px from {record.views} views"
+    if camera.calibration and camera.calibration.setting:
+        when += f", {camera.calibration.setting}"
     if record and record.temperature is not None:
         when += f", at {record.temperature:g} °C"
     return f"{camera.model}, focal length {paraxial_focal(camera)}{when}"

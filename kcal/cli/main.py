@@ -31,6 +31,7 @@ from kcal.cli.diff import diff_command
 from kcal.cli.exchange import export_command, import_command
 from kcal.cli.init import init_command
 from kcal.cli.inputs import with_inputs
+from kcal.cli.interpolate import interpolate_command
 from kcal.cli.live import live_command
 from kcal.cli.locate import locate_command
 from kcal.cli.mark import mark_command
@@ -128,6 +129,7 @@ app.add_typer(board, name="board")
 app.command("capture", cls=Command)(with_inputs(capture_command))
 app.command("detect", cls=Command)(with_json(with_inputs(detect_command)))
 app.command("calibrate", cls=Command)(with_json(with_inputs(calibrate_command)))
+app.command("interpolate", cls=Command)(with_json(with_inputs(interpolate_command)))
 app.command("compare", cls=Command)(with_json(with_inputs(compare_command)))
 app.command("batch", cls=Command)(with_json(with_inputs(batch_command)))
 app.command("mark", cls=Command)(with_inputs(mark_command))

@@ -47,6 +47,7 @@ class _CameraFacts:
     sigma: Mapping[str, float | None]
     sigma_px: tuple[float, float] | None
     record: Mapping[str, Any] | None
+    setting: Mapping[str, Any] | None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -152,6 +153,7 @@ def _stored_camera(content: dict[str, Any], summary: Any) -> _CameraFacts | None
         sigma=brief.sigma,
         sigma_px=brief.sigma_px,
         record=record and record | {"board": brief.board},
+        setting=content.get("setting"),
     )
 
 
@@ -184,6 +186,7 @@ def _facts_of(camera: Camera) -> _CameraFacts:
         sigma=sigma_of(camera),
         sigma_px=sigma_over_image(camera),
         record=_fields(known.record) if known else None,
+        setting=_fields(known.setting) if known else None,
     )
 
 
@@ -228,6 +231,10 @@ def _show_camera(camera: _CameraFacts) -> None:
         )
         if record["temperature"] is not None:
             out.print(f"at {record['temperature']:g} °C")
+    if stood := camera.setting:
+        text = " ".join(f"{name}={value:g}" for name, value in stood["values"].items())
+        sources = ", ".join(stood["interpolated_from"])
+        out.print(f"setting {text}" + (f", interpolated from {sources}" if sources else ""), markup=False)
     hybrid = ", on its axis; fx and fy below are parameters of the base projection alone" if camera.hybrid else ""
     out.print(f"focal length {camera.focal_length}{hybrid}", markup=False)
     rows = [["parameter", "value", "sigma"]]

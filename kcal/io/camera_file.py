@@ -22,7 +22,7 @@ from kcal.io.file_summary import CameraSummary
 from kcal.io.information_record import InformationRecord
 from kcal.io.lens_record import LensOrders
 from kcal.io.record import CovarianceRecord
-from kcal.lens.calibration import CalibrationRecord, CameraCalibration
+from kcal.lens.calibration import CalibrationRecord, CameraCalibration, LensSetting
 from kcal.lens.camera import Camera
 from kcal.lens.projection import INTRINSICS
 from kcal.native_file import NativeFile, Record, storing
@@ -79,6 +79,7 @@ class CameraFile(NativeFile):
             computed.
         valid_region: where the lens is valid; None if whoever wrote the file did not say.
         calibration: how the camera was calibrated, if it was.
+        setting: where zoom and focus stood; None if nobody said.
         summary: what `kcal show` prints of it without computing.
 
     Example:
@@ -106,6 +107,7 @@ class CameraFile(NativeFile):
     information: InformationRecord | None = None
     valid_region: ValidRegion | None = None
     calibration: CalibrationRecord | None = None
+    setting: LensSetting | None = None
     summary: CameraSummary | None = None
 
     @pydantic.field_validator("coefficients", "standard_deviations")
@@ -169,13 +171,15 @@ class CameraFile(NativeFile):
         """The camera, equal to the stored one to the last bit, with its `calibration` if the file has one."""
         parameters = torch.tensor(list(self._values().values()), dtype=torch.float64)
         camera = Camera(parameters, size=self.image_size, model=self.model.model())
-        if self.name or self.standard_deviations or self.covariance or self.information or self.calibration:
+        stated = (self.standard_deviations, self.covariance, self.information, self.calibration, self.setting)
+        if self.name or any(stated):
             camera.calibration = CameraCalibration(
                 name=self.name,
                 sigma=self.standard_deviations,
                 covariance=None if self.covariance is None else self.covariance.expand(camera.names),
                 information=None if self.information is None else self.information.information(self._values()),
                 record=self.calibration,
+                setting=self.setting,
             )
         return camera
 
@@ -204,6 +208,7 @@ def camera_to_file(
     *,
     name: str | None = None,
     calibration: CalibrationRecord | None = None,
+    setting: LensSetting | None = None,
 ) -> CameraFile:
     """Put a camera in the form in which it is stored.
 
@@ -212,6 +217,7 @@ def camera_to_file(
             variance is zero, were held fixed.
         name: free text that tells cameras apart, in place of the one in `calibration`.
         calibration: how the camera was calibrated, in place of the record there.
+        setting: where zoom and focus stood, in place of what is said there.
 
     Raises:
         InputError: a batch of cameras, a parameter that is not finite, or a name that the camera does not have.
@@ -249,6 +255,7 @@ def camera_to_file(
                 polygon=tuple((round(u, 3), round(v, 3)) for u, v in camera.valid_polygon().tolist()),
             ),
             calibration=known.record if calibration is None else calibration,
+            setting=known.setting if setting is None else setting,
         )
     return file.model_copy(update={"summary": CameraSummary.made(camera, file.model_dump(mode="json"))})
 

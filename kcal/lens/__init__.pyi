@@ -37,6 +37,7 @@ from kcal.lens.information import CameraInformation as CameraInformation
 
 # Calibration records
 from kcal.lens.calibration import CameraCalibration as CameraCalibration
+from kcal.lens.calibration import LensSetting as LensSetting
 from kcal.lens.calibration import CalibrationRecord as CalibrationRecord
 from kcal.lens.calibration import BoardRecord as BoardRecord
 from kcal.lens.calibration import Exclusion as Exclusion

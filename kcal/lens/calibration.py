@@ -134,6 +134,36 @@ class CalibrationRecord:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class LensSetting:
+    """Where zoom and focus of a lens stood, as numbers of any unit: steps of a motor, a scale, millimeters.
+
+    Args:
+        values: name -> number, for example `{"focus": 3.2}`.
+        interpolated_from: names of the cameras between whose settings this one was interpolated; empty if calibrated.
+
+    Raises:
+        InputError: no name, or a number that is not finite.
+
+    Example:
+        >>> print(LensSetting(values={"zoom": 12.5, "focus": 3.2}))
+        zoom=12.5 focus=3.2
+    """
+
+    values: dict[str, float]
+    interpolated_from: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.values or not all(self.values):
+            raise InputError(f"setting {self.values}: each number needs a name, for example focus=3.2")
+        for name, value in self.values.items():
+            if not math.isfinite(value):
+                raise InputError(f"setting {name}={value}: a finite number is needed")
+
+    def __str__(self) -> str:
+        return " ".join(f"{name}={value:.12g}" for name, value in self.values.items())
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class CameraCalibration:
     """Name, error bars and history of a camera: what its file stores beside the camera.
 
@@ -145,6 +175,7 @@ class CameraCalibration:
             information if that is given, and None if neither was computed.
         information: what the calibration says of the camera (`CameraInformation`); None if that was not computed.
         record: how the camera was calibrated, if it was.
+        setting: where zoom and focus stood, if it was stated.
 
     Example:
         >>> CameraCalibration(name="left", sigma={"fx": 0.5, "fy": 0.5, "skew": None}).sigma["fx"]
@@ -156,6 +187,7 @@ class CameraCalibration:
     covariance: Tensor | None = None
     information: CameraInformation | None = None
     record: CalibrationRecord | None = None
+    setting: LensSetting | None = None
 
     def __post_init__(self) -> None:
         if self.information is not None:

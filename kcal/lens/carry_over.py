@@ -14,7 +14,7 @@ from kcal.lens.uncertainty import pixel_slopes
 # Pixels by which parameters that a calibration held may move the image: other programs have no exact parameters.
 _HELD_PX = 1e-4
 # Pixels in proportion to which limits of parameters count where a lens is fitted to another, as in `refit_camera`.
-_NOISE = 0.01
+FIT_PX = 0.01
 # Pixels a unit that no parameter is as weak as.
 _ROUNDING = 1e-12
 
@@ -70,22 +70,36 @@ def carried_covariance(
     good = valid & seen & shown
     count, theirs, own = int(good.sum()), theirs[good].flatten(0, 1), own[good].flatten(0, 1)
     limits = torch.zeros(len(adjustable)).double() if width is None else 1.0 / width.double()[adjustable]
-    fitted, size = _inverse_half(theirs, _NOISE * limits)
-    by_image = half[:, free] @ own.T
-    moved = by_image @ theirs @ fitted.T @ fitted
-    missed = (by_image - moved @ theirs.T).square().sum() / count
-    total = (misfit**2 + float(missed)) ** 0.5
-    noise = total * (count / size) ** 0.5
-    spread = noise * _inverse_half(theirs, noise * limits)[0]
-    # Limits keep some of it back.
-    reached = float(((spread @ theirs.T).square().sum() / count).sqrt())
-    rows = torch.cat([moved, spread * (total / reached)]) if total > 0 else moved
+    rows = fitted_errors(half[:, free] @ own.T, theirs, limits, misfit, count)
     out = half.new_zeros(len(wanted), len(wanted))
     out[torch.tensor(adjustable)[:, None], torch.tensor(adjustable)] = rows.T @ rows
     return out
 
 
-def _inverse_half(rows: Tensor, limits: Tensor) -> tuple[Tensor, int]:
+def fitted_errors(by_image: Tensor, slopes: Tensor, limits: Tensor, misfit: float, count: int) -> Tensor:
+    """Errors (K', C) of the parameters of a lens that is fitted to another one, of errors (K, 2N) of that one's image.
+
+    With `misfit` and with what the lens cannot follow as in `carried_covariance`.
+
+    Args:
+        by_image: pixels by which the other lens may be wrong, in rows that are independent, each one sigma.
+        slopes: (2N, C) pixels by parameters.
+        limits: (C,) one over the widths of the parameters' priors.
+        misfit: root mean square of the distance between both, pixels.
+        count: N.
+    """
+    fitted, size = inverse_half(slopes, FIT_PX * limits)
+    moved = by_image @ slopes @ fitted.T @ fitted
+    missed = (by_image - moved @ slopes.T).square().sum() / count
+    total = (misfit**2 + float(missed)) ** 0.5
+    noise = total * (count / size) ** 0.5
+    spread = noise * inverse_half(slopes, noise * limits)[0]
+    # Limits keep some of it back.
+    reached = float(((spread @ slopes.T).square().sum() / count).sqrt())
+    return torch.cat([moved, spread * (total / reached)]) if total > 0 else moved
+
+
+def inverse_half(rows: Tensor, limits: Tensor) -> tuple[Tensor, int]:
     """H (C, C) with HᵀH the inverse of rowsᵀ rows + diag(limits²) where that is determined, and in how many ways."""
     found = whitened(torch.cat([rows, torch.diag(limits)]), rows.new_zeros(len(rows) + len(limits)))
     return torch.where(found.known, found.change, 0.0).T, int(found.known.sum())

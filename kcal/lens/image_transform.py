@@ -137,4 +137,4 @@ class ImageTransform:
             sigma = {name: None if value is None else value * factor for (name, value), factor in scaled}
         if known.covariance is not None:
             covariance = factors[:, None] * known.covariance * factors
-        return CameraCalibration(name=known.name, sigma=sigma, covariance=covariance)
+        return CameraCalibration(name=known.name, sigma=sigma, covariance=covariance, setting=known.setting)

@@ -25,6 +25,7 @@ LINES = [
     "calibrate seen.json -o new.json --camera camera.json",
     "calibrate seen.json -o new.json --board-shape board.json",
     "compare seen.json --model opencv5",
+    "interpolate camera.json --setting focus=2 -o new.json",
     "detect picture.png --board 9x6 --square 25mm -o new.json",
     "rectify camera.json picture.png -o straight",
     "bake camera.json -o new.npz",

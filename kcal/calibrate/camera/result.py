@@ -16,7 +16,7 @@ from kcal.calibrate.problem.state import warp_modes
 from kcal.calibrate.problem.views import among
 from kcal.corners.observations import Observations
 from kcal.io.camera_file import CameraFile, camera_to_file, provenance
-from kcal.lens.calibration import CalibrationRecord, CameraCalibration, Exclusion
+from kcal.lens.calibration import CalibrationRecord, CameraCalibration, Exclusion, LensSetting
 from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
 from kcal.solve.result import SolverStatus
@@ -228,23 +228,37 @@ class CameraCalibrationResult:
             *(Exclusion(name=f"{c.view} corner {c.corner}", reason=c.reason) for c in self.rejected_corners),
         )
 
-    def file(self, *, name: str = "", source: str | None = None, temperature: float | None = None) -> CameraFile:
+    def file(
+        self,
+        *,
+        name: str = "",
+        source: str | None = None,
+        temperature: float | None = None,
+        setting: LensSetting | None = None,
+    ) -> CameraFile:
         """The camera with its error bars and history, in the form in which it is stored.
 
         Args:
             name: free text that tells cameras apart.
             source: name of the observations file, if there is one.
             temperature: of the camera when the views were taken, °C, if it is known.
+            setting: where zoom and focus of the lens stood, if they can move.
         """
         record = dataclasses.replace(self._record(), observations=source, temperature=temperature)
-        return camera_to_file(self.camera, name=name, calibration=record)
+        return camera_to_file(self.camera, name=name, calibration=record, setting=setting)
 
     def save(
-        self, path: str | Path, *, name: str = "", source: str | None = None, temperature: float | None = None
+        self,
+        path: str | Path,
+        *,
+        name: str = "",
+        source: str | None = None,
+        temperature: float | None = None,
+        setting: LensSetting | None = None,
     ) -> Path:
         """Write the camera file, with error bars and record; arguments as in `file`.
 
         Raises:
             FileError: the file cannot be written.
         """
-        return self.file(name=name, source=source, temperature=temperature).save(path)
+        return self.file(name=name, source=source, temperature=temperature, setting=setting).save(path)

@@ -153,6 +153,6 @@ def _refined(camera: Camera, parameters: Tensor, covariance: Tensor) -> Camera:
     sigma = {
         name: float(value) if 0 < value < math.inf else None for name, value in zip(camera.names, spread, strict=True)
     }
-    name, record = ("", None) if known is None else (known.name, known.record)
-    out.calibration = CameraCalibration(name=name, sigma=sigma, record=record)
+    known = CameraCalibration() if known is None else known
+    out.calibration = CameraCalibration(name=known.name, sigma=sigma, record=known.record, setting=known.setting)
     return out
