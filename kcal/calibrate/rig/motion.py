@@ -20,9 +20,9 @@ from kcal.calibrate.hybrid.evidence import WORTH, evidence_of_motion, maximize_e
 from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies
 from kcal.calibrate.hybrid.quadratic import Quadratic, ViewData
 from kcal.calibrate.problem.readout import AMPLITUDES, FELT, MEDIAN, MOTION, MotionSigma, Readout, motion_sigma
+from kcal.calibrate.rig.camera_rows import CameraRows, summed_products
 from kcal.lens.model import LensModel
 from kcal.lens.projection import project_components
-from kcal.calibrate.rig.camera_rows import CameraRows, summed_products
 from kcal.solve.schur import Products, column_scale
 
 # Nats by which motions must raise the evidence without the board that tells most of them.

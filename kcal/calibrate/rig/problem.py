@@ -203,7 +203,9 @@ class RigProblem:
                 each = (self._gram(block, _of_item(parts, i)) for i in range(len(block)))
                 others = torch.stack([_others_fall(total, gram) for gram in each])
             else:
-                others = _few_others_fall(total, EliminatedItems(block.joined(parts, self.shared_size), block.size).rows)
+                others = _few_others_fall(
+                    total, EliminatedItems(block.joined(parts, self.shared_size), block.size).rows
+                )
             falls.append(own + others)
         return falls
 
