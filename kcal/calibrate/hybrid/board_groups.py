@@ -19,13 +19,13 @@ def grouped(cameras: Sequence[CameraFit], kinds: Sequence[Board]) -> list[Camera
     Whether one board is better than two is asked of messages alone. Nothing is fitted again, and the evidence of each
     camera and of each group is found once.
     """
-    out, groups = list(cameras), list[_Group]()
+    out, groups = list(cameras), list[_SharedBoard]()
     # Those that know most begin: they have most to lose from another's board.
     known = [float(camera.message.rows[:, :-1].square().sum()) for camera in cameras]
     # Boards as printers make them look alike from all ends: turned messages have the same evidence.
     alone = [_evidence([camera.message], camera) for camera in cameras]
     for i in sorted(range(len(out)), key=lambda i: -known[i]):
-        best: tuple[float, CameraFit, _Group | None, float] = (0.0, out[i], None, alone[i])
+        best: tuple[float, CameraFit, _SharedBoard | None, float] = (0.0, out[i], None, alone[i])
         for group in groups:
             if kinds[group.members[0]] == kinds[i]:
                 for turn in quarter_turns(kinds[i]):
@@ -36,7 +36,7 @@ def grouped(cameras: Sequence[CameraFit], kinds: Sequence[Board]) -> list[Camera
                     best = max(best, (gain, camera, group, together), key=lambda found: found[0])
         _, out[i], home, together = best
         if home is None:
-            groups.append(_Group([i], out[i].message, together))
+            groups.append(_SharedBoard([i], out[i].message, together))
         else:
             home.members.append(i)
             home.said, home.evidence = _merged([home.said, out[i].message]), together
@@ -54,7 +54,7 @@ def grouped(cameras: Sequence[CameraFit], kinds: Sequence[Board]) -> list[Camera
 
 
 @dataclasses.dataclass
-class _Group:
+class _SharedBoard:
     """Cameras that saw one board, what they say of it, and the log evidence of that."""
 
     members: list[int]

@@ -68,15 +68,15 @@ class Poses:
 def pose_alone(board: Tensor, pixels: Tensor, camera: Camera, solver: LMOptions) -> tuple[Poses, Tensor]:
     """Board poses from one camera alone, and the RMS (V,) of each view, px; NaN where a view has no pose."""
     state, cost = poses_under(camera, Views(board_points=board, pixels=pixels), solver)
-    return Poses(state.rotation, state.translation), _rms(pixels, cost)
+    return Poses(state.rotation, state.translation), _view_rms(pixels, cost)
 
 
-def _rms(pixels: Tensor, cost: Tensor) -> Tensor:
+def _view_rms(pixels: Tensor, cost: Tensor) -> Tensor:
     """(V,) px, of the costs of views."""
     return (2.0 * cost / torch.isfinite(pixels).all(-1).sum(-1)).sqrt()
 
 
-def _typical(rms: Tensor) -> float:
+def _median_rms(rms: Tensor) -> float:
     """The median; infinite where a view has no pose."""
     return float(rms.median().nan_to_num(math.inf)) if len(rms) else 0.0
 
@@ -104,7 +104,7 @@ def check_cameras(data: RigData, good: Tensor, alone: Sequence[SeenAlone], solve
     """
     boards = data.boards
     assert boards is not None
-    rms = [_typical(one.rms[good[:, c]]) for c, one in enumerate(alone)]
+    rms = [_median_rms(one.rms[good[:, c]]) for c, one in enumerate(alone)]
     for name, own in zip(data.names, rms, strict=True):
         if not own <= _FOREIGN_RMS:
             raise InputError(
@@ -121,7 +121,7 @@ def check_cameras(data: RigData, good: Tensor, alone: Sequence[SeenAlone], solve
             if not _may_fit(boards, a, good[:, a], alone[a], data.cameras[b]):
                 break
             swapped.append(
-                _typical(pose_alone(boards.points, boards.pixels[good[:, a], a], data.cameras[b], solver)[1])
+                _median_rms(pose_alone(boards.points, boards.pixels[good[:, a], a], data.cameras[b], solver)[1])
             )
             if swapped[-1] >= _CLEARLY * rms[a]:
                 break
@@ -140,7 +140,7 @@ def _may_fit(boards: Boards, index: int, good: Tensor, alone: SeenAlone, camera:
     pixels = boards.pixels[which, index]
     start = BoardState.flat(camera.params.detach(), alone.poses.rotation[which], alone.poses.translation[which])
     _, cost = refine_poses(Views(board_points=boards.points, pixels=pixels), camera.model, start, _ROUGH)
-    return _typical(_rms(pixels, cost)) < _typical(alone.rms[which])
+    return _median_rms(_view_rms(pixels, cost)) < _median_rms(alone.rms[which])
 
 
 def evenly(count: int, most: int) -> Tensor:

@@ -171,7 +171,7 @@ class RigRows:
         cross = -by_pose @ whole.half
         cross[..., torch.cat([shared, shared.new_tensor([-1])])] += moving @ rows[:, _POSE:].mT
         felt = whole.combined(cross[..., :-1].flatten(0, 1).T)
-        pull, square, freedom = whole.pull, whole.square, float(whole.count)
+        pull, square, freedom = whole.pull, whole.square, float(whole.freedom)
         if felt.shape[1] < len(felt):
             basis, felt = torch.linalg.qr(felt)
             inside = basis.T @ pull
@@ -198,7 +198,7 @@ class _Whole(NamedTuple):
         root: (S, S) lower triangle of its products in this scale, what is hardly known included.
         pull: (S,) products with the residuals, in combinations of unit weight.
         determined: how many of these combinations the boards determine.
-        count: of residuals, less those that poses take up.
+        freedom: residuals, less those that poses take up.
         square: of all residuals.
         variance: mean of that.
     """
@@ -209,7 +209,7 @@ class _Whole(NamedTuple):
     root: Tensor
     pull: Tensor
     determined: float
-    count: int
+    freedom: int
     square: float
     variance: float
 

@@ -135,36 +135,36 @@ def joint_unknowns(
     elif not shared and not lenses:
         return held(cameras), None
     prior, amplitudes = _board_beforehand(shared, modes)
-    said, lenses = [prior], list[_GivenBoard]()
+    said, given = [prior], list[_GivenBoard]()
     for camera, part in zip(cameras, parts, strict=True):
         if part is None:
             nothing = torch.zeros(len(camera.names), 0, dtype=torch.float64)
             by_board = nothing.new_zeros(len(nothing), len(amplitudes))
-            lenses.append(_GivenBoard(nothing, nothing[0], nothing[0] > 0, by_board))
+            given.append(_GivenBoard(nothing, nothing[0], nothing[0] > 0, by_board))
             continue
         own = part.data + part.lens_prior
         if len(shared) == 1:
             # What cameras told each other of their board counts once: of two in one rig, each brings its own rows.
             own = own + part.told
         said.append(own.marginal(part.board))
-        lenses.append(_given_board(part, own, prior.slots, amplitudes))
+        given.append(_given_board(part, own, prior.slots, amplitudes))
     told = stacked([one.placed(prior.slots, amplitudes) for one in said])
-    board = whitened(told.rows[:, :-1], told.rows[:, -1])
-    lenses = [lens._replace(by_board=lens.by_board @ board.change) for lens in lenses]
+    shape = whitened(told.rows[:, :-1], told.rows[:, -1])
+    given = [lens._replace(by_board=lens.by_board @ shape.change) for lens in given]
     shapes = torch.zeros(0, 3, 0, dtype=torch.float64) if modes is None else modes.shapes
-    parts_begin, parts_known = ([getattr(one, name) for one in (*lenses, board)] for name in ("begin", "known"))
+    parts_begin, parts_known = ([getattr(one, name) for one in (*given, shape)] for name in ("begin", "known"))
     turns = [torch.eye(len(known), dtype=torch.float64) for known in parts_known]
     if any(camera.model.hybrid for camera in cameras):
-        corners = torch.einsum("bk,bcn->kcn", board.change, shapes).flatten(1)
-        turns = _felt(cameras, lenses, _PX_PER_METER * corners, parts_known)
+        corners = torch.einsum("bk,bcn->kcn", shape.change, shapes).flatten(1)
+        turns = _felt(cameras, given, _PX_PER_METER * corners, parts_known)
     # The unknowns of each camera, one after the other, and the board's: through these, lenses depend on each other.
     columns, selected = torch.block_diag(*turns).split([len(known) for known in parts_known]), list[Tensor]()
-    for lens, own_columns in zip(lenses, columns, strict=False):
+    for lens, own_columns in zip(given, columns, strict=False):
         selected.append(lens.own @ own_columns + lens.by_board @ columns[-1])
     found = SharedUnknowns(
         cameras=tuple(selected),
         shapes=shapes,
-        board=board.change @ columns[-1],
+        board=shape.change @ columns[-1],
         begin=torch.cat([turn.T @ begin for turn, begin in zip(turns, parts_begin, strict=True)]),
         known=torch.cat([(turn[known] != 0).any(0) for turn, known in zip(turns, parts_known, strict=True)]),
         labels=("",) * sum(turn.shape[1] for turn in turns),
