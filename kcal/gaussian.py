@@ -224,7 +224,7 @@ class Whitened(NamedTuple):
 
     Attributes:
         change: (U, U).
-        begin: (U,) what y is at x = 0.
+        begin: (U,) what y is at x = 0; (U, Q) where residuals depend on more than x.
         known: (U,) whether y is a standard normal; nothing is known of the others.
     """
 
@@ -236,13 +236,17 @@ class Whitened(NamedTuple):
 def whitened(rows: Tensor, residuals: Tensor) -> Whitened:
     """Change variables so that ‖rows x + residuals‖² = Σ y² over the known y, and a constant; rows (R, U).
 
+    Residuals (R, Q) times any vector (Q,) may stand for residuals (R,); `begin` is multiplied by it, too.
+
     Example:
         >>> whitened(torch.tensor([[2.0, 0.0]]).double(), torch.tensor([6.0]).double()).known
         tensor([ True, False])
     """
-    triangle = triangular(torch.cat([rows, residuals[:, None]], 1))[: rows.shape[1]]
-    scale = unit_scale(triangle[:, :-1])
-    left, values, right = torch.linalg.svd(triangle[:, :-1] * scale)
+    count, beside = rows.shape[1], residuals if residuals.ndim == 2 else residuals[:, None]
+    triangle = triangular(torch.cat([rows, beside], 1))[:count]
+    scale = unit_scale(triangle[:, :count])
+    left, values, right = torch.linalg.svd(triangle[:, :count] * scale)
     known = values > _ROUNDING * values[:1].sum()
     change = scale[:, None] * right.T / torch.where(known, values, 1.0)
-    return Whitened(change, torch.where(known, left.T @ triangle[:, -1], 0.0), known)
+    begin = torch.where(known[:, None], left.T @ triangle[:, count:], 0.0)
+    return Whitened(change, begin.reshape(count, *residuals.shape[1:]), known)

@@ -6,9 +6,10 @@
     python -m scripts.bench.stations two [PAIRS]        # StereoLocalizer beside MultiViewLocalizer
     python -m scripts.bench.stations many [CAMERAS VIEWS]  # cameras and views calibrated together, 16 and 60
 
-`--write` puts a part into docs/measured/stations.md. CPU seconds on one core (time.process_time). `many` runs mrcal in
-the same loop where KCAL_MRCAL names an interpreter that has it: cameras in rows of four, 0.5 m apart, look at a board
-4 m away, which all of them see; corners have 0.1 px of noise; lenses have five coefficients, kcal fits its default.
+`--write` puts a part into docs/measured/stations.md, `many` under the name of its counts. CPU seconds on one core
+(time.process_time). `many` runs mrcal in the same loop where KCAL_MRCAL names an interpreter that has it: cameras in
+rows of four, 0.5 m apart, look at a board 4 m away, which all of them see; corners have 0.1 px of noise; lenses have
+five coefficients, kcal fits its default.
 """
 
 from __future__ import annotations
@@ -293,7 +294,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     lines = parts[given.part]()
     show(lines)
     if given.write:
-        write_section("stations.md", given.part, "\n".join(lines))
+        name = "-".join([given.part, *map(str, given.counts if given.part == "many" else [])])
+        write_section("stations.md", name, "\n".join(lines))
 
 
 if __name__ == "__main__":

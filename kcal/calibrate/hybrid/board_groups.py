@@ -14,34 +14,52 @@ from kcal.gaussian import Gaussian, stacked
 
 
 def grouped(cameras: Sequence[CameraFit], kinds: Sequence[Board]) -> list[CameraFit]:
-    """Put each camera to the board, among those of its kind, that it shares with most evidence, or to a new one."""
-    out, groups, said = list(cameras), list[list[int]](), list[Gaussian]()
+    """Put each camera to the board, among those of its kind, that it shares with most evidence, or to a new one.
+
+    Whether one board is better than two is asked of messages alone. Nothing is fitted again, and the evidence of each
+    camera and of each group is found once.
+    """
+    out, groups = list(cameras), list[_SharedBoard]()
     # Those that know most begin: they have most to lose from another's board.
     known = [float(camera.message.rows[:, :-1].square().sum()) for camera in cameras]
+    # Boards as printers make them look alike from all ends: turned messages have the same evidence.
+    alone = [_evidence([camera.message], camera) for camera in cameras]
     for i in sorted(range(len(out)), key=lambda i: -known[i]):
-        best: tuple[float, CameraFit, int] = (0.0, out[i], len(groups))
-        for k, group in enumerate(groups):
-            if kinds[group[0]] == kinds[i]:
+        best: tuple[float, CameraFit, _SharedBoard | None, float] = (0.0, out[i], None, alone[i])
+        for group in groups:
+            if kinds[group.members[0]] == kinds[i]:
                 for turn in quarter_turns(kinds[i]):
                     camera = _turned(cameras[i], turn)
+                    together = _evidence([camera.message, group.said], camera)
                     # Read from another end only where that is clear.
-                    gain = _gain(camera, said[k]) - (CLEAR if turn else 0.0)
-                    best = max(best, (gain, camera, k), key=lambda found: found[0])
-        _, out[i], k = best
-        if k == len(groups):
-            groups.append([i])
-            said.append(out[i].message)
+                    gain = together - alone[i] - group.evidence - (CLEAR if turn else 0.0)
+                    best = max(best, (gain, camera, group, together), key=lambda found: found[0])
+        _, out[i], home, together = best
+        if home is None:
+            groups.append(_SharedBoard([i], out[i].message, together))
         else:
-            groups[k].append(i)
-            said[k] = _merged([said[k], out[i].message])
+            home.members.append(i)
+            home.said, home.evidence = _merged([home.said, out[i].message]), together
     # Boards are numbered by their first cameras.
-    for k, group in enumerate(sorted(groups, key=min)):
-        but_one = _but_one([out[i].message for i in group])
-        for i, others in zip(group, but_one, strict=True):
-            rivals = [said[g] for g, other in enumerate(groups) if other is not group and kinds[other[0]] == kinds[i]]
-            gains = [_gain(out[i], rival) for rival in ([others] if others is not None else rivals)]
+    for k, group in enumerate(sorted(groups, key=lambda group: min(group.members))):
+        but_one = _but_one([out[i].message for i in group.members])
+        for i, others in zip(group.members, but_one, strict=True):
+            if others is not None:
+                gains = [group.evidence - alone[i] - _evidence([others], out[i])]
+            else:
+                rivals = [g for g in groups if g is not group and kinds[g.members[0]] == kinds[i]]
+                gains = [_evidence([out[i].message, g.said], out[i]) - alone[i] - g.evidence for g in rivals]
             out[i] = dataclasses.replace(out[i], board=k, nats=max(gains, default=math.nan))
     return out
+
+
+@dataclasses.dataclass
+class _SharedBoard:
+    """Cameras that saw one board, what they say of it, and the log evidence of that."""
+
+    members: list[int]
+    said: Gaussian
+    evidence: float
 
 
 def compared(camera: CameraFit, known: Gaussian, kind: Board) -> CameraFit:
@@ -85,12 +103,6 @@ def _merged(messages: Sequence[Gaussian]) -> Gaussian:
 def _evidence(messages: Sequence[Gaussian], like: CameraFit) -> float:
     """Log evidence of messages about one printed board."""
     return printed_board(like.fit.board_shapes, messages)[1]
-
-
-def _gain(camera: CameraFit, others: Gaussian) -> float:
-    """Nats by which one board for all is better than one for the camera and one for the others."""
-    alone = _evidence([camera.message], camera) + _evidence([others], camera)
-    return _evidence([camera.message, others], camera) - alone
 
 
 def _turned(camera: CameraFit, turn: int) -> CameraFit:

@@ -23,7 +23,7 @@ from kcal.calibrate.hybrid.measured_board import MeasuredBoard
 from kcal.calibrate.hybrid.turned_fit import CameraFit, Shape, fit_turned
 from kcal.corners.observations import Observations
 from kcal.errors import InputError
-from kcal.gaussian import stacked
+from kcal.gaussian import Gaussian, stacked
 from kcal.lens.zernike import ZernikeModes
 
 # Calls a function for each of the numbered argument lists; numbers and results come in any order.
@@ -118,12 +118,15 @@ def fit_cameras(
             lens, lenses[:] = _learned_fleet(cameras, lens)
         tasks: dict[int, _Task] = {}
         others = [others_of(cameras, k) for k in range(1 + max(camera.board for camera in cameras))]
+        # The prior of a printed board is the same for all that saw it.
+        printed: dict[int, Gaussian] = {}
         for i, camera in enumerate(cameras):
             same = others[camera.board][i] if camera.board >= 0 else None
             shape = alone if known is None else known
             if shape == "printed" and same is not None:
-                base, _ = printed_board(camera.fit.board_shapes, [camera.message, same])
-                shape = BoardPrior(base, same)
+                if camera.board not in printed:
+                    printed[camera.board], _ = printed_board(camera.fit.board_shapes, [camera.message, same])
+                shape = BoardPrior(printed[camera.board], same)
             if fleet or shape is not alone:
                 # Views that were turned since, and lenses of another form, have other unknowns.
                 kept = lenses[i] is None and torch.equal(camera.turns, fitted[i])

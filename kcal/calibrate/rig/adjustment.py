@@ -12,7 +12,7 @@ from torch import Tensor
 from kcal.calibrate.rig.blocks import Block, BoardBlock, Effects, FeatureBlock, Kind, PerKind, RigState
 from kcal.calibrate.rig.initial_poses import Start
 from kcal.calibrate.rig.landmark_block import LandmarkBlock
-from kcal.calibrate.rig.motion import BoardMotion, SeenBoards, WithoutMotion, board_motion
+from kcal.calibrate.rig.motion import BoardMotion, RigRows, SeenBoards, WithoutMotion, board_motion
 from kcal.calibrate.rig.problem import DistanceTerm, PlaceTerm, RigProblem, SharedTerm
 from kcal.calibrate.rig.sources import Features, Landmarks, RigData
 from kcal.calibrate.rig.star_block import StarBlock
@@ -214,14 +214,18 @@ class Adjustment:
         good = masks.boards & (square <= _WRONG * square[masks.boards].median())
         problem = self.problem(everything)
         block = next(block for block in problem.blocks if isinstance(block, BoardBlock))
-        posed, pixels = problem.posed(state), 2 * boards.pixels.shape[2]
-        rows = block.rows(posed, state, problem.shared_size)
-        # Rows of cameras whose motions are taken out of `rows`, as they were before.
+        posed = problem.posed(state)
+        rig = RigRows(block.camera_rows(posed, state), good, problem.shared_size)
+        # Rows of cameras whose motions are taken out, as they were before; what the others' motions were at that time.
         before: dict[int, Tensor] = {}
+        others: dict[int, list[BoardMotion | None]] = {}
         for c in trusted * _TURNS:
-            own = rows[..., pixels * c : pixels * (c + 1)]
+            beside = [one for k, one in enumerate(self.motion) if k != c]
+            if c in others and all(a is b for a, b in zip(beside, others[c], strict=True)):
+                continue
+            others[c] = beside
             if c in before:
-                own.copy_(before.pop(c))
+                rig.put(c, before.pop(c))
             seen = SeenBoards(
                 model=posed[c].camera.model,
                 parameters=posed[c].parameters,
@@ -232,10 +236,10 @@ class Adjustment:
                 whitening=block.whitening[:, c],
                 size=posed[c].camera.size,
             )
-            found = self.motion[c] = board_motion(seen, rows, pixels * c, good)
+            found = self.motion[c] = board_motion(seen, rig, c)
             if found is not None:
-                before[c] = own.clone()
-                own.copy_(WithoutMotion(found.columns, block.whitening[:, c])(before[c]))
+                before[c] = rig.parts[c].rows
+                rig.put(c, WithoutMotion(found.columns, block.whitening[:, c])(before[c]))
 
     def fit_corners(self, masks: PerKind, *, robust: bool = False) -> None:
         """Set the corners' sigma from the boards' residuals, unless it was given.

@@ -11,13 +11,14 @@ Residuals are divided by their standard deviations: their squares add up to χ²
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from kcal.calibrate.problem.twist import apply_twist
+from kcal.calibrate.rig.camera_rows import CameraRows
 from kcal.calibrate.rig.motion import WithoutMotion
 from kcal.lens.camera import Camera
 from kcal.lens.pose import side_axes, step_rows
@@ -113,6 +114,7 @@ class Block(ABC):
     def __init__(self, pixels: Tensor, whitening: Tensor, effects: Effects | None = None) -> None:
         self._effects = effects
         self.seen = torch.isfinite(pixels).all(-1)
+        self._used = self.seen.any(-1).any(0).tolist()
         self.target = torch.where(self.seen[..., None], pixels, 0.0).transpose(-1, -2).contiguous()
         self.whitening = torch.where(self.seen[..., None, None], whitening, 0.0).movedim(-3, -1).contiguous()
 
@@ -141,16 +143,19 @@ class Block(ABC):
     def retract(self, state: RigState, step: Tensor) -> RigState:
         """Apply a step (V, L) to this block's part of the state."""
 
-    def _by_board_or_air(self, state: RigState, by_q: Tensor, offset: Tensor, camera: int) -> Tensor | None:
-        """Derivatives (V, K, 2, N) of pixels by the unknowns through board or air; None where they have none.
+    def _through(self) -> Tensor | None:
+        """(E, K) what of board or air the unknowns change, by these; None where they change nothing."""
+        return None
+
+    def _by_board_or_air(self, state: RigState, by_q: Tensor, offset: Tensor) -> Tensor:
+        """Derivatives (V, E, 2, N) of pixels by what `_through` lists.
 
         Args:
             state: where.
             by_q: (V, 3, 2, N) of pixels by q in the world.
             offset: (V, 3, N) straight from the camera.
-            camera: number of the camera.
         """
-        return None
+        raise NotImplementedError
 
     def _moves(self, state: RigState, camera: int) -> Tensor:
         """(E, V, 3) by which one sigma of each effect shifts the items for a camera."""
@@ -177,6 +182,8 @@ class Block(ABC):
     ) -> Iterator[tuple[int, PosedCamera, Tensor, Tensor, Tensor, Projection, Tensor]]:
         y, w = self._place(state)
         for c, posed in enumerate(cameras):
+            if not self._used[c]:
+                continue
             offset = y - w * posed.center[:, None]
             if self._effects is not None:
                 amounts = self._effects.of_state @ state.unknown
@@ -191,7 +198,9 @@ class Block(ABC):
 
     def errors(self, cameras: Sequence[PosedCamera], state: RigState) -> Tensor:
         """(V, C, 2, N) projected minus seen, pixels; 0 where not seen."""
-        return torch.stack([error for *_, error in self._projected(cameras, state, False)], 1)
+        found = torch.zeros_like(self.target).unbind(1)
+        used = {c: error for c, *_, error in self._projected(cameras, state, False)}
+        return torch.stack([used.get(c, none) for c, none in enumerate(found)], 1)
 
     def residuals(self, cameras: Sequence[PosedCamera], state: RigState) -> Tensor:
         """(V, R) whitened residuals, pixels first."""
@@ -200,39 +209,58 @@ class Block(ABC):
         prior = self._prior(state)
         return white if prior is None else torch.cat([white, prior[:, -1]], -1)
 
-    def rows(self, cameras: Sequence[PosedCamera], state: RigState, shared_size: int) -> Tensor:
-        """(V, L + S + 1, R) derivatives of whitened residuals by local and shared unknowns; last the residuals."""
-        out = []
+    def camera_rows(self, cameras: Sequence[PosedCamera], state: RigState) -> Iterator[CameraRows]:
+        """Rows of each camera that sees anything; last what is known of the items beforehand."""
         for c, posed, offset, q, w, found, error in self._projected(cameras, state, True):
-            rows = q.new_zeros((len(self), self.size + shared_size + 1, 2, q.shape[-1]))
             by_q = torch.einsum("vkun,kj->vjun", found.by_point, posed.rotation)
             by_offset = self._by_offset(state, by_q, offset)
-            rows[:, : self.size] = self._by_local(state, by_offset, posed.center, found.by_meter)
-            shared = rows[:, self.size : -1]
-            count = posed.by_unknown.shape[1]
-            if count:
-                by_unknown = posed.by_unknown[posed.by_unknown.any(1)]
-                # Most unknowns are of another camera.
-                own = by_unknown.any(0).nonzero()[:, 0]
-                shared[:, own] = torch.einsum("vpun,pk->vkun", found.by_camera, by_unknown[:, own])
-                besides = self._by_board_or_air(state, by_q, offset, c)
-                if besides is not None:
-                    shared[:, :count] += besides
-                if self._effects is not None and self._effects.of_step is not None:
-                    by_effect = torch.einsum("vjun,evj->veun", by_offset, self._moves(state, c))
-                    shared[:, :count] += torch.einsum("ek,veun->vkun", self._effects.of_step, by_effect)
+            parts, maps = [self._by_local(state, by_offset, posed.center, found.by_meter)], list[Tensor]()
+            moved = list[Tensor]()
+            used = posed.by_unknown.any(1)
+            if bool(used.any()):
+                moved.append(found.by_camera)
+                maps.append(posed.by_unknown[used])
+            if (through := self._through()) is not None:
+                moved.append(self._by_board_or_air(state, by_q, offset))
+                maps.append(through)
+            if self._effects is not None and self._effects.of_step is not None:
+                moved.append(torch.einsum("vjun,evj->veun", by_offset, self._moves(state, c)))
+                maps.append(self._effects.of_step)
+            columns = torch.zeros(0, dtype=torch.long)
+            if maps:
+                onto = torch.cat(maps)
+                columns = onto.any(0).nonzero()[:, 0]
+                by = torch.cat(moved, 1)
+                own = (onto[:, columns].T @ by.flatten(2)).unflatten(2, by.shape[2:])
+                parts.append(own)
+            for slot in (posed.turn, posed.shift):
+                if slot is not None:
+                    columns = torch.cat([columns, torch.arange(slot.start, slot.stop)])
             if posed.turn is not None:
-                shared[:, posed.turn] = step_rows(found.by_point, q)[:, :3]
+                parts.append(step_rows(found.by_point, q)[:, :3])
             if posed.shift is not None:
-                shared[:, posed.shift] = -w[..., None] * by_offset
-            rows[:, -1] = error
+                parts.append(-w[..., None] * by_offset)
+            rows = torch.cat([*parts, error[:, None]], 1)
             rows = torch.where(self.seen[:, c, None, None, :], rows, 0.0)
-            out.append(self._white(c, rows))
+            yield CameraRows(c, columns, self._white(c, rows))
         prior = self._prior(state)
         if prior is not None:
-            rows = prior.new_zeros((len(self), self.size + shared_size + 1, prior.shape[-1]))
-            rows[:, : self.size], rows[:, -1] = prior[:, :-1], prior[:, -1]
-            out.append(rows)
+            yield CameraRows(None, torch.zeros(0, dtype=torch.long), prior)
+
+    def rows(self, cameras: Sequence[PosedCamera], state: RigState, shared_size: int) -> Tensor:
+        """(V, L + S + 1, R) derivatives of whitened residuals by local and shared unknowns; last the residuals."""
+        return self.joined(self.camera_rows(cameras, state), shared_size)
+
+    def joined(self, parts: Iterable[CameraRows], shared_size: int) -> Tensor:
+        """(V, L + S + 1, R) rows of all cameras and of what is known beforehand, with all columns."""
+        (_, count, *_), width = self.seen.shape, self.size + shared_size + 1
+        out = [self.target.new_zeros(len(self), width, self.target[0, 0].numel()) for _ in range(count)]
+        for camera, columns, rows in parts:
+            if camera is None:
+                out.append(rows.new_zeros(len(self), width, rows.shape[-1]))
+            wide = out[-1 if camera is None else camera]
+            wide[:, : self.size], wide[:, self.size + columns] = rows[:, : self.size], rows[:, self.size : -1]
+            wide[:, -1] = rows[:, -1]
         return torch.cat(out, -1)
 
 
@@ -285,12 +313,13 @@ class BoardBlock(Block):
         # By ω through ω × (R x), then by v.
         return step_rows(by_q, state.board_rotation @ self.shaped(state))
 
-    def _by_board_or_air(self, state: RigState, by_q: Tensor, offset: Tensor, camera: int) -> Tensor | None:
-        if self._shapes is None or self._by_unknown is None or not self._by_unknown.any():
-            return None
-        moved = torch.einsum("bk,bln->kln", self._by_unknown, self._shapes)
+    def _through(self) -> Tensor | None:
+        return self._by_unknown if self._by_unknown is not None and bool(self._by_unknown.any()) else None
+
+    def _by_board_or_air(self, state: RigState, by_q: Tensor, offset: Tensor) -> Tensor:
+        assert self._shapes is not None
         by_point = torch.einsum("vjun,vjl->vlun", by_q, state.board_rotation)
-        return torch.einsum("vlun,kln->vkun", by_point, moved)
+        return torch.einsum("vlun,bln->vbun", by_point, self._shapes)
 
     def retract(self, state: RigState, step: Tensor) -> RigState:
         """See `Block.retract`."""

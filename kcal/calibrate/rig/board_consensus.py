@@ -6,13 +6,15 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from kcal.calibrate.problem.poses import poses_under
+from kcal.calibrate.problem.poses import poses_under, refine_poses
+from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.views import Views
-from kcal.calibrate.rig.sources import RigData
+from kcal.calibrate.rig.sources import Boards, RigData
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.solve.lm import LMOptions
@@ -22,6 +24,10 @@ MINIMUM_CORNERS = 6
 _FOREIGN_RMS = 5.0
 # Cameras are swapped only if each fits the other's boards with less than this share of its own RMS.
 _CLEARLY = 0.9
+# Views, and steps of the solver, that tell whether another camera may fit them at all: of C cameras there are C² pairs.
+_FEW, _ROUGH = 4, LMOptions(max_iterations=10, tolerance=1e-4)
+# Pairs that propose a relative pose: half of them may be wrong.
+_PROPOSALS = 16
 # A turned order of corners is believed only if it leaves less than this share of the error.
 _TURNED = 0.2
 
@@ -59,25 +65,46 @@ class Poses:
         return Poses(self.rotation[index], self.translation[index])
 
 
-def pose_alone(board: Tensor, pixels: Tensor, camera: Camera, solver: LMOptions) -> tuple[Poses, float]:
-    """Board poses from one camera alone, and the median RMS of its views; infinite where one of them has no pose."""
+def pose_alone(board: Tensor, pixels: Tensor, camera: Camera, solver: LMOptions) -> tuple[Poses, Tensor]:
+    """Board poses from one camera alone, and the RMS (V,) of each view, px; NaN where a view has no pose."""
     state, cost = poses_under(camera, Views(board_points=board, pixels=pixels), solver)
-    corners = torch.isfinite(pixels).all(-1).sum(-1)
-    rms = float((2.0 * cost / corners).sqrt().median())
-    return Poses(state.rotation, state.translation), rms if math.isfinite(rms) else math.inf
+    return Poses(state.rotation, state.translation), _view_rms(pixels, cost)
 
 
-def check_cameras(data: RigData, good: Tensor, rms: Sequence[float], solver: LMOptions) -> None:
+def _view_rms(pixels: Tensor, cost: Tensor) -> Tensor:
+    """(V,) px, of the costs of views."""
+    return (2.0 * cost / torch.isfinite(pixels).all(-1).sum(-1)).sqrt()
+
+
+def _median_rms(rms: Tensor) -> float:
+    """The median; infinite where a view has no pose."""
+    return float(rms.median().nan_to_num(math.inf)) if len(rms) else 0.0
+
+
+class SeenAlone(NamedTuple):
+    """What one camera alone makes of the boards that it sees well.
+
+    Attributes:
+        poses: (V,) of all boards, NaN for others.
+        rms: (V,) px, likewise.
+    """
+
+    poses: Poses
+    rms: Tensor
+
+
+def check_cameras(data: RigData, good: Tensor, alone: Sequence[SeenAlone], solver: LMOptions) -> None:
     """Refuse cameras that do not fit their boards, or that fit each other's boards clearly better.
 
     Args:
         data: with boards.
         good: (V, C) which boards each camera sees well.
-        rms: of each camera alone on these (`pose_alone`).
+        alone: what each camera makes of these.
         solver: options of the solver.
     """
     boards = data.boards
     assert boards is not None
+    rms = [_median_rms(one.rms[good[:, c]]) for c, one in enumerate(alone)]
     for name, own in zip(data.names, rms, strict=True):
         if not own <= _FOREIGN_RMS:
             raise InputError(
@@ -89,10 +116,14 @@ def check_cameras(data: RigData, good: Tensor, rms: Sequence[float], solver: LMO
         if data.cameras[one].size != data.cameras[other].size or not bool(good[:, pair].any(0).all()):
             continue
         swapped = []
-        # The second of the two is seldom needed.
-        for own, a, b in ((rms[one], one, other), (rms[other], other, one)):
-            swapped.append(pose_alone(boards.points, boards.pixels[good[:, a], a], data.cameras[b], solver)[1])
-            if swapped[-1] >= _CLEARLY * own:
+        # The second of the two is seldom needed, and all views hardly ever.
+        for a, b in (pair, pair[::-1]):
+            if not _may_fit(boards, a, good[:, a], alone[a], data.cameras[b]):
+                break
+            swapped.append(
+                _median_rms(pose_alone(boards.points, boards.pixels[good[:, a], a], data.cameras[b], solver)[1])
+            )
+            if swapped[-1] >= _CLEARLY * rms[a]:
                 break
         else:
             first, second = data.names[one], data.names[other]
@@ -100,6 +131,21 @@ def check_cameras(data: RigData, good: Tensor, rms: Sequence[float], solver: LMO
                 f"the {first} observations fit the {second} camera better (RMS {swapped[0]:.2f} against "
                 f"{rms[one]:.2f} px), and the {second} ones the {first} camera: the cameras are swapped"
             )
+
+
+def _may_fit(boards: Boards, index: int, good: Tensor, alone: SeenAlone, camera: Camera) -> bool:
+    """Whether another camera fits a few of the boards that one sees better than this one does."""
+    which = good.nonzero()[:, 0]
+    which = which[evenly(len(which), _FEW)]
+    pixels = boards.pixels[which, index]
+    start = BoardState.flat(camera.params.detach(), alone.poses.rotation[which], alone.poses.translation[which])
+    _, cost = refine_poses(Views(board_points=boards.points, pixels=pixels), camera.model, start, _ROUGH)
+    return _median_rms(_view_rms(pixels, cost)) < _median_rms(alone.rms[which])
+
+
+def evenly(count: int, most: int) -> Tensor:
+    """Numbers below `count`, `most` at most, evenly taken."""
+    return torch.linspace(0, count - 1, min(count, most)).round().long()
 
 
 def half_turn(board: Tensor) -> Poses:
@@ -113,10 +159,12 @@ def consensus(
 ) -> tuple[Poses, Tensor, Tensor]:
     """Find the relative pose that most pairs agree with, which pairs are turned under it, and each pair's error (px).
 
-    Every pair proposes a relative pose, with the corners as read and with the second camera's order turned by 180°.
+    Each of some pairs, evenly taken, proposes a relative pose, with the corners as read and with the second camera's
+    order turned by 180°.
     """
-    proposals = [right[i].after(left[i].inverse()) for i in range(len(pixels))]
-    proposals += [right[i].after(half_turn(board)).after(left[i].inverse()) for i in range(len(pixels))]
+    some = evenly(len(pixels), _PROPOSALS).tolist()
+    proposals = [right[i].after(left[i].inverse()) for i in some]
+    proposals += [right[i].after(half_turn(board)).after(left[i].inverse()) for i in some]
     as_read, other_end = pixels[:, 1], pixels[:, 1].flip(-2)
     points_left = board @ left.rotation.transpose(-1, -2) + left.translation[:, None]
     best: tuple[float, Poses, Tensor, Tensor] | None = None
@@ -130,7 +178,7 @@ def consensus(
         rank = min(len(error), max(2, (len(error) + 1) // 2))
         score = float(error.sort().values[rank - 1])
         # One pair, or boards that hardly moved, fit a turned proposal as well: then the order is as read.
-        if best is None or score < (_TURNED if number >= len(pixels) else 1.0) * best[0]:
+        if best is None or score < (_TURNED if number >= len(some) else 1.0) * best[0]:
             best = (score, proposal, turned, error)
     assert best is not None
     return best[1:]

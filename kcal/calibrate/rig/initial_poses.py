@@ -10,7 +10,15 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.problem.closed_form import spread_out
-from kcal.calibrate.rig.board_consensus import MINIMUM_CORNERS, Poses, check_cameras, consensus, half_turn, pose_alone
+from kcal.calibrate.rig.board_consensus import (
+    MINIMUM_CORNERS,
+    Poses,
+    SeenAlone,
+    check_cameras,
+    consensus,
+    half_turn,
+    pose_alone,
+)
 from kcal.calibrate.rig.resection import consensus_pose, consensus_rotation, distinct_poses, rotation_between
 from kcal.calibrate.rig.sources import Boards, RigData
 from kcal.errors import DegenerateError
@@ -258,7 +266,8 @@ class _BoardViews:
         self.flipped: list[TurnedBoard] = []
         self.foreign: dict[int, str] = {}
         self._alone: list[Poses] = []
-        rms: list[float] = []
+        self._compared: set[tuple[int, int]] = set()
+        alone = list[SeenAlone]()
         self._good = torch.zeros(0, len(data.cameras), dtype=torch.bool)
         boards = data.boards
         if boards is None:
@@ -270,16 +279,15 @@ class _BoardViews:
             enough = (valid.sum(-1) >= MINIMUM_CORNERS) & spread_out(points, with_ray)
             rotation = torch.full((len(enough), 3, 3), math.nan, dtype=torch.float64)
             translation = torch.full((len(enough), 3), math.nan, dtype=torch.float64)
+            rms = torch.full((len(enough),), math.nan, dtype=torch.float64)
             if bool(enough.any()):
-                found, own = pose_alone(points, boards.pixels[enough, c], camera, solver)
-                rms.append(own)
+                found, rms[enough] = pose_alone(points, boards.pixels[enough, c], camera, solver)
                 rotation[enough], translation[enough] = found.rotation, found.translation
-            else:
-                rms.append(0.0)
-            self._alone.append(Poses(rotation, translation))
+            alone.append(SeenAlone(Poses(rotation, translation), rms))
             good.append(enough)
         self._good = torch.stack(good, -1)
-        check_cameras(data, self._good, rms, solver)
+        check_cameras(data, self._good, alone, solver)
+        self._alone = [one.poses for one in alone]
 
     def link(self, known: _Known, waiting: list[int]) -> bool:
         """Place the waiting camera that shares the most boards with one that is placed."""
@@ -294,12 +302,13 @@ class _BoardViews:
         if self.data.boards is None:
             return
         for camera in range(1, len(self.data.cameras)):
-            if bool((self._good[:, 0] & self._good[:, camera]).any()):
+            if (0, camera) not in self._compared and bool((self._good[:, 0] & self._good[:, camera]).any()):
                 self._relative(0, camera)
 
     def _relative(self, first: int, second: int) -> Poses:
         boards = self.data.boards
         assert boards is not None
+        self._compared.add((first, second))
         both = (self._good[:, first] & self._good[:, second]).nonzero()[:, 0]
         cameras = self.data.cameras[first], self.data.cameras[second]
         one, two = (Poses(self._alone[c].rotation[both], self._alone[c].translation[both]) for c in (first, second))

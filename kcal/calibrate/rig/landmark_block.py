@@ -62,11 +62,12 @@ class LandmarkBlock(Block):
         slope = 2.0 * state.refraction * _HALF_CURVATURE * offset[:, :_UP, None]
         return torch.cat([by_q[:, :_UP] + slope * by_q[:, _UP:], by_q[:, _UP:]], 1)
 
-    def _by_board_or_air(self, state: RigState, by_q: Tensor, offset: Tensor, camera: int) -> Tensor | None:
-        if self._by_refraction is None:
-            return None
+    def _through(self) -> Tensor | None:
+        return None if self._by_refraction is None else self._by_refraction[None]
+
+    def _by_board_or_air(self, state: RigState, by_q: Tensor, offset: Tensor) -> Tensor:
         lift = _HALF_CURVATURE * offset[:, :_UP, None].square().sum(1, keepdim=True)
-        return self._by_refraction[:, None, None] * (lift * by_q[:, _UP:])
+        return lift * by_q[:, _UP:]
 
     def _by_local(self, state: RigState, by_q: Tensor, center: Tensor, by_w: Tensor | None) -> Tensor:
         return by_q

@@ -8,7 +8,7 @@ its standard deviations, and (I + U Uᵀ)^-½ r takes the place of r.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,11 +18,12 @@ from torch import Tensor
 from kcal.calibrate.hybrid.amplitudes import expected_maximum
 from kcal.calibrate.hybrid.evidence import WORTH, evidence_of_motion, maximize_evidence
 from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies
-from kcal.calibrate.hybrid.quadratic import ViewData, view_data
+from kcal.calibrate.hybrid.quadratic import Quadratic, ViewData
 from kcal.calibrate.problem.readout import AMPLITUDES, FELT, MEDIAN, MOTION, MotionSigma, Readout, motion_sigma
+from kcal.calibrate.rig.camera_rows import CameraRows, summed_products
 from kcal.lens.model import LensModel
 from kcal.lens.projection import project_components
-from kcal.solve.schur import Products, without_local
+from kcal.solve.schur import Products, column_scale
 
 # Nats by which motions must raise the evidence without the board that tells most of them.
 _WORTH_OF_OTHERS = 1.0
@@ -76,60 +77,173 @@ class BoardMotion(NamedTuple):
     reach: float
 
 
-def board_motion(seen: SeenBoards, rows: Tensor, start: int, good: Tensor) -> BoardMotion | None:
+def board_motion(seen: SeenBoards, rig: RigRows, camera: int) -> BoardMotion | None:
     """How boards move while this camera reads its rows; None where they stand still.
 
     Args:
         seen: all boards.
-        rows: (V, 6 + S + 1, R) of all cameras, whitened, other cameras' motions integrated out: derivatives of
-            residuals by the boards' poses and by what they share, and the residuals.
-        start: where the 2 N rows of this camera begin.
-        good: (V,) of which boards the motion is told.
+        rig: rows of all cameras, other cameras' motions integrated out.
+        camera: its number.
     """
+    good = rig.good
+    if int(good.sum()) < _FEWEST or camera not in rig.parts:
+        return None
     points_cam = seen.rotation @ seen.points + seen.translation[..., None]
     found = project_components(points_cam, seen.parameters, seen.model, [])
-    good = good & rows.isfinite().all(-1).all(-1)
-    if int(good.sum()) < _FEWEST:
-        return None
     distance = float(seen.translation[good].norm(dim=-1).median())
     readout = Readout(center=seen.points.mean(-1), distance=distance, size=seen.size)
     columns = readout.columns_of(found.by_point, seen.rotation, readout.time(seen.pixels), seen.points).nan_to_num(0.0)
     white = torch.einsum("vuwn,vpwn->vpun", seen.whitening, columns).flatten(-2)
-    moving = torch.zeros(*white.shape[:2], rows.shape[-1], dtype=rows.dtype)
-    moving[..., start : start + white.shape[-1]] = white
-    off = without_local(torch.cat([rows[:, :_POSE], moving, rows[:, _POSE:]], 1)[good], _POSE)
-    counts = (rows[good, :_POSE] != 0).any(1).sum(-1) - _POSE
-    shared = off[:, MOTION:-1].transpose(0, 1).flatten(1).norm(dim=1)
-    families = _hardly_known(torch.where(shared > 0, _WIDE / shared, 0.0))
-    zero = torch.zeros_like(shared)
-
-    def told_by(views: Tensor) -> ViewData:
-        products = Products.of_rows(off[views, :MOTION], off[views, MOTION:])
-        return view_data(products, zero, off.new_zeros(len(products.local), MOTION), float(counts[views].sum()))
-
-    every = torch.ones(len(off), dtype=torch.bool)
-    data = told_by(every)
-    variance = float(off[:, -1].square().sum()) / max(float(counts.sum()), 1.0)
+    variance = rig.variance
     # Nothing is left to explain of corners without noise.
     if variance < _EXACT:
         return None
+    data, families = rig.told(camera, white)
     begin = np.full(AMPLITUDES, math.log(MEDIAN) - 0.5 * math.log(variance))
     best = maximize_evidence(data, families, _NONE, variance, _NO_PRIOR, begin)
-    # What a single board tells of is wrong with that board.
-    explained = data.integrated(best.log_ratio).half[..., -1].square().sum(-1)
-    others = every.clone()
-    others[int(explained.argmax())] = False
     if evidence_of_motion(data, best, families, 1.0) < WORTH:
         return None
-    if evidence_of_motion(told_by(others), best, families, 1.0) < _WORTH_OF_OTHERS:
+    # What a single board tells of is wrong with that board.
+    explained = data.integrated(best.log_ratio).half[..., -1].square().sum(-1)
+    others = rig.without(int(good.nonzero()[explained.argmax(), 0]))
+    rest, their_families = others.told(camera, white)
+    if evidence_of_motion(rest, best, their_families, 1.0) < _WORTH_OF_OTHERS:
         return None
     sigma = motion_sigma(expected_maximum(data, families, best, _NO_PRIOR).log_ratio, best.variance)
     each = torch.tensor(sigma, dtype=torch.float64).repeat_interleave(MOTION // AMPLITUDES)
     return BoardMotion(columns * each[:, None, None], sigma, readout.reach(seen.points.T))
 
 
+class RigRows:
+    """Rows of all cameras of a rig, from which what boards move before one camera is told after the other.
+
+    Args:
+        parts: `CameraRows` of the cameras, whitened: derivatives of residuals by the boards' poses and by what boards
+            share, and the residuals.
+        good: (V,) of which boards motions are told; of those, the ones whose rows are finite.
+        shared_size: number of the unknowns that boards share.
+    """
+
+    def __init__(self, parts: Iterable[CameraRows], good: Tensor, shared_size: int) -> None:
+        self.parts = {part.camera: part for part in parts}
+        finite = [part.rows.isfinite().all(-1).all(-1) for part in self.parts.values()]
+        self.good, self._size = torch.stack([good, *finite]).all(0), shared_size
+        self._whole: _Whole | None = None
+
+    def put(self, camera: int, rows: Tensor) -> None:
+        """Replace the rows of a camera."""
+        self.parts[camera] = self.parts[camera]._replace(rows=rows)
+        self._whole = None
+
+    def without(self, board: int) -> RigRows:
+        """The same, one board being no longer a good one."""
+        good = self.good.clone()
+        good[board] = False
+        return RigRows(self.parts.values(), good, self._size)
+
+    @property
+    def variance(self) -> float:
+        """Mean square of the residuals, in standard deviations, as boards that stand still leave them."""
+        return self._all().variance
+
+    def _all(self) -> _Whole:
+        """All cameras together; formed once, as long as their rows are the same."""
+        if self._whole is None:
+            some = [part._replace(rows=part.rows[self.good]) for part in self.parts.values()]
+            residuals = sum(int((part.rows[:, :_POSE] != 0).any(1).sum()) for part in some)
+            count = residuals - _POSE * int(self.good.sum())
+            self._whole = _Whole.of(summed_products(some, _POSE, self._size), count)
+        return self._whole
+
+    def told(self, camera: int, white: Tensor) -> tuple[ViewData, PriorFamilies]:
+        """What good boards tell of their motions before a camera, whatever their poses and all that they share are.
+
+        What they share comes in combinations in which it is independent and of unit weight, as if all boards stood
+        still. Of these, motions feel no more than there are motions: the others are taken out.
+
+        Args:
+            camera: its number.
+            white: (V, 12, 2 N) derivatives of the camera's whitened residuals by motions.
+        """
+        whole, (_, shared, rows) = self._all(), self.parts[camera]
+        moving, rows = white[self.good], rows[self.good]
+        by_pose = whole.off_pose(moving @ rows[:, :_POSE].mT)
+        cross = -by_pose @ whole.half
+        cross[..., torch.cat([shared, shared.new_tensor([-1])])] += moving @ rows[:, _POSE:].mT
+        felt = whole.combined(cross[..., :-1].flatten(0, 1).T)
+        pull, square, freedom = whole.pull, whole.square, float(whole.freedom)
+        if felt.shape[1] < len(felt):
+            basis, felt = torch.linalg.qr(felt)
+            inside = basis.T @ pull
+            square = square - float(pull.square().sum() - inside.square().sum())
+            freedom, pull = freedom - (whole.determined - len(inside)), inside
+        size = len(pull)
+        products = torch.eye(size + 1, dtype=pull.dtype)
+        products[-1, :-1] = products[:-1, -1] = pull
+        products[-1, -1] = square
+        still = Quadratic(products, freedom, torch.zeros_like(pull))
+        cross = torch.cat([felt.T.unflatten(0, (len(moving), -1)), cross[..., -1:]], -1)
+        own = moving @ moving.mT - by_pose @ by_pose.mT
+        data = ViewData(still=still, own=own, cross=cross, score=pull.new_zeros(len(moving), size))
+        return data, _hardly_known(torch.full_like(pull, _WIDE))
+
+
+class _Whole(NamedTuple):
+    """Products of all cameras' rows off the boards' poses.
+
+    Attributes:
+        pose: (V, 6, 6) lower triangles of the poses' own products.
+        half: (V, 6, S + 1) their inverses times the products with what boards share, and with the residuals.
+        scale: (S,) of what boards share; zero where nothing depends on it.
+        root: (S, S) lower triangle of its products in this scale, what is hardly known included.
+        pull: (S,) products with the residuals, in combinations of unit weight.
+        determined: how many of these combinations the boards determine.
+        freedom: residuals, less those that poses take up.
+        square: of all residuals.
+        variance: mean of that.
+    """
+
+    pose: Tensor
+    half: Tensor
+    scale: Tensor
+    root: Tensor
+    pull: Tensor
+    determined: float
+    freedom: int
+    square: float
+    variance: float
+
+    @classmethod
+    def of(cls, products: Products, count: int) -> _Whole:
+        """From products with the poses."""
+        scale = column_scale(products.local.diagonal(dim1=-2, dim2=-1))[..., None]
+        pose = torch.linalg.cholesky_ex(products.local * scale * scale.mT)[0] / scale
+        half = torch.linalg.solve_triangular(pose, products.right, upper=False)
+        flat = half.flatten(0, 1)
+        total = products.total - flat.T @ flat
+        square = float(total[-1, -1])
+        variance = square / max(count, 1)
+        length = total.diagonal()[:-1].clamp_min(0.0).sqrt()
+        unit = torch.where(length > 0, 1.0 / length, 0.0)
+        matrix, weak = total[:-1, :-1] * unit[:, None] * unit, variance / _WIDE**2
+        matrix.diagonal().add_(torch.where(length > 0, weak, 1.0))
+        root = torch.linalg.cholesky(matrix)
+        pull = torch.linalg.solve_triangular(root, (total[:-1, -1] * unit)[:, None], upper=False)[:, 0]
+        inverse = torch.linalg.solve_triangular(root, torch.diag((length > 0).to(root.dtype)), upper=False)
+        determined = int((length > 0).sum()) - weak * float(inverse.square().sum())
+        return cls(pose, half, unit, root, pull, determined, count, square, variance)
+
+    def off_pose(self, by_pose: Tensor) -> Tensor:
+        """Products (V, M, 6) of other unknowns with the poses, such that squares of them are what poses explain."""
+        return torch.linalg.solve_triangular(self.pose, by_pose.mT, upper=False).mT
+
+    def combined(self, by_shared: Tensor) -> Tensor:
+        """Products (S, M) with what boards share as products with combinations of unit weight."""
+        return torch.linalg.solve_triangular(self.root, by_shared * self.scale[:, None], upper=False)
+
+
 def _hardly_known(deviation: Tensor) -> PriorFamilies:
-    """Priors of unknowns about zero with these standard deviations; unknowns of no effect are held."""
+    """Priors of unknowns about zero with these standard deviations."""
     none = torch.full(deviation.shape, -1)
     return PriorFamilies(torch.zeros_like(deviation), deviation.log(), none, none, torch.zeros_like(deviation))
 

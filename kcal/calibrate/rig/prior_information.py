@@ -8,7 +8,8 @@ out of it first, so that no corner counts twice.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -19,7 +20,7 @@ from kcal.calibrate.hybrid.board_prior import printed_board, printed_prior
 from kcal.calibrate.hybrid.families import BOARD, typical_hyperprior
 from kcal.calibrate.rig.unknowns import SharedUnknowns, held
 from kcal.corners.board import Board
-from kcal.gaussian import Gaussian, stacked, unit_scale, whitened
+from kcal.gaussian import Gaussian, Slots, stacked, unit_scale, whitened
 from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
 from kcal.lens.projection import project_components
@@ -134,43 +135,66 @@ def joint_unknowns(
     elif not shared and not lenses:
         return held(cameras), None
     prior, amplitudes = _board_beforehand(shared, modes)
-    names: list[Hashable] = []
-    said, places = [prior], []
-    for number, part in enumerate(parts):
+    said, given = [prior], list[_GivenBoard]()
+    for camera, part in zip(cameras, parts, strict=True):
         if part is None:
+            nothing = torch.zeros(len(camera.names), 0, dtype=torch.float64)
+            by_board = nothing.new_zeros(len(nothing), len(amplitudes))
+            given.append(_GivenBoard(nothing, nothing[0], nothing[0] > 0, by_board))
             continue
         own = part.data + part.lens_prior
         if len(shared) == 1:
             # What cameras told each other of their board counts once: of two in one rig, each brings its own rows.
             own = own + part.told
-        said.append(own.named(tuple(slot if slot in prior.slots else (number, slot) for slot in own.slots)))
-        names += [(number, slot) for slot in part.lens]
-        places.append(part.estimate[: part.lens_size])
-    slots, at = (*names, *prior.slots), torch.cat([*places, amplitudes])
-    joint = stacked([one.placed(slots, at) for one in said]).compressed()
-    change, begin, known = whitened(joint.rows[:, :-1], joint.rows[:, -1])
-    selections, end = [], 0
-    for camera, part in zip(cameras, parts, strict=True):
-        onto = torch.zeros(len(camera.names), len(slots), dtype=torch.float64)
-        if part is not None:
-            onto[:, end : end + part.lens_size] = part.selection()[:, : part.lens_size]
-            end += part.lens_size
-        selections.append(onto)
-    maps = [onto @ change for onto in selections]
+        said.append(own.marginal(part.board))
+        given.append(_given_board(part, own, prior.slots, amplitudes))
+    told = stacked([one.placed(prior.slots, amplitudes) for one in said])
+    shape = whitened(told.rows[:, :-1], told.rows[:, -1])
+    given = [lens._replace(by_board=lens.by_board @ shape.change) for lens in given]
     shapes = torch.zeros(0, 3, 0, dtype=torch.float64) if modes is None else modes.shapes
-    by_board = change[lenses:] if modes is not None else change[:0]
-    turn = torch.eye(len(slots), dtype=torch.float64)
+    parts_begin, parts_known = ([getattr(one, name) for one in (*given, shape)] for name in ("begin", "known"))
+    turns = [torch.eye(len(known), dtype=torch.float64) for known in parts_known]
     if any(camera.model.hybrid for camera in cameras):
-        turn = _felt(cameras, maps, torch.einsum("bk,bcn->kcn", by_board, shapes).flatten(1), known)
+        corners = torch.einsum("bk,bcn->kcn", shape.change, shapes).flatten(1)
+        turns = _felt(cameras, given, _PX_PER_METER * corners, parts_known)
+    # The unknowns of each camera, one after the other, and the board's: through these, lenses depend on each other.
+    columns, selected = torch.block_diag(*turns).split([len(known) for known in parts_known]), list[Tensor]()
+    for lens, own_columns in zip(given, columns, strict=False):
+        selected.append(lens.own @ own_columns + lens.by_board @ columns[-1])
     found = SharedUnknowns(
-        cameras=tuple(onto @ turn for onto in maps),
+        cameras=tuple(selected),
         shapes=shapes,
-        board=by_board @ turn,
-        begin=turn.T @ begin,
-        known=(turn[known] != 0).any(0),
-        labels=("",) * turn.shape[1],
+        board=shape.change @ columns[-1],
+        begin=torch.cat([turn.T @ begin for turn, begin in zip(turns, parts_begin, strict=True)]),
+        known=torch.cat([(turn[known] != 0).any(0) for turn, known in zip(turns, parts_known, strict=True)]),
+        labels=("",) * sum(turn.shape[1] for turn in turns),
     )
     return found, None if modes is None else torch.einsum("b,bcn->nc", amplitudes, shapes)
+
+
+class _GivenBoard(NamedTuple):
+    """A camera's parameters as functions of unknowns y that are independent of its board, and of the board.
+
+    Attributes:
+        own: (5 + P, Y) derivatives by y.
+        begin: (Y,) what y is for the camera and the board as given.
+        known: (Y,) whether y is a standard normal; nothing is known of the others.
+        by_board: (5 + P, B) derivatives by the board's unknowns while y is held.
+    """
+
+    own: Tensor
+    begin: Tensor
+    known: Tensor
+    by_board: Tensor
+
+
+def _given_board(part: CameraInformation, own: Gaussian, board: Slots, amplitudes: Tensor) -> _GivenBoard:
+    """What is known of a camera and its board, as if the board were known."""
+    size = part.lens_size
+    rows = own.placed((*part.lens, *board), torch.cat([part.estimate[:size], amplitudes])).rows
+    change, pull, known = whitened(rows[:, :size], rows[:, size:])
+    selection = part.selection()[:, :size]
+    return _GivenBoard(selection @ change, pull[:, -1], known, -selection @ change @ pull[:, :-1])
 
 
 def _board_beforehand(shared: Sequence[CameraInformation], modes: BoardModes | None) -> tuple[Gaussian, Tensor]:
@@ -187,18 +211,36 @@ def _board_beforehand(shared: Sequence[CameraInformation], modes: BoardModes | N
     return prior, torch.zeros_like(prior.at)
 
 
-def _felt(cameras: Sequence[Camera], maps: Sequence[Tensor], by_corners: Tensor, known: Tensor) -> Tensor:
-    """(K, F) orthonormal directions: of the known unknowns those that move anything seen by `_FELT` px, all others."""
-    effects = [_PX_PER_METER * by_corners[known]]
-    for camera, onto in zip(cameras, maps, strict=True):
+def _felt(
+    cameras: Sequence[Camera], lenses: Sequence[_GivenBoard], by_corners: Tensor, known: Sequence[Tensor]
+) -> list[Tensor]:
+    """For each camera's unknowns, and last the board's, those directions (K, F) that matter, orthonormal.
+
+    Of the known unknowns they are those that move anything seen by `_FELT` px; all others stay.
+
+    Args:
+        cameras: of the rig.
+        lenses: their parameters by the unknowns.
+        by_corners: (B, 3 N) movements of the board by its unknowns, px.
+        known: of each camera's unknowns and of the board's, which are standard normals.
+    """
+    found, effects = list[Tensor](), [by_corners]
+    for camera, lens, standard in zip(cameras, lenses, known, strict=False):
         rays, valid = camera.unproject(camera.grid(25, 17).reshape(-1, 2))
-        rays = rays[valid]
+        own = list[Tensor]()
         for distance in (FAR, _NEAR):
-            points = rays * distance
-            seen = project_components(points.T, camera.params.detach(), camera.model, list(range(len(onto))))
+            points = (rays[valid] * distance).T
+            seen = project_components(points, camera.params.detach(), camera.model, list(range(len(lens.own))))
             good = torch.where(seen.regular, seen.by_camera, 0.0).flatten(1)
-            effects.append(onto.T[known] @ good)
-    moved = torch.cat(effects, 1)
+            own.append(lens.own.T @ good)
+            effects.append(lens.by_board.T @ good)
+        found.append(_moving(torch.cat(own, 1), standard))
+    return [*found, _moving(torch.cat(effects, 1), known[-1])]
+
+
+def _moving(effects: Tensor, known: Tensor) -> Tensor:
+    """(K, F): of the known ones of K unknowns those directions that move anything, by effects (K, N); all others."""
+    moved = effects[known]
     _, vectors = torch.linalg.eigh(moved @ moved.T)
     # The largest movement of any one place, not their sum.
     felt = vectors[:, (vectors.T @ moved).abs().amax(1) > _FELT].flip(-1)

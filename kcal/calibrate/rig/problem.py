@@ -13,13 +13,14 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.rig.blocks import LOCAL_SIZE, Block, PosedCamera, RigState
+from kcal.calibrate.rig.camera_rows import CameraRows, summed_products
 from kcal.calibrate.rig.unknowns import SharedUnknowns
 from kcal.lens.camera import Camera
 from kcal.lens.pose import nearest_rotation, rotation_from_vector
 from kcal.solve.eliminated import EliminatedItems, PartlyEliminated
 from kcal.solve.result import State
 from kcal.solve.robust import RobustLoss
-from kcal.solve.schur import SchurLinearization
+from kcal.solve.schur import Products, SchurLinearization
 
 # Share of a residual that the others must leave open for an item to be tested by them; less is rounding.
 _LEAST_LEFT = 1e-9
@@ -195,18 +196,23 @@ class RigProblem:
         (Baarda 1968; Cook and Weisberg 1982).
         """
         terms, (found, squares) = self.term_rows(state), self._rows(state)
-        parts = [self._without_own(block, rows) for block, rows in zip(self.blocks, found, strict=True)]
-        total = terms @ terms.T + sum((_summed(part) for part in parts), torch.zeros(()))
-        falls = []
-        for part, own in zip(parts, squares, strict=True):
-            others = _others_fall(total, part) if isinstance(part, Tensor) else _few_others_fall(total, part.rows)
+        grams = [self._gram(block, parts) for block, parts in zip(self.blocks, found, strict=True)]
+        total, falls = terms @ terms.T + sum(grams, torch.zeros(())), []
+        for block, parts, own in zip(self.blocks, found, squares, strict=True):
+            if block.kind == "boards":
+                each = (self._gram(block, _of_item(parts, i)) for i in range(len(block)))
+                others = torch.stack([_others_fall(total, gram) for gram in each])
+            else:
+                others = _few_others_fall(
+                    total, EliminatedItems(block.joined(parts, self.shared_size), block.size).rows
+                )
             falls.append(own + others)
         return falls
 
     def block_grams(self, state: RigState) -> list[Tensor]:
         """For each block (S + 1, S + 1) products of the rows of all its items, their own unknowns eliminated."""
         found, _ = self._rows(state)
-        return [_summed(self._without_own(block, rows)) for block, rows in zip(self.blocks, found, strict=True)]
+        return [self._gram(block, parts) for block, parts in zip(self.blocks, found, strict=True)]
 
     def response(self, state: RigState, block: Block) -> tuple[Tensor, Tensor]:
         """How the best unknowns of a block's items depend on the shared ones; see `EliminatedItems.response`.
@@ -216,24 +222,27 @@ class RigProblem:
         """
         return EliminatedItems(block.rows(self.posed(state), state, self.shared_size), block.size).response()
 
-    def _rows(self, state: RigState) -> tuple[list[Tensor], list[Tensor]]:
-        """`Block.rows` of all blocks with the loss's weights, and `item_squares`."""
-        posed, found, squares = self.posed(state), list[Tensor](), list[Tensor]()
+    def _rows(self, state: RigState) -> tuple[list[list[CameraRows]], list[Tensor]]:
+        """`Block.camera_rows` of all blocks with the loss's weights, and `item_squares`."""
+        posed, found, squares = self.posed(state), list[list[CameraRows]](), list[Tensor]()
         for block in self.blocks:
-            rows = block.rows(posed, state, self.shared_size)
-            squares.append(rows[:, -1].square().sum(-1))
+            parts = list(block.camera_rows(posed, state))
+            square = state.center.new_zeros(len(block))
+            for part in parts:
+                square = square + part.rows[:, -1].square().sum(-1)
             if self.loss is not None:
                 count = block.counts.clamp_min(1)
-                rows = rows * self.loss.weight(squares[-1] / count).sqrt()[:, None, None]
-            found.append(rows)
+                weight = self.loss.weight(square / count).sqrt()[:, None, None]
+                parts = [part._replace(rows=part.rows * weight) for part in parts]
+            squares.append(square)
+            found.append(parts)
         return found, squares
 
-    @staticmethod
-    def _without_own(block: Block, rows: Tensor) -> Tensor | EliminatedItems:
-        """The items without their own unknowns; for boards, of many residuals each, (V, S + 1, S + 1) products."""
-        if block.kind != "boards":
-            return EliminatedItems(rows, block.size)
-        return _reduced(rows @ rows.mT, block.size)
+    def _gram(self, block: Block, parts: Sequence[CameraRows]) -> Tensor:
+        """(S + 1, S + 1) products of rows, summed over the items, without what the items' own unknowns can do."""
+        if block.kind == "features":
+            return EliminatedItems(block.joined(parts, self.shared_size), block.size).gram
+        return _reduced(summed_products(parts, block.size, self.shared_size))
 
     def linearize(self, state: State) -> SchurLinearization | PartlyEliminated:
         """See `Problem.linearize`."""
@@ -242,19 +251,18 @@ class RigProblem:
         total, cost = terms @ terms.T, self._cost_of(terms[-1], squares)
         local, right = [total.new_zeros(0, LOCAL_SIZE, LOCAL_SIZE)], [total.new_zeros(0, LOCAL_SIZE, len(total))]
         matched: tuple[EliminatedItems, int] | None = None
-        for block, rows in zip(self.blocks, found, strict=True):
+        for block, parts in zip(self.blocks, found, strict=True):
             if block.kind == "features":
-                own = EliminatedItems(rows, block.size)
+                own = EliminatedItems(block.joined(parts, self.shared_size), block.size)
                 matched, total = (own, sum(map(len, local))), total + own.gram
                 continue
-            mine, others, missing = rows[:, : block.size], rows[:, block.size :], LOCAL_SIZE - block.size
+            products, missing = summed_products(parts, block.size, self.shared_size), LOCAL_SIZE - block.size
             # Unknowns that smaller items do not have: with a one on the diagonal they change nothing.
-            square = torch.nn.functional.pad(mine @ mine.mT, (missing, 0, missing, 0))
+            square = torch.nn.functional.pad(products.local, (missing, 0, missing, 0))
             square[:, range(missing), range(missing)] = 1.0
             local.append(square)
-            right.append(torch.nn.functional.pad(mine @ others.mT, (0, 0, missing, 0)))
-            flat = others.transpose(0, 1).flatten(1)
-            total = total + flat @ flat.T
+            right.append(torch.nn.functional.pad(products.right, (0, 0, missing, 0)))
+            total = total + products.total
         linear = SchurLinearization(torch.cat(local), torch.cat(right), total)
         if matched is not None:
             return PartlyEliminated(linear, *matched, cost)
@@ -299,26 +307,27 @@ class RigProblem:
         return found._replace(rotation=nearest_rotation(found.rotation))
 
 
-def _reduced(gram: Tensor, size: int) -> Tensor:
-    """(V, S + 1, S + 1) products of rows (V, L + S + 1, L + S + 1) off what each item's own unknowns can do."""
-    scale = gram[:, :size, :size].diagonal(dim1=-2, dim2=-1).rsqrt()
-    factor, _ = torch.linalg.cholesky_ex(gram[:, :size, :size] * scale[:, :, None] * scale[:, None, :])
-    coupling = gram[:, :size, size:] * scale[:, :, None]
-    return gram[:, size:, size:] - coupling.mT @ torch.cholesky_solve(coupling, factor)
+def _of_item(parts: Sequence[CameraRows], number: int) -> list[CameraRows]:
+    """Of one item."""
+    return [part._replace(rows=part.rows[number : number + 1]) for part in parts]
 
 
-def _summed(part: Tensor | EliminatedItems) -> Tensor:
-    return part.sum(0) if isinstance(part, Tensor) else part.gram
+def _reduced(products: Products) -> Tensor:
+    """(S + 1, S + 1) products of the shared unknowns off what each item's own unknowns can do."""
+    scale = products.local.diagonal(dim1=-2, dim2=-1).rsqrt()[..., None]
+    factor, _ = torch.linalg.cholesky_ex(products.local * scale * scale.mT)
+    half = torch.linalg.solve_triangular(factor, products.right * scale, upper=False).flatten(0, 1)
+    return products.total - half.T @ half
 
 
 def _others_fall(total: Tensor, part: Tensor) -> Tensor:
-    """(V,) by how much the others' χ² would fall without each item, from its products (V, S + 1, S + 1)."""
-    rest = (total - part)[:, :-1, :-1]
-    unit = rest.diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).rsqrt()
-    roots, info = torch.linalg.cholesky_ex(rest * unit[:, :, None] * unit[:, None, :])
-    pull = torch.linalg.solve_triangular(roots, (part[:, :-1, -1] * unit)[..., None], upper=False)
+    """() by how much the others' χ² would fall without an item, from its products (S + 1, S + 1)."""
+    rest = (total - part)[:-1, :-1]
+    unit = rest.diagonal().clamp_min(1e-300).rsqrt()
+    root, info = torch.linalg.cholesky_ex(rest * unit[:, None] * unit)
+    pull = torch.linalg.solve_triangular(root, (part[:-1, -1] * unit)[:, None], upper=False)
     # An item without which the rest would determine nothing cannot be tested.
-    return torch.where(info == 0, pull.square().sum((-2, -1)), 0.0)
+    return torch.where(info == 0, pull.square().sum(), 0.0)
 
 
 def _few_others_fall(total: Tensor, rows: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from kcal.calibrate.rig.adjustment import Adjustment
 from kcal.calibrate.rig.blocks import PerKind
+from kcal.calibrate.rig.board_consensus import evenly
 from kcal.calibrate.rig.initial_poses import InitialPoses
 from kcal.calibrate.rig.mixups import cost_of_features_behind
 from kcal.calibrate.rig.outliers import LOSS, ROUGHLY, possible
@@ -48,5 +49,5 @@ def robust_solution(initial: InitialPoses, masks: PerKind, unknowns: SharedUnkno
 def _evenly_taken(mask: Tensor, most: int) -> Tensor:
     """The mask with `most` of its items at most, evenly taken."""
     chosen, out = mask.nonzero()[:, 0], torch.zeros_like(mask)
-    out[chosen[torch.linspace(0, len(chosen) - 1, min(most, len(chosen))).round().long()]] = True
+    out[chosen[evenly(len(chosen), most)]] = True
     return out

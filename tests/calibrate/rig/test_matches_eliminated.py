@@ -132,7 +132,7 @@ def test_both_ways_to_leave_an_item_out_agree() -> None:
     rows = normal(7, 5, 2)
     part = rows @ rows.mT
     total = part.sum(0) + torch.eye(5).double()
-    torch.testing.assert_close(_few_others_fall(total, rows), _others_fall(total, part))
+    torch.testing.assert_close(_few_others_fall(total, rows), torch.stack([_others_fall(total, one) for one in part]))
     # Without the only item that tells an unknown nothing can be tested.
     alone = torch.zeros(1, 5, 1, dtype=torch.float64)
     alone[0, 0, 0] = alone[0, 4, 0] = 1.0

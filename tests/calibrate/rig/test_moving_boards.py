@@ -5,13 +5,18 @@ from __future__ import annotations
 import functools
 import math
 
+import numpy as np
 import pytest
 import torch
 from calibrate_scenes import observe
 from torch import Tensor
 
+from kcal.calibrate.hybrid.evidence import EvidenceLoss
+from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies
+from kcal.calibrate.hybrid.quadratic import view_data
+from kcal.calibrate.rig.camera_rows import CameraRows
 from kcal.calibrate.rig.from_boards import calibrate_rig
-from kcal.calibrate.rig.motion import WithoutMotion
+from kcal.calibrate.rig.motion import RigRows, WithoutMotion
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions
 from kcal.corners.board import Board
@@ -21,6 +26,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.sim.board import BoardPose, BoardSize
 from kcal.sim.poses import sample_board_poses
+from kcal.solve.schur import Products, without_local
 from scripts.shared.moving_captures import Hands, moving_capture
 
 F64 = torch.float64
@@ -77,6 +83,47 @@ def test_whitening_is_that_of_the_dense_covariance() -> None:
     dense = rows @ torch.linalg.solve(covariance, rows.transpose(1, 2))
     # A condition of some thousands.
     torch.testing.assert_close(found @ found.transpose(1, 2), dense, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("shared", [8, 70])
+def test_what_is_told_of_motions_is_that_of_all_rows(shared: int) -> None:
+    """Fewer and more unknowns that boards share than motions: the evidence is that of rows with all columns."""
+    generator = torch.Generator().manual_seed(shared)
+
+    def draw(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=F64)
+
+    views, corners = 4, 40
+    own = torch.arange(shared - 2), torch.arange(2, shared)
+    parts = [CameraRows(c, own[c], draw(views, 6 + len(own[c]) + 1, corners)) for c in range(2)]
+    moving = 0.3 * draw(views, 12, corners)
+    rig = RigRows(parts, torch.ones(views, dtype=torch.bool), shared)
+    data, families = rig.told(1, moving)
+    rows = torch.zeros(views, 6 + 12 + shared + 1, 2 * corners, dtype=F64)
+    for c, part in enumerate(parts):
+        columns = [*range(6), *(18 + own[c]).tolist(), 18 + shared]
+        rows[:, columns, c * corners : (c + 1) * corners] = part.rows
+    rows[:, 6:18, corners:] = moving
+    off = without_local(rows, 6)
+    counts = float(views * (2 * corners - 6))
+    whole = view_data(
+        Products.of_rows(off[:, :12], off[:, 12:]),
+        torch.zeros(shared, dtype=F64),
+        torch.zeros(views, 12, dtype=F64),
+        counts,
+    )
+    length = off[:, 12:-1].transpose(0, 1).flatten(1).norm(dim=1)
+    none = torch.full((shared,), -1)
+    wide = PriorFamilies(torch.zeros(shared).double(), (1e3 / length).log(), none, none, torch.zeros(shared).double())
+    zero = torch.zeros(1, dtype=F64)
+    losses = [
+        EvidenceLoss(*one, Hyperprior(zero, torch.ones_like(zero)), 1.0) for one in ((whole, wide), (data, families))
+    ]
+    assert rig.variance == pytest.approx(float(off[:, -1].square().sum()) / counts)
+    # Up to a constant: at several ratios of motions to the noise, and at two levels of that.
+    places = [np.array([0.0, a, b, a, b, noise]) for a, b, noise in ((-9, -9, 0), (-1, 0, 0), (1, -2, 0), (0, 1, 0.3))]
+    dense, told = ([loss.value(place) for place in places] for loss in losses)
+    np.testing.assert_allclose(np.subtract(told, told[0]), np.subtract(dense, dense[0]), rtol=1e-4, atol=1e-3)
 
 
 @pytest.mark.slow

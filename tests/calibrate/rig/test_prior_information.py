@@ -131,6 +131,18 @@ def test_unknowns_have_the_cameras_covariance() -> None:
         torch.testing.assert_close(by_unknown.square().sum(1).sqrt(), sigma, rtol=1e-6, atol=1e-12)
 
 
+def test_lenses_depend_on_each_other_through_their_board_alone() -> None:
+    """Each unknown is of one camera, or moves the board: so rows of a camera have no columns of another one."""
+    both = cameras("hybrid", tuple(f"{i}.png" for i in range(14)))
+    found, _ = joint_unknowns(both, gathered(both, [known(camera) for camera in both], BOARD)[0], BOARD)
+    left, right = (by_unknown.any(0) for by_unknown in found.cameras)
+    board = found.board.any(0)
+    assert 0 < int(board.sum()) <= len(found.shapes)
+    assert bool((left & right).any())
+    assert not bool((left & right & ~board).any())
+    assert bool((left | right).all())
+
+
 def sharing(both: tuple[Camera, Camera], known: list[CameraInformation], board: Board) -> tuple[bool, ...]:
     return tuple(part is not None and part.board_size > 0 for part in gathered(both, known, board)[0])
 
