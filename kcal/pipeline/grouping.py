@@ -22,8 +22,10 @@ from kcal.lens.rig import StereoRig
 from kcal.locate.multi_localizer import MultiViewLocalizer, common_errors, posed_cameras
 from kcal.locate.views import CommonErrors, ViewsFit, fit_views
 from kcal.pipeline.association import MOST_BOXES, AssociationOptions, size_cost
+from kcal.pipeline.clear_groups import FEWEST_VIEWS, Confirming, separate_pairs
 from kcal.pipeline.detections import Detections
 from kcal.pipeline.epipolar_band import near_epipolar_lines
+from kcal.pipeline.epipolar_pencil import FARTHEST_BEND_M, SightLines
 from kcal.pipeline.object_views import ObjectViews
 from kcal.pipeline.one_to_one import assign_groups
 
@@ -140,6 +142,76 @@ class _Scene:
 
     def chosen(self) -> tuple[list[tuple[int, ...]], list[bool]]:
         """Groups of two views and more, each detection once, and which are ambiguous."""
+        groups, doubts, free = self._clear()
+        self.own = [own[free[own]] for own in self.own]
+        return tuple(first + rest for first, rest in zip((groups, doubts), self._remaining(), strict=True))
+
+    def _clear(self) -> tuple[list[tuple[int, ...]], list[bool], NDArray[np.bool_]]:
+        """Groups that most cameras see, which are ambiguous, and which marks are of none of these things."""
+        posed, options, rig = self.posed, self.options, self.localize.rig
+        there = [c for c, own in enumerate(self.own) if len(own)]
+        groups: list[tuple[int, ...]] = []
+        doubts: list[bool] = []
+        free = np.ones(len(self.camera), dtype=bool)
+        if len(there) < FEWEST_VIEWS:
+            return groups, doubts, free
+        cameras = range(len(self.own))
+        axis, inner = (np.stack(value) for value in zip(*(self._middle(c) for c in cameras), strict=True))
+        near = 2.0 * math.log(options.odds)
+        kind = self.kind if options.same_category else np.zeros_like(self.kind)
+        confirming = Confirming(self._lines(), kind, axis, inner, there, options.gate, near)
+        pairs = separate_pairs(posed.center.numpy(), axis, there)
+        for misses in range(len(pairs)):
+            for pair in pairs[: misses + 1]:
+                found = confirming.found(pair, misses, free)
+                # Without the marks that could as well be of another thing, if views enough are left.
+                sure = np.where(found.rival, -1, found.marks)
+                doubtful = (sure >= 0).sum(1) < FEWEST_VIEWS
+                rows = np.where(doubtful[:, None], found.marks, sure)
+                number = {mark: i for i, row in enumerate(rows.tolist()) for mark in row}
+                for group in self._fitted([tuple(row) for row in rows.tolist()]):
+                    which = number[max(group.marks)]
+                    groups.append(group.marks)
+                    doubts.append(bool(doubtful[which]))
+                    free[found.marks[which][found.marks[which] >= 0]] = False
+        return groups, doubts, free
+
+    def _middle(self, c: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Where a camera looks, and the cosine of the widest cone about it that is inside its image."""
+        camera, turn = self.localize.rig.each[c], self.localize.rig.rotation[c]
+        width, height = camera.size
+        u, v = (torch.arange(count, dtype=torch.float64) for count in (width, height))
+        edge = torch.cat(
+            [torch.stack([u, torch.full_like(u, end)], 1) for end in (0.0, height - 1.0)]
+            + [torch.stack([torch.full_like(v, end), v], 1) for end in (0.0, width - 1.0)]
+        )
+        middle = camera.unproject(torch.tensor([[0.5 * (width - 1.0), 0.5 * (height - 1.0)]], dtype=torch.float64))[0][0]
+        rays, valid = camera.unproject(edge)
+        widest = torch.where(valid, rays @ middle, -1.0).amax()
+        return (turn.T @ middle).numpy(), widest.numpy()
+
+    def _lines(self) -> SightLines:
+        """Lines of sight of all detections; where pixels have none, they lead nowhere."""
+        posed, common = self.posed, common_errors(self.localize)
+        moved, turned, air = torch.zeros(len(self.own)).double(), torch.zeros(len(self.own)).double(), 0.0
+        if common is not None:
+            moved, turned = common.half[..., :6].square().sum(0).sqrt().unflatten(-1, (2, 3)).amax(-1).unbind(-1)
+            air = float(common.bending.square().sum().sqrt())
+        ray, sigma = torch.zeros(len(self.camera), 3, dtype=torch.float64), torch.ones(len(self.camera)).double()
+        for c, own in enumerate(self.own):
+            camera, pixels = posed.cameras[c], self.pixels[own]
+            steps = torch.stack([pixels, pixels + torch.tensor([1.0, 0.0]), pixels + torch.tensor([0.0, 1.0])])
+            rays, valid = camera.unproject(steps)
+            slope = (rays[1:] - rays[:1]).square().sum((0, -1)) / 2.0
+            ray[own] = rays[0] @ posed.rotation[c]
+            sigma[own] = (slope * self.options.box_sigma**2 + turned[c].square()).sqrt()
+        up = torch.zeros_like(posed.center) if posed.up is None else posed.up
+        return SightLines(
+            self.camera, ray.numpy(), sigma.numpy(), moved.numpy(), air, posed.center.numpy(), up.numpy(), posed.bending
+        )
+
+    def _remaining(self) -> tuple[list[tuple[int, ...]], list[bool]]:
+        """Groups of what no clear group has."""
         cameras = range(len(self.own))
         edges = {(i, j): self._edges(i, j) for i, j in itertools.combinations(cameras, 2)}
         candidates = self._fitted(_with_one_range(list(edges.values()), self.camera, len(self.own), self.options.gate))
