@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from kcal.pipeline.epipolar_pencil import Floats, Ints, Meetings, SightLines, meetings
+from kcal.pipeline.epipolar_pencil import Floats, Ints, Meetings, LinesOfSight, meetings
 from kcal.pipeline.one_to_one import assign_groups
 
 # Fewer views leave chance too much room where detections are dense.
@@ -62,20 +62,22 @@ class Confirming:
         there: cameras that have an image.
         gate: standard deviations of a possible pair.
         near: squared sigmas within which another grouping is about as likely.
+        nearest: see `meetings`.
     """
 
     def __init__(
         self,
-        lines: SightLines,
+        lines: LinesOfSight,
         kind: Ints,
         axis: Floats,
         inner: Floats,
         there: list[int],
         gate: float,
         near: float,
+        nearest: float,
     ) -> None:
         self.lines, self.axis, self.inner, self.there = lines, axis, inner, there
-        self.kind, self.gate, self.near = kind, gate, near
+        self.kind, self.gate, self.near, self.nearest = kind, gate, near, nearest
         # A fourth axis keeps kinds apart.
         self.place = np.column_stack([lines.ray, _ELSEWHERE * kind])
 
@@ -90,7 +92,7 @@ class Confirming:
         count = len(self.axis)
         own = [np.flatnonzero(free & (self.lines.camera == c)) for c in range(count)]
         trees = {c: cKDTree(self.place[own[c]]) for c in self.there if len(own[c])}
-        meet = meetings(self.lines, own[pair[0]], own[pair[1]], self.gate)
+        meet = meetings(self.lines, own[pair[0]], own[pair[1]], self.gate, self.nearest)
         meet = meet.at(self.kind[meet.first] == self.kind[meet.second])
         marks, cost = self._confirmed(meet, pair, misses, own, trees)
         marks = self._best(marks, cost)
@@ -190,7 +192,9 @@ class Confirming:
             # What the point would be, and how well known, without this camera.
             own_ray = self.lines.ray[done.marks[:, c]]
             across = np.eye(3) - own_ray[:, :, None] * own_ray[:, None, :]
-            weight = np.where(done.marks[:, c] >= 0, _ALL_BUT / self.lines.wide(done.marks[:, c], away[:, c, 0], c) ** 2, 0.0)
+            weight = np.where(
+                done.marks[:, c] >= 0, _ALL_BUT / self.lines.wide(done.marks[:, c], away[:, c, 0], c) ** 2, 0.0
+            )
             spread = np.linalg.inv(done.normal - weight[:, None, None] * across)
             line = self._line(done.point, c)
             moved = (spread @ (weight[:, None, None] * across) @ line[..., None])[..., 0]
@@ -268,7 +272,7 @@ def separate_pairs(center: Floats, axis: Floats, there: list[int]) -> list[tuple
         [(0, 2), (1, 3)]
     """
     worth = sorted(
-        ((abs(float(axis[a] @ axis[b])), a, b) for a in there for b in there if a < b and (center[a] != center[b]).any())
+        (abs(float(axis[a] @ axis[b])), a, b) for a in there for b in there if a < b and (center[a] != center[b]).any()
     )
     pairs: list[tuple[int, int]] = []
     for _, a, b in worth:

@@ -21,7 +21,7 @@ FARTHEST_BEND_M = 1e5
 _FLAT = 10.0
 
 
-class SightLines(NamedTuple):
+class LinesOfSight(NamedTuple):
     """N lines of sight of C cameras, all in one frame.
 
     Attributes:
@@ -73,7 +73,7 @@ class Meetings(NamedTuple):
         return Meetings(*(value[which] for value in self))
 
 
-def meetings(lines: SightLines, rows: Ints, others: Ints, gate: float, nearest: float = 1000.0) -> Meetings:
+def meetings(lines: LinesOfSight, rows: Ints, others: Ints, gate: float, nearest: float) -> Meetings:
     """Where lines of sight of one camera meet those of another within `gate` standard deviations.
 
     Those that cross at a small angle are left out: nothing linear is known of their range.
@@ -87,9 +87,9 @@ def meetings(lines: SightLines, rows: Ints, others: Ints, gate: float, nearest: 
 
     Example:
         >>> ray = np.array([[0.0, 1.0, 0.0], [-0.6, 0.8, 0.0], [-0.6, 0.8, 0.01]])
-        >>> lines = SightLines(np.array([0, 1, 1]), ray, np.full(3, 1e-3), np.zeros(2), 0.0,
+        >>> lines = LinesOfSight(np.array([0, 1, 1]), ray, np.full(3, 1e-3), np.zeros(2), 0.0,
         ...                    np.array([[0.0, 0, 0], [600.0, 0, 0]]), np.array([[0.0, 0, 1]] * 2), 0.0)
-        >>> found = meetings(lines, np.array([0]), np.array([1, 2]), 4.0)
+        >>> found = meetings(lines, np.array([0]), np.array([1, 2]), 4.0, 100.0)
         >>> found.second.tolist(), found.point.round(6).tolist()
         ([1], [[0.0, 800.0, 0.0]])
     """
@@ -102,7 +102,7 @@ def meetings(lines: SightLines, rows: Ints, others: Ints, gate: float, nearest: 
     if not length:
         return none
     base = shift / length
-    first, second = _near_in_angle(lines, base, rows, others, gate, nearest)
+    first, second = near_in_angle(lines, rows, others, gate, nearest)
     u, v = lines.ray[first], lines.ray[second]
     near, far = _ranges(u, v, base, length)
     good = (near > 0) & (far > 0) & (near < FARTHEST_BEND_M) & (far < FARTHEST_BEND_M)
@@ -126,10 +126,16 @@ def meetings(lines: SightLines, rows: Ints, others: Ints, gate: float, nearest: 
     )
 
 
-def _near_in_angle(
-    lines: SightLines, base: Floats, rows: Ints, others: Ints, gate: float, nearest: float
-) -> tuple[Ints, Ints]:
-    """Pairs whose planes through both cameras are the same within the noise and what light may bend."""
+def near_in_angle(lines: LinesOfSight, rows: Ints, others: Ints, gate: float, nearest: float) -> tuple[Ints, Ints]:
+    """Pairs whose planes through both cameras are the same within the noise and what light may bend; see `meetings`.
+
+    Cameras in one place have no such planes: no pairs.
+    """
+    shift = lines.center[lines.camera[others[0]]] - lines.center[lines.camera[rows[0]]]
+    length = float(np.linalg.norm(shift))
+    if not length:
+        return rows[:0], others[:0]
+    base = shift / length
     across = np.cross(base, np.eye(3)[np.abs(base).argmin()])
     across /= np.linalg.norm(across)
     axes = np.stack([across, np.cross(base, across)])

@@ -28,7 +28,7 @@ from kcal.lens.camera_rig import CameraRig
 from kcal.locate.ellipsoid import ecef_from_enu_rotation
 from kcal.locate.geodesy import anchor, enu_from_cam, enu_to_geodetic, geodetic_to_enu
 from kcal.locate.multi_localizer import MultiViewLocalizer
-from kcal.pipeline.association import AssociationOptions
+from kcal.pipeline.association_options import AssociationOptions
 from kcal.pipeline.detections import Detections
 from kcal.pipeline.grouping import group_objects
 from kcal.pipeline.motion import Motion
