@@ -1,8 +1,8 @@
 """Detections of things that most cameras see: found where lines of sight of two meet and those of others pass by.
 
 Each meeting of two lines of sight is looked up in trees of the other cameras' lines of sight. Those that enough cameras
-confirm are groups; the marks of each camera are then assigned to them one to one. Where r cameras may miss a thing, r + 1
-pairs of cameras, no two of which share a camera, find all: one of these pairs sees it.
+confirm are groups. Where r cameras may miss a thing, r + 1 pairs of cameras, no two of which share a camera, find all:
+one of these pairs sees it. At last, the marks of each camera are assigned to all groups together, one to one.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from kcal.pipeline.epipolar_pencil import Floats, Ints, Meetings, LinesOfSight, meetings
+from kcal.pipeline.epipolar_pencil import Floats, Ints, LinesOfSight, Meetings, meetings
 from kcal.pipeline.one_to_one import assign_groups
 
 # Fewer views leave chance too much room where detections are dense.
@@ -43,12 +43,23 @@ class ClearGroups(NamedTuple):
 
 
 class _Fitted(NamedTuple):
-    """M groups with their points: marks (M, V), point (M, 3), its inverse covariance (M, 3, 3) and right side (M, 3)."""
+    """M groups with their points.
+
+    Attributes:
+        marks: (M, V).
+        point: (M, 3).
+        normal: (M, 3, 3) its inverse covariance.
+        squared: (M, V) squared sigmas by which lines of sight pass by.
+    """
 
     marks: Ints
     point: Floats
     normal: Floats
     squared: Floats
+
+    def at(self, which: Ints) -> _Fitted:
+        """Some of them."""
+        return _Fitted(*(value[which] for value in self))
 
 
 class Confirming:
@@ -81,17 +92,15 @@ class Confirming:
         # A fourth axis keeps kinds apart.
         self.place = np.column_stack([lines.ray, _ELSEWHERE * kind])
 
-    def found(self, pair: tuple[int, int], misses: int, free: NDArray[np.bool_]) -> ClearGroups:
-        """Groups that two cameras see, and all others but so many that have them in their images.
+    def found(self, pair: tuple[int, int], misses: int, free: NDArray[np.bool_]) -> Ints:
+        """(K, V) marks of groups that two cameras see, and all others but so many that have them in their images.
 
         Args:
             pair: of cameras.
             misses: how many cameras may miss a thing.
             free: (N,) which marks may be taken.
         """
-        count = len(self.axis)
-        own = [np.flatnonzero(free & (self.lines.camera == c)) for c in range(count)]
-        trees = {c: cKDTree(self.place[own[c]]) for c in self.there if len(own[c])}
+        own, trees = self._trees(free)
         meet = meetings(self.lines, own[pair[0]], own[pair[1]], self.gate, self.nearest)
         meet = meet.at(self.kind[meet.first] == self.kind[meet.second])
         marks, cost = self._confirmed(meet, pair, misses, own, trees)
@@ -101,7 +110,17 @@ class Confirming:
             # Nearest to the point that all views tell, without those that contradict.
             marks, _ = self._nearest(done, own, trees)
             done = self._fit(np.unique(marks[(marks >= 0).sum(1) >= FEWEST_VIEWS], axis=0))
-        return self._assigned(done, misses, own, trees)
+        return self._assigned(self._chosen(done, misses), own, trees).marks
+
+    def settled(self, marks: Ints, free: NDArray[np.bool_]) -> ClearGroups:
+        """Groups (K, V) with the marks of each camera assigned to all of them anew."""
+        own, trees = self._trees(free)
+        return self._assigned(self._fit(marks), own, trees)
+
+    def _trees(self, free: NDArray[np.bool_]) -> tuple[list[Ints], dict[int, cKDTree]]:
+        """Numbers of each camera's marks, and trees of them."""
+        own = [np.flatnonzero(free & (self.lines.camera == c)) for c in range(len(self.axis))]
+        return own, {c: cKDTree(self.place[own[c]]) for c in self.there if len(own[c])}
 
     def _confirmed(
         self, meet: Meetings, pair: tuple[int, int], misses: int, own: list[Ints], trees: dict[int, cKDTree]
@@ -219,8 +238,8 @@ class Confirming:
             marks[:, c] = np.where(np.isfinite(value), np.take_along_axis(number, best, 1)[:, 0], -1)
         return marks, near
 
-    def _assigned(self, done: _Fitted, misses: int, own: list[Ints], trees: dict[int, cKDTree]) -> ClearGroups:
-        """Groups in the order of what they save, as far as they share no marks, with marks assigned one to one."""
+    def _chosen(self, done: _Fitted, misses: int) -> _Fitted:
+        """Groups in the order of what they save, as far as none is about as likely that has other marks."""
         views = (done.marks >= 0).sum(1)
         saved = (views - 1) * self.gate**2 - done.squared.sum(1)
         kept = np.flatnonzero(self._enough(done, misses))
@@ -238,29 +257,33 @@ class Confirming:
             elif 2 * shared.max() < len(marks):
                 for holder in holders:
                     clear[holder] &= bool(saved[chosen[holder]] - saved[one] >= self.near)
-        some = np.array(chosen, dtype=np.int64)[np.array(clear, dtype=bool)]
-        done = _Fitted(*(value[some] for value in done))
+        return done.at(np.array(chosen, dtype=np.int64)[np.array(clear, dtype=bool)])
+
+    def _assigned(self, done: _Fitted, own: list[Ints], trees: dict[int, cKDTree]) -> ClearGroups:
         marks, rival = np.full_like(done.marks, -1), np.zeros(done.marks.shape, dtype=bool)
         for c, (number, squared) in enumerate(self._nearest(done, own, trees)[1]):
-            if c not in trees or not len(some):
+            if c not in trees or not len(marks):
                 continue
-            cost = np.full((len(some), len(own[c])), np.inf)
+            cost = np.full((len(marks), len(own[c])), np.inf)
             row, column = np.nonzero(np.isfinite(squared))
             cost[row, np.searchsorted(own[c], number[row, column])] = squared[row, column]
-            best, doubt = assign_groups(cost, self.gate**2, self.near)
+            best, rival[:, c] = assign_groups(cost, self.gate**2, self.near)
             marks[:, c] = np.where(best >= 0, own[c][best], -1)
-            rival[:, c] = doubt
-        return ClearGroups(marks, rival)
+        several = (marks >= 0).sum(1) >= FEWEST_VIEWS
+        return ClearGroups(marks[several], rival[several])
 
     def _enough(self, done: _Fitted, misses: int) -> NDArray[np.bool_]:
-        """Which groups have views enough."""
+        """Which groups have views enough that do not contradict each other."""
         there = done.marks >= 0
         look = self._lines(done.point)
         look = look / np.linalg.norm(look, axis=2, keepdims=True)
         inside = np.zeros(len(self.axis), dtype=bool)
         inside[self.there] = True
         missed = ((look * self.axis).sum(-1) > self.inner) & ~there & inside
-        return (there.sum(1) >= FEWEST_VIEWS) & (missed.sum(1) <= misses)
+        # Mean and some standard deviations of chi-squared.
+        freedom = 2.0 * there.sum(1) - 3.0
+        good = done.squared.sum(1) < freedom + self.gate * np.sqrt(2.0 * np.maximum(freedom, 1.0))
+        return (there.sum(1) >= FEWEST_VIEWS) & (missed.sum(1) <= misses) & good
 
 
 def separate_pairs(center: Floats, axis: Floats, there: list[int]) -> list[tuple[int, int]]:

@@ -148,7 +148,7 @@ class _Scene:
 
     def _clear(self) -> tuple[list[tuple[int, ...]], list[bool], NDArray[np.bool_]]:
         """Groups that most cameras see, which are ambiguous, and which marks are of none of these things."""
-        posed, options, rig = self.posed, self.options, self.localize.rig
+        posed, options = self.posed, self.options
         there = [c for c, own in enumerate(self.own) if len(own)]
         groups: list[tuple[int, ...]] = []
         doubts: list[bool] = []
@@ -161,19 +161,28 @@ class _Scene:
         kind = self.kind if options.same_category else np.zeros_like(self.kind)
         confirming = Confirming(self.lines, kind, axis, inner, there, options.gate, near, self.nearest)
         pairs = separate_pairs(posed.center.numpy(), axis, there)
+        every = np.zeros(len(self.camera), dtype=bool)
+        every[np.concatenate(self.own)] = True
+        found = [np.zeros((0, len(self.own)), dtype=np.int64)]
+        left = every.copy()
         for misses in range(len(pairs)):
             for pair in pairs[: misses + 1]:
-                found = confirming.found(pair, misses, free)
-                # Without the marks that could as well be of another thing, if views enough are left.
-                sure = np.where(found.rival, -1, found.marks)
-                doubtful = (sure >= 0).sum(1) < FEWEST_VIEWS
-                rows = np.where(doubtful[:, None], found.marks, sure)
-                number = {mark: i for i, row in enumerate(rows.tolist()) for mark in row}
-                for group in self._fitted([tuple(row) for row in rows.tolist()]):
-                    which = number[max(group.marks)]
-                    groups.append(group.marks)
-                    doubts.append(bool(doubtful[which]))
-                    free[found.marks[which][found.marks[which] >= 0]] = False
+                found.append(confirming.found(pair, misses, left))
+                left[found[-1][found[-1] >= 0]] = False
+        all_found = np.concatenate(found)
+        if not len(all_found):
+            return groups, doubts, free
+        settled = confirming.settled(all_found, every)
+        # Without the marks that could as well be of another thing, if views enough are left.
+        sure = np.where(settled.rival, -1, settled.marks)
+        doubtful = (sure >= 0).sum(1) < FEWEST_VIEWS
+        rows = np.where(doubtful[:, None], settled.marks, sure)
+        number = {mark: i for i, row in enumerate(rows.tolist()) for mark in row}
+        for group in self._fitted([tuple(row) for row in rows.tolist()]):
+            which = number[max(group.marks)]
+            groups.append(group.marks)
+            doubts.append(bool(doubtful[which]))
+            free[settled.marks[which][settled.marks[which] >= 0]] = False
         return groups, doubts, free
 
     def _middle(self, c: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
