@@ -362,4 +362,6 @@ def _calendar_time(text: str) -> datetime.datetime:
         moment = datetime.datetime.fromisoformat(text)
     except ValueError as error:
         raise InputError(f"--start {text!r}: write a time such as 2026-05-01T12:00:00Z") from error
-    return moment if moment.tzinfo else moment.replace(tzinfo=datetime.UTC)
+    if moment.tzinfo is None:
+        raise InputError(f"--start {text!r} has no zone: end it with Z for UTC, or with +02:00")
+    return moment
