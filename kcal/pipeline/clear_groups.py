@@ -249,12 +249,12 @@ class Confirming:
             marks = done.marks[one][done.marks[one] >= 0]
             free = owner[marks] < 0
             holders, shared = np.unique(owner[marks][~free], return_counts=True)
-            # Things that share some marks, or nearly all, are told apart by the assignment, mark by mark.
+            # Groups that differ in one mark, or share a few, are told apart by the assignment, mark by mark.
             if free.sum() >= FEWEST_VIEWS:
                 owner[marks[free]] = len(chosen)
                 chosen.append(one)
                 clear.append(True)
-            elif 2 * shared.max() < len(marks):
+            elif shared.max() < len(marks) - 1:
                 for holder in holders:
                     clear[holder] &= bool(saved[chosen[holder]] - saved[one] >= self.near)
         return done.at(np.array(chosen, dtype=np.int64)[np.array(clear, dtype=bool)])
