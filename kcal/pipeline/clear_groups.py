@@ -59,7 +59,7 @@ class _Fitted(NamedTuple):
 
     def at(self, which: Ints) -> _Fitted:
         """Some of them."""
-        return _Fitted(*(value[which] for value in self))
+        return _Fitted(self.marks[which], self.point[which], self.normal[which], self.squared[which])
 
 
 class Confirming:
@@ -244,7 +244,8 @@ class Confirming:
         saved = (views - 1) * self.gate**2 - done.squared.sum(1)
         kept = np.flatnonzero(self._enough(done, misses))
         owner = np.full(len(self.lines.camera), -1)
-        chosen, clear = [], []
+        chosen: list[np.int64] = []
+        clear: list[bool] = []
         for one in kept[np.argsort(-saved[kept], kind="stable")]:
             marks = done.marks[one][done.marks[one] >= 0]
             free = owner[marks] < 0

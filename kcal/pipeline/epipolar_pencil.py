@@ -106,7 +106,8 @@ def meetings(lines: LinesOfSight, rows: Ints, others: Ints, gate: float, nearest
     u, v = lines.ray[first], lines.ray[second]
     near, far = _ranges(u, v, base, length)
     good = (near > 0) & (far > 0) & (near < FARTHEST_BEND_M) & (far < FARTHEST_BEND_M)
-    first, second, u, v, near, far = (value[good] for value in (first, second, u, v, near, far))
+    first, second = first[good], second[good]
+    u, v, near, far = (value[good] for value in (u, v, near, far))
     if lines.bending:
         # Straight lines to where the bent ones lead.
         u = u - (lines.bending * near)[:, None] * lines.up[a]
