@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from kcal.pipeline.epipolar_pencil import Floats, Ints, LinesOfSight, Meetings, meetings
+from kcal.pipeline.epipolar_pencil import Floats, Ints, StationSights, Meetings, meetings
 from kcal.pipeline.one_to_one import assign_groups
 
 # Fewer views leave chance too much room where detections are dense.
@@ -42,7 +42,7 @@ class ClearGroups(NamedTuple):
     rival: NDArray[np.bool_]
 
 
-class _Fitted(NamedTuple):
+class _FittedGroups(NamedTuple):
     """M groups with their points.
 
     Attributes:
@@ -57,9 +57,9 @@ class _Fitted(NamedTuple):
     normal: Floats
     squared: Floats
 
-    def at(self, which: Ints) -> _Fitted:
+    def at(self, which: Ints) -> _FittedGroups:
         """Some of them."""
-        return _Fitted(self.marks[which], self.point[which], self.normal[which], self.squared[which])
+        return _FittedGroups(self.marks[which], self.point[which], self.normal[which], self.squared[which])
 
 
 class Confirming:
@@ -78,7 +78,7 @@ class Confirming:
 
     def __init__(
         self,
-        lines: LinesOfSight,
+        lines: StationSights,
         kind: Ints,
         axis: Floats,
         inner: Floats,
@@ -173,7 +173,7 @@ class Confirming:
     def _lines(self, point: Floats) -> Floats:
         return np.stack([self._line(point, c) for c in range(len(self.axis))], 1)
 
-    def _fit(self, marks: Ints) -> _Fitted:
+    def _fit(self, marks: Ints) -> _FittedGroups:
         """The points (M, 3) nearest to lines of sight, in sigmas; where light bends from is known well enough."""
         there = marks >= 0
         ray = self.lines.ray[marks]
@@ -192,10 +192,10 @@ class Confirming:
             bent = center - middle - (self.lines.bending * apart)[..., None] * self.lines.up
         assert point is not None
         rest = (across @ (point[:, None] - bent)[..., None])[..., 0]
-        return _Fitted(marks, point + middle, normal, weight * (rest**2).sum(-1))
+        return _FittedGroups(marks, point + middle, normal, weight * (rest**2).sum(-1))
 
     def _nearest(
-        self, done: _Fitted, own: list[Ints], trees: dict[int, cKDTree]
+        self, done: _FittedGroups, own: list[Ints], trees: dict[int, cKDTree]
     ) -> tuple[Ints, list[tuple[Ints, Floats]]]:
         """(M, V) marks nearest to points by all other views; and of each camera nearest marks and squared sigmas."""
         count = len(self.axis)
@@ -238,7 +238,7 @@ class Confirming:
             marks[:, c] = np.where(np.isfinite(value), np.take_along_axis(number, best, 1)[:, 0], -1)
         return marks, near
 
-    def _chosen(self, done: _Fitted, misses: int) -> _Fitted:
+    def _chosen(self, done: _FittedGroups, misses: int) -> _FittedGroups:
         """Groups in the order of what they save, as far as none is about as likely that has other marks."""
         views = (done.marks >= 0).sum(1)
         saved = (views - 1) * self.gate**2 - done.squared.sum(1)
@@ -260,7 +260,7 @@ class Confirming:
                     clear[holder] &= bool(saved[chosen[holder]] - saved[one] >= self.near)
         return done.at(np.array(chosen, dtype=np.int64)[np.array(clear, dtype=bool)])
 
-    def _assigned(self, done: _Fitted, own: list[Ints], trees: dict[int, cKDTree]) -> ClearGroups:
+    def _assigned(self, done: _FittedGroups, own: list[Ints], trees: dict[int, cKDTree]) -> ClearGroups:
         marks, rival = np.full_like(done.marks, -1), np.zeros(done.marks.shape, dtype=bool)
         for c, (number, squared) in enumerate(self._nearest(done, own, trees)[1]):
             if c not in trees or not len(marks):
@@ -273,7 +273,7 @@ class Confirming:
         several = (marks >= 0).sum(1) >= FEWEST_VIEWS
         return ClearGroups(marks[several], rival[several])
 
-    def _enough(self, done: _Fitted, misses: int) -> NDArray[np.bool_]:
+    def _enough(self, done: _FittedGroups, misses: int) -> NDArray[np.bool_]:
         """Which groups have views enough that do not contradict each other."""
         there = done.marks >= 0
         look = self._lines(done.point)

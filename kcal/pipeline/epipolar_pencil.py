@@ -21,7 +21,7 @@ FARTHEST_BEND_M = 1e5
 _FLAT = 10.0
 
 
-class LinesOfSight(NamedTuple):
+class StationSights(NamedTuple):
     """N lines of sight of C cameras, all in one frame.
 
     Attributes:
@@ -73,7 +73,7 @@ class Meetings(NamedTuple):
         return Meetings(*(value[which] for value in self))
 
 
-def meetings(lines: LinesOfSight, rows: Ints, others: Ints, gate: float, nearest: float) -> Meetings:
+def meetings(lines: StationSights, rows: Ints, others: Ints, gate: float, nearest: float) -> Meetings:
     """Where lines of sight of one camera meet those of another within `gate` standard deviations.
 
     Those that cross at a small angle are left out: nothing linear is known of their range.
@@ -87,7 +87,7 @@ def meetings(lines: LinesOfSight, rows: Ints, others: Ints, gate: float, nearest
 
     Example:
         >>> ray = np.array([[0.0, 1.0, 0.0], [-0.6, 0.8, 0.0], [-0.6, 0.8, 0.01]])
-        >>> lines = LinesOfSight(np.array([0, 1, 1]), ray, np.full(3, 1e-3), np.zeros(2), 0.0,
+        >>> lines = StationSights(np.array([0, 1, 1]), ray, np.full(3, 1e-3), np.zeros(2), 0.0,
         ...                    np.array([[0.0, 0, 0], [600.0, 0, 0]]), np.array([[0.0, 0, 1]] * 2), 0.0)
         >>> found = meetings(lines, np.array([0]), np.array([1, 2]), 4.0, 100.0)
         >>> found.second.tolist(), found.point.round(6).tolist()
@@ -127,7 +127,7 @@ def meetings(lines: LinesOfSight, rows: Ints, others: Ints, gate: float, nearest
     )
 
 
-def near_in_angle(lines: LinesOfSight, rows: Ints, others: Ints, gate: float, nearest: float) -> tuple[Ints, Ints]:
+def near_in_angle(lines: StationSights, rows: Ints, others: Ints, gate: float, nearest: float) -> tuple[Ints, Ints]:
     """Pairs whose planes through both cameras are the same within the noise and what light may bend; see `meetings`.
 
     Cameras in one place have no such planes: no pairs.

@@ -22,7 +22,7 @@ from kcal.pipeline.association import MOST_BOXES
 from kcal.pipeline.association_options import AssociationOptions
 from kcal.pipeline.clear_groups import FEWEST_VIEWS, Confirming, separate_pairs
 from kcal.pipeline.detections import Detections
-from kcal.pipeline.epipolar_pencil import LinesOfSight, near_in_angle
+from kcal.pipeline.epipolar_pencil import StationSights, near_in_angle
 from kcal.pipeline.object_views import ObjectViews
 from kcal.pipeline.one_to_one import assign_groups
 from kcal.pipeline.pair_costs import fit_some, pair_costs
@@ -199,7 +199,7 @@ class _Scene:
         widest = torch.where(valid, rays @ middle, -1.0).amax()
         return (turn.T @ middle).numpy(), widest.numpy()
 
-    def _lines(self) -> LinesOfSight:
+    def _lines(self) -> StationSights:
         """Lines of sight of all detections."""
         posed, common = self.posed, common_errors(self.localize)
         moved, turned, air = torch.zeros(len(self.own)).double(), torch.zeros(len(self.own)).double(), 0.0
@@ -217,7 +217,7 @@ class _Scene:
             ray[own] = rays[0] @ posed.rotation[c]
             sigma[own] = (slope * self.options.box_sigma**2 + turned[c].square()).sqrt()
         up = torch.zeros_like(posed.center) if posed.up is None else posed.up
-        return LinesOfSight(
+        return StationSights(
             self.camera, ray.numpy(), sigma.numpy(), moved.numpy(), air, posed.center.numpy(), up.numpy(), posed.bending
         )
 

@@ -10,14 +10,14 @@ from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.pipeline.association_options import AssociationOptions
 from kcal.pipeline.clear_groups import separate_pairs
 from kcal.pipeline.detections import Detections
-from kcal.pipeline.epipolar_pencil import LinesOfSight, meetings
+from kcal.pipeline.epipolar_pencil import StationSights, meetings
 from kcal.pipeline.grouping import group_objects
 from scripts.shared.station_scenes import drawn_errors, marks, ring
 
 SIZE = (1920, 1080)
 
 
-def lines(points: torch.Tensor, center: torch.Tensor, bending: float = 0.0, turned: float = 0.0) -> LinesOfSight:
+def lines(points: torch.Tensor, center: torch.Tensor, bending: float = 0.0, turned: float = 0.0) -> StationSights:
     """Of points (N, 3) from two places, the second one's turned upward by `turned` radians."""
     rays = []
     for c in range(2):
@@ -27,7 +27,7 @@ def lines(points: torch.Tensor, center: torch.Tensor, bending: float = 0.0, turn
         rays.append(torch.nn.functional.normalize(away, dim=-1))
     count = len(points)
     up = np.array([[0.0, 0.0, 1.0]] * 2)
-    return LinesOfSight(
+    return StationSights(
         np.repeat([0, 1], count), torch.cat(rays).numpy(), np.full(2 * count, 1e-4), np.zeros(2), 0.0, center.numpy(),
         up, bending,
     )  # fmt: skip
