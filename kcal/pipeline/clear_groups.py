@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from kcal.pipeline.epipolar_pencil import Floats, Ints, StationSights, Meetings, meetings
+from kcal.pipeline.epipolar_pencil import Floats, Ints, Meetings, StationSights, meetings
 from kcal.pipeline.one_to_one import assign_groups
 
 # Fewer views leave chance too much room where detections are dense.
