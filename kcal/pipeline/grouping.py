@@ -144,7 +144,8 @@ class _Scene:
         """Groups of two views and more, each detection once, and which are ambiguous."""
         groups, doubts, free = self._clear()
         self.own = [own[free[own]] for own in self.own]
-        return tuple(first + rest for first, rest in zip((groups, doubts), self._remaining(), strict=True))
+        more, more_doubts = self._remaining()
+        return groups + more, doubts + more_doubts
 
     def _clear(self) -> tuple[list[tuple[int, ...]], list[bool], NDArray[np.bool_]]:
         """Groups that most cameras see, which are ambiguous, and which marks are of none of these things."""
