@@ -52,16 +52,14 @@ def one_line(text: str) -> str:
     return visible(text).replace("\t", r"\t").replace("\n", r"\n")
 
 
-def unix_seconds(text: str, *, zone: datetime.tzinfo | None) -> float:
-    """Seconds of a number, or since 1970 of an ISO time; NaN or infinity where a text is neither.
+def unix_seconds(text: str) -> float:
+    """Seconds of a number, or since 1970 of an ISO time with its zone; NaN or infinity where a text is neither.
 
-    Args:
-        text: of a table's cell.
-        zone: of a time that names none; None: such a time is none.
+    A time that names no zone is none: whose hour it is would be a guess.
 
     Example:
-        >>> unix_seconds("12.5", zone=None), unix_seconds("1970-01-01T00:01:00Z", zone=None)
-        (12.5, 60.0)
+        >>> unix_seconds("12.5"), unix_seconds("1970-01-01T00:01:00Z"), unix_seconds("1970-01-01T00:01:00")
+        (12.5, 60.0, nan)
     """
     try:
         # Python also reads "1_000", which is more likely a slip than a number.
@@ -72,11 +70,7 @@ def unix_seconds(text: str, *, zone: datetime.tzinfo | None) -> float:
         moment = datetime.datetime.fromisoformat(text.strip())
     except ValueError:
         return math.nan
-    if moment.tzinfo is None:
-        if zone is None:
-            return math.nan
-        moment = moment.replace(tzinfo=zone)
-    return moment.timestamp()
+    return math.nan if moment.tzinfo is None else moment.timestamp()
 
 
 def csv_line(cells: Iterable[Any]) -> str:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from kcal.locate.localizer import StereoLocalizer
     from kcal.locate.multi_localizer import MultiViewLocalizer
     from kcal.locate.positions import Located
-    from kcal.pipeline.association import AssociationOptions
+    from kcal.pipeline.association_options import AssociationOptions
     from kcal.pipeline.live_map import LiveMap
     from kcal.pipeline.stream import StreamCounts
     from kcal.pipeline.track_options import Tracks
@@ -157,7 +157,7 @@ def live_command(
     from kcal.files import check_writable
     from kcal.locate.multi_localizer import MultiViewLocalizer
     from kcal.locate.stations import names_of_rig
-    from kcal.pipeline.association import AssociationOptions
+    from kcal.pipeline.association_options import AssociationOptions
     from kcal.pipeline.lines import read_moment
     from kcal.pipeline.senders import sender_to
     from kcal.pipeline.shared_errors import ClockPrior
@@ -362,4 +362,6 @@ def _calendar_time(text: str) -> datetime.datetime:
         moment = datetime.datetime.fromisoformat(text)
     except ValueError as error:
         raise InputError(f"--start {text!r}: write a time such as 2026-05-01T12:00:00Z") from error
-    return moment if moment.tzinfo else moment.replace(tzinfo=datetime.UTC)
+    if moment.tzinfo is None:
+        raise InputError(f"--start {text!r} has no zone: end it with Z for UTC, or with +02:00")
+    return moment

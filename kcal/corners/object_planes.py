@@ -68,7 +68,7 @@ def plane_pixels(
     camera: Camera, planes: ObjectPlanes, places: Tensor, rotation: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Pixels (N, ..., 2) of places (N, ..., 2) on the planes, and valid; `rotation`: of the right camera."""
-    rays = torch.cat([places, torch.ones_like(places[..., :1])], -1).flatten(1, -2) @ planes.axes
+    rays = torch.cat([places, torch.ones_like(places[..., :1])], -1).reshape(len(places), -1, 3) @ planes.axes
     if rotation is not None:
         rays = rays @ rotation.T
     pixels, valid = camera.project_rays(rays.flatten(0, 1))

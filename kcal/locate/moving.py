@@ -162,7 +162,7 @@ def time_of_row(row: TableRow) -> float:
     Raises:
         FileError: neither.
     """
-    seconds = unix_seconds(row.cells["time"], zone=None)
+    seconds = unix_seconds(row.cells["time"])
     if not math.isfinite(seconds):
         raise FileError(
             f"{row.where}: time is {row.cells['time']!r}; write seconds, or a date with its zone: 2026-11-24T20:47:26Z"

@@ -7,7 +7,6 @@ from typing import NamedTuple, Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
@@ -146,18 +145,17 @@ def within(scores: Scores, track: Tensor, pair: Tensor, gate: Tensor) -> Candida
 
 
 def assigned(
-    possible: Candidates, marks: NDArray[np.int64], evidence: Sequence[float], tiers: Sequence[int]
+    possible: Candidates, ends: Sequence[set[tuple[int, int]]], evidence: Sequence[float], tiers: Sequence[int]
 ) -> list[int]:
     """Rows of `possible` to accept: each track, sighting and mark at most once, with the largest sum of log densities.
 
     Args:
         possible: all matches inside the gates.
-        marks: (N, V) from `mark_numbers`.
+        ends: of N sightings, numbers of cameras and of their marks.
         evidence: (T,) of each track so far: settles between tracks that want the same mark by different sightings.
         tiers: (T,) tracks of tier 0 choose before those of tier 1; tracks of a negative tier do not choose.
     """
     track, pair, density = possible.track.tolist(), possible.pair.tolist(), possible.scores.log_density.tolist()
-    ends = [{(camera, mark) for camera, mark in enumerate(row) if mark >= 0} for row in marks.tolist()]
     used: set[tuple[int, int]] = set()
     done: set[int] = set()
     accepted: list[int] = []

@@ -8,8 +8,6 @@ assignment with the least sum of costs is exact (`kcal.pipeline.one_to_one`); a 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -18,56 +16,20 @@ from torch import Tensor
 
 from kcal.corners.filters import as_gray
 from kcal.errors import InputError
-from kcal.lens.projection import Projection
-from kcal.lens.rig import RigCovariance, StereoRig
-from kcal.locate.max_likelihood import calibration_effect, unreached_direction
-from kcal.locate.stereo import PairFit, PositionStatus, fit_pairs, inverse_range
+from kcal.lens.rig import StereoRig
+from kcal.locate.multi_localizer import MultiViewLocalizer
+from kcal.locate.stations import stations_of
 from kcal.pipeline.appearance import appearance
-from kcal.pipeline.detections import Anchor, Detections
+from kcal.pipeline.association_options import AssociationOptions
+from kcal.pipeline.detections import Detections
 from kcal.pipeline.epipolar_band import near_epipolar_lines
 from kcal.pipeline.one_to_one import assign_groups
+from kcal.pipeline.pair_costs import pair_costs
 
-# Spread of the logarithm of an object's size between two views, besides what boxes err: it is seen from two sides.
-_SIZE_SPREAD = 0.15
 # Spread of 1 - correlation between two views of one object; of two objects it is 0.5 to 1.
 _LOOKS_SPREAD = 0.25
 # Of one image: more are a detector's fault, and their pairs grow with the square.
 MOST_BOXES = 2000
-# Numbers that are held at once while pairs are compared, some 100 MB with what is derived from them.
-_AT_ONCE = 1 << 19
-
-
-@dataclass(frozen=True, kw_only=True)
-class AssociationOptions:
-    """Options of `associate`.
-
-    Args:
-        box_sigma: standard deviation of a box's middle along each axis, pixels.
-        nearest: smallest range, meters; 10 baselines if None.
-        farthest: largest range, meters.
-        gate: a pair is possible up to this many standard deviations, epipolar error, size and looks together.
-        odds: a pair is ambiguous unless the best assignment with it is this many times as likely as the best one that
-            pairs one of its members otherwise.
-        same_category: whether only detections of the same category may be paired.
-        anchor: pixel that stands for an object; see `Detections.anchors`.
-
-    Raises:
-        InputError: a value out of range.
-    """
-
-    box_sigma: float = 2.0
-    nearest: float | None = None
-    farthest: float = math.inf
-    gate: float = 4.0
-    odds: float = 20.0
-    same_category: bool = True
-    anchor: Anchor = "center"
-
-    def __post_init__(self) -> None:
-        if not (0 < self.box_sigma < math.inf and 0 < self.gate < math.inf and 1 <= self.odds < math.inf):
-            raise InputError("association: box_sigma and gate are positive, and odds at least 1")
-        if not 0 < (self.nearest or 1e-9) < self.farthest:
-            raise InputError(f"association: 0 < nearest < farthest is needed, got {self.nearest} and {self.farthest}")
 
 
 class Association(NamedTuple):
@@ -133,7 +95,7 @@ def associate(
     anchors = left.anchors(options.anchor), right.anchors(options.anchor)
     ranges = _nearest(rig, options), options.farthest
     near &= near_epipolar_lines(rig, *anchors, options.box_sigma, options.gate, ranges)
-    cost = pair_costs(rig, left, right, options, near)
+    cost = association_costs(rig, left, right, options, near)
     if images is not None:
         gray = [as_gray(f"{word} image", image) for word, image in zip(("left", "right"), images, strict=True)]
         if [image.shape[::-1] for image in gray] != [rig.left.size, rig.right.size]:
@@ -149,7 +111,7 @@ def associate(
     return Association(rows, columns, cost[rows, columns], torch.from_numpy(ambiguous)[rows], possible)
 
 
-def pair_costs(
+def association_costs(
     rig: StereoRig, left: Detections, right: Detections, options: AssociationOptions, among: Tensor | None = None
 ) -> Tensor:
     """(N, M) squared standard deviations of epipolar error, range and size of pairs; infinite where impossible.
@@ -158,63 +120,21 @@ def pair_costs(
     """
     cost = torch.full((len(left), len(right)), torch.inf, dtype=torch.float64)
     rows, columns = (torch.ones_like(cost, dtype=torch.bool) if among is None else among).nonzero(as_tuple=True)
-    errors = 0 if rig.covariance is None else rig.covariance.half.shape[0]
-    size = _AT_ONCE // (16 + 8 * errors) + 1
-    for some, others in zip(rows.split(size), columns.split(size), strict=True):
-        if len(some):
-            cost[some, others] = _some_costs(rig, left, right, options, some, others)
+    if not len(rows):
+        return cost
+    # Where a mast stands does not matter.
+    alone = StereoRig(rig.left, rig.right, rig.right_from_left_rotation, rig.right_from_left_translation)
+    alone.covariance = rig.covariance
+    cost[rows, columns] = pair_costs(
+        MultiViewLocalizer(stations_of(alone)),
+        torch.tensor([0, 1]).expand(len(rows), 2),
+        torch.stack([left.anchors(options.anchor)[rows], right.anchors(options.anchor)[columns]], 1),
+        torch.stack([left.boxes[rows], right.boxes[columns]], 1),
+        options,
+        _nearest(rig, options),
+    ).cost
     return cost
 
 
 def _nearest(rig: StereoRig, options: AssociationOptions) -> float:
     return options.nearest if options.nearest is not None else 10.0 * float(rig.baseline)
-
-
-def _some_costs(
-    rig: StereoRig, left: Detections, right: Detections, options: AssociationOptions, rows: Tensor, columns: Tensor
-) -> Tensor:
-    """(L,) of the pairs of these numbers."""
-    variance = options.box_sigma**2
-    first, second = left.anchors(options.anchor)[rows], right.anchors(options.anchor)[columns]
-    # Every coordinate has the same noise: the point does not depend on how large it is.
-    found = fit_pairs(rig, first, second, by_camera=rig.covariance is not None)
-    spread = variance * found.fit.covariance[5]
-    if rig.covariance is not None:
-        moved = calibration_effect(found.fit, found.scale, rig.covariance.half.T)[2]
-        spread = spread + moved.square().sum(0)
-    reach = inverse_range(found, spread, PositionStatus.BEARING_ONLY)
-    beyond = (1.0 / options.farthest - reach.value).clamp_min(0.0)
-    before = (reach.value - 1.0 / _nearest(rig, options)).clamp_min(0.0)
-    total = epipolar_cost(found, variance, rig.covariance) + (torch.maximum(beyond, before) / reach.sigma).square()
-    total = total + size_cost(found.fit.projections, left.boxes[rows], right.boxes[columns], options.box_sigma)
-    return torch.where(found.usable & (reach.sigma > 0), total, torch.inf)
-
-
-def epipolar_cost(found: PairFit, variance: float, covariance: RigCovariance | None) -> Tensor:
-    """(N,) squared epipolar error over its variance: noise `variance` of every pixel coordinate, and the rig's.
-
-    The combination of the four coordinates that no point explains is orthogonal to the rows of `gain`.
-    """
-    across = unreached_direction(found.fit)
-    error = (across * found.fit.residual).sum(0)
-    spread = torch.full_like(error, variance)
-    if covariance is not None:
-        moved = calibration_effect(found.fit._replace(gain=across[None]), found.scale, covariance.half.T)
-        spread = spread + moved[0].square().sum(0)
-    return error.square() / spread
-
-
-def size_cost(
-    projections: Sequence[Projection], left: Tensor, right: Tensor, box_sigma: float, parallax: Tensor | float = 0.0
-) -> Tensor:
-    """(L,) squared standard deviations between the sizes of boxes, given how much each camera magnifies there.
-
-    `parallax` (L,): sine of the angle between the lines of sight. From another side, an object may have another size.
-    """
-    sizes = [boxes[:, 2:] - boxes[:, :2] for boxes in (left, right)]
-    near, far = (torch.linalg.vector_norm(p.by_point, dim=(-3, -2)).log() for p in projections)
-    ratio = (sizes[0] / sizes[1]).log() - (near - far)[:, None]
-    # Middles of boxes err by box_sigma, so edges by √2 and sizes by twice as much.
-    side = torch.as_tensor(parallax).reshape(-1, 1)
-    spread = sum((2.0 * box_sigma / size).square() for size in sizes) + _SIZE_SPREAD**2 + side.square()
-    return (ratio.square() / spread).sum(-1)

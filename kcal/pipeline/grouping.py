@@ -15,22 +15,22 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.lens.rig import StereoRig
 from kcal.locate.multi_localizer import MultiViewLocalizer, common_errors, posed_cameras
-from kcal.locate.views import CommonErrors, ViewsFit, fit_views
-from kcal.pipeline.association import MOST_BOXES, AssociationOptions, size_cost
+from kcal.pipeline.association import MOST_BOXES
+from kcal.pipeline.association_options import AssociationOptions
+from kcal.pipeline.clear_groups import FEWEST_VIEWS, Confirming, separate_pairs
 from kcal.pipeline.detections import Detections
-from kcal.pipeline.epipolar_band import near_epipolar_lines
+from kcal.pipeline.epipolar_pencil import StationSights, near_in_angle
 from kcal.pipeline.object_views import ObjectViews
 from kcal.pipeline.one_to_one import assign_groups
+from kcal.pipeline.pair_costs import fit_some, pair_costs
 
 # Rows of fits that are done at once.
 _AT_ONCE = 4096
-# Meters: light from the farthest targets bends by no more than on such a way.
-_FAR_M = 1e5
+# Meters: at smaller ranges than this, or than `nearest`, a first look may miss what errors of places explain.
+_NEAREST_M = 1000.0
 
 
 class _Edges(NamedTuple):
@@ -127,6 +127,7 @@ class _Scene:
         self, localize: MultiViewLocalizer, seen: Sequence[Detections | None], options: AssociationOptions
     ) -> None:
         self.localize, self.options, self.posed = localize, options, posed_cameras(localize)
+        self.nearest = options.nearest or _NEAREST_M
         there = [(c, each) for c, each in enumerate(seen) if each is not None]
         none = torch.zeros(0, dtype=torch.float64)
         self.camera = np.repeat([c for c, _ in there], [len(each) for _, each in there]).astype(np.int64)
@@ -137,12 +138,94 @@ class _Scene:
         names = {name: number for number, name in enumerate(dict.fromkeys(self.category))}
         self.kind = np.array([names[name] for name in self.category], dtype=np.int64)
         self.own = [np.flatnonzero(self.camera == c) for c in range(len(localize.rig))]
+        self.lines = self._lines()
 
     def chosen(self) -> tuple[list[tuple[int, ...]], list[bool]]:
         """Groups of two views and more, each detection once, and which are ambiguous."""
+        groups, doubts, free = self._clear()
+        self.own = [own[free[own]] for own in self.own]
+        more, more_doubts = self._remaining()
+        return groups + more, doubts + more_doubts
+
+    def _clear(self) -> tuple[list[tuple[int, ...]], list[bool], NDArray[np.bool_]]:
+        """Groups that most cameras see, which are ambiguous, and which marks are of none of these things."""
+        posed, options = self.posed, self.options
+        there = [c for c, own in enumerate(self.own) if len(own)]
+        groups: list[tuple[int, ...]] = []
+        doubts: list[bool] = []
+        free = np.ones(len(self.camera), dtype=bool)
+        if len(there) < FEWEST_VIEWS:
+            return groups, doubts, free
         cameras = range(len(self.own))
-        edges = {(i, j): self._edges(i, j) for i, j in itertools.combinations(cameras, 2)}
-        candidates = self._fitted(_with_one_range(list(edges.values()), self.camera, len(self.own), self.options.gate))
+        axis, inner = (np.stack(value) for value in zip(*(self._middle(c) for c in cameras), strict=True))
+        near = 2.0 * math.log(options.odds)
+        kind = self.kind if options.same_category else np.zeros_like(self.kind)
+        confirming = Confirming(self.lines, kind, axis, inner, there, options.gate, near, self.nearest)
+        pairs = separate_pairs(posed.center.numpy(), axis, there)
+        every = np.zeros(len(self.camera), dtype=bool)
+        every[np.concatenate(self.own)] = True
+        found = [np.zeros((0, len(self.own)), dtype=np.int64)]
+        left = every.copy()
+        for misses in range(len(pairs)):
+            for pair in pairs[: misses + 1]:
+                found.append(confirming.found(pair, misses, left))
+                left[found[-1][found[-1] >= 0]] = False
+        all_found = np.concatenate(found)
+        if not len(all_found):
+            return groups, doubts, free
+        settled = confirming.settled(all_found, every)
+        # Without the marks that could as well be of another thing, if views enough are left.
+        sure = np.where(settled.rival, -1, settled.marks)
+        doubtful = (sure >= 0).sum(1) < FEWEST_VIEWS
+        rows = np.where(doubtful[:, None], settled.marks, sure)
+        number = {mark: i for i, row in enumerate(rows.tolist()) for mark in row}
+        for group in self._fitted([tuple(row) for row in rows.tolist()]):
+            which = number[max(group.marks)]
+            groups.append(group.marks)
+            doubts.append(bool(doubtful[which]))
+            free[settled.marks[which][settled.marks[which] >= 0]] = False
+        return groups, doubts, free
+
+    def _middle(self, c: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Where a camera looks, and the cosine of the widest cone about it that is inside its image."""
+        camera, turn = self.localize.rig.each[c], self.localize.rig.rotation[c]
+        width, height = camera.size
+        u, v = (torch.arange(count, dtype=torch.float64) for count in (width, height))
+        edge = torch.cat(
+            [torch.stack([u, torch.full_like(u, end)], 1) for end in (0.0, height - 1.0)]
+            + [torch.stack([torch.full_like(v, end), v], 1) for end in (0.0, width - 1.0)]
+        )
+        middle = camera.unproject(0.5 * torch.tensor([[width - 1.0, height - 1.0]], dtype=torch.float64))[0][0]
+        rays, valid = camera.unproject(edge)
+        widest = torch.where(valid, rays @ middle, -1.0).amax()
+        return (turn.T @ middle).numpy(), widest.numpy()
+
+    def _lines(self) -> StationSights:
+        """Lines of sight of all detections."""
+        posed, common = self.posed, common_errors(self.localize)
+        moved, turned, air = torch.zeros(len(self.own)).double(), torch.zeros(len(self.own)).double(), 0.0
+        if common is not None:
+            moved, turned = common.half[..., :6].square().sum(0).sqrt().unflatten(-1, (2, 3)).amax(-1).unbind(-1)
+            air = float(common.bending.square().sum().sqrt())
+        ray, sigma = torch.zeros(len(self.camera), 3, dtype=torch.float64), torch.ones(len(self.camera)).double()
+        for c, own in enumerate(self.own):
+            camera, pixels = posed.cameras[c], self.pixels[own]
+            steps = torch.stack([pixels, pixels + torch.tensor([1.0, 0.0]), pixels + torch.tensor([0.0, 1.0])])
+            rays, valid = camera.unproject(steps)
+            # What has no line of sight stays alone.
+            self.own[c] = own[valid[0].numpy()]
+            slope = (rays[1:] - rays[:1]).square().sum((0, -1)) / 2.0
+            ray[own] = rays[0] @ posed.rotation[c]
+            sigma[own] = (slope * self.options.box_sigma**2 + turned[c].square()).sqrt()
+        up = torch.zeros_like(posed.center) if posed.up is None else posed.up
+        return StationSights(
+            self.camera, ray.numpy(), sigma.numpy(), moved.numpy(), air, posed.center.numpy(), up.numpy(), posed.bending
+        )
+
+    def _remaining(self) -> tuple[list[tuple[int, ...]], list[bool]]:
+        """Groups of what no clear group has."""
+        cameras, edges = range(len(self.own)), self._edges()
+        candidates = self._fitted(_with_one_range(edges, self.camera, len(self.own), self.options.gate))
         near = 2.0 * math.log(self.options.odds)
         by_mark: dict[int, list[_Group]] = {}
         for group in candidates:
@@ -160,83 +243,41 @@ class _Scene:
             groups.append(group.marks)
             doubts.append(any(group.saved - other.saved < near for other in rivals))
         alone = self.options.gate**2
-        for (i, j), found in edges.items():
-            rows, columns = (np.array([m for m in self.own[c] if m not in used], dtype=np.int64) for c in (i, j))
-            if not len(rows) or not len(columns):
-                continue
-            place = {int(mark): number for number, mark in enumerate([*rows, *columns])}
+        left = np.ones(len(self.camera), dtype=bool)
+        left[list(used)] = False
+        for i, j in itertools.combinations(cameras, 2):
+            possible = left[edges.first] & left[edges.second]
+            possible &= (self.camera[edges.first] == i) & (self.camera[edges.second] == j)
+            rows, row = np.unique(edges.first[possible], return_inverse=True)
+            columns, column = np.unique(edges.second[possible], return_inverse=True)
             cost = np.full((len(rows), len(columns)), np.inf)
-            for first, second, value in zip(found.first.tolist(), found.second.tolist(), found.cost, strict=True):
-                if first in place and second in place:
-                    cost[place[first], place[second] - len(rows)] = value
+            cost[row, column] = edges.cost[possible]
             best, rival = assign_groups(cost, alone, near)
-            for row in np.flatnonzero(best >= 0):
-                pair = {i: int(rows[row]), j: int(columns[best[row]])}
+            for one in np.flatnonzero(best >= 0):
+                pair = {i: int(rows[one]), j: int(columns[best[one]])}
                 groups.append(tuple(pair.get(c, -1) for c in cameras))
-                doubts.append(bool(rival[row]))
-                used |= set(pair.values())
+                doubts.append(bool(rival[one]))
+                left[list(pair.values())] = False
         return groups, doubts
 
-    def _edges(self, i: int, j: int) -> _Edges:
-        """Possible pairs of two cameras."""
-        rig, options = self.localize.rig, self.options
-        rows, columns = self.own[i], self.own[j]
-        turn = rig.rotation[j] @ rig.rotation[i].T
-        shift = rig.rotation[j] @ (rig.center[i] - rig.center[j])
-        near = torch.zeros(len(rows), len(columns), dtype=torch.bool)
-        if len(rows) and len(columns) and bool(shift.any()):
-            pair = StereoRig(rig.each[i], rig.each[j], turn, shift)
-            near = near_epipolar_lines(pair, self.pixels[rows], self.pixels[columns], self._wide(i, j), options.gate)
-        if options.same_category:
-            near &= torch.from_numpy(self.kind[rows][:, None] == self.kind[columns])
-        at = near.nonzero().numpy()
-        first, second = rows[at[:, 0]], columns[at[:, 1]]
-        cost, inverse, sigma = (np.zeros(len(at)) for _ in range(3))
-        for part in np.split(np.arange(len(at)), range(_AT_ONCE, len(at), _AT_ONCE)):
-            both = np.stack([first[part], second[part]], 1)
-            found = self._fit((i, j), self.pixels[both], torch.ones(both.shape, dtype=torch.bool))
-            cost[part], inverse[part], sigma[part] = self._pair_costs(found, both)
-        kept = cost < options.gate**2
-        return _Edges(first[kept], second[kept], cost[kept], inverse[kept], sigma[kept])
-
-    def _wide(self, i: int, j: int) -> float:
-        """Pixels: noise of a box and all that is not known of attitudes and air; a first look only."""
-        common, most = common_errors(self.localize), 0.0
-        for c in (i, j):
-            angle = 2.0 * self.posed.bending * _FAR_M
-            if common is not None:
-                moved = common.half[:, c, :6].square().sum(0).sqrt()
-                angle += float(moved[3:].max() + common.bending.square().sum().sqrt() * _FAR_M)
-                angle += float(moved[:3].max() / (self.options.nearest or 1000.0))
-            most = max(most, angle * float(self.localize.rig.each[c].focal.max()))
-        return math.hypot(self.options.box_sigma, most)
-
-    def _fit(self, cameras: Sequence[int], pixels: Tensor, seen: Tensor) -> ViewsFit:
-        chosen, posed = list(cameras), self.posed
-        part = posed._replace(
-            cameras=[posed.cameras[c] for c in chosen], rotation=posed.rotation[chosen], center=posed.center[chosen],
-            up=None if posed.up is None else posed.up[chosen],
+    def _edges(self) -> _Edges:
+        """Possible pairs of all cameras."""
+        pairs = []
+        for i, j in itertools.combinations(range(len(self.own)), 2):
+            if len(self.own[i]) and len(self.own[j]):
+                near = near_in_angle(self.lines, self.own[i], self.own[j], self.options.gate, self.nearest)
+                pairs.append(np.stack(near, 1))
+        both = np.concatenate([np.zeros((0, 2), dtype=np.int64), *pairs])
+        if self.options.same_category:
+            both = both[self.kind[both[:, 0]] == self.kind[both[:, 1]]]
+        if not len(both):
+            return _Edges(both[:, 0], both[:, 1], *(np.zeros(0),) * 3)
+        found = pair_costs(
+            self.localize, torch.from_numpy(self.camera[both]), self.pixels[both], self.boxes[both], self.options,
+            self.options.nearest,
         )  # fmt: skip
-        common = common_errors(self.localize)
-        if common is not None:
-            common = CommonErrors(tuple(common.lens[c] for c in chosen), common.half[:, chosen], common.bending)
-        return fit_views(part, pixels, seen, noise=self.options.box_sigma, shared=common)
-
-    def _pair_costs(self, found: ViewsFit, both: NDArray[np.int64]) -> tuple[NDArray[np.float64], ...]:
-        """Squared sigmas of what no point explains, of range and of size; inverse range and its sigma."""
-        options, fit = self.options, found.fit
-        total, _ = found.misfits()
-        length = fit.direction.square().sum(0).sqrt()
-        inverse = fit.inverse / (found.scale * length)
-        sigma = (found.variance * fit.covariance[5]).clamp_min(0.0).sqrt() / (found.scale * length)
-        beyond = (1.0 / options.farthest - inverse).clamp_min(0.0)
-        before = (inverse - 1.0 / options.nearest).clamp_min(0.0) if options.nearest else torch.zeros_like(inverse)
-        total = total + (torch.maximum(beyond, before) / sigma).square()
-        parallax = torch.linalg.vector_norm(torch.linalg.cross(found.rays[:, 0], found.rays[:, 1]), dim=-1)
-        first, second = self.boxes[both].unbind(1)
-        total = total + size_cost(fit.projections, first, second, options.box_sigma, parallax)
-        good = found.fitted & (sigma > 0) & (found.used.sum(-1) == both.shape[1])
-        return tuple(v.numpy() for v in (torch.where(good, total, torch.inf), inverse, sigma))
+        kept = found.cost.numpy() < self.options.gate**2
+        return _Edges(both[kept, 0], both[kept, 1], *(value.numpy()[kept] for value in found))
 
     def _fitted(self, groups: list[tuple[int, ...]]) -> list[_Group]:
         """Groups of three views and more, fitted; one view that contradicts is left out."""
@@ -248,7 +289,10 @@ class _Scene:
             for start in range(0, len(groups), _AT_ONCE):
                 part = groups[start : start + _AT_ONCE]
                 numbers = torch.tensor(part)
-                found = self._fit(range(len(self.own)), self.pixels[numbers.clamp_min(0)], numbers >= 0)
+                found = fit_some(
+                    self.localize, list(range(len(self.own))), self.pixels[numbers.clamp_min(0)], numbers >= 0,
+                    self.options.box_sigma,
+                )  # fmt: skip
                 chi2, falls = found.misfits()
                 views = found.used.sum(-1)
                 ahead = found.fitted & (found.fit.inverse > 0) & ~found.behind(self.posed.center)
@@ -264,13 +308,12 @@ class _Scene:
         return good
 
 
-def _with_one_range(edges: list[_Edges], camera: NDArray[np.int64], cameras: int, gate: float) -> list[tuple[int, ...]]:
+def _with_one_range(edges: _Edges, camera: NDArray[np.int64], cameras: int, gate: float) -> list[tuple[int, ...]]:
     """Groups of three detections and more whose inverse ranges from the first one agree."""
     if cameras < 3:
         return []
-    first, second, _, inverse, sigma = (np.concatenate(values) for values in zip(*edges, strict=True))
-    order = np.argsort(first, kind="stable")
-    first, second, inverse, sigma = first[order], second[order], inverse[order], sigma[order]
+    order = np.argsort(edges.first, kind="stable")
+    first, second, _, inverse, sigma = (value[order] for value in edges)
     bounds = np.flatnonzero(np.diff(first)) + 1
     found: set[tuple[int, ...]] = set()
     for at in np.split(np.arange(len(first)), bounds):

@@ -25,7 +25,7 @@ from torch import Tensor
 from kcal.errors import InputError
 from kcal.lens.rig import StereoRig
 from kcal.locate.multi_localizer import MultiViewLocalizer
-from kcal.pipeline.association import AssociationOptions
+from kcal.pipeline.association_options import AssociationOptions
 from kcal.pipeline.detections import Detections
 from kcal.pipeline.grouping import group_objects
 from kcal.pipeline.object_views import ObjectViews

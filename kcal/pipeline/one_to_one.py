@@ -23,8 +23,6 @@ _AT_ONCE = 1 << 22
 def assign_groups(cost: Floats, alone: float, near: float) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """For each row its column or -1, and whether another pairing of the two costs less than `near` more.
 
-    Rows and columns that no chain of possible pairs connects do not bear on each other: each group is solved alone.
-
     Args:
         cost: (N, M); infinite where a pair is impossible.
         alone: what a row and a column that stay alone cost together.
@@ -35,19 +33,17 @@ def assign_groups(cost: Floats, alone: float, near: float) -> tuple[NDArray[np.i
         (array([0, 1]), array([ True,  True]))
     """
     chosen, rival = np.full(len(cost), -1), np.zeros(len(cost), dtype=bool)
-    ends = np.nonzero(cost < np.inf)
-    graph = scipy.sparse.coo_array(
-        (np.ones(len(ends[0])), (ends[0], len(cost) + ends[1])), shape=(sum(cost.shape),) * 2
-    )
-    _, groups = scipy.sparse.csgraph.connected_components(graph, directed=False)
-    for group in np.unique(groups[ends[0]]):
-        rows = np.flatnonzero(groups[: len(cost)] == group)
-        columns = np.flatnonzero(groups[len(cost) :] == group)
+    worth = cost < alone
+    rows, columns = np.nonzero(worth)
+    # Most pairs have no other one: they need no search.
+    single = (worth.sum(1)[rows] == 1) & (worth.sum(0)[columns] == 1)
+    chosen[rows[single]] = columns[single]
+    rows, columns = np.unique(rows[~single]), np.unique(columns[~single])
+    if len(rows):
         part = cost[np.ix_(rows, columns)]
         best, _ = best_assignment(part, alone)
         chosen[rows] = np.where(best >= 0, columns[best], -1)
-        if part.size > 1:
-            rival[rows] = _has_rival(np.minimum(part - alone, 0.0), best, near)
+        rival[rows] = _has_rival(np.minimum(part - alone, 0.0), best, near)
     return chosen, rival
 
 

@@ -8,7 +8,8 @@ from torch import Tensor
 from kcal.corners.match import MatchStatus
 from kcal.errors import InputError
 from kcal.lens.rig import StereoRig
-from kcal.pipeline.association import AssociationOptions, associate
+from kcal.pipeline.association import associate
+from kcal.pipeline.association_options import AssociationOptions
 from kcal.pipeline.detections import Detections
 from kcal.pipeline.disparity import ObjectDisparity
 from kcal.pipeline.pairs import ObjectPairs

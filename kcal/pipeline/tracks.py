@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -36,6 +37,7 @@ from kcal.pipeline.track_steps import compiled_steps, track_steps
 
 # Of the gate: nearer sightings tell of the clocks. One in a hundred is left out where the gate loses one in 10,000.
 _SURE = 13.3 / 23.5
+_Ends: TypeAlias = "set[tuple[int, int]]"  # numbers of cameras and of their marks
 # A frame is turned toward its target when that is farther from the axis than this tangent: 17°.
 _TURN = 0.3
 
@@ -179,7 +181,7 @@ class Tracker:
         """The confirmed tracks as they are now."""
         told = [i for i, track in enumerate(self.records) if self._is_told(track)]
         which = torch.tensor(told, dtype=torch.long, device=self.frame.device)
-        records = [self.records[i] for i in told]
+        records, cameras = [self.records[i] for i in told], range(len(self.localize.rig))
         return Tracks(
             time=self.time,
             number=tuple(track.number for track in records),
@@ -189,9 +191,8 @@ class Tracker:
             state=self.steps.place(self.beliefs, self.frame, self.home, self.shared.mixing, which),
             models=self.beliefs.weight[:, which].T,
             seen=torch.tensor(
-                [[(track.key, c) in self.seen_now for c in range(len(self.localize.rig))] for track in records],
-                dtype=torch.bool,
-            ).reshape(len(records), len(self.localize.rig)),
+                [[(track.key, c) in self.seen_now for c in cameras] for track in records], dtype=torch.bool
+            ).reshape(len(records), len(cameras)),
         )
 
     def clock_estimate(self, camera: int = 1) -> ClockEstimate:
@@ -245,17 +246,18 @@ class Tracker:
 
     def _take(self, views: ObjectViews, seen: Sightings) -> None:
         timing, marks = self._delays(seen), mark_numbers(views.pixels, views.seen)
+        ends = [_mark_set(row) for row in marks]
         several = views.seen.sum(1) > 1
         numbers = torch.arange(len(views))
-        used: set[tuple[int, int]] = set()
+        used: _Ends = set()
         # Cameras that see a track together, and then, one after the other, those that see one alone.
         groups = [numbers[several], *(numbers[~several & views.seen[:, c]] for c in range(views.cameras))]
         for camera, rows in enumerate(groups, -1):
-            rows = rows[[not _mark_set(marks[i]) & used for i in rows.tolist()]]
+            rows = rows[[not ends[i] & used for i in rows.tolist()]]
             if len(rows) and self.records:
-                used |= self._match(views, seen, timing, marks, rows, camera)
+                used |= self._match(views, seen, timing, ends, rows, camera)
         usable = seen.usable.tolist()
-        fresh = [i for i in numbers[several].tolist() if usable[i] and not _mark_set(marks[i]) & used]
+        fresh = [i for i in numbers[several].tolist() if usable[i] and not ends[i] & used]
         if fresh:
             self._begin(torch.tensor(fresh), views, seen, timing)
         if self.shared.estimated:
@@ -264,8 +266,8 @@ class Tracker:
             self.beliefs = self.beliefs._replace(mean=self.beliefs.mean + shift)
 
     def _match(
-        self, views: ObjectViews, seen: Sightings, timing: Timing, marks: NDArray[np.int64], rows: Tensor, camera: int
-    ) -> set[tuple[int, int]]:
+        self, views: ObjectViews, seen: Sightings, timing: Timing, ends: list[_Ends], rows: Tensor, camera: int
+    ) -> _Ends:
         """Give tracks the sightings of some rows; those of one `camera` (not -1) go to tracks that it has not seen yet.
 
         Returns the marks that are used up.
@@ -278,17 +280,16 @@ class Tracker:
         track, which = close.nonzero(as_tuple=True)
         found = self.steps.score(merged, frame, home, part, when, root, track, which)
         possible = within(found, track, which, self.gates[part.seen.sum(0)[which]])
-        evidence = [track.evidence for track in self.records]
-        accepted = assigned(possible, marks[rows.numpy()], evidence, [self._tier(track) for track in self.records])
+        evidence, tiers = zip(*((track.evidence, self._tier(track)) for track in self.records), strict=True)
+        accepted = assigned(possible, [ends[i] for i in rows.tolist()], evidence, tiers)
         if not accepted:
             return set()
         taken = rows[possible.pair[accepted].cpu()].tolist()
-        self._update(
-            possible, torch.tensor(accepted), part, when, [views.category[i] for i in taken], views.score[taken]
-        )
+        names, score = [views.category[i] for i in taken], views.score[taken]
+        self._update(possible, torch.tensor(accepted), part, when, names, score)
         for t, i in zip(possible.track[accepted].tolist(), taken, strict=True):
-            self.seen_now |= {(self.records[t].key, c): i for c, _ in _mark_set(marks[i])}
-        return {mark for i in taken for mark in _mark_set(marks[i])}
+            self.seen_now |= {(self.records[t].key, c): i for c, _ in ends[i]}
+        return {mark for i in taken for mark in ends[i]}
 
     def _delays(self, seen: Sightings) -> Timing:
         since = seen.time[1:] - (self.shared.start or 0.0)
@@ -387,8 +388,7 @@ class Tracker:
         return near[0] if len(near) == 1 else None
 
 
-def _mark_set(row: NDArray[np.int64]) -> set[tuple[int, int]]:
-    """Numbers of cameras and their marks."""
+def _mark_set(row: NDArray[np.int64]) -> _Ends:
     return {(camera, mark) for camera, mark in enumerate(row.tolist()) if mark >= 0}
 
 

@@ -11,7 +11,7 @@ import torch
 from kcal.errors import InputError
 from kcal.lens.rig import StereoRig
 from kcal.locate.multi_localizer import MultiViewLocalizer
-from kcal.pipeline.association import AssociationOptions
+from kcal.pipeline.association_options import AssociationOptions
 from kcal.pipeline.detections import Detections
 from kcal.pipeline.detector_call import Detector, detect_in
 from kcal.pipeline.disparity import ObjectDisparity

@@ -8,8 +8,8 @@ from kcal.pipeline.pairs import ObjectPairs as ObjectPairs
 from kcal.pipeline.grouping import group_objects as group_objects
 from kcal.pipeline.object_views import ObjectViews as ObjectViews
 from kcal.pipeline.association import associate as associate
+from kcal.pipeline.association_options import AssociationOptions as AssociationOptions
 from kcal.pipeline.association import Association as Association
-from kcal.pipeline.association import AssociationOptions as AssociationOptions
 from kcal.pipeline.disparity import ObjectDisparity as ObjectDisparity
 from kcal.pipeline.disparity import ObjectDisparities as ObjectDisparities
 from kcal.pipeline.disparity import DisparityOptions as DisparityOptions

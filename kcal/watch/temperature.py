@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import bisect
-import datetime
 import math
 from pathlib import Path
 
@@ -17,7 +16,7 @@ _KEPT = 100_000
 
 
 def seconds_of(text: str) -> float:
-    """Unix seconds of a number or of an ISO time, which counts as UTC where it names no zone.
+    """Unix seconds of a number or of an ISO time with its zone.
 
     Raises:
         InputError: neither.
@@ -26,9 +25,9 @@ def seconds_of(text: str) -> float:
         >>> seconds_of("12.5"), seconds_of("1970-01-01T00:01:00Z")
         (12.5, 60.0)
     """
-    value = unix_seconds(text, zone=datetime.UTC)
+    value = unix_seconds(text)
     if not math.isfinite(value):
-        raise InputError(f"time {text!r}: seconds or a time such as 2026-05-01T12:00:00Z is needed")
+        raise InputError(f"time {text!r}: write seconds, or a time with its zone: 2026-05-01T12:00:00Z")
     return value
 
 

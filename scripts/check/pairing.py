@@ -21,7 +21,8 @@ from kcal.corners.match import MatchStatus
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import RigCovariance, StereoRig
-from kcal.pipeline.association import AssociationOptions, associate
+from kcal.pipeline.association import associate
+from kcal.pipeline.association_options import AssociationOptions
 from kcal.pipeline.detections import Detections
 from kcal.pipeline.disparity import ObjectDisparity
 from scripts.shared.marking_scene import Floats, background

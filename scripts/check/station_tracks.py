@@ -1,7 +1,7 @@
 """Tracks over stations: five of them 11 to 60 km apart on the round Earth, smokes, ships and drones, unlike clocks.
 
     python -m scripts.check.station_tracks --seeds 24 --seconds 60 --write
-    python -m scripts.check.station_tracks --speed --things 100 --write    # grouping, positions, tracks in 8 cameras
+    python -m scripts.check.station_tracks --speed --write    # 100 and 1,000 things in 8 cameras: grouping, tracks
 
 Each seed draws position, attitude and refraction errors, clocks (offset and rate) and targets anew, from what is
 stated. Marks are rendered in each station's own east, north, up (`scripts/shared/station_scenes.py`), not as kcal
@@ -28,7 +28,7 @@ from kcal.lens.camera_rig import CameraRig
 from kcal.locate.ellipsoid import ecef_from_enu_rotation
 from kcal.locate.geodesy import anchor, enu_from_cam, enu_to_geodetic, geodetic_to_enu
 from kcal.locate.multi_localizer import MultiViewLocalizer
-from kcal.pipeline.association import AssociationOptions
+from kcal.pipeline.association_options import AssociationOptions
 from kcal.pipeline.detections import Detections
 from kcal.pipeline.grouping import group_objects
 from kcal.pipeline.motion import Motion
@@ -242,35 +242,63 @@ def report(counts: list[int], all_sums: list[Sums], seeds: int, seconds: float) 
     ])  # fmt: skip
 
 
-def speed(things: int) -> str:
-    """Things in 8 cameras: CPU of grouping, of positions, and of tracking them."""
-    rig, g = ring(8, 8000.0), torch.Generator().manual_seed(0)
+def crowd(things: int, missed: float, false: int, seed: int) -> list[str]:
+    """Things in 8 cameras 8 km away, in one draw of the cameras' errors: a row of the table."""
+    rig, g = ring(8, 8000.0), torch.Generator().manual_seed(seed)
     rig.root = rig.with_errors(position_m=POSITION_M, attitude_deg=ATTITUDE_DEG, refraction=REFRACTION)
+    errors = drawn_errors(rig.root, 1, g).expand(things, -1)
     spread = torch.tensor([2500.0, 2500.0, 400.0]).double()
     points = (torch.rand(things, 3, generator=g).double() - 0.5) * 2 * spread + torch.tensor([0.0, 0.0, 700.0])
-    localize, rows = MultiViewLocalizer(rig), []
+    localize, sums = MultiViewLocalizer(rig), Sums()
     tracker = Tracker(localize, OPTIONS)
-    for number in range(2):
-        pixels = marks(rig, points) + BOX_PX * torch.randn(things, 8, 2, generator=g).double()
+    spent, marked, kept = [], 0, 0
+    # Tracks of a thousand things are not what is measured.
+    moments = 2 if things <= 100 else 1
+    for number in range(moments):
+        pixels = marks(rig, points, errors) + BOX_PX * torch.randn(things, 8, 2, generator=g).double()
         inside = torch.stack([camera.inside(pixels[:, c]) for c, camera in enumerate(rig.each)], 1)
-        seen = [
-            Detections.read(torch.cat([p - 6, p + 6], -1)[there], size=SIZE, time=float(number), first_pixel=0.0)
-            for p, there in zip(pixels.unbind(1), inside.unbind(1), strict=True)
-        ]
-        spent = [time.process_time()]
+        inside &= torch.rand(inside.shape, generator=g) >= missed
+        seen: list[Detections | None] = []
+        owners = []
+        for c in range(8):
+            # False detections are where true ones are.
+            wrong = torch.rand(false, 2, generator=g).double() * torch.tensor([1000.0, 200.0]) + 430.0
+            middle = torch.cat([pixels[inside[:, c], c], wrong])
+            seen.append(
+                Detections.read(torch.cat([middle - 6, middle + 6], -1), size=SIZE, time=float(number), first_pixel=0.0)
+            )
+            owners.append(torch.cat([inside[:, c].nonzero()[:, 0], torch.full((false,), -1)]))
+        before = time.process_time()
         views = group_objects(localize, seen, AssociationOptions(box_sigma=BOX_PX))
-        spent.append(time.process_time())
-        localize(pixels, inside)
-        spent.append(time.process_time())
-        tracker(views, float(number))
-        spent.append(time.process_time())
-        rows.append(np.diff(spent) * 1e3)
-        several = views.seen.sum(1) > 1
-    middle = rows[-1]
+        middle_time = time.process_time()
+        if moments > 1:
+            tracker(views, float(number))
+        spent.append((1e3 * (middle_time - before), 1e3 * (time.process_time() - middle_time)))
+        if number == moments - 1:
+            _judge_groups(views, seen, owners, sums)
+            several = (views.seen.sum(1) > 1) & ~views.ambiguous
+            marked, kept = int(inside.sum()), int(views.seen[several].sum())
+    return [
+        f"{things:,}", f"{marked:,}; {100 * missed:g} % missed, {false} false an image", f"{spent[-1][0]:,.0f} ms",
+        f"{sums.right:,}", f"{sums.groups - sums.right:,}", f"{sums.doubtful:,}", f"{kept:,}",
+        f"{spent[-1][1]:,.0f} ms" if moments > 1 else "",
+    ]  # fmt: skip
+
+
+def speed(things: list[int]) -> str:
+    """Things in 8 cameras: CPU of grouping and of tracking them, and how many groups are right."""
+    crowd(20, 0.0, 0, 0)
+    rows = [crowd(count, *rest, 0) for count in things for rest in ((0.0, 0), (0.15, 0), (0.15, count // 30))]
+    heads = [
+        "things", "marks of them in 8 cameras", "CPU of grouping", "right groups", "wrong groups", "doubtful groups",
+        "marks in groups that are not doubtful", "CPU of the tracker",
+    ]  # fmt: skip
     return "\n".join([
-        f"{things:,} things in 8 cameras, {int(inside.sum()):,} detections: grouping {middle[0]:,.0f} ms of CPU (into "
-        f"{int(several.sum()):,} groups), their positions with `MultiViewLocalizer` {middle[1]:,.0f} ms, the tracker "
-        f"{middle[2]:,.0f} ms a moment. Made by `scripts/check/station_tracks.py --speed`.",
+        "Things in 5 by 5 km, .8 km high, 8 cameras around them in 8 km; one thread, one draw of the cameras' "
+        "errors. A group is right if all its marks are of one thing. Made by "
+        "`scripts/check/station_tracks.py --speed`.",
+        "",
+        *table(heads, rows),
     ])  # fmt: skip
 
 
@@ -280,7 +308,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--counts", type=int, nargs="+", default=[2, 3, 5])
     parser.add_argument("--speed", action="store_true")
-    parser.add_argument("--things", type=int, default=100, help="of --speed")
+    parser.add_argument("--things", type=int, nargs="+", default=[100, 1000], help="of --speed")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     torch.set_num_threads(1)

@@ -39,7 +39,7 @@ from kcal.locate.survey import read_features, read_survey
 from kcal.locate.survey_files import import_survey
 from kcal.locate.view_marks import read_views
 from kcal.mark.journal import Journal
-from kcal.pipeline.association import AssociationOptions
+from kcal.pipeline.association_options import AssociationOptions
 from kcal.pipeline.detections import Detections
 from kcal.pipeline.lines import read_moment
 from kcal.pipeline.stream_journal import Ledger

@@ -120,6 +120,7 @@ def test_the_map_is_told_how_it_ended(folder: Path, how: str, monkeypatch: pytes
         (["-o", "positions.kml"], InputError, "output of a stream"),
         (["--to", "http://host"], InputError, "udp://HOST:PORT"),
         (["--start", "noon"], InputError, "2026-05-01T12:00:00Z"),
+        (["--start", "2026-05-01T12:00:00"], InputError, "has no zone: end it with Z"),
         (["--clock-offset", "nan"], InputError, "clock"),
         (["--box-sigma", "0"], InputError, "box_sigma"),
         (["--detections", "nowhere.jsonl"], FileError, "cannot read"),

@@ -58,7 +58,10 @@ class TestPlanes:
         left, right, _ = RIG(self.POINTS)
         planes = object_planes(RIG, left, right, torch.zeros(4))
         places = planes.left + tensor([0.01, 0.02], [-0.03, 0.0], [0.0, 0.05], [0.02, -0.02])
-        pixels, _ = plane_pixels(RIG.left, planes, places[:, None])
+        pixels, valid = plane_pixels(RIG.left, planes, places[:, None])
+        # Any axes between, also none.
+        assert torch.equal(plane_pixels(RIG.left, planes, places)[0], pixels[:, 0])
+        assert torch.equal(plane_pixels(RIG.left, planes, places[:, None, None])[1], valid[:, None])
         found, seen = plane_places(RIG.left, planes, pixels[:, 0])
         assert bool(seen.all())
         torch.testing.assert_close(found, places, rtol=0, atol=1e-10)

@@ -10,7 +10,6 @@ import torch
 
 from kcal.pipeline.assignment import Candidates, Scores, assigned
 from kcal.pipeline.measurements import Anchored
-from kcal.pipeline.object_views import mark_numbers
 
 
 def candidates(track: list[int], pair: list[int], density: list[float]) -> Candidates:
@@ -27,7 +26,7 @@ def test_the_best_of_all(seed: int) -> None:
     density = random.normal(0.0, 5.0, len(chosen)).tolist()
     possible = candidates(*(list(column) for column in zip(*chosen, strict=True)), density)
     # Every pair has marks of its own.
-    found = assigned(possible, np.array([[i, i] for i in range(4)]), [0.0] * 3, [0] * 3)
+    found = assigned(possible, [{(0, i), (1, i)} for i in range(4)], [0.0] * 3, [0] * 3)
 
     def is_valid(rows: tuple[int, ...]) -> bool:
         return all(len({chosen[i][end] for i in rows}) == len(rows) for end in (0, 1))
@@ -39,15 +38,14 @@ def test_the_best_of_all(seed: int) -> None:
 
 def test_a_mark_goes_to_the_track_of_more_evidence() -> None:
     """Two tracks, each with its own pair; the pairs share their left mark."""
-    left, right = torch.tensor([[5.0, 5.0], [5.0, 5.0]]), torch.tensor([[1.0, 5.0], [2.0, 5.0]])
-    marks = mark_numbers(torch.stack([left, right], 1), torch.ones(2, 2, dtype=torch.bool))
+    marks = [{(0, 0), (1, 0)}, {(0, 0), (1, 1)}]
     possible = candidates([0, 1], [0, 1], [-1.0, -2.0])
     assert assigned(possible, marks, [0.0, 0.0], [0, 0]) == [0]
     assert assigned(possible, marks, [0.0, 10.0], [0, 0]) == [1]
 
 
 def test_confirmed_tracks_choose_first_and_lost_ones_not_at_all() -> None:
-    marks = np.array([[0, 0]])
+    marks = [{(0, 0), (1, 0)}]
     possible = candidates([0, 1, 2], [0, 0, 0], [-9.0, -1.0, 0.0])
     assert assigned(possible, marks, [0.0] * 3, [0, 1, -1]) == [0]
     assert assigned(possible, marks, [0.0] * 3, [1, 1, -1]) == [1]

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import itertools
 import time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,14 +13,9 @@ from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import RigCovariance, StereoRig
-from kcal.locate.stereo import fit_pairs
-from kcal.pipeline.association import (
-    Association,
-    AssociationOptions,
-    associate,
-    epipolar_cost,
-    pair_costs,
-)
+from kcal.locate.views import PosedCameras, fit_views
+from kcal.pipeline.association import Association, associate, association_costs
+from kcal.pipeline.association_options import AssociationOptions
 from kcal.pipeline.detections import Detections
 from kcal.pipeline.epipolar_band import near_epipolar_lines
 from kcal.pipeline.one_to_one import assign_groups, best_assignment
@@ -90,7 +86,7 @@ def test_the_assignment_is_the_best_one() -> None:
         left, right = seen(left), seen((right + torch.randn(4, 2, generator=random))[:3])
         options = AssociationOptions(box_sigma=2.0)
         found = associate(rig, left, right, options)
-        cost = torch.where(found.possible, pair_costs(rig, left, right, options), torch.inf)
+        cost = torch.where(found.possible, association_costs(rig, left, right, options), torch.inf)
         assert total(found, (4, 3), 16.0) == pytest.approx(brute(cost, 16.0))
 
 
@@ -120,18 +116,12 @@ def test_the_band_leaves_out_no_pair_that_is_possible(kind: str, share: float) -
     left, right = (seen(torch.rand(120, 2, generator=random, dtype=torch.float64) * size) for _ in range(2))
     anchors, ranges = (left.anchors(), right.anchors()), (5.0, options.farthest)
     near = near_epipolar_lines(rig, *anchors, options.box_sigma, options.gate, ranges)
-    every = pair_costs(rig, left, right, options)
+    every = association_costs(rig, left, right, options)
     possible = every < options.gate**2
-    for i, j in (possible & ~near).nonzero().tolist():
-        # A false optimum: far from both marks, of rays that diverge.
-        found = fit_pairs(rig, left.anchors()[i : i + 1], right.anchors()[j : j + 1])
-        assert kind in {"fisheye", "ahead"}
-        assert float(found.fit.residual.abs().max()) > 30 * options.box_sigma
-        assert float(found.fit.inverse) < 0
-    possible &= near
+    assert not bool((possible & ~near).any())
     assert int(possible.sum()) > 30
     assert float(near.double().mean()) < share
-    gated = pair_costs(rig, left, right, options, near)
+    gated = association_costs(rig, left, right, options, near)
     assert torch.allclose(gated[possible], every[possible], rtol=1e-9, atol=1e-9)
     assert bool(gated[~near].isinf().all())
 
@@ -185,11 +175,11 @@ def test_a_crowd_takes_bounded_time_and_memory(monkeypatch: pytest.MonkeyPatch) 
     left, right = (seen(row - torch.tensor([440.0, 0.0])) for row in rows)
     sizes = []
 
-    def counted(rig: StereoRig, *pixels: Tensor, **options: bool) -> object:
-        sizes.append(len(pixels[0]))
-        return fit_pairs(rig, *pixels, **options)
+    def counted(posed: PosedCameras, pixels: Tensor, *rest: Any, **options: Any) -> object:
+        sizes.append(len(pixels))
+        return fit_views(posed, pixels, *rest, **options)
 
-    monkeypatch.setattr("kcal.pipeline.association.fit_pairs", counted)
+    monkeypatch.setattr("kcal.pipeline.pair_costs.fit_views", counted)
     begin = time.process_time()
     found = associate(rig_of(), left, right)
     assert time.process_time() - begin < 3.0
@@ -254,21 +244,23 @@ def test_the_epipolar_cost_is_chi_square_with_the_errors_of_the_rig() -> None:
     known = RigCovariance.of(truth, pose=torch.diag(sigma**2))
     random = torch.Generator().manual_seed(7)
     points = torch.tensor([[20.0, 30, 400], [-100, 50, 900], [0, -40, 200]]).double()
-    with_rig, without = [], []
-    spread = 0.25 * torch.eye(4, dtype=torch.float64).expand(3, 4, 4)
+    believed = StereoRig(truth.left, truth.right, truth.right_from_left_rotation, truth.right_from_left_translation)
+    marks = []
     for _ in range(60):
         step = sigma * torch.randn(6, dtype=torch.float64, generator=random)
         drawn = StereoRig(
             truth.left, truth.right, rotation_from_vector(step[:3]) @ truth.right_from_left_rotation,
             truth.right_from_left_translation + step[3:],
         )  # fmt: skip
-        left, right, _ = drawn(points)
-        noise = 0.5 * torch.randn(2, 3, 2, dtype=torch.float64, generator=random)
-        found = fit_pairs(truth, left + noise[0], right + noise[1], spread, by_camera=True)
-        with_rig.append(epipolar_cost(found, 0.25, known))
-        without.append(epipolar_cost(found, 0.25, None))
-    assert float(torch.cat(with_rig).mean()) == pytest.approx(1.0, abs=0.35)
-    assert float(torch.cat(without).mean()) > 2.0
+        marks.append(torch.stack(drawn(points)[:2]) + 0.5 * torch.randn(2, 3, 2, dtype=torch.float64, generator=random))
+    # Boxes so small that their sizes tell nothing.
+    left, right = (seen(both, 1e-3) for both in torch.cat(marks, 1))
+    mean = []
+    for believed.covariance in (known, None):
+        costs = association_costs(believed, left, right, AssociationOptions(box_sigma=0.5), torch.eye(180) > 0)
+        mean.append(float(costs.diagonal().mean()))
+    assert mean[0] == pytest.approx(1.0, abs=0.35)
+    assert mean[1] > 2.0
 
 
 def test_nothing_to_pair() -> None:

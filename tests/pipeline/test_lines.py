@@ -7,7 +7,7 @@ import pytest
 from track_scenes import tracked_site
 
 from kcal.errors import InputError
-from kcal.pipeline.association import AssociationOptions
+from kcal.pipeline.association_options import AssociationOptions
 from kcal.pipeline.lines import Moment, read_moment
 
 RIG = tracked_site().rig

@@ -15,7 +15,8 @@ from kcal.lens.mounting import Mounting
 from kcal.locate.budget import planned_rig
 from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.locate.stations import stations_of
-from kcal.pipeline.association import AssociationOptions, associate
+from kcal.pipeline.association import associate
+from kcal.pipeline.association_options import AssociationOptions
 from kcal.pipeline.detections import Detections
 from kcal.pipeline.grouping import group_objects
 from kcal.pipeline.motion import Motion

@@ -148,6 +148,10 @@ def test_temperatures_of_a_growing_table(tmp_path: Path) -> None:
         file.write("1300,295\n")
     with pytest.raises(FileError, match="line 5"):
         air.at(900.0)
+    # Whose hour a time without a zone is would be a guess.
+    path.write_text("time,temperature\n1970-01-01T00:10:00,20\n")
+    with pytest.raises(FileError, match=r"line 2: .*with its zone"):
+        Temperatures(path)
     path.write_text("when,what\n")
     with pytest.raises(FileError, match="columns time and temperature"):
         Temperatures(path)
