@@ -303,7 +303,7 @@ def fit_hybrid(
         estimate = estimate._replace(state=state._replace(parameters=parameters))
     # A fit that drifts stays where its evidence was largest.
     drifts = capture.readout is not None and not rounds.converged
-    problem, estimate, steps = capture.solved(estimate, never, (1, LAST[1]) if drifts else LAST)
+    problem, estimate, steps = capture.solved(estimate, never, (1, LAST[1]) if drifts else LAST, last_step=True)
     state = estimate.state
     off = problem.off_poses(state)
     K = Products.of_rows(off[:, :0], off).total[:-1, :-1]
