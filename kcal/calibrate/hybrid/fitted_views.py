@@ -74,6 +74,10 @@ class FittedViews:
         """(V, N)."""
         return torch.isfinite(self.pixels).all(-1) & (self.weights > 0)
 
+    def by_corner(self, errors: Tensor) -> Tensor:
+        """(V, N, 2) errors (V, 2, N) of pixels; NaN where a corner does not count."""
+        return torch.where(self.seen[..., None], errors.transpose(-1, -2), torch.nan)
+
     @property
     def freedom(self) -> int:
         """Residuals without those that poses take up."""
