@@ -35,7 +35,7 @@ from kcal.lens.field_modes import FieldModes
 from kcal.lens.hybrid_terms import LEADING
 from kcal.lens.information import CameraInformation
 from kcal.lens.model import LensModel
-from kcal.solve.schur import Products
+from kcal.solve.schur import products_of
 
 # Pixels that a mode can move any point by, below which it is left out.
 _UNFELT = 1e-6
@@ -244,8 +244,8 @@ def fit_hybrid(
     drifts = capture.readout is not None and not rounds.converged
     problem, estimate, steps = capture.solved(estimate, never, (1, LAST[1]) if drifts else LAST, last_step=True)
     state = estimate.state
-    off = problem.off_poses(state)
-    K = Products.of_rows(off[:, :0], off).total[:-1, :-1]
+    reduced = problem.reduced_rows(state)
+    K = products_of(reduced[:, :-1].T)
     deviation = torch.where(never, 0.0, families.deviation(h))
     inverse = posterior_root(K, deviation, variance)
     errors, weighted = problem.pixel_errors(state), problem.corner_residuals(state, weighted=True)
@@ -253,7 +253,7 @@ def fit_hybrid(
         check_shown(errors)
     wider = widening(len(pixels)) if capture.readout is not None else 1.0
     half = math.sqrt(wider) * inverse * deviation
-    information = information_of(problem, state, math.sqrt(wider * variance), off)
+    information = information_of(problem, state, math.sqrt(wider * variance), reduced)
     if isinstance(board, BoardPrior):
         mean, root = board.whole.mean_and_half()
         state = state._replace(board=mean + state.board @ root)
