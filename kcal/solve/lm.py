@@ -147,6 +147,7 @@ def _minimize(problem: Problem[S], start: S, options: LMOptions, callback: Callb
         iterations = iterations + running
         if not options.last_step and (flat == running).all():
             status = np.where(flat, int(SolverStatus.CONVERGED), status)
+            history.append(history[-1])
             break
         candidate = problem.retract(state, step)
         joint = problem.linearize(candidate) if problem.joint else None
