@@ -54,8 +54,7 @@ def reached(observations: Observations, columns: int, rows: int) -> Tensor:
             left = left[~around]
     found = np.ones(len(places), dtype=bool)
     found[left] = False
-    found = found.reshape(rows, columns)
-    return torch.from_numpy(found)
+    return torch.from_numpy(found.reshape(rows, columns))
 
 
 def unreached_share(observations: Observations) -> float:
