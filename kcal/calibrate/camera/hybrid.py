@@ -24,7 +24,7 @@ from kcal.calibrate.camera.pupil_check import pupil_warnings
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.camera.warnings import general_warnings, hybrid_warnings, outlier_warnings
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
-from kcal.calibrate.hybrid.settled import FitStart, fit_start
+from kcal.calibrate.hybrid.settled import FitStart, rough_start
 from kcal.corners.observations import Observations
 from kcal.solve.result import SolverStatus
 
@@ -42,7 +42,7 @@ def calibrate_hybrid(
         return _hybrid_without_outliers(observations, options, options.reject, progress)
     weights, start = torch.ones_like(pixels[..., 0]), None
     if options.weighted and observations.covariances() is not None:
-        start = fit_start(
+        start = rough_start(
             board,
             pixels,
             observations.image_size,

@@ -209,7 +209,7 @@ def fit_hybrid(
         motion: views may move while they are read; False: they stand still.
         focal: roughly known, pixels, for the start.
         start: an earlier fit of the same views with other weights or another board, to begin with, or
-            `kcal.calibrate.hybrid.settled.fit_start`.
+            `kcal.calibrate.hybrid.settled.rough_start`.
         robust: bound the weight of corners that are far off, so that a few wrong ones change nothing. Error bars of
             such a fit mean nothing; it tells which corners to leave out.
         hyperprior: of the amplitudes; the typical one if not given.

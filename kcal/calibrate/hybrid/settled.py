@@ -150,7 +150,7 @@ def settle(
     return Settled(rounds, never, hyperprior, board)
 
 
-def fit_start(
+def rough_start(
     points: Tensor,
     pixels: Tensor,
     size: tuple[int, int],

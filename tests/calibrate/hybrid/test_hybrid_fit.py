@@ -16,7 +16,7 @@ from kcal.calibrate.hybrid.evidence import maximize_evidence, negative_log_evide
 from kcal.calibrate.hybrid.families import PriorFamilies, prior_families, typical_hyperprior
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.quadratic import Quadratic
-from kcal.calibrate.hybrid.settled import fit_start
+from kcal.calibrate.hybrid.settled import rough_start
 from kcal.calibrate.hybrid.unknowns import hybrid_problem
 from kcal.calibrate.problem.state import BoardState
 from kcal.corners.board import Board
@@ -393,7 +393,7 @@ def test_a_fit_begins_where_another_has_settled() -> None:
     pixels = views(truth(), 12, 3)
     weights = torch.ones(pixels.shape[:2], dtype=torch.float64)
     weights[2, 5] = 0.0
-    start, whole = fit_start(BOARD.points, pixels, SIZE, weights), fit_hybrid(BOARD.points, pixels, SIZE, weights)
+    start, whole = rough_start(BOARD.points, pixels, SIZE, weights), fit_hybrid(BOARD.points, pixels, SIZE, weights)
     assert bool(start.residuals[2, 5].isnan().all())
     assert int(start.residuals.isnan().sum()) == 2
     rms = float(start.residuals.square().sum(-1).nanmean().sqrt())
@@ -406,4 +406,4 @@ def test_a_fit_begins_where_another_has_settled() -> None:
     # It begins at the end of the rounds, and not at the base projection.
     assert start.iterations < found.iterations < 2 * start.iterations
     with pytest.raises(InputError, match="no start explains"):
-        fit_start(BOARD.points, torch.full_like(pixels, torch.nan), SIZE, weights)
+        rough_start(BOARD.points, torch.full_like(pixels, torch.nan), SIZE, weights)
