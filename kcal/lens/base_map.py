@@ -18,6 +18,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from kcal.lens.dispatch import is_traced
+
 # Where |q| or |u| is below this, the series are exact to rounding and the closed forms cancel.
 _SMALL = 0.02
 _TAN = (1.0, 1 / 3, 2 / 15, 17 / 315, 62 / 2835, 1382 / 155925, 21844 / 6081075, 929569 / 638512875)
@@ -81,7 +83,7 @@ def growth_by_shape(u: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(slow, series(_GROWTH, near), value), torch.where(slow, series(by_u, near), slope)
 
 
-# ONNX runtimes have neither of these functions in float64.
+# ONNX runtimes have none of these functions in float64.
 
 
 def _tangent(x: Tensor) -> Tensor:
@@ -90,6 +92,8 @@ def _tangent(x: Tensor) -> Tensor:
 
 def _arctangent(x: Tensor) -> Tensor:
     """Halve the angle three times, then add the series: exact to rounding."""
+    if not is_traced():
+        return torch.atan(x)
     for _ in range(3):
         x = x / (1.0 + torch.sqrt(1.0 + x * x))
     return 8.0 * x * series(_ARCTAN_FAR, x * x)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 
 import torch
@@ -170,6 +171,10 @@ class CameraInformation:
 
     def half(self) -> Tensor:
         """(U, U): halfᵀ half is the covariance of the unknowns; what nothing determines has a very large one."""
+        return self._half
+
+    @functools.cached_property
+    def _half(self) -> Tensor:
         return self.whole.half()
 
     def by_parameter(self, columns: Tensor) -> Tensor:

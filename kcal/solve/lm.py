@@ -42,6 +42,8 @@ class LMOptions:
             predicted, or 100 steps in any case; 0: never.
         initial_damping: λ at the start, in units of the scaled normal matrix, whose diagonal is one.
         residual_floor: a root-mean-square residual below this counts as zero.
+        last_step: take the last step, too, of which little is predicted. False: end before it, where the problem is
+            linearized already, which saves a linearization to a caller that needs one.
     """
 
     max_iterations: int = 300
@@ -49,6 +51,7 @@ class LMOptions:
     flatness: float = 0.0
     initial_damping: float = 1e-3
     residual_floor: float = 1e-12
+    last_step: bool = True
 
     def __post_init__(self) -> None:
         if self.max_iterations < 1 or not 0 <= self.tolerance < 1:
@@ -137,21 +140,24 @@ def _minimize(problem: Problem[S], start: S, options: LMOptions, callback: Callb
                 running = running[kept]
                 linear = problem.linearize(state)
         step, decrease = linear.step(on_device(damping))
+        predicted = on_host(decrease)
+        solved = np.isfinite(predicted)
+        # A tiny prediction means a minimum only where little damping shaped the step.
+        flat = running & solved & (predicted <= options.tolerance * cost) & (damping <= _LITTLE_DAMPING)
+        iterations = iterations + running
+        if not options.last_step and (flat == running).all():
+            status = np.where(flat, int(SolverStatus.CONVERGED), status)
+            history.append(history[-1])
+            break
         candidate = problem.retract(state, step)
         joint = problem.linearize(candidate) if problem.joint else None
         new_cost = on_host(problem.cost(candidate) if joint is None else joint.cost)
-        predicted = on_host(decrease)
-        solved = np.isfinite(predicted)
         # An infinite fall over an infinite prediction is no gain, and not accepted.
         with np.errstate(invalid="ignore"):
             gain = (cost - np.where(np.isfinite(new_cost), new_cost, np.inf)) / np.where(
                 solved & (predicted > 0), predicted, np.inf
             )
         accept = running & solved & (new_cost < cost)
-        iterations = iterations + running
-
-        # A tiny prediction means a minimum only where little damping shaped the step.
-        flat = running & solved & (predicted <= options.tolerance * cost) & (damping <= _LITTLE_DAMPING)
         shrink = np.maximum(1.0 - (2.0 * np.where(accept, gain, 0.5) - 1.0) ** 3, 1.0 / 10.0)
         damping = np.where(accept, damping * shrink, np.where(running, damping * growth, damping))
         damping = np.maximum(damping, _LOWEST_DAMPING)

@@ -40,7 +40,7 @@ class Products(NamedTuple):
         """From derivatives (..., V, L, R) by the local unknowns and (..., V, S + 1, R) by the shared ones; last r."""
         flat, across = shared.transpose(-3, -2).flatten(-2), shared.transpose(-1, -2)
         score = (shared @ shared[..., -1, :, None])[..., 0]
-        return cls(local @ local.transpose(-1, -2), local @ across, score, _gram(flat))
+        return cls(local @ local.transpose(-1, -2), local @ across, score, products_of(flat))
 
     @classmethod
     def together(cls, parts: Sequence[Products]) -> Products:
@@ -65,7 +65,7 @@ class Products(NamedTuple):
             self.local[..., count:, count:] - by_local.transpose(-1, -2) @ by_local,
             self.right[..., count:, :] - by_local.transpose(-1, -2) @ by_shared,
             self.score - (by_shared.transpose(-1, -2) @ by_shared[..., -1:])[..., 0],
-            self.total - _gram(flat),
+            self.total - products_of(flat),
         )
 
 
@@ -166,7 +166,7 @@ def column_scale(diagonal: Tensor) -> Tensor:
     return torch.where(diagonal > 0, diagonal, 1.0).rsqrt()
 
 
-def _gram(rows: Tensor) -> Tensor:
+def products_of(rows: Tensor) -> Tensor:
     """(..., S, S) products of rows (..., S, R) with each other."""
     if rows.ndim == 2 and rows.device.type == "cpu" and not rows.requires_grad:
         # NumPy makes one half and mirrors it.

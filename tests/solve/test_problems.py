@@ -11,6 +11,7 @@ from solve_problems import KNOWN, MISRA_X, MISRA_Y, SOLVERS, Known, beale, freud
 from torch import Tensor
 
 from kcal.errors import InputError
+from kcal.solve.dense import DenseLinearization, DenseProblem
 from kcal.solve.lm import LevenbergMarquardt, LMOptions, minimize
 from kcal.solve.result import SolverStatus
 
@@ -352,3 +353,24 @@ def test_start_and_data_are_left_as_they_were_and_only_the_solution_has_a_gradie
 
 def test_every_status_has_a_sentence_of_its_own() -> None:
     assert len({status.message for status in SolverStatus}) == len(SolverStatus)
+
+
+def test_without_a_last_step_the_solution_is_where_the_problem_was_linearized() -> None:
+    where: list[Tensor] = []
+
+    class Watched(DenseProblem):
+        def linearize(self, state: tuple[Tensor]) -> DenseLinearization:
+            where.append(state[0])
+            return super().linearize(state)
+
+    start, problem = (vector(500.0, 1e-4),), Watched(misra1a, batch=())
+    whole = minimize(problem, start, LMOptions(tolerance=1e-6))
+    short = minimize(problem, start, LMOptions(tolerance=1e-6, last_step=False))
+    torch.testing.assert_close(where[-1], short.state[0], rtol=0, atol=0)
+    before = minimize(problem, start, LMOptions(tolerance=1e-6, max_iterations=int(whole.iterations) - 1))
+    torch.testing.assert_close(short.state[0], before.state[0], rtol=0, atol=0)
+    assert bool(whole.converged)
+    assert bool(short.converged)
+    assert not bool(before.converged)
+    assert int(short.iterations) == int(whole.iterations) == len(short.history) - 1
+    assert float(short.cost) == float(short.history[-1]) == float(before.cost) > float(whole.cost)

@@ -39,15 +39,22 @@ def reached(observations: Observations, columns: int, rows: int) -> Tensor:
     width, height = observations.image_size
     x = (np.arange(columns) + 0.5) * (width / columns) - 0.5
     y = (np.arange(rows) + 0.5) * (height / rows) - 0.5
-    places = np.stack(np.meshgrid(x, y), -1)
-    found = np.zeros((rows, columns), dtype=bool)
+    places = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+    left = np.arange(len(places))
     for view in observations.pixels().numpy():
         corners = view[np.isfinite(view).all(-1)]
-        if len(corners) >= 3:
+        if len(corners) < 3:
+            continue
+        around = ((places[left] >= corners.min(0)) & (places[left] <= corners.max(0))).all(-1)
+        # Most views show nothing that others have not shown.
+        if around.any():
             # Half planes a x + b y + c <= 0 of the convex hull.
             sides = ConvexHull(corners).equations
-            found |= (places @ sides[:, :2].T + sides[:, 2] <= 0).all(-1)
-    return torch.from_numpy(found)
+            around[around] = (places[left[around]] @ sides[:, :2].T + sides[:, 2] <= 0).all(-1)
+            left = left[~around]
+    found = np.ones(len(places), dtype=bool)
+    found[left] = False
+    return torch.from_numpy(found.reshape(rows, columns))
 
 
 def unreached_share(observations: Observations) -> float:

@@ -24,6 +24,7 @@ from kcal.calibrate.camera.pupil_check import pupil_warnings
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.camera.warnings import general_warnings, hybrid_warnings, outlier_warnings
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
+from kcal.calibrate.hybrid.settled import FitStart, rough_start
 from kcal.corners.observations import Observations
 from kcal.solve.result import SolverStatus
 
@@ -39,11 +40,20 @@ def calibrate_hybrid(
     check_views(board, pixels, names, _UNKNOWNS, fewest=MINIMUM_VIEWS)
     if options.reject is not None:
         return _hybrid_without_outliers(observations, options, options.reject, progress)
-    weighted = options.weighted and observations.covariances() is not None
-    ones = torch.ones_like(pixels[..., 0])
-    fit = _fit_views(observations, pixels, ones, None, options, progress, expected=not weighted)
-    if weighted:
-        fit = _fit_views(observations, pixels, corner_weights(observations, fit.residuals), fit, options, progress)
+    weights, start = torch.ones_like(pixels[..., 0]), None
+    if options.weighted and observations.covariances() is not None:
+        start = rough_start(
+            board,
+            pixels,
+            observations.image_size,
+            weights,
+            options.board,
+            options.motion,
+            options.start_focal(observations.image_size),
+            progress,
+        )
+        weights = corner_weights(observations, start.residuals)
+    fit = _fit_views(observations, pixels, weights, start, options, progress)
     return hybrid_result(observations, fit, options)
 
 
@@ -51,11 +61,10 @@ def _fit_views(
     observations: Observations,
     pixels: Tensor,
     weights: Tensor,
-    start: HybridFit | None,
+    start: FitStart | None,
     options: CalibrationOptions,
     progress: Progress,
     robust: bool = False,
-    expected: bool = True,
 ) -> HybridFit:
     return fit_hybrid(
         observations.board.points,
@@ -67,7 +76,6 @@ def _fit_views(
         focal=options.start_focal(observations.image_size),
         start=start,
         robust=robust,
-        expected=expected,
         progress=progress,
     )
 
@@ -91,7 +99,7 @@ def _hybrid_without_outliers(
     observations: Observations, options: CalibrationOptions, reject: OutlierRejection, progress: Progress
 ) -> CameraCalibrationResult:
     """Leave out corners and views that noise cannot explain."""
-    pixels = observations.pixels()
+    pixels, names = observations.pixels(), observations.names
     own = torch.isfinite(pixels).all(-1).double()
     # A few wrong corners bend a plain fit towards them; bounded weights let them stand out.
     robust = _fit_views(observations, pixels, own, None, options, progress, robust=True)
@@ -100,13 +108,13 @@ def _hybrid_without_outliers(
 
     def fit(left: list[int], rejected: Tensor) -> tuple[HybridFit, Tensor]:
         some, weights = pixels[left], own[left]
-        used = observations.subset([observations.names[i] for i in left])
+        used = observations.subset([names[i] for i in left])
         found = _fit_views(used, some, torch.where(rejected, 0.0, weights), None, options, progress)
         return found, found.residuals_of(some) * weights[..., None]
 
     kept = leave_out_outliers(observations, reject, robust.residuals_of(pixels) * own[..., None], fit, progress)
     plain, weights = kept.fit.residuals_of(pixels[kept.views]), own[kept.views][..., None]
-    used = observations.subset([observations.names[i] for i in kept.views])
+    used = observations.subset([names[i] for i in kept.views])
     return kept.complete(hybrid_result(used, kept.fit, options), observations, plain, plain * weights)
 
 
@@ -116,7 +124,7 @@ def hybrid_result(observations: Observations, fit: HybridFit, options: Calibrati
     Raises:
         DegenerateError: the views hardly determine where the camera sees what they show.
     """
-    camera, covariance = fit.camera, fit.covariance
+    camera, covariance, names = fit.camera, fit.covariance, observations.names
     per_view = fit.residuals.square().sum(-1).nanmean(-1).sqrt()
     spread = covariance.diagonal().sqrt()
     sigma: dict[str, float | None] = {
@@ -130,7 +138,7 @@ def hybrid_result(observations: Observations, fit: HybridFit, options: Calibrati
         # What views leave open is a matter of where boards were, not of how well motions are known.
         covariance / fit.wider,
         fit.state.rotation,
-        observations.names,
+        names,
     )
     status = SolverStatus.CONVERGED if fit.converged else SolverStatus.ITERATION_LIMIT
     used = [i for i, rms in enumerate(per_view.tolist()) if not math.isnan(rms)]
@@ -152,12 +160,12 @@ def hybrid_result(observations: Observations, fit: HybridFit, options: Calibrati
         hybrid=fit,
         advice=what_to_photograph(observations, camera, fit.state.rotation),
         warnings=(
-            *general_warnings([observations.names[i] for i in used], camera, fit.rms, per_view[used], (), status),
+            *general_warnings([names[i] for i in used], camera, fit.rms, per_view[used], (), status),
             *hybrid_warnings(fit),
             *motion_warnings(fit),
             *pixel_warnings(fit),
             *pupil_warnings(camera, covariance),
             *(roll_warnings(fit.state.rotation) if options.board == "printed" else ()),
-            *outlier_warnings(observations.names, fit.residuals),
+            *outlier_warnings(names, fit.residuals),
         ),
     )

@@ -250,43 +250,47 @@ def _base_start(
     middle = torch.tensor([(size[0] - 1) / 2, (size[1] - 1) / 2], dtype=torch.float64)
     offset = torch.where(seen[..., None], capture.pixels - middle, 0.0)
     half = 0.5 * math.hypot(*size)
-    best: tuple[float, float, float, Tensor] | None = None
     angles = torch.tensor(_CORNERS, dtype=torch.float64).deg2rad()
     radii = [(s, m) for s in _SHAPES for m in (angles * radius_over_angle(s * angles**2)).tolist()]
     usual = [(s, half / m) for s, m in radii]
     told = [] if known is None else [(s, known) for s in _SHAPES]
     tried = [*told, *([] if exact else usual)] if lens is None else [(lens.form.shape, lens.focal)]
-    for shape, focal in tried:
-        s = torch.tensor(shape, dtype=torch.float64)
-        ideal, usable = _through_base(offset, seen, focal, shape)
-        if bool((usable.sum(-1) < _FEWEST).any()):
-            continue
-        rotation, translation = poses_from_homographies(homographies(points, ideal), _PINHOLE)
-        cam = points @ rotation.transpose(-1, -2) + translation[:, None]
-        there = torch.atan2(cam[..., :2].norm(dim=-1), cam[..., 2])
-        direction = cam[..., :2] / cam[..., :2].norm(dim=-1, keepdim=True).clamp_min(1e-12)
-        # In pixels: angles near 80 degrees hardly differ, and such a projection would win for a narrow lens.
-        found = (focal * there * radius_over_angle(s * there**2))[..., None] * direction
-        error = torch.where(usable, (found - offset).norm(dim=-1), 0.0)
-        # By the median view: a few wrong views do not decide.
-        value = float((error.square().sum(-1) / usable.sum(-1)).median())
-        value *= 1.0 if known is None or focal == known else _DOUBT
-        if math.isfinite(value) and (best is None or value < best[0]):
-            best = value, focal, shape, ideal
-    if best is None:
+    # All at once: a view's homography takes few numbers.
+    shapes, focals = torch.tensor(tried, dtype=torch.float64).unbind(-1)
+    ideals, usables = _through_base(offset, seen, focals[:, None, None], shapes[:, None, None])
+    possible = ~(usables.sum(-1) < _FEWEST).any(-1)
+    shapes, focals, ideals, usables = (each[possible] for each in (shapes, focals, ideals, usables))
+    if not len(shapes):
         raise InputError("no start explains the corners: are all views of this board and from this camera?")
-    _, focal, shape, ideal = best
-    return focal, shape, *poses_from_homographies(homographies(points, ideal), _PINHOLE)
+    rotations, translations = (
+        part.unflatten(0, usables.shape[:2])
+        for part in poses_from_homographies(homographies(points, ideals.flatten(0, 1)), _PINHOLE)
+    )
+    cam = points @ rotations.transpose(-1, -2) + translations[..., None, :]
+    away = cam[..., :2].norm(dim=-1)
+    there = torch.atan2(away, cam[..., 2])
+    # In pixels: angles near 80 degrees hardly differ, and such a projection would win for a narrow lens.
+    found = focals[:, None, None] * there * radius_over_angle(shapes[:, None, None] * there**2)
+    errors = (found / away.clamp_min(1e-12))[..., None] * cam[..., :2] - offset
+    squared = torch.where(usables, errors.square().sum(-1), 0.0).sum(-1) / usables.sum(-1)
+    # By the median view: a few wrong views do not decide.
+    values = squared.median(-1).values
+    if known is not None:
+        values = torch.where(focals == known, values, _DOUBT * values)
+    best = int(torch.where(values.isfinite(), values, math.inf).argmin())
+    if not math.isfinite(float(values[best])):
+        raise InputError("no start explains the corners: are all views of this board and from this camera?")
+    return float(focals[best]), float(shapes[best]), rotations[best], translations[best]
 
 
-def _through_base(offset: Tensor, seen: Tensor, focal: float, shape: float) -> tuple[Tensor, Tensor]:
-    """Corners (V, N, 2) on the plane z = 1 from their offsets to the principal point, pixels; NaN where not usable.
+def _through_base(offset: Tensor, seen: Tensor, focal: Tensor | float, shape: Tensor | float) -> tuple[Tensor, Tensor]:
+    """Corners (..., V, N, 2) on the plane z = 1 from offsets (V, N, 2) to the principal point; NaN where not usable.
 
-    Also which are usable: seen, and not so far off the axis that the plane shows them poorly.
+    Also which are usable: seen, and not so far off the axis that the plane shows them poorly. Focal length, pixels, and
+    shape are numbers, or (..., 1, 1).
     """
     away = offset.norm(dim=-1)
-    s = torch.tensor(shape, dtype=torch.float64)
-    theta = away / focal * angle_over_radius(s * (away / focal) ** 2)
+    theta = away / focal * angle_over_radius(shape * (away / focal) ** 2)
     usable = seen & (theta < _STEEPEST)
     ideal = offset * (torch.tan(theta) / away.clamp_min(1e-9))[..., None]
     return torch.where(usable[..., None], ideal, torch.nan), usable

@@ -12,37 +12,30 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.hybrid.aspect import square_pixels, with_square_pixels
-from kcal.calibrate.hybrid.base_fit import fit_base
 from kcal.calibrate.hybrid.board_modes import BoardModes, board_modes
 from kcal.calibrate.hybrid.board_prior import BoardPrior
 from kcal.calibrate.hybrid.evidence_rounds import (
     LAST,
-    Rounds,
-    columns_may_be_read,
     expected_estimate,
-    motion_is_worth,
-    run_rounds,
 )
-from kcal.calibrate.hybrid.families import LEADING_UNKNOWNS, Hyperprior, PriorFamilies, typical_hyperprior
-from kcal.calibrate.hybrid.fitted_views import Estimate, FittedViews
+from kcal.calibrate.hybrid.families import LEADING_UNKNOWNS, Hyperprior, PriorFamilies
+from kcal.calibrate.hybrid.fitted_views import Estimate
 from kcal.calibrate.hybrid.fleet import LensPrior
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard
 from kcal.calibrate.hybrid.quadratic import posterior_root
+from kcal.calibrate.hybrid.settled import FitStart, check_shown, settle
 from kcal.calibrate.hybrid.unknowns import hybrid_problem, hybrid_unknowns
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.information import information_of
 from kcal.calibrate.problem.readout import MotionSigma, Readout, motion_sigma, stillness, widening
 from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.views import among
-from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.field_modes import FieldModes
 from kcal.lens.hybrid_terms import LEADING
 from kcal.lens.information import CameraInformation
 from kcal.lens.model import LensModel
-from kcal.lens.zernike import ZernikeModes
-from kcal.solve.schur import Products
+from kcal.solve.schur import products_of
 
 # Pixels that a mode can move any point by, below which it is left out.
 _UNFELT = 1e-6
@@ -167,6 +160,20 @@ class HybridFit:
         return dataclasses.replace(self, state=state, residuals=residuals, weights=weights)
 
     @property
+    def as_start(self) -> FitStart:
+        """With what another fit begins."""
+        estimate = Estimate(
+            self.model,
+            self.families,
+            self.state,
+            self.hyperparameters,
+            self.log_ratio,
+            self.sigma**2,
+            self.tempering,
+        )
+        return FitStart(estimate, self.readout, self.square, self.residuals, self.iterations)
+
+    @property
     def covariance(self) -> Tensor:
         """(5 + P, 5 + P) of the camera's parameters in the order of `Camera.names`: fx and fy alike, skew held."""
         unknowns = hybrid_unknowns(self.model, self.square)
@@ -183,11 +190,10 @@ def fit_hybrid(
     square: bool | None = None,
     motion: bool = True,
     focal: float | None = None,
-    start: HybridFit | None = None,
+    start: HybridFit | FitStart | None = None,
     robust: bool = False,
     hyperprior: Hyperprior | None = None,
     lens: LensPrior | None = None,
-    expected: bool = True,
     progress: Callable[[str], object] = lambda _: None,
 ) -> HybridFit:
     """Fit one camera.
@@ -202,13 +208,12 @@ def fit_hybrid(
         square: whether pixels are square; None: the views tell.
         motion: views may move while they are read; False: they stand still.
         focal: roughly known, pixels, for the start.
-        start: an earlier fit of the same views with other weights or another board, to begin with.
+        start: an earlier fit of the same views with other weights or another board, to begin with, or
+            `kcal.calibrate.hybrid.settled.rough_start`.
         robust: bound the weight of corners that are far off, so that a few wrong ones change nothing. Error bars of
             such a fit mean nothing; it tells which corners to leave out.
         hyperprior: of the amplitudes; the typical one if not given.
         lens: what is known of it from cameras of its type; its modes are used.
-        expected: state error bars for amplitudes as they are to be expected (`kcal.calibrate.hybrid.amplitudes`).
-            False: another fit will begin at this one, which then needs neither these nor to come to rest entirely.
         progress: called after each step.
 
     Raises:
@@ -216,85 +221,19 @@ def fit_hybrid(
         DegenerateError: the board is seen from one side only, or from too few, so that no projection is found.
     """
     weights = torch.ones_like(pixels[..., 0]) if weights is None else weights
-    if start is not None:
-        form = start.model.hybrid
-        assert form is not None
-        modes = form.modes
-    elif lens is not None:
-        modes = lens.form.modes
-    modes = modes or ZernikeModes()
-    hyperprior = hyperprior or typical_hyperprior(modes)
-    if isinstance(board, MeasuredBoard):
-        board = board.prior_for(points)
-    ordered, own = points, board_modes(points)
-    points, shown = board.applied(points, own) if isinstance(board, BoardPrior) else (points, own)
-    capture = FittedViews(
-        points=points,
-        board=shown,
-        pixels=pixels,
-        size=size,
-        weights=weights,
-        readout=_readout(ordered, size) if start is None and motion else start.readout if start else None,
-        square=start.square if start is not None else lens.square if lens is not None else square is True,
-        robust=robust,
-        exact=board == "exact",
+    begun = start.as_start if isinstance(start, HybridFit) else start
+    rounds, never, hyperprior, board = settle(
+        points, pixels, size, weights, modes, board, square, motion, focal, begun, robust, hyperprior, lens, progress
     )
-
-    def run(capture: FittedViews, estimate: Estimate, spent: int, cold: bool) -> tuple[Rounds, Tensor]:
-        held = torch.zeros_like(estimate.families.mean, dtype=torch.bool)
-        if capture.exact:
-            held[-len(shown.unit) :] = True
-        rounds = run_rounds(
-            capture, estimate, hyperprior, held, cold=cold, spent=spent, rough=not expected, progress=progress
-        )
-        return rounds, held
-
-    def begin(capture: FittedViews) -> tuple[Rounds, Tensor]:
-        estimate, steps = fit_base(capture, modes, focal, hyperprior.mean, lens)
-        progress("base projection")
-        if capture.readout is not None:
-            distance = float(estimate.state.translation.norm(dim=-1).median())
-            readout = dataclasses.replace(capture.readout, distance=distance)
-            capture = dataclasses.replace(capture, readout=readout)
-        return run(capture, estimate, steps, True)
-
-    if start is not None:
-        state = start.state
-        if isinstance(board, BoardPrior):
-            state = state._replace(board=torch.zeros_like(board.own.at))
-        estimate = Estimate(
-            start.model,
-            start.families.with_board(shown),
-            state,
-            start.hyperparameters,
-            start.log_ratio,
-            start.sigma**2,
-            start.tempering,
-        )
-        rounds, never = run(capture, estimate, start.iterations, False)
-    else:
-        rounds, never = begin(capture)
-        if square is None and lens is None and square_pixels(rounds, hyperprior, never):
-            # Motion along columns and the aspect of pixels look alike: with square pixels it is looked for anew.
-            one, readout = dataclasses.replace(rounds.capture, square=True), rounds.readout
-            near = with_square_pixels(rounds.estimate, shown)
-            if near is None:
-                rounds, never = begin(dataclasses.replace(one, readout=readout))
-            else:
-                rounds, never = run(one, near, rounds.steps, False)
-                if one.readout is None and readout is not None and motion_is_worth(rounds, readout, hyperprior, never):
-                    rounds, never = run(dataclasses.replace(one, readout=readout), near, rounds.steps, False)
-        if capture.readout is not None and columns_may_be_read(rounds, hyperprior, never):
-            by_columns = dataclasses.replace(capture.readout, columns=True)
-            other = begin(dataclasses.replace(capture, square=rounds.capture.square, readout=by_columns))
-            if other[0].untempered_loss < rounds.untempered_loss:
-                rounds, never = other
+    ordered, own = points, board_modes(points)
     capture, likely = rounds.capture, rounds.estimate
-    estimate = expected_estimate(rounds, hyperprior) if expected and not robust else likely
+    # Error bars are for amplitudes as they are to be expected (`kcal.calibrate.hybrid.amplitudes`).
+    estimate = likely if robust else expected_estimate(rounds, hyperprior)
     model, families, state, h, _, variance, tempering = estimate
     # Modes that the evidence holds so closely to zero that no pixel feels them are left out, error bars included.
-    peaks = torch.tensor(modes.peaks, dtype=torch.float64)
-    field = slice(LEADING_UNKNOWNS, LEADING_UNKNOWNS + len(modes))
+    assert model.hybrid is not None
+    peaks = torch.tensor(model.hybrid.modes.peaks, dtype=torch.float64)
+    field = slice(LEADING_UNKNOWNS, LEADING_UNKNOWNS + len(peaks))
     unfelt = families.deviation(h)[field] * float(state.parameters[0]) * peaks < _UNFELT
     never[field] |= unfelt
     if bool(unfelt.any()):
@@ -303,21 +242,18 @@ def fit_hybrid(
         estimate = estimate._replace(state=state._replace(parameters=parameters))
     # A fit that drifts stays where its evidence was largest.
     drifts = capture.readout is not None and not rounds.converged
-    problem, estimate, steps = capture.solved(estimate, never, (1, LAST[1]) if drifts else LAST)
+    problem, estimate, steps = capture.solved(estimate, never, (1, LAST[1]) if drifts else LAST, last_step=True)
     state = estimate.state
-    off = problem.off_poses(state)
-    K = Products.of_rows(off[:, :0], off).total[:-1, :-1]
+    reduced = problem.reduced_rows(state)
+    K = products_of(reduced[:, :-1].T)
     deviation = torch.where(never, 0.0, families.deviation(h))
     inverse = posterior_root(K, deviation, variance)
     errors, weighted = problem.pixel_errors(state), problem.corner_residuals(state, weighted=True)
-    if not robust and not bool(torch.isfinite(errors).all()):
-        raise InputError(
-            "the lens cannot show all corners where they are: are all views of this board and this camera? Rejection "
-            "of outliers leaves wrong views out"
-        )
+    if not robust:
+        check_shown(errors)
     wider = widening(len(pixels)) if capture.readout is not None else 1.0
     half = math.sqrt(wider) * inverse * deviation
-    information = information_of(problem, state, math.sqrt(wider * variance), off)
+    information = information_of(problem, state, math.sqrt(wider * variance), reduced)
     if isinstance(board, BoardPrior):
         mean, root = board.whole.mean_and_half()
         state = state._replace(board=mean + state.board @ root)
@@ -342,13 +278,9 @@ def fit_hybrid(
         effective=len(deviation) - float(inverse.square().sum()),
         board_shapes=own,
         board_points=ordered + torch.einsum("b,bkn->nk", state.board, own.shapes),
-        residuals=torch.where(capture.seen[..., None], errors.transpose(-1, -2), torch.nan),
+        residuals=capture.by_corner(errors),
         weights=weights,
         weighted_rms=math.sqrt(float(weighted.square().nansum()) / int(capture.seen.sum())),
         iterations=rounds.steps + steps,
         converged=rounds.converged,
     )
-
-
-def _readout(points: Tensor, size: tuple[int, int]) -> Readout:
-    return Readout(center=points.mean(0), distance=1.0, size=size)

@@ -74,6 +74,10 @@ class FittedViews:
         """(V, N)."""
         return torch.isfinite(self.pixels).all(-1) & (self.weights > 0)
 
+    def by_corner(self, errors: Tensor) -> Tensor:
+        """(V, N, 2) errors (V, 2, N) of pixels; NaN where a corner does not count."""
+        return torch.where(self.seen[..., None], errors.transpose(-1, -2), torch.nan)
+
     @property
     def freedom(self) -> int:
         """Residuals without those that poses take up."""
@@ -107,12 +111,18 @@ class FittedViews:
         return problem
 
     def solved(
-        self, estimate: Estimate, never: Tensor, effort: tuple[int, float]
+        self, estimate: Estimate, never: Tensor, effort: tuple[int, float], last_step: bool = False
     ) -> tuple[BoardProblem, Estimate, int]:
-        """The problem, the estimate with its solution, and the trial steps."""
+        """The problem, the estimate with its solution, and the trial steps.
+
+        Without a last step the solution is where the problem was linearized: what is linear in lens and board, as the
+        evidence is, follows from there.
+        """
         problem = self.problem(estimate, never)
         steps, gain = effort
-        options = LMOptions(max_iterations=steps, tolerance=gain / self.freedom, initial_damping=1e-10)
+        options = LMOptions(
+            max_iterations=steps, tolerance=gain / self.freedom, initial_damping=1e-10, last_step=last_step
+        )
         result = minimize(problem, estimate.state, options)
         return problem, estimate._replace(state=result.state), int(result.iterations)
 

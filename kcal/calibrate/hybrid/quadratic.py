@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.problem.readout import AMPLITUDES, MOTION, stillness
-from kcal.solve.schur import Products
+from kcal.solve.schur import Products, products_of
 
 Array = npt.NDArray[np.float64]
 
@@ -87,12 +87,12 @@ class ViewData(NamedTuple):
         matrix = self.own * torch.from_numpy(ratio[:, None] * ratio)
         matrix.diagonal(dim1=-2, dim2=-1).add_(1.0)
         root = torch.linalg.cholesky(matrix)
-        scaled = self.cross * torch.from_numpy(ratio)[:, None]
-        half = torch.linalg.solve_triangular(root, scaled, upper=False)
-        flat = half.flatten(0, 1)
-        data = self.still._replace(products=self.still.products - flat.T @ flat)
+        _, ones, _ = torch.broadcast_tensors(root, torch.eye(MOTION, dtype=root.dtype), root)
+        inverse = torch.linalg.solve_triangular(root, ones, upper=False)
+        half = (inverse * torch.from_numpy(ratio)) @ self.cross
+        data = self.still._replace(products=self.still.products - products_of(half.flatten(0, 1).T))
         log_determinant = 2.0 * float(root.diagonal(dim1=-2, dim2=-1).log().sum())
-        return Integrated(data, log_determinant, root, half)
+        return Integrated(data, log_determinant, inverse, half)
 
     def scores(self, log_ratio: Array) -> Tensor:
         """(V, S) derivatives of each view's -½ chi² by the shared unknowns, motions integrated out."""
@@ -109,13 +109,13 @@ class Integrated(NamedTuple):
     Attributes:
         data: the quadratic form of lens and board.
         log_determinant: ln det(R UᵀU R + I), over the views.
-        root: (V, 12, 12) Cholesky factor of that.
-        half: (V, 12, S + 1) its inverse times R Uᵀ [A, r].
+        inverse: (V, 12, 12) of the Cholesky factor of that.
+        half: (V, 12, S + 1) inverse times R Uᵀ [A, r].
     """
 
     data: Quadratic
     log_determinant: float
-    root: Tensor
+    inverse: Tensor
     half: Tensor
 
     def slopes(
@@ -134,34 +134,33 @@ class Integrated(NamedTuple):
             variance: of the noise.
             tempering: by which the data count less.
         """
-        _, ones, _ = torch.broadcast_tensors(self.root, torch.eye(MOTION, dtype=self.root.dtype), self.root)
-        root = torch.linalg.solve_triangular(self.root, ones, upper=False)
-        own = root.transpose(1, 2) @ root  # of motions whose lens and board are known
-        direction = torch.cat([torch.from_numpy(step)[:, None], (inverse * torch.from_numpy(deviation)).T], 1)
-        reach = self.half[..., :-1] @ direction
-        reach[..., 0] += self.half[..., -1]
-        E = (root.transpose(1, 2) @ reach) / math.sqrt(variance * tempering)
-        P = E[..., 1:] @ inverse
-        mean, kept = E[..., 0], own.diagonal(dim1=1, dim2=2)
+        own = self.inverse.transpose(1, 2) @ self.inverse  # of motions whose lens and board are known
+        size = len(step)
+        direction = inverse.new_zeros(size + 1, size + 1)
+        direction[:-1, 0], direction[-1, 0] = torch.from_numpy(step), 1.0
+        torch.mul(torch.from_numpy(deviation)[:, None], inverse.T, out=direction[:-1, 1:])
+        reach = (self.half.flatten(0, 1) @ direction).view(self.half.shape)
+        E = (self.inverse.transpose(1, 2) / math.sqrt(variance * tempering)) @ reach
+        mean, others, kept = E[..., 0], E[..., 1:], own.diagonal(dim1=1, dim2=2)
         by_order = (AMPLITUDES, MOTION // AMPLITUDES)
-        first = ((1.0 - kept) / tempering - E.square().sum(-1)).sum(0).view(by_order).sum(1)
+        G = others @ others.transpose(1, 2)
+        moment = mean.square() + G.diagonal(dim1=1, dim2=2)
+        first = ((1.0 - kept) / tempering - moment).sum(0).view(by_order).sum(1)
         # By pairs of orders: within a view, and across all views.
-        G = E[..., 1:] @ E[..., 1:].transpose(1, 2)
         within = (-0.5 * own.square() / tempering - own * (mean[:, :, None] * mean[:, None]) - own * G).sum(0)
-        within.diagonal().add_((0.5 * kept / tempering + 0.5 * E.square().sum(-1)).sum(0))
+        within.diagonal().add_((0.5 * kept / tempering + 0.5 * moment).sum(0))
         second = 4.0 * within.view(*by_order, *by_order).sum((1, 3))
-        orders = E[..., 1:].unflatten(1, by_order).transpose(0, 1).flatten(1, 2)
+        orders = others.unflatten(1, by_order).transpose(0, 1).flatten(1, 2)
         along = (orders.transpose(1, 2) @ mean.unflatten(1, by_order).transpose(0, 1).reshape(AMPLITUDES, -1, 1))[
             ..., 0
         ]
-        spread = (orders.transpose(1, 2) @ orders).flatten(1)
-        second -= 4.0 * (along @ along.T) + 2.0 * (spread @ spread.T)
-        squared, mixed = P.square().sum(0), (P * mean[..., None]).sum(0)
+        spread = torch.stack([products_of(rows.T) for rows in orders])
+        second -= 4.0 * (along @ along.T) + 2.0 * (spread.flatten(1) @ spread.flatten(1).T)
+        # Of E times the inverse, a row for each motion, only sums over motions are wanted.
+        squared, mixed = ((spread @ inverse) * inverse).sum(1), along @ inverse
         Y = torch.from_numpy(y)
         by_variance = -(2.0 * mixed * Y + squared)
-        by_noise = mean.square().sum(0) + 2.0 * mixed @ Y + squared.sum(-1)
-        by_variance = by_variance.view(*by_order, len(step)).sum(1)
-        by_noise = by_noise.view(by_order).sum(1)
+        by_noise = mean.square().sum(0).view(by_order).sum(1) + 2.0 * mixed @ Y + squared.sum(-1)
         return Slopes(first.numpy(), second.numpy(), by_variance.numpy(), by_noise.numpy())
 
 

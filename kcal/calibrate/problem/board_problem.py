@@ -19,6 +19,7 @@ from kcal.calibrate.problem.priors import GaussianPrior, Term
 from kcal.calibrate.problem.readout import MOTION, Readout
 from kcal.calibrate.problem.state import BoardState, warp_modes
 from kcal.calibrate.problem.twist import apply_twist
+from kcal.gaussian import triangular
 from kcal.lens.model import LensModel
 from kcal.lens.pose import nearest_rotation, step_rows
 from kcal.lens.projection import INTRINSICS, project_components
@@ -320,6 +321,14 @@ class BoardProblem(SchurProblem[BoardState]):
     def off_poses(self, state: BoardState) -> Tensor:
         """(V, S + 1, R) derivatives by the shared unknowns, and residuals, off what poses and motions can do (QR)."""
         return torch.cat([without_local(self.rows(part, v), self.local_size) for part, v in self._chunks(state)])
+
+    def reduced_rows(self, state: BoardState) -> Tensor:
+        """(S + 1, S + 1) triangle with the same products as the rows of `off_poses`, some views at a time."""
+        parts = [
+            triangular(without_local(self.rows(part, views), self.local_size).transpose(0, 1).flatten(1).T)
+            for part, views in self._chunks(state)
+        ]
+        return parts[0] if len(parts) == 1 else triangular(torch.cat(parts))
 
     def shared_gram(self, state: BoardState) -> Tensor:
         """See `SchurProblem.shared_gram`: of the terms."""

@@ -13,7 +13,7 @@ from kcal.lens.information import CameraInformation
 
 
 def information_of(
-    problem: BoardProblem, state: BoardState, noise: float, off: Tensor | None = None
+    problem: BoardProblem, state: BoardState, noise: float, reduced: Tensor | None = None
 ) -> CameraInformation:
     """Square roots of information about all unknowns that are not held, poses and motions eliminated.
 
@@ -21,11 +21,11 @@ def information_of(
         problem: with the Gaussian priors that count; barriers are no information.
         state: its minimum.
         noise: px, of a corner of weight one.
-        off: `BoardProblem.off_poses`, if it is known already.
+        reduced: `BoardProblem.reduced_rows`, if these are known already.
     """
-    off = problem.off_poses(state) if off is None else off
+    reduced = problem.reduced_rows(state) if reduced is None else reduced
     moving = problem.moving
-    rows = off.transpose(0, 1).flatten(1)[[*moving.tolist(), -1]].T / noise
+    rows = reduced[:, [*moving.tolist(), -1]] / noise
     triangle = triangular(rows)[:-1]
     precision = rows.new_zeros(len(moving))
     mean = torch.zeros_like(precision)

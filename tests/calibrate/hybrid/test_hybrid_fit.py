@@ -16,6 +16,7 @@ from kcal.calibrate.hybrid.evidence import maximize_evidence, negative_log_evide
 from kcal.calibrate.hybrid.families import PriorFamilies, prior_families, typical_hyperprior
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.quadratic import Quadratic
+from kcal.calibrate.hybrid.settled import rough_start
 from kcal.calibrate.hybrid.unknowns import hybrid_problem
 from kcal.calibrate.problem.state import BoardState
 from kcal.corners.board import Board
@@ -386,3 +387,23 @@ def test_a_start_may_have_corners_beyond_the_disc() -> None:
     state = BoardState.still(params, 0 * found.state.board, found.state.rotation[:4], found.state.translation[:4])
     assert math.isnan(float(problem.cost(state)))
     assert math.isfinite(float(problem.linearize(state).cost))
+
+
+def test_a_fit_begins_where_another_has_settled() -> None:
+    pixels = views(truth(), 12, 3)
+    weights = torch.ones(pixels.shape[:2], dtype=torch.float64)
+    weights[2, 5] = 0.0
+    start, whole = rough_start(BOARD.points, pixels, SIZE, weights), fit_hybrid(BOARD.points, pixels, SIZE, weights)
+    assert bool(start.residuals[2, 5].isnan().all())
+    assert int(start.residuals.isnan().sum()) == 2
+    rms = float(start.residuals.square().sum(-1).nanmean().sqrt())
+    assert rms == pytest.approx(whole.rms, rel=5e-3)
+    found = fit_hybrid(BOARD.points, pixels, SIZE, weights, start=start)
+    again = fit_hybrid(BOARD.points, pixels, SIZE, weights, start=whole)
+    for fit in (found, again):
+        spread = whole.covariance.diagonal().sqrt().clamp_min(1e-12)
+        assert float(((fit.camera.params - whole.camera.params) / spread).abs().max()) < 0.1
+    # It begins at the end of the rounds, and not at the base projection.
+    assert start.iterations < found.iterations < 2 * start.iterations
+    with pytest.raises(InputError, match="no start explains"):
+        rough_start(BOARD.points, torch.full_like(pixels, torch.nan), SIZE, weights)

@@ -340,6 +340,8 @@ def test_normal_equations_are_products_of_the_rows(
         torch.testing.assert_close(own, other, rtol=1e-8, atol=1e-10)
     off = whole[:, 6:] - whole[:, 6:] @ torch.linalg.pinv(whole[:, :6]) @ whole[:, :6]
     torch.testing.assert_close(problem.off_poses(state), off, rtol=1e-8, atol=1e-10)
+    flat, reduced = off.transpose(0, 1).flatten(1), problem.reduced_rows(state)
+    torch.testing.assert_close(reduced.T @ reduced, flat @ flat.T, rtol=1e-8, atol=1e-8)
     step = torch.arange(1.0, size, dtype=torch.float64), torch.zeros(VIEWS, 6, dtype=torch.float64)
     after = problem.retract(state, step)
     moved = torch.cat([after.parameters - state.parameters, after.board - state.board])

@@ -1,0 +1,188 @@
+"""Find where a fit of one camera settles: base projection, then rounds of solver and evidence, and what these decide.
+
+Decided are whether pixels are square, whether views moved while they were read, and whether rows or columns were read.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from kcal.calibrate.hybrid.aspect import square_pixels, with_square_pixels
+from kcal.calibrate.hybrid.base_fit import fit_base
+from kcal.calibrate.hybrid.board_modes import board_modes
+from kcal.calibrate.hybrid.board_prior import BoardPrior
+from kcal.calibrate.hybrid.evidence_rounds import Rounds, columns_may_be_read, motion_is_worth, run_rounds
+from kcal.calibrate.hybrid.families import Hyperprior, typical_hyperprior
+from kcal.calibrate.hybrid.fitted_views import Estimate, FittedViews
+from kcal.calibrate.hybrid.fleet import LensPrior
+from kcal.calibrate.hybrid.measured_board import MeasuredBoard
+from kcal.calibrate.problem.readout import Readout
+from kcal.errors import InputError
+from kcal.lens.field_modes import FieldModes
+from kcal.lens.zernike import ZernikeModes
+
+
+class FitStart(NamedTuple):
+    """With what a fit of the same views under other weights begins.
+
+    Attributes:
+        estimate: camera, board, poses, motions and amplitudes.
+        readout: how views move while they are read; None: they stand still.
+        square: whether pixels are square.
+        residuals: (V, N, 2) projected minus observed, pixels, weights left out; NaN where a corner did not count.
+        iterations: trial steps of the solver.
+    """
+
+    estimate: Estimate
+    readout: Readout | None
+    square: bool
+    residuals: Tensor
+    iterations: int
+
+
+class Settled(NamedTuple):
+    """Where a fit settled.
+
+    Attributes:
+        rounds: the last ones.
+        never: (S,) unknowns that were held.
+        hyperprior: of the amplitudes.
+        board: how it differs from the one that was ordered.
+    """
+
+    rounds: Rounds
+    never: Tensor
+    hyperprior: Hyperprior
+    board: Literal["printed", "exact"] | BoardPrior
+
+
+def settle(
+    points: Tensor,
+    pixels: Tensor,
+    size: tuple[int, int],
+    weights: Tensor,
+    modes: FieldModes | None,
+    board: Literal["printed", "exact"] | BoardPrior | MeasuredBoard,
+    square: bool | None,
+    motion: bool,
+    focal: float | None,
+    start: FitStart | None,
+    robust: bool,
+    hyperprior: Hyperprior | None,
+    lens: LensPrior | None,
+    progress: Callable[[str], object],
+    rough: bool = False,
+) -> Settled:
+    """Settle amplitudes, camera, board, poses and motions, with arguments as of `kcal.calibrate.hybrid.fit.fit_hybrid`.
+
+    If `rough`, another fit will begin where this one ends, so that it need not come to rest entirely.
+    """
+    if start is not None:
+        form = start.estimate.model.hybrid
+        assert form is not None
+        modes = form.modes
+    elif lens is not None:
+        modes = lens.form.modes
+    modes = modes or ZernikeModes()
+    hyperprior = hyperprior or typical_hyperprior(modes)
+    if isinstance(board, MeasuredBoard):
+        board = board.prior_for(points)
+    ordered, shown = points, board_modes(points)
+    if isinstance(board, BoardPrior):
+        points, shown = board.applied(points, shown)
+    capture = FittedViews(
+        points=points,
+        board=shown,
+        pixels=pixels,
+        size=size,
+        weights=weights,
+        readout=_readout(ordered, size) if start is None and motion else start.readout if start else None,
+        square=start.square if start is not None else lens.square if lens is not None else square is True,
+        robust=robust,
+        exact=board == "exact",
+    )
+
+    def run(capture: FittedViews, estimate: Estimate, spent: int, cold: bool) -> tuple[Rounds, Tensor]:
+        held = torch.zeros_like(estimate.families.mean, dtype=torch.bool)
+        if capture.exact:
+            held[-len(shown.unit) :] = True
+        rounds = run_rounds(capture, estimate, hyperprior, held, cold=cold, spent=spent, rough=rough, progress=progress)
+        return rounds, held
+
+    def begin(capture: FittedViews) -> tuple[Rounds, Tensor]:
+        estimate, steps = fit_base(capture, modes, focal, hyperprior.mean, lens)
+        progress("base projection")
+        if capture.readout is not None:
+            distance = float(estimate.state.translation.norm(dim=-1).median())
+            readout = dataclasses.replace(capture.readout, distance=distance)
+            capture = dataclasses.replace(capture, readout=readout)
+        return run(capture, estimate, steps, True)
+
+    if start is not None:
+        estimate = start.estimate
+        state = estimate.state
+        if isinstance(board, BoardPrior):
+            state = state._replace(board=torch.zeros_like(board.own.at))
+        estimate = estimate._replace(families=estimate.families.with_board(shown), state=state)
+        rounds, never = run(capture, estimate, start.iterations, False)
+    else:
+        rounds, never = begin(capture)
+        if square is None and lens is None and square_pixels(rounds, hyperprior, never):
+            # Motion along columns and the aspect of pixels look alike: with square pixels it is looked for anew.
+            one, readout = dataclasses.replace(rounds.capture, square=True), rounds.readout
+            near = with_square_pixels(rounds.estimate, shown)
+            if near is None:
+                rounds, never = begin(dataclasses.replace(one, readout=readout))
+            else:
+                rounds, never = run(one, near, rounds.steps, False)
+                if one.readout is None and readout is not None and motion_is_worth(rounds, readout, hyperprior, never):
+                    rounds, never = run(dataclasses.replace(one, readout=readout), near, rounds.steps, False)
+        if capture.readout is not None and columns_may_be_read(rounds, hyperprior, never):
+            by_columns = dataclasses.replace(capture.readout, columns=True)
+            other = begin(dataclasses.replace(capture, square=rounds.capture.square, readout=by_columns))
+            if other[0].untempered_loss < rounds.untempered_loss:
+                rounds, never = other
+    return Settled(rounds, never, hyperprior, board)
+
+
+def rough_start(
+    points: Tensor,
+    pixels: Tensor,
+    size: tuple[int, int],
+    weights: Tensor,
+    board: Literal["printed", "exact"] | BoardPrior | MeasuredBoard = "printed",
+    motion: bool = True,
+    focal: float | None = None,
+    progress: Callable[[str], object] = lambda _: None,
+) -> FitStart:
+    """With what a fit of these views under other weights begins: no error bars, and not entirely at rest.
+
+    Raises:
+        InputError: as `kcal.calibrate.hybrid.fit.fit_hybrid`.
+        DegenerateError: likewise.
+    """
+    rounds, never, *_ = settle(
+        points, pixels, size, weights, None, board, None, motion, focal, None, False, None, None, progress, rough=True
+    )
+    capture, estimate = rounds.capture, rounds.estimate
+    errors = capture.problem(estimate, never).pixel_errors(estimate.state)
+    check_shown(errors)
+    return FitStart(estimate, capture.readout, capture.square, capture.by_corner(errors), rounds.steps)
+
+
+def check_shown(errors: Tensor) -> None:
+    """Raise `InputError` where a corner has no image under the lens that was found: errors that are not finite."""
+    if not bool(torch.isfinite(errors).all()):
+        raise InputError(
+            "the lens cannot show all corners where they are: are all views of this board and this camera? Rejection "
+            "of outliers leaves wrong views out"
+        )
+
+
+def _readout(points: Tensor, size: tuple[int, int]) -> Readout:
+    return Readout(center=points.mean(0), distance=1.0, size=size)
