@@ -170,7 +170,7 @@ def fit_shape(
     def whiten(columns: Floats) -> Floats:
         return root[:, None] * columns
 
-    residual = _residual(shape, where, levels, whiten)
+    residual = _whitened_residual(shape, where, levels, whiten)
     costs = [0.0] if len(starts) == 1 else [float(np.square(residual(p)).sum()) for p in starts]
     return improve(shape, starts[int(np.argmin(costs))], where, levels, weight, whiten, iterations)
 
@@ -185,7 +185,7 @@ def improve(
     iterations: int = 15,
 ) -> ShapeFit | None:
     """Least squares from one start (P,), `whiten` making the errors of columns (N, K) alike and independent."""
-    residual = _residual(shape, where, levels, whiten)
+    residual = _whitened_residual(shape, where, levels, whiten)
     low, high = np.array([-6.0, -6.0, *shape.low]), np.array([6.0, 6.0, *shape.high])
     _, best = _minimized(residual, start, low, high, iterations)
     return _described(shape, best, residual, weight, whiten(levels[:, None])[:, 0])
@@ -196,7 +196,7 @@ def design_of(shape: ShapeModel, where: Floats, p: Floats) -> Floats:
     return np.concatenate([shape.patterns(where, p), where / np.abs(where).max()], 1)
 
 
-def _residual(
+def _whitened_residual(
     shape: ShapeModel, where: Floats, levels: Floats, whiten: Callable[[Floats], Floats]
 ) -> Callable[[Floats], Floats]:
     def residual(p: Floats) -> Floats:

@@ -59,7 +59,7 @@ def fit_before_texture(shape: ShapeModel, fit: ShapeFit, where: Floats, levels: 
     left_over = levels - design @ strengths
     unknowns = np.concatenate([design, slopes(modeled, fit.parameters, modeled(fit.parameters))], 1)
     found = texture_of(where, left_over, unknowns)
-    half = cholesky(found.strength * _alike(where, found.length) + np.eye(len(where)), lower=True)
+    half = cholesky(found.strength * _texture_correlation(where, found.length) + np.eye(len(where)), lower=True)
 
     def whiten(columns: Floats) -> Floats:
         result: Floats = solve_triangular(half, columns, lower=True, check_finite=False)
@@ -86,7 +86,7 @@ def texture_of(where: Floats, left_over: Floats, unknowns: Floats) -> Texture:
     basis = basis[:, values > 1e-9 * values[0]]
     best, result = -math.inf, Texture(_LENGTHS[0], 0.0)
     for length in _LENGTHS:
-        alike = sum(weight * _alike(middle, length, shift) for shift, weight in _PAIRS)
+        alike = sum(weight * _texture_correlation(middle, length, shift) for shift, weight in _PAIRS)
         for strength in _STRENGTHS:
             likelihood = _likelihood(means[:, 0], basis, strength * alike + 0.25 * np.eye(len(middle)))
             if likelihood > best:
@@ -104,7 +104,7 @@ def _fours(where: Floats, columns: Floats) -> tuple[Floats, Floats]:
     return means[:, :2], means[:, 2:]
 
 
-def _alike(where: Floats, length: float, shift: tuple[float, float] = (0.0, 0.0)) -> Floats:
+def _texture_correlation(where: Floats, length: float, shift: tuple[float, float] = (0.0, 0.0)) -> Floats:
     """Correlation (N, N) of the texture at positions (N, 2) with itself, the second of each pair shifted."""
     result: Floats = np.exp(-cdist(where, where + shift) / length)
     return result

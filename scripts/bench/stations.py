@@ -4,9 +4,9 @@
     python -m scripts.bench.stations frame [ROUNDS]     # 1,000 detections in 8 cameras
     python -m scripts.bench.stations table [ROWS ...]   # kcal locate of long tables: CPU seconds and peak memory
     python -m scripts.bench.stations two [PAIRS]        # StereoLocalizer beside MultiViewLocalizer
-    python -m scripts.bench.stations many [CAMERAS VIEWS]  # cameras and views calibrated together, 16 and 60
+    python -m scripts.bench.stations many [CAMERAS VIEWS ...]  # calibrated together: 8 and 24, 16 and 60
 
-`--write` puts a part into docs/measured/stations.md, `many` under the name of its counts. CPU seconds on one core
+`--write` puts a part into docs/measured/stations.md. CPU seconds on one core
 (time.process_time). `many` runs mrcal in the same loop where KCAL_MRCAL names an interpreter that has it: cameras in
 rows of four, 0.5 m apart, look at a board 4 m away, which all of them see; corners have 0.1 px of noise; lenses have
 five coefficients, kcal fits its default.
@@ -200,7 +200,7 @@ def long_tables(sizes: Sequence[int]) -> list[str]:
     return table(["lines", "positions", "CPU s", "peak MB"], rows)
 
 
-def many(cameras: int, views: int) -> list[str]:
+def many(cameras: int, views: int) -> list[list[str]]:
     """Cameras calibrated together, beside mrcal where it is."""
     generator = torch.Generator().manual_seed(0)
 
@@ -261,8 +261,14 @@ def many(cameras: int, views: int) -> list[str]:
                 rows.append(
                     ["mrcal, OPENCV8", f"{other['cpu']:.0f}", "", f"{other['peak']:.0f}", *_errors(rig, *poses)]
                 )
-    heads = ["program", "CPU s", "of it one by one", "peak MB", "RMS error of centers mm", "of attitudes °"]
-    return [f"{cameras} cameras x {views} views, {corners.shape[2]} corners each.", "", *table(heads, rows)]
+    return [[f"{cameras} x {views}", *row] for row in rows]
+
+
+def several_rigs(counts: Sequence[int]) -> list[str]:
+    """Rigs of CAMERAS VIEWS, CAMERAS VIEWS...; the smallest first, as memory is told by its peak."""
+    rows = [row for pair in zip(counts[::2], counts[1::2], strict=True) for row in many(*pair)]
+    heads = ["cameras x views", "program", "CPU s", "of it one by one", "peak MB", "RMS error of centers mm"]
+    return table([*heads, "of attitudes °"], rows)
 
 
 def _errors(rig: CameraRig, rotation: Tensor, center: Tensor) -> list[str]:
@@ -289,13 +295,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "frame": lambda: frame(*(given.counts or [20])),
         "table": lambda: long_tables(given.counts or [100_000, 1_000_000]),
         "two": lambda: two(*(given.counts or [200_000])),
-        "many": lambda: many(*(given.counts or [16, 60])),
+        "many": lambda: several_rigs(given.counts or [8, 24, 16, 60]),
     }
     lines = parts[given.part]()
     show(lines)
     if given.write:
-        name = "-".join([given.part, *map(str, given.counts if given.part == "many" else [])])
-        write_section("stations.md", name, "\n".join(lines))
+        write_section("stations.md", given.part, "\n".join(lines))
 
 
 if __name__ == "__main__":
