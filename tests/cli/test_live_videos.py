@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 pytest.importorskip("av", reason="the extra `video` is not installed")
 from rtsp_server import RtspCamera
@@ -19,7 +20,11 @@ from video_scenes import VELOCITY, bright_spots, film, places, small_rig, write_
 
 from kcal.cli.main import app
 from kcal.errors import FileError, InputError
+from kcal.io.camera_rig_file import save_camera_rig
 from kcal.io.rig_file import save_rig
+from kcal.lens.camera_rig import CameraRig
+from kcal.lens.mounting import Origin
+from kcal.lens.rig import StereoRig
 from kcal.pipeline.stream import Stream
 
 FRAMES, LATE = 14, 0.03
@@ -101,6 +106,58 @@ def test_sigterm_ends_it_and_the_next_run_continues(folder: Path, monkeypatch: p
         path.write_bytes(content)
     assert f"{FRAMES - 8} moments" in live(folder, "--clock-offset", str(LATE))
     assert (folder / "tracks.csv").read_bytes() == whole
+
+
+def test_three_videos_of_three_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The third camera stops in the middle and names stay; what SIGTERM interrupts is continued to the same table."""
+    pair = small_rig()
+    camera, north = pair.left, torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    center = torch.tensor([[0.0, 0, 0], [2.0, 0, 0], [-2.0, 0, 0]])
+    rig = CameraRig(
+        [camera] * 3,
+        ["left", "right", "third"],
+        north.repeat(3, 1, 1),
+        center,
+        origin=Origin(lat=19.07, lon=72.87, height=14.0),
+    )
+    rig.root = rig.with_errors(position_m=0.001, attitude_deg=0.001)
+    save_camera_rig(rig, tmp_path / "rig.json")
+    west = StereoRig(camera, camera, torch.eye(3), torch.tensor([2.0, 0.0, 0.0]))
+    times = [number / 15 for number in range(FRAMES)]
+    for name, scene, side, count in (("left", pair, 0, FRAMES), ("right", pair, 1, FRAMES), ("third", west, 1, 8)):
+        write_video(tmp_path / f"{name}.mp4", film(scene, side, times[:count]), times[:count], crf=23)
+    videos = [str(tmp_path / f"{name}.mp4") for name in rig.names]
+    command = ["live", str(tmp_path / "rig.json"), *videos, "--detector", "video_scenes:bright_spots"]
+
+    def run() -> str:
+        done = CliRunner().invoke(app, [*command, "-o", str(tmp_path / "tracks.csv")], catch_exceptions=False)
+        assert done.exit_code == 0, done.output
+        return done.output
+
+    run()
+    whole = (tmp_path / "tracks.csv").read_bytes()
+    rows = list(csv.DictReader(whole.decode().splitlines()))
+    assert {row["name"] for row in rows} == {"track 1", "track 2"}
+    assert {row["cameras"] for row in rows if row["sequence"] == "6"} == {"left right third"}
+    for row in rows[-2:]:
+        found = np.array([float(row[f"{axis}_m"]) for axis in ("east", "up", "north")]) * [1, -1, 1]
+        true = places(float(row["time_s"])).numpy()
+        sigma = np.sqrt([float(row[f"cov_{axis}_m2"]) for axis in ("ee", "uu", "nn")])
+        assert (np.abs(found - true[np.abs(true - found).sum(1).argmin()]) < 3.5 * sigma).all()
+    for path in tmp_path.glob("tracks.csv*"):
+        path.unlink()
+    write = Stream._write
+
+    def terminated(self: Stream, *what: object) -> None:
+        write(self, *what)  # type: ignore[arg-type]
+        if self.counts.moments == 5:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(Stream, "_write", terminated)
+    run()
+    monkeypatch.setattr(Stream, "_write", write)
+    assert "continuing after 5 moments" in run()
+    assert (tmp_path / "tracks.csv").read_bytes() == whole
 
 
 def test_a_shorter_video_ends_the_pairs(folder: Path) -> None:
