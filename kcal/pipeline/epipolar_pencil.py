@@ -90,7 +90,7 @@ def meetings(lines: StationSights, rows: Ints, others: Ints, gate: float, neares
         >>> lines = StationSights(np.array([0, 1, 1]), ray, np.full(3, 1e-3), np.zeros(2), 0.0,
         ...                    np.array([[0.0, 0, 0], [600.0, 0, 0]]), np.array([[0.0, 0, 1]] * 2), 0.0)
         >>> found = meetings(lines, np.array([0]), np.array([1, 2]), 4.0, 100.0)
-        >>> found.second.tolist(), found.point.round(6).tolist()
+        >>> found.second.tolist(), (found.point.round(6) + 0.0).tolist()
         ([1], [[0.0, 800.0, 0.0]])
     """
     none = Meetings(*(np.zeros(0, dtype=np.int64),) * 2, np.zeros((0, 3)), *(np.zeros(0),) * 3)
