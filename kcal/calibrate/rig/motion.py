@@ -225,7 +225,8 @@ class _Whole(NamedTuple):
         variance = square / max(count, 1)
         length = total.diagonal()[:-1].clamp_min(0.0).sqrt()
         unit = torch.where(length > 0, 1.0 / length, 0.0)
-        matrix, weak = total[:-1, :-1] * unit[:, None] * unit, variance / _WIDE**2
+        # Of corners without noise no motion is asked; their products may determine nothing to the last digit.
+        matrix, weak = total[:-1, :-1] * unit[:, None] * unit, max(variance, _EXACT) / _WIDE**2
         matrix.diagonal().add_(torch.where(length > 0, weak, 1.0))
         root = torch.linalg.cholesky(matrix)
         pull = torch.linalg.solve_triangular(root, (total[:-1, -1] * unit)[:, None], upper=False)[:, 0]
