@@ -128,7 +128,6 @@ def most_likely(
     by_camera: bool | Sequence[tuple[int, ...]] = False,
     differentiated: bool = False,
     around: Surroundings | None = None,
-    refined: bool = True,
 ) -> PointFit:
     """Minimize the weighted squares of the reprojection errors, each point on its own.
 
@@ -143,7 +142,6 @@ def most_likely(
             each camera that are listed.
         differentiated: let gradients flow to pixels, weights, cameras and poses.
         around: what there is besides pixels, if anything.
-        refined: whether to go to the optimum; else all is told at the start, its residual included.
     """
     base = start[0].detach().mT
     sides = torch.stack([side.mT for side in side_axes(start[0].detach())], -3)
@@ -168,9 +166,6 @@ def most_likely(
     zero = torch.zeros_like(start[1])
     with torch.no_grad():
         theta = torch.stack([zero, zero, first], -2)
-        if not refined:
-            at = _evaluate(whole, theta)
-            return _fit_at(at, theta, sides, _covariance_at(at, fixed))
         best, step, cost = theta, torch.zeros_like(theta), torch.full_like(zero, torch.inf)
         length, noise = torch.full_like(zero, torch.inf), _least_noise(weight)
         for number in range(_TRACED_STEPS if is_traced() else _MOST_STEPS):
