@@ -137,7 +137,7 @@ def view_rows(known: KnownViews, pixels: Tensor, seen: Tensor, covariance: Tenso
     fitted = alone | ((count > 1) & ~(seen & ~sound).any(-1))
     anchor = first_seen(used).to(torch.int64).argmax(-1)
     in_frame = rays @ posed.rotation
-    place = posed.center[anchor].T
+    place = posed.center.T.index_select(1, anchor)
     ray = in_frame[anchor, torch.arange(len(anchor), device=anchor.device)].T
     if known.axes is not None:
         both = in_frame @ known.axes
@@ -194,7 +194,7 @@ def view_rows(known: KnownViews, pixels: Tensor, seen: Tensor, covariance: Tenso
 def _whitening(covariance: Tensor, used: Tensor) -> Tensor:
     """`ViewRows.white`; the identity where the covariance of all pixels of a row is none."""
     still = torch.eye(covariance.shape[-1], dtype=covariance.dtype, device=covariance.device)
-    both = used.repeat_interleave(2, -1)
+    both = used[..., None].expand(-1, -1, 2).flatten(1)
     whole = torch.where(both[:, :, None] & both[:, None], covariance, still)
     mirrored = (whole - whole.mT).abs().amax((-2, -1)) <= 1e-6 * whole.abs().amax((-2, -1))
     lower, info = torch.linalg.cholesky_ex((0.5 * (whole + whole.mT)).flip(-2, -1))

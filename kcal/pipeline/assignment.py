@@ -36,7 +36,7 @@ class Scores(NamedTuple):
 
     def at(self, which: Tensor) -> Self:
         """The matches at some places."""
-        return type(self)(self.seen.at(which), *(value[..., which] for value in self[1:]))
+        return type(self)(self.seen.at(which), *(value.index_select(-1, which) for value in self[1:]))
 
 
 class SeenFrom(NamedTuple):

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from kcal.pipeline.measurements import Anchored
 from kcal.pipeline.motion import Transition, moved, rates
-from kcal.pipeline.small_matrices import congruent, eliminate, mahalanobis, outer, product, rooted, solved, squared
+from kcal.pipeline.small_matrices import Eliminated, congruent, eliminate, mahalanobis, outer, product, rooted, solved, squared
 
 
 class Summary(NamedTuple):
@@ -63,7 +63,7 @@ class Beliefs(NamedTuple):
 
     def at(self, which: Tensor) -> Self:
         """The tracks at some places."""
-        return type(self)(*(value[..., which] for value in self))
+        return type(self)(*(value.index_select(-1, which) for value in self))
 
     @property
     def middle(self) -> Tensor:
@@ -107,7 +107,7 @@ def no_beliefs(errors: int, clock_errors: int, models: int, device: torch.device
 
 def _effect(shared: Tensor, late: Tensor, pace: Tensor) -> Tensor:
     """(R, K + Q, ...) of effects (R, K, ...) and (R, Q, 3, ...), the latter with a velocity (3, ...)."""
-    return torch.cat([shared, (late * pace).sum(2)], 1)
+    return torch.cat([shared, (late * pace).sum(2)], 1) if late.shape[1] else shared
 
 
 def _with_noise(columns: Tensor, noise: Tensor) -> Tensor:
@@ -118,16 +118,19 @@ def _with_noise(columns: Tensor, noise: Tensor) -> Tensor:
 def predicted(beliefs: Beliefs, step: Transition, turn: Tensor | None = None, shift: Tensor | None = None) -> Beliefs:
     """Move all by a step; see `moved`."""
     found = moved(beliefs.mean, step, turn, shift)
-    width = beliefs.columns.shape[1]
-    columns = found.through(torch.cat([beliefs.columns, beliefs.late.flatten(1, 2)], 1))
+    exact, columns, width = not beliefs.late.shape[1], beliefs.columns, beliefs.columns.shape[1]
+    columns = found.through(columns if exact else torch.cat([columns, beliefs.late.flatten(1, 2)], 1))
     noise = found.through(columns[:, :6].transpose(0, 1)) + found.noise
+    both = torch.cat([noise, columns[:, 6:width]], 1)
+    if exact:
+        return Beliefs(found.state, both, beliefs.late, beliefs.weight)
     # Velocities of earlier moments are today's, turned back; a memory that fades would let them grow without end. The
     # velocity in the state is divided by z, and z has changed by `ahead`.
     keep = step.keep if turn is None else product(turn[:, :, None], step.keep)
     back = keep.transpose(0, 1) * (found.ahead / step.left)
     late = columns[:, width:].unflatten(1, beliefs.late.shape[1:3])
     late = (late[:, :, :, None] * back).sum(2)
-    return Beliefs(found.state, torch.cat([noise, columns[:, 6:width]], 1), late, beliefs.weight)
+    return Beliefs(found.state, both, late, beliefs.weight)
 
 
 def cross_covariance(before: Beliefs, after: Beliefs, step: Transition, turn: Tensor | None = None) -> Tensor:
@@ -153,7 +156,7 @@ class Timing(NamedTuple):
 
     def at(self, which: Tensor) -> Self:
         """The sightings at some places."""
-        return type(self)(*(value[..., which] for value in self))
+        return type(self)(*(value.index_select(-1, which) for value in self))
 
 
 class Innovations(NamedTuple):
@@ -220,26 +223,37 @@ class Fit(NamedTuple):
     log_density: Tensor
 
 
+def _whole(found: Innovations, root: Tensor | None) -> Tensor:
+    """(M, M, J, N) covariance of innovations, with all errors."""
+    return found.noise + squared(rooted(found.effect, root))
+
+
 def fit_of(found: Innovations, root: Tensor | None) -> Fit:
     """Judge innovations with all errors: the covariance of b is root rootᵀ, or the identity."""
-    covariance = found.noise + squared(rooted(found.effect, root))
-    distance, volume = mahalanobis(covariance, found.value)
+    distance, volume = mahalanobis(_whole(found, root), found.value)
     return Fit(distance, -0.5 * (distance + volume))
 
 
-def updated(beliefs: Beliefs, found: Innovations, fit: Fit) -> Beliefs:
-    """Take sightings in, one for each track; the gain follows the noise alone."""
-    gain = solved(eliminate(found.noise, found.crossed)).transpose(0, 1)
+def updated(beliefs: Beliefs, found: Innovations, root: Tensor | None) -> Beliefs:
+    """Take sightings in, one for each track: the gain follows the noise alone, and models are judged as in `fit_of`."""
+    models = len(beliefs.weight)
+    matrices = torch.cat([found.noise, _whole(found, root)], 2)
+    done = eliminate(matrices, torch.cat([found.crossed, found.value[:, None]], 1).repeat(1, 1, 2, 1))
+    gain = solved(Eliminated(done.pivots[:, :models], done.rows[:, :, :models], done.columns[:, :6, :models]))
+    gain, pivots = gain.transpose(0, 1), done.pivots[:, models:]
+    distance = (done.columns[:, 6, models:].square() / pivots).sum(0)
     mean = beliefs.mean + (gain * found.value).sum(1)
     rest = torch.eye(6, dtype=mean.dtype, device=mean.device)[..., None, None] - product(gain, found.slope)
     columns = product(rest, beliefs.columns)
     # Joseph's form: symmetric and positive whatever the rounding.
     noise = product(columns[:, :6], rest.transpose(0, 1)) + congruent(gain, found.marks)
     columns = torch.cat([noise, columns[:, 6:] - product(gain, found.shared)], 1)
-    late = product(rest, beliefs.late.flatten(1, 2)) - product(gain, found.late.flatten(1, 2))
-    log = beliefs.weight.log() + fit.log_density
-    weight = torch.softmax(log, 0).clamp_min(1e-12)
-    return Beliefs(mean, columns, late.unflatten(1, beliefs.late.shape[1:3]), weight)
+    late = beliefs.late
+    if late.shape[1]:
+        moved = product(rest, late.flatten(1, 2)) - product(gain, found.late.flatten(1, 2))
+        late = moved.unflatten(1, late.shape[1:3])
+    log = beliefs.weight.log() - 0.5 * (distance + pivots.log().sum(0))
+    return Beliefs(mean, columns, late, torch.softmax(log, 0).clamp_min(1e-12))
 
 
 def born(seen: Anchored, timing: Timing, speed: float, models: int) -> Beliefs:

@@ -58,7 +58,7 @@ class Sightings(NamedTuple):
 
     def at(self, which: Tensor) -> Self:
         """The sightings at some places."""
-        return type(self)(*(value[..., which] for value in self))
+        return type(self)(*(value.index_select(-1, which) for value in self))
 
 
 def known_sightings(localize: MultiViewLocalizer) -> KnownViews:
@@ -135,7 +135,7 @@ class Anchored(NamedTuple):
 
     def at(self, which: Tensor) -> Self:
         """The sightings at some places."""
-        return type(self)(*(value[..., which] for value in self))
+        return type(self)(*(value.index_select(-1, which) for value in self))
 
 
 def anchored(

@@ -56,7 +56,7 @@ def moved_on(beliefs: Beliefs, up: Tensor, numbers: Tensor, stay: Tensor) -> Bel
 def taken_in(beliefs: Beliefs, seen: Anchored, timing: Timing, root: Tensor | None) -> Beliefs:
     """Beliefs with sightings, one for each track."""
     found = innovations(beliefs, seen, timing)
-    return updated(beliefs, found, fit_of(found, root))
+    return updated(beliefs, found, root)
 
 
 def track_steps(localize: MultiViewLocalizer, lasting_px: float) -> TrackSteps:
@@ -71,7 +71,7 @@ def track_steps(localize: MultiViewLocalizer, lasting_px: float) -> TrackSteps:
 
     def looked_at(beliefs: Beliefs, frame: Tensor, home: Tensor, root: Tensor | None) -> tuple[Beliefs, Looks]:
         merged = beliefs.merged()
-        return merged, looks_of(merged, frame, centers[home].T, cameras, root)
+        return merged, looks_of(merged, frame, centers.T.index_select(1, home), cameras, root)
 
     def scored(
         merged: Beliefs, frame: Tensor, home: Tensor, seen: Sightings, timing: Timing, root: Tensor | None,
@@ -79,8 +79,8 @@ def track_steps(localize: MultiViewLocalizer, lasting_px: float) -> TrackSteps:
     ) -> Scores:  # fmt: skip
         """Sightings (L,) against tracks (L,), whose beliefs are merged."""
         beliefs, local = merged.at(track), seen.at(which)
-        origin = centers[home[track]].T
-        there = anchored(local, frame[..., track], origin, beliefs.mean[:3, 0], bending, k)
+        origin = centers.T.index_select(1, home[track])
+        there = anchored(local, frame.index_select(-1, track), origin, beliefs.mean[:3, 0], bending, k)
         found = innovations(beliefs, there, timing.at(which))
         fit = fit_of(found, root)
         density = fit.log_density[0] + _EXPLAINED * local.seen.sum(0)
@@ -90,7 +90,7 @@ def track_steps(localize: MultiViewLocalizer, lasting_px: float) -> TrackSteps:
 
     def place(beliefs: Beliefs, frame: Tensor, home: Tensor, root: Tensor | None, which: Tensor) -> TrackStates:
         summary = beliefs.at(which).summary()
-        return track_states(localize, frame[..., which].movedim(-1, 0), home[which], summary, root)
+        return track_states(localize, frame.index_select(-1, which).movedim(-1, 0), home[which], summary, root)
 
     return TrackSteps(measure, moved_on, looked_at, nearby, scored, taken_in, place)
 
