@@ -104,9 +104,7 @@ def looks_of(beliefs: Beliefs, frame: Tensor, home: Tensor, cameras: SeenFrom, r
     if cameras.turned is not None:
         # A camera that is turned sees sightings and tracks turned alike: only what differs counts.
         turn = cameras.turned[..., None]  # (3, K, V, 1)
-        turned = torch.linalg.cross(
-            turn.expand(-1, -1, -1, length.shape[1]), unit[:, None].expand_as(turn * unit[:, None]), dim=0
-        )
+        turned = torch.linalg.cross(turn, unit[:, None], dim=0)
         rest = moved.shape[1] - turn.shape[1]
         moved = moved - torch.nn.functional.pad(turned, (0, 0, 0, 0, 0, rest))
     spread = random + rooted(moved, root).square().sum((0, 1))

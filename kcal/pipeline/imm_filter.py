@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from kcal.pipeline.measurements import Anchored
-from kcal.pipeline.motion import Transition, moved, rates
-from kcal.pipeline.small_matrices import Eliminated, congruent, eliminate, mahalanobis, outer, product, rooted, solved, squared
+from kcal.pipeline.motion import Transition, by_rates, moved, rates
+from kcal.pipeline.small_matrices import congruent, eliminate, mahalanobis, outer, product, rooted, solved, squared
 
 
 class Summary(NamedTuple):
@@ -191,16 +191,15 @@ def innovations(beliefs: Beliefs, seen: Anchored, timing: Timing) -> Innovations
         seen: N sightings in the tracks' frames.
         timing: of the sightings.
     """
-    rate, by_state = rates(beliefs.mean)
     by_place = seen.late.sum(0)[:, :, None]  # (M, 3, 1, N)
     moving = (seen.late * timing.delay[:, None, None]).sum(0)[:, :, None]
-    slope = torch.nn.functional.pad(by_place, (0, 0, 0, 0, 0, 3)) + product(moving, by_state)
+    slope = by_rates(moving, beliefs.mean) + torch.nn.functional.pad(by_place, (0, 0, 0, 0, 0, 3))
     apart = seen.place[:, None] - beliefs.mean[:3]
-    value = seen.value[:, None] + (by_place * apart).sum(1) - (moving * rate).sum(1)
+    value = seen.value[:, None] + (by_place * apart).sum(1) - (moving * rates(beliefs.mean)).sum(1)
     marks = torch.eye(len(value), dtype=value.dtype, device=value.device)[..., None, None]
     late, own = [], seen.late[1:, :, :, None]
     for which in range(len(timing.clock)):
-        by_camera = product(own[which], by_state)
+        by_camera = by_rates(own[which], beliefs.mean)
         late.append(by_camera[:, None, 3:] * timing.clock[which, :, None, None])
         # The product of two unknowns, a rate and a delay, is noise of second order.
         marks = marks + congruent(timing.unsure[which] * by_camera, beliefs.noise)
@@ -236,12 +235,14 @@ def fit_of(found: Innovations, root: Tensor | None) -> Fit:
 
 def updated(beliefs: Beliefs, found: Innovations, root: Tensor | None) -> Beliefs:
     """Take sightings in, one for each track: the gain follows the noise alone, and models are judged as in `fit_of`."""
-    models = len(beliefs.weight)
-    matrices = torch.cat([found.noise, _whole(found, root)], 2)
-    done = eliminate(matrices, torch.cat([found.crossed, found.value[:, None]], 1).repeat(1, 1, 2, 1))
-    gain = solved(Eliminated(done.pivots[:, :models], done.rows[:, :, :models], done.columns[:, :6, :models]))
-    gain, pivots = gain.transpose(0, 1), done.pivots[:, models:]
-    distance = (done.columns[:, 6, models:].square() / pivots).sum(0)
+    models, still = len(beliefs.weight), torch.eye(len(found.value)).to(found.value)[..., None, None]
+    columns = torch.cat([found.crossed, found.value[:, None], still.expand_as(found.noise)], 1)
+    # Both at once: of the noise alone, and of all.
+    done = eliminate(torch.cat([found.noise, _whole(found, root)], 2), columns.repeat(1, 1, 2, 1))
+    white = done.columns / done.pivots[:, None]
+    gain = product(white[:, :6, :models].transpose(0, 1), done.columns[:, 7:, :models])
+    pivots = done.pivots[:, models:]
+    distance = (done.columns[:, 6, models:] * white[:, 6, models:]).sum(0)
     mean = beliefs.mean + (gain * found.value).sum(1)
     rest = torch.eye(6, dtype=mean.dtype, device=mean.device)[..., None, None] - product(gain, found.slope)
     columns = product(rest, beliefs.columns)
@@ -265,19 +266,18 @@ def born(seen: Anchored, timing: Timing, speed: float, models: int) -> Beliefs:
     gain = product(spread, slope.transpose(0, 1))  # (3, M, N)
     place = seen.place + (gain * seen.value).sum(1)
     state = torch.cat([place, torch.zeros_like(place)])
-    by_pace = rates(state)[1][:, 3:]
-    late = product(product(gain, (seen.late * timing.delay[:, None, None]).sum(0)), by_pace)
+    late = by_rates(product(gain, (seen.late * timing.delay[:, None, None]).sum(0)), state)[:, 3:]
     # The range is hardly known at first, but a speed per meter of range must not vanish.
     drift = speed**2 * (place[2].square() + spread[2, 2])
     here, by_clock = spread + drift * squared(late), []
     for which in range(len(timing.clock)):
-        by_camera = product(product(gain, seen.late[1 + which]), by_pace)
+        by_camera = by_rates(product(gain, seen.late[1 + which]), state)[:, 3:]
         here = here + drift * timing.unsure[which].square() * squared(by_camera)
         by_clock.append(by_camera[:, None] * timing.clock[which, :, None])
     pace, both = still * drift, -drift * late
     noise = torch.cat([torch.cat([here, both], 1), torch.cat([both.transpose(0, 1), pace], 1)])
     shared = torch.nn.functional.pad(product(gain, seen.shared), (0, 0, 0, 0, 0, 3))
-    clocks = torch.cat(by_clock, 1) if by_clock else state.new_zeros(3, 0, *by_pace.shape[1:])
+    clocks = torch.cat(by_clock, 1) if by_clock else state.new_zeros(3, 0, *late.shape[1:])
     clocks = torch.nn.functional.pad(-clocks, (0, 0, 0, 0, 0, 0, 0, 3))
     columns = torch.cat([noise, -shared], 1)
     state, columns, clocks = (value[..., None, :].repeat_interleave(models, -2) for value in (state, columns, clocks))

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from kcal.errors import InputError
+from kcal.lens.dispatch import known_true
 from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.pipeline.assignment import Looks, Scores, SeenFrom, looks_of, nearby
 from kcal.pipeline.estimates import TrackStates, track_states
@@ -80,7 +81,8 @@ def track_steps(localize: MultiViewLocalizer, lasting_px: float) -> TrackSteps:
         """Sightings (L,) against tracks (L,), whose beliefs are merged."""
         beliefs, local = merged.at(track), seen.at(which)
         origin = centers.T.index_select(1, home[track])
-        there = anchored(local, frame.index_select(-1, track), origin, beliefs.mean[:3, 0], bending, k)
+        where = None if known_true(~local.alone) else beliefs.mean[:3, 0]
+        there = anchored(local, frame.index_select(-1, track), origin, where, bending, k)
         found = innovations(beliefs, there, timing.at(which))
         fit = fit_of(found, root)
         density = fit.log_density[0] + _EXPLAINED * local.seen.sum(0)
