@@ -34,6 +34,7 @@ class KnownViews(NamedTuple):
         up: (C, 3, 1) the vertical in each camera's axes; zeros where lines of sight are straight.
         matrices: (C, 3, 4) of `PosedCameras`.
         axes: (3, 3) of two cameras: the line between them and across; None for more.
+        baseline: meters between the first camera and the last.
         moves: (C, 3 (K + 1), 5) what each error, and a larger k / 2R, makes of a point in a camera's axes, over its
             distance: by this point, by one over its distance, and by how much one of `up` it is lifted by bending.
         lens: for each camera the parameters that are not exact.
@@ -48,6 +49,7 @@ class KnownViews(NamedTuple):
     up: Tensor
     matrices: Tensor
     axes: Tensor | None
+    baseline: Tensor
     moves: Tensor
     lens: tuple[tuple[int, ...], ...]
     by_lens: Tensor
@@ -108,8 +110,8 @@ def known_views(posed: PosedCameras, common: CommonErrors | None) -> KnownViews:
     wide = torch.tensor([[camera.model.wide] for camera in cameras], device=center.device)
     axes = baseline_axes(center[1] - center[0]) if count == 2 else None
     return KnownViews(
-        posed, stacked(cameras), middle, size, wide, up[..., None], posed.matrices, axes, moves, lens,
-        half[..., 6:].movedim(0, 1),
+        posed, stacked(cameras), middle, size, wide, up[..., None], posed.matrices, axes,
+        torch.linalg.vector_norm(center[-1] - center[0]), moves, lens, half[..., 6:].movedim(0, 1),
     )  # fmt: skip
 
 
@@ -141,7 +143,7 @@ def view_rows(known: KnownViews, pixels: Tensor, seen: Tensor, covariance: Tenso
     ray = in_frame[anchor, torch.arange(len(anchor), device=anchor.device)].T
     if known.axes is not None:
         both = in_frame @ known.axes
-        found = meeting_points(both[0], both[1], known.axes, torch.linalg.vector_norm(posed.center[1] - posed.center[0]))
+        found = meeting_points(both[0], both[1], known.axes, known.baseline)
     elif cameras > 1:
         found = triangulate_angular(known.matrices, rays.movedim(0, 1), used)
     else:

@@ -122,7 +122,7 @@ def nearby(looks: Looks, seen: Sightings, timing: Timing, gate: Tensor) -> Tenso
         gate: largest squared Mahalanobis distance.
     """
     other = seen.direction / seen.direction.square().sum(0).sqrt()
-    ray, spread, pace = (value[..., seen.anchor, :] for value in looks)  # (3, N, T), (N, T), (N, T)
+    ray, spread, pace = (value.index_select(-2, seen.anchor) for value in looks)  # (3, N, T), (N, T), (N, T)
     apart = (ray - other[..., None]).square().sum(0)
     late = timing.delay.abs().amax(0)
     if len(timing.unsure):
