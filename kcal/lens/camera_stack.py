@@ -103,7 +103,9 @@ def project_stack(stack: CameraStack, points: Tensor, wanted: Sequence[Sequence[
     ]
     rates = None
     if any(one.by_meter is not None for one in each):
-        rates = torch.stack([torch.zeros_like(one.pixels) if one.by_meter is None else one.by_meter for one in each], -3)
+        rates = torch.stack(
+            [torch.zeros_like(one.pixels) if one.by_meter is None else one.by_meter for one in each], -3
+        )
     return Projection(
         torch.stack([one.pixels for one in each], -3),
         torch.stack([one.by_point for one in each], -4),

@@ -125,7 +125,7 @@ def most_likely(
     usable: Tensor,
     weight: Tensor | None = None,
     *,
-    by_camera: bool | Sequence[tuple[int, ...]] = False,
+    by_camera: bool = False,
     differentiated: bool = False,
     around: Surroundings | None = None,
 ) -> PointFit:
@@ -138,8 +138,7 @@ def most_likely(
         pixels: (..., 2 C, N): u, v of the first camera, u, v of the second, ...
         usable: (..., N); what is not gets a harmless answer.
         weight: (..., 2 C, 2 C, N) inverse covariance of the pixels; None: independent with a variance of one.
-        by_camera: also form derivatives by the cameras' own parameters (`projections[c].by_camera`), or by those of
-            each camera that are listed.
+        by_camera: also form derivatives by the cameras' own parameters (`projections[c].by_camera`).
         differentiated: let gradients flow to pixels, weights, cameras and poses.
         around: what there is besides pixels, if anything.
     """
@@ -147,8 +146,6 @@ def most_likely(
     sides = torch.stack([side.mT for side in side_axes(start[0].detach())], -3)
     lenses = [each.camera for each in cameras]
     wanted = tuple(tuple(range(lens.values.shape[-1])) if by_camera else () for lens in lenses)
-    if not isinstance(by_camera, bool):
-        wanted = tuple(by_camera)
     rotation = torch.stack([each.rotation for each in cameras])
     moves = [each.translation if each.translation.ndim > 1 else each.translation[:, None] for each in cameras]
     shift = torch.stack(moves, -3) / scale

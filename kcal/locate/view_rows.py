@@ -94,9 +94,8 @@ def known_views(posed: PosedCameras, common: CommonErrors | None) -> KnownViews:
     """Prepare cameras, and what is not known of them."""
     cameras, center = posed.cameras, posed.center
     count = len(cameras)
-    half, bending, lens = center.new_zeros(0, count, 6), center.new_zeros(0), tuple(() for _ in cameras)
-    if common is not None:
-        lens, half, bending = common
+    exact = CommonErrors(tuple(() for _ in cameras), center.new_zeros(0, count, 6), center.new_zeros(0))
+    lens, half, bending = exact if common is None else common
     half = torch.nn.functional.pad(half, (0, 0, 0, 0, 0, 1))
     bending = torch.cat([bending, bending.new_ones(1)])
     up = torch.zeros_like(center) if posed.up is None else (posed.rotation @ posed.up[..., None])[..., 0]

@@ -17,14 +17,7 @@ from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.locate.stations import MOUNTING_ERRORS, stations_at
 from kcal.pipeline.assignment import Candidates, assigned, within
-from kcal.pipeline.imm_filter import (
-    Beliefs,
-    Timing,
-    born,
-    cross_covariance,
-    no_beliefs,
-    predicted,
-)
+from kcal.pipeline.imm_filter import Beliefs, Timing, born, cross_covariance, no_beliefs, predicted
 from kcal.pipeline.measurements import Sightings, anchored
 from kcal.pipeline.motion import Motion, step_numbers, transition
 from kcal.pipeline.object_views import ObjectViews, mark_numbers
