@@ -45,7 +45,7 @@ class CameraStack(NamedTuple):
     ready: PreparedInverse | None
 
 
-def stacked(cameras: Sequence[Camera]) -> CameraStack:
+def camera_stack(cameras: Sequence[Camera]) -> CameraStack:
     """Put cameras together, once for many calls while they stay as they are."""
     if not stackable(cameras):
         return CameraStack(cameras, None, None)
@@ -65,7 +65,7 @@ def unproject_each(cameras: Sequence[Camera] | CameraStack, pixels: Tensor) -> t
         >>> rays[1].tolist(), valid.tolist()
         ([[0.0, 0.0, 1.0]], [[True], [True]])
     """
-    stack = cameras if isinstance(cameras, CameraStack) else stacked(cameras)
+    stack = cameras if isinstance(cameras, CameraStack) else camera_stack(cameras)
     if stack.values is None or stack.ready is None:
         found = [camera.unproject(pixels[..., number, :, :]) for number, camera in enumerate(stack.cameras)]
         return torch.stack([rays for rays, _ in found], -3), torch.stack([valid for _, valid in found], -2)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.lens.camera_stack import CameraStack, project_stack, stacked, unproject_each
+from kcal.lens.camera_stack import CameraStack, camera_stack, project_stack, unproject_each
 from kcal.lens.pose import side_axes
 from kcal.locate.angular import Found, baseline_axes, first_seen, meeting_points, triangulate_angular
 from kcal.locate.bent_light import LIGHT_HORIZON
@@ -109,7 +109,7 @@ def known_views(posed: PosedCameras, common: CommonErrors | None) -> KnownViews:
     wide = torch.tensor([[camera.model.wide] for camera in cameras], device=center.device)
     axes = baseline_axes(center[1] - center[0]) if count == 2 else None
     return KnownViews(
-        posed, stacked(cameras), middle, size, wide, up[..., None], posed.matrices, axes,
+        posed, camera_stack(cameras), middle, size, wide, up[..., None], posed.matrices, axes,
         torch.linalg.vector_norm(center[-1] - center[0]), moves, lens, half[..., 6:].movedim(0, 1),
     )  # fmt: skip
 
