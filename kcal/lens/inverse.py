@@ -98,8 +98,11 @@ def undistort_components(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """As `undistort`, for separate finite coordinates (..., N), of which only the `usable` ones count: x, y, valid."""
     with torch.no_grad():
-        solve = _solve_eagerly if may_branch(goal_x, coefficients, ready.start) else _solve_in_fixed_steps
-        x, y, valid = solve(goal_x, goal_y, coefficients, model, ready)
+        if model.size:
+            solve = _solve_eagerly if may_branch(goal_x, coefficients, ready.start) else _solve_in_fixed_steps
+            x, y, valid = solve(goal_x, goal_y, coefficients, model, ready)
+        else:
+            x, y, valid = goal_x, goal_y, in_region(goal_x, goal_y, coefficients, model, ready.region)
         valid = valid & usable
         all_valid = known_true(valid)
         if not all_valid:

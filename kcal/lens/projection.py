@@ -96,8 +96,8 @@ def project_components(
     pixels = torch.stack(to_pixels(lens.x, lens.y, parameters), -2)
     if not model.wide:
         regular = regular & (Z > 0)
+    empty = pixels.new_zeros((*pixels.shape[:-2], 0, *pixels.shape[-2:]))
     if wanted is None:
-        empty = pixels.new_zeros((*pixels.shape[:-2], 0, *pixels.shape[-2:]))
         return Projection(pixels, empty, empty, regular)
 
     a, b, d, e = lens.point
@@ -118,6 +118,8 @@ def project_components(
         by_meter = -by_depth * pupil.by_meter(parameters[..., offset:])[..., None, :]
         moved = torch.stack(torch.broadcast_tensors(*pupil.by_point(X, Y, Z)), -2)[..., None, :]
         by_point = by_point - by_depth[..., None, :, :] * moved
+    if not wanted:
+        return Projection(pixels, by_point, empty, regular, by_meter)
 
     zero, one = torch.zeros_like(lens.x), torch.ones_like(lens.x)
     intrinsic = [(lens.x, zero), (zero, lens.y), (one, zero), (zero, one), (lens.y, zero)]

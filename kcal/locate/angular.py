@@ -62,22 +62,29 @@ def triangulate_pairs(rays_left: Tensor, rays_right: Tensor, right_from_left: tu
     rotation, translation = right_from_left
     baseline = -translation @ rotation
     length = torch.linalg.vector_norm(baseline)
-    axes = _axes(baseline / length)
+    axes = baseline_axes(baseline)
     axes_right = rotation @ axes
     whole = is_traced() or is_differentiated(rays_left, rays_right, rotation, translation)
     if whole or rays_left.shape[-2] <= CHUNK:
-        return _meeting_points(rays_left, rays_right, axes, axes_right, length)
+        return meeting_points(rays_left @ axes, rays_right @ axes_right, axes, length)
     pieces = zip(rays_left.split(CHUNK, -2), rays_right.split(CHUNK, -2), strict=True)
     points, valid = zip(
-        *(_meeting_points(left, right, axes, axes_right, length) for left, right in pieces), strict=True
+        *(meeting_points(left @ axes, right @ axes_right, axes, length) for left, right in pieces), strict=True
     )
     return Found(torch.cat(points, -2), torch.cat(valid, -1))
 
 
-def _meeting_points(rays_left: Tensor, rays_right: Tensor, axes: Tensor, axes_right: Tensor, length: Tensor) -> Found:
-    # Along the baseline, and two components around it.
-    x0, p0, q0 = (rays_left @ axes).unbind(-1)
-    x1, p1, q1 = (rays_right @ axes_right).unbind(-1)
+def meeting_points(left: Tensor, right: Tensor, axes: Tensor, length: Tensor) -> Found:
+    """As `triangulate_pairs`, of rays (..., N, 3) in axes along the baseline and across it.
+
+    Args:
+        left: of the left camera.
+        right: of the right one.
+        axes: (3, 3) columns: the axes in the frame of the result.
+        length: of the baseline, meters.
+    """
+    x0, p0, q0 = left.unbind(-1)
+    x1, p1, q1 = right.unbind(-1)
     squared0, squared1 = torch.addcmul(p0 * p0, q0, q0), torch.addcmul(p1 * p1, q1, q1)
     norm0, norm1 = torch.addcmul(squared0, x0, x0), torch.addcmul(squared1, x1, x1)
     with torch.no_grad():
@@ -108,8 +115,9 @@ def _meeting_points(rays_left: Tensor, rays_right: Tensor, axes: Tensor, axes_ri
     return Found(points, valid)
 
 
-def _axes(axis: Tensor) -> Tensor:
-    """(3, 3) rotation whose first column is `axis`."""
+def baseline_axes(baseline: Tensor) -> Tensor:
+    """(3, 3) rotation whose first column is along a baseline."""
+    axis = baseline / torch.linalg.vector_norm(baseline)
     other = torch.where(axis[1].abs() < 0.9, axis.new_tensor([0.0, 1.0, 0.0]), axis.new_tensor([1.0, 0.0, 0.0]))
     second = torch.linalg.cross(axis, other)
     second = second / torch.linalg.vector_norm(second)

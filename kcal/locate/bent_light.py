@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 # Meters: light from beyond is bent as if it came from there; nothing on the Earth is seen so far.
-_HORIZON = 5e5
+LIGHT_HORIZON = 5e5
 
 
 class Surroundings(NamedTuple):
@@ -29,7 +29,7 @@ class Surroundings(NamedTuple):
 
 def length_of_one(scale: Tensor, inverse: Tensor) -> Tensor:
     """Meters of one in the units of ρ-scaled points, at most as far as anything on the Earth is seen."""
-    return scale / torch.maximum(inverse.abs(), scale / _HORIZON)
+    return scale / torch.maximum(inverse.abs(), scale / LIGHT_HORIZON)
 
 
 def lifted(seen: Tensor, around: Surroundings, unit: Tensor | float) -> Tensor:

@@ -125,10 +125,9 @@ def most_likely(
     usable: Tensor,
     weight: Tensor | None = None,
     *,
-    by_camera: bool | Sequence[tuple[int, ...]] = False,
+    by_camera: bool = False,
     differentiated: bool = False,
     around: Surroundings | None = None,
-    refined: bool = True,
 ) -> PointFit:
     """Minimize the weighted squares of the reprojection errors, each point on its own.
 
@@ -139,18 +138,14 @@ def most_likely(
         pixels: (..., 2 C, N): u, v of the first camera, u, v of the second, ...
         usable: (..., N); what is not gets a harmless answer.
         weight: (..., 2 C, 2 C, N) inverse covariance of the pixels; None: independent with a variance of one.
-        by_camera: also form derivatives by the cameras' own parameters (`projections[c].by_camera`), or by those of
-            each camera that are listed.
+        by_camera: also form derivatives by the cameras' own parameters (`projections[c].by_camera`).
         differentiated: let gradients flow to pixels, weights, cameras and poses.
         around: what there is besides pixels, if anything.
-        refined: whether to go to the optimum; else all is told at the start, its residual included.
     """
     base = start[0].detach().mT
     sides = torch.stack([side.mT for side in side_axes(start[0].detach())], -3)
     lenses = [each.camera for each in cameras]
     wanted = tuple(tuple(range(lens.values.shape[-1])) if by_camera else () for lens in lenses)
-    if not isinstance(by_camera, bool):
-        wanted = tuple(by_camera)
     rotation = torch.stack([each.rotation for each in cameras])
     moves = [each.translation if each.translation.ndim > 1 else each.translation[:, None] for each in cameras]
     shift = torch.stack(moves, -3) / scale
@@ -168,9 +163,6 @@ def most_likely(
     zero = torch.zeros_like(start[1])
     with torch.no_grad():
         theta = torch.stack([zero, zero, first], -2)
-        if not refined:
-            at = _evaluate(whole, theta)
-            return _fit_at(at, theta, sides, _covariance_at(at, fixed))
         best, step, cost = theta, torch.zeros_like(theta), torch.full_like(zero, torch.inf)
         length, noise = torch.full_like(zero, torch.inf), _least_noise(weight)
         for number in range(_TRACED_STEPS if is_traced() else _MOST_STEPS):

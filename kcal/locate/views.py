@@ -17,7 +17,6 @@ from torch import Tensor
 from kcal.lens.camera import Camera
 from kcal.lens.camera_stack import project_each, unproject_each
 from kcal.lens.pose import side_axes, step_rows
-from kcal.lens.projection import Projection
 from kcal.locate.angular import Found, first_seen, triangulate_angular
 from kcal.locate.bent_light import Surroundings, length_of_one, lifted
 from kcal.locate.max_likelihood import (
@@ -191,7 +190,6 @@ def fit_views(
     shared: CommonErrors | None = None,
     height: Callable[[Tensor, Tensor, Tensor, Tensor], StatedHeight] | None = None,
     differentiated: bool = False,
-    rows_of: CommonErrors | None = None,
 ) -> ViewsFit:
     """The most likely point of each row of views: in closed form first, then by `most_likely`.
 
@@ -200,25 +198,19 @@ def fit_views(
         pixels: (N, C, 2) float64; what is not finite was not seen.
         seen: (N, C) bool; what is False is neither read nor differentiated.
         noise: standard deviation of a pixel along each axis where there is no covariance, px.
-        cov: (N, C, 2, 2) covariance of each pixel, or (N, 2 C, 2 C) of all of a row.
+        cov: (N, C, 2, 2) covariance of each pixel.
         shared: what marks of a camera have in common.
         height: of places, rays, anchors, and which points one camera alone saw: where their height is known.
         differentiated: see `most_likely`.
-        rows_of: where it is given, points stay as the closed form has them, with derivatives by these errors' cameras:
-            what a filter needs, which is linear in the residuals.
     """
     finite = torch.isfinite(pixels).all(-1)
     wanted = seen & finite
     middle = torch.stack([camera.center.detach() for camera in posed.cameras])
     pixels = torch.where(wanted[..., None], pixels, middle)
-    sound = wanted if cov is None else _sound_covariances(cov)
+    sound = wanted if cov is None else sound_covariances(cov)
     if cov is not None:
-        still = torch.eye(cov.shape[-1], dtype=cov.dtype, device=cov.device)
-        good = (sound & wanted)[..., None, None]
-        if cov.ndim == 3:
-            good = (sound & wanted).repeat_interleave(2, -1)
-            good = good[..., :, None] & good[..., None, :]
-        cov = torch.where(good, cov, still)
+        still = torch.eye(2, dtype=cov.dtype, device=cov.device)
+        cov = torch.where((sound & wanted)[..., None, None], cov, still)
     center = posed.center
     # Weights follow the place where a point is sought first, and derivatives follow them.
     with torch.set_grad_enabled(differentiated and shared is not None):
@@ -271,17 +263,15 @@ def fit_views(
     ]
     fit = most_likely(
         lines, scale, (ahead, inverse), pixels.flatten(-2).mT, fitted, weight, differentiated=differentiated,
-        around=around, by_camera=False if rows_of is None else rows_of.lens, refined=rows_of is None,
+        around=around,
     )  # fmt: skip
     fit = fit._replace(direction=posed.rotation[0].mT @ fit.turned[0])
     return ViewsFit(fit, scale, anchor, place.detach(), in_frame.detach(), used, code, fitted, weight, variance)
 
 
-def _sound_covariances(cov: Tensor) -> Tensor:
-    """(N, C) which covariances (N, C, 2, 2), or blocks of (N, 2 C, 2 C), are those of a pixel."""
+def sound_covariances(cov: Tensor) -> Tensor:
+    """(N, C) which covariances (N, C, 2, 2) are those of a pixel."""
     with torch.no_grad():
-        if cov.ndim == 3:
-            cov = torch.stack([cov[:, i : i + 2, i : i + 2] for i in range(0, cov.shape[-1], 2)], 1)
         a, b, c, d = cov.flatten(-2).unbind(-1)
         largest = torch.maximum(a.abs(), d.abs())
         return torch.isfinite(a + b + c + d) & (a > 0) & (a * d > b * c) & ((b - c).abs() <= 1e-6 * largest)
@@ -301,12 +291,8 @@ def shared_pixels(
     at: tuple[Tensor, Tensor, Tensor],
     used: Tensor,
     scale: Tensor,
-    projections: Sequence[Projection] | None = None,
 ) -> Tensor:
-    """(K, 2 C, N) what each shared error moves in the pixels of points: anchor (N, 3), direction, inverse distance.
-
-    `projections` are those of the points there, if they are known.
-    """
+    """(K, 2 C, N) what each shared error moves in the pixels of points: anchor (N, 3), direction, inverse distance."""
     place, ahead, inverse = at
     line = ahead[..., None, :] + (inverse / scale)[..., None, None] * (place[..., None, :] - posed.center)
     seen = (posed.rotation @ line[..., None])[..., 0].movedim(-3, -1)  # (C, 3, N)
@@ -317,9 +303,7 @@ def shared_pixels(
         higher = lifted(seen, around._replace(bending=1.0), unit)
         seen = seen + around.bending * higher
     moved = []
-    if projections is None:
-        projections = project_each(posed.cameras, seen, shared.lens, inverse / scale)
-    for c, found in enumerate(projections):
+    for c, found in enumerate(project_each(posed.cameras, seen, shared.lens, inverse / scale)):
         turn = posed.rotation[c]
         turned = step_rows(found.by_point, seen[c])[:3]
         by_center = torch.einsum("ij,iun->jun", -turn, found.by_point) * (inverse / scale)
@@ -335,16 +319,11 @@ def shared_pixels(
 
 def _weight(cov: Tensor | None, noise: float, used: Tensor, moved: Tensor | None) -> Tensor:
     """(2 C, 2 C, N) inverse covariance of the pixels of used views; the identity for the others."""
-    if cov is not None and cov.ndim == 3:
-        both = used.repeat_interleave(2, -1)
-        still = torch.eye(cov.shape[-1], dtype=torch.float64, device=used.device)
-        whole = torch.where(both[:, :, None] & both[:, None, :], cov, still)
-    else:
-        still = torch.eye(2, dtype=torch.float64, device=used.device)
-        own = noise**2 * still if cov is None else cov
-        own = torch.where(used[..., None, None], own, still)  # (N, C, 2, 2)
-        among = torch.eye(used.shape[-1], dtype=torch.float64, device=used.device)
-        whole = (own[..., :, :, None, :] * among[:, None, :, None]).flatten(-2).flatten(-3, -2)
+    still = torch.eye(2, dtype=torch.float64, device=used.device)
+    own = noise**2 * still if cov is None else cov
+    own = torch.where(used[..., None, None], own, still)  # (N, C, 2, 2)
+    among = torch.eye(used.shape[-1], dtype=torch.float64, device=used.device)
+    whole = (own[..., :, :, None, :] * among[:, None, :, None]).flatten(-2).flatten(-3, -2)
     if moved is not None:
         each = moved.movedim(-1, 0)  # (N, K, 2 C)
         whole = whole + each.mT @ each

@@ -36,7 +36,7 @@ class Scores(NamedTuple):
 
     def at(self, which: Tensor) -> Self:
         """The matches at some places."""
-        return type(self)(self.seen.at(which), *(value[..., which] for value in self[1:]))
+        return type(self)(self.seen.at(which), *(value.index_select(-1, which) for value in self[1:]))
 
 
 class SeenFrom(NamedTuple):
@@ -104,9 +104,7 @@ def looks_of(beliefs: Beliefs, frame: Tensor, home: Tensor, cameras: SeenFrom, r
     if cameras.turned is not None:
         # A camera that is turned sees sightings and tracks turned alike: only what differs counts.
         turn = cameras.turned[..., None]  # (3, K, V, 1)
-        turned = torch.linalg.cross(
-            turn.expand(-1, -1, -1, length.shape[1]), unit[:, None].expand_as(turn * unit[:, None]), dim=0
-        )
+        turned = torch.linalg.cross(turn, unit[:, None], dim=0)
         rest = moved.shape[1] - turn.shape[1]
         moved = moved - torch.nn.functional.pad(turned, (0, 0, 0, 0, 0, rest))
     spread = random + rooted(moved, root).square().sum((0, 1))
@@ -124,7 +122,7 @@ def nearby(looks: Looks, seen: Sightings, timing: Timing, gate: Tensor) -> Tenso
         gate: largest squared Mahalanobis distance.
     """
     other = seen.direction / seen.direction.square().sum(0).sqrt()
-    ray, spread, pace = (value[..., seen.anchor, :] for value in looks)  # (3, N, T), (N, T), (N, T)
+    ray, spread, pace = (value.index_select(-2, seen.anchor) for value in looks)  # (3, N, T), (N, T), (N, T)
     apart = (ray - other[..., None]).square().sum(0)
     late = timing.delay.abs().amax(0)
     if len(timing.unsure):

@@ -13,7 +13,7 @@ from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.locate.ranges import BEARING_SIGMAS, range_interval
 from kcal.locate.stereo import PositionStatus, flag_positions
 from kcal.pipeline.imm_filter import Summary
-from kcal.pipeline.small_matrices import congruent, product, rooted, squared
+from kcal.pipeline.small_matrices import product, rooted, squared
 
 
 class TrackStates(NamedTuple):
@@ -87,7 +87,8 @@ def track_states(
     none = torch.zeros_like(axes)
     by_place = torch.cat([axes[:, :2], -straight[:, None], none], 1)
     by_state = torch.cat([by_place, torch.cat([none[:, :2], -velocity[:, None], axes], 1)]) * depth
-    random, systematic = congruent(by_state, noise), squared(product(by_state, spread))
+    carried = product(by_state, torch.cat([noise, spread], 1))
+    random, systematic = product(carried[:, :6], by_state.transpose(0, 1)), squared(carried[:, 6:])
     enu = localize.rig.center[home] + straight.T
     whole, systematic = (value.movedim(-1, 0) for value in (random + systematic, systematic))
     nowhere = torch.diag(mean.new_full((3,), math.inf))

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from kcal.pipeline.measurements import Anchored
-from kcal.pipeline.motion import Transition, moved, rates
+from kcal.pipeline.motion import Transition, by_rates, moved, rates
 from kcal.pipeline.small_matrices import congruent, eliminate, mahalanobis, outer, product, rooted, solved, squared
 
 
@@ -63,7 +63,7 @@ class Beliefs(NamedTuple):
 
     def at(self, which: Tensor) -> Self:
         """The tracks at some places."""
-        return type(self)(*(value[..., which] for value in self))
+        return type(self)(*(value.index_select(-1, which) for value in self))
 
     @property
     def middle(self) -> Tensor:
@@ -107,7 +107,7 @@ def no_beliefs(errors: int, clock_errors: int, models: int, device: torch.device
 
 def _effect(shared: Tensor, late: Tensor, pace: Tensor) -> Tensor:
     """(R, K + Q, ...) of effects (R, K, ...) and (R, Q, 3, ...), the latter with a velocity (3, ...)."""
-    return torch.cat([shared, (late * pace).sum(2)], 1)
+    return torch.cat([shared, (late * pace).sum(2)], 1) if late.shape[1] else shared
 
 
 def _with_noise(columns: Tensor, noise: Tensor) -> Tensor:
@@ -118,16 +118,19 @@ def _with_noise(columns: Tensor, noise: Tensor) -> Tensor:
 def predicted(beliefs: Beliefs, step: Transition, turn: Tensor | None = None, shift: Tensor | None = None) -> Beliefs:
     """Move all by a step; see `moved`."""
     found = moved(beliefs.mean, step, turn, shift)
-    width = beliefs.columns.shape[1]
-    columns = found.through(torch.cat([beliefs.columns, beliefs.late.flatten(1, 2)], 1))
+    exact, columns, width = not beliefs.late.shape[1], beliefs.columns, beliefs.columns.shape[1]
+    columns = found.through(columns if exact else torch.cat([columns, beliefs.late.flatten(1, 2)], 1))
     noise = found.through(columns[:, :6].transpose(0, 1)) + found.noise
+    both = torch.cat([noise, columns[:, 6:width]], 1)
+    if exact:
+        return Beliefs(found.state, both, beliefs.late, beliefs.weight)
     # Velocities of earlier moments are today's, turned back; a memory that fades would let them grow without end. The
     # velocity in the state is divided by z, and z has changed by `ahead`.
     keep = step.keep if turn is None else product(turn[:, :, None], step.keep)
     back = keep.transpose(0, 1) * (found.ahead / step.left)
     late = columns[:, width:].unflatten(1, beliefs.late.shape[1:3])
     late = (late[:, :, :, None] * back).sum(2)
-    return Beliefs(found.state, torch.cat([noise, columns[:, 6:width]], 1), late, beliefs.weight)
+    return Beliefs(found.state, both, late, beliefs.weight)
 
 
 def cross_covariance(before: Beliefs, after: Beliefs, step: Transition, turn: Tensor | None = None) -> Tensor:
@@ -153,7 +156,7 @@ class Timing(NamedTuple):
 
     def at(self, which: Tensor) -> Self:
         """The sightings at some places."""
-        return type(self)(*(value[..., which] for value in self))
+        return type(self)(*(value.index_select(-1, which) for value in self))
 
 
 class Innovations(NamedTuple):
@@ -188,16 +191,15 @@ def innovations(beliefs: Beliefs, seen: Anchored, timing: Timing) -> Innovations
         seen: N sightings in the tracks' frames.
         timing: of the sightings.
     """
-    rate, by_state = rates(beliefs.mean)
     by_place = seen.late.sum(0)[:, :, None]  # (M, 3, 1, N)
     moving = (seen.late * timing.delay[:, None, None]).sum(0)[:, :, None]
-    slope = torch.nn.functional.pad(by_place, (0, 0, 0, 0, 0, 3)) + product(moving, by_state)
+    slope = by_rates(moving, beliefs.mean) + torch.nn.functional.pad(by_place, (0, 0, 0, 0, 0, 3))
     apart = seen.place[:, None] - beliefs.mean[:3]
-    value = seen.value[:, None] + (by_place * apart).sum(1) - (moving * rate).sum(1)
+    value = seen.value[:, None] + (by_place * apart).sum(1) - (moving * rates(beliefs.mean)).sum(1)
     marks = torch.eye(len(value), dtype=value.dtype, device=value.device)[..., None, None]
     late, own = [], seen.late[1:, :, :, None]
     for which in range(len(timing.clock)):
-        by_camera = product(own[which], by_state)
+        by_camera = by_rates(own[which], beliefs.mean)
         late.append(by_camera[:, None, 3:] * timing.clock[which, :, None, None])
         # The product of two unknowns, a rate and a delay, is noise of second order.
         marks = marks + congruent(timing.unsure[which] * by_camera, beliefs.noise)
@@ -220,26 +222,39 @@ class Fit(NamedTuple):
     log_density: Tensor
 
 
+def _whole(found: Innovations, root: Tensor | None) -> Tensor:
+    """(M, M, J, N) covariance of innovations, with all errors."""
+    return found.noise + squared(rooted(found.effect, root))
+
+
 def fit_of(found: Innovations, root: Tensor | None) -> Fit:
     """Judge innovations with all errors: the covariance of b is root rootᵀ, or the identity."""
-    covariance = found.noise + squared(rooted(found.effect, root))
-    distance, volume = mahalanobis(covariance, found.value)
+    distance, volume = mahalanobis(_whole(found, root), found.value)
     return Fit(distance, -0.5 * (distance + volume))
 
 
-def updated(beliefs: Beliefs, found: Innovations, fit: Fit) -> Beliefs:
-    """Take sightings in, one for each track; the gain follows the noise alone."""
-    gain = solved(eliminate(found.noise, found.crossed)).transpose(0, 1)
+def updated(beliefs: Beliefs, found: Innovations, root: Tensor | None) -> Beliefs:
+    """Take sightings in, one for each track: the gain follows the noise alone, and models are judged as in `fit_of`."""
+    models, still = len(beliefs.weight), torch.eye(len(found.value)).to(found.value)[..., None, None]
+    columns = torch.cat([found.crossed, found.value[:, None], still.expand_as(found.noise)], 1)
+    # Both at once: of the noise alone, and of all.
+    done = eliminate(torch.cat([found.noise, _whole(found, root)], 2), columns.repeat(1, 1, 2, 1))
+    white = done.columns / done.pivots[:, None]
+    gain = product(white[:, :6, :models].transpose(0, 1), done.columns[:, 7:, :models])
+    pivots = done.pivots[:, models:]
+    distance = (done.columns[:, 6, models:] * white[:, 6, models:]).sum(0)
     mean = beliefs.mean + (gain * found.value).sum(1)
     rest = torch.eye(6, dtype=mean.dtype, device=mean.device)[..., None, None] - product(gain, found.slope)
     columns = product(rest, beliefs.columns)
     # Joseph's form: symmetric and positive whatever the rounding.
     noise = product(columns[:, :6], rest.transpose(0, 1)) + congruent(gain, found.marks)
     columns = torch.cat([noise, columns[:, 6:] - product(gain, found.shared)], 1)
-    late = product(rest, beliefs.late.flatten(1, 2)) - product(gain, found.late.flatten(1, 2))
-    log = beliefs.weight.log() + fit.log_density
-    weight = torch.softmax(log, 0).clamp_min(1e-12)
-    return Beliefs(mean, columns, late.unflatten(1, beliefs.late.shape[1:3]), weight)
+    late = beliefs.late
+    if late.shape[1]:
+        moved = product(rest, late.flatten(1, 2)) - product(gain, found.late.flatten(1, 2))
+        late = moved.unflatten(1, late.shape[1:3])
+    log = beliefs.weight.log() - 0.5 * (distance + pivots.log().sum(0))
+    return Beliefs(mean, columns, late, torch.softmax(log, 0).clamp_min(1e-12))
 
 
 def born(seen: Anchored, timing: Timing, speed: float, models: int) -> Beliefs:
@@ -251,19 +266,18 @@ def born(seen: Anchored, timing: Timing, speed: float, models: int) -> Beliefs:
     gain = product(spread, slope.transpose(0, 1))  # (3, M, N)
     place = seen.place + (gain * seen.value).sum(1)
     state = torch.cat([place, torch.zeros_like(place)])
-    by_pace = rates(state)[1][:, 3:]
-    late = product(product(gain, (seen.late * timing.delay[:, None, None]).sum(0)), by_pace)
+    late = by_rates(product(gain, (seen.late * timing.delay[:, None, None]).sum(0)), state)[:, 3:]
     # The range is hardly known at first, but a speed per meter of range must not vanish.
     drift = speed**2 * (place[2].square() + spread[2, 2])
     here, by_clock = spread + drift * squared(late), []
     for which in range(len(timing.clock)):
-        by_camera = product(product(gain, seen.late[1 + which]), by_pace)
+        by_camera = by_rates(product(gain, seen.late[1 + which]), state)[:, 3:]
         here = here + drift * timing.unsure[which].square() * squared(by_camera)
         by_clock.append(by_camera[:, None] * timing.clock[which, :, None])
     pace, both = still * drift, -drift * late
     noise = torch.cat([torch.cat([here, both], 1), torch.cat([both.transpose(0, 1), pace], 1)])
     shared = torch.nn.functional.pad(product(gain, seen.shared), (0, 0, 0, 0, 0, 3))
-    clocks = torch.cat(by_clock, 1) if by_clock else state.new_zeros(3, 0, *by_pace.shape[1:])
+    clocks = torch.cat(by_clock, 1) if by_clock else state.new_zeros(3, 0, *late.shape[1:])
     clocks = torch.nn.functional.pad(-clocks, (0, 0, 0, 0, 0, 0, 0, 3))
     columns = torch.cat([noise, -shared], 1)
     state, columns, clocks = (value[..., None, :].repeat_interleave(models, -2) for value in (state, columns, clocks))

@@ -1,6 +1,6 @@
 """Turn pixels of one moment into what a filter measures: rows of unit noise, with every error's effect on them.
 
-Where the lines of sight of the cameras that saw an object meet (`kcal.locate.views`) is told by three numbers: two
+Where the lines of sight of the cameras that saw an object meet (`kcal.locate.view_rows`) is told by three numbers: two
 across the line of sight of the first of them, and the inverse range from it. The pixels are nearly linear in them at
 any range. They are rows, whitened, so that those of cameras that saw nothing are zeros beside a noise of one and change
 nothing. One camera alone gives two rows: its inverse range is then that of the track.
@@ -13,14 +13,9 @@ from typing import NamedTuple, Self
 import torch
 from torch import Tensor
 
-from kcal.lens.dispatch import known_true
 from kcal.locate.multi_localizer import MultiViewLocalizer, common_errors, posed_cameras
-from kcal.locate.stereo import PositionStatus
-from kcal.locate.views import CommonErrors, StatedHeight, fit_views, shared_pixels
+from kcal.locate.view_rows import ALONE_M, KnownViews, known_views, view_rows
 from kcal.pipeline.small_matrices import outer, product
-
-# Meters at which a bearing of one camera is taken at first; what light bends elsewhere follows from it.
-_ALONE_M = 20_000.0
 
 
 class Sightings(NamedTuple):
@@ -63,28 +58,27 @@ class Sightings(NamedTuple):
 
     def at(self, which: Tensor) -> Self:
         """The sightings at some places."""
-        return type(self)(*(value[..., which] for value in self))
+        return type(self)(*(value.index_select(-1, which) for value in self))
 
 
-def _far_away(place: Tensor, ray: Tensor, _: Tensor, alone: Tensor) -> StatedHeight:
-    """What holds one camera's point at `_ALONE_M`."""
-    ones = torch.ones_like(ray[:, 0])
-    return StatedHeight(place + _ALONE_M * ray, ray, ones, ones.to(torch.bool))
+def known_sightings(localize: MultiViewLocalizer) -> KnownViews:
+    """What `sightings` needs of a rig; the calibration's errors are those that `localize` includes."""
+    return known_views(posed_cameras(localize), common_errors(localize))
 
 
 @torch.no_grad()
 def sightings(
-    localize: MultiViewLocalizer,
+    known: KnownViews,
     pixels: Tensor,
     seen: Tensor,
     covariance: Tensor,
     time: Tensor,
     lasting_px: float = 0.0,
 ) -> Sightings:
-    """Measure objects of one moment; the calibration's errors are those that `localize` includes.
+    """Measure objects of one moment.
 
     Args:
-        localize: the rig and how well it is known.
+        known: from `known_sightings`.
         pixels: (N, V, 2), and what follows: as in `ObjectViews`.
         seen: (N, V) bool.
         covariance: (N, 2 V, 2 V).
@@ -92,58 +86,33 @@ def sightings(
         lasting_px: standard deviation along each axis of errors that stay as long as a target, in the marks of all
             cameras but the first.
     """
-    rig, posed, cameras = localize.rig, posed_cameras(localize), len(localize.rig)
-    none = rig.center.new_zeros(0)
-    exact = CommonErrors(tuple(() for _ in rig.names), none.reshape(0, cameras, 6), none)
-    common = common_errors(localize) or exact
-    found = fit_views(posed, pixels, seen, noise=1.0, cov=covariance, height=_far_away, rows_of=common)
-    fit, scale, used, weight = found.fit, found.scale, found.used, found.weight
-    assert weight is not None
-    white = torch.linalg.cholesky(weight.movedim(-1, 0)).movedim(0, -1).transpose(0, 1)
-    meters = torch.stack([torch.ones_like(scale), torch.ones_like(scale), scale])[:, None]
-    rows = (fit.jacobian * meters[..., None]).transpose(0, 1)  # (2 V, 3, N)
-    each = white.unflatten(1, (cameras, 2)).movedim(1, 0)  # (V, M, 2, N)
-    late = (each[:, :, :, None] * rows.unflatten(0, (cameras, 2))[:, None]).sum(2)
-    alone = found.fitted & (used.sum(-1) == 1)
-    shared, bent = white[:, :0], torch.zeros_like(fit.residual)
-    at = (found.place, fit.direction.T, fit.inverse)
-    if len(common.half):
-        moved = shared_pixels(posed, common, at, used, scale, fit.projections)
-        shared = -product(white, moved.transpose(0, 1))
-    if posed.up is not None and not known_true(~alone):
-        moved = shared_pixels(
-            posed,
-            CommonErrors(exact.lens, none.new_zeros(1, cameras, 6), none.new_ones(1)),
-            at,
-            used,
-            scale,
-            fit.projections,
-        )
-        bent = torch.where(alone, product(white, moved.transpose(0, 1))[:, 0] / _ALONE_M, 0.0)
+    rows = view_rows(known, pixels, seen, covariance)
+    white, used, cameras = rows.white, rows.used, len(rows.used)
+    each = white.unflatten(1, (cameras, 2)).transpose(0, 1)  # (V, M, 2, N)
+    late = (each[:, :, :, None] * rows.jacobian.unflatten(0, (cameras, 2))[:, None]).sum(2)
+    # Of the common errors, of the residual, and of what light bends.
+    changes = torch.cat([rows.shared, rows.residual[:, None]], 1)
+    shared, more, value = (-product(white, changes)).split([changes.shape[1] - 2, 1, 1], 1)
     if lasting_px:
         shared = torch.cat([shared, lasting_px * white[:, 2:]], 1)
-    inverse = fit.inverse / scale
-    first, second = fit.sides.unbind(0)
-    a, b = (first * fit.direction).sum(0), (second * fit.direction).sum(0)
-    base = fit.direction - a * first - b * second
-    anchor = found.anchor.to(torch.int64).argmax(-1)
-    time = torch.where(used, time, time.gather(1, anchor[:, None]))
-    heights = rig.center.new_tensor([camera.size[1] for camera in rig.each])
+    first, second = rows.sides
+    clock = time.T
+    row = pixels[..., 1].T / known.size[:, 1:] - 0.5
     return Sightings(
-        anchor=anchor,
-        place=found.place.T,
-        direction=fit.direction,
-        inverse=inverse,
-        by_ray=torch.stack([first - a * base, second - b * base, -inverse * base]),
-        value=-(white * fit.residual).sum(1),
+        anchor=rows.anchor,
+        place=rows.place,
+        direction=rows.direction,
+        inverse=rows.inverse,
+        by_ray=torch.stack([first, second, -rows.inverse * rows.direction]),
+        value=value[:, 0],
         late=late,
         shared=shared,
-        bent=bent,
-        time=time.T,
-        row=torch.where(used, pixels[..., 1] / heights - 0.5, 0.0).T,
-        seen=used.T,
-        alone=alone,
-        usable=found.fitted & (found.status == int(PositionStatus.OK)),
+        bent=torch.where(rows.alone, more[:, 0] / -ALONE_M, 0.0),
+        time=torch.where(used, clock, clock.gather(0, rows.anchor[None])),
+        row=torch.where(used, row, 0.0),
+        seen=used,
+        alone=rows.alone,
+        usable=rows.fitted,
     )
 
 
@@ -166,7 +135,7 @@ class Anchored(NamedTuple):
 
     def at(self, which: Tensor) -> Self:
         """The sightings at some places."""
-        return type(self)(*(value[..., which] for value in self))
+        return type(self)(*(value.index_select(-1, which) for value in self))
 
 
 def anchored(
@@ -196,7 +165,7 @@ def anchored(
         there = torch.where(along > 0, predicted[2] / along.clamp_min(1e-12), 0.0).clamp_min(2e-6)
         inverse = torch.where(seen.alone, there, inverse)
         # Light bends more on a longer way.
-        more = seen.bent * (torch.where(seen.alone, 1.0 / inverse, _ALONE_M) - _ALONE_M)
+        more = seen.bent * (torch.where(seen.alone, 1.0 / inverse, ALONE_M) - ALONE_M)
         value = value - k * more
         if bending is not None:
             rest = len(shared[0]) - len(bending)

@@ -174,23 +174,30 @@ def moved(state: Tensor, step: Transition, turn: Tensor | None = None, shift: Te
     return Moved(new, ray[2], (state[2] / ray[2]).square() * _step_noise(new, step.noise), by_pace, rotation, origin)
 
 
+# What noise of position, of both together and of velocity adds to the 36 entries, where nothing depends on the state;
+# and the last of six numbers.
+_BASIS = torch.zeros(6, 6, 3, dtype=torch.float64)
+_BASIS[:2, :2, 0] = _BASIS[:2, 3:5, 1] = _BASIS[3:5, :2, 1] = torch.eye(2)
+_BASIS[3:, 3:, 2] = torch.eye(3)
+_BASIS = _BASIS.flatten(0, 1)
+_LAST = torch.eye(6, dtype=torch.float64)[5, :, None, None]
+
+
 def _step_noise(new: Tensor, noise: Tensor) -> Tensor:
     """Isotropic noise of position and velocity in the new state's numbers, where 1 / z is one: (6, 6, J, T)."""
-    # Slopes are [E - n e3ᵀ, e3 I] with E of the first two directions: what does not depend on n, and what does.
-    basis = torch.zeros(3, 6, 6, dtype=new.dtype, device=new.device)
-    basis[0, :2, :2] = basis[1, :2, 3:5] = basis[1, 3:5, :2] = torch.eye(2)
-    basis[2, 3:, 3:] = torch.eye(3)
-    fixed = (basis[..., None, None] * noise[:, None, None]).sum(0)
-    last = torch.eye(6, dtype=new.dtype, device=new.device)[5, :, None, None]
-    half = outer(new, 0.5 * noise[0] * new - noise[1] * last)
+    fixed = (_BASIS.to(new) @ noise[..., 0]).unflatten(0, (6, 6))[..., None]
+    half = outer(new, 0.5 * noise[0] * new - noise[1] * _LAST.to(new))
     return fixed + half + half.transpose(0, 1)
 
 
-def rates(state: Tensor) -> tuple[Tensor, Tensor]:
-    """Rates (3, ...) of the first three numbers, and their derivatives (3, 6, ...) by the state (6, ...)."""
-    place, closing = state[:3], state[5]
+def rates(state: Tensor) -> Tensor:
+    """Rates (3, ...) of the first three numbers of a state (6, ...)."""
     across = torch.cat([state[3:5], torch.zeros_like(state[:1])])
-    still = torch.eye(3, dtype=state.dtype, device=state.device).reshape(3, 3, *[1] * closing.ndim)
-    by_place = (-closing * still).expand(3, 3, *closing.shape)
-    by_pace = torch.cat([still[:, :2].expand(3, 2, *closing.shape), -place[:, None]], 1)
-    return across - place * closing, torch.cat([by_place, by_pace], 1)
+    return across - state[:3] * state[5]
+
+
+def by_rates(rows: Tensor, state: Tensor) -> Tensor:
+    """Rows (R, 3, ...) times the derivatives of `rates` by the state: (R, 6, ...)."""
+    by_closing = (rows * state[:3]).sum(1, keepdim=True)
+    by_place = rows * state[5]
+    return torch.cat([-by_place, rows[:, :2].expand(-1, -1, *by_place.shape[2:]), -by_closing], 1)

@@ -105,7 +105,7 @@ def _some_costs(
     magnified = torch.stack([torch.linalg.vector_norm(p.by_point, dim=(-3, -2)) for p in fit.projections], 1)
     rays = found.rays[rows, at]
     parallax = torch.linalg.vector_norm(torch.linalg.cross(rays[:, 0], rays[:, 1]), dim=-1)
-    total = total + _size_cost(magnified[rows, at], boxes, options.box_sigma, parallax)
+    total = total + size_cost(magnified[rows, at], boxes, options.box_sigma, parallax)
     # On different sides of the line that joins the cameras, lines of sight meet nowhere: a false optimum.
     apart = localize.rig.center[cameras[:, 1]] - localize.rig.center[cameras[:, 0]]
     along = (rays * apart[:, None]).sum(-1).prod(-1)
@@ -114,7 +114,7 @@ def _some_costs(
     return PairCosts(torch.where(good, total, torch.inf), inverse, sigma)
 
 
-def _size_cost(magnified: Tensor, boxes: Tensor, box_sigma: float, parallax: Tensor) -> Tensor:
+def size_cost(magnified: Tensor, boxes: Tensor, box_sigma: float, parallax: Tensor) -> Tensor:
     """(L,) squared standard deviations between the sizes of boxes (L, 2, 4), given how much cameras magnify (L, 2).
 
     `parallax` (L,): sine of the angle between the lines of sight. From another side, an object may have another size.

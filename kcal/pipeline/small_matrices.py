@@ -20,12 +20,12 @@ def product(first: Tensor, second: Tensor) -> Tensor:
         >>> torch.allclose(product(first, second).movedim(-1, 0), first.movedim(-1, 0) @ second.movedim(-1, 0))
         True
     """
-    return (first[:, :, None] * second[None]).sum(1)
+    return (first[:, :, None] * second).sum(1)
 
 
 def outer(first: Tensor, second: Tensor) -> Tensor:
     """(R, C, ...) from vectors (R, ...) and (C, ...)."""
-    return first[:, None] * second[None]
+    return first[:, None] * second
 
 
 def congruent(slope: Tensor, covariance: Tensor) -> Tensor:
@@ -74,7 +74,8 @@ def eliminate(matrix: Tensor, columns: Tensor) -> Eliminated:
         pivots.append(row[step].clamp_min(1e-300))
         upper.append(row)
         if step < size - 1:
-            rest = rest[1:] - outer(rest[1:, step] / pivots[-1], row)
+            below = rest[1:]
+            rest = torch.addcmul(below, (below[:, step] / pivots[-1])[:, None], row, value=-1.0)
     whole = torch.stack(upper)
     return Eliminated(torch.stack(pivots), whole[:, :size], whole[:, size:])
 

@@ -13,11 +13,12 @@ import torch
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.locate.multi_localizer import MultiViewLocalizer, posed_cameras
+from kcal.lens.dispatch import known_true
+from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.pipeline.assignment import Looks, Scores, SeenFrom, looks_of, nearby
 from kcal.pipeline.estimates import TrackStates, track_states
 from kcal.pipeline.imm_filter import Beliefs, Timing, fit_of, innovations, predicted, updated
-from kcal.pipeline.measurements import Anchored, Sightings, anchored, sightings
+from kcal.pipeline.measurements import Anchored, Sightings, anchored, known_sightings, sightings
 from kcal.pipeline.motion import transition
 
 # What a match gains for each mark that it explains: half the squared distance at which marks are no more taken.
@@ -56,21 +57,22 @@ def moved_on(beliefs: Beliefs, up: Tensor, numbers: Tensor, stay: Tensor) -> Bel
 def taken_in(beliefs: Beliefs, seen: Anchored, timing: Timing, root: Tensor | None) -> Beliefs:
     """Beliefs with sightings, one for each track."""
     found = innovations(beliefs, seen, timing)
-    return updated(beliefs, found, fit_of(found, root))
+    return updated(beliefs, found, root)
 
 
 def track_steps(localize: MultiViewLocalizer, lasting_px: float) -> TrackSteps:
     """The steps as they are."""
     centers, errors, bending = localize.rig.center, localize.errors, localize.bending_errors
     turned = None if errors is None else errors[:, :, 3:6].movedim(-1, 0)
-    cameras, k = SeenFrom(centers, turned), posed_cameras(localize).bending
+    cameras, known = SeenFrom(centers, turned), known_sightings(localize)
+    k = known.posed.bending
 
     def measure(pixels: Tensor, seen: Tensor, covariance: Tensor, time: Tensor) -> Sightings:
-        return sightings(localize, pixels, seen, covariance, time, lasting_px)
+        return sightings(known, pixels, seen, covariance, time, lasting_px)
 
     def looked_at(beliefs: Beliefs, frame: Tensor, home: Tensor, root: Tensor | None) -> tuple[Beliefs, Looks]:
         merged = beliefs.merged()
-        return merged, looks_of(merged, frame, centers[home].T, cameras, root)
+        return merged, looks_of(merged, frame, centers.T.index_select(1, home), cameras, root)
 
     def scored(
         merged: Beliefs, frame: Tensor, home: Tensor, seen: Sightings, timing: Timing, root: Tensor | None,
@@ -78,9 +80,9 @@ def track_steps(localize: MultiViewLocalizer, lasting_px: float) -> TrackSteps:
     ) -> Scores:  # fmt: skip
         """Sightings (L,) against tracks (L,), whose beliefs are merged."""
         beliefs, local = merged.at(track), seen.at(which)
-        known = bending if errors is not None else None
-        origin = centers[home[track]].T
-        there = anchored(local, frame[..., track], origin, beliefs.mean[:3, 0], known, k)
+        origin = centers.T.index_select(1, home[track])
+        where = None if known_true(~local.alone) else beliefs.mean[:3, 0]
+        there = anchored(local, frame.index_select(-1, track), origin, where, bending, k)
         found = innovations(beliefs, there, timing.at(which))
         fit = fit_of(found, root)
         density = fit.log_density[0] + _EXPLAINED * local.seen.sum(0)
@@ -90,7 +92,7 @@ def track_steps(localize: MultiViewLocalizer, lasting_px: float) -> TrackSteps:
 
     def place(beliefs: Beliefs, frame: Tensor, home: Tensor, root: Tensor | None, which: Tensor) -> TrackStates:
         summary = beliefs.at(which).summary()
-        return track_states(localize, frame[..., which].movedim(-1, 0), home[which], summary, root)
+        return track_states(localize, frame.index_select(-1, which).movedim(-1, 0), home[which], summary, root)
 
     return TrackSteps(measure, moved_on, looked_at, nearby, scored, taken_in, place)
 

@@ -17,14 +17,7 @@ from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.locate.stations import MOUNTING_ERRORS, stations_at
 from kcal.pipeline.assignment import Candidates, assigned, within
-from kcal.pipeline.imm_filter import (
-    Beliefs,
-    Timing,
-    born,
-    cross_covariance,
-    no_beliefs,
-    predicted,
-)
+from kcal.pipeline.imm_filter import Beliefs, Timing, born, cross_covariance, no_beliefs, predicted
 from kcal.pipeline.measurements import Sightings, anchored
 from kcal.pipeline.motion import Motion, step_numbers, transition
 from kcal.pipeline.object_views import ObjectViews, mark_numbers
@@ -281,7 +274,7 @@ class Tracker:
         found = self.steps.score(merged, frame, home, part, when, root, track, which)
         possible = within(found, track, which, self.gates[part.seen.sum(0)[which]])
         evidence, tiers = zip(*((track.evidence, self._tier(track)) for track in self.records), strict=True)
-        accepted = assigned(possible, [ends[i] for i in rows.tolist()], evidence, tiers)
+        accepted = sorted(assigned(possible, [ends[i] for i in rows.tolist()], evidence, tiers))
         if not accepted:
             return set()
         taken = rows[possible.pair[accepted].cpu()].tolist()
@@ -316,10 +309,13 @@ class Tracker:
             known = torch.tensor([self.records[i].number > 0 for i in track.tolist()])
             sure = scores.at(rows[known & (scores.squared[rows] < _SURE * self.gates[count])])
             self.shared.add(sure.effect, sure.innovation, sure.covariance)
-        old, local = self.beliefs.at(track), scores.seen.at(rows)
+        # Rows are in the order of tracks: where each has one, nothing is to be picked out.
+        every = len(track) == len(self.records)
+        old = self.beliefs if every else self.beliefs.at(track)
+        local = scores.seen if len(rows) == len(possible.track) else scores.seen.at(rows)
         new = self.steps.take(old, local, timing.at(which), self.shared.mixing)
         both = zip(self.beliefs, new, strict=True)
-        self.beliefs = Beliefs(*(value.index_copy(-1, track, part) for value, part in both))
+        self.beliefs = new if every else Beliefs(*(value.index_copy(-1, track, part) for value, part in both))
         columns = track.tolist(), scores.log_density[rows].tolist(), categories, score.tolist(), count.tolist()
         for t, density, name, weight, cameras in zip(*columns, strict=True):
             record = self.records[t]

@@ -12,11 +12,11 @@ from torch import Tensor
 
 from kcal.pipeline.appearance import appearance
 from kcal.pipeline.assignment import SeenFrom, looks_of, nearby
-from kcal.pipeline.association import size_cost
 from kcal.pipeline.imm_filter import Beliefs, Timing, fit_of, innovations, updated
 from kcal.pipeline.measurements import Anchored
 from kcal.pipeline.moment_order import MomentOrder
-from kcal.pipeline.motion import rates
+from kcal.pipeline.motion import by_rates, rates
+from kcal.pipeline.pair_costs import size_cost
 from kcal.pipeline.shared_errors import ClockEstimate, ClockPrior, SharedErrors
 
 
@@ -153,7 +153,7 @@ class TestUpdate:
         for t in range(2):
 
             def rows(state: Tensor, late: float = 0.04, t: int = t) -> Tensor:
-                speed = rates(state)[0]
+                speed = rates(state)
                 first, second = (seen.late[c, :, :, t] for c in (0, 1))
                 return first @ (state[:3] - seen.place[:, t]) + second @ (state[:3] + late * speed - seen.place[:, t])
 
@@ -168,7 +168,7 @@ class TestUpdate:
             delayed = torch.func.jacfwd(rows, argnums=1)(state, torch.tensor(0.04).double())
             before = (beliefs.late[:, 0, :, 0, t] * state[3:]).sum(-1)
             # Its derivative by the rate, with the velocity in the state: what closing adds is left to the filter.
-            own = (seen.late[1, :, :, t] @ rates(state)[1][:, 3:]) @ state[3:] * timing.clock[0, 0, t]
+            own = by_rates(seen.late[1, :, :, t], state)[:, 3:] @ state[3:] * timing.clock[0, 0, t]
             torch.testing.assert_close(own / timing.clock[0, 0, t], delayed)
             torch.testing.assert_close(found.effect[:, 2, 0, t], own + slope @ before)
             torch.testing.assert_close(
@@ -180,7 +180,7 @@ class TestUpdate:
         seen, timing = self.seen()
         found = innovations(beliefs, seen, timing)
         fit = fit_of(found, None)
-        after = updated(beliefs, found, fit)
+        after = updated(beliefs, found, None)
         for t in range(2):
             slope, noise = found.slope[:, :, 0, t], beliefs.noise[:, :, 0, t]
             gain = noise @ slope.T @ torch.linalg.inv(slope @ noise @ slope.T + torch.eye(4).double())
@@ -201,7 +201,7 @@ class TestUpdate:
         seen, timing = self.seen()
         found = innovations(beliefs, seen, timing)
         fit = fit_of(found, None)
-        after = updated(beliefs, found, fit)
+        after = updated(beliefs, found, None)
         posterior = beliefs.weight * fit.log_density.exp()
         torch.testing.assert_close(after.weight, (posterior / posterior.sum(0)).clamp_min(1e-12))
 
@@ -249,22 +249,20 @@ class TestLooks:
 
 class TestSizes:
     def test_sizes_of_boxes_by_how_much_cameras_magnify(self) -> None:
-        def magnified(scale: float) -> Any:
-            return SimpleNamespace(by_point=scale * torch.eye(2, 3).double()[..., None])
+        def cost(*magnified: float, aside: float = 0.0) -> float:
+            boxes = torch.tensor([[[0.0, 0.0, 40.0, 20.0], [5.0, 5.0, 25.0, 15.0]]]).double()
+            return float(size_cost(torch.tensor([magnified]).double(), boxes, 2.0, torch.tensor([aside]).double()))
 
-        left, right = torch.tensor([[0.0, 0.0, 40.0, 20.0]]).double(), torch.tensor([[5.0, 5.0, 25.0, 15.0]]).double()
         # The left camera magnifies twice as much: its box is twice as large.
-        assert float(size_cost([magnified(2.0), magnified(1.0)], left, right, 2.0)) == pytest.approx(0.0)
-        same = size_cost([magnified(1.0), magnified(1.0)], left, right, 2.0)
+        assert cost(2.0, 1.0) == pytest.approx(0.0)
         by_hand = sum(
             math.log(2) ** 2 / ((4 / a) ** 2 + (4 / b) ** 2 + 0.15**2) for a, b in ((40.0, 20.0), (20.0, 10.0))
         )
-        assert float(same) == pytest.approx(by_hand)
-        aside = size_cost([magnified(1.0), magnified(1.0)], left, right, 2.0, 0.5)
+        assert cost(1.0, 1.0) == pytest.approx(by_hand)
         by_hand = sum(
             math.log(2) ** 2 / ((4 / a) ** 2 + (4 / b) ** 2 + 0.15**2 + 0.25) for a, b in ((40.0, 20.0), (20.0, 10.0))
         )
-        assert float(aside) == pytest.approx(by_hand)
+        assert cost(1.0, 1.0, aside=0.5) == pytest.approx(by_hand)
 
     def test_looks_are_found_over_shifts_of_a_quarter(self) -> None:
         noise = torch.nn.functional.interpolate(draw(1, 1, 12, 16, seed=16), scale_factor=8, mode="bicubic")[0, 0]

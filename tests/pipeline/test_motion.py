@@ -9,7 +9,7 @@ import torch
 
 from kcal.errors import InputError
 from kcal.lens.pose import rotation_from_vector
-from kcal.pipeline.motion import MOTIONS, Motion, Transition, moved, rates, step_numbers, transition
+from kcal.pipeline.motion import MOTIONS, Motion, Transition, by_rates, moved, rates, step_numbers, transition
 
 UP = torch.tensor([[0.0], [-1.0], [0.0]], dtype=torch.float64)
 
@@ -84,14 +84,14 @@ def test_noise_reaches_the_state_by_its_derivatives(turned: bool) -> None:
 
 def test_rates_are_those_of_straight_motion() -> None:
     state = torch.tensor([0.1, -0.05, 0.002, 0.03, -0.01, 0.02], dtype=torch.float64)
-    found, by_state = rates(state)
+    found, by_state = rates(state), by_rates(torch.eye(3, dtype=torch.float64), state)
 
     def later(seconds: float) -> torch.Tensor:
         return moved(state[:, None, None], after((Motion(acceleration=0.0),), seconds)).state[:3, 0, 0]
 
     # The second derivative is left out: 1e-6 s of half of 1e-3 a second.
     torch.testing.assert_close((later(1e-6) - later(0.0)) / 1e-6, found, rtol=1e-6, atol=1e-9)
-    by_autograd = torch.autograd.functional.jacobian(lambda s: rates(s)[0], state)
+    by_autograd = torch.autograd.functional.jacobian(rates, state)
     torch.testing.assert_close(by_state, by_autograd, rtol=1e-12, atol=0.0)
 
 

@@ -16,7 +16,7 @@ from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.stations import stations_at
 from kcal.pipeline.estimates import track_states
 from kcal.pipeline.imm_filter import Timing, born
-from kcal.pipeline.measurements import anchored, sightings
+from kcal.pipeline.measurements import anchored, known_sightings, sightings
 from kcal.pipeline.motion import Motion
 from kcal.pipeline.track_options import TrackOptions, Tracks
 from kcal.pipeline.tracks import Tracker
@@ -40,7 +40,7 @@ def test_one_sighting_is_what_the_localizer_says() -> None:
     expected = localize(pairs.left, pairs.right, pairs.covariance)
     stations = stations_at(localize)
     views = pairs.views
-    seen = sightings(stations, views.pixels, views.seen, views.covariance, views.time)
+    seen = sightings(known_sightings(stations), views.pixels, views.seen, views.covariance, views.time)
     turned = torch.linalg.qr(torch.eye(3).double() + 0.2 * mix[:3, :3])[0]
     frame = ((turned * torch.sign(turned.diagonal())).T @ localize.enu_from_rig.T).expand(4, 3, 3)
     timing = Timing(torch.zeros(2, 4).double(), torch.zeros(0, 3, 4).double(), torch.zeros(0, 4).double())
