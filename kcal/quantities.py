@@ -6,7 +6,7 @@ Reports, pictures, tables and maps use these functions. Files for programs keep 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 # With more decimals, and below this power of ten, a number is written with an exponent.
@@ -137,3 +137,13 @@ def range_text(meters: float) -> str:
     """
     unit = MM if meters < 1.0 else M if meters < 1e3 else KM
     return f"{meters / unit.meters:g} {unit.name}"
+
+
+def setting_text(values: Mapping[str, float]) -> str:
+    """Where zoom and focus stand: names with their numbers, as precise as anyone states them.
+
+    Example:
+        >>> setting_text({"zoom": 12.5, "focus": 100000.5})
+        'zoom=12.5 focus=100000.5'
+    """
+    return " ".join(f"{name}={value:.12g}" for name, value in values.items())

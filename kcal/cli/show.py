@@ -21,7 +21,7 @@ from kcal.errors import FileError
 from kcal.file_kind import CAMERA_RIG_VERSION, file_kind
 from kcal.files import read_bytes
 from kcal.native_file import digest
-from kcal.quantities import number_text
+from kcal.quantities import number_text, setting_text
 from kcal.strict_json import MOST_BYTES, read_json
 
 if TYPE_CHECKING:
@@ -232,9 +232,11 @@ def _show_camera(camera: _CameraFacts) -> None:
         if record["temperature"] is not None:
             out.print(f"at {record['temperature']:g} °C")
     if stood := camera.setting:
-        text = " ".join(f"{name}={value:g}" for name, value in stood["values"].items())
         sources = ", ".join(stood["interpolated_from"])
-        out.print(f"setting {text}" + (f", interpolated from {sources}" if sources else ""), markup=False)
+        out.print(
+            f"setting {setting_text(stood['values'])}" + (f", interpolated from {sources}" if sources else ""),
+            markup=False,
+        )
     hybrid = ", on its axis; fx and fy below are parameters of the base projection alone" if camera.hybrid else ""
     out.print(f"focal length {camera.focal_length}{hybrid}", markup=False)
     rows = [["parameter", "value", "sigma"]]

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 from kcal.errors import InputError
+from kcal.quantities import setting_text
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -160,7 +161,7 @@ class LensSetting:
                 raise InputError(f"setting {name}={value}: a finite number is needed")
 
     def __str__(self) -> str:
-        return " ".join(f"{name}={value:.12g}" for name, value in self.values.items())
+        return setting_text(self.values)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

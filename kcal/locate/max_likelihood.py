@@ -37,11 +37,6 @@ _CHORDS = 2
 # A step that moves no pixel by more than this, in units of the noise, is the last.
 _SHORT_STEP = 1e-5
 
-# Minors of a 3x4 matrix: the column pairs 01, 02, 03, 12, 13, 23; and for each column left out, those of the others.
-_FIRST, _SECOND = [0, 0, 0, 1, 1, 2], [1, 2, 3, 2, 3, 3]
-_ALONG, _PAIR = [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]], [[5, 4, 3], [5, 2, 1], [4, 2, 0], [3, 1, 0]]
-_SIGN = [[1.0, -1.0, 1.0], [-1.0, 1.0, -1.0], [1.0, -1.0, 1.0], [-1.0, 1.0, -1.0]]
-
 Six = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 
 
@@ -307,17 +302,6 @@ def by_pose(fit: PointFit, number: int) -> Tensor:
     rows = step_rows(fit.projections[number].by_point, fit.turned[number])
     turn, shift = rows[..., :3, :, :], rows[..., 3:, :, :]
     return torch.cat([turn, shift * fit.inverse[..., None, None, :]], -3)
-
-
-def unreached_direction(fit: PointFit) -> Tensor:
-    """(4, N) for two cameras: the unit combination of pixel coordinates to which the point does not respond."""
-    # One over the length of each row: they are angles and one over meters.
-    length = fit.gain.square().sum(1, keepdim=True).sqrt()
-    # The vector across three others in four dimensions: minors along the first, of the 2x2 minors of the other two.
-    a, b, c = fit.gain / length.clamp_min(1e-300)
-    pairs = b[_FIRST, :] * c[_SECOND, :] - b[_SECOND, :] * c[_FIRST, :]
-    across = (a[_ALONG, :] * pairs[_PAIR, :] * a.new_tensor(_SIGN)[..., None]).sum(1)
-    return across / across.square().sum(0).sqrt().clamp_min(1e-12)
 
 
 def symmetric(six: Sequence[Tensor]) -> Tensor:

@@ -59,7 +59,7 @@ def fit_before_texture(shape: ShapeModel, fit: ShapeFit, where: Floats, levels: 
     left_over = levels - design @ strengths
     unknowns = np.concatenate([design, slopes(modeled, fit.parameters, modeled(fit.parameters))], 1)
     found = texture_of(where, left_over, unknowns)
-    half = cholesky(found.strength * _texture_correlation(where, found.length) + np.eye(len(where)), lower=True)
+    half = cholesky(found.strength * np.exp(-cdist(where, where) / found.length) + np.eye(len(where)), lower=True)
 
     def whiten(columns: Floats) -> Floats:
         result: Floats = solve_triangular(half, columns, lower=True, check_finite=False)
@@ -84,9 +84,10 @@ def texture_of(where: Floats, left_over: Floats, unknowns: Floats) -> Texture:
     middle, means = _fours(where, np.concatenate([left_over[:, None], unknowns], 1))
     basis, values, _ = np.linalg.svd(means[:, 1:], full_matrices=False)
     basis = basis[:, values > 1e-9 * values[0]]
+    apart = [(cdist(middle, middle + shift), weight) for shift, weight in _PAIRS]
     best, result = -math.inf, Texture(_LENGTHS[0], 0.0)
     for length in _LENGTHS:
-        alike = sum(weight * _texture_correlation(middle, length, shift) for shift, weight in _PAIRS)
+        alike = sum(weight * np.exp(-distance / length) for distance, weight in apart)
         for strength in _STRENGTHS:
             likelihood = _likelihood(means[:, 0], basis, strength * alike + 0.25 * np.eye(len(middle)))
             if likelihood > best:
@@ -102,12 +103,6 @@ def _fours(where: Floats, columns: Floats) -> tuple[Floats, Floats]:
     np.add.at(sums, index.ravel(), np.concatenate([where, columns], 1))
     means = sums[count == 4] / 4
     return means[:, :2], means[:, 2:]
-
-
-def _texture_correlation(where: Floats, length: float, shift: tuple[float, float] = (0.0, 0.0)) -> Floats:
-    """Correlation (N, N) of the texture at positions (N, 2) with itself, the second of each pair shifted."""
-    result: Floats = np.exp(-cdist(where, where + shift) / length)
-    return result
 
 
 def _likelihood(left_over: Floats, basis: Floats, covariance: Floats) -> float:

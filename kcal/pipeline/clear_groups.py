@@ -176,8 +176,7 @@ class Confirming:
     def _fit(self, marks: Ints) -> _FittedGroups:
         """The points (M, 3) nearest to lines of sight, in sigmas; where light bends from is known well enough."""
         there = marks >= 0
-        ray = self.lines.ray[marks]
-        across = np.eye(3) - ray[..., :, None] * ray[..., None, :]
+        across = _sideways(self.lines.ray[marks])
         center = self.lines.center
         middle = center.mean(0)
         point, weight, bent = None, there.astype(float), center - middle + np.zeros((len(marks), 1, 1))
@@ -200,26 +199,23 @@ class Confirming:
         """(M, V) marks nearest to points by all other views; and of each camera nearest marks and squared sigmas."""
         count = len(self.axis)
         marks, near = np.full_like(done.marks, -1), []
-        look = self._lines(done.point)
-        away = np.linalg.norm(look, axis=2, keepdims=True)
-        look = look / away
+        lines = self._lines(done.point)
+        away = np.linalg.norm(lines, axis=2, keepdims=True)
         kind = self.kind[done.marks.max(1)]
         for c in range(count):
             if c not in trees:
                 near.append((np.full((len(marks), 1), -1), np.full((len(marks), 1), np.inf)))
                 continue
             # What the point would be, and how well known, without this camera.
-            own_ray = self.lines.ray[done.marks[:, c]]
-            across = np.eye(3) - own_ray[:, :, None] * own_ray[:, None, :]
+            across = _sideways(self.lines.ray[done.marks[:, c]])
             weight = np.where(
                 done.marks[:, c] >= 0, _ALL_BUT / self.lines.wide(done.marks[:, c], away[:, c, 0], c) ** 2, 0.0
             )
             spread = np.linalg.inv(done.normal - weight[:, None, None] * across)
-            line = self._line(done.point, c)
-            moved = (spread @ (weight[:, None, None] * across) @ line[..., None])[..., 0]
-            at = line + moved
+            moved = (spread @ (weight[:, None, None] * across) @ lines[:, c, :, None])[..., 0]
+            at = lines[:, c] + moved
             at = at / np.linalg.norm(at, axis=1, keepdims=True)
-            side = np.eye(3) - at[:, :, None] * at[:, None, :]
+            side = _sideways(at)
             wide = self.lines.wide(own[c][:1], away[:, c], c)
             noise = (side @ spread @ side + wide[..., None] ** 2 * np.eye(3)) / away[:, c, :, None] ** 2
             widest = np.sqrt(np.trace(noise, axis1=1, axis2=2).max(initial=0.0))
@@ -285,6 +281,12 @@ class Confirming:
         freedom = 2.0 * there.sum(1) - 3.0
         good = done.squared.sum(1) < freedom + self.gate * np.sqrt(2.0 * np.maximum(freedom, 1.0))
         return (there.sum(1) >= FEWEST_VIEWS) & (missed.sum(1) <= misses) & good
+
+
+def _sideways(ray: Floats) -> Floats:
+    """(..., 3, 3) what of a vector lies across unit vectors (..., 3)."""
+    result: Floats = np.eye(3) - ray[..., :, None] * ray[..., None, :]
+    return result
 
 
 def separate_pairs(center: Floats, axis: Floats, there: list[int]) -> list[tuple[int, int]]:

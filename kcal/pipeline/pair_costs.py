@@ -74,21 +74,10 @@ def pair_costs(
     """
     errors = 0 if localize.errors is None else len(localize.errors)
     count = _AT_ONCE // (16 + 8 * errors) + 1
-    parts = [
-        _some_costs(localize, *each, options, nearest)
-        for each in zip(cameras.split(count), pixels.split(count), boxes.split(count), strict=True)
-    ]
-    return PairCosts(*(torch.cat(values) for values in zip(*parts, strict=True)))
-
-
-def _some_costs(
-    localize: MultiViewLocalizer,
-    cameras: Tensor,
-    pixels: Tensor,
-    boxes: Tensor,
-    options: AssociationOptions,
-    nearest: float | None,
-) -> PairCosts:
+    if len(cameras) > count:
+        each = zip(cameras.split(count), pixels.split(count), boxes.split(count), strict=True)
+        parts = [pair_costs(localize, *some, options, nearest) for some in each]
+        return PairCosts(*(torch.cat(values) for values in zip(*parts, strict=True)))
     which, place = np.unique(cameras.numpy(), return_inverse=True)
     rows, at = torch.arange(len(cameras))[:, None], torch.from_numpy(place).reshape(-1, 2)
     spread = pixels.new_zeros(len(cameras), len(which), 2).index_put((rows, at), pixels)

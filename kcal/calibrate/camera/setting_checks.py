@@ -13,6 +13,7 @@ from kcal.errors import InputError
 from kcal.lens.calibration import LensSetting
 from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
+from kcal.quantities import setting_text
 
 
 def usable_information(camera: Camera, first: Camera, name: str, first_name: str) -> CameraInformation:
@@ -83,6 +84,6 @@ def spline_between(axes: list[str], places: Tensor, at: Tensor, names: Sequence[
         raise InputError(f"{' and '.join(axes)} change together in these cameras: calibrate other combinations as well")
     spline = SettingSpline(places)
     if not spline.inside(at):
-        text = " ".join(f"{axis}={value:g}" for axis, value in zip(axes, at.tolist(), strict=True))
+        text = setting_text(dict(zip(axes, at.tolist(), strict=True)))
         raise InputError(f"{text} does not lie between these calibrations (in their convex hull): calibrate near it")
     return spline

@@ -14,10 +14,7 @@ from torch import Tensor
 
 from kcal.calibrate.hybrid.board_modes import BoardModes, board_modes
 from kcal.calibrate.hybrid.board_prior import BoardPrior
-from kcal.calibrate.hybrid.evidence_rounds import (
-    LAST,
-    expected_estimate,
-)
+from kcal.calibrate.hybrid.evidence_rounds import LAST, expected_estimate
 from kcal.calibrate.hybrid.families import LEADING_UNKNOWNS, Hyperprior, PriorFamilies
 from kcal.calibrate.hybrid.fitted_views import Estimate
 from kcal.calibrate.hybrid.fleet import LensPrior
@@ -223,8 +220,9 @@ def fit_hybrid(
     weights = torch.ones_like(pixels[..., 0]) if weights is None else weights
     begun = start.as_start if isinstance(start, HybridFit) else start
     rounds, never, hyperprior, board = settle(
-        points, pixels, size, weights, modes, board, square, motion, focal, begun, robust, hyperprior, lens, progress
-    )
+        points, pixels, size, weights, modes=modes, board=board, square=square, motion=motion, focal=focal,
+        start=begun, robust=robust, hyperprior=hyperprior, lens=lens, progress=progress,
+    )  # fmt: skip
     ordered, own = points, board_modes(points)
     capture, likely = rounds.capture, rounds.estimate
     # Error bars are for amplitudes as they are to be expected (`kcal.calibrate.hybrid.amplitudes`).

@@ -66,15 +66,16 @@ def settle(
     pixels: Tensor,
     size: tuple[int, int],
     weights: Tensor,
-    modes: FieldModes | None,
+    *,
+    modes: FieldModes | None = None,
     board: Literal["printed", "exact"] | BoardPrior | MeasuredBoard,
-    square: bool | None,
+    square: bool | None = None,
     motion: bool,
     focal: float | None,
-    start: FitStart | None,
-    robust: bool,
-    hyperprior: Hyperprior | None,
-    lens: LensPrior | None,
+    start: FitStart | None = None,
+    robust: bool = False,
+    hyperprior: Hyperprior | None = None,
+    lens: LensPrior | None = None,
     progress: Callable[[str], object],
     rough: bool = False,
 ) -> Settled:
@@ -167,7 +168,7 @@ def rough_start(
         DegenerateError: likewise.
     """
     rounds, never, *_ = settle(
-        points, pixels, size, weights, None, board, None, motion, focal, None, False, None, None, progress, rough=True
+        points, pixels, size, weights, board=board, motion=motion, focal=focal, progress=progress, rough=True
     )
     capture, estimate = rounds.capture, rounds.estimate
     errors = capture.problem(estimate, never).pixel_errors(estimate.state)

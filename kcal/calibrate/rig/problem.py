@@ -20,7 +20,7 @@ from kcal.lens.pose import nearest_rotation, rotation_from_vector
 from kcal.solve.eliminated import EliminatedItems, PartlyEliminated
 from kcal.solve.result import State
 from kcal.solve.robust import RobustLoss
-from kcal.solve.schur import Products, SchurLinearization
+from kcal.solve.schur import SchurLinearization
 
 # Share of a residual that the others must leave open for an item to be tested by them; less is rounding.
 _LEAST_LEFT = 1e-9
@@ -242,7 +242,7 @@ class RigProblem:
         """(S + 1, S + 1) products of rows, summed over the items, without what the items' own unknowns can do."""
         if block.kind == "features":
             return EliminatedItems(block.joined(parts, self.shared_size), block.size).gram
-        return _reduced(summed_products(parts, block.size, self.shared_size))
+        return summed_products(parts, block.size, self.shared_size).off(block.size).total
 
     def linearize(self, state: State) -> SchurLinearization | PartlyEliminated:
         """See `Problem.linearize`."""
@@ -310,14 +310,6 @@ class RigProblem:
 def _of_item(parts: Sequence[CameraRows], number: int) -> list[CameraRows]:
     """Of one item."""
     return [part._replace(rows=part.rows[number : number + 1]) for part in parts]
-
-
-def _reduced(products: Products) -> Tensor:
-    """(S + 1, S + 1) products of the shared unknowns off what each item's own unknowns can do."""
-    scale = products.local.diagonal(dim1=-2, dim2=-1).rsqrt()[..., None]
-    factor, _ = torch.linalg.cholesky_ex(products.local * scale * scale.mT)
-    half = torch.linalg.solve_triangular(factor, products.right * scale, upper=False).flatten(0, 1)
-    return products.total - half.T @ half
 
 
 def _others_fall(total: Tensor, part: Tensor) -> Tensor:
