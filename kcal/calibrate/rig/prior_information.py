@@ -151,11 +151,13 @@ def joint_unknowns(
     told = stacked([one.placed(prior.slots, amplitudes) for one in said])
     shape = whitened(told.rows[:, :-1], told.rows[:, -1])
     given = [lens._replace(by_board=lens.by_board @ shape.change) for lens in given]
+    # Without a board in view, only what cameras say of theirs is left, and no corner moves.
     shapes = torch.zeros(0, 3, 0, dtype=torch.float64) if modes is None else modes.shapes
+    of_board = shape.change[:0] if modes is None else shape.change
     parts_begin, parts_known = ([getattr(one, name) for one in (*given, shape)] for name in ("begin", "known"))
     turns = [torch.eye(len(known), dtype=torch.float64) for known in parts_known]
     if any(camera.model.hybrid for camera in cameras):
-        corners = torch.einsum("bk,bcn->kcn", shape.change, shapes).flatten(1)
+        corners = torch.einsum("bk,bcn->kcn", of_board, shapes).flatten(1)
         turns = _felt(cameras, given, _PX_PER_METER * corners, parts_known)
     # The unknowns of each camera, one after the other, and the board's: through these, lenses depend on each other.
     columns, selected = torch.block_diag(*turns).split([len(known) for known in parts_known]), list[Tensor]()
@@ -164,7 +166,7 @@ def joint_unknowns(
     found = SharedUnknowns(
         cameras=tuple(selected),
         shapes=shapes,
-        board=shape.change @ columns[-1],
+        board=of_board @ columns[-1],
         begin=torch.cat([turn.T @ begin for turn, begin in zip(turns, parts_begin, strict=True)]),
         known=torch.cat([(turn[known] != 0).any(0) for turn, known in zip(turns, parts_known, strict=True)]),
         labels=("",) * sum(turn.shape[1] for turn in turns),

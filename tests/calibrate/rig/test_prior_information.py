@@ -21,6 +21,7 @@ from kcal.corners.observations import Observations
 from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
 from kcal.lens.pose import rotation_from_vector
+from kcal.lens.uncertainty import pixel_covariance
 
 BOARD = Board(columns=7, rows=6, square=0.05)
 SIZE = (1280, 960)
@@ -129,6 +130,26 @@ def test_unknowns_have_the_cameras_covariance() -> None:
     for camera, by_unknown in zip(both, found.cameras, strict=True):
         sigma = known(camera).covariance().diagonal().sqrt()
         torch.testing.assert_close(by_unknown.square().sum(1).sqrt(), sigma, rtol=1e-6, atol=1e-12)
+
+
+def test_default_lenses_without_a_board_in_view() -> None:
+    """Of a rig of landmarks: the lenses as they were calibrated, and what they share through the board of that time."""
+    both = cameras("hybrid", tuple(f"{i}.png" for i in range(14)))
+    parts = [known(camera) for camera in both]
+    found, deviation = joint_unknowns(both, gathered(both, parts, None)[0], None)
+    assert deviation is None
+    assert found.board.shape == (0, found.cameras[0].shape[1])
+    assert bool(found.known.all())
+    pixels = both[0].grid(9, 7).reshape(-1, 2)
+    for camera, by_unknown, information in zip(both, found.cameras, parts, strict=True):
+        covariance = by_unknown @ by_unknown.T
+        own = information.by_parameter(information.half())
+        stated, wanted = (pixel_covariance(camera, pixels, one) for one in (covariance, own.T @ own))
+        good = wanted.isfinite().all(-1).all(-1)
+        sigma = [one[good].diagonal(dim1=-2, dim2=-1).sqrt() for one in (stated, wanted)]
+        # Directions that nothing seen feels are left out; and two cameras of one board know it better than one.
+        ratio = sigma[0] / sigma[1]
+        assert 0.5 < float(ratio.min()) <= float(ratio.median()) < 1.001
 
 
 def test_lenses_depend_on_each_other_through_their_board_alone() -> None:
