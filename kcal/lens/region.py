@@ -147,7 +147,8 @@ def direction_limits(coefficients: Tensor, model: LensModel, count: int) -> Tens
         return regular.to(torch.int64).cumprod(-2).sum(-2)
 
     # Outward in steps of 1/6°; then the interval is split in 32 again and again, until it is as narrow as rounding.
-    top = largest_radius(model)
+    # Rounding does not put the last of them beyond the disc of a hybrid lens, which is regular there as a rule.
+    top = largest_radius(model) * (1.0 - 1e-15)
     steps = torch.linspace(0, top if model.wide else math.atan(top), 535, dtype=torch.float64)
     radii = (steps if model.wide else torch.tan(steps)).to(coefficients.device)[:, None].expand(-1, count)
     fractions = torch.linspace(0, 1, 33, dtype=torch.float64, device=coefficients.device)[:, None]
@@ -157,6 +158,8 @@ def direction_limits(coefficients: Tensor, model: LensModel, count: int) -> Tens
         # A lens that is irregular on the axis itself, for example with a tilt beyond 90°, has a limit of zero.
         low = torch.gather(radii, -2, (regular - 1).clamp(min=0)[..., None, :])
         high = torch.gather(radii, -2, regular.clamp(max=radii.shape[-2] - 1)[..., None, :])
+        if known_true(low == high):
+            break
         radii = low + (high - low) * fractions
     return low[..., 0, :]
 
