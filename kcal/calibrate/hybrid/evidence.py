@@ -169,7 +169,7 @@ def maximize_evidence(
     at, value = _minimum(
         EvidenceLoss(data, families, prior, tempering), start, bounds, *(_ROUGHLY if rough else _EXACTLY)
     )
-    return Maximum(torch.from_numpy(at[:count].copy()), at[count:-1].copy(), math.exp(at[-1]), value)
+    return Maximum(torch.from_numpy(at[:count].copy()), at[count:-1].copy(), math.exp(at[-1]), float(value))
 
 
 def _minimum(
