@@ -275,13 +275,18 @@ def sampled_region(coefficients: Tensor, model: LensModel, limits: Tensor, singl
     # An infinite cap times a limit of zero would be NaN.
     capped = torch.minimum(limits[..., None, :], torch.nan_to_num(caps * smallest[..., None, :], nan=0.0, posinf=1e9))
     candidates = Region(capped.amin(-1), _fit_series(capped), none[..., None, :, :])
-    outline = candidates.outline(SECTORS).flatten(-3, -2)
-    lens = distort_components(outline[..., 0], outline[..., 1], coefficients, model, slopes=False)
-    fits = _winds_once(lens.x.unflatten(-1, (-1, SECTORS)), lens.y.unflatten(-1, (-1, SECTORS)))
-    if single is not None:
-        fits = fits & (candidates.sector_reach() <= single[..., None, :]).all(-1)
+    # The first is enough for nearly every lens.
+    for count in (1, len(_CAPS)):
+        some = candidates._replace(radius=candidates.radius[..., :count], edge=candidates.edge[..., :count, :])
+        outline = some.outline(SECTORS).flatten(-3, -2)
+        lens = distort_components(outline[..., 0], outline[..., 1], coefficients, model, slopes=False)
+        fits = _winds_once(lens.x.unflatten(-1, (-1, SECTORS)), lens.y.unflatten(-1, (-1, SECTORS)))
+        if single is not None:
+            fits = fits & (some.sector_reach() <= single[..., None, :]).all(-1)
+        if known_true(fits[..., 0]):
+            break
     # The first cap that fits, or the last one, with which nothing is valid.
-    first = (fits.to(torch.int64).cumsum(-1) == 0).sum(-1).clamp(max=len(_CAPS) - 1)[..., None]
+    first = (fits.to(torch.int64).cumsum(-1) == 0).sum(-1).clamp(max=fits.shape[-1] - 1)[..., None]
     radius = torch.gather(candidates.radius, -1, first)[..., 0]
     edge = torch.gather(candidates.edge, -2, first[..., None].expand(*first.shape, candidates.edge.shape[-1]))
     return Region(radius, edge[..., 0, :], none)
