@@ -67,16 +67,20 @@ def radius_over_angle(q: Tensor) -> Tensor:
 def angle_over_radius(u: Tensor) -> Tensor:
     """A(u) = θ / m for u = s m²; NaN for u ≤ -1, where no angle has that radius."""
     slow = u.abs() < _SMALL
-    root = torch.sqrt(torch.where(slow, 1.0, u).abs())
-    closed = torch.where(u > 0, _arctangent(root), _artanh(torch.where(u < 0, root, 0.0))) / root
-    return torch.where(slow, series(_ARCTAN, torch.where(slow, u, 0.0)), closed)
+    return torch.where(slow, series(_ARCTAN, torch.where(slow, u, 0.0)), _far(torch.where(slow, 1.0, u)))
+
+
+def _far(u: Tensor) -> Tensor:
+    """A(u) of u that are not small."""
+    root = torch.sqrt(u.abs())
+    return torch.where(u > 0, _arctangent(root), _artanh(torch.where(u < 0, root, 0.0))) / root
 
 
 def growth_by_shape(u: Tensor) -> tuple[Tensor, Tensor]:
     """G(u) and its derivative: how the radius grows with the shape, ∂m/∂s = m³ G(s m²)."""
     slow = u.abs() < _SMALL
     near, far = torch.where(slow, u, 0.0), torch.where(slow, 1.0, u)
-    ratio = angle_over_radius(far)
+    ratio = _far(far)
     value = (ratio * (1.0 + far) - 1.0) / (2.0 * far)
     slope = (0.5 * ratio - 1.5 * value) / far
     by_u = tuple(k * c for k, c in enumerate(_GROWTH))[1:]

@@ -134,6 +134,11 @@ class CameraInformation:
         return Gaussian.independent(tuple(slots[number] for number in known), self.mean[known], self.sigma[known])
 
     @property
+    def board_message(self) -> Gaussian:
+        """What the data say of the board, whatever the camera is within its prior."""
+        return (self.data + self.lens_prior).marginal(self.board)
+
+    @property
     def told(self) -> Gaussian:
         """What other cameras say of the board."""
         at = self.estimate[self.lens_size :]
@@ -183,11 +188,8 @@ class CameraInformation:
 
     def selection(self) -> Tensor:
         """(5 + P, U): the change of each parameter with each unknown."""
-        out = self.rows.new_zeros(len(self.slots), len(self.estimate))
-        for index, slot in enumerate(self.slots):
-            if slot >= 0:
-                out[index, slot] = 1.0
-        return out
+        places = torch.arange(len(self.estimate), device=self.rows.device)
+        return (torch.tensor(self.slots, device=self.rows.device)[:, None] == places).to(self.rows.dtype)
 
     def covariance(self) -> Tensor:
         """(5 + P, 5 + P) of the camera's parameters in the order of `Camera.names`, zero for those held."""

@@ -18,8 +18,8 @@ from kcal.lens.zernike import unbind_last
 
 _DEGREE = 11
 _NODES = 96
-# An interval is split into so many parts, so many times, until it is as narrow as rounding.
-_PARTS, _SECTIONS = 64, 9
+# An interval is split into so many parts, so many times: its end is a little beyond what was asked for, or the fold.
+_PARTS, _SECTIONS = 64, 2
 # Largest distorted radius for a lens without a camera: 56° through a pinhole.
 _DEFAULT_REACH = 1.5
 

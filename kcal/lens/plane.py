@@ -7,7 +7,8 @@ angle θ from the optical axis lies at distance θ from the origin, in the same 
 
 so that points beside and behind the camera have a place too (Kannala and Brandt, 2006). For θ / ρ, the angle is halved
 four times, tan(θ/2) = ρ / (R + Z) and tan(φ/2) = tan φ / (1 + √(1 + tan² φ)), and a series does the rest. This is
-exact to rounding, smooth on the axis, and uses only operations that every runtime has in float64.
+exact to rounding, smooth on the axis, and uses only operations that every runtime has in float64. Where neither is
+wanted, atan2 takes a third of the operations.
 
 A hybrid lens works on the plane of its base projection (`kcal.lens.base_map`), where that point lies at the distance
 m(θ). Its points are those of the camera frame minus the start of their rays (`kcal.lens.pupil`).
@@ -21,6 +22,7 @@ import torch
 from torch import Tensor
 
 from kcal.lens.base_map import angle_over_radius, radius_over_angle, series
+from kcal.lens.dispatch import is_differentiated, is_traced
 from kcal.lens.model import LensModel
 
 _HALVINGS = 4
@@ -44,6 +46,9 @@ def largest_radius(model: LensModel) -> float:
 def angle_over_distance(X: Tensor, Y: Tensor, Z: Tensor) -> Tensor:
     """θ / ρ of points (..., N); infinite or NaN on the axis behind the camera."""
     square = X * X + Y * Y
+    if not (is_traced() or is_differentiated(X, Y, Z)):
+        distance = torch.sqrt(square)
+        return torch.where(distance > 0, torch.atan2(distance, Z) / distance, Z.clamp(min=0.0).reciprocal())
     # tan(angle) / ρ of the half angle, the quarter, ...
     ratio = (torch.sqrt(square + Z * Z) + Z).reciprocal()
     for _ in range(_HALVINGS - 1):

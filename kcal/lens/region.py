@@ -147,7 +147,8 @@ def direction_limits(coefficients: Tensor, model: LensModel, count: int) -> Tens
         return regular.to(torch.int64).cumprod(-2).sum(-2)
 
     # Outward in steps of 1/6°; then the interval is split in 32 again and again, until it is as narrow as rounding.
-    top = largest_radius(model)
+    # Rounding does not put the last of them beyond the disc of a hybrid lens, which is regular there as a rule.
+    top = largest_radius(model) * (1.0 - 1e-15)
     steps = torch.linspace(0, top if model.wide else math.atan(top), 535, dtype=torch.float64)
     radii = (steps if model.wide else torch.tan(steps)).to(coefficients.device)[:, None].expand(-1, count)
     fractions = torch.linspace(0, 1, 33, dtype=torch.float64, device=coefficients.device)[:, None]
@@ -157,6 +158,8 @@ def direction_limits(coefficients: Tensor, model: LensModel, count: int) -> Tens
         # A lens that is irregular on the axis itself, for example with a tilt beyond 90°, has a limit of zero.
         low = torch.gather(radii, -2, (regular - 1).clamp(min=0)[..., None, :])
         high = torch.gather(radii, -2, regular.clamp(max=radii.shape[-2] - 1)[..., None, :])
+        if known_true(low == high):
+            break
         radii = low + (high - low) * fractions
     return low[..., 0, :]
 
@@ -272,13 +275,18 @@ def sampled_region(coefficients: Tensor, model: LensModel, limits: Tensor, singl
     # An infinite cap times a limit of zero would be NaN.
     capped = torch.minimum(limits[..., None, :], torch.nan_to_num(caps * smallest[..., None, :], nan=0.0, posinf=1e9))
     candidates = Region(capped.amin(-1), _fit_series(capped), none[..., None, :, :])
-    outline = candidates.outline(SECTORS).flatten(-3, -2)
-    lens = distort_components(outline[..., 0], outline[..., 1], coefficients, model, slopes=False)
-    fits = _winds_once(lens.x.unflatten(-1, (-1, SECTORS)), lens.y.unflatten(-1, (-1, SECTORS)))
-    if single is not None:
-        fits = fits & (candidates.sector_reach() <= single[..., None, :]).all(-1)
+    # The first is enough for nearly every lens.
+    for count in (1, len(_CAPS)):
+        some = candidates._replace(radius=candidates.radius[..., :count], edge=candidates.edge[..., :count, :])
+        outline = some.outline(SECTORS).flatten(-3, -2)
+        lens = distort_components(outline[..., 0], outline[..., 1], coefficients, model, slopes=False)
+        fits = _winds_once(lens.x.unflatten(-1, (-1, SECTORS)), lens.y.unflatten(-1, (-1, SECTORS)))
+        if single is not None:
+            fits = fits & (some.sector_reach() <= single[..., None, :]).all(-1)
+        if known_true(fits[..., 0]):
+            break
     # The first cap that fits, or the last one, with which nothing is valid.
-    first = (fits.to(torch.int64).cumsum(-1) == 0).sum(-1).clamp(max=len(_CAPS) - 1)[..., None]
+    first = (fits.to(torch.int64).cumsum(-1) == 0).sum(-1).clamp(max=fits.shape[-1] - 1)[..., None]
     radius = torch.gather(candidates.radius, -1, first)[..., 0]
     edge = torch.gather(candidates.edge, -2, first[..., None].expand(*first.shape, candidates.edge.shape[-1]))
     return Region(radius, edge[..., 0, :], none)

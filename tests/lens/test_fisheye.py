@@ -14,6 +14,7 @@ from torch.func import jacfwd
 from kcal.lens.camera import Camera
 from kcal.lens.distortion import distort
 from kcal.lens.model import PRESETS, LensModel
+from kcal.lens.plane import angle_over_distance
 from kcal.lens.projection import project_components
 
 FISHEYE = PRESETS["fisheye4"]
@@ -153,6 +154,16 @@ PLACES = torch.tensor(
     ],
     dtype=torch.float64,
 )
+
+
+def test_angles_by_both_formulas() -> None:
+    """Where derivatives are recorded, others are used; on the axis behind the camera there is no such ratio."""
+    X, Y, Z = torch.cat([PLACES, torch.tensor([[0.0], [0.0], [-1.0]]).double()], 1)
+    plain = angle_over_distance(X, Y, Z)
+    smooth = angle_over_distance(X.clone().requires_grad_(True), Y, Z).detach()
+    torch.testing.assert_close(plain[:-1], smooth[:-1], rtol=4e-15, atol=0)
+    assert not plain[-1].isfinite()
+    assert not smooth[-1].isfinite()
 
 
 class TestDerivatives:

@@ -144,3 +144,12 @@ def test_few_places_and_many(modes: ZernikeModes, slopes: bool) -> None:
         torch.testing.assert_close(one, other[:, :300], rtol=0, atol=1e-10 * float(other.abs().max()))
     by_columns = torch.einsum("bm,mkbn->kbn", weights, modes.columns(x[:, :300], y[:, :300]))
     torch.testing.assert_close(torch.stack(few[:2]), by_columns, rtol=1e-11, atol=1e-11)
+
+
+def test_powers_of_few_places_are_those_of_many() -> None:
+    """Below and above the number from which recurrences are faster, and while derivatives are recorded."""
+    x, y = torch.linspace(-0.7, 0.7, 5000, dtype=torch.float64), torch.linspace(0.6, -0.5, 5000, dtype=torch.float64)
+    many, few = MODES.columns(x, y), MODES.columns(x[:40], y[:40])
+    torch.testing.assert_close(few, many[..., :40], rtol=1e-12, atol=1e-14)
+    recorded = MODES.columns(x[:40].requires_grad_(True), y[:40])
+    torch.testing.assert_close(recorded.detach(), few, rtol=1e-12, atol=1e-14)

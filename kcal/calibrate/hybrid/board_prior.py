@@ -10,12 +10,13 @@ import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from kcal.calibrate.hybrid.board_modes import KNOWN, BoardModes
-from kcal.calibrate.hybrid.families import BOARD, Hyperprior, typical_hyperprior
+from kcal.calibrate.hybrid.evidence import maximize_evidence
+from kcal.calibrate.hybrid.families import BOARD, Hyperprior, PriorFamilies, typical_hyperprior
+from kcal.calibrate.hybrid.quadratic import still_data
 from kcal.gaussian import Gaussian, numbered, stacked
 from kcal.lens.information import BOARD_SLOT, CameraInformation
 
@@ -93,24 +94,11 @@ def printed_board(
         messages: of the cameras that saw it.
         hyperprior: of the amplitudes; the typical one if not given.
     """
-    prior = hyperprior or typical_hyperprior()
-    mean, deviation = prior.mean[BOARD:].numpy(), prior.sd[BOARD:].numpy()
-    family = modes.family.numpy()
-
-    def objective(h: np.ndarray) -> tuple[float, np.ndarray]:
-        prior = printed_prior(modes, torch.from_numpy(h))
-        whole = stacked([prior, *messages])
-        at, half = whole.mean_and_half()
-        weight = prior.rows.diagonal().square()
-        by_deviation = 1.0 - ((at.square() + half.square().sum(0)) * weight).numpy()
-        z = (h - mean) / deviation
-        slope = np.bincount(family, by_deviation, len(h))
-        value = whole.log_integral() - prior.log_integral()
-        return 0.5 * float(z @ z) - value, slope + z / deviation
-
-    bounds = list(zip(mean - 5 * deviation, mean + 5 * deviation, strict=True))
-    # Here, because SciPy takes long to load.
-    from scipy.optimize import minimize as lbfgs
-
-    found = lbfgs(objective, mean, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 60, "gtol": 1e-3})
-    return printed_prior(modes, torch.from_numpy(found.x.copy())), -float(found.fun)
+    prior, unit = hyperprior or typical_hyperprior(), modes.unit
+    prior = Hyperprior(prior.mean[BOARD:], prior.sd[BOARD:])
+    zero, none = torch.zeros_like(unit), torch.full_like(modes.family, -1)
+    families = PriorFamilies(zero, unit.log(), modes.family, none, zero)
+    data = still_data(stacked(messages).placed(numbered(BOARD_SLOT, len(unit)), zero).rows.T[None], zero, 0.0)
+    # Messages are in standard deviations already.
+    found = maximize_evidence(data, families, prior.mean, 1.0, prior, known_noise=True)
+    return printed_prior(modes, found.h), -found.loss

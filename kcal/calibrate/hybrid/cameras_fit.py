@@ -28,8 +28,8 @@ from kcal.lens.zernike import ZernikeModes
 
 # Calls a function for each of the numbered argument lists; numbers and results come in any order.
 Run = Callable[[Callable[..., CameraFit], dict[int, tuple[Any, ...]]], Iterable[tuple[int, CameraFit]]]
-# Of one fit: turns, shape, lens, a fit to begin with, a fit that is taken as it is.
-_Task = tuple[Tensor | None, Shape, LensPrior | None, HybridFit | None, HybridFit | None]
+# Of one fit: turns, shape, whether cameras are of one type, lens, a fit to begin with, a fit that is taken as it is.
+_Task = tuple[Tensor | None, Shape, bool, LensPrior | None, HybridFit | None, HybridFit | None]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -103,14 +103,14 @@ def fit_cameras(
                 advance(names[i])
         return found
 
-    begun = fit({i: (None, alone, None, None, first[i] if first else None) for i in each})
+    fleet = one_type and len(sets) >= LEAST_CAMERAS
+    begun = fit({i: (None, alone, fleet, None, None, first[i] if first else None) for i in each})
     cameras = [begun[i] for i in each]
     fitted = [camera.turns for camera in cameras]
     if known is not None:
         cameras = [compared(camera, known.own, seen.board) for camera, seen in zip(cameras, sets, strict=True)]
     elif alone == "printed":
         cameras = grouped(cameras, [seen.board for seen in sets])
-    fleet = one_type and len(sets) >= LEAST_CAMERAS
     lens = _begun_fleet(cameras) if fleet else None
     lenses = [lens] * len(sets)
     for turn in range(max(passes, 2) if fleet else passes):
@@ -130,7 +130,7 @@ def fit_cameras(
             if fleet or shape is not alone:
                 # Views that were turned since, and lenses of another form, have other unknowns.
                 kept = lenses[i] is None and torch.equal(camera.turns, fitted[i])
-                tasks[i] = camera.turns, shape, lenses[i], camera.fit if kept else None, None
+                tasks[i] = camera.turns, shape, fleet, lenses[i], camera.fit if kept else None, None
         for i, again in fit(tasks).items():
             fitted[i] = again.turns
             cameras[i] = dataclasses.replace(again, board=cameras[i].board, nats=cameras[i].nats)
@@ -189,14 +189,14 @@ def _begun_fleet(cameras: Sequence[CameraFit]) -> LensPrior:
     middle = sorted(stretched, key=lambda camera: float(camera.fit.state.parameters[0]))[len(stretched) // 2].fit
     form = middle.camera.model.hybrid
     assert form is not None
-    hyperprior, _ = fleet_priors([camera.hyper for camera in cameras], typical_hyperprior())
+    hyperprior, _ = fleet_priors([camera.hyper for camera in cameras if camera.hyper is not None], typical_hyperprior())
     usual = typical_lens(form, middle.families, hyperprior.mean, middle.square)
     return LensPrior(form, float(middle.families.mean[0]), usual)
 
 
 def _learned_fleet(cameras: Sequence[CameraFit], typical: LensPrior) -> tuple[LensPrior, list[LensPrior]]:
     """The lens of the next camera, and each camera's from all others: what a camera tells does not enter its prior."""
-    following, each = fleet_priors([camera.lens for camera in cameras], typical.unknowns)
+    following, each = fleet_priors([c.lens for c in cameras if c.lens is not None], typical.unknowns)
     return typical._replace(unknowns=following), [typical._replace(unknowns=prior) for prior in each]
 
 

@@ -143,6 +143,7 @@ def maximize_evidence(
     log_ratio: np.ndarray | None = None,
     tempering: float = 1.0,
     rough: bool = False,
+    known_noise: bool = False,
 ) -> Maximum:
     """The hyperparameters and the noise variance of largest evidence.
 
@@ -155,17 +156,20 @@ def maximize_evidence(
         log_ratio: start, for views that moved while they were read.
         tempering: by which the data count less.
         rough: end within some hundredths of a nat, for data that will change.
+        known_noise: the variance of the noise stays as it is.
     """
     prior = hyperprior or typical_hyperprior()
     ratios = np.zeros(0) if log_ratio is None else log_ratio
     count = len(prior.mean)
     log_variance = math.log(variance)
     bounds = hyper_bounds(prior, len(ratios), log_variance)
+    if known_noise:
+        bounds[-1] = log_variance, log_variance
     start = np.concatenate([h.numpy(), ratios, [log_variance]])
     at, value = _minimum(
         EvidenceLoss(data, families, prior, tempering), start, bounds, *(_ROUGHLY if rough else _EXACTLY)
     )
-    return Maximum(torch.from_numpy(at[:count].copy()), at[count:-1].copy(), math.exp(at[-1]), value)
+    return Maximum(torch.from_numpy(at[:count].copy()), at[count:-1].copy(), math.exp(at[-1]), float(value))
 
 
 def _minimum(

@@ -246,9 +246,10 @@ def fit_hybrid(
     K = products_of(reduced[:, :-1].T)
     deviation = torch.where(never, 0.0, families.deviation(h))
     inverse = posterior_root(K, deviation, variance)
-    errors, weighted = problem.pixel_errors(state), problem.corner_residuals(state, weighted=True)
+    errors = problem.pixel_errors(state)
     if not robust:
         check_shown(errors)
+    residuals = capture.by_corner(errors)
     wider = widening(len(pixels)) if capture.readout is not None else 1.0
     half = math.sqrt(wider) * inverse * deviation
     information = information_of(problem, state, math.sqrt(wider * variance), reduced)
@@ -276,9 +277,9 @@ def fit_hybrid(
         effective=len(deviation) - float(inverse.square().sum()),
         board_shapes=own,
         board_points=ordered + torch.einsum("b,bkn->nk", state.board, own.shapes),
-        residuals=capture.by_corner(errors),
+        residuals=residuals,
         weights=weights,
-        weighted_rms=math.sqrt(float(weighted.square().nansum()) / int(capture.seen.sum())),
+        weighted_rms=math.sqrt(float((weights[..., None] * residuals).square().nansum()) / int(capture.seen.sum())),
         iterations=rounds.steps + steps,
         converged=rounds.converged,
     )

@@ -154,10 +154,18 @@ class Integrated(NamedTuple):
         along = (orders.transpose(1, 2) @ mean.unflatten(1, by_order).transpose(0, 1).reshape(AMPLITUDES, -1, 1))[
             ..., 0
         ]
-        spread = torch.stack([products_of(rows.T) for rows in orders])
-        second -= 4.0 * (along @ along.T) + 2.0 * (spread.flatten(1) @ spread.flatten(1).T)
         # Of E times the inverse, a row for each motion, only sums over motions are wanted.
-        squared, mixed = ((spread @ inverse) * inverse).sum(1), along @ inverse
+        mixed = along @ inverse
+        if orders.shape[1] < orders.shape[2]:
+            # Few views have fewer rows than there are unknowns.
+            pairs = (
+                products_of(orders.flatten(0, 1)).square().unflatten(0, (AMPLITUDES, -1)).unflatten(2, (AMPLITUDES, -1))
+            )
+            across, squared = pairs.sum((1, 3)), (orders @ inverse).square().sum(1)
+        else:
+            spread = torch.stack([products_of(rows.T) for rows in orders])
+            across, squared = spread.flatten(1) @ spread.flatten(1).T, ((spread @ inverse) * inverse).sum(1)
+        second -= 4.0 * (along @ along.T) + 2.0 * across
         Y = torch.from_numpy(y)
         by_variance = -(2.0 * mixed * Y + squared)
         by_noise = mean.square().sum(0).view(by_order).sum(1) + 2.0 * mixed @ Y + squared.sum(-1)

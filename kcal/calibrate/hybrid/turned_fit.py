@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from kcal.calibrate.hybrid.board_orders import find_turns, turned_corners
+from kcal.calibrate.hybrid.board_orders import find_turns, quarter_turns, turned_corners
 from kcal.calibrate.hybrid.board_prior import BoardPrior, printed_prior
 from kcal.calibrate.hybrid.families import BOARD
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
@@ -35,8 +35,8 @@ class CameraFit:
         fit: the camera, with poses of the corners as they are turned.
         turns: (V,) quarter turns of the board by which the corners of each view were read from another end.
         message: what its data say about the board.
-        hyper: what its data say about the amplitudes of lenses.
-        lens: what they say about its lens, in the form of the fit.
+        hyper: what its data say about the amplitudes of lenses, and
+        lens: about its lens, in the form of the fit; None unless it is one of a type.
         board: which of the boards it saw; -1 for an exact one.
         nats: log evidence that it shares its board with the others of that board, against a board of its own. Of a
             camera that shares none: the same with the board that is most like its own, negative. With a measured board:
@@ -46,8 +46,8 @@ class CameraFit:
     fit: HybridFit
     turns: Tensor
     message: Gaussian
-    hyper: Gaussian
-    lens: Gaussian
+    hyper: Gaussian | None = None
+    lens: Gaussian | None = None
     board: int = -1
     nats: float = math.nan
 
@@ -58,6 +58,7 @@ def fit_turned(
     modes: ZernikeModes | None,
     turns: Tensor | None,
     shape: Shape,
+    one_type: bool = False,
     lens: LensPrior | None = None,
     start: HybridFit | None = None,
     first: HybridFit | None = None,
@@ -70,6 +71,7 @@ def fit_turned(
         modes: of the field.
         turns: (V,) quarter turns that are known already.
         shape: of the board.
+        one_type: the camera is one of a type, so that it tells of its lens, too.
         lens: what is known of the lens.
         start: an earlier fit of the views with these turns, to begin with.
         first: such a fit with these weights, board and lens, which is taken as it is.
@@ -83,18 +85,22 @@ def fit_turned(
             fit = first
         else:
             fit = fit_hybrid(board.points, ordered, seen.image_size, weighted, modes, shape, lens=lens, start=start)
-        rows = _absolute_rows(fit, board.points, ordered, weighted)
         deviation = fit.families.deviation(fit.expected)[: -len(fit.state.board)]
-        if shape == "exact" or attempt == _MOST_FITS - 1:
+        if shape == "exact" or len(quarter_turns(board)) == 1 or attempt == _MOST_FITS - 1:
             break
         prior = printed_prior(fit.board_shapes, fit.expected[BOARD:]) if shape == "printed" else shape.whole
-        more = find_turns(rows, board, prior, deviation, fit.sigma**2)
+        more = find_turns(_absolute_rows(fit, board.points, ordered, weighted), board, prior, deviation, fit.sigma**2)
         if not bool(more.any()):
             break
         turns, start = (turns + more) % 4, None
+    if not one_type:
+        # Of a board that is exact or was measured nobody asks.
+        known = fit.information
+        message = known.board_message.weighted(math.sqrt(fit.wider))
+        return CameraFit(fit=fit, turns=turns, message=message)
     of_lens, of_board = numbered(LENS_SLOT, len(deviation)), numbered(BOARD_SLOT, len(fit.state.board))
     mean = fit.families.mean[: len(deviation)]
-    flat = rows.transpose(1, 2).flatten(0, 1)
+    flat = _absolute_rows(fit, board.points, ordered, weighted).transpose(1, 2).flatten(0, 1)
     # The target is absolute, so that the residuals at the mean of lens and board are its negative.
     flat[:, -1] *= -1.0
     pixels_of = Gaussian((*of_lens, *of_board), torch.cat([mean, torch.zeros_like(fit.state.board)]), flat)

@@ -68,8 +68,7 @@ def gathered(
 def _agreeing(first: CameraInformation, other: CameraInformation, board: Board) -> CameraInformation | None:
     """The other camera's information with its board turned as the first camera's; None if they saw two boards."""
     modes = board_modes(board.points)
-    # What the data of each say of the board, whatever its lens is within its prior.
-    one, two = ((known.data + known.lens_prior).marginal(known.board) for known in (first, other))
+    one, two = first.board_message, other.board_message
     apart = printed_board(modes, [one])[1] + printed_board(modes, [two])[1]
     together = {turns: printed_board(modes, [one, turned(two, turns)])[1] - apart for turns in quarter_turns(board)}
     best = max(together, key=lambda turns: together[turns])

@@ -74,16 +74,27 @@ def test_value_is_the_density_of_the_residuals(moving: bool) -> None:
     assert loss(vector(moving))[0] == pytest.approx(wanted, rel=1e-10)
 
 
-@pytest.mark.parametrize("tempering", [1.0, 1.7])
-@pytest.mark.parametrize("moving", [False, True])
-def test_derivatives(moving: bool, tempering: float) -> None:
-    loss, at = EvidenceLoss(data(moving), FAMILIES, PRIOR, tempering), vector(moving)
+def check_derivatives(loss: EvidenceLoss, at: np.ndarray) -> None:
     steps = 1e-5 * np.eye(len(at))
     slopes = [(loss.value(at + step) - loss.value(at - step)) / 2e-5 for step in steps]
     _, found, bend = loss(at)
     np.testing.assert_allclose(found, slopes, rtol=1e-6, atol=1e-6)
     bends = [(loss(at + step)[1] - loss(at - step)[1]) / 2e-5 for step in steps]
     np.testing.assert_allclose(bend, bends, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("tempering", [1.0, 1.7])
+@pytest.mark.parametrize("moving", [False, True])
+def test_derivatives(moving: bool, tempering: float) -> None:
+    check_derivatives(EvidenceLoss(data(moving), FAMILIES, PRIOR, tempering), vector(moving))
+
+
+def test_derivatives_of_a_single_view() -> None:
+    """It has fewer motions of an order than there are unknowns of lens and board."""
+    U, A, residual, x, motion = (torch.from_numpy(part) for part in rows(True))
+    products = Products.of_rows(U[:1], torch.cat([A, residual[:, None]], 1)[:1])
+    one = view_data(products, x, motion[:1], float(ROWS))
+    check_derivatives(EvidenceLoss(one, FAMILIES, PRIOR, 1.2), vector(True))
 
 
 def test_beyond_numbers_is_worse_than_anything() -> None:
