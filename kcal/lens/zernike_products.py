@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.lens.dispatch import is_differentiated
+from kcal.lens.dispatch import is_differentiated, is_traced
 
 # Up to so many places one product of all powers is faster than vectorized recurrences (measured).
 _FEW = 4000
@@ -79,7 +79,7 @@ class ZernikeProducts(NamedTuple):
 
     def powers(self, x: Tensor, y: Tensor) -> Tensor:
         """(..., 2, J, N) real and imaginary parts of powers of z."""
-        if x.numel() <= _FEW and not is_differentiated(x, y):
+        if not (is_traced() or is_differentiated(x, y)) and x.numel() <= _FEW:
             z = torch.complex(x, y)[..., None, :]
             many = z.expand(*z.shape[:-2], len(self.order) - 1, -1)
             return torch.view_as_real(torch.cat([torch.ones_like(z), many], -2).cumprod(-2)).movedim(-1, -3)
