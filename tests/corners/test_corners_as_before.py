@@ -19,6 +19,8 @@ from torch import Tensor
 
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_board
+from kcal.corners.point import refine_point
+from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from scripts.shared.printed_board import Paper, pose
 
@@ -55,6 +57,9 @@ BEFORE: dict[str, tuple[float, ...]] = {
     "saddle": (35.0, -0.371, 1.743, 9.981, 0.322, -0.467),
     "saddle, small": (35.0, -1.228, -0.865, 5.086, 0.236, 0.955),
 }
+
+# Of a single point: place, covariance xx, xy, yy in millionths.
+POINT = (20764.8, 17439.1, 20438.2, -4561.61, 17772.5)
 
 
 @functools.cache
@@ -98,3 +103,39 @@ def test_as_before(name: str) -> None:
         print(f'    "{name}": {now},')
         return
     assert now == pytest.approx(BEFORE[name], abs=0.2, rel=0.01)
+
+
+def corner_image(noise: float = 1.0, beside: float = 40.0) -> Tensor:
+    """A corner at 20.6, 17.3 and an edge some 15 px beside it, which a wider window takes for a part of it."""
+    x = torch.arange(40.0, dtype=torch.float64)
+    image = 100 * torch.outer(torch.sigmoid(2 * (x - 17.3)), torch.sigmoid(1.5 * (x - 20.6)))
+    image += beside * torch.sigmoid(2 * (x[None] + 0.2 * x[:, None] - 38.0))
+    return image + noise * torch.randn(40, 40, generator=torch.Generator().manual_seed(0)).double()
+
+
+def test_a_point_as_before() -> None:
+    found = refine_point(corner_image(), torch.tensor([20.0, 18.0]))
+    covariance = found.covariance.flatten()[[0, 1, 3]]
+    assert (1e3 * found.pixel).tolist() == pytest.approx(POINT[:2], abs=2.0)
+    assert (1e6 * covariance).tolist() == pytest.approx(POINT[2:], rel=0.01)
+
+
+def test_room_and_reach_of_a_point() -> None:
+    """Five pixels from the border of the picture, three from where the mark is: on both sides."""
+    image = corner_image(0.0, 0.0)
+    corner = refine_point(image, torch.tensor([20.0, 18.0])).pixel
+    assert corner.tolist() == pytest.approx([20.7, 17.4], abs=0.1)
+    for x, y, good in ((2.0, 2.1, True), (2.2, 2.3, False), (-2.9, 0.0, True), (-3.1, 0.0, False), (0.0, -3.1, False)):
+        at = corner + torch.tensor([x, y])
+        if good:
+            assert refine_point(image, at).pixel.tolist() == pytest.approx(corner.tolist(), abs=0.01)
+        else:
+            with pytest.raises(InputError, match="more than 3 px away"):
+                refine_point(image, at)
+    for cut, good in ((15, True), (16, False)):
+        part, at = image[:, cut:], torch.tensor([20.0 - cut, 18.0])
+        if good:
+            refine_point(part, at)
+        else:
+            with pytest.raises(InputError, match="within 5 px"):
+                refine_point(part, at)
