@@ -212,6 +212,7 @@ def test_circles_that_tell_how_others_are_shifted(known, corrected, monkeypatch)
     lens = Camera.build(focal=(200, 200), center=(100, 75), size=(200, 150), model="pinhole")
     image, _ = Paper(board, cell_mm=0.5).shoot(lens, *pose(board, [0.7, 0.0, 0.0], 0.2))
     found = find_circles(image, board)
+
     def some_good(*arguments):
         refined = _with_statuses(*arguments)
         status = torch.full_like(refined.status, int(CornerStatus.OCCLUDED))

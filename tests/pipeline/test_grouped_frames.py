@@ -37,9 +37,7 @@ def videos(monkeypatch: pytest.MonkeyPatch, *times: list[float]) -> list[tuple[A
 def groups(count: int, offset: int = 0, **more: Any) -> tuple[FramesTogether, list[Any]]:
     sizes = dict(list(SIZES.items())[:count])
     together = FramesTogether([str(k) for k in range(count)], sizes, **more)
-    found = [
-        (place, time, [frame and frame.time for frame in group]) for place, (time, group) in together(offset)
-    ]
+    found = [(place, time, [frame and frame.time for frame in group]) for place, (time, group) in together(offset)]
     together.close()
     return together, found
 
@@ -54,7 +52,8 @@ def test_pairs_alone_or_all_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     assert asked == [("0", (64, 48), -0.2), ("1", (32, 24), -0.4)]
     _, found = groups(2, pairs=False, apart_s=0.2)
     assert found == [
-        (1, 0.0, [0.0, 0.1]), (1_000_001, 1.0, [1.0, None]), (2_000_001, 2.0, [2.0, 2.1]), (3_000_001, 3.0, [None, 3.0]),
+        (1, 0.0, [0.0, 0.1]), (1_000_001, 1.0, [1.0, None]), (2_000_001, 2.0, [2.0, 2.1]),
+        (3_000_001, 3.0, [None, 3.0]),
     ]  # fmt: skip
     # .05 s late: what says 1.05 is of 1.1; of times to go on from, frames just before are read again.
     asked.clear()
@@ -76,7 +75,7 @@ def test_nothing_together(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two files that never meet are refused; not where a run goes on, nor after it was ended."""
     videos(monkeypatch, [0.0, 1.0], [50.0, 51.0])
     for pairs in (True, False):
-        with pytest.raises(FileError, match="0 and 1: no frames within 0.5 s of each other; if the"):
+        with pytest.raises(FileError, match=r"0 and 1: no frames within 0\.5 s of each other; if the"):
             groups(2, pairs=pairs)
     assert groups(2, 1, pairs=True)[1] == []
     ended = FramesTogether(["0", "1"], {"left": (6, 4), "right": (6, 4)}, pairs=True)

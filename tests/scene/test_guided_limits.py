@@ -1,4 +1,4 @@
-"""Limits of matches along epipolar lines: parallax, band and what is no match, on both sides; which image is refused."""
+"""Limits of matches along epipolar lines on both sides: parallax, band, what is no match; which image is refused."""
 
 from __future__ import annotations
 

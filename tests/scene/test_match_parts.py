@@ -42,7 +42,9 @@ def test_the_best_of_each_cell_come_first() -> None:
         assert kept.pixels[:, 0].tolist() == [pytest.approx(places[i]) for i in sorted(order[:most])]
     assert match._thinned(found(places, variance), (320, 180), 20).counts.thinned == 0
     # Half a pixel beyond the edges belongs to the outer cells.
-    outside = match._thinned(found([[-0.4, 5], [5, -0.4], [320.4, 175], [315, 180.4]], [1.0, 2.0, 3.0, 4.0]), (320, 180), 2)
+    outside = match._thinned(
+        found([[-0.4, 5], [5, -0.4], [320.4, 175], [315, 180.4]], [1.0, 2.0, 3.0, 4.0]), (320, 180), 2
+    )
     assert outside.slant.tolist() == [0.0, 2.0]
 
 
@@ -212,8 +214,9 @@ def test_refined_from_a_plane_at_a_known_range() -> None:
     assert not bool(away.good[1])
     # Noise that stays: the covariance tells it.
     draw = torch.Generator().manual_seed(3)
-    noisy = images[0] + 2.0 * torch.randn(picture.shape, generator=draw), images[1] + 2.0 * torch.randn(
-        picture.shape, generator=draw
+    noisy = (
+        images[0] + 2.0 * torch.randn(picture.shape, generator=draw),
+        images[1] + 2.0 * torch.randn(picture.shape, generator=draw),
     )
     some = torch.tensor([[60.0 + 24.0 * i, 40.0 + 24.0 * j] for i in range(14) for j in range(9)]).double()
     found = refine_matches(rig, noisy, some, some + torch.tensor([-4.0, 0.0]).double())

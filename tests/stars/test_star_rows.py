@@ -86,10 +86,10 @@ def test_nameless_lights_are_matched_where_named_stars_put_them() -> None:
     """Within two pixels, the nearest both ways; never one with a name; sigmas and pixels of those."""
     places = np.array([[100.0, 100], [200, 300], [400, 200], [500, 420], [150, 400]])
     rays = torch.from_numpy(np.concatenate([(places - [320, 240]) / 1000.0, np.ones((5, 1))], 1)) @ TURN.T
-    there = (1000.0 * rays[:, :2] / rays[:, 2:]).numpy() + [320, 240]
-    there += [[0, 0], [1.2, 1.2], [1.5, 1.5], [0, 0], [0, 0]]
+    there = (1000.0 * rays[:, :2] / rays[:, 2:]).numpy()
+    there += np.array([320, 240]) + np.array([[0, 0], [1.2, 1.2], [1.5, 1.5], [0, 0], [0, 0]])
     left = image(places.tolist(), [-1, -1, -1, 50, -1])
-    right = image(there[[2, 1, 0, 3, 4]].tolist() + [[620.0, 20.0]], [-1, -1, -1, 50, 60, -1], turn=TURN, sigma=0.2)
+    right = image([*there[[2, 1, 0, 3, 4]].tolist(), [620.0, 20.0]], [-1, -1, -1, 50, 60, -1], turn=TURN, sigma=0.2)
     found = source([{0: left, 1: right}])
     # 1.7 px is near enough, 2.1 px is not; what has a name in one image alone is not matched.
     assert found.names[1:] == ("light 0 at 1, 1", "light 1 at 1, 1")
@@ -110,7 +110,7 @@ def test_nameless_lights_are_matched_where_named_stars_put_them() -> None:
 
 
 def test_clocks_and_their_drift() -> None:
-    """A second later the sky has turned by 15" about the pole, westward; hours count from each night that is long enough."""
+    """A second later the sky has turned by 15" about the pole, westward; hours count from the start of each night."""
     hours = [0.0, 3.0, 1.0, 30.0, 30.5, 60.0, 61.5]
     moments: list[Moment] = [
         {0: image([[1, 1]], [7], hours=h, turn=TURN), 1: image([[1, 1]], [7], hours=h), 2: image([[1, 1]], [7])}
