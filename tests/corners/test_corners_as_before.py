@@ -19,7 +19,10 @@ from torch import Tensor
 
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_board
+from kcal.corners.grid import local_side
 from kcal.corners.point import refine_point
+from kcal.corners.refine import refine_corners
+from kcal.corners.saddle import CornerStatus
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from scripts.shared.printed_board import Paper, pose
@@ -139,3 +142,18 @@ def test_room_and_reach_of_a_point() -> None:
         else:
             with pytest.raises(InputError, match="within 5 px"):
                 refine_point(part, at)
+
+
+@pytest.mark.parametrize("blur", [0.7, 1.5])
+def test_the_blur_of_corners(blur: float) -> None:
+    """That of the picture and of a pixel's area, variance 1/12 px²; none where a corner is not good."""
+    board = Board(columns=5, rows=4, square=0.03)
+    image, truth = render(board, (200, 160), homography(board, (200, 160), 22.0, roll=0.2), blur, 1.0, 1, 4)
+    start = truth.clone()
+    start[0] = torch.nan
+    found = refine_corners(image, start, local_side(truth, 5, 4), grid=(5, 4))
+    assert found.status.tolist() == [int(CornerStatus.MISSING)] + [int(CornerStatus.GOOD)] * 19
+    assert found.blur is not None
+    assert found.covariance is not None
+    assert bool(found.blur[0].isnan() & found.pixels[0].isnan().all() & found.covariance[0].isnan().all())
+    assert found.blur[1:].tolist() == pytest.approx([(blur**2 + 1.0 / 12.0) ** 0.5] * 19, rel=0.1)
