@@ -57,4 +57,5 @@ HARMLESS = {
     "1e51aa8f523d671c": "whether nothing is searched for what is missing of one camera alone, of which nothing is kept",
     "5e0d5c9b92387eca": "the third best of all, which nothing reads",
     "9c9b58ae1e5c2c2a": "numbers of cells, of which no two are alike in either way",
+    "f4b30131556f65a1": "the determinant of a product, in either order",
 }
