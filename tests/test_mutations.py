@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from scripts.check.mutants import interval
+from scripts.check.mutants import Draw, first_draw, interval
 from scripts.check.mutations import sites
 
 ROOT = Path(__file__).parents[1]
@@ -72,3 +72,18 @@ def test_names_and_keys() -> None:
 def test_interval_of_a_share() -> None:
     assert interval(45, 50) == pytest.approx((0.786, 0.957), abs=1e-3)
     assert interval(10, 10) == pytest.approx((0.722, 1.0), abs=1e-3)
+
+
+def test_first_draws_stay() -> None:
+    """Of the page where it has one, or where its only draw is not among the results; otherwise of the results."""
+    one, two = {41: Draw(8, 1, 5)}, {41: Draw(8, 1, 5), 42: Draw(8, 0, 8)}
+    for by_seed, row, before in (
+        (one, None, ""),
+        (two, None, "5 of 7"),
+        (one, ("`io`", "", "31", "8", "0", "4 of 8"), "4 of 8"),
+        (one, ("`io`", "7 of 17", "15", "5", "0", "2 of 5"), "7 of 17"),
+        (one, ("`io`", "7 of 17", "41", "8", "1", "5 of 7"), "7 of 17"),
+        (one, ("`io`", "", "41", "8", "1", "5 of 7"), ""),
+        (two, ("`io`", "", "41", "8", "1", "5 of 7"), "5 of 7"),
+    ):
+        assert first_draw(by_seed, row) == before

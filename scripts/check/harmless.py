@@ -55,4 +55,7 @@ HARMLESS = {
     "de07024734379c68": "by how many points a name stands beside its mark",
     "2d9fdadb75d7d0e3": "the size of letters",
     "1e51aa8f523d671c": "whether nothing is searched for what is missing of one camera alone, of which nothing is kept",
+    "5e0d5c9b92387eca": "the third best of all, which nothing reads",
+    "9c9b58ae1e5c2c2a": "numbers of cells, of which no two are alike in either way",
+    "f4b30131556f65a1": "the determinant of a product, in either order",
 }

@@ -232,6 +232,13 @@ class Draw(NamedTuple):
         return f"{self.noticed} of {self.drawn - self.harmless}"
 
 
+def first_draw(by_seed: dict[int, Draw], row: tuple[str, ...] | None) -> str:
+    """What the first draw of a room noticed: the row of the page tells it where .mutants/ began later."""
+    if row is not None and (row[1] or int(row[2]) not in by_seed):
+        return row[1] or row[-1]
+    return by_seed[min(by_seed)].share if len(by_seed) > 1 else ""
+
+
 def report() -> tuple[str, str]:
     """A table of the rooms, the first and the last draw of each; and what was not noticed, or is harmless, by line."""
     kept, at_first, known = results(), results(first=True), rows_of_page()
@@ -259,7 +266,7 @@ def report() -> tuple[str, str]:
                 hits, count = map(int, known[room][-1].split(" of "))
                 total, noticed = total + count, noticed + hits
             continue
-        first, last = min(by_seed), max(by_seed)
+        last = max(by_seed)
         for path, site, entry in sorted(judged, key=lambda row: (row[0], row[1].line)):
             texts = (f"`{' '.join(text.split())[:70]}`".replace("|", "\\|") for text in (site.before, site.after))
             where = f"{path}:{site.line}", entry["seed"], site.kind, *texts
@@ -269,7 +276,7 @@ def report() -> tuple[str, str]:
                 missed.append((*where, entry["tests"], site.key))
         end = by_seed[last]
         total, noticed = total + end.drawn - end.harmless, noticed + end.noticed
-        before = by_seed[first].share if first < last else ""
+        before = first_draw(by_seed, known.get(room))
         rows.append((f"`{room}`", before, last, end.drawn, end.harmless, end.share))
     if not total:
         return "Nothing was drawn yet.", ""

@@ -5,9 +5,10 @@ import torch
 
 from kcal.corners.board import Board
 from kcal.corners.circle_bias import center_shift, homography, local_maps
-from kcal.corners.circles import circle_order, find_circles, refine_circles
+from kcal.corners.circles import _with_statuses, circle_order, find_circles, refine_circles
 from kcal.corners.detect import detect, detect_board
 from kcal.corners.ellipse import fit_ellipses
+from kcal.corners.saddle import CornerStatus
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from scripts.shared.printed_board import Paper, errors, pose
@@ -202,3 +203,24 @@ def test_ellipses_beside_each_other_do_not_matter():
     )
     assert found.center[0].tolist() == pytest.approx([60.4, 40.2], abs=0.05)
     assert bool(found.converged[0])
+
+
+@pytest.mark.parametrize(("known", "corrected"), [(6, True), (5, False)])
+def test_circles_that_tell_how_others_are_shifted(known, corrected, monkeypatch):
+    """Six good circles tell the homography that moves ellipses' centers to those of the circles; five do not."""
+    board = Board.parse("circles:4x3", "30mm")
+    lens = Camera.build(focal=(200, 200), center=(100, 75), size=(200, 150), model="pinhole")
+    image, _ = Paper(board, cell_mm=0.5).shoot(lens, *pose(board, [0.7, 0.0, 0.0], 0.2))
+    found = find_circles(image, board)
+
+    def some_good(*arguments):
+        refined = _with_statuses(*arguments)
+        status = torch.full_like(refined.status, int(CornerStatus.OCCLUDED))
+        status[[0, 3, 5, 6, 8, 11][:known]] = int(CornerStatus.GOOD)
+        return refined._replace(status=status, pixels=arguments[2].center)
+
+    monkeypatch.setattr("kcal.corners.circles._with_statuses", some_good)
+    moved, _ = refine_circles(image, found.pixels, board, found.radius)
+    monkeypatch.setattr("kcal.corners.circles.center_shift", lambda maps, radius: torch.zeros(board.corners, 2))
+    centers, _ = refine_circles(image, found.pixels, board, found.radius)
+    assert (float((moved.pixels - centers.pixels).abs().max()) > 0.01) is corrected

@@ -102,3 +102,17 @@ def test_a_crowd_is_grouped_as_it_is(missed: float, false: int) -> None:
     # Each detection is in a row.
     for c in range(cameras):
         assert {tuple(p) for p in found.pixels[found.seen[:, c], c].tolist()} == set(owners[c])
+
+
+def test_how_far_two_lines_pass() -> None:
+    """Rays of σ 1 mrad from two stations pass 3 m apart at 800 and 1000 m: 9 / (.8² + 1²) variances."""
+    ray = np.array([[0.0, 1.0, 0.0], [-0.6, 0.8, 0.003]])
+    center = np.array([[0.0, 0.0, 0.0], [600.0, 0.0, 0.0]])
+    lines = StationSights(
+        np.array([0, 1]), ray, np.full(2, 1e-3), np.zeros(2), 0.0, center, np.array([[0.0, 0.0, 1.0]] * 2), 0.0
+    )
+    found = meetings(lines, np.array([0]), np.array([1]), 4.0, 100.0)
+    assert found.squared.tolist() == pytest.approx([9.0 / 1.64], rel=0.01)
+    # Nearer to the line that is known better there.
+    assert found.point[0].tolist() == pytest.approx([0.0, 800.0, 3.0 * 0.64 / 1.64], abs=0.02)
+    assert len(meetings(lines, np.array([0]), np.array([1]), 2.0, 100.0).first) == 0

@@ -24,11 +24,13 @@ from kcal.errors import InputError
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.difference import camera_difference
+from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import RigCovariance
 from kcal.locate.geodesy import geodetic_to_enu
 from kcal.locate.map_places import map_places
 from kcal.locate.range_sigmas import range_sigmas
+from kcal.locate.region import region_rings
 from kcal.report.backdrop import _placing, _tile, _warp, local_image
 from kcal.report.judge_camera import _camera_answer, _image_rms, other_views
 from kcal.report.judge_rig import _pairs_compared, _synchrony_finding, _worst_of_pair, named_cameras, rig_verdict
@@ -322,6 +324,21 @@ class TestMap:
             torch.tensor([[*place, 0.0] for place in first["field"]], dtype=torch.float64), found.origin
         )
         assert float(rim[30, :2].norm()) == pytest.approx(1.15 * far, rel=1e-3)
+
+    def test_places_and_regions_stay_together_across_the_antimeridian(self) -> None:
+        """The map of a camera at 179 degrees west has what it sees there beside it, not around the globe."""
+        found, truth = located()
+        for lon, turns in ((20.0, 0.0), (-179.0, -360.0)):
+            here = dataclasses.replace(found, origin=Origin(lat=10.0, lon=lon, height=0.0))
+            content = _content(here, truth)
+            seen = [(p.lat, p.lon + turns) for p in found.positions if p.lat is not None]
+            assert [point["place"] for point in content["points"]] == seen
+            assert len(content["regions"]) == len(region_rings(here)) > 0
+            for ring, there in zip(content["regions"], region_rings(here), strict=True):
+                assert [lat for lat, _ in ring] == [lat for lat, _ in there]
+                assert [lon % 360 for _, lon in ring] == pytest.approx([lon % 360 for _, lon in there], abs=1e-9)
+                assert max(abs(east - lon) for _, east in ring) < 1.0
+                assert len({east for _, east in ring}) > 2
 
     def test_arcs_sweep_what_the_cameras_see(self) -> None:
         found, _ = located()

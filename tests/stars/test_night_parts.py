@@ -18,7 +18,7 @@ from kcal.lens.camera import Camera
 from kcal.stars.attitude import _names_at, field_angle
 from kcal.stars.budget import NightPlan, PlannedStars, planned_stars
 from kcal.stars.catalog import StarCatalog
-from kcal.stars.detect import _night_sky, detect_stars
+from kcal.stars.detect import _night_sky, _uncrowded, detect_stars
 from kcal.stars.identification import Identification
 from kcal.stars.night_image import expand_nights, read_night, time_of
 from kcal.stars.rig_stars import moments_of
@@ -219,3 +219,12 @@ class TestPlans:
         # Both cameras' noise of all stars, whose centers are about as good as the median one.
         by_hand = math.sqrt(2.0 / one.stars) * one.sigma_px / 1600
         assert 0.4 * by_hand < one.yaw_sigma < 1.2 * by_hand
+
+
+def test_crowded_within_five_pixels_by_what_is_not_far_fainter() -> None:
+    """A twentieth of the brightness pulls a center, less does not; the fainter one is always pulled."""
+    place = np.array([[0.0, 0.0], [4.9, 0.0], [100.0, 0.0], [100.0, 5.1], [200.0, 0.0], [203.0, 0.0], [np.nan, 0.0]])
+    peak = np.array([1.0, 0.06, 1.0, 1.0, 1.0, 0.04, 1.0])
+    assert _uncrowded(place, peak).tolist() == [False, False, True, True, True, False, True]
+    assert _uncrowded(place[:1], peak[:1]).tolist() == [True]
+    assert _uncrowded(np.zeros((0, 2)), np.zeros(0)).tolist() == []

@@ -133,6 +133,21 @@ class TestRefraction:
             assert f"the stars stand {side} than" in text
         assert self.doubt(0.4, 10.0) is None
 
+    def test_what_a_good_lens_errs_is_no_doubt(self) -> None:
+        """However sure: only where the pattern that no turn explains differs by more than .04 px, root mean square."""
+        straight, _ = scattered(40)
+        lifted = straight + 2e-3 * torch.stack([0 * straight[:, 0], 0 * straight[:, 0], 1 - straight[:, 2] ** 2], -1)
+        refracted = torch.nn.functional.normalize(lifted, dim=-1)
+        used = torch.arange(40) != 3
+        (at, rows), (without, _) = (
+            star_rows(one[used], TURN, CAMERA, CAMERA.params.detach()) for one in (refracted, straight)
+        )
+        pattern, turns = (at - without).flatten().numpy(), rows.flatten(1).T.numpy()
+        own = pattern - turns @ np.linalg.lstsq(turns, pattern, rcond=None)[0]
+        size = float(np.sqrt((own**2).mean()))
+        for excess, told in ((0.036, False), (-0.036, False), (0.044, True), (-0.044, True)):
+            assert (self.doubt(1.0 - excess / size, 1e-4) is not None) is told
+
     def test_without_air_there_is_nothing_to_tell(self) -> None:
         straight, _ = scattered(9)
         looked = Attitude(rotation=TURN, covariance=torch.eye(3), star=np.arange(9), residual=np.ones((9, 2)),
