@@ -3,7 +3,10 @@
 The fit of a match tells what noise does to it. What remains shows in how far matches lie off their epipolar lines, and
 most of it is the same whenever the same thing is seen in the same light: it is no smaller after a hundred pairs. It
 comes from patches that look different in both images: ground at a slant, whose blur is another one in each, and edges
-before something farther away. Both parts are learned from the matches themselves, for classes of slant.
+before something farther away. Before the ground these even have a direction: its texture, seen from above, runs away
+from the middle of the image, and where it meets an edge that stands upright, a corner appears that goes up or down as
+the camera moves. Both parts are learned from the matches themselves, for classes of slant and of misfit, and matches
+far worse than the others of their class count less.
 """
 
 from __future__ import annotations
@@ -48,8 +51,9 @@ def with_common_errors(
 
     Patches that look the same in both images are good to the noise; what is seen at a slant has errors of its own,
     which stay as long as the light does. So the variance beyond noise, and the part of it that pairs have in common,
-    are learned for several classes of slant. A match counts with the sum of its covariances with itself and with all
-    others, each weighted as it will be: neighbors have nearly the same effect on a pose, and so its variance is right.
+    are learned for classes of slant and misfit (`_learned`). A match counts with the sum of its covariances with itself
+    and with all others, each weighted as it will be: neighbors have nearly the same effect on a pose, and so its
+    variance is right.
 
     Args:
         rigs: as each pair makes it.
