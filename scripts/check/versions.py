@@ -161,6 +161,7 @@ def cell(folder: Path, python: str, package: Path, pins: list[str], tests: list[
         counted = core_tests(folder, place / "bin", tests) if tests else ""
         return {"outcome": "passed" if not counted else f"passed; {counted}", "install_s": installed, **found}
     except SystemExit as error:
+        show([str(error)])
         return {"outcome": "FAILED: " + str(error).splitlines()[-1]}
     finally:
         shutil.rmtree(place, ignore_errors=True)
