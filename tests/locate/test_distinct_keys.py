@@ -8,6 +8,7 @@ import tempfile
 from pathlib import Path
 
 import pytest
+from locate_rigs import real_rig
 from typer.testing import CliRunner
 
 from kcal.cli.main import app
@@ -17,16 +18,11 @@ from kcal.locate import distinct_keys, tables, view_marks
 from kcal.locate.distinct_keys import DistinctKeys, Doubled
 from kcal.locate.tables import read_chunks
 from kcal.locate.view_marks import read_view_chunks
-from scripts.fuzz.readers import placed_rig
 
 
-@pytest.fixture(params=["hashes", "few hashes", "one hash"], autouse=True)
-def hashes(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Few in memory; and keys whose hashes are equal, too."""
+@pytest.fixture(autouse=True)
+def little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(distinct_keys, "_IN_MEMORY", 16)
-    if request.param != "hashes":
-        many = 5 if request.param == "few hashes" else 1
-        monkeypatch.setattr(distinct_keys, "hash", lambda key: (hash(key) % many - many // 2) << 60, raising=False)
 
 
 def found(keys: list[str], step: int) -> Doubled | None:
@@ -38,9 +34,16 @@ def found(keys: list[str], step: int) -> Doubled | None:
     return doubled
 
 
+@pytest.mark.parametrize("unlike", [None, 100, 5, 1], ids=lambda unlike: f"hashes {unlike or 'as they are'}")
 @pytest.mark.parametrize("step", [1, 7, 16, 1000])
 @pytest.mark.parametrize("count", [1, 15, 16, 17, 300])
-def test_a_doubled_key_is_found_wherever_it_is(count: int, step: int) -> None:
+def test_a_doubled_key_is_found_wherever_it_is(
+    count: int, step: int, unlike: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where unlike keys have equal hashes."""
+    if unlike is not None:
+        own = lambda key: (hash(key) % unlike - unlike // 2) << 56  # noqa: E731
+        monkeypatch.setattr(distinct_keys, "hash", own, raising=False)
     keys = [f"thing {i}" for i in range(count)]
     assert found(keys, step) is None
     draw = random.Random(count)
@@ -77,12 +80,13 @@ def test_a_long_table_of_views(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_nothing_is_written_of_a_refused_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    save_rig(placed_rig(), tmp_path / "rig.json")
+    save_rig(real_rig(), tmp_path / "rig.json")
     rows = [f"a{i},320,240,310,240" for i in range(40)]
     (tmp_path / "marks.csv").write_text("\n".join(["name,left_u,left_v,right_u,right_v", *rows, rows[0]]) + "\n")
     whole = tables.read_chunks
     monkeypatch.setattr("kcal.locate.marks.read_chunks", lambda *given, **more: whole(*given, **more | {"at_once": 5}))
     words = ["locate", str(tmp_path / "rig.json"), str(tmp_path / "marks.csv"), "-o", str(tmp_path / "out.csv")]
+    words += ["--origin", "0,0,0", "--heading", "0"]
     done = CliRunner().invoke(app, words)
     assert "line 42: the name 'a0' was used on line 2" in str(done.exception)
     assert not (tmp_path / "out.csv").exists()
