@@ -32,17 +32,17 @@ _DERIVED = "summary"
 class Record(pydantic.BaseModel):
     """Base of the blocks inside kcal's files: unknown fields, NaN and infinity are refused.
 
-    `LATER`: fields that a version of the format got after files of it had been written, with the value that stands for
+    `_LATER`: fields that a version of the format got after files of it had been written, with the value that stands for
     "not said". A field that has this value is left out, so that an older kcal reads the file.
     """
 
     model_config = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-    LATER: ClassVar[Mapping[str, Any]] = {}
+    _LATER: ClassVar[Mapping[str, Any]] = {}
 
     # No type for what it returns: in JSON schemas, pydantic would put that type in place of the fields.
     @pydantic.model_serializer(mode="wrap")
     def _as_before(self, plain: pydantic.SerializerFunctionWrapHandler):  # type: ignore[no-untyped-def]
-        later = self.LATER
+        later = self._LATER
         return {key: value for key, value in plain(self).items() if key not in later or value != later[key]}
 
 

@@ -54,7 +54,7 @@ class Board(Record):
         [0.1144, 0.0, 0.0]
     """
 
-    LATER: ClassVar[Mapping[str, Any]] = {"pattern": "checkerboard", "gap": None, "diameter": None, "first": 0}
+    _LATER: ClassVar[Mapping[str, Any]] = {"pattern": "checkerboard", "gap": None, "diameter": None, "first": 0}
 
     columns: int = pydantic.Field(ge=2, le=MOST)
     rows: int = pydantic.Field(ge=2, le=MOST)

@@ -96,7 +96,7 @@ class CameraFile(NativeFile):
     VERSION: ClassVar[int] = 2
     OLDER: ClassVar[tuple[int, ...]] = (1,)
     RETIRED: ClassVar[Mapping[str, str]] = RETIRED_FIELDS
-    LATER: ClassVar[Mapping[str, Any]] = {"setting": None}
+    _LATER: ClassVar[Mapping[str, Any]] = {"setting": None}
 
     name: str
     image_size: ImageSize

@@ -55,7 +55,7 @@ class HybridRecord(Record):
         network: of the field, if it is the last layer of a network.
     """
 
-    LATER: ClassVar[Mapping[str, Any]] = dict.fromkeys(_KINDS)
+    _LATER: ClassVar[Mapping[str, Any]] = dict.fromkeys(_KINDS)
 
     shape: float
     radius: float
@@ -92,7 +92,7 @@ class LensOrders(Record):
         hybrid: constants of a hybrid lens, which has no orders; None, and absent from the file, for other lenses.
     """
 
-    LATER: ClassVar[Mapping[str, Any]] = {"hybrid": None}
+    _LATER: ClassVar[Mapping[str, Any]] = {"hybrid": None}
 
     numerator: int
     denominator: int

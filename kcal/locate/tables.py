@@ -213,11 +213,11 @@ def read_chunks(
             own = by_column.get("name", [str(count + i) for i in range(1, len(lines) + 1)])
             if "name" in by_column and unique:
                 _check_filled(path, own, lines)
-                _check_once(path, earlier.add(own))
+                _refuse_doubled(path, earlier.add(own))
             count += len(lines)
             yield TableChunk(path, lines, own, by_column, read)
             read = _bytes_read(file)
-        _check_once(path, earlier.finish())
+        _refuse_doubled(path, earlier.finish())
     if count == 0:
         raise FileError(f"{path}: no rows under the header; write one line for each")
 
@@ -336,7 +336,7 @@ def _check_filled(path: Path, names: Sequence[str], lines: Sequence[int]) -> Non
         raise FileError(f"{where}: the name is empty; write one or leave the column out")
 
 
-def _check_once(path: Path, found: Doubled | None) -> None:
+def _refuse_doubled(path: Path, found: Doubled | None) -> None:
     if found is not None:
         key, first, again = found
         raise FileError(f"{path}: line {again}: the name {key!r} was used on line {first}; names must differ")

@@ -121,14 +121,14 @@ def read_view_chunks(path: str | Path, cameras: Sequence[str]) -> Iterator[tuple
             if open_key is not None:
                 done.move(open_key, reader)
             if done.first:
-                _check_once(path, earlier.add(done.rows))
+                _refuse_apart(path, earlier.add(done.rows))
                 yield done.marks(more, timed=True), chunk.bytes_read
-        _check_once(path, earlier.add(reader.rows))
-        _check_once(path, earlier.finish())
+        _refuse_apart(path, earlier.add(reader.rows))
+        _refuse_apart(path, earlier.finish())
     yield reader.marks(more, timed=True), path.stat().st_size
 
 
-def _check_once(path: Path, found: Doubled | None) -> None:
+def _refuse_apart(path: Path, found: Doubled | None) -> None:
     if found is not None:
         raise FileError(_not_together(f"{path}: line {found.again}", found.key[0]))
 
