@@ -151,6 +151,7 @@ def cell(folder: Path, python: str, package: Path, pins: list[str], tests: list[
     """
     place = folder / "environment"
     start = time.perf_counter()
+    found: dict[str, Any] = {}
     try:
         call(python, "-m", "venv", place)
         pip = place / "bin" / "pip"
@@ -160,11 +161,13 @@ def cell(folder: Path, python: str, package: Path, pins: list[str], tests: list[
         call(pip, "install", "--quiet", "--no-compile", *wheels, package, *pins)
         installed = time.perf_counter() - start
         found = json.loads(call(place / "bin" / "python", "-c", SMOKE, cwd=folder).splitlines()[-1])
-        counted = core_tests(folder, place / "bin", tests, processes) if tests else ""
-        return {"outcome": "passed" if not counted else f"passed; {counted}", "install_s": installed, **found}
+        outcome = "passed"
+        if tests:
+            outcome += f"; core tests: {core_tests(folder, place / 'bin', tests, processes)}"
+        return {"outcome": outcome, "install_s": installed, **found}
     except SystemExit as error:
         show([str(error)])
-        return {"outcome": "FAILED: " + str(error).splitlines()[-1]}
+        return {"outcome": "FAILED: " + str(error).splitlines()[-1], **found}
     finally:
         shutil.rmtree(place, ignore_errors=True)
 
