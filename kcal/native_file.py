@@ -30,9 +30,20 @@ _DERIVED = "summary"
 
 
 class Record(pydantic.BaseModel):
-    """Base of the blocks inside kcal's files: unknown fields, NaN and infinity are refused."""
+    """Base of the blocks inside kcal's files: unknown fields, NaN and infinity are refused.
+
+    `_LATER`: fields that a version of the format got after files of it had been written, with the value that stands for
+    "not said". A field that has this value is left out, so that an older kcal reads the file.
+    """
 
     model_config = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    _LATER: ClassVar[Mapping[str, Any]] = {}
+
+    # No type for what it returns: in JSON schemas, pydantic would put that type in place of the fields.
+    @pydantic.model_serializer(mode="wrap")
+    def _as_before(self, plain: pydantic.SerializerFunctionWrapHandler):  # type: ignore[no-untyped-def]
+        later = self._LATER
+        return {key: value for key, value in plain(self).items() if key not in later or value != later[key]}
 
 
 def _underived(content: Any, places: Iterable[tuple[int | str, ...]]) -> Any:
@@ -72,14 +83,13 @@ def _not_finite(value: Any) -> list[str] | None:
     return None
 
 
-class NativeFile(pydantic.BaseModel):
+class NativeFile(Record):
     """Base of kcal's files: a pydantic model that is stored with its `kind` and `version`.
 
     Subclasses set `KIND`, `VERSION`, in `OLDER` the versions that they read as well, and in `RETIRED` what to say of
     fields that are read no more. The JSON text begins `{"kcal": KIND, "version": VERSION, ...}`.
     """
 
-    model_config = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
     KIND: ClassVar[str]
     VERSION: ClassVar[int]
     OLDER: ClassVar[tuple[int, ...]] = ()

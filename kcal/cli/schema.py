@@ -37,8 +37,8 @@ def file_schema(kind: str) -> dict[str, Any]:
         "version": {"const": file.VERSION},
         **schema["properties"],
     }
-    # All fields are written, so that a reader need not know their defaults.
-    schema["required"] = list(schema["properties"])
+    # All fields of the version's first files are written, so that a reader need not know their defaults.
+    schema["required"] = [name for name in schema["properties"] if name not in file._LATER]
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": f"kcal {file.KIND} file, version {file.VERSION}",

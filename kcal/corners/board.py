@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import pydantic
 
@@ -11,17 +12,17 @@ from kcal.corners.board_text import DICTIONARIES, MOST, board_fields
 from kcal.corners.kalibr_target import target_fields
 from kcal.errors import FileError, InputError
 from kcal.lens.calibration import BoardRecord
+from kcal.native_file import Record
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 Pattern = Literal["checkerboard", "circles", "asymmetric", "aprilgrid"]
 TAGS = "apriltag_36h11"  # the dictionary of an AprilGrid
-_LATER = {"pattern": "checkerboard", "gap": None, "diameter": None, "first": 0}
 _TARGET_FILES = (".yaml", ".yml")
 
 
-class Board(pydantic.BaseModel):
+class Board(Record):
     """A checkerboard, a grid of circles or an AprilGrid, described by its points in rows and columns.
 
     Convention: x runs along a row, y down the columns, z into the board, away from a camera in front of it. Point
@@ -53,7 +54,7 @@ class Board(pydantic.BaseModel):
         [0.1144, 0.0, 0.0]
     """
 
-    model_config = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    _LATER: ClassVar[Mapping[str, Any]] = {"pattern": "checkerboard", "gap": None, "diameter": None, "first": 0}
 
     columns: int = pydantic.Field(ge=2, le=MOST)
     rows: int = pydantic.Field(ge=2, le=MOST)
@@ -101,12 +102,6 @@ class Board(pydantic.BaseModel):
         if self.first + self.markers > DICTIONARIES[dictionary]:
             since = f" from number {self.first} on" if self.first else ""
             raise ValueError(f"the board needs {self.markers} markers{since}, dictionary {dictionary} fewer")
-
-    @pydantic.model_serializer(mode="wrap")
-    def _as_before(self, handler: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out what boards did not have when files of version 1 were made, unless it says something."""
-        content: dict[str, Any] = handler(self)
-        return {name: value for name, value in content.items() if name not in _LATER or value != _LATER[name]}
 
     @classmethod
     def parse(cls, size: str, square: str | None = None) -> Board:

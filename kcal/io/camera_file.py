@@ -96,6 +96,7 @@ class CameraFile(NativeFile):
     VERSION: ClassVar[int] = 2
     OLDER: ClassVar[tuple[int, ...]] = (1,)
     RETIRED: ClassVar[Mapping[str, str]] = RETIRED_FIELDS
+    _LATER: ClassVar[Mapping[str, Any]] = {"setting": None}
 
     name: str
     image_size: ImageSize
@@ -146,11 +147,9 @@ class CameraFile(NativeFile):
         return value
 
     @pydantic.field_serializer("calibration", mode="wrap")
-    def _as_before(
-        self, value: CalibrationRecord | None, handler: pydantic.SerializerFunctionWrapHandler
-    ) -> dict[str, Any] | None:
+    def _board_as_before(self, value: CalibrationRecord | None, plain: pydantic.SerializerFunctionWrapHandler):  # type: ignore[no-untyped-def]
         """Leave out what checkerboards do not need, so that files of them stay as they were."""
-        content: dict[str, Any] | None = handler(value)
+        content = plain(value)
         if content is not None and content["board"]["pattern"] == "checkerboard":
             del content["board"]["pattern"], content["board"]["gap"]
         return content

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import pydantic
 
@@ -54,16 +55,13 @@ class HybridRecord(Record):
         network: of the field, if it is the last layer of a network.
     """
 
+    _LATER: ClassVar[Mapping[str, Any]] = dict.fromkeys(_KINDS)
+
     shape: float
     radius: float
     modes: ZernikeRecord | None = None
     gaussian: GaussianRecord | None = None
     network: NetworkRecord | None = None
-
-    @pydantic.model_serializer(mode="wrap")
-    def _without_other_kinds(self, plain: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
-        stored: dict[str, Any] = plain(self)
-        return {key: value for key, value in stored.items() if value is not None}
 
     @classmethod
     def of(cls, form: HybridForm) -> HybridRecord:
@@ -94,6 +92,8 @@ class LensOrders(Record):
         hybrid: constants of a hybrid lens, which has no orders; None, and absent from the file, for other lenses.
     """
 
+    _LATER: ClassVar[Mapping[str, Any]] = {"hybrid": None}
+
     numerator: int
     denominator: int
     tangential: bool
@@ -106,13 +106,6 @@ class LensOrders(Record):
     def _known(self) -> LensOrders:
         self.model()
         return self
-
-    @pydantic.model_serializer(mode="wrap")
-    def _without_empty_hybrid(self, plain: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
-        stored: dict[str, Any] = plain(self)
-        if stored["hybrid"] is None:
-            del stored["hybrid"]
-        return stored
 
     @classmethod
     def of(cls, model: LensModel) -> LensOrders:

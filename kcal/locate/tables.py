@@ -9,7 +9,7 @@ import math
 import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from io import TextIOWrapper
 from operator import methodcaller
 from pathlib import Path
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from kcal.errors import FileError
 from kcal.files import read_head
 from kcal.lens.dispatch import CHUNK
+from kcal.locate.distinct_keys import DistinctKeys, Doubled
 
 # The pieces in which the localizer does many points: a table is located as in one call, to the last bit.
 CHUNK_ROWS = CHUNK
@@ -160,7 +161,8 @@ def read_chunks(
 ) -> Iterator[TableChunk]:
     """The same, some rows at a time, so that a table may be longer than memory.
 
-    Names of earlier rows are remembered as eight bytes each.
+    Of the names, some megabytes are kept in memory, the others as eight bytes each in a temporary file: one that was
+    used before is refused when its line is reached or, if a million lines or more are between, at the end.
 
     Args:
         path: of the file.
@@ -175,9 +177,13 @@ def read_chunks(
         FileError: as `read_rows`, when the line is reached.
     """
     path = Path(path)
-    seen = np.empty(0, np.int64)
     count = 0
-    with _text_of(path) as file:
+
+    def names_again() -> Iterator[tuple[str, int]]:
+        again = read_chunks(path, header, columns, required, extras=extras, unique=False, at_once=at_once)
+        return ((name, line) for chunk in again for name, line in zip(chunk.names, chunk.lines, strict=True))
+
+    with _text_of(path) as file, closing(DistinctKeys(path, names_again)) as earlier:
         line = 0
         names: list[str] = []
         texts_of = _lines_of(path, file)
@@ -206,10 +212,12 @@ def read_chunks(
                     by_column[name] = list(map(_unguarded, cells))
             own = by_column.get("name", [str(count + i) for i in range(1, len(lines) + 1)])
             if "name" in by_column and unique:
-                seen = _check_names(path, own, lines, seen)
+                _check_filled(path, own, lines)
+                _refuse_doubled(path, earlier.add(own))
             count += len(lines)
             yield TableChunk(path, lines, own, by_column, read)
             read = _bytes_read(file)
+        _refuse_doubled(path, earlier.finish())
     if count == 0:
         raise FileError(f"{path}: no rows under the header; write one line for each")
 
@@ -322,38 +330,16 @@ def _check_widths(path: Path, rows: Sequence[tuple[int, list[str]]], width: int)
             raise FileError(f"{path}: line {line}: {len(cells)} fields, the header has {width}: {text}")
 
 
-def _check_names(path: Path, names: list[str], lines: Sequence[int], seen: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Raise if a name is empty or was used before; return the sorted hashes of all names so far.
-
-    Equal hashes of unlike names are possible: whether a name was really there before, the file says.
-    """
-    hashes = np.fromiter(map(hash, names), np.int64, len(names))
-    place = np.searchsorted(seen, hashes)
-    suspect = (seen[np.minimum(place, len(seen) - 1)] == hashes) if len(seen) else np.zeros(len(names), bool)
-    if "" in names or len(set(names)) < len(names) or bool(suspect.any()):
-        lines_by_name: dict[str, int] = {}
-        for name, line, again in zip(names, lines, suspect.tolist(), strict=True):
-            where = f"{path}: line {line}"
-            if not name:
-                raise FileError(f"{where}: the name is empty; write one or leave the column out")
-            before = lines_by_name.get(name) or (_line_of(path, name, line) if again else None)
-            if before is not None:
-                raise FileError(f"{where}: the name {name!r} was used on line {before}; names must differ")
-            lines_by_name[name] = line
-    return np.sort(np.concatenate([seen, hashes]), kind="stable")
+def _check_filled(path: Path, names: Sequence[str], lines: Sequence[int]) -> None:
+    if "" in names:
+        where = f"{path}: line {lines[names.index('')]}"
+        raise FileError(f"{where}: the name is empty; write one or leave the column out")
 
 
-def _line_of(path: Path, name: str, before: int) -> int | None:
-    """The line above `before` where a name was used."""
-    with _text_of(path) as file:
-        reader = _csv_reader(file)
-        column = next(cells for cells in map(_stripped, reader) if any(cells)).index("name")
-        for cells in reader:
-            if reader.line_num >= before:
-                break
-            if any(cells) and _unguarded(cells[column].strip()) == name:
-                return int(reader.line_num)
-    return None
+def _refuse_doubled(path: Path, found: Doubled | None) -> None:
+    if found is not None:
+        key, first, again = found
+        raise FileError(f"{path}: line {again}: the name {key!r} was used on line {first}; names must differ")
 
 
 def _check_header(

@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from kcal.calibrate.rig.sources import Features, Landmarks
 from kcal.errors import FileError, InputError
+from kcal.locate.distinct_keys import DistinctKeys, Doubled
 from kcal.locate.marks import read_marks
 from kcal.locate.survey import MarkedLandmarks, Survey, inverse_range_of
 from kcal.locate.tables import TableChunk, TableRow, header_of, read_chunks
@@ -105,42 +105,50 @@ def read_view_chunks(path: str | Path, cameras: Sequence[str]) -> Iterator[tuple
     if not is_long(path) or path.stat().st_size <= _WHOLE:
         yield read_views(path, cameras, others=False), path.stat().st_size
         return
-    reader, more, seen = _Gather(cameras), list[str](), np.empty(0, np.int64)
+    reader, more = _Gather(cameras), list[str]()
     open_key: tuple[str, str] | None = None
-    for chunk in _view_chunks(path, False):
-        more = [column for column in chunk.columns if column not in _KNOWN]
-        for row in chunk.rows():
-            key = row.name, row.cells.get("time", "")
-            if key != open_key and key in reader.rows:
-                raise FileError(_not_together(row))
-            reader.add(row)
-            open_key = key
-        # The last thing may go on.
-        done, reader = reader, _Gather(cameras)
-        if open_key is not None:
-            done.move(open_key, reader)
-        if done.first:
-            seen = _things_once(done, seen)
-            yield done.marks(more, timed=True), chunk.bytes_read
-    _things_once(reader, seen)
+    with closing(DistinctKeys(path, lambda: _things(path))) as earlier:
+        for chunk in _view_chunks(path, False):
+            more = [column for column in chunk.columns if column not in _KNOWN]
+            for row in chunk.rows():
+                key = row.name, row.cells.get("time", "")
+                if key != open_key and key in reader.rows:
+                    raise FileError(_not_together(row.where, row.name))
+                reader.add(row)
+                open_key = key
+            # The last thing may go on.
+            done, reader = reader, _Gather(cameras)
+            if open_key is not None:
+                done.move(open_key, reader)
+            if done.first:
+                _refuse_apart(path, earlier.add(done.rows))
+                yield done.marks(more, timed=True), chunk.bytes_read
+        _refuse_apart(path, earlier.add(reader.rows))
+        _refuse_apart(path, earlier.finish())
     yield reader.marks(more, timed=True), path.stat().st_size
 
 
-def _things_once(done: _Gather, seen: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Raise if a thing was there before; return the sorted hashes of all so far, eight bytes each."""
-    hashes = np.fromiter(map(hash, done.rows), np.int64, len(done.rows))
-    place = np.searchsorted(seen, hashes)
-    again = (seen[np.minimum(place, len(seen) - 1)] == hashes) if len(seen) else np.zeros(len(hashes), bool)
-    if again.any():
-        raise FileError(_not_together(done.first[int(again.argmax())]))
-    return np.sort(np.concatenate([seen, hashes]), kind="stable")
+def _refuse_apart(path: Path, found: Doubled | None) -> None:
+    if found is not None:
+        raise FileError(_not_together(f"{path}: line {found.again}", found.key[0]))
 
 
-def _not_together(row: TableRow) -> str:
+def _not_together(where: str, name: str) -> str:
     return (
-        f"{row.where}: lines of {row.name!r} stand at several places; in a table this long they must stand together: "
+        f"{where}: lines of {name!r} stand at several places; in a table this long they must stand together: "
         "sort it by name and time"
     )
+
+
+def _things(path: Path) -> Iterator[tuple[tuple[str, str], int]]:
+    """Name and time of each thing, and the first of its lines that stand together."""
+    last = None
+    for chunk in _view_chunks(path, False):
+        times = chunk.columns.get("time", [""] * len(chunk.names))
+        for name, time, line in zip(chunk.names, times, chunk.lines, strict=True):
+            if (name, time) != last:
+                last = name, time
+                yield last, line
 
 
 def _view_chunks(path: str | Path, ranges: bool) -> Iterator[TableChunk]:

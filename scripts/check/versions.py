@@ -117,7 +117,7 @@ def built(folder: Path) -> dict[str, Path]:
     return {"wheel": next(folder.glob("*.whl")), "sdist": next(folder.glob("*.tar.gz"))}
 
 
-def core_tests(folder: Path, bin_folder: Path, tests: list[str]) -> str:
+def core_tests(folder: Path, bin_folder: Path, tests: list[str], processes: int) -> str:
     """Run tests of a copy of this repository that has no package beside them; what pytest counted.
 
     Raises:
@@ -129,15 +129,16 @@ def core_tests(folder: Path, bin_folder: Path, tests: list[str]) -> str:
             shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
         shutil.copy(ROOT / "pyproject.toml", copy)
     # What tests themselves import; it must not move what is tested.
-    tools = "pytest", "hypothesis", "onnx", "onnxscript", "onnxruntime", "safetensors"
+    tools = "pytest", "pytest-xdist", "hypothesis", "onnx", "onnxscript", "onnxruntime", "safetensors"
     fixed = folder / "fixed.txt"
     fixed.write_text(call(bin_folder / "pip", "freeze", "--exclude", "kcal"))
     call(bin_folder / "pip", "install", "--quiet", "--no-compile", "--constraint", fixed, *tools)
-    said = call(bin_folder / "python", "-m", "pytest", "-m", "not slow", "-p", "no:cacheprovider", *tests, cwd=copy)
+    options = "-m", "not slow", "-p", "no:cacheprovider", "-n", processes
+    said = call(bin_folder / "python", "-m", "pytest", *options, *tests, cwd=copy)
     return said.strip().splitlines()[-1].split(" in ")[0]
 
 
-def cell(folder: Path, python: str, package: Path, pins: list[str], tests: list[str]) -> dict[str, Any]:
+def cell(folder: Path, python: str, package: Path, pins: list[str], tests: list[str], processes: int) -> dict[str, Any]:
     """Install a package into an empty environment and use it; the environment is removed.
 
     Args:
@@ -146,9 +147,11 @@ def cell(folder: Path, python: str, package: Path, pins: list[str], tests: list[
         package: wheel or sdist.
         pins: requirements besides it.
         tests: paths of tests to run after that.
+        processes: that run them.
     """
     place = folder / "environment"
     start = time.perf_counter()
+    found: dict[str, Any] = {}
     try:
         call(python, "-m", "venv", place)
         pip = place / "bin" / "pip"
@@ -158,10 +161,13 @@ def cell(folder: Path, python: str, package: Path, pins: list[str], tests: list[
         call(pip, "install", "--quiet", "--no-compile", *wheels, package, *pins)
         installed = time.perf_counter() - start
         found = json.loads(call(place / "bin" / "python", "-c", SMOKE, cwd=folder).splitlines()[-1])
-        counted = core_tests(folder, place / "bin", tests) if tests else ""
-        return {"outcome": "passed" if not counted else f"passed; {counted}", "install_s": installed, **found}
+        outcome = "passed"
+        if tests:
+            outcome += f"; core tests: {core_tests(folder, place / 'bin', tests, processes)}"
+        return {"outcome": outcome, "install_s": installed, **found}
     except SystemExit as error:
-        return {"outcome": "FAILED: " + str(error).splitlines()[-1]}
+        show([str(error)])
+        return {"outcome": "FAILED: " + str(error).splitlines()[-1], **found}
     finally:
         shutil.rmtree(place, ignore_errors=True)
 
@@ -179,6 +185,7 @@ def main() -> None:
     parser.add_argument("--only", choices=("oldest", "newest"), help="only these dependencies")
     parser.add_argument("--pythons", nargs="+", default=list(PYTHONS), metavar="X.Y")
     parser.add_argument("--tests", nargs="*", default=list(CORE), metavar="PATH", help="to run; none if only named")
+    parser.add_argument("--processes", type=int, default=1, help="that run the tests")
     parser.add_argument("--newest-torch", default="", metavar="REQUIREMENT", help="in place of what pip chooses")
     parser.add_argument("--out", type=Path, help="JSON lines of rows; those in it are kept and shown")
     parser.add_argument("--no-page", action="store_true")
@@ -201,7 +208,7 @@ def main() -> None:
                 if arguments.only in (None, age) and not done:
                     newest = [arguments.newest_torch] if arguments.newest_torch else []
                     pins = lower if age == "oldest" else newest
-                    found = cell(folder, python, packages[kind], pins, arguments.tests)
+                    found = cell(folder, python, packages[kind], pins, arguments.tests, arguments.processes)
                     seen = found.get("versions", {})
                     names = ("torch", "numpy", "scipy")
                     rows.append([version, kind, age, *(seen.get(name, "") for name in names), found["outcome"]])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import av
 import cv2
 import numpy as np
 import pytest
@@ -55,6 +54,7 @@ def test_damaged_images_are_refused() -> None:
 
 
 def test_a_video_has_its_frames_at_their_times(tmp_path: Path) -> None:
+    av = pytest.importorskip("av")
     frames = [np.full((32, 48), 40 * number, np.uint8) for number in range(5)]
     path = write_video(tmp_path / "a.mp4", iter(frames), 4, quality=0)
     with av.open(str(path)) as container:

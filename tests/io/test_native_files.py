@@ -193,7 +193,6 @@ class TestCamera:
                 "polygon": [[-0.5, 479.5], [-0.5, -0.5], [639.5, -0.5], [639.5, 479.5]],
             },
             "calibration": None,
-            "setting": None,
         }
 
     def test_valid_region_of_a_lens_that_folds(self, tmp_path: Path) -> None:

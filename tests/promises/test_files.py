@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from kcal.calibrate.hybrid.measured_board import load_measured_board
+from kcal.calibrate.hybrid.measured_board import load_measured_board, save_measured_board
 from kcal.corners.observations import Observations
 from kcal.io.camera_file import CameraFile, load_camera, save_camera
 from kcal.io.camera_rig_file import CameraRigFile, save_camera_rig
 from kcal.io.file_summary import sigma_of
 from kcal.io.lookup_file import load_lookup
-from kcal.io.rig_file import RigFile, load_rig
+from kcal.io.rig_file import RigFile, load_rig, save_rig
 from kcal.lens.camera import Camera
 from kcal.locate.stations import load_camera_rig
 
@@ -84,6 +84,34 @@ def test_rigs_of_several_cameras(folder: Path, tmp_path: Path) -> None:
         close(rig.root.square().sum(0), known["variance"])
         for camera, numbers in zip(rig.each, known["cameras"], strict=True):
             same_camera(camera, numbers, whole)
+
+
+def fields(content: object, at: str = "") -> set[str]:
+    """Places of all fields of a decoded JSON value."""
+    if isinstance(content, list):
+        return set().union(*(fields(each, f"{at}[]") for each in content))
+    if not isinstance(content, dict):
+        return set()
+    return set().union(*({f"{at}.{key}"} | fields(value, f"{at}.{key}") for key, value in content.items()))
+
+
+WRITTEN_AGAIN = {
+    "camera": lambda path, to: save_camera(load_camera(path), to),
+    "rig": lambda path, to: save_rig(load_rig(path), to),
+    "camera-rig": lambda path, to: save_camera_rig(load_camera_rig(path), to),
+    "observations": lambda path, to: Observations.load(path).save(to),
+    "board": lambda path, to: save_measured_board(load_measured_board(path), to),
+}
+NEWEST = [*sorted((FILES / "0.1-format2").glob("*.json")), FILES / "0.2-camera-rig" / "camera-rig.json"]
+
+
+@pytest.mark.parametrize("path", [path for path in NEWEST if path.name != "computed.json"], ids=lambda path: path.name)
+def test_the_newest_version_has_the_fields_of_its_first_files(path: Path, tmp_path: Path) -> None:
+    """An older kcal that reads the version refuses any field that it does not know."""
+    stored = json.loads(path.read_text(encoding="utf-8"))
+    kind = "camera-rig" if "names" in stored else stored["kcal"]
+    again = json.loads(WRITTEN_AGAIN[kind](path, tmp_path / "again.json").read_text(encoding="utf-8"))
+    assert (again["version"], fields(again)) == (stored["version"], fields(stored))
 
 
 def test_each_format_that_is_read_has_files() -> None:
