@@ -160,6 +160,8 @@ def _learned(off: Tensor, sigma: Tensor, pixels: Tensor, kind: Tensor, repeats: 
         widened = (1.0 - leverage * repeats).clamp_min(0.5).rsqrt()
         for one in kind.unique():
             own = kind == one
+            if int(own.sum()) < _FEWEST:
+                continue
             shape[own], tail = _error_variance(error[own], sigma[own])
             ratio = error[own].square() / shape[own]
             share = (tail + 1.0) / (tail + ratio)
@@ -172,7 +174,8 @@ def _learned(off: Tensor, sigma: Tensor, pixels: Tensor, kind: Tensor, repeats: 
             # small is worse than it says by twice the relative variance of it.
             things = len(moment) / repeats[own].mean()
             unsure = (moment.square().mean() / moment.mean().square() - 1.0) / things
-            variance[own] = shape[own] * moment.mean() * (1.0 + 2.0 * unsure)
+            # Errors that happen to be smaller than noise are not known to stay so.
+            variance[own] = shape[own] * moment.mean().clamp_min(1.0) * (1.0 + 2.0 * unsure)
             weight[own] = share / share.mean()
     return shape, influence, variance, weight
 
@@ -192,17 +195,16 @@ def _without_lenses(error: Tensor, weight: Tensor, pixels: Tensor) -> tuple[Tens
 def _error_variance(error: Tensor, sigma: Tensor) -> tuple[Tensor, float]:
     """Squared scales (M,) and degrees of freedom of Student's distribution that make errors likeliest.
 
-    The squares are a multiple of σ² + floor, and not below σ² where there is no floor.
+    The squares are a multiple of σ² + floor, and not below σ².
     """
-    if len(error) < _FEWEST:
-        return sigma.square(), _TAILS[-1]
     tails = torch.tensor(_TAILS, dtype=torch.float64).repeat(len(_FLOORS))[:, None]
     floor = torch.tensor(_FLOORS, dtype=torch.float64).repeat_interleave(len(_TAILS))[:, None]
     shape, square = sigma.square() + floor, error.square()
-    scale = torch.where(floor == 0.0, 1.0, (0.45 * error.abs().median()) ** 2 / shape.median(1, keepdim=True).values)
+    least = (sigma.square() / shape).amax(1, keepdim=True)
+    scale = torch.maximum(least, (0.45 * error.abs().median()) ** 2 / shape.median(1, keepdim=True).values)
     for _ in range(_STEPS):
         scale = ((tails + 1.0) * square / (tails * shape + square / scale)).mean(1, keepdim=True)
-        scale = torch.where(floor == 0.0, scale.clamp_min(1.0), scale)
+        scale = torch.maximum(scale, least)
     likelihood = (
         torch.lgamma(0.5 * (tails + 1.0)) - torch.lgamma(0.5 * tails) - 0.5 * torch.log(tails * scale * shape)
         - 0.5 * (tails + 1.0) * torch.log1p(square / (tails * scale * shape))
