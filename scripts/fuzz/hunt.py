@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import hypothesis
+import torch
 from hypothesis.strategies import SearchStrategy
 
 # What one case may take: seconds, and bytes beyond what the process has when it begins.
@@ -179,6 +180,8 @@ def _be_child(work: Callable[[Write], int], folder: Path, out: Path) -> None:
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
         signal.signal(signal.SIGALRM, _overtime)
         limit_memory()
+        # Threads of the parent are not here, and what waits for them waits for ever.
+        torch.set_num_threads(1)
         os.chdir(folder)
         with open(out, "a") as file:
 
