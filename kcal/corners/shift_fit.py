@@ -32,7 +32,6 @@ class ShiftFit(NamedTuple):
         converged: (N,).
         share: (N,) share of the weight that robust weights left.
         slant: (N,) steps along the first axis by which a step stretches or shears the right patch; 0 if not fitted.
-        residual: (N,) robust standard deviation of the gray levels that are left over.
     """
 
     shift: Tensor
@@ -40,7 +39,6 @@ class ShiftFit(NamedTuple):
     converged: Tensor
     share: Tensor
     slant: Tensor
-    residual: Tensor
 
 
 class _Patches(NamedTuple):
@@ -130,8 +128,9 @@ def fit_shifts(
     which = wanted.nonzero()[:, 0]
     nothing = torch.zeros_like(moved[:, 0, 0])
     if not len(which):
-        none = nothing[:, 0]
-        return ShiftFit(nothing, torch.zeros_like(slopes[:, 0, 0]), torch.zeros_like(wanted), none, none, none)
+        return ShiftFit(
+            nothing, torch.zeros_like(slopes[:, 0, 0]), torch.zeros_like(wanted), nothing[:, 0], nothing[:, 0]
+        )
     half = (template.shape[2] // 2, template.shape[1] // 2)
     grid = grid_of(half, template.device) if sheared else None
     patches = _Patches(template, right, moved, slopes, weight, grid).at(which)
@@ -150,8 +149,7 @@ def fit_shifts(
     shift = theta[:, :2]
     if torch.is_grad_enabled() and (template.requires_grad or right.values.requires_grad):
         shift = _implicit(patches, theta, scale, converged)[:, :2]
-    slant = torch.linalg.vector_norm(theta[:, 4:], dim=1)
-    found = ShiftFit(shift, covariance, converged, share, slant, scale)
+    found = ShiftFit(shift, covariance, converged, share, torch.linalg.vector_norm(theta[:, 4:], dim=1))
     return ShiftFit(*(part.new_zeros(len(wanted), *part.shape[1:]).index_copy(0, which, part) for part in found))
 
 

@@ -3,10 +3,7 @@
 The fit of a match tells what noise does to it. What remains shows in how far matches lie off their epipolar lines, and
 most of it is the same whenever the same thing is seen in the same light: it is no smaller after a hundred pairs. It
 comes from patches that look different in both images: ground at a slant, whose blur is another one in each, and edges
-before something farther away. Before the ground these even have a direction: its texture, seen from above, runs away
-from the middle of the image, and where it meets an edge that stands upright, a corner appears that goes up or down as
-the camera moves. Both parts are learned from the matches themselves, for classes of slant and of misfit, and matches
-far worse than the others of their class count less.
+before something farther away. Both parts are learned from the matches themselves, for classes of slant.
 """
 
 from __future__ import annotations
@@ -25,42 +22,34 @@ from kcal.lens.rig import StereoRig
 PATCH = 15.0
 # Pixels of sway of a mast between pairs, of disparity and of place within which two matches are of one thing.
 _SWAY, _SAME_DISPARITY, _SAME_PLACE = 8.0, 1.5, 1.5
-# Degrees of freedom of Student's distribution that are tried; the last one is as good as Gaussian.
-_TAILS = (2.0, 3.0, 4.0, 6.0, 10.0, 30.0, 1000.0)
+# Errors off the epipolar lines beyond so many standard deviations are wrong matches, and tell nothing of the others.
+_WRONG = 5.0
 # Pairs of matches of one thing without which nothing is learned: then all that is not noise counts as common.
 _FEWEST = 50
-# Classes of slant and, in each, of misfit.
-_SLANTS, _MISFITS = 2, 2
+# Classes of slant: with four, yaw from three pairs of a minute was a little better than with one, on 18 terrains.
+_CLASSES = 4
 # Degree of the polynomial that takes errors of lenses out, which are known from elsewhere and smooth.
 _DEGREE = 4
 # The floor under variances that is tried, px².
-_FLOORS = (0.0, *np.geomspace(1e-5, 0.04, 13).tolist())
-# Rounds of lenses and variances in turn, and steps to the likeliest scale.
-_ROUNDS, _STEPS = 4, 12
+_FLOORS = [0.0, *np.geomspace(1e-5, 0.04, 25).tolist()]
 
 
 @torch.no_grad()
 def with_common_errors(
-    rigs: Sequence[StereoRig],
-    pixels: Sequence[Tensor],
-    covariance: Sequence[Tensor],
-    slant: Sequence[Tensor],
-    misfit: Sequence[Tensor],
+    rigs: Sequence[StereoRig], pixels: Sequence[Tensor], covariance: Sequence[Tensor], slant: Sequence[Tensor]
 ) -> list[Tensor]:
     """Covariances (M, 2, 2) of the matches of some pairs with which they may be counted as if they were independent.
 
     Patches that look the same in both images are good to the noise; what is seen at a slant has errors of its own,
     which stay as long as the light does. So the variance beyond noise, and the part of it that pairs have in common,
-    are learned for classes of slant and misfit (`_learned`). A match counts with the sum of its covariances with itself
-    and with all others, each weighted as it will be: neighbors have nearly the same effect on a pose, and so its
-    variance is right.
+    are learned for several classes of slant. A match counts with the sum of its covariances with itself and with all
+    others, each weighted as it will be: neighbors have nearly the same effect on a pose, and so its variance is right.
 
     Args:
         rigs: as each pair makes it.
         pixels: (M, 2, 2) left and right of each pair.
         covariance: (M, 2, 2) px² of the right pixels by noise alone.
         slant: (M,) see `kcal.scene.refine.RefinedMatches`.
-        misfit: (M,) likewise.
     """
     places, stated = torch.cat(list(pixels)), torch.cat(list(covariance))
     if not len(places):
@@ -68,7 +57,17 @@ def with_common_errors(
     found = [off_line(*one) for one in zip(rigs, pixels, covariance, strict=True)]
     off, sigma = (torch.cat(part) for part in zip(*found, strict=True))
     pair = torch.repeat_interleave(torch.tensor([len(own) for own in pixels]))
-    kind = _classes(slant, misfit)
+    kind = _classes(torch.cat(list(slant)), len(pixels))
+    scale, floor, common = (torch.zeros(len(places), dtype=torch.float64) for _ in range(3))
+    variance = sigma.square()
+    # What is smooth over the image is told best by those that turn out to be good.
+    for _ in range(2):
+        error = _without_lenses(off, variance.sqrt(), places[:, 0])
+        good = error.abs() < _WRONG * sigma
+        for one in kind.unique():
+            own = kind == one
+            scale[own], floor[own] = _error_variance(error[own & good], sigma[own & good])
+        variance = scale * sigma.square() + floor
     still = places[:, 0] - _shifts(places, pair)[pair]
     near = torch.from_numpy(cKDTree(still.numpy()).query_pairs(PATCH, p=math.inf, output_type="ndarray")).long()
     same_time = pair[near[:, 0]] == pair[near[:, 1]]
@@ -77,16 +76,10 @@ def with_common_errors(
     # Only things at one distance are the same.
     disparity = places[:, 1] - places[:, 0]
     alike = (disparity[near[:, 0]] - disparity[near[:, 1]]).abs().amax(1) < _SAME_DISPARITY
-    same = ~same_time & alike & (apart < _SAME_PLACE).all(1)
-    repeats = torch.ones(len(places), dtype=torch.float64)
-    for side in (0, 1):
-        repeats.index_add_(0, near[:, side], overlap)
-    shape, influence, variance, share = _learned(off, sigma, places[:, 0], kind, repeats)
-    common = torch.zeros_like(variance)
+    same = ~same_time & alike & (apart < _SAME_PLACE).all(1) & good[near].all(1)
     for one in kind.unique():
         own = kind == one
-        both = same & own[near].all(1)
-        common[own] = _common_share(influence, variance, near[both], overlap[both])
+        common[own] = _common_share(error, variance, near[same & own[near].all(1)], overlap[same & own[near].all(1)])
     common = common * variance
     weight = 1.0 / (common + (variance - common) / len(pixels))
     part = overlap * torch.where(same_time[:, None], variance[near], common[near]).prod(1).sqrt()
@@ -94,31 +87,17 @@ def with_common_errors(
     for side in (0, 1):
         total.index_add_(0, near[:, side], part * weight[near[:, 1 - side]])
     total = total / weight
-    # As if all directions were as much worse as the one across the epipolar line.
-    floor = (shape - sigma.square()).clamp_min(0.0)[:, None, None] * torch.eye(2, dtype=torch.float64)
-    counted = (total / (share * torch.maximum(shape, sigma.square())))[:, None, None] * (stated + floor)
+    counted = (total / variance)[:, None, None] * (
+        scale[:, None, None] * stated + floor[:, None, None] * torch.eye(2, dtype=torch.float64)
+    )
     return list(counted.split([len(own) for own in pixels]))
 
 
-def _classes(slant: Sequence[Tensor], misfit: Sequence[Tensor]) -> Tensor:
-    """(M,) number of the class of slant and, within it, of misfit, each with as many."""
-    # Contrast, and so misfit, depends on the light.
-    beside = torch.cat([own / own.median().clamp_min(1e-9) if len(own) else own for own in misfit])
-    most = max(1, sum(map(len, slant)) // (len(slant) * _FEWEST))
-    slants = max(1, min(_SLANTS, most // _MISFITS))
-    kind = _by_size(torch.cat(list(slant)), slants)
-    found = torch.zeros_like(kind)
-    for one in range(slants):
-        own = kind == one
-        found[own] = one * _MISFITS + _by_size(beside[own], min(_MISFITS, most // slants))
-    return found
-
-
-def _by_size(value: Tensor, count: int) -> Tensor:
-    """(N,) number of the class of a value, each of some classes with as many."""
-    if not len(value):
-        return torch.zeros(0, dtype=torch.long)
-    return torch.bucketize(value, value.quantile(torch.arange(1, count, dtype=torch.float64) / count))
+def _classes(slant: Tensor, pairs: int) -> Tensor:
+    """(M,) number of the class of slant, each with as many."""
+    count = max(1, min(_CLASSES, len(slant) // (pairs * _FEWEST)))
+    edges = slant.quantile(torch.arange(1, count, dtype=torch.float64) / count)
+    return torch.bucketize(slant, edges)
 
 
 def off_line(rig: StereoRig, pixels: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:
@@ -138,79 +117,30 @@ def off_line(rig: StereoRig, pixels: Tensor, covariance: Tensor) -> tuple[Tensor
     return here / length, (across[:, None] @ covariance @ across[..., None])[:, 0, 0].sqrt()
 
 
-def _learned(off: Tensor, sigma: Tensor, pixels: Tensor, kind: Tensor, repeats: Tensor) -> tuple[Tensor, ...]:
-    """What errors (M,) of all classes tell: their variance, influence on a robust solution, its variance, and weights.
-
-    Some matches are far worse than others and cannot be told from them beforehand: patches with an edge before
-    something farther away, whose errors even have a direction in common. So errors have Student's distribution, and a
-    match counts by the weight that this gives it. The influence of an error on such a solution is bounded, and its mean
-    square is the variance that counts (P. Huber, "Robust Statistics", 1981, section 6.3); nothing has to be cut off.
-
-    Args:
-        off: px off the epipolar lines.
-        sigma: by noise.
-        pixels: (M, 2) left ones.
-        kind: class.
-        repeats: patches that tell the same, each by how much of it, with itself.
-    """
-    shape, weight, influence, variance = sigma.square(), torch.ones_like(sigma), off.clone(), sigma.square()
-    for _ in range(_ROUNDS):
-        error, leverage = _without_lenses(off, weight / shape, pixels)
-        # What was taken out of the image with the lenses was in part these errors (J. MacKinnon and H. White 1985).
-        widened = (1.0 - leverage * repeats).clamp_min(0.5).rsqrt()
-        for one in kind.unique():
-            own = kind == one
-            if int(own.sum()) < _FEWEST:
-                continue
-            shape[own], tail = _error_variance(error[own], sigma[own])
-            ratio = error[own].square() / shape[own]
-            share = (tail + 1.0) / (tail + ratio)
-            # The mean slope of the influence is what keeps a solution where it is.
-            slope = (share * (tail - ratio) / (tail + ratio)).mean().clamp_min(0.1)
-            bounded = share * error[own] / slope * widened[own]
-            influence[own] = bounded
-            moment = bounded.square() / shape[own]
-            # A variance that few things tell is not sure; a solution that leans on the class that happened to come out
-            # small is worse than it says by twice the relative variance of it.
-            things = len(moment) / repeats[own].mean()
-            unsure = (moment.square().mean() / moment.mean().square() - 1.0) / things
-            # Errors that happen to be smaller than noise are not known to stay so.
-            variance[own] = shape[own] * moment.mean().clamp_min(1.0) * (1.0 + 2.0 * unsure)
-            weight[own] = share / share.mean()
-    return shape, influence, variance, weight
-
-
-def _without_lenses(error: Tensor, weight: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor]:
-    """Errors without what is smooth over the image, and the leverage of each in telling that."""
+def _without_lenses(error: Tensor, sigma: Tensor, pixels: Tensor) -> Tensor:
+    """Errors without what is smooth over the image."""
     at = (pixels - pixels.mean(0)) / pixels.std(0).clamp_min(1e-6)
     powers = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
-    if len(error) < 4 * len(powers):
-        return error, torch.zeros_like(error)
-    root = weight.sqrt()[:, None]
-    columns = torch.stack([at[:, 0] ** i * at[:, 1] ** j for i, j in powers], -1) * root
-    basis = torch.linalg.qr(columns)[0]
-    return error - (basis @ (basis.T @ (error[:, None] * root)) / root)[:, 0], basis.square().sum(1)
+    columns = torch.stack([at[:, 0] ** i * at[:, 1] ** j for i, j in powers], -1)
+    good = (error.abs() < _WRONG * sigma).nonzero()[:, 0]
+    if len(good) < 4 * len(powers):
+        return error
+    weight = 1.0 / sigma[good]
+    fit = torch.linalg.lstsq(columns[good] * weight[:, None], (error[good] * weight)[:, None], driver="gelsd").solution
+    return error - (columns @ fit)[:, 0]
 
 
-def _error_variance(error: Tensor, sigma: Tensor) -> tuple[Tensor, float]:
-    """Squared scales (M,) and degrees of freedom of Student's distribution that make errors likeliest.
-
-    The squares are a multiple of σ² + floor, and not below σ².
-    """
-    tails = torch.tensor(_TAILS, dtype=torch.float64).repeat(len(_FLOORS))[:, None]
-    floor = torch.tensor(_FLOORS, dtype=torch.float64).repeat_interleave(len(_TAILS))[:, None]
-    shape, square = sigma.square() + floor, error.square()
-    least = (sigma.square() / shape).amax(1, keepdim=True)
-    scale = torch.maximum(least, (0.45 * error.abs().median()) ** 2 / shape.median(1, keepdim=True).values)
-    for _ in range(_STEPS):
-        scale = ((tails + 1.0) * square / (tails * shape + square / scale)).mean(1, keepdim=True)
-        scale = torch.maximum(scale, least)
-    likelihood = (
-        torch.lgamma(0.5 * (tails + 1.0)) - torch.lgamma(0.5 * tails) - 0.5 * torch.log(tails * scale * shape)
-        - 0.5 * (tails + 1.0) * torch.log1p(square / (tails * scale * shape))
-    ).mean(1)  # fmt: skip
-    best = int(likelihood.argmax())
-    return (scale * shape)[best], float(tails[best])
+def _error_variance(error: Tensor, sigma: Tensor) -> tuple[float, float]:
+    """Scale and floor of variances scale σ² + floor, not below σ²: the likeliest for Gaussian errors."""
+    if len(error) < _FEWEST:
+        return 1.0, 0.0
+    best = (math.inf, 1.0, 0.0)
+    for floor in _FLOORS:
+        shape = sigma.square() + floor
+        scale = max(float((error.square() / shape).mean()), 1.0 if floor == 0.0 else 0.0)
+        cost = float((torch.log(scale * shape) + error.square() / (scale * shape)).mean())
+        best = min(best, (cost, scale, scale * floor))
+    return best[1:]
 
 
 def _shifts(places: Tensor, pair: Tensor) -> Tensor:

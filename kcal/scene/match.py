@@ -89,7 +89,6 @@ class MatchedPair(NamedTuple):
         pixels: (M, 2, 2) left and right.
         covariance: (M, 2, 2) px² of the right one, the left one being given.
         slant: (M,) see `kcal.scene.refine.RefinedMatches`.
-        misfit: (M,) likewise.
         counts: what became of the others.
         rig: with a baseline of one, as these matches make it.
     """
@@ -97,15 +96,14 @@ class MatchedPair(NamedTuple):
     pixels: Tensor
     covariance: Tensor
     slant: Tensor
-    misfit: Tensor
     counts: PairCounts
     rig: StereoRig
 
     def at(self, which: Tensor, **counts: Any) -> MatchedPair:
         """Those at some places."""
         counted = dataclasses.replace(self.counts, **counts)
-        pixels, covariance, slant, misfit = (part[which] for part in self[:4])
-        return MatchedPair(pixels, covariance, slant, misfit, counted, self.rig)
+        pixels, covariance, slant = self.pixels[which], self.covariance[which], self.slant[which]
+        return MatchedPair(pixels, covariance, slant, counted, self.rig)
 
 
 def scene_features(cameras: tuple[Camera, Camera], pairs: Sequence[ImagePair], most: int = MOST) -> SceneMatches:
@@ -164,7 +162,6 @@ def counted(found: Sequence[MatchedPair], size: tuple[int, int], most: int = MOS
         [one.pixels for one in found],
         [one.covariance for one in found],
         [one.slant for one in found],
-        [one.misfit for one in found],
     )
     features = _features(names, torch.cat([one.pixels for one in found]), torch.cat(covariance))
     return SceneMatches(features, tuple(one.counts for one in found))
@@ -224,15 +221,14 @@ def match_scene(cameras: tuple[Camera, Camera], pair: ImagePair) -> MatchedPair:
             "image blurred, or is there fog?"
         )
     pixels = torch.stack([pixels[:, 0], refined.right], 1)[refined.good]
-    covariance = refined.covariance[refined.good]
+    covariance, slant = refined.covariance[refined.good], refined.slant[refined.good]
     rig, over = _posed(rig, pixels, covariance)
     good = over <= 1.0
     counts = PairCounts(
         name=pair.name, matched=matched, untextured=matched - fine, off_line=int((~good).sum()), moved=0, thinned=0,
         used=int(good.sum()),
     )  # fmt: skip
-    slant, misfit = refined.slant[refined.good][good], refined.misfit[refined.good][good]
-    return MatchedPair(pixels[good], covariance[good], slant, misfit, counts, rig)
+    return MatchedPair(pixels[good], covariance[good], slant[good], counts, rig)
 
 
 def _guided(rig: StereoRig, points: tuple[Keypoints, Keypoints]) -> Tensor:

@@ -39,15 +39,12 @@ class RefinedMatches(NamedTuple):
         good: (M,) whether it was found.
         slant: (M,) by how much a step of a patch is longer, or goes sideways, in the other image: 0 for what is seen
             alike.
-        misfit: (M,) gray levels in which the patches differ after the fit, more for what loses a part of its weight:
-            large where not all of a patch is one flat thing.
     """
 
     right: Tensor
     covariance: Tensor
     good: Tensor
     slant: Tensor
-    misfit: Tensor
 
 
 @torch.no_grad()
@@ -86,7 +83,7 @@ def _refined_part(rig: StereoRig, images: tuple[Tensor, Tensor], left: Tensor, r
     worst = torch.linalg.eigvalsh(covariance.nan_to_num(1e6))[:, -1].sqrt()
     near = torch.linalg.vector_norm(pixels[:, 0] - right, dim=-1) < _FARTHEST
     good = valid & fit.converged & again[:, 0] & near & (worst < _FAINTEST) & (fit.share > _LEAST_SHARE)
-    return RefinedMatches(pixels[:, 0], covariance, good, fit.slant, fit.residual / fit.share.clamp_min(_LEAST_SHARE))
+    return RefinedMatches(pixels[:, 0], covariance, good, fit.slant)
 
 
 def _patch(

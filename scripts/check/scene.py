@@ -351,9 +351,7 @@ def common() -> list[str]:
         z: tuple[list[float], list[float]] = [], []
         for first in range(0, 7 - count, count):
             some = found[first : first + count]
-            parts = [
-                [getattr(one, part) for one in some] for part in ("rig", "pixels", "covariance", "slant", "misfit")
-            ]
+            parts = [[getattr(one, part) for one in some] for part in ("rig", "pixels", "covariance", "slant")]
             pixels, stated = torch.cat(parts[1]), torch.cat(parts[2])
             rig, _ = posed(found[0].rig, pixels, stated)
             place = (pixels[:, 0] / BLOCK).long()

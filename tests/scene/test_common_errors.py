@@ -23,25 +23,18 @@ def spread_places(step: float, sway: float) -> tuple[torch.Tensor, torch.Tensor]
     return left, RIG(ranges * RIG.left.unproject(left)[0])[1]
 
 
-def drawn(shape: torch.Size, draw: torch.Generator) -> torch.Tensor:
-    """Gaussian errors whose mean square is one, so that it is not a draw's."""
-    values = torch.randn(shape, dtype=torch.float64, generator=draw)
-    return values / values.square().mean(0).sqrt()
-
-
 def counted(pairs: int, *, step: float = 16.0, own: float = SIGMA, common: float = 0.0, sway: float = 0.0) -> float:
     """Stated over counted information of the matches of some pairs, each error with a part that all pairs share."""
     draw = torch.Generator().manual_seed(3)
     places = [spread_places(step, k * sway) for k in range(pairs)]
     left, right = places[0]
-    shared = common * drawn(right.shape, draw)
+    shared = common * torch.randn(right.shape, dtype=torch.float64, generator=draw)
     pixels = []
     for left, right in places:
-        noise = own * drawn(right.shape, draw)
+        noise = own * torch.randn(right.shape, dtype=torch.float64, generator=draw)
         pixels.append(torch.stack([left, right + shared + noise], 1))
     stated = [(SIGMA**2 * torch.eye(2, dtype=torch.float64)).expand(len(left), 2, 2)] * pairs
-    alike = [torch.zeros(len(left)).double()] * pairs
-    found = with_common_errors([RIG] * pairs, pixels, stated, alike, alike)
+    found = with_common_errors([RIG] * pairs, pixels, stated, [torch.zeros(len(left)).double()] * pairs)
     return sum(float((SIGMA**2 / one[:, 1, 1]).sum()) for one in found) / len(left)
 
 
@@ -67,12 +60,11 @@ def test_errors_larger_than_noise_are_learned() -> None:
 def test_overlapping_patches() -> None:
     # Errors of neighbors are drawn alike here: half a patch apart, each counts (1 + 2/2)² as much in both directions.
     inner = counted(1, step=PATCH / 2.0)
-    assert 0.23 < inner < 0.33
+    assert 0.25 < inner < 0.33
     assert counted(1, step=2.0 * PATCH) > 0.85
 
 
-@pytest.mark.parametrize("by", ["slant", "misfit"])
-def test_what_is_seen_at_a_slant_or_fits_badly_is_judged_by_itself(by: str) -> None:
+def test_what_is_seen_at_a_slant_is_judged_by_itself() -> None:
     """Half of the things repeat an error; without classes, all of them lost a part of what several pairs tell."""
     draw = torch.Generator().manual_seed(4)
     left, right = spread_places(16.0, 0.0)
@@ -81,39 +73,17 @@ def test_what_is_seen_at_a_slant_or_fits_badly_is_judged_by_itself(by: str) -> N
     shared = torch.where(slanted[:, None], 1.5 * SIGMA * torch.randn(right.shape, generator=draw), 0.0)
     pixels = []
     for _ in range(4):
-        noise = SIGMA * drawn(right.shape, draw)
+        noise = SIGMA * torch.randn(right.shape, dtype=torch.float64, generator=draw)
         pixels.append(torch.stack([left, right + shared + noise], 1))
     stated = [(SIGMA**2 * torch.eye(2, dtype=torch.float64)).expand(len(left), 2, 2)] * 4
-    signs = [slant] * 4, [torch.ones_like(slant)] * 4
-    signs = signs if by == "slant" else signs[::-1]
-    found = torch.stack(with_common_errors([RIG] * 4, pixels, stated, *signs))[..., 1, 1] / SIGMA**2
+    found = torch.stack(with_common_errors([RIG] * 4, pixels, stated, [slant] * 4))[..., 1, 1] / SIGMA**2
     level, steep = ((1.0 / found[:, which]).sum(0).mean() for which in (~slanted, slanted))
-    # Four times the information of one, as far as few things tell that nothing is common; and that of one with the
-    # variance 1.5² + 1/4.
-    assert float(level) == pytest.approx(4.0, rel=0.2)
+    # Four times the information of one; and that of one with the variance 1.5² + 1/4.
+    assert float(level) == pytest.approx(4.0, rel=0.15)
     assert float(steep) == pytest.approx(1.0 / 2.5, rel=0.2)
-
-
-def test_a_few_that_are_far_worse_count_little_and_the_others_as_they_should() -> None:
-    """A twentieth is ten times worse, and to one side: the mean stays where it is, as surely as it says."""
-    z, cost = [], []
-    for seed in range(12):
-        draw = torch.Generator().manual_seed(seed)
-        left, right = spread_places(16.0, 0.0)
-        noise = SIGMA * drawn(right.shape, draw)
-        bad = torch.rand(len(right), generator=draw) < 0.05
-        noise[bad, 1] += 10.0 * SIGMA * torch.rand(int(bad.sum()), dtype=torch.float64, generator=draw)
-        stated = (SIGMA**2 * torch.eye(2, dtype=torch.float64)).expand(len(left), 2, 2)
-        alike = [torch.zeros(len(left)).double()]
-        (found,) = with_common_errors([RIG], [torch.stack([left, right + noise], 1)], [stated], alike, alike)
-        weight = 1.0 / found[:, 1, 1]
-        z.append(float((weight * noise[:, 1]).sum() / weight.sum().sqrt()))
-        cost.append(float(weight[bad].mean() / weight[~bad].mean()))
-    assert math.sqrt(sum(one**2 for one in z) / len(z)) < 1.6
-    assert sum(cost) / len(cost) < 0.5
 
 
 def test_no_matches() -> None:
     nothing = torch.zeros(0, 2, 2, dtype=torch.float64)
-    assert len(with_common_errors([RIG], [nothing], [nothing], [nothing[:, 0, 0]], [nothing[:, 0, 0]])[0]) == 0
+    assert len(with_common_errors([RIG], [nothing], [nothing], [nothing[:, 0, 0]])[0]) == 0
     assert math.isfinite(counted(2, step=120.0))

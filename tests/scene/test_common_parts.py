@@ -1,12 +1,12 @@
-"""Each step of what errors of matches have in common, against values worked out by hand."""
+"""Each step of what errors of matches have in common, against values worked out by hand or in plain loops."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 import pytest
 import torch
-from scipy.special import ndtri
-from scipy.stats import t as student
 from torch import Tensor
 
 from kcal.lens.camera import Camera
@@ -15,6 +15,7 @@ from kcal.lens.rig import StereoRig
 from kcal.scene import common_errors as parts
 
 DRAW = torch.Generator().manual_seed(8)
+FLAT = torch.zeros(3, dtype=torch.float64)
 
 
 def level_rig(roll: float = 0.0) -> StereoRig:
@@ -41,94 +42,58 @@ def test_off_the_line_by_so_many_pixels(roll: float) -> None:
 
 
 def test_smooth_errors_are_the_lenses() -> None:
-    """A polynomial of degree four goes altogether, one of degree five stays; leverages add up to their number."""
+    """A polynomial of degree four goes altogether; one of degree five stays in part; what is far off stays whole."""
     at = 400.0 * torch.rand(300, 2, generator=DRAW).double()
     u, v = ((at - 200.0) / 120.0).unbind(1)
     smooth = 0.1 + 0.2 * u - 0.1 * v + 0.1 * u * v**3 + 0.05 * u**4 - 0.02 * v**4 + 0.03 * u**2 * v**2
-    weight = 0.5 + torch.rand(300, generator=DRAW).double()
-    left, leverage = parts._without_lenses(smooth, weight, at)
+    sigma = 0.5 + torch.rand(300, generator=DRAW).double()
+    left = parts._without_lenses(smooth, sigma, at)
     assert float(left.abs().max()) < 1e-10
-    assert float(leverage.sum()) == pytest.approx(15.0)
-    assert float(parts._without_lenses(u**5 / 5, weight, at)[0].abs().max()) > 0.02
+    assert float(parts._without_lenses(u**5 / 5, 20 * sigma, at).abs().max()) > 0.02
+    odd = smooth.clone()
+    odd[7] += 6.0 * sigma[7] + smooth.abs().max()
+    odd[9] -= 6.0 * sigma[9] + smooth.abs().max()
+    left = parts._without_lenses(odd, sigma, at)
+    assert left[[7, 9]] == pytest.approx((odd - smooth)[[7, 9]], abs=1e-9)
+    left[[7, 9]] = 0.0
+    assert float(left.abs().max()) < 1e-9
 
 
 def test_smooth_errors_by_weight_and_of_enough() -> None:
     """Of two errors at each place the weighted mean is smooth: (0 + 1/4) / (1 + 1/4) of 0 ± 1 and 1 ± 2."""
     at = 400.0 * torch.rand(40, 2, generator=DRAW).double().repeat(2, 1)
-    error = torch.tensor([0.0, 1.0]).double().repeat_interleave(40)
-    left, leverage = parts._without_lenses(error, (error + 1.0) ** -2, at)
-    assert left == pytest.approx([-0.2] * 40 + [0.8] * 40)
-    # Each place is told four times as much by the better of the two.
-    assert leverage[:40] == pytest.approx(4.0 * leverage[40:])
+    error, sigma = (torch.tensor([0.0, 1.0]).double().repeat_interleave(40) + k for k in (0.0, 1.0))
+    assert parts._without_lenses(error, sigma, at) == pytest.approx([-0.2] * 40 + [0.8] * 40)
     # Four for each of the 15 coefficients.
     ones = torch.ones(60).double()
-    assert float(parts._without_lenses(ones, ones, at[:60])[0].abs().max()) < 1e-9
-    left, leverage = parts._without_lenses(ones[:59], ones[:59], at[:59])
-    assert (left.tolist(), leverage.tolist()) == ([1.0] * 59, [0.0] * 59)
+    assert float(parts._without_lenses(ones, ones, at[:60]).abs().max()) < 1e-9
+    assert parts._without_lenses(ones[:59], ones[:59], at[:59]).tolist() == [1.0] * 59
     # One row of pixels: no spread downward.
     at[:, 1] = 7.0
-    assert float(parts._without_lenses(ones, ones, at[:60])[0].abs().max()) < 1e-9
-
-
-@pytest.mark.parametrize("tail", [3.0, 10.0])
-def test_the_likeliest_scale_and_tail(tail: float) -> None:
-    """Quantiles of Student's distribution: its squared scale, and its degrees of freedom or a neighbor of them."""
-    error = torch.from_numpy(student.ppf((np.arange(4000) + 0.5) / 4000, tail))
-    sigma = torch.full((4000,), 0.5).double()
-    shape, found = parts._error_variance(1.5 * error, sigma)
-    assert found == tail
-    assert shape == pytest.approx(np.full(4000, 2.25), rel=0.03)
+    assert float(parts._without_lenses(ones, ones, at[:60]).abs().max()) < 1e-9
 
 
 def test_variance_of_errors() -> None:
-    """Errors of scale σ² + floor without tails; never less than σ²."""
-    sigma = torch.tensor([0.02, 0.2, 0.05]).double().repeat(400)
-    floor = parts._FLOORS[9]
-    normal = torch.from_numpy(ndtri((np.arange(400) + 0.5) / 400)).repeat_interleave(3)
-    shape, tail = parts._error_variance((2.0 * (sigma.square() + floor)).sqrt() * normal, sigma)
-    assert tail >= 30.0
-    assert shape / (2.0 * (sigma.square() + floor)) == pytest.approx(np.ones(1200), rel=0.05)
-    shape, _ = parts._error_variance(0.1 * sigma * normal, sigma)
-    assert bool((shape >= sigma.square() - 1e-12).all())
+    """Errors that have scale σ² + floor exactly; never less than σ² without a floor; too few tell nothing."""
+    sigma = torch.tensor([0.02, 0.2, 0.05]).double().repeat(20)
+    floor = parts._FLOORS[13]
+    error = (2.0 * (sigma.square() + floor)).sqrt() * torch.tensor([1.0, -1.0]).repeat(30)
+    assert parts._error_variance(error, sigma) == pytest.approx((2.0, 2.0 * floor))
+    assert parts._error_variance(1.5 * sigma, sigma) == pytest.approx((2.25, 0.0))
+    assert parts._error_variance(sigma[:50], sigma[:50]) == pytest.approx((1.0, 0.0))
+    assert parts._error_variance(3.0 * sigma[:50], sigma[:50]) == pytest.approx((9.0, 0.0))
+    assert parts._error_variance(3.0 * sigma[:49], sigma[:49]) == (1.0, 0.0)
 
 
-def test_what_few_errors_tell() -> None:
-    """Of fifty something is learned; of fewer nothing, and they count as noise says."""
-    at, kind, repeats = (
-        400.0 * torch.rand(50, 2, generator=DRAW).double(),
-        torch.zeros(50).long(),
-        torch.ones(50).double(),
-    )
-    sigma = torch.full((50,), 0.1).double()
-    error = 0.3 * torch.from_numpy(ndtri((np.arange(50) + 0.5) / 50))
-    *_, variance, _ = parts._learned(error, sigma, at, kind, repeats)
-    assert float(variance.min()) > 4.0 * 0.1**2
-    shape, influence, variance, weight = parts._learned(*(part[:49] for part in (error, sigma, at, kind, repeats)))
-    assert torch.equal(variance, sigma[:49].square())
-    assert torch.equal(shape, variance)
-    assert torch.equal(influence, error[:49])
-    assert weight.tolist() == [1.0] * 49
-    # Errors a tenth of noise are noise.
-    *_, variance, _ = parts._learned(0.03 * error, sigma, at, kind, repeats)
-    assert float(variance.min()) >= 0.1**2 - 1e-12
-
-
-def test_classes_of_slant_and_misfit() -> None:
-    """Fifty for each at least: halves of slant, and in each as many of little as of much misfit."""
-    slant, misfit = torch.rand(2, 400, generator=DRAW).double()
-    for count, pairs, classes in ((400, 2, 4), (399, 2, 2), (100, 1, 2), (99, 1, 1), (200, 1, 4), (20, 1, 1)):
-        some = [part[:count].split(count // pairs + count % pairs) for part in (slant, misfit)]
-        found = parts._classes(*some)
+def test_classes_of_slant() -> None:
+    slant = torch.rand(400, generator=DRAW).double()
+    for count, pairs, classes in ((400, 2, 4), (399, 2, 3), (199, 2, 1), (400, 1, 4), (100, 1, 2), (20, 1, 1)):
+        found = parts._classes(slant[:count], pairs)
         sizes = found.bincount()
-        assert len(sizes) == classes, (count, pairs)
-        assert int(sizes.max() - sizes.min()) <= 2
-    found = parts._classes([slant], [misfit])
-    assert float(slant[found < 2].max()) < float(slant[found >= 2].min())
-    for low in (0, 2):
-        assert float(misfit[found == low].max()) < float(misfit[found == low + 1].min())
-    # Of pairs with other contrast, each counts by its own.
-    other = parts._classes([slant, slant], [misfit, 7.0 * misfit])
-    assert other[:400].tolist() == other[400:].tolist()
+        assert len(sizes) == classes
+        assert int(sizes.max() - sizes.min()) <= 1
+        order = slant[:count].argsort()
+        assert found[order].tolist() == sorted(found.tolist())
 
 
 def test_shifts_between_pairs() -> None:
@@ -185,8 +150,7 @@ def test_too_few_to_learn_from_count_their_overlap() -> None:
 
     def factor(left: list[list[float]], values: list[float]) -> list[float]:
         covariance = stated(values)
-        none = [torch.zeros(len(left)).double()]
-        (found,) = parts.with_common_errors([rig], [matches(left)], [covariance], none, none)
+        (found,) = parts.with_common_errors([rig], [matches(left)], [covariance], [torch.zeros(len(left)).double()])
         share = found / covariance
         assert share.flatten(1).amax(1) == pytest.approx(share.flatten(1).amin(1))
         return share[:, 0, 0].tolist()
@@ -204,7 +168,60 @@ def test_one_thing_in_three_pairs_counts_once() -> None:
     pixels = [matches([[100, 100], [300, 200]]), matches([[100, 100]]), matches([[100, 100]])]
     covariance = [stated([1.0, 1.0]), stated([1.0]), stated([1.0])]
     slant = [torch.zeros(len(own)).double() for own in pixels]
-    found = parts.with_common_errors([rig] * 3, pixels, covariance, slant, slant)
+    found = parts.with_common_errors([rig] * 3, pixels, covariance, slant)
     assert [len(one) for one in found] == [2, 1, 1]
     ratio = torch.cat(found)[:, 1, 1]
     assert ratio == pytest.approx([3.0, 1.0, 3.0, 3.0])
+
+
+def test_learned_parts_against_plain_loops() -> None:
+    """Two pairs of things some of which are alike: scale, floor, share and overlaps put together one by one."""
+    rig, count = level_rig(), 70
+    draw = torch.Generator().manual_seed(5)
+    left = torch.tensor([[20.0 + 21.5 * i, 20.0 + 33.0 * j] for i in range(14) for j in range(5)]).double()
+    beside = left[::3] + torch.tensor([4.0, -6.0]).double()
+    shared = 0.08 * torch.randn(count, generator=draw).double()
+    pixels, covariance = [], []
+    for k in range(2):
+        own = torch.cat([left, beside]) + 1.25 * k
+        right = own - torch.tensor([10.0, 0.0]).double()
+        right[:count, 1] += shared
+        right[:, 1] += 0.05 * torch.randn(len(right), generator=draw).double()
+        pixels.append(torch.stack([own, right], 1))
+        covariance.append(stated((0.002 + 0.004 * torch.rand(len(own), generator=draw)).tolist()))
+    slant = [torch.zeros(len(own)).double()] * 2
+    found = torch.cat(parts.with_common_errors([rig] * 2, pixels, covariance, slant))
+
+    places, every = torch.cat(pixels), torch.cat(covariance)
+    off, sigma = parts.off_line(rig, places, every)
+    variance = sigma**2
+    for _ in range(2):
+        error = parts._without_lenses(off, variance**0.5, places[:, 0])
+        good = error.abs() < 5.0 * sigma
+        scale, floor = parts._error_variance(error[good], sigma[good])
+        variance = scale * sigma**2 + floor
+    size = len(pixels[0])
+    still = places[:, 0] - 1.25 * torch.tensor([[0.0]] * size + [[1.0]] * size).double()
+    overlap = np.zeros((2 * size, 2 * size))
+    same = []
+    x, y = still.T.tolist()
+    for i in range(2 * size):
+        for j in range(2 * size):
+            dx, dy = abs(x[i] - x[j]), abs(y[i] - y[j])
+            overlap[i, j] = max(0.0, 1 - dx / 15.0) * max(0.0, 1 - dy / 15.0)
+            if i < size <= j and max(dx, dy) < 1.5 and bool(good[i] & good[j]):
+                same.append((i, j))
+    assert len(same) > 50
+    products = sum(float(error[i] * error[j] / (variance[i] * variance[j]).sqrt()) for i, j in same)
+    share = products / sum(overlap[i, j] for i, j in same)
+    assert 0.3 < share < 0.95
+    weight = [1.0 / (share * v + (1 - share) * v / 2) for v in variance.tolist()]
+    for i in range(2 * size):
+        total = float(variance[i]) * weight[i]
+        for j in range(2 * size):
+            if i != j and overlap[i, j]:
+                part = overlap[i, j] * math.sqrt(float(variance[i] * variance[j]))
+                total += part * weight[j] * (1.0 if (i < size) == (j < size) else share)
+        own = scale * every[i] + floor * torch.eye(2).double()
+        wanted = total / weight[i] / float(variance[i]) * own
+        assert found[i].flatten().tolist() == pytest.approx(wanted.flatten().tolist(), rel=1e-6)

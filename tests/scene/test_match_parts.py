@@ -26,7 +26,7 @@ def found(left: list[list[float]], variance: list[float]) -> MatchedPair:
     counts = PairCounts(name="pair", matched=9, untextured=1, off_line=1, moved=0, thinned=0, used=len(left))
     covariance = torch.tensor(variance).double()[:, None, None] * torch.eye(2).double()
     slant = torch.arange(len(left)).double()
-    return MatchedPair(torch.stack([pixels, pixels - 5.0], 1), covariance, slant, 2.0 * slant, counts, RIG)
+    return MatchedPair(torch.stack([pixels, pixels - 5.0], 1), covariance, slant, counts, RIG)
 
 
 def test_the_best_of_each_cell_come_first() -> None:
@@ -173,9 +173,9 @@ def test_still_is_what_lies_between_both_pixels(monkeypatch: pytest.MonkeyPatch)
         there = scores > 0.6
         assert first.tolist() == (left + sway)[there].tolist()
         assert second.tolist() == (pixels[:, 1] + sway)[there].tolist()
-        both_turned, none = torch.tensor([1.5, 0.25]).double(), torch.zeros(len(first))
+        both_turned = torch.tensor([1.5, 0.25]).double()
         covariance = (0.03**2 * torch.eye(2).double()).expand(len(first), 2, 2)
-        return RefinedMatches(second + both_turned + off[there], covariance, good[there], none, none)
+        return RefinedMatches(second + both_turned + off[there], covariance, good[there], torch.zeros(len(first)))
 
     monkeypatch.setattr(still, "whole_shifts", shifts)
     monkeypatch.setattr(still, "refine_matches", refined)
