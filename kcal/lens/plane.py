@@ -7,8 +7,8 @@ angle θ from the optical axis lies at distance θ from the origin, in the same 
 
 so that points beside and behind the camera have a place too (Kannala and Brandt, 2006). For θ / ρ, the angle is halved
 four times, tan(θ/2) = ρ / (R + Z) and tan(φ/2) = tan φ / (1 + √(1 + tan² φ)), and a series does the rest. This is
-exact to rounding, smooth on the axis, and uses only operations that every runtime has in float64. Where neither is
-wanted, atan2 takes a third of the operations.
+exact to rounding, smooth on the axis, and uses only operations that every runtime has in float64. Where
+nothing is differentiated or exported, atan2 takes a third of the operations.
 
 A hybrid lens works on the plane of its base projection (`kcal.lens.base_map`), where that point lies at the distance
 m(θ). Its points are those of the camera frame minus the start of their rays (`kcal.lens.pupil`).

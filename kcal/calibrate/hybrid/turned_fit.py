@@ -35,8 +35,8 @@ class CameraFit:
         fit: the camera, with poses of the corners as they are turned.
         turns: (V,) quarter turns of the board by which the corners of each view were read from another end.
         message: what its data say about the board.
-        hyper: what its data say about the amplitudes of lenses, and
-        lens: about its lens, in the form of the fit; None unless it is one of a type.
+        hyper: what its data say about the amplitudes of lenses; None unless it is one of a type.
+        lens: likewise about its own lens, in the form of the fit.
         board: which of the boards it saw; -1 for an exact one.
         nats: log evidence that it shares its board with the others of that board, against a board of its own. Of a
             camera that shares none: the same with the board that is most like its own, negative. With a measured board:
@@ -85,41 +85,45 @@ def fit_turned(
             fit = first
         else:
             fit = fit_hybrid(board.points, ordered, seen.image_size, weighted, modes, shape, lens=lens, start=start)
-        deviation = fit.families.deviation(fit.expected)[: -len(fit.state.board)]
         if shape == "exact" or len(quarter_turns(board)) == 1 or attempt == _MOST_FITS - 1:
             break
         prior = printed_prior(fit.board_shapes, fit.expected[BOARD:]) if shape == "printed" else shape.whole
+        deviation = fit.families.deviation(fit.expected)[: -len(fit.state.board)]
         more = find_turns(_absolute_rows(fit, board.points, ordered, weighted), board, prior, deviation, fit.sigma**2)
         if not bool(more.any()):
             break
         turns, start = (turns + more) % 4, None
-    if not one_type:
-        # Of a board that is exact or was measured nobody asks.
-        known = fit.information
-        message = known.board_message.weighted(math.sqrt(fit.wider))
-        return CameraFit(fit=fit, turns=turns, message=message)
-    of_lens, of_board = numbered(LENS_SLOT, len(deviation)), numbered(BOARD_SLOT, len(fit.state.board))
-    mean = fit.families.mean[: len(deviation)]
-    flat = _absolute_rows(fit, board.points, ordered, weighted).transpose(1, 2).flatten(0, 1)
+    message = fit.information.board_message.weighted(math.sqrt(fit.wider))
+    found = CameraFit(fit=fit, turns=turns, message=message)
+    return _with_its_type(found, board.points, ordered, weighted, shape) if one_type else found
+
+
+def _with_its_type(camera: CameraFit, points: Tensor, pixels: Tensor, weights: Tensor, shape: Shape) -> CameraFit:
+    """With what its data say about the amplitudes of lenses, and about its lens."""
+    fit = camera.fit
+    deviation = fit.families.deviation(fit.expected)
+    of_board = numbered(BOARD_SLOT, len(fit.state.board))
+    of_lens = numbered(LENS_SLOT, len(deviation) - len(of_board))
+    mean = fit.families.mean[: len(of_lens)]
+    flat = _absolute_rows(fit, points, pixels, weights).transpose(1, 2).flatten(0, 1)
     # The target is absolute, so that the residuals at the mean of lens and board are its negative.
     flat[:, -1] *= -1.0
     pixels_of = Gaussian((*of_lens, *of_board), torch.cat([mean, torch.zeros_like(fit.state.board)]), flat)
     data = pixels_of.weighted(1.0 / fit.sigma)
-    message = (data + Gaussian.independent(of_lens, mean, deviation)).marginal(of_board)
     if shape == "exact":
         lens_alone = data.conditioned(of_board).compressed()
         pixels_of = pixels_of.conditioned(of_board).placed(pixels_of.slots, pixels_of.at)
     elif shape == "printed":
-        sigma = fit.families.deviation(fit.expected)[len(deviation) :]
+        sigma = deviation[len(of_lens) :]
         lens_alone = (data + Gaussian.independent(of_board, torch.zeros_like(sigma), sigma)).marginal(of_lens)
     else:
         lens_alone = (data + shape.whole).marginal(of_lens)
         # In the variables of the fit's priors.
         at, half = shape.whole.mean_and_half()
         pixels_of = pixels_of.replaced(of_board, at, half.T, of_board)
-    freedom = 2 * int((torch.isfinite(ordered).all(-1) & (weighted > 0)).sum()) - 6 * len(pixels)
+    freedom = 2 * int((torch.isfinite(pixels).all(-1) & (weights > 0)).sum()) - 6 * len(pixels)
     hyper = _about_hyperparameters(fit, pixels_of.weighted(fit.tempering**-0.5), freedom / fit.tempering)
-    return CameraFit(fit=fit, turns=turns, message=message, hyper=hyper, lens=lens_alone)
+    return dataclasses.replace(camera, hyper=hyper, lens=lens_alone)
 
 
 def _absolute_rows(fit: HybridFit, points: Tensor, pixels: Tensor, weights: Tensor) -> Tensor:
