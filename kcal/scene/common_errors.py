@@ -23,13 +23,13 @@ PATCH = 15.0
 # Pixels of sway of a mast between pairs, of disparity and of place within which two matches are of one thing.
 _SWAY, _SAME_DISPARITY, _SAME_PLACE = 8.0, 1.5, 1.5
 # Errors off the epipolar lines beyond so many standard deviations are wrong matches, and tell nothing of the others.
-_WRONG = 5.0
+WRONG = 5.0
 # Pairs of matches of one thing without which nothing is learned: then all that is not noise counts as common.
 _FEWEST = 50
 # Classes of slant: with four, yaw from three pairs of a minute was a little better than with one, on 18 terrains.
 _CLASSES = 4
 # Degree of the polynomial that takes errors of lenses out, which are known from elsewhere and smooth.
-_DEGREE = 4
+DEGREE = 4
 # The floor under variances that is tried, px².
 _FLOORS = [0.0, *np.geomspace(1e-5, 0.04, 25).tolist()]
 
@@ -63,7 +63,7 @@ def with_common_errors(
     # What is smooth over the image is told best by those that turn out to be good.
     for _ in range(2):
         error = _without_lenses(off, variance.sqrt(), places[:, 0])
-        good = error.abs() < _WRONG * sigma
+        good = error.abs() < WRONG * sigma
         for one in kind.unique():
             own = kind == one
             scale[own], floor[own] = _error_variance(error[own & good], sigma[own & good])
@@ -117,13 +117,17 @@ def off_line(rig: StereoRig, pixels: Tensor, covariance: Tensor) -> tuple[Tensor
     return here / length, (across[:, None] @ covariance @ across[..., None])[:, 0, 0].sqrt()
 
 
+def smooth_columns(pixels: Tensor, degree: int) -> Tensor:
+    """(M, K) powers of places (M, 2), up to a degree."""
+    at = (pixels - pixels.mean(0)) / pixels.std(0).clamp_min(1e-6)
+    return torch.stack([at[:, 0] ** i * at[:, 1] ** j for i in range(degree + 1) for j in range(degree + 1 - i)], -1)
+
+
 def _without_lenses(error: Tensor, sigma: Tensor, pixels: Tensor) -> Tensor:
     """Errors without what is smooth over the image."""
-    at = (pixels - pixels.mean(0)) / pixels.std(0).clamp_min(1e-6)
-    powers = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
-    columns = torch.stack([at[:, 0] ** i * at[:, 1] ** j for i, j in powers], -1)
-    good = (error.abs() < _WRONG * sigma).nonzero()[:, 0]
-    if len(good) < 4 * len(powers):
+    columns = smooth_columns(pixels, DEGREE)
+    good = (error.abs() < WRONG * sigma).nonzero()[:, 0]
+    if len(good) < 4 * columns.shape[1]:
         return error
     weight = 1.0 / sigma[good]
     fit = torch.linalg.lstsq(columns[good] * weight[:, None], (error[good] * weight)[:, None], driver="gelsd").solution

@@ -22,8 +22,9 @@ import time
 from pathlib import Path
 
 from kcal.files import make_folder
-from scripts.fuzz.harnesses import HARNESSES, missing
+from scripts.fuzz.harnesses import HARNESSES
 from scripts.fuzz.hunt import corpus, hunt, replay
+from scripts.fuzz.readers import missing
 
 
 def main() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import json
 import warnings
 from collections.abc import Callable
@@ -213,3 +214,10 @@ READERS: dict[str, Reader] = {
                        write=whole_text(
         "name,left_u,left_v,right_u,right_v\n" + _ROWS)),
 }  # fmt: skip
+_NEEDED = {"terrain": "rasterio", "map picture": "rasterio", "FITS": "astropy"}
+
+
+def missing(name: str) -> str:
+    """The package that a reader needs and that is not installed, or ""."""
+    package = _NEEDED.get(name, "kcal")
+    return "" if importlib.util.find_spec(package) else package

@@ -254,7 +254,8 @@ def live_map(folder: Path) -> Prepared:
         ):
             connection.sendall(data)
             if ends:  # a request that is not whole is waited for; one of events is told until then
-                connection.shutdown(socket.SHUT_WR)
+                with contextlib.suppress(OSError):  # cut off already
+                    connection.shutdown(socket.SHUT_WR)
             while len(found) < 1 << 20 and (part := connection.recv(1 << 16)):
                 found += part
         return found

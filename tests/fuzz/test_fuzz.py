@@ -20,8 +20,9 @@ pytest.importorskip("starlette", reason="the extra `mark` is not installed")
 
 from kcal.errors import FileError
 from scripts.fuzz import hunt
-from scripts.fuzz.harnesses import HARNESSES, missing
+from scripts.fuzz.harnesses import HARNESSES
 from scripts.fuzz.reader import Reader, whole_text
+from scripts.fuzz.readers import missing
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="cases run in child processes")
 

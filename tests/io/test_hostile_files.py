@@ -16,7 +16,7 @@ import pytest
 from kcal.errors import KcalError
 from scripts.fuzz.hunt import Prepared, replay
 from scripts.fuzz.reader import Reader
-from scripts.fuzz.readers import READERS
+from scripts.fuzz.readers import READERS, missing
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="crashes are looked for in child processes")
 
@@ -93,9 +93,8 @@ def hostile(reader: Reader, folder: Path) -> Prepared:
 
 @pytest.mark.parametrize("name", [name for name in READERS if name != "file kind"])  # which names what anything is
 def test_no_reader_crashes_hangs_or_raises_anything_else(name: str, tmp_path: Path) -> None:
-    for reader, module in (("terrain", "rasterio"), ("FITS", "astropy")):
-        if name == reader:
-            pytest.importorskip(module)
+    if package := missing(name):
+        pytest.skip(f"{package} is not installed")
     reader = READERS[name]
     cases = [text for _, text in hostile_texts()]
     cases += [case for whole in reader.wholes(tmp_path)[:1] for case in impossible(whole)]
