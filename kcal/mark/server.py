@@ -137,5 +137,5 @@ def marking_app(desk: Desk, token: str, hosts: tuple[str, ...]) -> Starlette:
 
 
 def marking_files() -> dict[str, tuple[bytes, str]]:
-    """The page's own files and the map library."""
-    return page_files(("kcal.mark", "page"), ("kcal.report", "leaflet"))
+    """The page's own files, and those of maps."""
+    return page_files(("kcal.mark", "page"), ("kcal.report", "leaflet"), ("kcal.web", "map"))

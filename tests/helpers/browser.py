@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import functools
 import importlib.util
+import itertools
 import shutil
 import subprocess
 import tempfile
@@ -71,6 +72,21 @@ def chromium_page(width: int = 1366, height: int = 768) -> Iterator[Any]:
 
 def _is_local(url: str) -> bool:
     return url.startswith(("http://127.0.0.1", "file:", "data:", "blob:"))
+
+
+def names_on_a_map(page: Any) -> tuple[int, int, list[Any]]:
+    """How many names and dots a map shows, and pairs of a name and what it covers: a name, a dot or a control."""
+    names, dots, controls = page.evaluate(
+        "() => ['.leaflet-tooltip', '#map path[aria-label]', '.leaflet-control'].map((kind) =>"
+        " [...document.querySelectorAll(kind)].filter((e) => getComputedStyle(e).visibility === 'visible')"
+        " .map((e) => e.getBoundingClientRect()).map((b) => [b.left, b.top, b.right, b.bottom]))"
+    )
+    covered = [
+        (a, b)
+        for a, b in [*itertools.combinations(names, 2), *itertools.product(names, [*dots, *controls])]
+        if min(a[2], b[2]) - max(a[0], b[0]) > 0.5 and min(a[3], b[3]) - max(a[1], b[1]) > 0.5
+    ]
+    return len(names), len(dots), covered
 
 
 def violations(page: Any) -> list[str]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from browser import chromium_page, needs_browser
+from browser import chromium_page, names_on_a_map, needs_browser
 from marking_browser import Server, choose, click_at, free_port, look_at, settled
 from typer.testing import CliRunner
 
@@ -105,10 +105,13 @@ def test_a_whole_site_while_the_server_is_killed(site: tuple[Path, MarkingSite],
             solved = page.evaluate("kcal.rig")
             things = page.evaluate("kcal.items")
             page.screenshot(path=str(tmp_path / "page.png"))
+            names, dots, covered = names_on_a_map(page)
             complaints = page.complaints
     finally:
         server.stop()
     assert complaints == []
+    assert covered == []
+    assert (dots, names >= 6) == (2 + len(LANDMARKS) + len(TARGETS), True)
     assert solved["solved"]
     assert len(solved["promises"]) == 3
     assert [item["name"] for item in things if item["residual"] and not item["residual"]["used"]] == []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import multiprocessing
 import threading
 import time
@@ -16,7 +15,7 @@ import numpy as np
 import orjson
 import pytest
 import torch
-from browser import chromium_page, needs_browser
+from browser import chromium_page, names_on_a_map, needs_browser
 from track_scenes import ORIGIN, pairs_of, tracked_site
 
 pytest.importorskip("uvicorn")
@@ -167,19 +166,9 @@ def test_names_cover_neither_each_other_nor_dots(width: int, height: int) -> Non
     with crowded_map(40) as live, chromium_page(width, height) as tab:
         tab.goto(live.address)
         tab.wait_for_function("() => document.documentElement.dataset.sequence === '1'", timeout=60_000)
-        boxes = tab.evaluate(
-            "() => ['.leaflet-tooltip', 'path.leaflet-interactive', '.leaflet-control'].map((kind) =>"
-            " [...document.querySelectorAll(kind)].filter((e) => getComputedStyle(e).visibility === 'visible')"
-            " .map((e) => e.getBoundingClientRect()).map((b) => [b.left, b.top, b.right, b.bottom]))"
-        )
-        names, dots, controls = boxes
-        assert len(dots) == 42
-        assert len(names) >= 15  # the others wait until there is room
-        covered = [
-            (a, b)
-            for a, b in [*itertools.combinations(names, 2), *itertools.product(names, [*dots, *controls])]
-            if min(a[2], b[2]) - max(a[0], b[0]) > 0.5 and min(a[3], b[3]) - max(a[1], b[1]) > 0.5
-        ]
+        names, dots, covered = names_on_a_map(tab)
+        assert dots == 42
+        assert names >= 15  # the others wait until there is room
         assert covered == []
         # With the keyboard every target can be reached, and then its name is there.
         hidden = tab.evaluate(
