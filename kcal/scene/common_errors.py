@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -100,21 +101,42 @@ def _classes(slant: Tensor, pairs: int) -> Tensor:
     return torch.bucketize(slant, edges)
 
 
-def off_line(rig: StereoRig, pixels: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:
-    """Pixels (M,) by which right pixels are off their epipolar lines, and the standard deviations of that."""
-    rays, _ = rig.left.unproject(pixels[:, 0])
-    normal = torch.linalg.cross(rig.right_from_left_translation.expand_as(rays), rays @ rig.right_from_left_rotation.T)
+class LineErrors(NamedTuple):
+    """How matches (M,) lie to their epipolar lines.
 
-    def off(at: Tensor) -> Tensor:
-        found: Tensor = (rig.right.unproject(at)[0] * normal).sum(-1)
-        return found
+    Attributes:
+        off: pixels by which right pixels are off.
+        sigma: standard deviations of that.
+        left: (M, 3) lines of sight of the left camera in the right one's frame.
+        right: (M, 3) those of the right camera.
+        per_px: what `right · (shift x left)` changes by in one pixel across the line.
+    """
 
+    off: Tensor
+    sigma: Tensor
+    left: Tensor
+    right: Tensor
+    per_px: Tensor
+
+
+def line_errors(rig: StereoRig, pixels: Tensor, covariance: Tensor) -> LineErrors:
+    """Matches (M, 2, 2) with covariances (M, 2, 2) px² of their right pixels beside their epipolar lines."""
+    left = rig.left.unproject(pixels[:, 0])[0] @ rig.right_from_left_rotation.T
+    normal = torch.linalg.cross(rig.right_from_left_translation.expand_as(left), left)
+    right = rig.right.unproject(pixels[:, 1])[0]
     steps = 0.1 * torch.eye(2, dtype=torch.float64)
-    here = off(pixels[:, 1])
-    slope = torch.stack([off(pixels[:, 1] + step) - here for step in steps], -1) / 0.1
+    moved = torch.stack([rig.right.unproject(pixels[:, 1] + step)[0] for step in steps], -1)
+    slope = (normal[..., None] * (moved - right[..., None])).sum(-2) / 0.1
     length = torch.linalg.vector_norm(slope, dim=-1)
     across = slope / length[:, None]
-    return here / length, (across[:, None] @ covariance @ across[..., None])[:, 0, 0].sqrt()
+    sigma = (across[:, None] @ covariance @ across[..., None])[:, 0, 0].sqrt()
+    return LineErrors((right * normal).sum(-1) / length, sigma, left, right, length)
+
+
+def off_line(rig: StereoRig, pixels: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:
+    """Pixels (M,) by which right pixels are off their epipolar lines, and the standard deviations of that."""
+    found = line_errors(rig, pixels, covariance)
+    return found.off, found.sigma
 
 
 def smooth_columns(pixels: Tensor, degree: int) -> Tensor:

@@ -14,15 +14,14 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from kcal.lens.pose import rotation_from_vector, side_axes
+from kcal.lens.pose import side_axes
 from kcal.lens.rig import StereoRig
-from kcal.scene.common_errors import DEGREE, PATCH, WRONG, off_line, smooth_columns
+from kcal.scene.common_errors import DEGREE, WRONG, line_errors, smooth_columns
 
-# Pixels: of 30, 45, 60, 80 and 120 tried on 26 terrains, the farthest whose ratio of independent errors scatters as
-# little (0.17); from 60 on it scatters by 0.26, and tells no more.
-_NEAR = 3.0 * PATCH
-# Radians, and baselines, for differences.
-_STEP = 1e-5
+# Share of the root of an image's pixels within which matches are neighbors, 45 px of 960 x 540: of 30, 45, 60, 80 and
+# 120 px tried on 26 terrains, the farthest whose ratio of independent errors scatters as little (0.17); from 60 px on
+# it scatters by 0.26, and tells no more.
+_NEAR = 1.0 / 16.0
 
 
 @torch.no_grad()
@@ -55,7 +54,8 @@ def pose_variance_ratio(rigs: Sequence[StereoRig], pixels: Sequence[Tensor], cov
     variance = torch.linalg.inv(slope.T @ slope)
     weight = slope @ variance / variance.diagonal().sqrt()
     # A match with itself once, with each neighbor twice: in i, j and in j, i.
-    i, j = torch.from_numpy(cKDTree(places.numpy()).query_pairs(_NEAR, output_type="ndarray")).long().T
+    near = _NEAR * math.sqrt(math.prod(rigs[0].left.size))
+    i, j = torch.from_numpy(cKDTree(places.numpy()).query_pairs(near, output_type="ndarray")).long().T
     both = 2.0 * (weight[i] * weight[j]).sum(-1)
     alone = weight.square().sum(-1)
     real = (alone * score.square()).sum() + (both * score[i] * score[j]).sum()
@@ -67,12 +67,10 @@ def pose_variance_ratio(rigs: Sequence[StereoRig], pixels: Sequence[Tensor], cov
 
 def _off_lines(rig: StereoRig, pixels: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Pixels (M,) off the epipolar lines, their slopes (M, 5) along turns and shifts of the rig, and σ (M,)."""
-    turn, shift = rig.right_from_left_rotation, rig.right_from_left_translation
-    cameras = rig.left, rig.right
-    here, sigma = off_line(rig, pixels, covariance)
-    turned = [rotation_from_vector(_STEP * axis) @ turn for axis in torch.eye(3, dtype=torch.float64)]
-    moved = [StereoRig(*cameras, one, shift) for one in turned]
-    axes = torch.cat(side_axes(shift[None] / rig.baseline))
-    moved += [StereoRig(*cameras, turn, shift + _STEP * rig.baseline * axis) for axis in axes]
-    slope = torch.stack([off_line(at, pixels, covariance)[0] - here for at in moved], -1) / _STEP
-    return here, slope, sigma
+    found = line_errors(rig, pixels, covariance)
+    shift = rig.right_from_left_translation
+    axes = rig.baseline * torch.cat(side_axes(shift[None] / rig.baseline))
+    # right · (shift x left) is what is off: a turn adds turn x left to left, a shift adds to shift.
+    turned = torch.linalg.cross(torch.linalg.cross(found.right, shift.expand_as(found.right)), found.left)
+    shifted = torch.linalg.cross(found.left, found.right) @ axes.T
+    return found.off, torch.cat([-turned, shifted], 1) / found.per_px[:, None], found.sigma

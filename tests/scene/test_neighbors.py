@@ -4,8 +4,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from kcal.lens.pose import rotation_from_vector, side_axes
 from kcal.lens.rig import StereoRig
 from kcal.scene import neighbors
+from kcal.scene.common_errors import off_line
 from kcal.scene.neighbors import pose_variance_ratio
 from tests.helpers.scene_pairs import SIZE, small_rig
 
@@ -46,11 +48,11 @@ def test_independent_errors(monkeypatch: pytest.MonkeyPatch) -> None:
     unbounded(monkeypatch)
     draw = torch.Generator().manual_seed(1)
     found = []
-    for _ in range(12):
+    for _ in range(60):
         pixels = drawn_pixels(draw)
         found.append(ratio(pixels, SIGMA * torch.randn(len(pixels), dtype=torch.float64, generator=draw)))
-    # 12 ratios that scatter by 0.17.
-    assert sum(found) / len(found) == pytest.approx(1.0, abs=0.1)
+    # Three standard errors of 60 ratios that scatter by 0.16.
+    assert sum(found) / len(found) == pytest.approx(1.0, abs=0.065)
 
 
 def test_errors_that_neighbors_share_count_as_they_act(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -82,6 +84,23 @@ def test_errors_of_lenses_are_no_errors_of_matches() -> None:
     smooth = 0.3 * (at[:, 0] ** 3 - 2.0 * at[:, 1] ** 2 * at[:, 0] + at[:, 1] ** 4)
     assert smooth.abs().max() > SIGMA
     assert ratio(pixels, noise + smooth) == pytest.approx(ratio(pixels, noise), abs=0.02)
+
+
+def test_slopes_are_those_of_differences() -> None:
+    """Where nothing is off: what is off has a slope of its own, which a pose does not use."""
+    pixels = drawn_pixels(torch.Generator().manual_seed(6), 40)
+    covariance = torch.eye(2, dtype=torch.float64).expand(len(pixels), 2, 2)
+    turn, shift, step = RIG.right_from_left_rotation, RIG.right_from_left_translation, 1e-6
+    turned = [rotation_from_vector(step * axis) @ turn for axis in torch.eye(3, dtype=torch.float64)]
+    moved = [StereoRig(RIG.left, RIG.right, one, shift) for one in turned]
+    axes = torch.cat(side_axes(shift[None] / RIG.baseline))
+    moved += [StereoRig(RIG.left, RIG.right, turn, shift + step * RIG.baseline * axis) for axis in axes]
+    expected = torch.stack([off_line(rig, pixels, covariance)[0] for rig in moved], -1) / step
+    off, slope, sigma = neighbors._off_lines(RIG, pixels, covariance)
+    # Of right pixels that are found by iteration.
+    assert off.abs().max() < 1e-7
+    torch.testing.assert_close(slope, expected, rtol=1e-4, atol=1e-3)
+    torch.testing.assert_close(sigma, torch.ones_like(sigma), rtol=1e-12, atol=0.0)
 
 
 def test_few_matches_and_wrong_ones() -> None:
