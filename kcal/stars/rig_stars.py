@@ -197,22 +197,22 @@ def _add_nameless(rows: _Rows, moment: Moment, cameras: Sequence[Camera], number
                 rows.pixels[-1][c], rows.sigma[-1][c] = image.detected.pixels[place], image.detected.sigma[place]
 
 
-def _nights(moments: Sequence[Moment], rows: _Rows) -> list[Tensor]:
-    """For each night of an hour or more: (S,) hours of each star since it began, 0 in other nights."""
+def _nights(moments: Sequence[Moment], rows: _Rows) -> dict[int, Tensor]:
+    """By the number of each night of an hour or more: (S,) hours of each star since it began, 0 in other nights."""
     times = [next(iter(moment.values())).view.time for moment in moments]
     if None in times:
-        return []
+        return {}
     hours = np.array([time.timestamp() / 3600.0 for time in times if time is not None])
     order = np.argsort(hours, kind="stable")
     night = np.empty(len(hours), np.int64)
     night[order] = np.cumsum(np.diff(hours[order], prepend=hours[order[0]]) > _DAY_BETWEEN)
     of_row = np.array(rows.moment)
-    found = []
+    found = {}
     for number in range(night.max() + 1):
         own = night == number
         if np.ptp(hours[own]) >= _LEAST_NIGHT:
             since = np.where(own, hours - hours[own].min(), 0.0)
-            found.append(torch.from_numpy(since[of_row]))
+            found[number + 1] = torch.from_numpy(since[of_row])
     return found
 
 
@@ -240,15 +240,15 @@ def _effects(
     found = []
     # An hour later the sky has turned from east to west: against the axis that points north.
     second = -EARTH_RATE * pole
-    nights = _nights(moments, rows) if drift_sigma > 0 else []
+    nights = _nights(moments, rows) if drift_sigma > 0 else {}
     for camera in range(1, cameras):
         turn, whose = torch.zeros(cameras, 3, dtype=torch.float64), f"the clock of camera {camera + 1}"
         turn[camera] = second
         if clock_sigma > 0:
             found.append(StarEffect(name=f"{whose} against that of the first", turn=clock_sigma * turn))
-        for number, hours in enumerate(nights):
+        for number, hours in nights.items():
             found.append(
-                StarEffect(name=f"drift of {whose}, night {number + 1}", turn=drift_sigma * turn, factor=hours)
+                StarEffect(name=f"drift of {whose}, night {number}", turn=drift_sigma * turn, factor=hours)
             )
     if not on_earth:
         return found

@@ -110,10 +110,11 @@ def test_nights_begin_anew(nights: list[list[NamedStars]]) -> None:
         time = TIME + datetime.timedelta(hours=hours)
         return {c: dataclasses.replace(one, view=dataclasses.replace(one.view, time=time)) for c, one in pair.items()}
 
-    moments = [at(hours) for hours in (0.0, 3.0, 24.0, 26.0, 48.0)]
+    # The second night is of one image.
+    moments = [at(hours) for hours in (0.0, 3.0, 24.0, 48.0, 50.0)]
     source = star_source(moments, (camera, camera), origin=PLACE, drift_sigma=0.1)
     drifts = [effect for effect in source.effects if effect.factor is not None]
-    assert [effect.name for effect in drifts] == [f"drift of the clock of camera 2, night {k}" for k in (1, 2)]
+    assert [effect.name for effect in drifts] == [f"drift of the clock of camera 2, night {k}" for k in (1, 3)]
     hours = torch.stack([effect.factor for effect in drifts if effect.factor is not None])
     assert sorted(set(hours[0].tolist())) == pytest.approx([0.0, 3.0])
     assert sorted(set(hours[1].tolist())) == pytest.approx([0.0, 2.0])
