@@ -140,6 +140,9 @@ class TestRules:
         assert told.category == ("ship",)
         assert scene.tracker.records[0].categories == pytest.approx({"car": 1.0, "ship": 1.1})
 
+    def test_a_third_of_what_compression_adds_lasts(self) -> None:
+        assert TrackOptions.for_video(0.03).lasting_px == pytest.approx(math.hypot(0.01, 0.01))
+
     def test_gates_lose_as_many_of_any_number_of_cameras(self) -> None:
         gates = Tracker(tracked_site(), dataclasses.replace(SLOW, gate=20.0)).gates
         assert chdtrc([2, 2, 4], gates.numpy()).tolist() == pytest.approx([float(chdtrc(4, 20.0))] * 3)
