@@ -58,4 +58,5 @@ HARMLESS = {
     "5e0d5c9b92387eca": "the third best of all, which nothing reads",
     "9c9b58ae1e5c2c2a": "numbers of cells, of which no two are alike in either way",
     "f4b30131556f65a1": "the determinant of a product, in either order",
+    "fd451fa74fc52ba2": "whether all of two axes are finite, whichever comes first",
 }
