@@ -59,4 +59,5 @@ HARMLESS = {
     "9c9b58ae1e5c2c2a": "numbers of cells, of which no two are alike in either way",
     "f4b30131556f65a1": "the determinant of a product, in either order",
     "fd451fa74fc52ba2": "whether all of two axes are finite, whichever comes first",
+    "839c16b3f3d8599d": "what is taken where no angle is wide enough, and the widest one always is",
 }

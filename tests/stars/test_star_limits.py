@@ -268,6 +268,12 @@ class TestTables:
         np.savez(path, allow_pickle=False, **(good | change))
         assert _table_on_disk(path) is None
 
+    def test_a_single_star_has_no_pairs(self, tmp_path: Path) -> None:
+        path = tmp_path / "table.npz"
+        for stars, whole in ((1, True), (0, False)):
+            np.savez(path, pairs=np.zeros((0, 2), np.uint16), angle=np.zeros(0, np.float32), stars=np.array(stars))
+            assert (_table_on_disk(path) is not None) is whole
+
 
 class TestSky:
     def test_years_with_their_fraction(self) -> None:
