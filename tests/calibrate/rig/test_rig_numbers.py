@@ -7,7 +7,20 @@ import math
 import numpy as np
 import pytest
 import torch
-from rig_scenes import BOARD, CAMERAS, CENTER, NAMES, ROTATION, boards, features, landmarks, normal, tensor
+from rig_scenes import (
+    BOARD,
+    CAMERAS,
+    CENTER,
+    NAMES,
+    ROTATION,
+    boards,
+    features,
+    landmarks,
+    normal,
+    see,
+    spread_points,
+    tensor,
+)
 from scipy.special import chdtri
 from torch import Tensor
 
@@ -22,7 +35,7 @@ from kcal.calibrate.rig.prior_information import _moving
 from kcal.calibrate.rig.problem import DistanceTerm, PlaceTerm, RigProblem
 from kcal.calibrate.rig.redundancy import least_redundancy, redundancy, refuse_exact
 from kcal.calibrate.rig.sources import RigData
-from kcal.calibrate.rig.uncertainty import mounting_rows, relative_rows
+from kcal.calibrate.rig.uncertainty import SharedCovariance, mounting_rows, relative_rows
 from kcal.calibrate.rig.unknowns import held
 from kcal.calibrate.rig.weak_geometry import _advice, _Targets
 from kcal.errors import DegenerateError
@@ -233,6 +246,45 @@ class TestRows:
             seen, _ = CAMERAS[camera].project((place - CENTER[camera])[None] @ ROTATION[camera].T)
             assert seen[0].tolist() == pytest.approx(far.pixels[k, camera].tolist(), abs=0.02)
         assert direction[2].tolist() == [0.0, 0.0, 1.0]
+
+
+class TestOpen:
+    def test_what_matches_alone_leave_open_has_its_name(self) -> None:
+        """Things of unknown range tell how two cameras stand but for the scale; without a frame, not where they are."""
+        points = spread_points(8, 60.0, 900.0, 9)
+        pixels = torch.stack([see(points, c) for c in (0, 1)], 1)
+        unknown = torch.zeros(8).double(), torch.full((8,), math.inf).double()
+        anchor = CENTER.mean(0)
+        block = FeatureBlock(pixels, white(pixels), *unknown, anchor)
+        towards = points - anchor
+        length = towards.norm(dim=-1)
+        state = (
+            TestRows()
+            .problem()[1]
+            ._replace(
+                points=torch.zeros(0, 3).double(), direction=towards / length[:, None], inverse_range=1.0 / length
+            )
+        )
+        held_first = SharedCovariance(problem_of(block, loose=(False, True)), state, 4.0)
+        scale = "the scale (how far apart the cameras stand)"
+        assert held_first.open_directions(NAMES[:2], absolute=False) == (scale,)
+        free = SharedCovariance(problem_of(block), state, 1.0).open_directions(NAMES[:2], absolute=True)
+        assert free[:6] == (
+            "where the rig stands (east)", "where the rig stands (north)", "where the rig stands (up)",
+            "the heading (a turn about the vertical)", "a turn of the rig about its baseline", scale,
+        )  # fmt: skip
+        assert len(free) == 7
+        # How the second camera is turned is known, where it stands is not: along the baseline alone.
+        problem = problem_of(block, loose=(False, True))
+        covariance, known = held_first.of(relative_rows(problem, state, 0, 1))
+        assert known.tolist() == [True] * 3 + [False] * 3
+        assert bool(torch.isinf(covariance.diagonal()[3:]).all())
+        narrow = SharedCovariance(problem, state, 1.0).of(relative_rows(problem, state, 0, 1))[0]
+        torch.testing.assert_close(covariance[:3, :3], 4.0 * narrow[:3, :3])
+        assert held_first.half_of(relative_rows(problem, state, 0, 1)) is None
+        variances = held_first.variances(relative_rows(problem, state, 0, 1))
+        torch.testing.assert_close(variances[:3], covariance.diagonal()[:3])
+        assert bool(torch.isinf(variances[3:]).all())
 
 
 class TestWeak:
