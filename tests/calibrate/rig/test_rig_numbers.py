@@ -32,7 +32,7 @@ from kcal.calibrate.rig.drift import drift_of_turns
 from kcal.calibrate.rig.initial_poses import Start
 from kcal.calibrate.rig.landmark_block import LandmarkBlock
 from kcal.calibrate.rig.prior_information import _moving
-from kcal.calibrate.rig.problem import DistanceTerm, PlaceTerm, RigProblem
+from kcal.calibrate.rig.problem import DistanceTerm, PlaceTerm, RigProblem, _of_item
 from kcal.calibrate.rig.redundancy import least_redundancy, redundancy, refuse_exact
 from kcal.calibrate.rig.sources import RigData
 from kcal.calibrate.rig.uncertainty import SharedCovariance, mounting_rows, relative_rows
@@ -185,6 +185,10 @@ class TestRows:
         torch.testing.assert_close(found.right, whole[:, :2] @ whole[:, 2:].mT)
         torch.testing.assert_close(found.total, (whole[:, 2:] @ whole[:, 2:].mT).sum(0))
         torch.testing.assert_close(found.score, (whole[:, 2:] @ whole[:, -1:].mT)[..., 0])
+        # Each item by itself adds its own.
+        each = [summed_products(_of_item(parts, k), 2, 5) for k in range(4)]
+        torch.testing.assert_close(torch.stack([one.total for one in each]).sum(0), found.total)
+        torch.testing.assert_close(torch.cat([one.local for one in each]), found.local)
 
     def test_directions_that_move_anything(self) -> None:
         """By a thousandth of a pixel somewhere; those of which nothing is known stay."""
