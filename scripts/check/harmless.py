@@ -60,4 +60,6 @@ HARMLESS = {
     "f4b30131556f65a1": "the determinant of a product, in either order",
     "fd451fa74fc52ba2": "whether all of two axes are finite, whichever comes first",
     "839c16b3f3d8599d": "what is taken where no angle is wide enough, and the widest one always is",
+    "a163b7a5790def1c": "where a search of amplitudes begins",
+    "de5f75858fc5244d": "how far away things are put that are as good as infinitely far",
 }

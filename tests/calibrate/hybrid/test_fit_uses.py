@@ -20,7 +20,7 @@ from kcal.calibrate.hybrid.board_modes import board_modes
 from kcal.calibrate.hybrid.board_orders import turned
 from kcal.calibrate.hybrid.board_prior import evidence, printed_board
 from kcal.calibrate.hybrid.cameras_fit import _begun_fleet, _learned_fleet
-from kcal.calibrate.hybrid.families import prior_families, typical_hyperprior
+from kcal.calibrate.hybrid.families import Hyperprior, prior_families, typical_hyperprior
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.fitted_views import _cauchy_weights
 from kcal.calibrate.hybrid.fleet import LensPrior, fleet_priors, typical_lens
@@ -271,14 +271,20 @@ def test_pixels_that_amplitudes_to_be_expected_leave_square(monkeypatch: pytest.
             return Rounds(estimate)
 
     ratios = {"likely": (1.01, 0.002), "expected": (1.01, 0.004)}
-    monkeypatch.setattr(aspect, "expected_estimate", lambda rounds, hyperprior: "expected")
+    beforehand = typical_hyperprior()
+
+    def expected(rounds: Rounds, hyperprior: Hyperprior) -> str:
+        assert (rounds.estimate, hyperprior) == ("likely", beforehand)
+        return "expected"
+
+    monkeypatch.setattr(aspect, "expected_estimate", expected)
     monkeypatch.setattr(aspect, "aspect_of", lambda rounds, never: ratios[rounds.estimate])
     begin = cast(Any, Rounds("likely"))
-    assert aspect.square_pixels(begin, typical_hyperprior(), torch.zeros(0))
+    assert aspect.square_pixels(begin, beforehand, torch.zeros(0))
     ratios["expected"] = (1.01, 0.0025)
-    assert not aspect.square_pixels(begin, typical_hyperprior(), torch.zeros(0))
+    assert not aspect.square_pixels(begin, beforehand, torch.zeros(0))
     ratios["likely"] = (1.01, 0.004)
-    assert aspect.square_pixels(begin, typical_hyperprior(), torch.zeros(0))
+    assert aspect.square_pixels(begin, beforehand, torch.zeros(0))
 
 
 def test_motions_of_views_that_were_held_out() -> None:
