@@ -58,4 +58,8 @@ HARMLESS = {
     "5e0d5c9b92387eca": "the third best of all, which nothing reads",
     "9c9b58ae1e5c2c2a": "numbers of cells, of which no two are alike in either way",
     "f4b30131556f65a1": "the determinant of a product, in either order",
+    "fd451fa74fc52ba2": "whether all of two axes are finite, whichever comes first",
+    "839c16b3f3d8599d": "what is taken where no angle is wide enough, and the widest one always is",
+    "a163b7a5790def1c": "where a search of amplitudes begins",
+    "de5f75858fc5244d": "how far away things are put that are as good as infinitely far",
 }

@@ -10,8 +10,8 @@ observed. A line that no test executes is not noticed. Each mistake costs a fork
 First, every test file runs once, to see which lines each test executes and what time it takes; `--times` prints the
 rooms and tests that take long. All results are kept in .mutants/, and another run goes on where the last one stopped.
 Another seed draws afresh: what was drawn with one seed is not drawn with the next. `--again` repeats mistakes that went
-unnoticed, with the tests as they are now; `--write` writes the table of all seeds into docs/measured/mutants.md, where
-rooms without results in .mutants/ keep their rows.
+unnoticed, with the tests as they are now, and changes no share; `--write` writes the table of all seeds into
+docs/measured/mutants.md, where rooms without results in .mutants/ keep their rows.
 
 Neither mutmut (8 hours for one run of each mistake; it rewrites every function, which `torch.compile` refuses) nor
 cosmic-ray (a new process and the whole suite for each mistake) draws samples or chooses tests by what they execute.
@@ -253,10 +253,8 @@ def report() -> tuple[str, str]:
         every = [entry for entry in kept.values() if Path(entry["path"]).parent == folder]
         by_seed: dict[int, Draw] = {}
         for seed in sorted({entry["seed"] for entry in every}):
-            own = [(entry["key"], entry["noticed"]) for entry in every if entry["seed"] == seed]
-            if seed == min(entry["seed"] for entry in every):
-                # Before anything was mended.
-                own = [(key, at_first[key]["noticed"]) for key, _ in own]
+            # As drawn, before anything was mended.
+            own = [(entry["key"], at_first[entry["key"]]["noticed"]) for entry in every if entry["seed"] == seed]
             matter = [found for key, found in own if key not in HARMLESS]
             by_seed[seed] = Draw(len(own), len(own) - len(matter), sum(matter))
         if not by_seed:

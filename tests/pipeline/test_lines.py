@@ -7,6 +7,8 @@ import pytest
 from track_scenes import tracked_site
 
 from kcal.errors import InputError
+from kcal.locate.multi_localizer import MultiViewLocalizer
+from kcal.locate.stations import stations_of
 from kcal.pipeline.association_options import AssociationOptions
 from kcal.pipeline.lines import Moment, read_moment
 
@@ -71,3 +73,41 @@ def test_malformed(content: object, message: str) -> None:
         read(content)
     with pytest.raises(InputError, match="not a line of JSON"):
         read_moment(b"{", RIG, AssociationOptions(), 0.5)
+
+
+def test_cameras_by_their_names() -> None:
+    """The time is that of the first camera that has an image; only names of the rig's cameras are possible."""
+    localize = MultiViewLocalizer(stations_of(RIG))
+    first, second = localize.rig.names
+    options = AssociationOptions()
+
+    def read_cameras(content: object) -> Moment:
+        return read_moment(orjson.dumps(content), localize, options, 0.5)
+
+    boxes = [[100, 500, 120, 520]]
+    one = read_cameras({"cameras": {second: {"time": 4.5, "boxes": boxes}}})
+    assert (one.time, one.pairs.seen.tolist()) == (4.5, [[False, True]])
+    both = {first: {"time": 4.4, "boxes": [[140, 500, 160, 520]]}, second: {"time": 4.5, "boxes": boxes}}
+    pair = read_cameras({"cameras": both})
+    assert (pair.time, pair.pairs.seen.tolist()) == (4.4, [[True, True]])
+    assert pair.pairs.pixels[0].tolist() == [[149.5, 509.5], [109.5, 509.5]]
+    for wrong in (
+        [],
+        {"cameras": {}},
+        {"cameras": []},
+        {"cameras": both, "time": 3},
+        {"cameras": {"mill": both[first]}},
+    ):
+        with pytest.raises(InputError, match=f"with names of {first}, {second}"):
+            read_cameras(wrong)
+    with pytest.raises(InputError, match="need a time"):
+        read_cameras({"cameras": {first: {"boxes": boxes}}})
+
+
+def test_covariances_of_pairs() -> None:
+    line = {"time": 3, "left": [[1, 2]], "right": [[0, 2]]}
+    own = [[0.04, 0, 0.01, 0], [0, 0.05, 0, 0], [0.01, 0, 0.06, 0], [0, 0, 0, 0.07]]
+    assert read(line | {"covariance": [own]}).pairs.covariance[0].tolist() == own
+    for wrong in ([], [own, own], 3):
+        with pytest.raises(InputError, match="a list of 1 matrices"):
+            read(line | {"covariance": wrong})

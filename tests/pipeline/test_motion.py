@@ -121,3 +121,20 @@ def test_a_hovering_target_forgets_its_velocity() -> None:
 def test_impossible_motions(wrong: dict[str, float]) -> None:
     with pytest.raises(InputError, match="motion"):
         Motion(**wrong)
+
+
+def test_another_origin() -> None:
+    """Counted from 30 m to the side and 100 m behind; derivatives are those of the map."""
+    place, velocity = torch.tensor([30.0, -5.0, 400.0]).double(), torch.tensor([8.0, 1.0, -20.0]).double()
+    shift = torch.tensor([-30.0, 4.0, 100.0]).double()
+    turn = rotation_from_vector(torch.tensor([0.1, -0.3, 0.2]).double())
+    step = after((Motion(acceleration=0.5),), 1.5)
+    state = state_of(place, velocity)
+    found = moved(state, step, turn[..., None], shift[:, None])
+    true = state_of(turn @ (place + 1.5 * velocity) + shift, turn @ velocity)
+    torch.testing.assert_close(found.state, true, rtol=1e-12, atol=1e-15)
+    by_autograd = torch.autograd.functional.jacobian(
+        lambda s: moved(s[:, None, None], step, turn[..., None], shift[:, None]).state[:, 0, 0], state[:, 0, 0]
+    )
+    slope = found.through(torch.eye(6).double()[..., None, None])
+    torch.testing.assert_close(slope[:, :, 0, 0], by_autograd)

@@ -1,0 +1,143 @@
+"""Small decisions of commands: which options go together, what stars are told of landmarks, how meters are written."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner, Result
+
+from kcal.cli.demo_score import _first, _short_meters, _signed
+from kcal.cli.main import app
+from kcal.cli.rig_sources import Sources, parse_baselines, read_sources
+from kcal.errors import InputError
+from kcal.io.camera_file import save_camera
+from kcal.io.images import write_png
+from kcal.io.rig_file import save_rig
+from kcal.lens.camera import Camera
+from kcal.lens.mounting import Origin
+from kcal.lens.rig import StereoRig
+
+CAMERAS = [
+    Camera.build(focal=(1600 + 5 * k, 1600), center=(960, 540), size=(1920, 1080), model="pinhole") for k in range(2)
+]
+
+
+@pytest.mark.parametrize(("value", "text"), [
+    (12.4, "12"), (10.0, "10"), (-10.6, "-11"), (9.94, "9.9"), (0.012, "0.012"), (0.01, "0.01"), (0.0096, "0.010"),
+    (0.0004, "0.000"), (-0.25, "-0.25"), (math.nan, ""),
+])  # fmt: skip
+def test_meters(value: float, text: str) -> None:
+    assert _short_meters(value) == text
+
+
+@pytest.mark.parametrize(("value", "text"), [(12.4, "+12"), (-12.4, "-12"), (-0.5, "-0.5"), (0.0, "+0.000")])
+def test_errors_have_their_sign(value: float, text: str) -> None:
+    assert _signed(value) == text
+
+
+def test_the_first_result_that_is_there(tmp_path: Path) -> None:
+    assert _first(tmp_path, ("a", "b")) is None
+    (tmp_path / "b").touch()
+    assert _first(tmp_path, ("a", "b")) == tmp_path / "b"
+    (tmp_path / "a").touch()
+    assert _first(tmp_path, ("a", "b")) == tmp_path / "a"
+
+
+class Server:
+    """In place of the one that answers browsers: it ends at once."""
+
+    def __init__(self, make_app: Callable[..., object], port: int, *, fallback: bool) -> None:
+        self.address = "http://127.0.0.1:8347/#" + 60 * "t"
+
+    def run(self) -> None: ...
+
+
+class TestMark:
+    @pytest.fixture
+    def folder(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr("kcal.web.serving.LocalServer", Server)
+        lens = Camera.build(focal=(60, 60), center=(31, 24), size=(64, 48), model="pinhole")
+        for name in ("l", "r"):
+            write_png(tmp_path / f"{name}.png", np.arange(48 * 64).reshape(48, 64).astype(np.uint8))
+            save_camera(lens, tmp_path / f"{name}.json")
+        save_rig(StereoRig(lens, lens, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0])), tmp_path / "rig.json")
+        (tmp_path / "old.csv").write_text("name,left_u,left_v,right_u,right_v\np,30,20,29,20\n")
+        return tmp_path
+
+    def marking(self, *options: str) -> Result:
+        words = ["mark", "l.png", "r.png", "-o", "marks.csv", "--no-browser", *options]
+        return CliRunner().invoke(app, words, env={"COLUMNS": "40"})
+
+    @pytest.mark.usefixtures("folder")
+    def test_what_goes_together(self) -> None:
+        """A rig or its cameras, not both; old marks with the images that they are in."""
+        cameras, rig = ["--cameras", "l.json", "r.json"], ["--rig", "rig.json"]
+        assert "not both: a rig file contains its cameras" in str(self.marking(*cameras, *rig).exception)
+        old, images = ["--reference", "old.csv"], ["--reference-images", "l.png", "r.png"]
+        for options in (old, images):
+            assert "belong together" in str(self.marking(*options).exception)
+        for options in ([], cameras, rig, [*rig, *old, *images]):
+            done = self.marking(*options)
+            assert done.exit_code == 0, done.output
+            assert f"marking page: {Server(app, 0, fallback=True).address}\n" in done.output
+
+
+class TestSources:
+    @pytest.mark.parametrize("landmarks", [False, True])
+    def test_stars_know_whether_landmarks_place_the_cameras(
+        self, landmarks: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        told: list[tuple[list[str], bool]] = []
+
+        def stars(
+            cameras: dict[str, Camera], options: object, origin: Origin | None, positions: object, *, placed: bool
+        ) -> Any:
+            told.append((list(cameras), placed))
+            return None, positions, ["a note of the stars"]
+
+        monkeypatch.setattr("kcal.cli.rig_stars.read_stars", stars)
+        survey, marks = tmp_path / "survey.csv", tmp_path / "marks.csv"
+        survey.write_text("name,east,north,up,sigma\n" + "".join(f"p{k},{k},{100 + k},2,0.02\n" for k in range(3)))
+        marks.write_text("name,left_u,left_v,right_u,right_v\n" + "".join(f"p{k},{k},1,2,3\n" for k in range(3)))
+        given = Sources(stars=cast(Any, object()))
+        if landmarks:
+            given = dataclasses.replace(given, landmarks=survey, marks=marks)
+        found = read_sources(CAMERAS, given)
+        assert told == [(["left", "right"], landmarks)]
+        assert found.notes == ("a note of the stars",)
+        assert (found.data.landmarks is not None) is landmarks
+
+    def test_landmarks_and_marks_belong_together(self) -> None:
+        for some in (Sources(landmarks=Path("a")), Sources(marks=Path("a"))):
+            with pytest.raises(InputError, match="belong together"):
+                read_sources(CAMERAS, some)
+        with pytest.raises(InputError, match="the same camera twice"):
+            read_sources(CAMERAS[:1] * 2, Sources())
+
+    def test_baselines(self) -> None:
+        (one,) = parse_baselines(" 10.02+-0.005")
+        assert (one.first, one.second, one.length, one.sigma) == (0, 1, 10.02, 0.005)
+        names = ("mill", "mast", "church")
+        found = parse_baselines("church:mill=812.4±0.02, mill:mast=30±1", names)
+        assert [(b.first, b.second, b.length, b.sigma) for b in found] == [(2, 0, 812.4, 0.02), (0, 1, 30.0, 1.0)]
+        for text, message in (("10", "LENGTH±SIGMA in meters"), ("mill:tree=3±1", "the names being mill, mast, church"),
+                              ("mill=3±1", "FIRST:SECOND=LENGTH"), ("3±1", "of 3 cameras")):  # fmt: skip
+            with pytest.raises(InputError, match=message):
+                parse_baselines(text, names)
+
+    def test_files(self) -> None:
+        """All that are read, those of a kind in their order."""
+        some = Sources(
+            pairs=(Path("l"), Path("r")), match=Path("m"), landmarks=Path("a"), features=Path("f"),
+            tracks=(Path("t"), Path("u")), observations=(Path("o"),),
+        )  # fmt: skip
+        assert [str(path) for path in some.files] == ["l", "r", "t", "u", "o", "m", "a", "f"]
+        assert Sources().files == []

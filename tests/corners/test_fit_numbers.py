@@ -1,0 +1,345 @@
+"""What the fits of corners and ellipses compute, against dense matrices of NumPy and values by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from scipy.special import erfc
+from torch import Tensor
+
+from kcal.corners.circles import _with_statuses
+from kcal.corners.crossing import LineDistances, crossing
+from kcal.corners.ellipse import Ellipses, _pixels, _system, fit_ellipses
+from kcal.corners.erf_board import light_at, line_covariance
+from kcal.corners.erf_fit import _start, fit_crossings
+from kcal.corners.erf_spread import center_covariance
+from kcal.corners.erf_window import CornerWindow, cut_windows
+from kcal.corners.grid import Neighbors
+from kcal.corners.saddle import CornerStatus
+
+
+def draw(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+def windows_about(offset: Tensor, radius: float, size: int = 13) -> CornerWindow:
+    """Windows without gray levels yet, around offsets (M, 2)."""
+    count = len(offset)
+    places = torch.arange(size * size)
+    return CornerWindow(torch.zeros(count, size**2).double(), offset, torch.full((count,), radius), places, size)
+
+
+def with_levels(window: CornerWindow, levels: Tensor) -> CornerWindow:
+    return CornerWindow(levels, window.offset, window.radius, window.places, window.size)
+
+
+class TestCorners:
+    @pytest.mark.parametrize("usable_share", [1.0, 0.7])
+    def test_covariance_is_that_of_dense_matrices(self, usable_share: float) -> None:
+        """G R Gᵀ with the correlation that odd parts of the residuals show beyond what fitting makes of white noise."""
+        count, size = 600, 5
+        residual = draw(1, count, size + 1, size)[:, :, :size] + 0.5 * draw(1, count, size + 1, size)[:, :, 1:]
+        weight = 0.2 + 0.8 * draw(1, count, size, size, seed=1).abs().clamp_max(1.0)
+        axis = torch.arange(size).double() - size // 2
+        down, right = torch.meshgrid(axis, axis, indexing="ij")
+        shapes = torch.stack([right, down, right**3, down**3])
+        jacobian = (1.0 + 0.2 * draw(1, count, 4, 1, 1, seed=2)) * shapes
+        half = 0.05 * torch.eye(4) + 0.01 * draw(1, count, 4, 4, seed=3)
+        inverse = half @ half.mT
+        usable = torch.arange(count)[None] < usable_share * count
+        found = center_covariance(residual, weight, jacobian, inverse, torch.zeros(1, count, 2), usable, 0.0)
+
+        n = size * size
+        J = jacobian[0].flatten(2).mT.numpy()
+        G = inverse[0].numpy() @ (J * weight[0].flatten(1)[..., None].numpy()).transpose(0, 2, 1)
+        e = residual[0].flatten(1).numpy()
+        odd = (e - e[:, ::-1]) / math.sqrt(2.0)
+        w = weight[0].flatten(1).numpy()
+        pair = np.minimum(w, w[:, ::-1])
+        eye = np.eye(n)
+        made_of_white = (eye - J @ G) @ (eye - J @ G).transpose(0, 2, 1) - eye
+        y, x = np.divmod(np.arange(n), size)
+        good = usable[0].numpy()
+
+        def sums(lag: NDArray[np.bool_]) -> tuple[NDArray[np.float64], ...]:
+            both = pair[:, :, None] * pair[:, None] * lag
+            parts = both * odd[:, :, None] * odd[:, None], 2.0 * both * made_of_white, both
+            return tuple(part.sum((1, 2)) for part in parts)
+
+        of_found, made, number = sums(eye > 0)
+        freedom = number + made
+        common = of_found[good].sum() / freedom[good].sum()
+        # The image's mean counts as much as forty pixels.
+        noise = (of_found + 40.0 * common) / (freedom + 40.0)
+        correlated = eye.copy()
+        for dy in range(3):
+            for dx in range(-2, 3):
+                if dy == 0 and dx <= 0:
+                    continue
+                lag = (y[None] - y[:, None] == dy) & (x[None] - x[:, None] == dx)
+                of_found, made, number = sums(lag)
+                share = (of_found / noise - made)[good].sum() / number[good].sum()
+                correlated += share * (lag + lag.T)
+        wanted = noise[:, None, None] * (G @ correlated @ G.transpose(0, 2, 1))[:, :2, :2]
+        ratio = np.linalg.eigvals(
+            np.linalg.solve((noise[:, None, None] * (G @ G.transpose(0, 2, 1)))[:, :2, :2], wanted)
+        )
+        assert 0.1 < ratio.real.min() < 0.95
+        assert ratio.real.max() < 10.0
+        np.testing.assert_allclose(found[0].numpy(), wanted, rtol=1e-6, atol=1e-9 * wanted.max())
+
+    def test_least_noise_and_few_pixels(self) -> None:
+        """Below two thousand pixels noise is white; rounding of gray levels is the least."""
+        jacobian = draw(1, 1, 4, 5, 5, seed=2)
+        jacobian = jacobian - jacobian.flip(-1, -2)
+        inverse = torch.eye(4).double()[None, None]
+        ones, center, usable = torch.ones(1, 1, 5, 5).double(), torch.zeros(1, 1, 2), torch.ones(1, 1).bool()
+        gain = jacobian[0, 0, :2].flatten(1)
+        found = center_covariance(0 * ones, ones, jacobian, inverse, center, usable, 0.25)
+        torch.testing.assert_close(found[0, 0], 0.25 * gain @ gain.mT)
+
+    def test_light_is_that_of_the_typical_corner(self) -> None:
+        """Black and white are shared, whichever squares are light; what is not usable tells nothing."""
+        lights = torch.tensor([1.0, 0.8, 1.25, 3.0], dtype=torch.float64)
+        turned = torch.tensor([1.0, -1.0, 1.0, 1.0], dtype=torch.float64)
+        common = torch.tensor([0.2, -0.1, 0.1, 1.7, 0.2, 100.0, 60.0, 0.0, 0.0, 5.0], dtype=torch.float64).repeat(4, 1)
+        common[:, 2] += 0.05 * torch.arange(4)
+        own = common.clone()
+        own[:, 5:7] *= lights[:, None]
+        own[:, 9] *= lights
+        own[:, 6] *= turned
+        common[:, 6] *= turned
+        own[:, 7:9] = 0.01
+        own[3, 4:] = 9.0
+        bend = torch.tensor([[0.01, -0.02]], dtype=torch.float64).expand(4, 2)
+        window = windows_about(torch.zeros(4, 2).double(), 5.0)
+        window = with_levels(window, lights[:, None] * crossing(common, window.where, bend)[0])
+        usable = torch.tensor([[True, True, True, False]])
+        own[:, 9] = common[:, 9]  # its median is what counts
+        light = light_at(own, window, bend, None, usable)
+        torch.testing.assert_close(light[0], lights)
+
+    def test_errors_of_the_next_lines_move_a_corner(self) -> None:
+        """By the derivative of its gray levels by their distances; neighbors' errors are as large as its own."""
+        parameters = torch.tensor([[0.1, -0.2, 0.2, 1.6, 0.5, 120.0, 70.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
+        window = windows_about(torch.zeros(1, 2).double(), 5.0)
+        bend = torch.zeros(1, 2).double()
+        distance = torch.tensor([[[5.0, 6.0], [5.5, 7.0]]], dtype=torch.float64)
+        turn = torch.tensor([[[1.0, 1.0], [0.5, 1.0]]], dtype=torch.float64)[..., None]
+        gain = 1e-3 * draw(1, 2, len(window.places), seed=5)
+
+        def levels(distance: Tensor) -> Tensor:
+            wide = distance[..., None].expand(1, 2, 2, len(window.places))
+            return crossing(parameters, window.where, bend, LineDistances(wide, turn))[0][0]
+
+        steps = 1e-5 * torch.eye(4).double().reshape(2, 2, 1, 2, 2)
+        slopes = [
+            [(levels(distance + steps[e, s]) - levels(distance - steps[e, s])) / 2e-5 for s in (0, 1)] for e in (0, 1)
+        ]
+        moves = torch.stack([gain[0] @ slope for row in slopes for slope in row]).reshape(2, 2, 2)
+        own = torch.tensor([[[4e-4, 1e-4], [1e-4, 9e-4]]], dtype=torch.float64)
+        normals = torch.stack([-parameters[0, 2:4].sin(), parameters[0, 2:4].cos()], -1)
+        added = torch.zeros(2, 2).double()
+        for _ in range(2):
+            variance = 2.0 * torch.einsum("ei,ij,ej->e", normals, own[0] + added, normals)
+            added = torch.einsum("e,esi,esj->ij", variance, moves, moves)
+        lines = LineDistances(distance[..., None].expand(1, 2, 2, len(window.places)), turn)
+        found = line_covariance(parameters, window, bend, lines, gain, own)
+        torch.testing.assert_close(found[0], added, rtol=1e-4, atol=0)
+        assert float(added.diagonal().min()) > 0.0
+
+    @pytest.mark.parametrize(("first", "second"), [(0.2, 1.5), (-0.6, 1.0), (1.0, 2.4)])
+    def test_fits_begin_with_the_asymptotes_of_a_saddle(self, first: float, second: float) -> None:
+        offset = torch.tensor([[0.3, -0.2]], dtype=torch.float64)
+        window = windows_about(offset, 5.0)
+        x, y = (window.where - offset).unbind(-1)
+        product = (math.cos(first) * y - math.sin(first) * x) * (math.cos(second) * y - math.sin(second) * x)
+        levels = (100.0 + 2.0 * x + 3.0 * product)[None]
+        parameters, crosses = _start(with_levels(window, levels))
+        assert bool(crosses.all())
+        found = sorted((angle % math.pi) for angle in parameters[0, 2:4].tolist())
+        assert found == pytest.approx(sorted((first % math.pi, second % math.pi)))
+        assert parameters[0, :2].tolist() == [0.3, -0.2]
+        # A fifth of the radius, within 0.6 and 1.5 px.
+        assert float(parameters[0, 4].exp()) == pytest.approx(1.0)
+        # Mean and contrast by weighted least squares of the model.
+        shape = parameters.clone()
+        shape[:, 5], shape[:, 6] = 0.0, 1.0
+        design = np.stack([np.ones(window.size**2), crossing(shape, window.where, torch.zeros(1, 2))[0][0].numpy()], -1)
+        root = window.weight[0].sqrt().numpy()
+        best = np.linalg.lstsq(design * root[:, None], levels[0].numpy() * root, rcond=None)[0]
+        assert parameters[0, 5:7].tolist() == pytest.approx(best.tolist())
+        bowl = with_levels(window, (x * x + 0.5 * y * y)[None])
+        assert not bool(_start(bowl)[1].any())
+        for radius, blur in ((2.5, 0.6), (12.0, 1.5)):
+            wide = windows_about(offset, radius)
+            assert float(_start(with_levels(wide, levels))[0][0, 4].exp()) == pytest.approx(blur)
+
+    @pytest.mark.parametrize(("side", "blur", "radius", "near"), [
+        (4.0, 0.3, 2.5, False), (16.0, 0.8, 8.0, False), (30.0, 0.8, 12.0, False), (12.0, 2.2, 9.0, True),
+    ])  # fmt: skip
+    def test_windows_of_half_a_square_and_wider_where_lines_are_near(
+        self, side: float, blur: float, radius: float, near: bool
+    ) -> None:
+        x = torch.arange(61.0, dtype=torch.float64)
+
+        def stripes(at: Tensor) -> Tensor:
+            lines = [torch.erf((at - k * side) / (blur * math.sqrt(2.0))) * (-1) ** k for k in range(-9, 10)]
+            return torch.stack(lines).sum(0)
+
+        image = 128.0 + 80.0 * torch.outer(stripes(x - 30.2), stripes(x - 29.7))
+        step = side * torch.tensor([[[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]]], dtype=torch.float64)
+        around = Neighbors(step, torch.zeros_like(step), torch.zeros(1, 4).bool())
+        start = torch.tensor([[[30.0, 30.0]]], dtype=torch.float64)
+        sides = torch.tensor([[side]], dtype=torch.float64)
+        fit = fit_crossings(image[None], start, sides, None, around, 0.0)
+        assert float(fit.window.radius) == pytest.approx(radius)
+        assert fit.near.tolist() == [near]
+        assert fit.center[0].tolist() == pytest.approx([-0.3, 0.2], abs=0.02)
+        assert float(fit.blur) == pytest.approx(blur, rel=0.03)
+        # A marker in the square leaves less than half of it.
+        narrow = fit_crossings(image[None], start, 0.9 * sides, None, around, 0.0)
+        assert float(narrow.window.radius) == pytest.approx(min(max(0.45 * side, 2.5), 12.0))
+
+    def test_a_window_has_all_pixels_within_its_radius(self) -> None:
+        image = torch.arange(900.0).reshape(1, 30, 30).double()
+        base, offset = torch.tensor([[[14.0, 16.0]]]), torch.tensor([[0.5, -0.5]], dtype=torch.float64)
+        window, levels = cut_windows(image, base, offset, torch.tensor([4.0]))
+        y, x = np.mgrid[:30, :30]
+        weight = np.clip(4.5 - np.hypot(x - 14.5, y - 15.5), 0.0, 1.0)
+        assert float(window.weight.sum()) == pytest.approx(weight.sum())
+        assert float((window.weight * levels).sum()) == pytest.approx((weight * image[0].numpy()).sum())
+
+
+def model(p: NDArray[np.float64], where: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Light of a blurred ellipse and a ramp at places (K, 2)."""
+    B = np.array([[p[2], p[3]], [p[3], p[4]]])
+    w = (where - p[:2]) @ B
+    rho = np.linalg.norm(w, axis=1)
+    distance = (rho**2 - rho) / np.linalg.norm(w @ B, axis=1)
+    light: NDArray[np.float64] = p[5] + p[6] * 0.5 * erfc(distance / p[7] / math.sqrt(2.0)) + where @ p[8:]
+    return light
+
+
+class TestEllipses:
+    def test_normal_equations_are_those_of_differences(self) -> None:
+        p = np.array([0.3, -0.2, 0.16, 0.03, 0.2, 200.0, -150.0, 0.9, 0.1, -0.2])
+        where = np.array([(x, y) for x in range(-9, 10, 2) for y in range(-9, 10)], dtype=float)
+        steps = 1e-6 * np.eye(10)
+        slopes = np.stack([(model(p + step, where) - model(p - step, where)) / 2e-6 for step in steps], -1)
+        levels = 100.0 + draw(len(where)).numpy()
+        weight = draw(len(where), seed=1).abs().numpy()
+        arguments = (torch.from_numpy(part)[None] for part in (p, where, levels, weight))
+        cost, normal, gradient = _system(*arguments)
+        residual = model(p, where) - levels
+        assert float(cost) == pytest.approx((weight * residual**2).sum())
+        np.testing.assert_allclose(gradient[0], slopes.T @ (weight * residual), rtol=1e-4, atol=1e-3)
+        np.testing.assert_allclose(normal[0], (slopes.T * weight) @ slopes, rtol=1e-4, atol=1e-3)
+
+    def test_covariance_and_misfit_are_those_of_least_squares(self) -> None:
+        truth = np.array([0.3, -0.2, 0.16, 0.03, 0.2, 200.0, -150.0, 0.9, 0.1, -0.2])
+        y, x = np.mgrid[:41, :41]
+        image = model(truth, np.stack([x - 20.0, y - 20.0], -1).reshape(-1, 2)).reshape(41, 41)
+        image = image + 2.0 * draw(41, 41).numpy()
+        start, shape = torch.tensor([[20.4, 19.6]], dtype=torch.float64), torch.eye(2).double()[None] / 6.0
+        reach = torch.tensor([1.7], dtype=torch.float64)
+        found = fit_ellipses(image, start, shape, reach)
+        assert found.converged.tolist() == [True]
+        assert found.center[0].tolist() == pytest.approx([20.3, 19.8], abs=0.1)
+        offset = (found.center - start)[0].tolist()
+        b = found.shape[0]
+        where, levels, weight = (part[0].numpy() for part in _pixels(image, start, shape, reach))
+        inside = np.hypot(*(where.T)) <= 1.7 * 6.0
+        assert int(weight.sum()) == int(inside.sum()) == int((np.hypot(x - 20.4, y - 19.6) <= 10.2).sum())
+        base = np.array([*offset, float(b[0, 0]), float(b[0, 1]), float(b[1, 1])])
+        used = weight > 0
+
+        def light(edge: NDArray[np.float64], rest: NDArray[np.float64]) -> NDArray[np.float64]:
+            return model(np.concatenate([edge, rest]), where[used])
+
+        # The rest is linear but for the blur: the best for this edge is what the fit has.
+        columns = np.stack(
+            [np.ones(used.sum()), light(base, np.array([0, 1.0, float(found.blur), 0, 0])), *where[used].T], -1
+        )
+        best = np.linalg.lstsq(columns, levels[used], rcond=None)[0]
+        assert float(found.contrast) == pytest.approx(best[1], rel=1e-4)
+        p = np.array([*base, best[0], best[1], float(found.blur), *best[2:]])
+        slopes = np.stack(
+            [(model(p + step, where[used]) - model(p - step, where[used])) / 2e-6 for step in 1e-6 * np.eye(10)], -1
+        )
+        rest = levels[used] - model(p, where[used])
+        noise = (rest**2).sum() / (used.sum() - 10)
+        np.testing.assert_allclose(found.covariance[0], noise * np.linalg.inv(slopes.T @ slopes)[:2, :2], rtol=1e-3)
+        assert float(found.misfit) == pytest.approx(math.sqrt(noise) / 150.0, rel=0.05)
+
+    def test_large_ellipses_are_fitted_to_every_other_row_and_column(self) -> None:
+        image = np.zeros((200, 200))
+        for radius, stride in ((42.0, 1), (43.0, 2), (64.0, 2), (65.0, 3)):
+            where, _, weight = _pixels(
+                image,
+                torch.tensor([[100.0, 100.0]], dtype=torch.float64),
+                torch.eye(2).double()[None] / radius,
+                torch.tensor([1.0]),
+            )
+            kept = where[0][weight[0] > 0]
+            assert kept[:, 0].unique().diff().unique().tolist() == [stride]
+            assert kept[:, 1].unique().diff().unique().tolist() == [stride]
+        # The image ends.
+        _, _, weight = _pixels(
+            image,
+            torch.tensor([[0.0, 199.0]], dtype=torch.float64),
+            torch.eye(2).double()[None] / 3.0,
+            torch.tensor([1.0]),
+        )
+        assert int(weight.sum()) == 4 + 3 + 3 + 1
+
+    @pytest.mark.parametrize(("change", "status"), [
+        ({}, CornerStatus.GOOD),
+        ({"center": (6.4, 50.0)}, CornerStatus.OUTSIDE), ({"center": (6.6, 50.0)}, CornerStatus.GOOD),
+        ({"center": (92.6, 50.0)}, CornerStatus.OUTSIDE), ({"center": (92.4, 50.0)}, CornerStatus.GOOD),
+        ({"center": (50.0, 5.4)}, CornerStatus.OUTSIDE), ({"center": (50.0, 5.6)}, CornerStatus.GOOD),
+        ({"center": (50.0, 73.6)}, CornerStatus.OUTSIDE), ({"center": (50.0, 73.4)}, CornerStatus.GOOD),
+        ({"contrast": 20.0}, CornerStatus.NO_SADDLE),
+        ({"misfit": 0.21}, CornerStatus.OCCLUDED), ({"misfit": 0.19}, CornerStatus.GOOD),
+        ({"blur": 2.3}, CornerStatus.BLURRED), ({"blur": 2.2}, CornerStatus.GOOD),
+        ({"moved": 2.3}, CornerStatus.MOVED), ({"moved": 2.2}, CornerStatus.GOOD),
+        ({"converged": False}, CornerStatus.NOT_CONVERGED),
+    ])  # fmt: skip
+    def test_which_circles_are_good(self, change: dict[str, float], status: CornerStatus) -> None:
+        """Of half axes 5 and 4 px, hence of the size of a circle of 4.47 px, in an image of 100 x 80."""
+        values: dict[str, object] = {
+            "center": (50.0, 40.0),
+            "blur": 1.5,
+            "contrast": -90.0,
+            "misfit": 0.05,
+            "moved": 0.1,
+        }
+        values |= {"converged": True, **change}
+
+        def both(value: object, usual: object) -> Tensor:
+            return torch.tensor([value, usual, usual])
+
+        found = Ellipses(
+            center=both(values["center"], (40.0, 40.0)).double(),
+            shape=torch.diag(torch.tensor([1 / 5.0, 1 / 4.0])).double().expand(3, 2, 2),
+            covariance=torch.eye(2).double().expand(3, 2, 2),
+            blur=both(values["blur"], 1.0).double(),
+            contrast=both(values["contrast"], -100.0).double(),
+            misfit=both(values["misfit"], 0.05).double(),
+            converged=both(values["converged"], True),
+        )
+        start = found.center + torch.tensor([[values["moved"], 0.0], [0.0, 0.0], [0.0, 0.0]], dtype=torch.float64)
+        refined = _with_statuses(np.zeros((80, 100), np.uint8), start, found)
+        assert refined.status.tolist() == [int(status), 0, 0]
+        good = status == CornerStatus.GOOD
+        assert refined.covariance is not None
+        assert refined.blur is not None
+        assert bool(torch.isfinite(refined.covariance[0]).all()) == good
+        assert refined.blur[0].tolist() == (
+            pytest.approx(values["blur"]) if good else pytest.approx(math.nan, nan_ok=True)
+        )
+        torch.testing.assert_close(refined.pixels[1:], found.center[1:])

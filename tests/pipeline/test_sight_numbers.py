@@ -1,0 +1,289 @@
+"""Lines of sight of several cameras: pencils, points, who is nearest and which groups hold, against plain NumPy."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from kcal.pipeline.clear_groups import Confirming, _FittedGroups
+from kcal.pipeline.epipolar_pencil import FARTHEST_BEND_M, StationSights, meetings, near_in_angle
+from kcal.pipeline.grouping import _Edges, _with_one_range
+
+SIGMA, PLACE, AIR = 1e-4, 0.2, 2e-10
+UP = np.array([[0.0, 0.0, 1.0], [0.02, 0.0, 1.0], [0.0, 0.02, 1.0], [-0.02, 0.0, 1.0], [0.0, -0.02, 1.0]])
+CENTER = np.array([[0.0, 0, 0], [5000.0, 0, 50], [5200.0, 4800, -20], [100.0, 5100, 30], [2500.0, -900, 10]])
+POINTS = np.array([[2500.0, 2500, 600], [2300.0, 2600, 500], [2900.0, 2200, 700]])
+
+
+def sights(bending: float = 0.0, turned: float = 0.0, seed: int = 0) -> StationSights:
+    """Of all points from all five cameras, camera by camera; turned by so many sigmas."""
+    random = np.random.default_rng(seed)
+    rays = []
+    for center, up in zip(CENTER, UP, strict=True):
+        away = POINTS - center
+        away = away + bending * (away**2).sum(1)[:, None] * up
+        ray = away / np.linalg.norm(away, axis=1, keepdims=True)
+        ray = ray + turned * SIGMA * random.normal(size=ray.shape)
+        rays.append(ray / np.linalg.norm(ray, axis=1, keepdims=True))
+    camera = np.repeat(np.arange(5), len(POINTS))
+    return StationSights(
+        camera, np.concatenate(rays), np.full(len(camera), SIGMA), np.full(5, PLACE), AIR, CENTER, UP, bending
+    )
+
+
+def confirming(lines: StationSights, gate: float = 4.0, near: float = 2.0, inner: float = -1.0) -> Confirming:
+    axis = np.array([2500.0, 2500.0, 300.0]) - CENTER
+    axis = axis / np.linalg.norm(axis, axis=1, keepdims=True)
+    kind = np.zeros(len(lines.camera), dtype=np.int64)
+    return Confirming(lines, kind, axis, np.full(5, inner), [0, 1, 2, 3, 4], gate, near, 100.0)
+
+
+def marks_of(*points: int) -> NDArray[np.int64]:
+    """All five marks of points."""
+    return np.array([[c * len(POINTS) + p for c in range(5)] for p in points])
+
+
+def width(away: float) -> float:
+    return math.sqrt((SIGMA * away) ** 2 + PLACE**2 + (AIR * away**2) ** 2)
+
+
+def best_point(lines: StationSights, marks: NDArray[np.int64]) -> tuple[NDArray, NDArray, float]:
+    """Nearest to straight lines of sight, weighted by the widths there; its covariance and chi-squared."""
+    point = POINTS.mean(0)
+    for _ in range(20):
+        normal, right, chi2 = np.zeros((3, 3)), np.zeros(3), 0.0
+        for c, mark in enumerate(marks):
+            if mark >= 0:
+                ray = lines.ray[mark]
+                side = (np.eye(3) - np.outer(ray, ray)) / width(float(np.linalg.norm(point - CENTER[c]))) ** 2
+                normal, right = normal + side, right + side @ CENTER[c]
+                chi2 += (point - CENTER[c]) @ side @ (point - CENTER[c])
+        point = np.linalg.solve(normal, right)
+    return point, np.linalg.inv(normal), chi2
+
+
+class TestPencils:
+    @pytest.mark.parametrize("gate", [4.0, 40.0])
+    @pytest.mark.parametrize("pair", [(0, 1), (1, 3)])
+    def test_planes_within_the_noise(self, pair: tuple[int, int], gate: float) -> None:
+        """By the angle between normals; noise counts for more, the nearer a line of sight is to the base."""
+        random = np.random.default_rng(1)
+        ray = random.normal(size=(400, 3))
+        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+        camera = np.repeat(np.array(pair), 200)
+        sigma = random.uniform(1e-4, 1e-2, 400)
+        lines = StationSights(camera, ray, sigma, np.arange(5.0) + 0.5, 1e-9, CENTER, UP, 2e-8)
+        rows, others = np.arange(200), np.arange(200, 400)
+        found = set(zip(*(part.tolist() for part in near_in_angle(lines, rows, others, gate, 2000.0)), strict=True))
+        base = CENTER[pair[1]] - CENTER[pair[0]]
+        base = base / np.linalg.norm(base)
+        normal = np.cross(base, ray)
+        flat = np.linalg.norm(normal, axis=1)
+        place = (camera + 0.5) / 2000.0
+        wide = gate * np.hypot(sigma, place) + (2e-8 + gate * 1e-9) * FARTHEST_BEND_M
+        wide = np.minimum(wide / flat, math.pi)
+        cosine = (normal[rows, None] * normal[None, others]).sum(-1)
+        turned = np.cross(normal[rows, None], normal[None, others]) @ base
+        angle = np.abs(np.arctan2(turned, cosine))
+        limit = np.hypot(wide[rows, None], wide[None, others])
+        wanted = {(int(i), int(j) + 200) for i, j in zip(*np.nonzero(angle <= limit), strict=True)}
+        assert found == wanted
+        assert 100 < len(wanted) < 40_000
+
+    def test_how_well_a_meeting_is_known(self) -> None:
+        """Both widths over the sine of the crossing; what is nearly parallel has no range."""
+        lines = sights()
+        found = meetings(lines, np.array([0]), np.array([3]), 4.0, 100.0)
+        away = [float(np.linalg.norm(POINTS[0] - CENTER[c])) for c in (0, 1)]
+        sine = float(np.linalg.norm(np.cross(lines.ray[0], lines.ray[3])))
+        assert found.sigma.tolist() == pytest.approx([math.hypot(*map(width, away)) / sine], rel=1e-6)
+        assert found.range.tolist() == pytest.approx(away[:1])
+        np.testing.assert_allclose(found.point, POINTS[:1], atol=1e-6)
+        # The crossing must be ten times the angles that both widths are seen at.
+        for share, known in ((9.5, False), (10.5, True)):
+            turn = share * math.hypot(0.01, 0.01)
+            ray = np.array([[0.0, 1.0, 0.0], [-math.sin(turn), math.cos(turn), 0.0]])
+            shift = np.array([[0.0, 0.0, 0.0], [100.0 * math.sin(turn), 100.0 * (1.0 - math.cos(turn)), 0.0]])
+            two = StationSights(
+                np.array([0, 1]), ray, np.full(2, 0.01), np.zeros(2), 0.0, shift, np.array([[0.0, 0, 1]] * 2), 0.0
+            )
+            assert (len(meetings(two, np.array([0]), np.array([1]), 4.0, 10.0).first) == 1) is known
+
+    def test_behind_and_far_beyond_is_no_meeting(self) -> None:
+        center = np.array([[0.0, 0.0, 0.0], [600.0, 0.0, 0.0]])
+
+        def count(at: tuple[float, float], behind: int | None = None) -> int:
+            ray = np.array([*at, 0.0]) - center
+            ray = ray / np.linalg.norm(ray, axis=1, keepdims=True)
+            if behind is not None:
+                ray[behind] *= -1.0
+            lines = StationSights(
+                np.array([0, 1]), ray, np.full(2, 1e-6), np.zeros(2), 0.0, center, np.array([[0.0, 0, 1]] * 2), 0.0
+            )
+            return len(meetings(lines, np.array([0]), np.array([1]), 4.0, 100.0).first)
+
+        assert count((200.0, 900.0)) == 1
+        assert count((200.0, 900.0), 0) == count((200.0, 900.0), 1) == 0
+        assert count((300.0, 9.9e4)) == 1
+        assert count((300.0, 1.01e5)) == 0
+
+
+class TestGroups:
+    def test_points_are_those_of_least_squares(self) -> None:
+        lines = sights(turned=1.0)
+        marks = marks_of(0, 2)
+        marks[1, 3] = -1
+        done = confirming(lines)._fit(marks)
+        for row in (0, 1):
+            point, spread, chi2 = best_point(lines, marks[row])
+            np.testing.assert_allclose(done.point[row], point, atol=1e-3)
+            np.testing.assert_allclose(np.linalg.inv(done.normal[row]), spread, rtol=1e-3, atol=1e-5)
+            assert done.squared[row].sum() == pytest.approx(chi2, rel=1e-2)
+        assert done.squared[1, 3] == 0.0
+        assert done.squared.sum() > 1.0
+
+    def test_bent_light_leads_to_the_point(self) -> None:
+        lines = sights(bending=6e-8)
+        done = confirming(lines)._fit(marks_of(0, 1, 2))
+        np.testing.assert_allclose(done.point, POINTS, atol=1e-2)
+        assert float(done.squared.max()) < 1e-3
+
+    @pytest.mark.parametrize("gate", [4.0, 1.5])
+    def test_each_camera_has_what_is_nearest_to_the_others_point(self, gate: float) -> None:
+        """Within the gate of both errors: those of the point and those of the camera's own marks."""
+        lines = sights(turned=1.2, seed=3)
+        trees = confirming(lines, gate)
+        own, found = trees._trees(np.ones(15, dtype=bool))
+        done = trees._fit(marks_of(0, 1, 2))
+        marks, near = trees._nearest(done, own, found)
+        for c in range(5):
+            for p in range(3):
+                others = marks_of(p)[0].copy()
+                others[c] = -1
+                point, spread, _ = best_point(lines, others)
+                away = point - CENTER[c]
+                length = float(np.linalg.norm(away))
+                at = away / length
+                side = np.linalg.svd(at[None])[2][1:]  # two axes across
+                rest = side @ (lines.ray[c * 3 + p] * (1.0 / (lines.ray[c * 3 + p] @ at)) - at)
+                noise = (side @ spread @ side.T + width(length) ** 2 * np.eye(2)) / length**2
+                squared = float(rest @ np.linalg.solve(noise, rest))
+                number, value = near[c]
+                listed = dict(zip(number[p].tolist(), value[p].tolist(), strict=True))
+                if squared < 0.98 * gate**2:
+                    assert listed[c * 3 + p] == pytest.approx(squared, rel=0.02, abs=1e-3)
+                    assert marks[p, c] == c * 3 + p
+                elif squared > 1.02 * gate**2:
+                    assert listed.get(c * 3 + p, math.inf) == math.inf
+                    assert marks[p, c] == -1
+        assert gate > 2.0 or bool((marks < 0).any())
+
+    def test_candidates_that_are_about_the_best_of_a_mark(self) -> None:
+        """They may lose by `near` and sixteen squared sigmas; the same group counts once."""
+        trees = confirming(sights(), near=2.0)
+        first, second, third = marks_of(0)[0], marks_of(1)[0], marks_of(2)[0]
+        mixed = np.where(np.arange(5) < 2, first, -1)
+        some = np.stack([first, second, mixed, first, third])
+        kept = trees._best(some, np.array([50.0, 30.0, 32.1, 49.0, 10.0]))
+        assert {tuple(row) for row in kept.tolist()} == {tuple(row) for row in (first, second, mixed, third)}
+        kept = trees._best(some, np.array([50.0, 30.0, 31.9, 49.0, 10.0]))
+        assert {tuple(row) for row in kept.tolist()} == {tuple(row) for row in (first, second, third)}
+
+    def groups(self, marks: NDArray[np.int64], squared: float = 0.5) -> _FittedGroups:
+        count = len(marks)
+        return _FittedGroups(
+            marks, np.repeat(POINTS[:1], count, 0), np.repeat(np.eye(3)[None], count, 0), np.full(marks.shape, squared)
+        )
+
+    def test_views_that_do_not_contradict_each_other(self) -> None:
+        """Four at least; chi-squared of 2 n - 3 degrees of freedom within four of its standard deviations."""
+        trees = confirming(sights())
+        whole, four, three = marks_of(0)[0], marks_of(0)[0].copy(), marks_of(0)[0].copy()
+        four[1], three[1:3] = -1, -1
+        some = np.stack([whole, four, three])
+        assert trees._enough(self.groups(some), 2).tolist() == [True, True, False]
+        assert trees._enough(self.groups(some), 0).tolist() == [True, False, False]
+        # Cameras that do not have the point in their image have not missed it.
+        narrow = confirming(sights(), inner=0.999999)
+        assert narrow._enough(self.groups(some), 0).tolist() == [True, True, False]
+        limit = 7.0 + 4.0 * math.sqrt(14.0)
+        for share, good in ((0.99, True), (1.01, False)):
+            assert trees._enough(self.groups(whole[None], share * limit / 5.0), 0).tolist() == [good]
+
+    def test_groups_of_their_own_marks(self) -> None:
+        """The best first; one that shares several marks with it and saves about as much makes both unclear."""
+        trees = confirming(sights(), near=2.0)
+        first, second = marks_of(0)[0], marks_of(1)[0]
+        mixed = np.where(np.arange(5) < 2, first, second)
+        alone = trees._chosen(self.groups(np.stack([first, second])), 0)
+        assert {tuple(row) for row in alone.marks.tolist()} == {tuple(first), tuple(second)}
+        for behind, clear in ((3.0, True), (1.0, False)):
+            some = self.groups(np.stack([first, mixed]))
+            some.squared[1] += behind / 5.0
+            kept = trees._chosen(some, 0).marks.tolist()
+            assert kept == ([first.tolist()] if clear else [])
+        # One that differs in one mark only is no rival: marks are settled one by one.
+        one_off = first.copy()
+        one_off[4] = second[4]
+        assert trees._chosen(self.groups(np.stack([first, one_off])), 0).marks.tolist() in (
+            [first.tolist()], [one_off.tolist()]
+        )  # fmt: skip
+
+    def test_meetings_that_enough_cameras_confirm(self) -> None:
+        lines = sights()
+        trees = confirming(lines)
+        own, found = trees._trees(np.ones(15, dtype=bool))
+        meet = meetings(lines, own[0], own[1], 4.0, 100.0)
+        marks, saved = trees._confirmed(meet, (0, 1), 0, own, found)
+        assert {tuple(row) for row in marks.tolist()} >= {tuple(row) for row in marks_of(0, 1, 2).tolist()}
+        # Two lines that meet and three cameras that agree save sixteen squared sigmas each.
+        same = [row.tolist() in marks_of(0, 1, 2).tolist() for row in marks]
+        assert saved[same].tolist() == pytest.approx([64.0] * sum(same), abs=0.01)
+        # Without one of three marks of the third camera, one group has missed it.
+        free = np.ones(15, dtype=bool)
+        free[7] = False
+        own, found = trees._trees(free)
+        for misses, count in ((0, 2), (1, 3)):
+            some, _ = trees._confirmed(meet, (0, 1), misses, own, found)
+            whole = marks_of(0, 1, 2)
+            whole[whole == 7] = -1
+            hit = {tuple(row) for row in some.tolist()} & {tuple(row) for row in whole.tolist()}
+            assert len(hit) == count
+
+    def test_everything_at_once(self) -> None:
+        for kinds in (1, 2):
+            trees = confirming(sights(turned=0.5))
+            if kinds == 2:
+                # One camera says that the second thing is of another kind.
+                trees.kind[1] = 1
+                trees.place[1, 3] = 10.0
+            found = trees.found((0, 2), 0, np.ones(15, dtype=bool))
+            wanted = marks_of(0, 1, 2)
+            assert sorted(map(tuple, found.tolist())) == [
+                tuple(row) for row in (wanted if kinds == 1 else wanted[[0, 2]])
+            ]
+
+
+def test_pairs_with_one_range() -> None:
+    """Inverse ranges from the same detection that agree within the gate, of other cameras; the nearest of each."""
+    camera = np.array([0, 1, 1, 2, 3])
+
+    def groups(inverse: list[float], sigma: float = 0.5, gate: float = 2.0) -> list[tuple[int, ...]]:
+        numbers = np.array([1, 2, 3, 4])[: len(inverse)]
+        edges = _Edges(
+            np.zeros(len(inverse), dtype=np.int64), numbers, np.zeros(len(inverse)), np.array(inverse),
+            np.full(len(inverse), sigma),
+        )  # fmt: skip
+        return _with_one_range(edges, camera, 4, gate)
+
+    # 1.4 apart are two standard deviations of the difference.
+    assert groups([1.0, 9.0, 2.40]) == [(0, 1, 3, -1)]
+    assert groups([1.0, 9.0, 2.42]) == []
+    assert groups([1.0, 1.2, 9.0]) == []  # both of one camera
+    assert groups([1.0, 1.3, 1.1, 1.2]) == [(0, 1, 3, 4), (0, 2, 3, 4)]
+    assert groups([1.0]) == []
+    none, nothing = np.zeros(0, dtype=np.int64), np.zeros(0)
+    assert _with_one_range(_Edges(none, none, nothing, nothing, nothing), camera, 2, 2.0) == []
