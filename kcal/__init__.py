@@ -11,7 +11,7 @@ from typing import Any
 from kcal.doors import door
 from kcal.old_names import GONE, PLACES, find_old
 
-__version__ = "0.1.0"
+__version__ = "1.0.0"
 
 _find, __dir__ = door(__name__, __file__)
 

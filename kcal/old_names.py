@@ -1,4 +1,4 @@
-"""Names that version 0.1 had in `kcal` itself: they warn in version 0.2 and are gone after it."""
+"""Names that version 0.1 had in `kcal` itself: they warn in version 1 and are gone in version 2.0."""
 
 from __future__ import annotations
 
@@ -80,5 +80,5 @@ def find_old(name: str) -> Any:
     module, _, new_name = PLACES[name].rpartition(".")
     now = f"is now {PLACES[name]}" if name in _PUBLIC else "is internal, and not public any more"
     # The third frame is the one that asked `kcal` for the name.
-    warnings.warn(f"kcal.{name} {now}; the old name is gone after version 0.2", DeprecationWarning, stacklevel=3)
+    warnings.warn(f"kcal.{name} {now}; the old name is gone in version 2.0", DeprecationWarning, stacklevel=3)
     return getattr(importlib.import_module(module), new_name)

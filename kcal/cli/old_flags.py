@@ -1,4 +1,4 @@
-"""Options that have another name now: the old one works in version 0.2, with a warning."""
+"""Options that have another name now: the old one works in version 1, with a warning."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def with_new_names(words: list[str]) -> tuple[list[str], list[str]]:
 
     Example:
         >>> with_new_names(["live", "rig.json", "--map", "8350"])
-        (['live', 'rig.json', '--port', '8350'], ['--map is called --port now; the old name goes after version 0.2'])
+        (['live', 'rig.json', '--port', '8350'], ['--map is called --port now; the old name goes in version 2.0'])
     """
     command = words[0] if words else ""
     found: list[str] = []
@@ -42,13 +42,13 @@ def with_new_names(words: list[str]) -> tuple[list[str], list[str]]:
             word, divisor = _divided(word, divisor), 1.0
         option, equals, value = word.partition("=")
         if reason := _NEEDLESS.get((command, option)):
-            warnings.append(f"{option} is not needed any more and goes after version 0.2: {reason}")
+            warnings.append(f"{option} is not needed any more and goes in version 2.0: {reason}")
             continue
         renamed = _RENAMED.get((command, option)) or _RENAMED.get(("", option))
         if renamed is None:
             found.append(word)
             continue
-        warnings.append(f"{option} is called {renamed.now} now; the old name goes after version 0.2")
+        warnings.append(f"{option} is called {renamed.now} now; the old name goes in version 2.0")
         if renamed.divisor != 1.0:
             warnings[-1] += ", and the value of the new one is divided by √2: noise of one mark along each axis"
         if equals:

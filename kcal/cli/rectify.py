@@ -110,7 +110,7 @@ def undistort_command(
     mask: _MASK = False,
 ) -> None:
     """`kcal rectify CAMERA IMAGES` under its old name and with the old order of arguments."""
-    warn("kcal undistort is called kcal rectify CAMERA IMAGES now; the old name goes after version 0.2")
+    warn("kcal undistort is called kcal rectify CAMERA IMAGES now; the old name goes in version 2.0")
     _rectify_camera(
         str(camera), images, output, None, False, (0.0, 0.0), False, mask, "undistorted", alpha=alpha, size=None,
         at=math.inf,

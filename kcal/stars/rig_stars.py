@@ -247,9 +247,7 @@ def _effects(
         if clock_sigma > 0:
             found.append(StarEffect(name=f"{whose} against that of the first", turn=clock_sigma * turn))
         for number, hours in nights.items():
-            found.append(
-                StarEffect(name=f"drift of {whose}, night {number}", turn=drift_sigma * turn, factor=hours)
-            )
+            found.append(StarEffect(name=f"drift of {whose}, night {number}", turn=drift_sigma * turn, factor=hours))
     if not on_earth:
         return found
     turn = (some.view.clock_sigma * second).expand(cameras, 3)

@@ -128,7 +128,7 @@ def test_old_names_work_and_warn(old: str, new: str) -> None:
     words, warnings = with_new_names(old.split())
     assert words == new.split()
     assert len(warnings) == (old != new)
-    assert all("after version 0.2" in text for text in warnings)
+    assert all("in version 2.0" in text for text in warnings)
 
 
 def test_an_old_name_without_a_number_is_refused() -> None:

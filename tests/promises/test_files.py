@@ -102,10 +102,17 @@ WRITTEN_AGAIN = {
     "observations": lambda path, to: Observations.load(path).save(to),
     "board": lambda path, to: save_measured_board(load_measured_board(path), to),
 }
-NEWEST = [*sorted((FILES / "0.1-format2").glob("*.json")), FILES / "0.2-camera-rig" / "camera-rig.json"]
+NEWEST = [
+    *sorted((FILES / "0.1-format2").glob("*.json")), FILES / "0.2-camera-rig" / "camera-rig.json",
+    *sorted((FILES / "1.0").glob("*.json")),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize("path", [path for path in NEWEST if path.name != "computed.json"], ids=lambda path: path.name)
+@pytest.mark.parametrize(
+    "path",
+    [path for path in NEWEST if path.name != "computed.json"],
+    ids=lambda path: f"{path.parent.name}/{path.name}",
+)
 def test_the_newest_version_has_the_fields_of_its_first_files(path: Path, tmp_path: Path) -> None:
     """An older kcal that reads the version refuses any field that it does not know."""
     stored = json.loads(path.read_text(encoding="utf-8"))
