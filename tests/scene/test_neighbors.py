@@ -42,6 +42,7 @@ def ratio(pixels: Tensor, error: Tensor, rig: StereoRig = RIG) -> float:
 def unbounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ratios below one are to be seen, too."""
     monkeypatch.setattr(neighbors, "max", lambda _, found: found, raising=False)
+    monkeypatch.setattr(neighbors, "_SMOOTH_PX", 0.0)
 
 
 def test_independent_errors(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -101,6 +102,26 @@ def test_slopes_are_those_of_differences() -> None:
     assert off.abs().max() < 1e-7
     torch.testing.assert_close(slope, expected, rtol=1e-4, atol=1e-3)
     torch.testing.assert_close(sigma, torch.ones_like(sigma), rtol=1e-12, atol=0.0)
+
+
+def test_smooth_errors_do_not_become_smaller_with_more_matches(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The variance of a pose beyond that of noise is that of errors of 0.006 px at the border, however many match."""
+    draw = torch.Generator().manual_seed(7)
+    beyond = []
+    for count in (300, 1200):
+        pixels = drawn_pixels(draw, count)
+        covariance = (SIGMA**2 * torch.eye(2, dtype=torch.float64)).expand(count, 2, 2)
+        _, slope, sigma = neighbors._off_lines(RIG, pixels, covariance)
+        solved = torch.linalg.pinv(slope / sigma[:, None]) / sigma
+        variance = torch.linalg.inv((slope / sigma[:, None]).T @ (slope / sigma[:, None])).diagonal()
+        u, v = (2.0 * pixels[:, 0] / torch.tensor(SIZE) - 1.0).unbind(1)
+        poses = torch.stack([solved @ (0.006 * field) for field in (u, v, u * v, u * u, v * v)])
+        beyond.append(float((poses.square().sum(0) / variance).mean()))
+        monkeypatch.setattr(neighbors, "_SMOOTH_PX", 0.006)
+        with_them = pose_variance_ratio([RIG], [pixels], [covariance])
+        monkeypatch.setattr(neighbors, "_SMOOTH_PX", 0.0)
+        assert with_them - pose_variance_ratio([RIG], [pixels], [covariance]) == pytest.approx(beyond[-1], rel=1e-6)
+    assert beyond[1] / beyond[0] == pytest.approx(4.0, rel=0.1)
 
 
 def test_few_matches_and_wrong_ones() -> None:
