@@ -3,7 +3,7 @@
 A hill, a row of houses or the ground before the mast has slopes and edges of one kind, and the errors that they make
 lean to one side. Between two matches that is next to nothing (some 2 % of their variance within 60 pixels), and in a
 pose from hundreds of them a quarter to a third of its variance. Thousands of matches, of a day and of large images,
-share errors that are smooth over the whole image: hundredths of a pixel, which no number of matches makes smaller.
+share errors that are smooth over the whole image: thousandths of a pixel, which no number of matches makes smaller.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from kcal.scene.common_errors import DEGREE, WRONG, line_errors, smooth_columns
 # 120 px tried on 26 terrains, the farthest whose ratio of independent errors scatters as little (0.17); from 60 px on
 # it scatters by 0.26, and tells no more.
 _NEAR = 1.0 / 16.0
-# Pixels at the image's border of each of five smooth errors: with it the relative rotation's χ² of 3 is 3.0 and 3.1
-# from one and three pairs of a minute (60 terrains, 960 x 540), 2.3 from ten of a day (10), and 2.8 from ten of a day at
-# 1920 x 1080 (6); without 3.4, 3.7, 3.2 and 5.7.
+# Pixels at the image's border of each of five smooth errors. With them χ² of the relative rotation, which should be 3,
+# is 3.0 and 3.1 from one and three pairs of a minute (60 terrains, 960 x 540), 2.3 from ten pairs of a day (10 terrains),
+# and 2.8 from ten of a day at 1920 x 1080 (6); without 3.4, 3.7, 3.2 and 5.7.
 _SMOOTH_PX = 0.006
 
 
