@@ -57,7 +57,10 @@ def pose_variance_ratio(rigs: Sequence[StereoRig], pixels: Sequence[Tensor], cov
     fitted = fitted[:, size > 1e-9 * size[0]]
     score = error / sigma
     score = score - fitted @ (fitted.T @ score)
-    variance = torch.linalg.inv(slope.T @ slope)
+    variance, singular = torch.linalg.inv_ex(slope.T @ slope)
+    # Where matches leave a pose open, there is nothing to compare.
+    if singular or not bool((variance.diagonal() > 0).all()):
+        return 1.0
     weight = slope @ variance / variance.diagonal().sqrt()
     # A match with itself once, with each neighbor twice: in i, j and in j, i.
     near = _NEAR * math.sqrt(math.prod(rigs[0].left.size))

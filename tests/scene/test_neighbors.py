@@ -1,5 +1,7 @@
 """The variance of a pose is what errors that neighbors share make it."""
 
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor
@@ -122,6 +124,18 @@ def test_smooth_errors_do_not_become_smaller_with_more_matches(monkeypatch: pyte
         monkeypatch.setattr(neighbors, "_SMOOTH_PX", 0.0)
         assert with_them - pose_variance_ratio([RIG], [pixels], [covariance]) == pytest.approx(beyond[-1], rel=1e-6)
     assert beyond[1] / beyond[0] == pytest.approx(4.0, rel=0.1)
+
+
+def test_where_matches_leave_a_pose_open_there_is_no_ratio(monkeypatch: pytest.MonkeyPatch) -> None:
+    draw = torch.Generator().manual_seed(8)
+    pixels, plain = drawn_pixels(draw), neighbors._off_lines
+
+    def open_shifts(*matches: Any) -> tuple[Tensor, ...]:
+        off, slope, sigma = plain(*matches)
+        return off, slope * torch.tensor([1.0, 1.0, 1.0, 0.0, 0.0]), sigma
+
+    monkeypatch.setattr(neighbors, "_off_lines", open_shifts)
+    assert ratio(pixels, SIGMA * torch.randn(len(pixels), dtype=torch.float64, generator=draw)) == 1.0
 
 
 def test_few_matches_and_wrong_ones() -> None:
