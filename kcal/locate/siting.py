@@ -217,7 +217,7 @@ def siting_map(area: Area, sites: Sequence[Site], weights: Tensor | None = None)
         ...           (("mill", 5.9), ("mast", 6.1))]
         >>> area = area_of((45.05, 5.95, 45.15, 6.05), level_ground(0.0), towers, cells=10)
         >>> found = siting_map(area, towers)
-        >>> found.covered, round(float(found.sigma[5, 3]))
+        >>> round(found.covered, 6), round(float(found.sigma[5, 3]))
         (1.0, 19)
     """
     seen = [_seen_by(area, site) for site in sites]
