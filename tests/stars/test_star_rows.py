@@ -120,8 +120,8 @@ def test_clocks_and_their_drift() -> None:
     names = [effect.name for effect in found.effects]
     clock, other = "the clock of camera 2", "the clock of camera 3"
     assert names == [
-        f"{clock} against that of the first", f"drift of {clock}, night 1", f"drift of {clock}, night 2",
-        f"{other} against that of the first", f"drift of {other}, night 1", f"drift of {other}, night 2",
+        f"{clock} against that of the first", f"drift of {clock}, night 1", f"drift of {clock}, night 3",
+        f"{other} against that of the first", f"drift of {other}, night 1", f"drift of {other}, night 3",
     ]  # fmt: skip
     # Without a place the pole of the first camera's frame.
     second = -EARTH_RATE * TURN[:, 2]

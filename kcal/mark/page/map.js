@@ -5,7 +5,7 @@ import {latest} from "/page/api.js";
 let map = null, layer = null, labels = null, named = [], fitted = "";
 
 function build() {
-  map = L.map("map", {zoomSnap: 0.25, maxZoom: 22, zoomControl: false, keyboard: false});
+  map = L.map("map", {zoomSnap: 0.25, maxZoom: 22, zoomControl: false, keyboard: false, fadeAnimation: false});
   map.attributionControl.setPrefix("Leaflet");
   L.control.scale({imperial: false}).addTo(map);
   layer = L.layerGroup().addTo(map);
