@@ -94,12 +94,13 @@ def terrain(path: str | Path, geoid_height: float = 0.0) -> Raster:
     if not (system.is_geographic and pyproj.CRS("EPSG:4326").datum == system.datum):
         into = pyproj.Transformer.from_crs("EPSG:4326", system, always_xy=True)
     a, b, c, d, e, f = to_cell
-    per_area = a * e - b * d
-    area = abs(1.0 / per_area) if per_area else math.inf
+    # Not a number for cells without an area, which the checks below refuse.
+    per_area = (a * e - b * d) or math.nan
+    area = abs(1.0 / per_area)
     sides = [math.hypot(e, d) * area, math.hypot(a, b) * area]
     if system.is_geographic:
         # y of the middle row.
-        lat = (a * (0.5 * heights.shape[0] - f) - d * (0.5 * heights.shape[1] - c)) / (per_area or math.nan)
+        lat = (a * (0.5 * heights.shape[0] - f) - d * (0.5 * heights.shape[1] - c)) / per_area
         if not abs(lat) <= 90.0:
             raise FileError(f"{path}: its middle row lies at latitude {lat:g}: at most 90 degrees are possible")
         degree = math.radians(1.0) * mean_radius(lat)

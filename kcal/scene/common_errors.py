@@ -30,7 +30,7 @@ _FEWEST = 50
 # Classes of slant: with four, yaw from three pairs of a minute was a little better than with one, on 18 terrains.
 _CLASSES = 4
 # Degree of the polynomial that takes errors of lenses out, which are known from elsewhere and smooth.
-DEGREE = 4
+_DEGREE = 4
 # The floor under variances that is tried, px².
 _FLOORS = [0.0, *np.geomspace(1e-5, 0.04, 25).tolist()]
 
@@ -80,7 +80,8 @@ def with_common_errors(
     same = ~same_time & alike & (apart < _SAME_PLACE).all(1) & good[near].all(1)
     for one in kind.unique():
         own = kind == one
-        common[own] = _common_share(error, variance, near[same & own[near].all(1)], overlap[same & own[near].all(1)])
+        both = same & own[near].all(1)
+        common[own] = _common_share(error, variance, near[both], overlap[both])
     common = common * variance
     weight = 1.0 / (common + (variance - common) / len(pixels))
     part = overlap * torch.where(same_time[:, None], variance[near], common[near]).prod(1).sqrt()
@@ -139,15 +140,16 @@ def off_line(rig: StereoRig, pixels: Tensor, covariance: Tensor) -> tuple[Tensor
     return found.off, found.sigma
 
 
-def smooth_columns(pixels: Tensor, degree: int) -> Tensor:
-    """(M, K) powers of places (M, 2), up to a degree."""
+def smooth_columns(pixels: Tensor) -> Tensor:
+    """(M, K) powers of places (M, 2), which errors of lenses are made of."""
     at = (pixels - pixels.mean(0)) / pixels.std(0).clamp_min(1e-6)
-    return torch.stack([at[:, 0] ** i * at[:, 1] ** j for i in range(degree + 1) for j in range(degree + 1 - i)], -1)
+    powers = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
+    return torch.stack([at[:, 0] ** i * at[:, 1] ** j for i, j in powers], -1)
 
 
 def _without_lenses(error: Tensor, sigma: Tensor, pixels: Tensor) -> Tensor:
     """Errors without what is smooth over the image."""
-    columns = smooth_columns(pixels, DEGREE)
+    columns = smooth_columns(pixels)
     good = (error.abs() < WRONG * sigma).nonzero()[:, 0]
     if len(good) < 4 * columns.shape[1]:
         return error

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from kcal.lens.pose import side_axes
 from kcal.lens.rig import StereoRig
-from kcal.scene.common_errors import DEGREE, WRONG, line_errors, smooth_columns
+from kcal.scene.common_errors import WRONG, line_errors, smooth_columns
 
 # Share of the root of an image's pixels within which matches are neighbors, 45 px of 960 x 540: of 30, 45, 60, 80 and
 # 120 px tried on 26 terrains, the farthest whose ratio of independent errors scatters as little (0.17); from 60 px on
@@ -49,7 +49,7 @@ def pose_variance_ratio(rigs: Sequence[StereoRig], pixels: Sequence[Tensor], cov
     places = torch.cat([one[:, 0] for one in pixels])
     good = error.abs() < WRONG * sigma
     error, slope, sigma, places = error[good], slope[good], sigma[good], places[good]
-    smooth = smooth_columns(places, DEGREE)
+    smooth = smooth_columns(places)
     if len(error) < 4 * (smooth.shape[1] + slope.shape[1]):
         return 1.0
     slope = slope / sigma[:, None]
