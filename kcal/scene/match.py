@@ -25,6 +25,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
 from kcal.scene.common_errors import with_common_errors
 from kcal.scene.guided import guided_matches, rough_rig
+from kcal.scene.line_errors import line_errors
 from kcal.scene.neighbors import pose_variance_ratio
 from kcal.scene.refine import refine_matches
 from kcal.scene.still import Stillness, still_there
@@ -158,9 +159,9 @@ def counted(found: Sequence[MatchedPair], size: tuple[int, int], most: int = MOS
     each = math.ceil(most / len(found))
     found = [_thinned(one, size, each) for one in found]
     names = tuple(f"{one.counts.name} {i}" for one in found for i in range(len(one.pixels)))
-    rigs, pixels = [one.rig for one in found], [one.pixels for one in found]
-    covariance = with_common_errors(rigs, pixels, [one.covariance for one in found], [one.slant for one in found])
-    ratio = pose_variance_ratio(rigs, pixels, covariance)
+    pixels, lines = [one.pixels for one in found], [line_errors(one.rig, one.pixels) for one in found]
+    covariance = with_common_errors(lines, pixels, [one.covariance for one in found], [one.slant for one in found])
+    ratio = pose_variance_ratio(lines, pixels, covariance, size)
     features = _features(names, torch.cat(pixels), ratio * torch.cat(covariance))
     return SceneMatches(features, tuple(one.counts for one in found))
 

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from kcal.scene.common_errors import PATCH, with_common_errors
+from kcal.scene.line_errors import line_errors
 from tests.helpers.scene_pairs import SIZE, small_rig
 
 RIG = small_rig()
@@ -34,7 +35,8 @@ def counted(pairs: int, *, step: float = 16.0, own: float = SIGMA, common: float
         noise = own * torch.randn(right.shape, dtype=torch.float64, generator=draw)
         pixels.append(torch.stack([left, right + shared + noise], 1))
     stated = [(SIGMA**2 * torch.eye(2, dtype=torch.float64)).expand(len(left), 2, 2)] * pairs
-    found = with_common_errors([RIG] * pairs, pixels, stated, [torch.zeros(len(left)).double()] * pairs)
+    lines = [line_errors(RIG, one) for one in pixels]
+    found = with_common_errors(lines, pixels, stated, [torch.zeros(len(left)).double()] * pairs)
     return sum(float((SIGMA**2 / one[:, 1, 1]).sum()) for one in found) / len(left)
 
 
@@ -76,7 +78,8 @@ def test_what_is_seen_at_a_slant_is_judged_by_itself() -> None:
         noise = SIGMA * torch.randn(right.shape, dtype=torch.float64, generator=draw)
         pixels.append(torch.stack([left, right + shared + noise], 1))
     stated = [(SIGMA**2 * torch.eye(2, dtype=torch.float64)).expand(len(left), 2, 2)] * 4
-    found = torch.stack(with_common_errors([RIG] * 4, pixels, stated, [slant] * 4))[..., 1, 1] / SIGMA**2
+    lines = [line_errors(RIG, one) for one in pixels]
+    found = torch.stack(with_common_errors(lines, pixels, stated, [slant] * 4))[..., 1, 1] / SIGMA**2
     level, steep = ((1.0 / found[:, which]).sum(0).mean() for which in (~slanted, slanted))
     # Four times the information of one; and that of one with the variance 1.5² + 1/4.
     assert float(level) == pytest.approx(4.0, rel=0.15)
@@ -85,5 +88,5 @@ def test_what_is_seen_at_a_slant_is_judged_by_itself() -> None:
 
 def test_no_matches() -> None:
     nothing = torch.zeros(0, 2, 2, dtype=torch.float64)
-    assert len(with_common_errors([RIG], [nothing], [nothing], [nothing[:, 0, 0]])[0]) == 0
+    assert len(with_common_errors([line_errors(RIG, nothing)], [nothing], [nothing], [nothing[:, 0, 0]])[0]) == 0
     assert math.isfinite(counted(2, step=120.0))
