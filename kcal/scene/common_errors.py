@@ -17,9 +17,9 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from kcal.scene.line_errors import LineErrors
+from kcal.scene.refine import HALF
 
-# Pixels across a patch, as it is compared in `kcal.scene.refine`.
-PATCH = 15.0
+PATCH = 2.0 * HALF + 1.0  # pixels across
 # Pixels of sway of a mast between pairs, of disparity and of place within which two matches are of one thing.
 _SWAY, _SAME_DISPARITY, _SAME_PLACE = 8.0, 1.5, 1.5
 # Errors off the epipolar lines beyond so many standard deviations are wrong matches, and tell nothing of the others.

@@ -22,8 +22,10 @@ from kcal.corners.shift_fit import ShiftFit, fit_shifts
 from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
 
-# Steps of a patch from its middle.
-_HALF = 7
+# Steps of a patch from its middle: of 7, 10 and 13 tried on 6 terrains beside the truth, the variance across the lines is
+# half of that with 7 for walls and level ground with 10, and three quarters where there are edges; 13 takes 1.7 times as
+# long and makes it smaller by a third.
+HALF = 10
 # px: the least-squares fit ends that near to where it began, or it found something else.
 _FARTHEST = 3.0
 # px along the worst axis: beyond, there is too little texture.
@@ -32,7 +34,7 @@ _FAINTEST = 0.35
 _LEAST_SHARE = 0.55
 # How much longer or shorter a pixel is in the other image: below, blur is alike, and beyond, it is no patch of ground.
 _LEAST_WARPED, _MOST_WARPED = 0.05, 2.5
-_AT_ONCE = 1000
+_AT_ONCE = 200  # a thousand take a quarter longer
 
 
 class RefinedMatches(NamedTuple):
@@ -84,7 +86,7 @@ def _refined_part(rig: StereoRig, images: tuple[Tensor, Tensor], left: Tensor, r
 
     fit = fitted(image_windows(images[0], here, 0, math.inf), image_windows(images[1], wide, 0, math.inf))
     which = fit.converged.nonzero()[:, 0]
-    warp = _warps(steps[which, _HALF, _HALF], slopes[which, _HALF, _HALF], fit.shear[which])
+    warp = _warps(steps[which, HALF, HALF], slopes[which, HALF, HALF], fit.shear[which])
     longest, shortest = torch.linalg.svdvals(warp).unbind(1)
     unlike = (longest < _MOST_WARPED) & (shortest > 1.0 / _MOST_WARPED)
     unlike &= torch.maximum(longest - 1.0, 1.0 - shortest) > _LEAST_WARPED
@@ -96,7 +98,7 @@ def _refined_part(rig: StereoRig, images: tuple[Tensor, Tensor], left: Tensor, r
         fit = ShiftFit(*(before.index_copy(0, which, after) for before, after in better))
     column = planes.right + planes.step[:, None] * fit.shift
     pixels, inside = plane_pixels(rig.right, planes, column[:, None], turn)
-    middle = slopes[:, _HALF, _HALF]
+    middle = slopes[:, HALF, HALF]
     covariance = middle @ fit.covariance @ middle.mT
     worst = torch.linalg.eigvalsh(covariance.nan_to_num(1e6))[:, -1].sqrt()
     near = torch.linalg.vector_norm(pixels[:, 0] - right, dim=-1) < _FARTHEST
@@ -119,13 +121,13 @@ def _patch(
 
     Nine places of a patch are projected; a parabola goes through them, since a lens hardly bends within a patch.
     """
-    nodes = _HALF * grid_of((1, 1), middle.device)
+    nodes = HALF * grid_of((1, 1), middle.device)
     places, seen = plane_pixels(
         camera, planes, middle[:, None, None] + planes.step[:, None, None, None] * nodes, rotation
     )
-    t = torch.arange(-_HALF, _HALF + 1, dtype=torch.float64) / _HALF
+    t = torch.arange(-HALF, HALF + 1, dtype=torch.float64) / HALF
     values = torch.stack([0.5 * t * (t - 1.0), 1.0 - t.square(), 0.5 * t * (t + 1.0)], 1)
-    steps = torch.stack([t - 0.5, -2.0 * t, t + 0.5], 1) / _HALF
+    steps = torch.stack([t - 0.5, -2.0 * t, t + 0.5], 1) / HALF
     pixels = torch.einsum("ya,xb,nabk->nyxk", values, values, places)
     across = torch.einsum("ya,xb,nabk->nyxk", values, steps, places)
     down = torch.einsum("ya,xb,nabk->nyxk", steps, values, places)

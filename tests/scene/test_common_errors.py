@@ -5,12 +5,20 @@ import math
 import pytest
 import torch
 
-from kcal.scene.common_errors import PATCH, with_common_errors
+from kcal.scene import common_errors
+from kcal.scene.common_errors import with_common_errors
 from kcal.scene.line_errors import line_errors
 from tests.helpers.scene_pairs import SIZE, small_rig
 
 RIG = small_rig()
 SIGMA = 0.05
+PATCH = 15.0
+
+
+@pytest.fixture(autouse=True)
+def small_patches(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of which many fit into a small image without overlap."""
+    monkeypatch.setattr(common_errors, "PATCH", PATCH)
 
 
 def spread_places(step: float, sway: float) -> tuple[torch.Tensor, torch.Tensor]:

@@ -219,7 +219,7 @@ def test_learned_parts_against_plain_loops() -> None:
     for i in range(2 * size):
         for j in range(2 * size):
             dx, dy = abs(x[i] - x[j]), abs(y[i] - y[j])
-            overlap[i, j] = max(0.0, 1 - dx / 15.0) * max(0.0, 1 - dy / 15.0)
+            overlap[i, j] = max(0.0, 1 - dx / parts.PATCH) * max(0.0, 1 - dy / parts.PATCH)
             if i < size <= j and max(dx, dy) < 1.5 and bool(good[i] & good[j]):
                 same.append((i, j))
     assert len(same) > 50

@@ -13,7 +13,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
 from kcal.scene import match, still
 from kcal.scene.match import ImagePair, MatchedPair, PairCounts
-from kcal.scene.refine import _HALF, RefinedMatches, _patch, refine_matches
+from kcal.scene.refine import HALF, RefinedMatches, _patch, refine_matches
 from kcal.scene.still import SWAY, Stillness, still_there, whole_shifts
 from tests.helpers.scene_pairs import small_rig
 
@@ -134,18 +134,18 @@ def test_patches_are_those_of_the_lens() -> None:
     ):
         pixels, slopes, seen = _patch(camera, planes, middle, turn)
         assert seen.tolist() == [True, True]
-        assert pixels.shape == (2, 2 * _HALF + 1, 2 * _HALF + 1, 2)
+        assert pixels.shape == (2, 2 * HALF + 1, 2 * HALF + 1, 2)
 
         def at(x: float, y: float) -> Tensor:
             step = planes.step[:, None] * torch.tensor([x, y]).double()
             return plane_pixels(camera, planes, (middle + step)[:, None], turn)[0][:, 0]  # noqa: B023
 
-        for i in (-7, -4, 0, 3, 7):
-            for j in (-7, 0, 5):
-                assert pixels[:, j + 7, i + 7] == pytest.approx(at(i, j), abs=2e-3)
+        for i in (-HALF, -4, 0, 3, HALF):
+            for j in (-HALF, 0, 5):
+                assert pixels[:, j + HALF, i + HALF] == pytest.approx(at(i, j), abs=2e-3)
                 across, down = at(i + 0.5, j) - at(i - 0.5, j), at(i, j + 0.5) - at(i, j - 0.5)
-                assert slopes[:, j + 7, i + 7, :, 0] == pytest.approx(across, abs=2e-3)
-                assert slopes[:, j + 7, i + 7, :, 1] == pytest.approx(down, abs=2e-3)
+                assert slopes[:, j + HALF, i + HALF, :, 0] == pytest.approx(across, abs=2e-3)
+                assert slopes[:, j + HALF, i + HALF, :, 1] == pytest.approx(down, abs=2e-3)
 
 
 def test_still_is_what_lies_between_both_pixels(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -46,7 +46,7 @@ def below() -> tuple[Tensor, Tensor]:
 def errors(second: Tensor) -> tuple[Tensor, RefinedMatches]:
     left, truth = below()
     found = refine_matches(RIG, (waves(torch.eye(2).double()).float(), second.float()), left, truth + 0.4)
-    assert float(found.good.double().mean()) > 0.9
+    assert float(found.good.double().mean()) > 0.75
     return (found.right - truth)[found.good], found
 
 
@@ -57,7 +57,7 @@ def test_both_images_are_blurred_alike(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(refine, "_LEAST_WARPED", math.inf)
     before, _ = errors(waves(WARP))
     assert float(error[:, 1].square().mean().sqrt()) < 0.01
-    assert float(before[:, 1].square().mean().sqrt()) > 0.03
+    assert float(before[:, 1].square().mean().sqrt()) > 0.02
 
 
 def test_brightness_may_have_a_slope() -> None:
