@@ -74,7 +74,7 @@ def warped_blur_windows(image: Tensor, pixels: Tensor, warp: Tensor) -> ImageWin
 
 
 def _raw_windows(image: Tensor, pixels: Tensor, reach: int, level: int) -> tuple[Tensor, Tensor]:
-    """Gray levels (N, h, w) of windows with a margin of `reach` around, and the pixel (N, 2) of the first without it."""
+    """Gray levels (N, h, w) of windows with a margin of `reach`, and the first pixel (N, 2) inside of it."""
     height, width = image.shape
     flat = pixels.detach().flatten(1, -2)
     # One more for the slopes' steps, and one for bilinear samples.

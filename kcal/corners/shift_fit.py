@@ -135,9 +135,7 @@ def fit_shifts(
     which = wanted.nonzero()[:, 0]
     nothing = torch.zeros_like(moved[:, 0, 0])
     if not len(which):
-        return ShiftFit(
-            nothing, torch.zeros_like(slopes[:, 0, 0]), torch.zeros_like(wanted), nothing[:, 0], nothing
-        )
+        return ShiftFit(nothing, torch.zeros_like(slopes[:, 0, 0]), torch.zeros_like(wanted), nothing[:, 0], nothing)
     half = (template.shape[2] // 2, template.shape[1] // 2)
     grid = grid_of(half, template.device) if sheared else None
     patches = _Patches(template, right, moved, slopes, weight, grid).at(which)

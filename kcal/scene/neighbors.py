@@ -78,4 +78,3 @@ def pose_variance_ratio(
     moved = weight.T @ (fields / sigma[:, None])
     shared = _SMOOTH_PX**2 * float(moved.square().sum(1).mean())
     return shared + (max(1.0, ratio) if math.isfinite(ratio) and expected > 0.0 else 1.0)
-

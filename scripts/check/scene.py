@@ -37,7 +37,7 @@ from kcal.calibrate.rig.sources import Baseline, Features, Landmarks, RigData
 from kcal.corners.keypoints import keypoints
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector, side_axes, vector_from_rotation
+from kcal.lens.pose import vector_from_rotation
 from kcal.lens.rig import StereoRig
 from kcal.locate.localizer import StereoLocalizer
 from kcal.scene.common_errors import with_common_errors

@@ -31,7 +31,7 @@ def ramps(count: int, height: int, width: int) -> ImageWindows:
 
 class TestShifts:
     def test_residuals_of_ramps(self) -> None:
-        """Of a sheared patch: right(moved + slopes shift) - gain template - offset and its slope, and its derivatives."""
+        """Of a sheared patch: right(moved + slopes shift) - gain template - offset - ramp, and its derivatives."""
         grid = grid_of((2, 1), torch.device("cpu"))  # three rows of five
         template = draw(1, 3, 5)
         moved = (grid + torch.tensor([25.0, 32.0]))[None]
