@@ -52,7 +52,7 @@ def image_windows(image: Tensor, pixels: Tensor, level: int, brightest: float) -
     blurred = torch.nn.functional.conv2d(torch.cat(parts)[:, None], kernel.reshape(1, 1, 1, -1))
     blurred = torch.nn.functional.conv2d(blurred, kernel.reshape(1, 1, -1, 1))[:, 0]
     values, saturated = blurred.chunk(2) if len(parts) == 2 else (blurred, torch.zeros_like(blurred))
-    return ImageWindows(values, saturated, low, image.shape[::-1], level)
+    return ImageWindows(values, saturated, low, (image.shape[1], image.shape[0]), level)
 
 
 def warped_blur_windows(image: Tensor, pixels: Tensor, warp: Tensor) -> ImageWindows:
@@ -70,7 +70,7 @@ def warped_blur_windows(image: Tensor, pixels: Tensor, warp: Tensor) -> ImageWin
     kernel = torch.exp(-0.5 * torch.einsum("hwi,nij,hwj->nhw", offset, torch.linalg.inv(covariance), offset))
     kernel = kernel / kernel.sum((1, 2), keepdim=True)
     values = torch.nn.functional.conv2d(raw[None], kernel[:, None], groups=len(raw))[0]
-    return ImageWindows(values, torch.zeros_like(values), low, image.shape[::-1], 0)
+    return ImageWindows(values, torch.zeros_like(values), low, (image.shape[1], image.shape[0]), 0)
 
 
 def _raw_windows(image: Tensor, pixels: Tensor, reach: int, level: int) -> tuple[Tensor, Tensor]:
