@@ -43,14 +43,13 @@ class RefinedMatches(NamedTuple):
         right: (M, 2) px.
         covariance: (M, 2, 2) px² of it.
         good: (M,) whether it was found.
-        slant: (M,) by how much a step of a patch is longer, or goes sideways, in the other image: 0 for what is seen
-            alike.
+        share: (M,) share of the weight of a patch's pixels that fits: the others are of something behind or before.
     """
 
     right: Tensor
     covariance: Tensor
     good: Tensor
-    slant: Tensor
+    share: Tensor
 
 
 @torch.no_grad()
@@ -102,7 +101,7 @@ def _refined_part(rig: StereoRig, images: tuple[Tensor, Tensor], left: Tensor, r
     worst = torch.linalg.eigvalsh(covariance.nan_to_num(1e6))[:, -1].sqrt()
     near = torch.linalg.vector_norm(pixels[:, 0] - right, dim=-1) < _FARTHEST
     good = valid & fit.converged & inside[:, 0] & near & (worst < _FAINTEST) & (fit.share > _LEAST_SHARE)
-    return RefinedMatches(pixels[:, 0], covariance, good, torch.linalg.vector_norm(fit.shear, dim=1))
+    return RefinedMatches(pixels[:, 0], covariance, good, fit.share)
 
 
 def _warps(left: Tensor, right: Tensor, shear: Tensor) -> Tensor:

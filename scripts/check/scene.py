@@ -346,7 +346,7 @@ def common() -> list[str]:
         z: tuple[list[float], list[float]] = [], []
         for first in range(0, 7 - count, count):
             some = found[first : first + count]
-            parts = [[getattr(one, part) for one in some] for part in ("pixels", "covariance", "slant")]
+            parts = [[getattr(one, part) for one in some] for part in ("pixels", "covariance", "share")]
             lines = [line_errors(one.rig, one.pixels) for one in some]
             pixels, stated = torch.cat(parts[0]), torch.cat(parts[1])
             rig, _ = posed(found[0].rig, pixels, stated)

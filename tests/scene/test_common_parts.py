@@ -93,14 +93,14 @@ def test_variance_of_errors() -> None:
     assert parts._error_variance(3.0 * sigma[:49], sigma[:49]) == (1.0, 0.0)
 
 
-def test_classes_of_slant() -> None:
-    slant = torch.rand(400, generator=DRAW).double()
+def test_classes_of_shares() -> None:
+    share = torch.rand(400, generator=DRAW).double()
     for count, pairs, classes in ((400, 2, 4), (399, 2, 3), (199, 2, 1), (400, 1, 4), (100, 1, 2), (20, 1, 1)):
-        found = parts._classes(slant[:count], pairs)
+        found = parts._classes(share[:count], pairs)
         sizes = found.bincount()
         assert len(sizes) == classes
         assert int(sizes.max() - sizes.min()) <= 1
-        order = slant[:count].argsort()
+        order = share[:count].argsort()
         assert found[order].tolist() == sorted(found.tolist())
 
 
@@ -176,8 +176,8 @@ def test_one_thing_in_three_pairs_counts_once() -> None:
     rig = level_rig()
     pixels = [matches([[100, 100], [300, 200]]), matches([[100, 100]]), matches([[100, 100]])]
     covariance = [stated([1.0, 1.0]), stated([1.0]), stated([1.0])]
-    slant = [torch.zeros(len(own)).double() for own in pixels]
-    found = parts.with_common_errors([line_errors(rig, own) for own in pixels], pixels, covariance, slant)
+    fits = [torch.ones(len(own)).double() for own in pixels]
+    found = parts.with_common_errors([line_errors(rig, own) for own in pixels], pixels, covariance, fits)
     assert [len(one) for one in found] == [2, 1, 1]
     ratio = torch.cat(found)[:, 1, 1]
     assert ratio == pytest.approx([3.0, 1.0, 3.0, 3.0])
@@ -198,9 +198,9 @@ def test_learned_parts_against_plain_loops() -> None:
         right[:, 1] += 0.05 * torch.randn(len(right), generator=draw).double()
         pixels.append(torch.stack([own, right], 1))
         covariance.append(stated((0.002 + 0.004 * torch.rand(len(own), generator=draw)).tolist()))
-    slant = [torch.zeros(len(own)).double()] * 2
+    fits = [torch.ones(len(own)).double()] * 2
     lines = [line_errors(rig, own) for own in pixels]
-    found = torch.cat(parts.with_common_errors(lines, pixels, covariance, slant))
+    found = torch.cat(parts.with_common_errors(lines, pixels, covariance, fits))
 
     places, every = torch.cat(pixels), torch.cat(covariance)
     together = line_errors(rig, places)
