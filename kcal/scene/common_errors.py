@@ -2,8 +2,8 @@
 
 The fit of a match tells what noise does to it. What remains shows in how far matches lie off their epipolar lines, and
 most of it is the same whenever the same thing is seen in the same light: it is no smaller after a hundred pairs. It
-comes from edges before something farther away, of which a patch holds another part in each image. Both parts are learned
-from the matches themselves, for classes of how much of a patch fits.
+comes from edges before something farther away, of which a patch holds another part in each image. Both parts are
+learned from the matches themselves, for classes of how much of a patch fits.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ def with_common_errors(
 ) -> list[Tensor]:
     """Covariances (M, 2, 2) of the matches of some pairs with which they may be counted as if they were independent.
 
-    Patches that fit as a whole are good to the noise; those of which a part does not have errors of their own, which stay
-    as long as the light does. So the variance beyond noise, and the part of it that pairs have in common, are learned
+    Patches that fit as a whole are good to the noise; those that fit in part have errors of their own, which stay as
+    long as the light does. So the variance beyond noise, and the part of it that pairs have in common, are learned
     for several classes of that share. A match counts with the sum of its covariances with itself and with all
     others, each weighted as it will be: neighbors have nearly the same effect on a pose, and so its variance is right.
 

@@ -35,7 +35,7 @@ PATCH, DEEP = 21, 0.03  # px, and the logarithm of the depth's ratio in a patch 
 
 
 class Errors(NamedTuple):
-    """Matches (M,) of a terrain: kind, px across their lines with and without noise, σ, and degrees of yaw that make."""
+    """Matches (M,): kind, px across their lines with noise and without, σ, and degrees of yaw by those without."""
 
     kind: Tensor
     noisy: Tensor
