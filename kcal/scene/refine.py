@@ -22,8 +22,8 @@ from kcal.corners.shift_fit import ShiftFit, fit_shifts
 from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
 
-# Steps of a patch from its middle. Of 7, 10 and 13 tried on six terrains, 10 leaves half of the variance across lines
-# that 7 does, and three quarters at edges; 13 leaves two thirds of that and takes 1.7 times as long.
+# Steps of a patch from its middle. Of 7, 10 and 13 tried on four terrains, 10 leaves half of the variance across lines
+# that 7 does, and three quarters at edges; 13 leaves two thirds of that, of 1.7 times as many pixels.
 HALF = 10
 # px: the least-squares fit ends that near to where it began, or it found something else.
 _FARTHEST = 3.0
