@@ -45,9 +45,37 @@ class ImageWindows(NamedTuple):
 
 def image_windows(image: Tensor, pixels: Tensor, level: int, brightest: float) -> ImageWindows:
     """Windows that cover pixels (N, ..., 2) of an image (H, W) with room for blur and slopes; edges repeat."""
-    height, width = image.shape
     kernel = gaussian_kernel(IMAGE_BLUR * 2**level, 3 * 2**level).to(image.device)
-    reach = len(kernel) // 2
+    raw, low = _raw_windows(image, pixels, len(kernel) // 2, level)
+    # Without a brightest level nothing is saturated.
+    parts = [raw] if math.isinf(brightest) else [raw, (raw.detach() >= brightest).double()]
+    blurred = torch.nn.functional.conv2d(torch.cat(parts)[:, None], kernel.reshape(1, 1, 1, -1))
+    blurred = torch.nn.functional.conv2d(blurred, kernel.reshape(1, 1, -1, 1))[:, 0]
+    values, saturated = blurred.chunk(2) if len(parts) == 2 else (blurred, torch.zeros_like(blurred))
+    return ImageWindows(values, saturated, low, (image.shape[1], image.shape[0]), level)
+
+
+def warped_blur_windows(image: Tensor, pixels: Tensor, warp: Tensor) -> ImageWindows:
+    """As `image_windows` at level 0 without saturation, but blurred as the other image is, seen from this one.
+
+    Args:
+        image: (H, W) gray levels.
+        pixels: (N, ..., 2) px.
+        warp: (N, 2, 2) pixels of this image by those of the other one.
+    """
+    covariance = IMAGE_BLUR**2 * warp @ warp.mT
+    reach = math.ceil(3.0 * float(torch.linalg.matrix_norm(covariance, 2).amax().sqrt()))
+    raw, low = _raw_windows(image, pixels, reach, 0)
+    offset = grid_of((reach, reach), image.device)
+    kernel = torch.exp(-0.5 * torch.einsum("hwi,nij,hwj->nhw", offset, torch.linalg.inv(covariance), offset))
+    kernel = kernel / kernel.sum((1, 2), keepdim=True)
+    values = torch.nn.functional.conv2d(raw[None], kernel[:, None], groups=len(raw))[0]
+    return ImageWindows(values, torch.zeros_like(values), low, (image.shape[1], image.shape[0]), 0)
+
+
+def _raw_windows(image: Tensor, pixels: Tensor, reach: int, level: int) -> tuple[Tensor, Tensor]:
+    """Gray levels (N, h, w) of windows with a margin of `reach`, and the first pixel (N, 2) inside of it."""
+    height, width = image.shape
     flat = pixels.detach().flatten(1, -2)
     # One more for the slopes' steps, and one for bilinear samples.
     low = (flat.amin(1) - reach - 2**level - 1).floor().long()
@@ -56,13 +84,7 @@ def image_windows(image: Tensor, pixels: Tensor, level: int, brightest: float) -
         (low[:, i : i + 1] + torch.arange(min(count, 3 * max(width, height)), device=image.device)).clamp(0, side - 1)
         for i, (count, side) in enumerate(zip(counts, (width, height), strict=True))
     )
-    raw = image[rows[:, :, None], columns[:, None, :]].to(torch.float64)
-    # Without a brightest level nothing is saturated.
-    parts = [raw] if math.isinf(brightest) else [raw, (raw.detach() >= brightest).double()]
-    blurred = torch.nn.functional.conv2d(torch.cat(parts)[:, None], kernel.reshape(1, 1, 1, -1))
-    blurred = torch.nn.functional.conv2d(blurred, kernel.reshape(1, 1, -1, 1))[:, 0]
-    values, saturated = blurred.chunk(2) if len(parts) == 2 else (blurred, torch.zeros_like(blurred))
-    return ImageWindows(values, saturated, low + float(reach), (width, height), level)
+    return image[rows[:, :, None], columns[:, None, :]].to(torch.float64), low + float(reach)
 
 
 def sample(windows: ImageWindows, pixels: Tensor, *, saturated: bool = False) -> Tensor:

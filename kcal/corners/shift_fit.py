@@ -31,14 +31,15 @@ class ShiftFit(NamedTuple):
         covariance: (N, 2, 2) of the shift.
         converged: (N,).
         share: (N,) share of the weight that robust weights left.
-        slant: (N,) steps along the first axis by which a step stretches or shears the right patch; 0 if not fitted.
+        shear: (N, 2) steps along the first axis by which a step along each axis stretches or shears the right patch; 0
+            if not fitted.
     """
 
     shift: Tensor
     covariance: Tensor
     converged: Tensor
     share: Tensor
-    slant: Tensor
+    shear: Tensor
 
 
 class _Patches(NamedTuple):
@@ -57,11 +58,14 @@ class _Patches(NamedTuple):
 
 
 def _residual(patches: _Patches, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Residual (N, K), slopes (N, K, 2) and design (N, K, 4 or 6) at theta: shift, gain, offset, scale and shear."""
+    """Residual (N, K), slopes (N, K, 2) and design (N, K, 4 or 8) at theta.
+
+    Theta is shift, gain, offset and, of sheared patches, scale and shear, and slopes of brightness.
+    """
     across, down = patches.slopes.unbind(-1)
     shift = theta[:, None, None, :2]
     if patches.grid is not None:
-        along = torch.einsum("hwk,nk->nhw", patches.grid, theta[:, 4:])
+        along = torch.einsum("hwk,nk->nhw", patches.grid, theta[:, 4:6])
         shift = torch.stack([shift[..., 0] + along, shift[..., 1].expand_as(along)], -1)
     at = torch.addcmul(torch.addcmul(patches.moved, across, shift[..., :1]), down, shift[..., 1:])
     # The value and, for the slopes, a step to each side along both axes.
@@ -72,7 +76,9 @@ def _residual(patches: _Patches, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]
     residual = values - theta[:, 2:3] * template - theta[:, 3:4]
     design = torch.cat([slope, -template[..., None], -torch.ones_like(template)[..., None]], -1)
     if patches.grid is not None:
-        design = torch.cat([design, slope[..., :1] * patches.grid.flatten(0, 1)], -1)
+        steps = patches.grid.flatten(0, 1)
+        residual = residual - theta[:, 6:] @ steps.T
+        design = torch.cat([design, slope[..., :1] * steps, -steps.expand(len(slope), -1, -1)], -1)
     return residual, slope, design
 
 
@@ -96,7 +102,7 @@ def _scale(residual: Tensor, weight: Tensor) -> Tensor:
 
 
 def _balance(patches: _Patches, theta: Tensor, scale: Tensor) -> Tensor:
-    """(N, 4 or 6) what is zero at the solution."""
+    """(N, 4 or 8) what is zero at the solution."""
     residual, _, design = _residual(patches, theta)
     weight = patches.weight.flatten(1) * _biweight(residual, scale, patches)
     return ((weight * residual)[..., None] * design).sum(1)
@@ -123,14 +129,13 @@ def fit_shifts(
         weight: (N, h, w) of the pixels.
         wanted: (N,) bool: objects to fit. Others have not converged, and zeros.
         robust: pixels that do not fit lose their weight.
-        sheared: the right patch may also be scaled and sheared along the plane's first axis.
+        sheared: the right patch may also be scaled and sheared along the plane's first axis, and its brightness may
+            have a slope: the sun's reflection, haze and vignetting of one camera are others in the other.
     """
     which = wanted.nonzero()[:, 0]
     nothing = torch.zeros_like(moved[:, 0, 0])
     if not len(which):
-        return ShiftFit(
-            nothing, torch.zeros_like(slopes[:, 0, 0]), torch.zeros_like(wanted), nothing[:, 0], nothing[:, 0]
-        )
+        return ShiftFit(nothing, torch.zeros_like(slopes[:, 0, 0]), torch.zeros_like(wanted), nothing[:, 0], nothing)
     half = (template.shape[2] // 2, template.shape[1] // 2)
     grid = grid_of(half, template.device) if sheared else None
     patches = _Patches(template, right, moved, slopes, weight, grid).at(which)
@@ -149,14 +154,15 @@ def fit_shifts(
     shift = theta[:, :2]
     if torch.is_grad_enabled() and (template.requires_grad or right.values.requires_grad):
         shift = _implicit(patches, theta, scale, converged)[:, :2]
-    found = ShiftFit(shift, covariance, converged, share, torch.linalg.vector_norm(theta[:, 4:], dim=1))
+    shear = theta.new_zeros(len(theta), 2) if grid is None else theta[:, 4:6]
+    found = ShiftFit(shift, covariance, converged, share, shear)
     return ShiftFit(*(part.new_zeros(len(wanted), *part.shape[1:]).index_copy(0, which, part) for part in found))
 
 
 def _fitted_shifts(patches: _Patches, robust: bool) -> tuple[Tensor, Tensor, Tensor]:
     """Theta, scale of the residuals and length of the last step; each object stops when it has converged."""
     count = len(patches.weight)
-    unknowns = 4 if patches.grid is None else 6
+    unknowns = 4 if patches.grid is None else 8
     theta = patches.template.new_zeros(count, unknowns)
     theta[:, 2] = 1.0
     eye = torch.eye(unknowns, dtype=theta.dtype, device=theta.device)
@@ -207,8 +213,9 @@ def _covariance(
     flat = torch.stack([template.flatten(1), torch.ones_like(residual)], -1)
     mixed = 0.5 * (own + slope)
     if patches.grid is not None:
-        # And of scale and shear.
-        flat = torch.cat([flat, mixed[..., :1] * patches.grid.flatten(0, 1)], -1)
+        # And of scale and shear, and of slopes of brightness.
+        steps = patches.grid.flatten(0, 1)
+        flat = torch.cat([flat, mixed[..., :1] * steps, steps.expand(count, -1, -1)], -1)
     size = (robust[..., None] * flat.square()).sum(1, keepdim=True).clamp_min(1e-12).sqrt()
     flat = flat / size
     gram = (robust[..., None] * flat).mT @ flat + 1e-9 * torch.eye(flat.shape[-1], dtype=flat.dtype, device=flat.device)
@@ -220,15 +227,16 @@ def _covariance(
     determinant = normal[:, 0, 0] * normal[:, 1, 1] - normal[:, 0, 1].square()
     sound = (normal[:, 0, 0] > 0) & (determinant > 1e-6 * normal[:, 0, 0] * normal[:, 1, 1])
     inverse = torch.linalg.inv_ex(torch.where(sound[:, None, None], normal, torch.eye(2).to(normal)))[0]
-    kernel = _NOISE_BLUR.to(template)
-    share_of_noise = float(kernel.square().sum()) ** 2
-    freedom = (1.0 - theta.shape[1] / (total * share_of_noise)).clamp_min(0.2)
+    columns = torch.cat([flat, across], -1)
+    weighted = robust[..., None] * columns
+    spread = _blurred(weighted.mT.reshape(count, -1, height, width))
+    # What of the noise the fit takes away: of blurred noise, smooth columns take most.
+    gram = weighted.mT @ columns + 1e-9 * torch.eye(columns.shape[-1]).to(gram)
+    taken = torch.linalg.solve_ex(gram, spread @ spread.mT)[0].diagonal(dim1=-2, dim2=-1).sum(-1)
+    share_of_noise = float(_NOISE_BLUR.square().sum()) ** 2
+    freedom = (1.0 - taken / (total * share_of_noise)).clamp_min(0.2)
     noise = (robust * residual.square()).sum(1) / total / (share_of_noise * freedom)
-    force = (robust[..., None] * across).mT.reshape(-1, 1, height, width)
-    beyond = 2 * (len(kernel) // 2)
-    spread = torch.nn.functional.conv2d(force, kernel.reshape(1, 1, 1, -1), padding=(0, beyond))
-    spread = torch.nn.functional.conv2d(spread, kernel.reshape(1, 1, -1, 1), padding=(beyond, 0)).reshape(count, 2, -1)
-    middle = noise[:, None, None] * (spread @ spread.mT)
+    middle = noise[:, None, None] * (spread[:, -2:] @ spread[:, -2:].mT)
     # Residuals of another texture than noise, such as the background's, are correlated farther: then what they add up
     # to counts (W. Newey and K. West 1987).
     pull = (robust * residual)[..., None] * across
@@ -239,6 +247,15 @@ def _covariance(
     found = pull.reshape(count, 2, -1) @ wider.reshape(count, 2, -1).mT / freedom[:, None, None]
     excess = torch.linalg.solve_ex(middle, found)[0].diagonal(dim1=-2, dim2=-1).mean(-1).clamp_min(1.0)
     return excess[:, None, None] * inverse @ middle @ inverse, sound
+
+
+def _blurred(columns: Tensor) -> Tensor:
+    """(N, C, pixels) of columns (N, C, h, w), blurred as noise is, also beyond the patch."""
+    kernel = _NOISE_BLUR.to(columns)
+    reach = 2 * (len(kernel) // 2)
+    wide = torch.nn.functional.conv2d(columns.flatten(0, 1)[:, None], kernel.reshape(1, 1, 1, -1), padding=(0, reach))
+    wide = torch.nn.functional.conv2d(wide, kernel.reshape(1, 1, -1, 1), padding=(reach, 0))
+    return wide.reshape(*columns.shape[:2], -1)
 
 
 def _implicit(patches: _Patches, theta: Tensor, scale: Tensor, converged: Tensor) -> Tensor:

@@ -25,6 +25,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
 from kcal.scene.common_errors import with_common_errors
 from kcal.scene.guided import guided_matches, rough_rig
+from kcal.scene.line_errors import line_errors
 from kcal.scene.neighbors import pose_variance_ratio
 from kcal.scene.refine import refine_matches
 from kcal.scene.still import Stillness, still_there
@@ -89,22 +90,22 @@ class MatchedPair(NamedTuple):
     Attributes:
         pixels: (M, 2, 2) left and right.
         covariance: (M, 2, 2) px² of the right one, the left one being given.
-        slant: (M,) see `kcal.scene.refine.RefinedMatches`.
+        share: (M,) see `kcal.scene.refine.RefinedMatches`.
         counts: what became of the others.
         rig: with a baseline of one, as these matches make it.
     """
 
     pixels: Tensor
     covariance: Tensor
-    slant: Tensor
+    share: Tensor
     counts: PairCounts
     rig: StereoRig
 
     def at(self, which: Tensor, **counts: Any) -> MatchedPair:
         """Those at some places."""
         counted = dataclasses.replace(self.counts, **counts)
-        pixels, covariance, slant = self.pixels[which], self.covariance[which], self.slant[which]
-        return MatchedPair(pixels, covariance, slant, counted, self.rig)
+        pixels, covariance, share = self.pixels[which], self.covariance[which], self.share[which]
+        return MatchedPair(pixels, covariance, share, counted, self.rig)
 
 
 def scene_features(cameras: tuple[Camera, Camera], pairs: Sequence[ImagePair], most: int = MOST) -> SceneMatches:
@@ -158,9 +159,9 @@ def counted(found: Sequence[MatchedPair], size: tuple[int, int], most: int = MOS
     each = math.ceil(most / len(found))
     found = [_thinned(one, size, each) for one in found]
     names = tuple(f"{one.counts.name} {i}" for one in found for i in range(len(one.pixels)))
-    rigs, pixels = [one.rig for one in found], [one.pixels for one in found]
-    covariance = with_common_errors(rigs, pixels, [one.covariance for one in found], [one.slant for one in found])
-    ratio = pose_variance_ratio(rigs, pixels, covariance)
+    pixels, lines = [one.pixels for one in found], [line_errors(one.rig, one.pixels) for one in found]
+    covariance = with_common_errors(lines, pixels, [one.covariance for one in found], [one.share for one in found])
+    ratio = pose_variance_ratio(lines, pixels, covariance, size)
     features = _features(names, torch.cat(pixels), ratio * torch.cat(covariance))
     return SceneMatches(features, tuple(one.counts for one in found))
 
@@ -219,14 +220,14 @@ def match_scene(cameras: tuple[Camera, Camera], pair: ImagePair) -> MatchedPair:
             "image blurred, or is there fog?"
         )
     pixels = torch.stack([pixels[:, 0], refined.right], 1)[refined.good]
-    covariance, slant = refined.covariance[refined.good], refined.slant[refined.good]
+    covariance, share = refined.covariance[refined.good], refined.share[refined.good]
     rig, over = _posed(rig, pixels, covariance)
     good = over <= 1.0
     counts = PairCounts(
         name=pair.name, matched=matched, untextured=matched - fine, off_line=int((~good).sum()), moved=0, thinned=0,
         used=int(good.sum()),
     )  # fmt: skip
-    return MatchedPair(pixels[good], covariance[good], slant[good], counts, rig)
+    return MatchedPair(pixels[good], covariance[good], share[good], counts, rig)
 
 
 def _guided(rig: StereoRig, points: tuple[Keypoints, Keypoints]) -> Tensor:

@@ -15,22 +15,24 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from kcal.lens.pose import side_axes
-from kcal.lens.rig import StereoRig
-from kcal.scene.common_errors import WRONG, line_errors, smooth_columns
+from kcal.scene.common_errors import WRONG, smooth_columns
+from kcal.scene.line_errors import LineErrors
 
 # Share of the root of an image's pixels within which matches are neighbors, 45 px of 960 x 540: of 30, 45, 60, 80 and
 # 120 px tried on 26 terrains, the farthest whose ratio of independent errors scatters as little (0.17); from 60 px on
 # it scatters by 0.26, and tells no more.
 _NEAR = 1.0 / 16.0
 # Pixels at the image's border of each of five smooth errors. With them χ² of the relative rotation, which should be 3,
-# is 3.0 and 3.1 from one and three pairs of a minute (60 terrains, 960 x 540), 2.3 from ten pairs of a day (10),
-# and 2.8 from ten of a day at 1920 x 1080 (6); without 3.4, 3.7, 3.2 and 5.7.
+# was 3.0 and 3.1 from one and three pairs of a minute (60 terrains, 960 x 540), 2.3 from ten pairs of a day (10), and
+# 2.8 from ten of a day at 1920 x 1080 (6); without 3.4, 3.7, 3.2 and 5.7. On 40 other terrains it was 3.0 and 3.6. In
+# all of these the ground made errors that have been mended since, so that the size is rather too large.
 _SMOOTH_PX = 0.006
 
 
 @torch.no_grad()
-def pose_variance_ratio(rigs: Sequence[StereoRig], pixels: Sequence[Tensor], covariance: Sequence[Tensor]) -> float:
+def pose_variance_ratio(
+    lines: Sequence[LineErrors], pixels: Sequence[Tensor], covariance: Sequence[Tensor], size: tuple[int, int]
+) -> float:
     """How many times larger the variance of a relative pose is than matches counted as independent make it.
 
     The variance of weighted least squares with errors that neighbors share (Conley 1999, with one weight for all that
@@ -40,12 +42,13 @@ def pose_variance_ratio(rigs: Sequence[StereoRig], pixels: Sequence[Tensor], cov
     no residual shows, is added.
 
     Args:
-        rigs: of each pair, as its matches make it.
+        lines: of each pair, by the rig as its matches make it.
         pixels: (M, 2, 2) left and right of each pair.
         covariance: (M, 2, 2) px² of the right pixels, with which they are counted.
+        size: width and height of the left image.
     """
-    found = [_off_lines(*one) for one in zip(rigs, pixels, covariance, strict=True)]
-    error, slope, sigma = (torch.cat(part) for part in zip(*found, strict=True))
+    error, slope = (torch.cat([getattr(one, part) for one in lines]) for part in ("off", "slopes"))
+    sigma = torch.cat([one.sigma(own) for one, own in zip(lines, covariance, strict=True)])
     places = torch.cat([one[:, 0] for one in pixels])
     good = error.abs() < WRONG * sigma
     error, slope, sigma, places = error[good], slope[good], sigma[good], places[good]
@@ -53,8 +56,8 @@ def pose_variance_ratio(rigs: Sequence[StereoRig], pixels: Sequence[Tensor], cov
     if len(error) < 4 * (smooth.shape[1] + slope.shape[1]):
         return 1.0
     slope = slope / sigma[:, None]
-    fitted, size, _ = torch.linalg.svd(torch.cat([slope, smooth / sigma[:, None]], 1), full_matrices=False)
-    fitted = fitted[:, size > 1e-9 * size[0]]
+    fitted, singular_values, _ = torch.linalg.svd(torch.cat([slope, smooth / sigma[:, None]], 1), full_matrices=False)
+    fitted = fitted[:, singular_values > 1e-9 * singular_values[0]]
     score = error / sigma
     score = score - fitted @ (fitted.T @ score)
     variance, singular = torch.linalg.inv_ex(slope.T @ slope)
@@ -63,7 +66,7 @@ def pose_variance_ratio(rigs: Sequence[StereoRig], pixels: Sequence[Tensor], cov
         return 1.0
     weight = slope @ variance / variance.diagonal().sqrt()
     # A match with itself once, with each neighbor twice: in i, j and in j, i.
-    near = _NEAR * math.sqrt(math.prod(rigs[0].left.size))
+    near = _NEAR * math.sqrt(math.prod(size))
     i, j = torch.from_numpy(cKDTree(places.numpy()).query_pairs(near, output_type="ndarray")).long().T
     both = 2.0 * (weight[i] * weight[j]).sum(-1)
     alone = weight.square().sum(-1)
@@ -71,19 +74,8 @@ def pose_variance_ratio(rigs: Sequence[StereoRig], pixels: Sequence[Tensor], cov
     # The residuals of independent errors have the covariance 1 - fitted fittedᵀ.
     expected = (alone * (1.0 - fitted.square().sum(-1))).sum() - (both * (fitted[i] * fitted[j]).sum(-1)).sum()
     ratio = float(real / expected)
-    at = 2.0 * places / torch.tensor(rigs[0].left.size) - 1.0
+    at = 2.0 * places / torch.tensor(size) - 1.0
     fields = torch.stack([at[:, 0], at[:, 1], at.prod(1), *at.square().T], -1)
     moved = weight.T @ (fields / sigma[:, None])
     shared = _SMOOTH_PX**2 * float(moved.square().sum(1).mean())
     return shared + (max(1.0, ratio) if math.isfinite(ratio) and expected > 0.0 else 1.0)
-
-
-def _off_lines(rig: StereoRig, pixels: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Pixels (M,) off the epipolar lines, their slopes (M, 5) along turns and shifts of the rig, and σ (M,)."""
-    found = line_errors(rig, pixels, covariance)
-    shift = rig.right_from_left_translation
-    axes = rig.baseline * torch.cat(side_axes(shift[None] / rig.baseline))
-    # right · (shift x left) is what is off: a turn adds turn x left to left, a shift adds to shift.
-    turned = torch.linalg.cross(torch.linalg.cross(found.right, shift.expand_as(found.right)), found.left)
-    shifted = torch.linalg.cross(found.left, found.right) @ axes.T
-    return found.off, torch.cat([-turned, shifted], 1) / found.per_px[:, None], found.sigma

@@ -107,6 +107,7 @@ class Terrain:
 
     def __init__(self, rig: TrueRig, seed: int) -> None:
         self.rig, self.seed = rig, seed
+        self._focal = float(rig.left.focal[0])
         self._still = functools.lru_cache(2)(self._still_picture)
         self._eye = functools.lru_cache(2)(self._turning_eye)
 
@@ -116,7 +117,7 @@ class Terrain:
         if moment is None:
             return still
         random = np.random.default_rng([self.seed, moment, 7])
-        return self._painted(side, still, _vehicles(random, weather), weather, moving=True)
+        return self._painted(side, still, _vehicles(random, weather, self._focal), weather, moving=True)
 
     def images(self, moment: int, weather: Weather | None = None) -> list[NDArray[np.uint8]]:
         """Both images (H, W) of a moment."""
@@ -176,7 +177,7 @@ class Terrain:
         size = self.rig.left.size[::-1]
         nothing = np.zeros(size, dtype=bool)
         sky = Picture(np.full(size, _SKY * _brightness(weather)), np.full(size, np.inf), nothing, nothing)
-        return self._painted(side, sky, _pieces(self.seed, weather), weather)
+        return self._painted(side, sky, _pieces(self.seed, weather, self._focal), weather)
 
     def _painted(
         self, side: int, behind: Picture, facets: list[Facet], weather: Weather, *, moving: bool = False
@@ -229,16 +230,25 @@ def _lit(normal: Floats, weather: Weather) -> float:
     return sky + (1.0 - _FROM_SKY) * direct / highest
 
 
-def _patterned(seed: float, waves: tuple[float, ...], light: float, season: float) -> Callable[[Cut], Floats]:
-    """Relative brightness with texture of some wavelengths, meters; what is finer than four pixels is left out."""
+def _patterned(
+    seed: float,
+    waves: tuple[float, ...],
+    light: float,
+    season: float,
+    pixel: Callable[[Cut], tuple[Floats | float, Floats | float]],
+) -> Callable[[Cut], Floats]:
+    """Relative brightness with texture of some wavelengths, meters; what is finer than four pixels is left out.
+
+    `pixel` tells the meters of a pixel along its longer and its shorter side by the place alone: by how a camera sees
+    it, both would see another texture there, which moved matches of the ground before them to one side by 0.007 px.
+    """
     new, old = math.sin(0.5 * math.pi * season), math.cos(0.5 * math.pi * season)
 
     def pattern(at: Cut) -> Floats:
         found = np.ones_like(at.along)
-        pixel = np.broadcast_to(np.maximum(at.slope(1.0, 0.0), at.slope(0.0, 1.0)), found.shape)
-        narrow = np.broadcast_to(np.minimum(at.slope(1.0, 0.0), at.slope(0.0, 1.0)), found.shape)
+        longer, shorter = (np.broadcast_to(size, found.shape) for size in pixel(at))
         for wave in waves:
-            fine = np.clip(wave / (4.0 * pixel) - 0.25, 0.0, 1.0) * np.clip(60.0 * narrow / wave, 0.0, 1.0)
+            fine = np.clip(wave / (4.0 * longer) - 0.25, 0.0, 1.0) * np.clip(60.0 * shorter / wave, 0.0, 1.0)
             some = (fine > 0.01) & (at.far > 0)
             if some.any():
                 x, y = at.along[some] / wave + seed, at.up[some] / wave + wave
@@ -251,7 +261,18 @@ def _patterned(seed: float, waves: tuple[float, ...], light: float, season: floa
     return pattern
 
 
-def _pieces(seed: int, weather: Weather) -> list[Facet]:
+def _ground_pixel(focal: float) -> Callable[[Cut], tuple[Floats, Floats]]:
+    """Meters of a pixel on the level ground ahead and across, longer first."""
+
+    def pixel(at: Cut) -> tuple[Floats, Floats]:
+        across = np.maximum(at.up, 1.0) / focal
+        ahead = across * np.maximum(at.up, 1.0) / EYE_HEIGHT
+        return np.maximum(across, ahead), np.minimum(across, ahead)
+
+    return pixel
+
+
+def _pieces(seed: int, weather: Weather, focal: float) -> list[Facet]:
     """Ground, hills, shadows and blocks of a seed, in the order in which they are painted."""
     random = np.random.default_rng(seed)
     ahead, right = np.array([0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0])
@@ -259,7 +280,7 @@ def _pieces(seed: int, weather: Weather) -> list[Facet]:
     ground = Facet(
         origin=np.array([0.0, 0.0, -EYE_HEIGHT]), along=right, up=ahead, color=(105.0,),
         outline=box_outline((-2.0 * _FARTHEST, 5.0, 2.0 * _FARTHEST, _FARTHEST)),
-        pattern=_patterned(seed, waves, _brightness(weather), weather.season),
+        pattern=_patterned(seed, waves, _brightness(weather), weather.season, _ground_pixel(focal)),
     )  # fmt: skip
     hills, blocks = [], []
     for distance, top in _HILLS:
@@ -268,7 +289,7 @@ def _pieces(seed: int, weather: Weather) -> list[Facet]:
         hill = facing(
             np.array([0.0, distance, 0.0]), outline, (gray,), top=_skyline(top, distance, offset)
         )  # fmt: skip
-        hills.append(_textured(hill, offset, weather, weather.season))
+        hills.append(_textured(hill, offset, weather, weather.season, focal))
     for distance in np.geomspace(50.0, 2500.0, 48):
         side, width = float(distance * random.uniform(-0.6, 0.6)), float(distance * random.uniform(0.015, 0.05))
         height, offset = float(random.uniform(1.0, 3.0) * width), float(random.uniform(0, 99))
@@ -279,17 +300,17 @@ def _pieces(seed: int, weather: Weather) -> list[Facet]:
             (gray,),
             turn=turn,
         )
-        blocks.append(_textured(block, offset, weather, 0.0))
+        blocks.append(_textured(block, offset, weather, 0.0, focal))
     shadows = [shadow for block in blocks if (shadow := _shadow(block, weather)) is not None]
     return [ground, *hills, *shadows, *blocks[::-1]]
 
 
-def _vehicles(random: np.random.Generator, weather: Weather) -> list[Facet]:
+def _vehicles(random: np.random.Generator, weather: Weather, focal: float) -> list[Facet]:
     found = []
     for distance in np.geomspace(60.0, 400.0, 10)[::-1]:
         place = np.array([float(distance * random.uniform(-0.5, 0.5)), float(distance), -EYE_HEIGHT])
         body = facing(place, box_outline((-2.5, 0.0, 2.5, 3.0)), (float(random.uniform(50, 200)),))
-        found.append(_textured(body, float(random.uniform(0, 99)), weather, 0.0))
+        found.append(_textured(body, float(random.uniform(0, 99)), weather, 0.0, focal))
     return found
 
 
@@ -301,11 +322,12 @@ def _skyline(top: float, distance: float, offset: float) -> Callable[[Floats], F
     return edge
 
 
-def _textured(facet: Facet, offset: float, weather: Weather, season: float) -> Facet:
+def _textured(facet: Facet, offset: float, weather: Weather, season: float, focal: float) -> Facet:
     """An upright piece with light and with texture of 5 to 40 pixels of a camera of 1500 pixels' focal length."""
-    pixel = float(np.linalg.norm(facet.origin)) / 1500.0
+    distance = float(np.linalg.norm(facet.origin))
+    waves = tuple(distance / 1500.0 * wide for wide in (5.0, 9.0, 17.0, 40.0))
     light = _lit(np.cross(facet.along, facet.up), weather)
-    pattern = _patterned(offset, tuple(pixel * wide for wide in (5.0, 9.0, 17.0, 40.0)), light, season)
+    pattern = _patterned(offset, waves, light, season, lambda _: (distance / focal,) * 2)
     return Facet(
         origin=facet.origin, along=facet.along, up=facet.up, outline=facet.outline, color=facet.color, top=facet.top,
         pattern=pattern,

@@ -37,10 +37,11 @@ from kcal.calibrate.rig.sources import Baseline, Features, Landmarks, RigData
 from kcal.corners.keypoints import keypoints
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector, side_axes, vector_from_rotation
+from kcal.lens.pose import vector_from_rotation
 from kcal.lens.rig import StereoRig
 from kcal.locate.localizer import StereoLocalizer
-from kcal.scene.common_errors import off_line, with_common_errors
+from kcal.scene.common_errors import with_common_errors
+from kcal.scene.line_errors import line_errors
 from kcal.scene.match import ImagePair, MatchedPair, counted, match_scene, scene_of, still_matches
 from kcal.scene.match import _posed as posed
 from kcal.sim.scene import FOCAL_MM
@@ -276,17 +277,11 @@ def all_matches(scale: float, count: int, times: str, seed: int, folder: Path) -
 
 def noise_bound(rig: TrueRig, cameras: tuple[Camera, Camera], found: list[MatchedPair]) -> float:
     """Cramér-Rao bound of yaw in degrees from matches with unknown ranges whose errors are noise alone, independent."""
-    turn, shift = rig.right_from_left_rotation, rig.right_from_left_translation
-    across = torch.cat(side_axes(shift[None] / rig.baseline))
-    step = 1e-5
-    steps = [*(rotation_from_vector(step * axis) for axis in torch.eye(3, dtype=torch.float64))]
-    moved = [StereoRig(*cameras, one @ turn, shift) for one in steps]
-    moved += [StereoRig(*cameras, turn, shift + step * rig.baseline * axis) for axis in across]
+    true = StereoRig(*cameras, rig.right_from_left_rotation, rig.right_from_left_translation)
     total = torch.zeros(5, 5, dtype=torch.float64)
     for one in found:
-        here, sigma = off_line(StereoRig(*cameras, turn, shift), one.pixels, one.covariance)
-        slope = torch.stack([off_line(at, one.pixels, one.covariance)[0] - here for at in moved], -1) / step
-        slope = slope / sigma[:, None]
+        lines = line_errors(true, one.pixels)
+        slope = lines.slopes / lines.sigma(one.covariance)[:, None]
         total += slope.T @ slope
     return math.degrees(float(torch.linalg.inv(total)[1, 1].sqrt()))
 
@@ -351,15 +346,16 @@ def common() -> list[str]:
         z: tuple[list[float], list[float]] = [], []
         for first in range(0, 7 - count, count):
             some = found[first : first + count]
-            parts = [[getattr(one, part) for one in some] for part in ("rig", "pixels", "covariance", "slant")]
-            pixels, stated = torch.cat(parts[1]), torch.cat(parts[2])
+            parts = [[getattr(one, part) for one in some] for part in ("pixels", "covariance", "share")]
+            lines = [line_errors(one.rig, one.pixels) for one in some]
+            pixels, stated = torch.cat(parts[0]), torch.cat(parts[1])
             rig, _ = posed(found[0].rig, pixels, stated)
             place = (pixels[:, 0] / BLOCK).long()
             block = 100 * place[:, 1] + place[:, 0]
-            off, by_noise = off_line(rig, pixels, stated)
-            good = off.abs() < 5.0 * by_noise
-            for own, covariance in zip(z, (stated, torch.cat(with_common_errors(*parts))), strict=True):
-                error, sigma = off_line(rig, pixels, covariance)
+            together = line_errors(rig, pixels)
+            error, good = together.off, together.off.abs() < 5.0 * together.sigma(stated)
+            for own, covariance in zip(z, (stated, torch.cat(with_common_errors(lines, *parts))), strict=True):
+                sigma = together.sigma(covariance)
                 for which in block.unique():
                     here = (block == which) & good
                     if int(here.sum()) >= 4 * count:

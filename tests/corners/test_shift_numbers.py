@@ -31,24 +31,26 @@ def ramps(count: int, height: int, width: int) -> ImageWindows:
 
 class TestShifts:
     def test_residuals_of_ramps(self) -> None:
-        """Of a sheared patch: right(moved + slopes shift) - gain template - offset, and its derivatives."""
+        """Of a sheared patch: right(moved + slopes shift) - gain template - offset - ramp, and its derivatives."""
         grid = grid_of((2, 1), torch.device("cpu"))  # three rows of five
         template = draw(1, 3, 5)
         moved = (grid + torch.tensor([25.0, 32.0]))[None]
         slopes = torch.tensor([[1.1, -0.2], [0.1, 0.9]], dtype=torch.float64)
         across, down = slopes[:, 0], slopes[:, 1]
         patches = _Patches(template, ramps(1, 30, 40), moved, slopes.expand(1, 3, 5, 2, 2), torch.ones(1, 3, 5), grid)
-        theta = torch.tensor([[0.4, -0.3, 1.5, 7.0, 0.02, -0.05]], dtype=torch.float64)
+        theta = torch.tensor([[0.4, -0.3, 1.5, 7.0, 0.02, -0.05, 0.6, -0.9]], dtype=torch.float64)
         residual, slope, design = _residual(patches, theta)
         ahead = 0.4 + 0.02 * grid[..., 0] - 0.05 * grid[..., 1]
         at = moved[0] + ahead[..., None] * across - 0.3 * down
         wanted = 2.0 * at[..., 0] + 3.0 * at[..., 1] - 1.5 * template[0] - 7.0
+        wanted = wanted - 0.6 * grid[..., 0] + 0.9 * grid[..., 1]
         torch.testing.assert_close(residual[0], wanted.flatten())
         # A step along the first axis is (1.1, 0.1) px, along the second (-0.2, 0.9).
         assert slope[0, 4].tolist() == pytest.approx([2.2 + 0.3, -0.4 + 2.7])
         columns = torch.stack(
             [torch.full((15,), 2.5).double(), torch.full((15,), 2.3).double(), -template.flatten(),
-             -torch.ones(15).double(), 2.5 * grid[..., 0].flatten(), 2.5 * grid[..., 1].flatten()], -1)  # fmt: skip
+             -torch.ones(15).double(), 2.5 * grid[..., 0].flatten(), 2.5 * grid[..., 1].flatten(),
+             -grid[..., 0].flatten(), -grid[..., 1].flatten()], -1)  # fmt: skip
         torch.testing.assert_close(design[0], columns)
         assert _residual(patches._replace(grid=None), theta[:, :4])[2].shape == (1, 15, 4)
 
@@ -88,7 +90,7 @@ class TestShifts:
         if alike:
             rough = torch.nn.functional.conv2d(draw(1, 1, height + 8, width + 8, seed=3), blur[None, None, None])
             residual = 9.0 * torch.nn.functional.conv2d(rough, blur[None, None, :, None])[0].flatten(1)
-        theta = torch.tensor([[0.1, 0.2, 1.3, 4.0, 0.01, 0.02][: 6 if sheared else 4]], dtype=torch.float64)
+        theta = torch.tensor([[0.1, 0.2, 1.3, 4.0, 0.01, 0.02, 0.3, -0.1][: 8 if sheared else 4]], dtype=torch.float64)
         robust = 0.3 + draw(1, n, seed=4).abs().clamp_max(1.0)
         padded = np.pad(template[0].numpy(), 1, mode="edge")
         along = 0.5 * (padded[1:-1, 2:] - padded[1:-1, :-2])
@@ -104,6 +106,7 @@ class TestShifts:
         free = [template[0].flatten().numpy(), np.ones(n)]
         if grid is not None:
             free += [mixed[:, 0] * grid[..., k].flatten().numpy() for k in (0, 1)]
+            free += [grid[..., k].flatten().numpy() for k in (0, 1)]
         design, root = np.stack(free, -1), np.sqrt(w)
 
         def beyond(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -128,7 +131,11 @@ class TestShifts:
         kernel = np.exp(-0.5 * (np.arange(-4, 5) / sigma) ** 2)
         kernel /= kernel.sum()
         left = float((kernel**2).sum()) ** 2  # the variance that blur leaves of noise
-        freedom = max(1.0 - theta.shape[1] / (w.sum() * left), 0.2)
+        # The fit takes the part of the noise that lies in the space of its columns.
+        columns = np.concatenate([design, mixed], 1)
+        blurred = spread_by(kernel) @ (w[:, None] * columns)
+        taken = np.trace(np.linalg.inv((columns.T * w) @ columns) @ blurred.T @ blurred)
+        freedom = max(1.0 - taken / (w.sum() * left), 0.2)
         noise = (w * r**2).sum() / w.sum() / (left * freedom)
         force = w[:, None] * beyond(mixed)
         blurred = spread_by(kernel) @ force

@@ -5,11 +5,20 @@ import math
 import pytest
 import torch
 
-from kcal.scene.common_errors import PATCH, with_common_errors
+from kcal.scene import common_errors
+from kcal.scene.common_errors import with_common_errors
+from kcal.scene.line_errors import line_errors
 from tests.helpers.scene_pairs import SIZE, small_rig
 
 RIG = small_rig()
 SIGMA = 0.05
+PATCH = 15.0
+
+
+@pytest.fixture(autouse=True)
+def small_patches(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of which many fit into a small image without overlap."""
+    monkeypatch.setattr(common_errors, "PATCH", PATCH)
 
 
 def spread_places(step: float, sway: float) -> tuple[torch.Tensor, torch.Tensor]:
@@ -34,7 +43,8 @@ def counted(pairs: int, *, step: float = 16.0, own: float = SIGMA, common: float
         noise = own * torch.randn(right.shape, dtype=torch.float64, generator=draw)
         pixels.append(torch.stack([left, right + shared + noise], 1))
     stated = [(SIGMA**2 * torch.eye(2, dtype=torch.float64)).expand(len(left), 2, 2)] * pairs
-    found = with_common_errors([RIG] * pairs, pixels, stated, [torch.zeros(len(left)).double()] * pairs)
+    lines = [line_errors(RIG, one) for one in pixels]
+    found = with_common_errors(lines, pixels, stated, [torch.zeros(len(left)).double()] * pairs)
     return sum(float((SIGMA**2 / one[:, 1, 1]).sum()) for one in found) / len(left)
 
 
@@ -64,26 +74,27 @@ def test_overlapping_patches() -> None:
     assert counted(1, step=2.0 * PATCH) > 0.85
 
 
-def test_what_is_seen_at_a_slant_is_judged_by_itself() -> None:
+def test_what_fits_in_part_is_judged_by_itself() -> None:
     """Half of the things repeat an error; without classes, all of them lost a part of what several pairs tell."""
     draw = torch.Generator().manual_seed(4)
     left, right = spread_places(16.0, 0.0)
-    slanted = torch.rand(len(left), generator=draw) < 0.5
-    slant = slanted.double() + 0.01 * torch.rand(len(left), generator=draw)
-    shared = torch.where(slanted[:, None], 1.5 * SIGMA * torch.randn(right.shape, generator=draw), 0.0)
+    partly = torch.rand(len(left), generator=draw) < 0.5
+    share = 0.8 - 0.2 * partly.double() + 0.01 * torch.rand(len(left), generator=draw)
+    shared = torch.where(partly[:, None], 1.5 * SIGMA * torch.randn(right.shape, generator=draw), 0.0)
     pixels = []
     for _ in range(4):
         noise = SIGMA * torch.randn(right.shape, dtype=torch.float64, generator=draw)
         pixels.append(torch.stack([left, right + shared + noise], 1))
     stated = [(SIGMA**2 * torch.eye(2, dtype=torch.float64)).expand(len(left), 2, 2)] * 4
-    found = torch.stack(with_common_errors([RIG] * 4, pixels, stated, [slant] * 4))[..., 1, 1] / SIGMA**2
-    level, steep = ((1.0 / found[:, which]).sum(0).mean() for which in (~slanted, slanted))
+    lines = [line_errors(RIG, one) for one in pixels]
+    found = torch.stack(with_common_errors(lines, pixels, stated, [share] * 4))[..., 1, 1] / SIGMA**2
+    plain, edges = ((1.0 / found[:, which]).sum(0).mean() for which in (~partly, partly))
     # Four times the information of one; and that of one with the variance 1.5² + 1/4.
-    assert float(level) == pytest.approx(4.0, rel=0.15)
-    assert float(steep) == pytest.approx(1.0 / 2.5, rel=0.2)
+    assert float(plain) == pytest.approx(4.0, rel=0.15)
+    assert float(edges) == pytest.approx(1.0 / 2.5, rel=0.2)
 
 
 def test_no_matches() -> None:
     nothing = torch.zeros(0, 2, 2, dtype=torch.float64)
-    assert len(with_common_errors([RIG], [nothing], [nothing], [nothing[:, 0, 0]])[0]) == 0
+    assert len(with_common_errors([line_errors(RIG, nothing)], [nothing], [nothing], [nothing[:, 0, 0]])[0]) == 0
     assert math.isfinite(counted(2, step=120.0))

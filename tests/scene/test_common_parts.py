@@ -13,6 +13,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import StereoRig
 from kcal.scene import common_errors as parts
+from kcal.scene.line_errors import line_errors
 
 DRAW = torch.Generator().manual_seed(8)
 FLAT = torch.zeros(3, dtype=torch.float64)
@@ -35,10 +36,10 @@ def test_off_the_line_by_so_many_pixels(roll: float) -> None:
     apart = torch.tensor([[-9.0, 0.7], [-3.0, -0.4], [-30.0, 0.0]]).double()
     right = (left + apart - middle) @ turn.T + middle
     own = torch.tensor([[0.04, 0.01], [0.01, 0.09]]).double()
-    off, sigma = parts.off_line(rig, torch.stack([left, right], 1), (turn @ own @ turn.T).expand(3, 2, 2))
-    sign = float(torch.sign(off[0]))
-    assert sign * off == pytest.approx([0.7, -0.4, 0.0], abs=1e-3)
-    assert sigma == pytest.approx(3 * [0.3], rel=2e-3)
+    found = line_errors(rig, torch.stack([left, right], 1))
+    sign = float(torch.sign(found.off[0]))
+    assert sign * found.off == pytest.approx([0.7, -0.4, 0.0], abs=1e-3)
+    assert found.sigma((turn @ own @ turn.T).expand(3, 2, 2)) == pytest.approx(3 * [0.3], rel=2e-3)
 
 
 def test_smooth_errors_are_the_lenses() -> None:
@@ -73,6 +74,13 @@ def test_smooth_errors_by_weight_and_of_enough() -> None:
     assert float(parts._without_lenses(ones, ones, at[:60]).abs().max()) < 1e-9
 
 
+@pytest.mark.parametrize("count", [0, 1])
+def test_columns_of_hardly_any_places(count: int) -> None:
+    """Without a warning, which would stop the tests; one place is the middle."""
+    found = parts.smooth_columns(torch.full((count, 2), 7.0).double())
+    assert found.tolist() == [[1.0] + [0.0] * 14] * count
+
+
 def test_variance_of_errors() -> None:
     """Errors that have scale σ² + floor exactly; never less than σ² without a floor; too few tell nothing."""
     sigma = torch.tensor([0.02, 0.2, 0.05]).double().repeat(20)
@@ -85,14 +93,14 @@ def test_variance_of_errors() -> None:
     assert parts._error_variance(3.0 * sigma[:49], sigma[:49]) == (1.0, 0.0)
 
 
-def test_classes_of_slant() -> None:
-    slant = torch.rand(400, generator=DRAW).double()
+def test_classes_of_shares() -> None:
+    share = torch.rand(400, generator=DRAW).double()
     for count, pairs, classes in ((400, 2, 4), (399, 2, 3), (199, 2, 1), (400, 1, 4), (100, 1, 2), (20, 1, 1)):
-        found = parts._classes(slant[:count], pairs)
+        found = parts._classes(share[:count], pairs)
         sizes = found.bincount()
         assert len(sizes) == classes
         assert int(sizes.max() - sizes.min()) <= 1
-        order = slant[:count].argsort()
+        order = share[:count].argsort()
         assert found[order].tolist() == sorted(found.tolist())
 
 
@@ -150,7 +158,8 @@ def test_too_few_to_learn_from_count_their_overlap() -> None:
 
     def factor(left: list[list[float]], values: list[float]) -> list[float]:
         covariance = stated(values)
-        (found,) = parts.with_common_errors([rig], [matches(left)], [covariance], [torch.zeros(len(left)).double()])
+        lines = line_errors(rig, matches(left))
+        (found,) = parts.with_common_errors([lines], [matches(left)], [covariance], [torch.zeros(len(left)).double()])
         share = found / covariance
         assert share.flatten(1).amax(1) == pytest.approx(share.flatten(1).amin(1))
         return share[:, 0, 0].tolist()
@@ -167,8 +176,8 @@ def test_one_thing_in_three_pairs_counts_once() -> None:
     rig = level_rig()
     pixels = [matches([[100, 100], [300, 200]]), matches([[100, 100]]), matches([[100, 100]])]
     covariance = [stated([1.0, 1.0]), stated([1.0]), stated([1.0])]
-    slant = [torch.zeros(len(own)).double() for own in pixels]
-    found = parts.with_common_errors([rig] * 3, pixels, covariance, slant)
+    fits = [torch.ones(len(own)).double() for own in pixels]
+    found = parts.with_common_errors([line_errors(rig, own) for own in pixels], pixels, covariance, fits)
     assert [len(one) for one in found] == [2, 1, 1]
     ratio = torch.cat(found)[:, 1, 1]
     assert ratio == pytest.approx([3.0, 1.0, 3.0, 3.0])
@@ -189,11 +198,13 @@ def test_learned_parts_against_plain_loops() -> None:
         right[:, 1] += 0.05 * torch.randn(len(right), generator=draw).double()
         pixels.append(torch.stack([own, right], 1))
         covariance.append(stated((0.002 + 0.004 * torch.rand(len(own), generator=draw)).tolist()))
-    slant = [torch.zeros(len(own)).double()] * 2
-    found = torch.cat(parts.with_common_errors([rig] * 2, pixels, covariance, slant))
+    fits = [torch.ones(len(own)).double()] * 2
+    lines = [line_errors(rig, own) for own in pixels]
+    found = torch.cat(parts.with_common_errors(lines, pixels, covariance, fits))
 
     places, every = torch.cat(pixels), torch.cat(covariance)
-    off, sigma = parts.off_line(rig, places, every)
+    together = line_errors(rig, places)
+    off, sigma = together.off, together.sigma(every)
     variance = sigma**2
     for _ in range(2):
         error = parts._without_lenses(off, variance**0.5, places[:, 0])
@@ -208,7 +219,7 @@ def test_learned_parts_against_plain_loops() -> None:
     for i in range(2 * size):
         for j in range(2 * size):
             dx, dy = abs(x[i] - x[j]), abs(y[i] - y[j])
-            overlap[i, j] = max(0.0, 1 - dx / 15.0) * max(0.0, 1 - dy / 15.0)
+            overlap[i, j] = max(0.0, 1 - dx / parts.PATCH) * max(0.0, 1 - dy / parts.PATCH)
             if i < size <= j and max(dx, dy) < 1.5 and bool(good[i] & good[j]):
                 same.append((i, j))
     assert len(same) > 50

@@ -13,7 +13,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
 from kcal.scene import match, still
 from kcal.scene.match import ImagePair, MatchedPair, PairCounts
-from kcal.scene.refine import _HALF, RefinedMatches, _patch, refine_matches
+from kcal.scene.refine import HALF, RefinedMatches, _patch, refine_matches
 from kcal.scene.still import SWAY, Stillness, still_there, whole_shifts
 from tests.helpers.scene_pairs import small_rig
 
@@ -25,8 +25,8 @@ def found(left: list[list[float]], variance: list[float]) -> MatchedPair:
     pixels = torch.tensor(left).double()
     counts = PairCounts(name="pair", matched=9, untextured=1, off_line=1, moved=0, thinned=0, used=len(left))
     covariance = torch.tensor(variance).double()[:, None, None] * torch.eye(2).double()
-    slant = torch.arange(len(left)).double()
-    return MatchedPair(torch.stack([pixels, pixels - 5.0], 1), covariance, slant, counts, RIG)
+    share = torch.arange(len(left)).double()
+    return MatchedPair(torch.stack([pixels, pixels - 5.0], 1), covariance, share, counts, RIG)
 
 
 def test_the_best_of_each_cell_come_first() -> None:
@@ -37,7 +37,7 @@ def test_the_best_of_each_cell_come_first() -> None:
     order = [1, 6, 5, 7, 3, 4, 2, 0]
     for most in range(1, 9):
         kept = match._thinned(found(places, variance), (320, 180), most)
-        assert kept.slant.tolist() == sorted(order[:most])
+        assert kept.share.tolist() == sorted(order[:most])
         assert (kept.counts.thinned, kept.counts.used) == (8 - most, most)
         assert kept.pixels[:, 0].tolist() == [pytest.approx(places[i]) for i in sorted(order[:most])]
     assert match._thinned(found(places, variance), (320, 180), 20).counts.thinned == 0
@@ -45,7 +45,7 @@ def test_the_best_of_each_cell_come_first() -> None:
     outside = match._thinned(
         found([[-0.4, 5], [5, -0.4], [320.4, 175], [315, 180.4]], [1.0, 2.0, 3.0, 4.0]), (320, 180), 2
     )
-    assert outside.slant.tolist() == [0.0, 2.0]
+    assert outside.share.tolist() == [0.0, 2.0]
 
 
 def test_counted_features() -> None:
@@ -86,10 +86,10 @@ def test_which_other_pairs_tell(monkeypatch: pytest.MonkeyPatch) -> None:
     pairs = [ImagePair(str(k), k * level, (k + 10) * level) for k in range(4)]
     kept = match._still(pairs, [own] * 4, 3)
     assert asked == [(3.0, 0.0, 10.0), (3.0, 2.0, 12.0)]
-    assert kept.slant.tolist() == [0.0, 1.0, 2.0]
+    assert kept.share.tolist() == [0.0, 1.0, 2.0]
     assert (kept.counts.moved, kept.counts.used) == (3, 3)
     asked.clear()
-    assert match._still(pairs[:2], [own] * 2, 1).slant.tolist() == [0.0, 1.0, 3.0]
+    assert match._still(pairs[:2], [own] * 2, 1).share.tolist() == [0.0, 1.0, 3.0]
     assert asked == [(1.0, 0.0, 10.0)]
     # One pair alone has nothing to be compared with.
     assert match.still_matches(pairs[:1], [own])[0] is own
@@ -134,18 +134,18 @@ def test_patches_are_those_of_the_lens() -> None:
     ):
         pixels, slopes, seen = _patch(camera, planes, middle, turn)
         assert seen.tolist() == [True, True]
-        assert pixels.shape == (2, 2 * _HALF + 1, 2 * _HALF + 1, 2)
+        assert pixels.shape == (2, 2 * HALF + 1, 2 * HALF + 1, 2)
 
         def at(x: float, y: float) -> Tensor:
             step = planes.step[:, None] * torch.tensor([x, y]).double()
             return plane_pixels(camera, planes, (middle + step)[:, None], turn)[0][:, 0]  # noqa: B023
 
-        for i in (-7, -4, 0, 3, 7):
-            for j in (-7, 0, 5):
-                assert pixels[:, j + 7, i + 7] == pytest.approx(at(i, j), abs=2e-3)
+        for i in (-HALF, -4, 0, 3, HALF):
+            for j in (-HALF, 0, 5):
+                assert pixels[:, j + HALF, i + HALF] == pytest.approx(at(i, j), abs=2e-3)
                 across, down = at(i + 0.5, j) - at(i - 0.5, j), at(i, j + 0.5) - at(i, j - 0.5)
-                assert slopes[:, j + 7, i + 7, :, 0] == pytest.approx(across, abs=2e-3)
-                assert slopes[:, j + 7, i + 7, :, 1] == pytest.approx(down, abs=2e-3)
+                assert slopes[:, j + HALF, i + HALF, :, 0] == pytest.approx(across, abs=2e-3)
+                assert slopes[:, j + HALF, i + HALF, :, 1] == pytest.approx(down, abs=2e-3)
 
 
 def test_still_is_what_lies_between_both_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -204,7 +204,7 @@ def test_refined_from_a_plane_at_a_known_range() -> None:
         # Of the patch at the edge 8 of 15 columns are there: less than .55.
         assert found.good.tolist() == [True, True, False, True, True]
         assert found.right[found.good] == pytest.approx(truth[found.good], abs=0.01)
-        assert float(found.slant[found.good].abs().max()) < 0.01
+        assert float(found.share[found.good].min()) > 0.65
     # Parts of a thousand at a time are the whole.
     many = refine_matches(rig, images, left[:2].repeat(501, 1), truth[:2].repeat(501, 1))
     assert many.right.shape == (1002, 2)

@@ -1,7 +1,5 @@
 """The variance of a pose is what errors that neighbors share make it."""
 
-from typing import Any
-
 import pytest
 import torch
 from torch import Tensor
@@ -9,7 +7,7 @@ from torch import Tensor
 from kcal.lens.pose import rotation_from_vector, side_axes
 from kcal.lens.rig import StereoRig
 from kcal.scene import neighbors
-from kcal.scene.common_errors import off_line
+from kcal.scene.line_errors import LineErrors, line_errors
 from kcal.scene.neighbors import pose_variance_ratio
 from tests.helpers.scene_pairs import SIZE, small_rig
 
@@ -34,11 +32,18 @@ def shared(pixels: Tensor, part: float, draw: torch.Generator) -> Tensor:
     return torch.randn(1000, dtype=torch.float64, generator=draw)[cell[:, 0] + 30 * cell[:, 1]]
 
 
-def ratio(pixels: Tensor, error: Tensor, rig: StereoRig = RIG) -> float:
-    moved = pixels.clone()
-    moved[:, 1, 1] += error
+def lines_of(pixels: Tensor, error: Tensor) -> LineErrors:
+    """Of matches with errors (M,) px downward."""
+    return line_errors(RIG, pixels + error[:, None, None] * torch.tensor([[0.0, 0.0], [0.0, 1.0]]))
+
+
+def ratio_of(lines: LineErrors, pixels: Tensor) -> float:
     covariance = (SIGMA**2 * torch.eye(2, dtype=torch.float64)).expand(len(pixels), 2, 2)
-    return pose_variance_ratio([rig], [moved], [covariance])
+    return pose_variance_ratio([lines], [pixels], [covariance], SIZE)
+
+
+def ratio(pixels: Tensor, error: Tensor) -> float:
+    return ratio_of(lines_of(pixels, error), pixels)
 
 
 def unbounded(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -63,8 +68,8 @@ def test_errors_that_neighbors_share_count_as_they_act(monkeypatch: pytest.Monke
     draw = torch.Generator().manual_seed(2)
     pixels = drawn_pixels(draw)
     covariance = (SIGMA**2 * torch.eye(2, dtype=torch.float64)).expand(len(pixels), 2, 2)
-    _, slope, sigma = neighbors._off_lines(RIG, pixels, covariance)
-    slope = slope / sigma[:, None]
+    lines = line_errors(RIG, pixels)
+    slope = lines.slopes / lines.sigma(covariance)[:, None]
     stated = torch.linalg.inv(slope.T @ slope)
     found, poses = [], []
     for turn in range(400):
@@ -98,11 +103,12 @@ def test_slopes_are_those_of_differences() -> None:
     moved = [StereoRig(RIG.left, RIG.right, one, shift) for one in turned]
     axes = torch.cat(side_axes(shift[None] / RIG.baseline))
     moved += [StereoRig(RIG.left, RIG.right, turn, shift + step * RIG.baseline * axis) for axis in axes]
-    expected = torch.stack([off_line(rig, pixels, covariance)[0] for rig in moved], -1) / step
-    off, slope, sigma = neighbors._off_lines(RIG, pixels, covariance)
+    expected = torch.stack([line_errors(rig, pixels).off for rig in moved], -1) / step
+    found = line_errors(RIG, pixels)
+    sigma = found.sigma(covariance)
     # Of right pixels that are found by iteration.
-    assert off.abs().max() < 1e-7
-    torch.testing.assert_close(slope, expected, rtol=1e-4, atol=1e-3)
+    assert found.off.abs().max() < 1e-7
+    torch.testing.assert_close(found.slopes, expected, rtol=1e-4, atol=1e-3)
     torch.testing.assert_close(sigma, torch.ones_like(sigma), rtol=1e-12, atol=0.0)
 
 
@@ -113,29 +119,27 @@ def test_smooth_errors_do_not_become_smaller_with_more_matches(monkeypatch: pyte
     for count in (300, 1200):
         pixels = drawn_pixels(draw, count)
         covariance = (SIGMA**2 * torch.eye(2, dtype=torch.float64)).expand(count, 2, 2)
-        _, slope, sigma = neighbors._off_lines(RIG, pixels, covariance)
+        lines = line_errors(RIG, pixels)
+        slope, sigma = lines.slopes, lines.sigma(covariance)
         solved = torch.linalg.pinv(slope / sigma[:, None]) / sigma
         variance = torch.linalg.inv((slope / sigma[:, None]).T @ (slope / sigma[:, None])).diagonal()
         u, v = (2.0 * pixels[:, 0] / torch.tensor(SIZE) - 1.0).unbind(1)
         poses = torch.stack([solved @ (0.006 * field) for field in (u, v, u * v, u * u, v * v)])
         beyond.append(float((poses.square().sum(0) / variance).mean()))
         monkeypatch.setattr(neighbors, "_SMOOTH_PX", 0.006)
-        with_them = pose_variance_ratio([RIG], [pixels], [covariance])
+        with_them = ratio_of(lines, pixels)
         monkeypatch.setattr(neighbors, "_SMOOTH_PX", 0.0)
-        assert with_them - pose_variance_ratio([RIG], [pixels], [covariance]) == pytest.approx(beyond[-1], rel=1e-6)
+        assert with_them - ratio_of(lines, pixels) == pytest.approx(beyond[-1], rel=1e-6)
     assert beyond[1] / beyond[0] == pytest.approx(4.0, rel=0.1)
 
 
-def test_where_matches_leave_a_pose_open_there_is_no_ratio(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_matches_leave_a_pose_open_there_is_no_ratio() -> None:
     draw = torch.Generator().manual_seed(8)
-    pixels, plain = drawn_pixels(draw), neighbors._off_lines
-
-    def open_shifts(*matches: Any) -> tuple[Tensor, ...]:
-        off, slope, sigma = plain(*matches)
-        return off, slope * torch.tensor([1.0, 1.0, 1.0, 0.0, 0.0]), sigma
-
-    monkeypatch.setattr(neighbors, "_off_lines", open_shifts)
-    assert ratio(pixels, SIGMA * torch.randn(len(pixels), dtype=torch.float64, generator=draw)) == 1.0
+    pixels = drawn_pixels(draw)
+    lines = lines_of(pixels, SIGMA * torch.randn(len(pixels), dtype=torch.float64, generator=draw))
+    assert ratio_of(lines, pixels) > 1.0
+    # Nothing tells of shifts.
+    assert ratio_of(lines._replace(slopes=lines.slopes * torch.tensor([1.0, 1.0, 1.0, 0.0, 0.0])), pixels) == 1.0
 
 
 def test_few_matches_and_wrong_ones() -> None:
