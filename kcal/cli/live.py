@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from kcal.cli.commands import rarely
 from kcal.cli.console import err, steps
 from kcal.cli.inputs import RIG, VIDEO
 from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_of
@@ -73,8 +74,7 @@ def live_command(
         typer.Option("--port", metavar="PORT", help="Serve the live map to this machine's browser; 0: any free port."),
     ] = None,
     journal: Annotated[
-        Path | None,
-        typer.Option(help="Remembers what was written; the first output with .journal if not given.", hidden=True),
+        Path | None, rarely("", "Remembers what was written; the first output with .journal if not given.")
     ] = None,
     origin: Annotated[
         str | None,
@@ -84,22 +84,12 @@ def live_command(
         float | None, typer.Option(metavar="DEG", help="Azimuth of the left camera's axis; needed with --origin.")
     ] = None,
     pixel_sigma: PixelSigma = None,
-    box_sigma: Annotated[
-        float, typer.Option(metavar="PX", help="Noise of the middle of a box, each axis.", hidden=True)
-    ] = 2.0,
+    box_sigma: Annotated[float, rarely("PX", "Noise of the middle of a box, each axis.")] = 2.0,
     match_sigma: Annotated[
-        float,
-        typer.Option(
-            metavar="PX", help="Error of matched images that compression of the videos adds, each axis.", hidden=True
-        ),
+        float, rarely("PX", "Error of matched images that compression of the videos adds, each axis.")
     ] = 0.06,
     clock_offset: Annotated[
-        float,
-        typer.Option(
-            metavar="S",
-            help="Seconds by which the right images are later than their times; of two cameras.",
-            hidden=True,
-        ),
+        float, rarely("S", "Seconds by which the right images are later than their times; of two cameras.")
     ] = 0.0,
     clock_sigma: Annotated[
         float,
@@ -108,10 +98,7 @@ def live_command(
         ),
     ] = 0.0,
     compiled: Annotated[
-        bool,
-        typer.Option(
-            "--compile", help="Translate the filter to C++ first, which takes minutes; for many targets.", hidden=True
-        ),
+        bool, rarely("", "Translate the filter to C++ first, which takes minutes; for many targets.", "--compile")
     ] = False,
     watch: Annotated[
         Path | None,
@@ -120,10 +107,7 @@ def live_command(
         ),
     ] = None,
     start: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ISO", help="Calendar time of second 0, if times are not Unix seconds; for events.", hidden=True
-        ),
+        str | None, rarely("ISO", "Calendar time of second 0, if times are not Unix seconds; for events.")
     ] = None,
 ) -> None:
     """Follow what cameras see: tracks with latitude, longitude, velocity and honest errors, written as they come.
