@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import datetime
 import os
-import signal
 import sys
 import time as clocks
 from collections.abc import Callable
@@ -14,11 +13,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from kcal.cli.commands import rarely
-from kcal.cli.console import err, steps
+from kcal.cli.console import err, on_signals, steps
 from kcal.cli.inputs import RIG, VIDEO
 from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_of
 from kcal.cli.settings import taken
-from kcal.errors import InputError
+from kcal.errors import InputError, with_extra
 from kcal.quantities import measured_text
 
 if TYPE_CHECKING:
@@ -194,16 +193,14 @@ def live_command(
             ending = "stopped"
             stream.stop()
 
-        before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
+        live = frames is not None and frames.live
         try:
-            live = frames is not None and frames.live
-            counts = stream.follow(source, waits=not live, resumes=not live and detections != "-")
+            with on_signals(stop):
+                counts = stream.follow(source, waits=not live, resumes=not live and detections != "-")
         except BaseException:
             ending = "ended by an error: see the terminal"
             raise
         finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
             if page is not None:
                 page.close(ending)
     err.print(summary(counts), markup=False)
@@ -295,10 +292,8 @@ def _videos(
     options: AssociationOptions,
     match_sigma: float,
 ) -> Videos:
-    try:
+    with with_extra("video", "videos need"):
         from kcal.pipeline.video_source import Videos
-    except ImportError as error:
-        raise InputError(f"videos need {error.name}; install it with: pip install 'kcal[video]'") from error
     from kcal.pipeline.detector_call import load_detector
 
     # As `python -m` does: a detector beside which the command is run is found.
@@ -315,10 +310,8 @@ def _videos(
 
 
 def _live_map(run: Located, port: int) -> LiveMap:
-    try:
+    with with_extra("mark", "--port needs"):
         from kcal.pipeline.live_map import LiveMap
-    except ImportError as error:
-        raise InputError(f"--port needs {error.name}; install it with: pip install 'kcal[mark]'") from error
     page = LiveMap(run, port)
     err.print(f"live map: {page.address}", markup=False)
     return page
