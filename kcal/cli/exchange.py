@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kcal.cli.camera_sources import named_source, parse_size, picked
+from kcal.cli.camera_sources import cameras_and_rig, named_source, parse_size, picked
 from kcal.cli.console import out, print_wrote, steps, warn
 from kcal.cli.inputs import CAMERA_OR_RIG, FOREIGN
 from kcal.errors import InputError
@@ -68,16 +68,15 @@ def export_command(
     check_writable(output, path)
 
     from kcal.calibrate.camera.export import export_cameras
-    from kcal.io.formats import import_cameras
 
     if picture is not None:
         check_picture(picture)
-    found = import_cameras(path)
-    subject = _subject(path, name)
-    chosen = subject if subject is not None else picked(found, name, source)
+    found, rig = cameras_and_rig(path)
+    alone = name is not None or len(found.cameras) == 1
+    chosen = picked(found, name, source) if alone else rig or found.cameras
     with steps("fitting what the format holds", None):
         done = export_cameras(chosen, output, format=format, model=model)
-    names = found.names if subject is not None else (name or found.names[0],)
+    names = (name or found.names[0],) if alone else found.names
     for camera, model_name, misfit in zip(names, done.models, done.misfits, strict=True):
         label = f"{camera or 'camera'}: {model_name}"
         if misfit is None:
@@ -104,21 +103,6 @@ def export_command(
     elif picture is not None:
         out.print("no picture: nothing was refitted")
     print_wrote(*done.paths)
-
-
-def _subject(path: Path, name: str | None):  # type: ignore[no-untyped-def]
-    """What a file contains as a whole: its rig or its cameras; None where one of them was named."""
-    from kcal.io.formats import import_cameras, recognized
-    from kcal.io.rig_file import load_rig
-
-    if name is not None:
-        return None
-    found = import_cameras(path)
-    if len(found.cameras) == 1:
-        return found.cameras[0]
-    if recognized(path) == "kcal":
-        return load_rig(path)
-    return found.rig() if found.is_rig() else found.cameras
 
 
 def import_command(
