@@ -138,24 +138,29 @@ def match_landmarks(survey: Survey, marks: Marks, pixel_sigma: float | Tensor) -
         >>> found.landmarks.names, found.unmarked, found.unsurveyed
         (('post',), ('mast',), ('tree',))
     """
-    index = {name: i for i, name in enumerate(marks.names)}
-    common = [name for name in survey.names if name in index]
-    if not common:
+    return marked_places(survey, marks.names, marks.pixels, pixel_sigma)
+
+
+def marked_places(survey: Survey, names: Sequence[str], pixels: Tensor, pixel_sigma: float | Tensor) -> MarkedLandmarks:
+    """The same for pixels (N, C, 2) of C cameras; `pixel_sigma` is one number, or (N, C)."""
+    index = {name: i for i, name in enumerate(names)}
+    places = [i for i, name in enumerate(survey.names) if name in index]
+    if not places:
         raise InputError(
-            f"no surveyed place ({', '.join(survey.names[:3])} ...) has a mark ({', '.join(marks.names[:3])} ...): "
+            f"no surveyed place ({', '.join(survey.names[:3])} ...) has a mark ({', '.join(names[:3])} ...): "
             "the names must be the same in both files"
         )
+    common = tuple(survey.names[i] for i in places)
     rows = [index[name] for name in common]
-    places = [survey.names.index(name) for name in common]
     landmarks = Landmarks(
-        names=tuple(common),
+        names=common,
         points=survey.points[places],
         sigma=survey.sigma[places],
-        pixels=marks.pixels[rows],
+        pixels=pixels[rows],
         pixel_sigma=pixel_sigma[rows] if isinstance(pixel_sigma, Tensor) else pixel_sigma,
     )
     unmarked = tuple(name for name in survey.names if name not in index)
-    return MarkedLandmarks(landmarks, unmarked, tuple(name for name in marks.names if name not in common))
+    return MarkedLandmarks(landmarks, unmarked, tuple(name for name in names if name not in common))
 
 
 def read_features(path: str | Path, pixel_sigma: float) -> Features:
