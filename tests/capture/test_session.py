@@ -119,8 +119,7 @@ def test_of_a_stream_the_newest_frame_is_looked_at(monkeypatch: pytest.MonkeyPat
     going.wait(5)
     rest: list[str] = []
     with pytest.raises(FileError, match="the stream ended"):
-        for shot in found:
-            rest.append(shot.name)
+        rest.extend(shot.name for shot in found)
     assert first.moving
     # What came in between is gone, the order is kept.
     assert 0 < len(rest) < 4
