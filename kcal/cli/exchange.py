@@ -216,11 +216,9 @@ def _import_corners(
 
 
 def _import_survey(sources: list[Path], output: Path, sigma: float | None, geoid: float | None) -> None:
-    import csv
-    import io
-
     from kcal.files import write_atomic
     from kcal.locate.geodesy import enu_to_geodetic
+    from kcal.locate.survey import EARTH, survey_text
     from kcal.locate.survey_files import import_survey
 
     if len(sources) != 1:
@@ -228,11 +226,10 @@ def _import_survey(sources: list[Path], output: Path, sigma: float | None, geoid
     survey = import_survey(sources[0], sigma=sigma, geoid=geoid)
     assert survey.origin is not None
     places = enu_to_geodetic(survey.points, survey.origin).tolist()
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["name", "lat", "lon", "height", "sigma", "sigma_up"])
-    for name, (lat, lon, height), (level, _, up) in zip(survey.names, places, survey.sigma.tolist(), strict=True):
-        writer.writerow([name, f"{lat:.11f}", f"{lon:.11f}", f"{height:.5f}", repr(level), repr(up)])
-    write_atomic(output, text.getvalue())
+    rows = (
+        [name, f"{lat:.11f}", f"{lon:.11f}", f"{height:.5f}", level, up]
+        for name, (lat, lon, height), (level, _, up) in zip(survey.names, places, survey.sigma.tolist(), strict=True)
+    )
+    write_atomic(output, survey_text(EARTH, rows))
     out.print(f"{len(places)} places")
     print_wrote(output)

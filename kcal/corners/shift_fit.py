@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.corners.filters import gaussian_kernel
+from kcal.corners.filters import correlated, gaussian_kernel
 from kcal.corners.patch_windows import IMAGE_BLUR, ImageWindows, grid_of, sample
 
 _MOST_STEPS = 25
@@ -82,8 +82,7 @@ def _biweight(residual: Tensor, scale: Tensor, patches: _Patches) -> Tensor:
     squares = residual.square().reshape(patches.template.shape)[:, None]
     reach = len(kernel) // 2
     padded = torch.nn.functional.pad(squares, (reach,) * 4, mode="replicate")
-    mean = torch.nn.functional.conv2d(padded, kernel.reshape(1, 1, 1, -1))
-    mean = torch.nn.functional.conv2d(mean, kernel.reshape(1, 1, -1, 1)).reshape(residual.shape)
+    mean = correlated(padded, kernel, kernel).reshape(residual.shape)
     return (1.0 - mean / (_BIWEIGHT * scale[:, None]).square()).clamp_min(0.0).square()
 
 
@@ -225,18 +224,15 @@ def _covariance(
     freedom = (1.0 - theta.shape[1] / (total * share_of_noise)).clamp_min(0.2)
     noise = (robust * residual.square()).sum(1) / total / (share_of_noise * freedom)
     force = (robust[..., None] * across).mT.reshape(-1, 1, height, width)
-    beyond = 2 * (len(kernel) // 2)
-    spread = torch.nn.functional.conv2d(force, kernel.reshape(1, 1, 1, -1), padding=(0, beyond))
-    spread = torch.nn.functional.conv2d(spread, kernel.reshape(1, 1, -1, 1), padding=(beyond, 0)).reshape(count, 2, -1)
+    spread = correlated(force, kernel, kernel, zeros=2 * (len(kernel) // 2)).reshape(count, 2, -1)
     middle = noise[:, None, None] * (spread @ spread.mT)
     # Residuals of another texture than noise, such as the background's, are correlated farther: then what they add up
     # to counts (W. Newey and K. West 1987).
     pull = (robust * residual)[..., None] * across
     pull = pull.mT.reshape(-1, 1, height, width)
     reach = _TRIANGLE.to(template)
-    wider = torch.nn.functional.conv2d(pull, reach.reshape(1, 1, 1, -1), padding=(0, len(reach) // 2))
-    wider = torch.nn.functional.conv2d(wider, reach.reshape(1, 1, -1, 1), padding=(len(reach) // 2, 0))
-    found = pull.reshape(count, 2, -1) @ wider.reshape(count, 2, -1).mT / freedom[:, None, None]
+    wider = correlated(pull, reach, reach, zeros=len(reach) // 2).reshape(count, 2, -1)
+    found = pull.reshape(count, 2, -1) @ wider.mT / freedom[:, None, None]
     excess = torch.linalg.solve_ex(middle, found)[0].diagonal(dim1=-2, dim2=-1).mean(-1).clamp_min(1.0)
     return excess[:, None, None] * inverse @ middle @ inverse, sound
 

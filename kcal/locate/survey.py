@@ -7,7 +7,7 @@ above the WGS84 ellipsoid. Local meters are east, north, up of the same origin.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,7 +19,8 @@ from kcal.errors import FileError, InputError
 from kcal.lens.mounting import Origin
 from kcal.locate.geodesy import geodetic_to_enu
 from kcal.locate.marks import PIXELS, Marks, pixel_of
-from kcal.locate.tables import TableRow, read_rows
+from kcal.locate.tables import TableRow, guarded, read_rows
+from kcal.texts import csv_line
 
 EARTH, LOCAL = ("lat", "lon", "height"), ("east", "north", "up")
 FEATURE_COLUMNS = ("name", *PIXELS, "range", "range_sigma", "beyond", "note")
@@ -71,6 +72,12 @@ def read_survey(path: str | Path, origin: Origin | None = None, *, measured: boo
     values, origin = places_of(rows, path, origin)
     sigma = [place_sigma(row, "place") if measured or row.cells.get("sigma") else (0.0, 0.0, 0.0) for row in rows]
     return Survey(tuple(row.name for row in rows), values, torch.tensor(sigma, dtype=torch.float64), origin)
+
+
+def survey_text(columns: Sequence[str], places: Iterable[Sequence[str | float | None]]) -> str:
+    """Places as CSV that `read_survey` reads: each its name, three coordinates in `columns`, sigma and sigma_up."""
+    lines = [csv_line([guarded(str(name)), *numbers]) for name, *numbers in places]
+    return csv_line(["name", *columns, "sigma", "sigma_up"]) + "".join(lines)
 
 
 def places_of(rows: Sequence[TableRow], path: str | Path, origin: Origin | None) -> tuple[Tensor, Origin | None]:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from kcal.calibrate.rig.result import ItemResidual, RigResult
 from kcal.lens.camera import Camera
+from kcal.locate.tabulate import middle_row_ends
 from kcal.quantities import length_text, measured_length, range_text
 from kcal.report.colors import CAMERA_COLORS, FAINT, WARN
 from kcal.report.figures import HALO, draw_north, field_outline, new_figure, save_picture, wrapped
@@ -181,12 +182,11 @@ def _draw_plan(axes: Axes, result: RigResult) -> None:
 
 def _edges(result: RigResult, c: int, camera: Camera) -> tuple[float, float] | None:
     """Azimuths on the plan of the left and right ends of the image's middle row; None without rays there."""
-    width, height = camera.size
-    ends = torch.tensor([[-0.5, 0.5 * height], [width - 0.5, 0.5 * height]], dtype=torch.float64)
-    with torch.no_grad():
-        rays, valid = camera.unproject(ends)
+    rays = middle_row_ends(camera)
+    if rays is None:
+        return None
     flat = _flat(result, (rays @ result.rotation[c]).numpy())
-    if not bool(valid.all()) or float(np.linalg.norm(flat, axis=-1).min()) < 1e-6:
+    if float(np.linalg.norm(flat, axis=-1).min()) < 1e-6:
         return None
     return float(np.arctan2(*flat[0])), float(np.arctan2(*flat[1]))
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from kcal.locate.geodesy import geodetic_to_enu
 from kcal.locate.siting import Area, RankedSite, Site, SitingMap, siting_map
+from kcal.locate.tabulate import middle_row_ends
 from kcal.quantities import length_text
 from kcal.report.figures import HALO, new_figure, round_levels, save_picture
 
@@ -180,10 +181,8 @@ def _site_field(axes: Axes, area: Area, site: Site) -> tuple[float, float]:
         half = 0.5 * site.field_deg
         if site.camera is not None:
             # The angle between its rays through the left and right ends of the middle row.
-            width, height = site.camera.size
-            ends = torch.tensor([[-0.5, 0.5 * height], [width - 0.5, 0.5 * height]], dtype=torch.float64)
-            rays, valid = site.camera.unproject(ends)
-            if not bool(valid.all()):
+            rays = middle_row_ends(site.camera)
+            if rays is None:
                 return x, y
             half = math.degrees(0.5 * math.acos(max(-1.0, min(1.0, float(rays[0] @ rays[1])))))
         turn = np.radians(np.linspace(site.heading_deg - half, site.heading_deg + half, 40))
