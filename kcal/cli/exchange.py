@@ -218,7 +218,7 @@ def _import_corners(
 def _import_survey(sources: list[Path], output: Path, sigma: float | None, geoid: float | None) -> None:
     from kcal.files import write_atomic
     from kcal.locate.geodesy import enu_to_geodetic
-    from kcal.locate.survey import EARTH, survey_text
+    from kcal.locate.survey import EARTH, places_csv
     from kcal.locate.survey_files import import_survey
 
     if len(sources) != 1:
@@ -230,6 +230,6 @@ def _import_survey(sources: list[Path], output: Path, sigma: float | None, geoid
         [name, f"{lat:.11f}", f"{lon:.11f}", f"{height:.5f}", level, up]
         for name, (lat, lon, height), (level, _, up) in zip(survey.names, places, survey.sigma.tolist(), strict=True)
     )
-    write_atomic(output, survey_text(EARTH, rows))
+    write_atomic(output, places_csv(EARTH, rows))
     out.print(f"{len(places)} places")
     print_wrote(output)

@@ -74,7 +74,7 @@ def read_survey(path: str | Path, origin: Origin | None = None, *, measured: boo
     return Survey(tuple(row.name for row in rows), values, torch.tensor(sigma, dtype=torch.float64), origin)
 
 
-def survey_text(columns: Sequence[str], places: Iterable[Sequence[str | float | None]]) -> str:
+def places_csv(columns: Sequence[str], places: Iterable[Sequence[str | float | None]]) -> str:
     """Places as CSV that `read_survey` reads: each its name, three coordinates in `columns`, sigma and sigma_up."""
     lines = [csv_line([guarded(str(name)), *numbers]) for name, *numbers in places]
     return csv_line(["name", *columns, "sigma", "sigma_up"]) + "".join(lines)

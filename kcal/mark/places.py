@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from kcal.errors import FileError
-from kcal.locate.survey import EARTH, LOCAL, PLACE_COLUMNS, read_survey, survey_text
+from kcal.locate.survey import EARTH, LOCAL, PLACE_COLUMNS, places_csv, read_survey
 from kcal.locate.tables import read_rows
 from kcal.mark.items import Place
 
@@ -44,6 +44,6 @@ def read_places(path: Path) -> SurveyedPlaces:
 
 def places_text(survey: SurveyedPlaces) -> str:
     """The places as CSV that `read_survey` reads."""
-    return survey_text(
+    return places_csv(
         survey.columns, ([name, *place.at, place.sigma, place.sigma_up] for name, place in survey.places.items())
     )
