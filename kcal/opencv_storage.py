@@ -22,7 +22,7 @@ from kcal.strict_yaml import MOST_BYTES as MOST_YAML
 MOST_DEPTH = 16
 # Of a matrix: a thousand views of a large board have ten million.
 MOST_NUMBERS = 20_000_000
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+_NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")
 _SPECIAL = {".nan": math.nan, ".inf": math.inf, "-.inf": -math.inf, "+.inf": math.inf}
 # Long lists of numbers outside texts: the parser of YAML would take seconds for them.
 _LONG_LIST = re.compile(r""""(?:[^"\\]|\\.)*+"|'[^']*+'|#.*|(?:!\S+\s+)?\[(?P<numbers>[-+.,\d\seEnaifNAIF]{200,})\]""")
