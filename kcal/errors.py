@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class KcalError(Exception):
     """Base of every error that kcal raises on purpose."""
@@ -17,3 +20,19 @@ class FileError(KcalError):
 
 class DegenerateError(KcalError):
     """Data that do not determine the answer: too few views, parallel boards, an unstable focal length."""
+
+
+@contextmanager
+def with_extra(name: str, what: str, instead: str = "") -> Iterator[None]:
+    """Import inside what an extra of kcal installs; without it, an `InputError` says how to.
+
+    Example:
+        >>> with with_extra("video", "videos need"):
+        ...     import no_such_library
+        Traceback (most recent call last):
+        kcal.errors.InputError: videos need no_such_library; install it with: pip install 'kcal[video]'
+    """
+    try:
+        yield
+    except ImportError as error:
+        raise InputError(f"{what} {error.name}; install it with: pip install 'kcal[{name}]'{instead}") from error

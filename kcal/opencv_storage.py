@@ -12,19 +12,20 @@ from typing import Any
 from xml.etree.ElementTree import Element
 
 import numpy as np
+import yaml
 
 from kcal.errors import FileError
 from kcal.strict_json import read_json
 from kcal.strict_xml import read_xml
+from kcal.strict_yaml import MOST_BYTES as MOST_YAML
 
 MOST_DEPTH = 16
 # Of a matrix: a thousand views of a large board have ten million.
 MOST_NUMBERS = 20_000_000
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+_NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")
 _SPECIAL = {".nan": math.nan, ".inf": math.inf, "-.inf": -math.inf, "+.inf": math.inf}
-_KEY = re.compile(r'("(?:[^"\\]|\\.)*"|[A-Za-z_][^:#"\'\[\]{}]*?)\s*:(?=\s|$)')
-_TAG = re.compile(r"!\S*\s*")
-_TOKEN = re.compile(r"""\s*(?:([\[\]{},:])|("(?:[^"\\]|\\.)*"|'(?:[^']|'')*')|([^\s\[\]{},:"'][^\[\]{},:"']*))""")
+# Long lists of numbers outside texts: the parser of YAML would take seconds for them.
+_LONG_LIST = re.compile(r""""(?:[^"\\]|\\.)*+"|'[^']*+'|#.*|(?:!\S+\s+)?\[(?P<numbers>[-+.,\d\seEnaifNAIF]{200,})\]""")
 _ESCAPES = {"n": "\n", "t": "\t", "r": "\r"}
 
 
@@ -130,147 +131,54 @@ def _add(found: dict[str, Any], key: str, value: Any) -> None:
 
 
 def _from_yaml(text: str) -> Any:
-    lines = []
-    for number, line in enumerate(text.splitlines(), 1):
-        bare = line.strip()
-        if bare and not bare.startswith(("#", "%")) and bare not in ("---", "..."):
-            lines.append((number, len(line) - len(line.lstrip(" ")), bare))
-    if not lines:
+    lists: list[list[Any]] = []
+
+    def put_away(match: re.Match[str]) -> str:
+        cells = match["numbers"] and match["numbers"].split(",")
+        if not cells or not all(cell.strip() for cell in cells):
+            return match[0]
+        lists.append([_scalar(cell) for cell in cells])
+        # As many lines as before, so that messages name the right one.
+        return f"!numbers {len(lists) - 1}" + "\n" * match[0].count("\n")
+
+    # The first line is no directive of YAML 1.1, and tabs are not its white space.
+    plain = _LONG_LIST.sub(put_away, re.sub(r"^%.*", "", text, flags=re.MULTILINE).expandtabs())
+    if len(plain) > MOST_YAML:
+        raise ValueError(f"more than {MOST_YAML // 2**20} MiB besides lists of numbers")
+    try:
+        root = yaml.compose(plain, _Nodes)
+    except yaml.YAMLError as error:
+        raise ValueError(" ".join(str(error).split())[:300]) from error
+    if root is None:
         raise ValueError("it is empty")
-    reader = _YamlLines(lines)
-    found = reader.block(lines[0][1], 1)
-    if reader.at < len(lines):
-        raise reader.wrong("it does not belong to what stands above")
-    return found
+    return _of_node(root, lists)
 
 
-class _YamlLines:
-    """Lines with their numbers and indentation, read from the top down."""
+class _Nodes(yaml.BaseLoader):
+    """Composes nodes that are not nested too deeply, and none twice."""
 
-    def __init__(self, lines: list[tuple[int, int, str]]) -> None:
-        self.lines, self.at = lines, 0
+    depth = 0
 
-    def wrong(self, what: str) -> ValueError:
-        number, _, text = self.lines[min(self.at, len(self.lines) - 1)]
-        return ValueError(f"line {number}: {what}: {text[:40]!r}")
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """Called for each node."""
+        if self.check_event(yaml.AliasEvent):
+            raise ValueError("a reference to another part (*name); OpenCV writes none")
+        self.depth += 1
+        if self.depth > MOST_DEPTH + 1:
+            raise ValueError(f"nested deeper than {MOST_DEPTH} levels")
+        node = super().compose_node(parent, index)
+        self.depth -= 1
+        return node
 
-    def indent(self) -> int:
-        """Of the next line; -1 at the end."""
-        return self.lines[self.at][1] if self.at < len(self.lines) else -1
 
-    def starts_item(self) -> bool:
-        return self.at < len(self.lines) and re.match(r"-(\s|$)", self.lines[self.at][2]) is not None
-
-    def block(self, indent: int, depth: int) -> Any:
-        """A map or a sequence whose lines begin at this column."""
-        if depth > MOST_DEPTH:
-            raise self.wrong(f"nested deeper than {MOST_DEPTH} levels")
-        if self.starts_item():
-            items = []
-            while self.indent() == indent and self.starts_item():
-                items.append(self.value(self.lines[self.at][2][1:].strip(), indent, depth, True))
-            return items
+def _of_node(node: yaml.Node, lists: list[list[Any]]) -> Any:
+    if isinstance(node, yaml.SequenceNode):
+        return [_of_node(item, lists) for item in node.value]
+    if isinstance(node, yaml.MappingNode):
         found: dict[str, Any] = {}
-        while self.indent() == indent and not self.starts_item():
-            text = self.lines[self.at][2]
-            key = _KEY.match(text)
-            if key is None:
-                raise self.wrong("a name and a colon are needed")
-            name = str(_scalar(key[1])) if key[1].startswith('"') else key[1].strip()
-            _add(found, name, self.value(text[key.end() :].strip(), indent, depth, False))
+        for key, value in node.value:
+            _add(found, str(key.value), _of_node(value, lists))
         return _stored_matrix(found)
-
-    def value(self, rest: str, indent: int, depth: int, item: bool) -> Any:
-        """What stands behind a name or a dash, and on the lines below."""
-        if rest.startswith("!"):
-            rest = _TAG.sub("", rest, count=1)
-        if rest and rest[0] not in "[{\"'" and item and _KEY.match(rest):
-            # A map that begins behind the dash.
-            number, _, text = self.lines[self.at]
-            inner = indent + len(text) - len(text[1:].lstrip())
-            self.lines[self.at] = (number, inner, rest)
-            return self.block(inner, depth + 1)
-        if not rest or rest.startswith("#"):
-            self.at += 1
-            inner = self.indent()
-            if inner > indent or (inner == indent and not item and self.starts_item()):
-                return self.block(inner, depth + 1)
-            return ""
-        if rest[0] in "[{":
-            return self.flow(rest, depth)
-        self.at += 1
-        return _scalar(rest if rest[0] in "\"'" else rest.split(" #")[0])
-
-    def flow(self, rest: str, depth: int) -> Any:
-        """A sequence or map in brackets, which may go on over lines."""
-        begin, parts = self.at, [rest]
-        # Brackets in texts end it too late at worst, and are then found to be missing.
-        balance = _open_brackets(rest)
-        while balance > 0 and self.at + 1 < len(self.lines):
-            self.at += 1
-            parts.append(self.lines[self.at][2])
-            balance += _open_brackets(parts[-1])
-        text = " ".join(parts)
-        self.at += 1
-        if text[0] == "[" and text[-1] == "]" and not any(sign in text[1:-1] for sign in "[]{}\"'#:"):
-            # A long list of numbers, without tokens.
-            cells = text[1:-1].split(",")
-            if all(cell.strip() for cell in cells):
-                return [_scalar(cell) for cell in cells]
-        tokens = _tokens(text)
-        value, end = _flow(tokens, 0, depth + 1)
-        if end != len(tokens):
-            self.at = begin
-            raise self.wrong("more than one value")
-        return value
-
-
-def _open_brackets(text: str) -> int:
-    bare = re.sub(r"\"(?:[^\"\\]|\\.)*\"|'[^']*'", "", text)
-    return bare.count("[") + bare.count("{") - bare.count("]") - bare.count("}")
-
-
-def _tokens(text: str) -> list[str]:
-    """Brackets, commas, colons, quoted and bare texts; a bare text is never one of the signs alone."""
-    found, place, text = [], 0, text.rstrip()
-    while place < len(text):
-        match = _TOKEN.match(text, place)
-        if match is None:
-            raise ValueError(f"not understood: {text[place : place + 40]!r}")
-        place = match.end()
-        found.append(match[0].strip())
-    return found
-
-
-def _flow(tokens: list[str], at: int, depth: int) -> tuple[Any, int]:
-    """The value that begins at a token, and the number of the token after it."""
-    if depth > MOST_DEPTH:
-        raise ValueError(f"nested deeper than {MOST_DEPTH} levels")
-    opening = _at(tokens, at)
-    if opening not in ("[", "{"):
-        if opening in ("]", "}", ",", ":"):
-            raise ValueError(f"{opening!r} where a value belongs")
-        return _scalar(opening), at + 1
-    closing, items, found = {"[": "]", "{": "}"}[opening], [], dict[str, Any]()
-    at += 1
-    while _at(tokens, at) != closing:
-        if opening == "{":
-            name = _scalar(_at(tokens, at))
-            if _at(tokens, at + 1) != ":":
-                raise ValueError(f"{str(name)[:40]!r} has no colon")
-            value, at = _flow(tokens, at + 2, depth + 1)
-            _add(found, str(name), value)
-        else:
-            value, at = _flow(tokens, at, depth + 1)
-            items.append(value)
-        if _at(tokens, at) == ",":
-            at += 1
-        elif _at(tokens, at) != closing:
-            raise ValueError(f"{closing!r} or a comma is missing before {_at(tokens, at)[:40]!r}")
-    return (items if opening == "[" else _stored_matrix(found)), at + 1
-
-
-def _at(tokens: list[str], at: int) -> str:
-    if at >= len(tokens):
-        raise ValueError("a bracket is not closed")
-    return tokens[at]
+    if node.tag == "!numbers":
+        return lists[int(node.value)]
+    return _scalar(node.value) if node.style is None else node.value

@@ -14,10 +14,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from kcal.corners.images import read_gray
+from kcal.corners.images import decode_image, read_gray
 from kcal.errors import FileError
 from kcal.image_header import _FORMATS, check_image_header
-from kcal.io.images import decode_image
 
 LEVELS = np.random.default_rng(0).integers(0, 255, (37, 53), np.uint8)
 

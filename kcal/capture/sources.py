@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
-import queue
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 from kcal.corners.images import IMAGE_SUFFIXES, Gray, decode_gray
-from kcal.corners.video import Frame, read_frames, sharpest
+from kcal.corners.video import read_frames, sharpest
 from kcal.errors import FileError
 from kcal.files import read_bytes
+from kcal.pipeline.handover import Handover
 from kcal.sources import is_stream, source_name
 
 # Seconds between two looks into a folder.
@@ -48,10 +46,16 @@ def shots(source: str, stopped: Callable[[], bool], tell: Callable[[str], None])
     name = source_name(source)
     # A live source ends when it is told to.
     frames = sharpest(read_frames(source, float("inf")))
-    for frame in newest(frames) if is_stream(source) else frames:
-        if stopped():
-            return
-        yield Shot(f"{name}#{frame.number:06d}", frame.image, True)
+    # Of a stream, frames that come while one is looked at are left out.
+    newest = Handover(frames, 1, waits=False) if is_stream(source) else None
+    try:
+        for frame in newest or frames:
+            if stopped():
+                return
+            yield Shot(f"{name}#{frame.number:06d}", frame.image, True)
+    finally:
+        if newest is not None:
+            newest.close(wait=5.0)
 
 
 def _of_folder(folder: Path, stopped: Callable[[], bool], tell: Callable[[str], None]) -> Iterator[Shot]:
@@ -77,39 +81,3 @@ def _of_folder(folder: Path, stopped: Callable[[], bool], tell: Callable[[str], 
         sizes = found
         if not ready:
             time.sleep(_LOOK)
-
-
-def newest(frames: Iterator[Frame]) -> Iterator[Frame]:
-    """Frames of a live source, leaving out those that came while the one before was looked at."""
-    slot: queue.Queue[Frame | Exception | None] = queue.Queue(maxsize=1)
-    ended = threading.Event()
-
-    def put(item: Frame | Exception | None) -> None:
-        while not ended.is_set():
-            try:
-                slot.put(item, timeout=0.1)
-                return
-            except queue.Full:
-                with contextlib.suppress(queue.Empty):
-                    slot.get_nowait()
-
-    def read() -> None:
-        try:
-            for frame in frames:
-                if ended.is_set():
-                    return
-                put(frame)
-            put(None)
-        except Exception as error:  # of the source: raised where the frames are used
-            put(error)
-
-    reader = threading.Thread(target=read, daemon=True)
-    reader.start()
-    try:
-        while (item := slot.get()) is not None:
-            if isinstance(item, Exception):
-                raise item
-            yield item
-    finally:
-        ended.set()
-        reader.join(timeout=5)

@@ -11,6 +11,7 @@ from rich.markup import escape
 
 from kcal.cli.calibrate_result import calibration_numbers, print_calibration
 from kcal.cli.calibrate_stars import by_night, joined_by_stars
+from kcal.cli.commands import rarely
 from kcal.cli.console import out, print_wrote, steps, tell, warn
 from kcal.cli.cures import ending_with, views_cure, with_command
 from kcal.cli.inputs import BOARD, CAMERA, OBSERVATIONS, check_file
@@ -40,12 +41,8 @@ def calibrate_command(
         list[str] | None,
         typer.Option(metavar="IMAGES", help="Night images: the lens at infinity, by stars, alone or with boards."),
     ] = None,
-    star_time: Annotated[
-        str | None, typer.Option("--time", metavar="TIME", help=f"Of --stars. {TIME_HELP}", hidden=True)
-    ] = None,
-    star_place: Annotated[
-        str | None, typer.Option("--place", metavar="LAT,LON,HEIGHT", help="Of --stars, for refraction.", hidden=True)
-    ] = None,
+    star_time: Annotated[str | None, rarely("TIME", f"Of --stars. {TIME_HELP}", "--time")] = None,
+    star_place: Annotated[str | None, rarely("LAT,LON,HEIGHT", "Of --stars, for refraction.", "--place")] = None,
     picture: Annotated[
         Path | None,
         typer.Option(
@@ -53,7 +50,7 @@ def calibrate_command(
             "cameras, NAME.png in this folder."
         ),
     ] = None,
-    verbose: Annotated[bool, typer.Option("--verbose", help="Print every parameter with its σ.", hidden=True)] = False,
+    verbose: Annotated[bool, rarely("", "Print every parameter with its σ.", "--verbose")] = False,
     board: Annotated[
         str,
         typer.Option(
@@ -70,13 +67,9 @@ def calibrate_command(
     reject: Annotated[
         bool, typer.Option("--reject", help="Leave out and list corners and views that noise cannot explain.")
     ] = False,
-    reject_limit: Annotated[
-        float,
-        typer.Option(metavar="SHARE", help="Largest share of all corners that --reject may leave out.", hidden=True),
-    ] = 0.1,
+    reject_limit: Annotated[float, rarely("SHARE", "Largest share of all corners that --reject may leave out.")] = 0.1,
     temperature: Annotated[
-        float | None,
-        typer.Option(metavar="°C", help="Of the camera when the views were taken; kept in its file.", hidden=True),
+        float | None, rarely("°C", "Of the camera when the views were taken; kept in its file.")
     ] = None,
     setting: Annotated[
         list[str] | None,
@@ -86,9 +79,7 @@ def calibrate_command(
             "one number for all, or focus=1,2.5,4 for each.",
         ),
     ] = None,
-    name: Annotated[
-        str, typer.Option(help="Name of the camera; the name of the observations file if not given.", hidden=True)
-    ] = "",
+    name: Annotated[str, rarely("", "Name of the camera; the name of the observations file if not given.")] = "",
     model: Annotated[
         str,
         typer.Option(
@@ -108,103 +99,60 @@ def calibrate_command(
             rich_help_panel=_USE,
         ),
     ] = None,
-    baseline: Annotated[
-        float,
-        typer.Option(
-            metavar="M", help="Distance to a second camera like this one.", min=1e-3, rich_help_panel=_USE, hidden=True
-        ),
-    ] = 10.0,
+    baseline: Annotated[float, rarely("M", "Distance to a second camera like this one.", min=1e-3, panel=_USE)] = 10.0,
     pixel_sigma: PixelSigma = None,
     focal: Annotated[
-        float | None,
-        typer.Option(
-            metavar="PX", help="Rough focal length to start from, in pixels; estimated if not given.", hidden=True
-        ),
+        float | None, rarely("PX", "Rough focal length to start from, in pixels; estimated if not given.")
     ] = None,
     fov: Annotated[
         float | None,
-        typer.Option(
-            metavar="DEG",
-            help="Rough horizontal field of view to start from, instead of --focal; a fisheye may have 180 and more.",
-            hidden=True,
+        rarely(
+            "DEG", "Rough horizontal field of view to start from, instead of --focal; a fisheye may have 180 and more."
         ),
     ] = None,
     board_warp: Annotated[
-        bool,
-        typer.Option(
-            "--board-warp", help="Parametric: estimate how the board bends.", rich_help_panel=_PARAMETRIC, hidden=True
-        ),
+        bool, rarely("", "Parametric: estimate how the board bends.", "--board-warp", panel=_PARAMETRIC)
     ] = False,
     fix: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME[=VALUE]",
-            help="Hold a parameter at a value; without one, cx and cy at the image center, all others at 0.",
-            rich_help_panel=_PARAMETRIC,
-            hidden=True,
+        rarely(
+            "NAME[=VALUE]",
+            "Hold a parameter at a value; without one, cx and cy at the image center, all others at 0.",
+            panel=_PARAMETRIC,
         ),
     ] = None,
     tie: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=NAME",
-            help="Keep parameters equal, for example fx=fy.",
-            rich_help_panel=_PARAMETRIC,
-            hidden=True,
-        ),
+        list[str] | None, rarely("NAME=NAME", "Keep parameters equal, for example fx=fy.", panel=_PARAMETRIC)
     ] = None,
     free: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME",
-            help="Estimate a parameter that is held by default, as skew.",
-            rich_help_panel=_PARAMETRIC,
-            hidden=True,
-        ),
+        list[str] | None, rarely("NAME", "Estimate a parameter that is held by default, as skew.", panel=_PARAMETRIC)
     ] = None,
     prior: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME=VALUE±SIGMA",
-            help="Gaussian prior of a parameter; +- may be typed for ±.",
-            rich_help_panel=_PARAMETRIC,
-            hidden=True,
-        ),
+        rarely("NAME=VALUE±SIGMA", "Gaussian prior of a parameter; +- may be typed for ±.", panel=_PARAMETRIC),
     ] = None,
     weak_prior: Annotated[
         float,
-        typer.Option(
-            metavar="SHARE",
+        rarely(
+            "SHARE",
+            "How far a rich lens is expected to be from a pinhole; 0: no such prior, as in OpenCV.",
             min=0.0,
-            help="How far a rich lens is expected to be from a pinhole; 0: no such prior, as in OpenCV.",
-            rich_help_panel=_PARAMETRIC,
-            hidden=True,
+            panel=_PARAMETRIC,
         ),
     ] = 0.3,
     camera: Annotated[
         Path | None,
-        typer.Option(
-            help="Camera file with known parameters; only board poses and what --free names are estimated.",
-            rich_help_panel=_PARAMETRIC,
-            hidden=True,
+        rarely(
+            "",
+            "Camera file with known parameters; only board poses and what --free names are estimated.",
+            panel=_PARAMETRIC,
         ),
         CAMERA,
     ] = None,
     loss: Annotated[
-        str | None,
-        typer.Option(
-            metavar="KIND",
-            help="Robust loss against wrong corners: huber, cauchy or tukey.",
-            rich_help_panel=_PARAMETRIC,
-            hidden=True,
-        ),
+        str | None, rarely("KIND", "Robust loss against wrong corners: huber, cauchy or tukey.", panel=_PARAMETRIC)
     ] = None,
-    loss_scale: Annotated[
-        float,
-        typer.Option(
-            metavar="PX", help="Residual at which the robust loss sets in.", rich_help_panel=_PARAMETRIC, hidden=True
-        ),
-    ] = 1.0,
+    loss_scale: Annotated[float, rarely("PX", "Residual at which the robust loss sets in.", panel=_PARAMETRIC)] = 1.0,
 ) -> None:
     """Calibrate a camera, or several: intrinsics, lens and error bars.
 

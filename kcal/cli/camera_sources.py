@@ -11,6 +11,7 @@ from kcal.file_kind import file_kind
 if TYPE_CHECKING:
     from kcal.io.foreign import ImportedCameras
     from kcal.lens.camera import Camera
+    from kcal.lens.rig import StereoRig
 
 
 def named_source(source: str) -> tuple[Path, str | None]:
@@ -36,6 +37,19 @@ def picked(found: ImportedCameras, name: str | None, source: str) -> Camera:
         wrong = f"no camera {name!r}" if name else f"{len(names)} cameras"
         raise InputError(f"{source}: {wrong}; name one of {', '.join(map(repr, names))}")
     return found.cameras[names.index(name)]
+
+
+def cameras_and_rig(path: Path) -> tuple[ImportedCameras, StereoRig | None]:
+    """The cameras of a file of any program, and the rig that they are, if they are one."""
+    from kcal.io.formats import import_cameras, recognized
+    from kcal.io.rig_file import load_rig
+
+    found = import_cameras(path)
+    if len(found.cameras) == 1:
+        return found, None
+    if recognized(path) == "kcal":
+        return found, load_rig(path)
+    return found, found.rig() if found.is_rig() else None
 
 
 def single_camera(source: str) -> Camera:

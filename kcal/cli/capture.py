@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from kcal.cli.board_options import BoardSize, Refine, RefineMethod, SquareSide
-from kcal.cli.console import err, out
-from kcal.errors import InputError, KcalError
+from kcal.cli.console import err, out, show_page
+from kcal.errors import InputError, KcalError, with_extra
 from kcal.files import check_writable
 
 if TYPE_CHECKING:
@@ -83,21 +83,13 @@ def capture_command(
     threads = [threading.Thread(target=watch), threading.Thread(target=follow, args=(session,), kwargs={"until": over})]
     server = None
     if page:
-        try:
+        with with_extra("mark", "the page needs", ", or give --no-page"):
             from kcal.capture.server import capture_app
             from kcal.web.serving import LocalServer
-        except ImportError as error:
-            raise InputError(
-                f"the page needs {error.name}; install it with: pip install 'kcal[mark]', or give --no-page"
-            ) from error
         server = LocalServer(
             lambda token, hosts: capture_app(session, stop, token, hosts), port, fallback=port == _PORT
         )
-        out.print(f"capture page: {server.address}", markup=False, soft_wrap=True)
-        if browser:
-            import webbrowser
-
-            webbrowser.open(server.address)
+        show_page(server.address, "capture page", browser=browser)
     for thread in threads:
         thread.start()
     try:

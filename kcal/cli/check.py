@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kcal.cli.console import err, out, print_table, print_wrote, steps, tell, warn
+from kcal.cli.console import err, out, print_answer, print_table, print_wrote, steps, tell, warn
 from kcal.cli.inputs import CALIBRATED, OBSERVATIONS
 from kcal.cli.report import NO
 from kcal.cli.sides import check_views_of
@@ -239,8 +239,7 @@ def _told_refits(found: IntervalCheck, count: int) -> bool:
             f"the stated 95 % intervals are too narrow: they contain {share:.0f} % of {count} refits, {where}; "
             f"multiply σ by {found.factors[worst]:.2f}, or take more views"
         )
-    out.print(f"[bold]{'YES' if found.true else 'NO'}[/]:", end=" ")
-    out.print(text, markup=False)
+    print_answer(found.true, text)
     tell(
         true=found.true,
         refits=count,
@@ -259,11 +258,10 @@ def _told_views(result: CameraCalibrationResult, options: CalibrationOptions) ->
 
     with steps("examining the views", None) as advance:
         fault = fault_of_views(result, options, advance)
-    out.print(f"[bold]{'YES' if fault is None else 'NO'}[/]:", end=" ")
     if fault is None:
-        out.print("its own views say nothing against lens model and board", markup=False)
+        print_answer(True, "its own views say nothing against lens model and board")
     else:
-        out.print(f"its own views contradict the stated intervals: {fault.text}; {fault.action}", markup=False)
+        print_answer(False, f"its own views contradict the stated intervals: {fault.text}; {fault.action}")
     tell(fault=None if fault is None else fault.text)
     return fault is None
 
@@ -288,8 +286,7 @@ def _told_against(
     same = all(bool(one.same) for one in found)
     verdict = "agrees with" if same else "contradicts"
     more = "" if same else ": a lens or board that the model does not describe, or a camera that changed"
-    out.print(f"[bold]{'YES' if same else 'NO'}[/]:", end=" ")
-    out.print(f"the second capture {verdict} the stated intervals{more}", markup=False)
+    print_answer(same, f"the second capture {verdict} the stated intervals{more}")
     tell(
         against={"same": same, "ratios": [one.ratio for one in found], "probabilities": [o.probability for o in found]}
     )

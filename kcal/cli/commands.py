@@ -4,14 +4,20 @@ from __future__ import annotations
 
 from typing import Any
 
+import typer
 from typer.core import TyperCommand
 
 from kcal.cli.console import err
 from kcal.cli.settings import settings_text, taken
 
 
+def rarely(metavar: str, about: str, *flags: str, panel: str | None = None, **more: Any) -> Any:
+    """An option that few people need: `--help-all` shows it."""
+    return typer.Option(*flags, metavar=metavar or None, help=about, hidden=True, rich_help_panel=panel, **more)
+
+
 class Command(TyperCommand):
-    """A command whose `hidden` options are shown by `--help-all`, and that says what it took from kcal.toml."""
+    """A command whose rare options are shown by `--help-all`, and that says what it took from kcal.toml."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import gc
 import inspect
+import signal
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -105,6 +106,32 @@ def print_table(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> 
         aligned = [cell.ljust(w) if i in left else cell.rjust(w) for i, (cell, w) in enumerate(cells)]
         lines.append("  ".join(aligned).rstrip())
     out.print("\n".join(lines), markup=False)
+
+
+def print_answer(yes: bool, text: str) -> None:
+    """Print a yes or no, and why."""
+    out.print(f"[bold]{'YES' if yes else 'NO'}[/]:", end=" ")
+    out.print(text, markup=False)
+
+
+def show_page(address: str, what: str, *, browser: bool) -> None:
+    """Print the address of a local page, and open it in the browser if that is wanted."""
+    out.print(f"{what}: {address}", markup=False, soft_wrap=True)
+    if browser:
+        import webbrowser
+
+        webbrowser.open(address)
+
+
+@contextmanager
+def on_signals(stop: Callable[..., object]) -> Iterator[None]:
+    """Call `stop` meanwhile in place of what Ctrl-C and SIGTERM do otherwise."""
+    before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @contextmanager

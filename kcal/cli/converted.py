@@ -132,13 +132,10 @@ def convert_images(
 def _convert(path: Path, target: Path, module: Undistort) -> None:
     import torch
 
-    from kcal.corners.images import decode_gray
-    from kcal.io.images import decode_image, write_png
+    from kcal.corners.images import decode_image
+    from kcal.io.images import write_png
 
-    data = read_bytes(path)
-    # This refuses damaged files, which `decode_image` alone would fill with gray.
-    decode_gray(data, path)
-    image = torch.from_numpy(decode_image(data, path))
+    image = torch.from_numpy(decode_image(read_bytes(path), path))
     (height, width), size = image.shape[:2], module.camera.size
     if (width, height) != size:
         raise InputError(f"{path}: the image is {width}x{height} px, the camera {size[0]}x{size[1]} px")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kcal.cli.camera_sources import named_source, parse_size, picked
+from kcal.cli.camera_sources import cameras_and_rig, named_source, parse_size, picked
 from kcal.cli.console import out, print_wrote, steps, warn
 from kcal.cli.inputs import CAMERA_OR_RIG, FOREIGN
 from kcal.errors import InputError
@@ -68,16 +68,15 @@ def export_command(
     check_writable(output, path)
 
     from kcal.calibrate.camera.export import export_cameras
-    from kcal.io.formats import import_cameras
 
     if picture is not None:
         check_picture(picture)
-    found = import_cameras(path)
-    subject = _subject(path, name)
-    chosen = subject if subject is not None else picked(found, name, source)
+    found, rig = cameras_and_rig(path)
+    alone = name is not None or len(found.cameras) == 1
+    chosen = picked(found, name, source) if alone else rig or found.cameras
     with steps("fitting what the format holds", None):
         done = export_cameras(chosen, output, format=format, model=model)
-    names = found.names if subject is not None else (name or found.names[0],)
+    names = (name or found.names[0],) if alone else found.names
     for camera, model_name, misfit in zip(names, done.models, done.misfits, strict=True):
         label = f"{camera or 'camera'}: {model_name}"
         if misfit is None:
@@ -104,21 +103,6 @@ def export_command(
     elif picture is not None:
         out.print("no picture: nothing was refitted")
     print_wrote(*done.paths)
-
-
-def _subject(path: Path, name: str | None):  # type: ignore[no-untyped-def]
-    """What a file contains as a whole: its rig or its cameras; None where one of them was named."""
-    from kcal.io.formats import import_cameras, recognized
-    from kcal.io.rig_file import load_rig
-
-    if name is not None:
-        return None
-    found = import_cameras(path)
-    if len(found.cameras) == 1:
-        return found.cameras[0]
-    if recognized(path) == "kcal":
-        return load_rig(path)
-    return found.rig() if found.is_rig() else found.cameras
 
 
 def import_command(
@@ -232,11 +216,9 @@ def _import_corners(
 
 
 def _import_survey(sources: list[Path], output: Path, sigma: float | None, geoid: float | None) -> None:
-    import csv
-    import io
-
     from kcal.files import write_atomic
     from kcal.locate.geodesy import enu_to_geodetic
+    from kcal.locate.survey import EARTH, places_csv
     from kcal.locate.survey_files import import_survey
 
     if len(sources) != 1:
@@ -244,11 +226,10 @@ def _import_survey(sources: list[Path], output: Path, sigma: float | None, geoid
     survey = import_survey(sources[0], sigma=sigma, geoid=geoid)
     assert survey.origin is not None
     places = enu_to_geodetic(survey.points, survey.origin).tolist()
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["name", "lat", "lon", "height", "sigma", "sigma_up"])
-    for name, (lat, lon, height), (level, _, up) in zip(survey.names, places, survey.sigma.tolist(), strict=True):
-        writer.writerow([name, f"{lat:.11f}", f"{lon:.11f}", f"{height:.5f}", repr(level), repr(up)])
-    write_atomic(output, text.getvalue())
+    rows = (
+        [name, f"{lat:.11f}", f"{lon:.11f}", f"{height:.5f}", level, up]
+        for name, (lat, lon, height), (level, _, up) in zip(survey.names, places, survey.sigma.tolist(), strict=True)
+    )
+    write_atomic(output, places_csv(EARTH, rows))
     out.print(f"{len(places)} places")
     print_wrote(output)

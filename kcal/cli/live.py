@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import datetime
 import os
-import signal
 import sys
 import time as clocks
 from collections.abc import Callable
@@ -13,11 +12,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kcal.cli.console import err, steps
+from kcal.cli.commands import rarely
+from kcal.cli.console import err, on_signals, steps
 from kcal.cli.inputs import RIG, VIDEO
 from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_of
 from kcal.cli.settings import taken
-from kcal.errors import InputError
+from kcal.errors import InputError, with_extra
 from kcal.quantities import measured_text
 
 if TYPE_CHECKING:
@@ -73,8 +73,7 @@ def live_command(
         typer.Option("--port", metavar="PORT", help="Serve the live map to this machine's browser; 0: any free port."),
     ] = None,
     journal: Annotated[
-        Path | None,
-        typer.Option(help="Remembers what was written; the first output with .journal if not given.", hidden=True),
+        Path | None, rarely("", "Remembers what was written; the first output with .journal if not given.")
     ] = None,
     origin: Annotated[
         str | None,
@@ -84,22 +83,12 @@ def live_command(
         float | None, typer.Option(metavar="DEG", help="Azimuth of the left camera's axis; needed with --origin.")
     ] = None,
     pixel_sigma: PixelSigma = None,
-    box_sigma: Annotated[
-        float, typer.Option(metavar="PX", help="Noise of the middle of a box, each axis.", hidden=True)
-    ] = 2.0,
+    box_sigma: Annotated[float, rarely("PX", "Noise of the middle of a box, each axis.")] = 2.0,
     match_sigma: Annotated[
-        float,
-        typer.Option(
-            metavar="PX", help="Error of matched images that compression of the videos adds, each axis.", hidden=True
-        ),
+        float, rarely("PX", "Error of matched images that compression of the videos adds, each axis.")
     ] = 0.06,
     clock_offset: Annotated[
-        float,
-        typer.Option(
-            metavar="S",
-            help="Seconds by which the right images are later than their times; of two cameras.",
-            hidden=True,
-        ),
+        float, rarely("S", "Seconds by which the right images are later than their times; of two cameras.")
     ] = 0.0,
     clock_sigma: Annotated[
         float,
@@ -108,10 +97,7 @@ def live_command(
         ),
     ] = 0.0,
     compiled: Annotated[
-        bool,
-        typer.Option(
-            "--compile", help="Translate the filter to C++ first, which takes minutes; for many targets.", hidden=True
-        ),
+        bool, rarely("", "Translate the filter to C++ first, which takes minutes; for many targets.", "--compile")
     ] = False,
     watch: Annotated[
         Path | None,
@@ -120,10 +106,7 @@ def live_command(
         ),
     ] = None,
     start: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ISO", help="Calendar time of second 0, if times are not Unix seconds; for events.", hidden=True
-        ),
+        str | None, rarely("ISO", "Calendar time of second 0, if times are not Unix seconds; for events.")
     ] = None,
 ) -> None:
     """Follow what cameras see: tracks with latitude, longitude, velocity and honest errors, written as they come.
@@ -210,16 +193,14 @@ def live_command(
             ending = "stopped"
             stream.stop()
 
-        before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
+        live = frames is not None and frames.live
         try:
-            live = frames is not None and frames.live
-            counts = stream.follow(source, waits=not live, resumes=not live and detections != "-")
+            with on_signals(stop):
+                counts = stream.follow(source, waits=not live, resumes=not live and detections != "-")
         except BaseException:
             ending = "ended by an error: see the terminal"
             raise
         finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
             if page is not None:
                 page.close(ending)
     err.print(summary(counts), markup=False)
@@ -311,10 +292,8 @@ def _videos(
     options: AssociationOptions,
     match_sigma: float,
 ) -> Videos:
-    try:
+    with with_extra("video", "videos need"):
         from kcal.pipeline.video_source import Videos
-    except ImportError as error:
-        raise InputError(f"videos need {error.name}; install it with: pip install 'kcal[video]'") from error
     from kcal.pipeline.detector_call import load_detector
 
     # As `python -m` does: a detector beside which the command is run is found.
@@ -331,10 +310,8 @@ def _videos(
 
 
 def _live_map(run: Located, port: int) -> LiveMap:
-    try:
+    with with_extra("mark", "--port needs"):
         from kcal.pipeline.live_map import LiveMap
-    except ImportError as error:
-        raise InputError(f"--port needs {error.name}; install it with: pip install 'kcal[mark]'") from error
     page = LiveMap(run, port)
     err.print(f"live map: {page.address}", markup=False)
     return page

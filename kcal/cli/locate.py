@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from kcal.cli.commands import rarely
 from kcal.cli.console import err, steps
 from kcal.cli.inputs import MARKS, RIG, SURVEY
 from kcal.cli.located_text import draw_positions, tell_located
@@ -38,20 +39,11 @@ def locate_command(
             metavar="DEG", help="Azimuth of the left camera's axis, clockwise from true north; needed with --origin."
         ),
     ] = None,
-    pitch: Annotated[
-        float, typer.Option(metavar="DEG", help="Elevation of the left camera's axis, positive up.", hidden=True)
-    ] = 0.0,
-    roll: Annotated[
-        float,
-        typer.Option(metavar="DEG", help="Roll of the left camera, clockwise as seen from behind it.", hidden=True),
-    ] = 0.0,
+    pitch: Annotated[float, rarely("DEG", "Elevation of the left camera's axis, positive up.")] = 0.0,
+    roll: Annotated[float, rarely("DEG", "Roll of the left camera, clockwise as seen from behind it.")] = 0.0,
     grid: Annotated[
         str | None,
-        typer.Option(
-            metavar="CRS",
-            help="Map whose grid north --heading counts from, for example EPSG:32643; true north if not given.",
-            hidden=True,
-        ),
+        rarely("CRS", "Map whose grid north --heading counts from, for example EPSG:32643; true north if not given."),
     ] = None,
     pixel_sigma: PixelSigma = None,
     yaw_sigma: Annotated[
@@ -60,10 +52,9 @@ def locate_command(
     ] = 0.0,
     aged: Annotated[
         str | None,
-        typer.Option(
-            metavar="9h:DEG,8K:DEG",
-            help="Hours since the rig was solved, and degrees of yaw that it loses in one; the same for kelvin.",
-            hidden=True,
+        rarely(
+            "9h:DEG,8K:DEG",
+            "Hours since the rig was solved, and degrees of yaw that it loses in one; the same for kelvin.",
         ),
     ] = None,
     watch: Annotated[
@@ -74,37 +65,21 @@ def locate_command(
         ),
     ] = None,
     heading_sigma: Annotated[
-        float,
-        typer.Option(
-            metavar="DEG", help="Standard deviation of the heading, added to the rig file's.", min=0, hidden=True
-        ),
+        float, rarely("DEG", "Standard deviation of the heading, added to the rig file's.", min=0)
     ] = 0.0,
     origin_sigma: Annotated[
-        float,
-        typer.Option(
-            metavar="M",
-            help="Standard deviation of the origin along each axis, added to the rig file's.",
-            min=0,
-            hidden=True,
-        ),
+        float, rarely("M", "Standard deviation of the origin along each axis, added to the rig file's.", min=0)
     ] = 0.0,
     refraction: Annotated[
         float | None,
-        typer.Option(
-            metavar="K",
-            help="Refraction: 0.13, the default, lowers a point at 5 km by 0.26 m; 0 for straight lines. A rig solved "
+        rarely(
+            "K",
+            "Refraction: 0.13, the default, lowers a point at 5 km by 0.26 m; 0 for straight lines. A rig solved "
             "from landmarks has its own.",
-            hidden=True,
         ),
     ] = None,
     refraction_sigma: Annotated[
-        float | None,
-        typer.Option(
-            metavar="K",
-            help="Its standard deviation, 0.1; 0.5 for lines of sight near hot or cold ground.",
-            min=0,
-            hidden=True,
-        ),
+        float | None, rarely("K", "Its standard deviation, 0.1; 0.5 for lines of sight near hot or cold ground.", min=0)
     ] = None,
     height: Annotated[
         str | None,
@@ -115,24 +90,15 @@ def locate_command(
     ] = None,
     terrain: Annotated[
         Path | None,
-        typer.Option(
-            metavar="RASTER",
-            help="In place of --height: heights of the ground on which it stands, an ESRI ASCII grid (.asc), or a "
+        rarely(
+            "RASTER",
+            "In place of --height: heights of the ground on which it stands, an ESRI ASCII grid (.asc), or a "
             "GeoTIFF (needs 'kcal\\[terrain]').",
-            hidden=True,
         ),
     ] = None,
-    terrain_sigma: Annotated[
-        float,
-        typer.Option(metavar="M", help="Standard deviation of the terrain's heights.", min=0.01, hidden=True),
-    ] = 3.0,
-    geoid_height: Annotated[
-        float,
-        typer.Option(metavar="M", help="Added to the terrain's heights if they are above the sea.", hidden=True),
-    ] = 0.0,
-    geoid: Annotated[
-        Path | None, typer.Option(help="Geoid grid file (.tif, .gtx); one that PROJ finds if not given.", hidden=True)
-    ] = None,
+    terrain_sigma: Annotated[float, rarely("M", "Standard deviation of the terrain's heights.", min=0.01)] = 3.0,
+    geoid_height: Annotated[float, rarely("M", "Added to the terrain's heights if they are above the sea.")] = 0.0,
+    geoid: Annotated[Path | None, rarely("", "Geoid grid file (.tif, .gtx); one that PROJ finds if not given.")] = None,
     truth: Annotated[
         Path | None,
         typer.Option(
@@ -149,26 +115,16 @@ def locate_command(
         ),
     ] = None,
     stream_format: Annotated[
-        str,
-        typer.Option(
-            "--format", metavar="NAME", help="Format of `-o -`: csv, geojson, geojsonl, kml or cot.", hidden=True
-        ),
+        str, rarely("NAME", "Format of `-o -`: csv, geojson, geojsonl, kml or cot.", "--format")
     ] = "csv",
     as_json: Annotated[bool, typer.Option("--json", help="Print a summary as JSON in place of the table.")] = False,
     picture: Annotated[Path | None, typer.Option(help="PNG file to write: the map and the intervals.")] = None,
     web_map: Annotated[
         Path | None, typer.Option("--map", help="HTML file to write: an interactive map that needs no network.")
     ] = None,
-    tiles: Annotated[
-        Path | None,
-        typer.Option(metavar="FOLDER", help="With --map: folder of tiles FOLDER/zoom/x/y.png to embed.", hidden=True),
-    ] = None,
-    image: Annotated[
-        Path | None, typer.Option(metavar="TIF", help="With --map: GeoTIFF to embed.", hidden=True)
-    ] = None,
-    online: Annotated[
-        bool, typer.Option("--online", help="With --map: let the page load tiles of OpenStreetMap.", hidden=True)
-    ] = False,
+    tiles: Annotated[Path | None, rarely("FOLDER", "With --map: folder of tiles FOLDER/zoom/x/y.png to embed.")] = None,
+    image: Annotated[Path | None, rarely("TIF", "With --map: GeoTIFF to embed.")] = None,
+    online: Annotated[bool, rarely("", "With --map: let the page load tiles of OpenStreetMap.", "--online")] = False,
 ) -> None:
     """Locate points that were marked in both images: latitude, longitude, height and a 95 % range interval.
 

@@ -7,10 +7,10 @@ from typing import Annotated
 
 import typer
 
-from kcal.cli.console import err, out, warn
+from kcal.cli.console import err, out, show_page, warn
 from kcal.cli.inputs import CALIBRATED, IMAGES, MARKS, RIG, SURVEY
 from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_of
-from kcal.errors import InputError
+from kcal.errors import InputError, with_extra
 
 _PORT = 8347
 
@@ -62,12 +62,9 @@ def mark_command(
 
     `kcal mark new-left.png new-right.png --reference then.csv --reference-images left.png right.png -o now.csv`
     """
-    try:
+    with with_extra("mark", "kcal mark needs"):
         from kcal.mark.server import marking_app
         from kcal.web.serving import LocalServer
-    except ImportError as error:
-        raise InputError(f"kcal mark needs {error.name}; install it with: pip install 'kcal[mark]'") from error
-    import webbrowser
 
     from kcal.io.camera_file import load_camera
     from kcal.io.rig_file import load_rig
@@ -89,13 +86,11 @@ def mark_command(
     try:
         desk.check_sizes()
         server = LocalServer(lambda token, hosts: marking_app(desk, token, hosts), port, fallback=port == _PORT)
-        out.print(f"marking page: {server.address}", markup=False, soft_wrap=True)
+        show_page(server.address, "marking page", browser=browser)
         if session.version:
             err.print(f"continued after {session.version} actions in {session.files.log}", markup=False)
         for note in (*session.notes, *filter(None, [session.trouble])):
             warn(note)
-        if browser:
-            webbrowser.open(server.address)
         server.run()
     finally:
         desk.close()

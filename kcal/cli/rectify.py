@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kcal.cli.camera_sources import named_source, parse_size, single_camera
+from kcal.cli.camera_sources import cameras_and_rig, named_source, parse_size, single_camera
 from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
 from kcal.cli.converted import convert_images, prepare, targets_of
 from kcal.cli.inputs import CAMERA, CAMERA_OR_RIG, IMAGES
@@ -119,18 +119,8 @@ def undistort_command(
 
 def rig_of(source: str) -> StereoRig | None:
     """The rig of a file of kcal or of another program; None for a camera."""
-    from kcal.io.formats import import_cameras, recognized
-    from kcal.io.rig_file import load_rig
-
     path, name = named_source(source)
-    if name is not None:
-        return None
-    found = import_cameras(path)
-    if len(found.cameras) == 1:
-        return None
-    if recognized(path) == "kcal":
-        return load_rig(path)
-    return found.rig() if found.is_rig() else None
+    return cameras_and_rig(path)[1] if name is None else None
 
 
 def _rectify_camera(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, TypeAlias
 import typer
 
 from kcal.cli.camera_sources import single_camera
-from kcal.cli.console import out, print_wrote, steps, tell
+from kcal.cli.console import out, print_answer, print_wrote, steps, tell
 from kcal.cli.inputs import CAMERA_OR_RIG, OBSERVATIONS
 from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_of
 from kcal.cli.sides import check_views_of
@@ -124,8 +124,7 @@ def print_verdict(verdict: Verdict, warned: tuple[str, ...] = ()) -> None:
     single = [answer.text for answer in verdict.answers] == [verdict.reason]
     for answer in () if single else verdict.answers:
         out.print(f"{'[green]yes[/]' if answer.ok else '[red]no[/]'}: {answer.text}")
-    out.print(f"[bold]{'YES' if verdict.usable else 'NO'}[/]:", end=" ")
-    out.print(verdict.reason, markup=False)
+    print_answer(verdict.usable, verdict.reason)
     if not verdict.usable:
         out.print(f"next: {verdict.next_step}", markup=False)
     for finding in verdict.findings:

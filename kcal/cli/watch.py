@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import signal
 import time as clocks
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kcal.cli.console import err, out, print_table, print_wrote, warn
+from kcal.cli.console import err, on_signals, out, print_table, print_wrote, warn
 from kcal.cli.inputs import RIG
 from kcal.cli.rig_check import DRIFTED
-from kcal.errors import InputError
+from kcal.errors import InputError, with_extra
 
 if TYPE_CHECKING:
     from kcal.corners.images import Gray
@@ -147,32 +146,28 @@ def _follow(watcher: Watcher, rig: StereoRig, sources: tuple[str, str], hooks: l
         if frames is not None:
             frames.close()
 
-    before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
     next_word = 0.0
     try:
-        for time, left, right in _folder_pairs(watcher, sources) if frames is None else _of_frames(watcher, frames):
-            noticed = watcher.look(time, left, right)
-            for hook in hooks:
-                hook.send(_message(noticed, watcher)) if noticed.begins else hook.again()
-            if noticed.begins:
-                warn(f"{_turn_text(noticed)}: beyond the limit of {watcher.limit_deg:g}°")
-            if clocks.monotonic() >= next_word:
-                next_word = clocks.monotonic() + 10.0
-                err.print(f"{time:.0f} s: {_turn_text(noticed)}", markup=False)
-            if stopped or (ends and noticed.begins):
-                break
+        with on_signals(stop):
+            for time, left, right in _folder_pairs(watcher, sources) if frames is None else _of_frames(watcher, frames):
+                noticed = watcher.look(time, left, right)
+                for hook in hooks:
+                    hook.send(_message(noticed, watcher)) if noticed.begins else hook.again()
+                if noticed.begins:
+                    warn(f"{_turn_text(noticed)}: beyond the limit of {watcher.limit_deg:g}°")
+                if clocks.monotonic() >= next_word:
+                    next_word = clocks.monotonic() + 10.0
+                    err.print(f"{time:.0f} s: {_turn_text(noticed)}", markup=False)
+                if stopped or (ends and noticed.begins):
+                    break
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
         if frames is not None:
             frames.close()
 
 
 def _frame_pairs(rig: StereoRig, sources: tuple[str, str]) -> FramesTogether:
-    try:
+    with with_extra("video", "videos need"):
         from kcal.pipeline.paired_frames import FramesTogether
-    except ImportError as error:
-        raise InputError(f"videos need {error.name}; install it with: pip install 'kcal[video]'") from error
 
     sizes = {"left": rig.left.size, "right": rig.right.size}
     return FramesTogether(sources, sizes, pairs=True, tell=lambda text: err.print(text, markup=False))

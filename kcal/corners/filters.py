@@ -20,8 +20,13 @@ def filtered(image: Tensor, across: Tensor, down: Tensor) -> Tensor:
     """Correlate the rows of (H, W) with one kernel and its columns with another of equal odd length; edges repeat."""
     reach = len(across) // 2
     padded = torch.nn.functional.pad(image[None, None], (reach,) * 4, mode="replicate")
-    rows = torch.nn.functional.conv2d(padded, across.reshape(1, 1, 1, -1))
-    result: Tensor = torch.nn.functional.conv2d(rows, down.reshape(1, 1, -1, 1))[0, 0]
+    return correlated(padded, across, down)[0, 0]
+
+
+def correlated(images: Tensor, across: Tensor, down: Tensor, *, zeros: int = 0) -> Tensor:
+    """Correlate rows of (N, 1, H, W) with one kernel, columns with another, with so many zeros beyond each edge."""
+    rows = torch.nn.functional.conv2d(images, across.reshape(1, 1, 1, -1), padding=(0, zeros))
+    result: Tensor = torch.nn.functional.conv2d(rows, down.reshape(1, 1, -1, 1), padding=(zeros, 0))
     return result
 
 

@@ -29,6 +29,11 @@ def as_grid(pixels: Tensor, columns: int, rows: int) -> Tensor:
     return pixels.reshape(rows, columns, 2)
 
 
+def sides(grid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """A grid (rows, columns, 2), turned or mirrored so that top, bottom, left and right in turn are its first row."""
+    return grid, grid.flip(0), grid.transpose(0, 1), grid.transpose(0, 1).flip(0)
+
+
 def local_side(pixels: Tensor, columns: int, rows: int) -> Tensor:
     """The distance in pixels from each corner to its nearest neighbor in the grid, (rows * columns,).
 
@@ -117,6 +122,12 @@ def levels_at(image: npt.NDArray[np.generic], where: Tensor) -> Tensor:
     x, y = x.clamp(0, image.shape[1] - 1), y.clamp(0, image.shape[0] - 1)
     levels = torch.from_numpy(image[y.numpy(), x.numpy()].astype(np.float64))
     return torch.where(torch.isfinite(where).all(-1), levels, torch.nan)
+
+
+def in_image(image: npt.NDArray[np.generic], places: Tensor) -> Tensor:
+    """Whether places (..., 2) lie between the centers of the image's border pixels; False for NaN."""
+    limit = torch.tensor([image.shape[1] - 1.0, image.shape[0] - 1.0], dtype=torch.float64)
+    return ((places >= 0) & (places <= limit)).all(-1)
 
 
 def line_bend(pixels: Tensor, columns: int, rows: int) -> Tensor:

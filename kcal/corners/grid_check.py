@@ -7,7 +7,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from kcal.corners.grid import as_grid, first_square_dark, levels_at, local_side
+from kcal.corners.grid import as_grid, first_square_dark, in_image, levels_at, local_side, sides
 
 MAX_BEND = 0.25  # of a square: distance of a corner from its neighbors' homography; a wrong grid is off by 1
 MAX_RATIO = 1.7  # of one square's side to the next along a row; perspective reaches it only 3 squares from the board
@@ -67,8 +67,7 @@ def goes_on(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: 
     board's outer edge three of the four places have one color.
     """
     grid = as_grid(pixels, columns, rows)
-    sides = (grid, grid.flip(0), grid.transpose(0, 1), grid.transpose(0, 1).flip(0))
-    return any(_goes_on_above(image, side) for side in sides if len(side) >= 3)
+    return any(_goes_on_above(image, side) for side in sides(grid) if len(side) >= 3)
 
 
 def false_sides(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: int) -> Tensor:
@@ -78,8 +77,7 @@ def false_sides(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, ro
     is dark. Outside such a line squares do not alternate. A side that glare hides, or the image cuts, counts as true.
     """
     grid = as_grid(pixels, columns, rows)
-    sides = (grid, grid.flip(0), grid.transpose(0, 1), grid.transpose(0, 1).flip(0))
-    return torch.tensor([_alternates_less_outside(image, side) for side in sides])
+    return torch.tensor([_alternates_less_outside(image, side) for side in sides(grid)])
 
 
 def without_false_sides(image: npt.NDArray[np.generic], grid: Tensor) -> Tensor | None:
@@ -97,9 +95,7 @@ def _alternates_less_outside(image: npt.NDArray[np.generic], grid: Tensor) -> bo
     along = torch.gradient(grid, dim=1)[0][0]
     out = 2 * grid[0] - 3 * grid[1] + grid[2]  # the next step outward, as perspective continues
     inner, outer = (step_along(image, grid[0], along, down) for down in (grid[1] - grid[0], out))
-    limit = torch.tensor([image.shape[1] - 1.0, image.shape[0] - 1.0], dtype=torch.float64)
-    end = grid[0] + 0.5 * out
-    usable = ((end >= 0) & (end <= limit)).all(-1)
+    usable = in_image(image, grid[0] + 0.5 * out)
     usable &= inner.abs() > 0.3 * step_along(image, grid[1], along, grid[2] - grid[1]).abs().median()
     if 2 * int(usable.sum()) < len(usable):
         return False
@@ -148,23 +144,17 @@ def _contrast(image: npt.NDArray[np.generic], places: Tensor, along: Tensor, dow
 
 
 def _goes_on_above(image: npt.NDArray[np.generic], grid: Tensor) -> bool:
-    along = torch.gradient(grid, dim=1)[0]
+    along = torch.gradient(grid, dim=1)[0][0]
     # Extrapolated quadratically, because perspective would shift a linear step by a good part of a square.
     beyond = 3 * grid[0] - 3 * grid[1] + grid[2]
-    places = torch.stack([beyond, grid[0]])[:, :, None]
-    out = torch.stack([beyond - grid[0], (grid[0] - grid[1] + beyond - grid[0]) / 2])[:, :, None]
-    step = along[0][None, :, None]
-    share = torch.tensor([0.2, 0.3, 0.4], dtype=torch.float64)[:, None]
-    signs = torch.tensor([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]], dtype=torch.float64)
-    four = torch.stack([levels_at(image, places + share * (a * step + b * out)).mean(-1) for a, b in signs.tolist()])
-    contrast = four[0] + four[1] - four[2] - four[3]  # (beyond or own, along)
-    reach = beyond + 0.5 * out[0, :, 0]
-    limit = torch.tensor([image.shape[1] - 1.0, image.shape[0] - 1.0], dtype=torch.float64)
-    inside = ((reach >= 0) & (reach <= limit)).all(-1)
+    out = beyond - grid[0]
+    inside = in_image(image, beyond + 0.5 * out)
     if int(inside.sum()) * 2 < len(inside):
         return False
-    own = torch.where(contrast[1].abs() < 1e-9, 1e-9, contrast[1])
-    return float((-contrast[0] / own)[inside].median()) > GOES_ON
+    there = _contrast(image, beyond, along, out)
+    own = _contrast(image, grid[0], along, (grid[0] - grid[1] + out) / 2)
+    own = torch.where(own.abs() < 1e-9, 1e-9, own)
+    return float((-there / own)[inside].median()) > GOES_ON
 
 
 def _corner_areas(grid: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from kcal.corners.grid import sides
 from kcal.corners.grid_check import MIN_OUTER, MIN_SQUARE, step_along
 from kcal.corners.saddle import CornerStatus, saddle
 
@@ -61,11 +62,6 @@ def _extended(image: npt.NDArray[np.generic], light: Tensor, grid: Tensor, free:
     grid = grid.clone()
     grid[new] = torch.where(good[:, None], refined.pixels, torch.nan)
     return grid
-
-
-def sides(grid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The grid, turned or mirrored so that each side in turn is its first row."""
-    return grid, grid.flip(0), grid.transpose(0, 1), grid.transpose(0, 1).flip(0)
 
 
 def local_steps(grid: Tensor) -> tuple[Tensor, Tensor]:

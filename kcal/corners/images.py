@@ -1,4 +1,4 @@
-"""Read image files as gray pixels, and list the files that folders and wildcards stand for.
+"""Read image files as gray pixels or as stored, and list the files that folders and wildcards stand for.
 
 Pixels are always in the order in which the sensor wrote them. An EXIF orientation tag is ignored: a phone that was
 turned between two shots would otherwise swap width and height, and the lens does not turn with the tag.
@@ -47,22 +47,29 @@ def decode_gray(data: bytes, source: str | Path) -> Gray:
             fill the rest with gray), pixels other than 8 or 16 bit unsigned, smaller than 16 pixels, or of one gray
             level.
     """
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    check_image_header(data, source)
-    image, complaints = _imdecode(data, flags)
-    broken = _BROKEN_JPEG.search(complaints)
-    if image is None:
-        raise FileError(f"{source}: the image is truncated or corrupt; copy it again or leave it out")
-    if broken:
-        raise FileError(f"{source}: {broken.group().decode(errors='replace').strip()}; copy it again or leave it out")
-    if image.dtype not in (np.uint8, np.uint16):
-        raise FileError(f"{source}: pixels are {image.dtype}; store the image with 8 or 16 bits unsigned")
+    image = _decoded(data, source, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
     height, width = image.shape
     if min(height, width) < MIN_IMAGE_SIDE:
         raise FileError(f"{source}: {width}x{height} pixels are too few; {MIN_IMAGE_SIDE} in each direction are needed")
     if image.min() == image.max():
         raise FileError(f"{source}: every pixel has the same gray level; the image shows nothing")
     return image
+
+
+def decode_image(data: bytes, source: str | Path) -> Gray:
+    """Decode an image file's bytes as stored: gray (H, W), RGB (H, W, 3) or RGBA (H, W, 4), uint8 or uint16.
+
+    The EXIF orientation is ignored: row 0 is the row the sensor read first, because the lens does not turn with it.
+
+    Raises:
+        FileError: empty, not an image, more than 500 megapixels, truncated or corrupt, or pixels other than 8 or 16
+            bits unsigned; `source` names it.
+    """
+    image = _decoded(data, source, cv2.IMREAD_UNCHANGED)
+    if image.ndim == 2:
+        return image
+    colors: npt.NDArray[Any] = cv2.cvtColor(image, cv2.COLOR_BGR2RGB if image.shape[2] == 3 else cv2.COLOR_BGRA2RGBA)
+    return colors
 
 
 def read_gray(path: str | Path) -> Gray:
@@ -169,6 +176,19 @@ def _natural(paths: Iterable[Path]) -> list[Path]:
         return [(0, int(piece), "") if piece.isdecimal() else (1, 0, piece.casefold()) for piece in pieces]
 
     return sorted(paths, key=lambda path: (key(path), str(path)))
+
+
+def _decoded(data: bytes, source: str | Path, flags: int) -> npt.NDArray[Any]:
+    check_image_header(data, source)
+    image, complaints = _imdecode(data, flags)
+    broken = _BROKEN_JPEG.search(complaints)
+    if image is None:
+        raise FileError(f"{source}: the image is truncated or corrupt; copy it again or leave it out")
+    if broken:
+        raise FileError(f"{source}: {broken.group().decode(errors='replace').strip()}; copy it again or leave it out")
+    if image.dtype not in (np.uint8, np.uint16):
+        raise FileError(f"{source}: pixels are {image.dtype}; store the image with 8 or 16 bits unsigned")
+    return image
 
 
 def _imdecode(data: bytes, flags: int) -> tuple[npt.NDArray[Any] | None, bytes]:

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from kcal.corners.board import Board
+from kcal.corners.grid import in_image, sides
 from kcal.corners.grid_check import (
     MIN_OUTER,
     levels_beside,
@@ -24,7 +25,7 @@ from kcal.corners.grid_check import (
     uneven,
     without_false_sides,
 )
-from kcal.corners.grow import checkered, grown_grid, local_steps, sides
+from kcal.corners.grow import checkered, grown_grid, local_steps
 from kcal.corners.order import handedness, uprightness
 
 MIN_CORNERS = 12
@@ -127,7 +128,7 @@ def _is_end(image: npt.NDArray[np.generic], grid: Tensor, paper: bool) -> bool:
     own, inner, outer = (
         step_along(image, places, along, down) for places, down in ((grid[0], out), (beyond, -out), (beyond, out))
     )
-    usable = _is_inside(image, beyond + 0.5 * out) & torch.isfinite(own + inner + outer)
+    usable = in_image(image, beyond + 0.5 * out) & torch.isfinite(own + inner + outer)
     ends = (inner / own > OUTER_SQUARE) & (outer.abs() < MIN_OUTER * inner.abs())
     if paper:
         square, ground = (levels_beside(image, beyond, along, down) for down in (-out, out))
@@ -142,11 +143,6 @@ def _next_line(grid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     beyond = 3 * grid[0] - 3 * grid[1] + grid[2]
     beyond = torch.where(torch.isfinite(beyond), beyond, 2 * grid[0] - grid[1])
     return beyond, beyond - grid[0], along
-
-
-def _is_inside(image: npt.NDArray[np.generic], places: Tensor) -> Tensor:
-    limit = torch.tensor([image.shape[1] - 1.0, image.shape[0] - 1.0], dtype=torch.float64)
-    return ((places >= 0) & (places <= limit)).all(-1)  # False for NaN
 
 
 def _placements(
@@ -192,7 +188,7 @@ def _hidden_sides(image: npt.NDArray[np.generic], grid: Tensor, ends: tuple[bool
         x, y = (side[0].nanmean(0) - middle).tolist()
         name = ("right" if x > 0 else "left") if abs(x) > abs(y) else ("bottom" if y > 0 else "top")
         known = torch.isfinite(beyond + out).all(-1)
-        outside = known & ~_is_inside(image, beyond + 0.5 * out)
+        outside = known & ~in_image(image, beyond + 0.5 * out)
         (cut if 2 * int(outside.sum()) >= int(known.sum()) else unclear).append(name)
     texts = []
     if cut:

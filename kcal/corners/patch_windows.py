@@ -8,7 +8,7 @@ from typing import NamedTuple, Self
 import torch
 from torch import Tensor
 
-from kcal.corners.filters import gaussian_kernel
+from kcal.corners.filters import correlated, gaussian_kernel
 
 IMAGE_BLUR = 0.8  # steps, of both images: bilinear samples of it are good to 0.005 px
 
@@ -49,8 +49,7 @@ def image_windows(image: Tensor, pixels: Tensor, level: int, brightest: float) -
     raw, low = _raw_windows(image, pixels, len(kernel) // 2, level)
     # Without a brightest level nothing is saturated.
     parts = [raw] if math.isinf(brightest) else [raw, (raw.detach() >= brightest).double()]
-    blurred = torch.nn.functional.conv2d(torch.cat(parts)[:, None], kernel.reshape(1, 1, 1, -1))
-    blurred = torch.nn.functional.conv2d(blurred, kernel.reshape(1, 1, -1, 1))[:, 0]
+    blurred = correlated(torch.cat(parts)[:, None], kernel, kernel)[:, 0]
     values, saturated = blurred.chunk(2) if len(parts) == 2 else (blurred, torch.zeros_like(blurred))
     return ImageWindows(values, saturated, low, (image.shape[1], image.shape[0]), level)
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.corners.filters import gaussian_kernel
+from kcal.corners.filters import correlated, gaussian_kernel
 from kcal.corners.patch_windows import IMAGE_BLUR, ImageWindows, grid_of, sample
 
 _MOST_STEPS = 25
@@ -88,8 +88,7 @@ def _biweight(residual: Tensor, scale: Tensor, patches: _Patches) -> Tensor:
     squares = residual.square().reshape(patches.template.shape)[:, None]
     reach = len(kernel) // 2
     padded = torch.nn.functional.pad(squares, (reach,) * 4, mode="replicate")
-    mean = torch.nn.functional.conv2d(padded, kernel.reshape(1, 1, 1, -1))
-    mean = torch.nn.functional.conv2d(mean, kernel.reshape(1, 1, -1, 1)).reshape(residual.shape)
+    mean = correlated(padded, kernel, kernel).reshape(residual.shape)
     return (1.0 - mean / (_BIWEIGHT * scale[:, None]).square()).clamp_min(0.0).square()
 
 
@@ -242,9 +241,8 @@ def _covariance(
     pull = (robust * residual)[..., None] * across
     pull = pull.mT.reshape(-1, 1, height, width)
     reach = _TRIANGLE.to(template)
-    wider = torch.nn.functional.conv2d(pull, reach.reshape(1, 1, 1, -1), padding=(0, len(reach) // 2))
-    wider = torch.nn.functional.conv2d(wider, reach.reshape(1, 1, -1, 1), padding=(len(reach) // 2, 0))
-    found = pull.reshape(count, 2, -1) @ wider.reshape(count, 2, -1).mT / freedom[:, None, None]
+    wider = correlated(pull, reach, reach, zeros=len(reach) // 2).reshape(count, 2, -1)
+    found = pull.reshape(count, 2, -1) @ wider.mT / freedom[:, None, None]
     excess = torch.linalg.solve_ex(middle, found)[0].diagonal(dim1=-2, dim2=-1).mean(-1).clamp_min(1.0)
     return excess[:, None, None] * inverse @ middle @ inverse, sound
 
@@ -253,8 +251,7 @@ def _blurred(columns: Tensor) -> Tensor:
     """(N, C, pixels) of columns (N, C, h, w), blurred as noise is, also beyond the patch."""
     kernel = _NOISE_BLUR.to(columns)
     reach = 2 * (len(kernel) // 2)
-    wide = torch.nn.functional.conv2d(columns.flatten(0, 1)[:, None], kernel.reshape(1, 1, 1, -1), padding=(0, reach))
-    wide = torch.nn.functional.conv2d(wide, kernel.reshape(1, 1, -1, 1), padding=(reach, 0))
+    wide = correlated(columns.flatten(0, 1)[:, None], kernel, kernel, zeros=reach)
     return wide.reshape(*columns.shape[:2], -1)
 
 

@@ -14,10 +14,8 @@ import pydantic
 import torch
 
 from kcal.file_kind import CAMERA_RIG_VERSION
-from kcal.io.camera_file import RETIRED_FIELDS, CameraFile, camera_to_file
+from kcal.io.camera_file import RETIRED_FIELDS, CameraFile, named_camera_file
 from kcal.io.record import Packed
-from kcal.lens.calibration import CameraCalibration
-from kcal.lens.camera import Camera
 from kcal.lens.camera_rig import CameraRig, CameraRigCalibration
 from kcal.lens.mounting import Origin
 from kcal.native_file import NativeFile, Record, storing
@@ -103,7 +101,7 @@ def camera_rig_to_file(rig: CameraRig) -> CameraRigFile:
     with storing("rig"):
         return CameraRigFile(
             names=rig.names,
-            cameras=tuple(_named_file(camera, name) for camera, name in zip(rig.each, rig.names, strict=True)),
+            cameras=tuple(named_camera_file(camera, name) for camera, name in zip(rig.each, rig.names, strict=True)),
             poses=tuple(
                 StationPose.model_validate({"rotation": turn, "center": center})
                 for turn, center in zip(rig.rotation.tolist(), rig.center.tolist(), strict=True)
@@ -113,11 +111,6 @@ def camera_rig_to_file(rig: CameraRig) -> CameraRigFile:
             root=None if root is None else Packed.of(root),
             calibration=rig.calibration,
         )
-
-
-def _named_file(camera: Camera, name: str) -> CameraFile:
-    known = camera.calibration or CameraCalibration()
-    return camera_to_file(camera, name=known.name or name)
 
 
 def save_camera_rig(rig: CameraRig, path: str | Path) -> Path:

@@ -235,6 +235,29 @@ def dump_yaml(content: Mapping[str, Any]) -> str:
     return yaml.safe_dump(dict(content), sort_keys=False, default_flow_style=None, width=120)
 
 
+def core_of(matrix: Any, what: str) -> tuple[list[float], float]:
+    """fx, fy, cx, cy, and the skew, of a camera matrix's nine numbers, row by row.
+
+    Raises:
+        ValueError: see `numbers`; another number than 0 or 1 where these belong.
+    """
+    fx, skew, cx, below, fy, cy, *last = numbers(matrix, 9, what)
+    if below or last != [0.0, 0.0, 1.0]:
+        raise ValueError(f"{what} is no camera matrix")
+    return [fx, fy, cx, cy], skew
+
+
+def known_size(stated: tuple[int, int] | None) -> tuple[int, int]:
+    """A size that a file or its reader's options tell.
+
+    Raises:
+        ValueError: neither does.
+    """
+    if stated is None:
+        raise ValueError("the image size is not in the file; give it (--size WIDTHxHEIGHT)")
+    return stated
+
+
 def camera_name(camera: Camera, otherwise: str) -> str:
     """The name that a camera has, or another one."""
     return (camera.calibration.name if camera.calibration else "") or otherwise

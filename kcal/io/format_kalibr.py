@@ -16,6 +16,7 @@ from kcal.io.foreign import (
     ImportedCameras,
     checked_pose,
     dump_yaml,
+    known_size,
     named_camera,
     numbers,
     plain,
@@ -84,8 +85,7 @@ def read_kalibr(path: Path, hints: Hints) -> ImportedCameras:
 
 def _read_results(text: str, hints: Hints) -> ImportedCameras:
     """The cameras of Kalibr's text of results, which has standard deviations and no image size."""
-    if hints.size is None:
-        raise ValueError("the image size is not in a text of results; give it (--size WIDTHxHEIGHT)")
+    size = known_size(hints.size)
     cameras, notes = [], {"poses are read from the camchain, not from the text of results"}
     for part in re.split(r"^(?=cam\d+ \()", text, flags=re.MULTILINE)[1:]:
         name, found = part.split(" ", 1)[0], {key: (value, sigma) for key, value, sigma in _RESULTS.findall(part)}
@@ -94,7 +94,7 @@ def _read_results(text: str, hints: Hints) -> ImportedCameras:
             raise ValueError(f"{name}: {kind[1] if kind else 'no type'}: kcal reads {', '.join(_GEOMETRIES)}")
         lens = numbers(found["distortion"][0].split(), 4, f"{name} distortion")
         core = numbers(found["projection"][0].split(), 4, f"{name} projection")
-        camera = named_camera(name, core, hints.size, _GEOMETRIES[kind[1]], lens)
+        camera = named_camera(name, core, size, _GEOMETRIES[kind[1]], lens)
         sigmas = [numbers(found[key][1].split(), 4, f"{name} {key}") for key in ("projection", "distortion")]
         notes.add(with_sigmas(camera, [*sigmas[0], *sigmas[1]]))
         cameras.append(camera)

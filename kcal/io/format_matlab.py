@@ -21,6 +21,8 @@ from kcal.io.foreign import (
     Hints,
     ImportedCameras,
     checked_pose,
+    core_of,
+    known_size,
     named_camera,
     numbers,
     plain,
@@ -70,20 +72,15 @@ def _with_errors(found: ImportedCameras, errors: Sequence[Any]) -> ImportedCamer
 
 def _matlab_camera(value: Mapping[str, Any], name: str, hints: Hints) -> Camera:
     if "K" in value or "IntrinsicMatrix" in value:
-        matrix = np.array(numbers(value["K"], 9, "K") if "K" in value else numbers(value["IntrinsicMatrix"], 9, "K"))
-        matrix = matrix.reshape(3, 3) if "K" in value else matrix.reshape(3, 3).T
-        if matrix[1, 0] or matrix[2].tolist() != [0.0, 0.0, 1.0]:
-            raise ValueError("its intrinsic matrix has numbers where zeros belong")
-        fx, fy, cx, cy, skew = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], matrix[0, 1]
+        matrix = value["K"] if "K" in value else np.transpose(value["IntrinsicMatrix"])
+        (fx, fy, cx, cy), skew = core_of(matrix, "its intrinsic matrix")
     else:
         fx, fy = numbers(value["FocalLength"], 2, "FocalLength")
         cx, cy = numbers(value["PrincipalPoint"], 2, "PrincipalPoint")
         (skew,) = numbers(value.get("Skew", 0.0), 1, "Skew")
     size = value.get("ImageSize")
     stated = None if size is None else numbers(size, (0, 2), "ImageSize")
-    size = hints.size or (whole_size(*stated[::-1]) if stated else None)
-    if size is None:
-        raise ValueError("ImageSize is empty; give it (--size WIDTHxHEIGHT)")
+    size = known_size(hints.size or (whole_size(*stated[::-1]) if stated else None))
     radial = numbers(value.get("RadialDistortion", []), (0, 2, 3), "RadialDistortion")
     tangential = numbers(value.get("TangentialDistortion", []), (0, 2), "TangentialDistortion") or [0.0, 0.0]
     lens = [*radial[:2], *tangential, *radial[2:]] if radial else [0.0, 0.0, *tangential]

@@ -22,6 +22,8 @@ from kcal.io.foreign import (
     Hints,
     ImportedCameras,
     checked_pose,
+    core_of,
+    known_size,
     named_camera,
     numbers,
     plain,
@@ -89,18 +91,15 @@ def _opencv_camera(
     fisheye: bool | None,
     notes: list[str],
 ) -> Camera:
-    if size is None:
-        raise ValueError("the image size is not in the file; give it (--size WIDTHxHEIGHT)")
-    fx, skew, cx, zero_a, fy, cy, *last = numbers(stored[matrix], 9, matrix)
-    if zero_a or last != [0.0, 0.0, 1.0]:
-        raise ValueError(f"{matrix} is no camera matrix")
+    size = known_size(size)
+    core, skew = core_of(stored[matrix], matrix)
     if skew:
         notes.append(f"{matrix} has a skew of {skew:g}, which OpenCV does not use and kcal does not take over")
     lens = numbers(stored.get(coefficients, []), tuple(BY_COUNT), coefficients)
     if "xi" in stored:
         if len(lens) != 4 or skew:
             raise ValueError("an omnidir camera has 4 coefficients and, here, no skew")
-        camera, note = omni_camera(name, [*numbers(stored["xi"], 1, "xi"), fx, fy, cx, cy, *lens], size)
+        camera, note = omni_camera(name, [*numbers(stored["xi"], 1, "xi"), *core, *lens], size)
         notes.append(note)
         return camera
     known = fisheye
@@ -111,7 +110,7 @@ def _opencv_camera(
     if known is None and len(lens) == 4:
         notes.append("4 coefficients read as k1 k2 p1 p2; if they are a fisheye's, use --fisheye")
     model = "fisheye4" if known else BY_COUNT[len(lens)]
-    camera = named_camera(name, (fx, fy, cx, cy), size, model, lens)
+    camera = named_camera(name, core, size, model, lens)
     if (sigmas := _present(stored, _SIGMAS)) and matrix in _MATRICES:
         # OpenCV always states those of 14 coefficients.
         given = numbers(stored[sigmas], (4 + len(lens), 18), sigmas)

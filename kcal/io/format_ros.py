@@ -20,6 +20,7 @@ from kcal.io.foreign import (
     ImportedCameras,
     camera_name,
     checked_pose,
+    core_of,
     dump_yaml,
     load_yaml,
     named_camera,
@@ -46,11 +47,11 @@ def read_ros(path: Path, hints: Hints) -> ImportedCameras:
     if kind not in _LENSES:
         raise ValueError(f"distortion_model {kind!r}: kcal reads {', '.join(_LENSES)}")
     model, counts = _LENSES[kind]
-    fx, skew, cx, _, fy, cy, *_ = numbers(content["camera_matrix"]["data"], 9, "camera_matrix")
+    core, skew = core_of(content["camera_matrix"]["data"], "camera_matrix")
     lens = numbers(content["distortion_coefficients"]["data"], (*counts, 0), "distortion_coefficients")
     notes = [f"camera_matrix has a skew of {skew:g}, which kcal does not take over"] if skew else []
     size = whole_size(content["image_width"], content["image_height"])
-    camera = named_camera(name, (fx, fy, cx, cy), size, model if lens else "pinhole", lens)
+    camera = named_camera(name, core, size, model if lens else "pinhole", lens)
     poses: tuple[CameraPose, ...] = ()
     if "rectification_matrix" in content and "projection_matrix" in content:
         rotation = np.array(numbers(content["rectification_matrix"]["data"], 9, "rectification_matrix")).reshape(3, 3)

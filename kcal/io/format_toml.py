@@ -22,6 +22,8 @@ from kcal.io.foreign import (
     ImportedCameras,
     camera_name,
     checked_pose,
+    core_of,
+    known_size,
     named_camera,
     numbers,
     plain,
@@ -58,19 +60,15 @@ def read_toml(path: Path, hints: Hints) -> ImportedCameras:
 
 def _toml_camera(key: str, part: Mapping[str, Any], hints: Hints) -> Camera:
     name = str(part.get("name", key))
-    size = whole_size(*numbers(part["size"], 2, f"{name} size")) if "size" in part else hints.size
-    if size is None:
-        raise ValueError(f"{name}: the image size is not in the file; give it (--size WIDTHxHEIGHT)")
-    fx, skew, cx, zero, fy, cy, *last = numbers(part["matrix"], 9, f"{name} matrix")
-    if zero or skew or last != [0.0, 0.0, 1.0]:
-        raise ValueError(f"{name}: matrix is no camera matrix without skew")
+    size = known_size(whole_size(*numbers(part["size"], 2, f"{name} size")) if "size" in part else hints.size)
+    core, skew = core_of(part["matrix"], f"{name} matrix")
+    if skew:
+        raise ValueError(f"{name}: matrix has a skew of {skew:g}, which aniposelib does not know")
     lens = numbers(part.get("distortions", []), tuple(BY_COUNT), f"{name} distortions")
     fisheye = bool(part.get("fisheye", False))
     if (fisheye and len(lens) < 4) or (fisheye and any(lens[4:])):
         raise ValueError(f"{name}: a fisheye has 4 coefficients, distortions has {len(lens)}")
-    return named_camera(
-        name, (fx, fy, cx, cy), size, "fisheye4" if fisheye else BY_COUNT[len(lens)], lens[:4] if fisheye else lens
-    )
+    return named_camera(name, core, size, "fisheye4" if fisheye else BY_COUNT[len(lens)], lens[:4] if fisheye else lens)
 
 
 def _toml_pose(part: Mapping[str, Any], meters: float) -> CameraPose:

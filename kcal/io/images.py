@@ -1,7 +1,4 @@
-"""Images in color or gray: PNG files written, any image file's bytes to pixels.
-
-Whether a file is whole (JPEG decoders only mutter about damage) is found out by `kcal.corners.images.decode_gray`.
-"""
+"""Images in color or gray as PNG files; `kcal.corners.images` reads images."""
 
 from __future__ import annotations
 
@@ -12,35 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kcal.errors import FileError, InputError
+from kcal.errors import InputError
 from kcal.files import write_atomic
-from kcal.image_header import check_image_header
-
-
-def decode_image(data: bytes, source: str | Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
-    """Decode an image file's bytes as stored: gray (H, W), RGB (H, W, 3) or RGBA (H, W, 4), uint8 or uint16.
-
-    The EXIF orientation is ignored: row 0 is the row the sensor read first, because the lens does not turn with it.
-
-    Raises:
-        FileError: not an image, more than 500 megapixels, or pixels other than 8 or 16 bits unsigned; `source` names
-            it.
-
-    Example:
-        >>> colors = np.zeros((4, 6, 3), np.uint16) + np.array([1, 2, 65535], np.uint16)
-        >>> decode_image(encode_png(colors), "memory")[0, 0].tolist()
-        [1, 2, 65535]
-    """
-    check_image_header(data, source)
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        image = None
-    if image is None:
-        raise FileError(f"{source}: the image is truncated or corrupt; copy it again or leave it out")
-    if image.dtype not in (np.uint8, np.uint16):
-        raise FileError(f"{source}: pixels are {image.dtype}; store the image with 8 or 16 bits unsigned")
-    return _swap_red_and_blue(image)
 
 
 def encode_png(image: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
@@ -58,7 +28,9 @@ def encode_png(image: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
         raise InputError(
             f"an image (H, W), (H, W, 3) or (H, W, 4) of uint8 or uint16 is needed, got {image.shape} of {image.dtype}"
         )
-    done, data = cv2.imencode(".png", _swap_red_and_blue(image))
+    # OpenCV's order of channels is blue, green, red.
+    swapped: NDArray[Any] = image if image.ndim == 2 else image[..., [2, 1, 0, *range(3, image.shape[2])]]
+    done, data = cv2.imencode(".png", np.ascontiguousarray(swapped))
     if not done:
         raise InputError(f"an image of shape {image.shape} cannot be encoded as PNG")
     return bytes(data.tobytes())
@@ -78,8 +50,3 @@ def write_png(path: str | Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -
         'gray.png'
     """
     return write_atomic(path, encode_png(image))
-
-
-def _swap_red_and_blue(image: NDArray[Any]) -> NDArray[Any]:
-    """OpenCV's order of channels to RGB(A), or back."""
-    return image if image.ndim == 2 else np.ascontiguousarray(image[..., [2, 1, 0, *range(3, image.shape[2])]])

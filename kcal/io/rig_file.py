@@ -20,11 +20,10 @@ from torch import Tensor
 from kcal.checks import as_covariance
 from kcal.errors import FileError
 from kcal.file_kind import CAMERA_RIG_VERSION
-from kcal.io.camera_file import RETIRED_FIELDS, CameraFile, camera_to_file
+from kcal.io.camera_file import RETIRED_FIELDS, CameraFile, named_camera_file
 from kcal.io.file_summary import RigSummary
 from kcal.io.record import Packed
 from kcal.lens.calibration import RigCalibration
-from kcal.lens.camera import Camera
 from kcal.lens.mounting import Mounting, Origin
 from kcal.lens.projection import INTRINSICS
 from kcal.lens.rig import RigCovariance, StereoRig, half_of_covariance
@@ -239,8 +238,8 @@ def rig_to_file(rig: StereoRig) -> RigFile:
     covariance, mounting = rig.covariance, rig.mounting
     with storing("rig"):
         file = RigFile(
-            left=_camera_to_file(rig.left, "left"),
-            right=_camera_to_file(rig.right, "right"),
+            left=named_camera_file(rig.left, "left"),
+            right=named_camera_file(rig.right, "right"),
             right_from_left=RigPose.model_validate(
                 {
                     "rotation": rig.right_from_left_rotation.tolist(),
@@ -252,11 +251,6 @@ def rig_to_file(rig: StereoRig) -> RigFile:
             calibration=rig.calibration,
         )
     return file.model_copy(update={"summary": RigSummary.made(rig, file.model_dump(mode="json"))})
-
-
-def _camera_to_file(camera: Camera, name: str) -> CameraFile:
-    known = camera.calibration
-    return camera_to_file(camera, name=known.name if known is not None and known.name else name)
 
 
 def save_rig(rig: StereoRig, path: str | Path) -> Path:

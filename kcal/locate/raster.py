@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcal.errors import FileError, InputError
+from kcal.errors import FileError, InputError, with_extra
 from kcal.files import read_head, read_text
 from kcal.locate.ellipsoid import mean_radius
 
@@ -121,10 +121,8 @@ def _check_cells(path: Path, columns: int, rows: int) -> None:
 
 
 def _read_raster(path: Path) -> _Read:
-    try:
+    with with_extra("terrain", "terrain needs"):
         import rasterio
-    except ImportError as error:
-        raise InputError("terrain needs rasterio; install it with: pip install 'kcal[terrain]'") from error
     try:
         with rasterio.open(path) as raster:
             _check_cells(path, raster.width, raster.height)

@@ -7,7 +7,7 @@ above the WGS84 ellipsoid. Local meters are east, north, up of the same origin.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,7 +19,8 @@ from kcal.errors import FileError, InputError
 from kcal.lens.mounting import Origin
 from kcal.locate.geodesy import geodetic_to_enu
 from kcal.locate.marks import PIXELS, Marks, pixel_of
-from kcal.locate.tables import TableRow, read_rows
+from kcal.locate.tables import TableRow, guarded, read_rows
+from kcal.texts import csv_line
 
 EARTH, LOCAL = ("lat", "lon", "height"), ("east", "north", "up")
 FEATURE_COLUMNS = ("name", *PIXELS, "range", "range_sigma", "beyond", "note")
@@ -71,6 +72,12 @@ def read_survey(path: str | Path, origin: Origin | None = None, *, measured: boo
     values, origin = places_of(rows, path, origin)
     sigma = [place_sigma(row, "place") if measured or row.cells.get("sigma") else (0.0, 0.0, 0.0) for row in rows]
     return Survey(tuple(row.name for row in rows), values, torch.tensor(sigma, dtype=torch.float64), origin)
+
+
+def places_csv(columns: Sequence[str], places: Iterable[Sequence[str | float | None]]) -> str:
+    """Places as CSV that `read_survey` reads: each its name, three coordinates in `columns`, sigma and sigma_up."""
+    lines = [csv_line([guarded(str(name)), *numbers]) for name, *numbers in places]
+    return csv_line(["name", *columns, "sigma", "sigma_up"]) + "".join(lines)
 
 
 def places_of(rows: Sequence[TableRow], path: str | Path, origin: Origin | None) -> tuple[Tensor, Origin | None]:
@@ -138,24 +145,29 @@ def match_landmarks(survey: Survey, marks: Marks, pixel_sigma: float | Tensor) -
         >>> found.landmarks.names, found.unmarked, found.unsurveyed
         (('post',), ('mast',), ('tree',))
     """
-    index = {name: i for i, name in enumerate(marks.names)}
-    common = [name for name in survey.names if name in index]
-    if not common:
+    return marked_places(survey, marks.names, marks.pixels, pixel_sigma)
+
+
+def marked_places(survey: Survey, names: Sequence[str], pixels: Tensor, pixel_sigma: float | Tensor) -> MarkedLandmarks:
+    """The same for pixels (N, C, 2) of C cameras; `pixel_sigma` is one number, or (N, C)."""
+    index = {name: i for i, name in enumerate(names)}
+    places = [i for i, name in enumerate(survey.names) if name in index]
+    if not places:
         raise InputError(
-            f"no surveyed place ({', '.join(survey.names[:3])} ...) has a mark ({', '.join(marks.names[:3])} ...): "
+            f"no surveyed place ({', '.join(survey.names[:3])} ...) has a mark ({', '.join(names[:3])} ...): "
             "the names must be the same in both files"
         )
+    common = tuple(survey.names[i] for i in places)
     rows = [index[name] for name in common]
-    places = [survey.names.index(name) for name in common]
     landmarks = Landmarks(
-        names=tuple(common),
+        names=common,
         points=survey.points[places],
         sigma=survey.sigma[places],
-        pixels=marks.pixels[rows],
+        pixels=pixels[rows],
         pixel_sigma=pixel_sigma[rows] if isinstance(pixel_sigma, Tensor) else pixel_sigma,
     )
     unmarked = tuple(name for name in survey.names if name not in index)
-    return MarkedLandmarks(landmarks, unmarked, tuple(name for name in marks.names if name not in common))
+    return MarkedLandmarks(landmarks, unmarked, tuple(name for name in names if name not in common))
 
 
 def read_features(path: str | Path, pixel_sigma: float) -> Features:

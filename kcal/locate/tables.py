@@ -29,7 +29,7 @@ CHUNK_ROWS = CHUNK
 # Characters of a line.
 _LONGEST = 1 << 20
 
-_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+_NUMBER = re.compile(r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]+)?")
 # Apostrophes, and what begins a formula: see `kcal.texts.csv_line`.
 _GUARDED = re.compile(r"'+\s*[=+\-@＝＋－＠]")
 

@@ -185,14 +185,20 @@ def viewpoint(
     name: str, camera: Camera, enu: Tensor, enu_from_camera: Tensor, geodetic: tuple[float, float, float]
 ) -> Viewpoint:
     """Where a camera stands and what it sees, given its center (3,), attitude (3, 3) and place on the Earth."""
-    width, height = camera.size
-    ends = camera.focal.new_tensor([[-0.5, (height - 1) / 2], [width - 0.5, (height - 1) / 2]])
-    rays, valid = camera.unproject(ends)
-    first, last = azimuth_elevation(rays.cpu() @ enu_from_camera.T)[:, 0].tolist()
+    ends = middle_row_ends(camera)
     east, north, up = enu.tolist()
     return Viewpoint(
         name=name,
         enu=(east, north, up),
         geodetic=geodetic,
-        azimuths_deg=(first, last) if bool(valid.all()) else None,
+        azimuths_deg=None if ends is None else tuple(azimuth_elevation(ends @ enu_from_camera.T)[:, 0].tolist()),
     )
+
+
+def middle_row_ends(camera: Camera) -> Tensor | None:
+    """Rays (2, 3) through the left and right ends of the image's middle row, on the CPU; None where there are none."""
+    width, height = camera.size
+    ends = camera.focal.new_tensor([[-0.5, (height - 1) / 2], [width - 0.5, (height - 1) / 2]])
+    with torch.no_grad():
+        rays, valid = camera.unproject(ends)
+    return rays.cpu() if bool(valid.all()) else None

@@ -12,11 +12,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.sources import Features, Landmarks
-from kcal.errors import FileError, InputError
+from kcal.calibrate.rig.sources import Features
+from kcal.errors import FileError
 from kcal.locate.distinct_keys import DistinctKeys, Doubled
 from kcal.locate.marks import read_marks
-from kcal.locate.survey import MarkedLandmarks, Survey, inverse_range_of
+from kcal.locate.survey import MarkedLandmarks, Survey, inverse_range_of, marked_places
 from kcal.locate.tables import TableChunk, TableRow, header_of, read_chunks
 
 _LONG = ("name", "camera", "u", "v")
@@ -212,27 +212,7 @@ def match_views(survey: Survey, views: ViewMarks, pixel_sigma: float) -> MarkedL
     Raises:
         InputError: no name is in both.
     """
-    index = {name: i for i, name in enumerate(views.names)}
-    places = [i for i, name in enumerate(survey.names) if name in index]
-    if not places:
-        raise InputError(
-            f"no surveyed place ({', '.join(survey.names[:3])} ...) has a mark ({', '.join(views.names[:3])} ...): "
-            "the names must be the same in both files"
-        )
-    rows = [index[survey.names[i]] for i in places]
-    landmarks = Landmarks(
-        names=tuple(survey.names[i] for i in places),
-        points=survey.points[places],
-        sigma=survey.sigma[places],
-        pixels=views.pixels[rows],
-        pixel_sigma=views.sigmas(pixel_sigma)[rows],
-    )
-    named = set(survey.names)
-    return MarkedLandmarks(
-        landmarks,
-        tuple(name for name in survey.names if name not in index),
-        tuple(name for name in views.names if name not in named),
-    )
+    return marked_places(survey, views.names, views.pixels, views.sigmas(pixel_sigma))
 
 
 def read_feature_views(path: str | Path, cameras: Sequence[str], pixel_sigma: float) -> Features:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
 from kcal.errors import FileError
-from kcal.locate.survey import EARTH, LOCAL, PLACE_COLUMNS, read_survey
+from kcal.locate.survey import EARTH, LOCAL, PLACE_COLUMNS, places_csv, read_survey
 from kcal.locate.tables import read_rows
 from kcal.mark.items import Place
 
@@ -46,10 +44,6 @@ def read_places(path: Path) -> SurveyedPlaces:
 
 def places_text(survey: SurveyedPlaces) -> str:
     """The places as CSV that `read_survey` reads."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["name", *survey.columns, "sigma", "sigma_up"])
-    for name, place in survey.places.items():
-        up = "" if place.sigma_up is None else repr(place.sigma_up)
-        writer.writerow([name, *map(repr, place.at), repr(place.sigma), up])
-    return text.getvalue()
+    return places_csv(
+        survey.columns, ([name, *place.at, place.sigma, place.sigma_up] for name, place in survey.places.items())
+    )

@@ -97,6 +97,8 @@ class FramesTogether:
         frames = [self._frames(0, 1e-6 * offset - self._apart)]
         for c in range(1, len(self._videos)):
             frames.append(self._frames(c, 1e-6 * offset - 2 * self._apart - self._late(c)))
+        if not (offset or self.live or self._pairs):
+            self._tell_early()
         groups: Iterable[Together] = self._grouped(frames)
         if self.live:
             groups = self._newest = Handover(groups, 1, waits=False)
@@ -111,6 +113,16 @@ class FramesTogether:
                 f"{' and '.join(self._videos)}: no frames within {self._apart:g} s of each other; if the "
                 "recordings began at different times, say so with --clock-offset"
             )
+
+    def _tell_early(self) -> None:
+        """Say what is left out of files that begin before second 0 of the first one, from which times count."""
+        first, *others = self._sizes
+        for c, name in enumerate(others, 1):
+            if (early := -self._late(c)) > 0:
+                self._tell(
+                    f"{name}: what it shows in the {early:.3g} s before second 0 of {first} is left out, because times "
+                    "count from there; put the camera first that begins first"
+                )
 
     def _grouped(self, frames: list[Iterator[TimedFrame]]) -> Iterator[Together]:
         if self._pairs:

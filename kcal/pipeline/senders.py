@@ -15,7 +15,7 @@ from collections.abc import Callable
 from typing import Any, Protocol
 from urllib.parse import urlsplit
 
-from kcal.errors import InputError
+from kcal.errors import InputError, with_extra
 from kcal.locate.columns import PositionColumns
 from kcal.locate.cot import cot_events
 from kcal.locate.geojson import point_features
@@ -102,10 +102,8 @@ class MqttSender:
     """
 
     def __init__(self, address: str) -> None:
-        try:
+        with with_extra("mqtt", "MQTT needs"):
             from paho.mqtt import client, enums
-        except ImportError as error:
-            raise InputError("MQTT needs paho-mqtt; install it with: pip install 'kcal[mqtt]'") from error
         parts = urlsplit(address)
         self._topic = parts.path.strip("/")
         if parts.scheme != "mqtt" or not parts.hostname or not self._topic or set(self._topic) & set("#+"):

@@ -15,7 +15,7 @@ from kcal.calibrate.camera.calibrate import CameraCalibrationResult
 from kcal.corners.observations import Observations
 from kcal.lens.uncertainty import image_sigma
 from kcal.report.colors import ACCENT, FAINT, INK, WARN
-from kcal.report.figures import HALO, draw_arrows, frame_image, new_figure, save_picture, shortened
+from kcal.report.figures import HALO, draw_arrows, frame_image, new_figure, round_levels, save_picture, shortened
 
 # Of the width of axes: their color bar and the gap before it.
 COLORBAR_SHARE = 0.055
@@ -122,7 +122,7 @@ def draw_uncertainty(axes: Axes, observations: Observations, result: CameraCalib
     places = result.camera.grid(columns, rows).numpy()
     good = np.isfinite(sigma)
     low, high = np.quantile(sigma[good], [0.0, 0.98])
-    levels = _round_levels(max(low, 1e-6), max(high, 2e-6))
+    levels = round_levels(max(low, 1e-6), max(high, 2e-6))
     shown = axes.contourf(
         places[..., 0], places[..., 1], np.where(good, sigma, np.nan), levels=levels, cmap="viridis_r",
         norm=LogNorm(levels[0], levels[-1]), extend="both",
@@ -135,14 +135,6 @@ def draw_uncertainty(axes: Axes, observations: Observations, result: CameraCalib
         axes.contour(x, y, seen, levels=[0.5], colors=INK, linewidths=1.0, linestyles="dashed")
     axes.set_title("σ of far directions, pixels; dashed: what boards reached", fontsize=10, loc="left")
     axes.figure.colorbar(shown, ax=axes, fraction=COLORBAR_SHARE - 0.02, pad=0.02, format="%g")
-
-
-def _round_levels(low: float, high: float) -> list[float]:
-    """Values 1, 2, 5, 10, ... around a range."""
-    steps = [m * 10.0**e for e in range(-7, 7) for m in (1, 2, 5)]
-    first = max(i for i, value in enumerate(steps) if value <= low)
-    last = min(i for i, value in enumerate(steps) if value >= high)
-    return steps[first : max(last, first + 1) + 1]
 
 
 def draw_residuals(axes: Axes, result: CameraCalibrationResult) -> None:

@@ -118,6 +118,39 @@ def draw_arrows(
     return scale
 
 
+def round_levels(low: float, high: float, least: int = 1) -> list[float]:
+    """Values 1, 2, 5, 10, 20, ... from at or below one number to at or above another; `least` steps at least.
+
+    Example:
+        >>> round_levels(0.03, 0.3)
+        [0.02, 0.05, 0.1, 0.2, 0.5]
+    """
+    steps = [step * 10.0**power for power in range(-7, 7) for step in (1, 2, 5)]
+    first = max((i for i, step in enumerate(steps) if step <= low), default=0)
+    last = next((i for i, step in enumerate(steps) if step >= high), len(steps) - 1)
+    return steps[first : max(last, first + least) + 1]
+
+
+def field_outline(
+    foot: NDArray[np.float64], first: float, last: float, reach: float, count: int = 120
+) -> NDArray[np.float64]:
+    """(M, 2) outline of what a camera sees on a plan, from one azimuth clockwise to another (radians).
+
+    Its straight sides have many points, because those of a camera beside the middle are curved on a logarithmic plan.
+    """
+    fan = np.linspace(first, first + (last - first) % (2.0 * math.pi), count)
+    rim = foot + reach * np.stack([np.sin(fan), np.cos(fan)], -1)
+    steps = np.concatenate([[0.0], np.geomspace(1e-4, 1.0, 60)])[:, None]
+    return np.concatenate([foot + steps * (rim[0] - foot), rim, (foot + steps * (rim[-1] - foot))[::-1]])
+
+
+def draw_north(axes: Axes, x: float) -> None:
+    """Draw the arrow to the north, up, at a share of the width of axes."""
+    arrow = {"arrowstyle": "-|>", "color": "#374151", "linewidth": 1.4}
+    axes.annotate("", (x, 1.0), (x, 0.89), xycoords="axes fraction", arrowprops=arrow)
+    axes.text(x, 0.88, "N", transform=axes.transAxes, ha="center", va="top", fontsize=11, color="#374151")
+
+
 def save_picture(path: str | Path, figure: Figure) -> Path:
     """Write a figure as PNG or SVG, as the suffix says, atomically.
 

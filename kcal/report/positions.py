@@ -17,7 +17,7 @@ from kcal.locate.positions import Located, Position
 from kcal.locate.stereo import PositionStatus
 from kcal.quantities import Unit, length_text, range_text
 from kcal.report.colors import CAMERA_COLORS, FAINT, GRAY, INK, WARN
-from kcal.report.figures import HALO, new_figure, save_picture
+from kcal.report.figures import HALO, draw_north, field_outline, new_figure, save_picture
 from kcal.report.tables import range_sigma, range_unit
 
 Array = NDArray[np.float64]
@@ -164,12 +164,7 @@ def _draw_map(axes: Axes, located: Located, true_enu: Array | None, shown: list[
         foot = np.asarray(camera.enu[:2])
         if camera.azimuths_deg is not None:
             first, last = camera.azimuths_deg
-            fan = np.radians(np.linspace(first, first + (last - first) % 360, 120))
-            rim = foot + scale.rim * np.stack([np.sin(fan), np.cos(fan)], -1)
-            # Straight lines from a camera beside the center are curved on a logarithmic map.
-            steps = np.concatenate([[0.0], np.geomspace(1e-4, 1.0, 60)])[:, None]
-            outline = np.concatenate([foot + steps * (rim[0] - foot), rim, (foot + steps * (rim[-1] - foot))[::-1]])
-            wedge = scale.place(outline)
+            wedge = scale.place(field_outline(foot, math.radians(first), math.radians(last), scale.rim))
             extent.append(wedge)
             axes.fill(*wedge.T, facecolor=color, alpha=0.07, edgecolor="none", zorder=0)
             axes.plot(*wedge.T, color=color, alpha=0.55, linewidth=0.9, zorder=1)
@@ -192,11 +187,7 @@ def _draw_map(axes: Axes, located: Located, true_enu: Array | None, shown: list[
     (left, bottom), (right, top) = box.min(0) - 0.05, box.max(0) + 0.05
     axes.set(xlim=(left - 0.04, right + 0.08), ylim=(bottom, top), aspect="equal", anchor="C")
     axes.axis("off")
-    axes.annotate(
-        "", (0.03, 1.0), (0.03, 0.89), xycoords="axes fraction",
-        arrowprops={"arrowstyle": "-|>", "color": "#374151", "linewidth": 1.4},
-    )  # fmt: skip
-    axes.text(0.03, 0.88, "N", transform=axes.transAxes, ha="center", va="top", fontsize=11, color="#374151")
+    draw_north(axes, 0.03)
     axes.legend(
         loc="upper center", bbox_to_anchor=(0.5, -0.005), ncols=4, fontsize=9, frameon=False, handletextpad=0.3,
         columnspacing=1.4,

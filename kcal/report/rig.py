@@ -9,15 +9,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from matplotlib import patheffects
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from kcal.calibrate.rig.result import ItemResidual, RigResult
 from kcal.lens.camera import Camera
+from kcal.locate.tabulate import middle_row_ends
 from kcal.quantities import length_text, measured_length, range_text
-from kcal.report.figures import new_figure, save_picture, wrapped
+from kcal.report.colors import CAMERA_COLORS, FAINT, WARN
+from kcal.report.figures import HALO, draw_north, field_outline, new_figure, save_picture, wrapped
 
 Array = NDArray[np.float64]
 
@@ -29,9 +30,6 @@ _COLORS = {
     "baselines": "#7c3aed",
     "positions": "#dd7a1f",
 }
-_WRONG, _FAINT = "#c02a6b", "#9aa3af"
-_CAMERAS = ("#2b6cb0", "#dd7a1f", "#0f766e", "#7c3aed")
-_HALO = [patheffects.withStroke(linewidth=2.5, foreground="white")]
 _ROWS = 45
 # Of what is shown: cameras farther from their middle stand around it.
 _WIDE = 0.1
@@ -131,39 +129,33 @@ def _draw_plan(axes: Axes, result: RigResult) -> None:
 
     extent = []
     for c, camera in enumerate(result.cameras):
-        color, edges = _CAMERAS[c % len(_CAMERAS)], _edges(result, c, camera)
+        color, edges = CAMERA_COLORS[c % len(CAMERA_COLORS)], _edges(result, c, camera)
         if edges is not None:
-            first, last = edges
-            fan = np.linspace(first, first + (last - first) % (2.0 * math.pi), 100)
-            rim = centers[c] + 1.1 * reach * np.stack([np.sin(fan), np.cos(fan)], -1)
-            # Straight lines from a camera beside the middle are curved on a logarithmic plan.
-            steps = np.concatenate([[0.0], np.geomspace(1e-4, 1.0, 60)])[:, None]
-            sides = [centers[c] + steps * (end - centers[c]) for end in (rim[0], rim[-1])]
-            extent.append(place(np.concatenate([sides[0], rim, sides[1][::-1]])))
+            extent.append(place(field_outline(centers[c], *edges, 1.1 * reach, 100)))
             axes.fill(*extent[-1].T, facecolor=color, alpha=0.07, edgecolor="none", zorder=0)
             axes.plot(*extent[-1].T, color=color, alpha=0.5, linewidth=0.9, zorder=1)
     circle = np.linspace(0.0, 2.0 * math.pi, 200)
     for radius in (step * 10.0**power for power in range(-3, 7) for step in (1.0, 5.0)):
         if nearest / 4 <= radius <= reach:
             ring = length(radius)
-            axes.plot(ring * np.sin(circle), ring * np.cos(circle), color=_FAINT, linewidth=0.7, linestyle=":")
+            axes.plot(ring * np.sin(circle), ring * np.cos(circle), color=FAINT, linewidth=0.7, linestyle=":")
             axes.text(
-                0.0, ring, range_text(radius), fontsize=8, color="#4b5563", ha="center", va="bottom", path_effects=_HALO
+                0.0, ring, range_text(radius), fontsize=8, color="#4b5563", ha="center", va="bottom", path_effects=HALO
             )
     for kind, (points, names, used) in places.items():
         drawn, good = place(points), np.array(used)
         marker = {"landmarks": "^", "boards": "s", "features": "o"}[kind]
         axes.plot(*drawn[good].T, marker, label=kind, markersize=6, color=_COLORS[kind], markerfacecolor="white")
-        axes.plot(*drawn[~good].T, "x", color=_WRONG, markersize=8, markeredgewidth=1.8)
+        axes.plot(*drawn[~good].T, "x", color=WARN, markersize=8, markeredgewidth=1.8)
         for xy, name, fine in zip(drawn, names, used, strict=True):
             if not fine or (kind == "landmarks" and len(names) <= 30):
-                color = _COLORS[kind] if fine else _WRONG
+                color = _COLORS[kind] if fine else WARN
                 axes.annotate(
                     name, (float(xy[0]), float(xy[1])), (6, 0), textcoords="offset points", fontsize=8, color=color,
                     va="center",
                 )  # fmt: skip
     if any(not item.used for item in result.items):
-        axes.plot([], [], "x", color=_WRONG, markeredgewidth=1.8, label="left out")
+        axes.plot([], [], "x", color=WARN, markeredgewidth=1.8, label="left out")
     looks = result.rotation[:, 2].numpy()
     for c, name in enumerate(result.names):
         here = place(centers[c])
@@ -173,16 +165,16 @@ def _draw_plan(axes: Axes, result: RigResult) -> None:
             "", (float(here[0] + 0.12 * ahead[0]), float(here[1] + 0.12 * ahead[1])), (float(here[0]), float(here[1])),
             arrowprops={"arrowstyle": "-|>", "color": "#111827", "linewidth": 1.2},
         )  # fmt: skip
-        axes.plot(*here, "o", color=_CAMERAS[c % len(_CAMERAS)], markersize=6, zorder=5, label=f"{name} camera")
+        axes.plot(
+            *here, "o", color=CAMERA_COLORS[c % len(CAMERA_COLORS)], markersize=6, zorder=5, label=f"{name} camera"
+        )
     seen = np.concatenate([place(centers), *extent, *(place(points) for points, _, _ in places.values())])
     low, high = seen.min(0) - 0.1, seen.max(0) + 0.15
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     axes.axis("off")
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.005), ncols=4, fontsize=9, frameon=False)
     if result.absolute:
-        arrow = {"arrowstyle": "-|>", "color": "#374151", "linewidth": 1.4}
-        axes.annotate("", (0.04, 1.0), (0.04, 0.89), xycoords="axes fraction", arrowprops=arrow)
-        axes.text(0.04, 0.88, "N", transform=axes.transAxes, ha="center", va="top", fontsize=11, color="#374151")
+        draw_north(axes, 0.04)
     where = "north up" if result.absolute else "first camera's axis up"
     scale = "to scale" if wide else "ranges on a logarithmic scale"
     axes.set_title(f"From above, {where}, {scale}", fontsize=10.5, color="#374151")
@@ -190,12 +182,11 @@ def _draw_plan(axes: Axes, result: RigResult) -> None:
 
 def _edges(result: RigResult, c: int, camera: Camera) -> tuple[float, float] | None:
     """Azimuths on the plan of the left and right ends of the image's middle row; None without rays there."""
-    width, height = camera.size
-    ends = torch.tensor([[-0.5, 0.5 * height], [width - 0.5, 0.5 * height]], dtype=torch.float64)
-    with torch.no_grad():
-        rays, valid = camera.unproject(ends)
+    rays = middle_row_ends(camera)
+    if rays is None:
+        return None
     flat = _flat(result, (rays @ result.rotation[c]).numpy())
-    if not bool(valid.all()) or float(np.linalg.norm(flat, axis=-1).min()) < 1e-6:
+    if float(np.linalg.norm(flat, axis=-1).min()) < 1e-6:
         return None
     return float(np.arctan2(*flat[0])), float(np.arctan2(*flat[1]))
 
@@ -210,7 +201,7 @@ def _draw_items(axes: Axes, result: RigResult) -> None:
     limit = max([3.5, *(min(item.sigmas, 8.0) for item in items)]) * 1.05
     for row, item in enumerate(items):
         length = min(item.sigmas, limit)
-        axes.barh(row, length, color=_COLORS[item.source] if item.used else _WRONG, height=0.7, alpha=0.85)
+        axes.barh(row, length, color=_COLORS[item.source] if item.used else WARN, height=0.7, alpha=0.85)
         if item.sigmas > limit:
             axes.text(limit * 0.99, row, f"{item.sigmas:.0f} ▸", ha="right", va="center", fontsize=7.5, color="white")
     axes.axvline(1.0, color="#374151", linewidth=0.9, linestyle=(0, (4, 3)))

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from kcal.locate.geodesy import geodetic_to_enu
 from kcal.locate.siting import Area, RankedSite, Site, SitingMap, siting_map
+from kcal.locate.tabulate import middle_row_ends
 from kcal.quantities import length_text
-from kcal.report.figures import HALO, new_figure, save_picture
+from kcal.report.figures import HALO, new_figure, round_levels, save_picture
 
 # From good to poor; blind and single are told apart by the blind eye too.
 _RAMP = LinearSegmentedColormap.from_list("sigma", ["#0b5d4f", "#3aa17e", "#a6d69b", "#f3e79b", "#e9a857", "#c8553d"])
@@ -119,10 +120,7 @@ def _sigma_levels(maps: Sequence[SitingMap]) -> list[float]:
     values = np.concatenate([_map_sigma(found).ravel() for found in maps])
     values = values[np.isfinite(values)]
     low, high = np.quantile(values, [0.02, 0.95]) if len(values) else (1.0, 10.0)
-    steps = [step * 10.0**power for power in range(-3, 6) for step in (1.0, 2.0, 5.0)]
-    first = max((i for i, step in enumerate(steps) if step <= low), default=0)
-    last = next((i for i, step in enumerate(steps) if step >= high), len(steps) - 1)
-    return steps[first : max(last, first + 2) + 1]
+    return round_levels(max(float(low), 1e-3), float(high), least=2)
 
 
 def _map_grid(area: Area) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -183,10 +181,8 @@ def _site_field(axes: Axes, area: Area, site: Site) -> tuple[float, float]:
         half = 0.5 * site.field_deg
         if site.camera is not None:
             # The angle between its rays through the left and right ends of the middle row.
-            width, height = site.camera.size
-            ends = torch.tensor([[-0.5, 0.5 * height], [width - 0.5, 0.5 * height]], dtype=torch.float64)
-            rays, valid = site.camera.unproject(ends)
-            if not bool(valid.all()):
+            rays = middle_row_ends(site.camera)
+            if rays is None:
                 return x, y
             half = math.degrees(0.5 * math.acos(max(-1.0, min(1.0, float(rays[0] @ rays[1])))))
         turn = np.radians(np.linspace(site.heading_deg - half, site.heading_deg + half, 40))

@@ -37,7 +37,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.sim.board import BoardSize, project_board
 from kcal.sim.render import RenderOptions, render_light
-from scripts.shared.page import write_section
+from scripts.shared.page import table, write_section
 
 BOARD = Board(columns=9, rows=6, square=0.025)
 SQUARES, BLURS, NOISES = (8, 10, 20, 40), (0.5, 1.0, 2.0), (0, 2, 5)
@@ -156,20 +156,19 @@ def _lost(pixels: Tensor, truth: Tensor) -> Tensor:
     return torch.nan_to_num(pixels - truth, nan=1e3)
 
 
-def table(cells: dict[tuple[int, float, float], dict[str, Errors]]) -> list[str]:
+def rms_table(cells: dict[tuple[int, float, float], dict[str, Errors]]) -> list[str]:
     """RMS per axis of every method at the usual noise, then the predicted over the true standard deviation of erf."""
     names = list(next(iter(cells.values())))
-    head = ["square", "blur", *names, "predicted/true σ"]
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    rows = []
     for (square, blur, noise), cell in cells.items():
         if noise != SHOWN:
             continue
-        row = [f"{square}", f"{blur:g}"]
+        row = [str(square), f"{blur:g}"]
         for errors in cell.values():
             rms, _, _, lost, _ = errors.row()
             row.append("lost" if math.isnan(rms) else f"{rms:.4f}" + (f" ({100 * lost:.1f} %)" if lost > 5e-4 else ""))
-        lines.append("| " + " | ".join([*row, f"{cell['kcal erf'].row()[4]:.2f}"]) + " |")
-    return lines
+        rows.append([*row, f"{cell['kcal erf'].row()[4]:.2f}"])
+    return table(["square", "blur", *names, "predicted/true σ"], rows)
 
 
 def summary(cells: dict[tuple[int, float, float], dict[str, Errors]]) -> str:
@@ -214,7 +213,7 @@ def main() -> None:
     torch.set_num_threads(1)
     squares, count = (SQUARES[1:], 2) if arguments.quick else (SQUARES, 20)
     cells = {(s, b, n): run_cell(s, b, n, count) for s, b, n in itertools.product(squares, BLURS, NOISES)}
-    lines = [*table(cells), "", summary(cells)]
+    lines = [*rms_table(cells), "", summary(cells)]
     print(*lines, sep="\n")
     if arguments.write:
         write_section("corners.md", "refinement", "\n".join(lines))

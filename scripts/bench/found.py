@@ -28,7 +28,8 @@ from kcal.corners.detect import detect_board, limit_threads
 from kcal.corners.images import expand_images, read_gray, to_8bit
 from kcal.corners.order import canonical_order
 from scripts.bench.hard_boards import BOARD, HARD, NOT_THE_BOARD, Picture, large, pictures
-from scripts.shared.page import write_section
+from scripts.shared.page import table, write_section
+from scripts.shared.timing import row, show
 
 FALSE = 2.0  # pixels
 FOLDERS = (
@@ -116,30 +117,31 @@ def main() -> None:
     parser.add_argument("--write", action="store_true", help="write the section of docs/measured/corners.md")
     arguments = parser.parse_args()
     limit_threads(1)
-    head = ["| | " + " | ".join(DETECTORS) + " |", "|" + "---|" * (1 + len(DETECTORS))]
-    rows = []
+    heads = ["", *DETECTORS]
+    rows: list[list[str]] = []
     for kind in HARD:
         some = list(pictures(kind, arguments.images))
-        rows.append(" | ".join([kind.__name__, *(score(find, some, BOARD) for find in DETECTORS.values())]))
-        print(rows[-1], flush=True)
+        rows.append([kind.__name__, *(score(find, some, BOARD) for find in DETECTORS.values())])
+        show([row(*rows[-1])])
     if arguments.large:
         some = list(pictures(large, arguments.large))
         cells = [score(find, some, BOARD) for name, find in DETECTORS.items() if not name.startswith("SB, ")]
-        rows.append(" | ".join([f"large ({arguments.large})", *cells, "not run: minutes"]))
-        print(rows[-1], flush=True)
+        rows.append([f"large ({arguments.large})", *cells, "not run: minutes"])
+        show([row(*rows[-1])])
     for kind in NOT_THE_BOARD:
         some = list(pictures(kind, arguments.images))
         cells = [score(find, some, BOARD) for find in DETECTORS.values()]
-        rows.append(" | ".join([f"{kind.__name__} (none is right)", *cells]))
-        print(rows[-1], flush=True)
-    text = [*head, *(f"| {row} |" for row in rows)]
+        rows.append([f"{kind.__name__} (none is right)", *cells])
+        show([row(*rows[-1])])
+    text = table(heads, rows)
     if os.environ.get("KCAL_DATA"):
-        text += ["", *head]
+        real_rows = []
         for folder, board in FOLDERS:
             images = real(folder, board)()
             cells = [found_only(find, images, board) for find in DETECTORS.values()]
-            text.append(f"| {folder}, {board.columns}x{board.rows} | " + " | ".join(cells) + " |")
-            print(text[-1], flush=True)
+            real_rows.append([f"{folder}, {board.columns}x{board.rows}", *cells])
+            show([row(*real_rows[-1])])
+        text += ["", *table(heads, real_rows)]
     if arguments.write:
         write_section("corners.md", "found", "\n".join(text))
 

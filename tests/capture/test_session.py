@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -12,7 +13,7 @@ from capture_frames import BOARD, images
 from typer.testing import CliRunner
 
 from kcal.capture.session import FIRST_VIEWS, CaptureOptions, CaptureSession, follow
-from kcal.capture.sources import Shot, newest, shots
+from kcal.capture.sources import Shot, shots
 from kcal.cli.main import app
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations
@@ -103,29 +104,26 @@ def test_images_that_come_into_a_folder(tmp_path: Path) -> None:
         next(shots(str(tmp_path / "none"), lambda: False, told.append))
 
 
-def test_a_slow_reader_gets_the_newest_frame() -> None:
+def test_of_a_stream_the_newest_frame_is_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
     going = threading.Event()
 
-    def frames():  # type: ignore[no-untyped-def]
-        for i in range(5):
-            yield Frame(i, images()[0])
+    def frames(source: str, duration: float) -> Iterator[Frame]:
+        for number in range(7 * 5):
+            yield Frame(number, images()[0])
         going.set()
-
-    found = newest(frames())
-    first = next(found)
-    going.wait(5)
-    rest = [frame.number for frame in found]
-    assert first.number < 5
-    # What came in between is gone, the order is kept.
-    assert rest == sorted(rest)
-    assert len(rest) < 4
-
-    def broken():  # type: ignore[no-untyped-def]
-        yield Frame(0, images()[0])
         raise FileError("the stream ended")
 
+    monkeypatch.setattr("kcal.capture.sources.read_frames", frames)
+    found = shots("camera:0", lambda: False, print)
+    first = next(found)
+    going.wait(5)
+    rest: list[str] = []
     with pytest.raises(FileError, match="the stream ended"):
-        list(newest(broken()))
+        rest.extend(shot.name for shot in found)
+    assert first.moving
+    # What came in between is gone, the order is kept.
+    assert 0 < len(rest) < 4
+    assert [first.name, *rest] == sorted([first.name, *rest])
 
 
 @pytest.mark.slow

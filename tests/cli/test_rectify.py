@@ -11,9 +11,10 @@ import pytest
 import torch
 
 from kcal.cli.main import main
+from kcal.corners.images import decode_image
 from kcal.errors import FileError, InputError
 from kcal.io.camera_file import load_camera, save_camera
-from kcal.io.images import decode_image, encode_png
+from kcal.io.images import encode_png
 from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.camera import Camera
 from kcal.lens.images import Undistort

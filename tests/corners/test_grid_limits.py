@@ -13,8 +13,9 @@ from torch import Tensor
 
 from kcal.corners.board import Board
 from kcal.corners.circle_bias import _degree, homography, local_maps
+from kcal.corners.grid import sides
 from kcal.corners.grid_check import false_sides, goes_on, grid_trouble, skips, uneven
-from kcal.corners.grow import filled_grid, grown_grid, sides
+from kcal.corners.grow import filled_grid, grown_grid
 from kcal.corners.match import MatchOptions, MatchStatus, PatchMatch, fit_peak, joined
 from kcal.corners.order import uprightness
 from kcal.corners.part import _grown, _hidden_sides, _placements, _symmetries, board_ends

@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
+from kcal.corners.images import decode_image
 from kcal.errors import FileError, InputError
-from kcal.io.images import decode_image, encode_png, write_png
+from kcal.io.images import encode_png, write_png
 from kcal.io.video_file import write_video
 
 DRAW = np.random.default_rng(1)

@@ -71,6 +71,22 @@ def test_three_cameras(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [group for _, _, group in found] == [[1.0, 1.1, 1.05], [2.0, None, 1.95], [None, 2.4, None]]
 
 
+def test_what_is_before_the_first_camera_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Times count from second 0 of the first file: what another one shows before is left out, and not silently."""
+    videos(monkeypatch, [0.0, 1.0], [0.0, 2.0, 3.0], [0.0, 1.0])
+    told: list[str] = []
+    options: dict[str, Any] = {"apart_s": 0.2, "late": lambda c: -2.0 if c == 1 else 0.5, "tell": told.append}
+    _, found = groups(3, pairs=False, **options)
+    assert [time for _, time, _ in found] == [0.0, 0.5, 1.0, 1.5]
+    (text,) = told
+    assert text.startswith("right: what it shows in the 2 s before second 0 of left is left out")
+    # Not where a run goes on, nor of pairs, whose frames without a partner are left out anyway.
+    groups(3, 500_000, pairs=False, **options)
+    videos(monkeypatch, [0.0, 1.0], [0.0, 2.0, 3.0])
+    groups(2, pairs=True, **options)
+    assert len(told) == 1
+
+
 def test_nothing_together(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two files that never meet are refused; not where a run goes on, nor after it was ended."""
     videos(monkeypatch, [0.0, 1.0], [50.0, 51.0])

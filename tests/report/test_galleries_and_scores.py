@@ -22,8 +22,8 @@ from kcal.lens.mounting import Origin
 from kcal.locate.geodesy import enu_to_geodetic
 from kcal.locate.positions import locate_points
 from kcal.report import site_sketch
-from kcal.report.calibration import _round_levels
 from kcal.report.colors import ACCENT, WARN
+from kcal.report.figures import round_levels
 from kcal.report.gallery import FailedImage, _predicted_sigma, _thumbnail, coverage_figure, gallery_figure
 from kcal.report.practice_score import _place_at, located_rows, score_positions, score_tracks
 from kcal.report.tables import range_sigma, truth_rows
@@ -103,9 +103,9 @@ class TestGallery:
         assert figure.get_figheight() == pytest.approx(9.0 * 480 / 640 * 0.86 + 1.2)
 
     def test_levels_are_round(self) -> None:
-        assert _round_levels(0.03, 0.4) == [0.02, 0.05, 0.1, 0.2, 0.5]
-        assert _round_levels(0.05, 0.05) == [0.05, 0.1]
-        assert _round_levels(1.0, 2.0) == [1.0, 2.0]
+        assert round_levels(0.03, 0.4) == [0.02, 0.05, 0.1, 0.2, 0.5]
+        assert round_levels(0.05, 0.05) == [0.05, 0.1]
+        assert round_levels(1.0, 2.0) == [1.0, 2.0]
 
 
 def test_a_sketch_names_what_to_mark(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
