@@ -20,7 +20,7 @@ from kcal.calibrate.problem.readout import AMPLITUDES, LARGEST, MOTION, Readout,
 
 _ROUNDS = 12
 # Rounds after which views stand still if motion gains nothing.
-_SETTLED = 1
+_SETTLED = 0
 # Steps of the solver, and squared standard deviations by which one must lower chi² to be worth the next: in the first
 # round, in the others, and at the end.
 _FIRST, _LATER, LAST = (8, 0.1), (12, 0.02), (10, 0.01)

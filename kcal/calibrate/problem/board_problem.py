@@ -20,9 +20,10 @@ from kcal.calibrate.problem.readout import MOTION, Readout
 from kcal.calibrate.problem.state import BoardState, warp_modes
 from kcal.calibrate.problem.twist import apply_twist
 from kcal.gaussian import triangular
+from kcal.lens.hybrid_terms import LEADING, fill_field_columns
 from kcal.lens.model import LensModel
 from kcal.lens.pose import nearest_rotation, step_rows
-from kcal.lens.projection import INTRINSICS, project_components
+from kcal.lens.projection import INTRINSICS, Projection, project_components
 from kcal.solve.result import State
 from kcal.solve.robust import RobustLoss
 from kcal.solve.schur import Products, SchurLinearization, SchurProblem, without_local
@@ -30,7 +31,7 @@ from kcal.solve.schur import Products, SchurLinearization, SchurProblem, without
 _ALL = slice(None)
 POSE = 6
 # Numbers in the rows of derivatives that are formed at a time: with fewer, default cameras took longer (measured).
-_CHUNK = 1_200_000
+_CHUNK = 600_000
 
 
 class BoardProblem(SchurProblem[BoardState]):
@@ -111,6 +112,11 @@ class BoardProblem(SchurProblem[BoardState]):
         # With hundreds of columns a linearization costs far more than the cost alone.
         self.joint = not model.hybrid
         self._kept: list[tuple[BoardState, Products]] = []
+        self._shown: list[tuple[BoardState, _Imaged]] = []
+        self._slots = torch.tensor(self.free.slots, dtype=torch.long, device=pixels.device)
+        first = len(INTRINSICS) + len(LEADING)
+        self._leading = [index for index in self.free.indices if index < first]
+        self._field = self._field_slots(first, weights) if model.hybrid and not batch else None
         self.slots = self._places(model.size)
 
     def _weigh(self, weights: Tensor | None) -> None:
@@ -122,6 +128,16 @@ class BoardProblem(SchurProblem[BoardState]):
             self.weights = torch.where(self.seen, weights, 0.0)
             self._counts = self.weights > 0
         self._all_count = bool(self._counts.all())
+
+    def _field_slots(self, first: int, weights: Tensor | None) -> slice | None:
+        """Where all weights of the field, or none, stand among the unknowns; None where they stand elsewhere."""
+        begin = len(self._leading)
+        indices, slots = self.free.indices[begin:], self.free.slots[begin:]
+        start = min(slots, default=0)
+        apart = bool(indices) and indices != tuple(range(first, len(INTRINSICS) + self.model.size))
+        if apart or slots != tuple(range(start, start + len(slots))) or (weights is not None and weights.ndim > 2):
+            return None
+        return slice(start, start + len(slots))
 
     def _places(self, coefficients: int) -> Tensor:
         """(5 + P + B,) the place of each of `values` among the unknowns of a step; -1 where it has none."""
@@ -162,7 +178,7 @@ class BoardProblem(SchurProblem[BoardState]):
         if len(self.batch) != 1:
             return None
         part = copy.copy(self)
-        part._kept = []
+        part._kept, part._shown = [], []
         part.batch = (len(elements),)
         if self.seen.ndim > 2:
             part.seen, part._target, part._counts = self.seen[elements], self._target[elements], self._counts[elements]
@@ -192,6 +208,26 @@ class BoardProblem(SchurProblem[BoardState]):
         rotated = state.rotation @ moved.points
         return _Placed(flat, rotated, rotated + state.translation[..., None] + moved.shift, moved.turn)
 
+    def _imaged(self, state: BoardState, views: slice = _ALL) -> _Imaged:
+        """Corners of a state, with derivatives by all parameters but those of a field whose columns follow."""
+        if not self._by_field(state):
+            part = state if views == _ALL else state.views(views)
+            placed = self._placed(part, views)
+            seen = project_components(placed.points, part.parameters[..., None, :], self.model, self.free.indices)
+            return _Imaged(placed, seen, part.rotation, views)
+        if not (self._shown and self._shown[0][0] is state):
+            # What the cost of a trial needs serves its derivatives, too, if it is accepted.
+            placed = self._placed(state)
+            seen = project_components(placed.points, state.parameters[None], self.model, self._leading)
+            self._shown[:] = [(state, _Imaged(placed, seen, state.rotation, _ALL))]
+        return self._shown[0][1].of(views)
+
+    def _by_field(self, state: BoardState) -> bool:
+        """Whether derivatives by the field's weights are written where they belong, as nothing is differentiated."""
+        fixed = (self._board, self.shapes, *(() if self.readout is None else (self._time,)))
+        plain = self._field is not None and float(state.parameters[4]) == 0.0
+        return plain and not any(each.requires_grad for each in (*state, *fixed))
+
     def points(self, state: BoardState) -> Tensor:
         """(..., V, N, 3) the board's corners in the camera's frame, meters."""
         return self._placed(state).points.transpose(-1, -2)
@@ -201,7 +237,11 @@ class BoardProblem(SchurProblem[BoardState]):
 
         NaN where a seen corner lies behind the camera, or beyond a pole or a fold of the lens.
         """
-        projected = project_components(self._placed(state).points, state.parameters[..., None, :], self.model)
+        if self._by_field(state):
+            projected = self._imaged(state).seen
+        else:
+            points = self._placed(state).points
+            projected = project_components(points, state.parameters[..., None, :], self.model)
         bad = torch.where(projected.regular, 0.0, torch.nan)[..., None, :]
         return torch.where(self.seen[..., None, :], projected.pixels - self._target + bad, 0.0)
 
@@ -236,68 +276,91 @@ class BoardProblem(SchurProblem[BoardState]):
         # Without an image a corner of weight zero is NaN.
         return torch.where(weights > 0, vectors * weights, 0.0)
 
+    def _counted(self, vectors: Tensor, views: slice) -> Tensor:
+        """Vectors as in `_weighted`, zero where a corner does not count."""
+        if not self._all_count:
+            vectors = torch.where(self._counts[..., views, None, None, :], vectors, 0.0)
+        return self._weighted(vectors, views)
+
     def corner_rows(self, state: BoardState, views: slice = _ALL) -> Tensor:
-        """(..., V, L + S + 1, 2 N) as `rows`, of the corners alone."""
-        flat, rotated, points, turn = self._placed(state, views)
-        projected = project_components(points, state.parameters[..., None, :], self.model, self.free.indices)
-        parts = [step_rows(projected.by_point, rotated)]
-        if self.readout is not None:
-            parts.append(self.readout.columns_of(projected.by_point, state.rotation, self._time[views], flat))
-        parts.extend(self.free.collapsed(projected.by_camera, -3))
-        if self.free_board:
-            by_board = torch.einsum("...vkun,...vkl->...vlun", projected.by_point, state.rotation)
-            if turn is not None:
-                # What displaces a corner of the board turns with it.
-                by_board = by_board + torch.linalg.cross(by_board, turn[:, :, None].expand_as(by_board), dim=1)
-            parts.append(torch.einsum("...vlun,bln->...vbun", by_board, self.shapes))
-        error = projected.pixels - self._target[..., views, :, :]
+        """(..., V, L + S + 1, 2 N) as `rows`, of the corners alone, and as if no unknown were held."""
+        placed, seen, rotation, _ = self._imaged(state, views)
+        error = seen.pixels - self._target[..., views, :, :]
         if self.joint:
             # A hybrid lens has values beyond its disc, too: a start may have corners there, but no state that follows.
-            error = error + torch.where(projected.regular, 0.0, torch.nan)[..., None, :]
-        rows = torch.cat([*parts, error[..., None, :, :]], -3)
-        if not self._all_count:
-            rows = torch.where(self._counts[..., views, None, None, :], rows, 0.0)
-        rows = self._weighted(rows, views)
+            error = error + torch.where(seen.regular, 0.0, torch.nan)[..., None, :]
+        by_point, by_camera, error = (
+            self._counted(part, views) for part in (seen.by_point, seen.by_camera, error[..., None, :, :])
+        )
+        L, count = self.local_size, len(self.free)
+        rows = self._memory(by_point, L + self.unknown_count + 1)
+        rows[..., :POSE, :, :] = step_rows(by_point, placed.rotated)
+        if self.readout is not None:
+            rows[..., POSE:L, :, :] = self.readout.columns_of(by_point, rotation, self._time[views], placed.flat)
+        shared = rows[..., L:-1, :, :]
+        slots = self._slots[: by_camera.shape[-3]]
+        shared.index_fill_(-3, slots, 0.0).index_add_(-3, slots, by_camera)
+        if len(slots) < len(self._slots):
+            self._fill_field(shared, seen, state, views)
+        if self.free_board:
+            by_board = (rotation.mT @ by_point.flatten(-2)).unflatten(-1, (2, -1))
+            if placed.turn is not None:
+                # What displaces a corner of the board turns with it.
+                by_board = by_board + torch.linalg.cross(by_board, placed.turn[:, :, None].expand_as(by_board), dim=1)
+            along = zip(by_board.split(1, -3), self.shapes[:, :, None].unbind(1), strict=True)
+            shared[..., count:, :, :] = sum(slope * shape for slope, shape in along)
+        rows[..., -1:, :, :] = error
         if self.loss is not None:
-            squared = rows[..., -1, :, :].square().sum(-2)
-            rows = rows * self.loss.weight(squared).sqrt()[..., None, None, :]
-        rows = rows.flatten(-2)
+            rows = rows * self.loss.weight(error.square().sum(-2)).sqrt()[..., None, :]
+        return rows.flatten(-2)
+
+    def _memory(self, like: Tensor, count: int) -> Tensor:
+        """(..., V, count, 2, N), of one camera such that each column is in one piece."""
+        *views, _, axes, corners = like.shape
+        if len(views) == 1:
+            return like.new_empty(count, *views, axes, corners).transpose(0, 1)
+        return like.new_empty(*views, count, axes, corners)
+
+    def _fill_field(self, shared: Tensor, seen: Projection, state: BoardState, views: slice) -> None:
+        """Write derivatives by the field's weights."""
+        assert self._field is not None and self.model.hybrid is not None
+        x, y = seen.plane
+        scale = state.parameters[:2, None]
+        if not self._all_count:
+            counts = self._counts[views]
+            x, y = torch.where(counts, x, 0.0), torch.where(counts, y, 0.0)
+        if self.weights is not None:
+            scale = scale * self.weights[views, None]
+        fill_field_columns(shared[:, self._field].transpose(0, 1), x, y, scale, self.model.hybrid)
+
+    def rows(self, state: BoardState, views: slice = _ALL) -> Tensor:
+        """See `SchurProblem.rows`; of some views. Zero by unknowns that are held."""
+        rows = self.corner_rows(state, views)
         if not self._all_move:
             held = torch.ones(self.unknown_count, dtype=torch.bool).index_fill_(0, self.moving, False)
             rows[..., self.local_size : -1, :].masked_fill_(held[:, None], 0.0)
-        return rows
-
-    def rows(self, state: BoardState, views: slice = _ALL) -> Tensor:
-        """See `SchurProblem.rows`; with `views` given, of a state of these alone. Zero by unknowns that are held."""
-        rows = self.corner_rows(state, views)
         if self.readout is None:
             return rows
         prior = rows.new_zeros(*rows.shape[:-1], MOTION)
         prior[..., POSE : self.local_size, :] = torch.diag(self._still.sqrt())
-        prior[..., -1, :] = self._still.sqrt() * state.motion
+        prior[..., -1, :] = self._still.sqrt() * state.motion[views]
         return torch.cat([rows, prior], -1)
 
-    def _chunks(self, state: BoardState) -> Iterator[tuple[BoardState, slice]]:
-        """The state of a few views at a time, so that their rows stay in the cache."""
+    def _chunks(self, state: BoardState) -> Iterator[slice]:
+        """A few views at a time, so that their rows stay in the cache."""
         count, row = state.rotation.shape[-3], 2 * self._board.shape[-1] * max(1, math.prod(self.batch))
         size = max(1, _CHUNK // (row * (self.local_size + self.unknown_count + 1)))
-        for start in range(0, count, size):
-            views = slice(start, start + size)
-            yield (state if size >= count else state.views(views)), views
+        yield from (slice(start, start + size) for start in range(0, count, size)) if size < count else (_ALL,)
 
     def products(self, state: BoardState) -> Products:
         """What the corners alone say near a state, by the unknowns that are not held; the last ones are kept."""
         if self._kept and self._kept[0][0] is state:
             return self._kept[0][1]
-        L = self.local_size
-        columns = [*(L + self.moving).tolist(), -1]
-        parts = []
-        for part, views in self._chunks(state):
-            rows = self.corner_rows(part, views)
-            parts.append(
-                Products.of_rows(rows[..., :L, :], rows[..., L:, :] if self._all_move else rows[..., columns, :])
-            )
-        found = Products.together(parts)
+        found = Products.together(
+            [Products.of_rows(self.corner_rows(state, views), self.local_size) for views in self._chunks(state)]
+        )
+        if not self._all_move:
+            found = found.of_shared(self.moving)
         if not found.total.requires_grad:
             self._kept[:] = [(state, found)]
         return found
@@ -320,13 +383,13 @@ class BoardProblem(SchurProblem[BoardState]):
 
     def off_poses(self, state: BoardState) -> Tensor:
         """(V, S + 1, R) derivatives by the shared unknowns, and residuals, off what poses and motions can do (QR)."""
-        return torch.cat([without_local(self.rows(part, v), self.local_size) for part, v in self._chunks(state)])
+        return torch.cat([without_local(self.rows(state, views), self.local_size) for views in self._chunks(state)])
 
     def reduced_rows(self, state: BoardState) -> Tensor:
         """(S + 1, S + 1) triangle with the same products as the rows of `off_poses`, some views at a time."""
         parts = [
-            triangular(without_local(self.rows(part, views), self.local_size).transpose(0, 1).flatten(1).T)
-            for part, views in self._chunks(state)
+            triangular(without_local(self.rows(state, views), self.local_size).transpose(0, 1).flatten(1).T)
+            for views in self._chunks(state)
         ]
         return parts[0] if len(parts) == 1 else triangular(torch.cat(parts))
 
@@ -368,3 +431,23 @@ class _Placed(NamedTuple):
     rotated: Tensor
     points: Tensor
     turn: Tensor | None
+
+    def of(self, views: slice) -> _Placed:
+        """The same of some of all views of one camera."""
+        turn = None if self.turn is None else self.turn[views]
+        return self._replace(rotated=self.rotated[views], points=self.points[views], turn=turn)
+
+
+class _Imaged(NamedTuple):
+    """Boards in some views as the camera shows them: placed, projected, and cam_from_board (..., V, 3, 3)."""
+
+    placed: _Placed
+    seen: Projection
+    rotation: Tensor
+    views: slice
+
+    def of(self, views: slice) -> _Imaged:
+        """The same of some of all views of one camera."""
+        if views == _ALL:
+            return self
+        return _Imaged(self.placed.of(views), self.seen.of(views), self.rotation[views], views)
