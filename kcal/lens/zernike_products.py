@@ -112,6 +112,10 @@ class ZernikeProducts(NamedTuple):
 
     def field(self, weights: Tensor, x: Tensor, y: Tensor, slopes: bool) -> tuple[Tensor, ...]:
         """As `FieldModes.field`."""
+        if x.ndim > 1 and weights.numel() == weights.shape[-1]:
+            # All places in one row: twice as fast for many short ones.
+            found = self.field(weights.flatten(), x.flatten(), y.flatten(), slopes)
+            return tuple(part.view(x.shape) for part in found)
         powers, count = self.powers(x, y), len(self.order)
         matrix = (weights @ (self.slopes if slopes else self.values)).unflatten(-1, (-1, self.profiles.shape[1]))
         # By value or derivative by t, u or v, real or imaginary part, and power.

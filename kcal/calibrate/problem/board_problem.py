@@ -282,8 +282,12 @@ class BoardProblem(SchurProblem[BoardState]):
             vectors = torch.where(self._counts[..., views, None, None, :], vectors, 0.0)
         return self._weighted(vectors, views)
 
-    def corner_rows(self, state: BoardState, views: slice = _ALL) -> Tensor:
-        """(..., V, L + S + 1, 2 N) as `rows`, of the corners alone, and as if no unknown were held."""
+    def corner_rows(self, state: BoardState, views: slice = _ALL, memory: list[Tensor] | None = None) -> Tensor:
+        """(..., V, L + S + 1, 2 N) as `rows`, of the corners alone, and as if no unknown were held.
+
+        With `memory` given, an empty list at first, the next call may overwrite what this one returns: new memory costs
+        as much time as what is written there.
+        """
         placed, seen, rotation, _ = self._imaged(state, views)
         error = seen.pixels - self._target[..., views, :, :]
         if self.joint:
@@ -293,7 +297,7 @@ class BoardProblem(SchurProblem[BoardState]):
             self._counted(part, views) for part in (seen.by_point, seen.by_camera, error[..., None, :, :])
         )
         L, count = self.local_size, len(self.free)
-        rows = self._memory(by_point, L + self.unknown_count + 1)
+        rows = self._memory(by_point, L + self.unknown_count + 1, memory)
         rows[..., :POSE, :, :] = step_rows(by_point, placed.rotated)
         if self.readout is not None:
             rows[..., POSE:L, :, :] = self.readout.columns_of(by_point, rotation, self._time[views], placed.flat)
@@ -314,12 +318,16 @@ class BoardProblem(SchurProblem[BoardState]):
             rows = rows * self.loss.weight(error.square().sum(-2)).sqrt()[..., None, :]
         return rows.flatten(-2)
 
-    def _memory(self, like: Tensor, count: int) -> Tensor:
+    def _memory(self, like: Tensor, count: int, memory: list[Tensor] | None) -> Tensor:
         """(..., V, count, 2, N), of one camera such that each column is in one piece."""
         *views, _, axes, corners = like.shape
-        if len(views) == 1:
+        if len(views) > 1:
+            return like.new_empty(*views, count, axes, corners)
+        if memory is None or like.requires_grad:
             return like.new_empty(count, *views, axes, corners).transpose(0, 1)
-        return like.new_empty(*views, count, axes, corners)
+        size = count * views[0] * axes * corners
+        memory[:] = memory if memory and len(memory[0]) >= size else [like.new_empty(size)]
+        return memory[0][:size].view(count, *views, axes, corners).transpose(0, 1)
 
     def _fill_field(self, shared: Tensor, seen: Projection, state: BoardState, views: slice) -> None:
         """Write derivatives by the field's weights."""
@@ -356,8 +364,9 @@ class BoardProblem(SchurProblem[BoardState]):
         """What the corners alone say near a state, by the unknowns that are not held; the last ones are kept."""
         if self._kept and self._kept[0][0] is state:
             return self._kept[0][1]
+        memory: list[Tensor] = []
         found = Products.together(
-            [Products.of_rows(self.corner_rows(state, views), self.local_size) for views in self._chunks(state)]
+            [Products.of_rows(self.corner_rows(state, views, memory), self.local_size) for views in self._chunks(state)]
         )
         if not self._all_move:
             found = found.of_shared(self.moving)

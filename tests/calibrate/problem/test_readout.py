@@ -218,7 +218,7 @@ def linear_views() -> tuple[ViewData, object]:
     error = torch.einsum("s,vsr->vr", x, lens) + torch.einsum("vm,vmr->vr", m, motion)
     error = -error + 0.3 * torch.randn(views, residuals, generator=generator, dtype=F64)
     rows = torch.cat([motion, lens, error[:, None]], 1)
-    products, still = Products.of_rows(rows[:, :MOTION], rows[:, MOTION:]), torch.zeros(views, MOTION, dtype=F64)
+    products, still = Products.of_rows(rows, MOTION), torch.zeros(views, MOTION, dtype=F64)
     return view_data(products, torch.zeros(size, dtype=F64), still, views * residuals), (families, form.modes)
 
 
