@@ -41,7 +41,7 @@ class Projection(NamedTuple):
         regular: (..., N), in front of the camera (for a fisheye: anywhere), before any pole, and not folded
             (det J > 0).
         by_meter: (..., 2, N), by `meter`; None for a lens without a moving pupil.
-        plane: x and y (..., N) on which the lens's terms act (`kcal.lens.plane`).
+        plane: (..., 2, N) places on which the terms of a hybrid lens act (`kcal.lens.plane`); None for other lenses.
     """
 
     pixels: Tensor
@@ -49,13 +49,12 @@ class Projection(NamedTuple):
     by_camera: Tensor
     regular: Tensor
     by_meter: Tensor | None = None
-    plane: tuple[Tensor, ...] = ()
+    plane: Tensor | None = None
 
     def of(self, chosen: slice) -> Projection:
         """The same of some along the first dimension, which all have."""
-        meter = None if self.by_meter is None else self.by_meter[chosen]
+        meter, plane = (None if each is None else each[chosen] for each in (self.by_meter, self.plane))
         pixels, by_point, by_camera, regular = (each[chosen] for each in self[:4])
-        plane = tuple(each[chosen] for each in self.plane)
         return Projection(pixels, by_point, by_camera, regular, meter, plane)
 
 
@@ -96,6 +95,7 @@ def project_components(
     if pupil:
         Z = Z - pupil.depth
     x, y, x_X, x_Y, y_Y, x_Z, y_Z = plane_with_slopes(X, Y, Z, model)
+    plane = torch.stack([x, y], -2) if model.hybrid and wanted is not None else None
     lens_wanted = [i - offset for i in wanted or () if i >= offset]
     lens = distort_components(x, y, parameters[..., offset:], model, lens_wanted)
     fx, fy, _, _, skew = unbind_last(parameters[..., :offset])
@@ -128,7 +128,7 @@ def project_components(
         moved = torch.stack(torch.broadcast_tensors(*pupil.by_point(X, Y, Z)), -2)[..., None, :]
         by_point = by_point - by_depth[..., None, :, :] * moved
     if not wanted:
-        return Projection(pixels, by_point, empty, regular, by_meter, (x, y))
+        return Projection(pixels, by_point, empty, regular, by_meter, plane)
 
     zero, one = torch.zeros_like(lens.x), torch.ones_like(lens.x)
     intrinsic = [(lens.x, zero), (zero, lens.y), (one, zero), (zero, one), (lens.y, zero)]
@@ -151,4 +151,4 @@ def project_components(
         for place, rate in enumerate(pupil.by_coefficients(), offset + 1):
             if place in wanted:
                 by_camera[..., list(wanted).index(place), :, :] = -by_depth * rate[..., None, :]
-    return Projection(pixels, by_point, by_camera, regular, by_meter, (x, y))
+    return Projection(pixels, by_point, by_camera, regular, by_meter, plane)

@@ -19,7 +19,8 @@ from kcal.calibrate.hybrid.quadratic import ViewData, overdispersion
 from kcal.calibrate.problem.readout import AMPLITUDES, LARGEST, MOTION, Readout, motion_sigma
 
 _ROUNDS = 12
-# Rounds after which views stand still if motion gains nothing.
+# Rounds after which views stand still if motion gains nothing. What it gains is told by the first round within .05 nats
+# of what the second tells, for 16 simulated captures of 6 to 200 views that stood still.
 _SETTLED = 0
 # Steps of the solver, and squared standard deviations by which one must lower chi² to be worth the next: in the first
 # round, in the others, and at the end.
@@ -135,7 +136,7 @@ def run_rounds(
             tempering=tempering,
         )
         progress(f"evidence, round {turn + 1}")
-        if data.moving and turn >= _SETTLED:
+        if data.moving and _SETTLED <= turn < _ROUNDS - 1:
             gained = evidence_of_motion(data, best, estimate.families, tempering)
             if gained < WORTH:
                 capture = dataclasses.replace(capture, readout=None)

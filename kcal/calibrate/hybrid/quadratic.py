@@ -164,7 +164,10 @@ class Integrated(NamedTuple):
             across, squared = pairs.sum((1, 3)), matrix_product(orders, inverse).square().sum(1)
         else:
             spread = torch.stack([products_of(rows.T) for rows in orders])
-            across, squared = spread.flatten(1) @ spread.flatten(1).T, (matrix_product(spread, inverse) * inverse).sum(1)
+            across, squared = (
+                spread.flatten(1) @ spread.flatten(1).T,
+                (matrix_product(spread, inverse) * inverse).sum(1),
+            )
         second -= 4.0 * (along @ along.T) + 2.0 * across
         Y = torch.from_numpy(y)
         by_variance = -(2.0 * mixed * Y + squared)

@@ -9,32 +9,29 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from kcal.calibrate.problem.board_images import ALL, POSE, BoardImages
 from kcal.calibrate.problem.parameters import FreeParameters
 from kcal.calibrate.problem.priors import GaussianPrior, Term
 from kcal.calibrate.problem.readout import MOTION, Readout
-from kcal.calibrate.problem.state import BoardState, warp_modes
+from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.twist import apply_twist
 from kcal.gaussian import triangular
-from kcal.lens.hybrid_terms import LEADING, fill_field_columns
 from kcal.lens.model import LensModel
-from kcal.lens.pose import nearest_rotation, step_rows
-from kcal.lens.projection import INTRINSICS, Projection, project_components
+from kcal.lens.pose import nearest_rotation
+from kcal.lens.projection import INTRINSICS
 from kcal.solve.result import State
 from kcal.solve.robust import RobustLoss
 from kcal.solve.schur import Products, SchurLinearization, SchurProblem, without_local
 
-_ALL = slice(None)
-POSE = 6
 # Numbers in the rows of derivatives that are formed at a time: with fewer, default cameras took longer (measured).
 _CHUNK = 600_000
 
 
-class BoardProblem(SchurProblem[BoardState]):
+class BoardProblem(BoardImages, SchurProblem[BoardState]):
     """Reprojection residuals (pixels) of one camera's views of a board, for `kcal.solve.lm.minimize`.
 
     Args:
@@ -90,54 +87,16 @@ class BoardProblem(SchurProblem[BoardState]):
         stillness: Tensor | None = None,
         batch: tuple[int, ...] = (),
     ) -> None:
-        self.model, self.loss, self.terms, self.batch = model, loss, tuple(terms), batch
-        self.free, self.free_board = FreeParameters.of(free), free_board
-        self.board_points, self._board = board_points, board_points.T.contiguous()
-        self.shapes = warp_modes(board_points) if shapes is None else shapes
-        self.seen = torch.isfinite(pixels).all(-1)
-        if weights is not None and weights.ndim == self.seen.ndim:
-            self.seen = self.seen & (weights > 0)
-        self._target = torch.where(self.seen[..., None], pixels, 0.0).transpose(-1, -2).contiguous()
-        self._weigh(weights)
+        super().__init__(board_points, pixels, model, free, shapes, free_board, weights, loss, readout, batch)
+        self.terms = tuple(terms)
         self.residual_count = 2 * int(self.seen.sum((-2, -1)).max())
-        self.readout = readout
-        self.local_size = POSE + (MOTION if readout else 0)
         if readout is not None:
-            self._time = readout.time(pixels)
             self._still = torch.zeros(MOTION, dtype=pixels.dtype) if stillness is None else stillness
-        self.unknown_count = len(self.free) + len(self.shapes) * free_board
         self.moving = torch.arange(self.unknown_count) if held is None else (~held).nonzero()[:, 0]
         self.shared_size = len(self.moving)
         self._all_move = self.shared_size == self.unknown_count
-        # With hundreds of columns a linearization costs far more than the cost alone.
-        self.joint = not model.hybrid
         self._kept: list[tuple[BoardState, Products]] = []
-        self._shown: list[tuple[BoardState, _Imaged]] = []
-        self._slots = torch.tensor(self.free.slots, dtype=torch.long, device=pixels.device)
-        first = len(INTRINSICS) + len(LEADING)
-        self._leading = [index for index in self.free.indices if index < first]
-        self._field = self._field_slots(first, weights) if model.hybrid and not batch else None
         self.slots = self._places(model.size)
-
-    def _weigh(self, weights: Tensor | None) -> None:
-        self.weights: Tensor | None = None  # (..., V, N) or (..., V, 2, 2, N)
-        self._counts = self.seen
-        if weights is not None and weights.ndim > self.seen.ndim:
-            self.weights = torch.where(self.seen[..., None, None], weights, 0.0).movedim(-3, -1).contiguous()
-        elif weights is not None and not bool((weights[self.seen] == 1.0).all()):
-            self.weights = torch.where(self.seen, weights, 0.0)
-            self._counts = self.weights > 0
-        self._all_count = bool(self._counts.all())
-
-    def _field_slots(self, first: int, weights: Tensor | None) -> slice | None:
-        """Where all weights of the field, or none, stand among the unknowns; None where they stand elsewhere."""
-        begin = len(self._leading)
-        indices, slots = self.free.indices[begin:], self.free.slots[begin:]
-        start = min(slots, default=0)
-        apart = bool(indices) and indices != tuple(range(first, len(INTRINSICS) + self.model.size))
-        if apart or slots != tuple(range(start, start + len(slots))) or (weights is not None and weights.ndim > 2):
-            return None
-        return slice(start, start + len(slots))
 
     def _places(self, coefficients: int) -> Tensor:
         """(5 + P + B,) the place of each of `values` among the unknowns of a step; -1 where it has none."""
@@ -162,11 +121,6 @@ class BoardProblem(SchurProblem[BoardState]):
         changed = copy.copy(self)
         changed.terms, changed._still = tuple(terms), stillness
         return changed
-
-    @property
-    def pixels(self) -> Tensor:
-        """(..., V, N, 2) observed corners; NaN where not seen."""
-        return torch.where(self.seen[..., None], self._target.transpose(-1, -2), torch.nan)
 
     @property
     def prior_count(self) -> int:
@@ -196,62 +150,6 @@ class BoardProblem(SchurProblem[BoardState]):
         own = state.parameters[..., list(self.free.leading)]
         return torch.cat([own, state.board], -1) if self.free_board else own
 
-    def _placed(self, state: BoardState, views: slice = _ALL) -> _Placed:
-        flat = self._board
-        if len(self.shapes) and (self.free_board or bool(state.board.any())):
-            flat = flat + torch.einsum("...b,bkn->...kn", state.board, self.shapes)[..., None, :, :]
-        if self.readout is None:
-            rotated = state.rotation @ flat
-            return _Placed(flat, rotated, rotated + state.translation[..., None], None)
-        flat = flat.squeeze(0)
-        moved = self.readout.moved(state.motion, self._time[views], flat)
-        rotated = state.rotation @ moved.points
-        return _Placed(flat, rotated, rotated + state.translation[..., None] + moved.shift, moved.turn)
-
-    def _imaged(self, state: BoardState, views: slice = _ALL) -> _Imaged:
-        """Corners of a state, with derivatives by all parameters but those of a field whose columns follow."""
-        if not self._by_field(state):
-            part = state if views == _ALL else state.views(views)
-            placed = self._placed(part, views)
-            seen = project_components(placed.points, part.parameters[..., None, :], self.model, self.free.indices)
-            return _Imaged(placed, seen, part.rotation, views)
-        if not (self._shown and self._shown[0][0] is state):
-            # What the cost of a trial needs serves its derivatives, too, if it is accepted.
-            placed = self._placed(state)
-            seen = project_components(placed.points, state.parameters[None], self.model, self._leading)
-            self._shown[:] = [(state, _Imaged(placed, seen, state.rotation, _ALL))]
-        return self._shown[0][1].of(views)
-
-    def _by_field(self, state: BoardState) -> bool:
-        """Whether derivatives by the field's weights are written where they belong, as nothing is differentiated."""
-        fixed = (self._board, self.shapes, *(() if self.readout is None else (self._time,)))
-        plain = self._field is not None and float(state.parameters[4]) == 0.0
-        return plain and not any(each.requires_grad for each in (*state, *fixed))
-
-    def points(self, state: BoardState) -> Tensor:
-        """(..., V, N, 3) the board's corners in the camera's frame, meters."""
-        return self._placed(state).points.transpose(-1, -2)
-
-    def pixel_errors(self, state: BoardState) -> Tensor:
-        """Projected minus observed, (..., V, 2, N) pixels, not weighted; 0 where not seen.
-
-        NaN where a seen corner lies behind the camera, or beyond a pole or a fold of the lens.
-        """
-        if self._by_field(state):
-            projected = self._imaged(state).seen
-        else:
-            points = self._placed(state).points
-            projected = project_components(points, state.parameters[..., None, :], self.model)
-        bad = torch.where(projected.regular, 0.0, torch.nan)[..., None, :]
-        return torch.where(self.seen[..., None, :], projected.pixels - self._target + bad, 0.0)
-
-    def corner_residuals(self, state: BoardState, *, weighted: bool = False) -> Tensor:
-        """(..., V, N, 2) residuals by corner; NaN where not seen."""
-        errors = self.pixel_errors(state)
-        if weighted:
-            errors = self._weighted(errors[..., None, :, :])[..., 0, :, :]
-        return torch.where(self.seen[..., None], errors.transpose(-1, -2), torch.nan)
-
     def residuals(self, state: BoardState) -> Tensor:
         """See `SchurProblem.residuals`: weighted `pixel_errors`, u of all corners, then v; last those of motions."""
         errors = self._weighted(self.pixel_errors(state)[..., None, :, :])[..., 0, :, :].flatten(-2)
@@ -266,82 +164,7 @@ class BoardProblem(SchurProblem[BoardState]):
         squared = residuals[..., :corners].unflatten(-1, (2, -1)).square().sum(-2)
         return 0.5 * (self.loss.value(squared).sum(-1) + residuals[..., corners:].square().sum(-1))
 
-    def _weighted(self, vectors: Tensor, views: slice = _ALL) -> Tensor:
-        """Vectors (..., V, Q, 2, N) of pixels, multiplied by the corners' weights; 0 where these are zero."""
-        if self.weights is None:
-            return vectors
-        if self.weights.ndim > self.seen.ndim:
-            return torch.einsum("...uwn,...qwn->...qun", self.weights[..., views, :, :, :], vectors)
-        weights = self.weights[..., views, None, None, :]
-        # Without an image a corner of weight zero is NaN.
-        return torch.where(weights > 0, vectors * weights, 0.0)
-
-    def _counted(self, vectors: Tensor, views: slice) -> Tensor:
-        """Vectors as in `_weighted`, zero where a corner does not count."""
-        if not self._all_count:
-            vectors = torch.where(self._counts[..., views, None, None, :], vectors, 0.0)
-        return self._weighted(vectors, views)
-
-    def corner_rows(self, state: BoardState, views: slice = _ALL, memory: list[Tensor] | None = None) -> Tensor:
-        """(..., V, L + S + 1, 2 N) as `rows`, of the corners alone, and as if no unknown were held.
-
-        With `memory` given, an empty list at first, the next call may overwrite what this one returns: new memory costs
-        as much time as what is written there.
-        """
-        placed, seen, rotation, _ = self._imaged(state, views)
-        error = seen.pixels - self._target[..., views, :, :]
-        if self.joint:
-            # A hybrid lens has values beyond its disc, too: a start may have corners there, but no state that follows.
-            error = error + torch.where(seen.regular, 0.0, torch.nan)[..., None, :]
-        by_point, by_camera, error = (
-            self._counted(part, views) for part in (seen.by_point, seen.by_camera, error[..., None, :, :])
-        )
-        L, count = self.local_size, len(self.free)
-        rows = self._memory(by_point, L + self.unknown_count + 1, memory)
-        rows[..., :POSE, :, :] = step_rows(by_point, placed.rotated)
-        if self.readout is not None:
-            rows[..., POSE:L, :, :] = self.readout.columns_of(by_point, rotation, self._time[views], placed.flat)
-        shared = rows[..., L:-1, :, :]
-        slots = self._slots[: by_camera.shape[-3]]
-        shared.index_fill_(-3, slots, 0.0).index_add_(-3, slots, by_camera)
-        if len(slots) < len(self._slots):
-            self._fill_field(shared, seen, state, views)
-        if self.free_board:
-            by_board = (rotation.mT @ by_point.flatten(-2)).unflatten(-1, (2, -1))
-            if placed.turn is not None:
-                # What displaces a corner of the board turns with it.
-                by_board = by_board + torch.linalg.cross(by_board, placed.turn[:, :, None].expand_as(by_board), dim=1)
-            along = zip(by_board.split(1, -3), self.shapes[:, :, None].unbind(1), strict=True)
-            shared[..., count:, :, :] = sum(slope * shape for slope, shape in along)
-        rows[..., -1:, :, :] = error
-        if self.loss is not None:
-            rows = rows * self.loss.weight(error.square().sum(-2)).sqrt()[..., None, :]
-        return rows.flatten(-2)
-
-    def _memory(self, like: Tensor, count: int, memory: list[Tensor] | None) -> Tensor:
-        """(..., V, count, 2, N), of one camera such that each column is in one piece."""
-        *views, _, axes, corners = like.shape
-        if len(views) > 1:
-            return like.new_empty(*views, count, axes, corners)
-        if memory is None or like.requires_grad:
-            return like.new_empty(count, *views, axes, corners).transpose(0, 1)
-        size = count * views[0] * axes * corners
-        memory[:] = memory if memory and len(memory[0]) >= size else [like.new_empty(size)]
-        return memory[0][:size].view(count, *views, axes, corners).transpose(0, 1)
-
-    def _fill_field(self, shared: Tensor, seen: Projection, state: BoardState, views: slice) -> None:
-        """Write derivatives by the field's weights."""
-        assert self._field is not None and self.model.hybrid is not None
-        x, y = seen.plane
-        scale = state.parameters[:2, None]
-        if not self._all_count:
-            counts = self._counts[views]
-            x, y = torch.where(counts, x, 0.0), torch.where(counts, y, 0.0)
-        if self.weights is not None:
-            scale = scale * self.weights[views, None]
-        fill_field_columns(shared[:, self._field].transpose(0, 1), x, y, scale, self.model.hybrid)
-
-    def rows(self, state: BoardState, views: slice = _ALL) -> Tensor:
+    def rows(self, state: BoardState, views: slice = ALL) -> Tensor:
         """See `SchurProblem.rows`; of some views. Zero by unknowns that are held."""
         rows = self.corner_rows(state, views)
         if not self._all_move:
@@ -358,7 +181,7 @@ class BoardProblem(SchurProblem[BoardState]):
         """A few views at a time, so that their rows stay in the cache."""
         count, row = state.rotation.shape[-3], 2 * self._board.shape[-1] * max(1, math.prod(self.batch))
         size = max(1, _CHUNK // (row * (self.local_size + self.unknown_count + 1)))
-        yield from (slice(start, start + size) for start in range(0, count, size)) if size < count else (_ALL,)
+        yield from (slice(start, start + size) for start in range(0, count, size)) if size < count else (ALL,)
 
     def products(self, state: BoardState) -> Products:
         """What the corners alone say near a state, by the unknowns that are not held; the last ones are kept."""
@@ -431,32 +254,3 @@ class BoardProblem(SchurProblem[BoardState]):
     def tidy(self, state: BoardState) -> BoardState:
         """The state with its rotations made orthonormal again after many small steps."""
         return state._replace(rotation=nearest_rotation(state.rotation))
-
-
-class _Placed(NamedTuple):
-    """The board (..., 3, N) in its frame; in each view rotated, and in the camera's frame; turns while it is read."""
-
-    flat: Tensor
-    rotated: Tensor
-    points: Tensor
-    turn: Tensor | None
-
-    def of(self, views: slice) -> _Placed:
-        """The same of some of all views of one camera."""
-        turn = None if self.turn is None else self.turn[views]
-        return self._replace(rotated=self.rotated[views], points=self.points[views], turn=turn)
-
-
-class _Imaged(NamedTuple):
-    """Boards in some views as the camera shows them: placed, projected, and cam_from_board (..., V, 3, 3)."""
-
-    placed: _Placed
-    seen: Projection
-    rotation: Tensor
-    views: slice
-
-    def of(self, views: slice) -> _Imaged:
-        """The same of some of all views of one camera."""
-        if views == _ALL:
-            return self
-        return _Imaged(self.placed.of(views), self.seen.of(views), self.rotation[views], views)

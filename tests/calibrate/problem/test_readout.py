@@ -19,7 +19,8 @@ from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.fitted_views import FittedViews
 from kcal.calibrate.hybrid.quadratic import Quadratic, ViewData, view_data
 from kcal.calibrate.hybrid.unknowns import hybrid_problem
-from kcal.calibrate.problem.board_problem import POSE, BoardProblem
+from kcal.calibrate.problem.board_images import POSE
+from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.readout import (
     AMPLITUDES,
     LARGEST,
