@@ -78,7 +78,7 @@ class _Posterior(NamedTuple):
 
 
 def _best(data: Quadratic, families: PriorFamilies, h: np.ndarray, log_variance: np.ndarray | float) -> _Best:
-    """Also of many at once: hyperparameters (..., H), ln σ² (...), and products of data with the same shape before them.
+    """Also of many at once: hyperparameters (..., H), ln σ² (...), and data whose products may have these dimensions.
 
     The value is infinite where priors are too wide for the precision of numbers, or noise is beyond them.
     """

@@ -218,7 +218,8 @@ class BoardImages:
 
     def _fill_field(self, shared: Tensor, seen: Projection, state: BoardState, views: slice) -> None:
         """Write derivatives by the field's weights."""
-        assert self._field is not None and self.model.hybrid is not None and seen.plane is not None
+        assert self._field is not None and self.model.hybrid is not None
+        assert seen.plane is not None
         x, y = seen.plane.unbind(-2)
         scale = state.parameters[:2, None]
         if not self._all_count:
