@@ -126,8 +126,9 @@ class BoardImages:
     def _by_field(self, state: BoardState) -> bool:
         """Whether derivatives by the field's weights are written where they belong, as nothing is differentiated."""
         fixed = (self._board, self.shapes, *(() if self.readout is None else (self._time,)))
-        plain = self._field is not None and float(state.parameters[4]) == 0.0
-        return plain and not any(each.requires_grad for each in (*state, *fixed))
+        if self._field is None or any(each.requires_grad for each in (*state, *fixed)):
+            return False
+        return float(state.parameters[INTRINSICS.index("skew")]) == 0.0
 
     def points(self, state: BoardState) -> Tensor:
         """(..., V, N, 3) the board's corners in the camera's frame, meters."""
@@ -218,7 +219,8 @@ class BoardImages:
 
     def _fill_field(self, shared: Tensor, seen: Projection, state: BoardState, views: slice) -> None:
         """Write derivatives by the field's weights."""
-        assert self._field is not None and self.model.hybrid is not None
+        assert self._field is not None
+        assert self.model.hybrid is not None
         assert seen.plane is not None
         x, y = seen.plane.unbind(-2)
         scale = state.parameters[:2, None]
