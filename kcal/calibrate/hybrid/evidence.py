@@ -27,8 +27,8 @@ from kcal.solve.schur import matrix_product
 # Nats by which motions must raise the evidence to be taken for real.
 WORTH = 3.0
 # Of the next step of Newton's method, in nats, and largest slope: where the maximum is reached; roughly, for another
-# round (1e-2 of ln amplitude is 5e-3 sigma); and for a first round, or to tell whether something gains `WORTH`.
-EXACTLY, ROUGHLY, BARELY = (1e-9, 1e-4), (5e-3, 0.05), (0.3, 3.0)
+# round. 1e-2 of ln amplitude is 5e-3 sigma.
+_EXACTLY, _ROUGHLY = (1e-9, 1e-4), (5e-3, 0.05)
 _STEPS = 60
 # Lengths of its steps: first, longest, and that at which it gives up; curvature that is taken where there is less.
 _FIRST_STEP, _LONGEST, _SHORTEST, _FLAT = 2.0, 4.0, 1e-7, 0.05
@@ -145,7 +145,7 @@ def maximize_evidence(
     hyperprior: Hyperprior | None = None,
     log_ratio: np.ndarray | None = None,
     tempering: float = 1.0,
-    effort: tuple[float, float] = EXACTLY,
+    rough: bool = False,
     known_noise: bool = False,
 ) -> Maximum:
     """The hyperparameters and the noise variance of largest evidence.
@@ -158,7 +158,7 @@ def maximize_evidence(
         hyperprior: of h; the typical one of the default field if not given.
         log_ratio: start, for views that moved while they were read.
         tempering: by which the data count less.
-        effort: how far it is followed: `EXACTLY`, or `ROUGHLY` or `BARELY` for data that will change.
+        rough: end within some hundredths of a nat, for data that will change.
         known_noise: the variance of the noise stays as it is.
     """
     prior = hyperprior or typical_hyperprior()
@@ -169,7 +169,9 @@ def maximize_evidence(
     if known_noise:
         bounds[-1] = log_variance, log_variance
     start = np.concatenate([h.numpy(), ratios, [log_variance]])
-    at, value = _minimum(EvidenceLoss(data, families, prior, tempering), start, bounds, *effort)
+    at, value = _minimum(
+        EvidenceLoss(data, families, prior, tempering), start, bounds, *(_ROUGHLY if rough else _EXACTLY)
+    )
     return Maximum(torch.from_numpy(at[:count].copy()), at[count:-1].copy(), math.exp(at[-1]), float(value))
 
 

@@ -12,16 +12,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.hybrid.amplitudes import expected_maximum
-from kcal.calibrate.hybrid.evidence import (
-    BARELY,
-    EXACTLY,
-    ROUGHLY,
-    WORTH,
-    Maximum,
-    evidence_of_motion,
-    maximize_evidence,
-    with_tempering,
-)
+from kcal.calibrate.hybrid.evidence import WORTH, Maximum, evidence_of_motion, maximize_evidence, with_tempering
 from kcal.calibrate.hybrid.families import Hyperprior
 from kcal.calibrate.hybrid.fitted_views import NO_MOTION, Estimate, FittedViews
 from kcal.calibrate.hybrid.quadratic import ViewData, overdispersion
@@ -129,9 +120,9 @@ def run_rounds(
             tempering = math.sqrt(tempering * found) if tempered else found
             tempered = True
         best = Maximum(estimate.hyperparameters, estimate.log_ratio, estimate.variance / former, math.inf)
-        for effort in (BARELY,) if first else (ROUGHLY,) if rough else (ROUGHLY, EXACTLY):
+        for roughly in (True,) if rough else (True, False):
             best = maximize_evidence(
-                data, estimate.families, best.h, best.variance, hyperprior, best.log_ratio, tempering, effort
+                data, estimate.families, best.h, best.variance, hyperprior, best.log_ratio, tempering, roughly
             )
             change = max(_moved_by(estimate, best), abs(math.log(tempering / former)))
             resting = not first and (change < _NEAR_REST if rough else change < _AT_REST and steps <= 2)
@@ -190,7 +181,7 @@ def motion_is_worth(rounds: Rounds, readout: Readout, hyperprior: Hyperprior, ne
     data = capture.data(capture.problem(moving, never), moving, never)
     variance, families = estimate.variance / estimate.tempering, estimate.families
     best = maximize_evidence(
-        data, families, estimate.hyperparameters, variance, hyperprior, moving.log_ratio, effort=BARELY
+        data, families, estimate.hyperparameters, variance, hyperprior, moving.log_ratio, rough=True
     )
     return bool(evidence_of_motion(data, best, families, 1.0) >= WORTH)
 
@@ -218,7 +209,7 @@ def columns_may_be_read(rounds: Rounds, hyperprior: Hyperprior, never: Tensor) -
             estimate.variance / estimate.tempering,
             hyperprior,
             estimate.log_ratio,
-            effort=ROUGHLY,
+            rough=True,
         )
         losses.append(best.loss)
     return losses[1] < losses[0]
