@@ -84,7 +84,7 @@ def project_each(
             for number, camera in enumerate(cameras)
         ]
     values = torch.stack([camera.values for camera in cameras])
-    pixels, by_point, by_camera, regular, _ = project_components(points, values, cameras[0].model, wanted[0])
+    pixels, by_point, by_camera, regular, *_ = project_components(points, values, cameras[0].model, wanted[0])
     return [
         Projection(*parts)
         for parts in zip(pixels.unbind(-3), by_point.unbind(-4), by_camera.unbind(-4), regular.unbind(-2), strict=True)

@@ -59,6 +59,9 @@ class FieldModes(Protocol):
     def columns(self, x: Tensor, y: Tensor) -> Tensor:
         """Evaluate each feature at places (x, y) (..., N) of the unit disc: (M, 2, ..., N)."""
 
+    def fill_columns(self, out: Tensor, x: Tensor, y: Tensor, scale: Tensor) -> None:
+        """Write `columns` times a scale (..., 2, N) into memory (M, ..., 2, N); nothing is differentiated."""
+
     def field(self, weights: Tensor, x: Tensor, y: Tensor, slopes: bool = True) -> tuple[Tensor, ...]:
         """Evaluate the weighted sum: the displacement (f, g), and if wanted its slopes f_x, f_y, g_x, g_y.
 
@@ -95,6 +98,14 @@ class UnitModes:
     def peaks(self) -> tuple[float, ...]:
         """See `FieldModes`."""
         return (1.0,) * len(self)
+
+    def columns(self, x: Tensor, y: Tensor) -> Tensor:
+        """See `FieldModes`."""
+        raise NotImplementedError
+
+    def fill_columns(self, out: Tensor, x: Tensor, y: Tensor, scale: Tensor) -> None:
+        """See `FieldModes`."""
+        torch.mul(self.columns(x, y).movedim(1, -2), scale, out=out)
 
 
 def vector_columns(values: Tensor) -> Tensor:

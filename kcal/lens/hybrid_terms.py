@@ -112,11 +112,26 @@ def hybrid_terms(
         # The entrance pupil acts before this plane.
         by_bend = square * growth
         lead = torch.stack([by_bend * x, by_bend * y], -2)[..., None, :, :]
-        leading = torch.cat([lead, torch.zeros_like(lead).expand(*(-1,) * (lead.ndim - 3), offset - 1, -1, -1)], -3)
-        fields = form.modes.columns(x * to_disc, y * to_disc).movedim((0, 1), (-3, -2))
-        columns = torch.cat([leading, fields], -3)
-        if list(wanted) != list(range(offset + len(form.modes))):
+        columns = torch.cat([lead, torch.zeros_like(lead).expand(*(-1,) * (lead.ndim - 3), offset - 1, -1, -1)], -3)
+        if max(wanted) >= offset:
+            fields = form.modes.columns(x * to_disc, y * to_disc).movedim((0, 1), (-3, -2))
+            columns = torch.cat([columns, fields], -3)
+        if list(wanted) != list(range(columns.shape[-3])):
             columns = columns[..., list(wanted), :, :]
     else:
         columns = x.new_zeros((*x.shape[:-1], 0, 2, x.shape[-1]))
     return x * scale + f, y * scale + g, point, columns, square <= form.reach**2
+
+
+def fill_field_columns(out: Tensor, x: Tensor, y: Tensor, scale: Tensor, form: HybridForm) -> None:
+    """Derivatives of points of that plane by the field's weights, times a scale, into memory.
+
+    Args:
+        out: (M, ..., 2, N).
+        x: (..., N) before the lens acts.
+        y: (..., N).
+        scale: (..., 2, N) pixels per unit of the plane, times weights.
+        form: the constants.
+    """
+    to_disc = form.constants(x)[1]
+    form.modes.fill_columns(out, x * to_disc, y * to_disc, scale)

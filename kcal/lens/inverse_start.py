@@ -37,7 +37,8 @@ def fit_start(coefficients: Tensor, model: LensModel, reach: float | Tensor = _D
         (..., 1 + 12): D², then the coefficients by rising powers of 2 √(1 - r_D² / D²) - 1.
     """
     if model.hybrid:
-        radial, kept = model, torch.tensor([name in model.hybrid.radial_names for name in model.names])
+        names = model.hybrid.radial_names
+        radial, kept = model, torch.tensor([name in names for name in model.names])
         own = torch.where(kept.to(coefficients.device), coefficients, 0.0)
     else:
         radial = LensModel(numerator=model.numerator, denominator=model.denominator, fisheye=model.fisheye)

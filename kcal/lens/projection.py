@@ -41,6 +41,7 @@ class Projection(NamedTuple):
         regular: (..., N), in front of the camera (for a fisheye: anywhere), before any pole, and not folded
             (det J > 0).
         by_meter: (..., 2, N), by `meter`; None for a lens without a moving pupil.
+        plane: (..., 2, N) places on which the terms of a hybrid lens act (`kcal.lens.plane`); None for other lenses.
     """
 
     pixels: Tensor
@@ -48,6 +49,13 @@ class Projection(NamedTuple):
     by_camera: Tensor
     regular: Tensor
     by_meter: Tensor | None = None
+    plane: Tensor | None = None
+
+    def of(self, chosen: slice) -> Projection:
+        """The same of some along the first dimension, which all have."""
+        meter, plane = (None if each is None else each[chosen] for each in (self.by_meter, self.plane))
+        pixels, by_point, by_camera, regular = (each[chosen] for each in self[:4])
+        return Projection(pixels, by_point, by_camera, regular, meter, plane)
 
 
 def to_pixels(x: Tensor, y: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
@@ -87,6 +95,7 @@ def project_components(
     if pupil:
         Z = Z - pupil.depth
     x, y, x_X, x_Y, y_Y, x_Z, y_Z = plane_with_slopes(X, Y, Z, model)
+    plane = torch.stack([x, y], -2) if model.hybrid and wanted is not None else None
     lens_wanted = [i - offset for i in wanted or () if i >= offset]
     lens = distort_components(x, y, parameters[..., offset:], model, lens_wanted)
     fx, fy, _, _, skew = unbind_last(parameters[..., :offset])
@@ -119,7 +128,7 @@ def project_components(
         moved = torch.stack(torch.broadcast_tensors(*pupil.by_point(X, Y, Z)), -2)[..., None, :]
         by_point = by_point - by_depth[..., None, :, :] * moved
     if not wanted:
-        return Projection(pixels, by_point, empty, regular, by_meter)
+        return Projection(pixels, by_point, empty, regular, by_meter, plane)
 
     zero, one = torch.zeros_like(lens.x), torch.ones_like(lens.x)
     intrinsic = [(lens.x, zero), (zero, lens.y), (one, zero), (zero, one), (lens.y, zero)]
@@ -142,4 +151,4 @@ def project_components(
         for place, rate in enumerate(pupil.by_coefficients(), offset + 1):
             if place in wanted:
                 by_camera[..., list(wanted).index(place), :, :] = -by_depth * rate[..., None, :]
-    return Projection(pixels, by_point, by_camera, regular, by_meter)
+    return Projection(pixels, by_point, by_camera, regular, by_meter, plane)

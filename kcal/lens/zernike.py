@@ -140,7 +140,11 @@ class ZernikeModes:
 
     def columns(self, x: Tensor, y: Tensor) -> Tensor:
         """See `FieldModes`."""
-        return self._products.to(x.device).columns(x, y)
+        return self._products.to(x.device).columns(x, y).movedim(-2, 1)
+
+    def fill_columns(self, out: Tensor, x: Tensor, y: Tensor, scale: Tensor) -> None:
+        """See `FieldModes`."""
+        self._products.to(x.device).columns(x, y, scale, out)
 
     def field(self, weights: Tensor, x: Tensor, y: Tensor, slopes: bool = True) -> tuple[Tensor, ...]:
         """See `FieldModes`."""

@@ -29,8 +29,7 @@ class ZernikeProducts(NamedTuple):
         order: (J, 1) 0, 1, ..., J - 1.
         profiles: (R, K) each polynomial in t that modes have.
         profile: (M,) which of these a mode has.
-        power: (M, 2) the row of its u and v: of real parts (0 to J - 1), imaginary ones (from J), or these with the
-            other sign (from 2 J).
+        pair: (M,) the row of its (u, v): J rows of (re, im), of (-im, re), (re, -im) and (im, re).
     """
 
     values: Tensor
@@ -38,7 +37,7 @@ class ZernikeProducts(NamedTuple):
     order: Tensor
     profiles: Tensor
     profile: Tensor
-    power: Tensor
+    pair: Tensor
 
     @classmethod
     def of(cls, modes: Sequence[tuple[int, int, np.ndarray]]) -> ZernikeProducts:
@@ -50,7 +49,7 @@ class ZernikeProducts(NamedTuple):
         K = max((len(polynomial) for *_, polynomial in modes), default=1)
         table = np.zeros((len(modes), 2, 2, 2, J, K))
         profiles: dict[tuple[float, ...], int] = {}
-        profile, power = [], []
+        profile, pair = [], []
         for row, (j, part, polynomial) in enumerate(modes):
             turn = 1.0 if j >= 0 else -1.0
             # (re, ± im), or i times that: (∓ im, re).
@@ -60,7 +59,7 @@ class ZernikeProducts(NamedTuple):
                 table[row, 0, column, which, abs(j), : len(polynomial)] = factor * polynomial
                 table[row, 1, column, which, abs(j), : len(slope)] = factor * slope
             profile.append(profiles.setdefault(tuple(polynomial.tolist()), len(profiles)))
-            power.append([(which + (factor < 0)) * J + abs(j) for which, factor in places])
+            pair.append((part + 2 * (j < 0)) * J + abs(j))
         rows = np.zeros((len(profiles), K))
         for coefficients, at in profiles.items():
             rows[at, : len(coefficients)] = coefficients
@@ -70,7 +69,7 @@ class ZernikeProducts(NamedTuple):
             order=torch.arange(J, dtype=torch.float64)[:, None],
             profiles=torch.from_numpy(rows),
             profile=torch.tensor(profile, dtype=torch.long),
-            power=torch.tensor(power, dtype=torch.long).view(-1, 2),
+            pair=torch.tensor(pair, dtype=torch.long),
         )
 
     def to(self, device: torch.device) -> ZernikeProducts:
@@ -99,16 +98,28 @@ class ZernikeProducts(NamedTuple):
             out.append(torch.addcmul(out[-2], double, out[-1]).sub_(out[-2], alpha=2.0))
         return torch.stack(out[: self.profiles.shape[1]], -2)
 
-    def columns(self, x: Tensor, y: Tensor) -> Tensor:
-        """(M, 2, ..., N) as `FieldModes.columns`."""
-        profiles = (self.profiles @ self.polynomials(x, y)).movedim(-2, 0)
+    def columns(self, x: Tensor, y: Tensor, scale: Tensor | None = None, out: Tensor | None = None) -> Tensor:
+        """(M, ..., 2, N) as `FieldModes.columns`, times a scale (..., 2, N), into memory if it is given."""
+        profiles = (self.profiles @ self.polynomials(x.reshape(-1), y.reshape(-1))).unflatten(
+            -1, (*x.shape[:-1], 1, -1)
+        )
         re, im = self.powers(x, y).movedim((-3, -2), (0, 1))
+        # A mode has one of four pairs of u and v.
+        pairs = (
+            torch.stack([re, im, -im, re, re, -im, im, re]).unflatten(0, (4, 2)).movedim((2, 1), (1, -2)).flatten(0, 1)
+        )
+        if scale is not None:
+            pairs = pairs * scale
         # Rows at a time: these tables are large, and bound by memory.
-        powers = torch.cat([re, im, -im]).index_select(0, self.power.flatten()).unflatten(0, self.power.shape)
-        return powers.mul_(profiles.index_select(0, self.profile)[:, None])
+        found = torch.index_select(pairs, 0, self.pair, out=out)
+        return found.mul_(profiles.index_select(0, self.profile))
 
     def field(self, weights: Tensor, x: Tensor, y: Tensor, slopes: bool) -> tuple[Tensor, ...]:
         """As `FieldModes.field`."""
+        if x.ndim > 1 and weights.numel() == weights.shape[-1]:
+            # All places in one row: twice as fast for many short ones.
+            found = self.field(weights.flatten(), x.flatten(), y.flatten(), slopes)
+            return tuple(part.view(x.shape) for part in found)
         powers, count = self.powers(x, y), len(self.order)
         matrix = (weights @ (self.slopes if slopes else self.values)).unflatten(-1, (-1, self.profiles.shape[1]))
         # By value or derivative by t, u or v, real or imaginary part, and power.

@@ -11,6 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Generic, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -36,11 +37,19 @@ class Products(NamedTuple):
     total: Tensor
 
     @classmethod
-    def of_rows(cls, local: Tensor, shared: Tensor) -> Products:
-        """From derivatives (..., V, L, R) by the local unknowns and (..., V, S + 1, R) by the shared ones; last r."""
-        flat, across = shared.transpose(-3, -2).flatten(-2), shared.transpose(-1, -2)
-        score = (shared @ shared[..., -1, :, None])[..., 0]
-        return cls(local @ local.transpose(-1, -2), local @ across, score, products_of(flat))
+    def of_rows(cls, rows: Tensor, local_size: int) -> Products:
+        """From rows (..., V, L + S + 1, R) as those of `SchurProblem.rows`."""
+        L, across = local_size, rows.transpose(-1, -2)
+        # The residuals' own products beside those of the local unknowns: one pass over all rows.
+        beside = matrix_product(rows, torch.cat([across[..., :L], across[..., -1:]], -1)).transpose(-1, -2)
+        total = products_of(rows[..., L:, :].transpose(-3, -2).flatten(-2))
+        return cls(beside[..., :L, :L], beside[..., :L, L:], beside[..., L, L:], total)
+
+    def of_shared(self, moving: Tensor) -> Products:
+        """The same of some of the shared unknowns, by their numbers (M,)."""
+        kept = torch.cat([moving, moving.new_tensor([self.total.shape[-1] - 1])])
+        right, score = self.right[..., kept], self.score[..., kept]
+        return self._replace(right=right, score=score, total=self.total[..., kept[:, None], kept])
 
     @classmethod
     def together(cls, parts: Sequence[Products]) -> Products:
@@ -122,21 +131,22 @@ class SchurLinearization:
         vars(out).update(zip(names, blend(mask, old, new), strict=True))
         return out
 
-    def _reduce(self, damping: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Eliminate the local blocks: reduced matrix, reduced gradient, D⁻¹[B, g] of the views, failures."""
-        factor, info = torch.linalg.cholesky_ex(_damped(self._local, damping[..., None]))
-        solved = torch.cholesky_solve(self._right, factor)
-        # One product over all views at once: (S, V L) times (V L, S + 1).
-        product = self._right[..., :-1].flatten(-3, -2).transpose(-1, -2) @ solved.flatten(-3, -2)
-        matrix = _damped(self._shared, damping) - product[..., :-1]
-        return matrix, self._shared_gradient - product[..., -1], solved, (info != 0).any(-1)
+    def _reduce(self, damping: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Eliminate the local blocks: reduced matrix, reduced gradient, roots R of the blocks, R⁻¹[B, g], failures."""
+        root, info = torch.linalg.cholesky_ex(_damped(self._local, damping[..., None]))
+        half = torch.linalg.solve_triangular(root, self._right, upper=False)
+        # One product over all views at once.
+        product = products_of(half.flatten(-3, -2).transpose(-1, -2))
+        matrix = _damped(self._shared, damping) - product[..., :-1, :-1]
+        return matrix, self._shared_gradient - product[..., :-1, -1], root, half, (info != 0).any(-1)
 
     def step(self, damping: Tensor) -> tuple[State, Tensor]:
         """See `Linearization.step`; the step is (shared (..., S), local (..., V, L))."""
-        matrix, gradient, solved, failed = self._reduce(damping)
+        matrix, gradient, root, half, failed = self._reduce(damping)
         factor, info = torch.linalg.cholesky_ex(matrix)
         shared = -torch.cholesky_solve(gradient[..., None], factor)[..., 0]
-        local = -(solved[..., -1] + (solved[..., :-1] @ shared[..., None, :, None])[..., 0])
+        left = half[..., -1] + (half[..., :-1] @ shared[..., None, :, None])[..., 0]
+        local = -torch.linalg.solve_triangular(root.transpose(-1, -2), left[..., None], upper=True)[..., 0]
         squared = (shared * shared).sum(-1) + (local * local).sum((-2, -1))
         along = (self._shared_gradient * shared).sum(-1) + (self._right[..., -1] * local).sum((-2, -1))
         predicted = 0.5 * (damping * squared - along)
@@ -149,7 +159,7 @@ class SchurLinearization:
         Its inverse, multiplied by scale ⊗ scale and by the noise variance, is the covariance of the shared
         parameters with the local ones free.
         """
-        matrix, _, _, _ = self._reduce(torch.zeros_like(self.cost))
+        matrix, *_ = self._reduce(torch.zeros_like(self.cost))
         return matrix, self._shared_scale
 
 
@@ -164,6 +174,13 @@ def without_local(rows: Tensor, local_size: int) -> Tensor:
 def column_scale(diagonal: Tensor) -> Tensor:
     """Scale of each column; the parameter of a zero column never moves."""
     return torch.where(diagonal > 0, diagonal, 1.0).rsqrt()
+
+
+def matrix_product(one: Tensor, other: Tensor) -> Tensor:
+    """Products of matrices, many of which are small: two to four times faster by NumPy than by torch on a processor."""
+    if one.device.type == "cpu" and not (one.requires_grad or other.requires_grad):
+        return torch.from_numpy(np.matmul(one.numpy(), other.numpy()))
+    return one @ other
 
 
 def products_of(rows: Tensor) -> Tensor:

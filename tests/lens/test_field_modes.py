@@ -61,6 +61,19 @@ def test_the_field_is_the_sum_of_its_columns(kind: str) -> None:
     torch.testing.assert_close(again[0][0], found[0][0], rtol=1e-12, atol=1e-13)
 
 
+@every
+def test_columns_in_memory_that_is_given(kind: str) -> None:
+    """Times a scale for each place and axis; memory may be part of other memory."""
+    modes, scale = KINDS[kind], draw((3, 2, 7), 6)
+    x, y = 0.5 * draw((2, 3, 7), 4)
+    memory = draw((len(modes) + 2, 3, 2, 7), 7)
+    kept = memory.clone()
+    modes.fill_columns(memory[1:-1], x, y, scale)
+    wanted = modes.columns(x, y).movedim(1, -2) * scale
+    torch.testing.assert_close(memory[1:-1], wanted, rtol=1e-12, atol=1e-13)
+    assert torch.equal(memory[[0, -1]], kept[[0, -1]])
+
+
 @both
 def test_slopes_against_autograd(kind: str) -> None:
     modes, weights = KINDS[kind], draw((len(KINDS[kind]),), 2)

@@ -39,22 +39,23 @@ def reached(observations: Observations, columns: int, rows: int) -> Tensor:
     width, height = observations.image_size
     x = (np.arange(columns) + 0.5) * (width / columns) - 0.5
     y = (np.arange(rows) + 0.5) * (height / rows) - 0.5
-    places = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
-    left = np.arange(len(places))
+    open_places = np.ones((rows, columns), dtype=bool)
     for view in observations.pixels().numpy():
         corners = view[np.isfinite(view).all(-1)]
         if len(corners) < 3:
             continue
-        around = ((places[left] >= corners.min(0)) & (places[left] <= corners.max(0))).all(-1)
+        (left, top), (right, bottom) = corners.min(0), corners.max(0)
+        across = slice(np.searchsorted(x, left), np.searchsorted(x, right, "right"))
+        down = slice(np.searchsorted(y, top), np.searchsorted(y, bottom, "right"))
+        around = open_places[down, across]
         # Most views show nothing that others have not shown.
         if around.any():
             # Half planes a x + b y + c <= 0 of the convex hull.
             sides = ConvexHull(corners).equations
-            around[around] = (places[left[around]] @ sides[:, :2].T + sides[:, 2] <= 0).all(-1)
-            left = left[~around]
-    found = np.ones(len(places), dtype=bool)
-    found[left] = False
-    return torch.from_numpy(found.reshape(rows, columns))
+            row, column = around.nonzero()
+            places = np.stack([x[across][column], y[down][row]], -1)
+            around[row, column] = ~(places @ sides[:, :2].T + sides[:, 2] <= 0).all(-1)
+    return torch.from_numpy(~open_places)
 
 
 def unreached_share(observations: Observations) -> float:

@@ -24,7 +24,8 @@ from kcal.calibrate.camera.options import CalibrationOptions, Progress
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.hybrid.evidence import with_tempering
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
-from kcal.calibrate.problem.board_problem import POSE, BoardProblem
+from kcal.calibrate.problem.board_images import POSE
+from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.views import LEAST_NOISE
 from kcal.errors import DegenerateError, InputError

@@ -45,7 +45,7 @@ def expected_maximum(
     at = np.concatenate([best.h.numpy(), best.log_ratio, [log_variance]])
     found = expected_amplitudes(
         loss(at)[2],
-        loss.value,
+        loss.values,
         at,
         which,
         hyper_bounds(hyperprior, len(best.log_ratio), log_variance),
@@ -55,7 +55,7 @@ def expected_maximum(
 
 def expected_amplitudes(
     bend: np.ndarray,
-    value: Callable[[np.ndarray], float],
+    values: Callable[[np.ndarray], np.ndarray],
     at: np.ndarray,
     which: list[int],
     bounds: list[tuple[float, float | None]],
@@ -64,14 +64,14 @@ def expected_amplitudes(
 
     Args:
         bend: (H, H) the Hessian of -ln p.
-        value: -ln p alone.
+        values: -ln p alone, (N,) of places (N, H).
         at: (H,) where it is smallest.
         which: numbers of the ln A.
         bounds: of all.
 
     Example:
         >>> def loss(v):  # ln A is normal, with a standard deviation of a half: <A²> = exp(2 · ¼)
-        ...     return float(2.0 * (v @ v))
+        ...     return 2.0 * (v * v).sum(-1)
         >>> found = expected_amplitudes(4.0 * np.eye(2), loss, np.zeros(2), [0], [(-9.0, 9.0), (-9.0, None)])
         >>> [round(float(value), 2) for value in found]
         [0.25, 0.0]
@@ -83,7 +83,7 @@ def expected_amplitudes(
         low, high = bounds[i]
         places = np.array([t for t in sigma * _PLACES if low <= at[i] + t <= (math.inf if high is None else high)])
         along = covariance[:, i] / covariance[i, i]
-        losses = np.array([value(at + t * along) for t in places])
+        losses = values(at + places[:, None] * along)
         share = np.exp(losses.min() - losses)
         found[i] += 0.5 * math.log(float(share @ np.exp(2.0 * places)) / float(share.sum()))
     return found

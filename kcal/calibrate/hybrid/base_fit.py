@@ -235,7 +235,7 @@ def _solve_base(
     if not capture.square:
         held[-1 - len(capture.board.unit)] = False
     problem = capture.problem(Estimate(model, families, state, h, NO_MOTION, 1.0, 1.0), held)
-    found = minimize(problem, state, LMOptions(max_iterations=15, tolerance=1e-6, initial_damping=1e-6))
+    found = minimize(problem, state, LMOptions(max_iterations=15, tolerance=1e-4, initial_damping=1e-6))
     return found.state, max(2.0 * float(found.cost) / capture.freedom, LEAST_NOISE**2), int(found.iterations)
 
 

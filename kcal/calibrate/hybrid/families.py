@@ -77,9 +77,9 @@ class PriorFamilies(NamedTuple):
         )
 
     def deviation(self, h: Tensor) -> Tensor:
-        """(S,) prior standard deviations."""
-        out = self.log_unit + torch.where(self.amplitude >= 0, h[self.amplitude], 0.0)
-        return torch.exp(out - torch.where(self.decay >= 0, torch.exp(h[self.decay]), 0.0) * self.degree)
+        """(..., S) prior standard deviations, of hyperparameters (..., H)."""
+        out = self.log_unit + torch.where(self.amplitude >= 0, h[..., self.amplitude], 0.0)
+        return torch.exp(out - torch.where(self.decay >= 0, torch.exp(h[..., self.decay]), 0.0) * self.degree)
 
     def log_variance_slopes(self, h: Tensor) -> tuple[np.ndarray, np.ndarray]:
         """(S, H) first derivatives of 2 ln sd by h, and second ones, each by the same hyperparameter twice."""

@@ -14,7 +14,8 @@ from kcal.calibrate.hybrid.board_modes import BoardModes
 from kcal.calibrate.hybrid.families import PriorFamilies
 from kcal.calibrate.hybrid.quadratic import ViewData, view_data
 from kcal.calibrate.hybrid.unknowns import hybrid_prior, hybrid_problem
-from kcal.calibrate.problem.board_problem import POSE, BoardProblem
+from kcal.calibrate.problem.board_images import POSE
+from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.readout import Readout, stillness
 from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.views import LEAST_NOISE

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.problem.readout import AMPLITUDES, MOTION, stillness
-from kcal.solve.schur import Products, products_of
+from kcal.solve.schur import Products, matrix_product, products_of
 
 Array = npt.NDArray[np.float64]
 
@@ -89,7 +89,7 @@ class ViewData(NamedTuple):
         root = torch.linalg.cholesky(matrix)
         _, ones, _ = torch.broadcast_tensors(root, torch.eye(MOTION, dtype=root.dtype), root)
         inverse = torch.linalg.solve_triangular(root, ones, upper=False)
-        half = (inverse * torch.from_numpy(ratio)) @ self.cross
+        half = matrix_product(inverse * torch.from_numpy(ratio), self.cross)
         data = self.still._replace(products=self.still.products - products_of(half.flatten(0, 1).T))
         log_determinant = 2.0 * float(root.diagonal(dim1=-2, dim2=-1).log().sum())
         return Integrated(data, log_determinant, inverse, half)
@@ -139,8 +139,8 @@ class Integrated(NamedTuple):
         direction = inverse.new_zeros(size + 1, size + 1)
         direction[:-1, 0], direction[-1, 0] = torch.from_numpy(step), 1.0
         torch.mul(torch.from_numpy(deviation)[:, None], inverse.T, out=direction[:-1, 1:])
-        reach = (self.half.flatten(0, 1) @ direction).view(self.half.shape)
-        E = (self.inverse.transpose(1, 2) / math.sqrt(variance * tempering)) @ reach
+        reach = matrix_product(self.half.flatten(0, 1), direction).view(self.half.shape)
+        E = matrix_product(self.inverse.transpose(1, 2) / math.sqrt(variance * tempering), reach)
         mean, others, kept = E[..., 0], E[..., 1:], own.diagonal(dim1=1, dim2=2)
         by_order = (AMPLITUDES, MOTION // AMPLITUDES)
         G = others @ others.transpose(1, 2)
@@ -161,10 +161,13 @@ class Integrated(NamedTuple):
             pairs = (
                 products_of(orders.flatten(0, 1)).square().unflatten(0, (AMPLITUDES, -1)).unflatten(2, (AMPLITUDES, -1))
             )
-            across, squared = pairs.sum((1, 3)), (orders @ inverse).square().sum(1)
+            across, squared = pairs.sum((1, 3)), matrix_product(orders, inverse).square().sum(1)
         else:
             spread = torch.stack([products_of(rows.T) for rows in orders])
-            across, squared = spread.flatten(1) @ spread.flatten(1).T, ((spread @ inverse) * inverse).sum(1)
+            across, squared = (
+                spread.flatten(1) @ spread.flatten(1).T,
+                (matrix_product(spread, inverse) * inverse).sum(1),
+            )
         second -= 4.0 * (along @ along.T) + 2.0 * across
         Y = torch.from_numpy(y)
         by_variance = -(2.0 * mixed * Y + squared)
@@ -200,7 +203,7 @@ def view_data(products: Products, x: Tensor, motion: Tensor, freedom: float) -> 
 
 def still_data(rows: Tensor, x: Tensor, freedom: float) -> ViewData:
     """From rows (V, S + 1, R) of views without poses and motions, at lens and board x; the residuals last."""
-    return view_data(Products.of_rows(rows[:, :0], rows), x, rows.new_zeros(len(rows), 0), freedom)
+    return view_data(Products.of_rows(rows, 0), x, rows.new_zeros(len(rows), 0), freedom)
 
 
 def overdispersion(score: Tensor, K: Tensor, deviation: Tensor, variance: float) -> float:

@@ -9,31 +9,29 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from kcal.calibrate.problem.board_images import ALL, POSE, BoardImages
 from kcal.calibrate.problem.parameters import FreeParameters
 from kcal.calibrate.problem.priors import GaussianPrior, Term
 from kcal.calibrate.problem.readout import MOTION, Readout
-from kcal.calibrate.problem.state import BoardState, warp_modes
+from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.twist import apply_twist
 from kcal.gaussian import triangular
 from kcal.lens.model import LensModel
-from kcal.lens.pose import nearest_rotation, step_rows
-from kcal.lens.projection import INTRINSICS, project_components
+from kcal.lens.pose import nearest_rotation
+from kcal.lens.projection import INTRINSICS
 from kcal.solve.result import State
 from kcal.solve.robust import RobustLoss
 from kcal.solve.schur import Products, SchurLinearization, SchurProblem, without_local
 
-_ALL = slice(None)
-POSE = 6
 # Numbers in the rows of derivatives that are formed at a time: with fewer, default cameras took longer (measured).
-_CHUNK = 1_200_000
+_CHUNK = 600_000
 
 
-class BoardProblem(SchurProblem[BoardState]):
+class BoardProblem(BoardImages, SchurProblem[BoardState]):
     """Reprojection residuals (pixels) of one camera's views of a board, for `kcal.solve.lm.minimize`.
 
     Args:
@@ -89,39 +87,16 @@ class BoardProblem(SchurProblem[BoardState]):
         stillness: Tensor | None = None,
         batch: tuple[int, ...] = (),
     ) -> None:
-        self.model, self.loss, self.terms, self.batch = model, loss, tuple(terms), batch
-        self.free, self.free_board = FreeParameters.of(free), free_board
-        self.board_points, self._board = board_points, board_points.T.contiguous()
-        self.shapes = warp_modes(board_points) if shapes is None else shapes
-        self.seen = torch.isfinite(pixels).all(-1)
-        if weights is not None and weights.ndim == self.seen.ndim:
-            self.seen = self.seen & (weights > 0)
-        self._target = torch.where(self.seen[..., None], pixels, 0.0).transpose(-1, -2).contiguous()
-        self._weigh(weights)
+        super().__init__(board_points, pixels, model, free, shapes, free_board, weights, loss, readout, batch)
+        self.terms = tuple(terms)
         self.residual_count = 2 * int(self.seen.sum((-2, -1)).max())
-        self.readout = readout
-        self.local_size = POSE + (MOTION if readout else 0)
         if readout is not None:
-            self._time = readout.time(pixels)
             self._still = torch.zeros(MOTION, dtype=pixels.dtype) if stillness is None else stillness
-        self.unknown_count = len(self.free) + len(self.shapes) * free_board
         self.moving = torch.arange(self.unknown_count) if held is None else (~held).nonzero()[:, 0]
         self.shared_size = len(self.moving)
         self._all_move = self.shared_size == self.unknown_count
-        # With hundreds of columns a linearization costs far more than the cost alone.
-        self.joint = not model.hybrid
         self._kept: list[tuple[BoardState, Products]] = []
         self.slots = self._places(model.size)
-
-    def _weigh(self, weights: Tensor | None) -> None:
-        self.weights: Tensor | None = None  # (..., V, N) or (..., V, 2, 2, N)
-        self._counts = self.seen
-        if weights is not None and weights.ndim > self.seen.ndim:
-            self.weights = torch.where(self.seen[..., None, None], weights, 0.0).movedim(-3, -1).contiguous()
-        elif weights is not None and not bool((weights[self.seen] == 1.0).all()):
-            self.weights = torch.where(self.seen, weights, 0.0)
-            self._counts = self.weights > 0
-        self._all_count = bool(self._counts.all())
 
     def _places(self, coefficients: int) -> Tensor:
         """(5 + P + B,) the place of each of `values` among the unknowns of a step; -1 where it has none."""
@@ -148,11 +123,6 @@ class BoardProblem(SchurProblem[BoardState]):
         return changed
 
     @property
-    def pixels(self) -> Tensor:
-        """(..., V, N, 2) observed corners; NaN where not seen."""
-        return torch.where(self.seen[..., None], self._target.transpose(-1, -2), torch.nan)
-
-    @property
     def prior_count(self) -> int:
         """Number of scalar residuals that are priors."""
         return sum(len(term.index) for term in self.terms if isinstance(term, GaussianPrior))
@@ -162,7 +132,7 @@ class BoardProblem(SchurProblem[BoardState]):
         if len(self.batch) != 1:
             return None
         part = copy.copy(self)
-        part._kept = []
+        part._kept, part._shown = [], []
         part.batch = (len(elements),)
         if self.seen.ndim > 2:
             part.seen, part._target, part._counts = self.seen[elements], self._target[elements], self._counts[elements]
@@ -180,38 +150,6 @@ class BoardProblem(SchurProblem[BoardState]):
         own = state.parameters[..., list(self.free.leading)]
         return torch.cat([own, state.board], -1) if self.free_board else own
 
-    def _placed(self, state: BoardState, views: slice = _ALL) -> _Placed:
-        flat = self._board
-        if len(self.shapes) and (self.free_board or bool(state.board.any())):
-            flat = flat + torch.einsum("...b,bkn->...kn", state.board, self.shapes)[..., None, :, :]
-        if self.readout is None:
-            rotated = state.rotation @ flat
-            return _Placed(flat, rotated, rotated + state.translation[..., None], None)
-        flat = flat.squeeze(0)
-        moved = self.readout.moved(state.motion, self._time[views], flat)
-        rotated = state.rotation @ moved.points
-        return _Placed(flat, rotated, rotated + state.translation[..., None] + moved.shift, moved.turn)
-
-    def points(self, state: BoardState) -> Tensor:
-        """(..., V, N, 3) the board's corners in the camera's frame, meters."""
-        return self._placed(state).points.transpose(-1, -2)
-
-    def pixel_errors(self, state: BoardState) -> Tensor:
-        """Projected minus observed, (..., V, 2, N) pixels, not weighted; 0 where not seen.
-
-        NaN where a seen corner lies behind the camera, or beyond a pole or a fold of the lens.
-        """
-        projected = project_components(self._placed(state).points, state.parameters[..., None, :], self.model)
-        bad = torch.where(projected.regular, 0.0, torch.nan)[..., None, :]
-        return torch.where(self.seen[..., None, :], projected.pixels - self._target + bad, 0.0)
-
-    def corner_residuals(self, state: BoardState, *, weighted: bool = False) -> Tensor:
-        """(..., V, N, 2) residuals by corner; NaN where not seen."""
-        errors = self.pixel_errors(state)
-        if weighted:
-            errors = self._weighted(errors[..., None, :, :])[..., 0, :, :]
-        return torch.where(self.seen[..., None], errors.transpose(-1, -2), torch.nan)
-
     def residuals(self, state: BoardState) -> Tensor:
         """See `SchurProblem.residuals`: weighted `pixel_errors`, u of all corners, then v; last those of motions."""
         errors = self._weighted(self.pixel_errors(state)[..., None, :, :])[..., 0, :, :].flatten(-2)
@@ -226,78 +164,35 @@ class BoardProblem(SchurProblem[BoardState]):
         squared = residuals[..., :corners].unflatten(-1, (2, -1)).square().sum(-2)
         return 0.5 * (self.loss.value(squared).sum(-1) + residuals[..., corners:].square().sum(-1))
 
-    def _weighted(self, vectors: Tensor, views: slice = _ALL) -> Tensor:
-        """Vectors (..., V, Q, 2, N) of pixels, multiplied by the corners' weights; 0 where these are zero."""
-        if self.weights is None:
-            return vectors
-        if self.weights.ndim > self.seen.ndim:
-            return torch.einsum("...uwn,...qwn->...qun", self.weights[..., views, :, :, :], vectors)
-        weights = self.weights[..., views, None, None, :]
-        # Without an image a corner of weight zero is NaN.
-        return torch.where(weights > 0, vectors * weights, 0.0)
-
-    def corner_rows(self, state: BoardState, views: slice = _ALL) -> Tensor:
-        """(..., V, L + S + 1, 2 N) as `rows`, of the corners alone."""
-        flat, rotated, points, turn = self._placed(state, views)
-        projected = project_components(points, state.parameters[..., None, :], self.model, self.free.indices)
-        parts = [step_rows(projected.by_point, rotated)]
-        if self.readout is not None:
-            parts.append(self.readout.columns_of(projected.by_point, state.rotation, self._time[views], flat))
-        parts.extend(self.free.collapsed(projected.by_camera, -3))
-        if self.free_board:
-            by_board = torch.einsum("...vkun,...vkl->...vlun", projected.by_point, state.rotation)
-            if turn is not None:
-                # What displaces a corner of the board turns with it.
-                by_board = by_board + torch.linalg.cross(by_board, turn[:, :, None].expand_as(by_board), dim=1)
-            parts.append(torch.einsum("...vlun,bln->...vbun", by_board, self.shapes))
-        error = projected.pixels - self._target[..., views, :, :]
-        if self.joint:
-            # A hybrid lens has values beyond its disc, too: a start may have corners there, but no state that follows.
-            error = error + torch.where(projected.regular, 0.0, torch.nan)[..., None, :]
-        rows = torch.cat([*parts, error[..., None, :, :]], -3)
-        if not self._all_count:
-            rows = torch.where(self._counts[..., views, None, None, :], rows, 0.0)
-        rows = self._weighted(rows, views)
-        if self.loss is not None:
-            squared = rows[..., -1, :, :].square().sum(-2)
-            rows = rows * self.loss.weight(squared).sqrt()[..., None, None, :]
-        rows = rows.flatten(-2)
+    def rows(self, state: BoardState, views: slice = ALL) -> Tensor:
+        """See `SchurProblem.rows`; of some views. Zero by unknowns that are held."""
+        rows = self.corner_rows(state, views)
         if not self._all_move:
             held = torch.ones(self.unknown_count, dtype=torch.bool).index_fill_(0, self.moving, False)
             rows[..., self.local_size : -1, :].masked_fill_(held[:, None], 0.0)
-        return rows
-
-    def rows(self, state: BoardState, views: slice = _ALL) -> Tensor:
-        """See `SchurProblem.rows`; with `views` given, of a state of these alone. Zero by unknowns that are held."""
-        rows = self.corner_rows(state, views)
         if self.readout is None:
             return rows
         prior = rows.new_zeros(*rows.shape[:-1], MOTION)
         prior[..., POSE : self.local_size, :] = torch.diag(self._still.sqrt())
-        prior[..., -1, :] = self._still.sqrt() * state.motion
+        prior[..., -1, :] = self._still.sqrt() * state.motion[views]
         return torch.cat([rows, prior], -1)
 
-    def _chunks(self, state: BoardState) -> Iterator[tuple[BoardState, slice]]:
-        """The state of a few views at a time, so that their rows stay in the cache."""
+    def _chunks(self, state: BoardState) -> Iterator[slice]:
+        """A few views at a time, so that their rows stay in the cache."""
         count, row = state.rotation.shape[-3], 2 * self._board.shape[-1] * max(1, math.prod(self.batch))
         size = max(1, _CHUNK // (row * (self.local_size + self.unknown_count + 1)))
-        for start in range(0, count, size):
-            views = slice(start, start + size)
-            yield (state if size >= count else state.views(views)), views
+        yield from (slice(start, start + size) for start in range(0, count, size)) if size < count else (ALL,)
 
     def products(self, state: BoardState) -> Products:
         """What the corners alone say near a state, by the unknowns that are not held; the last ones are kept."""
         if self._kept and self._kept[0][0] is state:
             return self._kept[0][1]
-        L = self.local_size
-        columns = [*(L + self.moving).tolist(), -1]
-        parts = []
-        for part, views in self._chunks(state):
-            rows = self.corner_rows(part, views)
-            parts.append(
-                Products.of_rows(rows[..., :L, :], rows[..., L:, :] if self._all_move else rows[..., columns, :])
-            )
-        found = Products.together(parts)
+        memory: list[Tensor] = []
+        found = Products.together(
+            [Products.of_rows(self.corner_rows(state, views, memory), self.local_size) for views in self._chunks(state)]
+        )
+        if not self._all_move:
+            found = found.of_shared(self.moving)
         if not found.total.requires_grad:
             self._kept[:] = [(state, found)]
         return found
@@ -320,13 +215,13 @@ class BoardProblem(SchurProblem[BoardState]):
 
     def off_poses(self, state: BoardState) -> Tensor:
         """(V, S + 1, R) derivatives by the shared unknowns, and residuals, off what poses and motions can do (QR)."""
-        return torch.cat([without_local(self.rows(part, v), self.local_size) for part, v in self._chunks(state)])
+        return torch.cat([without_local(self.rows(state, views), self.local_size) for views in self._chunks(state)])
 
     def reduced_rows(self, state: BoardState) -> Tensor:
         """(S + 1, S + 1) triangle with the same products as the rows of `off_poses`, some views at a time."""
         parts = [
-            triangular(without_local(self.rows(part, views), self.local_size).transpose(0, 1).flatten(1).T)
-            for part, views in self._chunks(state)
+            triangular(without_local(self.rows(state, views), self.local_size).transpose(0, 1).flatten(1).T)
+            for views in self._chunks(state)
         ]
         return parts[0] if len(parts) == 1 else triangular(torch.cat(parts))
 
@@ -359,12 +254,3 @@ class BoardProblem(SchurProblem[BoardState]):
     def tidy(self, state: BoardState) -> BoardState:
         """The state with its rotations made orthonormal again after many small steps."""
         return state._replace(rotation=nearest_rotation(state.rotation))
-
-
-class _Placed(NamedTuple):
-    """The board (..., 3, N) in its frame; in each view rotated, and in the camera's frame; turns while it is read."""
-
-    flat: Tensor
-    rotated: Tensor
-    points: Tensor
-    turn: Tensor | None

@@ -41,7 +41,7 @@ def summed_products(parts: Sequence[CameraRows], size: int, shared_size: int) ->
     new = parts[0].rows.new_zeros
     local, right, score, total = new(count, size, size), new(count, size, width), new(count, width), new(width, width)
     for _, shared, rows in parts:
-        own, columns = Products.of_rows(rows[:, :size], rows[:, size:]), torch.cat([shared, shared.new_tensor([-1])])
+        own, columns = Products.of_rows(rows, size), torch.cat([shared, shared.new_tensor([-1])])
         local += own.local
         right[..., columns] += own.right
         score[:, columns] += own.score

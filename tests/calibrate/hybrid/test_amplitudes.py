@@ -37,6 +37,10 @@ def weights_seen(sizes: list[float], sigma: float) -> Loss:
     return loss
 
 
+def values_of(loss: Loss) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda many: np.array([loss(v)[0] for v in many])
+
+
 def smallest(loss: Loss) -> np.ndarray:
     places = np.linspace(-8.0, 4.0, 4001)
     best = min(places, key=lambda x: loss(np.array([x, 0.0, 0.0]))[0])
@@ -48,7 +52,7 @@ def test_mean_square_is_that_of_the_integral(sizes: list[float]) -> None:
     """Where the amplitude is well determined, where it is not, and where nothing but an upper bound is known."""
     loss = weights_seen(sizes, 0.2)
     at = smallest(loss)
-    found = expected_amplitudes(bend(loss, at), lambda v: loss(v)[0], at, [0], WIDE)
+    found = expected_amplitudes(bend(loss, at), values_of(loss), at, [0], WIDE)
 
     def density(x: float, power: float) -> float:
         return math.exp(loss(at)[0] - loss(np.array([x, 0.0, 0.0]))[0] + power * x)
@@ -67,7 +71,7 @@ def test_others_follow() -> None:
     def loss(v: np.ndarray) -> tuple[float, np.ndarray]:
         return 0.5 * float(v @ precision @ v), precision @ v
 
-    found = expected_amplitudes(precision, lambda v: loss(v)[0], np.zeros(2), [0, 1], WIDE[:2])
+    found = expected_amplitudes(precision, values_of(loss), np.zeros(2), [0, 1], WIDE[:2])
     # ln A has a variance of 1 each: ½ ln <A²> = 1.
     assert found == pytest.approx([1.0, 1.0], abs=0.02)
 
@@ -76,5 +80,5 @@ def test_bounds_hold() -> None:
     loss = weights_seen([0.01, 0.02], 0.2)
     at = smallest(loss)
     top = float(at[0]) + 0.4
-    found = expected_amplitudes(bend(loss, at), lambda v: loss(v)[0], at, [0], [(-12.0, top), *WIDE[1:]])
+    found = expected_amplitudes(bend(loss, at), values_of(loss), at, [0], [(-12.0, top), *WIDE[1:]])
     assert at[0] - 1.0 < found[0] <= top

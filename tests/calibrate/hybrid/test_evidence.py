@@ -40,7 +40,7 @@ def rows(moving: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, 
 
 def data(moving: bool) -> ViewData:
     U, A, residual, x, motion = (torch.from_numpy(part) for part in rows(moving))
-    products = Products.of_rows(U, torch.cat([A, residual[:, None]], 1))
+    products = Products.of_rows(torch.cat([U, A, residual[:, None]], 1), U.shape[1])
     return view_data(products, x, motion, float(VIEWS * ROWS))
 
 
@@ -70,13 +70,13 @@ def test_value_is_the_density_of_the_residuals(moving: bool) -> None:
     w = (AT[2:6] + 0.5 * AT[-1] - math.log(MEDIAN)) / SPREAD if moving else np.zeros(0)
     wanted = density(moving) + 0.5 * float(z @ z + w @ w)
     loss = EvidenceLoss(data(moving), FAMILIES, PRIOR, 1.0)
-    assert loss.value(vector(moving)) == pytest.approx(wanted, rel=1e-10)
+    assert loss.values(vector(moving)[None])[0] == pytest.approx(wanted, rel=1e-10)
     assert loss(vector(moving))[0] == pytest.approx(wanted, rel=1e-10)
 
 
 def check_derivatives(loss: EvidenceLoss, at: np.ndarray) -> None:
     steps = 1e-5 * np.eye(len(at))
-    slopes = [(loss.value(at + step) - loss.value(at - step)) / 2e-5 for step in steps]
+    slopes = [float(np.subtract(*loss.values(np.stack([at + step, at - step])))) / 2e-5 for step in steps]
     _, found, bend = loss(at)
     np.testing.assert_allclose(found, slopes, rtol=1e-6, atol=1e-6)
     bends = [(loss(at + step)[1] - loss(at - step)[1]) / 2e-5 for step in steps]
@@ -92,7 +92,7 @@ def test_derivatives(moving: bool, tempering: float) -> None:
 def test_derivatives_of_a_single_view() -> None:
     """It has fewer motions of an order than there are unknowns of lens and board."""
     U, A, residual, x, motion = (torch.from_numpy(part) for part in rows(True))
-    products = Products.of_rows(U[:1], torch.cat([A, residual[:, None]], 1)[:1])
+    products = Products.of_rows(torch.cat([U, A, residual[:, None]], 1)[:1], U.shape[1])
     one = view_data(products, x, motion[:1], float(ROWS))
     check_derivatives(EvidenceLoss(one, FAMILIES, PRIOR, 1.2), vector(True))
 
@@ -100,7 +100,7 @@ def test_derivatives_of_a_single_view() -> None:
 def test_beyond_numbers_is_worse_than_anything() -> None:
     loss, at = EvidenceLoss(data(False), FAMILIES, PRIOR, 1.0), vector(False)
     beyond = at + np.array([0.0, 0.0, 400.0])
-    assert loss.value(beyond) == math.inf
+    assert loss.values(beyond[None])[0] == math.inf
     assert loss(beyond)[0] == math.inf
 
 

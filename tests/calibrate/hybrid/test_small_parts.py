@@ -229,7 +229,7 @@ class TestQuadratics:
         rows, motions, residual = draw(3, 2, 9), draw(3, 12, 9, seed=1), draw(3, 1, 9, seed=2)
         motion = draw(3, 12, seed=3)
         shared = torch.cat([rows, residual], 1)
-        found = view_data(Products.of_rows(motions, shared), tensor(0.3, 0.4), motion, 11.0)
+        found = view_data(Products.of_rows(torch.cat([motions, shared], 1), 12), tensor(0.3, 0.4), motion, 11.0)
         still = residual - motion[:, None] @ motions
         both = torch.cat([rows, still], 1)
         torch.testing.assert_close(found.still.products, (both @ both.mT).sum(0))

@@ -19,7 +19,9 @@ from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.fitted_views import FittedViews
 from kcal.calibrate.hybrid.quadratic import Quadratic, ViewData, view_data
 from kcal.calibrate.hybrid.unknowns import hybrid_problem
-from kcal.calibrate.problem.board_problem import POSE, BoardProblem
+from kcal.calibrate.problem import board_images
+from kcal.calibrate.problem.board_images import POSE
+from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.readout import (
     AMPLITUDES,
     LARGEST,
@@ -203,6 +205,59 @@ def test_products_serve_under_other_priors() -> None:
         torch.testing.assert_close(mine, its)
 
 
+def weighed_problem(square: bool) -> tuple[BoardProblem, BoardState]:
+    """With weights, of which some are zero."""
+    problem, state = moving_problem(square)
+    weights = 0.3 + torch.rand(4, BOARD.corners, generator=torch.Generator().manual_seed(5), dtype=F64)
+    weights[1, :9], weights[3, 20] = 0.0, 0.0
+    return problem.with_weights(weights), state
+
+
+@pytest.mark.parametrize("square", [True, False])
+def test_rows_in_one_piece_of_memory(square: bool) -> None:
+    """As those that are differentiated, which are formed column by column; of some views, too."""
+    problem, state = weighed_problem(square)
+    wanted = problem.rows(state._replace(parameters=state.parameters.clone().requires_grad_())).detach()
+    size = float(wanted.abs().max())
+    torch.testing.assert_close(problem.rows(state), wanted, rtol=1e-11, atol=1e-12 * size)
+    assert float(wanted[1, :, [0, 8, BOARD.corners]].abs().max()) == 0.0
+    some = slice(1, 3)
+    torch.testing.assert_close(problem.rows(state, some), wanted[some], rtol=1e-11, atol=1e-12 * size)
+
+
+def test_products_of_few_views_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They use one piece of memory in turn; of three views, then of one."""
+    problem, state = weighed_problem(True)
+    rows, local = problem.corner_rows(state), problem.local_size
+    columns = rows.shape[1] * rows.shape[2]
+    monkeypatch.setattr("kcal.calibrate.problem.board_problem._CHUNK", 3 * columns)
+    assert [len(range(*views.indices(4))) for views in problem._chunks(state)] == [3, 1]
+    found = problem.products(state)
+    across = rows.mT
+    torch.testing.assert_close(found.local, rows[:, :local] @ across[..., :local])
+    torch.testing.assert_close(found.right, rows[:, :local] @ across[..., local:])
+    torch.testing.assert_close(found.score, (rows[:, local:] @ across[..., -1:])[..., 0])
+    torch.testing.assert_close(found.total, (rows[:, local:] @ across[..., local:]).sum(0))
+
+
+def test_corners_of_a_trial_are_projected_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its cost and its linearization share them; another state, and one that is differentiated, do not."""
+    problem, state = moving_problem(True)
+    calls = []
+    project = board_images.project_components
+    monkeypatch.setattr(board_images, "project_components", lambda *a: calls.append(1) or project(*a))
+    cost = problem.cost(state)
+    torch.testing.assert_close(problem.linearize(state).cost, cost, rtol=1e-12, atol=0.0)
+    assert len(calls) == 1
+    other = state._replace(translation=1.001 * state.translation)
+    assert float(problem.cost(other)) != float(cost)
+    assert len(calls) == 2
+    followed = other._replace(parameters=other.parameters.clone().requires_grad_())
+    with torch.no_grad():
+        problem.cost(followed)
+    assert problem.cost(followed).requires_grad
+
+
 def linear_views() -> tuple[ViewData, object]:
     """Views of a Gaussian linear model whose motions are drawn with known deviations."""
     generator = torch.Generator().manual_seed(7)
@@ -218,7 +273,7 @@ def linear_views() -> tuple[ViewData, object]:
     error = torch.einsum("s,vsr->vr", x, lens) + torch.einsum("vm,vmr->vr", m, motion)
     error = -error + 0.3 * torch.randn(views, residuals, generator=generator, dtype=F64)
     rows = torch.cat([motion, lens, error[:, None]], 1)
-    products, still = Products.of_rows(rows[:, :MOTION], rows[:, MOTION:]), torch.zeros(views, MOTION, dtype=F64)
+    products, still = Products.of_rows(rows, MOTION), torch.zeros(views, MOTION, dtype=F64)
     return view_data(products, torch.zeros(size, dtype=F64), still, views * residuals), (families, form.modes)
 
 
