@@ -1,0 +1,261 @@
+"""How a camera looks, from the skyline in its image and a raster of the terrain: attitude, covariance, what it rests on.
+
+The rotation is fitted to all columns at once by generalized least squares. Columns that look at one ridge share the
+error of the raster's heights there, and all columns share the refraction of light, the height and place of the camera
+and the errors of its lens, so they are correlated, and the covariance says so.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from kcal.calibrate.rig.adjustment import chi2_quantile
+from kcal.errors import DegenerateError, InputError
+from kcal.lens.camera import Camera
+from kcal.lens.mounting import Origin
+from kcal.locate.ellipsoid import mean_radius
+from kcal.locate.mounting import attitude
+from kcal.locate.raster import Raster
+from kcal.skyline.border import Border, sky_border
+from kcal.skyline.fit import Fit, SkylineErrors, fit_rotation, lens_errors
+from kcal.skyline.heading import Candidate, candidates, rotation_by
+from kcal.skyline.horizon import Horizon, terrain_horizon
+from kcal.skyline.raster_error import RasterError
+from kcal.skyline.seen_horizon import Columns, columns_of, compare
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+# Degrees between azimuths all around, where headings are searched, and beyond the image where a skyline is fitted.
+_AROUND, _BEYOND = 0.05, 1.5
+# Share of the image's columns that must be clear, and of the clear ones that must agree with the raster.
+_CLEAR, _AGREEING = 0.1, 0.5
+# Degrees: a heading known worse is none; and headings as near as this are one.
+_FLAT, _ONE = 0.5, 0.5
+# χ² by which the second heading must fit worse: a thousand to one.
+_CLEARLY = 2.0 * math.log(1000.0)
+# Residuals may be larger than their sigmas say by this factor; beyond, the raster is not of this terrain.
+_CONTRADICTS = 3.0
+# Meters above the raster's ground at which a camera's height is doubted.
+_HIGH = 150.0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class SkylineAttitude:
+    """How a camera looks, from a skyline.
+
+    Args:
+        rotation: (3, 3) the camera's axes from east, north, up at the camera.
+        heading_deg: as `Mounting`.
+        pitch_deg: likewise.
+        roll_deg: likewise.
+        sigma_deg: (3,) of heading, pitch and roll.
+        covariance: (3, 3) rad², of a small turn of the camera about the axes east, north, up.
+        shares: of the variances of heading, pitch and roll (3,) by where they come from: image, raster, refraction,
+            position, lens.
+        widened: by how much residuals are larger than their sigmas say, at least 1; the covariance has it.
+        border: of the image.
+        used: (W,) which columns agree with the raster and were used.
+        expected: (W,) px, the raster's skyline in each clear column; NaN elsewhere.
+        second_deg: heading of the next best explanation; NaN if there is none.
+        second_worse: by how much its χ² is larger.
+        warnings: what to know of it.
+        fit: the columns used, in bins, and the covariance about the camera's axes.
+    """
+
+    rotation: Floats
+    heading_deg: float
+    pitch_deg: float
+    roll_deg: float
+    sigma_deg: Floats
+    covariance: Floats
+    shares: dict[str, Floats]
+    widened: float
+    border: Border
+    used: Bools
+    expected: Floats
+    second_deg: float
+    second_worse: float
+    warnings: tuple[str, ...]
+    fit: Fit
+
+
+def skyline_attitude(
+    image: NDArray[np.generic],
+    camera: Camera,
+    place: Origin,
+    raster: Raster,
+    *,
+    place_sigma: tuple[float, float, float] = (3.0, 3.0, 3.0),
+    error: RasterError | None = None,
+    heading: tuple[float, float] | None = None,
+) -> SkylineAttitude:
+    """Find the attitude of a camera from the border of sky and ground; no rough pose is needed.
+
+    Args:
+        image: (H, W) gray levels, by day.
+        camera: which lens; errors of its calibration are part of the covariance.
+        place: of the camera.
+        raster: heights above the ellipsoid, from `kcal.locate.terrain`.
+        place_sigma: meters, of the place, east, north and up.
+        error: of the raster and of refraction.
+        heading: a rough heading of the optical axis and the most it is off, degrees.
+
+    Raises:
+        InputError: an image of another size; no clear border of sky and ground; a raster that does not reach, or that
+            contradicts the image.
+        DegenerateError: the skyline is too flat to tell the heading, or several headings fit about equally well.
+
+    Example:
+        >>> camera = Camera.build(focal=(300, 300), center=(159.5, 99.5), size=(320, 200), model="pinhole")
+        >>> skyline_attitude(np.zeros((100, 100)), camera, Origin(lat=47.0, lon=11.0, height=600.0), None)
+        Traceback (most recent call last):
+        kcal.errors.InputError: the image has 100 x 100 pixels, the camera 320 x 200: give an image of this camera
+    """
+    error = error or RasterError()
+    shape = np.asarray(image).shape
+    if shape != tuple(reversed(camera.size)):
+        got = " x ".join(str(side) for side in reversed(shape))
+        raise InputError(
+            f"the image has {got} pixels, the camera {camera.size[0]} x {camera.size[1]}: give an image of this camera"
+        )
+    if not all(0.0 < sigma < math.inf for sigma in place_sigma):
+        raise InputError(f"place_sigma {place_sigma}: three positive numbers of meters are needed")
+    border = sky_border(image)
+    columns = columns_of(border.row, border.sigma, camera)
+    if len(columns.pixel) < max(_CLEAR * camera.size[0], 30):
+        raise InputError(
+            f"the border of sky and ground is clear in {len(columns.pixel)} of {camera.size[0]} columns only: the "
+            "skyline must be in the image, by day, without fog, and without things close by in front of it"
+        )
+    around = terrain_horizon(raster, place, np.radians(np.arange(-180.0, 180.0, _AROUND)), refraction=error.refraction)
+    found = candidates(columns, around, camera, error, heading)
+    errors = SkylineErrors(error, np.array(place_sigma), lens_errors(camera), mean_radius(place.lat))
+    horizon = terrain_horizon(raster, place, _azimuths(columns, found[0]), refraction=error.refraction)
+    fit = fit_rotation(columns, horizon, found[0].rotation, camera, errors)
+    if fit is None:
+        raise InputError(f"{_CONTRADICTED} no heading fits; {_CURE}")
+    return _checked(fit, found, columns, horizon, border, camera, raster, place)
+
+
+_CONTRADICTED = "the raster contradicts the image:"
+_CURE = (
+    "check the camera's place and height, the raster's heights (--geoid) and accuracy, and that the image shows a "
+    "skyline by day"
+)
+
+
+def _azimuths(columns: Columns, found: Candidate) -> Floats:
+    """Radians, increasing, two for each column of the image."""
+    heading = columns.ray @ found.rotation
+    middle = math.radians(found.heading)
+    off = np.remainder(np.arctan2(heading[:, 0], heading[:, 1]) - middle + math.pi, 2.0 * math.pi) - math.pi
+    step = 0.5 * float(np.median(np.abs(np.diff(off)) / np.diff(columns.pixel[:, 0])))
+    beyond = math.radians(_BEYOND)
+    return middle + np.arange(off.min() - beyond, off.max() + beyond, step)
+
+
+def _checked(
+    fit: Fit, found: list[Candidate], columns: Columns, horizon: Horizon, border: Border, camera: Camera,
+    raster: Raster, place: Origin,
+) -> SkylineAttitude:  # fmt: skip
+    """The attitude, unless something speaks against it."""
+    heading, pitch, roll = attitude(torch.from_numpy(fit.rotation.T.copy()))
+    large = fit.freedom > 0 and fit.chi2 > float(chi2_quantile(torch.tensor(float(fit.freedom)), 0.999))
+    widened = math.sqrt(fit.chi2 / fit.freedom) if large else 1.0
+    turn = _by_angles(fit.rotation)
+    sigma = widened * np.sqrt(np.diag(turn @ fit.covariance @ turn.T))
+    if sigma[0] > _FLAT:
+        raise DegenerateError(
+            f"the skyline is too flat to tell the heading: its sigma is {sigma[0]:.2g} degrees (a plain or the sea has "
+            "one elevation all around); use landmarks or stars"
+        )
+    apart = [abs((one.heading - heading + 180.0) % 360.0 - 180.0) for one in found]
+    others = [one for one, off in zip(found, apart, strict=True) if off > max(5.0 * sigma[0], _ONE)]
+    worse = others[0].cost - found[0].cost if others else math.inf
+    if worse < _CLEARLY:
+        raise DegenerateError(
+            f"two headings explain the skyline about equally well: {heading:.1f} and {others[0].heading:.1f} degrees "
+            f"(chi-squared differs by {worse:.1f}; {_CLEARLY:.0f} are needed): state a rough heading, or use an image "
+            "that shows more of the skyline"
+        )
+    agreeing = float(fit.used.mean())
+    if agreeing < _AGREEING:
+        raise InputError(
+            f"{_CONTRADICTED} {100 * agreeing:.0f} % of the skyline's clear columns agree in the best heading, "
+            f"{heading:.1f} degrees; {_CURE}"
+        )
+    if widened > _CONTRADICTS:
+        raise InputError(f"{_CONTRADICTED} residuals are {widened:.1f} times as large as their sigmas say; {_CURE}")
+    expected = np.full(camera.size[0], np.nan)
+    used = np.zeros(camera.size[0], dtype=np.bool_)
+    at = columns.pixel[:, 0].astype(int)
+    seen = compare(columns, horizon, fit.rotation, camera)
+    # Down the column, as far as the skyline is from the border across it.
+    upright = np.where(columns.sigma > 0, seen.sigma / columns.sigma, 1.0)
+    expected[at] = np.where(seen.known, columns.pixel[:, 1] + seen.residual / np.maximum(upright, 0.05), np.nan)
+    used[at] = fit.used
+    total = np.diag(turn @ fit.covariance @ turn.T)
+    back = fit.rotation.T
+    return SkylineAttitude(
+        rotation=fit.rotation,
+        heading_deg=heading,
+        pitch_deg=pitch,
+        roll_deg=roll,
+        sigma_deg=sigma,
+        covariance=widened**2 * back @ fit.covariance @ back.T,
+        shares={name: np.diag(turn @ part @ turn.T) / total for name, part in fit.parts.items()},
+        widened=widened,
+        border=border,
+        used=used,
+        expected=expected,
+        second_deg=others[0].heading if others else math.nan,
+        second_worse=worse,
+        warnings=tuple(_warnings(fit, columns, horizon, raster, place, widened)),
+        fit=fit,
+    )
+
+
+def _by_angles(rotation: Floats) -> Floats:
+    """(3, 3) degrees of heading, pitch and roll by a turn about the camera's axes, rad."""
+    step, found = 1e-6, np.empty((3, 3))
+    for axis in range(3):
+        ends = []
+        for sign in (1.0, -1.0):
+            turned = rotation_by(sign * step * np.eye(3)[axis]) @ rotation
+            ends.append(np.array(attitude(torch.from_numpy(turned.T.copy()))))
+        found[:, axis] = ((ends[0] - ends[1] + 180.0) % 360.0 - 180.0) / (2.0 * step)
+    return found
+
+
+def _warnings(
+    fit: Fit, columns: Columns, horizon: Horizon, raster: Raster, place: Origin, widened: float
+) -> list[str]:
+    found = []
+    above = place.height - float(raster(*(torch.tensor([part]).double() for part in (place.lat, place.lon)))[0])
+    if above > _HIGH:
+        found.append(
+            f"the camera stands {above:.0f} m above the raster's ground; if its heights are above the sea, add the "
+            "height of the geoid (--geoid)"
+        )
+    if widened > 1.0:
+        found.append(
+            f"residuals are {widened:.1f} times as large as their sigmas say; the covariance was widened: is the raster "
+            "as accurate as stated?"
+        )
+    heading = columns.ray[fit.used] @ fit.rotation
+    near = np.searchsorted(horizon.azimuth, horizon.azimuth[0] + np.remainder(
+        np.arctan2(heading[:, 0], heading[:, 1]) - horizon.azimuth[0], 2.0 * math.pi
+    )).clip(0, len(horizon.azimuth) - 1)  # fmt: skip
+    doubtful = float(horizon.doubtful[near].mean())
+    if doubtful > 0.1:
+        found.append(
+            f"ground as high as the raster's highest, if it stood just beyond its end ({horizon.reach.min() / 1e3:.1f} "
+            f"km away), would hide the horizon in {100 * doubtful:.0f} % of the columns; a larger raster would tell"
+        )
+    return found
