@@ -38,6 +38,7 @@ class Hills:
         relief: meters: about the height of its hills.
         level: meters above the ellipsoid.
         clear: meters around the origin in which it is level, where a camera stands.
+        far: meters from the origin at which the hills end before a plain, so that nothing beyond is seen.
         trees: meters: height of woods that no raster of the ground has.
         woods: share of the terrain with trees.
     """
@@ -46,6 +47,7 @@ class Hills:
     relief: float = 500.0
     level: float = 200.0
     clear: float = 1_500.0
+    far: float = 13_000.0
     trees: float = 0.0
     woods: float = 0.0
 
@@ -61,9 +63,10 @@ class Hills:
             if number < _RIDGED:
                 value = 0.7 - 2.0 * np.sqrt(np.square(value) + 0.002)
             total = total + share * value
-        far = np.hypot(east, north) / self.clear
-        rise = np.clip(far - 1.0, 0.0, None)
-        return self.level + self.relief * (1.0 + total) * rise / (1.0 + rise)
+        away = np.hypot(east, north)
+        rise = np.clip(away / self.clear - 1.0, 0.0, None)
+        fall = 1.0 / (1.0 + np.exp(np.clip((away - self.far) / 300.0, -50.0, 50.0)))
+        return self.level + self.relief * (1.0 + total) * fall * rise / (1.0 + rise)
 
     def seen(self, east: Floats, north: Floats) -> Floats:
         """Meters above the ellipsoid of what stands there, trees included."""

@@ -22,17 +22,18 @@ from kcal.locate.ellipsoid import mean_radius
 from kcal.locate.mounting import attitude
 from kcal.locate.raster import Raster
 from kcal.skyline.border import Border, sky_border
-from kcal.skyline.fit import Fit, SkylineErrors, fit_rotation, lens_errors
+from kcal.skyline.fit import Fit, fit_rotation, lens_errors
 from kcal.skyline.heading import Candidate, candidates, rotation_by
 from kcal.skyline.horizon import Horizon, terrain_horizon
-from kcal.skyline.raster_error import RasterError
+from kcal.skyline.raised import raised_horizon
+from kcal.skyline.raster_error import RasterError, SkylineErrors
 from kcal.skyline.seen_horizon import Columns, columns_of, compare
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 # Degrees between azimuths all around, where headings are searched, and beyond the image where a skyline is fitted.
-_AROUND, _BEYOND = 0.05, 1.5
+_AROUND, _BEYOND = 0.1, 1.5
 # Share of the image's columns that must be clear, and of the clear ones that must agree with the raster.
 _CLEAR, _AGREEING = 0.1, 0.5
 # Degrees: a heading known worse is none; and headings as near as this are one.
@@ -134,9 +135,10 @@ def skyline_attitude(
             "skyline must be in the image, by day, without fog, and without things close by in front of it"
         )
     around = terrain_horizon(raster, place, np.radians(np.arange(-180.0, 180.0, _AROUND)), refraction=error.refraction)
-    found = candidates(columns, around, camera, error, heading)
     errors = SkylineErrors(error, np.array(place_sigma), lens_errors(camera), mean_radius(place.lat))
+    found = candidates(columns, around, camera, errors, heading)
     horizon = terrain_horizon(raster, place, _azimuths(columns, found[0]), refraction=error.refraction)
+    horizon = raised_horizon(horizon, raster, place, error)
     fit = fit_rotation(columns, horizon, found[0].rotation, camera, errors)
     if fit is None:
         raise InputError(f"{_CONTRADICTED} no heading fits; {_CURE}")
@@ -233,9 +235,7 @@ def _by_angles(rotation: Floats) -> Floats:
     return found
 
 
-def _warnings(
-    fit: Fit, columns: Columns, horizon: Horizon, raster: Raster, place: Origin, widened: float
-) -> list[str]:
+def _warnings(fit: Fit, columns: Columns, horizon: Horizon, raster: Raster, place: Origin, widened: float) -> list[str]:
     found = []
     above = place.height - float(raster(*(torch.tensor([part]).double() for part in (place.lat, place.lon)))[0])
     if above > _HIGH:

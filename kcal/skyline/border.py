@@ -191,7 +191,9 @@ def _refined(light: Floats, path: NDArray[np.int64], noise: Floats) -> Border:
     row = path - 0.5 + place
     level = median_filter(row, _MEDIAN, mode="nearest")
     trend = np.abs(np.gradient(level))
-    broken = (np.abs(row - level) > _BREAK + _MEDIAN * trend) | (np.abs(np.diff(row, prepend=row[0])) > _BREAK + 2 * trend)
+    broken = (np.abs(row - level) > _BREAK + _MEDIAN * trend) | (
+        np.abs(np.diff(row, prepend=row[0])) > _BREAK + 2 * trend
+    )
     good &= uniform_filter1d(broken.astype(np.float64), 2 * _BESIDE + 1, mode="nearest") < 0.5 / (2 * _BESIDE + 1)
     return Border(
         row=np.where(good, row, np.nan), sigma=np.where(good, sigma, np.nan), step=step, size=(columns, rows)

@@ -13,7 +13,7 @@ from kcal.calibrate.rig.prior_information import gathered, joint_unknowns
 from kcal.lens.camera import Camera
 from kcal.skyline.heading import column_sigma, rotation_by
 from kcal.skyline.horizon import Horizon
-from kcal.skyline.raster_error import RasterError
+from kcal.skyline.raster_error import SkylineErrors
 from kcal.skyline.seen_horizon import Columns, Comparison, compare
 
 Floats = NDArray[np.float64]
@@ -56,22 +56,6 @@ class Fit(NamedTuple):
     freedom: int
 
 
-class SkylineErrors(NamedTuple):
-    """What besides the columns a skyline's fit has to know.
-
-    Attributes:
-        raster: its errors and those of refraction.
-        place: (3,) meters, sigma of the camera's place, east, north, up.
-        lens: (P, K) changes of the camera's parameters at one sigma of what its calibration does not know.
-        radius: of the Earth, meters.
-    """
-
-    raster: RasterError
-    place: Floats
-    lens: Floats
-    radius: float
-
-
 def lens_errors(camera: Camera) -> Floats:
     """(P, K) changes of a camera's parameters by K independent standard normals; none without a calibration."""
     known = None if camera.calibration is None else camera.calibration.known(camera.params.detach())
@@ -88,9 +72,10 @@ def covariances(seen: Comparison, errors: SkylineErrors) -> dict[str, Floats]:
     shift = seen.by_shift * errors.place
     lens = seen.by_lens @ errors.lens if seen.by_lens.shape[1] else np.zeros((len(height), 0))
     bent = errors.raster.refraction_sigma * seen.by_refraction(errors.radius)
+    raised = seen.by_elevation * seen.raised
     return {
         "image": np.diag(np.square(seen.sigma)) + COMMON**2,
-        "raster": errors.raster.heights(seen.point) * height[:, None] * height,
+        "raster": errors.raster.heights(seen.point) * height[:, None] * height + raised[:, None] * raised,
         "refraction": bent[:, None] * bent,
         "position": shift @ shift.T,
         "lens": lens @ lens.T,
@@ -114,8 +99,8 @@ def fit_rotation(
     """
     used = np.ones(len(columns.pixel), dtype=np.bool_)
     for number in range(_ROUNDS):
-        rotation = _robust(columns, horizon, rotation, camera, errors.raster, used if number else None)
-        before, used = used, _agreeing(compare(columns, horizon, rotation, camera), errors.raster)
+        rotation = _robust(columns, horizon, rotation, camera, errors, used if number else None)
+        before, used = used, _agreeing(compare(columns, horizon, rotation, camera), errors)
         if used.sum() < _LEAST:
             return None
         if number and np.array_equal(before, used):
@@ -139,12 +124,12 @@ def fit_rotation(
 
 
 def _robust(
-    columns: Columns, horizon: Horizon, rotation: Floats, camera: Camera, error: RasterError, used: Bools | None
+    columns: Columns, horizon: Horizon, rotation: Floats, camera: Camera, errors: SkylineErrors, used: Bools | None
 ) -> Floats:
     """A rotation after some steps: columns count by what they tell alone, and less the worse they fit."""
     for _ in range(_STEPS):
         seen = compare(columns, horizon, rotation, camera)
-        sigma = column_sigma(seen, error)
+        sigma = column_sigma(seen, errors)
         ratio = seen.residual / sigma
         limit = np.where(ratio > 0, _ABOVE, _BELOW)
         soft = 1.0 / (1.0 + np.square(ratio / limit)) if used is None else used.astype(np.float64)
@@ -159,8 +144,8 @@ def _robust(
     return rotation
 
 
-def _agreeing(seen: Comparison, error: RasterError) -> Bools:
-    ratio = seen.residual / column_sigma(seen, error)
+def _agreeing(seen: Comparison, errors: SkylineErrors) -> Bools:
+    ratio = seen.residual / column_sigma(seen, errors)
     wrong = ~seen.known | (ratio > _ABOVE) | (ratio < -_BELOW)
     near = np.convolve(wrong, np.ones(2 * _BESIDE + 1), mode="same") > 0
     found: Bools = ~near

@@ -13,7 +13,7 @@ from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.skyline.horizon import Horizon
-from kcal.skyline.raster_error import RasterError
+from kcal.skyline.raster_error import SkylineErrors
 from kcal.skyline.seen_horizon import Columns, Comparison, compare
 
 Floats = NDArray[np.float64]
@@ -51,7 +51,7 @@ class Candidate(NamedTuple):
 
 
 def candidates(
-    columns: Columns, horizon: Horizon, camera: Camera, error: RasterError, near: tuple[float, float] | None = None
+    columns: Columns, horizon: Horizon, camera: Camera, errors: SkylineErrors, near: tuple[float, float] | None = None
 ) -> list[Candidate]:
     """Attitudes that fit, the best first.
 
@@ -59,7 +59,7 @@ def candidates(
         columns: of the border.
         horizon: all around, in equal steps of azimuth.
         camera: which lens.
-        error: of the raster.
+        errors: of raster and place.
         near: heading and the most it is off, degrees, if it is known roughly.
 
     Raises:
@@ -86,7 +86,7 @@ def candidates(
         # A horizon that stands higher by p ahead and q on the right: the camera looks up by p and is rolled by q.
         p, q = tilt[number]
         tilted = rotation_by(np.array([p, -q, 0.0])) @ leveled
-        found.append(_adjusted(some, horizon, (turned @ tilted).T, camera, error))
+        found.append(_adjusted(some, horizon, (turned @ tilted).T, camera, errors))
     return sorted(found, key=lambda one: one.cost)
 
 
@@ -140,11 +140,11 @@ def _minima(cost: Floats, azimuth: Floats) -> list[int]:
     return found
 
 
-def _adjusted(columns: Columns, horizon: Horizon, rotation: Floats, camera: Camera, error: RasterError) -> Candidate:
+def _adjusted(columns: Columns, horizon: Horizon, rotation: Floats, camera: Camera, errors: SkylineErrors) -> Candidate:
     """An attitude after some robust steps, all columns counting by what they tell alone."""
     for _ in range(_STEPS):
         seen = compare(columns, horizon, rotation, camera)
-        sigma = column_sigma(seen, error)
+        sigma = column_sigma(seen, errors)
         rough = sigma + np.abs(seen.by_elevation) * _ROUGH * 0.25
         weight = seen.known / np.square(rough) / np.square(1.0 + np.square(seen.residual / (3.0 * rough)))
         normal = np.einsum("n,ni,nj->ij", weight, seen.by_turn, seen.by_turn) + 1e-6 * np.eye(3)
@@ -153,23 +153,24 @@ def _adjusted(columns: Columns, horizon: Horizon, rotation: Floats, camera: Came
         rotation = rotation_by(turn * min(1.0, 0.05 / max(size, 1e-12))) @ rotation
         if size < 1e-8:
             break
-    return Candidate(rotation, column_cost(compare(columns, horizon, rotation, camera), error, columns))
+    return Candidate(rotation, column_cost(compare(columns, horizon, rotation, camera), errors, columns))
 
 
-def column_sigma(seen: Comparison, error: RasterError) -> Floats:
-    """(N,) px, of each column alone: noise of the image and errors of the raster."""
-    height = np.hypot(error.sigma, error.offset)
-    found: Floats = np.hypot(seen.sigma, seen.by_height() * height)
+def column_sigma(seen: Comparison, errors: SkylineErrors) -> Floats:
+    """(N,) px, of each column alone: noise of the image, errors of the raster and of the camera's place."""
+    height = seen.by_height() * np.hypot(errors.raster.sigma, errors.raster.offset)
+    place = np.linalg.norm(seen.by_shift * errors.place, axis=1)
+    found: Floats = np.sqrt(np.square(seen.sigma) + np.square(height) + np.square(place))
     return found
 
 
-def column_cost(seen: Comparison, error: RasterError, columns: Columns) -> float:
+def column_cost(seen: Comparison, errors: SkylineErrors, columns: Columns) -> float:
     """χ² of the columns, each at most nine, those that share an error of the raster counting once."""
     # Unknown columns say nothing for a heading, and so they count like ones that do not fit.
-    square = np.where(seen.known, np.square(seen.residual / column_sigma(seen, error)), _MOST)
+    square = np.where(seen.known, np.square(seen.residual / column_sigma(seen, errors)), _MOST)
     heading = columns.ray[1:] * columns.ray[:-1]
     spacing = np.arccos(np.clip(heading.sum(1), -1.0, 1.0))
-    alike = error.alike(seen.distance, np.append(spacing, np.median(spacing)))
+    alike = errors.raster.alike(seen.distance, np.append(spacing, np.median(spacing)))
     return float((np.minimum(square, _MOST) / alike).sum())
 
 

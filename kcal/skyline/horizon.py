@@ -48,6 +48,7 @@ class Horizon(NamedTuple):
             the way.
         reach: (A,) meters to which the raster is known.
         doubtful: (A,) whether ground as high as the raster's highest, just beyond `reach`, would stand above it.
+        raised: (A,) radians by which errors of the raster change it on average; see `kcal.skyline.raised`.
     """
 
     azimuth: Floats
@@ -57,6 +58,7 @@ class Horizon(NamedTuple):
     known: Bools
     reach: Floats
     doubtful: Bools
+    raised: Floats
 
 
 def terrain_horizon(raster: Raster, eye: Origin, azimuth: Floats, *, refraction: float = REFRACTION) -> Horizon:
@@ -90,9 +92,8 @@ def terrain_horizon(raster: Raster, eye: Origin, azimuth: Floats, *, refraction:
             "ellipsoid, as the raster's is? The height of the geoid (--geoid) is added to a raster of heights above "
             "the sea"
         )
-    rays = _Rays(raster, eye, refraction)
-    step = 0.5 * raster.cell_m
-    distance = np.arange(_NEAREST * raster.cell_m, rays.farthest + step, step)
+    rays = Rays(raster, eye, refraction)
+    distance = sample_distances(raster, rays)
     parts = []
     each = max(_SAMPLES // len(distance), 1)
     for begin in range(0, len(azimuth), each):
@@ -101,7 +102,13 @@ def terrain_horizon(raster: Raster, eye: Origin, azimuth: Floats, *, refraction:
     highest = float(np.nanmax(raster.heights))
     curve = (1.0 - refraction) / (2.0 * rays.radius)
     beyond = np.arctan((highest - eye.height) / reach - curve * reach)
-    return Horizon(azimuth, elevation, far, point, known, reach, known & (beyond > elevation))
+    return Horizon(azimuth, elevation, far, point, known, reach, known & (beyond > elevation), np.zeros(len(azimuth)))
+
+
+def sample_distances(raster: Raster, rays: Rays) -> Floats:
+    """(S,) meters, half a cell apart, at which the ground is sampled."""
+    step = 0.5 * raster.cell_m
+    return np.arange(_NEAREST * raster.cell_m, rays.farthest + step, step)
 
 
 def _depth(raster: Raster) -> float:
@@ -109,7 +116,7 @@ def _depth(raster: Raster) -> float:
     return max(5.0, 0.25 * raster.cell_m)
 
 
-class _Rays:
+class Rays:
     """Heights, places and slopes along azimuths from an eye."""
 
     def __init__(self, raster: Raster, eye: Origin, refraction: float) -> None:
@@ -178,7 +185,7 @@ def _lagrange(nodes: Floats, at: Floats) -> Floats:
     return found
 
 
-def _highest(rays: _Rays, azimuth: Floats, distance: Floats) -> tuple[Floats, Floats, Floats, Bools, Floats]:
+def _highest(rays: Rays, azimuth: Floats, distance: Floats) -> tuple[Floats, Floats, Floats, Bools, Floats]:
     """Elevation, level distance, point, whether it is a horizon, and reach of the raster, of some azimuths."""
     nodes, step = rays.along(azimuth), distance[1] - distance[0]
     slope, _, _ = rays.seen(nodes, distance)

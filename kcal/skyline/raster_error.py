@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,3 +61,19 @@ class RasterError:
     def alike(self, distance: Floats, spacing: Floats) -> Floats:
         """(M,) how many columns share one error of the raster: columns `spacing` radians apart that see `distance`."""
         return np.maximum(2.0 * self.correlation / np.maximum(distance * spacing, 1e-9), 1.0)
+
+
+class SkylineErrors(NamedTuple):
+    """All errors of a skyline but the image's noise.
+
+    Attributes:
+        raster: of heights and refraction.
+        place: (3,) meters, sigma of the camera's place, east, north, up.
+        lens: (P, K) changes of the camera's parameters at one sigma of what its calibration does not know.
+        radius: of the Earth, meters.
+    """
+
+    raster: RasterError
+    place: Floats
+    lens: Floats
+    radius: float

@@ -54,6 +54,7 @@ class Comparison:
         elevation: (N,) radians, of the horizon.
         distance: (N,) level meters to it.
         point: (N, 3) meters, where it stands from the eye.
+        raised: (N,) radians by which errors of the raster change it on average.
         known: (N,) whether the raster has a horizon there.
     """
 
@@ -66,6 +67,7 @@ class Comparison:
     elevation: Floats
     distance: Floats
     point: Floats
+    raised: Floats
     known: Bools
 
     def by_height(self) -> Floats:
@@ -79,9 +81,7 @@ class Comparison:
         return found
 
 
-def compare(
-    columns: Columns, horizon: Horizon, rotation: Floats, camera: Camera, *, lens: bool = False
-) -> Comparison:
+def compare(columns: Columns, horizon: Horizon, rotation: Floats, camera: Camera, *, lens: bool = False) -> Comparison:
     """Compare borders with a horizon.
 
     Args:
@@ -147,6 +147,7 @@ def compare(
         elevation=elevation,
         distance=distance,
         point=np.where(known[:, None], horizon.point[near], 0.0),
+        raised=horizon.raised[near],
         known=known,
     )
 
