@@ -108,8 +108,8 @@ def read_skyline(
     without = sorted({names[image.camera] for image in images if image.camera not in places})
     if origin is None or without:
         raise InputError(
-            f"--skyline needs the place of {' and '.join(without) or 'each camera'} on the Earth: measure it (GNSS) and "
-            "give --positions with latitudes and longitudes (or with local meters and --origin)"
+            f"--skyline needs the place of {' and '.join(without) or 'each camera'} on the Earth: measure it (GNSS) "
+            "and give --positions with latitudes and longitudes (or with local meters and --origin)"
         )
     centers, sigma = torch.zeros(len(names), 3).double(), torch.ones(len(names), 3).double()
     for number, position in places.items():

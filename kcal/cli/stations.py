@@ -179,9 +179,9 @@ def station_command(
 ) -> None:
     """Solve how one camera stands on the Earth: position, heading, pitch and roll, with error bars.
 
-    Four landmarks are needed, six or more are good; or the skyline, a raster of the terrain (--skyline) and the measured
-    position. Light of landmarks is bent as for `kcal rig`, and east, north and
-    up are those at the camera. `kcal locate` then gives bearings, or positions of what stands at a known height.
+    Four landmarks are needed, six or more are good; or images of the skyline, a raster of the terrain (--skyline) and
+    the measured position. Light of landmarks is bent as for `kcal rig`; east, north and up are those at the camera.
+    `kcal locate` then gives bearings, or positions of what stands at a known height.
 
     **Example**
 

@@ -42,8 +42,10 @@ class Raster:
         """Meters above the ellipsoid at latitudes and longitudes (degrees, of one shape); NaN where unknown."""
         return torch.from_numpy(self.between(*self.cells(lat.numpy(), lon.numpy())))
 
-    def cells(self, lat: NDArray[np.float64], lon: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-        """Columns and rows of latitudes and longitudes (degrees, of one shape), counted from the first cell's middle."""
+    def cells(
+        self, lat: NDArray[np.float64], lon: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Columns and rows of latitudes and longitudes (degrees, of one shape), from the first cell's middle on."""
         x, y = lon, lat
         if self.into is not None:
             x, y = map(np.asarray, self.into.transform(x, y))

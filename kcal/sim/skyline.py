@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 from torch import Tensor
 
+from kcal.lens.camera import Camera
 from kcal.sim.backdrop import exposed
 from kcal.sim.noise import smooth_noise
 from kcal.sim.truth import TruthLens
@@ -56,7 +57,7 @@ class Hills:
         random = np.random.default_rng([self.seed, 11])
         total = np.zeros(np.broadcast(east, north).shape)
         for number, (wave, share) in enumerate(_WAVES):
-            dx, dy, turn = random.uniform(0.0, 250.0, 2).tolist() + [random.uniform(0.0, math.pi)]
+            dx, dy, turn = *random.uniform(0.0, 250.0, 2), random.uniform(0.0, math.pi)
             across, along = math.cos(turn), math.sin(turn)
             x, y = (east * across + north * along) / wave + dx, (north * across - east * along) / wave + dy
             value = smooth_noise(x, y, 1)
@@ -121,7 +122,7 @@ class Skyline(NamedTuple):
 
 
 def skyline_image(
-    hills: Hills, lens: TruthLens, enu_from_cam: Tensor, eye: Floats, air: Air, *, farthest: float = 20_000.0
+    hills: Hills, lens: TruthLens | Camera, enu_from_cam: Tensor, eye: Floats, air: Air, *, farthest: float = 20_000.0
 ) -> Skyline:
     """Render a terrain as a camera sees it.
 
@@ -158,7 +159,7 @@ def skyline_image(
     return Skyline(exposed(light, air.blur, air.noise, random), table, top, far)
 
 
-def _angles(lens: TruthLens, enu_from_cam: Tensor) -> tuple[Floats, Floats]:
+def _angles(lens: TruthLens | Camera, enu_from_cam: Tensor) -> tuple[Floats, Floats]:
     """(H, W) azimuth, without a jump, and elevation of every pixel, from a grid of them."""
     width, height = lens.size
     x, y = (np.linspace(0.0, size - 1.0, max(size // 12, 24)) for size in (width, height))

@@ -1,4 +1,4 @@
-"""How a camera looks, from the skyline in its image and a raster of the terrain: attitude, covariance, what it rests on.
+"""How a camera looks, from the skyline in its image and a raster of the terrain, and how well that is known.
 
 The rotation is fitted to all columns at once by generalized least squares. Columns that look at one ridge share the
 error of the raster's heights there, and all columns share the refraction of light, the height and place of the camera
@@ -37,11 +37,19 @@ _AROUND, _BEYOND = 0.1, 1.5
 # Share of the image's columns that must be clear, and of the clear ones that must agree with the raster.
 _CLEAR, _AGREEING = 0.1, 0.5
 # Degrees: a heading known worse is none; and headings as near as this are one.
-_FLAT, _ONE = 0.5, 0.5
+_FLAT, _ONE = 0.5, 1.0
 # χ² by which the second heading must fit worse: a thousand to one.
 _CLEARLY = 2.0 * math.log(1000.0)
+# Share of columns below the raster's skyline, beyond their errors, that a wrong border here and there explains.
+_BELOW = 0.1
+# So many other headings that fit as well are those of a flat horizon.
+_MANY = 4
 # Residuals may be larger than their sigmas say by this factor; beyond, the raster is not of this terrain.
 _CONTRADICTS = 3.0
+# Share of columns left out that is worth naming.
+_LEFT_OUT = 0.15
+# Share of directions without a horizon that is worth naming.
+_OPEN = 0.1
 # Meters above the raster's ground at which a camera's height is doubted.
 _HIGH = 150.0
 
@@ -140,16 +148,30 @@ def skyline_attitude(
     horizon = terrain_horizon(raster, place, _azimuths(columns, found[0]), refraction=error.refraction)
     horizon = raised_horizon(horizon, raster, place, error)
     fit = fit_rotation(columns, horizon, found[0].rotation, camera, errors)
+    open_share = 1.0 - float(around.known.mean())
+    gap = "" if open_share < _OPEN else (
+        f". The raster has no horizon in {100 * open_share:.0f} % of the directions around the camera: it ends before "
+        "the terrain falls away, or has cells without a height"
+    )  # fmt: skip
     if fit is None:
-        raise InputError(f"{_CONTRADICTED} no heading fits; {_CURE}")
-    return _checked(fit, found, columns, horizon, border, camera, raster, place)
+        raise InputError(f"{_CONTRADICTED} no heading fits; {_cure(raster, place)}{gap}")
+    return _checked(fit, found, columns, horizon, border, camera, raster, place, gap)
 
 
 _CONTRADICTED = "the raster contradicts the image:"
-_CURE = (
-    "check the camera's place and height, the raster's heights (--geoid) and accuracy, and that the image shows a "
-    "skyline by day"
-)
+
+
+def _cure(raster: Raster, place: Origin) -> str:
+    return (
+        f"check the camera's place and height ({_above(raster, place):.0f} m above the raster's ground), the raster's "
+        "heights (--geoid) and accuracy, and that the image shows a skyline by day"
+    )
+
+
+def _above(raster: Raster, place: Origin) -> float:
+    """Meters of the camera above the raster's ground."""
+    lat, lon = (torch.tensor([part], dtype=torch.float64) for part in (place.lat, place.lon))
+    return place.height - float(raster(lat, lon)[0])
 
 
 def _azimuths(columns: Columns, found: Candidate) -> Floats:
@@ -164,7 +186,7 @@ def _azimuths(columns: Columns, found: Candidate) -> Floats:
 
 def _checked(
     fit: Fit, found: list[Candidate], columns: Columns, horizon: Horizon, border: Border, camera: Camera,
-    raster: Raster, place: Origin,
+    raster: Raster, place: Origin, gap: str,
 ) -> SkylineAttitude:  # fmt: skip
     """The attitude, unless something speaks against it."""
     heading, pitch, roll = attitude(torch.from_numpy(fit.rotation.T.copy()))
@@ -172,28 +194,38 @@ def _checked(
     widened = math.sqrt(fit.chi2 / fit.freedom) if large else 1.0
     turn = _by_angles(fit.rotation)
     sigma = widened * np.sqrt(np.diag(turn @ fit.covariance @ turn.T))
-    if sigma[0] > _FLAT:
-        raise DegenerateError(
-            f"the skyline is too flat to tell the heading: its sigma is {sigma[0]:.2g} degrees (a plain or the sea has "
-            "one elevation all around); use landmarks or stars"
-        )
-    apart = [abs((one.heading - heading + 180.0) % 360.0 - 180.0) for one in found]
-    others = [one for one, off in zip(found, apart, strict=True) if off > max(5.0 * sigma[0], _ONE)]
-    worse = others[0].cost - found[0].cost if others else math.inf
-    if worse < _CLEARLY:
-        raise DegenerateError(
-            f"two headings explain the skyline about equally well: {heading:.1f} and {others[0].heading:.1f} degrees "
-            f"(chi-squared differs by {worse:.1f}; {_CLEARLY:.0f} are needed): state a rough heading, or use an image "
-            "that shows more of the skyline"
-        )
     agreeing = float(fit.used.mean())
     if agreeing < _AGREEING:
         raise InputError(
             f"{_CONTRADICTED} {100 * agreeing:.0f} % of the skyline's clear columns agree in the best heading, "
-            f"{heading:.1f} degrees; {_CURE}"
+            f"{heading:.1f} degrees; {_cure(raster, place)}{gap}"
+        )
+    if fit.below > _BELOW:
+        raise InputError(
+            f"{_CONTRADICTED} in {100 * fit.below:.0f} % of the columns its skyline is below the raster's, which nothing "
+            f"that grows or was built explains; {_cure(raster, place)}{gap}"
         )
     if widened > _CONTRADICTS:
-        raise InputError(f"{_CONTRADICTED} residuals are {widened:.1f} times as large as their sigmas say; {_CURE}")
+        raise InputError(
+            f"{_CONTRADICTED} residuals are {widened:.1f} times as large as their sigmas say; "
+            f"{_cure(raster, place)}{gap}"
+        )
+    apart = [abs((one.heading - heading + 180.0) % 360.0 - 180.0) for one in found]
+    others = [one for one, off in zip(found, apart, strict=True) if off > max(5.0 * sigma[0], _ONE)]
+    worse = others[0].cost - found[0].cost if others else math.inf
+    as_good = sum(one.cost - found[0].cost < _CLEARLY for one in others)
+    if sigma[0] > _FLAT or as_good >= _MANY:
+        why = f"its sigma is {sigma[0]:.2g} degrees" if sigma[0] > _FLAT else f"{as_good} others fit as well"
+        raise DegenerateError(
+            f"the skyline is too flat to tell the heading ({why}): a plain or the sea has one elevation all around; "
+            "use landmarks or stars"
+        )
+    if as_good:
+        raise DegenerateError(
+            f"two headings explain the skyline about equally well: {heading:.1f} and {others[0].heading:.1f} degrees "
+            f"(chi-squared differs by {worse:.1f}; {_CLEARLY:.0f} are needed): state a rough heading, or use an image "
+            f"that shows more of the skyline{gap}"
+        )
     expected = np.full(camera.size[0], np.nan)
     used = np.zeros(camera.size[0], dtype=np.bool_)
     at = columns.pixel[:, 0].astype(int)
@@ -237,7 +269,7 @@ def _by_angles(rotation: Floats) -> Floats:
 
 def _warnings(fit: Fit, columns: Columns, horizon: Horizon, raster: Raster, place: Origin, widened: float) -> list[str]:
     found = []
-    above = place.height - float(raster(*(torch.tensor([part]).double() for part in (place.lat, place.lon)))[0])
+    above = _above(raster, place)
     if above > _HIGH:
         found.append(
             f"the camera stands {above:.0f} m above the raster's ground; if its heights are above the sea, add the "
@@ -245,8 +277,15 @@ def _warnings(fit: Fit, columns: Columns, horizon: Horizon, raster: Raster, plac
         )
     if widened > 1.0:
         found.append(
-            f"residuals are {widened:.1f} times as large as their sigmas say; the covariance was widened: is the raster "
-            "as accurate as stated?"
+            f"residuals are {widened:.1f} times as large as their sigmas say; the covariance was widened: is the "
+            "raster as accurate as stated?"
+        )
+    left_out = 1.0 - float(fit.used.mean())
+    if left_out > _LEFT_OUT:
+        found.append(
+            f"{100 * left_out:.0f} % of the clear columns contradict the raster and are left out, as trees and buildings "
+            "above a raster of the bare ground do; lower ones among the rest still pull the pitch down: a surface "
+            "model, with what grows, is better"
         )
     heading = columns.ray[fit.used] @ fit.rotation
     near = np.searchsorted(horizon.azimuth, horizon.azimuth[0] + np.remainder(

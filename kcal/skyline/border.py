@@ -24,8 +24,8 @@ Bools = NDArray[np.bool_]
 _BOX, _ACROSS = 3, 5
 # An edge counts half if its step is so many standard deviations, and so many gray levels in a range of 255.
 _SURE, _LEAST_STEP = 6.0, 2.0
-# Strength below which there is no edge: half of `_SURE` standard deviations.
-_NOTHING = 0.2
+# Columns over which the noise is taken as even.
+_EVEN = 31
 # Of the dynamic program: what a row of change costs, most rows between neighbors, what a longer jump costs, and what it
 # costs to leave an edge of full strength in the sky.
 _SLOPE, _ROWS, _JUMP, _CROSSED = 0.02, 6, 2.0, 1.5
@@ -99,12 +99,11 @@ def sky_border(image: NDArray[np.generic]) -> Border:
 
 def _noise(light: Floats) -> Floats:
     """(W,) standard deviation of the noise of the smoother half of each column's pixels, as its neighbors smooth it."""
-    off = light[1:-1] - 0.5 * (light[:-2] + light[2:])
-    # A median of the smaller half of the absolute values: what is sky, mostly.
-    own = np.quantile(np.abs(off), 0.25, axis=0) / (0.3186 * math.sqrt(1.5))
-    whole = float(np.median(own))
-    # Rounding to gray levels leaves a quarter of one, even where there is no noise.
-    return np.maximum(median_filter(own, 31, mode="nearest"), max(0.5 * whole, 0.29))
+    off = np.sort(np.abs(light[1:-1] - 0.5 * (light[:-2] + light[2:])), axis=0)
+    # The mean of the smaller half, which is sky mostly: of normal values it is 0.325 σ.
+    own = off[: len(off) // 2].mean(0) / (0.325 * math.sqrt(1.5))
+    # Rounding to gray levels leaves 0.29 of one, even where there is no noise.
+    return np.maximum(uniform_filter1d(own, _EVEN, mode="nearest"), max(0.5 * float(np.median(own)), 0.29))
 
 
 def _row_steps(light: Floats) -> Floats:
@@ -119,8 +118,6 @@ def _strength(step: Floats, noise: Floats, least: float) -> Floats:
     spread = noise * math.sqrt(2.0 / (_BOX * _ACROSS))
     scale = np.maximum(_SURE * spread, least)
     found: Floats = np.square(step) / (np.square(step) + np.square(scale))
-    # Many rows of noise are no edge.
-    found = np.clip((found - _NOTHING) / (1.0 - _NOTHING), 0.0, 1.0)
     found[: 2 * _BOX] = 0.0
     found[-2 * _BOX :] = 0.0
     return found
@@ -136,8 +133,10 @@ def _on_steepest(step: Floats, path: NDArray[np.int64]) -> NDArray[np.int64]:
 def _best_path(strength: Floats) -> NDArray[np.int64]:
     """(W,) the row of the border in each column, by dynamic programming from left to right."""
     rows, columns = strength.shape
-    # An edge spreads over the rows of a box; an own edge is crossed in part.
-    above = np.cumsum(strength, 0) - strength
+    # Edges count as crossed from half of their full strength on: many rows of noise are none. An edge spreads over the
+    # rows of a box, and an own edge is crossed in part.
+    sure = np.maximum(2.0 * strength - 1.0, 0.0)
+    above = np.cumsum(sure, 0) - sure
     own = np.zeros_like(strength)
     own[2 * _BOX :] = above[2 * _BOX :] - above[: -2 * _BOX]
     cost = _CROSSED / _BOX * (above - own) - strength

@@ -25,10 +25,10 @@ _BINS, _ALIKE = 240, 4.0
 # on rendered hills.
 COMMON = 0.05
 # Sigmas above and below the raster's skyline at which a column is left out. What grows or was built on the terrain
-# only adds to it.
-_ABOVE, _BELOW = 3.0, 4.0
+# only adds to it, so that columns below pull in full until they are farther away than trees are high.
+_ABOVE, _BELOW, _FAR_BELOW = 3.0, 4.0, 15.0
 # Columns beside those left out that go with them.
-_BESIDE = 2
+_BESIDE = 6
 _ROUNDS, _STEPS = 12, 4
 # Least columns that a fit needs.
 _LEAST = 8
@@ -40,6 +40,7 @@ class Fit(NamedTuple):
     Attributes:
         rotation: (3, 3) the camera's axes from east, north, up.
         used: (N,) which columns agree.
+        below: share of the columns in which the image's skyline is below the raster's, which no tree explains.
         binned: the columns that agree, in bins, at this rotation.
         covariance: (3, 3) rad² of a turn about the camera's axes.
         parts: of that covariance by where it comes from.
@@ -49,6 +50,7 @@ class Fit(NamedTuple):
 
     rotation: Floats
     used: Bools
+    below: float
     binned: Comparison
     covariance: Floats
     parts: dict[str, Floats]
@@ -100,11 +102,15 @@ def fit_rotation(
     used = np.ones(len(columns.pixel), dtype=np.bool_)
     for number in range(_ROUNDS):
         rotation = _robust(columns, horizon, rotation, camera, errors, used if number else None)
-        before, used = used, _agreeing(compare(columns, horizon, rotation, camera), errors)
+        before, used = used, _agreeing(compare(columns, horizon, rotation, camera), errors, _FAR_BELOW)
         if used.sum() < _LEAST:
             return None
         if number and np.array_equal(before, used):
             break
+    close = _agreeing(compare(columns, horizon, rotation, camera), errors, _BELOW)
+    below, used = float((used & ~close).mean()), close
+    if used.sum() < _LEAST:
+        return None
     for _ in range(_STEPS):
         binned = _binned(columns, compare(columns, horizon, rotation, camera, lens=True), used, camera.size[0])
         parts = covariances(binned, errors)
@@ -119,7 +125,14 @@ def fit_rotation(
     by_part = {name: gain @ part @ gain.T for name, part in parts.items()}
     left = rows[:, 3] + rows[:, :3] @ turn
     return Fit(
-        rotation, used, binned, sum(by_part.values(), np.zeros((3, 3))), by_part, float(left @ left), len(left) - 3
+        rotation,
+        used,
+        below,
+        binned,
+        sum(by_part.values(), np.zeros((3, 3))),
+        by_part,
+        float(left @ left),
+        len(left) - 3,
     )
 
 
@@ -131,7 +144,7 @@ def _robust(
         seen = compare(columns, horizon, rotation, camera)
         sigma = column_sigma(seen, errors)
         ratio = seen.residual / sigma
-        limit = np.where(ratio > 0, _ABOVE, _BELOW)
+        limit = np.where(ratio > 0, _ABOVE, _FAR_BELOW)
         soft = 1.0 / (1.0 + np.square(ratio / limit)) if used is None else used.astype(np.float64)
         weight = seen.known * soft / np.square(sigma)
         normal = np.einsum("n,ni,nj->ij", weight, seen.by_turn, seen.by_turn)
@@ -144,9 +157,9 @@ def _robust(
     return rotation
 
 
-def _agreeing(seen: Comparison, errors: SkylineErrors) -> Bools:
+def _agreeing(seen: Comparison, errors: SkylineErrors, most_below: float) -> Bools:
     ratio = seen.residual / column_sigma(seen, errors)
-    wrong = ~seen.known | (ratio > _ABOVE) | (ratio < -_BELOW)
+    wrong = ~seen.known | (ratio > _ABOVE) | (ratio < -most_below)
     near = np.convolve(wrong, np.ones(2 * _BESIDE + 1), mode="same") > 0
     found: Bools = ~near
     return found

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
-import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -26,24 +25,22 @@ from scripts.shared.traced import as_camera
 Floats = NDArray[np.float64]
 HERE = (47.0, 11.0)
 # Meters: above the ground, and how far the terrain and its rasters go.
-MAST, FARTHEST, REACH = 12.0, 15_000.0, 16_000.0
+MAST, FARTHEST, REACH = 12.0, 11_000.0, 12_000.0
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Ground:
     """A raster as it is given to kcal.
 
     Args:
         cell: meters.
-        error: as its errors are drawn, and as they are stated unless `stated` is given.
-        stated: what kcal is told of them.
+        error: as its errors are drawn, and as they are stated.
         place: meters, sigma of the camera's measured place, east and north; half as much again upward.
         trees: meters, height of woods on a third of the terrain that the raster does not have.
     """
 
     cell: float
     error: RasterError
-    stated: RasterError | None = None
     place: float = 0.5
     trees: float = 0.0
 
@@ -71,8 +68,8 @@ class Site(NamedTuple):
 
 @functools.lru_cache(8)
 def lens_of(number: int) -> TruthLens:
-    """A traced surveillance lens, f 1600 px, 1920 x 1080."""
-    return drawn_lens("surveillance", 1.0, number, focal_mm=4.64)
+    """A traced surveillance lens, f 800 px, 960 x 540."""
+    return drawn_lens("surveillance", 1.0, number, focal_mm=4.64, scale=0.5)
 
 
 @functools.lru_cache(8)
@@ -84,7 +81,7 @@ def exact_camera(number: int) -> Camera:
 def site_of(seed: int, trees: float = 0.0, refraction_sigma: float = 0.1) -> Site:
     """A site of a seed: terrain, attitude, air."""
     random = np.random.default_rng([seed, 5])
-    hills = Hills(seed=seed, relief=float(random.uniform(250, 600)), trees=trees, woods=0.33)
+    hills = Hills(seed=seed, relief=float(random.uniform(250, 600)), far=9_500.0, trees=trees, woods=0.33)
     angles = float(random.uniform(0, 360)), float(random.uniform(-1, 4)), float(random.uniform(-1.5, 1.5))
     nowhere = np.zeros(1)
     eye = np.array([0.0, 0.0, float(hills.ground(nowhere, nowhere)[0]) + MAST])
@@ -100,29 +97,31 @@ def site_of(seed: int, trees: float = 0.0, refraction_sigma: float = 0.1) -> Sit
 
 def picture(site: Site, lens: TruthLens, seed: int = 0) -> Skyline:
     """An image; another seed is another moment with other clouds and noise."""
-    import dataclasses
-
     air = dataclasses.replace(site.air, seed=site.air.seed + 1000 * seed)
     return skyline_image(site.hills, lens, enu_from_cam(*site.angles), site.eye, air, farthest=FARTHEST)
 
 
 def raster_of(hills: Hills, ground: Ground, seed: int) -> Raster:
     """Heights in cells, with drawn errors: alike over the correlation length, and of all heights together."""
-    count = int(2 * REACH / ground.cell)
-    x = -REACH + ground.cell * (np.arange(count) + 0.5)
-    bare = Hills(seed=hills.seed, relief=hills.relief, level=hills.level, clear=hills.clear, far=hills.far)
+    bare = dataclasses.replace(hills, trees=0.0)
+    return _raster(bare, ground.cell, ground.error, seed)
+
+
+@functools.lru_cache(2)
+def _raster(bare: Hills, cell: float, error: RasterError, seed: int) -> Raster:
+    count = int(2 * REACH / cell)
+    x = -REACH + cell * (np.arange(count) + 0.5)
     heights = np.stack([bare.ground(x, np.full(count, -y)) for y in x])
     # Cells have the mean of what is in them: to second order, by how each differs from its neighbors.
     edge = np.pad(heights, 1, mode="edge")
     heights += (edge[2:, 1:-1] + edge[:-2, 1:-1] + edge[1:-1, 2:] + edge[1:-1, :-2] - 4.0 * heights) / 24.0
     random = np.random.default_rng([seed, 23])
-    error = ground.error
-    heights += error.sigma * _alike(count, error.correlation / ground.cell, random)
+    heights += error.sigma * _alike(count, error.correlation / cell, random)
     heights += error.offset * random.standard_normal()
     system = pyproj.CRS.from_proj4(f"+proj=aeqd +lat_0={HERE[0]} +lon_0={HERE[1]} +datum=WGS84 +units=m")
     into = pyproj.Transformer.from_crs("EPSG:4326", system, always_xy=True)
-    middle = REACH / ground.cell
-    return Raster(heights, (1 / ground.cell, 0.0, middle, 0.0, -1 / ground.cell, middle), into, ground.cell)
+    middle = REACH / cell
+    return Raster(heights, (1 / cell, 0.0, middle, 0.0, -1 / cell, middle), into, cell)
 
 
 def _alike(count: int, correlation: float, random: np.random.Generator) -> Floats:
@@ -154,9 +153,3 @@ def true_directions(site: Site, lens: TruthLens, pixels: Tensor) -> Tensor:
     """(N, 3) unit vectors east, north, up in which pixels see."""
     rays, _ = lens.unproject(pixels)
     return rays @ enu_from_cam(*site.angles).T
-
-
-def degrees_of(values: Floats) -> Floats:
-    """From radians."""
-    found: Floats = values * (180.0 / math.pi)
-    return found
