@@ -55,6 +55,7 @@ PUBLIC = {
         save_measured_board summarize camera_at_setting InterpolatedCamera
     """,
     "kcal.rig": """
+        RasterError SkylineAttitude SkylineImage SkylineSource skyline_attitude skyline_source
         Identity LandmarkEffect MovingControl MovingOptions MovingTrack Sighting match_moving read_sightings
         read_tracks CameraRig CameraRigCalibration load_camera_rig save_camera_rig station_mounting stations_of
         Drift DriftEffect ImagePair ItemResidual MarkedLandmarks Mounting PairCounts RigCalibration RigCovariance

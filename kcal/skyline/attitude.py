@@ -202,8 +202,8 @@ def _checked(
         )
     if fit.below > _BELOW:
         raise InputError(
-            f"{_CONTRADICTED} in {100 * fit.below:.0f} % of the columns its skyline is below the raster's, which nothing "
-            f"that grows or was built explains; {_cure(raster, place)}{gap}"
+            f"{_CONTRADICTED} in {100 * fit.below:.0f} % of the columns its skyline is below the raster's, which "
+            f"nothing that grows or was built explains; {_cure(raster, place)}{gap}"
         )
     if widened > _CONTRADICTS:
         raise InputError(
@@ -283,8 +283,8 @@ def _warnings(fit: Fit, columns: Columns, horizon: Horizon, raster: Raster, plac
     left_out = 1.0 - float(fit.used.mean())
     if left_out > _LEFT_OUT:
         found.append(
-            f"{100 * left_out:.0f} % of the clear columns contradict the raster and are left out, as trees and buildings "
-            "above a raster of the bare ground do; lower ones among the rest still pull the pitch down: a surface "
+            f"{100 * left_out:.0f} % of the clear columns contradict the raster and are left out, as trees and "
+            "buildings above a raster of the bare ground do; lower ones among the rest still pull the pitch down: a surface "
             "model, with what grows, is better"
         )
     heading = columns.ray[fit.used] @ fit.rotation

@@ -74,11 +74,11 @@ def terrain_horizon(raster: Raster, eye: Origin, azimuth: Floats, *, refraction:
         InputError: the eye is outside the raster, or below its ground.
 
     Example:
-        >>> raster = Raster(np.full((5, 5), 10.0), (1e3, 0, -6e3, 0, -1e3, 45.0025e3), None, 80.0)  # 5 x 5 cells
-        >>> raster.heights[:, 4] = 20.0  # higher in the east
-        >>> seen = terrain_horizon(raster, Origin(lat=45.0, lon=6.001, height=12.0), np.array([0.5, 0.55]) * np.pi)
-        >>> seen.elevation.round(3).tolist(), seen.known.tolist()
-        ([0.034, 0.033], [False, False])
+        >>> heights = np.zeros((600, 600))  # a plain at sea level, in cells of 0.002 degrees
+        >>> raster = Raster(heights, (500, 0, -2700, 0, -500, 22800), None, 157.0)
+        >>> seen = terrain_horizon(raster, Origin(lat=45.0, lon=6.0, height=50.0), np.array([0.0]))
+        >>> seen.elevation.round(4).tolist(), (seen.distance / 1000).round().tolist(), seen.known.tolist()
+        ([-0.0037], [27.0], [True])
     """
     ground = float(raster(*(torch.tensor([value], dtype=torch.float64) for value in (eye.lat, eye.lon)))[0])
     if math.isnan(ground):

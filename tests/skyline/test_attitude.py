@@ -104,7 +104,7 @@ def test_trees_above_the_raster_are_left_out() -> None:
 def test_a_rough_heading_chooses() -> None:
     near = found(heading=(45.0, 20.0))
     assert near.heading_deg == pytest.approx(as_it_is().heading_deg, abs=1e-6)
-    with pytest.raises(InputError, match="contradicts|equally|flat"):
+    with pytest.raises(InputError, match=r"contradicts|equally|flat"):
         found(heading=(200.0, 20.0))
 
 
