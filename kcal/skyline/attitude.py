@@ -284,8 +284,8 @@ def _warnings(fit: Fit, columns: Columns, horizon: Horizon, raster: Raster, plac
     if left_out > _LEFT_OUT:
         found.append(
             f"{100 * left_out:.0f} % of the clear columns contradict the raster and are left out, as trees and "
-            "buildings above a raster of the bare ground do; lower ones among the rest still pull the pitch down: a surface "
-            "model, with what grows, is better"
+            "buildings above a raster of the bare ground do; lower ones among the rest still pull the pitch down: a "
+            "surface model, with what grows, is better"
         )
     heading = columns.ray[fit.used] @ fit.rotation
     near = np.searchsorted(horizon.azimuth, horizon.azimuth[0] + np.remainder(

@@ -167,7 +167,8 @@ def _refined(light: Floats, path: NDArray[np.int64], noise: Floats) -> Border:
     # An edge between the rows path - 1 and path stands at path - 0.5.
     index = np.clip(path[:, None] + offset, 0, rows - 1)
     value = light[index, np.arange(columns)[:, None]]
-    blur, found = np.full(columns, _BLUR), None
+    blur: Floats = np.full(columns, _BLUR)
+    found = None
     for own_blur in (True, False):
         found = _steps(offset + 0.5, value, blur, own_blur=own_blur)
         good = inside & (np.abs(found[0]) < _MOST_MOVE) & (np.abs(found[1]) > _SURE * noise)
