@@ -83,7 +83,7 @@ class Hills:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Air:
+class HillWeather:
     """How clear the air is, and how an image is taken.
 
     Args:
@@ -122,7 +122,13 @@ class Skyline(NamedTuple):
 
 
 def skyline_image(
-    hills: Hills, lens: TruthLens | Camera, enu_from_cam: Tensor, eye: Floats, air: Air, *, farthest: float = 20_000.0
+    hills: Hills,
+    lens: TruthLens | Camera,
+    enu_from_cam: Tensor,
+    eye: Floats,
+    air: HillWeather,
+    *,
+    farthest: float = 20_000.0,
 ) -> Skyline:
     """Render a terrain as a camera sees it.
 
@@ -138,14 +144,14 @@ def skyline_image(
         >>> from kcal.sim.captures import drawn_lens
         >>> look = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]).double()  # to the north
         >>> lens = drawn_lens("surveillance", 1.0, 1, scale=0.1)
-        >>> seen = skyline_image(Hills(seed=1), lens, look, np.array([0.0, 0, 220]), Air(), farthest=5e3)
+        >>> seen = skyline_image(Hills(seed=1), lens, look, np.array([0.0, 0, 220]), HillWeather(), farthest=5e3)
         >>> seen.image.shape, bool(seen.elevation.max() > 0.02)
         ((108, 192), True)
     """
-    azimuth, elevation = _angles(lens, enu_from_cam)
+    azimuth, elevation = _pixel_angles(lens, enu_from_cam)
     low, high = float(azimuth.min()), float(azimuth.max())
     table = np.linspace(low, high, 2 * azimuth.shape[1])
-    distance, slope = _slopes(hills, eye, table, air, farthest)
+    distance, slope = _sampled_slopes(hills, eye, table, air, farthest)
     tops = np.maximum.accumulate(slope, 1)
     top, far = _exact_tops(hills, eye, table, distance, slope, air)
     # Height over the horizon in pixels, by its slope in the image.
@@ -153,13 +159,13 @@ def skyline_image(
     steep = np.hypot(*np.gradient(above))
     share = np.clip(0.5 + above / np.maximum(steep, 1e-9), 0.0, 1.0)
     random = np.random.default_rng([air.seed, 17])
-    sky = _sky(azimuth, elevation, air, random.uniform(0.0, 200.0))
+    sky = _sky_light(azimuth, elevation, air, random.uniform(0.0, 200.0))
     land = _land(hills, eye, azimuth, elevation, table, distance, tops, sky, air)
     light = air.light * (share * sky + (1.0 - share) * land)
     return Skyline(exposed(light, air.blur, air.noise, random), table, top, far)
 
 
-def _angles(lens: TruthLens | Camera, enu_from_cam: Tensor) -> tuple[Floats, Floats]:
+def _pixel_angles(lens: TruthLens | Camera, enu_from_cam: Tensor) -> tuple[Floats, Floats]:
     """(H, W) azimuth, without a jump, and elevation of every pixel, from a grid of them."""
     width, height = lens.size
     x, y = (np.linspace(0.0, size - 1.0, max(size // 12, 24)) for size in (width, height))
@@ -180,13 +186,15 @@ def _angles(lens: TruthLens | Camera, enu_from_cam: Tensor) -> tuple[Floats, Flo
     return found[0] + middle, found[1]
 
 
-def _slopes(hills: Hills, eye: Floats, azimuth: Floats, air: Air, farthest: float) -> tuple[Floats, Floats]:
+def _sampled_slopes(
+    hills: Hills, eye: Floats, azimuth: Floats, air: HillWeather, farthest: float
+) -> tuple[Floats, Floats]:
     """Distances (S,) and the tangent of the elevation (A, S) of the terrain there."""
     distance = np.concatenate([np.geomspace(30.0, 1_500.0, 80)[:-1], np.arange(1_500.0, farthest, 12.0)])
     return distance, _slope_at(hills, eye, azimuth[:, None], distance, air)
 
 
-def _slope_at(hills: Hills, eye: Floats, azimuth: Floats, distance: Floats, air: Air) -> Floats:
+def _slope_at(hills: Hills, eye: Floats, azimuth: Floats, distance: Floats, air: HillWeather) -> Floats:
     east, north = eye[0] + distance * np.sin(azimuth), eye[1] + distance * np.cos(azimuth)
     radius = EARTH + hills.seen(east, north)
     turn = distance / EARTH
@@ -196,7 +204,7 @@ def _slope_at(hills: Hills, eye: Floats, azimuth: Floats, distance: Floats, air:
 
 
 def _exact_tops(
-    hills: Hills, eye: Floats, azimuth: Floats, distance: Floats, slope: Floats, air: Air
+    hills: Hills, eye: Floats, azimuth: Floats, distance: Floats, slope: Floats, air: HillWeather
 ) -> tuple[Floats, Floats]:
     """Elevation of the horizon and meters to it, from samples a meter apart around the highest ones."""
     best = slope.argmax(1)
@@ -207,7 +215,7 @@ def _exact_tops(
     return np.arctan(fine[pick]), near[pick]
 
 
-def _sky(azimuth: Floats, elevation: Floats, air: Air, place: float) -> Floats:
+def _sky_light(azimuth: Floats, elevation: Floats, air: HillWeather, place: float) -> Floats:
     steep = np.maximum(elevation, 0.01) + 0.05
     cloud = smooth_noise(0.4 / steep + place, azimuth / (0.3 + 0.0 * steep) + 3.0, 4)
     return _SKY - 60.0 * np.clip(elevation, 0.0, 1.0) + 45.0 * air.clouds * cloud
@@ -215,7 +223,7 @@ def _sky(azimuth: Floats, elevation: Floats, air: Air, place: float) -> Floats:
 
 def _land(
     hills: Hills, eye: Floats, azimuth: Floats, elevation: Floats, table: Floats, distance: Floats, tops: Floats,
-    sky: Floats, air: Air,
+    sky: Floats, air: HillWeather,
 ) -> Floats:  # fmt: skip
     """(H, W) gray levels of the ground: textured, and the more of the sky's brightness the farther it is."""
     column = np.clip(np.rint(np.interp(azimuth, table, np.arange(len(table)))).astype(int), 0, len(table) - 1)

@@ -22,7 +22,7 @@ from kcal.locate.ellipsoid import mean_radius
 from kcal.locate.mounting import attitude
 from kcal.locate.raster import Raster
 from kcal.skyline.border import Border, sky_border
-from kcal.skyline.fit import Fit, fit_rotation, lens_errors
+from kcal.skyline.fit import SkylineFit, fit_rotation, lens_errors
 from kcal.skyline.heading import Candidate, candidates, rotation_by
 from kcal.skyline.horizon import Horizon, terrain_horizon
 from kcal.skyline.raised import raised_horizon
@@ -91,7 +91,7 @@ class SkylineAttitude:
     second_deg: float
     second_worse: float
     warnings: tuple[str, ...]
-    fit: Fit
+    fit: SkylineFit
 
 
 def skyline_attitude(
@@ -155,7 +155,7 @@ def skyline_attitude(
     )  # fmt: skip
     if fit is None:
         raise InputError(f"{_CONTRADICTED} no heading fits; {_cure(raster, place)}{gap}")
-    return _checked(fit, found, columns, horizon, border, camera, raster, place, gap)
+    return _checked_attitude(fit, found, columns, horizon, border, camera, raster, place, gap)
 
 
 _CONTRADICTED = "the raster contradicts the image:"
@@ -163,12 +163,12 @@ _CONTRADICTED = "the raster contradicts the image:"
 
 def _cure(raster: Raster, place: Origin) -> str:
     return (
-        f"check the camera's place and height ({_above(raster, place):.0f} m above the raster's ground), the raster's "
+        f"check the camera's place and height ({_above_ground(raster, place):.0f} m above the raster's ground), the raster's "
         "heights (--geoid) and accuracy, and that the image shows a skyline by day"
     )
 
 
-def _above(raster: Raster, place: Origin) -> float:
+def _above_ground(raster: Raster, place: Origin) -> float:
     """Meters of the camera above the raster's ground."""
     lat, lon = (torch.tensor([part], dtype=torch.float64) for part in (place.lat, place.lon))
     return place.height - float(raster(lat, lon)[0])
@@ -184,15 +184,15 @@ def _azimuths(columns: Columns, found: Candidate) -> Floats:
     return middle + np.arange(off.min() - beyond, off.max() + beyond, step)
 
 
-def _checked(
-    fit: Fit, found: list[Candidate], columns: Columns, horizon: Horizon, border: Border, camera: Camera,
+def _checked_attitude(
+    fit: SkylineFit, found: list[Candidate], columns: Columns, horizon: Horizon, border: Border, camera: Camera,
     raster: Raster, place: Origin, gap: str,
 ) -> SkylineAttitude:  # fmt: skip
     """The attitude, unless something speaks against it."""
     heading, pitch, roll = attitude(torch.from_numpy(fit.rotation.T.copy()))
     large = fit.freedom > 0 and fit.chi2 > float(chi2_quantile(torch.tensor(float(fit.freedom)), 0.999))
     widened = math.sqrt(fit.chi2 / fit.freedom) if large else 1.0
-    turn = _by_angles(fit.rotation)
+    turn = _angles_by_turn(fit.rotation)
     sigma = widened * np.sqrt(np.diag(turn @ fit.covariance @ turn.T))
     agreeing = float(fit.used.mean())
     if agreeing < _AGREEING:
@@ -250,12 +250,12 @@ def _checked(
         expected=expected,
         second_deg=others[0].heading if others else math.nan,
         second_worse=worse,
-        warnings=tuple(_warnings(fit, columns, horizon, raster, place, widened)),
+        warnings=tuple(_attitude_warnings(fit, columns, horizon, raster, place, widened)),
         fit=fit,
     )
 
 
-def _by_angles(rotation: Floats) -> Floats:
+def _angles_by_turn(rotation: Floats) -> Floats:
     """(3, 3) degrees of heading, pitch and roll by a turn about the camera's axes, rad."""
     step, found = 1e-6, np.empty((3, 3))
     for axis in range(3):
@@ -267,9 +267,11 @@ def _by_angles(rotation: Floats) -> Floats:
     return found
 
 
-def _warnings(fit: Fit, columns: Columns, horizon: Horizon, raster: Raster, place: Origin, widened: float) -> list[str]:
+def _attitude_warnings(
+    fit: SkylineFit, columns: Columns, horizon: Horizon, raster: Raster, place: Origin, widened: float
+) -> list[str]:
     found = []
-    above = _above(raster, place)
+    above = _above_ground(raster, place)
     if above > _HIGH:
         found.append(
             f"the camera stands {above:.0f} m above the raster's ground; if its heights are above the sea, add the "

@@ -94,7 +94,7 @@ def sky_border(image: NDArray[np.generic]) -> Border:
     noise = _noise(light)
     step = _row_steps(light)
     path = _on_steepest(step, _best_path(_strength(step, noise, _LEAST_STEP / 255.0 * full)))
-    return _refined(light, path, noise)
+    return _refined_border(light, path, noise)
 
 
 def _noise(light: Floats) -> Floats:
@@ -159,7 +159,7 @@ def _best_path(strength: Floats) -> NDArray[np.int64]:
     return path
 
 
-def _refined(light: Floats, path: NDArray[np.int64], noise: Floats) -> Border:
+def _refined_border(light: Floats, path: NDArray[np.int64], noise: Floats) -> Border:
     """A blurred step in each column around the path."""
     rows, columns = light.shape
     inside = (path >= 2 * _BOX + 1) & (path < rows - 2 * _BOX - 1)
@@ -170,7 +170,7 @@ def _refined(light: Floats, path: NDArray[np.int64], noise: Floats) -> Border:
     blur: Floats = np.full(columns, _BLUR)
     found = None
     for own_blur in (True, False):
-        found = _steps(offset + 0.5, value, blur, own_blur=own_blur)
+        found = _fit_steps(offset + 0.5, value, blur, own_blur=own_blur)
         good = inside & (np.abs(found[0]) < _MOST_MOVE) & (np.abs(found[1]) > _SURE * noise)
         if own_blur:
             # A lens has one blur, and a slanting edge a wider one.
@@ -200,7 +200,9 @@ def _refined(light: Floats, path: NDArray[np.int64], noise: Floats) -> Border:
     )  # fmt: skip
 
 
-def _steps(at: Floats, value: Floats, blur: Floats, *, own_blur: bool) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+def _fit_steps(
+    at: Floats, value: Floats, blur: Floats, *, own_blur: bool
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """Fit m - c erf((x - x0) / (√2 s)) to values (W, K) at places (K,): x0, step 2 c, s, variance of x0, residual.
 
     The variance is for residuals of one gray level; the residual is the root of their mean square.

@@ -1,4 +1,4 @@
-"""Fit a camera's rotation to a skyline by generalized least squares, and say where its variance comes from."""
+"""SkylineFit a camera's rotation to a skyline by generalized least squares, and say where its variance comes from."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _ROUNDS, _STEPS = 12, 4
 _LEAST = 8
 
 
-class Fit(NamedTuple):
+class SkylineFit(NamedTuple):
     """A rotation and what it rests on.
 
     Attributes:
@@ -86,8 +86,8 @@ def covariances(seen: Comparison, errors: SkylineErrors) -> dict[str, Floats]:
 
 def fit_rotation(
     columns: Columns, horizon: Horizon, rotation: Floats, camera: Camera, errors: SkylineErrors
-) -> Fit | None:
-    """Fit a rotation from a rough one; columns that contradict the others are left out.
+) -> SkylineFit | None:
+    """SkylineFit a rotation from a rough one; columns that contradict the others are left out.
 
     Args:
         columns: clear ones of the border.
@@ -101,18 +101,18 @@ def fit_rotation(
     """
     used = np.ones(len(columns.pixel), dtype=np.bool_)
     for number in range(_ROUNDS):
-        rotation = _robust(columns, horizon, rotation, camera, errors, used if number else None)
-        before, used = used, _agreeing(compare(columns, horizon, rotation, camera), errors, _FAR_BELOW)
+        rotation = _robust_rotation(columns, horizon, rotation, camera, errors, used if number else None)
+        before, used = used, _columns_that_agree(compare(columns, horizon, rotation, camera), errors, _FAR_BELOW)
         if used.sum() < _LEAST:
             return None
         if number and np.array_equal(before, used):
             break
-    close = _agreeing(compare(columns, horizon, rotation, camera), errors, _BELOW)
+    close = _columns_that_agree(compare(columns, horizon, rotation, camera), errors, _BELOW)
     below, used = float((used & ~close).mean()), close
     if used.sum() < _LEAST:
         return None
     for _ in range(_STEPS):
-        binned = _binned(columns, compare(columns, horizon, rotation, camera, lens=True), used, camera.size[0])
+        binned = _in_bins(columns, compare(columns, horizon, rotation, camera, lens=True), used, camera.size[0])
         parts = covariances(binned, errors)
         # What correlates all columns, a lens and a place, is integrated out with the rest.
         root = np.linalg.cholesky(sum(parts.values(), 1e-12 * np.eye(len(binned.residual))))
@@ -124,7 +124,7 @@ def fit_rotation(
             break
     by_part = {name: gain @ part @ gain.T for name, part in parts.items()}
     left = rows[:, 3] + rows[:, :3] @ turn
-    return Fit(
+    return SkylineFit(
         rotation,
         used,
         below,
@@ -136,7 +136,7 @@ def fit_rotation(
     )
 
 
-def _robust(
+def _robust_rotation(
     columns: Columns, horizon: Horizon, rotation: Floats, camera: Camera, errors: SkylineErrors, used: Bools | None
 ) -> Floats:
     """A rotation after some steps: columns count by what they tell alone, and less the worse they fit."""
@@ -157,7 +157,7 @@ def _robust(
     return rotation
 
 
-def _agreeing(seen: Comparison, errors: SkylineErrors, most_below: float) -> Bools:
+def _columns_that_agree(seen: Comparison, errors: SkylineErrors, most_below: float) -> Bools:
     ratio = seen.residual / column_sigma(seen, errors)
     wrong = ~seen.known | (ratio > _ABOVE) | (ratio < -most_below)
     near = np.convolve(wrong, np.ones(2 * _BESIDE + 1), mode="same") > 0
@@ -165,7 +165,7 @@ def _agreeing(seen: Comparison, errors: SkylineErrors, most_below: float) -> Boo
     return found
 
 
-def _binned(columns: Columns, seen: Comparison, used: Bools, width: int) -> Comparison:
+def _in_bins(columns: Columns, seen: Comparison, used: Bools, width: int) -> Comparison:
     """Means of the columns used, in bins of neighbors."""
     each = max(math.ceil(width / _BINS), 1)
     number = (columns.pixel[used, 0] // each).astype(int)

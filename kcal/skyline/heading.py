@@ -69,7 +69,7 @@ def candidates(
     leveled = _leveled(some.ray)
     ray = some.ray @ leveled.T
     off, elevation = np.arctan2(ray[:, 0], ray[:, 1]), np.arcsin(ray[:, 2])
-    cost, tilt = _search(off, elevation, horizon)
+    cost, tilt = _search_headings(off, elevation, horizon)
     if near is not None:
         away = np.degrees(horizon.azimuth) - near[0]
         cost = np.where(np.abs((away + 180.0) % 360.0 - 180.0) <= near[1], cost, np.inf)
@@ -106,7 +106,7 @@ def _leveled(ray: Floats) -> Floats:
     return np.stack([np.cross(ahead, up), ahead, up])
 
 
-def _search(off: Floats, elevation: Floats, horizon: Horizon) -> tuple[Floats, Floats]:
+def _search_headings(off: Floats, elevation: Floats, horizon: Horizon) -> tuple[Floats, Floats]:
     """Cost (A,) of each heading, and how the camera is tilted then (A, 2)."""
     step = horizon.azimuth[1] - horizon.azimuth[0]
     count = len(horizon.azimuth)

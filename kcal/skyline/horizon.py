@@ -92,7 +92,7 @@ def terrain_horizon(raster: Raster, eye: Origin, azimuth: Floats, *, refraction:
             "ellipsoid, as the raster's is? The height of the geoid (--geoid) is added to a raster of heights above "
             "the sea"
         )
-    rays = Rays(raster, eye, refraction)
+    rays = TerrainRays(raster, eye, refraction)
     distance = sample_distances(raster, rays)
     parts = []
     each = max(_SAMPLES // len(distance), 1)
@@ -105,7 +105,7 @@ def terrain_horizon(raster: Raster, eye: Origin, azimuth: Floats, *, refraction:
     return Horizon(azimuth, elevation, far, point, known, reach, known & (beyond > elevation), np.zeros(len(azimuth)))
 
 
-def sample_distances(raster: Raster, rays: Rays) -> Floats:
+def sample_distances(raster: Raster, rays: TerrainRays) -> Floats:
     """(S,) meters, half a cell apart, at which the ground is sampled."""
     step = 0.5 * raster.cell_m
     return np.arange(_NEAREST * raster.cell_m, rays.farthest + step, step)
@@ -116,7 +116,7 @@ def _depth(raster: Raster) -> float:
     return max(5.0, 0.25 * raster.cell_m)
 
 
-class Rays:
+class TerrainRays:
     """Heights, places and slopes along azimuths from an eye."""
 
     def __init__(self, raster: Raster, eye: Origin, refraction: float) -> None:
@@ -145,7 +145,7 @@ class Rays:
 
     def joined(self, nodes: Floats, distance: Floats) -> Floats:
         """Values (A, V, K) at the nodes, at distances (S,) of all azimuths or (A, S) of each: (A, V, S)."""
-        weight = _lagrange(self._nodes, distance)
+        weight = _chebyshev_weights(self._nodes, distance)
         return nodes @ weight if weight.ndim == 2 else np.einsum("avk,aks->avs", nodes, weight)
 
     def seen(self, nodes: Floats, distance: Floats) -> tuple[Floats, Floats, Floats]:
@@ -175,7 +175,7 @@ def _farthest(raster: Raster, eye: Origin) -> float:
     return float(torch.linalg.vector_norm(geodetic_to_ecef(geodetic) - geodetic_to_ecef(eye.geodetic), dim=-1).max())
 
 
-def _lagrange(nodes: Floats, at: Floats) -> Floats:
+def _chebyshev_weights(nodes: Floats, at: Floats) -> Floats:
     """Weights (..., K, S) of values at Chebyshev nodes for the polynomial through them, at places (..., S)."""
     count = len(nodes)
     factor = (-1.0) ** np.arange(count) * np.sin(math.pi * (np.arange(count) + 0.5) / count)
@@ -185,7 +185,7 @@ def _lagrange(nodes: Floats, at: Floats) -> Floats:
     return found
 
 
-def _highest(rays: Rays, azimuth: Floats, distance: Floats) -> tuple[Floats, Floats, Floats, Bools, Floats]:
+def _highest(rays: TerrainRays, azimuth: Floats, distance: Floats) -> tuple[Floats, Floats, Floats, Bools, Floats]:
     """Elevation, level distance, point, whether it is a horizon, and reach of the raster, of some azimuths."""
     nodes, step = rays.along(azimuth), distance[1] - distance[0]
     slope, _, _ = rays.seen(nodes, distance)

@@ -16,7 +16,7 @@ from scipy.signal import lfilter
 
 from kcal.lens.mounting import Origin
 from kcal.locate.raster import Raster
-from kcal.skyline.horizon import Horizon, Rays, sample_distances
+from kcal.skyline.horizon import Horizon, TerrainRays, sample_distances
 from kcal.skyline.raster_error import RasterError
 
 Floats = NDArray[np.float64]
@@ -35,7 +35,7 @@ def raised_horizon(horizon: Horizon, raster: Raster, eye: Origin, error: RasterE
         error: of the raster; errors along a ray have the correlation exp(-d / `correlation`).
     """
     some = np.unique(np.linspace(0, len(horizon.azimuth) - 1, _AZIMUTHS).round().astype(int))
-    rays = Rays(raster, eye, error.refraction)
+    rays = TerrainRays(raster, eye, error.refraction)
     # A draw differs from the horizon by errors within the top of a hill, whose samples need not be finer than a cell.
     distance = sample_distances(raster, rays)[::2]
     slope, level, _ = rays.seen(rays.along(horizon.azimuth[some]), distance)

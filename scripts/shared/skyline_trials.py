@@ -17,7 +17,7 @@ from kcal.lens.mounting import Origin
 from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic
 from kcal.locate.raster import Raster
 from kcal.sim.captures import drawn_lens
-from kcal.sim.skyline import Air, Hills, Skyline, skyline_image
+from kcal.sim.skyline import Hills, HillWeather, Skyline, skyline_image
 from kcal.sim.truth import TruthLens
 from kcal.skyline.raster_error import RasterError
 from scripts.shared.traced import as_camera
@@ -63,7 +63,7 @@ class Site(NamedTuple):
     hills: Hills
     angles: tuple[float, float, float]
     eye: Floats
-    air: Air
+    air: HillWeather
 
 
 @functools.lru_cache(8)
@@ -85,7 +85,7 @@ def site_of(seed: int, trees: float = 0.0, refraction_sigma: float = 0.1) -> Sit
     angles = float(random.uniform(0, 360)), float(random.uniform(-1, 4)), float(random.uniform(-1.5, 1.5))
     nowhere = np.zeros(1)
     eye = np.array([0.0, 0.0, float(hills.ground(nowhere, nowhere)[0]) + MAST])
-    air = Air(
+    air = HillWeather(
         haze=float(random.uniform(8_000, 30_000)),
         refraction=0.13 + refraction_sigma * float(random.standard_normal()),
         clouds=float(random.uniform(0.0, 0.8)),

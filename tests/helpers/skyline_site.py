@@ -14,7 +14,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.mounting import Origin
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.raster import Raster
-from kcal.sim.skyline import Air, Hills, skyline_image
+from kcal.sim.skyline import Hills, HillWeather, skyline_image
 from kcal.skyline.raster_error import RasterError
 
 HILLS = Hills(seed=3, relief=260.0, clear=700.0, far=4_500.0)
@@ -44,9 +44,11 @@ def camera() -> Camera:
     return Camera.build(focal=(400, 400), center=(239.5, 134.5), size=(480, 270), model="pinhole")
 
 
-def image(angles: tuple[float, float, float] = ANGLES, air: Air | None = None, east: float = 0.0) -> NDArray[np.uint8]:
+def image(
+    angles: tuple[float, float, float] = ANGLES, air: HillWeather | None = None, east: float = 0.0
+) -> NDArray[np.uint8]:
     """The site as that camera sees it."""
-    air = air or Air(haze=9_000.0)
+    air = air or HillWeather(haze=9_000.0)
     return skyline_image(HILLS, camera(), enu_from_cam(*angles), eye(east), air, farthest=REACH).image
 
 

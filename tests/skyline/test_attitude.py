@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.mounting import Origin
 from kcal.locate.geodesy import enu_from_cam
-from kcal.sim.skyline import Air, Hills, skyline_image
+from kcal.sim.skyline import Hills, HillWeather, skyline_image
 from kcal.skyline import attitude
 from kcal.skyline.attitude import SkylineAttitude, skyline_attitude
 from kcal.skyline.heading import Candidate
@@ -92,7 +92,9 @@ def test_larger_errors_are_stated_larger() -> None:
 
 def test_trees_above_the_raster_are_left_out() -> None:
     woods = dataclasses.replace(HILLS, trees=20.0, woods=0.2)
-    view = skyline_image(woods, small_site().camera, enu_from_cam(*ANGLES), eye(), Air(haze=9_000.0), farthest=REACH)
+    view = skyline_image(
+        woods, small_site().camera, enu_from_cam(*ANGLES), eye(), HillWeather(haze=9_000.0), farthest=REACH
+    )
     one = found(image=view.image)
     assert 0.5 < one.used.mean() < 0.97
     assert np.abs(errors(one)).max() < 4.0
@@ -134,7 +136,7 @@ def sea() -> NDArray[np.float64]:
             },
             DegenerateError, "too flat to tell the heading",
         ),
-        (lambda: {"image": image(air=Air(haze=9_000.0, light=0.004))}, InputError, "clear in .* columns only"),
+        (lambda: {"image": image(air=HillWeather(haze=9_000.0, light=0.004))}, InputError, "clear in .* columns only"),
         (lambda: {"image": np.roll(small_site().image, 135, 0)}, InputError, "clear in|contradicts"),
         (lambda: {"image": small_site().image[:-1]}, InputError, "480 x 269 pixels, the camera 480 x 270"),
         (lambda: {"place_sigma": (1.0, 0.0, 1.0)}, InputError, "three positive numbers"),

@@ -19,7 +19,7 @@ from kcal.errors import InputError
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.stations import station_mounting
-from kcal.sim.skyline import Air
+from kcal.sim.skyline import HillWeather
 from kcal.skyline.rig_skyline import SkylineImage, skyline_source
 from tests.helpers.skyline_site import ANGLES, ERROR, camera, image, small_site
 
@@ -31,7 +31,7 @@ RIGHT = (40.4, 2.5, 0.0)
 @functools.cache
 def seen(moment: int, side: int) -> SkylineImage:
     """An image of a camera at a moment."""
-    air = Air(haze=9_000.0, seed=2 * moment + side)
+    air = HillWeather(haze=9_000.0, seed=2 * moment + side)
     return SkylineImage(
         name=f"{side} at {moment}", camera=side, image=image(RIGHT if side else ANGLES, air, 10.0 * side)
     )
