@@ -99,6 +99,12 @@ NAMESPACES = {door.removeprefix("kcal.") for door in PUBLIC} - {"kcal"}
 # Names that were not in `kcal` itself before there were namespaces.
 NEW_NAMES = (
     {
+        "RasterError",
+        "SkylineAttitude",
+        "SkylineImage",
+        "SkylineSource",
+        "skyline_attitude",
+        "skyline_source",
         "Watched",
         "LensSetting",
         "InterpolatedCamera",
@@ -144,9 +150,22 @@ NEW_NAMES = (
     | set(PUBLIC["kcal.stars"].split())
 )
 # Types of attributes in which only those look who work on kcal.
-INSIDE = {"GroundSurface", "FieldModes", "HybridFit", "BoardState", "Spline", "HistoryRow", "TurnModel"}
+INSIDE = {
+    "Border",
+    "SkylineFit",
+    "GroundSurface",
+    "FieldModes",
+    "HybridFit",
+    "BoardState",
+    "Spline",
+    "HistoryRow",
+    "TurnModel",
+}
 # What functions return, and blocks of files: examples are those of the functions.
 RECORDS = {
+    "SkylineAttitude",
+    "SkylineImage",
+    "SkylineSource",
     "InterpolatedCamera",
     "Area",
     "RankedSite",

@@ -163,8 +163,8 @@ _CONTRADICTED = "the raster contradicts the image:"
 
 def _cure(raster: Raster, place: Origin) -> str:
     return (
-        f"check the camera's place and height ({_above_ground(raster, place):.0f} m above the raster's ground), the raster's "
-        "heights (--geoid) and accuracy, and that the image shows a skyline by day"
+        f"check the camera's place and height ({_above_ground(raster, place):.0f} m above the raster's ground), the "
+        "raster's heights (--geoid) and accuracy, and that the image shows a skyline by day"
     )
 
 

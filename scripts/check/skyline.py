@@ -211,4 +211,4 @@ if __name__ == "__main__":
     print("\n".join(lines))
     if "--write" in sys.argv:
         made = f"Made by `python -m scripts.check.skyline {what} {count} --write`."
-        write_section("skyline.md", what, "\n".join([made, "", *lines]))
+        write_section("skyline.md", what, "\n".join([*lines, "", made]))
