@@ -170,7 +170,7 @@ def _refined_border(light: Floats, path: NDArray[np.int64], noise: Floats) -> Bo
     blur: Floats = np.full(columns, _BLUR)
     found = None
     for own_blur in (True, False):
-        found = _fit_steps(offset + 0.5, value, blur, own_blur=own_blur)
+        found = _fit_steps((offset + 0.5).astype(np.float64), value, blur, own_blur=own_blur)
         good = inside & (np.abs(found[0]) < _MOST_MOVE) & (np.abs(found[1]) > _SURE * noise)
         if own_blur:
             # A lens has one blur, and a slanting edge a wider one.
