@@ -168,7 +168,7 @@ def _farthest(raster: Raster, eye: Origin) -> float:
     a, b, c, d, e, f = raster.to_cell
     corner = np.array([[0, 0], [columns, 0], [0, rows], [columns, rows]], dtype=np.float64)
     xy = np.linalg.solve([[a, b], [d, e]], (corner - [c, f]).T)
-    lon, lat = xy if raster.into is None else map(np.asarray, raster.into.transform(*xy, direction="INVERSE"))
+    lon, lat = xy if raster.into is None else map(np.asarray, raster.into.transform(xy[0], xy[1], direction="INVERSE"))
     if not (np.isfinite(lon).all() and np.isfinite(lat).all()):
         return _FARTHEST
     geodetic = torch.from_numpy(np.stack([lat, lon, np.full(4, eye.height)], -1))

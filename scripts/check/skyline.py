@@ -84,9 +84,9 @@ def alone(seed: int) -> dict[str, Any]:
             found[name] = str(error)
             continue
         spent = time.process_time() - begin
-        error = angle_errors((seen.heading_deg, seen.pitch_deg, seen.roll_deg), site)
+        off = angle_errors((seen.heading_deg, seen.pitch_deg, seen.roll_deg), site)
         raster_share = [float(value) for value in seen.shares["raster"]]
-        found[name] = [*error.tolist(), *seen.sigma_deg.tolist(), *raster_share, spent, float(seen.used.mean())]
+        found[name] = [*off.tolist(), *seen.sigma_deg.tolist(), *raster_share, spent, float(seen.used.mean())]
     return found
 
 

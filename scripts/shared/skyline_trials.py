@@ -110,7 +110,7 @@ def raster_of(hills: Hills, ground: Ground, seed: int) -> Raster:
 @functools.lru_cache(2)
 def _raster(bare: Hills, cell: float, error: RasterError, seed: int) -> Raster:
     count = int(2 * REACH / cell)
-    x = -REACH + cell * (np.arange(count) + 0.5)
+    x: Floats = (-REACH + cell * (np.arange(count) + 0.5)).astype(np.float64)
     heights = np.stack([bare.ground(x, np.full(count, -y)) for y in x])
     # Cells have the mean of what is in them: to second order, by how each differs from its neighbors.
     edge = np.pad(heights, 1, mode="edge")
