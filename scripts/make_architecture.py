@@ -40,6 +40,7 @@ LOOKS = {
     "nets": (4.55, "learned inverse"),
     "stars": (3.95, "stars of the night"),
     "scene": (2.4, "matches of the scene"),
+    "skyline": (5.1, "skyline and terrain"),
     "watch": (4.6, "a rig over time"),
     "sim": (0.0, "simulated truth"),
     "io": (1.0, "files"),

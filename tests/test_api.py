@@ -55,6 +55,7 @@ PUBLIC = {
         save_measured_board summarize camera_at_setting InterpolatedCamera
     """,
     "kcal.rig": """
+        RasterError SkylineAttitude SkylineImage SkylineSource skyline_attitude skyline_source
         Identity LandmarkEffect MovingControl MovingOptions MovingTrack Sighting match_moving read_sightings
         read_tracks CameraRig CameraRigCalibration load_camera_rig save_camera_rig station_mounting stations_of
         Drift DriftEffect ImagePair ItemResidual MarkedLandmarks Mounting PairCounts RigCalibration RigCovariance
@@ -98,6 +99,12 @@ NAMESPACES = {door.removeprefix("kcal.") for door in PUBLIC} - {"kcal"}
 # Names that were not in `kcal` itself before there were namespaces.
 NEW_NAMES = (
     {
+        "RasterError",
+        "SkylineAttitude",
+        "SkylineImage",
+        "SkylineSource",
+        "skyline_attitude",
+        "skyline_source",
         "Watched",
         "LensSetting",
         "InterpolatedCamera",
@@ -143,9 +150,22 @@ NEW_NAMES = (
     | set(PUBLIC["kcal.stars"].split())
 )
 # Types of attributes in which only those look who work on kcal.
-INSIDE = {"GroundSurface", "FieldModes", "HybridFit", "BoardState", "Spline", "HistoryRow", "TurnModel"}
+INSIDE = {
+    "Border",
+    "SkylineFit",
+    "GroundSurface",
+    "FieldModes",
+    "HybridFit",
+    "BoardState",
+    "Spline",
+    "HistoryRow",
+    "TurnModel",
+}
 # What functions return, and blocks of files: examples are those of the functions.
 RECORDS = {
+    "SkylineAttitude",
+    "SkylineImage",
+    "SkylineSource",
     "InterpolatedCamera",
     "Area",
     "RankedSite",

@@ -22,6 +22,7 @@ FLOORS = {
     "pipeline": 8,
     "stars": 8,
     "scene": 8,
+    "skyline": 8,
     "nets": 2,
     "locate": 7,
     "calibrate/batch": 6,

@@ -16,6 +16,7 @@ from kcal.cli.night_images import TIME_HELP
 from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_and_source
 from kcal.cli.report import NO, REQUIRE_HELP, required, told_usable
 from kcal.cli.rig_check import check
+from kcal.cli.rig_skyline import IMAGES_HELP, PICTURE_HELP, SIGMA_HELP, SKYLINE_HELP, skyline_options
 from kcal.cli.rig_text import print_rig, rig_lines
 from kcal.errors import InputError
 
@@ -131,6 +132,14 @@ def solve_command(
             "seen by both determine how the cameras are turned; a length must come from elsewhere (--baseline).",
         ),
     ] = None,
+    skyline: Annotated[Path | None, typer.Option(metavar="DEM", help=SKYLINE_HELP)] = None,
+    skyline_images: Annotated[
+        list[str] | None, typer.Option("--skyline-images", metavar="NAME=IMAGES", help=IMAGES_HELP, hidden=True)
+    ] = None,
+    skyline_sigma: Annotated[
+        float | None, typer.Option("--skyline-sigma", metavar="M", help=SIGMA_HELP, min=0, hidden=True)
+    ] = None,
+    skyline_picture: Annotated[Path | None, typer.Option("--skyline-picture", help=PICTURE_HELP, hidden=True)] = None,
     night: Annotated[
         list[str] | None,
         typer.Option(
@@ -271,6 +280,9 @@ def solve_command(
         baseline=baseline, origin=origin, mark_sigma=noise, survey_sigma=survey_sigma, geoid=geoid,
         stars=nights, scene=scene, observations=tuple(observations or ()), tracks=tracks, tracks_clock=tracks_clock,
         clock_sigma=clock_sigma,
+        skyline=skyline_options(
+            skyline, skyline_images or (), scene, geoid, skyline_sigma, (refraction, refraction_sigma), skyline_picture
+        ),
         names=tuple(path.name.split(".")[0] for path in (left, right)),
     )  # fmt: skip
     check_writable(output, left, right, *sources.files)
@@ -279,7 +291,9 @@ def solve_command(
         check_writable(report, left, right, *sources.files)
     if picture is not None:
         check_picture(picture)
-    if not any((pairs, landmarks, marks, features, positions, baseline, stars, scene, tracks, observations, night)):
+    if not any(
+        (pairs, landmarks, marks, features, positions, baseline, stars, scene, tracks, observations, night, skyline)
+    ):
         raise typer.BadParameter("give boards (--pairs), landmarks (--landmarks and --marks) or features (--features)")
     options = RigOptions(
         intrinsics=intrinsics, board_warp=board_warp, reject=not keep_all, refraction=refraction,

@@ -12,6 +12,7 @@ from kcal.errors import InputError
 if TYPE_CHECKING:
     from kcal.calibrate.rig.result import RigResult
     from kcal.calibrate.rig.sources import Baseline, Boards, Landmarks, MeasuredPosition, RigData
+    from kcal.cli.rig_skyline import SkylineOptions
     from kcal.cli.rig_stars import NightOptions
     from kcal.lens.camera import Camera
     from kcal.lens.mounting import Origin
@@ -36,6 +37,7 @@ class Sources:
     geoid: float | None = None
     stars: NightOptions | None = None
     scene: tuple[str, str] | None = None
+    skyline: SkylineOptions | None = None
     observations: tuple[Path, ...] = ()
     tracks: tuple[Path, Path] | None = None
     tracks_clock: float = 2.0
@@ -45,7 +47,8 @@ class Sources:
     @property
     def files(self) -> list[Path]:
         """All files that are read."""
-        single = (self.match, self.landmarks, self.marks, self.features, self.positions)
+        raster = None if self.skyline is None else self.skyline.raster
+        single = (self.match, self.landmarks, self.marks, self.features, self.positions, raster)
         more = (*(self.pairs or ()), *(self.tracks or ()), *self.observations)
         return [*more, *(path for path in single if path is not None)]
 
@@ -151,6 +154,12 @@ def read_sources(cameras: Sequence[Camera], sources: Sources) -> RigInput:
         stars, positions, notes = read_stars(
             dict(zip(names, cameras, strict=True)), sources.stars, origin, positions, placed=landmarks is not None
         )
+    skyline = None
+    if sources.skyline is not None:
+        from kcal.cli.rig_skyline import read_skyline
+
+        skyline, more = read_skyline(dict(zip(names, cameras, strict=True)), sources.skyline, origin, positions)
+        notes = [*notes, *more]
     features = None
     if sources.features is not None and (not pair or is_long(sources.features)):
         features = read_feature_views(sources.features, sources.names, sources.mark_sigma)
@@ -177,6 +186,7 @@ def read_sources(cameras: Sequence[Camera], sources: Sources) -> RigInput:
         baselines=() if sources.baseline is None else parse_baselines(sources.baseline, names),
         positions=positions,
         stars=stars,
+        skyline=skyline,
     )
     return RigInput(data, origin, unpaired, tuple(notes), pixel_sigma, told)
 

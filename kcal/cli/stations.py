@@ -13,6 +13,7 @@ import typer
 from kcal.cli.console import err, out, print_table, print_wrote, steps, tell
 from kcal.cli.inputs import CALIBRATED, MARKS, SURVEY
 from kcal.cli.pixel_sigma import ASSUMED, PixelSigma
+from kcal.cli.rig_skyline import IMAGES_HELP, PICTURE_HELP, SIGMA_HELP, SKYLINE_HELP, skyline_options
 from kcal.errors import InputError
 from kcal.files import check_writable
 
@@ -148,13 +149,15 @@ def _stands(rig: CameraRig) -> dict[str, dict[str, float]]:
 
 def station_command(
     camera: Annotated[Path, typer.Argument(help="Camera file."), CALIBRATED],
-    landmarks: Annotated[Path, typer.Argument(help="Surveyed places, as for `kcal rig --landmarks`."), SURVEY],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Rig file to write, with one camera.")],
+    landmarks: Annotated[
+        Path | None, typer.Argument(help="Surveyed places, as for `kcal rig --landmarks`."), SURVEY
+    ] = None,
     marks: Annotated[
-        Path,
+        Path | None,
         typer.Option(metavar="CSV", help="Where they are in the image: name,camera,u,v, camera by file name."),
         MARKS,
-    ],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Rig file to write, with one camera.")],
+    ] = None,
     position: Annotated[
         Path | None,
         typer.Option(metavar="CSV", help="Its measured position (GNSS), as a table of places with its name."),
@@ -163,24 +166,44 @@ def station_command(
     origin: Annotated[
         str | None, typer.Option(metavar="LAT,LON,HEIGHT", help="Of the local frame, if the places have none.")
     ] = None,
+    skyline: Annotated[Path | None, typer.Option(metavar="DEM", help=SKYLINE_HELP)] = None,
+    skyline_images: Annotated[
+        list[str] | None, typer.Option("--skyline-images", metavar="IMAGES", help=IMAGES_HELP)
+    ] = None,
+    skyline_sigma: Annotated[float | None, typer.Option("--skyline-sigma", metavar="M", help=SIGMA_HELP, min=0)] = None,
+    skyline_picture: Annotated[Path | None, typer.Option("--skyline-picture", help=PICTURE_HELP)] = None,
+    geoid: Annotated[
+        float | None, typer.Option(metavar="M", help="Height of the geoid above the WGS84 ellipsoid, for --skyline.")
+    ] = None,
     pixel_sigma: PixelSigma = None,
 ) -> None:
     """Solve how one camera stands on the Earth: position, heading, pitch and roll, with error bars.
 
-    Four landmarks are needed, six or more are good. Their light is bent as it is for `kcal rig`, and east, north and
-    up are those at the camera. `kcal locate` then gives bearings, or positions of what stands at a known height.
+    Four landmarks are needed, six or more are good; or images of the skyline, a raster of the terrain (--skyline) and
+    the measured position. Light of landmarks is bent as for `kcal rig`; east, north and up are those at the camera.
+    `kcal locate` then gives bearings, or positions of what stands at a known height.
 
     **Example**
 
     `kcal station mast.camera.json survey.csv --marks marks.csv -o mast.rig.json`
+
+    `kcal station mast.camera.json --position gnss.csv --skyline dem.tif --skyline-images noon.jpg -o mast.rig.json`
     """
     from kcal.calibrate.rig.solve import RigOptions
     from kcal.cli.rig_sources import Sources
 
+    if landmarks is None and skyline is None:
+        raise typer.BadParameter("give surveyed places and --marks, or a raster of the terrain (--skyline)")
+    options = RigOptions()
     sources = Sources(
-        landmarks=landmarks, marks=marks, positions=position, origin=origin, mark_sigma=pixel_sigma or ASSUMED
-    )
-    solve_stations([camera], sources, RigOptions(), output)
+        landmarks=landmarks, marks=marks, positions=position, origin=origin, mark_sigma=pixel_sigma or ASSUMED,
+        geoid=geoid,
+        skyline=skyline_options(
+            skyline, skyline_images or (), None, geoid, skyline_sigma, (options.refraction, options.refraction_sigma),
+            skyline_picture,
+        ),
+    )  # fmt: skip
+    solve_stations([camera], sources, options, output)
 
 
 def parse_height(text: str) -> tuple[float, float]:

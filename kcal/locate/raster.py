@@ -40,12 +40,22 @@ class Raster:
 
     def __call__(self, lat: Tensor, lon: Tensor) -> Tensor:
         """Meters above the ellipsoid at latitudes and longitudes (degrees, of one shape); NaN where unknown."""
-        x, y = lon.numpy(), lat.numpy()
+        return torch.from_numpy(self.between(*self.cells(lat.numpy(), lon.numpy())))
+
+    def cells(
+        self, lat: NDArray[np.float64], lon: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Columns and rows of latitudes and longitudes (degrees, of one shape), from the first cell's middle on."""
+        x, y = lon, lat
         if self.into is not None:
             x, y = map(np.asarray, self.into.transform(x, y))
-        rows, columns = self.heights.shape
         column = self.to_cell[0] * x + self.to_cell[1] * y + self.to_cell[2] - 0.5
         row = self.to_cell[3] * x + self.to_cell[4] * y + self.to_cell[5] - 0.5
+        return column, row
+
+    def between(self, column: NDArray[np.float64], row: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Heights at columns and rows of `cells`, interpolated; NaN outside and beside unknown cells."""
+        rows, columns = self.heights.shape
         left, top = np.floor(column), np.floor(row)
         with np.errstate(invalid="ignore"):
             inside = (left >= 0) & (top >= 0) & (left < columns - 1) & (top < rows - 1)
@@ -53,7 +63,7 @@ class Raster:
         a, b, heights = column - left, row - top, self.heights
         found = (1 - b) * ((1 - a) * heights[i, j] + a * heights[i, j + 1])
         found = found + b * ((1 - a) * heights[i + 1, j] + a * heights[i + 1, j + 1])
-        return torch.from_numpy(np.where(inside, found, np.nan))
+        return np.where(inside, found, np.nan)
 
 
 def terrain(path: str | Path, geoid_height: float = 0.0) -> Raster:

@@ -27,6 +27,7 @@ _COLORS = {
     "landmarks": "#2b6cb0",
     "features": "#0f766e",
     "stars": "#b7791f",
+    "skyline": "#be3455",
     "baselines": "#7c3aed",
     "positions": "#dd7a1f",
 }

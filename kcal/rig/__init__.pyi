@@ -17,6 +17,13 @@ from kcal.scene.match import scene_features as scene_features
 from kcal.scene.match import SceneMatches as SceneMatches
 from kcal.scene.match import PairCounts as PairCounts
 
+from kcal.skyline.rig_skyline import skyline_source as skyline_source
+from kcal.skyline.rig_skyline import SkylineImage as SkylineImage
+from kcal.calibrate.rig.skyline_source import SkylineSource as SkylineSource
+from kcal.skyline.attitude import skyline_attitude as skyline_attitude
+from kcal.skyline.attitude import SkylineAttitude as SkylineAttitude
+from kcal.skyline.raster_error import RasterError as RasterError
+
 from kcal.locate.moving import MovingTrack as MovingTrack
 from kcal.locate.moving import read_tracks as read_tracks
 from kcal.locate.moving import Sighting as Sighting

@@ -14,6 +14,7 @@ from kcal.calibrate.rig.initial_poses import Start
 from kcal.calibrate.rig.landmark_block import LandmarkBlock
 from kcal.calibrate.rig.motion import BoardMotion, RigRows, SeenBoards, WithoutMotion, board_motion
 from kcal.calibrate.rig.problem import DistanceTerm, PlaceTerm, RigProblem, SharedTerm
+from kcal.calibrate.rig.skyline_term import SkylineTerm
 from kcal.calibrate.rig.sources import Features, Landmarks, RigData
 from kcal.calibrate.rig.star_block import StarBlock
 from kcal.calibrate.rig.unknowns import SharedUnknowns
@@ -69,6 +70,7 @@ class Adjustment:
         self.anchor = start.center.mean(0)
         self.terms: list[SharedTerm] = [DistanceTerm(b.first, b.second, b.length, b.sigma) for b in data.baselines]
         self.terms += [PlaceTerm(p.camera, p.point, p.sigma) for p in data.positions]
+        self.terms += [] if data.skyline is None else [SkylineTerm(data.skyline)]
         # Of `terms`, those that are left out, by their indices.
         self.without: frozenset[int] = frozenset()
         self.motion: list[BoardMotion | None] = [None] * len(data.cameras)
@@ -139,9 +141,9 @@ class Adjustment:
     def term_labels(self) -> list[str]:
         """A name for each of `terms`."""
         data = self.data
-        return [f"the baseline {data.names[b.first]} to {data.names[b.second]}" for b in data.baselines] + [
-            f"the position of {data.names[p.camera]}" for p in data.positions
-        ]
+        found = [f"the baseline {data.names[b.first]} to {data.names[b.second]}" for b in data.baselines]
+        found += [f"the position of {data.names[p.camera]}" for p in data.positions]
+        return found + ([] if data.skyline is None else ["the skyline"])
 
     def names(self, kind: Kind) -> tuple[str, ...]:
         """Names of all items of a kind."""

@@ -89,6 +89,9 @@ def rig_result(
     for block in problem.blocks:
         squared += block.errors(problem.posed(state), state).square().sum((0, 2, 3))
         counts += block.seen.sum((0, 2))
+    if data.skyline is not None:
+        for c, many, px in zip(data.skyline.cameras, data.skyline.columns, data.skyline.rms_px, strict=True):
+            squared[c], counts[c] = squared[c] + many * px**2, counts[c] + many
     rms, status = math.sqrt(float(squared.sum() / counts.sum())), SolverStatus(int(found.status))
     if fit.variance > 1.0:
         times = math.sqrt(fit.variance)

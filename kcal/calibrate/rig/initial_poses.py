@@ -86,7 +86,8 @@ def first_poses(data: RigData, solver: LMOptions) -> InitialPoses:
     Raises:
         DegenerateError: nothing connects a camera with the others; it is named.
     """
-    known, views = _from_landmarks(data) or _from_named_stars(data), _BoardViews(data, solver)
+    known = {**_from_skyline(data), **(_from_landmarks(data) or _from_named_stars(data))}
+    views = _BoardViews(data, solver)
     placed = bool(known)
     starts = None if placed else _level_starts(data)
     if starts is None:
@@ -200,6 +201,12 @@ def _from_named_stars(data: RigData) -> _Known:
         if place is not None and int(use.sum()) >= 2:
             known[c] = Poses.at(consensus_rotation(rays[use], data.stars.direction[use])[0], place)
     return known
+
+
+def _from_skyline(data: RigData) -> _Known:
+    """Poses of the cameras whose skylines are known, where these were measured to be."""
+    source = data.skyline
+    return {} if source is None else {c: Poses.at(source.rotation[c], source.center[c]) for c in source.cameras}
 
 
 def _baseline(data: RigData, one: int, other: int) -> float | None:

@@ -35,6 +35,9 @@ def refuse_same_camera(data: RigData) -> None:
                 for kind in KINDS
                 if (source := getattr(data, kind)) is not None
             ]
+            # Skylines and measured positions have no pixels in common.
+            if not pairs:
+                continue
             both = torch.cat([pair[torch.isfinite(pair).all(-1).all(-1)] for pair in pairs])
             if len(both) >= _EQUAL_PIXELS and torch.equal(both[:, 0], both[:, 1]):
                 raise InputError(

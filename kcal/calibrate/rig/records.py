@@ -71,10 +71,14 @@ def source_records(work: Adjustment, masks: PerKind, items: Sequence[ItemResidua
     """Each source that there is."""
     squares, freedom, found = work.squares(masks), work.freedom(masks), list[SourceResidual]()
     problem, state = work.problem(masks), work.part(masks)
-    rms_px = {
+    rms_px: dict[Source, float] = {
         block.kind: math.sqrt(float(block.errors(problem.posed(state), state).square().sum()) / int(block.seen.sum()))
         for block in problem.blocks
     }
+    skyline = work.data.skyline
+    if skyline is not None:
+        squares_px = [many * px**2 for many, px in zip(skyline.columns, skyline.rms_px, strict=True)]
+        rms_px["skyline"] = math.sqrt(sum(squares_px) / sum(skyline.columns))
     for source in get_args(Source):
         own = [item for item in items if item.source == source]
         if not own:
@@ -160,6 +164,11 @@ def _measurement_records(work: Adjustment) -> list[ItemResidual]:
         error = float(torch.linalg.vector_norm(center[b.first] - center[b.second])) - b.length
         name = f"{data.names[b.first]} to {data.names[b.second]}"
         out.append(ItemResidual(source="baselines", name=name, meters=error, sigmas=abs(error) / b.sigma))
+    if data.skyline is not None:
+        own = zip(data.skyline.names, data.skyline.cameras, data.skyline.rms_px, data.skyline.sigmas, strict=True)
+        for name, camera, rms, sigmas in own:
+            pixels = tuple(rms if c == camera else None for c in range(len(data.cameras)))
+            out.append(ItemResidual(source="skyline", name=name, pixels=pixels, sigmas=sigmas))
     for p in data.positions:
         off = center[p.camera] - p.point
         sigmas = math.sqrt(float((off / p.sigma).square().mean()))

@@ -23,7 +23,7 @@ from kcal.lens.mounting import Origin
 from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.solve.result import SolverStatus
 
-Source = Literal["boards", "landmarks", "features", "stars", "baselines", "positions"]
+Source = Literal["boards", "landmarks", "features", "stars", "skyline", "baselines", "positions"]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.problem.weights import whitening
+from kcal.calibrate.rig.skyline_source import SkylineSource
 from kcal.calibrate.rig.star_source import StarSource
 from kcal.checks import as_points, require_finite
 from kcal.corners.board import Board
@@ -298,9 +299,10 @@ class RigData:
         baselines: see `Baseline`.
         positions: see `MeasuredPosition`.
         stars: see `StarSource`.
+        skyline: see `SkylineSource`.
 
     Raises:
-        InputError: names or shapes that do not fit each other, one camera without landmarks.
+        InputError: names or shapes that do not fit each other, one camera without landmarks or skyline.
 
     Example:
         >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080))
@@ -316,11 +318,12 @@ class RigData:
     baselines: tuple[Baseline, ...] = ()
     positions: tuple[MeasuredPosition, ...] = ()
     stars: StarSource | None = None
+    skyline: SkylineSource | None = None
 
     def __post_init__(self) -> None:
         count = len(self.cameras)
-        if not count or (count == 1 and self.landmarks is None):
-            raise InputError("a rig has two cameras or more; one camera alone needs landmarks")
+        if not count or (count == 1 and self.landmarks is None and self.skyline is None):
+            raise InputError("a rig has two cameras or more; one camera alone needs landmarks, or a skyline")
         _names("cameras", self.names, count)
         if not all(isinstance(camera, Camera) and camera.params.ndim == 1 for camera in self.cameras):
             raise InputError("a rig is made of single cameras")
@@ -334,6 +337,10 @@ class RigData:
                 raise InputError(f"{kind}: pixels of {source.pixels.shape[1]} cameras, the rig has {count}")
         if self.stars is not None and bool(self.stars.named.any()) and not self.absolute:
             raise InputError("stars with names need a frame on the Earth: landmarks, or a camera's measured position")
+        if self.skyline is not None and len(self.skyline.rotation) != count:
+            raise InputError(f"skyline: attitudes of {len(self.skyline.rotation)} cameras, the rig has {count}")
+        if self.skyline is not None and not self.absolute:
+            raise InputError("a skyline needs a frame on the Earth: landmarks, or a camera's measured position")
         numbers = [n for b in self.baselines for n in (b.first, b.second)] + [p.camera for p in self.positions]
         if any(not 0 <= number < count for number in numbers):
             raise InputError(f"baselines and positions name cameras 0 to {count - 1}")

@@ -1,0 +1,302 @@
+"""How a camera looks, from the skyline in its image and a raster of the terrain, and how well that is known.
+
+The rotation is fitted to all columns at once by generalized least squares. Columns that look at one ridge share the
+error of the raster's heights there, and all columns share the refraction of light, the height and place of the camera
+and the errors of its lens, so they are correlated, and the covariance says so.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from kcal.calibrate.rig.adjustment import chi2_quantile
+from kcal.errors import DegenerateError, InputError
+from kcal.lens.camera import Camera
+from kcal.lens.mounting import Origin
+from kcal.locate.ellipsoid import mean_radius
+from kcal.locate.mounting import attitude
+from kcal.locate.raster import Raster
+from kcal.skyline.border import Border, sky_border
+from kcal.skyline.fit import SkylineFit, fit_rotation, lens_errors
+from kcal.skyline.heading import Candidate, candidates, rotation_by
+from kcal.skyline.horizon import Horizon, terrain_horizon
+from kcal.skyline.raised import raised_horizon
+from kcal.skyline.raster_error import RasterError, SkylineErrors
+from kcal.skyline.seen_horizon import Columns, columns_of, compare
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+# Degrees between azimuths all around, where headings are searched, and beyond the image where a skyline is fitted.
+_AROUND, _BEYOND = 0.1, 1.5
+# Share of the image's columns that must be clear, and of the clear ones that must agree with the raster.
+_CLEAR, _AGREEING = 0.1, 0.5
+# Degrees: a heading known worse is none; and headings as near as this are one.
+_FLAT, _ONE = 0.5, 1.0
+# χ² by which the second heading must fit worse: a thousand to one.
+_CLEARLY = 2.0 * math.log(1000.0)
+# Share of columns below the raster's skyline, beyond their errors, that a wrong border here and there explains.
+_BELOW = 0.1
+# So many other headings that fit as well are those of a flat horizon.
+_MANY = 4
+# Residuals may be larger than their sigmas say by this factor; beyond, the raster is not of this terrain.
+_CONTRADICTS = 3.0
+# Share of columns left out that is worth naming.
+_LEFT_OUT = 0.15
+# Share of directions without a horizon that is worth naming.
+_OPEN = 0.1
+# Meters above the raster's ground at which a camera's height is doubted.
+_HIGH = 150.0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class SkylineAttitude:
+    """How a camera looks, from a skyline.
+
+    Args:
+        rotation: (3, 3) the camera's axes from east, north, up at the camera.
+        heading_deg: as `Mounting`.
+        pitch_deg: likewise.
+        roll_deg: likewise.
+        sigma_deg: (3,) of heading, pitch and roll.
+        covariance: (3, 3) rad², of a small turn of the camera about the axes east, north, up.
+        shares: of the variances of heading, pitch and roll (3,) by where they come from: image, raster, refraction,
+            position, lens.
+        widened: by how much residuals are larger than their sigmas say, at least 1; the covariance has it.
+        border: of the image.
+        used: (W,) which columns agree with the raster and were used.
+        expected: (W,) px, the raster's skyline in each clear column; NaN elsewhere.
+        second_deg: heading of the next best explanation; NaN if there is none.
+        second_worse: by how much its χ² is larger.
+        warnings: what to know of it.
+        fit: the columns used, in bins, and the covariance about the camera's axes.
+    """
+
+    rotation: Floats
+    heading_deg: float
+    pitch_deg: float
+    roll_deg: float
+    sigma_deg: Floats
+    covariance: Floats
+    shares: dict[str, Floats]
+    widened: float
+    border: Border
+    used: Bools
+    expected: Floats
+    second_deg: float
+    second_worse: float
+    warnings: tuple[str, ...]
+    fit: SkylineFit
+
+
+def skyline_attitude(
+    image: NDArray[np.generic],
+    camera: Camera,
+    place: Origin,
+    raster: Raster,
+    *,
+    place_sigma: tuple[float, float, float] = (3.0, 3.0, 3.0),
+    error: RasterError | None = None,
+    heading: tuple[float, float] | None = None,
+) -> SkylineAttitude:
+    """Find the attitude of a camera from the border of sky and ground; no rough pose is needed.
+
+    Args:
+        image: (H, W) gray levels, by day.
+        camera: which lens; errors of its calibration are part of the covariance.
+        place: of the camera.
+        raster: heights above the ellipsoid, from `kcal.locate.terrain`.
+        place_sigma: meters, of the place, east, north and up.
+        error: of the raster and of refraction.
+        heading: a rough heading of the optical axis and the most it is off, degrees.
+
+    Raises:
+        InputError: an image of another size; no clear border of sky and ground; a raster that does not reach, or that
+            contradicts the image.
+        DegenerateError: the skyline is too flat to tell the heading, or several headings fit about equally well.
+
+    Example:
+        >>> camera = Camera.build(focal=(300, 300), center=(159.5, 99.5), size=(320, 200), model="pinhole")
+        >>> skyline_attitude(np.zeros((100, 100)), camera, Origin(lat=47.0, lon=11.0, height=600.0), None)
+        Traceback (most recent call last):
+        kcal.errors.InputError: the image has 100 x 100 pixels, the camera 320 x 200: give an image of this camera
+    """
+    error = error or RasterError()
+    shape = np.asarray(image).shape
+    if shape != tuple(reversed(camera.size)):
+        got = " x ".join(str(side) for side in reversed(shape))
+        raise InputError(
+            f"the image has {got} pixels, the camera {camera.size[0]} x {camera.size[1]}: give an image of this camera"
+        )
+    if not all(0.0 < sigma < math.inf for sigma in place_sigma):
+        raise InputError(f"place_sigma {place_sigma}: three positive numbers of meters are needed")
+    border = sky_border(image)
+    columns = columns_of(border.row, border.sigma, camera)
+    if len(columns.pixel) < max(_CLEAR * camera.size[0], 30):
+        raise InputError(
+            f"the border of sky and ground is clear in {len(columns.pixel)} of {camera.size[0]} columns only: the "
+            "skyline must be in the image, by day, without fog, and without things close by in front of it"
+        )
+    around = terrain_horizon(raster, place, np.radians(np.arange(-180.0, 180.0, _AROUND)), refraction=error.refraction)
+    errors = SkylineErrors(error, np.array(place_sigma), lens_errors(camera), mean_radius(place.lat))
+    found = candidates(columns, around, camera, errors, heading)
+    horizon = terrain_horizon(raster, place, _azimuths(columns, found[0]), refraction=error.refraction)
+    horizon = raised_horizon(horizon, raster, place, error)
+    fit = fit_rotation(columns, horizon, found[0].rotation, camera, errors)
+    open_share = 1.0 - float(around.known.mean())
+    gap = "" if open_share < _OPEN else (
+        f". The raster has no horizon in {100 * open_share:.0f} % of the directions around the camera: it ends before "
+        "the terrain falls away, or has cells without a height"
+    )  # fmt: skip
+    if fit is None:
+        raise InputError(f"{_CONTRADICTED} no heading fits; {_cure(raster, place)}{gap}")
+    return _checked_attitude(fit, found, columns, horizon, border, camera, raster, place, gap)
+
+
+_CONTRADICTED = "the raster contradicts the image:"
+
+
+def _cure(raster: Raster, place: Origin) -> str:
+    return (
+        f"check the camera's place and height ({_above_ground(raster, place):.0f} m above the raster's ground), the "
+        "raster's heights (--geoid) and accuracy, and that the image shows a skyline by day"
+    )
+
+
+def _above_ground(raster: Raster, place: Origin) -> float:
+    """Meters of the camera above the raster's ground."""
+    lat, lon = (torch.tensor([part], dtype=torch.float64) for part in (place.lat, place.lon))
+    return place.height - float(raster(lat, lon)[0])
+
+
+def _azimuths(columns: Columns, found: Candidate) -> Floats:
+    """Radians, increasing, two for each column of the image."""
+    heading = columns.ray @ found.rotation
+    middle = math.radians(found.heading)
+    off = np.remainder(np.arctan2(heading[:, 0], heading[:, 1]) - middle + math.pi, 2.0 * math.pi) - math.pi
+    step = 0.5 * float(np.median(np.abs(np.diff(off)) / np.diff(columns.pixel[:, 0])))
+    beyond = math.radians(_BEYOND)
+    return middle + np.arange(off.min() - beyond, off.max() + beyond, step)
+
+
+def _checked_attitude(
+    fit: SkylineFit, found: list[Candidate], columns: Columns, horizon: Horizon, border: Border, camera: Camera,
+    raster: Raster, place: Origin, gap: str,
+) -> SkylineAttitude:  # fmt: skip
+    """The attitude, unless something speaks against it."""
+    heading, pitch, roll = attitude(torch.from_numpy(fit.rotation.T.copy()))
+    large = fit.freedom > 0 and fit.chi2 > float(chi2_quantile(torch.tensor(float(fit.freedom)), 0.999))
+    widened = math.sqrt(fit.chi2 / fit.freedom) if large else 1.0
+    turn = _angles_by_turn(fit.rotation)
+    sigma = widened * np.sqrt(np.diag(turn @ fit.covariance @ turn.T))
+    agreeing = float(fit.used.mean())
+    if agreeing < _AGREEING:
+        raise InputError(
+            f"{_CONTRADICTED} {100 * agreeing:.0f} % of the skyline's clear columns agree in the best heading, "
+            f"{heading:.1f} degrees; {_cure(raster, place)}{gap}"
+        )
+    if fit.below > _BELOW:
+        raise InputError(
+            f"{_CONTRADICTED} in {100 * fit.below:.0f} % of the columns its skyline is below the raster's, which "
+            f"nothing that grows or was built explains; {_cure(raster, place)}{gap}"
+        )
+    if widened > _CONTRADICTS:
+        raise InputError(
+            f"{_CONTRADICTED} residuals are {widened:.1f} times as large as their sigmas say; "
+            f"{_cure(raster, place)}{gap}"
+        )
+    apart = [abs((one.heading - heading + 180.0) % 360.0 - 180.0) for one in found]
+    others = [one for one, off in zip(found, apart, strict=True) if off > max(5.0 * sigma[0], _ONE)]
+    worse = others[0].cost - found[0].cost if others else math.inf
+    as_good = sum(one.cost - found[0].cost < _CLEARLY for one in others)
+    if sigma[0] > _FLAT or as_good >= _MANY:
+        why = f"its sigma is {sigma[0]:.2g} degrees" if sigma[0] > _FLAT else f"{as_good} others fit as well"
+        raise DegenerateError(
+            f"the skyline is too flat to tell the heading ({why}): a plain or the sea has one elevation all around; "
+            "use landmarks or stars"
+        )
+    if as_good:
+        raise DegenerateError(
+            f"two headings explain the skyline about equally well: {heading:.1f} and {others[0].heading:.1f} degrees "
+            f"(chi-squared differs by {worse:.1f}; {_CLEARLY:.0f} are needed): state a rough heading, or use an image "
+            f"that shows more of the skyline{gap}"
+        )
+    expected = np.full(camera.size[0], np.nan)
+    used = np.zeros(camera.size[0], dtype=np.bool_)
+    at = columns.pixel[:, 0].astype(int)
+    seen = compare(columns, horizon, fit.rotation, camera)
+    # Down the column, as far as the skyline is from the border across it.
+    upright = np.where(columns.sigma > 0, seen.sigma / columns.sigma, 1.0)
+    expected[at] = np.where(seen.known, columns.pixel[:, 1] + seen.residual / np.maximum(upright, 0.05), np.nan)
+    used[at] = fit.used
+    total = np.diag(turn @ fit.covariance @ turn.T)
+    back = fit.rotation.T
+    return SkylineAttitude(
+        rotation=fit.rotation,
+        heading_deg=heading,
+        pitch_deg=pitch,
+        roll_deg=roll,
+        sigma_deg=sigma,
+        covariance=widened**2 * back @ fit.covariance @ back.T,
+        shares={name: np.diag(turn @ part @ turn.T) / total for name, part in fit.parts.items()},
+        widened=widened,
+        border=border,
+        used=used,
+        expected=expected,
+        second_deg=others[0].heading if others else math.nan,
+        second_worse=worse,
+        warnings=tuple(_attitude_warnings(fit, columns, horizon, raster, place, widened)),
+        fit=fit,
+    )
+
+
+def _angles_by_turn(rotation: Floats) -> Floats:
+    """(3, 3) degrees of heading, pitch and roll by a turn about the camera's axes, rad."""
+    step, found = 1e-6, np.empty((3, 3))
+    for axis in range(3):
+        ends = []
+        for sign in (1.0, -1.0):
+            turned = rotation_by(sign * step * np.eye(3)[axis]) @ rotation
+            ends.append(np.array(attitude(torch.from_numpy(turned.T.copy()))))
+        found[:, axis] = ((ends[0] - ends[1] + 180.0) % 360.0 - 180.0) / (2.0 * step)
+    return found
+
+
+def _attitude_warnings(
+    fit: SkylineFit, columns: Columns, horizon: Horizon, raster: Raster, place: Origin, widened: float
+) -> list[str]:
+    found = []
+    above = _above_ground(raster, place)
+    if above > _HIGH:
+        found.append(
+            f"the camera stands {above:.0f} m above the raster's ground; if its heights are above the sea, add the "
+            "height of the geoid (--geoid)"
+        )
+    if widened > 1.0:
+        found.append(
+            f"residuals are {widened:.1f} times as large as their sigmas say; the covariance was widened: is the "
+            "raster as accurate as stated?"
+        )
+    left_out = 1.0 - float(fit.used.mean())
+    if left_out > _LEFT_OUT:
+        found.append(
+            f"{100 * left_out:.0f} % of the clear columns contradict the raster and are left out, as trees and "
+            "buildings above a raster of the bare ground do; lower ones among the rest still pull the pitch down: a "
+            "surface model, with what grows, is better"
+        )
+    heading = columns.ray[fit.used] @ fit.rotation
+    near = np.searchsorted(horizon.azimuth, horizon.azimuth[0] + np.remainder(
+        np.arctan2(heading[:, 0], heading[:, 1]) - horizon.azimuth[0], 2.0 * math.pi
+    )).clip(0, len(horizon.azimuth) - 1)  # fmt: skip
+    doubtful = float(horizon.doubtful[near].mean())
+    if doubtful > 0.1:
+        found.append(
+            f"ground as high as the raster's highest, if it stood just beyond its end ({horizon.reach.min() / 1e3:.1f} "
+            f"km away), would hide the horizon in {100 * doubtful:.0f} % of the columns; a larger raster would tell"
+        )
+    return found

@@ -1,0 +1,122 @@
+"""The horizon of a raster, against the definition by brute force."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from kcal.errors import InputError
+from kcal.lens.mounting import Origin
+from kcal.locate.geodesy import geodetic_to_enu
+from kcal.locate.raster import Raster
+from kcal.skyline.horizon import terrain_horizon
+from kcal.skyline.raised import raised_horizon
+from kcal.skyline.raster_error import RasterError
+from tests.helpers.skyline_site import CELL, heights, raster_of, small_site
+
+RADIUS = 6_371_000.0
+
+
+def directions(raster: Raster, eye: Origin, refraction: float) -> tuple[np.ndarray, np.ndarray]:
+    """Azimuth and elevation of the middle of every cell, as seen from an eye."""
+    count = len(raster.heights)
+    middle = np.arange(count) + 0.5
+    column, row = np.meshgrid(middle, middle)
+    cell = 1.0 / raster.to_cell[0]
+    x, y = cell * (column - 0.5 * count), cell * (0.5 * count - row)
+    assert raster.into is not None
+    lon, lat = raster.into.transform(x.ravel(), y.ravel(), direction="INVERSE")
+    enu = geodetic_to_enu(torch.from_numpy(np.stack([lat, lon, raster.heights.ravel()], -1)), eye).numpy()
+    level = np.hypot(enu[:, 0], enu[:, 1])
+    return np.arctan2(enu[:, 0], enu[:, 1]), np.arctan(enu[:, 2] / level + refraction * level / (2.0 * RADIUS))
+
+
+def test_a_single_summit_stands_where_geodesy_puts_it() -> None:
+    values = np.zeros((481, 481))
+    values[100, 300] = 900.0
+    raster, eye = raster_of(values), Origin(lat=47.0, lon=11.0, height=20.0)
+    azimuth, elevation = directions(raster, eye, 0.13)
+    summit = int(values.argmax())
+    found = terrain_horizon(raster, eye, azimuth[summit] + np.radians([-5.0, 0.0, 5.0]))
+    # Interpolated between samples 0.8 m apart, a summit whose sides fall by 36 m a meter loses some meters of 3.7 km.
+    assert found.elevation[1] == pytest.approx(elevation[summit], abs=1e-3)
+    assert found.distance[1] == pytest.approx(CELL * np.hypot(300 - 240, 100 - 240), abs=2.0)
+    assert found.known[1]
+    assert not found.known[[0, 2]].any()
+
+
+def test_no_cell_stands_above_the_horizon_and_some_cell_near_it() -> None:
+    site = small_site()
+    azimuth, elevation = directions(site.raster, site.place, 0.13)
+    far = np.hypot(*np.meshgrid(*[CELL * (np.arange(480) - 239.5)] * 2)).ravel() > 3 * CELL
+    table = np.linspace(-np.pi, np.pi, 3601)
+    found = terrain_horizon(site.raster, site.place, table)
+    off = elevation - np.interp(azimuth, table, found.elevation)
+    assert off[far].max() < 3e-4  # a cell between two rays
+    some = table[50::400]
+    highest = [elevation[far & (np.abs(azimuth - one) < 5e-3)].max() for one in some]
+    # Within 5 mrad there are several cells, but not one on the crest each time.
+    assert np.median(np.abs(highest - found.elevation[50::400])) < 1e-3
+
+
+def test_the_eye_on_the_earths_curve() -> None:
+    # A plain at sea level: its horizon is at sqrt(2 R h / (1 - k)), below the level by sqrt(2 h (1 - k) / R).
+    raster, eye = raster_of(np.zeros((400, 400)), cell=200.0), Origin(lat=47.0, lon=11.0, height=50.0)
+    found = terrain_horizon(raster, eye, np.radians([30.0, 90.0, 200.0]))
+    assert found.elevation == pytest.approx(-np.sqrt(2 * 50.0 * 0.87 / RADIUS), rel=0.01)
+    assert found.distance == pytest.approx(np.sqrt(2 * RADIUS * 50.0 / 0.87), rel=0.1)
+    assert found.known.all()
+    assert not found.doubtful.any()
+
+
+def test_a_raster_that_ends_is_no_horizon() -> None:
+    site = small_site()
+    small = heights()[200:280, 200:280]
+    found = terrain_horizon(raster_of(small), site.place, np.linspace(-3.0, 3.0, 100))
+    # Its ground rises to its end nearly everywhere; where it does not, what is beyond may be higher.
+    assert found.known.mean() < 0.5
+    assert found.doubtful[found.known].mean() > 0.9
+    assert (found.reach < 1.5 * 40 * CELL).all()
+
+
+def test_cells_without_height_hide_what_is_behind_them() -> None:
+    site = small_site()
+    azimuth = np.radians([35.0, 40.0, 45.0])
+    whole = terrain_horizon(site.raster, site.place, azimuth)
+    assert whole.known.all()
+    values = heights()
+    way = 0.5 * whole.point[1, :2]
+    row, column = int(240 - way[1] / CELL), int(240 + way[0] / CELL)
+    values[row - 1 : row + 2, column - 1 : column + 2] = np.nan
+    assert terrain_horizon(raster_of(values), site.place, azimuth).known.tolist() == [True, False, True]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [({"lat": 48.0}, "no height at the camera's place"), ({"height": 150.0}, "below the raster's ground")],
+)
+def test_a_place_that_cannot_be(change: dict[str, float], said: str) -> None:
+    site = small_site()
+    with pytest.raises(InputError, match=said):
+        terrain_horizon(site.raster, dataclasses.replace(site.place, **change), np.zeros(1))
+
+
+def test_errors_of_heights_raise_a_horizon() -> None:
+    site = small_site()
+    azimuth = np.radians(np.linspace(0.0, 90.0, 60))
+    exact = terrain_horizon(site.raster, site.place, azimuth)
+    error = RasterError(sigma=2.0, correlation=60.0)
+    stated = raised_horizon(exact, site.raster, site.place, error).raised
+    # Independent errors of cells, smoothed: many draws of whole rasters raise the horizon as much.
+    random, rise = np.random.default_rng(1), []
+    apart = CELL * np.hypot(*np.meshgrid(*[np.minimum(np.arange(480), 480 - np.arange(480))] * 2))
+    root = np.sqrt(np.maximum(np.fft.rfft2(np.exp(-apart / 60.0)).real, 0.0))
+    for _ in range(5):
+        drawn = np.fft.irfft2(root * np.fft.rfft2(random.standard_normal((480, 480))), (480, 480))
+        noisy = terrain_horizon(raster_of(heights() + 2.0 * drawn), site.place, azimuth)
+        rise.append(float((noisy.elevation - exact.elevation).mean()))
+    assert float(stated.mean()) == pytest.approx(np.mean(rise), rel=0.5)
+    assert float(stated.mean()) > 0.0
