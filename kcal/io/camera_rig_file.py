@@ -51,6 +51,7 @@ class CameraRigFile(NativeFile):
         calibration: how the rig was solved, if it was.
 
     Example:
+        >>> from kcal import Camera
         >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
         >>> rig = CameraRig([camera] * 3, ["a", "b", "c"], torch.eye(3).repeat(3, 1, 1), torch.eye(3))
         >>> camera_rig_to_file(rig).rig().names
@@ -122,6 +123,7 @@ def save_camera_rig(rig: CameraRig, path: str | Path) -> Path:
 
     Example:
         >>> import tempfile
+        >>> from kcal import Camera
         >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
         >>> rig = CameraRig([camera], ["tower"], torch.eye(3)[None], torch.zeros(1, 3))
         >>> with tempfile.TemporaryDirectory() as folder:

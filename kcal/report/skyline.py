@@ -42,6 +42,7 @@ def skyline_figure(images: Sequence[tuple[str, NDArray[Any]]], found: Sequence[S
         axes.imshow(image, cmap="gray", interpolation="nearest")
         frame_image(axes, (width, image.shape[0]))
         axes.set_ylim(high - 0.5, low - 0.5)
+        axes.set_xlabel("")
         column = np.arange(width)
         axes.plot(column, one.expected, color=ACCENT, linewidth=1.0, label="raster")
         left_out = one.border.clear & ~one.used
@@ -59,6 +60,7 @@ def skyline_figure(images: Sequence[tuple[str, NDArray[Any]]], found: Sequence[S
         below.axhline(0.0, color=INK, linewidth=0.5)
         most = float(np.nanquantile(np.abs(off[one.used]), 0.99)) * 1.6
         below.set(xlim=(-0.5, width - 0.5), ylim=(-most, most))
+        below.set_xlabel("u, pixels", fontsize=7)
         below.set_ylabel("image above\nraster, px", fontsize=7)
         below.tick_params(labelsize=7)
     return figure

@@ -143,10 +143,10 @@ def skyline_image(
     Example:
         >>> from kcal.sim.captures import drawn_lens
         >>> look = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]).double()  # to the north
-        >>> lens = drawn_lens("surveillance", 1.0, 1, focal_mm=4.64, scale=0.1)
+        >>> lens = drawn_lens("surveillance", 1.0, 1, focal_mm=4.64, scale=0.25)
         >>> seen = skyline_image(Hills(seed=1), lens, look, np.array([0.0, 0, 220]), HillWeather(), farthest=5e3)
         >>> seen.image.shape, bool(seen.elevation.max() > 0.02)
-        ((108, 192), True)
+        ((270, 480), True)
     """
     azimuth, elevation = _pixel_angles(lens, enu_from_cam)
     low, high = float(azimuth.min()), float(azimuth.max())

@@ -1,4 +1,4 @@
-"""SkylineFit a camera's rotation to a skyline by generalized least squares, and say where its variance comes from."""
+"""Fit a camera's rotation to a skyline by generalized least squares, and say where its variance comes from."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def covariances(seen: Comparison, errors: SkylineErrors) -> dict[str, Floats]:
 def fit_rotation(
     columns: Columns, horizon: Horizon, rotation: Floats, camera: Camera, errors: SkylineErrors
 ) -> SkylineFit | None:
-    """SkylineFit a rotation from a rough one; columns that contradict the others are left out.
+    """Fit a rotation from a rough one; columns that contradict the others are left out.
 
     Args:
         columns: clear ones of the border.
