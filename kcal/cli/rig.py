@@ -132,7 +132,7 @@ def solve_command(
             "seen by both determine how the cameras are turned; a length must come from elsewhere (--baseline).",
         ),
     ] = None,
-    skyline: Annotated[Path | None, typer.Option(metavar="DEM", help=SKYLINE_HELP)] = None,
+    skyline: Annotated[Path | None, typer.Option(metavar="DEM", help=SKYLINE_HELP, hidden=True)] = None,
     skyline_images: Annotated[
         list[str] | None, typer.Option("--skyline-images", metavar="NAME=IMAGES", help=IMAGES_HELP, hidden=True)
     ] = None,
@@ -238,7 +238,8 @@ def solve_command(
     range (--features) or measured positions tell the baseline's direction.
 
     So does the scene itself (--scene): pairs of images, best of several days, and a taped baseline. Drones with RTK,
-    ships with AIS and aircraft with ADS-B (--tracks) are landmarks that move.
+    ships with AIS and aircraft with ADS-B (--tracks) are landmarks that move. The skyline before a raster of the terrain
+    (--skyline) tells how the cameras look on the Earth.
 
     `kcal rig check` tells later whether the cameras have turned since.
 
