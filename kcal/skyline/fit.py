@@ -77,7 +77,7 @@ def covariances(seen: Comparison, errors: SkylineErrors) -> dict[str, Floats]:
     raised = seen.by_elevation * seen.raised
     return {
         "image": np.diag(np.square(seen.sigma)) + COMMON**2,
-        "raster": errors.raster.heights(seen.point) * height[:, None] * height + raised[:, None] * raised,
+        "raster": errors.raster.heights(seen.point, seen.blunted) * height[:, None] * height + raised[:, None] * raised,
         "refraction": bent[:, None] * bent,
         "position": shift @ shift.T,
         "lens": lens @ lens.T,

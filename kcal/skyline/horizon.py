@@ -49,6 +49,7 @@ class Horizon(NamedTuple):
         reach: (A,) meters to which the raster is known.
         doubtful: (A,) whether ground as high as the raster's highest, just beyond `reach`, would stand above it.
         raised: (A,) radians by which errors of the raster change it on average; see `kcal.skyline.raised`.
+        blunted: (A,) meters by which it stands lower in a raster with cells of twice the size.
     """
 
     azimuth: Floats
@@ -59,6 +60,7 @@ class Horizon(NamedTuple):
     reach: Floats
     doubtful: Bools
     raised: Floats
+    blunted: Floats
 
 
 def terrain_horizon(raster: Raster, eye: Origin, azimuth: Floats, *, refraction: float = REFRACTION) -> Horizon:
@@ -102,7 +104,8 @@ def terrain_horizon(raster: Raster, eye: Origin, azimuth: Floats, *, refraction:
     highest = float(np.nanmax(raster.heights))
     curve = (1.0 - refraction) / (2.0 * rays.radius)
     beyond = np.arctan((highest - eye.height) / reach - curve * reach)
-    return Horizon(azimuth, elevation, far, point, known, reach, known & (beyond > elevation), np.zeros(len(azimuth)))
+    nothing = np.zeros(len(azimuth))
+    return Horizon(azimuth, elevation, far, point, known, reach, known & (beyond > elevation), nothing, nothing)
 
 
 def sample_distances(raster: Raster, rays: TerrainRays) -> Floats:
@@ -120,7 +123,7 @@ class TerrainRays:
     """Heights, places and slopes along azimuths from an eye."""
 
     def __init__(self, raster: Raster, eye: Origin, refraction: float) -> None:
-        self.raster, self.eye = raster, eye
+        self.raster, self.eye, self.refraction = raster, eye, refraction
         self.radius = mean_radius(eye.lat)
         self.bending = refraction / (2.0 * self.radius)
         self.farthest = min(_farthest(raster, eye), _FARTHEST)

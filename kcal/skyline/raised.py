@@ -1,9 +1,9 @@
-"""How much errors of a raster change its horizon on average, because a horizon is the highest of many heights.
+"""How much errors of a raster, and its cells, change its horizon, because a horizon is the highest of many heights.
 
 Errors that are independent of the terrain raise it: the highest of many wrong heights is more often one that is too
-high. A raster that is smoother than the terrain has its ridges too low instead. Which of both a raster is, it does not
-say. So the horizon is not corrected; the change that errors of the stated size make is one standard deviation of what
-all columns have in common.
+high. Cells blunt a crest that is sharper than they are, and lower it: cells of twice the size tell by how much. How much
+a raster has of either, it does not say. So the horizon is not corrected: what errors of the stated size change is one
+standard deviation of what all columns have in common, and what cells change is one of each crest.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _AZIMUTHS, _DRAWS = 96, 24
 
 
 def raised_horizon(horizon: Horizon, raster: Raster, eye: Origin, error: RasterError) -> Horizon:
-    """A horizon with its `raised`: radians by which errors of the raster's heights raise it on average.
+    """A horizon with `raised`, by errors of the raster's heights on average, and `blunted`, by its cells.
 
     Args:
         horizon: from `terrain_horizon`.
@@ -49,4 +49,20 @@ def raised_horizon(horizon: Horizon, raster: Raster, eye: Origin, error: RasterE
         total += (slope + noise / level).max(1)
     rise = np.maximum(total / _DRAWS - slope.max(1), 0.0)
     rise = np.where(np.isfinite(rise), rise, 0.0)
-    return horizon._replace(raised=np.interp(horizon.azimuth, horizon.azimuth[some], rise))
+    blunted = _blunted(rays, raster, horizon.azimuth[some])
+    raised, lowered = (np.interp(horizon.azimuth, horizon.azimuth[some], one) for one in (rise, blunted))
+    return horizon._replace(raised=raised, blunted=lowered * horizon.distance)
+
+
+def _blunted(rays: TerrainRays, raster: Raster, azimuth: Floats) -> Floats:
+    """(A,) by how much higher, as a slope, a horizon stands than with cells of twice the size."""
+    rows, columns = (side // 2 for side in raster.heights.shape)
+    heights = raster.heights[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2).mean((1, 3))
+    a, b, c, d, e, f = (0.5 * value for value in raster.to_cell)
+    coarse = Raster(heights, (a, b, c, d, e, f), raster.into, 2.0 * raster.cell_m)
+    distance, tops = sample_distances(raster, rays), []
+    for one in (rays, TerrainRays(coarse, rays.eye, rays.refraction)):
+        slope, _, _ = one.seen(one.along(azimuth), distance)
+        tops.append(np.where(np.isfinite(slope), slope, -np.inf).max(1))
+    known = np.isfinite(tops[0]) & np.isfinite(tops[1])
+    return np.where(known, np.subtract(*tops, where=known, out=np.zeros(len(azimuth))), 0.0)

@@ -51,11 +51,15 @@ class RasterError:
             raise InputError(f"raster correlation {self.correlation}: a positive number of meters is needed")
         check_refraction(self.refraction, self.refraction_sigma)
 
-    def heights(self, points: Floats) -> Floats:
-        """(M, M) m², covariance of the raster's heights at places (M, 3) of one frame, meters."""
+    def heights(self, points: Floats, blunted: Floats | float = 0.0) -> Floats:
+        """(M, M) m², covariance of the raster's heights at places (M, 3) of one frame, meters.
+
+        With `blunted` (M,) meters, by which cells lower a crest, that is one more standard deviation.
+        """
         level = points[:, :2]
         apart = np.hypot(*(level[:, None] - level).transpose(2, 0, 1))
-        found: Floats = self.sigma**2 * np.exp(-apart / self.correlation) + self.offset**2
+        own = np.hypot(np.broadcast_to(self.sigma, len(points)), blunted)
+        found: Floats = own[:, None] * own * np.exp(-apart / self.correlation) + self.offset**2
         return found
 
     def alike(self, distance: Floats, spacing: Floats) -> Floats:

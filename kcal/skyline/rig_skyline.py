@@ -115,7 +115,7 @@ def _joined(
     count, sizes = len(cameras), [camera.params.shape[-1] for camera in cameras]
     rotation, center = torch.full((count, 3, 3), math.nan).double(), torch.full((count, 3), math.nan).double()
     world_from_eye = {c: _world_from_eye(origin, eye) for c, eye in eyes.items()}
-    rows, residual, scale, points, height, raised, bent, own = [], [], [], [], [], [], [], []
+    rows, residual, scale, points, blunted, height, raised, bent, own = [], [], [], [], [], [], [], [], []
     begin = np.cumsum([6 * count, *sizes])
     for number, (image, one) in enumerate(zip(images, found, strict=True)):
         c, seen, turn = image.camera, one.fit.binned, world_from_eye[image.camera]
@@ -132,13 +132,15 @@ def _joined(
         residual.append(seen.residual + seen.by_turn @ off)
         scale.append(np.full(len(part), one.widened))
         points.append(seen.point @ turn.T + centers[c].numpy())
+        blunted.append(seen.blunted)
         height.append(seen.by_height())
         raised.append(seen.by_elevation * seen.raised)
         bent.append(error.refraction_sigma * seen.by_refraction(mean_radius(origin.lat)))
         own.append((np.full(len(part), number), np.square(seen.sigma)))
     by_height, by_rise, by_light, widened = map(np.concatenate, (height, raised, bent, scale))
     image_of, noise = (np.concatenate(part) for part in zip(*own, strict=True))
-    covariance = error.heights(np.concatenate(points)) * by_height[:, None] * by_height + by_light[:, None] * by_light
+    covariance = error.heights(np.concatenate(points), np.concatenate(blunted)) * by_height[:, None] * by_height
+    covariance += by_light[:, None] * by_light
     covariance += by_rise[:, None] * by_rise
     covariance += np.diag(noise) + COMMON**2 * (image_of[:, None] == image_of)
     root = np.linalg.cholesky(covariance * widened[:, None] * widened)

@@ -55,6 +55,7 @@ class Comparison:
         distance: (N,) level meters to it.
         point: (N, 3) meters, where it stands from the eye.
         raised: (N,) radians by which errors of the raster change it on average.
+        blunted: (N,) meters by which its cells may have lowered it.
         known: (N,) whether the raster has a horizon there.
     """
 
@@ -68,6 +69,7 @@ class Comparison:
     distance: Floats
     point: Floats
     raised: Floats
+    blunted: Floats
     known: Bools
 
     def by_height(self) -> Floats:
@@ -148,6 +150,7 @@ def compare(columns: Columns, horizon: Horizon, rotation: Floats, camera: Camera
         distance=distance,
         point=np.where(known[:, None], horizon.point[near], 0.0),
         raised=horizon.raised[near],
+        blunted=horizon.blunted[near],
         known=known,
     )
 

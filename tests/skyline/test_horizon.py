@@ -120,3 +120,32 @@ def test_errors_of_heights_raise_a_horizon() -> None:
         rise.append(float((noisy.elevation - exact.elevation).mean()))
     assert float(stated.mean()) == pytest.approx(np.mean(rise), rel=0.5)
     assert float(stated.mean()) > 0.0
+
+
+@pytest.mark.parametrize("sharp", [True, False])
+def test_cells_lower_a_crest_that_is_sharper(sharp: bool) -> None:
+    """A crest with flanks of 45 degrees stands half a cell lower in cells of twice the size; a dome does not."""
+    site = small_site()
+    count = len(site.raster.heights)
+    middle = CELL * (np.arange(count) - 0.5 * count + 0.5)
+    north = np.broadcast_to(-middle[:, None], (count, count))
+    crest = np.maximum(400.0 - np.abs(north - 1500.0 - 0.5 * CELL), 0.0)
+    dome = 50.0 * (1.0 - np.square(np.hypot(north, north.T) / middle[-1]))
+    raster = raster_of(crest if sharp else dome)
+    here = (torch.tensor([value]).double() for value in (site.place.lat, site.place.lon))
+    eye = dataclasses.replace(site.place, height=float(raster(*here)[0]) + 60.0)
+    horizon = terrain_horizon(raster, eye, np.radians(np.linspace(-10.0, 10.0, 40)))
+    assert not horizon.blunted.any()
+    blunted = raised_horizon(horizon, raster, eye, RasterError()).blunted
+    if sharp:
+        # Aside from where a crest is seen in the middle of its cells, somewhat more.
+        assert 0.45 * CELL < blunted.min() < blunted.max() < 0.65 * CELL
+    else:
+        assert 0.0 < blunted.min() < blunted.max() < 0.02
+
+
+def test_what_cells_lower_counts_as_an_error_of_each_crest() -> None:
+    places = np.array([[0.0, 0.0, 0.0], [30.0, 40.0, 9.0]])
+    error = RasterError(sigma=3.0, correlation=50.0, offset=1.0)
+    found = error.heights(places, np.array([4.0, 0.0]))
+    np.testing.assert_allclose(found, [[26.0, 1.0 + 15.0 / np.e], [1.0 + 15.0 / np.e, 10.0]], rtol=1e-12)
