@@ -238,8 +238,8 @@ def solve_command(
     range (--features) or measured positions tell the baseline's direction.
 
     So does the scene itself (--scene): pairs of images, best of several days, and a taped baseline. Drones with RTK,
-    ships with AIS and aircraft with ADS-B (--tracks) are landmarks that move. The skyline before a raster of the terrain
-    (--skyline) tells how the cameras look on the Earth.
+    ships with AIS and aircraft with ADS-B (--tracks) are landmarks that move. The skyline and a raster of the terrain
+    (--skyline) tell how the cameras look on the Earth.
 
     `kcal rig check` tells later whether the cameras have turned since.
 

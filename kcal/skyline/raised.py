@@ -1,9 +1,9 @@
 """How much errors of a raster, and its cells, change its horizon, because a horizon is the highest of many heights.
 
 Errors that are independent of the terrain raise it: the highest of many wrong heights is more often one that is too
-high. Cells blunt a crest that is sharper than they are, and lower it: cells of twice the size tell by how much. How much
-a raster has of either, it does not say. So the horizon is not corrected: what errors of the stated size change is one
-standard deviation of what all columns have in common, and what cells change is one of each crest.
+high. Cells blunt a crest that is sharper than they are, and lower it: cells of twice the size tell by how much. How
+much a raster has of either, it does not say. So the horizon is not corrected: what errors of the stated size change is
+one standard deviation of what all columns have in common, and what cells change is one of each crest.
 """
 
 from __future__ import annotations
@@ -65,4 +65,5 @@ def _blunted(rays: TerrainRays, raster: Raster, azimuth: Floats) -> Floats:
         slope, _, _ = one.seen(one.along(azimuth), distance)
         tops.append(np.where(np.isfinite(slope), slope, -np.inf).max(1))
     known = np.isfinite(tops[0]) & np.isfinite(tops[1])
-    return np.where(known, np.subtract(*tops, where=known, out=np.zeros(len(azimuth))), 0.0)
+    sharp, blunt = (np.where(known, one, 0.0) for one in tops)
+    return sharp - blunt
