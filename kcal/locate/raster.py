@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from pathlib import Path
 
@@ -41,6 +42,14 @@ class Raster:
     def __call__(self, lat: Tensor, lon: Tensor) -> Tensor:
         """Meters above the ellipsoid at latitudes and longitudes (degrees, of one shape); NaN where unknown."""
         return torch.from_numpy(self.between(*self.cells(lat.numpy(), lon.numpy())))
+
+    @functools.cached_property
+    def coarser(self) -> Raster:
+        """The same ground in cells of twice the size, means of four; of an odd side the last cells are left out."""
+        rows, columns = (side // 2 for side in self.heights.shape)
+        heights = self.heights[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2).mean((1, 3))
+        a, b, c, d, e, f = (0.5 * value for value in self.to_cell)
+        return Raster(heights, (a, b, c, d, e, f), self.into, 2.0 * self.cell_m)
 
     def cells(
         self, lat: NDArray[np.float64], lon: NDArray[np.float64]

@@ -45,7 +45,7 @@ def line_errors(rig: StereoRig, pixels: Tensor) -> LineErrors:
     per_px = torch.linalg.vector_norm(slope, dim=-1, keepdim=True)
     # right · (shift x left) is what is off: a turn adds turn x left to left, a shift adds to shift.
     turned = -torch.linalg.cross(torch.linalg.cross(right, shift), left)
-    axes = rig.baseline * torch.cat(side_axes(shift[:1] / rig.baseline))
+    axes = rig.baseline * torch.cat(side_axes(rig.right_from_left_translation[None] / rig.baseline))
     shifted = torch.linalg.cross(left, right) @ axes.T
     slopes = torch.cat([turned, shifted], 1) / per_px
     return LineErrors((right * normal).sum(-1) / per_px[:, 0], slope / per_px, slopes)

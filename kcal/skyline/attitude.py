@@ -8,7 +8,9 @@ and the errors of its lens, so they are correlated, and the covariance says so.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -127,6 +129,20 @@ def skyline_attitude(
         kcal.errors.InputError: the image has 100 x 100 pixels, the camera 320 x 200: give an image of this camera
     """
     error = error or RasterError()
+    around = functools.partial(horizon_around, raster, place, error)
+    return attitude_against(around, image, camera, place, raster, place_sigma, error, heading)
+
+
+def horizon_around(raster: Raster, place: Origin, error: RasterError) -> Horizon:
+    """All directions from a place."""
+    return terrain_horizon(raster, place, np.radians(np.arange(-180.0, 180.0, _AROUND)), refraction=error.refraction)
+
+
+def attitude_against(
+    horizon_there: Callable[[], Horizon], image: NDArray[np.generic], camera: Camera, place: Origin, raster: Raster,
+    place_sigma: tuple[float, float, float], error: RasterError, heading: tuple[float, float] | None = None,
+) -> SkylineAttitude:  # fmt: skip
+    """As `skyline_attitude`, before a horizon that other images may share; it is called for if the image is clear."""
     shape = np.asarray(image).shape
     if shape != tuple(reversed(camera.size)):
         got = " x ".join(str(side) for side in reversed(shape))
@@ -142,7 +158,7 @@ def skyline_attitude(
             f"the border of sky and ground is clear in {len(columns.pixel)} of {camera.size[0]} columns only: the "
             "skyline must be in the image, by day, without fog, and without things close by in front of it"
         )
-    around = terrain_horizon(raster, place, np.radians(np.arange(-180.0, 180.0, _AROUND)), refraction=error.refraction)
+    around = horizon_there()
     errors = SkylineErrors(error, np.array(place_sigma), lens_errors(camera), mean_radius(place.lat))
     found = candidates(columns, around, camera, errors, heading)
     horizon = terrain_horizon(raster, place, _azimuths(columns, found[0]), refraction=error.refraction)

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from kcal.calibrate.rig.prior_information import gathered, joint_unknowns
 from kcal.lens.camera import Camera
-from kcal.skyline.heading import column_sigma, rotation_by
+from kcal.skyline.heading import column_sigma, rotation_by, turned_to
 from kcal.skyline.horizon import Horizon
-from kcal.skyline.raster_error import SkylineErrors
+from kcal.skyline.raster_error import RasterError, SkylineErrors
 from kcal.skyline.seen_horizon import Columns, Comparison, compare
 
 Floats = NDArray[np.float64]
@@ -68,17 +68,21 @@ def lens_errors(camera: Camera) -> Floats:
     return found
 
 
+def terrain_covariances(seen: Comparison, raster: RasterError, radius: float) -> dict[str, Floats]:
+    """(M, M) px² of residuals by errors of a raster and of refraction, which images share; over the Earth's radius."""
+    height, raised = seen.by_height(), seen.by_elevation * seen.raised
+    bent = raster.refraction_sigma * seen.by_refraction(radius)
+    heights = raster.heights(seen.point, seen.blunted) * height[:, None] * height
+    return {"raster": heights + raised[:, None] * raised, "refraction": bent[:, None] * bent}
+
+
 def covariances(seen: Comparison, errors: SkylineErrors) -> dict[str, Floats]:
     """(M, M) px² of residuals by where errors come from."""
-    height = seen.by_height()
     shift = seen.by_shift * errors.place
-    lens = seen.by_lens @ errors.lens if seen.by_lens.shape[1] else np.zeros((len(height), 0))
-    bent = errors.raster.refraction_sigma * seen.by_refraction(errors.radius)
-    raised = seen.by_elevation * seen.raised
+    lens = seen.by_lens @ errors.lens if seen.by_lens.shape[1] else np.zeros((len(shift), 0))
     return {
         "image": np.diag(np.square(seen.sigma)) + COMMON**2,
-        "raster": errors.raster.heights(seen.point, seen.blunted) * height[:, None] * height + raised[:, None] * raised,
-        "refraction": bent[:, None] * bent,
+        **terrain_covariances(seen, errors.raster, errors.radius),
         "position": shift @ shift.T,
         "lens": lens @ lens.T,
     }
@@ -147,11 +151,8 @@ def _robust_rotation(
         limit = np.where(ratio > 0, _ABOVE, _FAR_BELOW)
         soft = 1.0 / (1.0 + np.square(ratio / limit)) if used is None else used.astype(np.float64)
         weight = seen.known * soft / np.square(sigma)
-        normal = np.einsum("n,ni,nj->ij", weight, seen.by_turn, seen.by_turn)
-        turn = -np.linalg.lstsq(normal, np.einsum("n,ni,n->i", weight, seen.by_turn, seen.residual), rcond=None)[0]
-        size = float(np.linalg.norm(turn))
         # A flat horizon leaves the heading open; no step is longer than a degree.
-        rotation = rotation_by(turn * min(1.0, math.radians(1.0) / max(size, 1e-12))) @ rotation
+        rotation, size = turned_to(seen, weight, rotation, math.radians(1.0))
         if size < 1e-8:
             break
     return rotation

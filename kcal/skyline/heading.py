@@ -147,13 +147,18 @@ def _adjusted(columns: Columns, horizon: Horizon, rotation: Floats, camera: Came
         sigma = column_sigma(seen, errors)
         rough = sigma + np.abs(seen.by_elevation) * _ROUGH * 0.25
         weight = seen.known / np.square(rough) / np.square(1.0 + np.square(seen.residual / (3.0 * rough)))
-        normal = np.einsum("n,ni,nj->ij", weight, seen.by_turn, seen.by_turn) + 1e-6 * np.eye(3)
-        turn = -np.linalg.solve(normal, np.einsum("n,ni,n->i", weight, seen.by_turn, seen.residual))
-        size = float(np.linalg.norm(turn))
-        rotation = rotation_by(turn * min(1.0, 0.05 / max(size, 1e-12))) @ rotation
+        rotation, size = turned_to(seen, weight, rotation, 0.05)
         if size < 1e-8:
             break
     return Candidate(rotation, column_cost(compare(columns, horizon, rotation, camera), errors, columns))
+
+
+def turned_to(seen: Comparison, weight: Floats, rotation: Floats, most: float) -> tuple[Floats, float]:
+    """A rotation after one step of weighted least squares, no longer than `most` radians, and how far it would go."""
+    normal = np.einsum("n,ni,nj->ij", weight, seen.by_turn, seen.by_turn)
+    turn = -np.linalg.lstsq(normal, np.einsum("n,ni,n->i", weight, seen.by_turn, seen.residual), rcond=None)[0]
+    size = float(np.linalg.norm(turn))
+    return rotation_by(turn * min(1.0, most / max(size, 1e-12))) @ rotation, size
 
 
 def column_sigma(seen: Comparison, errors: SkylineErrors) -> Floats:

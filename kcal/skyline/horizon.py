@@ -123,7 +123,7 @@ class TerrainRays:
     """Heights, places and slopes along azimuths from an eye."""
 
     def __init__(self, raster: Raster, eye: Origin, refraction: float) -> None:
-        self.raster, self.eye, self.refraction = raster, eye, refraction
+        self.raster, self.eye = raster, eye
         self.radius = mean_radius(eye.lat)
         self.bending = refraction / (2.0 * self.radius)
         self.farthest = min(_farthest(raster, eye), _FARTHEST)

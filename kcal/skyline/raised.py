@@ -36,10 +36,12 @@ def raised_horizon(horizon: Horizon, raster: Raster, eye: Origin, error: RasterE
     """
     some = np.unique(np.linspace(0, len(horizon.azimuth) - 1, _AZIMUTHS).round().astype(int))
     rays = TerrainRays(raster, eye, error.refraction)
+    distance = sample_distances(raster, rays)
+    slope, level = _seen_slopes(rays, horizon.azimuth[some], distance)
+    blunt, _ = _seen_slopes(TerrainRays(raster.coarser, eye, error.refraction), horizon.azimuth[some], distance)
+    lowered = _less(slope.max(1), blunt.max(1))
     # A draw differs from the horizon by errors within the top of a hill, whose samples need not be finer than a cell.
-    distance = sample_distances(raster, rays)[::2]
-    slope, level, _ = rays.seen(rays.along(horizon.azimuth[some]), distance)
-    slope, level = np.where(np.isfinite(slope), slope, -np.inf), np.where(np.isfinite(level), level, 1.0)
+    distance, slope, level = distance[::2], slope[:, ::2], level[:, ::2]
     alike = math.exp(-(distance[1] - distance[0]) / error.correlation)
     random, total = np.random.default_rng(0), np.zeros(len(some))
     for _ in range(_DRAWS):
@@ -47,23 +49,19 @@ def raised_horizon(horizon: Horizon, raster: Raster, eye: Origin, error: RasterE
         noise[:, 1:] *= math.sqrt(1.0 - alike**2)
         noise = error.sigma * lfilter([1.0], [1.0, -alike], noise, axis=1)
         total += (slope + noise / level).max(1)
-    rise = np.maximum(total / _DRAWS - slope.max(1), 0.0)
-    rise = np.where(np.isfinite(rise), rise, 0.0)
-    blunted = _blunted(rays, raster, horizon.azimuth[some])
-    raised, lowered = (np.interp(horizon.azimuth, horizon.azimuth[some], one) for one in (rise, blunted))
-    return horizon._replace(raised=raised, blunted=lowered * horizon.distance)
+    rise = np.maximum(_less(total / _DRAWS, slope.max(1)), 0.0)
+    raised, blunted = (np.interp(horizon.azimuth, horizon.azimuth[some], one) for one in (rise, lowered))
+    return horizon._replace(raised=raised, blunted=blunted * horizon.distance)
 
 
-def _blunted(rays: TerrainRays, raster: Raster, azimuth: Floats) -> Floats:
-    """(A,) by how much higher, as a slope, a horizon stands than with cells of twice the size."""
-    rows, columns = (side // 2 for side in raster.heights.shape)
-    heights = raster.heights[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2).mean((1, 3))
-    a, b, c, d, e, f = (0.5 * value for value in raster.to_cell)
-    coarse = Raster(heights, (a, b, c, d, e, f), raster.into, 2.0 * raster.cell_m)
-    distance, tops = sample_distances(raster, rays), []
-    for one in (rays, TerrainRays(coarse, rays.eye, rays.refraction)):
-        slope, _, _ = one.seen(one.along(azimuth), distance)
-        tops.append(np.where(np.isfinite(slope), slope, -np.inf).max(1))
-    known = np.isfinite(tops[0]) & np.isfinite(tops[1])
-    sharp, blunt = (np.where(known, one, 0.0) for one in tops)
-    return sharp - blunt
+def _seen_slopes(rays: TerrainRays, azimuth: Floats, distance: Floats) -> tuple[Floats, Floats]:
+    """Slopes (A, S) at which the ground is seen, -∞ where it is not known, and level distances, 1 there."""
+    slope, level, _ = rays.seen(rays.along(azimuth), distance)
+    known = np.isfinite(slope)
+    return np.where(known, slope, -np.inf), np.where(known, level, 1.0)
+
+
+def _less(one: Floats, other: Floats) -> Floats:
+    """(A,) one less the other; 0 where either is not known."""
+    known = np.isfinite(one) & np.isfinite(other)
+    return np.where(known, one, 0.0) - np.where(known, other, 0.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Sequence
 
@@ -19,9 +20,10 @@ from kcal.lens.pose import vector_from_rotation
 from kcal.locate.ellipsoid import ecef_from_enu_rotation, mean_radius
 from kcal.locate.geodesy import enu_to_geodetic
 from kcal.locate.raster import Raster
-from kcal.skyline.attitude import SkylineAttitude, skyline_attitude
-from kcal.skyline.fit import COMMON, lens_errors
+from kcal.skyline.attitude import SkylineAttitude, attitude_against, horizon_around
+from kcal.skyline.fit import COMMON, lens_errors, terrain_covariances
 from kcal.skyline.raster_error import RasterError
+from kcal.skyline.seen_horizon import Comparison
 
 Floats = NDArray[np.float64]
 
@@ -87,16 +89,14 @@ def skyline_source(
     if not images:
         raise InputError("skyline: no images")
     eyes = {c: _eye(origin, centers[c]) for c in sorted({image.camera for image in images})}
+    around = {c: functools.cache(functools.partial(horizon_around, raster, eye, error)) for c, eye in eyes.items()}
     found = []
     for image in images:
-        east, north, up = center_sigma[image.camera].tolist()
+        c, (east, north, up) = image.camera, center_sigma[image.camera].tolist()
         try:
             found.append(
-                skyline_attitude(
-                    image.image, cameras[image.camera], eyes[image.camera], raster, place_sigma=(east, north, up),
-                    error=error,
-                )
-            )  # fmt: skip
+                attitude_against(around[c], image.image, cameras[c], eyes[c], raster, (east, north, up), error)
+            )
         except InputError as problem:
             raise type(problem)(f"{image.name}: {problem}") from problem
     return _joined(images, found, cameras, origin, eyes, centers, center_sigma, error), found
@@ -115,7 +115,7 @@ def _joined(
     count, sizes = len(cameras), [camera.params.shape[-1] for camera in cameras]
     rotation, center = torch.full((count, 3, 3), math.nan).double(), torch.full((count, 3), math.nan).double()
     world_from_eye = {c: _world_from_eye(origin, eye) for c, eye in eyes.items()}
-    rows, residual, scale, points, blunted, height, raised, bent, own = [], [], [], [], [], [], [], [], []
+    rows, residual, widened, image_of, seen_of = [], [], [], [], []
     begin = np.cumsum([6 * count, *sizes])
     for number, (image, one) in enumerate(zip(images, found, strict=True)):
         c, seen, turn = image.camera, one.fit.binned, world_from_eye[image.camera]
@@ -130,20 +130,13 @@ def _joined(
         off = _vector((rotation[c] @ here.T).numpy())
         rows.append(part)
         residual.append(seen.residual + seen.by_turn @ off)
-        scale.append(np.full(len(part), one.widened))
-        points.append(seen.point @ turn.T + centers[c].numpy())
-        blunted.append(seen.blunted)
-        height.append(seen.by_height())
-        raised.append(seen.by_elevation * seen.raised)
-        bent.append(error.refraction_sigma * seen.by_refraction(mean_radius(origin.lat)))
-        own.append((np.full(len(part), number), np.square(seen.sigma)))
-    by_height, by_rise, by_light, widened = map(np.concatenate, (height, raised, bent, scale))
-    image_of, noise = (np.concatenate(part) for part in zip(*own, strict=True))
-    covariance = error.heights(np.concatenate(points), np.concatenate(blunted)) * by_height[:, None] * by_height
-    covariance += by_light[:, None] * by_light
-    covariance += by_rise[:, None] * by_rise
-    covariance += np.diag(noise) + COMMON**2 * (image_of[:, None] == image_of)
-    root = np.linalg.cholesky(covariance * widened[:, None] * widened)
+        widened += len(part) * [one.widened]
+        image_of += len(part) * [number]
+        seen_of.append(dataclasses.replace(seen, point=seen.point @ turn.T + centers[c].numpy()))
+    together, number_of, times = Comparison.together(seen_of), np.array(image_of), np.array(widened)
+    covariance = np.diag(np.square(together.sigma)) + COMMON**2 * (number_of[:, None] == number_of)
+    covariance += sum(terrain_covariances(together, error, mean_radius(origin.lat)).values())
+    root = np.linalg.cholesky(covariance * times[:, None] * times)
     white = np.linalg.solve(root, np.column_stack([np.concatenate(rows), np.concatenate(residual)]))
     # Only what moves by turns, and by what is not known of places and lenses, is kept: the rest says how well the
     # skylines fit, which each image has told.

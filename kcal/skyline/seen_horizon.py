@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -71,6 +72,13 @@ class Comparison:
     raised: Floats
     blunted: Floats
     known: Bools
+
+    @classmethod
+    def together(cls, parts: Sequence[Comparison]) -> Comparison:
+        """Columns of several images after each other, without derivatives by their lenses."""
+        names = [field.name for field in dataclasses.fields(cls) if field.name != "by_lens"]
+        found = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+        return cls(**found, by_lens=np.zeros((len(found["residual"]), 0)))
 
     def by_height(self) -> Floats:
         """(N,) by the raster's height there, px/m."""

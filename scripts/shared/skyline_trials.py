@@ -118,10 +118,19 @@ def _raster(bare: Hills, cell: float, error: RasterError, seed: int) -> Raster:
     random = np.random.default_rng([seed, 23])
     heights += error.sigma * _alike(count, error.correlation / cell, random)
     heights += error.offset * random.standard_normal()
-    system = pyproj.CRS.from_proj4(f"+proj=aeqd +lat_0={HERE[0]} +lon_0={HERE[1]} +datum=WGS84 +units=m")
-    into = pyproj.Transformer.from_crs("EPSG:4326", system, always_xy=True)
-    middle = REACH / cell
+    return raster_around(heights, cell)
+
+
+def raster_around(heights: Floats, cell: float) -> Raster:
+    """A raster of square cells around `HERE`, from north to south."""
+    into = pyproj.Transformer.from_crs("EPSG:4326", level_system(), always_xy=True)
+    middle = 0.5 * len(heights)
     return Raster(heights, (1 / cell, 0.0, middle, 0.0, -1 / cell, middle), into, cell)
+
+
+def level_system() -> pyproj.CRS:
+    """Meters east and north of `HERE`."""
+    return pyproj.CRS.from_proj4(f"+proj=aeqd +lat_0={HERE[0]} +lon_0={HERE[1]} +datum=WGS84 +units=m")
 
 
 def _alike(count: int, correlation: float, random: np.random.Generator) -> Floats:

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import pyproj
 from numpy.typing import NDArray
 
 from kcal.lens.camera import Camera
@@ -16,6 +15,7 @@ from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.raster import Raster
 from kcal.sim.skyline import Hills, HillWeather, skyline_image
 from kcal.skyline.raster_error import RasterError
+from scripts.shared.skyline_trials import level_system, raster_around
 
 HILLS = Hills(seed=3, relief=260.0, clear=700.0, far=4_500.0)
 ANGLES = (40.0, 3.0, 1.0)
@@ -66,14 +66,7 @@ def _heights() -> NDArray[np.float64]:
 
 def raster_of(values: NDArray[np.float64], cell: float = CELL) -> Raster:
     """A raster around the site."""
-    into = pyproj.Transformer.from_crs("EPSG:4326", system(), always_xy=True)
-    middle = 0.5 * len(values)
-    return Raster(values, (1 / cell, 0.0, middle, 0.0, -1 / cell, middle), into, cell)
-
-
-def system() -> pyproj.CRS:
-    """Meters east and north of the site."""
-    return pyproj.CRS.from_proj4("+proj=aeqd +lat_0=47 +lon_0=11 +datum=WGS84 +units=m")
+    return raster_around(values, cell)
 
 
 def write_raster(path: Path, values: NDArray[np.float64]) -> None:
@@ -81,7 +74,7 @@ def write_raster(path: Path, values: NDArray[np.float64]) -> None:
     side = 0.5 * len(values) * CELL
     head = f"ncols {len(values)}\nnrows {len(values)}\nxllcorner {-side}\nyllcorner {-side}\ncellsize {CELL}\n"
     path.write_text(head + "\n".join(" ".join(f"{value:.2f}" for value in row) for row in values))
-    path.with_suffix(".prj").write_text(system().to_wkt("WKT1_ESRI"))
+    path.with_suffix(".prj").write_text(level_system().to_wkt("WKT1_ESRI"))
 
 
 @functools.cache

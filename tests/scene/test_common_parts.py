@@ -42,6 +42,12 @@ def test_off_the_line_by_so_many_pixels(roll: float) -> None:
     assert found.sigma((turn @ own @ turn.T).expand(3, 2, 2)) == pytest.approx(3 * [0.3], rel=2e-3)
 
 
+def test_no_matches_have_slopes_of_their_shape() -> None:
+    """So that a pair without matches goes with others."""
+    found = line_errors(level_rig(), torch.zeros(0, 2, 2).double())
+    assert (found.off.shape, found.slopes.shape) == ((0,), (0, 5))
+
+
 def test_smooth_errors_are_the_lenses() -> None:
     """A polynomial of degree four goes altogether; one of degree five stays in part; what is far off stays whole."""
     at = 400.0 * torch.rand(300, 2, generator=DRAW).double()

@@ -149,3 +149,16 @@ def test_what_cells_lower_counts_as_an_error_of_each_crest() -> None:
     error = RasterError(sigma=3.0, correlation=50.0, offset=1.0)
     found = error.heights(places, np.array([4.0, 0.0]))
     np.testing.assert_allclose(found, [[26.0, 1.0 + 15.0 / np.e], [1.0 + 15.0 / np.e, 10.0]], rtol=1e-12)
+
+
+def test_cells_of_twice_the_size_have_the_mean_of_four() -> None:
+    values = np.arange(35.0).reshape(5, 7) ** 2
+    coarse = raster_of(values).coarser
+    assert coarse.heights.shape == (2, 3)
+    assert coarse.heights[1, 2] == values[2:4, 4:6].mean()
+    place = small_site().place
+    fine = [float(part) for part in raster_of(values).cells(np.array(place.lat), np.array(place.lon))]
+    # Counted from the middle of the first cell.
+    assert [float(part) for part in coarse.cells(np.array(place.lat), np.array(place.lon))] == pytest.approx(
+        [0.5 * part - 0.25 for part in fine], abs=1e-9
+    )

@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from kcal.calibrate.rig.blocks import PosedCamera
 from kcal.calibrate.rig.result import RigResult
@@ -16,10 +17,14 @@ from kcal.calibrate.rig.skyline_term import SkylineTerm
 from kcal.calibrate.rig.solve import solve_rig
 from kcal.calibrate.rig.sources import MeasuredPosition, RigData
 from kcal.errors import InputError
+from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.locate.geodesy import enu_from_cam
+from kcal.locate.raster import Raster
 from kcal.locate.stations import station_mounting
 from kcal.sim.skyline import HillWeather
+from kcal.skyline import attitude
+from kcal.skyline.horizon import Horizon, terrain_horizon
 from kcal.skyline.rig_skyline import SkylineImage, skyline_source
 from tests.helpers.skyline_site import ANGLES, ERROR, camera, image, small_site
 
@@ -94,6 +99,21 @@ def test_more_images_do_not_average_the_terrain() -> None:
     ratio = (three.covariance.diagonal()[3:6] / one.covariance.diagonal()[3:6]).sqrt()
     assert ((ratio < 1.001) & (ratio > 0.7)).all()  # independent images: 0.58
     assert abs(three.heading_deg - one.heading_deg) < 0.02
+
+
+def test_images_of_one_camera_share_its_surroundings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All around is looked for once; then once for each image, in its directions alone."""
+    seen_from: list[int] = []
+
+    def counted(raster: Raster, eye: Origin, azimuth: NDArray[np.float64], **given: float) -> Horizon:
+        seen_from.append(len(azimuth))
+        return terrain_horizon(raster, eye, azimuth, **given)
+
+    monkeypatch.setattr(attitude, "terrain_horizon", counted)
+    site = small_site()
+    images = [seen(moment, 0) for moment in (0, 1)]
+    skyline_source(images, [camera()], site.raster, site.place, CENTERS[:1], SIGMA[:1], error=ERROR)
+    assert [count == 3600 for count in seen_from] == [True, False, False]
 
 
 def test_derivatives_of_the_term() -> None:
