@@ -74,7 +74,7 @@ def skyline_options(
     if not found and scene is not None:
         found = dict(zip(("left", "right"), scene, strict=True))
     if not found:
-        raise InputError("--skyline needs images of the skyline: --skyline-images left=IMAGES, once for each camera")
+        raise InputError("--skyline needs images: --skyline-images IMAGES, or NAME=IMAGES once for each camera")
     if picture is not None:
         check_picture(picture)
     known = {} if sigma is None else {"sigma": sigma, "offset": 0.5 * sigma}
@@ -109,7 +109,8 @@ def read_skyline(
     if origin is None or without:
         raise InputError(
             f"--skyline needs the place of {' and '.join(without) or 'each camera'} on the Earth: measure it (GNSS) "
-            "and give --positions with latitudes and longitudes (or with local meters and --origin)"
+            f"and give --position{'s' * (len(names) > 1)} with latitudes and longitudes (or with local meters and "
+            "--origin)"
         )
     centers, sigma = torch.zeros(len(names), 3).double(), torch.ones(len(names), 3).double()
     for number, position in places.items():
