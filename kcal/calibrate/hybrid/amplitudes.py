@@ -37,14 +37,20 @@ def expected_maximum(
         best: where the evidence is largest.
         hyperprior: of the hyperparameters.
         tempering: by which the data counted less there.
+
+    Raises:
+        ArithmeticError: the evidence is beyond numbers at its maximum: nothing can be averaged.
     """
     count, log_variance = len(best.h), math.log(best.variance)
     used = families.amplitude
     which = [*used[used >= 0].unique().tolist(), *range(count, count + len(best.log_ratio))]
     loss = EvidenceLoss(data, families, hyperprior, tempering)
     at = np.concatenate([best.h.numpy(), best.log_ratio, [log_variance]])
+    value, _, bend = loss(at)
+    if not math.isfinite(value):
+        raise ArithmeticError("the views contradict each other so far that the evidence of their lens is no number")
     found = expected_amplitudes(
-        loss(at)[2],
+        bend,
         loss.values,
         at,
         which,
