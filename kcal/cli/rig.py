@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from kcal.cli.commands import Command
+from kcal.cli.commands import Command, rarely
 from kcal.cli.console import with_json
 from kcal.cli.groups import group_with_default
 from kcal.cli.inputs import CALIBRATED, MARKS, OBSERVATIONS, SURVEY, TABLE, with_inputs
@@ -43,18 +43,12 @@ def solve_command(
     ] = None,
     observations: Annotated[
         list[Path] | None,
-        typer.Option(
-            metavar="OBS.json",
-            help="Of three cameras and more: boards seen by any two, once for each camera, named as it is.",
-            hidden=True,
-        ),
+        rarely("OBS.json", "Of three cameras and more: boards seen by any two, once for each camera, named as it is."),
         OBSERVATIONS,
     ] = None,
     match: Annotated[
         Path | None,
-        typer.Option(
-            metavar="CSV", help="Which views belong together: columns left,right. By name if not given.", hidden=True
-        ),
+        rarely("CSV", "Which views belong together: columns left,right. By name if not given."),
         TABLE,
     ] = None,
     landmarks: Annotated[
@@ -76,11 +70,10 @@ def solve_command(
     ] = None,
     features: Annotated[
         Path | None,
-        typer.Option(
-            metavar="CSV",
-            help="Far things matched between the images: left_u,left_v,right_u,right_v and range,range_sigma or "
+        rarely(
+            "CSV",
+            "Far things matched between the images: left_u,left_v,right_u,right_v and range,range_sigma or "
             "beyond (meters), if known.",
-            hidden=True,
         ),
         MARKS,
     ] = None,
@@ -100,21 +93,15 @@ def solve_command(
     ] = None,
     origin: Annotated[
         str | None,
-        typer.Option(
-            metavar="LAT,LON,HEIGHT", help="Of the local frame; the first surveyed place if not given.", hidden=True
-        ),
+        rarely("LAT,LON,HEIGHT", "Of the local frame; the first surveyed place if not given."),
     ] = None,
     survey_sigma: Annotated[
         float | None,
-        typer.Option(
-            metavar="M", help="How well places of GeoJSON and GPX files are known, where these do not say.", hidden=True
-        ),
+        rarely("M", "How well places of GeoJSON and GPX files are known, where these do not say."),
     ] = None,
     geoid: Annotated[
         float | None,
-        typer.Option(
-            metavar="M", help="Height of the geoid above the WGS84 ellipsoid, added to elevations of GPX.", hidden=True
-        ),
+        rarely("M", "Height of the geoid above the WGS84 ellipsoid, added to elevations of GPX."),
     ] = None,
     stars: Annotated[
         tuple[str, str] | None,
@@ -132,67 +119,44 @@ def solve_command(
             "seen by both determine how the cameras are turned; a length must come from elsewhere (--baseline).",
         ),
     ] = None,
-    skyline: Annotated[Path | None, typer.Option(metavar="DEM", help=SKYLINE_HELP, hidden=True)] = None,
-    skyline_images: Annotated[
-        list[str] | None, typer.Option("--skyline-images", metavar="NAME=IMAGES", help=IMAGES_HELP, hidden=True)
-    ] = None,
-    skyline_sigma: Annotated[
-        float | None, typer.Option("--skyline-sigma", metavar="M", help=SIGMA_HELP, min=0, hidden=True)
-    ] = None,
-    skyline_picture: Annotated[Path | None, typer.Option("--skyline-picture", help=PICTURE_HELP, hidden=True)] = None,
+    skyline: Annotated[Path | None, rarely("DEM", SKYLINE_HELP)] = None,
+    skyline_images: Annotated[list[str] | None, rarely("NAME=IMAGES", IMAGES_HELP, "--skyline-images")] = None,
+    skyline_sigma: Annotated[float | None, rarely("M", SIGMA_HELP, "--skyline-sigma", min=0)] = None,
+    skyline_picture: Annotated[Path | None, rarely("", PICTURE_HELP, "--skyline-picture")] = None,
     night: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME=IMAGES",
-            help="Of three cameras and more, in place of --stars: the night images of one of them, once for each.",
-            hidden=True,
+        rarely(
+            "NAME=IMAGES",
+            "Of three cameras and more, in place of --stars: the night images of one of them, once for each.",
         ),
     ] = None,
     tracks: Annotated[
         tuple[Path, Path] | None,
-        typer.Option(
-            metavar="TRACKS.csv SIGHTINGS.csv",
-            help="Where drones, ships or aircraft were (name,time,lat,lon,height,sigma), and what the cameras followed "
+        rarely(
+            "TRACKS.csv SIGHTINGS.csv",
+            "Where drones, ships or aircraft were (name,time,lat,lon,height,sigma), and what the cameras followed "
             "(name,camera,time,u,v): landmarks that move.",
-            hidden=True,
         ),
         TABLE,
     ] = None,
     tracks_clock: Annotated[
         float,
-        typer.Option(
-            metavar="S",
-            help="Of the cameras' clocks against that of --tracks; found within three of it.",
-            min=0,
-            hidden=True,
-        ),
+        rarely("S", "Of the cameras' clocks against that of --tracks; found within three of it.", min=0),
     ] = 2.0,
-    star_time: Annotated[str | None, typer.Option("--star-time", metavar="TIME", help=TIME_HELP, hidden=True)] = None,
+    star_time: Annotated[str | None, rarely("TIME", TIME_HELP, "--star-time")] = None,
     clock_sigma: Annotated[
         float,
-        typer.Option(
-            metavar="S",
-            help="Of the offset between the two cameras' clocks: 1 s is 2.3 % of a range of 5 km.",
-            min=0,
-            hidden=True,
-        ),
+        rarely("S", "Of the offset between the two cameras' clocks: 1 s is 2.3 % of a range of 5 km.", min=0),
     ] = 0.1,
     clock_drift: Annotated[
         float,
-        typer.Option(
-            metavar="S",
-            help="Of the rate at which it changes, seconds an hour; 0 where GPS or a network keeps the clocks.",
-            min=0,
-            hidden=True,
+        rarely(
+            "S", "Of the rate at which it changes, seconds an hour; 0 where GPS or a network keeps the clocks.", min=0
         ),
     ] = 0.05,
-    celsius: Annotated[
-        float | None, typer.Option(metavar="C", help="Temperature at night, for stars.", hidden=True)
-    ] = None,
-    hectopascal: Annotated[
-        float | None, typer.Option(metavar="HPA", help="Pressure there, for stars.", hidden=True)
-    ] = None,
-    dut1: Annotated[float | None, typer.Option(metavar="S", help="UT1 - UTC at night, if known.", hidden=True)] = None,
+    celsius: Annotated[float | None, rarely("C", "Temperature at night, for stars.")] = None,
+    hectopascal: Annotated[float | None, rarely("HPA", "Pressure there, for stars.")] = None,
+    dut1: Annotated[float | None, rarely("S", "UT1 - UTC at night, if known.")] = None,
     require: Annotated[
         str, typer.Option(metavar="RANGE:ERROR", help=f"{REQUIRE_HELP} Exit code 3 if it is not met.")
     ] = "",
@@ -200,28 +164,20 @@ def solve_command(
     pixel_sigma: PixelSigma = None,
     intrinsics: Annotated[
         Literal["prior", "fixed", "free"],
-        typer.Option(
-            help="Refine the cameras within what their calibrations know, hold them as if they were exact, or let them "
+        rarely(
+            "",
+            "Refine the cameras within what their calibrations know, hold them as if they were exact, or let them "
             "free.",
-            hidden=True,
         ),
     ] = "prior",
     refraction: Annotated[
         float,
-        typer.Option(
-            metavar="K", help="Refraction of light from landmarks beforehand; 0 for straight lines.", hidden=True
-        ),
+        rarely("K", "Refraction of light from landmarks beforehand; 0 for straight lines."),
     ] = 0.13,
-    refraction_sigma: Annotated[
-        float, typer.Option(metavar="K", help="Its standard deviation; 0 holds it.", min=0, hidden=True)
-    ] = 0.1,
-    keep_all: Annotated[bool, typer.Option("--keep-all", help="Leave nothing out; only warn.", hidden=True)] = False,
-    board_warp: Annotated[
-        bool, typer.Option("--board-warp", help="Also estimate how the board bends.", hidden=True)
-    ] = False,
-    picture: Annotated[
-        Path | None, typer.Option(help="A .png or .svg file: a plan, and residuals.", hidden=True)
-    ] = None,
+    refraction_sigma: Annotated[float, rarely("K", "Its standard deviation; 0 holds it.", min=0)] = 0.1,
+    keep_all: Annotated[bool, rarely("", "Leave nothing out; only warn.", "--keep-all")] = False,
+    board_warp: Annotated[bool, rarely("", "Also estimate how the board bends.", "--board-warp")] = False,
+    picture: Annotated[Path | None, rarely("", "A .png or .svg file: a plan, and residuals.")] = None,
 ) -> None:
     """Solve a rig: where the right camera stands from the left, and where both, or any number, stand on the Earth.
 
