@@ -145,14 +145,14 @@ def written_files() -> Iterator[list[Path]]:
 
 
 @contextmanager
-def open_atomic(path: str | Path) -> Iterator[BinaryIO]:
+def open_atomic(path: str | Path, *, told: bool = True) -> Iterator[BinaryIO]:
     """Open a file beside `path` for writing, and move it into place when the block ends.
 
     If the block fails or is interrupted, the new file is removed and an old one is untouched. What a killed process
     left of this file is removed by the next one that writes it.
 
     If `path` is a link, the file it points at is replaced. A file that exists keeps its permissions; a new one gets
-    those of the umask.
+    those of the umask. Unless it is `told`, nothing is said of it after an interruption (`written_files`): a cache.
 
     Raises:
         FileError: the folder is missing, or nothing can be written there.
@@ -188,7 +188,7 @@ def open_atomic(path: str | Path) -> Iterator[BinaryIO]:
                 temporary.unlink()
             else:
                 # In place, also where an interruption came right after that.
-                for paths in _watching:
+                for paths in _watching if told else ():
                     paths.append(path)
     except OSError as error:
         raise FileError(f"{path}: cannot write: {error.strerror or error}") from error
@@ -238,13 +238,18 @@ def _sweep(target: Path) -> None:
                 os.close(handle)
 
 
-def write_atomic(path: str | Path, data: str | bytes) -> Path:
+def write_atomic(path: str | Path, data: str | bytes, *, told: bool = True) -> Path:
     """Write `data` beside `path` and move it into place, so that a reader never sees half a file.
+
+    Args:
+        path: the file.
+        data: all that it contains.
+        told: see `open_atomic`.
 
     Raises:
         FileError: the folder is missing, or nothing can be written there; an old file is then untouched.
     """
-    with open_atomic(path) as file:
+    with open_atomic(path, told=told) as file:
         file.write(data.encode() if isinstance(data, str) else data)
     return Path(path)
 

@@ -232,7 +232,7 @@ def _doubts(rig: StereoRig | CameraRig, result: RigResult | None) -> list[Findin
                 part="lenses",
             )
         )
-    variance = result.variance if result is not None else _stored_variance(record)
+    variance = max(1.0 if result is None else result.variance, _largest_variance(record if result is None else result))
     if variance > _MOST_VARIANCE:
         found.append(
             Finding(
@@ -261,9 +261,9 @@ def _exact_lenses(rig: StereoRig | CameraRig, result: RigResult | None) -> tuple
     return tuple(name for (name, _), part in parts if not bool(part.any()))
 
 
-def _stored_variance(record: RigCalibration | CameraRigCalibration | None) -> float:
+def _largest_variance(solved: RigResult | RigCalibration | CameraRigCalibration | None) -> float:
     """Largest mean square of a source's residuals in their sigmas."""
-    sources = () if record is None else record.sources
+    sources = () if solved is None else solved.sources
     return max((source.sigmas**2 for source in sources if source.sigmas is not None), default=0.0)
 
 

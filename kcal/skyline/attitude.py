@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from kcal.calibrate.rig.adjustment import chi2_quantile
+from kcal.chance import variance_factor
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.mounting import Origin
@@ -206,8 +206,7 @@ def _checked_attitude(
 ) -> SkylineAttitude:  # fmt: skip
     """The attitude, unless something speaks against it."""
     heading, pitch, roll = attitude(torch.from_numpy(fit.rotation.T.copy()))
-    large = fit.freedom > 0 and fit.chi2 > float(chi2_quantile(torch.tensor(float(fit.freedom)), 0.999))
-    widened = math.sqrt(fit.chi2 / fit.freedom) if large else 1.0
+    widened = math.sqrt(variance_factor(fit.chi2, fit.freedom))
     turn = _angles_by_turn(fit.rotation)
     sigma = widened * np.sqrt(np.diag(turn @ fit.covariance @ turn.T))
     agreeing = float(fit.used.mean())

@@ -107,6 +107,6 @@ def _keep_table(path: Path, table: _Pairs) -> None:
     np.savez(data, pairs=pairs, angle=angle, stars=np.array(stars))
     try:
         make_folder(path.parent)
-        write_atomic(path, data.getvalue())
+        write_atomic(path, data.getvalue(), told=False)
     except FileError:
         return  # a home that cannot be written costs a second each time, no more

@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import torch
 
-from kcal.calibrate.rig.adjustment import chi2_quantile
 from kcal.calibrate.rig.drift import drift_of_turns
 from kcal.lens.rig import StereoRig
 from kcal.locate.relock import relocked
@@ -14,8 +13,6 @@ from kcal.watch.watched import Watched
 
 # Seconds of a history before a swing of the day is known, and looks at its end that were not used for the proof.
 _DAY, _HELD_OUT = 86400.0, 20
-# χ² of three angles that chance exceeds once in a thousand tries.
-_BEYOND_CHANCE = float(chi2_quantile(torch.tensor(3.0), 0.999))
 
 
 class Relock(NamedTuple):
@@ -42,7 +39,7 @@ def relock(watched: Watched) -> Relock:
     best = min((turn.covariance for turn in turns), key=lambda matrix: float(matrix.trace()))
     gust = torch.diag(watched.model.gust**2)
     drift = drift_of_turns(watched.rig, mean, best + apart.T @ apart / len(turns) + gust, watched.cam_from_local)
-    if drift.chi2 <= _BEYOND_CHANCE:
+    if not drift.significant:
         return Relock(None, "the attitude does not differ from the rig file's beyond its swing and chance")
     new, old = 0.0, 0.0
     for time in watched.times[-_HELD_OUT:]:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.adjustment import chi2_quantile
+from kcal.chance import chi2_quantile
 from kcal.lens.rig import StereoRig
 from kcal.watch.model import HEAT_SIGMA, LASTING_S, TurnModel
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from statistics import NormalDist
 
 import torch
 from torch import Tensor
@@ -13,12 +12,14 @@ from kcal.calibrate.rig.blocks import Block, BoardBlock, Effects, FeatureBlock, 
 from kcal.calibrate.rig.initial_poses import Start
 from kcal.calibrate.rig.landmark_block import LandmarkBlock
 from kcal.calibrate.rig.motion import BoardMotion, RigRows, SeenBoards, WithoutMotion, board_motion
+from kcal.calibrate.rig.own_fit import own_fits
 from kcal.calibrate.rig.problem import DistanceTerm, PlaceTerm, RigProblem, SharedTerm
 from kcal.calibrate.rig.skyline_term import SkylineTerm
 from kcal.calibrate.rig.sources import Features, Landmarks, RigData
 from kcal.calibrate.rig.star_block import StarBlock
 from kcal.calibrate.rig.unknowns import SharedUnknowns
 from kcal.calibrate.rig.unknowns import held as nothing
+from kcal.chance import beyond_chance, chi2_quantile
 from kcal.solve.lm import LMOptions, minimize
 from kcal.solve.result import Result
 from kcal.solve.robust import RobustLoss
@@ -29,17 +30,6 @@ _LEAST_SIGMA = 1e-3
 _WRONG = 9.0
 # How often each camera's motions are found, those of the others being known: the second time changes little.
 _TURNS = 2
-
-
-def chi2_quantile(dof: Tensor, probability: float) -> Tensor:
-    """Quantile of the χ² distribution by Wilson and Hilferty's cube (1931), good to a few percent from one degree on.
-
-    Example:
-        >>> round(float(chi2_quantile(torch.tensor(10.0), 0.999)), 1)  # 29.6 exactly
-        29.8
-    """
-    spread = 2.0 / (9.0 * dof.clamp_min(1))
-    return dof * (1.0 - spread + NormalDist().inv_cdf(probability) * spread.sqrt()) ** 3
 
 
 class Adjustment:
@@ -73,6 +63,8 @@ class Adjustment:
         self.terms += [] if data.skyline is None else [SkylineTerm(data.skyline)]
         # Of `terms`, those that are left out, by their indices.
         self.without: frozenset[int] = frozenset()
+        # By how much the sigmas of a kind's items are multiplied, because these fit themselves worse than stated.
+        self.widened: dict[Kind, float] = {}
         self.motion: list[BoardMotion | None] = [None] * len(data.cameras)
         direction, inverse_range = _feature_start(data, start, self.anchor)
         self.state = RigState(
@@ -108,15 +100,20 @@ class Adjustment:
             motion = [one and one.columns[masks.boards] for one in self.motion]
             found.append(BoardBlock(pixels, white, data.boards.points, shapes, by_unknown, motion))
         if data.landmarks and masks.landmarks.any():
-            surveyed = data.landmarks.points[masks.landmarks], data.landmarks.sigma[masks.landmarks]
-            marks = _weighted(data.landmarks, masks.landmarks)
+            times = self.widened.get("landmarks", 1.0)
+            surveyed = data.landmarks.points[masks.landmarks], times * data.landmarks.sigma[masks.landmarks]
+            marks = _weighted(data.landmarks, masks.landmarks, times)
             before = 0 if data.stars is None else len(data.stars.effects)
             effects = self._effects(slice(before, None), unknowns)
             shifts = data.landmarks.shifts()[:, masks.landmarks]
             found.append(LandmarkBlock(*marks, *surveyed, unknowns.by_refraction, effects, shifts))
         if data.features and masks.features.any():
-            known = data.features.inverse_range[masks.features], data.features.inverse_range_sigma[masks.features]
-            found.append(FeatureBlock(*_weighted(data.features, masks.features), *known, self.anchor))
+            times = self.widened.get("features", 1.0)
+            known = (
+                data.features.inverse_range[masks.features],
+                times * data.features.inverse_range_sigma[masks.features],
+            )
+            found.append(FeatureBlock(*_weighted(data.features, masks.features, times), *known, self.anchor))
         if data.stars and masks.stars.any():
             found.append(self._star_block(masks.stars, unknowns))
         return found
@@ -124,8 +121,9 @@ class Adjustment:
     def _star_block(self, mask: Tensor, unknowns: SharedUnknowns) -> StarBlock:
         stars = self.data.stars
         assert stars is not None
-        white = torch.eye(2, dtype=torch.float64) / stars.pixel_sigma[mask][..., None, None]
-        known = stars.direction[mask], stars.direction_sigma[mask]
+        times = self.widened.get("stars", 1.0)
+        white = torch.eye(2, dtype=torch.float64) / (times * stars.pixel_sigma[mask][..., None, None])
+        known = stars.direction[mask], times * stars.direction_sigma[mask]
         moves = stars.by_effects(), stars.factors()[:, mask], stars.shifts()[:, mask]
         effects = self._effects(slice(len(stars.effects)), unknowns)
         return StarBlock(stars.pixels[mask], white, *known, *moves, effects)
@@ -243,20 +241,38 @@ class Adjustment:
                 before[c] = rig.parts[c].rows
                 rig.put(c, WithoutMotion(found.columns, block.whitening[:, c])(before[c]))
 
-    def fit_corners(self, masks: PerKind, *, robust: bool = False) -> None:
+    def fit_widened(self, masks: PerKind) -> float:
+        """Multiply the sigmas of landmarks, features and stars by what each kind's fit to itself tells, never below 1.
+
+        Returns:
+            the largest relative change.
+        """
+        change = 0.0
+        for kind, fit in own_fits(self.problem(masks), self.part(masks)).items():
+            before = self.widened.get(kind, 1.0)
+            if before > 1.0 or beyond_chance(fit.chi2, fit.freedom):
+                after = max(1.0, before * math.sqrt(fit.chi2 / fit.freedom))
+                self.widened = {**self.widened, kind: after}
+                change = max(change, abs(after / before - 1.0))
+        return change
+
+    def fit_corners(self, masks: PerKind, *, robust: bool = False) -> float:
         """Set the corners' sigma from the boards' residuals, unless it was given.
 
         Args:
             masks: the items that take part.
             robust: by the median board, so that some wrong ones do not matter.
+
+        Returns:
+            its relative change.
         """
-        boards = self.data.boards
+        boards, before = self.data.boards, self.sigma_corner
         if boards is None or boards.sigma is not None or not bool(masks.boards.any()):
-            return
+            return 0.0
         squares, freedom = self.squares(masks).boards[masks.boards], self.freedom(masks).boards[masks.boards]
         dof = int(freedom.sum())
         if dof <= 0:
-            return
+            return 0.0
         if robust:
             ratio = typical_ratio(squares, freedom)
         else:
@@ -267,6 +283,7 @@ class Adjustment:
             ratio = float(squares.sum()) / max(dof - alone * free, 1)
         if 0 < ratio < math.inf:
             self.sigma_corner = max(self.sigma_corner * math.sqrt(ratio), _LEAST_SIGMA)
+        return abs(self.sigma_corner / before - 1.0)
 
 
 def _masks_of_fields(masks: PerKind) -> RigState:
@@ -275,15 +292,15 @@ def _masks_of_fields(masks: PerKind) -> RigState:
     return RigState(None, None, None, None, None, None, boards, boards, landmarks, features, features, stars)  # type: ignore[arg-type]
 
 
-def _weighted(source: Landmarks | Features, mask: Tensor) -> tuple[Tensor, Tensor]:
-    """Pixels and whitening of marks."""
+def _weighted(source: Landmarks | Features, mask: Tensor, times: float) -> tuple[Tensor, Tensor]:
+    """Pixels and whitening of marks, their sigmas multiplied."""
     if isinstance(source, Features) and source.covariance is not None:
         # Where a mark is missing, its covariance may be anything.
         known = source.covariance[mask].nan_to_num(1.0)
-        return source.pixels[mask], torch.linalg.inv(torch.linalg.cholesky_ex(known)[0])
+        return source.pixels[mask], torch.linalg.inv(torch.linalg.cholesky_ex(known)[0]) / times
     pixels, sigma = source.pixels[mask], source.pixel_sigma
     each = sigma[mask] if isinstance(sigma, Tensor) else torch.tensor(sigma, dtype=torch.float64)
-    return pixels, (torch.eye(2, dtype=torch.float64) / each[..., None, None]).expand(*pixels.shape, 2)
+    return pixels, (torch.eye(2, dtype=torch.float64) / (times * each[..., None, None])).expand(*pixels.shape, 2)
 
 
 def _of_all(masks: PerKind, problem: RigProblem, values: Sequence[Tensor]) -> PerKind:
@@ -299,7 +316,7 @@ def typical_ratio(squares: Tensor, freedom: Tensor) -> float:
     known = (freedom > 0) & torch.isfinite(squares)
     if int(known.sum()) < 4:
         return 1.0
-    return float((squares[known] / chi2_quantile(freedom[known].double(), 0.5)).median())
+    return float((squares[known] / chi2_quantile(freedom[known], 0.5)).median())
 
 
 def _star_start(data: RigData, start: Start) -> Tensor:

@@ -93,6 +93,11 @@ def rig_result(
         for c, many, px in zip(data.skyline.cameras, data.skyline.columns, data.skyline.rms_px, strict=True):
             squared[c], counts[c] = squared[c] + many * px**2, counts[c] + many
     rms, status = math.sqrt(float(squared.sum() / counts.sum())), SolverStatus(int(found.status))
+    warnings += [
+        f"the {kind} differ from each other by {times:.1f} times what their sigmas say: these were multiplied by it"
+        for kind, times in work.widened.items()
+        if times > 1.0
+    ]
     if fit.variance > 1.0:
         times = math.sqrt(fit.variance)
         warnings.append(f"residuals are {times:.1f} times as large as their sigmas say; the covariance was widened")

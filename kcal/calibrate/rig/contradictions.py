@@ -14,15 +14,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.adjustment import Adjustment, chi2_quantile
+from kcal.calibrate.rig.adjustment import Adjustment
 from kcal.calibrate.rig.blocks import RigState
+from kcal.calibrate.rig.own_fit import least
 from kcal.calibrate.rig.problem import RigProblem
-from kcal.gaussian import inverse_root
+from kcal.chance import variance_factor
 
 # Standard deviations of a normal variable as unlikely as what is found: a doubt, and beyond reasonable doubt.
 _DOUBT, CERTAIN = 3.5, 4.5
-# Eigenvalues of a scaled normal matrix below this share of the largest are rounding.
-_RANK_TOLERANCE = 1e-10
 
 
 class Contradiction(NamedTuple):
@@ -55,22 +54,6 @@ class _Part(NamedTuple):
     term: int | None
 
 
-class _Least(NamedTuple):
-    """The least χ² of some rows, how many unknowns they determine, and where it is.
-
-    Attributes:
-        chi2: the least.
-        rank: number of unknowns that are determined.
-        step: (S,) to the minimum.
-        root: (S, R) of the covariance there.
-    """
-
-    chi2: float
-    rank: int
-    step: Tensor
-    root: Tensor
-
-
 class _Test(NamedTuple):
     """One source against the others: χ² of their difference, its freedom, and how unlikely it is."""
 
@@ -96,7 +79,7 @@ def contradictions(work: Adjustment, problem: RigProblem, state: RigState) -> li
     if not found:
         return []
     suspects = [group for group in found if not _quarrel(parts, set(everything) - set(group), known)]
-    own = {group: sum(parts[i].rows for i in group) - _least(_sum(parts, group)).rank for group in found}
+    own = {group: sum(parts[i].rows for i in group) - least(_sum(parts, group)).rank for group in found}
     suspects = suspects or [max(found, key=lambda group: found[group].sigmas)]
     suspects.sort(key=lambda group: (own[group], len(group), -found[group].sigmas))
     named = suspects[0]
@@ -113,7 +96,7 @@ def contradictions(work: Adjustment, problem: RigProblem, state: RigState) -> li
 def still_determined(problem: RigProblem, state: RigState) -> list[bool]:
     """For each of the problem's terms whether the others determine as much without it."""
     whole = torch.stack([*problem.block_grams(state), *_term_grams(problem, state)]).sum(0)
-    return [_least(whole - gram).rank == _least(whole).rank for gram in _term_grams(problem, state)]
+    return [least(whole - gram).rank == least(whole).rank for gram in _term_grams(problem, state)]
 
 
 def _term_grams(problem: RigProblem, state: RigState) -> list[Tensor]:
@@ -138,27 +121,18 @@ def _sum(parts: list[_Part], chosen: tuple[int, ...] | set[int], known: _Part | 
     return torch.stack(grams).sum(0)
 
 
-def _least(gram: Tensor) -> _Least:
-    N, g = gram[:-1, :-1], gram[:-1, -1]
-    scale = torch.where(N.diagonal() > 0, N.diagonal(), 1.0).rsqrt()
-    root, _ = inverse_root(N * scale[:, None] * scale, scale, _RANK_TOLERANCE)
-    pull = g @ root
-    return _Least(float(gram[-1, -1] - pull.square().sum()), root.shape[1], -root @ pull, root)
-
-
 def _test(parts: list[_Part], group: tuple[int, ...], within: tuple[int, ...], known: _Part) -> _Test:
     """A group of parts against the rest of `within` and what is known beforehand."""
     rest = tuple(i for i in within if i not in group)
     own, others = _sum(parts, group), _sum(parts, rest, known)
-    alone, without, together = _least(own), _least(others), _least(own + others)
+    alone, without, together = least(own), least(others), least(own + others)
     freedom = alone.rank + without.rank - together.rank
     if freedom <= 0:
         return _Test(0.0, 0, 0.0)
     rows = sum(parts[i].rows for i in within) + known.rows
     inner, left = alone.chi2 + without.chi2, rows - alone.rank - without.rank
     # Where stated sigmas are too small throughout, a difference counts by what residuals really are.
-    large = left > 0 and inner > float(chi2_quantile(torch.tensor(float(left)), 0.999))
-    chi2 = max(together.chi2 - inner, 0.0) / (inner / left if large else 1.0)
+    chi2 = max(together.chi2 - inner, 0.0) / variance_factor(inner, left)
     if freedom == 1:
         return _Test(chi2, 1, math.sqrt(chi2))
     # Wilson and Hilferty (1931).
@@ -192,7 +166,7 @@ def _what_contradicts(
     apart = f"what they say of the cameras differs by {math.sqrt(test.chi2 / test.freedom):.1f} times what their"
     how = f"{apart} sigmas explain"
     if term is not None and len(group) == 1:
-        without = _least(_sum(parts, set(range(len(parts))) - set(group), known))
+        without = least(_sum(parts, set(range(len(parts))) - set(group), known))
         rows = problem.terms[term].rows(problem.posed(state), problem.shared_size)
         off = rows[-1] + without.step @ rows[:-1]
         how = problem.terms[term].against(off, (rows[:-1].T @ without.root).square().sum(1).sqrt())

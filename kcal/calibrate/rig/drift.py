@@ -12,7 +12,7 @@ import dataclasses
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.adjustment import Adjustment, chi2_quantile
+from kcal.calibrate.rig.adjustment import Adjustment
 from kcal.calibrate.rig.blocks import KINDS, PerKind
 from kcal.calibrate.rig.initial_poses import Start
 from kcal.calibrate.rig.outliers import LOSS, ROUGHLY, without_wrong
@@ -22,6 +22,7 @@ from kcal.calibrate.rig.sources import Features, Landmarks, RigData
 from kcal.calibrate.rig.turns import camera_turns
 from kcal.calibrate.rig.uncertainty import SharedCovariance, goodness_of_fit, relative_rows, turn_rows
 from kcal.calibrate.rig.unknowns import held
+from kcal.chance import beyond_chance
 from kcal.checks import as_points
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA
@@ -30,8 +31,6 @@ from kcal.lens.rig import StereoRig
 from kcal.solve.lm import LMOptions
 
 _NAMES = ("left", "right")
-# χ² of a turn, with three degrees of freedom, that chance exceeds once in a thousand checks.
-_BEYOND_CHANCE = float(chi2_quantile(torch.tensor(3.0), 0.999))
 _SOLVER = LMOptions(residual_floor=1e-8)
 
 
@@ -71,14 +70,14 @@ class Drift:
     @property
     def significant(self) -> bool:
         """Whether chance alone would show so large a relative turn in less than one of a thousand checks."""
-        return self.chi2 > _BEYOND_CHANCE
+        return beyond_chance(self.chi2, 3)
 
     @property
     def left_significant(self) -> bool:
         """The same of the left camera's turn; False where that cannot be told."""
         if self.left is None or self.left_covariance is None:
             return False
-        return float(self.left @ torch.linalg.solve(self.left_covariance, self.left)) > _BEYOND_CHANCE
+        return beyond_chance(float(self.left @ torch.linalg.solve(self.left_covariance, self.left)), 3)
 
     @property
     def left_out(self) -> tuple[ItemResidual, ...]:
@@ -236,6 +235,8 @@ def _against(
     work.solve(masks, ROUGHLY, LOSS)
     masks = without_wrong(work, masks, _SOLVER)
     problem, _ = work.solve(masks, _SOLVER)
+    if work.fit_widened(masks) > 0.0:
+        problem, _ = work.solve(masks, _SOLVER)
     state = work.part(masks)
     fit = goodness_of_fit(problem, state)
     known = SharedCovariance(problem, state, fit.variance)
@@ -263,7 +264,7 @@ def _against(
         pose_covariance=covariance,
         cam_from_local=state.rotation[0] if pose is not None else None,
         items=item_records(work, masks, reasons),
-        variance=fit.variance,
+        variance=max([fit.variance, *(times**2 for times in work.widened.values())]),
     )
 
 

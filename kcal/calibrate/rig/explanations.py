@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import torch
 
-from kcal.calibrate.rig.adjustment import Adjustment, chi2_quantile
+from kcal.calibrate.rig.adjustment import Adjustment
 from kcal.calibrate.rig.blocks import KINDS, Kind, PerKind, RigState
 from kcal.calibrate.rig.contradictions import still_determined
 from kcal.calibrate.rig.outliers import LOSS, MOST_WRONG, ROUGHLY, without_wrong
@@ -26,9 +26,9 @@ from kcal.solve.lm import LMOptions
 
 # Up to so many landmarks every explanation is tried, if there are not more of them than this.
 _FEW, _MOST_TRIED = 9, 64
-# χ² that good data stay below, and by how much less one explanation must have than another to be the likelier one
-# beyond reasonable doubt: a thousand to one.
-_GOOD, AS_GOOD = 0.999, 2.0 * math.log(1000.0)
+# By how much less χ² one explanation must have than another to be the likelier one beyond reasonable doubt: a thousand
+# to one.
+AS_GOOD = 2.0 * math.log(1000.0)
 TRIAL = LMOptions(max_iterations=40, tolerance=1e-7, residual_floor=1e-8)
 
 
@@ -227,7 +227,7 @@ def _solved(trial: Adjustment, masks: PerKind) -> float | None:
         trial.state = state
         problem, _ = trial.solve(masks, TRIAL)
         fit = goodness_of_fit(problem, trial.part(masks))
-        if fit.freedom > 0 and fit.chi2 <= float(chi2_quantile(torch.tensor(float(fit.freedom)), _GOOD)):
+        if fit.freedom > 0 and fit.variance == 1.0:
             return fit.chi2
     return None
 

@@ -11,10 +11,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.adjustment import Adjustment, chi2_quantile, typical_ratio
+from kcal.calibrate.rig.adjustment import Adjustment, typical_ratio
 from kcal.calibrate.rig.blocks import LOCAL_SIZE, BoardBlock, PerKind, RigState
 from kcal.calibrate.rig.problem import RigProblem
 from kcal.calibrate.rig.unknowns import held
+from kcal.chance import chi2_quantile
 from kcal.solve.lm import LMOptions, minimize
 
 # Probability that any good item at all is taken for a wrong one.
@@ -46,7 +47,7 @@ def over_limit(work: Adjustment, masks: PerKind, values: PerKind, probability: f
     found = [boards]
     for mask, value, square, dof in list(zip(masks, values, squares, freedom, strict=True))[1:]:
         scale = 1.0 if probability else max(1.0, typical_ratio(square, dof))
-        found.append(torch.where(mask, value / (scale * chi2_quantile(dof.double(), level)), 0.0))
+        found.append(torch.where(mask, value / (scale * chi2_quantile(dof, level)), 0.0))
     return PerKind(*found)
 
 
@@ -60,8 +61,8 @@ def _boards_over_limit(
     lens, between = (share**2 * dof / work.sigma_corner**2 for share in (_LENS, _BETWEEN))
     own = (dof - further).clamp_min(0)
     scales = (1.0, 1.0) if probability else (typical_ratio(alone, own), typical_ratio(square - alone, further))
-    first = max(1.0, scales[0]) * chi2_quantile(own.double(), level) + lens
-    second = max(1.0, scales[1]) * chi2_quantile(further.double(), level) + between
+    first = max(1.0, scales[0]) * chi2_quantile(own, level) + lens
+    second = max(1.0, scales[1]) * chi2_quantile(further, level) + between
     if int((dof > 0).sum()) < _FEW_BOARDS:
         first, second = (torch.maximum(limit, _WORSE_BOARD**2 * dof) for limit in (first, second))
     return torch.where(mask, torch.maximum(alone / first, (value - alone) / second), 0.0)

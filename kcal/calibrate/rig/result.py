@@ -37,7 +37,7 @@ class ItemResidual:
             camera did not see it.
         meters: of a landmark between survey and adjusted position, of a measured position between measured and solved,
             of a baseline its error; None for the others.
-        sigmas: root of χ² over its degrees of freedom; 1 is typical.
+        sigmas: root of χ² over its degrees of freedom, by the stated sigmas; 1 is typical.
         over_limit: by how much χ² falls without it, over the most that noise and lenses explain
             (`kcal.calibrate.rig.limits`): above 1, it contradicts the rest. 0 for baselines and positions.
         used: whether it is part of the solution.
@@ -69,7 +69,7 @@ class SourceResidual:
         left_out: how many are not.
         rms_px: sqrt(mean ‖r‖²) over its pixels; None where it has none.
         rms_m: root of the mean squared meters of the items that have them.
-        sigmas: root of χ² over the degrees of freedom; 1 where the stated sigmas are right.
+        sigmas: root of χ² over the degrees of freedom, by the stated sigmas; 1 where these are right.
     """
 
     source: Source
@@ -100,7 +100,8 @@ class RigResult:
         flipped: boards that had been read from the other end and were turned.
         rms: sqrt(mean ‖r‖²) over the pixels of all cameras.
         rms_px: likewise of each camera; NaN for a camera with none.
-        chi2: sum of squares of all residuals over their sigmas.
+        chi2: sum of squares of all residuals over their sigmas, as used: those of a source that fits itself worse than
+            stated were multiplied (`kcal.calibrate.rig.own_fit`).
         freedom: degrees of freedom.
         variance: by which covariances are multiplied, because residuals are larger than their sigmas say or because
             ranges are not linear in errors of the baseline (`kcal.calibrate.rig.weak_geometry`); 1 if neither.

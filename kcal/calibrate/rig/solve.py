@@ -140,11 +140,10 @@ def solve_rig(
     near = dataclasses.replace(options.solver, initial_damping=_NEAR_DAMPING)
     _, found = work.solve(masks, near)
     for _ in range(3):
-        before = work.sigma_corner
-        work.fit_corners(masks)
-        if work.sigma_corner != before:
+        change = max(work.fit_corners(masks), work.fit_widened(masks))
+        if change > 0.0:
             _, found = work.solve(masks, near)
-        if abs(work.sigma_corner / before - 1.0) < 1e-3:
+        if change < 1e-3:
             break
     progress("uncertainty")
     return rig_result(work, found, masks, reasons, initial, warnings, refuse=options.reject)

@@ -14,11 +14,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.adjustment import chi2_quantile, typical_ratio
+from kcal.calibrate.rig.adjustment import typical_ratio
 from kcal.calibrate.rig.limits import FALSE_ALARM
 from kcal.calibrate.rig.outliers import LOSS, MOST_WRONG, WRONG_AS_A_WHOLE
 from kcal.calibrate.rig.result import ItemResidual
 from kcal.calibrate.rig.sources import Features
+from kcal.chance import chi2_quantile, variance_factor
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector, step_rows, vector_from_rotation
@@ -93,8 +94,7 @@ def camera_turns(
         found = [view.turn(used, sigma) for view in views]
     chi2 = sum(float((turn.off[used].nan_to_num() / sigma).square().sum()) for turn in found)
     freedom = 2 * int((known & used).sum()) - 3 * len(cameras)
-    large = freedom > 0 and chi2 > float(chi2_quantile(torch.tensor(float(freedom)), 0.999))
-    variance = chi2 / freedom if large else 1.0
+    variance = variance_factor(chi2, freedom)
     items = []
     for i, feature in enumerate(features.names):
         off = {name: float(turn.off[i].norm()) for name, turn in zip(names, found, strict=True)}
@@ -164,4 +164,4 @@ def _typical(turn: CameraTurn) -> float:
 def _over_limit(turn: CameraTurn, known: Tensor) -> Tensor:
     """(F,) χ² of each mark over the largest that noise explains; what is typical of a camera counts as its noise."""
     level = 1.0 - FALSE_ALARM / int(known.sum())
-    return turn.squares / (max(1.0, _typical(turn)) * chi2_quantile(torch.tensor(2.0), level))
+    return turn.squares / (max(1.0, _typical(turn)) * chi2_quantile(2.0, level))

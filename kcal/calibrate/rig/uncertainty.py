@@ -9,9 +9,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.adjustment import chi2_quantile
 from kcal.calibrate.rig.blocks import RigState
 from kcal.calibrate.rig.problem import RigProblem
+from kcal.chance import variance_factor
 from kcal.gaussian import inverse_root
 
 # Eigenvalues of the scaled information below this share of the largest are rounding, not information.
@@ -43,8 +43,7 @@ def goodness_of_fit(problem: RigProblem, state: RigState) -> GoodnessOfFit:
     chi2 = 2.0 * float(problem.cost(state))
     counted = sum(int((block.counts - block.size).sum()) for block in problem.blocks)
     freedom = counted + problem.term_rows(state).shape[1] - problem.shared_size
-    large = freedom > 0 and chi2 > float(chi2_quantile(torch.tensor(float(freedom)), 0.999))
-    return GoodnessOfFit(chi2, freedom, chi2 / freedom if large else 1.0)
+    return GoodnessOfFit(chi2, freedom, variance_factor(chi2, freedom))
 
 
 class SharedCovariance:

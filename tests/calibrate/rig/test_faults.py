@@ -186,6 +186,9 @@ class TestContradictions:
     def test_a_position_and_all_positions(self) -> None:
         marks = {"landmarks": marked(), "baselines": baseline()}
         with pytest.raises(InputError, match=r"the position of left contradicts .* the camera stands 0\.\d+ ± 0\.0"):
+            solve_rig(data(**marks, positions=positions(tensor([0.15, 0.1, 0.05], [0.0, 0, 0]))), STRAIGHT)
+        # So far off that good landmarks would have to go.
+        with pytest.raises(InputError, match="the position of left contradicts the rest, which agrees otherwise"):
             solve_rig(data(**marks, positions=positions(tensor([0.3, 0.2, 0.1], [0.0, 0, 0]))), STRAIGHT)
         with pytest.raises(InputError, match="the measured positions contradict the landmarks and the baseline"):
             solve_rig(data(**marks, positions=positions(tensor([0.3, 0.2, 0.1], [0.3, 0.2, 0.1]))), STRAIGHT)

@@ -461,8 +461,8 @@ class TestCovariance:
         marks = landmarks(count=16, noise=0.1, error=0.02)
         honest = solve_rig(data(landmarks=marks))
         boast = solve_rig(data(landmarks=dataclasses.replace(marks, pixel_sigma=0.02, sigma=marks.sigma / 5)))
-        assert boast.variance > 10
-        assert any("times as large as their sigmas say" in text for text in boast.warnings)
+        assert next(one.sigmas for one in boast.sources if one.source == "landmarks") > 3
+        assert any("the landmarks differ from each other by" in text for text in boast.warnings)
         ratio = boast.relative_covariance().diagonal() / honest.relative_covariance().diagonal()
         assert bool(((ratio > 0.3) & (ratio < 3)).all())
 
@@ -547,7 +547,9 @@ class TestWrong:
         marks.points[4] += tensor(0.0, 0.0, 2.0)
         found = solve_rig(data(landmarks=marks), RigOptions(reject=False))
         assert found.left_out == ()
-        assert found.variance > 5
+        good = solve_rig(data(landmarks=landmarks(noise=0.1, error=0.02)))
+        ratio = found.relative_covariance().diagonal() / good.relative_covariance().diagonal()
+        assert bool((ratio > 5).all())
 
 
 class TestNotDetermined:
