@@ -235,8 +235,6 @@ def _against(
     work.solve(masks, ROUGHLY, LOSS)
     masks = without_wrong(work, masks, _SOLVER)
     problem, _ = work.solve(masks, _SOLVER)
-    if work.fit_widened(masks) > 0.0:
-        problem, _ = work.solve(masks, _SOLVER)
     state = work.part(masks)
     fit = goodness_of_fit(problem, state)
     known = SharedCovariance(problem, state, fit.variance)
@@ -264,7 +262,7 @@ def _against(
         pose_covariance=covariance,
         cam_from_local=state.rotation[0] if pose is not None else None,
         items=item_records(work, masks, reasons),
-        variance=max([fit.variance, *(times**2 for times in work.widened.values())]),
+        variance=fit.variance,
     )
 
 
