@@ -18,7 +18,9 @@ from pathlib import Path
 import orjson
 import pytest
 import torch
+from ports import deaf_port
 from track_scenes import seen_by, tracked_site
+from waiting import PATIENCE
 
 from kcal.errors import FileError, InputError
 from kcal.locate.positions import located_by
@@ -188,7 +190,7 @@ class _Slow:
         self.__dict__.update(tracker=tracker, release=release)
 
     def __call__(self, *args: object) -> object:
-        self.release.wait(10.0)
+        self.release.wait()
         return self.tracker(*args)
 
     def __getattr__(self, name: str) -> object:
@@ -273,7 +275,7 @@ def test_a_line_that_never_ends_is_malformed(tmp_path: Path, monkeypatch: pytest
 def test_events_over_the_network(whole: tuple[Path, dict[str, bytes]], tmp_path: Path, kind: str) -> None:
     with socket.socket(type=socket.SOCK_STREAM if kind == "tcp" else socket.SOCK_DGRAM) as receiver:
         receiver.bind(("127.0.0.1", 0))
-        receiver.settimeout(5.0)
+        receiver.settimeout(PATIENCE)
         if kind == "tcp":
             receiver.listen()
         port = receiver.getsockname()[1]
@@ -291,11 +293,9 @@ def test_events_over_the_network(whole: tuple[Path, dict[str, bytes]], tmp_path:
 
 
 def test_a_receiver_that_is_not_there_is_counted(whole: tuple[Path, dict[str, bytes]], tmp_path: Path) -> None:
-    with socket.socket() as unused:
-        unused.bind(("127.0.0.1", 0))
-        port = unused.getsockname()[1]
-    stream = new_stream(tmp_path, senders=[CotSender(f"tcp://127.0.0.1:{port}")])
-    counts = stream.follow(lines_of(whole[0], read), waits=True, resumes=True)
+    with deaf_port() as port:
+        stream = new_stream(tmp_path, senders=[CotSender(f"tcp://127.0.0.1:{port}")])
+        counts = stream.follow(lines_of(whole[0], read), waits=True, resumes=True)
     assert counts.unsent == 37
     assert contents(tmp_path) == whole[1]
 
