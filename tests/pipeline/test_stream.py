@@ -10,10 +10,12 @@ import os
 import random
 import signal
 import socket
+import sys
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import FrameType
+from typing import Any
 
 import orjson
 import pytest
@@ -108,33 +110,41 @@ def test_a_second_run_adds_nothing_and_new_lines_are_continued(
     assert contents(tmp_path) == whole[1]
 
 
+def kill_after(lines: int) -> None:
+    """Kill this process after so many lines of the stream and of its journal."""
+    left = lines
+
+    def count(frame: FrameType, event: str, argument: object) -> Any:
+        nonlocal left
+        if Path(frame.f_code.co_filename).name not in ("stream.py", "stream_journal.py"):
+            return None
+        left -= event == "line"
+        if not left:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return count
+
+    sys.settrace(count)
+
+
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="kills a process")
 def test_killed_at_any_time_the_outputs_are_the_same(
     whole: tuple[Path, dict[str, bytes]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """At any line of what writes: six times early, so that there is always more to do, and then not any more."""
     monkeypatch.setattr("kcal.pipeline.stream._CHECKPOINT", 9)
     chance = random.Random(1)
-    kills, size = 0, sum(map(len, whole[1].values()))
-    for attempt in range(7):
+    for lines in [*(chance.randrange(50, 800) for _ in range(6)), 0]:
         child = os.fork()
         if child == 0:
             try:
+                if lines:
+                    kill_after(lines)
                 new_stream(tmp_path).follow(lines_of(whole[0], read), waits=True, resumes=True)
                 os._exit(0)
             except BaseException:
                 os._exit(3)
-        if attempt < 6:
-            # Somewhere in its sixth of the work, as fast as this machine does it.
-            until, end = size * (attempt + chance.random()) / 6.0, time.monotonic() + 60.0
-            while time.monotonic() < end and sum(map(len, contents(tmp_path).values())) < until:
-                time.sleep(0.001)
-            os.kill(child, signal.SIGKILL)
-        status = os.waitpid(child, 0)[1]
-        if os.WIFEXITED(status):
-            assert os.WEXITSTATUS(status) == 0
-            break
-        kills += 1
-    assert kills >= 2
+        ended = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        assert ended == (-signal.SIGKILL if lines else 0)
     assert contents(tmp_path) == whole[1]
 
 
