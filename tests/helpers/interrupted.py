@@ -16,11 +16,13 @@ import runpy
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import rich.progress
+from waiting import wait_for
 
 
 def interrupt_at(moment: str) -> None:
@@ -35,6 +37,9 @@ def interrupt_at(moment: str) -> None:
         left[0] -= 1
         if left[0] == 0:
             os.killpg(0, sent)
+            # The main thread hears it, at some time; until then another one goes no further.
+            if threading.current_thread() is not threading.main_thread():
+                wait_for(_awaited)
 
     def struck(call: Callable[..., Any], *, after: bool = False) -> Callable[..., Any]:
         def run(*arguments: Any, **options: Any) -> Any:
@@ -60,6 +65,16 @@ def interrupt_at(moment: str) -> None:
         rich.progress.Progress.update = struck(rich.progress.Progress.update)  # type: ignore[method-assign]
     else:
         os.replace = struck(os.replace, after=kind != "write")
+
+
+def _awaited() -> bool:
+    """Whether the main thread waits for this one to end."""
+    frame = sys._current_frames()[threading.main_thread().ident or 0]
+    while frame is not None:
+        if frame.f_code is threading.Thread.join.__code__ and frame.f_locals["self"] is threading.current_thread():
+            return True
+        frame = frame.f_back
+    return False
 
 
 def interrupt(folder: Path, moment: str, line: str) -> str:
