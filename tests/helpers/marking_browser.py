@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import os
 import re
-import select
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -28,16 +26,9 @@ class Server:
 
     def _address(self) -> str:
         assert self.process.stdout is not None
-        until = time.monotonic() + PATIENCE
-        while time.monotonic() < until:
-            ready, _, _ = select.select([self.process.stdout], [], [], 1)
-            if ready:
-                line = self.process.stdout.readline()
-                found = re.search(r"http://127\.0\.0\.1:\d+/#\S+", line)
-                if found:
-                    return found.group()
-            if self.process.poll() is not None:
-                break
+        for line in self.process.stdout:
+            if found := re.search(r"http://127\.0\.0\.1:\d+/#\S+", line):
+                return found.group()
         self.errors.seek(0)
         raise AssertionError(f"the server did not start: {self.errors.read()[-2000:]}")
 
