@@ -6,11 +6,22 @@ import os
 from pathlib import Path
 
 import hypothesis
+import numpy as np
 import pytest
+import torch
 
 # The same examples each time: a failure belongs to the change that is tested. Time is not what is tested.
-hypothesis.settings.register_profile("kcal", derandomize=True, deadline=None, print_blob=True)
+hypothesis.settings.register_profile(
+    "kcal", derandomize=True, deadline=None, print_blob=True, suppress_health_check=[hypothesis.HealthCheck.too_slow]
+)
 hypothesis.settings.load_profile("kcal")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup() -> None:
+    """What is drawn without a generator of its own does not depend on the tests that ran before in this process."""
+    np.random.seed(0)  # noqa: NPY002
+    torch.manual_seed(0)
 
 
 @pytest.fixture(scope="session")

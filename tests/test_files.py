@@ -124,13 +124,13 @@ class TestWriteAtomic:
 
 
 KILLED = """
-import sys, time
+import sys
 from kcal.files import open_atomic
 with open_atomic(sys.argv[1]) as one, open_atomic(sys.argv[2]) as other:
     one.write(b"half")
     one.flush()
     print("ready", flush=True)
-    time.sleep(60)
+    sys.stdin.read()
 """
 
 
@@ -141,7 +141,8 @@ class TestParts:
     @staticmethod
     def _start(folder: Path) -> subprocess.Popen[bytes]:
         child = subprocess.Popen(
-            [sys.executable, "-c", KILLED, str(folder / "a.csv"), str(folder / "b.csv")], stdout=subprocess.PIPE,
+            [sys.executable, "-c", KILLED, str(folder / "a.csv"), str(folder / "b.csv")], stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
             env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
         )  # fmt: skip
         assert child.stdout is not None

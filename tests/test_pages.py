@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from browser import chromium_page, needs_browser, violations
+from browser import at_rest, chromium_page, needs_browser, violations
 
 pytest.importorskip("uvicorn", reason="the extra `mark` is not installed")
 from pages import PAGES, build_site
@@ -23,7 +23,7 @@ def faults(page: Any, name: str) -> list[str]:
     found = []
     for width, height in SIZES:
         page.set_viewport_size({"width": width, "height": height})
-        page.wait_for_timeout(300)
+        at_rest(page)
         if SHOTS:
             page.screenshot(path=f"{SHOTS}/{name}-{width}.png")
         found += [f"{name} at {width} px: {text}" for text in violations(page)]
@@ -36,7 +36,7 @@ def faults(page: Any, name: str) -> list[str]:
 def test_axe_finds_nothing(name: str, tmp_path: Path) -> None:
     with PAGES[name](tmp_path) as (address, ready), chromium_page() as page:
         page.goto(address)
-        page.wait_for_function(ready, timeout=60_000)
+        page.wait_for_function(ready)
         found = faults(page, name)
     assert not found, "\n".join(found)
 
@@ -82,5 +82,5 @@ def test_the_tutorial_is_found_and_read(site: Path, width: int) -> None:
             page.locator("label.md-header__button[for=__search]").click()
         page.locator(".md-search__input").click()
         page.keyboard.type("baseline")
-        page.locator(".md-search-result__link").first.wait_for(timeout=60_000)
+        page.locator(".md-search-result__link").first.wait_for()
         assert page.complaints == []

@@ -17,6 +17,7 @@ import pytest
 import torch
 from browser import chromium_page, needs_browser
 from track_scenes import ORIGIN, seen_by, tracked_site
+from waiting import PATIENCE
 
 pytest.importorskip("uvicorn", reason="the extra `mark` is not installed")
 from marking_browser import click_at, on_screen, settled
@@ -33,8 +34,9 @@ def zoom_and_click(page: Any, side: str, place: Any) -> None:
     """Zoom in on a pixel with the mouse's wheel, and click it."""
     for _ in range(8):
         page.mouse.move(*on_screen(page, side, *place))
+        before = page.evaluate("side => kcal.views[side].scale", side)
         page.mouse.wheel(0, -240)
-        page.wait_for_timeout(30)
+        page.wait_for_function("([side, before]) => kcal.views[side].scale > before", arg=[side, before])
     click_at(page, side, *place)
 
 
@@ -55,16 +57,16 @@ def test_a_site_is_marked_by_clicks(tmp_path: Path) -> None:
             page.get_by_role("cell", name=name, exact=False).first.click()
             for side, place in zip(("left", "right"), site.pixels[name], strict=True):
                 zoom_and_click(page, side, place)
-                page.wait_for_function("side => kcal.item() && kcal.item()[side]", arg=side, timeout=60_000)
+                page.wait_for_function("side => kcal.item() && kcal.item()[side]", arg=side)
                 page.get_by_role("button", name="Fit").click()
         page.get_by_role("button", name="New target").click()
-        page.wait_for_function("() => (kcal.selected || '').startsWith('target ')", timeout=60_000)
+        page.wait_for_function("() => (kcal.selected || '').startsWith('target ')")
         page.get_by_label("Name").fill("gate")
         page.get_by_role("button", name="Rename").click()
-        page.wait_for_function("() => kcal.selected === 'gate'", timeout=60_000)
+        page.wait_for_function("() => kcal.selected === 'gate'")
         for side, place in zip(("left", "right"), site.pixels["gate"], strict=True):
             zoom_and_click(page, side, place)
-            page.wait_for_function("side => kcal.item()[side]", arg=side, timeout=60_000)
+            page.wait_for_function("side => kcal.item()[side]", arg=side)
             page.get_by_role("button", name="Fit").click()
         settled(page)
         assert page.complaints == []
@@ -76,7 +78,7 @@ def test_a_site_is_marked_by_clicks(tmp_path: Path) -> None:
                 clicked = [float(row[f"{side}_{axis}"]) for axis in ("u", "v")]
                 assert clicked == pytest.approx(place, abs=0.6), (name, side)
         page.get_by_role("button", name="Undo").click()
-        page.wait_for_function("() => !kcal.item().right", timeout=60_000)
+        page.wait_for_function("() => !kcal.item().right")
         assert rows_of(tmp_path / "marks.points.csv") == {}
         # The page knows all of it when it is opened again.
         page.reload()
@@ -116,7 +118,8 @@ def test_targets_are_watched_until_the_stream_ends(tmp_path: Path) -> None:
             address = re.search(r"http://127\.0\.0\.1:\d+/#\S+", line)
         with chromium_page(1280, 800) as page:
             page.goto(address.group())
-            page.wait_for_function("() => document.getElementById('status').textContent === 'running'", timeout=60_000)
+            page.wait_for_function("() => document.getElementById('status').textContent === 'running'")
+            page.wait_for_function("() => document.querySelectorAll('.leaflet-tooltip').length === 2")
             assert page.locator(".leaflet-tooltip").all_inner_texts() == ["left camera", "right camera"]
             for frame in range(20):
                 left, right = seen_by(site.rig, start + frame / 10.0 * velocity, 0.2, generator)
@@ -124,15 +127,15 @@ def test_targets_are_watched_until_the_stream_ends(tmp_path: Path) -> None:
                 print(json.dumps(moment), file=process.stdin, flush=True)
                 if frame == 9:
                     # They are there while more are to come.
-                    page.wait_for_function("() => document.documentElement.dataset.sequence === '10'", timeout=60_000)
+                    page.wait_for_function("() => document.documentElement.dataset.sequence === '10'")
                     assert page.inner_text("#count") == "2 tracks, moment 10"
                     assert page.inner_text("#status") == "running"
                     shown = page.locator(".leaflet-tooltip").all_inner_texts()
             process.stdin.close()
-            page.wait_for_function("() => document.getElementById('status').textContent === 'finished'", timeout=60_000)
+            page.wait_for_function("() => document.getElementById('status').textContent === 'finished'")
             assert page.inner_text("#count") == "2 tracks, moment 20"
             assert page.complaints == []
-        assert process.wait(timeout=60) == 0
+        assert process.wait(timeout=PATIENCE) == 0
     assert [text.split(",")[0] for text in shown] == ["left camera", "right camera", "track 1", "track 2"]
     with (tmp_path / "tracks.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))

@@ -90,9 +90,9 @@ def capture_command(
             lambda token, hosts: capture_app(session, stop, token, hosts), port, fallback=port == _PORT
         )
         show_page(server.address, "capture page", browser=browser)
-    for thread in threads:
-        thread.start()
     try:
+        for thread in threads:
+            thread.start()
         if server is None:
             _tell(session, over)
         else:
@@ -101,7 +101,9 @@ def capture_command(
     finally:
         stop.set()
         for thread in threads:
-            thread.join()
+            # An interruption may come before all have started.
+            if thread.ident is not None:
+                thread.join()
     if failed:
         raise failed[0]
     # What came last has not been thought about yet.

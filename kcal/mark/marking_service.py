@@ -125,13 +125,17 @@ class Desk:
 
     def state(self) -> Json:
         """Things, marks, residuals, positions, and what the landmarks promise."""
+        # The thread sets `_solved` last, so it is read first, and a change counts last, so its number is read last:
+        # what is told not to be pending is solved with all marks that are told.
+        solved = self._solved
         state, live = self.session.state, self._live
+        version = self.session.version
         undo, redo = self.session.undoable
         residuals = {item.name: item for item in live.items}
         positions = {} if self._located is None else {p.name: p for p in self._located.positions}
         return {
-            "version": self.session.version,
-            "pending": self._solved < self.session.version,
+            "version": version,
+            "pending": solved < version,
             "trouble": self.session.trouble,
             "undo": undo,
             "redo": redo,

@@ -124,14 +124,16 @@ class Session:
         ]
         if state.survey:
             files.append((self.files.landmarks, places_text(SurveyedPlaces(self.columns, state.survey))))
-        self.trouble = ""
+        trouble = ""
         for path, text in files:
             try:
                 _write_if_new(path, text)
             except FileError as error:
                 cause = error.__cause__
                 why = f"{path}: cannot write: {reason(cause)}" if isinstance(cause, OSError) else str(error)
-                self.trouble = f"{why}. Nothing is lost: all marks are in {self.files.log}"
+                trouble = f"{why}. Nothing is lost: all marks are in {self.files.log}"
+        # Once: it is read meanwhile.
+        self.trouble = trouble
 
     def _take_over_places(self, places: SurveyedPlaces) -> tuple[str, str, str]:
         """Log the places that are new or have changed, and return the columns of coordinates."""

@@ -11,6 +11,7 @@ import datetime
 import re
 import socket
 import time
+from collections import deque
 from collections.abc import Callable
 from typing import Any, Protocol
 from urllib.parse import urlsplit
@@ -22,8 +23,9 @@ from kcal.locate.geojson import point_features
 from kcal.locate.positions import Located
 
 _EVENT = re.compile(r" <event.*?</event>\n", re.DOTALL)
-# Seconds: a receiver that does not answer must not stop the stream, and is tried again after a while.
-_PATIENCE, _AGAIN = 1.0, 5.0
+# Seconds: a receiver that does not answer must not stop the stream, and is tried again after a while; a broker has some
+# at the end for what it has not acknowledged.
+_PATIENCE, _AGAIN, _FAREWELL = 1.0, 5.0, 5.0
 
 
 class Sender(Protocol):
@@ -118,21 +120,38 @@ class MqttSender:
         except OSError as error:
             raise InputError(f"{_without_password(address)}: the broker does not answer ({error})") from error
         self._client.loop_start()
+        # The messages of each moment, from the first that the broker has not acknowledged.
+        self._sent: deque[list[Any]] = deque()
         self.failed = 0
 
     _client: Any
 
     def send(self, columns: PositionColumns, run: Located, moment: datetime.datetime) -> None:
         """Publish a feature for each position, at least once."""
-        lost = False
-        for name, feature in zip(columns.names, point_features(columns), strict=True):
-            lost |= self._client.publish(f"{self._topic}/{name.replace(' ', '-')}", feature, qos=1).rc != 0
-        self.failed += lost
+        messages = [
+            self._client.publish(f"{self._topic}/{name.replace(' ', '-')}", feature, qos=1)
+            for name, feature in zip(columns.names, point_features(columns), strict=True)
+        ]
+        if any(message.rc != 0 for message in messages):
+            self.failed += 1
+        else:
+            self._sent.append(messages)
+        self._forget_arrived()
 
     def close(self) -> None:
-        """Send what is waiting, and disconnect."""
+        """Wait until the broker has what was sent, for some seconds, and disconnect; count what it does not have."""
+        until = time.monotonic() + _FAREWELL
+        while self._sent and time.monotonic() < until:
+            time.sleep(0.01)
+            self._forget_arrived()
+        self.failed += len(self._sent)
+        self._sent.clear()
         self._client.disconnect()
         self._client.loop_stop()
+
+    def _forget_arrived(self) -> None:
+        while self._sent and all(message.is_published() for message in self._sent[0]):
+            self._sent.popleft()
 
 
 def _network_address(address: str, schemes: tuple[str, str]) -> tuple[bool, tuple[str, int]]:

@@ -166,6 +166,7 @@ class Stream:
             self.ledger.close()
             for sender in self.senders:
                 sender.close()
+            self.counts.unsent = sum(sender.failed for sender in self.senders)
             # The interpreter must not end while the reader computes; one that waits for input may be left alone.
             close = getattr(source, "close", None)
             if close is not None:

@@ -6,10 +6,10 @@
     python -m scripts.fuzz --list
 
 Invariants of a reader: a file is refused by one of kcal's errors that names it, or what was read has finite numbers, a
-status for each that is not, and is the same after saving and loading; within 10 s and 2 GiB. Of a server: no status of
-500, JSON with finite numbers, nothing without the token, and a log that gives the same state again. Of a command: no
-traceback and no number that is not finite. `--keep FOLDER` leaves the smallest case of each finding there; a case that
-was mended goes into tests/fuzz/corpus/HARNESS.
+status for each that is not, and is the same after saving and loading; within 10 s of computing and 2 GiB. Of a server:
+no status of 500, JSON with finite numbers, nothing without the token, and a log that gives the same state again. Of a
+command: no traceback and no number that is not finite. `--keep FOLDER` leaves the smallest case of each finding there;
+a case that was mended goes into tests/fuzz/corpus/HARNESS.
 """
 
 from __future__ import annotations

@@ -11,7 +11,6 @@ import json
 import math
 import random
 import shutil
-import signal
 import sys
 import tempfile
 import traceback
@@ -39,15 +38,11 @@ from kcal.lens.camera import Camera
 from kcal.lens.mounting import Mounting, Origin
 from kcal.lens.rig import StereoRig
 from scripts.fuzz.damage import damage_bytes, damage_json, damage_table
-from scripts.fuzz.hunt import Prepared
+from scripts.fuzz.hunt import Overtime, Prepared, within
 from scripts.shared.small_photographs import photographs
 
 _SECONDS = 30.0  # for one command
 BOARD = Board(columns=6, rows=5, square=0.02)
-
-
-class Hang(Exception):  # noqa: N818
-    """A case took longer than its limit."""
 
 
 class Finding(NamedTuple):
@@ -123,20 +118,6 @@ COMMANDS: dict[str, list[str | Callable[[Path], object]]] = {
 }
 
 
-@contextlib.contextmanager
-def _limit(seconds: float) -> Iterator[None]:
-    def ring(*_: object) -> None:
-        raise Hang(f"longer than {seconds:g} s")
-
-    before = signal.signal(signal.SIGALRM, ring)
-    signal.setitimer(signal.ITIMER_REAL, seconds)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
-
-
 def _run(command: str | Callable[[Path], object], path: Path) -> bool:
     """Whether the file was accepted."""
     if not isinstance(command, str):
@@ -197,9 +178,9 @@ def run_case(case: int, whole: dict[str, bytes], seconds: float, *, one: bool = 
             try:
                 with warnings.catch_warnings(), contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
                     warnings.simplefilter("ignore")
-                    with _limit(seconds):
+                    with within(seconds):
                         accepted = _run(command, path)
-            except Hang as hang:
+            except Overtime as hang:
                 found.append(Finding(case, "hang", shown, done, str(hang)))
                 continue
             except BaseException:

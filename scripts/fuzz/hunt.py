@@ -26,9 +26,11 @@ import hypothesis
 import torch
 from hypothesis.strategies import SearchStrategy
 
-# What one case may take: seconds, and bytes beyond what the process has when it begins.
+# What one case may take: seconds that its process computes, and bytes beyond what the process has when it begins.
 SECONDS, MEMORY = 10, 2 * 2**30
-_STUCK = 90  # seconds after which a child that does not hear its alarm is ended
+# By the clock so many times as long, for what waits: that a machine is loaded is no finding.
+_BY_CLOCK = 10
+_STUCK = 900  # seconds after which a child that does not hear its alarm is ended
 _EXAMPLES = 200  # of one seed of Hypothesis, which thinks about earlier ones
 _RESTARTS = 8
 
@@ -58,6 +60,20 @@ class Finding(NamedTuple):
 
 class Overtime(BaseException):
     """A case took longer than its limit. No `Exception`: readers catch those."""
+
+
+@contextlib.contextmanager
+def within(seconds: float) -> Iterator[None]:
+    """Raise `Overtime` when this process has computed for so many seconds, or waited for many times as many."""
+    limits = ((signal.SIGPROF, signal.ITIMER_PROF, seconds), (signal.SIGALRM, signal.ITIMER_REAL, _BY_CLOCK * seconds))
+    before = [(signal.signal(alarm, _overtime), signal.setitimer(timer, most)) for alarm, timer, most in limits]
+    try:
+        yield
+    finally:
+        for (alarm, timer, _), (handler, outer) in zip(limits, before, strict=True):
+            signal.setitimer(timer, 0)
+            signal.signal(alarm, handler)
+            signal.setitimer(timer, *outer)
 
 
 def hunt(
@@ -97,13 +113,14 @@ def replay(harness: Harness, folder: Path, cases: list[bytes]) -> list[Finding]:
 def _search(
     harness: Harness, folder: Path, seed: int, seconds: float, known: set[str], most: int | None, write: Write
 ) -> int:
-    until, count = time.monotonic() + seconds, 0
     now, prepared = folder / "now", harness(folder)
+    # One case at least, however long it took to make the files.
+    until, count = time.monotonic() + seconds, 0
     smallest: dict[str, Finding] = {}
 
     def body(case: bytes) -> None:
         nonlocal count
-        if time.monotonic() > until:
+        if count and time.monotonic() > until:
             return
         now.write_bytes(case)
         count += 1
@@ -119,7 +136,7 @@ def _search(
         phases=[hypothesis.Phase.generate, hypothesis.Phase.shrink],
     )  # fmt: skip
     for batch in itertools.count():
-        if time.monotonic() > until or (most and len(known) >= most):
+        if (count and time.monotonic() > until) or (most and len(known) >= most):
             break
         run = hypothesis.seed(seed * 100_003 + batch)(quiet(hypothesis.given(prepared.cases)(body)))
         # Beside the finding: that it came only once, when the time ended while it was made smaller.
@@ -133,10 +150,10 @@ def _search(
 
 def _outcome(prepared: Prepared, case: bytes) -> tuple[str, str]:
     """What a case breaks, as a key that is the same for the same fault, and with all that is known; or nothing."""
-    begin = time.monotonic()
-    signal.setitimer(signal.ITIMER_REAL, prepared.seconds)
+    begin, computed = time.monotonic(), time.process_time()
     try:
-        prepared.check(case)
+        with within(prepared.seconds):
+            prepared.check(case)
     except BaseException as error:
         frames = traceback.extract_tb(error.__traceback__)
         inside = [frame for frame in frames if f"{os.sep}kcal{os.sep}" in frame.filename] or frames
@@ -144,9 +161,7 @@ def _outcome(prepared: Prepared, case: bytes) -> tuple[str, str]:
         at = "" if isinstance(error, AssertionError) else f"{Path(inside[-1].filename).name}:{inside[-1].lineno}"
         whole = "".join(traceback.format_exception(error, limit=-4))[-2500:]
         return f"{type(error).__name__} {at} {text}", whole
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-    taken = time.monotonic() - begin
+    taken = max(time.process_time() - computed, (time.monotonic() - begin) / _BY_CLOCK)
     # What caught the alarm, or ran in a library until its end.
     return ("too long", f"took {taken:.0f} s") if taken > prepared.seconds else ("", "")
 
@@ -178,7 +193,6 @@ def _be_child(work: Callable[[Write], int], folder: Path, out: Path) -> None:
         warnings.simplefilter("ignore")
         for stream in (1, 2):
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
-        signal.signal(signal.SIGALRM, _overtime)
         limit_memory()
         # Threads of the parent are not here, and what waits for them waits for ever.
         torch.set_num_threads(1)
@@ -200,7 +214,7 @@ def _be_child(work: Callable[[Write], int], folder: Path, out: Path) -> None:
 
 def _waited(child: int, now: Path, seconds: float) -> str:
     """How the child ended, "" if by itself; one that hangs inside a library is ended."""
-    until = time.monotonic() + seconds + 60
+    until = time.monotonic() + seconds + _STUCK
     while True:
         done, status = os.waitpid(child, os.WNOHANG)
         if done:

@@ -39,6 +39,8 @@ from scripts.fuzz.damage import ODD_NUMBERS, ODD_TEXTS, damage_bytes, damaged
 from scripts.fuzz.hunt import Prepared
 from scripts.fuzz.readers import ACTIONS, BOARD, placed_rig
 
+# Seconds for an answer; less than what the clock allows a case, so that the message says who was silent.
+_PATIENCE = 60.0
 _TOKEN, _HOST = "secret-of-this-start", "127.0.0.1:8347"
 _MARK = {"u": 20.5, "v": 20.0, "cov": [0.01, 0.0, 0.01], "frame": ""}
 _GETS: list[tuple[str, dict[str, Any]]] = [
@@ -250,7 +252,7 @@ def live_map(folder: Path) -> Prepared:
         found = b""
         with (
             contextlib.suppress(ConnectionError),  # a request that is too large is cut off
-            socket.create_connection((parts.hostname or "", parts.port or 0), timeout=5) as connection,
+            socket.create_connection((parts.hostname or "", parts.port or 0), timeout=_PATIENCE) as connection,
         ):
             connection.sendall(data)
             if ends:  # a request that is not whole is waited for; one of events is told until then

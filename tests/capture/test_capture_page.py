@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 from browser import chromium_page, needs_browser
 from capture_frames import BOARD, images
-from marking_browser import Server, free_port
+from marking_browser import Server
+from waiting import PATIENCE
 
 from kcal.corners.observations import Observations
 from kcal.io.images import write_png
@@ -24,16 +25,15 @@ def test_frames_are_shown_and_the_page_ends_it(tmp_path: Path) -> None:
         write_png(folder / f"{i}.png", image)
     output = tmp_path / "x.obs.json"
     board = f"{BOARD.columns}x{BOARD.rows}"
-    port = free_port()
     server = Server(
-        [str(folder), "--board", board, "--square", "20mm", "-o", str(output)], port, tmp_path, program="capture"
+        [str(folder), "--board", board, "--square", "20mm", "-o", str(output)], 0, tmp_path, program="capture"
     )
     with chromium_page() as page:
         page.goto(server.address)
-        page.wait_for_function("() => document.documentElement.dataset.views === '2'", timeout=60_000)
+        page.wait_for_function("() => document.documentElement.dataset.views === '2'")
         # The first proposal comes from a thread of its own.
         words = "document.getElementById('words').innerText"
-        page.wait_for_function(f"() => {words}.includes('Match the orange outline')", timeout=60_000)
+        page.wait_for_function(f"() => {words}.includes('Match the orange outline')")
         assert page.evaluate("document.querySelectorAll('#where polygon').length") == 3
         # The frame is on the canvas: it is not of one color.
         colors = page.evaluate(
@@ -43,7 +43,7 @@ def test_frames_are_shown_and_the_page_ends_it(tmp_path: Path) -> None:
         assert colors > 20
         page.screenshot(path=str(tmp_path / "page.png"))
         page.click("#stop")
-        server.process.wait(timeout=60)
+        server.process.wait(timeout=PATIENCE)
         assert page.complaints == []
     assert server.process.returncode == 0
     assert len(Observations.load(output).views) == 2

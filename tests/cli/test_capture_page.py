@@ -25,7 +25,7 @@ class Server:
         self.made.append((port, fallback))
 
     def run(self) -> None:
-        assert self._stopped.wait(60.0)
+        self._stopped.wait()
 
     def stop(self) -> None:
         self._stopped.set()
@@ -69,3 +69,32 @@ def test_no_page(tmp_path: Path, opened: list[str]) -> None:
     assert "capture page" not in done.output
     assert opened == []
     assert Server.made == []
+
+
+def test_an_interruption_before_all_has_started(
+    tmp_path: Path, opened: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What has started ends: a thread that was left behind would keep the command alive."""
+    start, begun, ended, given_up = threading.Thread.start, [], threading.Event(), threading.Event()
+
+    def endless(source: str, stopped: Callable[[], bool], tell: object) -> Iterator[None]:
+        while not (stopped() or given_up.wait(0.01)):
+            pass
+        ended.set()
+        return iter(())
+
+    def interrupted(thread: threading.Thread) -> None:
+        begun.append(thread)
+        if len(begun) == 2:
+            raise KeyboardInterrupt
+        start(thread)
+
+    monkeypatch.setattr("kcal.capture.sources.shots", endless)
+    with monkeypatch.context() as patched:
+        patched.setattr(threading.Thread, "start", interrupted)
+        done = capture(tmp_path, "--no-page")
+    try:
+        assert done.exit_code == 130
+        assert ended.is_set()
+    finally:
+        given_up.set()

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import typer
 from typer.testing import CliRunner
+from waiting import PATIENCE
 
 from kcal.cli.console import err, out, print_table, print_wrote, steps, warn
 from kcal.cli.main import app, main, usage_errors_shown
@@ -118,7 +119,7 @@ def test_a_pipe_is_an_error_at_once(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "kcal", "detect", str(tmp_path / "pipe.png"), "--board", "9x6", "--square", "25mm",
          "-o", str(tmp_path / "x.json")],
-        capture_output=True, text=True, timeout=60, check=False,
+        capture_output=True, text=True, timeout=PATIENCE, check=False,
     )  # fmt: skip
     assert done.returncode == 1
     assert "not a regular file" in done.stderr

@@ -5,10 +5,10 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
+from waiting import PATIENCE, wait_for
 
 from kcal.io.rig_file import save_rig
 from kcal.lens.mounting import Mounting, Origin
@@ -27,12 +27,11 @@ def test_a_signal_while_it_waits_for_a_line(sent: signal.Signals, tmp_path: Path
     try:
         live.stdin.write(b'{"time": 1.0, "left": [[960, 540]], "right": [[944, 540]]}\n')
         live.stdin.flush()
-        written, until = tmp_path / "tracks.csv", time.monotonic() + 120
-        while not (written.exists() and written.stat().st_size) and time.monotonic() < until:
-            time.sleep(0.1)
+        written = tmp_path / "tracks.csv"
+        wait_for(lambda: written.exists() and written.stat().st_size > 0)
         live.send_signal(sent)
         # Its input stays open until it has ended.
-        live.wait(60)
+        live.wait(PATIENCE)
         said = live.stderr.read().decode()
     finally:
         live.kill()

@@ -7,7 +7,9 @@ import os
 import shutil
 import signal
 import time
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ pytest.importorskip("av", reason="the extra `video` is not installed")
 from rtsp_server import RtspCamera
 from typer.testing import CliRunner
 from video_scenes import VELOCITY, bright_spots, film, places, small_rig, write_video
+from waiting import wait_for
 
 from kcal.cli.main import app
 from kcal.errors import FileError, InputError
@@ -25,6 +28,7 @@ from kcal.io.rig_file import save_rig
 from kcal.lens.camera_rig import CameraRig
 from kcal.lens.mounting import Origin
 from kcal.lens.rig import StereoRig
+from kcal.pipeline.handover import Handover
 from kcal.pipeline.stream import Stream
 
 FRAMES, LATE = 14, 0.03
@@ -246,8 +250,20 @@ def test_incomplete_commands(folder: Path, arguments: list[str]) -> None:
     assert done.exit_code == 2
 
 
+class Pairs(Handover[Any]):
+    """Groups of frames on their way to the detector; the last one made is known to `slow_spots`."""
+
+    last: ClassVar[Pairs]
+
+    def __init__(self, items: Iterable[Any], most: int, *, waits: bool) -> None:
+        if most == 1:
+            Pairs.last = self
+        super().__init__(items, most, waits=waits)
+
+
 def slow_spots(image: np.ndarray) -> np.ndarray:
-    time.sleep(0.15)
+    """So slow that a pair is dropped meanwhile."""
+    wait_for(lambda: Pairs.last.dropped > 0)
     return bright_spots(image)
 
 
@@ -263,6 +279,8 @@ def test_two_rtsp_streams_whose_newest_frames_are_taken(folder: Path, monkeypatc
             os.kill(os.getpid(), signal.SIGTERM)
 
     monkeypatch.setattr(Stream, "_write", terminated)
+    monkeypatch.setattr("kcal.pipeline.paired_frames.Handover", Pairs)
+    began = time.time()
     cameras = [RtspCamera(lambda when, side=side: table[side][round(10 * when) % 7], 10.0) for side in (0, 1)]
     with cameras[0], cameras[1]:
         videos = [camera.address for camera in cameras]
@@ -277,7 +295,7 @@ def test_two_rtsp_streams_whose_newest_frames_are_taken(folder: Path, monkeypatc
     assert rows
     for row in rows:
         assert np.abs(places(1.0)[:, 2].numpy() - float(row["north_m"])).min() < 5.0
-        assert abs(float(row["time_s"]) - time.time()) < 60.0
+        assert began <= float(row["time_s"]) < time.time()
 
 
 def test_a_file_beside_a_stream(folder: Path) -> None:

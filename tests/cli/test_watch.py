@@ -13,6 +13,7 @@ import pytest
 import torch
 from PIL import Image
 from typer.testing import CliRunner
+from waiting import PATIENCE
 
 from kcal.cli.main import app
 from kcal.io.rig_file import load_rig, save_rig
@@ -144,7 +145,8 @@ def test_live_tracks_have_the_sigma_of_the_moment(watched: Path) -> None:
     assert sigmas["dark"] > 1.3 * sigmas["day"]
 
 
-def test_a_webhook_gets_the_alarm_and_is_tried_again() -> None:
+def test_a_webhook_gets_the_alarm_and_is_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("kcal.watch.alarm._PATIENCE", PATIENCE)
     got: list[dict[str, object]] = []
 
     class Hook(BaseHTTPRequestHandler):

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import pytest
+from waiting import PATIENCE
 
 CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
@@ -56,9 +57,10 @@ def chromium_page(width: int = 1366, height: int = 768) -> Iterator[Any]:
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
-        context = playwright.chromium.connect_over_cdp(_endpoint()).new_context(
+        context = playwright.chromium.connect_over_cdp(_endpoint(), timeout=1e3 * PATIENCE).new_context(
             viewport={"width": width, "height": height}
         )
+        context.set_default_timeout(1e3 * PATIENCE)
         page: Any = context.new_page()
         page.complaints = []
         page.on("pageerror", lambda error: page.complaints.append(str(error)))
@@ -72,6 +74,12 @@ def chromium_page(width: int = 1366, height: int = 768) -> Iterator[Any]:
 
 def _is_local(url: str) -> bool:
     return url.startswith(("http://127.0.0.1", "file:", "data:", "blob:"))
+
+
+def at_rest(page: Any) -> None:
+    """Wait until the page is drawn as it stands now, and nothing in it moves."""
+    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    page.wait_for_function("() => document.getAnimations().every((each) => each.playState !== 'running')")
 
 
 def names_on_a_map(page: Any) -> tuple[int, int, list[Any]]:

@@ -4,7 +4,8 @@
 
 * `import:NAME`: when that module is imported;
 * `step:N`: at the N-th step of a progress bar;
-* `write:N`, `written:N`: right before and right after the N-th file comes into its place.
+* `write:N`, `written:N`: right before and right after the N-th file comes into its place;
+* `killed:N`: right after that, but killed, as when the power fails.
 """
 
 from __future__ import annotations
@@ -15,24 +16,30 @@ import runpy
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import rich.progress
+from waiting import wait_for
 
 
 def interrupt_at(moment: str) -> None:
-    """Send SIGINT to all processes of this command at that moment."""
+    """Send SIGINT, or SIGKILL, to all processes of this command at that moment."""
     # Where tests run in the background of a shell, it was ignored.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     kind, _, value = moment.partition(":")
     left = [1 if kind == "import" else int(value)]
+    sent = signal.SIGKILL if kind == "killed" else signal.SIGINT
 
     def strike() -> None:
         left[0] -= 1
         if left[0] == 0:
-            os.killpg(0, signal.SIGINT)
+            os.killpg(0, sent)
+            # The main thread hears it, at some time; until then another one goes no further.
+            if threading.current_thread() is not threading.main_thread():
+                wait_for(_awaited)
 
     def struck(call: Callable[..., Any], *, after: bool = False) -> Callable[..., Any]:
         def run(*arguments: Any, **options: Any) -> Any:
@@ -57,14 +64,24 @@ def interrupt_at(moment: str) -> None:
     elif kind == "step":
         rich.progress.Progress.update = struck(rich.progress.Progress.update)  # type: ignore[method-assign]
     else:
-        os.replace = struck(os.replace, after=kind == "written")
+        os.replace = struck(os.replace, after=kind != "write")
+
+
+def _awaited() -> bool:
+    """Whether the main thread waits for this one to end."""
+    frame = sys._current_frames()[threading.main_thread().ident or 0]
+    while frame is not None:
+        if frame.f_code is threading.Thread.join.__code__ and frame.f_locals["self"] is threading.current_thread():
+            return True
+        frame = frame.f_back
+    return False
 
 
 def interrupt(folder: Path, moment: str, line: str) -> str:
     """The last line on the error stream of a command that was interrupted; nothing else may have been said."""
     before = set(folder.rglob("*"))
     words = [sys.executable, __file__, moment, *line.split()]
-    done = subprocess.run(words, cwd=folder, capture_output=True, text=True, start_new_session=True, timeout=300)
+    done = subprocess.run(words, cwd=folder, capture_output=True, text=True, start_new_session=True, timeout=1800)
     assert done.returncode == 130, done.stdout + done.stderr
     assert "Traceback" not in done.stderr
     left = [path.name for path in set(folder.rglob("*")) - before]

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import os
 import re
-import select
 import signal
-import socket
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
+
+from waiting import PATIENCE
 
 
 class Server:
@@ -27,16 +26,9 @@ class Server:
 
     def _address(self) -> str:
         assert self.process.stdout is not None
-        until = time.monotonic() + 120
-        while time.monotonic() < until:
-            ready, _, _ = select.select([self.process.stdout], [], [], 1)
-            if ready:
-                line = self.process.stdout.readline()
-                found = re.search(r"http://127\.0\.0\.1:\d+/#\S+", line)
-                if found:
-                    return found.group()
-            if self.process.poll() is not None:
-                break
+        for line in self.process.stdout:
+            if found := re.search(r"http://127\.0\.0\.1:\d+/#\S+", line):
+                return found.group()
         self.errors.seek(0)
         raise AssertionError(f"the server did not start: {self.errors.read()[-2000:]}")
 
@@ -49,23 +41,13 @@ class Server:
         """As with Ctrl+C."""
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGINT)
-            self.process.wait(timeout=20)
+            self.process.wait(timeout=PATIENCE)
 
 
-def free_port() -> int:
-    """A port that nobody uses now."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
-
-
-def settled(page: Any, timeout: float = 60_000) -> None:
+def settled(page: Any) -> None:
     """Wait until all actions are answered and the rig is solved."""
     page.wait_for_function(
-        "() => window.kcal && kcal.actions.waiting.length === 0 && "
-        "document.documentElement.dataset.pending === 'false'",
-        timeout=timeout,
+        "() => window.kcal && kcal.actions.waiting.length === 0 && document.documentElement.dataset.pending === 'false'"
     )
 
 

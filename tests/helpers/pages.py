@@ -5,7 +5,6 @@ from __future__ import annotations
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
@@ -55,9 +54,11 @@ def served(make_app: Callable[[str, tuple[str, ...]], Starlette]) -> Iterator[st
     server = LocalServer(make_app, 0, fallback=False)
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()
-    yield server.address
-    server.stop()
-    thread.join(10.0)
+    try:
+        yield server.address
+    finally:
+        server.stop()
+        thread.join()
 
 
 def write_site(folder: Path) -> tuple[MarkingSite, Path]:
@@ -180,11 +181,3 @@ def build_site(folder: Path) -> Path:
     words = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "-d", str(folder)]
     subprocess.run(words, cwd=ROOT, check=True, capture_output=True)
     return folder
-
-
-def wait_for(true: Callable[[], bool], seconds: float = 20.0) -> None:
-    """Wait until something is true."""
-    until = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < until, "waited in vain"
-        time.sleep(0.05)

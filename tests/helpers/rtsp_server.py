@@ -15,6 +15,7 @@ from typing import Self
 import av
 import numpy as np
 import numpy.typing as npt
+from waiting import PATIENCE
 
 _SDP = (
     "v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=camera\r\nt=0 0\r\nm=video 0 RTP/AVP 96\r\na=rtpmap:96 H264/90000\r\n"
@@ -32,7 +33,7 @@ class RtspCamera:
         rate: frames a second.
         ahead: seconds by which the camera's own clock is ahead, in its reports.
         reports: whether it sends any.
-        cut_after: seconds after which the first connection is cut.
+        cut_after: frames after which the first connection is cut.
     """
 
     def __init__(
@@ -42,7 +43,7 @@ class RtspCamera:
         *,
         ahead: float = 0.0,
         reports: bool = True,
-        cut_after: float | None = None,
+        cut_after: int | None = None,
     ) -> None:
         self._draw, self._rate, self._ahead, self._reports, self._cut = draw, rate, ahead, reports, cut_after
         self._listener = socket.create_server(("127.0.0.1", 0))
@@ -58,7 +59,7 @@ class RtspCamera:
     def __exit__(self, *_: object) -> None:
         self._ended.set()
         self._listener.close()
-        self._thread.join(5.0)
+        self._thread.join()
 
     def _serve(self) -> None:
         while not self._ended.is_set():
@@ -68,7 +69,7 @@ class RtspCamera:
                 self._talk(link)
 
     def _talk(self, link: socket.socket) -> None:
-        link.settimeout(5.0)
+        link.settimeout(PATIENCE)
         asked = b""
         while True:
             while b"\r\n\r\n" not in asked:
@@ -88,6 +89,10 @@ class RtspCamera:
             link.sendall((answer + "\r\n" + body).encode())
             if method == "PLAY":
                 self._play(link)
+                # What was not read would make the end of the stream an error.
+                link.shutdown(socket.SHUT_WR)
+                while not self._ended.is_set() and link.recv(4096):
+                    pass
                 return
 
     def _play(self, link: socket.socket) -> None:
@@ -102,20 +107,21 @@ class RtspCamera:
                 ports[0] = stack.enter_context(socket.socket(type=socket.SOCK_DGRAM))
             for port in ports:
                 port.setblocking(False)
+            start = math.ceil(time.time() * self._rate) / self._rate
             target = f"rtp://127.0.0.1:{ports[0].getsockname()[1]}?pkt_size=1200"
-            camera = stack.enter_context(av.open(target, "w", format="rtp"))
+            # Reports are of that moment, whenever this thread comes to send them.
+            real = {"start_time_realtime": str(1000 * round(1000 * start))}
+            camera = stack.enter_context(av.open(target, "w", format="rtp", options=real))
             options = {"crf": "10", "preset": "ultrafast", "tune": "zerolatency", "g": "10"}
             stream = camera.add_stream(
                 "libx264", rate=25, options=options | {"x264-params": "repeat-headers=1:annexb=1"}
             )
-            first = self._draw(time.time())
+            first = self._draw(start)
             stream.width, stream.height, stream.pix_fmt = first.shape[1], first.shape[0], "yuvj420p"
             stream.time_base = stream.codec_context.time_base = Fraction(1, 90000)
-            start = math.ceil(time.time() * self._rate) / self._rate
-            time.sleep(start - time.time())
             camera.start_encoding()
             number = 0
-            while not self._ended.is_set() and (self._cut is None or time.time() < start + self._cut):
+            while not self._ended.is_set() and number != self._cut:
                 due = start + number / self._rate
                 time.sleep(max(0.0, due - time.time()))
                 frame = av.VideoFrame.from_ndarray(self._draw(due), format="gray")

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from pathlib import Path
 from typing import cast
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from lenses import FEW_MODES, hybrid_camera
+from waiting import wait_for
 
 from kcal.corners.match import Matches, MatchStatus
 from kcal.corners.refind import find_again
@@ -21,7 +23,7 @@ from kcal.locate.positions import locate_points
 from kcal.locate.relock import check_rig, seen_again
 from kcal.locate.survey import Survey
 from kcal.mark.guide import RigBand, at_shape, propose
-from kcal.mark.items import Add, Mark, Place, Put, Side, SurveyPlace
+from kcal.mark.items import Add, Mark, MarkingState, Place, Put, Side, SurveyPlace
 from kcal.mark.live import Promise, solve_live, verdict
 from kcal.mark.marking_service import Desk
 from kcal.mark.overview import map_content
@@ -372,11 +374,8 @@ def test_a_desk_from_clicks_to_positions(site: MarkingSite, tmp_path: Path) -> N
     for side, at in (("left", left), ("right", right)):
         mark = Mark(u=at[0], v=at[1], cov=(0.0025, 0.0, 0.0025), frame="left")
         state = desk.act(Put(do="put", name="gate", side=cast("Side", side), mark=mark), f"key-{side}")
-    for _ in range(200):
-        state = desk.state()
-        if not state["pending"]:
-            break
-        desk._thread.join(timeout=0.1)
+    wait_for(lambda: not desk.state()["pending"])
+    state = desk.state()
     position = state["items"][0]["position"]
     true = float(torch.linalg.vector_norm(site.points["gate"]))
     assert position["low"] < true < position["high"]
@@ -386,4 +385,39 @@ def test_a_desk_from_clicks_to_positions(site: MarkingSite, tmp_path: Path) -> N
     dragged = desk.position(Mark(u=left[0] + 1, v=left[1], cov=(0.09, 0, 0.09)),
                             Mark(u=right[0], v=right[1], cov=(0.09, 0, 0.09)), None)  # fmt: skip
     assert dragged["range"] < true
+    desk.close()
+
+
+def test_what_is_not_pending_is_solved(site: MarkingSite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also if the solution comes while the state is being told."""
+    for side, image in zip(("left", "right"), site.images, strict=True):
+        write_png(tmp_path / f"{side}.png", image)
+    desk = Desk(
+        open_pictures(tmp_path / "left.png", tmp_path / "right.png"), Session(tmp_path / "marks.csv"), None, site.rig
+    )
+    wait_for(lambda: not desk.state()["pending"])
+    begin, solve, undoable = threading.Event(), desk._solve, Session.undoable.fget
+
+    def held(state: MarkingState) -> None:
+        begin.wait()
+        solve(state)
+
+    def late(session: Session) -> tuple[bool, bool]:
+        begin.set()
+        wait_for(lambda: desk._solved == session.version)
+        return undoable(session)
+
+    monkeypatch.setattr(desk, "_solve", held)
+    desk.session.do(Add(do="add", name="mast", kind="landmark"), "key-00001")
+    place = Place(at=(1.0, 2.0, 3.0), sigma=0.1)
+    desk.session.do(SurveyPlace(do="survey", name="mast", place=place), "key-00002")
+    for side, (u, v) in zip(("left", "right"), site.pixels["gate"], strict=True):
+        mark = Mark(u=u, v=v, cov=(0.01, 0.0, 0.01), frame="left")
+        desk.session.do(Put(do="put", name="mast", side=cast("Side", side), mark=mark), f"key-{side}")
+    desk._wake.set()
+    with monkeypatch.context() as patched:
+        patched.setattr(Session, "undoable", property(late))
+        told = desk.state()
+    assert told["pending"] == (told["rig"]["count"] == 0)
+    assert desk.state()["rig"]["count"] == 1
     desk.close()

@@ -1,12 +1,12 @@
 from __future__ import annotations
 
 import itertools
-import time
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from kcal.errors import InputError
@@ -173,16 +173,20 @@ def test_a_crowd_takes_bounded_time_and_memory(monkeypatch: pytest.MonkeyPatch) 
     random = torch.Generator().manual_seed(0)
     rows = [torch.rand(400, 2, generator=random).double() * torch.tensor([1800.0, 20.0]) + 500.0 for _ in range(2)]
     left, right = (seen(row - torch.tensor([440.0, 0.0])) for row in rows)
-    sizes = []
+    sizes, solved = [], []
+
+    def assigned(cost: np.ndarray) -> object:
+        solved.append(cost.shape)
+        return linear_sum_assignment(cost)
 
     def counted(posed: PosedCameras, pixels: Tensor, *rest: Any, **options: Any) -> object:
         sizes.append(len(pixels))
         return fit_views(posed, pixels, *rest, **options)
 
     monkeypatch.setattr("kcal.pipeline.pair_costs.fit_views", counted)
-    begin = time.process_time()
+    monkeypatch.setattr("kcal.pipeline.one_to_one.linear_sum_assignment", assigned)
     found = associate(rig_of(), left, right)
-    assert time.process_time() - begin < 3.0
+    assert len(solved) == 1
     assert len(found.left) > 300
     assert found.ambiguous.double().mean() > 0.8
     # Pairs that diverge or are too near are not fitted, and others some at a time.

@@ -13,6 +13,7 @@ import pytest
 
 pytest.importorskip("av", reason="the extra `video` is not installed")
 import av
+from ports import deaf_port
 from rtsp_server import RtspCamera
 from video_scenes import SIZE, Image
 
@@ -41,6 +42,14 @@ def follow(address: str, count: int) -> tuple[list[TimedFrame], list[str]]:
     return [next(frames) for _ in range(count)], told
 
 
+def arriving(address: str, count: int) -> tuple[list[TimedFrame], list[str]]:
+    """As `follow`, of a stream whose times must be those at which its frames come."""
+    began = time.time()
+    frames, told = follow(address, count)
+    assert all(began < frame.time < time.time() for frame in frames)
+    return frames, told
+
+
 @pytest.mark.parametrize("ahead", [0.0, 3600.25])
 def test_rtsp_times_are_those_of_the_cameras_clock(ahead: float) -> None:
     with RtspCamera(bar, ahead=ahead) as camera:
@@ -55,7 +64,7 @@ def test_rtsp_times_are_those_of_the_cameras_clock(ahead: float) -> None:
 
 def test_a_stream_that_breaks_off_is_connected_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_FIRST_WAIT", 0.05)
-    with RtspCamera(bar, cut_after=0.8) as camera:
+    with RtspCamera(bar, cut_after=16) as camera:
         frames, told = follow(camera.address, 24)
         assert camera.connections == 2
     assert told == ["127.0.0.1: the stream ended; connecting again in 0.05 s"]
@@ -65,18 +74,16 @@ def test_a_stream_that_breaks_off_is_connected_again(monkeypatch: pytest.MonkeyP
 def test_a_camera_without_reports_gets_times_of_arrival(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_NO_REPORT", 0.3)
     with RtspCamera(bar, reports=False) as camera:
-        frames, told = follow(camera.address, 4)
+        _, told = arriving(camera.address, 4)
     assert len(told) == 1
     assert "127.0.0.1: the stream tells no capture times" in told[0]
     assert "secret" not in told[0]
-    assert 0 < time.time() - frames[-1].time < 5.0
 
 
 def test_a_camera_whose_clock_was_never_set_gets_times_of_arrival() -> None:
     with RtspCamera(bar, ahead=-time.time() + 1000.0) as camera:
-        frames, told = follow(camera.address, 2)
+        _, told = arriving(camera.address, 2)
     assert "those of arrival" in told[0]
-    assert 0 < time.time() - frames[-1].time < 5.0
 
 
 def test_mpegts_over_tcp_has_times_of_arrival() -> None:
@@ -96,16 +103,16 @@ def test_mpegts_over_tcp_has_times_of_arrival() -> None:
                     time.sleep(0.02)
 
         threading.Thread(target=serve, daemon=True).start()
-        frames, told = follow(f"tcp://127.0.0.1:{listener.getsockname()[1]}", 5)
+        frames, told = arriving(f"tcp://127.0.0.1:{listener.getsockname()[1]}", 5)
     assert "those of arrival" in told[0]
-    assert all(0 < time.time() - frame.time < 10.0 for frame in frames)
     assert (np.diff([frame.time for frame in frames]) > 0).all()
 
 
 def test_a_stream_that_does_not_answer_or_has_another_size() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
-    with pytest.raises(FileError, match=r"127\.0\.0\.1: cannot be opened as a video: Connection refused"):
+    with (
+        deaf_port() as port,
+        pytest.raises(FileError, match=r"127\.0\.0\.1: cannot be opened as a video: Connection refused"),
+    ):
         follow(f"rtsp://user:secret@127.0.0.1:{port}/main", 1)
     with (
         RtspCamera(bar) as camera,

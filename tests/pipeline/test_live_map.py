@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import threading
-import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
@@ -17,6 +16,7 @@ import pytest
 import torch
 from browser import chromium_page, names_on_a_map, needs_browser
 from track_scenes import ORIGIN, pairs_of, tracked_site
+from waiting import PATIENCE, wait_for
 
 pytest.importorskip("uvicorn")
 from pages import crowded_map
@@ -59,7 +59,7 @@ def level(places: list[list[float]], origin: Origin = ORIGIN) -> np.ndarray:
 def events(page: LiveMap, count: int) -> dict[str, Any]:
     parts = urlsplit(page.address)
     found = {}
-    with urllib.request.urlopen(f"http://{parts.netloc}/events?token={parts.fragment}", timeout=5) as answer:
+    with urllib.request.urlopen(f"http://{parts.netloc}/events?token={parts.fragment}", timeout=PATIENCE) as answer:
         while len(found) < count:
             name = answer.readline().decode().removeprefix("event: ").strip()
             found[name] = orjson.loads(answer.readline().removeprefix(b"data: "))
@@ -116,11 +116,10 @@ def test_the_last_tracks_and_the_end_are_told(page: LiveMap) -> None:
     found: dict[str, Any] = {}
     reader = threading.Thread(target=lambda: found.update(events(page, 3)))
     reader.start()
-    while not page.readers:
-        time.sleep(0.01)
+    wait_for(lambda: page.readers == 1)
     show(page)
     page.close("stopped")
-    reader.join(5.0)
+    reader.join()
     assert list(found) == ["site", "tracks", "end"]
     assert found["end"] == {"words": "stopped"}
 
@@ -130,14 +129,12 @@ def test_others_are_refused(page: LiveMap, path: str, host: str | None) -> None:
     place = urlsplit(page.address).netloc
     with pytest.raises(urllib.error.HTTPError, match="403"):
         urllib.request.urlopen(
-            urllib.request.Request(f"http://{place}{path}", headers={"Host": host or place}), timeout=5
+            urllib.request.Request(f"http://{place}{path}", headers={"Host": host or place}), timeout=PATIENCE
         )
 
 
 def status(page: Any, words: str) -> None:
-    page.wait_for_function(
-        "words => document.getElementById('status').textContent === words", arg=words, timeout=60_000
-    )
+    page.wait_for_function("words => document.getElementById('status').textContent === words", arg=words)
 
 
 @needs_browser
@@ -145,7 +142,7 @@ def test_the_page_in_a_browser(page: LiveMap) -> None:
     with chromium_page() as tab:
         tab.goto(page.address)
         show(page, "<img src=x onerror=alert(1)>")
-        tab.wait_for_function("() => document.documentElement.dataset.sequence === '7'", timeout=60_000)
+        tab.wait_for_function("() => document.documentElement.dataset.sequence === '7'")
         status(tab, "running")
         assert tab.inner_text("#count") == "1 track, moment 7"
         names = tab.locator(".leaflet-tooltip").all_inner_texts()
@@ -165,7 +162,7 @@ def test_the_page_in_a_browser(page: LiveMap) -> None:
 def test_names_cover_neither_each_other_nor_dots(width: int, height: int) -> None:
     with crowded_map(40) as live, chromium_page(width, height) as tab:
         tab.goto(live.address)
-        tab.wait_for_function("() => document.documentElement.dataset.sequence === '1'", timeout=60_000)
+        tab.wait_for_function("() => document.documentElement.dataset.sequence === '1'")
         names, dots, covered = names_on_a_map(tab)
         assert dots == 42
         assert names >= 15  # the others wait until there is room
@@ -183,7 +180,7 @@ def test_names_cover_neither_each_other_nor_dots(width: int, height: int) -> Non
 def serve(answer: Any) -> None:
     page = LiveMap(located_by(Locator(SITE.rig, origin=SITE.origin, heading_deg=0.0)), 0)
     answer.send(page.address)
-    time.sleep(120)
+    answer.recv()
 
 
 @needs_browser

@@ -9,6 +9,7 @@ import threading
 import numpy as np
 import orjson
 import pytest
+from ports import deaf_port
 from track_scenes import tracked_site
 
 pytest.importorskip("paho.mqtt.client")
@@ -16,14 +17,15 @@ from kcal.errors import InputError
 from kcal.locate.columns import NUMBERS, PositionColumns
 from kcal.locate.positions import located_by
 from kcal.locate.tabulate import Locator
-from kcal.pipeline.senders import sender_to
+from kcal.pipeline.senders import Sender, sender_to
 
 
 class Broker(threading.Thread):
     """The least that a broker does for a publisher: accept, and acknowledge."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, acknowledges: bool = True) -> None:
         super().__init__(daemon=True)
+        self.acknowledges = acknowledges
         self.listener = socket.create_server(("127.0.0.1", 0))
         self.port = self.listener.getsockname()[1]
         self.messages: list[tuple[str, bytes]] = []
@@ -46,34 +48,40 @@ class Broker(threading.Thread):
                 elif head[0] >> 4 == 3:
                     end = 2 + int.from_bytes(body[:2], "big")
                     self.messages.append((body[2:end].decode(), body[end + 2 :]))
-                    link.sendall(b"\x40\x02" + body[end : end + 2])
+                    if self.acknowledges:
+                        link.sendall(b"\x40\x02" + body[end : end + 2])
 
 
-def test_each_track_has_a_topic() -> None:
-    broker, site = Broker(), tracked_site()
+def sent_to(broker: Broker) -> Sender:
+    """A sender that sent two tracks and was closed at once."""
+    site = tracked_site()
     sender = sender_to(f"mqtt://127.0.0.1:{broker.port}/site/tracks")
     numbers = np.full((2, len(NUMBERS)), np.nan)
     numbers[:, :3] = 19.0, 72.0, 5.0
     columns = PositionColumns(["track 1", "track 2"], np.zeros(2, np.int8), ["", ""], numbers, {"sequence": ["9", "9"]})
     run = located_by(Locator(site.rig, origin=site.origin, heading_deg=0.0))
     sender.send(columns, run, datetime.datetime.now(datetime.UTC))
-    deadline = threading.Event()
-    for _ in range(100):
-        if len(broker.messages) == 2:
-            break
-        deadline.wait(0.05)
     sender.close()
-    assert sender.failed == 0
+    broker.join()
+    return sender
+
+
+def test_each_track_has_a_topic() -> None:
+    """Also those that were sent right before the end."""
+    broker = Broker()
+    assert sent_to(broker).failed == 0
     assert [topic for topic, _ in broker.messages] == ["site/tracks/track-1", "site/tracks/track-2"]
     feature = orjson.loads(broker.messages[1][1])
     assert feature["geometry"]["coordinates"] == [72.0, 19.0, 5.0]
     assert feature["properties"]["sequence"] == 9
 
 
+def test_what_a_broker_does_not_acknowledge_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("kcal.pipeline.senders._FAREWELL", 0.1)
+    assert sent_to(Broker(acknowledges=False)).failed == 1
+
+
 def test_a_broker_that_is_not_there() -> None:
-    with socket.socket() as unused:
-        unused.bind(("127.0.0.1", 0))
-        address = f"mqtt://user:secret@127.0.0.1:{unused.getsockname()[1]}/tracks"
-    with pytest.raises(InputError, match="does not answer") as caught:
-        sender_to(address)
+    with deaf_port() as port, pytest.raises(InputError, match="does not answer") as caught:
+        sender_to(f"mqtt://user:secret@127.0.0.1:{port}/tracks")
     assert "secret" not in str(caught.value)

@@ -10,15 +10,19 @@ import os
 import random
 import signal
 import socket
+import sys
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import FrameType
+from typing import Any
 
 import orjson
 import pytest
 import torch
+from ports import deaf_port
 from track_scenes import seen_by, tracked_site
+from waiting import PATIENCE
 
 from kcal.errors import FileError, InputError
 from kcal.locate.positions import located_by
@@ -106,33 +110,41 @@ def test_a_second_run_adds_nothing_and_new_lines_are_continued(
     assert contents(tmp_path) == whole[1]
 
 
+def kill_after(lines: int) -> None:
+    """Kill this process after so many lines of the stream and of its journal."""
+    left = lines
+
+    def count(frame: FrameType, event: str, argument: object) -> Any:
+        nonlocal left
+        if Path(frame.f_code.co_filename).name not in ("stream.py", "stream_journal.py"):
+            return None
+        left -= event == "line"
+        if not left:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return count
+
+    sys.settrace(count)
+
+
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="kills a process")
 def test_killed_at_any_time_the_outputs_are_the_same(
     whole: tuple[Path, dict[str, bytes]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """At any line of what writes: six times early, so that there is always more to do, and then not any more."""
     monkeypatch.setattr("kcal.pipeline.stream._CHECKPOINT", 9)
     chance = random.Random(1)
-    kills, size = 0, sum(map(len, whole[1].values()))
-    for attempt in range(7):
+    for lines in [*(chance.randrange(50, 800) for _ in range(6)), 0]:
         child = os.fork()
         if child == 0:
             try:
+                if lines:
+                    kill_after(lines)
                 new_stream(tmp_path).follow(lines_of(whole[0], read), waits=True, resumes=True)
                 os._exit(0)
             except BaseException:
                 os._exit(3)
-        if attempt < 6:
-            # Somewhere in its sixth of the work, as fast as this machine does it.
-            until, end = size * (attempt + chance.random()) / 6.0, time.monotonic() + 60.0
-            while time.monotonic() < end and sum(map(len, contents(tmp_path).values())) < until:
-                time.sleep(0.001)
-            os.kill(child, signal.SIGKILL)
-        status = os.waitpid(child, 0)[1]
-        if os.WIFEXITED(status):
-            assert os.WEXITSTATUS(status) == 0
-            break
-        kills += 1
-    assert kills >= 2
+        ended = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        assert ended == (-signal.SIGKILL if lines else 0)
     assert contents(tmp_path) == whole[1]
 
 
@@ -188,7 +200,7 @@ class _Slow:
         self.__dict__.update(tracker=tracker, release=release)
 
     def __call__(self, *args: object) -> object:
-        self.release.wait(10.0)
+        self.release.wait()
         return self.tracker(*args)
 
     def __getattr__(self, name: str) -> object:
@@ -273,7 +285,7 @@ def test_a_line_that_never_ends_is_malformed(tmp_path: Path, monkeypatch: pytest
 def test_events_over_the_network(whole: tuple[Path, dict[str, bytes]], tmp_path: Path, kind: str) -> None:
     with socket.socket(type=socket.SOCK_STREAM if kind == "tcp" else socket.SOCK_DGRAM) as receiver:
         receiver.bind(("127.0.0.1", 0))
-        receiver.settimeout(5.0)
+        receiver.settimeout(PATIENCE)
         if kind == "tcp":
             receiver.listen()
         port = receiver.getsockname()[1]
@@ -291,11 +303,9 @@ def test_events_over_the_network(whole: tuple[Path, dict[str, bytes]], tmp_path:
 
 
 def test_a_receiver_that_is_not_there_is_counted(whole: tuple[Path, dict[str, bytes]], tmp_path: Path) -> None:
-    with socket.socket() as unused:
-        unused.bind(("127.0.0.1", 0))
-        port = unused.getsockname()[1]
-    stream = new_stream(tmp_path, senders=[CotSender(f"tcp://127.0.0.1:{port}")])
-    counts = stream.follow(lines_of(whole[0], read), waits=True, resumes=True)
+    with deaf_port() as port:
+        stream = new_stream(tmp_path, senders=[CotSender(f"tcp://127.0.0.1:{port}")])
+        counts = stream.follow(lines_of(whole[0], read), waits=True, resumes=True)
     assert counts.unsent == 37
     assert contents(tmp_path) == whole[1]
 

@@ -146,14 +146,14 @@ def test_sparse_and_slow_times_are_taken_as_they_come() -> None:
 
 
 SECOND = """
-import sys, time
+import sys
 from pathlib import Path
 from kcal.pipeline.stream_journal import Ledger
 ledger = Ledger(Path(sys.argv[2]), [Path(sys.argv[1])])
 ledger.checkpoint({})
 ledger.append([b"row\\n"], 1.0, 5)
 print("ready", flush=True)
-time.sleep(60)
+sys.stdin.read()
 """
 
 
@@ -162,7 +162,7 @@ def test_one_process_at_a_time_writes_an_output(tmp_path: Path) -> None:
     (tmp_path / "link.csv").symlink_to(tmp_path / "tracks.csv")
     child = subprocess.Popen(
         [sys.executable, "-c", SECOND, str(tmp_path / "link.csv"), str(tmp_path / "journal")],
-        stdout=subprocess.PIPE, env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
     )  # fmt: skip
     try:
         assert child.stdout is not None

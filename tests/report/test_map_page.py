@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from browser import chromium_page, needs_browser
+from browser import at_rest, chromium_page, needs_browser
 from locate_rigs import pinhole_rig, tensor
 from PIL import Image, TiffImagePlugin
+from waiting import wait_for
 
 from kcal.errors import FileError, InputError
 from kcal.lens.mounting import Origin
@@ -75,7 +76,7 @@ def dom(file: Path) -> str:
     """What a browser makes of a page; it must not complain."""
     with chromium_page() as page:
         page.goto(file.as_uri())
-        page.wait_for_function("() => document.documentElement.dataset.drawn", timeout=60_000)
+        page.wait_for_function("() => document.documentElement.dataset.drawn")
         assert page.complaints == []
         return page.content()
 
@@ -129,13 +130,16 @@ def test_nothing_else_runs_in_the_page(tmp_path: Path) -> None:
     path.write_text(page.replace('<main id="map"', planted))
     with chromium_page() as tab:
         tab.goto(path.as_uri())
-        tab.wait_for_function("() => document.documentElement.dataset.drawn", timeout=60_000)
-        tab.wait_for_timeout(500)
+        tab.wait_for_function("() => document.documentElement.dataset.drawn")
+
+        def refused() -> list[str]:
+            return [text for text in tab.complaints if "Content Security Policy" in text]
+
+        wait_for(lambda: len(refused()) >= 4, lambda seconds: tab.wait_for_timeout(1e3 * seconds))
+        at_rest(tab)
         drawn = tab.content()
-        refused = [text for text in tab.complaints if "Content Security Policy" in text]
     assert "data-ran" not in drawn
     assert 'data-drawn="3/' in drawn
-    assert len(refused) >= 4
 
 
 def geotiff(path: Path) -> Path:
@@ -241,7 +245,7 @@ def test_numbers_are_within_the_keyboards_reach(tmp_path: Path) -> None:
     located, truth = scene()
     with chromium_page() as page:
         page.goto(save_map(tmp_path / "map.html", located, truth).as_uri())
-        page.wait_for_function("() => document.documentElement.dataset.drawn", timeout=60_000)
+        page.wait_for_function("() => document.documentElement.dataset.drawn")
         for _ in range(40):
             page.keyboard.press("Tab")
             if page.evaluate("document.activeElement.getAttribute('aria-label')") == "ship":

@@ -7,6 +7,8 @@ import socket
 import threading
 
 import pytest
+from ports import free_port
+from waiting import PATIENCE
 
 pytest.importorskip("starlette", reason="the extra `mark` is not installed")
 pytest.importorskip("uvicorn", reason="the extra `mark` is not installed")
@@ -22,7 +24,7 @@ def test_a_port_in_use_is_refused_or_replaced() -> None:
         name, port = first.getsockname()
         assert name == "127.0.0.1"
         # Who connects before the server answers waits.
-        with socket.create_connection((name, port), timeout=5):
+        with socket.create_connection((name, port), timeout=PATIENCE):
             pass
         with pytest.raises(InputError, match=f"port {port} cannot be used: .*; give another --port"):
             listening_socket(port, fallback=False)
@@ -32,11 +34,13 @@ def test_a_port_in_use_is_refused_or_replaced() -> None:
 
 
 def test_a_port_can_be_used_again_at_once() -> None:
-    with listening_socket(0, fallback=False) as first:
-        port = first.getsockname()[1]
-        with socket.create_connection(("127.0.0.1", port), timeout=5) as there:
-            first.accept()[0].close()
-            there.recv(1)
+    port = free_port()
+    with (
+        listening_socket(port, fallback=False) as first,
+        socket.create_connection(("127.0.0.1", port), timeout=PATIENCE) as there,
+    ):
+        first.accept()[0].close()
+        there.recv(1)
     with listening_socket(port, fallback=False) as again:
         assert again.getsockname()[1] == port
 
@@ -55,10 +59,9 @@ def test_a_server_answers_at_its_address_until_it_is_stopped() -> None:
     assert set(hosts) == {host, host.replace("127.0.0.1", "localhost")}
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()
-    connection = http.client.HTTPConnection(host, timeout=20)
+    connection = http.client.HTTPConnection(host, timeout=PATIENCE)
     connection.request("GET", "/")
     assert connection.getresponse().read() == b"hello"
     connection.close()
     server.stop()
-    thread.join(20)
-    assert not thread.is_alive()
+    thread.join()

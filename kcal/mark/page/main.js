@@ -93,7 +93,10 @@ class App {
     this.items = state.items;
     this.survey = state.survey;
     this.rig = state.rig;
-    if (!this.item()) this.selected = null;
+    const item = this.item();
+    if (!item) this.selected = null;
+    // Whoever marked a side while its proposal was on the way needs none.
+    else for (const side of SIDES) if (item[side]) this.proposals[side] = undefined;
     byId("trouble").textContent = state.trouble;
     byId("trouble").hidden = !state.trouble;
     byId("undo").disabled = !state.undo;

@@ -9,10 +9,12 @@ import time
 from concurrent.futures import Future
 
 import cv2
+import interrupted
 import numpy as np
 import pytest
 import torch
 from typer.testing import CliRunner
+from waiting import wait_for
 
 from kcal.calibrate.batch.jobs import BatchOptions, detect_image, pieces, read_jobs, sharing_jobs
 from kcal.calibrate.batch.results import Results, SummaryRow, write_summary
@@ -321,23 +323,16 @@ def test_every_piece_comes_back_when_workers_die(folder):
 @pytest.mark.slow
 def test_a_killed_run_continues_and_gives_the_same_table(folder, tmp_path):
     out, whole = tmp_path / "out", tmp_path / "whole"
-    command = [sys.executable, "-m", "kcal", "batch", str(folder), *WHAT, "--model", "opencv5", "--workers", "1", "-o"]
+    words = ["batch", str(folder), *WHAT, "--model", "opencv5", "--workers", "1", "-o", str(out)]
     # A session of its own, so that the workers die with it: one that lived on could still finish a piece.
-    running = subprocess.Popen(
-        [*command, str(out)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
-    )
-    deadline = time.monotonic() + 60
-    while len(list(out.glob(".work/*.json"))) < 3 and running.poll() is None and time.monotonic() < deadline:
-        time.sleep(0.002)
-    os.killpg(running.pid, signal.SIGKILL)
-    running.wait()
+    dead = subprocess.run([sys.executable, interrupted.__file__, "killed:3", *words], start_new_session=True)
+    assert dead.returncode == -signal.SIGKILL
     before = {path: path.stat().st_mtime_ns for path in out.glob(".work/*.json")}
-    assert len(before) >= 3
-
+    assert len(before) == 3
     assert not (out / "summary.csv").exists()
-    again = subprocess.run([*command, str(out)], capture_output=True, text=True)
+    again = subprocess.run([sys.executable, "-m", "kcal", *words], capture_output=True, text=True)
     assert again.returncode == 0, again.stderr
-    assert f"{len(before)} of 10 pieces of work were there already" in again.stdout
+    assert "3 of 10 pieces of work were there already" in again.stdout
     for path, stamp in before.items():
         assert path.stat().st_mtime_ns == stamp
     run(folder, whole)
@@ -413,9 +408,8 @@ def dask_processes(tmp_path):
             command += ["--host", "127.0.0.1", "--no-dashboard", "--scheduler-file", str(where)]
             quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": tmp_path}
             started.append(subprocess.Popen(command, **quiet))
-            deadline = time.monotonic() + 60
-            while not where.exists() and time.monotonic() < deadline:
-                time.sleep(0.1)
+            # Its file is there before all of it is written.
+            wait_for(lambda: where.exists() and where.read_text().endswith("}"))
         yield json.loads(where.read_text())["address"], *started
     finally:
         for process in started:
@@ -430,9 +424,7 @@ def test_a_scheduler_or_its_last_worker_that_dies_is_an_error(dask_processes, mo
     monkeypatch.setattr("kcal.calibrate.batch.workers._LOOK", 0.5)
     monkeypatch.setattr("kcal.calibrate.batch.workers.WORKERS_BACK", 3.0)
     with pool(1, address) as workers:
-        deadline = time.monotonic() + 60
-        while not workers._client.nthreads() and time.monotonic() < deadline:
-            time.sleep(0.1)
+        wait_for(lambda: bool(workers._client.nthreads()))
         threading.Timer(1.0, (scheduler if killed == "scheduler" else worker).kill).start()
         with pytest.raises(FileError, match="the Dask scheduler or its last worker is gone"):
             run_tasks([Task(0, time.sleep, (600,)), Task(1, time.sleep, (600,))], lambda *_: [], workers)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from concurrent.futures import BrokenExecutor, Future
 from typing import Any
 
@@ -58,6 +57,11 @@ class Crew:
         self.work()
 
 
+@pytest.fixture(autouse=True)
+def _quickly(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_LOOK", 0.01)
+
+
 def outcomes(crew: Crew, count: int, more: int = 0) -> dict[int, Any]:
     found: dict[int, Any] = {}
 
@@ -68,11 +72,6 @@ def outcomes(crew: Crew, count: int, more: int = 0) -> dict[int, Any]:
 
     run_tasks((Task(i, divmod, (i, 3)) for i in range(count)), done, crew)  # type: ignore[arg-type]
     return found
-
-
-@pytest.fixture(autouse=True)
-def _quickly(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_LOOK", 0.01)
 
 
 def test_all_is_done_and_few_tasks_wait() -> None:
@@ -182,15 +181,18 @@ def client(monkeypatch: pytest.MonkeyPatch) -> Client:
     return made
 
 
-def test_a_scheduler_counts_its_threads(client: Client) -> None:
+def test_a_scheduler_counts_its_threads(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
     with pool(7, "tcp://x") as crew:
         assert crew.ahead == 15
         client.threads = {"a": 1, "b": 1, "c": 1}
+        now[0] += 0.005
         assert crew.ahead == 15  # not asked every time
-        time.sleep(0.02)
+        now[0] += 0.01
         assert crew.ahead == 9
         client.threads = None
-        time.sleep(0.02)
+        now[0] += 0.02
         assert crew.ahead == 9  # as it was
         client.threads = {"a": 3}
         assert crew.submit(Task(0, abs, (-4,))).result() == 4
