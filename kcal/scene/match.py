@@ -26,6 +26,7 @@ from kcal.lens.rig import StereoRig
 from kcal.scene.common_errors import with_common_errors
 from kcal.scene.guided import guided_matches, rough_rig
 from kcal.scene.line_errors import line_errors
+from kcal.scene.neighbors import pose_variance_ratio
 from kcal.scene.refine import refine_matches
 from kcal.scene.smooth_errors import smooth_effects
 from kcal.scene.still import Stillness, still_there
@@ -162,9 +163,9 @@ def counted(found: Sequence[MatchedPair], size: tuple[int, int], most: int = MOS
     names = tuple(f"{one.counts.name} {i}" for one in found for i in range(len(one.pixels)))
     pixels, lines = [one.pixels for one in found], [line_errors(one.rig, one.pixels) for one in found]
     covariance = with_common_errors(lines, pixels, [one.covariance for one in found], [one.share for one in found])
-    places = torch.cat(pixels)
+    ratio, places = pose_variance_ratio(lines, pixels, covariance, size), torch.cat(pixels)
     effects = smooth_effects(places, torch.cat([one.across for one in lines]), size)
-    features = dataclasses.replace(_features(names, places, torch.cat(covariance)), effects=effects)
+    features = dataclasses.replace(_features(names, places, ratio * torch.cat(covariance)), effects=effects)
     return SceneMatches(features, tuple(one.counts for one in found))
 
 

@@ -13,10 +13,10 @@ from torch import Tensor
 
 from kcal.calibrate.rig.sources import FeatureEffect
 
-# px across the lines of each of three errors, at the image's borders. Chosen on 13 terrains at 960 x 540 (yaw's seeds
-# 400-412; one and three pairs of a minute, and ten of a day of two of them): χ² of the relative rotation, which should
-# be 3, is 3.2, 2.6 and 2.8, and without them 4.6, 4.4 and 6.9. Products and squares of both coordinates, which would
-# change yaw, have no part in it (maximum likelihood).
+# px across the lines of each of three errors, at the image's borders: the likeliest on 13 terrains at 960 x 540 (yaw's
+# seeds 400-412; one and three pairs of a minute, and ten of a day of two of them). With the 20 of 430-449 χ² of the
+# relative rotation, which should be 3, is 3.1 and 2.2 from one and three pairs, and 2.8 from ten; without them 4.1, 3.3
+# and 6.9. Products and squares of both coordinates, which would change yaw, have no part in it.
 _SMOOTH_PX = 0.0035
 _NAMES = tuple(f"errors that matches share, {part}" for part in ("everywhere", "by columns", "by rows"))
 
