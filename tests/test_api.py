@@ -56,7 +56,8 @@ PUBLIC = {
     """,
     "kcal.rig": """
         RasterError SkylineAttitude SkylineImage SkylineSource skyline_attitude skyline_source
-        Identity LandmarkEffect MovingControl MovingOptions MovingTrack Sighting match_moving read_sightings
+        FeatureEffect Identity LandmarkEffect MovingControl MovingOptions MovingTrack Sighting match_moving
+        read_sightings
         read_tracks CameraRig CameraRigCalibration load_camera_rig save_camera_rig station_mounting stations_of
         Drift DriftEffect ImagePair ItemResidual MarkedLandmarks Mounting PairCounts RigCalibration RigCovariance
         RigSource SceneMatches Sides SourceResidual Survey TurnedBoard Watched camera_positions check_rig drift_effect
@@ -110,6 +111,7 @@ NEW_NAMES = (
         "InterpolatedCamera",
         "camera_at_setting",
         "Identity",
+        "FeatureEffect",
         "LandmarkEffect",
         "MovingControl",
         "MovingOptions",

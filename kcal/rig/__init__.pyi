@@ -16,6 +16,7 @@ from kcal.scene.match import ImagePair as ImagePair
 from kcal.scene.match import scene_features as scene_features
 from kcal.scene.match import SceneMatches as SceneMatches
 from kcal.scene.match import PairCounts as PairCounts
+from kcal.calibrate.rig.sources import FeatureEffect as FeatureEffect
 
 from kcal.skyline.rig_skyline import skyline_source as skyline_source
 from kcal.skyline.rig_skyline import SkylineImage as SkylineImage

@@ -28,6 +28,7 @@ from kcal.scene.guided import guided_matches, rough_rig
 from kcal.scene.line_errors import line_errors
 from kcal.scene.neighbors import pose_variance_ratio
 from kcal.scene.refine import refine_matches
+from kcal.scene.smooth_errors import smooth_effects
 from kcal.scene.still import Stillness, still_there
 
 # Keypoints of an image: more tell little more and cost as much again.
@@ -112,8 +113,9 @@ def scene_features(cameras: tuple[Camera, Camera], pairs: Sequence[ImagePair], m
     """Find and match what both cameras see, and check it: along epipolar lines, both ways, and in time.
 
     Nothing is known of how the cameras stand but what the images tell; lenses are taken as calibrated. Each match has
-    the covariance of its least-squares fit, widened by what its error has in common with others
-    (`kcal.scene.common_errors`). Where there are several pairs, what is not there in the others, or is there at another
+    the covariance of its least-squares fit, widened by what its error has in common with those of others
+    (`kcal.scene.common_errors`); errors that are smooth over the image are effects that all share
+    (`kcal.scene.smooth_errors`). Where there are several pairs, what is not there in the others, or is there at another
     range, is left out: vehicles, waves, clouds, leaves.
 
     Args:
@@ -161,8 +163,9 @@ def counted(found: Sequence[MatchedPair], size: tuple[int, int], most: int = MOS
     names = tuple(f"{one.counts.name} {i}" for one in found for i in range(len(one.pixels)))
     pixels, lines = [one.pixels for one in found], [line_errors(one.rig, one.pixels) for one in found]
     covariance = with_common_errors(lines, pixels, [one.covariance for one in found], [one.share for one in found])
-    ratio = pose_variance_ratio(lines, pixels, covariance, size)
-    features = _features(names, torch.cat(pixels), ratio * torch.cat(covariance))
+    ratio, places = pose_variance_ratio(lines, pixels, covariance, size), torch.cat(pixels)
+    effects = smooth_effects(places, torch.cat([one.across for one in lines]), size)
+    features = dataclasses.replace(_features(names, places, ratio * torch.cat(covariance)), effects=effects)
     return SceneMatches(features, tuple(one.counts for one in found))
 
 

@@ -2,8 +2,7 @@
 
 A hill, a row of houses or the ground before the mast has slopes and edges of one kind, and the errors that they make
 lean to one side. Between two matches that is next to nothing (some 2 % of their variance within 60 pixels), and in a
-pose from hundreds of them a quarter to a third of its variance. Thousands of matches, of a day and of large images,
-share errors that are smooth over the whole image: thousandths of a pixel, which no number of matches makes smaller.
+pose from hundreds of them a quarter to a third of its variance.
 """
 
 from __future__ import annotations
@@ -22,11 +21,6 @@ from kcal.scene.line_errors import LineErrors
 # 120 px tried on 26 terrains, the farthest whose ratio of independent errors scatters as little (0.17); from 60 px on
 # it scatters by 0.26, and tells no more.
 _NEAR = 1.0 / 16.0
-# Pixels at the image's border of each of five smooth errors. With them χ² of the relative rotation, which should be 3,
-# was 3.0 and 3.1 from one and three pairs of a minute (60 terrains, 960 x 540), 2.3 from ten pairs of a day (10), and
-# 2.8 from ten of a day at 1920 x 1080 (6); without 3.4, 3.7, 3.2 and 5.7. On 40 other terrains it was 3.0 and 3.6. In
-# all of these the ground made errors that have been mended since, so that the size is rather too large.
-_SMOOTH_PX = 0.006
 
 
 @torch.no_grad()
@@ -38,8 +32,8 @@ def pose_variance_ratio(
     The variance of weighted least squares with errors that neighbors share (Conley 1999, with one weight for all that
     are near) over its value if none were shared. Both are of what a fit leaves, in which errors of lenses, which are
     known from elsewhere and smooth over the image, are absent; and both are summed over the five parameters of a
-    relative pose, in units of their variances. The ratio counts as 1 at least; what smooth errors of matches do, which
-    no residual shows, is added.
+    relative pose, in units of their variances. The ratio counts as 1 at least. Smooth errors of matches, which no
+    residual shows, are not in it (`kcal.scene.smooth_errors`).
 
     Args:
         lines: of each pair, by the rig as its matches make it.
@@ -74,8 +68,4 @@ def pose_variance_ratio(
     # The residuals of independent errors have the covariance 1 - fitted fittedᵀ.
     expected = (alone * (1.0 - fitted.square().sum(-1))).sum() - (both * (fitted[i] * fitted[j]).sum(-1)).sum()
     ratio = float(real / expected)
-    at = 2.0 * places / torch.tensor(size) - 1.0
-    fields = torch.stack([at[:, 0], at[:, 1], at.prod(1), *at.square().T], -1)
-    moved = weight.T @ (fields / sigma[:, None])
-    shared = _SMOOTH_PX**2 * float(moved.square().sum(1).mean())
-    return shared + (max(1.0, ratio) if math.isfinite(ratio) and expected > 0.0 else 1.0)
+    return max(1.0, ratio) if math.isfinite(ratio) and expected > 0.0 else 1.0

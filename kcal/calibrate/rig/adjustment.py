@@ -17,6 +17,7 @@ from kcal.calibrate.rig.problem import DistanceTerm, PlaceTerm, RigProblem, Shar
 from kcal.calibrate.rig.skyline_term import SkylineTerm
 from kcal.calibrate.rig.sources import Features, Landmarks, RigData
 from kcal.calibrate.rig.star_block import StarBlock
+from kcal.calibrate.rig.star_source import StarSource
 from kcal.calibrate.rig.unknowns import SharedUnknowns
 from kcal.calibrate.rig.unknowns import held as nothing
 from kcal.chance import beyond_chance, chi2_quantile
@@ -103,17 +104,14 @@ class Adjustment:
             times = self.widened.get("landmarks", 1.0)
             surveyed = data.landmarks.points[masks.landmarks], times * data.landmarks.sigma[masks.landmarks]
             marks = _weighted(data.landmarks, masks.landmarks, times)
-            before = 0 if data.stars is None else len(data.stars.effects)
-            effects = self._effects(slice(before, None), unknowns)
+            effects = self._effects(data.landmarks, unknowns)
             shifts = data.landmarks.shifts()[:, masks.landmarks]
             found.append(LandmarkBlock(*marks, *surveyed, unknowns.by_refraction, effects, shifts))
         if data.features and masks.features.any():
-            times = self.widened.get("features", 1.0)
-            known = (
-                data.features.inverse_range[masks.features],
-                times * data.features.inverse_range_sigma[masks.features],
-            )
-            found.append(FeatureBlock(*_weighted(data.features, masks.features, times), *known, self.anchor))
+            times, some = self.widened.get("features", 1.0), masks.features
+            known = data.features.inverse_range[some], times * data.features.inverse_range_sigma[some]
+            shared = self._effects(data.features, unknowns), data.features.shifts()[:, some]
+            found.append(FeatureBlock(*_weighted(data.features, some, times), *known, self.anchor, *shared))
         if data.stars and masks.stars.any():
             found.append(self._star_block(masks.stars, unknowns))
         return found
@@ -125,14 +123,19 @@ class Adjustment:
         white = torch.eye(2, dtype=torch.float64) / (times * stars.pixel_sigma[mask][..., None, None])
         known = stars.direction[mask], times * stars.direction_sigma[mask]
         moves = stars.by_effects(), stars.factors()[:, mask], stars.shifts()[:, mask]
-        effects = self._effects(slice(len(stars.effects)), unknowns)
+        effects = self._effects(stars, unknowns)
         return StarBlock(stars.pixels[mask], white, *known, *moves, effects)
 
-    def _effects(self, part: slice, unknowns: SharedUnknowns) -> Effects | None:
-        """What shifts items together, of all unknowns in the state and of those of a step; None where nothing does."""
+    def _effects(self, source: StarSource | Landmarks | Features, unknowns: SharedUnknowns) -> Effects | None:
+        """What shifts a source's items, of all unknowns in the state and of those of a step; None: nothing does."""
         whole = self.unknowns.by_effects
-        if whole is None or not len(whole[part]):
+        if whole is None or not source.effects:
             return None
+        # As `RigData.effects` lists them.
+        order = (self.data.stars, self.data.landmarks, self.data.features)
+        before = order[: next(i for i, one in enumerate(order) if one is source)]
+        begin = sum(len(one.effects) for one in before if one is not None)
+        part = slice(begin, begin + len(source.effects))
         return Effects(whole[part], None if unknowns.by_effects is None else unknowns.by_effects[part])
 
     @property

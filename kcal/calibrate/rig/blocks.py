@@ -105,7 +105,7 @@ class Block(ABC):
     Args:
         pixels: (V, C, N, 2), NaN where not seen.
         whitening: (V, C, N, 2, 2) by which pixel residuals are multiplied.
-        effects: that shift points by Σ_e u_e `_moves`; None: there are none.
+        effects: that shift points by Σ_e u_e `_moves`, or marks by Σ_e u_e `_beside`; None: there are none.
     """
 
     kind: Kind
@@ -161,6 +161,10 @@ class Block(ABC):
         """(E, V, 3) by which one sigma of each effect shifts the items for a camera."""
         return state.unknown.new_zeros(0, len(self), 3)
 
+    def _beside(self, camera: int) -> Tensor | None:
+        """(E, V, 2, 1) px by which one sigma of each effect puts marks of a camera beside things; None: `_moves`."""
+        return None
+
     def _bent(self, state: RigState, offset: Tensor, camera: int) -> Tensor:
         """Where things are seen (V, 3, N) that stand at `offset` from the camera."""
         return offset
@@ -185,15 +189,19 @@ class Block(ABC):
             if not self._used[c]:
                 continue
             offset = y - w * posed.center[:, None]
+            beside = offset.new_zeros(())
             if self._effects is not None:
                 amounts = self._effects.of_state @ state.unknown
-                offset = offset + torch.einsum("e,evk->vk", amounts, self._moves(state, c))[..., None]
+                if (marks := self._beside(c)) is None:
+                    offset = offset + torch.einsum("e,evk->vk", amounts, self._moves(state, c))[..., None]
+                else:
+                    beside = torch.einsum("e,evun->vun", amounts, marks)
             q = posed.rotation @ self._bent(state, offset, c)
             wanted = posed.by_unknown.any(1).nonzero()[:, 0].tolist() if derivatives else None
             found = project_components(q, posed.parameters, posed.camera.model, wanted, w[..., 0])
             # NaN where a seen point has no projection, so that such a pose is never accepted.
             bad = torch.where(found.regular, 0.0, torch.nan)[..., None, :]
-            error = torch.where(self.seen[:, c, None, :], found.pixels - self.target[:, c] + bad, 0.0)
+            error = torch.where(self.seen[:, c, None, :], found.pixels + beside - self.target[:, c] + bad, 0.0)
             yield c, posed, offset, q, w, found, error
 
     def errors(self, cameras: Sequence[PosedCamera], state: RigState) -> Tensor:
@@ -224,7 +232,10 @@ class Block(ABC):
                 moved.append(self._by_board_or_air(state, by_q, offset))
                 maps.append(through)
             if self._effects is not None and self._effects.of_step is not None:
-                moved.append(torch.einsum("vjun,evj->veun", by_offset, self._moves(state, c)))
+                marks = self._beside(c)
+                if marks is None:
+                    marks = torch.einsum("vjun,evj->evun", by_offset, self._moves(state, c))
+                moved.append(marks.movedim(0, 1))
                 maps.append(self._effects.of_step)
             columns = torch.zeros(0, dtype=torch.long)
             if maps:
@@ -328,13 +339,29 @@ class BoardBlock(Block):
 
 
 class FeatureBlock(Block):
-    """Things of unknown position: a direction and an inverse range from `anchor` each."""
+    """Things of unknown position: a direction and an inverse range from `anchor` each.
+
+    Args:
+        pixels: (V, C, 2), see `Block`, as `whitening` (V, C, 2, 2) and `effects`.
+        inverse_range: (V,) as known beforehand, with `sigma`.
+        shifts: (E, V, C, 2) see `FeatureEffect`; needed with effects.
+    """
 
     kind: Kind = "features"
     size = 3
 
-    def __init__(self, pixels: Tensor, whitening: Tensor, inverse_range: Tensor, sigma: Tensor, anchor: Tensor) -> None:
-        super().__init__(pixels[:, :, None], whitening[:, :, None])
+    def __init__(
+        self,
+        pixels: Tensor,
+        whitening: Tensor,
+        inverse_range: Tensor,
+        sigma: Tensor,
+        anchor: Tensor,
+        effects: Effects | None = None,
+        shifts: Tensor | None = None,
+    ) -> None:
+        super().__init__(pixels[:, :, None], whitening[:, :, None], effects)
+        self._shifts = shifts
         self._mean, self._weight = inverse_range, torch.where(torch.isfinite(sigma), 1.0 / sigma, 0.0)
         self._anchor = anchor
 
@@ -344,6 +371,9 @@ class FeatureBlock(Block):
     def _place(self, state: RigState) -> tuple[Tensor, Tensor]:
         inverse = state.inverse_range[:, None]
         return (state.direction + inverse * self._anchor)[..., None], inverse[..., None]
+
+    def _beside(self, camera: int) -> Tensor | None:
+        return None if self._shifts is None else self._shifts[:, :, camera, :, None]
 
     def _by_local(self, state: RigState, by_q: Tensor, center: Tensor, by_w: Tensor | None) -> Tensor:
         # By two steps across the direction, then by ρ.

@@ -294,7 +294,7 @@ class RigResult:
         return float(self._state.refraction)
 
     def effects(self) -> dict[str, tuple[float, float]]:
-        """What shifts stars or landmarks together: its amount and standard deviation, in sigmas stated beforehand."""
+        """What shifts stars, landmarks or features together: its amount and standard deviation, in stated sigmas."""
         maps = self._problem.unknowns.by_effects
         if maps is None:
             return {}

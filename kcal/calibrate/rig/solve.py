@@ -206,7 +206,6 @@ def _what_may_change(data: RigData, options: RigOptions) -> tuple[RigData, Share
         unknowns = unknowns.and_warp(boards.points)
     if data.absolute:
         unknowns = unknowns.and_refraction(options.refraction, options.refraction_sigma)
-    # Those of stars first: `Adjustment` counts on it.
     if data.effects:
         unknowns = unknowns.and_effects(*data.effects)
     return data, unknowns, doubts

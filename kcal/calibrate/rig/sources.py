@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections import Counter
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -184,9 +185,30 @@ class Landmarks:
         return torch.as_tensor(self.pixel_sigma, dtype=torch.float64).expand(self.pixels.shape[:2])
 
 
-def _padded(effect: LandmarkEffect, before: int, after: int) -> LandmarkEffect:
+def _padded(effect: _Effect, before: int, after: int) -> _Effect:
     shift = torch.nn.functional.pad(effect.shift, (0, 0, 0, 0, before, after))
-    return LandmarkEffect(name=effect.name, shift=shift)
+    return dataclasses.replace(effect, shift=shift)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class FeatureEffect:
+    """An error that the marks of many features share and of which only the size is known, such as of matching.
+
+    Args:
+        name: what it is, for messages.
+        shift: (F, C, 2) px by which each mark is off at one sigma of it.
+
+    Example:
+        >>> lower = torch.tensor([[[0.0, 0.0], [0.0, 0.01]]], dtype=torch.float64)  # of one feature in two images
+        >>> FeatureEffect(name="matches are too low", shift=lower).shift.shape
+        torch.Size([1, 2, 2])
+    """
+
+    name: str
+    shift: Tensor
+
+
+_Effect = TypeVar("_Effect", LandmarkEffect, FeatureEffect)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -204,6 +226,7 @@ class Features:
         inverse_range_sigma: (F,) its standard deviation; infinite where the range is not known.
         pixel_sigma: of a mark along an axis, px.
         covariance: (F, C, 2, 2) px² of marks, in place of `pixel_sigma`.
+        effects: errors that marks of many of them share, beyond these.
     """
 
     names: tuple[str, ...]
@@ -212,6 +235,7 @@ class Features:
     inverse_range_sigma: Tensor
     pixel_sigma: float = 0.3
     covariance: Tensor | None = None
+    effects: tuple[FeatureEffect, ...] = ()
 
     def __post_init__(self) -> None:
         count = len(self.names)
@@ -225,9 +249,18 @@ class Features:
             raise InputError(
                 f"features: a covariance {(*self.pixels.shape, 2)} is needed, got {tuple(self.covariance.shape)}"
             )
+        for effect in self.effects:
+            if effect.shift.shape != self.pixels.shape or not bool(torch.isfinite(effect.shift).all()):
+                raise InputError(f"features: the effect of {effect.name} needs finite shifts (F, C, 2)")
+
+    def shifts(self) -> Tensor:
+        """(E, F, C, 2) of all effects."""
+        shifts = [effect.shift for effect in self.effects]
+        return torch.stack(shifts) if shifts else self.pixels.new_zeros(0, *self.pixels.shape)
 
     def __add__(self, other: Features) -> Features:
-        """Both, with a covariance for each mark."""
+        """Both, with a covariance for each mark; effects shift only those whose they are."""
+        counts = len(self.names), len(other.names)
         both = self._whole(), other._whole()
         return Features(
             names=self.names + other.names,
@@ -235,6 +268,10 @@ class Features:
             inverse_range=torch.cat([self.inverse_range, other.inverse_range]),
             inverse_range_sigma=torch.cat([self.inverse_range_sigma, other.inverse_range_sigma]),
             covariance=torch.cat(both),
+            effects=(
+                *(_padded(effect, 0, counts[1]) for effect in self.effects),
+                *(_padded(effect, counts[0], 0) for effect in other.effects),
+            ),
         )
 
     def _whole(self) -> Tensor:
@@ -347,11 +384,9 @@ class RigData:
 
     @property
     def effects(self) -> tuple[str, ...]:
-        """Names of what shifts stars, and then of what shifts landmarks, together."""
-        return (
-            *(effect.name for effect in (self.stars.effects if self.stars else ())),
-            *(effect.name for effect in (self.landmarks.effects if self.landmarks else ())),
-        )
+        """Names of what shifts stars, then landmarks, and then features, together."""
+        sources = [one for one in (self.stars, self.landmarks, self.features) if one is not None]
+        return tuple(effect.name for source in sources for effect in source.effects)
 
     @property
     def absolute(self) -> bool:

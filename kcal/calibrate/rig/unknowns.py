@@ -28,8 +28,8 @@ class SharedUnknowns:
         labels: (K,) names of those that have one.
         refraction: coefficient of refraction of light for the unknowns as they begin.
         by_refraction: (K,) of it by each unknown; None: it is held.
-        by_effects: (E, K) of what shifts stars (`StarEffect`) and then landmarks (`LandmarkEffect`) together, by each
-            unknown; None: there is nothing.
+        by_effects: (E, K) of what shifts stars (`StarEffect`), then landmarks (`LandmarkEffect`), and then features
+            (`FeatureEffect`) together, by each unknown; None: there is nothing.
     """
 
     cameras: tuple[Tensor, ...]
@@ -69,7 +69,7 @@ class SharedUnknowns:
         return dataclasses.replace(more, refraction=refraction, by_refraction=slope)
 
     def and_effects(self, *names: str) -> SharedUnknowns:
-        """These, and amounts of what shifts stars or landmarks together, in standard deviations."""
+        """These, and amounts of what shifts stars, landmarks or features together, in standard deviations."""
         more = self._and(*names, known=True)
         count = len(names)
         select = torch.zeros(count, len(more), dtype=torch.float64)
