@@ -30,8 +30,8 @@ _REACH = 1.08
 # Shapes and angles of the image's corner from which the base projection is begun.
 _SHAPES = (1.0, 0.25, 0.0)
 _CORNERS = (12.0, 20.0, 30.0, 42.0, 55.0, 68.0, 80.0)
-# Views by which the start is chosen.
-_VIEWS = 60
+# Views by which the start is chosen: its projection among several, and that fitted.
+_SOME, _VIEWS = 15, 60
 # Corners that a view needs at least, and how far off the axis they are at most, radians.
 _FEWEST, _STEEPEST = 6, math.radians(80.0)
 _PINHOLE = torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=torch.float64)
@@ -262,9 +262,11 @@ def _base_start(
     shapes, focals, ideals, usables = (each[possible] for each in (shapes, focals, ideals, usables))
     if not len(shapes):
         raise InputError("no start explains the corners: are all views of this board and from this camera?")
+    some = slice(None, None, 1 + (len(offset) - 1) // _SOME)
+    whole, offset, usables = ideals, offset[some], usables[:, some]
     rotations, translations = (
         part.unflatten(0, usables.shape[:2])
-        for part in poses_from_homographies(homographies(points, ideals.flatten(0, 1)), _PINHOLE)
+        for part in poses_from_homographies(homographies(points, ideals[:, some].flatten(0, 1)), _PINHOLE)
     )
     cam = points @ rotations.transpose(-1, -2) + translations[..., None, :]
     away = cam[..., :2].norm(dim=-1)
@@ -280,7 +282,8 @@ def _base_start(
     best = int(torch.where(values.isfinite(), values, math.inf).argmin())
     if not math.isfinite(float(values[best])):
         raise InputError("no start explains the corners: are all views of this board and from this camera?")
-    return float(focals[best]), float(shapes[best]), rotations[best], translations[best]
+    poses = poses_from_homographies(homographies(points, whole[best]), _PINHOLE)
+    return float(focals[best]), float(shapes[best]), *poses
 
 
 def _through_base(offset: Tensor, seen: Tensor, focal: Tensor | float, shape: Tensor | float) -> tuple[Tensor, Tensor]:

@@ -121,13 +121,14 @@ def run_rounds(
             tempering = math.sqrt(tempering * found) if tempered else found
             tempered = True
         best = Maximum(estimate.hyperparameters, estimate.log_ratio, estimate.variance / former, math.inf)
+        # An earlier fit of still views, under another prior, is farther off than what a round leaves: by a step.
+        most = 3 if turn == 0 and problem.readout is None else 2
         for roughly in (True,) if rough else (True, False):
             best = maximize_evidence(
                 data, estimate.families, best.h, best.variance, hyperprior, best.log_ratio, tempering, roughly
             )
             change = max(_moved_by(estimate, best), abs(math.log(tempering / former)))
-            # What an earlier fit found under another prior is farther off than what a round leaves: by a step.
-            resting = not first and (change < _NEAR_REST if rough else change < _AT_REST and steps <= 2 + (turn == 0))
+            resting = not first and (change < _NEAR_REST if rough else change < _AT_REST and steps <= most)
             # To the end where nothing will change any more.
             if not resting:
                 break
