@@ -37,6 +37,8 @@ _FEWEST, _STEEPEST = 6, math.radians(80.0)
 _PINHOLE = torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=torch.float64)
 # How many times smaller the squared misfit of another focal length must be than that of the one that was given.
 _DOUBT = 2.0
+# Changes of focal length and shape after which these are constants of the lens: what is left is their square.
+_NEAR = 0.02
 # A field that is held at zero, as small as there is one.
 _NO_FIELD = ZernikeModes(radial=0, decentered=0, astigmatic=1, other=0)
 
@@ -171,7 +173,7 @@ def _fit_projection(capture: FittedViews, known_focal: float | None, exact_focal
                 "the views do not determine the focal length: they are parallel to the image or too similar; add views "
                 "with the board tilted by 30 to 45 degrees in different directions"
             )
-        if not capture.robust and abs(scale) < 1e-3 and abs(bend) < 1e-3 * (1 + abs(base.shape)):
+        if not capture.robust and abs(scale) < _NEAR and abs(bend) < _NEAR * (1 + abs(base.shape)):
             break
     return base
 
