@@ -151,7 +151,7 @@ def direction_limits(coefficients: Tensor, model: LensModel, count: int) -> Tens
     steps = torch.linspace(0, top if model.wide else math.atan(top), 535, dtype=torch.float64)
     radii = (steps if model.wide else torch.tan(steps)).to(coefficients.device)[:, None].expand(-1, count)
     if model.hybrid:
-        # Its field is smooth: where every third one is farther above zero than it bends, those between are above it, too.
+        # Its field is smooth: where every third is farther above zero than it bends, those between are above zero, too.
         few = determinants(radii[::3])
         if known_true(few.amin((-2, -1)) > few.diff(n=2, dim=-2).abs().amax((-2, -1))):
             return radii[-1].expand(*few.shape[:-2], -1)
