@@ -78,7 +78,7 @@ class _ByView(NamedTuple):
     def fall(self, second: Tensor) -> Tensor:
         """(...) by how much χ² falls with the best of both groups."""
         theta = self.best(second)
-        return -torch.where(second, *(self.change(theta[..., k : k + 1, :]) for k in (1, 0))).sum(-1)
+        return -torch.where(second, self.change(theta[..., 1:, :]), self.change(theta[..., :1, :])).sum(-1)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -152,8 +152,8 @@ def settle(
                 rounds, never = run(one, near, rounds.steps)
                 # Motion along columns and the aspect of pixels look alike: with square pixels it may explain what the
                 # aspect did, and that is no more than the nats that the aspect was worth.
-                hidden = one.square and one.readout is None and readout is not None
-                if hidden and not most < WORTH and motion_is_worth(rounds, readout, hyperprior, never):
+                hidden = one.square and one.readout is None and not most < WORTH
+                if hidden and readout is not None and motion_is_worth(rounds, readout, hyperprior, never):
                     rounds, never = run(dataclasses.replace(one, readout=readout), near, rounds.steps)
         if capture.readout is not None and columns_may_be_read(rounds, hyperprior, never):
             by_columns = dataclasses.replace(capture.readout, columns=True)
