@@ -139,21 +139,25 @@ def direction_limits(coefficients: Tensor, model: LensModel, count: int) -> Tens
     """Distance (..., count) of the first place along each of `count` directions where the lens is not regular."""
     unit_x, unit_y = directions(count, coefficients)
 
-    def count_regular(radius: Tensor) -> Tensor:
-        """For radii (..., K, count), one column per direction: number (..., count) of leading regular ones."""
+    def determinants(radius: Tensor) -> Tensor:
+        """For radii (..., K, count), one column per direction: the determinant before any pole, -1 beyond."""
         x, y = (radius * unit_x).flatten(-2), (radius * unit_y).flatten(-2)
         lens = distort_components(x, y, coefficients, model)
-        regular = (lens.positive & (lens.determinant > 0)).unflatten(-1, (-1, count))
-        return regular.to(torch.int64).cumprod(-2).sum(-2)
+        return torch.where(lens.positive, lens.determinant, -1.0).unflatten(-1, (-1, count))
 
     # Outward in steps of 1/6°; then the interval is split in 32 again and again, until it is as narrow as rounding.
     # Rounding does not put the last of them beyond the disc of a hybrid lens, which is regular there as a rule.
     top = largest_radius(model) * (1.0 - 1e-15)
     steps = torch.linspace(0, top if model.wide else math.atan(top), 535, dtype=torch.float64)
     radii = (steps if model.wide else torch.tan(steps)).to(coefficients.device)[:, None].expand(-1, count)
+    if model.hybrid:
+        # Its field is smooth: where every third is farther above zero than it bends, those between are above zero, too.
+        few = determinants(radii[::3])
+        if known_true(few.amin((-2, -1)) > few.diff(n=2, dim=-2).abs().amax((-2, -1))):
+            return radii[-1].expand(*few.shape[:-2], -1)
     fractions = torch.linspace(0, 1, 33, dtype=torch.float64, device=coefficients.device)[:, None]
     for _ in range(11):
-        regular = count_regular(radii)
+        regular = (determinants(radii) > 0).to(torch.int64).cumprod(-2).sum(-2)
         radii = radii.expand(*regular.shape[:-1], -1, -1)
         # A lens that is irregular on the axis itself, for example with a tilt beyond 90°, has a limit of zero.
         low = torch.gather(radii, -2, (regular - 1).clamp(min=0)[..., None, :])

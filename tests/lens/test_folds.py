@@ -13,8 +13,9 @@ from torch import Tensor
 
 from kcal.lens.camera import Camera
 from kcal.lens.distortion import distort
+from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.model import LensModel
-from kcal.lens.region import in_region, valid_region
+from kcal.lens.region import direction_limits, in_region, valid_region
 from kcal.lens.taylor_bounds import Jet, Span
 from scripts.check import folds
 from scripts.check.uncertainty import LENS
@@ -136,6 +137,15 @@ class TestOtherTerms:
             assert torch.equal(alone.edge, own[1])
             assert torch.equal(alone.cuts, own[2][: len(alone.cuts)])
             assert bool(torch.isinf(own[2][len(alone.cuts) :, 3]).all())
+
+
+def test_a_fold_between_every_third_step() -> None:
+    """Of a hybrid lens every third is looked at first: there the determinant is .06, and here it is -2e-4."""
+    model = LensModel(hybrid=HybridForm(shape=0.5, radius=0.9))
+    lens = torch.zeros(model.size, dtype=torch.float64)
+    lens[model.names.index("z31+1")] = 2.32596e-3
+    assert float(direction_limits(lens, model, 4).max()) == pytest.approx(0.9 * 0.9869, abs=1e-4)
+    assert direction_limits(0.5 * lens, model, 4).tolist() == pytest.approx([0.9] * 4, abs=1e-14)
 
 
 @pytest.mark.parametrize("name", [*MODELS, "pinhole", "fisheye4"])

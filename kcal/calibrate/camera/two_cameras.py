@@ -65,18 +65,20 @@ class _ByView(NamedTuple):
     g: Tensor
 
     def change(self, theta: Tensor) -> Tensor:
-        """(V,) of χ² by θ (3,), or by one for each view (V, 3)."""
-        each = theta.expand_as(self.g)
+        """(..., V) of χ² by θ (..., 1, 3), or by one for each view (..., V, 3)."""
+        each = theta.expand(*theta.shape[:-2], *self.g.shape)
         return (each * (2.0 * self.g + (self.N @ each[..., None])[..., 0])).sum(-1)
 
     def best(self, second: Tensor) -> Tensor:
-        """(2, 3) the best θ of both groups; `second` (V,) tells which views are in the second one."""
-        groups = [(self.N[one].sum(0), self.g[one].sum(0)) for one in (~second, second)]
-        return torch.stack([-torch.linalg.lstsq(N, g[:, None]).solution[:, 0] for N, g in groups])
+        """(..., 2, 3) the best θ of both groups; `second` (..., V) tells which views are in the second one."""
+        groups = torch.stack([~second, second], -2).to(self.g.dtype)
+        N, g = (groups @ self.N.flatten(1)).unflatten(-1, self.N.shape[1:]), groups @ self.g
+        return -torch.linalg.lstsq(N, g[..., None]).solution[..., 0]
 
-    def fall(self, second: Tensor) -> float:
-        """By how much χ² falls with the best of both groups."""
-        return -float(self.change(self.best(second)[second.long()]).sum())
+    def fall(self, second: Tensor) -> Tensor:
+        """(...) by how much χ² falls with the best of both groups."""
+        theta = self.best(second)
+        return -torch.where(second, self.change(theta[..., 1:, :]), self.change(theta[..., :1, :])).sum(-1)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -234,7 +236,7 @@ def _by_view(problem: BoardProblem, state: BoardState, variance: float) -> _ByVi
 def _promising(views: _ByView, pixels: Tensor, size: tuple[int, int]) -> Tensor | None:
     """The second group (V,) if two groups might be real, else None."""
     second = _grouped(views, size)
-    if second is None or 0.5 * views.fall(second) < _PROMISED * (_chance(pixels) + _BEYOND):
+    if second is None or 0.5 * float(views.fall(second)) < _PROMISED * (_chance(pixels) + _BEYOND):
         return None
     change = views.best(second)[1] - views.best(second)[0]
     return second if _far_apart(2.0 * float(change[0]), 2.0 * change[1:], size) else None
@@ -252,19 +254,22 @@ def _grouped(views: _ByView, size: tuple[int, int]) -> Tensor | None:
     each, white = unit * found, found @ torch.linalg.cholesky(scaled.mean(0) + one)
     _, axes = torch.linalg.eigh(torch.cov(white.T))
     order = torch.arange(len(each), dtype=torch.float64)
-    lines = [order, order % 2, *(white @ axes).T, *each.T]
-    best: tuple[float, Tensor] | None = None
-    for line in lines:
-        second = line > 0.5 * (line.min() + line.max()) if line is lines[1] else line > line.median()
-        for _ in range(_STEPS):
-            theta = views.best(second)
-            moved = views.change(theta[1]) < views.change(theta[0])
-            if bool((moved == second).all()):
-                break
-            second = moved
-        if _FEWEST <= int(second.sum()) <= len(second) - _FEWEST and (best is None or views.fall(second) > best[0]):
-            best = views.fall(second), second
-    return None if best is None else best[1]
+    lines = torch.stack([order, order % 2, *(white @ axes).T, *each.T])
+    low, high = lines.aminmax(dim=1, keepdim=True)
+    middle = lines.median(1, keepdim=True).values
+    # Every other view: there is nothing between the two values.
+    middle[1] = 0.5 * (low + high)[1]
+    second = lines > middle
+    for _ in range(_STEPS):
+        theta = views.best(second)
+        moved = views.change(theta[:, 1:]) < views.change(theta[:, :1])
+        if torch.equal(moved, second):
+            break
+        second = moved
+    count = second.sum(1)
+    possible = (count >= _FEWEST) & (count <= len(order) - _FEWEST)
+    falls = torch.where(possible, views.fall(second), -torch.inf)
+    return second[falls.argmax()] if bool(possible.any()) else None
 
 
 def _chance(pixels: Tensor) -> float:

@@ -22,28 +22,23 @@ _CLEAR = 3.75
 _NEARLY = 0.03
 
 
-def square_pixels(rounds: Rounds, hyperprior: Hyperprior, never: Tensor) -> bool:
-    """Whether the aspect ratio that a fit with two focal lengths found cannot be told from one.
+def aspect_score(rounds: Rounds, hyperprior: Hyperprior, never: Tensor) -> float:
+    """Standard deviations by which the aspect ratio that a fit with two focal lengths found is off one.
 
     Args:
         rounds: of the fit.
         hyperprior: of its amplitudes.
         never: (S,) unknowns that were held.
     """
-    if pixels_are_square(*aspect_of(rounds, never)):
-        return True
+    score = _score(rounds, never)
+    if pixels_are_square(score):
+        return score
     # Amplitudes as they are to be expected: those of largest evidence may state the ratio too surely.
-    expected = rounds._replace(estimate=expected_estimate(rounds, hyperprior))
-    return pixels_are_square(*aspect_of(expected, never))
+    return _score(rounds._replace(estimate=expected_estimate(rounds, hyperprior)), never)
 
 
-def aspect_of(rounds: Rounds, never: Tensor) -> tuple[float, float]:
-    """f_y / f_x and its standard deviation, the board's stretch being hardly known.
-
-    Args:
-        rounds: of a fit with two focal lengths.
-        never: (S,) unknowns that were held.
-    """
+def _score(rounds: Rounds, never: Tensor) -> float:
+    """The same at the amplitudes of the rounds, the board's stretch being hardly known."""
     estimate, data = rounds.estimate, rounds.data
     families, h = estimate.families, estimate.hyperparameters.clone()
     h[BOARD + STRETCH] = h[BOARD + STRETCH].clamp_min(math.log(_PRINTED))
@@ -55,12 +50,12 @@ def aspect_of(rounds: Rounds, never: Tensor) -> tuple[float, float]:
     aspect = float(x[rows] / x[columns])
     slope = torch.zeros_like(x)
     slope[rows], slope[columns] = 1.0 / x[columns], -aspect / x[columns]
-    return aspect, float((half @ slope).norm())
+    return (aspect - 1.0) / float((half @ slope).norm())
 
 
-def pixels_are_square(aspect: float, sigma: float) -> bool:
-    """Whether an aspect ratio cannot be told from one."""
-    return not abs(aspect - 1.0) > _CLEAR * sigma
+def pixels_are_square(score: float) -> bool:
+    """Whether an aspect ratio that is so many standard deviations off cannot be told from one."""
+    return not abs(score) > _CLEAR
 
 
 def with_square_pixels(estimate: Estimate, board: BoardModes) -> Estimate | None:

@@ -30,13 +30,15 @@ _REACH = 1.08
 # Shapes and angles of the image's corner from which the base projection is begun.
 _SHAPES = (1.0, 0.25, 0.0)
 _CORNERS = (12.0, 20.0, 30.0, 42.0, 55.0, 68.0, 80.0)
-# Views by which the start is chosen.
-_VIEWS = 60
+# Views by which the start is chosen: its projection among several, and that fitted.
+_SOME, _VIEWS = 15, 60
 # Corners that a view needs at least, and how far off the axis they are at most, radians.
 _FEWEST, _STEEPEST = 6, math.radians(80.0)
 _PINHOLE = torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=torch.float64)
 # How many times smaller the squared misfit of another focal length must be than that of the one that was given.
 _DOUBT = 2.0
+# Changes of focal length and shape after which these are constants of the lens: what is left is their square.
+_NEAR = 0.02
 # A field that is held at zero, as small as there is one.
 _NO_FIELD = ZernikeModes(radial=0, decentered=0, astigmatic=1, other=0)
 
@@ -171,7 +173,7 @@ def _fit_projection(capture: FittedViews, known_focal: float | None, exact_focal
                 "the views do not determine the focal length: they are parallel to the image or too similar; add views "
                 "with the board tilted by 30 to 45 degrees in different directions"
             )
-        if not capture.robust and abs(scale) < 1e-3 and abs(bend) < 1e-3 * (1 + abs(base.shape)):
+        if not capture.robust and abs(scale) < _NEAR and abs(bend) < _NEAR * (1 + abs(base.shape)):
             break
     return base
 
@@ -262,9 +264,11 @@ def _base_start(
     shapes, focals, ideals, usables = (each[possible] for each in (shapes, focals, ideals, usables))
     if not len(shapes):
         raise InputError("no start explains the corners: are all views of this board and from this camera?")
+    some = slice(None, None, 1 + (len(offset) - 1) // _SOME)
+    whole, offset, usables = ideals, offset[some], usables[:, some]
     rotations, translations = (
         part.unflatten(0, usables.shape[:2])
-        for part in poses_from_homographies(homographies(points, ideals.flatten(0, 1)), _PINHOLE)
+        for part in poses_from_homographies(homographies(points, ideals[:, some].flatten(0, 1)), _PINHOLE)
     )
     cam = points @ rotations.transpose(-1, -2) + translations[..., None, :]
     away = cam[..., :2].norm(dim=-1)
@@ -280,7 +284,8 @@ def _base_start(
     best = int(torch.where(values.isfinite(), values, math.inf).argmin())
     if not math.isfinite(float(values[best])):
         raise InputError("no start explains the corners: are all views of this board and from this camera?")
-    return float(focals[best]), float(shapes[best]), rotations[best], translations[best]
+    poses = poses_from_homographies(homographies(points, whole[best]), _PINHOLE)
+    return float(focals[best]), float(shapes[best]), *poses
 
 
 def _through_base(offset: Tensor, seen: Tensor, focal: Tensor | float, shape: Tensor | float) -> tuple[Tensor, Tensor]:

@@ -50,6 +50,16 @@ class BoardPrior(NamedTuple):
         known = BoardModes(shapes, unit, torch.full_like(modes.family, KNOWN))
         return points + torch.einsum("b,bkn->nk", mean, modes.shapes), known
 
+    def in_amplitudes(self, units: Tensor) -> Tensor:
+        """(B,) amplitudes of the board's own modes, from the variables (B,) of `applied`."""
+        mean, half = self.whole.mean_and_half()
+        return mean + units @ half
+
+    def in_units(self, amplitudes: Tensor) -> Tensor:
+        """The inverse of `in_amplitudes`."""
+        mean, half = self.whole.mean_and_half()
+        return torch.linalg.solve_triangular(half, (amplitudes - mean)[None], upper=False, left=False)[0]
+
     def in_modes(self, known: CameraInformation, amplitudes: Tensor) -> CameraInformation:
         """What is known of a camera and of the variables of `applied`, by the board's own modes and what others told.
 

@@ -12,12 +12,13 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.calibrate.hybrid.aspect import square_pixels, with_square_pixels
+from kcal.calibrate.hybrid.aspect import aspect_score, pixels_are_square, with_square_pixels
 from kcal.calibrate.hybrid.base_fit import fit_base
 from kcal.calibrate.hybrid.board_modes import board_modes
 from kcal.calibrate.hybrid.board_prior import BoardPrior
+from kcal.calibrate.hybrid.evidence import WORTH
 from kcal.calibrate.hybrid.evidence_rounds import Rounds, columns_may_be_read, motion_is_worth, run_rounds
-from kcal.calibrate.hybrid.families import Hyperprior, typical_hyperprior
+from kcal.calibrate.hybrid.families import BOARD, Hyperprior, typical_hyperprior
 from kcal.calibrate.hybrid.fitted_views import Estimate, FittedViews
 from kcal.calibrate.hybrid.fleet import LensPrior
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard
@@ -108,41 +109,52 @@ def settle(
         exact=board == "exact",
     )
 
-    def run(capture: FittedViews, estimate: Estimate, spent: int, cold: bool) -> tuple[Rounds, Tensor]:
+    def run(
+        capture: FittedViews, estimate: Estimate, spent: int, *, cold: bool = False, rough: bool = rough
+    ) -> tuple[Rounds, Tensor]:
         held = torch.zeros_like(estimate.families.mean, dtype=torch.bool)
         if capture.exact:
             held[-len(shown.unit) :] = True
         rounds = run_rounds(capture, estimate, hyperprior, held, cold=cold, spent=spent, rough=rough, progress=progress)
         return rounds, held
 
-    def begin(capture: FittedViews) -> tuple[Rounds, Tensor]:
+    def begin(capture: FittedViews, rough: bool = rough) -> tuple[Rounds, Tensor]:
         estimate, steps = fit_base(capture, modes, focal, hyperprior.mean, lens)
         progress("base projection")
         if capture.readout is not None:
             distance = float(estimate.state.translation.norm(dim=-1).median())
             readout = dataclasses.replace(capture.readout, distance=distance)
             capture = dataclasses.replace(capture, readout=readout)
-        return run(capture, estimate, steps, True)
+        return run(capture, estimate, steps, cold=True, rough=rough)
 
     if start is not None:
         estimate = start.estimate
-        state = estimate.state
+        state, h = estimate.state, estimate.hyperparameters
         if isinstance(board, BoardPrior):
-            state = state._replace(board=torch.zeros_like(board.own.at))
-        estimate = estimate._replace(families=estimate.families.with_board(shown), state=state)
-        rounds, never = run(capture, estimate, start.iterations, False)
+            state, h = state._replace(board=board.in_units(state.board)), h.clone()
+            # Nothing depends on them any more, so that they are no reason for another round.
+            h[BOARD:] = hyperprior.mean[BOARD:]
+        families = estimate.families.with_board(shown)
+        estimate = estimate._replace(families=families, state=state, hyperparameters=h)
+        rounds, never = run(capture, estimate, start.iterations)
     else:
-        rounds, never = begin(capture)
-        if square is None and lens is None and square_pixels(rounds, hyperprior, never):
-            # Motion along columns and the aspect of pixels look alike: with square pixels it is looked for anew.
-            one, readout = dataclasses.replace(rounds.capture, square=True), rounds.readout
-            near = with_square_pixels(rounds.estimate, shown)
+        undecided = square is None and lens is None
+        # Whether pixels are square is told well enough before amplitudes are entirely at rest.
+        rounds, never = begin(capture, rough or undecided)
+        if undecided:
+            score = aspect_score(rounds, hyperprior, never)
+            one = dataclasses.replace(rounds.capture, square=pixels_are_square(score))
+            near = with_square_pixels(rounds.estimate, shown) if one.square else rounds.estimate
+            readout, most = rounds.readout, rounds.gained + 0.5 * score**2
             if near is None:
                 rounds, never = begin(dataclasses.replace(one, readout=readout))
-            else:
-                rounds, never = run(one, near, rounds.steps, False)
-                if one.readout is None and readout is not None and motion_is_worth(rounds, readout, hyperprior, never):
-                    rounds, never = run(dataclasses.replace(one, readout=readout), near, rounds.steps, False)
+            elif one.square or not rough:
+                rounds, never = run(one, near, rounds.steps)
+                # Motion along columns and the aspect of pixels look alike: with square pixels it may explain what the
+                # aspect did, and that is no more than the nats that the aspect was worth.
+                hidden = one.square and one.readout is None and not most < WORTH
+                if hidden and readout is not None and motion_is_worth(rounds, readout, hyperprior, never):
+                    rounds, never = run(dataclasses.replace(one, readout=readout), near, rounds.steps)
         if capture.readout is not None and columns_may_be_read(rounds, hyperprior, never):
             by_columns = dataclasses.replace(capture.readout, columns=True)
             other = begin(dataclasses.replace(capture, square=rounds.capture.square, readout=by_columns))
@@ -167,12 +179,15 @@ def rough_start(
         InputError: as `kcal.calibrate.hybrid.fit.fit_hybrid`.
         DegenerateError: likewise.
     """
-    rounds, never, *_ = settle(
+    rounds, never, _, known = settle(
         points, pixels, size, weights, board=board, motion=motion, focal=focal, progress=progress, rough=True
     )
     capture, estimate = rounds.capture, rounds.estimate
     errors = capture.problem(estimate, never).pixel_errors(estimate.state)
     check_shown(errors)
+    if isinstance(known, BoardPrior):
+        state = estimate.state
+        estimate = estimate._replace(state=state._replace(board=known.in_amplitudes(state.board)))
     return FitStart(estimate, capture.readout, capture.square, capture.by_corner(errors), rounds.steps)
 
 

@@ -13,13 +13,14 @@ import torch
 from printed_boards import shown
 from torch import Tensor
 
-from kcal.calibrate.hybrid import aspect
+from kcal.calibrate.hybrid import aspect, settled
 from kcal.calibrate.hybrid.base_fit import fit_projection
 from kcal.calibrate.hybrid.board_groups import compared
 from kcal.calibrate.hybrid.board_modes import board_modes
 from kcal.calibrate.hybrid.board_orders import turned
 from kcal.calibrate.hybrid.board_prior import evidence, printed_board
 from kcal.calibrate.hybrid.cameras_fit import _begun_fleet, _learned_fleet
+from kcal.calibrate.hybrid.evidence import WORTH
 from kcal.calibrate.hybrid.families import Hyperprior, prior_families, typical_hyperprior
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.fitted_views import _cauchy_weights
@@ -270,7 +271,7 @@ def test_pixels_that_amplitudes_to_be_expected_leave_square(monkeypatch: pytest.
         def _replace(self, estimate: str) -> Rounds:
             return Rounds(estimate)
 
-    ratios = {"likely": (1.01, 0.002), "expected": (1.01, 0.004)}
+    scores = {"likely": 5.0, "expected": 2.5}
     beforehand = typical_hyperprior()
 
     def expected(rounds: Rounds, hyperprior: Hyperprior) -> str:
@@ -278,13 +279,32 @@ def test_pixels_that_amplitudes_to_be_expected_leave_square(monkeypatch: pytest.
         return "expected"
 
     monkeypatch.setattr(aspect, "expected_estimate", expected)
-    monkeypatch.setattr(aspect, "aspect_of", lambda rounds, never: ratios[rounds.estimate])
+    monkeypatch.setattr(aspect, "_score", lambda rounds, never: scores[rounds.estimate])
     begin = cast(Any, Rounds("likely"))
-    assert aspect.square_pixels(begin, beforehand, torch.zeros(0))
-    ratios["expected"] = (1.01, 0.0025)
-    assert not aspect.square_pixels(begin, beforehand, torch.zeros(0))
-    ratios["likely"] = (1.01, 0.004)
-    assert aspect.square_pixels(begin, beforehand, torch.zeros(0))
+    assert aspect.aspect_score(begin, beforehand, torch.zeros(0)) == 2.5
+    scores["expected"] = -4.0
+    assert aspect.aspect_score(begin, beforehand, torch.zeros(0)) == -4.0
+    scores["likely"] = -3.0
+    assert aspect.aspect_score(begin, beforehand, torch.zeros(0)) == -3.0
+
+
+def test_motion_is_looked_for_again_where_the_aspect_may_have_hidden_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The aspect hides no more motion than it was worth: half the square of its standard deviations, in nats."""
+    asked: list[float] = []
+    for score in (0.0, 3.5):
+
+        def motion_is_worth(*_: object, score: float = score) -> bool:
+            asked.append(score)
+            return False
+
+        def of_pixels(rounds: Any, *_: object, score: float = score) -> float:
+            assert rounds.gained < WORTH
+            return score
+
+        monkeypatch.setattr(settled, "motion_is_worth", motion_is_worth)
+        monkeypatch.setattr(settled, "aspect_score", of_pixels)
+        fit_hybrid(BOARD.points, shots(8), SIZE, modes=MODES)
+    assert asked == [3.5]
 
 
 def test_motions_of_views_that_were_held_out() -> None:
