@@ -63,6 +63,22 @@ def test_what_was_mended_stays_so() -> None:
     assert found == {name: len(corpus[name]) for name in found}
 
 
+def test_a_limit_is_of_what_is_computed() -> None:
+    """The clock has many times as long; limits outside go on."""
+
+    def left() -> list[float]:
+        return [signal.getitimer(timer)[0] for timer in (signal.ITIMER_PROF, signal.ITIMER_REAL)]
+
+    with hunt.within(60.0):
+        with hunt.within(20.0):
+            assert 0 < left()[0] <= 20 < left()[1] <= 200
+        assert 20 < left()[0] <= 60 < left()[1] <= 600
+    assert left() == [0.0, 0.0]
+    with pytest.raises(hunt.Overtime), hunt.within(0.1):
+        while True:
+            pass
+
+
 def first(path: Path) -> torch.Tensor:
     """The first number of a file, refused by name where there is none."""
     try:
