@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import signal
@@ -61,6 +62,21 @@ def test_what_was_mended_stays_so() -> None:
     assert corpus.keys() <= HARNESSES.keys()
     found = counts(list(corpus), "--replay", str(CORPUS))
     assert found == {name: len(corpus[name]) for name in found}
+
+
+def test_a_limit_is_of_what_is_computed() -> None:
+    """The clock has many times as long; limits outside go on."""
+
+    def left() -> list[float]:
+        return [signal.getitimer(timer)[0] for timer in (signal.ITIMER_PROF, signal.ITIMER_REAL)]
+
+    with hunt.within(60.0):
+        with hunt.within(20.0):
+            assert 0 < left()[0] < 21 < left()[1] < 201
+        assert 21 < left()[0] < 61 < left()[1] < 601
+    assert left() == [0.0, 0.0]
+    with pytest.raises(hunt.Overtime), hunt.within(0.1):
+        next(number for number in itertools.count() if number < 0)
 
 
 def first(path: Path) -> torch.Tensor:
