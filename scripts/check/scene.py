@@ -457,7 +457,7 @@ def speed(write: bool) -> None:
         data = rig_data((cameras[0], cameras[1]), drawn(places, 1, draw, 0.03), draw)
         start = time.process_time()
         solve_rig(data)
-        cells = (count, None, f"{time.process_time() - start:.1f}")
+        cells = (f"{count:,}", None, f"{time.process_time() - start:.1f}")
         print(*cells, flush=True)
         if write:
             write_row("scene.md", "speed", ("matches", "CPU s before", "CPU s"), cells)
