@@ -17,7 +17,9 @@ from kcal.scene.match import scene_features as scene_features
 from kcal.scene.match import SceneMatches as SceneMatches
 from kcal.scene.match import PairCounts as PairCounts
 from kcal.calibrate.rig.sources import FeatureEffect as FeatureEffect
+from kcal.calibrate.rig.sources import LandmarkEffect as LandmarkEffect
 
+# Skylines
 from kcal.skyline.rig_skyline import skyline_source as skyline_source
 from kcal.skyline.rig_skyline import SkylineImage as SkylineImage
 from kcal.calibrate.rig.skyline_source import SkylineSource as SkylineSource
@@ -25,6 +27,7 @@ from kcal.skyline.attitude import skyline_attitude as skyline_attitude
 from kcal.skyline.attitude import SkylineAttitude as SkylineAttitude
 from kcal.skyline.raster_error import RasterError as RasterError
 
+# Things that move
 from kcal.locate.moving import MovingTrack as MovingTrack
 from kcal.locate.moving import read_tracks as read_tracks
 from kcal.locate.moving import Sighting as Sighting
@@ -33,7 +36,6 @@ from kcal.locate.moving_match import MovingOptions as MovingOptions
 from kcal.locate.moving_match import match_moving as match_moving
 from kcal.locate.moving_match import MovingControl as MovingControl
 from kcal.locate.moving_match import Identity as Identity
-from kcal.calibrate.rig.sources import LandmarkEffect as LandmarkEffect
 
 # Results
 from kcal.calibrate.rig.result import ItemResidual as ItemResidual

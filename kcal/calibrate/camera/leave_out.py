@@ -17,6 +17,7 @@ from kcal.calibrate.camera.hybrid import calibrate_hybrid
 from kcal.calibrate.camera.options import CalibrationOptions, Progress
 from kcal.calibrate.camera.outliers import corners_beyond, views_beyond
 from kcal.calibrate.camera.result import CameraCalibrationResult, RejectedView
+from kcal.calibrate.camera.two_cameras import AUTOFOCUS
 from kcal.calibrate.hybrid.fit import fit_hybrid
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError
@@ -25,9 +26,9 @@ from kcal.errors import DegenerateError, InputError
 _FAILED = (InputError, ArithmeticError, torch.linalg.LinAlgError)
 # Largest share of the views that is left out without being asked.
 _FEW = 0.2
-# In warnings about what was not used: they concern the views, not the fit, and stay with another fit of the same views.
 # How many times larger or smaller a focal length is that was given wrongly.
 _FAR = 1.5
+# In warnings about what was not used: they concern the views, not the fit, and stay with another fit of the same views.
 _LEFT_OUT, _START = "views were left out:", "was given for the start"
 # Names and reasons in one message, at most.
 _SHOWN = 5
@@ -151,8 +152,8 @@ def _wrong_views(observations: Observations, options: CalibrationOptions) -> dic
 
 
 def lasting_warnings(result: CameraCalibrationResult) -> tuple[str, ...]:
-    """Those of a result's warnings that hold for another fit of the same views, too: what was not used."""
-    return tuple(text for text in result.warnings if _LEFT_OUT in text or _START in text)
+    """Those of a result's warnings that hold for another fit of the same views, too: of these, or what was not used."""
+    return tuple(text for text in result.warnings if any(part in text for part in (_LEFT_OUT, _START, AUTOFOCUS)))
 
 
 def _few_names(names: Sequence[str]) -> str:

@@ -31,6 +31,8 @@ from kcal.calibrate.problem.views import LEAST_NOISE
 from kcal.errors import DegenerateError, InputError
 from kcal.solve.schur import without_local
 
+# What to do, in warnings of views that are perhaps not of one camera.
+AUTOFOCUS = "switch the autofocus off"
 # Views of the smaller group: two views of any camera find a scale and principal point that suit them.
 _FEWEST = 3
 # fx, fy, cx, cy among the parameters; groups differ in their common scale, and in cx and cy.
@@ -152,7 +154,7 @@ def two_camera_warnings(
     text = found.text([seen.names[i] for i in used])
     if found.certain(seen.image_size):
         raise InputError(text)
-    return (f"{text}. A lens that focused by itself does this, too: switch the autofocus off",)
+    return (f"{text}. A lens that focused by itself does this, too: {AUTOFOCUS}",)
 
 
 def two_cameras(

@@ -30,14 +30,14 @@ def aspect_score(rounds: Rounds, hyperprior: Hyperprior, never: Tensor) -> float
         hyperprior: of its amplitudes.
         never: (S,) unknowns that were held.
     """
-    score = _score(rounds, never)
+    score = _standing(rounds, never)
     if pixels_are_square(score):
         return score
     # Amplitudes as they are to be expected: those of largest evidence may state the ratio too surely.
-    return _score(rounds._replace(estimate=expected_estimate(rounds, hyperprior)), never)
+    return _standing(rounds._replace(estimate=expected_estimate(rounds, hyperprior)), never)
 
 
-def _score(rounds: Rounds, never: Tensor) -> float:
+def _standing(rounds: Rounds, never: Tensor) -> float:
     """The same at the amplitudes of the rounds, the board's stretch being hardly known."""
     estimate, data = rounds.estimate, rounds.data
     families, h = estimate.families, estimate.hyperparameters.clone()

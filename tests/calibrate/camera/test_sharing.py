@@ -21,6 +21,7 @@ from kcal.calibrate.camera.calibrate import (
 )
 from kcal.calibrate.camera.options import OutlierRejection
 from kcal.calibrate.camera.sharing import sharing
+from kcal.calibrate.camera.two_cameras import AUTOFOCUS
 from kcal.calibrate.hybrid.board_orders import turned_corners
 from kcal.calibrate.rig.prior_information import gathered, joint_unknowns
 from kcal.cli.main import app
@@ -94,6 +95,16 @@ def test_a_shared_board_is_better_known() -> None:
     assert two is not None
     spread = one.half.square().sum(0).sqrt()
     assert float(((one.amplitudes - two.amplitudes) / spread).abs().max()) < 1.0
+
+
+def test_what_was_said_of_the_views_stays() -> None:
+    """Warnings of a fit alone are found anew; those of its views are not, and must not be lost."""
+    doubts = (f"views 3 and 4 may be of another camera: {AUTOFOCUS}", "1 of 5 views were left out: d")
+    one = dataclasses.replace(alone(1), warnings=("of this fit alone", *doubts))
+    found = result_of(sharing([one, alone(2)], CalibrationOptions())[0])
+    assert found.shared_board is not None
+    assert found.warnings[:2] == doubts
+    assert "of this fit alone" not in found.warnings
 
 
 def test_what_others_said_is_told_apart(tmp_path: Path) -> None:
