@@ -279,7 +279,7 @@ def test_pixels_that_amplitudes_to_be_expected_leave_square(monkeypatch: pytest.
         return "expected"
 
     monkeypatch.setattr(aspect, "expected_estimate", expected)
-    monkeypatch.setattr(aspect, "_score", lambda rounds, never: scores[rounds.estimate])
+    monkeypatch.setattr(aspect, "_standing", lambda rounds, never: scores[rounds.estimate])
     begin = cast(Any, Rounds("likely"))
     assert aspect.aspect_score(begin, beforehand, torch.zeros(0)) == 2.5
     scores["expected"] = -4.0
