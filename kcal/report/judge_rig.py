@@ -264,7 +264,8 @@ def _exact_lenses(rig: StereoRig | CameraRig, result: RigResult | None) -> tuple
 def _largest_variance(solved: RigResult | RigCalibration | CameraRigCalibration | None) -> float:
     """Largest mean square of a source's residuals in their sigmas."""
     sources = () if solved is None else solved.sources
-    return max((source.sigmas**2 for source in sources if source.sigmas is not None), default=0.0)
+    known = [source.sigmas for source in sources if source.sigmas is not None and not math.isnan(source.sigmas)]
+    return max((sigmas**2 for sigmas in known), default=0.0)
 
 
 def _pairs_compared(rig: StereoRig, result: RigResult | None, pairs: tuple[Tensor, Tensor] | None) -> Synchrony | None:

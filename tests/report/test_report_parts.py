@@ -290,6 +290,17 @@ class TestAnswers:
         changed = dataclasses.replace(source, sigmas=3.1)
         rig.calibration = dataclasses.replace(rig.calibration, sources=(changed,))
         assert {one.name: one for one in rig_verdict(rig).findings}["misfit"].severity == "stop"
+        # A solution that has just been found is judged as its file is; a source without freedom says nothing.
+        found = landmarks_rig()
+        (own,) = found.sources
+        open_one = dataclasses.replace(own, source="features", sigmas=math.nan)
+        for sources in (
+            (dataclasses.replace(own, sigmas=3.1), open_one),
+            (open_one, dataclasses.replace(own, sigmas=3.1)),
+        ):
+            solved = dataclasses.replace(found, sources=sources)
+            named = {one.name: one for one in rig_verdict(found.stereo(), result=solved).findings}
+            assert named["misfit"].severity == "stop"
 
     def test_a_camera_that_differs_by_its_error_bars(self) -> None:
         result = calibrated()
