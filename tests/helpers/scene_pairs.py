@@ -32,6 +32,16 @@ def small_rig() -> StereoRig:
     return StereoRig(left, right, turn, turn @ torch.tensor([-2.0, 0.05, 0.1], dtype=torch.float64))
 
 
+def drawn_pixels(draw: torch.Generator, count: int) -> torch.Tensor:
+    """(M, 2, 2): places that both cameras of the small rig see, without errors."""
+    rig, size = small_rig(), torch.tensor(SIZE, dtype=torch.float64)
+    left = torch.rand(2 * count, 2, dtype=torch.float64, generator=draw) * (size - 1.0)
+    ranges = 40.0 * 20.0 ** torch.rand(len(left), 1, dtype=torch.float64, generator=draw)
+    right = rig(ranges * rig.left.unproject(left)[0])[1]
+    seen = rig.right.inside(right)
+    return torch.stack([left, right], 1)[seen][:count]
+
+
 def pair(
     seed: int,
     *,

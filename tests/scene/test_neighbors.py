@@ -7,21 +7,11 @@ from torch import Tensor
 from kcal.scene import neighbors
 from kcal.scene.line_errors import LineErrors, line_errors
 from kcal.scene.neighbors import pose_variance_ratio
-from tests.helpers.scene_pairs import SIZE, small_rig
+from tests.helpers.scene_pairs import SIZE, drawn_pixels, small_rig
 
 RIG = small_rig()
 SIGMA = 0.05
 COUNT = 600
-
-
-def drawn_pixels(draw: torch.Generator, count: int = COUNT) -> Tensor:
-    """(M, 2, 2): places that both cameras see, without errors."""
-    size = torch.tensor(SIZE, dtype=torch.float64)
-    left = torch.rand(2 * count, 2, dtype=torch.float64, generator=draw) * (size - 1.0)
-    ranges = 40.0 * 20.0 ** torch.rand(len(left), 1, dtype=torch.float64, generator=draw)
-    right = RIG(ranges * RIG.left.unproject(left)[0])[1]
-    seen = RIG.right.inside(right)
-    return torch.stack([left, right], 1)[seen][:count]
 
 
 def shared(pixels: Tensor, part: float, draw: torch.Generator) -> Tensor:
@@ -54,7 +44,7 @@ def test_independent_errors(monkeypatch: pytest.MonkeyPatch) -> None:
     draw = torch.Generator().manual_seed(1)
     found = []
     for _ in range(60):
-        pixels = drawn_pixels(draw)
+        pixels = drawn_pixels(draw, COUNT)
         found.append(ratio(pixels, SIGMA * torch.randn(len(pixels), dtype=torch.float64, generator=draw)))
     # Three standard errors of 60 ratios that scatter by 0.16.
     assert sum(found) / len(found) == pytest.approx(1.0, abs=0.065)
@@ -63,7 +53,7 @@ def test_independent_errors(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_errors_that_neighbors_share_count_as_they_act(monkeypatch: pytest.MonkeyPatch) -> None:
     unbounded(monkeypatch)
     draw = torch.Generator().manual_seed(2)
-    pixels = drawn_pixels(draw)
+    pixels = drawn_pixels(draw, COUNT)
     covariance = (SIGMA**2 * torch.eye(2, dtype=torch.float64)).expand(len(pixels), 2, 2)
     lines = line_errors(RIG, pixels)
     slope = lines.slopes / lines.sigma(covariance)[:, None]
@@ -83,7 +73,7 @@ def test_errors_that_neighbors_share_count_as_they_act(monkeypatch: pytest.Monke
 
 def test_errors_of_lenses_are_no_errors_of_matches() -> None:
     draw = torch.Generator().manual_seed(3)
-    pixels = drawn_pixels(draw)
+    pixels = drawn_pixels(draw, COUNT)
     noise = SIGMA * torch.randn(len(pixels), dtype=torch.float64, generator=draw)
     at = pixels[:, 0] / torch.tensor(SIZE) - 0.5
     smooth = 0.3 * (at[:, 0] ** 3 - 2.0 * at[:, 1] ** 2 * at[:, 0] + at[:, 1] ** 4)
@@ -93,7 +83,7 @@ def test_errors_of_lenses_are_no_errors_of_matches() -> None:
 
 def test_where_matches_leave_a_pose_open_there_is_no_ratio() -> None:
     draw = torch.Generator().manual_seed(8)
-    pixels = drawn_pixels(draw)
+    pixels = drawn_pixels(draw, COUNT)
     noise = torch.randn(len(pixels), dtype=torch.float64, generator=draw)
     lines = lines_of(pixels, SIGMA * (noise + shared(pixels, 20.0, draw)))
     assert ratio_of(lines, pixels) > 1.5
@@ -103,7 +93,7 @@ def test_where_matches_leave_a_pose_open_there_is_no_ratio() -> None:
 
 def test_few_matches_and_wrong_ones() -> None:
     draw = torch.Generator().manual_seed(5)
-    pixels = drawn_pixels(draw)
+    pixels = drawn_pixels(draw, COUNT)
     error = SIGMA * (torch.randn(COUNT, dtype=torch.float64, generator=draw) + shared(pixels, 20.0, draw))
     few = slice(0, 79)
     assert ratio(pixels[few], error[few]) == 1.0

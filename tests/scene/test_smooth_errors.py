@@ -13,22 +13,15 @@ from kcal.scene import smooth_errors
 from kcal.scene.line_errors import line_errors
 from kcal.scene.match import MatchedPair, PairCounts, counted
 from kcal.scene.smooth_errors import smooth_effects
-from tests.helpers.scene_pairs import SIZE, small_rig
+from tests.helpers.scene_pairs import SIZE, drawn_pixels, small_rig
 
 RIG = small_rig()
 SIGMA = 0.05
 SIZE_OF_EACH = smooth_errors._SMOOTH_PX
 
 
-def drawn_pixels(count: int) -> Tensor:
-    """(M, 2, 2): places that both cameras see, without errors."""
-    draw = torch.Generator().manual_seed(7)
-    size = torch.tensor(SIZE, dtype=torch.float64)
-    left = torch.rand(2 * count, 2, dtype=torch.float64, generator=draw) * (size - 1.0)
-    ranges = 40.0 * 20.0 ** torch.rand(len(left), 1, dtype=torch.float64, generator=draw)
-    right = RIG(ranges * RIG.left.unproject(left)[0])[1]
-    seen = RIG.right.inside(right)
-    return torch.stack([left, right], 1)[seen][:count]
+def some_pixels(count: int) -> Tensor:
+    return drawn_pixels(torch.Generator().manual_seed(7), count)
 
 
 def effects_of(pixels: Tensor) -> tuple[FeatureEffect, ...]:
@@ -49,7 +42,7 @@ def turn_covariance(pixels: Tensor, effects: tuple[FeatureEffect, ...]) -> Tenso
 
 
 def test_three_errors_across_the_lines() -> None:
-    pixels = drawn_pixels(50)
+    pixels = some_pixels(50)
     across = line_errors(RIG, pixels).across
     both = torch.stack([one.shift[:, 1] - one.shift[:, 0] for one in effects_of(pixels)])
     u, v = (2.0 * pixels[:, 0] / torch.tensor(SIZE) - 1.0).unbind(1)
@@ -61,7 +54,7 @@ def test_a_pose_is_as_uncertain_as_they_make_it() -> None:
     """The variances of generalized least squares with errors that matches share, and ones that do not vanish."""
     floor = []
     for count in (150, 600):
-        pixels = drawn_pixels(count)
+        pixels = some_pixels(count)
         lines = line_errors(RIG, pixels)
         u, v = (2.0 * pixels[:, 0] / torch.tensor(SIZE) - 1.0).unbind(1)
         shared = SIZE_OF_EACH * torch.stack([torch.ones_like(u), u, v], 1)
@@ -75,7 +68,7 @@ def test_a_pose_is_as_uncertain_as_they_make_it() -> None:
 
 
 def test_matches_have_them() -> None:
-    pixels = drawn_pixels(100)
+    pixels = some_pixels(100)
     each = (SIGMA**2 * torch.eye(2, dtype=torch.float64)).expand(len(pixels), 2, 2)
     counts = PairCounts(name="a", matched=100, untextured=0, off_line=0, moved=0, thinned=0, used=100)
     own = MatchedPair(pixels, each, torch.ones(100, dtype=torch.float64), counts, RIG)
@@ -88,7 +81,7 @@ def test_matches_have_them() -> None:
 
 def test_slopes_are_those_of_differences() -> None:
     """Where nothing is off: what is off has a slope of its own, which a pose does not use."""
-    pixels = drawn_pixels(40)
+    pixels = some_pixels(40)
     covariance = torch.eye(2, dtype=torch.float64).expand(len(pixels), 2, 2)
     turn, shift, step = RIG.right_from_left_rotation, RIG.right_from_left_translation, 1e-6
     turned = [rotation_from_vector(step * axis) @ turn for axis in torch.eye(3, dtype=torch.float64)]

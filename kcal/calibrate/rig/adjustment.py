@@ -8,14 +8,14 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.blocks import Block, BoardBlock, Effects, FeatureBlock, Kind, PerKind, RigState
+from kcal.calibrate.rig.blocks import KINDS, Block, BoardBlock, Effects, FeatureBlock, Kind, PerKind, RigState
 from kcal.calibrate.rig.initial_poses import Start
 from kcal.calibrate.rig.landmark_block import LandmarkBlock
 from kcal.calibrate.rig.motion import BoardMotion, RigRows, SeenBoards, WithoutMotion, board_motion
 from kcal.calibrate.rig.own_fit import own_fits
 from kcal.calibrate.rig.problem import DistanceTerm, PlaceTerm, RigProblem, SharedTerm
 from kcal.calibrate.rig.skyline_term import SkylineTerm
-from kcal.calibrate.rig.sources import Features, Landmarks, RigData
+from kcal.calibrate.rig.sources import Features, Landmarks, RigData, with_effects
 from kcal.calibrate.rig.star_block import StarBlock
 from kcal.calibrate.rig.star_source import StarSource
 from kcal.calibrate.rig.unknowns import SharedUnknowns
@@ -65,7 +65,7 @@ class Adjustment:
         # Of `terms`, those that are left out, by their indices.
         self.without: frozenset[int] = frozenset()
         # By how much the sigmas of a kind's items are multiplied, because these fit themselves worse than stated.
-        self.widened: dict[Kind, float] = {}
+        self.widened: dict[Kind, float] = dict.fromkeys(KINDS, 1.0)
         self.motion: list[BoardMotion | None] = [None] * len(data.cameras)
         direction, inverse_range = _feature_start(data, start, self.anchor)
         self.state = RigState(
@@ -101,14 +101,14 @@ class Adjustment:
             motion = [one and one.columns[masks.boards] for one in self.motion]
             found.append(BoardBlock(pixels, white, data.boards.points, shapes, by_unknown, motion))
         if data.landmarks and masks.landmarks.any():
-            times = self.widened.get("landmarks", 1.0)
+            times = self.widened["landmarks"]
             surveyed = data.landmarks.points[masks.landmarks], times * data.landmarks.sigma[masks.landmarks]
             marks = _weighted(data.landmarks, masks.landmarks, times)
             effects = self._effects(data.landmarks, unknowns)
             shifts = data.landmarks.shifts()[:, masks.landmarks]
             found.append(LandmarkBlock(*marks, *surveyed, unknowns.by_refraction, effects, shifts))
         if data.features and masks.features.any():
-            times, some = self.widened.get("features", 1.0), masks.features
+            times, some = self.widened["features"], masks.features
             known = data.features.inverse_range[some], times * data.features.inverse_range_sigma[some]
             shared = self._effects(data.features, unknowns), data.features.shifts()[:, some]
             found.append(FeatureBlock(*_weighted(data.features, some, times), *known, self.anchor, *shared))
@@ -119,7 +119,7 @@ class Adjustment:
     def _star_block(self, mask: Tensor, unknowns: SharedUnknowns) -> StarBlock:
         stars = self.data.stars
         assert stars is not None
-        times = self.widened.get("stars", 1.0)
+        times = self.widened["stars"]
         white = torch.eye(2, dtype=torch.float64) / (times * stars.pixel_sigma[mask][..., None, None])
         known = stars.direction[mask], times * stars.direction_sigma[mask]
         moves = stars.by_effects(), stars.factors()[:, mask], stars.shifts()[:, mask]
@@ -131,10 +131,8 @@ class Adjustment:
         whole = self.unknowns.by_effects
         if whole is None or not source.effects:
             return None
-        # As `RigData.effects` lists them.
-        order = (self.data.stars, self.data.landmarks, self.data.features)
-        before = order[: next(i for i, one in enumerate(order) if one is source)]
-        begin = sum(len(one.effects) for one in before if one is not None)
+        order = with_effects(self.data)
+        begin = sum(len(one.effects) for one in order[: order.index(source)])
         part = slice(begin, begin + len(source.effects))
         return Effects(whole[part], None if unknowns.by_effects is None else unknowns.by_effects[part])
 
@@ -252,7 +250,7 @@ class Adjustment:
         """
         change = 0.0
         for kind, fit in own_fits(self.problem(masks), self.part(masks)).items():
-            before = self.widened.get(kind, 1.0)
+            before = self.widened[kind]
             if before > 1.0 or beyond_chance(fit.chi2, fit.freedom):
                 after = max(1.0, before * math.sqrt(fit.chi2 / fit.freedom))
                 self.widened = {**self.widened, kind: after}

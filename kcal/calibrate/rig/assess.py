@@ -94,7 +94,8 @@ def rig_result(
             squared[c], counts[c] = squared[c] + many * px**2, counts[c] + many
     rms, status = math.sqrt(float(squared.sum() / counts.sum())), SolverStatus(int(found.status))
     warnings += [
-        f"the {kind} differ from each other by {times:.1f} times what their sigmas say: these were multiplied by it"
+        f"the {kind} differ from each other by {times:.1f} times what their sigmas say: their sigmas were multiplied "
+        f"by {times:.1f}"
         for kind, times in work.widened.items()
         if times > 1.0
     ]

@@ -59,9 +59,10 @@ def own_fits(problem: RigProblem, state: RigState) -> dict[Kind, OwnFit]:
     Boards have none: their corners' noise is estimated as it is.
     """
     prior, found = problem.prior_rows(state), dict[Kind, OwnFit]()
+    known = prior @ prior.T
     for block, gram in zip(problem.blocks, problem.block_grams(state), strict=True):
         if block.kind != "boards":
-            alone = least(gram + prior @ prior.T)
+            alone = least(gram + known)
             rows = int((block.counts - block.size).sum()) + prior.shape[1]
             found[block.kind] = OwnFit(alone.chi2, rows - alone.rank)
     return found

@@ -37,7 +37,7 @@ def item_records(work: Adjustment, masks: PerKind, reasons: Reasons) -> tuple[It
         squares, freedom, pixels = work.squares(chosen), work.freedom(chosen), _rms_by_camera(work, chosen, used)
         over = over_limit(work, chosen, work.deletions(chosen)) if used else over_limit(work, chosen, squares, 0.999)
         for k, kind in enumerate(KINDS):
-            times = work.widened.get(kind, 1.0)
+            times = work.widened[kind]
             for i in chosen[k].nonzero()[:, 0].tolist():
                 sigmas = times * math.sqrt(float(squares[k][i]) / max(int(freedom[k][i]), 1))
                 why = (
@@ -88,7 +88,7 @@ def source_records(work: Adjustment, masks: PerKind, items: Sequence[ItemResidua
         if source in KINDS:
             k = KINDS.index(source)
             total, dof = float(squares[k].nansum()), int(freedom[k].sum())
-            sigmas = work.widened.get(source, 1.0) * math.sqrt(total / dof) if dof > 0 else math.nan
+            sigmas = work.widened[KINDS[k]] * math.sqrt(total / dof) if dof > 0 else math.nan
         meters = [item.meters for item in own if item.used and item.meters is not None]
         found.append(
             SourceResidual(

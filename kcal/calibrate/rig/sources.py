@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections import Counter
+from collections.abc import Sequence
 from typing import TypeVar
 
 import torch
@@ -149,9 +150,7 @@ class Landmarks:
         require_finite("landmarks: points", as_points("landmarks: points", self.points, 3))
         if not bool((torch.isfinite(self.sigma) & (self.sigma > 0)).all()):
             raise InputError("landmarks: every sigma must be a positive number of meters; nothing is surveyed exactly")
-        for effect in self.effects:
-            if effect.shift.shape != (*self.pixels.shape[:2], 3) or not bool(torch.isfinite(effect.shift).all()):
-                raise InputError(f"landmarks: the effect of {effect.name} needs finite shifts (L, C, 3)")
+        _check_effects("landmarks", self.effects, (*self.pixels.shape[:2], 3), "(L, C, 3)")
         if not isinstance(self.pixel_sigma, Tensor):
             _positive("landmarks: pixel_sigma", self.pixel_sigma)
             return
@@ -163,31 +162,22 @@ class Landmarks:
 
     def shifts(self) -> Tensor:
         """(E, L, C, 3) of all effects."""
-        shifts = [effect.shift for effect in self.effects]
-        return torch.stack(shifts) if shifts else self.pixels.new_zeros(0, *self.pixels.shape[:2], 3)
+        nothing = self.pixels.new_zeros(0, *self.pixels.shape[:2], 3)
+        return torch.cat([nothing, *(effect.shift[None] for effect in self.effects)])
 
     def __add__(self, other: Landmarks) -> Landmarks:
         """Both, with a sigma for each mark; effects shift only those whose they are."""
-        counts = len(self.names), len(other.names)
         return Landmarks(
             names=self.names + other.names,
             points=torch.cat([self.points, other.points]),
             sigma=torch.cat([self.sigma, other.sigma]),
             pixels=torch.cat([self.pixels, other.pixels]),
             pixel_sigma=torch.cat([self._each(), other._each()]),
-            effects=(
-                *(_padded(effect, 0, counts[1]) for effect in self.effects),
-                *(_padded(effect, counts[0], 0) for effect in other.effects),
-            ),
+            effects=_effects_of_both(self.effects, len(self.names), other.effects, len(other.names)),
         )
 
     def _each(self) -> Tensor:
         return torch.as_tensor(self.pixel_sigma, dtype=torch.float64).expand(self.pixels.shape[:2])
-
-
-def _padded(effect: _Effect, before: int, after: int) -> _Effect:
-    shift = torch.nn.functional.pad(effect.shift, (0, 0, 0, 0, before, after))
-    return dataclasses.replace(effect, shift=shift)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -209,6 +199,21 @@ class FeatureEffect:
 
 
 _Effect = TypeVar("_Effect", LandmarkEffect, FeatureEffect)
+
+
+def _check_effects(kind: str, effects: Sequence[_Effect], shape: tuple[int, ...], axes: str) -> None:
+    for effect in effects:
+        if effect.shift.shape != shape or not bool(torch.isfinite(effect.shift).all()):
+            raise InputError(f"{kind}: the effect of {effect.name} needs finite shifts {axes}")
+
+
+def _effects_of_both(one: Sequence[_Effect], count: int, other: Sequence[_Effect], more: int) -> tuple[_Effect, ...]:
+    """Effects of `count` items and of `more` others, for all of them: each shifts its own alone."""
+    around = [(effect, 0, more) for effect in one] + [(effect, count, 0) for effect in other]
+    return tuple(
+        dataclasses.replace(effect, shift=torch.nn.functional.pad(effect.shift, (0, 0, 0, 0, before, after)))
+        for effect, before, after in around
+    )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -249,18 +254,16 @@ class Features:
             raise InputError(
                 f"features: a covariance {(*self.pixels.shape, 2)} is needed, got {tuple(self.covariance.shape)}"
             )
-        for effect in self.effects:
-            if effect.shift.shape != self.pixels.shape or not bool(torch.isfinite(effect.shift).all()):
-                raise InputError(f"features: the effect of {effect.name} needs finite shifts (F, C, 2)")
+        _check_effects("features", self.effects, self.pixels.shape, "(F, C, 2)")
 
     def shifts(self) -> Tensor:
         """(E, F, C, 2) of all effects."""
-        shifts = [effect.shift for effect in self.effects]
-        return torch.stack(shifts) if shifts else self.pixels.new_zeros(0, *self.pixels.shape)
+        return torch.cat(
+            [self.pixels.new_zeros(0, *self.pixels.shape), *(effect.shift[None] for effect in self.effects)]
+        )
 
     def __add__(self, other: Features) -> Features:
         """Both, with a covariance for each mark; effects shift only those whose they are."""
-        counts = len(self.names), len(other.names)
         both = self._whole(), other._whole()
         return Features(
             names=self.names + other.names,
@@ -268,10 +271,7 @@ class Features:
             inverse_range=torch.cat([self.inverse_range, other.inverse_range]),
             inverse_range_sigma=torch.cat([self.inverse_range_sigma, other.inverse_range_sigma]),
             covariance=torch.cat(both),
-            effects=(
-                *(_padded(effect, 0, counts[1]) for effect in self.effects),
-                *(_padded(effect, counts[0], 0) for effect in other.effects),
-            ),
+            effects=_effects_of_both(self.effects, len(self.names), other.effects, len(other.names)),
         )
 
     def _whole(self) -> Tensor:
@@ -385,10 +385,14 @@ class RigData:
     @property
     def effects(self) -> tuple[str, ...]:
         """Names of what shifts stars, then landmarks, and then features, together."""
-        sources = [one for one in (self.stars, self.landmarks, self.features) if one is not None]
-        return tuple(effect.name for source in sources for effect in source.effects)
+        return tuple(effect.name for source in with_effects(self) for effect in source.effects)
 
     @property
     def absolute(self) -> bool:
         """Whether anything places the rig in the local frame; otherwise that is the first camera's."""
         return self.landmarks is not None or bool(self.positions)
+
+
+def with_effects(data: RigData) -> tuple[StarSource | Landmarks | Features, ...]:
+    """The sources that may have effects, in the order in which `RigData.effects` names these."""
+    return tuple(source for source in (data.stars, data.landmarks, data.features) if source is not None)
