@@ -75,7 +75,10 @@ def calibration_figure(result: CameraCalibrationResult, name: str = "") -> Figur
         drawn.set_title("", loc="center")
     model = "" if result.hybrid is not None else f", model {result.camera.model}"
     whose = f"{shortened(name, 60)}: " if name else ""
-    text = f"{whose}{len(observations.views)} views{model}, RMS {result.rms:.3f} px"
+    total = len(observations.views)
+    used = total - len({view.view for view in result.rejected_views})
+    views = f"{used} of {total} views" if used < total else f"{total} views"
+    text = f"{whose}{views}{model}, RMS {result.rms:.3f} px"
     place = 0.3 / size[0], 1.0 - 0.2 / size[1]
     figure.text(*place, text, ha="left", va="top", fontsize=17, fontweight="bold", color=INK)
     return figure
@@ -91,7 +94,8 @@ def draw_coverage(axes: Axes, observations: Observations, result: CameraCalibrat
     width, height = observations.image_size
     pixels = observations.pixels().numpy()
     errors = -result.residuals.numpy()
-    seen = np.isfinite(pixels).all(-1)
+    # Views that were left out have corners and no residuals.
+    seen = np.isfinite(pixels + errors).all(-1)
     where, error = pixels[seen], errors[seen]
     axes.add_patch(Rectangle((-0.5, -0.5), width, height, fill=False, edgecolor=INK, linewidth=1.2))
     view = np.broadcast_to(np.arange(len(pixels))[:, None], seen.shape)[seen]

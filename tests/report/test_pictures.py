@@ -8,6 +8,7 @@ from calibrate_scenes import BOARD, camera, motions
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.quiver import Quiver
 
 from kcal.calibrate.camera.advice import unreached_share
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
@@ -85,6 +86,16 @@ def test_the_picture_of_a_camera_names_it() -> None:
     result = calibrate_camera(observed(), CalibrationOptions(model="opencv4"))
     (title,) = [text.get_text() for text in calibration_figure(result, "left").texts]
     assert title.startswith("left: 8 views")
+
+
+def test_a_view_that_was_left_out_has_no_arrows() -> None:
+    seen = observed()
+    twice = seen.model_copy(update={"views": (*seen.views, seen.views[0].model_copy(update={"name": "copy.png"}))})
+    result = calibrate_camera(twice, CalibrationOptions(model="opencv4"))
+    figure = calibration_figure(result, "left")
+    (drawn,) = [part for part in figure.axes[0].collections if isinstance(part, Quiver)]
+    assert drawn.N == 8 * BOARD.corners
+    assert figure.texts[0].get_text().startswith("left: 8 of 9 views")
 
 
 def test_the_share_that_boards_reached_is_everywhere_the_same() -> None:
