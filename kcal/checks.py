@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
+from torch.utils import _pytree
 
 from kcal.errors import InputError
 
 # Pixels: a telescope of 100 m has 1e8.
 MOST_FOCAL = 1e8
+Named = TypeVar("Named", bound=type[tuple])
+
+
+def exportable(result: Named) -> Named:
+    """Decorate the named tuple that a module returns, so that `torch.export.save` and `load` know it by its name."""
+    # Torch has no public function for named tuples, and its own classes of results are registered by this one.
+    _pytree._register_namedtuple(result, serialized_type_name=f"kcal.{result.__name__}")
+    return result
 
 
 def as_points(name: str, value: Tensor, last: int) -> Tensor:

@@ -236,7 +236,8 @@ def unbind_last(values: Tensor) -> tuple[Tensor, ...]:
 
     A single vector gives scalars without a dimension, which elementwise kernels take as constants.
     """
-    return (values if values.ndim == 1 else values.unsqueeze(-2)).unbind(-1)
+    # `torch.export.load` fails where `unbind` gives nothing, as for a pinhole.
+    return (values if values.ndim == 1 else values.unsqueeze(-2)).unbind(-1) if values.shape[-1] else ()
 
 
 def _horner_in_z(

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from kcal.checks import exportable
 from kcal.errors import InputError
 from kcal.lens.rectification import StereoRectification
 from kcal.locate.geodesy import Origin
@@ -19,6 +20,7 @@ _STEP = 0.25
 _PIECE = 1 << 15
 
 
+@exportable
 class RangeImage(NamedTuple):
     """Distances from the left camera, meters, each (..., H, W).
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Self
 import torch
 from torch import Tensor, nn
 
-from kcal.checks import as_covariance, as_points, keep_float64
+from kcal.checks import as_covariance, as_points, exportable, keep_float64
 from kcal.errors import InputError
 from kcal.io.rig_file import load_rig
 from kcal.lens.dispatch import is_differentiated
@@ -32,6 +32,7 @@ from kcal.locate.stereo import (
 )
 
 
+@exportable
 class Localization(NamedTuple):
     """Result of `StereoLocalizer`; nothing in it is NaN, whatever went in. Look at `status` before anything else.
 

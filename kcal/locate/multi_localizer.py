@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeAlias
 import torch
 from torch import Tensor
 
-from kcal.checks import Float64Module, as_points
+from kcal.checks import Float64Module, as_points, exportable
 from kcal.errors import InputError
 from kcal.lens.camera_rig import CameraRig
 from kcal.lens.dispatch import is_differentiated, is_traced, known_true
@@ -28,6 +28,7 @@ _BAD, _DOUBTFUL = 1e-4, 1e-2
 _Options: TypeAlias = "tuple[float, bool, Ground | None]"
 
 
+@exportable
 class ViewsLocalization(NamedTuple):
     """Result of `MultiViewLocalizer`; nothing in it is NaN, whatever went in. Look at `status` before anything else.
 

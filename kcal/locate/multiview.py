@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import torch
 from torch import Tensor, nn
 
-from kcal.checks import as_points, keep_float64, require_finite
+from kcal.checks import as_points, exportable, keep_float64, require_finite
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.dispatch import is_differentiated
@@ -20,6 +20,7 @@ from kcal.locate.views import PosedCameras, fit_views
 Method = Literal["linear", "angular", "likelihood"]
 
 
+@exportable
 class ViewsResult(NamedTuple):
     """Result of `TriangulateViews`; nothing in it is NaN.
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from kcal.checks import exportable
 from kcal.lens.dispatch import is_differentiated
 from kcal.lens.rig import StereoRig
 from kcal.locate.stereo import (
@@ -20,6 +21,7 @@ from kcal.locate.stereo import (
 )
 
 
+@exportable
 class Triangulation(NamedTuple):
     """Result of `Triangulate`; no tensor contains NaN, whatever went in.
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from kcal.checks import as_points, keep_float64, require_finite
+from kcal.checks import as_points, exportable, keep_float64, require_finite
 from kcal.corners.match import MatchStatus
 from kcal.corners.object_planes import object_planes, plane_pixels, plane_places
 from kcal.corners.patch_correlation import highest_peak, is_textured, weighted_correlation
@@ -64,6 +64,7 @@ class DisparityOptions:
             raise InputError("disparity options: min_score, max_rival and min_share lie between 0 and 1")
 
 
+@exportable
 class ObjectDisparities(NamedTuple):
     """Objects found in the right image; nothing in it is NaN.
 
