@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 
 import pydantic
 import torch
+from torch import nn
 
 import kcal
 from kcal.checks import MOST_FOCAL
@@ -116,7 +117,7 @@ class CameraFile(NativeFile):
     def _named(cls, value: dict[str, Any] | None, info: pydantic.ValidationInfo) -> dict[str, Any] | None:
         if value is None or "model" not in info.data:
             return value
-        names: tuple[str, ...] = info.data["model"].model().names
+        names: tuple[str, ...] = info.data["model"].names
         if info.field_name == "standard_deviations":
             names = (*INTRINSICS, *names)
         missing, unknown = [n for n in names if n not in value], [n for n in value if n not in names]
@@ -130,7 +131,7 @@ class CameraFile(NativeFile):
     def _of_model(cls, value: CovarianceRecord | None, info: pydantic.ValidationInfo) -> CovarianceRecord | None:
         if value is None or "model" not in info.data:
             return value
-        names = (*INTRINSICS, *info.data["model"].model().names)
+        names = (*INTRINSICS, *info.data["model"].names)
         unknown = [name for name in value.names if name not in names]
         if unknown:
             raise ValueError(f"covariance: {unknown[0]} is unknown; the lens model has {_listed(names)}")
@@ -140,7 +141,7 @@ class CameraFile(NativeFile):
     @classmethod
     def _on_model(cls, value: InformationRecord | None, info: pydantic.ValidationInfo) -> InformationRecord | None:
         if value is not None and "model" in info.data:
-            names = (*INTRINSICS, *info.data["model"].model().names)
+            names = (*INTRINSICS, *info.data["model"].names)
             unknown = [name for group in value.unknowns for name in group if name not in names]
             if unknown:
                 raise ValueError(f"information: {unknown[0]} is unknown; the lens model has {_listed(names)}")
@@ -166,10 +167,13 @@ class CameraFile(NativeFile):
         """All parameters by name, in the order of `Camera.names`."""
         return {name: getattr(self.intrinsics, name) for name in INTRINSICS} | self.coefficients
 
-    def camera(self) -> Camera:
-        """The camera, equal to the stored one to the last bit, with its `calibration` if the file has one."""
+    def camera(self, field: nn.Module | None = None) -> Camera:
+        """The camera, equal to the stored one to the last bit, with its `calibration` if the file has one.
+
+        `field` as for `load_camera`.
+        """
         parameters = torch.tensor(list(self._values().values()), dtype=torch.float64)
-        camera = Camera(parameters, size=self.image_size, model=self.model.model())
+        camera = Camera(parameters, size=self.image_size, model=self.model.model(field))
         stated = (self.standard_deviations, self.covariance, self.information, self.calibration, self.setting)
         if self.name or any(stated):
             camera.calibration = CameraCalibration(
@@ -281,10 +285,16 @@ def save_camera(camera: Camera, path: str | Path, *, name: str | None = None) ->
     return camera_to_file(camera, name=name).save(path)
 
 
-def load_camera(path: str | Path) -> Camera:
+def load_camera(path: str | Path, *, field: nn.Module | None = None) -> Camera:
     """Read the camera of a kcal camera file; its `calibration` has what else the file contains.
 
+    Args:
+        path: of the file.
+        field: for a camera whose field is a network of a class of your own: a module of that class. It is copied, and
+            the copy gets the weights of the file.
+
     Raises:
+        InputError: the file needs a `field` that was not given, or another one.
         FileError: missing, not JSON, another kind of file (a rig, say), or a field that is wrong; it names the path.
 
     Example:
@@ -292,4 +302,4 @@ def load_camera(path: str | Path) -> Camera:
         Traceback (most recent call last):
         kcal.errors.FileError: no-such-file.json: cannot read: No such file or directory
     """
-    return CameraFile.load(path).camera()
+    return CameraFile.load(path).camera(field)

@@ -12,6 +12,7 @@ from typing import ClassVar
 
 import pydantic
 import torch
+from torch import nn
 
 from kcal.file_kind import CAMERA_RIG_VERSION
 from kcal.io.camera_file import RETIRED_FIELDS, CameraFile, named_camera_file
@@ -74,13 +75,14 @@ class CameraRigFile(NativeFile):
     def _fitting(self) -> CameraRigFile:
         if not len(self.names) == len(self.cameras) == len(self.poses):
             raise ValueError(f"{len(self.names)} names, {len(self.cameras)} cameras and {len(self.poses)} poses")
-        self.rig()
+        if all(file.model.complete for file in self.cameras):
+            self.rig()
         return self
 
-    def rig(self) -> CameraRig:
-        """The rig, equal to the stored one to the last bit."""
+    def rig(self, field: nn.Module | None = None) -> CameraRig:
+        """The rig, equal to the stored one to the last bit; `field` as for `kcal.load_rig`."""
         rig = CameraRig(
-            [file.camera() for file in self.cameras],
+            [file.camera(field) for file in self.cameras],
             self.names,
             torch.tensor([pose.rotation for pose in self.poses], dtype=torch.float64).reshape(-1, 3, 3),
             torch.tensor([pose.center for pose in self.poses], dtype=torch.float64).reshape(-1, 3),

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import base64
+import binascii
+import re
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import pydantic
+import safetensors.torch
+from torch import Tensor, nn
 
+from kcal.errors import InputError
+from kcal.lens.field_modes import FieldModes
 from kcal.lens.gaussian_modes import GaussianModes
-from kcal.lens.hybrid_terms import HybridForm
+from kcal.lens.hybrid_terms import LEADING, HybridForm
 from kcal.lens.model import LensModel
-from kcal.lens.network_modes import NetworkModes
+from kcal.lens.network_modes import SLOPES, NetworkModes, known_chain, network_names
 from kcal.lens.zernike import ZernikeModes
 from kcal.native_file import Record
 
@@ -30,18 +37,110 @@ class GaussianRecord(Record):
     widths: tuple[float, ...]
 
 
-class NetworkRecord(Record):
-    """A fixed hidden layer: a, b, c of each feature (`kcal.lens.network_modes.NetworkModes`)."""
+# Layers without weights that a file describes.
+_LAYERS = {layer.__name__.lower(): layer for layer in SLOPES}
 
-    hidden: tuple[tuple[float, float, float], ...]
+
+class NetworkRecord(Record):
+    """The network of a field, without its last layer (`kcal.lens.network_modes.NetworkModes`).
+
+    Args:
+        hidden: a, b, c of each feature tanh(a x + b y + c), in files of kcal 1.0; nothing else is said then.
+        layers: of a chain: "linear 2 40", "tanh" and so on; None: the class of the network is not kcal's.
+        kind: the name of its class, for messages.
+        features: how many there are; None: the network makes one displacement.
+        weights: the base64 text of its weights in the format safetensors.
+        digest: `NetworkModes.digest`.
+    """
+
+    _LATER: ClassVar[Mapping[str, Any]] = {"hidden": None}
+
+    hidden: tuple[tuple[float, float, float], ...] | None = None
+    layers: tuple[str, ...] | None = None
+    kind: str = ""
+    features: pydantic.PositiveInt | None = None
+    weights: str = ""
+    digest: str = ""
+
+    @classmethod
+    def of(cls, modes: NetworkModes) -> NetworkRecord:
+        """As it is stored."""
+        state = {name: value.detach().cpu().contiguous() for name, value in modes.trunk.state_dict().items()}
+        return cls(
+            layers=_chain_texts(modes.trunk),
+            kind=modes.trunk.__class__.__name__,
+            features=None if modes.vector else len(modes) // 2,
+            weights=base64.b64encode(safetensors.torch.save(state)).decode("ascii"),
+            digest=modes.digest,
+        )
+
+    @property
+    def known(self) -> bool:
+        """Whether the file itself says what the network is."""
+        return self.hidden is not None or self.layers is not None
+
+    def modes(self, field: nn.Module | None) -> NetworkModes:
+        """The network with its weights; `field` has the class that the file does not describe."""
+        if self.hidden is not None:
+            return NetworkModes.hidden_layer(self.hidden)
+        if field is not None:
+            found, _ = NetworkModes.of(field)
+        elif self.layers is not None:
+            found = NetworkModes(_built(self.layers), vector=self.features is None)
+        else:
+            raise InputError(
+                f"the field of this camera is a network of the class {self.kind}, which is not kcal's: give such a "
+                f"module when loading, as in load_camera(path, field={self.kind}())"
+            )
+        stored, own = self._state(), found.trunk.state_dict()
+        shapes = [{name: tuple(value.shape) for name, value in each.items()} for each in (stored, own)]
+        if shapes[0] != shapes[1] or found.names != network_names(self.features):
+            name = next((n for n in {**shapes[0], **shapes[1]} if shapes[0].get(n) != shapes[1].get(n)), "features")
+            raise InputError(
+                f"the network that was given is not that of the file, a {self.kind}: {name} has the shape "
+                f"{shapes[1].get(name)}, and {shapes[0].get(name)} there"
+            )
+        found.trunk.load_state_dict(stored)
+        if found.digest != self.digest:
+            raise InputError(f"network: its weights have the digest {found.digest}, and the file says {self.digest}")
+        return NetworkModes(found.trunk, vector=found.vector)
+
+    def _state(self) -> dict[str, Tensor]:
+        try:
+            return safetensors.torch.load(base64.b64decode(self.weights, validate=True))
+        except (binascii.Error, safetensors.SafetensorError, KeyError) as error:
+            raise InputError(f"network: its weights cannot be read: {error}") from None
+
+
+def _chain_texts(trunk: nn.Module) -> tuple[str, ...] | None:
+    """The layers of a chain that a file can describe; None for other modules."""
+    chain = known_chain(trunk)
+    if chain is None or type(trunk) is not nn.Sequential:
+        return None
+    return tuple(
+        f"linear {layer.in_features} {layer.out_features}{'' if layer.bias is not None else ' unbiased'}"
+        if isinstance(layer, nn.Linear)
+        else layer.__class__.__name__.lower()
+        for layer in chain
+    )
+
+
+def _built(layers: tuple[str, ...]) -> nn.Module:
+    """The chain that a file describes, with any weights."""
+    chain: list[nn.Module] = []
+    for text in layers:
+        linear = re.fullmatch(r"linear ([1-9]\d{0,3}) ([1-9]\d{0,3})( unbiased)?", text)
+        if linear:
+            chain.append(nn.Linear(int(linear[1]), int(linear[2]), bias=linear[3] is None))
+        elif text in _LAYERS:
+            chain.append(_LAYERS[text]())
+        else:
+            raise InputError(f"network: unknown layer {text!r}; a chain has linear IN OUT, {', '.join(_LAYERS)}")
+    return nn.Sequential(*chain)
 
 
 # The key under which a file has each kind of field.
-_KINDS: dict[str, tuple[type[Record], type]] = {
-    "modes": (ZernikeRecord, ZernikeModes),
-    "gaussian": (GaussianRecord, GaussianModes),
-    "network": (NetworkRecord, NetworkModes),
-}
+_KINDS: dict[str, type] = {"modes": ZernikeModes, "gaussian": GaussianModes, "network": NetworkModes}
 
 
 class HybridRecord(Record):
@@ -66,16 +165,29 @@ class HybridRecord(Record):
     @classmethod
     def of(cls, form: HybridForm) -> HybridRecord:
         """The constants of a lens."""
-        key, record = next((key, record) for key, (record, kind) in _KINDS.items() if isinstance(form.modes, kind))
-        fields = {key: record.model_validate(form.modes, from_attributes=True)}
-        return cls.model_validate({"shape": form.shape, "radius": form.radius, **fields})
+        modes, own = form.modes, next(key for key, kind in _KINDS.items() if isinstance(form.modes, kind))
+        if isinstance(modes, NetworkModes):
+            return cls(shape=form.shape, radius=form.radius, network=NetworkRecord.of(modes))
+        return cls.model_validate({"shape": form.shape, "radius": form.radius, own: modes}, from_attributes=True)
 
-    def form(self) -> HybridForm:
-        """The `HybridForm` with these constants."""
+    @pydantic.model_validator(mode="after")
+    def _one_kind(self) -> HybridRecord:
         given = [key for key in _KINDS if getattr(self, key) is not None]
         if len(given) != 1:
             raise ValueError(f"a field has one kind, {' or '.join(_KINDS)}; got {' and '.join(given) or 'none'}")
-        modes = _KINDS[given[0]][1](**dict(getattr(self, given[0])))
+        return self
+
+    def form(self, field: nn.Module | None = None) -> HybridForm:
+        """The `HybridForm` with these constants; `field` as for `NetworkRecord.modes`."""
+        modes: FieldModes
+        if self.network is not None:
+            modes = self.network.modes(field)
+        elif field is not None:
+            raise InputError("a network was given for the field, and the field of this camera is none; leave it out")
+        elif self.gaussian is not None:
+            modes = GaussianModes(**dict(self.gaussian))
+        else:
+            modes = ZernikeModes(**dict(self.modes or {}))
         return HybridForm(shape=self.shape, radius=self.radius, modes=modes)
 
 
@@ -104,8 +216,26 @@ class LensOrders(Record):
 
     @pydantic.model_validator(mode="after")
     def _known(self) -> LensOrders:
-        self.model()
+        if self.complete:
+            self.model()
         return self
+
+    @property
+    def complete(self) -> bool:
+        """Whether the file says all of the lens: not where its network is of a user's class."""
+        return self._own_network is None
+
+    @property
+    def _own_network(self) -> NetworkRecord | None:
+        """The network of a user's class."""
+        network = None if self.hybrid is None else self.hybrid.network
+        return None if network is None or network.known else network
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the coefficients."""
+        network = self._own_network
+        return self.model().names if network is None else LEADING + network_names(network.features)
 
     @classmethod
     def of(cls, model: LensModel) -> LensOrders:
@@ -113,6 +243,8 @@ class LensOrders(Record):
         orders = {name: getattr(model, name) for name in cls.model_fields}
         return cls(**orders | {"hybrid": model.hybrid and HybridRecord.of(model.hybrid)})
 
-    def model(self) -> LensModel:
-        """The `LensModel` with these orders."""
-        return LensModel(**dict(self) | {"hybrid": self.hybrid and self.hybrid.form()})
+    def model(self, field: nn.Module | None = None) -> LensModel:
+        """The `LensModel` with these orders; `field` as for `NetworkRecord.modes`."""
+        if self.hybrid is None and field is not None:
+            raise InputError("a network was given for the field, and this lens has no field; leave it out")
+        return LensModel(**dict(self) | {"hybrid": self.hybrid and self.hybrid.form(field)})

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Self
 
 import pydantic
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from kcal.checks import as_covariance
 from kcal.errors import FileError
@@ -211,11 +211,14 @@ class RigFile(NativeFile):
         matrix = _loaded(self.covariance)
         return None if matrix is None else RigCovariance(half=half_of_covariance(matrix))
 
-    def rig(self) -> StereoRig:
-        """The rig, equal to the stored one to the last bit, with its covariance, mounting and calibration."""
+    def rig(self, field: nn.Module | None = None) -> StereoRig:
+        """The rig, equal to the stored one to the last bit, with its covariance, mounting and calibration.
+
+        `field` as for `load_rig`.
+        """
         pose = self.right_from_left
         translation = torch.tensor(pose.translation, dtype=torch.float64)
-        rig = StereoRig(self.left.camera(), self.right.camera(), pose.matrix(), translation)
+        rig = StereoRig(self.left.camera(field), self.right.camera(field), pose.matrix(), translation)
         rig.covariance = self.known()
         rig.mounting = None if self.mounting is None else self.mounting.mounting()
         rig.calibration = self.calibration
@@ -272,8 +275,10 @@ def save_rig(rig: StereoRig, path: str | Path) -> Path:
     return rig_to_file(rig).save(path)
 
 
-def load_rig(path: str | Path) -> StereoRig:
+def load_rig(path: str | Path, *, field: nn.Module | None = None) -> StereoRig:
     """Read the rig of a kcal rig file, with its covariance, mounting and calibration, and those of its cameras.
+
+    `field` as for `kcal.load_camera`, for both cameras: each gets a copy with its own weights.
 
     Raises:
         FileError: missing, not JSON, another kind of file (a camera, say), or a field that is wrong; it names the path.
@@ -283,4 +288,4 @@ def load_rig(path: str | Path) -> StereoRig:
         Traceback (most recent call last):
         kcal.errors.FileError: no-such-file.json: cannot read: No such file or directory
     """
-    return RigFile.load(path).rig()
+    return RigFile.load(path).rig(field)

@@ -73,6 +73,7 @@ class Camera(ConvertibleCamera):
         # They follow from the parameters, so they are not part of the saved state.
         for name, value in self._measured_region().items():
             self.register_buffer(name, value, persistent=False)
+        self.register_load_state_dict_post_hook(_with_new_region)
 
     @classmethod
     def build(
@@ -163,7 +164,7 @@ class Camera(ConvertibleCamera):
         values = self.values
         coefficients, center = values[..., 5:], values[..., None, 2:4]
 
-        differentiated = is_differentiated(points, values)
+        differentiated = is_differentiated(points, values, *self.model.weights)
 
         def one(points: Tensor) -> tuple[Tensor, Tensor]:
             X, Y, Z = split_coordinates(points)
@@ -341,9 +342,10 @@ class Camera(ConvertibleCamera):
         share = polygon_area(self.valid_polygon()) / (self.size[0] * self.size[1])
         return f"{text}, valid={'whole image' if share > 1 - 1e-9 else f'{share:.1%} of the image'}"
 
-    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
-        super()._load_from_state_dict(*args, **kwargs)
-        self.update_valid_region()
+
+def _with_new_region(camera: Camera, _: Any) -> None:
+    """After a state was loaded, that of a network in the lens too."""
+    camera.update_valid_region()
 
 
 def pixels_to_plane(

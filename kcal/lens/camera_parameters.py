@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 from typing import Self
 
@@ -28,10 +29,13 @@ class CameraParameters(Float64Module):
 
     params: Tensor
     free_mask: Tensor
+    field: nn.Module | None
 
     def __init__(self, parameters: Tensor, size: tuple[int, int], model: LensModel) -> None:
         super().__init__()
-        self.model = model
+        # A network in the lens is this camera's own: it trains, moves between devices and is copied with it.
+        self.model = model if model.network is None else copy.deepcopy(model)
+        self.field = self.model.network
         self.size = (int(size[0]), int(size[1]))
         parameters = as_points("camera parameters", parameters, 5 + model.size)
         require_finite("camera parameters", parameters)
@@ -64,6 +68,8 @@ class CameraParameters(Float64Module):
     def free(self, *names: str) -> Self:
         """Let gradients reach these parameters only; without names, all but skew. Return the camera itself.
 
+        "field" names the weights of the network in the lens, where there is one (`camera.field`).
+
         The choice is part of the state (`free_mask`). Frozen parameters get a gradient of exactly zero, but weight
         decay in an optimizer would still move them. `requires_grad_(False)` freezes the whole camera again.
 
@@ -77,13 +83,17 @@ class CameraParameters(Float64Module):
             >>> [name for name, g in zip(camera.names, camera.params.grad) if g != 0]
             ['fx', 'k1']
         """
-        unknown = [name for name in names if name not in self.names]
+        known = self.names if self.field is None else (*self.names, "field")
+        unknown = [name for name in names if name not in known]
         if unknown:
-            raise InputError(f"unknown parameter {unknown[0]!r}: the camera has {', '.join(self.names)}")
-        chosen = names or tuple(name for name in self.names if name != "skew")
+            raise InputError(f"unknown parameter {unknown[0]!r}: the camera has {', '.join(known)}")
+        chosen = names or tuple(name for name in known if name != "skew")
         with torch.no_grad():
             self.free_mask.copy_(torch.tensor([name in chosen for name in self.names]))
-        return self.requires_grad_(True)
+        if self.field is not None:
+            self.field.requires_grad_("field" in chosen)
+        self.params.requires_grad_(True)
+        return self
 
     @property
     def focal(self) -> Tensor:

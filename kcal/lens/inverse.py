@@ -89,7 +89,10 @@ def undistort(
         return torch.stack([x, y], -1), valid
 
     return in_chunks(
-        one, distorted, coefficients[..., :1].numel(), differentiated=is_differentiated(distorted, coefficients)
+        one,
+        distorted,
+        coefficients[..., :1].numel(),
+        differentiated=is_differentiated(distorted, coefficients, *model.weights),
     )
 
 
@@ -107,7 +110,7 @@ def undistort_components(
         all_valid = known_true(valid)
         if not all_valid:
             x, y = torch.where(valid, x, 0.0), torch.where(valid, y, 0.0)
-    if is_differentiated(goal_x, goal_y, coefficients):
+    if is_differentiated(goal_x, goal_y, coefficients, *model.weights):
         for _ in range(2):
             x, y = _full_step(x, y, goal_x, goal_y, coefficients, model)
             if not all_valid:

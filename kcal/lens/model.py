@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 
+from torch import Tensor, nn
+
 from kcal.errors import InputError
 from kcal.lens.hybrid_terms import HybridForm
+from kcal.lens.network_modes import NetworkModes
 
 # The term and the order of every coefficient, in storage order: OpenCV's 14 first, so that its models are prefixes,
 # then the higher orders of Eq. 10 of the paper and their continuation. A name means the same in every model.
@@ -133,6 +136,17 @@ class LensModel:
         return self.fisheye or self.hybrid is not None
 
     @property
+    def network(self) -> nn.Module | None:
+        """The module inside the field of a hybrid lens, if that is a network (`kcal.lens.network_modes`)."""
+        modes = self.hybrid and self.hybrid.modes
+        return modes.trunk if isinstance(modes, NetworkModes) else None
+
+    @property
+    def weights(self) -> tuple[Tensor, ...]:
+        """Weights of that network, by which derivatives may be asked for besides those by coefficients."""
+        return () if self.network is None else tuple(self.network.parameters())
+
+    @property
     def untilted(self) -> LensModel:
         """The same model without its tilt."""
         return self if self.without_tilt is None else self.without_tilt
@@ -143,7 +157,7 @@ class LensModel:
 
     def __str__(self) -> str:
         if self.hybrid:
-            return "hybrid"
+            return "hybrid" if self.network is None else "network"
         kind = "fisheye " if self.fisheye else ""
         return next((name for name, model in PRESETS.items() if model == self), f"{kind}({', '.join(self.names)})")
 

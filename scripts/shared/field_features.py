@@ -32,8 +32,8 @@ def train_features(
     Example:
         >>> places = 2.0 * torch.rand(300, 2, dtype=torch.float64) - 1.0
         >>> modes = train_features(places, torch.sin(3.0 * places), count=6)
-        >>> len(modes.hidden)
-        6
+        >>> len(modes)
+        12
     """
     inputs, targets = as_points("places", places, 2).T, as_points("corrections", corrections, 2).T
     widths = (2, count, 2)
@@ -43,4 +43,4 @@ def train_features(
     options = LMOptions(max_iterations=iterations, tolerance=1e-6)
     fit_weights(net, problem, (net.weights.detach(),), options)
     (matrix, bias), _ = layers(net.weights.detach(), widths)
-    return NetworkModes(hidden=tuple((a, b, c) for a, b, c in torch.cat([matrix, bias], 1).tolist()))
+    return NetworkModes.hidden_layer(torch.cat([matrix, bias], 1).tolist())

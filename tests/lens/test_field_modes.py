@@ -204,5 +204,5 @@ def test_bad_widths(widths: tuple[float, ...]) -> None:
 
 @pytest.mark.parametrize("hidden", [(), ((0.0, 0.0, 1.0),), ((1.0, math.inf, 0.0),)])
 def test_bad_features(hidden: tuple[tuple[float, float, float], ...]) -> None:
-    with pytest.raises(InputError, match="at least one feature"):
-        NetworkModes(hidden=hidden)
+    with pytest.raises(InputError, match=r"at least one feature|finite"):
+        NetworkModes.hidden_layer(hidden)
