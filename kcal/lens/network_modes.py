@@ -192,8 +192,8 @@ class NetworkModes(UnitModes):
             return (shaped(self.trunk(flat)),)
         along = [one.expand_as(flat) for one in flat.new_tensor([[1.0, 0.0], [0.0, 1.0]])]
         if known_chain(self.trunk) is None:
-            (value, by_x), (_, by_y) = (jvp(self.trunk, (flat,), (one,)) for one in along)
-            return shaped(value), shaped(by_x), shaped(by_y)
+            pairs = [jvp(self.trunk, (flat,), (one,)) for one in along]
+            return shaped(pairs[0][0]), shaped(pairs[0][1]), shaped(pairs[1][1])
         # By hand: compilers, exporters and an outer forward mode cannot follow another one.
         value, (by_x, by_y) = flat, along
         for layer in known_chain(self.trunk) or ():
