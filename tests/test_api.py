@@ -76,7 +76,7 @@ PUBLIC = {
     "kcal.track": """
         Association AssociationOptions ClockEstimate ClockPrior Detections DisparityOptions Motion
         ObjectDisparities ObjectDisparity ObjectPairs SmoothedTrack TrackOptions TrackStates Tracker Tracks
-        associate pair_objects group_objects ObjectViews
+        associate pair_objects group_objects ObjectViews PairBoxes BoxPairs
     """,
     "kcal.report": """
         FailedImage Finding RangeAnswer Requirement Verdict calibration_figure camera_verdict positions_figure
@@ -134,7 +134,7 @@ NEW_NAMES = (
     | {"pupil_shift", "ray_error", "IntervalCheck", "Refit", "against_capture", "interval_check", "simulated_refits"}
     | {"DisparityRanges", "RangeImage", "forgotten_yaw", "save_interval_picture"}
     | {"CameraRig", "CameraRigCalibration", "load_camera_rig", "save_camera_rig", "station_mounting", "stations_of"}
-    | {"ObjectViews", "group_objects"}
+    | {"ObjectViews", "group_objects", "PairBoxes", "BoxPairs"}
     | {"MultiViewLocalizer", "ViewMarks", "ViewsLocalization", "locate_views", "read_views"}
     | {
         "Area",

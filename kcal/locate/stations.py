@@ -92,11 +92,12 @@ def stations_at(localize: StereoLocalizer, *, errors: int | None = None) -> Mult
     rig, factor, stands = localize.rig, localize.calibration_factor, localize.mounting
     size, half = rig.left.values.shape[-1] + rig.right.values.shape[-1] + 6, None
     if factor is not None or stands is not None:
-        half = torch.zeros(0, size + 7, dtype=torch.float64)
-        left_over = torch.zeros(7, 7, dtype=torch.float64) if stands is None else stands
+        left = localize.enu_from_rig
+        half = left.new_zeros(0, size + 7)
+        left_over = left.new_zeros(7, 7) if stands is None else stands
         if factor is not None:
             # What the mounting owes to the calibration's errors: factor · ofᵀ = link.
-            of = torch.zeros(7, factor.shape[1], dtype=torch.float64)
+            of = left.new_zeros(7, factor.shape[1])
             if localize.link is not None:
                 scale = torch.linalg.vector_norm(factor, dim=1, keepdim=True)
                 unit = torch.where(scale > 0, scale, 1.0)
@@ -127,11 +128,11 @@ def _two_stations(
     if half is None:
         return stations
     size = half.shape[1] - 7
-    by = torch.zeros(stations.quantities, half.shape[1], dtype=torch.float64)
+    half, by = half.to(shift), shift.new_zeros(stations.quantities, half.shape[1])
     lenses = size - 6
-    by[:lenses, :lenses] = torch.eye(lenses, dtype=torch.float64)
+    by[:lenses, :lenses] = torch.eye(lenses).to(shift)
     turn, move, center, attitude = (slice(size + at, size + at + 3) for at in (-6, -3, 0, 3))
-    still = torch.eye(3, dtype=torch.float64)
+    still = torch.eye(3).to(shift)
     first, second = stations.pose_columns(0).start, stations.pose_columns(1).start
     by[first : first + 3, center], by[first + 3 : first + 6, attitude] = still, still
     by[second : second + 3, center] = still
@@ -147,7 +148,7 @@ def _two_stations(
 def _crossed(vector: Tensor) -> Tensor:
     """(3, 3) with `_crossed(v) @ w` = v × w."""
     x, y, z = vector.tolist()
-    return torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64)
+    return vector.new_tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def _joint_covariance(rig: StereoRig) -> Tensor | None:
@@ -156,7 +157,7 @@ def _joint_covariance(rig: StereoRig) -> Tensor | None:
     if known is None and (stands is None or stands.covariance is None):
         return None
     size = rig.left.values.shape[-1] + rig.right.values.shape[-1] + 6
-    whole = torch.zeros(size + 7, size + 7, dtype=torch.float64)
+    whole = rig.right_from_left_translation.new_zeros(size + 7, size + 7)
     if known is not None:
         whole[:size, :size] = known.matrix
     if stands is not None:

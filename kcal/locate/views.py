@@ -146,20 +146,26 @@ class ViewsFit(NamedTuple):
         )
         return (((offset * self.rays).sum(-1) < 0) & self.used).any(-1) & self.fitted
 
+    @property
+    def _weight(self) -> Tensor:
+        if self.weight is not None:
+            return self.weight
+        still = torch.eye(len(self.fit.residual)).to(self.fit.residual)
+        return (still / self.variance)[..., None]
+
+    @property
+    def chi2(self) -> Tensor:
+        """χ² (N,) of the residuals."""
+        return (self.fit.residual * (self._weight * self.fit.residual).sum(-2)).sum(-2)
+
     @torch.no_grad()
     def misfits(self) -> tuple[Tensor, Tensor]:
         """χ² (N,) of the residuals, and (N, C) by how much it falls when a view is left out.
 
         Of two views, either takes all of it. To first order, which is exact to rounding for views some sigmas off.
         """
-        residual, jacobian = self.fit.residual, self.fit.jacobian
-        if self.weight is None:
-            still = torch.eye(len(residual), dtype=residual.dtype, device=residual.device)
-            weight = (still / self.variance)[..., None]
-        else:
-            weight = self.weight
-        pulled = (weight * residual).sum(-2)
-        chi2 = (residual * pulled).sum(-2)
+        jacobian, weight, chi2 = self.fit.jacobian, self._weight, self.chi2
+        pulled = (weight * self.fit.residual).sum(-2)
         weighted = (weight[None] * jacobian[:, None]).sum(-2)  # (3, 2 C, N)
         a, b, c, d, e, f = (self.variance * entry for entry in self.fit.covariance)
         spread = torch.stack([a, b, c, b, d, e, c, e, f]).unflatten(0, (3, 3))

@@ -24,6 +24,9 @@ class Detections:
     Convention: pixel (0, 0) is the center of the first pixel, as everywhere in kcal. Detectors mostly count from the
     first pixel's upper left *edge*; `read` subtracts the half pixel.
 
+    Tensors stay on the device and in the graph of what was read, so that a loss on positions reaches a detector's
+    boxes and keypoints. Half precision is refused: it rounds a pixel near 1920 to 1 px.
+
     Args:
         boxes: (N, 4) left, top, right and bottom edge, pixels; floating point.
         score: (N,) confidence.
@@ -60,8 +63,8 @@ class Detections:
                 f"detections: {count} categories, but boxes {tuple(boxes.shape)}, score {tuple(score.shape)} and "
                 f"{len(self.track)} tracks"
             )
-        require_finite("boxes", boxes)
-        require_finite("score", score)
+        require_finite("boxes", boxes.detach())
+        require_finite("score", score.detach())
         if not bool((boxes[:, 2:] > boxes[:, :2]).all()):
             number = int((boxes[:, 2:] <= boxes[:, :2]).any(-1).nonzero()[0])
             raise InputError(f"boxes: number {number}, {boxes[number].tolist()}, has no area; x1, y1, x2, y2 is needed")
@@ -127,7 +130,7 @@ class Detections:
             masks = masks[:, 0]
         return cls(
             boxes=raw.boxes - first_pixel,
-            score=torch.ones(count, dtype=torch.float64) if raw.score is None else raw.score,
+            score=torch.ones_like(raw.boxes[:, 0]).detach() if raw.score is None else raw.score,
             category=_category_names(raw, count, names or {}),
             track=tuple(None if track is None else str(track) for track in raw.track or (None,) * count),
             keypoints=None if raw.keypoints is None else raw.keypoints - (0.0 if raw.centered else first_pixel),
@@ -135,6 +138,12 @@ class Detections:
             size=(int(image_size[0]), int(image_size[1])),
             time=raw.time if time is None else time,
         )
+
+    def to(self, device: torch.device | str) -> Detections:
+        """The same on another device, in the same graph."""
+        own = {name: getattr(self, name) for name in ("boxes", "score", "keypoints", "masks")}
+        moved = {name: value.to(device) for name, value in own.items() if value is not None}
+        return dataclasses.replace(self, **moved)
 
     def select(self, chosen: Tensor) -> Detections:
         """Those that a mask (N,) or a list of numbers chooses."""
@@ -158,14 +167,8 @@ class Detections:
         Raises:
             InputError: an unknown name, or a keypoint that there is not.
         """
-        left, top, right, bottom = self.boxes.unbind(-1)
-        middle = 0.5 * (left + right)
-        if anchor == "center":
-            return torch.stack([middle, 0.5 * (top + bottom)], -1)
-        if anchor == "bottom":
-            return torch.stack([middle, bottom], -1)
         if not isinstance(anchor, int):
-            raise InputError(f"anchor {anchor!r}: 'center', 'bottom' or the number of a keypoint is needed")
+            return box_anchors(self.boxes, anchor)
         if self.keypoints is None or not 0 <= anchor < self.keypoints.shape[1]:
             raise InputError(f"anchor {anchor}: these detections have no such keypoint")
         return self.keypoints[:, anchor]
@@ -195,6 +198,18 @@ class Detections:
             masks=masks,
             size=transform.full,
         )
+
+
+def box_anchors(boxes: Tensor, anchor: str) -> Tensor:
+    """Pixels (..., 2) of boxes (..., 4): their `"center"`, or `"bottom"`, the middle of the lower edge.
+
+    Raises:
+        InputError: an unknown name.
+    """
+    left, top, right, bottom = boxes.unbind(-1)
+    if anchor not in ("center", "bottom"):
+        raise InputError(f"anchor {anchor!r}: 'center', 'bottom' or the number of a keypoint is needed")
+    return torch.stack([0.5 * (left + right), bottom if anchor == "bottom" else 0.5 * (top + bottom)], -1)
 
 
 def _category_names(raw: RawDetections, count: int, names: dict[int, str]) -> tuple[str, ...]:

@@ -19,6 +19,7 @@ import orjson
 import torch
 from torch import Tensor
 
+from kcal.checks import as_points
 from kcal.errors import InputError
 
 _KEYS = {"time", "size", "boxes", "scores", "categories", "tracks", "keypoints"}
@@ -67,18 +68,20 @@ def raw_detections(source: Any) -> RawDetections:
 
 
 def _as_numbers(name: str, values: Any) -> Tensor:
-    """A float64 tensor; boxes that were stored as integers are edges all the same."""
-    try:
-        found = values.detach() if isinstance(values, Tensor) else torch.as_tensor(np.asarray(values, dtype=np.float64))
-    except (TypeError, ValueError) as error:
-        raise InputError(f"detections: {name} are not numbers of one shape ({error})") from error
-    return found.to("cpu", torch.float64)
+    """A float64 tensor on the device and in the graph of the values; integers are edges all the same."""
+    if not isinstance(values, Tensor):
+        half = isinstance(values, np.ndarray) and values.dtype == np.float16
+        try:
+            values = torch.as_tensor(values if half else np.asarray(values, dtype=np.float64))
+        except (TypeError, ValueError) as error:
+            raise InputError(f"detections: {name} are not numbers of one shape ({error})") from error
+    if not values.is_floating_point():
+        values = values.double()
+    return as_points(name, values, values.shape[-1] if values.ndim else 1)
 
 
 def _boxes(values: Any) -> Tensor:
     boxes = _as_numbers("boxes", values)
-    if not boxes.ndim:
-        raise InputError(f"boxes: rows of x1, y1, x2, y2 are needed, got {float(boxes):g}")
     return boxes.reshape(0, 4) if boxes.numel() == 0 else boxes
 
 

@@ -39,8 +39,12 @@ class _Rays(NamedTuple):
     by_pixel: Tensor
     by_error: Tensor
 
-    def at(self, which: Tensor) -> _Rays:
+    def at(self, which: Tensor | tuple[Tensor, Tensor]) -> _Rays:
         return _Rays(*(value[which] for value in self))
+
+    def split(self, moments: int) -> _Rays:
+        """Those of so many moments: (B, N / B, ...)."""
+        return _Rays(*(value.unflatten(0, (moments, -1)) for value in self))
 
 
 def near_epipolar_lines(
@@ -51,12 +55,12 @@ def near_epipolar_lines(
     gate: float,
     ranges: tuple[float, float] | None = None,
 ) -> Tensor:
-    """(N, M) bool: False only where the epipolar error is beyond `gate` standard deviations for certain.
+    """(..., N, M) bool: False only where the epipolar error is beyond `gate` standard deviations for certain.
 
     Args:
         rig: the calibrated cameras; errors of its `covariance` widen the band.
-        left: (N, 2) float64 pixels.
-        right: (M, 2).
+        left: (..., N, 2) float64 pixels.
+        right: (..., M, 2), with the same leading dimensions: moments, whose pixels are not compared with each other's.
         sigma: standard deviation of every pixel along each axis.
         gate: standard deviations.
         ranges: nearest and farthest, meters: pairs beyond them by as many standard deviations are left out, too.
@@ -70,22 +74,28 @@ def near_epipolar_lines(
     """
     rotation, shift = rig.right_from_left_rotation, rig.right_from_left_translation
     sizes = (rig.left.values.shape[-1], rig.right.values.shape[-1], 3, 3)
-    known = shift.new_zeros(0, sum(sizes)) if rig.covariance is None else rig.covariance.half
+    known = shift.new_zeros(0, sum(sizes)) if rig.covariance is None else rig.covariance.half.to(shift)
     own = known.T.split(sizes)
-    ray, by_pixel, by_error = _turns(rig.left, left, own[0])
-    first = _Rays(ray @ rotation.T, rotation @ by_pixel, own[2] - rotation @ by_error)
-    other = _Rays(*_turns(rig.right, right, own[1]))
+    near = torch.zeros(*left.shape[:-1], right.shape[-2], dtype=torch.bool, device=left.device)
+    if not near.numel():
+        return near
+    whole = near.reshape(-1, *near.shape[-2:])
+    ray, by_pixel, by_error = _turns(rig.left, left.reshape(-1, 2), own[0])
+    first = _Rays(ray @ rotation.T, rotation @ by_pixel, own[2] - rotation @ by_error).split(len(whole))
+    other = _Rays(*_turns(rig.right, right.reshape(-1, 2), own[1])).split(len(whole))
     shifts = shift, own[3]
-    near = torch.zeros(len(left), len(right), dtype=torch.bool, device=left.device)
-    errors = max(1, own[3].shape[1])
-    for rows in torch.arange(len(left), device=left.device).split(_AT_ONCE // (32 * max(1, len(right))) + 1):
-        part = first.at(rows)
-        block = _possible(part, other, shifts, sigma, _SLACK * gate, ranges)
-        if len(known):
-            # Exact where the bound on what the errors of the rig do leaves it open.
-            for some, columns in (which.T for which in block.nonzero().split(_AT_ONCE // (8 * errors) + 1)):
-                block[some, columns] = _certain(part.at(some), other.at(columns), shifts, sigma, _SLACK * gate)
-        near[rows] = block
+    errors, pairs = max(1, own[3].shape[1]), whole[0].numel()
+    for moments in torch.arange(len(whole), device=left.device).split(_AT_ONCE // (32 * pairs) + 1):
+        seen = other.at(moments)
+        for rows in torch.arange(left.shape[-2], device=left.device).split(_AT_ONCE // (32 * right.shape[-2]) + 1):
+            part = first.at((moments[:, None], rows))
+            block = _possible(part, seen, shifts, sigma, _SLACK * gate, ranges)
+            if len(known):
+                # Exact where the bound on what the errors of the rig do leaves it open.
+                for at, some, columns in (which.T for which in block.nonzero().split(_AT_ONCE // (8 * errors) + 1)):
+                    certain = _certain(part.at((at, some)), seen.at((at, columns)), shifts, sigma, _SLACK * gate)
+                    block[at, some, columns] = certain
+            whole[moments[:, None], rows] = block
     return near
 
 
@@ -97,22 +107,22 @@ def _possible(
     gate: float,
     ranges: tuple[float, float] | None,
 ) -> Tensor:
-    """(N, M) bool: each error of the rig as large as it can be beside the others."""
+    """(B, N, M) bool: each error of the rig as large as it can be beside the others."""
     shift, by_shift = shifts
-    turned, rays = first.ray[:, None], other.ray[None]
+    turned, rays = first.ray[..., None, :], other.ray[:, None]
     across = torch.linalg.cross(rays, shift.expand_as(rays))
     shifted = torch.linalg.cross(*torch.broadcast_tensors(turned, rays))
     error = (turned * across).sum(-1)
-    # Derivatives of the error (N, M, 3) by turns of the left rays about the right camera's axes, and of the right rays.
+    # Derivatives of the error (B, N, M, 3) by turns of the left rays about the right camera's axes, and of right rays.
     by_turn = torch.linalg.cross(*torch.broadcast_tensors(turned, across))
     by_other = torch.linalg.cross(*torch.broadcast_tensors(rays, torch.linalg.cross(shift.expand_as(turned), turned)))
     marks = (by_turn @ first.by_pixel).square().sum(-1)
-    marks = marks + (by_other.movedim(1, 0) @ other.by_pixel).movedim(0, 1).square().sum(-1)
-    moved = _length(by_turn, first.by_error) + _length(by_other.movedim(1, 0), other.by_error).T
+    marks = marks + (by_other.transpose(1, 2) @ other.by_pixel).square().sum(-1).mT
+    moved = _length(by_turn, first.by_error) + _length(by_other.transpose(1, 2), other.by_error).mT
     moved = moved + _length(shifted, by_shift)
     # What products of two turns add at most.
-    turns = [ray.by_pixel.square().sum((1, 2)) for ray in (first, other)]
-    second = (gate * sigma) ** 2 * (turns[0][:, None] + turns[1])
+    turns = first.by_pixel.square().sum((-2, -1))[..., None], other.by_pixel.square().sum((-2, -1))[:, None]
+    second = (gate * sigma) ** 2 * (turns[0] + turns[1])
     baseline = torch.linalg.vector_norm(shift)
     near = error.abs() <= gate * ((sigma**2 * marks).sqrt() + moved) + second * baseline
     if ranges is None:
@@ -120,10 +130,10 @@ def _possible(
     # A point at the inverse distance q is seen where the cross product of its rays is q times that with the baseline.
     length = torch.linalg.vector_norm(across, dim=-1).clamp_min(1e-12)
     inverse = (shifted * across).sum(-1) / length.square()
-    own = [(sigma**2 * turn).sqrt() + ray.by_error.square().sum((1, 2)).sqrt()
-           for turn, ray in zip(turns, (first, other), strict=True)]  # fmt: skip
+    errors = first.by_error.square().sum((-2, -1))[..., None], other.by_error.square().sum((-2, -1))[:, None]
+    own = [(sigma**2 * turn).sqrt() + error.sqrt() for turn, error in zip(turns, errors, strict=True)]
     stretch = (own[1] * baseline + by_shift.square().sum().sqrt()) / length
-    reach = gate * ((own[0][:, None] + own[1]) / length + inverse.abs() * stretch) + second / length
+    reach = gate * ((own[0] + own[1]) / length + inverse.abs() * stretch) + second / length
     beyond = inverse + reach < 1.0 / (_MIDDLE * ranges[1])
     before = inverse - reach > _MIDDLE / ranges[0]
     # Near the baseline's own direction nothing is said of the distance.

@@ -7,6 +7,7 @@ every error that the cameras share. The likeliest groups are taken first; what r
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
 from collections.abc import Sequence
@@ -50,11 +51,12 @@ class _Group(NamedTuple):
     saved: float
 
 
-@torch.no_grad()
 def group_objects(
     localize: MultiViewLocalizer, seen: Sequence[Detections | None], options: AssociationOptions | None = None
 ) -> ObjectViews:
     """Group the detections that the cameras of a rig have at one moment.
+
+    Works on the CPU; pixels come back on the device and in the graph of the detections.
 
     Rows of one camera alone are those that no group has, and those of ambiguous groups once more: a tracker gives them
     to the track that they continue.
@@ -95,28 +97,34 @@ def group_objects(
             raise InputError(f"the detections of {name} need a time")
         if len(each) > MOST_BOXES:
             raise InputError(f"{len(each):,} detections of {name} in one image; at most {MOST_BOXES:,} can be grouped")
-    scene = _Scene(localize, seen, options)
-    groups, ambiguous = scene.chosen()
+    with torch.no_grad():
+        here = localize if rig.center.device.type == "cpu" else copy.deepcopy(localize).cpu()
+        scene = _Scene(here, [None if each is None else each.to("cpu") for each in seen], options)
+        groups, ambiguous = scene.chosen()
     taken = {mark for group, doubt in zip(groups, ambiguous, strict=True) if not doubt for mark in group}
     alone = [mark for mark in range(len(scene.camera)) if mark not in taken]
     count = len(rig)
     rows = [*groups, *(tuple(mark if c == scene.camera[mark] else -1 for c in range(count)) for mark in alone)]
-    numbers = torch.tensor(rows, dtype=torch.long).reshape(-1, count)
+    marks = [each.anchors(options.anchor) for each in seen if each is not None]
+    every = torch.cat(marks) if marks else scene.pixels
+    place = every.device
+    numbers = torch.tensor(rows, dtype=torch.long, device=place).reshape(-1, count)
     there = numbers >= 0
-    pixels = torch.where(there[..., None], scene.pixels[numbers.clamp_min(0)], torch.nan)
+    pixels = torch.where(there[..., None], every[numbers.clamp_min(0)], torch.nan)
+    score = scene.score.to(place)
     stamps = [math.nan if each is None else float(each.time or 0.0) for each in seen]
     known = [stamp for stamp in stamps if math.isfinite(stamp)]
     filled = [stamp if math.isfinite(stamp) else min(known, default=0.0) for stamp in stamps]
-    time = torch.tensor(filled, dtype=torch.float64)
+    time = torch.tensor(filled, dtype=torch.float64, device=place)
     firsts = [next(mark for mark in row if mark >= 0) for row in rows]
     return ObjectViews(
         pixels=pixels,
         seen=there,
-        covariance=options.box_sigma**2 * torch.eye(2 * count, dtype=torch.float64).expand(len(rows), -1, -1),
+        covariance=options.box_sigma**2 * torch.eye(2 * count).to(every).expand(len(rows), -1, -1),
         time=time.expand(len(rows), count),
-        score=torch.where(there, scene.score[numbers.clamp_min(0)], torch.inf).amin(-1) if rows else scene.score[:0],
+        score=torch.where(there, score[numbers.clamp_min(0)], torch.inf).amin(-1) if rows else score[:0],
         category=tuple(scene.category[mark] for mark in firsts),
-        ambiguous=torch.tensor([*ambiguous, *[False] * len(alone)], dtype=torch.bool),
+        ambiguous=torch.tensor([*ambiguous, *[False] * len(alone)], dtype=torch.bool, device=place),
     )
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kcal.lens.dispatch import is_differentiated
 from kcal.locate.multi_localizer import MultiViewLocalizer, common_errors, posed_cameras
 from kcal.locate.views import CommonErrors, PosedCameras, ViewsFit, fit_views
 from kcal.pipeline.association_options import AssociationOptions
@@ -41,10 +42,9 @@ def fit_some(localize: MultiViewLocalizer, cameras: list[int], pixels: Tensor, s
     )  # fmt: skip
     if common is not None:
         common = CommonErrors(tuple(common.lens[c] for c in cameras), common.half[:, cameras], common.bending)
-    return fit_views(part, pixels, seen, noise=noise, shared=common)
+    return fit_views(part, pixels, seen, noise=noise, shared=common, differentiated=is_differentiated(pixels))
 
 
-@torch.no_grad()
 def pair_costs(
     localize: MultiViewLocalizer,
     cameras: Tensor,
@@ -53,11 +53,11 @@ def pair_costs(
     options: AssociationOptions,
     nearest: float | None,
 ) -> PairCosts:
-    """Compare pairs of detections of any two cameras.
+    """Compare pairs of detections of any two cameras; differentiable by pixels and boxes.
 
     Args:
         localize: the rig and how well it is known.
-        cameras: (L, 2) numbers of two cameras each; pairs of the same two stand together.
+        cameras: (L, 2) numbers of two cameras each, on the CPU; pairs of the same two stand together.
         pixels: (L, 2, 2) what stands for the objects.
         boxes: (L, 2, 4) x1, y1, x2, y2.
         options: of the association.
@@ -79,27 +79,31 @@ def pair_costs(
         parts = [pair_costs(localize, *some, options, nearest) for some in each]
         return PairCosts(*(torch.cat(values) for values in zip(*parts, strict=True)))
     which, place = np.unique(cameras.numpy(), return_inverse=True)
-    rows, at = torch.arange(len(cameras))[:, None], torch.from_numpy(place).reshape(-1, 2)
+    at = torch.from_numpy(place).reshape(-1, 2).to(pixels.device)
+    rows = torch.arange(len(cameras), device=pixels.device)[:, None]
     spread = pixels.new_zeros(len(cameras), len(which), 2).index_put((rows, at), pixels)
-    seen = torch.zeros(spread.shape[:2], dtype=torch.bool).index_put((rows, at), torch.tensor(True))
+    seen = torch.zeros(spread.shape[:2], dtype=torch.bool, device=pixels.device)
+    seen[rows, at] = True
     found = fit_some(localize, which.tolist(), spread, seen, options.box_sigma)
     fit = found.fit
-    total, _ = found.misfits()
+    total = found.chi2
     length = fit.direction.square().sum(0).sqrt()
     inverse = fit.inverse / (found.scale * length)
-    sigma = (found.variance * fit.covariance[5]).clamp_min(0.0).sqrt() / (found.scale * length)
+    variance = found.variance * fit.covariance[5]
+    known = variance.detach() > 0
+    sigma = torch.where(known, torch.where(known, variance, 1.0).sqrt() / (found.scale * length), 0.0)
     beyond = (1.0 / options.farthest - inverse).clamp_min(0.0)
     before = (inverse - 1.0 / nearest).clamp_min(0.0) if nearest else torch.zeros_like(inverse)
-    total = total + (torch.maximum(beyond, before) / sigma).square()
+    total = total + (torch.maximum(beyond, before) / torch.where(known, sigma, 1.0)).square()
     magnified = torch.stack([torch.linalg.vector_norm(p.by_point, dim=(-3, -2)) for p in fit.projections], 1)
     rays = found.rays[rows, at]
     parallax = torch.linalg.vector_norm(torch.linalg.cross(rays[:, 0], rays[:, 1]), dim=-1)
     total = total + size_cost(magnified[rows, at], boxes, options.box_sigma, parallax)
     # On different sides of the line that joins the cameras, lines of sight meet nowhere: a false optimum.
-    apart = localize.rig.center[cameras[:, 1]] - localize.rig.center[cameras[:, 0]]
+    apart = localize.rig.center[cameras[:, 1].to(rays.device)] - localize.rig.center[cameras[:, 0].to(rays.device)]
     along = (rays * apart[:, None]).sum(-1).prod(-1)
     one_side = apart.square().sum(-1) * (rays[:, 0] * rays[:, 1]).sum(-1) > along
-    good = found.fitted & one_side & (sigma > 0) & (found.used.sum(-1) == 2)
+    good = found.fitted & one_side & known & (found.used.sum(-1) == 2)
     return PairCosts(torch.where(good, total, torch.inf), inverse, sigma)
 
 

@@ -56,7 +56,7 @@ def pair_objects(
     first, second = left.select(found.left), right.select(found.right)
     anchors = first.anchors(options.anchor)
     pixels = second.anchors(options.anchor)
-    noise = options.box_sigma**2 * torch.eye(4, dtype=torch.float64)
+    noise = options.box_sigma**2 * torch.eye(4).to(anchors)
     covariance = noise.repeat(len(first), 1, 1)
     if images is not None and len(first):
         match = disparity or ObjectDisparity(rig)
@@ -73,7 +73,7 @@ def pair_objects(
         left=anchors,
         right=pixels,
         covariance=covariance,
-        time=torch.tensor([left.time or 0.0, right.time or 0.0], dtype=torch.float64).expand(len(first), 2),
+        time=anchors.new_tensor([left.time or 0.0, right.time or 0.0]).expand(len(first), 2),
         score=torch.minimum(first.score, second.score),
         category=first.category,
         track=tuple(one or other for one, other in zip(first.track, second.track, strict=True)),

@@ -117,16 +117,16 @@ class ObjectPairs:
             raise InputError(f"pixel_sigma: a positive number of pixels is needed, got {pixel_sigma}")
         if bool((matches.get("batch_indexes", torch.zeros(1)) != 0).any()):
             raise InputError("matches: one pair of images at a time is needed, not a batch")
-        count = len(matches["keypoints0"])
+        count, place = len(matches["keypoints0"]), matches["keypoints0"].device
         return cls(
             left=matches["keypoints0"],
             right=matches["keypoints1"],
-            covariance=(pixel_sigma**2 * torch.eye(4, dtype=torch.float64)).expand(count, 4, 4),
-            time=torch.tensor(time, dtype=torch.float64).expand(count, 2),
+            covariance=(pixel_sigma**2 * torch.eye(4, dtype=torch.float64, device=place)).expand(count, 4, 4),
+            time=torch.tensor(time, dtype=torch.float64, device=place).expand(count, 2),
             score=matches["confidence"],
             category=(category,) * count,
             track=(None,) * count,
-            ambiguous=torch.zeros(count, dtype=torch.bool),
+            ambiguous=torch.zeros(count, dtype=torch.bool, device=place),
         )
 
 

@@ -10,6 +10,8 @@ from kcal.pipeline.object_views import ObjectViews as ObjectViews
 from kcal.pipeline.association import associate as associate
 from kcal.pipeline.association_options import AssociationOptions as AssociationOptions
 from kcal.pipeline.association import Association as Association
+from kcal.pipeline.association import PairBoxes as PairBoxes
+from kcal.pipeline.association import BoxPairs as BoxPairs
 from kcal.pipeline.disparity import ObjectDisparity as ObjectDisparity
 from kcal.pipeline.disparity import ObjectDisparities as ObjectDisparities
 from kcal.pipeline.disparity import DisparityOptions as DisparityOptions

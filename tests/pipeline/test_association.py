@@ -49,6 +49,15 @@ def site(count: int, seed: int, sigma: float = 1.0) -> tuple[StereoRig, Detectio
     return rig, seen(left + noise[0]), seen((right + noise[1])[order]), order
 
 
+def costs_of(
+    rig: StereoRig, left: Detections, right: Detections, options: AssociationOptions, among: Tensor | None = None
+) -> Tensor:
+    """(N, M) of one moment."""
+    among = torch.ones(len(left), len(right), dtype=torch.bool) if among is None else among
+    both = [left.anchors()[None], right.anchors()[None]], [left.boxes[None], right.boxes[None]]
+    return association_costs(rig, *both, among[None], options)[0]
+
+
 def test_targets_find_each_other() -> None:
     right_ones = total = 0
     for seed in range(5):
@@ -86,7 +95,7 @@ def test_the_assignment_is_the_best_one() -> None:
         left, right = seen(left), seen((right + torch.randn(4, 2, generator=random))[:3])
         options = AssociationOptions(box_sigma=2.0)
         found = associate(rig, left, right, options)
-        cost = torch.where(found.possible, association_costs(rig, left, right, options), torch.inf)
+        cost = torch.where(found.possible, costs_of(rig, left, right, options), torch.inf)
         assert total(found, (4, 3), 16.0) == pytest.approx(brute(cost, 16.0))
 
 
@@ -116,12 +125,12 @@ def test_the_band_leaves_out_no_pair_that_is_possible(kind: str, share: float) -
     left, right = (seen(torch.rand(120, 2, generator=random, dtype=torch.float64) * size) for _ in range(2))
     anchors, ranges = (left.anchors(), right.anchors()), (5.0, options.farthest)
     near = near_epipolar_lines(rig, *anchors, options.box_sigma, options.gate, ranges)
-    every = association_costs(rig, left, right, options)
+    every = costs_of(rig, left, right, options)
     possible = every < options.gate**2
     assert not bool((possible & ~near).any())
     assert int(possible.sum()) > 30
     assert float(near.double().mean()) < share
-    gated = association_costs(rig, left, right, options, near)
+    gated = costs_of(rig, left, right, options, near)
     assert torch.allclose(gated[possible], every[possible], rtol=1e-9, atol=1e-9)
     assert bool(gated[~near].isinf().all())
 
@@ -261,7 +270,7 @@ def test_the_epipolar_cost_is_chi_square_with_the_errors_of_the_rig() -> None:
     left, right = (seen(both, 1e-3) for both in torch.cat(marks, 1))
     mean = []
     for believed.covariance in (known, None):
-        costs = association_costs(believed, left, right, AssociationOptions(box_sigma=0.5), torch.eye(180) > 0)
+        costs = costs_of(believed, left, right, AssociationOptions(box_sigma=0.5), torch.eye(180) > 0)
         mean.append(float(costs.diagonal().mean()))
     assert mean[0] == pytest.approx(1.0, abs=0.35)
     assert mean[1] > 2.0

@@ -10,8 +10,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal.pipeline.appearance import appearance
 from kcal.pipeline.assignment import SeenFrom, looks_of, nearby
+from kcal.pipeline.association import appearance
 from kcal.pipeline.imm_filter import Beliefs, Timing, fit_of, innovations, updated
 from kcal.pipeline.measurements import Anchored
 from kcal.pipeline.moment_order import MomentOrder

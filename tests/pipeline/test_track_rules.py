@@ -15,7 +15,7 @@ from track_scenes import pairs_of, tracked_site
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import StereoRig
-from kcal.pipeline.appearance import _patches, appearance
+from kcal.pipeline.association import _patches, appearance
 from kcal.pipeline.epipolar_band import near_epipolar_lines
 from kcal.pipeline.motion import Motion
 from kcal.pipeline.pairs import ObjectPairs
