@@ -198,6 +198,7 @@ RECORDS = {
     "RangeAnswer",
     "ResidualStructure",
     "Association",
+    "BoxPairs",
     "Baseline",
     "ClockEstimate",
     "ClockPrior",
