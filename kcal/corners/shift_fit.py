@@ -10,6 +10,7 @@ from torch import Tensor
 
 from kcal.corners.filters import correlated, gaussian_kernel
 from kcal.corners.patch_windows import IMAGE_BLUR, ImageWindows, grid_of, sample
+from kcal.lens.dispatch import is_differentiated
 
 _MOST_STEPS = 25
 _CONVERGED = 1e-4  # steps
@@ -151,7 +152,7 @@ def fit_shifts(
         converged = (step < 10 * _CONVERGED) & sound & theta.isfinite().all(1)
         theta = torch.where(converged[:, None], theta, 0.0)
     shift = theta[:, :2]
-    if torch.is_grad_enabled() and (template.requires_grad or right.values.requires_grad):
+    if is_differentiated(template, right.values):
         shift = _implicit(patches, theta, scale, converged)[:, :2]
     shear = theta.new_zeros(len(theta), 2) if grid is None else theta[:, 4:6]
     found = ShiftFit(shift, covariance, converged, share, shear)

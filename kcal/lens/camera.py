@@ -247,7 +247,7 @@ class Camera(ConvertibleCamera):
         return usable & self.valid_region.encloses(x, y), False
 
     def _in_chunks(self, function: Callable[[Tensor], tuple[Tensor, Tensor]], points: Tensor) -> tuple[Tensor, Tensor]:
-        differentiated = is_differentiated(points, *self.parameters())
+        differentiated = is_differentiated(points, self)
         return in_chunks(function, points, self.valid_radius.numel(), differentiated=differentiated)
 
     def _to_plane(self, pixels: Tensor, start: InverseStart | None) -> tuple[Tensor, Tensor, Tensor]:

@@ -8,7 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch._C import _functorch as functorch
 from torch.autograd import forward_ad
 
 from kcal.errors import InputError
@@ -60,11 +61,31 @@ def finite_or(x: Tensor, y: Tensor, other_x: Tensor, other_y: Tensor) -> tuple[T
     return torch.where(finite, x, other_x), torch.where(finite, y, other_y), finite
 
 
-def is_differentiated(*tensors: Tensor) -> bool:
-    """Whether derivatives by any of the tensors are being recorded, in reverse or in forward mode."""
+def is_differentiated(*entering: Tensor | nn.Module | None) -> bool:
+    """Whether derivatives by anything that enters a result are being recorded, in reverse or in forward mode.
+
+    Args:
+        entering: tensors, None, and modules, of which every parameter and every buffer is asked. Ask all of them: a
+            tensor that is left out has a derivative of zero, or a part of it, without a word.
+    """
+    tensors: list[Tensor] = []
+    for each in entering:
+        if isinstance(each, nn.Module):
+            tensors += [*each.parameters(), *each.buffers()]
+        elif each is not None:
+            tensors.append(each)
+    if not is_traced():
+        tensors = [_below_vmap(tensor) for tensor in tensors]
     if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
         return True
     return not is_traced() and any(forward_ad.unpack_dual(tensor).tangent is not None for tensor in tensors)
+
+
+def _below_vmap(tensor: Tensor) -> Tensor:
+    """The tensor that `vmap` has wrapped: the wrapper itself never requires a gradient and has no tangent."""
+    while functorch.is_batchedtensor(tensor):
+        tensor = functorch.get_unwrapped(tensor)
+    return tensor
 
 
 def may_overwrite(*tensors: Tensor) -> bool:

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
+from kcal.lens.dispatch import is_differentiated
 from kcal.lens.pinhole import TurnedCamera, new_pinhole, source_pixels
 from kcal.lens.views import Cylinder
 
@@ -188,8 +189,7 @@ class Undistort(nn.Module):
         return torch.cat([part.detach().flatten().to(torch.float64) for part in parts])
 
     def _maps(self, precision: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
-        cameras = (self.camera, self.new_camera)
-        live = torch.is_grad_enabled() and any(p.requires_grad for c in cameras for p in c.parameters())
+        live = is_differentiated(self)
         compiling = torch.compiler.is_compiling()
         if live or (compiling and self.grid_x.dtype != precision):
             return self._grid(precision)

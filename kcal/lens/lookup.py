@@ -102,7 +102,7 @@ class LookupCamera(Float64Module):
             valid = valid & usable & self.inside(pixels.detach())
             return torch.where(valid[..., None], pixels, self.center), valid
 
-        return in_chunks(one, points, 1, differentiated=is_differentiated(points))
+        return in_chunks(one, points, 1, differentiated=is_differentiated(points, self))
 
     def unproject(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         """Map pixels (..., N, 2) of the image to rays (..., N, 3) of length one and valid (..., N).
@@ -121,7 +121,7 @@ class LookupCamera(Float64Module):
             valid = valid & finite
             return rays_from_chart(torch.where(valid, chart, 0.0).movedim(0, -1)), valid
 
-        return in_chunks(one, pixels, 1, differentiated=is_differentiated(pixels))
+        return in_chunks(one, pixels, 1, differentiated=is_differentiated(pixels, self))
 
     def inside(self, pixels: Tensor) -> Tensor:
         """Whether pixels (..., N, 2) lie in the image, whose edges are half a pixel beyond the outer pixel centers."""

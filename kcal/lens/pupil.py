@@ -89,7 +89,7 @@ def ray_starts(
             found = pupil.found & (step * step <= _LAST_STEP**2 * (X * X + Y * Y + Z * Z))
             if known_true(found):
                 break
-    if is_differentiated(X, Y, Z, coefficients):
+    if is_differentiated(X, Y, Z, coefficients, meter if isinstance(meter, Tensor) else None):
         for _ in range(2):
             wanted, pupil = _pupil_at(X, Y, Z, coefficients, depth, meter)
             depth = depth + (wanted - depth) * pupil.gain

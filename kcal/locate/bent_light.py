@@ -19,12 +19,14 @@ class Surroundings(NamedTuple):
         up: (C, 3) the vertical at each camera, in its axes; straight lines of sight if None.
         bending: 1/m: light from the level distance d comes from bending * d² too high: k / 2R.
         held: (..., 3, N) row of (a, b, ρ) that stays as it is at the start, over its sigma: a stated height.
+        held_off: (..., N) by how much it is too high, over its sigma: zeros, with derivatives.
     """
 
     present: Tensor | None = None
     up: Tensor | None = None
     bending: float = 0.0
     held: Tensor | None = None
+    held_off: Tensor | float = 0.0
 
 
 def length_of_one(scale: Tensor, inverse: Tensor) -> Tensor:

@@ -37,8 +37,43 @@ class EarthFrame(NamedTuple):
     half_curvature: float
 
 
-@torch.no_grad()
-def ground_ahead(
+def stated_ahead(
+    frame: EarthFrame,
+    place: Tensor,
+    ray: Tensor,
+    first: Tensor,
+    alone: Tensor,
+    *,
+    height: Tensor | Ground,
+    sigma: float,
+    differentiated: bool,
+) -> StatedHeight:
+    """Where rays (N, 3) from places of cameras first reach heights (N,) above the ellipsoid, or the ground.
+
+    Args:
+        frame: on the Earth.
+        place: (N, 3) centers of cameras.
+        ray: (N, 3) directions.
+        first: (N, C) bool: whose they are.
+        alone: (N,) what one camera alone saw.
+        height: (N,) meters, or the ground.
+        sigma: of the height, meters.
+        differentiated: derivatives by heights and frame are wanted; `StatedHeight.off` has them.
+    """
+    still = frame._replace(**{name: v.detach() for name, v in frame._asdict().items() if isinstance(v, Tensor)})  # type: ignore[arg-type]
+    at = still, place.detach(), ray.detach(), first, alone
+    found = (
+        _height_ahead(*at, height.detach(), sigma) if isinstance(height, Tensor) else _ground_ahead(*at, height, sigma)
+    )
+    with torch.set_grad_enabled(differentiated):
+        point = found.point @ frame.ecef_from_enu.mT + frame.ecef_of_origin
+        off = (found.up * ((point - point.detach()) @ still.ecef_from_enu)).sum(-1)
+        if isinstance(height, Tensor):
+            off = off - torch.where(found.reached, height - height.detach(), 0.0)
+    return found._replace(off=off)
+
+
+def _ground_ahead(
     frame: EarthFrame, place: Tensor, ray: Tensor, first: Tensor, alone: Tensor, ground: Ground, sigma: float
 ) -> StatedHeight:
     """Where rays (N, 3) from places of cameras meet the ground for the first time, of those that are `alone`."""
@@ -66,7 +101,7 @@ def ground_ahead(
     return StatedHeight(point, normal, torch.full_like(place[:, 0], sigma), met)
 
 
-def height_ahead(
+def _height_ahead(
     frame: EarthFrame, place: Tensor, ray: Tensor, first: Tensor, alone: Tensor, height: Tensor, sigma: float
 ) -> StatedHeight:
     """Where rays (N, 3) from places of cameras reach heights (N,) above the ellipsoid for the first time."""

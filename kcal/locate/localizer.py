@@ -18,7 +18,7 @@ from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA, Origin, check_refra
 from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.ellipsoid import mean_radius
 from kcal.locate.geodesy import anchor, enu_from_cam, place_enu
-from kcal.locate.max_likelihood import by_pose, calibration_effect, position_slope, symmetric
+from kcal.locate.max_likelihood import by_pose, calibration_effect, inverse_variance, position_slope, symmetric
 from kcal.locate.mounting import by_mounting
 from kcal.locate.stereo import (
     PairFit,
@@ -256,7 +256,7 @@ class StereoLocalizer(nn.Module):
             if mask.dtype != torch.bool:
                 raise InputError(f"mask: bool is needed, got {mask.dtype}")
             mask = mask.expand(left.shape[:-1])
-        differentiated = is_differentiated(left, right, *([] if cov is None else [cov]), *self.parameters())
+        differentiated = is_differentiated(left, right, cov, self)
 
         def locate(left: Tensor, right: Tensor, cov: Tensor | None, mask: Tensor | None) -> Localization:
             by_camera = self.calibration_factor is not None
@@ -275,7 +275,7 @@ class StereoLocalizer(nn.Module):
             moved, by_link = effect.tensor_split([self.calibration_factor.shape[1]], -2)
             for number, (i, j) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))):
                 spread[number] = spread[number] + (moved[..., i, :, :] * moved[..., j, :, :]).sum(-2)
-        reach = inverse_range(found, spread[5], PositionStatus.BEARING_ONLY)
+        reach = inverse_range(found, inverse_variance(fit, spread), PositionStatus.BEARING_ONLY)
         ok = reach.status == int(PositionStatus.OK)
         there = usable | (reach.status == int(PositionStatus.PARALLEL))
         bearing = (fit.direction / found.length[..., None, :]).mT @ self.enu_from_rig.mT

@@ -246,7 +246,7 @@ def _evaluate(fixed: _Fixed, theta: Tensor) -> _Evaluated:
     slope = (weighted * residual[..., None, :, :]).sum(-2)
     if around.held is not None:
         moved = torch.stack([*theta.unbind(-2)[:2], theta[..., 2, :] - fixed.start], -2)
-        off = (around.held * moved).sum(-2)
+        off = (around.held * moved).sum(-2) + around.held_off
         cost, slope = cost + off * off, slope + around.held * off[..., None, :]
     return _Evaluated(cost, jacobian, weighted, residual, turned, tuple(projections), slope)
 
@@ -304,6 +304,15 @@ def by_pose(fit: PointFit, number: int) -> Tensor:
     return torch.cat([turn, shift * fit.inverse[..., None, None, :]], -3)
 
 
+def inverse_variance(fit: PointFit, spread: Sequence[Tensor]) -> Tensor:
+    """(..., N) variance of ρ / |direction| times |direction|², given that of a, b and ρ in six entries."""
+    aa, ab, ar, bb, br, rr = spread
+    a, b = (fit.direction[..., None, :, :] * fit.sides).sum(-2).unbind(-2)
+    # The direction was of length one where a and b are zero: they are small, and their derivatives are not.
+    share = fit.inverse / fit.direction.square().sum(-2)
+    return rr + share * (share * (a * a * aa + 2.0 * a * b * ab + b * b * bb) - 2.0 * (a * ar + b * br))
+
+
 def symmetric(six: Sequence[Tensor]) -> Tensor:
     """Six entries (..., N) as symmetric matrices (..., N, 3, 3)."""
     a, b, c, d, e, f = six
@@ -356,5 +365,6 @@ def inverse_covariances(cov: Tensor | None) -> tuple[Tensor | None, Tensor]:
         _, info = torch.linalg.cholesky_ex(torch.where(finite[..., None, None], cov, still))
         sound = finite & (info == 0)
     safe = torch.where(sound[..., None, None], 0.5 * (cov + cov.mT), still)
-    inverse = torch.cholesky_inverse(torch.linalg.cholesky_ex(safe)[0])
+    # The forward derivative of `torch.cholesky_inverse` is wrong (PyTorch 2.11).
+    inverse = torch.cholesky_solve(still.expand_as(safe), torch.linalg.cholesky_ex(safe)[0])
     return inverse.movedim(-3, -1), sound

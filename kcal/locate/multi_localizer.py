@@ -16,7 +16,8 @@ from kcal.lens.dispatch import is_differentiated, is_traced, known_true
 from kcal.locate.ellipsoid import ecef_from_enu_rotation, mean_radius
 from kcal.locate.geodesy import anchor, enu_to_geodetic, place_enu
 from kcal.locate.ground import Ground
-from kcal.locate.ground_ahead import EarthFrame, ground_ahead, height_ahead
+from kcal.locate.ground_ahead import EarthFrame, stated_ahead
+from kcal.locate.max_likelihood import inverse_variance
 from kcal.locate.multiview import checked_views_covariance
 from kcal.locate.ranges import BEARING_SIGMAS, range_interval
 from kcal.locate.stereo import PositionStatus, flag_positions, piece_by_piece, reprojection_errors
@@ -50,7 +51,7 @@ class ViewsLocalization(NamedTuple):
         used: (..., V) which views are part of the position.
         bad: (..., V) views that were left out because they contradict the others.
         misfit: (..., V) what leaving out each view changes, with all views: the root of the fall of χ² over two, in
-            sigmas; 1 is typical. Of two views, either takes it all.
+            sigmas; 1 is typical. Of two views, either takes it all. It has no gradient.
         reprojection: (..., V) distance in px between mark and reprojected point; zero where a view is not used.
     """
 
@@ -80,7 +81,8 @@ class MultiViewLocalizer(Float64Module):
 
     Light bends at each camera about its own vertical, and the frame is straight: the Earth falls away below it.
     There is no branch on values under `torch.compile`, `torch.export` and `vmap`: bad views are then sought once, and
-    one is found; otherwise again until two are left. Gradients by pixels and covariances are exact.
+    one is found; otherwise again until two are left. Gradients by pixels, covariances, velocities, heights, cameras,
+    poses and errors are exact. What one camera and a stated height locate has error bars without a gradient.
 
     Args:
         rig: the cameras, and what is known of them.
@@ -207,10 +209,8 @@ class MultiViewLocalizer(Float64Module):
             if isinstance(height, Tensor):
                 height = height.to(torch.float64).expand(lead).reshape(-1)
         pixels = pixels.reshape(-1, count, 2)
-        differentiated = is_differentiated(pixels, *([] if cov is None else [cov]), *self.parameters())
-
-        ground = None if isinstance(height, Tensor) else height
-        heights = height if isinstance(height, Tensor) else None
+        ground, heights = (None, height) if isinstance(height, Tensor) else (height, None)
+        differentiated = is_differentiated(pixels, cov, heights, self)
 
         def locate(pixels: Tensor, seen: Tensor, cov: Tensor | None, height: Tensor | None) -> ViewsLocalization:
             return self._checked(pixels, seen, cov, height, (height_sigma, differentiated, ground))
@@ -251,16 +251,15 @@ class MultiViewLocalizer(Float64Module):
         if self.up is not None and self.ecef_from_enu is not None:
             bending = self.rig.refraction, self.half_curvature
             frame = EarthFrame(self.up, self.heights, self.ecef_from_enu, self.ecef_of_origin, *bending)
-            if ground is not None:
-                reach = partial(ground_ahead, frame, ground=ground, sigma=sigma)
-            elif height is not None:
-                reach = partial(height_ahead, frame, height=height, sigma=sigma)
+            stated = height if ground is None else ground
+            if stated is not None:
+                reach = partial(stated_ahead, frame, height=stated, sigma=sigma, differentiated=differentiated)
         views = fit_views(
             posed, pixels, seen, noise=self.pixel_sigma, cov=cov, shared=shared, height=reach,
             differentiated=differentiated,
         )  # fmt: skip
         with torch.no_grad():
-            chi2, falls = views.misfits()
+            chi2, falls = (value.detach() for value in views.misfits())
             count = views.used.sum(-1)
             wrong = views.fitted & (chi2 > self.limits[0][count]) & (count > 1)
             rest = chi2[..., None] - falls
@@ -276,10 +275,11 @@ class MultiViewLocalizer(Float64Module):
         fit, scale, code = views.fit, views.scale, views.status
         length = fit.direction.square().sum(-2).sqrt()
         value = torch.where(views.fitted, fit.inverse / (scale * length), 0.0)
-        variance = views.variance * fit.covariance[5]
+        variance = views.variance * inverse_variance(fit, fit.covariance)
         with torch.no_grad():
             known = torch.isfinite(variance) & (variance > 0) & views.fitted
         sigma = torch.where(known, torch.sqrt(torch.where(known, variance, 1.0)) / (scale * length), 0.0)
+        sigma = views.steady(sigma)
         with torch.no_grad():
             lost = views.fitted & ~(value > 0)
             weak = views.fitted & (~known | (value < BEARING_SIGMAS * sigma))
@@ -308,8 +308,8 @@ class MultiViewLocalizer(Float64Module):
             bearing=torch.where(aimed[..., None], sight, 0.0),
             inverse_range=value,
             inverse_range_sigma=sigma,
-            range_low=interval.low,
-            range_high=interval.high,
+            range_low=views.steady(interval.low),
+            range_high=views.steady(interval.high),
             used=views.used,
             bad=torch.zeros_like(views.used),
             misfit=(0.5 * falls.clamp_min(0.0)).sqrt(),

@@ -125,9 +125,7 @@ class TriangulateViews(nn.Module):
             raise InputError(f"pixels: shape (..., N, {count}, 2) is needed, got {tuple(pixels.shape)}")
         cov = checked_views_covariance(cov, pixels)
         pixels = pixels.reshape(-1, count, 2)
-        differentiated = self.method == "likelihood" and is_differentiated(
-            pixels, *self.parameters(), *([] if cov is None else [cov])
-        )
+        differentiated = is_differentiated(pixels, cov, self)
         posed, finite = self.posed, torch.isfinite(pixels).all(-1)
         views = fit_views(posed, pixels, finite, noise=self.pixel_sigma, cov=cov, differentiated=differentiated)
         code, off = views.status, finite & ~views.used

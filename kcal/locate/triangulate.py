@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from kcal.checks import exportable
 from kcal.lens.dispatch import is_differentiated
 from kcal.lens.rig import StereoRig
+from kcal.locate.max_likelihood import inverse_variance
 from kcal.locate.stereo import (
     PositionStatus,
     checked_pairs,
@@ -92,11 +93,13 @@ class Triangulate(nn.Module):
             InputError: not floating point, or shapes that are wrong or unlike.
         """
         left, right = checked_pairs(pixels_left, pixels_right)
-        differentiated = is_differentiated(left, right, *self.parameters())
+        differentiated = is_differentiated(left, right, self)
 
         def triangulate(left: Tensor, right: Tensor) -> Triangulation:
             found = fit_pairs(self.rig, left, right, differentiated=differentiated)
-            reach = inverse_range(found, self.pixel_sigma**2 * found.fit.covariance[5], PositionStatus.OK)
+            reach = inverse_range(
+                found, self.pixel_sigma**2 * inverse_variance(found.fit, found.fit.covariance), PositionStatus.OK
+            )
             ok = reach.status == int(PositionStatus.OK)
             depth = found.scale / torch.where(ok, found.fit.inverse, 1.0)
             return Triangulation(

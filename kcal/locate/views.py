@@ -92,12 +92,14 @@ class StatedHeight(NamedTuple):
         up: (N, 3) the vertical there; over terrain the slope of the height above the ground.
         sigma: (N,) of the height, meters.
         reached: (N,) bool.
+        off: (N,) meters by which the points lie too high: zeros, with the derivatives by what states the height.
     """
 
     point: Tensor
     up: Tensor
     sigma: Tensor
     reached: Tensor
+    off: Tensor | float = 0.0
 
 
 class ViewsFit(NamedTuple):
@@ -114,6 +116,7 @@ class ViewsFit(NamedTuple):
         fitted: (N,) which points have an optimum.
         weight: (2 C, 2 C, N) of the pixels; None: all have the variance `variance`.
         variance: px².
+        alone: (N,) points that one camera and a stated height determine, whose error bars carry no gradient; or None.
     """
 
     fit: PointFit
@@ -126,6 +129,7 @@ class ViewsFit(NamedTuple):
     fitted: Tensor
     weight: Tensor | None
     variance: float
+    alone: Tensor | None
 
     def points(self, ok: Tensor) -> Tensor:
         """(N, 3) in the frame; the anchor's center unless `ok`."""
@@ -135,8 +139,14 @@ class ViewsFit(NamedTuple):
     def covariance(self, ok: Tensor) -> Tensor:
         """(N, 3, 3) of the points; an infinite diagonal unless `ok`."""
         slope = position_slope(self.fit, self.scale, ok)
-        found = self.variance * (slope @ symmetric(self.fit.covariance) @ slope.mT)
+        found = self.steady(self.variance * (slope @ symmetric(self.fit.covariance) @ slope.mT))
         return torch.where(ok[..., None, None], found, torch.diag(found.new_full((3,), torch.inf)))
+
+    def steady(self, values: Tensor) -> Tensor:
+        """Values (N, ...) without derivatives where a stated height was needed."""
+        if self.alone is None:
+            return values
+        return torch.where(self.alone.reshape(-1, *[1] * (values.ndim - 1)), values.detach(), values)
 
     @torch.no_grad()
     def behind(self, center: Tensor) -> Tensor:
@@ -218,10 +228,11 @@ def fit_views(
         still = torch.eye(2, dtype=cov.dtype, device=cov.device)
         cov = torch.where((sound & wanted)[..., None, None], cov, still)
     center = posed.center
+    rays, valid = unproject_each(posed.cameras, pixels.movedim(-2, -3))
+    rays, valid = rays.movedim(-3, -2), valid.mT
+    in_frame = (rays[..., None, :] @ posed.rotation)[..., 0, :]
     # Weights follow the place where a point is sought first, and derivatives follow them.
     with torch.set_grad_enabled(differentiated and shared is not None):
-        rays, valid = unproject_each(posed.cameras, pixels.movedim(-2, -3))
-        rays, valid = rays.movedim(-3, -2), valid.mT
         inside = torch.stack([camera.inside(pixels[..., c, :]) for c, camera in enumerate(posed.cameras)], -1)
         used = wanted & valid & inside & sound
         code = torch.full(used.shape[:-1], int(PositionStatus.OK), dtype=torch.int8, device=used.device)
@@ -238,14 +249,15 @@ def fit_views(
             code = flag_positions(code, condition, status)
         anchor = first_seen(used)
         anchor = torch.cat([anchor[..., :1] | nothing[..., None], anchor[..., 1:]], -1)
-        in_frame = (rays[..., None, :] @ posed.rotation)[..., 0, :]
-        place, ray = (anchor[..., None] * center).sum(-2), (anchor[..., None] * in_frame).sum(-2)
+        ray = (anchor[..., None] * in_frame).sum(-2)
+        with torch.set_grad_enabled(differentiated):
+            place = (anchor[..., None] * center).sum(-2)
         found = Found(torch.zeros_like(ray), torch.zeros_like(nothing))
         if len(posed.cameras) > 1:
             found = triangulate_angular(posed.matrices, rays, used)
         met, scale = found.valid & (count > 1), posed.scale.detach()
         away = found.points + center[0] - place
-        held = None
+        alone: Tensor | None = None
         if height is not None:
             stated = height(place, ray, anchor, count == 1)
             alone = (count == 1) & stated.reached
@@ -254,15 +266,17 @@ def fit_views(
         away = torch.where(met[..., None], away, ray)
         distance = torch.linalg.vector_norm(away, dim=-1)
         ahead, inverse = away / distance[..., None], torch.where(met, scale / distance, 0.0)
-    if height is not None:
-        held = torch.where(alone[..., None, :], _height_row(ahead, inverse, scale, stated), 0.0)
+    around = posed.around._replace(present=used.mT)
+    if alone is not None:
+        held = torch.where(alone[..., None, :], _height_row(ahead.detach(), inverse.detach(), scale, stated), 0.0)
+        off = ((place - place.detach()) * stated.up).sum(-1) + stated.off
+        around = around._replace(held=held, held_off=torch.where(alone, off / stated.sigma, 0.0))
     fitted = code == int(PositionStatus.OK)
-    around = posed.around._replace(present=used.mT, held=held)
     weight, variance = None, noise**2
     if cov is not None or shared is not None:
         moved = None if shared is None else shared_pixels(posed, shared, (place, ahead, inverse), used, scale)
         weight, variance = _weight(cov, noise, used, moved), 1.0
-    apart = place.detach()[..., None, :] - center
+    apart = place[..., None, :] - center
     lines = [
         RelativeCamera(camera, turn, turn @ apart[..., c, :].mT)
         for c, (camera, turn) in enumerate(zip(posed.cameras, posed.rotation, strict=True))
@@ -272,7 +286,7 @@ def fit_views(
         around=around,
     )  # fmt: skip
     fit = fit._replace(direction=posed.rotation[0].mT @ fit.turned[0])
-    return ViewsFit(fit, scale, anchor, place.detach(), in_frame.detach(), used, code, fitted, weight, variance)
+    return ViewsFit(fit, scale, anchor, place, in_frame, used, code, fitted, weight, variance, alone)
 
 
 def sound_covariances(cov: Tensor) -> Tensor:
@@ -285,8 +299,8 @@ def sound_covariances(cov: Tensor) -> Tensor:
 
 def _height_row(ahead: Tensor, inverse: Tensor, scale: Tensor, stated: StatedHeight) -> Tensor:
     """(3, N) the slope of the height by (a, b, ρ) over its sigma."""
-    first, second = side_axes(ahead.detach())
-    range_ = (scale / torch.where(inverse > 0, inverse, 1.0)).detach()
+    first, second = side_axes(ahead)
+    range_ = scale / torch.where(inverse > 0, inverse, 1.0)
     climb = [(axis * stated.up).sum(-1) * range_ / stated.sigma for axis in (first, second, ahead)]
     return torch.stack([climb[0], climb[1], -climb[2] * range_ / scale], -2)
 
