@@ -44,6 +44,7 @@ from kcal.errors import KcalError as KcalError
 from kcal.errors import InputError as InputError
 from kcal.errors import DegenerateError as DegenerateError
 from kcal.errors import FileError as FileError
+from kcal.errors import KcalWarning as KcalWarning
 
 # Namespaces
 from kcal import lens as lens

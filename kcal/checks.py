@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, TypeVar
 
+import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor, nn
 from torch.utils import _pytree
 
@@ -23,29 +25,101 @@ def exportable(result: Named) -> Named:
     return result
 
 
-def as_points(name: str, value: Tensor, last: int) -> Tensor:
-    """Return `value` as float64 after checking that it is a real floating tensor of shape (..., last).
+def as_tensor(name: str, value: Tensor | ArrayLike) -> Tensor:
+    """Return a tensor as it is, and numbers of other kinds as a new tensor on the CPU.
+
+    Those are arrays of NumPy, what turns into one (such as columns of a table), and lists of numbers. Whole numbers of
+    a list are taken as exact; an array keeps its type, so that `as_points` can refuse one of integers.
+
+    Raises:
+        InputError: a unit, a mask, objects, texts, or lists of unlike lengths.
+
+    Example:
+        >>> as_tensor("pixels", [[960, 540]])
+        tensor([[960., 540.]], dtype=torch.float64)
+    """
+    if isinstance(value, Tensor):
+        return value
+    if (unit := getattr(value, "unit", getattr(value, "units", None))) is not None:
+        raise InputError(
+            f"{name}: plain numbers are needed, these are in {unit}; convert to meters or pixels, unit off"
+        )
+    if np.ma.isMaskedArray(value):
+        raise InputError(f"{name}: a masked array would lose its mask; use .filled(numpy.nan) or leave those rows out")
+    try:
+        array = np.asarray(value)
+    except (ValueError, TypeError, RuntimeError) as error:
+        # Of unlike lengths, or tensors that a list would cut off from their gradients.
+        raise InputError(
+            f"{name}: one array is needed, got a {type(value).__name__} ({error}); use torch.stack"
+        ) from error
+    if array.dtype.kind not in "fiu":
+        what = f" of {array.dtype}; convert with .astype(float)" if array.ndim else ""
+        raise InputError(f"{name}: a tensor or array of numbers is needed, got {type(value).__name__}{what}")
+    exact = array.dtype.itemsize > 2 if array.dtype.kind == "f" else isinstance(value, list | tuple | int)
+    kept = np.float64 if exact else np.float16 if array.dtype.kind == "f" else np.int64
+    return torch.from_numpy(np.array(array, kept, order="C"))
+
+
+def as_points(
+    name: str, value: Tensor | ArrayLike, last: int, like: Tensor | None = None, otherwise: str = ""
+) -> Tensor:
+    """Return `value` as float64 after checking that it is real, floating, and of shape (..., last).
 
     Integers are refused: a pixel rounded to an integer is a measurement thrown away, and whoever passes one should
     say so with `.double()`. float16 and bfloat16 are refused for the same reason: near 1000 px they have steps of 0.5
-    and 4 px. float32 is promoted.
+    and 4 px. float32 is promoted. Arrays and lists are converted by `as_tensor`, to the device of `like`. `otherwise`
+    says what to call for something of another shape.
 
     Raises:
-        InputError: not a tensor, not floating point, less than float32, or another last dimension.
+        InputError: no numbers, not floating point, less than float32, another last dimension, or a tensor on another
+            device than `like`.
     """
-    if not isinstance(value, Tensor):
-        raise InputError(f"{name}: a torch tensor is needed, got {type(value).__name__}")
-    if not value.is_floating_point():
-        raise InputError(f"{name}: floating point is needed, got {value.dtype}; convert with .double()")
-    if torch.finfo(value.dtype).bits < 32:
-        step = 512 * torch.finfo(value.dtype).eps
+    points = as_tensor(name, value)
+    if not points.is_floating_point():
+        cure = ".double()" if isinstance(value, Tensor) else ".astype(float)"
+        raise InputError(f"{name}: floating point is needed, got {points.dtype}; convert with {cure}")
+    if torch.finfo(points.dtype).bits < 32:
+        step = 512 * torch.finfo(points.dtype).eps
         raise InputError(
-            f"{name}: {value.dtype} has steps of {step:g} near 1000; compute it in float32 or float64, or accept the "
+            f"{name}: {points.dtype} has steps of {step:g} near 1000; compute it in float32 or float64, or accept the "
             "rounding with .double()"
         )
-    if value.ndim < 1 or value.shape[-1] != last:
-        raise InputError(f"{name}: shape (..., {last}) is needed, got {tuple(value.shape)}")
-    return value.to(torch.float64)
+    if points.ndim < 1 or points.shape[-1] != last:
+        turned = points.ndim == 2 and points.shape[0] == last
+        hint = "transpose it" if turned else otherwise
+        raise InputError(
+            "; ".join(filter(None, [f"{name}: shape (..., {last}) is needed, got {tuple(points.shape)}", hint]))
+        )
+    if like is not None and points.device != like.device:
+        if isinstance(value, Tensor):
+            raise InputError(
+                f"{name}: on {points.device}, the parameters on {like.device}; move one of them with .to()"
+            )
+        points = points.to(like.device)
+    return points.to(torch.float64)
+
+
+def as_size(size: Any) -> tuple[int, int]:
+    """Return (width, height) as two plain numbers.
+
+    Raises:
+        InputError: not two whole numbers that are positive.
+
+    Example:
+        >>> as_size(np.array([1920.0, 1080.0]))
+        (1920, 1080)
+    """
+    try:
+        width, height = (float(side) for side in size)
+    except (TypeError, ValueError, RuntimeError):
+        width = height = 0.0
+    if not (width >= 1 and height >= 1 and width.is_integer() and height.is_integer()):
+        raise InputError(
+            f"image size: (width, height) in pixels is needed, both positive and whole, got {size!r:.80}; of an image "
+            "in an array it is image.shape[1::-1]"
+        )
+    return int(width), int(height)
 
 
 def require_finite(name: str, value: Tensor) -> None:
@@ -69,17 +143,17 @@ def keep_float64(fn: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
     return moved
 
 
-def as_covariance(name: str, matrix: Tensor | None, size: int) -> Tensor:
+def as_covariance(name: str, matrix: Tensor | ArrayLike | None, size: int) -> Tensor:
     """Return `matrix` as float64 (size, size) after checking that it is a covariance; zeros for None.
 
     Raises:
-        InputError: not a tensor, another shape, not finite, not symmetric, or with a negative eigenvalue.
+        InputError: no numbers, another shape, not finite, not symmetric, or with a negative eigenvalue.
     """
     if matrix is None:
         return torch.zeros(size, size, dtype=torch.float64)
-    if not isinstance(matrix, Tensor) or tuple(matrix.shape) != (size, size):
-        shape = tuple(matrix.shape) if isinstance(matrix, Tensor) else type(matrix).__name__
-        raise InputError(f"{name}: a covariance of shape ({size}, {size}) is needed, got {shape}")
+    matrix = as_tensor(name, matrix)
+    if tuple(matrix.shape) != (size, size):
+        raise InputError(f"{name}: a covariance of shape ({size}, {size}) is needed, got {tuple(matrix.shape)}")
     matrix = matrix.detach().to(torch.float64)
     require_finite(name, matrix)
     # Entries have different units: compare them as correlations.

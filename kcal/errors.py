@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -20,6 +22,16 @@ class FileError(KcalError):
 
 class DegenerateError(KcalError):
     """Data that do not determine the answer: too few views, parallel boards, an unstable focal length."""
+
+
+class KcalWarning(UserWarning):
+    """Input that can be right and is more likely a slip: meters for millimeters, width for height, right for left."""
+
+
+def warn_user(message: str) -> None:
+    """Warn with a `KcalWarning` where the caller was called, unless by kcal, which means what it does."""
+    if not sys._getframe(2).f_globals.get("__name__", "").startswith("kcal."):
+        warnings.warn(message, KcalWarning, stacklevel=3)
 
 
 @contextmanager

@@ -29,7 +29,7 @@ from kcal.old_names import GONE, PLACES
 PUBLIC = {
     "kcal": """
         Baseline Board Boards CalibrationOptions Camera CameraCalibrationResult DegenerateError Features
-        FileError InputError KcalError Landmarks Located MeasuredPosition Observations Origin PositionStatus
+        FileError InputError KcalError KcalWarning Landmarks Located MeasuredPosition Observations Origin PositionStatus
         RigData RigOptions RigResult StereoLocalizer StereoRig View calibrate_camera calibrate_rig detect
         load_camera load_rig locate_points save_camera save_rig solve_rig
     """,
@@ -306,7 +306,7 @@ def test_each_name(door: str, name: str) -> None:
     docstring = inspect.getdoc(value) or ""
     # Options are shown where they are used, and errors by the messages they carry.
     plain = dataclasses.is_dataclass(value) and name.endswith("Options")
-    wanted = "Args:" if plain else "" if name.endswith("Error") or name in RECORDS | WITHOUT_EXAMPLE else "Example:"
+    wanted = "Args:" if plain else "" if name.endswith(("Error", "Warning")) or name in RECORDS | WITHOUT_EXAMPLE else "Example:"
     assert wanted in docstring
     assert len(docstring.splitlines()[0]) > 20
 

@@ -19,7 +19,6 @@ def test_points_are_float64_of_the_right_shape() -> None:
     assert found.dtype == F64
     assert as_points("x", torch.ones(2, dtype=F64), 2).shape == (2,)
     for value, message in (
-        ([1.0, 2.0], "x: a torch tensor is needed, got list"),
         (torch.ones(3, 2, dtype=torch.int64), r"floating point is needed, got torch.int64"),
         (torch.ones(3, 2, dtype=torch.float16), r"torch.float16 has steps of 0.5 near 1000"),
         (torch.ones(3, 2, dtype=torch.bfloat16), r"torch.bfloat16 has steps of 4 near 1000"),
@@ -27,7 +26,7 @@ def test_points_are_float64_of_the_right_shape() -> None:
         (torch.ones(2, 3), r"shape \(..., 2\) is needed, got \(2, 3\)"),
     ):
         with pytest.raises(InputError, match=message):
-            as_points("x", value, 2)  # type: ignore[arg-type]
+            as_points("x", value, 2)
 
 
 def test_the_first_value_that_is_not_finite_is_named() -> None:
@@ -54,7 +53,7 @@ def test_covariances() -> None:
     ("matrix", "message"),
     [
         (torch.eye(3), r"shape \(2, 2\) is needed, got \(3, 3\)"),
-        ([[1.0, 0.0], [0.0, 1.0]], "is needed, got list"),
+        ([1.0, 0.0], r"is needed, got \(2,\)"),
         (torch.tensor([[1.0, torch.nan], [torch.nan, 1.0]]), "2 of 4 values are not finite"),
         (torch.tensor([[1.0, 1.01], [1.01, 1.0]]), "no negative eigenvalue"),
         (torch.tensor([[-1e-3, 0.0], [0.0, 1.0]]), "no negative eigenvalue"),

@@ -32,10 +32,10 @@ from kcal.io.foreign import (
 )
 from kcal.io.kalibr_omni import omni_camera
 from kcal.lens.camera import Camera
+from kcal.lens.camera_conversions import OPENCV_MODELS
 from kcal.opencv_storage import read_storage
 
-MODELS = ("pinhole", "opencv4", "opencv5", "opencv8", "opencv12", "opencv14", "fisheye4")
-BY_COUNT = {0: "pinhole", 4: "opencv4", 5: "opencv5", 8: "opencv8", 12: "opencv12", 14: "opencv14"}
+MODELS = (*OPENCV_MODELS.values(), "fisheye4")
 _MATRICES = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "mtx")
 _SIGMAS = ("stdDeviationsIntrinsics", "std_deviations_intrinsics", "stdDeviations", "std_deviations")
 _COEFFICIENTS = ("distortion_coefficients", "distCoeffs", "Distortion_Coefficients", "D", "dist")
@@ -95,7 +95,7 @@ def _opencv_camera(
     core, skew = core_of(stored[matrix], matrix)
     if skew:
         notes.append(f"{matrix} has a skew of {skew:g}, which OpenCV does not use and kcal does not take over")
-    lens = numbers(stored.get(coefficients, []), tuple(BY_COUNT), coefficients)
+    lens = numbers(stored.get(coefficients, []), tuple(OPENCV_MODELS), coefficients)
     if "xi" in stored:
         if len(lens) != 4 or skew:
             raise ValueError("an omnidir camera has 4 coefficients and, here, no skew")
@@ -109,7 +109,7 @@ def _opencv_camera(
         raise ValueError(f"a fisheye has 4 coefficients, {coefficients} has {len(lens)}")
     if known is None and len(lens) == 4:
         notes.append("4 coefficients read as k1 k2 p1 p2; if they are a fisheye's, use --fisheye")
-    model = "fisheye4" if known else BY_COUNT[len(lens)]
+    model = "fisheye4" if known else OPENCV_MODELS[len(lens)]
     camera = named_camera(name, core, size, model, lens)
     if (sigmas := _present(stored, _SIGMAS)) and matrix in _MATRICES:
         # OpenCV always states those of 14 coefficients.

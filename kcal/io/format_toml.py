@@ -29,8 +29,8 @@ from kcal.io.foreign import (
     plain,
     whole_size,
 )
-from kcal.io.format_opencv import BY_COUNT
 from kcal.lens.camera import Camera
+from kcal.lens.camera_conversions import OPENCV_MODELS
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 
 MODELS = ("pinhole", "opencv4", "opencv5", "opencv8", "opencv12", "opencv14", "fisheye4")
@@ -64,11 +64,13 @@ def _toml_camera(key: str, part: Mapping[str, Any], hints: Hints) -> Camera:
     core, skew = core_of(part["matrix"], f"{name} matrix")
     if skew:
         raise ValueError(f"{name}: matrix has a skew of {skew:g}, which aniposelib does not know")
-    lens = numbers(part.get("distortions", []), tuple(BY_COUNT), f"{name} distortions")
+    lens = numbers(part.get("distortions", []), tuple(OPENCV_MODELS), f"{name} distortions")
     fisheye = bool(part.get("fisheye", False))
     if (fisheye and len(lens) < 4) or (fisheye and any(lens[4:])):
         raise ValueError(f"{name}: a fisheye has 4 coefficients, distortions has {len(lens)}")
-    return named_camera(name, core, size, "fisheye4" if fisheye else BY_COUNT[len(lens)], lens[:4] if fisheye else lens)
+    return named_camera(
+        name, core, size, "fisheye4" if fisheye else OPENCV_MODELS[len(lens)], lens[:4] if fisheye else lens
+    )
 
 
 def _toml_pose(part: Mapping[str, Any], meters: float) -> CameraPose:

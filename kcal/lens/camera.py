@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Self
 
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from kcal.checks import as_points
@@ -135,14 +136,25 @@ class Camera(ConvertibleCamera):
         for name, value in self._measured_region().items():
             setattr(self, name, value)
 
-    def project(self, points_cam: Tensor) -> tuple[Tensor, Tensor]:
+    def _taken(self, name: str, value: Tensor | ArrayLike, last: int) -> Tensor:
+        """Points of a user as float64 (..., N, last) on this camera's device; its batch broadcasts with theirs."""
+        other = "pixels are for unproject" if last == 3 else "points and rays are for project"
+        points = as_points(name, value, last, like=self.params, otherwise=other)
+        pairs = zip(reversed(points.shape[:-2]), reversed(self.params.shape[:-1]), strict=False)
+        if not all(a == b or 1 in (a, b) for a, b in pairs):
+            raise InputError(
+                f"{name}: shape {tuple(points.shape)} does not fit a batch of {tuple(self.params.shape[:-1])} cameras"
+            )
+        return points
+
+    def project(self, points_cam: Tensor | ArrayLike) -> tuple[Tensor, Tensor]:
         """Map points to pixels.
 
         The entrance pupil of a hybrid lens moves with the angle, so that the distance of a point counts, too. For
         directions there is `project_rays`.
 
         Args:
-            points_cam: (..., N, 3) in the camera frame, meters.
+            points_cam: (..., N, 3) in the camera frame, meters; a tensor, array or list.
 
         Returns:
             pixels (..., N, 2) and valid (..., N). Valid points are finite, in front of the camera (for a fisheye:
@@ -153,7 +165,7 @@ class Camera(ConvertibleCamera):
         Raises:
             InputError: a wrong shape or an integer dtype.
         """
-        points = as_points("points_cam", points_cam, 3)
+        points = self._taken("points_cam", points_cam, 3)
         if worth_fitting(points, self.params, self.model):
             polynomials = self._fitted.forward(self.params.detach(), self.model, self.valid_region)
             if polynomials is not None:
@@ -187,7 +199,7 @@ class Camera(ConvertibleCamera):
 
         return self._in_chunks(one, points)
 
-    def project_rays(self, rays: Tensor) -> tuple[Tensor, Tensor]:
+    def project_rays(self, rays: Tensor | ArrayLike) -> tuple[Tensor, Tensor]:
         """Map directions (..., N, 3), that is points at infinity, to pixels (..., N, 2), and valid (..., N).
 
         This is the inverse of `unproject`. It differs from `project` for a hybrid lens only.
@@ -195,9 +207,9 @@ class Camera(ConvertibleCamera):
         Raises:
             InputError: a wrong shape or an integer dtype.
         """
-        return self.project(as_points("rays", rays, 3) * FAR)
+        return self.project(self._taken("rays", rays, 3) * FAR)
 
-    def ray_origins(self, rays: Tensor) -> Tensor:
+    def ray_origins(self, rays: Tensor | ArrayLike) -> Tensor:
         """Find where rays start: (0, 0, ζ₁ θ² + ζ₂ θ⁴) for a hybrid lens (`kcal.lens.pupil`), the origin for others.
 
         With a ray of `unproject`, every point `ray_origin + t * ray` with t > 0 is projected to the pixel of the ray,
@@ -217,7 +229,7 @@ class Camera(ConvertibleCamera):
             >>> camera.ray_origins(torch.tensor([[0.0, 0.6, 0.8]])).tolist()
             [[0.0, 0.0, 0.0]]
         """
-        rays = as_points("rays", rays, 3)
+        rays = self._taken("rays", rays, 3)
         X, Y, Z = rays.unbind(-1)
         depth = torch.zeros_like(Z)
         if self.model.hybrid:
@@ -255,7 +267,7 @@ class Camera(ConvertibleCamera):
         ready = PreparedInverse(self.valid_region, self.inverse_start, start)
         return pixels_to_plane(pixels, self.values, self.model, ready)
 
-    def normalize(self, pixels: Tensor, *, start: InverseStart | None = None) -> tuple[Tensor, Tensor]:
+    def normalize(self, pixels: Tensor | ArrayLike, *, start: InverseStart | None = None) -> tuple[Tensor, Tensor]:
         """Map pixels (..., N, 2) to undistorted coordinates (..., N, 2) on the plane z = 1, and valid (..., N).
 
         Pixels of a fisheye that look 89° or more off axis have no such coordinates and are not valid. `start` is that
@@ -264,7 +276,7 @@ class Camera(ConvertibleCamera):
         Raises:
             InputError: a wrong shape or an integer dtype.
         """
-        pixels = as_points("pixels", pixels, 2)
+        pixels = self._taken("pixels", pixels, 2)
         if self.model.wide:
             rays, valid = self.unproject(pixels, start=start)
             valid = valid & (math.cos(math.radians(89.0)) < rays[..., 2])
@@ -277,7 +289,7 @@ class Camera(ConvertibleCamera):
 
         return self._in_chunks(one, pixels)
 
-    def unproject(self, pixels: Tensor, *, start: InverseStart | None = None) -> tuple[Tensor, Tensor]:
+    def unproject(self, pixels: Tensor | ArrayLike, *, start: InverseStart | None = None) -> tuple[Tensor, Tensor]:
         """Map pixels to rays.
 
         Args:
@@ -293,7 +305,7 @@ class Camera(ConvertibleCamera):
         Raises:
             InputError: a wrong shape or an integer dtype.
         """
-        pixels = as_points("pixels", pixels, 2)
+        pixels = self._taken("pixels", pixels, 2)
         if start is None and worth_fitting(pixels, self.params, self.model):
             ready = PreparedInverse(self.valid_region, self.inverse_start)
             polynomials = self._fitted.backward(self.params.detach(), self.model, ready)
@@ -308,9 +320,9 @@ class Camera(ConvertibleCamera):
 
         return self._in_chunks(one, pixels)
 
-    def inside(self, pixels: Tensor) -> Tensor:
+    def inside(self, pixels: Tensor | ArrayLike) -> Tensor:
         """Whether pixels (..., N, 2) lie in the image, whose edges are half a pixel beyond the outer pixel centers."""
-        pixels = as_points("pixels", pixels, 2)
+        pixels = self._taken("pixels", pixels, 2)
         width, height = self.size
         u, v = pixels.unbind(-1)
         return (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)
@@ -330,7 +342,7 @@ class Camera(ConvertibleCamera):
         _, valid = self.unproject(border)
         return valid.all(-1)
 
-    def forward(self, points_cam: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, points_cam: Tensor | ArrayLike) -> tuple[Tensor, Tensor]:
         """The same as `project`."""
         return self.project(points_cam)
 

@@ -1,13 +1,24 @@
-"""Cameras made from a camera: of resized, cropped and letterboxed images, and of kornia."""
+"""Cameras made from a camera: of resized, cropped and letterboxed images, of OpenCV and of kornia."""
 
 from __future__ import annotations
 
 from typing import Any, Self
 
-from kcal.errors import InputError
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from kcal.checks import as_size, as_tensor
+from kcal.errors import InputError, warn_user
 from kcal.lens.calibration import CameraCalibration, UntilChanged
 from kcal.lens.camera_parameters import CameraParameters
 from kcal.lens.image_transform import ImageTransform
+from kcal.lens.model import PRESETS
+
+# The lens model that has so many of OpenCV's coefficients.
+OPENCV_MODELS = {
+    0: "pinhole", 4: "opencv4", 5: "opencv5", 8: "opencv8", 12: "opencv12", 14: "opencv14",
+}  # fmt: skip
 
 
 class ConvertibleCamera(CameraParameters):
@@ -50,6 +61,84 @@ class ConvertibleCamera(CameraParameters):
         """The camera of images scaled to fit into `size` and padded on both sides; see `ImageTransform.letterbox`."""
         return self.transformed(ImageTransform.letterbox(self.size, size))
 
+    def to_opencv(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """OpenCV's K (3, 3) and D (4 to 14 coefficients); of a fisheye for `cv2.fisheye`, whose alpha is K₀₁ / K₀₀.
+
+        Raises:
+            InputError: a lens or a skew that OpenCV's functions do not have, or a batch of cameras.
+
+        Example:
+            >>> from kcal import Camera
+            >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), coefficients=[-0.1])
+            >>> camera.to_opencv()[1].tolist()
+            [-0.1, 0.0, 0.0, 0.0, 0.0]
+        """
+        if self.params.ndim != 1:
+            raise InputError("to_opencv: a single camera is needed, not a batch; convert the cameras one by one")
+        fisheye = self.model.fisheye
+        order = PRESETS["fisheye4" if fisheye else "opencv14"].names
+        lens = dict(zip(self.model.names, self.coefficients.tolist(), strict=True))
+        skew = float(self.values[4])
+        if any(value for name, value in lens.items() if name not in order) or (skew and not fisheye):
+            raise InputError(
+                f"to_opencv: OpenCV's functions have no {self.model} lens{' with skew' if skew else ''}. Fit one that "
+                "they have, with its misfit stated: kcal.lens.refit_camera(camera, 'opencv14').camera"
+            )
+        needed = max((order.index(name) + 1 for name in lens if name in order), default=0)
+        count = next(count for count in OPENCV_MODELS if count >= max(needed, 4))
+        return self.matrix.detach().cpu().numpy(), np.array([lens.get(name, 0.0) for name in order[:count]])
+
+    @classmethod
+    def from_opencv(
+        cls, K: npt.ArrayLike, D: npt.ArrayLike | None, size: tuple[int, int], *, fisheye: bool = False
+    ) -> Self:
+        """The camera of K and D as `cv2.calibrateCamera`, `stereoCalibrate` or `cv2.fisheye.calibrate` return them.
+
+        A `KcalWarning` says where K seems to be of an image of another size, or `size` to be (height, width).
+
+        Args:
+            K: (3, 3) camera matrix, pixels.
+            D: 4, 5, 8, 12 or 14 coefficients in any shape; None: no distortion.
+            size: (width, height) of the image in pixels, as OpenCV's `imageSize`.
+            fisheye: whether K and D are of `cv2.fisheye`; D has 4 coefficients then, and K₀₁ is a skew.
+
+        Raises:
+            InputError: no camera matrix, another number of coefficients, or a skew, which `cv2.projectPoints` ignores.
+
+        Example:
+            >>> from kcal import Camera
+            >>> K = [[800, 0, 319.5], [0, 800, 239.5], [0, 0, 1]]
+            >>> camera = Camera.from_opencv(K, [[-0.1, 0.01, 0, 0, 0]], (640, 480))
+            >>> camera.project(np.array([[0.1, 0.0, 1.0]]))[0].tolist()
+            [[399.42008, 239.5]]
+        """
+        matrix, size = as_tensor("K", K).detach().to("cpu", torch.float64), as_size(size)
+        lens = torch.zeros(0) if D is None else as_tensor("D", D).detach().cpu()
+        if matrix.shape != (3, 3):
+            raise InputError(f"K: a camera matrix (3, 3) is needed, got {tuple(matrix.shape)}")
+        (fx, skew, cx), (below, fy, cy), last = matrix.tolist()
+        if below or last != [0.0, 0.0, 1.0]:
+            turned = matrix[:2, 2].any() or not matrix[2, :2].any()
+            raise InputError(f"K: no camera matrix, got {matrix.tolist()}" + ("" if turned else "; give its transpose"))
+        counts = (0, 4) if fisheye else tuple(OPENCV_MODELS)
+        if lens.numel() not in counts or lens.numel() != max(lens.shape, default=1):
+            raise InputError(
+                f"D: {' or '.join(map(str, counts[1:]))} coefficients are needed, got shape {tuple(lens.shape)}"
+                + ("" if fisheye else "; cameras of more are made with Camera.build(..., model='ext20')")
+            )
+        if skew and not fisheye:
+            raise InputError(
+                f"K: a skew of {skew:g} px, which cv2.projectPoints ignores; set it to 0 for the same pixels, or use "
+                "it with Camera.build(..., skew=...)"
+            )
+        values = torch.cat([torch.tensor([fx, fy, cx, cy, skew]).double(), lens.flatten().double()])
+        if fisheye:
+            values = torch.nn.functional.pad(values, (0, 9 - len(values)))
+        camera = cls(values, size=size, model=PRESETS["fisheye4" if fisheye else OPENCV_MODELS[lens.numel()]])
+        if doubt := _size_doubt(fx, fy, cx, cy, size):
+            warn_user(doubt)
+        return camera
+
     def to_kornia(self) -> Any:
         """The same camera in kornia: a `PinholeCamera`, or a `CameraModel` of `kornia.sensors.camera` with its lens.
 
@@ -83,3 +172,28 @@ class ConvertibleCamera(CameraParameters):
 
         parameters, size, model = parameters_from_kornia(camera)
         return cls(parameters, size=size, model=model)
+
+
+def _size_doubt(fx: float, fy: float, cx: float, cy: float, size: tuple[int, int]) -> str:
+    """Why a camera matrix does not seem to belong to an image of this size; empty if it may."""
+
+    def off(width: int, height: int) -> float:
+        return max(abs((cx + 0.5) / width - 0.5), abs((cy + 0.5) / height - 0.5))
+
+    (width, height), image = size, f"an image of {size[0]}x{size[1]} px"
+    # A rectilinear lens of twenty focal lengths to the side would see 168°.
+    if min(fx / width, fy / height) < 0.05:
+        return f"K: focal lengths of {fx:g}, {fy:g} px are short for {image}; K must be in pixels of this image"
+    # Principal points lie within a few percent of the middle. Of 4:3 with sides exchanged they are off by 0.17.
+    if off(width, height) > 0.1 and off(height, width) < 0.05:
+        return (
+            f"the principal point ({cx:g}, {cy:g}) is in the middle of {height}x{width} px, not of {width}x{height}: "
+            "size is (width, height)"
+        )
+    # Where K is of half the image's size, it is off by a quarter; more is left to crops.
+    if off(width, height) > 0.24:
+        return (
+            f"the principal point ({cx:g}, {cy:g}) is far from the middle of {image}: if K is of another size, give "
+            "that one, and use camera.resized(...)"
+        )
+    return ""

@@ -9,7 +9,7 @@ from typing import Self
 import torch
 from torch import Tensor, nn
 
-from kcal.checks import Float64Module, as_points, require_finite
+from kcal.checks import Float64Module, as_points, as_size, require_finite
 from kcal.errors import InputError
 from kcal.lens.model import LensModel
 from kcal.lens.projection import INTRINSICS, parameter_names
@@ -36,13 +36,11 @@ class CameraParameters(Float64Module):
         # A network in the lens is this camera's own: it trains, moves between devices and is copied with it.
         self.model = model if model.network is None else copy.deepcopy(model)
         self.field = self.model.network
-        self.size = (int(size[0]), int(size[1]))
+        self.size = as_size(size)
         parameters = as_points("camera parameters", parameters, 5 + model.size)
         require_finite("camera parameters", parameters)
         if not bool((parameters[..., :2] > 0).all()):
             raise InputError("camera parameters: focal lengths must be positive, in pixels")
-        if min(self.size) < 1:
-            raise InputError(f"image size {self.size}: width and height must be positive")
         self.params = nn.Parameter(parameters.detach().clone(), requires_grad=False)
         self.register_buffer("free_mask", torch.ones(5 + model.size, dtype=torch.bool, device=parameters.device))
 

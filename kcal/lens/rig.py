@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import math
 from collections.abc import Callable
 from typing import Any
 
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
-from kcal.checks import as_covariance, as_points, keep_float64, require_finite
-from kcal.errors import InputError
+from kcal.checks import as_covariance, as_points, as_tensor, keep_float64, require_finite
+from kcal.errors import InputError, warn_user
 from kcal.lens.calibration import RigCalibration, UntilChanged
 from kcal.lens.camera import Camera
 from kcal.lens.mounting import Mounting
+from kcal.quantities import length_text
 
 
 class StereoRig(nn.Module):
@@ -30,11 +33,14 @@ class StereoRig(nn.Module):
     Args:
         left: the first camera.
         right: the second camera.
-        right_from_left_rotation: (3, 3) rotation matrix.
-        right_from_left_translation: (3,) meters.
+        right_from_left_rotation: (3, 3) rotation matrix, such as R of `cv2.stereoCalibrate`.
+        right_from_left_translation: (3,) or (3, 1) meters, such as T if the board was measured in meters.
 
     Raises:
         InputError: wrong shapes, values that are not finite, or a matrix that is no rotation.
+
+    A `KcalWarning` says where the right camera stands to the left of the left one, and where the baseline is beyond
+    1 mm to 1 km.
 
     Example:
         >>> camera = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080))
@@ -50,11 +56,26 @@ class StereoRig(nn.Module):
     calibration = UntilChanged[RigCalibration]()
 
     def __init__(
-        self, left: Camera, right: Camera, right_from_left_rotation: Tensor, right_from_left_translation: Tensor
+        self,
+        left: Camera,
+        right: Camera,
+        right_from_left_rotation: Tensor | ArrayLike,
+        right_from_left_translation: Tensor | ArrayLike,
     ) -> None:
         super().__init__()
-        rotation = as_points("right_from_left_rotation", right_from_left_rotation, 3)
-        translation = as_points("right_from_left_translation", right_from_left_translation, 3)
+        for camera in (left, right):
+            if not hasattr(camera, "unproject"):
+                raise InputError(
+                    "StereoRig: left, right, rotation and translation are needed in this order, got a "
+                    f"{type(camera).__name__} for a camera; Camera.build, Camera.from_opencv and kcal.load_camera make "
+                    "cameras"
+                )
+        like = getattr(left, "params", None)
+        rotation = as_points("right_from_left_rotation", right_from_left_rotation, 3, like)
+        translation = as_tensor("right_from_left_translation", right_from_left_translation)
+        # OpenCV's T is (3, 1).
+        translation = translation[:, 0] if translation.shape == (3, 1) else translation
+        translation = as_points("right_from_left_translation", translation, 3, like)
         if rotation.shape != (3, 3) or translation.shape != (3,):
             raise InputError(
                 f"rig pose: shapes (3, 3) and (3,) are needed, got {tuple(rotation.shape)} and "
@@ -69,6 +90,8 @@ class StereoRig(nn.Module):
         self.right = right
         self.register_buffer("right_from_left_rotation", rotation.detach().clone())
         self.register_buffer("right_from_left_translation", translation.detach().clone())
+        if doubt := _pose_doubt(rotation.detach(), translation.detach()):
+            warn_user(doubt)
 
     @property
     def baseline(self) -> Tensor:
@@ -213,6 +236,25 @@ class RigCovariance:
         link, mounting = link.to(matrix), mounting.to(matrix)
         whole = torch.cat([torch.cat([matrix, link], 1), torch.cat([link.T, mounting], 1)])
         return as_covariance("covariance of calibration and mounting", whole, size + more)[:size, size:]
+
+
+def _pose_doubt(rotation: Tensor, translation: Tensor) -> str:
+    """Why a relative pose is more likely a slip; empty where there is no reason to doubt it."""
+    x, y, z = (-translation @ rotation).tolist()
+    baseline = math.hypot(x, y, z)
+    # Endoscopes have 4 mm. Masts are 10 to 500 m apart; beyond, cameras are stations.
+    if baseline and not 1e-3 <= baseline <= 1e3:
+        return (
+            f"StereoRig: the baseline is {length_text(baseline)}; the translation must be in meters (T of "
+            "cv2.stereoCalibrate has the unit of the board's points)"
+        )
+    # Side by side, and looking to the same side. One above the other, or facing each other, neither is on the left.
+    if x < -0.9 * baseline and float(rotation[2, 2]) > 0:
+        return (
+            f"StereoRig: the right camera stands {length_text(-x)} to the left of the left one: exchanged images, or a "
+            "pose left_from_right? points_right = rotation @ points_left + translation is needed"
+        )
+    return ""
 
 
 def half_of_covariance(matrix: Tensor) -> Tensor:

@@ -204,7 +204,7 @@ class TestRefusals:
             Camera(vector, size=(4, 3), model="opencv5")
 
     def test_camera_options(self) -> None:
-        with pytest.raises(InputError, match="width and height"):
+        with pytest.raises(InputError, match="width, height"):
             Camera(torch.ones(10), size=(0, 3))
         with pytest.raises(InputError, match="unknown lens model 'opencv6'"):
             Camera(torch.ones(10), size=(4, 3), model="opencv6")
