@@ -306,7 +306,8 @@ def test_each_name(door: str, name: str) -> None:
     docstring = inspect.getdoc(value) or ""
     # Options are shown where they are used, and errors by the messages they carry.
     plain = dataclasses.is_dataclass(value) and name.endswith("Options")
-    wanted = "Args:" if plain else "" if name.endswith(("Error", "Warning")) or name in RECORDS | WITHOUT_EXAMPLE else "Example:"
+    without = name.endswith(("Error", "Warning")) or name in RECORDS | WITHOUT_EXAMPLE
+    wanted = "Args:" if plain else "" if without else "Example:"
     assert wanted in docstring
     assert len(docstring.splitlines()[0]) > 20
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from kcal.checks import Float64Module, as_covariance, as_points, require_finite
+from kcal.checks import Float64Module, as_covariance, as_points, as_size, require_finite
 from kcal.errors import InputError
 from kcal.image_size import check_pixel_count
 from kcal.sources import is_stream, source_name
@@ -27,6 +30,86 @@ def test_points_are_float64_of_the_right_shape() -> None:
     ):
         with pytest.raises(InputError, match=message):
             as_points("x", value, 2)
+
+
+class Table:
+    """Columns as pandas has them: an array on demand."""
+
+    def __init__(self, values: np.ndarray) -> None:
+        self.values = values
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return self.values
+
+
+ROWS = np.array([[1.5, 2.0], [3.0, 4.25]])
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        ROWS, ROWS.tolist(), tuple(map(tuple, ROWS)), list(ROWS), Table(ROWS), ROWS.astype(np.float32),
+        ROWS.astype(">f8"), ROWS.astype(np.longdouble), np.asfortranarray(ROWS), ROWS[::-1][::-1],
+        np.broadcast_to(ROWS, (2, 2)), list(torch.from_numpy(ROWS)), np.ma.masked_array(ROWS.copy()).data,
+    ],
+)  # fmt: skip
+def test_arrays_lists_and_tables_are_converted(value: Any) -> None:
+    found = as_points("x", value, 2)
+    assert torch.equal(found, torch.from_numpy(ROWS))
+    # Nothing is shared with the caller, who may write into the array afterwards.
+    found += 1.0
+    assert ROWS[0, 0] == 1.5
+
+
+def test_whole_numbers_of_a_list_are_exact() -> None:
+    assert torch.equal(as_points("x", [[960, 540]], 2), torch.tensor([[960.0, 540.0]]).double())
+    assert as_points("x", [], 0).shape == (0,)
+
+
+class Quantity(Table):
+    unit = "mm"
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (ROWS.astype(np.int32), r"x: floating point is needed, got torch.int64; convert with .astype\(float\)"),
+        (Table(ROWS.astype(np.uint64)), r"got torch.int64; convert with .astype\(float\)"),
+        (ROWS.astype(np.float16), "torch.float16 has steps of 0.5"),
+        (ROWS.astype(object), r"got ndarray of object; convert with .astype\(float\)"),
+        (ROWS.astype(str), "got ndarray of <U"),
+        (ROWS > 2, "got ndarray of bool"),
+        (ROWS + 1j, "got ndarray of complex128"),
+        ([[1.0, None]], "got list of object"),
+        ([[1.0, 2.0], [3.0]], "one array is needed, got a list"),
+        ([torch.ones(2, requires_grad=True)], "use torch.stack"),
+        (None, "x: a tensor or array of numbers is needed, got NoneType$"),
+        ("12", "got str$"),
+        (torch.nn.Linear(2, 2), "got Linear$"),
+        (Quantity(ROWS), "these are in mm; convert to meters or pixels"),
+        (np.ma.masked_array(ROWS, ROWS > 2), "would lose its mask"),
+        (np.zeros((2, 5)), r"shape \(..., 2\) is needed, got \(2, 5\); transpose it"),
+        (np.zeros((5, 3)), r"shape \(..., 2\) is needed, got \(5, 3\)$"),
+    ],
+)
+def test_what_is_no_array_of_points(value: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        as_points("x", value, 2)
+
+
+def test_devices() -> None:
+    there = torch.empty(0, device="meta")
+    assert as_points("x", ROWS, 2, like=there).device == there.device
+    with pytest.raises(InputError, match=r"x: on cpu, the parameters on meta; move one of them with .to\(\)"):
+        as_points("x", torch.from_numpy(ROWS), 2, like=there)
+
+
+def test_sizes() -> None:
+    for size in ((1920, 1080), [1920.0, 1080], np.array([1920, 1080]), torch.tensor([1920, 1080])):
+        assert as_size(size) == (1920, 1080)
+    for size in ((1920,), (1080, 1920, 3), (1920.5, 1080), (0, 5), (float("nan"), 5), (float("inf"), 5), None, 5, "ab"):
+        with pytest.raises(InputError, match=r"\(width, height\) in pixels is needed"):
+            as_size(size)
 
 
 def test_the_first_value_that_is_not_finite_is_named() -> None:
