@@ -23,7 +23,7 @@ _ROUNDS = 12
 _SETTLED = 1
 # Steps of the solver, and squared standard deviations by which one must lower chi² to be worth the next: in the first
 # round, in the others, and at the end.
-_FIRST, _LATER, LAST = (8, 0.1), (12, 0.02), (10, 0.01)
+_FIRST, _LATER, LAST = (8, 0.1), (12, 0.02), (60, 0.01)
 # Nats by which the evidence may fall from one round to another, because the problem is not linear.
 _DRIFT = 5.0
 # Motions beyond this stand for something else.
@@ -149,9 +149,9 @@ def run_rounds(
         if resting:
             converged = True
             break
-        if data.moving and turn >= _SETTLED:
+        if data.moving and turn >= _SETTLED and steps < _LATER[0]:
             # Few views that move much leave a direction along which the best camera drifts while the evidence falls:
-            # the round of largest evidence counts.
+            # the round of largest evidence counts, among those whose solver came to its end.
             if top is None or best.loss < top.loss:
                 top = Rounds(capture, readout, estimate, data, best.loss, spent, False)
             elif best.loss > top.loss + _DRIFT:

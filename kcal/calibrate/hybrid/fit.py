@@ -238,9 +238,7 @@ def fit_hybrid(
         parameters = state.parameters.clone()
         parameters[5 + len(LEADING) :][unfelt] = families.mean[field][unfelt]
         estimate = estimate._replace(state=state._replace(parameters=parameters))
-    # A fit that drifts stays where its evidence was largest.
-    drifts = capture.readout is not None and not rounds.converged
-    problem, estimate, steps = capture.solved(estimate, never, (1, LAST[1]) if drifts else LAST, last_step=True)
+    problem, estimate, steps = capture.solved(estimate, never, LAST, last_step=True)
     state = estimate.state
     reduced = problem.reduced_rows(state)
     K = products_of(reduced[:, :-1].T)
