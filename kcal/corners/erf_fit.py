@@ -17,7 +17,7 @@ from kcal.corners.erf_board import FAR, RampPrior, curvatures, light_at, light_s
 from kcal.corners.erf_spread import center_covariance
 from kcal.corners.erf_window import CornerWindow, cut_windows
 from kcal.corners.grid import Neighbors
-from kcal.lens.dispatch import is_differentiated
+from kcal.dispatch import is_differentiated
 
 MIN_ANGLE = math.radians(25.0)  # between the edges; below, the series of `crossing` is too short
 # Radius of the window as a share of the smallest square side. 0.4 was 5 to 20 % worse at squares of 8 to 20 px; 0.6 is

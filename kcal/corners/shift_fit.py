@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kcal.corners.filters import correlated, gaussian_kernel
 from kcal.corners.patch_windows import IMAGE_BLUR, ImageWindows, grid_of, sample
-from kcal.lens.dispatch import is_differentiated
+from kcal.dispatch import is_differentiated
 
 _MOST_STEPS = 25
 _CONVERGED = 1e-4  # steps

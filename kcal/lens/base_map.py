@@ -18,7 +18,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from kcal.lens.dispatch import is_traced
+from kcal.dispatch import is_traced
 
 # Where |q| or |u| is below this, the series are exact to rounding and the closed forms cancel.
 _SMALL = 0.02

@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from kcal.checks import as_points
+from kcal.dispatch import finite_or, in_chunks, is_differentiated, known_true, split_coordinates
 from kcal.errors import InputError
 from kcal.lens.camera_conversions import ConvertibleCamera
-from kcal.lens.dispatch import finite_or, in_chunks, is_differentiated, known_true, split_coordinates
 from kcal.lens.distortion import distort_components
 from kcal.lens.hybrid_points import map_points
 from kcal.lens.hybrid_points_fit import FittedPolynomials, worth_fitting

@@ -9,7 +9,7 @@ import torch
 from numpy.polynomial import chebyshev
 from torch import Tensor
 
-from kcal.lens.dispatch import is_traced, may_overwrite
+from kcal.dispatch import is_traced, may_overwrite
 from kcal.lens.distortion import distort_components
 from kcal.lens.hybrid_points import FEWEST, Backward, Forward
 from kcal.lens.hybrid_terms import HybridForm

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from kcal.dispatch import is_differentiated
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.lens.dispatch import is_differentiated
 from kcal.lens.pinhole import TurnedCamera, new_pinhole, source_pixels
 from kcal.lens.views import Cylinder
 

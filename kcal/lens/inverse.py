@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from kcal.checks import as_points
-from kcal.lens.dispatch import finite_or, in_chunks, is_differentiated, known_true, may_branch
+from kcal.dispatch import finite_or, in_chunks, is_differentiated, known_true, may_branch
 from kcal.lens.distortion import check_coefficients, distort_components
 from kcal.lens.inverse_safeguarded import solve_safeguarded
 from kcal.lens.inverse_start import fit_start, start_from, undo_tilt

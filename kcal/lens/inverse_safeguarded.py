@@ -13,7 +13,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcal.lens.dispatch import known_true
+from kcal.dispatch import known_true
 from kcal.lens.distortion import distort_components
 from kcal.lens.model import LensModel
 from kcal.lens.newton import inverse_jacobian, newton_step

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from kcal.checks import Float64Module, as_points
+from kcal.dispatch import finite_or, in_chunks, is_differentiated
 from kcal.errors import InputError
-from kcal.lens.dispatch import finite_or, in_chunks, is_differentiated
 from kcal.lens.spline import Spline, evaluate_spline
 
 _PARTS = Spline._fields

@@ -21,8 +21,8 @@ import math
 import torch
 from torch import Tensor
 
+from kcal.dispatch import is_differentiated, is_traced
 from kcal.lens.base_map import angle_over_radius, radius_over_angle, series
-from kcal.lens.dispatch import is_differentiated, is_traced
 from kcal.lens.model import LensModel
 
 _HALVINGS = 4

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.lens.dispatch import may_overwrite
+from kcal.dispatch import may_overwrite
 from kcal.lens.distortion import as_columns, distort_components
 from kcal.lens.model import LensModel
 from kcal.lens.plane import plane_with_slopes

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.lens.dispatch import is_differentiated, known_true
+from kcal.dispatch import is_differentiated, known_true
 from kcal.lens.plane import angle_over_distance
 from kcal.lens.zernike import unbind_last
 

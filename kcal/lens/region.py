@@ -25,7 +25,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.lens.dispatch import known_true, may_branch
+from kcal.dispatch import known_true, may_branch
 from kcal.lens.distortion import Distorted, check_coefficients, distort_components
 from kcal.lens.fold_proof import SECTORS, prove_regular
 from kcal.lens.model import LensModel

@@ -24,8 +24,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kcal.dispatch import may_branch, may_overwrite
 from kcal.errors import InputError
-from kcal.lens.dispatch import may_branch, may_overwrite
 from kcal.lens.field_modes import WeightPrior
 from kcal.lens.zernike_products import ZernikeProducts
 

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.lens.dispatch import is_differentiated, is_traced
+from kcal.dispatch import is_differentiated, is_traced
 
 # Up to so many places one product of all powers is faster than vectorized recurrences (measured).
 _FEW = 4000

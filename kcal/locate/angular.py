@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 from kcal.checks import as_points
+from kcal.dispatch import CHUNK, is_differentiated, is_traced, known_true
 from kcal.errors import InputError
-from kcal.lens.dispatch import CHUNK, is_differentiated, is_traced, known_true
 from kcal.lens.pose import side_axes
 
 # Sine of the angle between a ray and the baseline: below, both rays meet everywhere on the line through the cameras.

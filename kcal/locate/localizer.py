@@ -11,9 +11,9 @@ import torch
 from torch import Tensor, nn
 
 from kcal.checks import as_covariance, as_points, exportable, keep_float64
+from kcal.dispatch import is_differentiated
 from kcal.errors import InputError
 from kcal.io.rig_file import load_rig
-from kcal.lens.dispatch import is_differentiated
 from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA, Origin, check_refraction
 from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.ellipsoid import mean_radius

@@ -21,9 +21,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kcal.dispatch import is_traced, known_true
 from kcal.lens.camera import Camera
 from kcal.lens.camera_stack import project_each
-from kcal.lens.dispatch import is_traced, known_true
 from kcal.lens.pose import side_axes, step_rows
 from kcal.lens.projection import Projection
 from kcal.locate.bent_light import Surroundings, length_of_one, lifted

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from kcal.checks import Float64Module, as_points, exportable
+from kcal.dispatch import is_differentiated, is_traced, known_true
 from kcal.errors import InputError
 from kcal.lens.camera_rig import CameraRig
-from kcal.lens.dispatch import is_differentiated, is_traced, known_true
 from kcal.locate.ellipsoid import ecef_from_enu_rotation, mean_radius
 from kcal.locate.geodesy import anchor, enu_to_geodetic, place_enu
 from kcal.locate.ground import Ground

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor, nn
 
 from kcal.checks import as_points, exportable, keep_float64, require_finite
+from kcal.dispatch import is_differentiated
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
-from kcal.lens.dispatch import is_differentiated
 from kcal.locate.angular import triangulate_angular
 from kcal.locate.linear import triangulate_linear
 from kcal.locate.stereo import PositionStatus, flag_positions, reprojection_errors

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from kcal.checks import as_points
+from kcal.dispatch import CHUNK, is_traced, known_true
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera_stack import unproject_each
-from kcal.lens.dispatch import CHUNK, is_traced, known_true
 from kcal.lens.rig import StereoRig
 from kcal.locate.angular import EPIPOLE, triangulate_pairs
 from kcal.locate.max_likelihood import PointFit, RelativeCamera, inverse_covariances, most_likely

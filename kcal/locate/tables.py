@@ -19,9 +19,9 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
+from kcal.dispatch import CHUNK
 from kcal.errors import FileError
 from kcal.files import read_head
-from kcal.lens.dispatch import CHUNK
 from kcal.locate.distinct_keys import DistinctKeys, Doubled
 
 # The pieces in which the localizer does many points: a table is located as in one call, to the last bit.

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from kcal.checks import exportable
-from kcal.lens.dispatch import is_differentiated
+from kcal.dispatch import is_differentiated
 from kcal.lens.rig import StereoRig
 from kcal.locate.max_likelihood import inverse_variance
 from kcal.locate.stereo import (

@@ -17,8 +17,8 @@ from torch import Tensor, nn
 
 from kcal.checks import as_points
 from kcal.corners.filters import as_gray
+from kcal.dispatch import is_differentiated
 from kcal.errors import InputError
-from kcal.lens.dispatch import is_differentiated
 from kcal.lens.rig import StereoRig
 from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.locate.stations import stations_of

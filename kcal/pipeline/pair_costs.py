@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.lens.dispatch import is_differentiated
+from kcal.dispatch import is_differentiated
 from kcal.locate.multi_localizer import MultiViewLocalizer, common_errors, posed_cameras
 from kcal.locate.views import CommonErrors, PosedCameras, ViewsFit, fit_views
 from kcal.pipeline.association_options import AssociationOptions

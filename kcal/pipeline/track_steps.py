@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from kcal.dispatch import known_true
 from kcal.errors import InputError
-from kcal.lens.dispatch import known_true
 from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.pipeline.assignment import Looks, Scores, SeenFrom, looks_of, nearby
 from kcal.pipeline.estimates import TrackStates, track_states

@@ -60,14 +60,15 @@ class DenseProblem:
 
     def cost(self, state: State) -> Tensor:
         """See `Problem.cost`."""
-        residuals = self._residuals(state)
+        residuals = self.residuals(state)
         return 0.5 * (residuals * residuals).sum(-1)
 
     def linearize(self, state: State) -> DenseLinearization:
         """See `Problem.linearize`."""
-        return DenseLinearization(self._residuals(state), self._jacobian(state[0], *self._data))
+        return DenseLinearization(self.residuals(state), self._jacobian(state[0], *self._data))
 
-    def _residuals(self, state: State) -> Tensor:
+    def residuals(self, state: State) -> Tensor:
+        """(..., R) at a state."""
         residuals = self._value(state[0], *self._data)
         if residuals.ndim != len(self.batch) + 1 or residuals.dtype != torch.float64:
             shape = tuple(residuals.shape[len(self.batch) :])

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from kcal.checks import require_finite
+from kcal.dispatch import host_values, is_differentiated, is_traced, may_branch
 from kcal.errors import InputError
 from kcal.solve.dense import DenseProblem
 from kcal.solve.implicit import attach_implicit_gradient
@@ -105,7 +106,7 @@ def _minimize(problem: Problem[S], start: S, options: LMOptions, callback: Callb
     device = linear.cost.device
 
     def on_host(values: Tensor) -> np.ndarray:
-        return values.detach().cpu().numpy().copy()
+        return host_values(values)
 
     def on_device(values: np.ndarray) -> Tensor:
         return torch.from_numpy(np.asarray(values)).to(device)
@@ -246,8 +247,9 @@ class LevenbergMarquardt(nn.Module):
         residual: maps x (P,) and the data of one element to residuals (R,), in operations that `torch.func` can
             differentiate.
         options: see `LMOptions`.
-        backward: how the solution `x` gets gradients where data require them. "implicit": exact first derivatives by
-            the implicit function theorem, at the cost of one Hessian; elements that did not converge carry none.
+        backward: how the solution `x` gets gradients by data, by weights of a residual that is a module, and by tensors
+            that a function closes over. "implicit": exact first derivatives by the implicit function theorem, at the
+            cost of one Hessian; elements that did not converge carry none.
             "unroll": autograd through the steps that were taken, also for a start that requires gradients; memory grows
             with the steps, and the derivative lags one step behind the solution. "none": no gradients.
 
@@ -290,6 +292,11 @@ class LevenbergMarquardt(nn.Module):
             raise InputError(f"LevenbergMarquardt: the start must be a tensor (..., P) with values, got {shape}")
         if start.dtype != torch.float64:
             raise InputError(f"LevenbergMarquardt: the start must be float64, got {start.dtype}; use .double()")
+        if not (is_traced() or may_branch(start, *data, *self.parameters(), *self.buffers())):
+            raise InputError(
+                "LevenbergMarquardt: it stops by values, which vmap hides; give the batch as leading dimensions of the "
+                "start and the data"
+            )
         require_finite("LevenbergMarquardt start", start)
         for tensor in data:
             if tensor.shape[: start.ndim - 1] != start.shape[:-1]:
@@ -304,7 +311,9 @@ class LevenbergMarquardt(nn.Module):
         constant = tuple(tensor.detach() for tensor in data)
         problem = DenseProblem(self.residual, start.shape[:-1], constant)
         result = minimize(problem, (start.detach(),), self.options, callback)
-        if self.backward == "implicit" and torch.is_grad_enabled() and any(tensor.requires_grad for tensor in data):
+        result = dataclasses.replace(result, state=(result.x.detach(),))
+        # Weights of the residual and tensors that it closes over enter the solution as data do.
+        if self.backward == "implicit" and is_differentiated(*data, problem.residuals(result.state)):
             x = attach_implicit_gradient(self.residual, result.x, result.converged, data)
             result = dataclasses.replace(result, state=(x,))
         return result

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from kcal.errors import InputError
 from kcal.solve.lm import LevenbergMarquardt, LMOptions
@@ -95,3 +97,65 @@ class TestBackward:
     def test_refuses_other_words(self) -> None:
         with pytest.raises(InputError, match="implicit, unroll or none"):
             LevenbergMarquardt(decay, backward="explicit")
+
+
+class Weighed(nn.Module):
+    """w (x - d - b): its minimum is a mean, whose derivatives are known."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.w = nn.Parameter(torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))
+        self.register_buffer("b", torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64))
+
+    def forward(self, x: Tensor, d: Tensor) -> Tensor:
+        return self.w * (x[0] - d - self.b)  # type: ignore[operator]
+
+
+class TestWeightsOfAResidual:
+    start, data = torch.zeros(1).double(), torch.tensor([0.0, 1.0, 2.0], dtype=torch.float64)
+
+    def exact(self) -> dict[str, Tensor]:
+        module = Weighed()
+        w, moved = module.w.detach(), self.data + module.b
+        x = (w**2 * moved).sum() / (w**2).sum()
+        return {"residual.w": 2 * w * (moved - x) / (w**2).sum(), "residual.b": w**2 / (w**2).sum()}
+
+    @pytest.mark.parametrize("backward", ["implicit", "unroll"])
+    @pytest.mark.parametrize("batch", [(), (7,)])
+    def test_an_optimizer_sees_them(self, backward: str, batch: tuple[int, ...]) -> None:
+        """Found: no gradient at all while no data required one."""
+        solver = LevenbergMarquardt(Weighed(), backward=backward)  # type: ignore[arg-type]
+        solver(self.start.expand(*batch, 1), self.data.expand(*batch, 3)).x.mean().backward()
+        (weight,) = solver.parameters()
+        torch.testing.assert_close(weight.grad, self.exact()["residual.w"])
+
+    @pytest.mark.parametrize("transform", [torch.func.jacrev, torch.func.jacfwd])
+    @pytest.mark.parametrize("name", ["residual.w", "residual.b"])
+    def test_functional(self, transform: Callable[..., Callable[..., Tensor]], name: str) -> None:
+        solver = LevenbergMarquardt(Weighed())
+
+        def solution(value: Tensor) -> Tensor:
+            return torch.func.functional_call(solver, {name: value}, (self.start, self.data)).x[0]
+
+        torch.testing.assert_close(transform(solution)(solver.state_dict()[name]), self.exact()[name])
+
+    def test_closures(self) -> None:
+        w = Weighed().w.detach().requires_grad_()
+        solver = LevenbergMarquardt(lambda x, d: w * (x[0] - d - Weighed().b))
+        (found,) = torch.autograd.grad(solver(self.start, self.data).x.sum(), w)
+        torch.testing.assert_close(found, self.exact()["residual.w"])
+
+    def test_what_is_not_asked_for_is_not_computed(self) -> None:
+        solver = LevenbergMarquardt(Weighed().requires_grad_(False))
+        assert not solver(self.start, self.data).x.requires_grad
+        with torch.no_grad():
+            assert not LevenbergMarquardt(Weighed())(self.start, self.data).x.requires_grad
+
+    def test_vmap_is_refused(self) -> None:
+        solver = LevenbergMarquardt(Weighed())
+        with pytest.raises(InputError, match="leading dimensions"):
+            torch.func.vmap(lambda data: solver(self.start, data).x)(self.data.expand(2, 3))
+        with pytest.raises(InputError, match="leading dimensions"):
+            torch.func.vmap(lambda w: torch.func.functional_call(solver, {"residual.w": w}, (self.start, self.data)).x)(
+                torch.ones(2, 3).double()
+            )

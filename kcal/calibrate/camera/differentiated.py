@@ -13,6 +13,7 @@ from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.state import BoardState
+from kcal.dispatch import is_differentiated
 from kcal.errors import InputError
 from kcal.solve.hessian import HessianSolve, implicit_step, newton_minimum
 from kcal.solve.lm import LMOptions
@@ -45,7 +46,7 @@ def differentiated(
         for _ in range(_UNROLLED):
             step, _ = recorded.linearize(state).step(found.zero[0].new_zeros(()))
             state = recorded.retract(state, step)
-    elif backward == "implicit" and torch.is_grad_enabled() and any(tensor.requires_grad for tensor in data):
+    elif backward == "implicit" and is_differentiated(*data):
         problem, here = problem_of(*(tensor.detach() for tensor in data)), state
 
         def cost(shared: Tensor, local: Tensor, *values: Tensor) -> Tensor:

@@ -19,6 +19,7 @@ from kcal.calibrate.problem.priors import GaussianPrior, Term
 from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.views import Views
 from kcal.checks import as_points, require_finite
+from kcal.dispatch import is_differentiated
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
@@ -289,6 +290,11 @@ def _checked(
     """Corners (NaN where they do not count), board points and prior means as float64."""
     if backward not in ("implicit", "unroll", "none"):
         raise InputError(f"calibrate_views: backward must be implicit, unroll or none, got {backward!r}")
+    if backward != "none" and is_differentiated(options.camera):
+        raise InputError(
+            "calibrate_views: there are no derivatives by the parameters that options.camera holds; freeze it with "
+            "requires_grad_(False)"
+        )
     if options.reject is not None:
         raise InputError("calibrate_views: `reject` is not continuous; use a robust loss or a mask")
     if corner_sigma is not None and options.hybrid:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch._C import _functorch as functorch
@@ -86,6 +87,16 @@ def _below_vmap(tensor: Tensor) -> Tensor:
     while functorch.is_batchedtensor(tensor):
         tensor = functorch.get_unwrapped(tensor)
     return tensor
+
+
+def host_values(tensor: Tensor) -> np.ndarray:
+    """A copy of the values, also of a tensor that `torch.func.grad`, `jacrev`, `jvp` or `jacfwd` has wrapped."""
+    if functorch.maybe_current_level() is None:
+        return tensor.detach().cpu().numpy().copy()
+    with torch._C._DisableFuncTorch():
+        while functorch.is_gradtrackingtensor(tensor):
+            tensor = functorch.get_unwrapped(tensor)
+        return tensor.detach().cpu().numpy().copy()
 
 
 def may_overwrite(*tensors: Tensor) -> bool:
