@@ -255,6 +255,13 @@ def test_training_through_calibrations_finds_the_corners_bias() -> None:
 
 
 class TestRefusals:
+    def test_a_known_camera_that_requires_gradients(self) -> None:
+        corners = pixels_of(camera("pinhole"), POSES)
+        options = CalibrationOptions(camera=camera("pinhole").free("fx"))
+        with pytest.raises(InputError, match="options.camera"):
+            calibrate_views(corners, BOARD.points, SIZE, options)
+        assert not calibrate_views(corners, BOARD.points, SIZE, options, backward="none").parameters.requires_grad
+
     def test_what_the_views_do_not_determine(self) -> None:
         """Boards parallel to the image leave the focal length open."""
         flat = torch.eye(3).double().expand(4, 3, 3)
