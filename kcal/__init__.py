@@ -1,7 +1,8 @@
 """kcal: camera calibration and long-range stereo localization for PyTorch.
 
 The names here are those that most programs need; the others are in `kcal.lens`, `kcal.corners`, `kcal.calibrate`,
-`kcal.rig`, `kcal.locate`, `kcal.track`, `kcal.report` and `kcal.solve`. All are loaded when they are first used.
+`kcal.rig`, `kcal.locate`, `kcal.track`, `kcal.report`, `kcal.solve`, `kcal.stars` and `kcal.nets`. All are loaded when
+they are first used.
 """
 
 from __future__ import annotations

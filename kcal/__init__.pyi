@@ -56,5 +56,6 @@ from kcal import track as track
 from kcal import report as report
 from kcal import solve as solve
 from kcal import stars as stars
+from kcal import nets as nets
 
 __version__: str

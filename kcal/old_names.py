@@ -10,11 +10,11 @@ from typing import Any
 _MOVED = {
     "kcal.lens": """
         BoardRecord CalibrationRecord CameraCalibration CameraDifference CameraInformation CameraPose Exclusion
-        ExportedCameras HybridForm ImageTransform ImportedCameras InverseFit InverseNet InverseNetOptions
-        LearnedStart LensModel LookupCamera Misfit ParaxialFocal RefittedCamera Undistort UndistortImage
+        ExportedCameras HybridForm ImageTransform ImportedCameras LearnedStart LensModel LookupCamera Misfit
+        ParaxialFocal RefittedCamera Undistort UndistortImage
         UndistortMaps Unproject ZernikeModes bake camera_difference export_cameras image_sigma import_cameras
         load_lookup new_pinhole paraxial_focal pixel_covariance projection_sigma
-        refit_camera save_lookup save_onnx train_inverse undistort_maps
+        refit_camera save_lookup save_onnx undistort_maps
     """,
     "kcal.corners": """
         Detection Failure MatchOptions MatchStatus Matches RefinedPoint detect_board detect_video expand_images
@@ -50,6 +50,9 @@ _MOVED = {
     """,
     "kcal.solve": """
         LMOptions LevenbergMarquardt RobustLoss SolverStatus
+    """,
+    "kcal.nets": """
+        InverseFit InverseNet InverseNetOptions train_inverse
     """,
 }
 _RENAMED = {"detect_images": "kcal.detect"}

@@ -19,7 +19,7 @@ from typing import Any
 import typer
 
 DOORS = ("kcal", *(f"kcal.{name}" for name in
-         ["lens", "corners", "calibrate", "rig", "locate", "track", "report", "stars", "solve"]))  # fmt: skip
+         ["lens", "corners", "calibrate", "rig", "locate", "track", "report", "stars", "solve", "nets"]))  # fmt: skip
 FOLDER = Path(__file__).parents[1] / "tests" / "promises"
 
 

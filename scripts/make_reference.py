@@ -17,7 +17,7 @@ FOLDER = ROOT / "docs" / "reference"
 # In the order in which a program uses them.
 DOORS = (
     "kcal", "kcal.lens", "kcal.corners", "kcal.calibrate", "kcal.rig", "kcal.locate", "kcal.track", "kcal.report",
-    "kcal.solve", "kcal.stars",
+    "kcal.solve", "kcal.stars", "kcal.nets",
 )  # fmt: skip
 
 

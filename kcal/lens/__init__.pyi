@@ -3,6 +3,7 @@
 
 # Lens models
 from kcal.lens.model import LensModel as LensModel
+from kcal.lens.extended_distortion import ExtendedDistortion as ExtendedDistortion
 from kcal.lens.hybrid_terms import HybridForm as HybridForm
 from kcal.lens.zernike import ZernikeModes as ZernikeModes
 from kcal.lens.paraxial import paraxial_focal as paraxial_focal
@@ -51,7 +52,7 @@ from kcal.calibrate.camera.export import ExportedCameras as ExportedCameras
 from kcal.calibrate.camera.misfit import Misfit as Misfit
 from kcal.io.onnx_file import save_onnx as save_onnx
 
-# Tables and networks
+# Tables and learned inverses (these are also in kcal.nets)
 from kcal.lens.baking import bake as bake
 from kcal.lens.lookup import LookupCamera as LookupCamera
 from kcal.io.lookup_file import load_lookup as load_lookup

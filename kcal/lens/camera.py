@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, Self
+from typing import Self
 
 import torch
 from numpy.typing import ArrayLike
@@ -15,15 +15,16 @@ from kcal.dispatch import finite_or, in_chunks, is_differentiated, known_true, s
 from kcal.errors import InputError
 from kcal.lens.camera_conversions import ConvertibleCamera
 from kcal.lens.distortion import distort_components
+from kcal.lens.extended_distortion import CameraDistortion, ExtendedDistortion
 from kcal.lens.hybrid_points import map_points
 from kcal.lens.hybrid_points_fit import FittedPolynomials, worth_fitting
-from kcal.lens.inverse import InverseStart, PreparedInverse, prepare_inverse, undistort_components
+from kcal.lens.inverse import InverseStart, PreparedInverse, undistort_components
 from kcal.lens.model import LensModel
 from kcal.lens.outline import image_outline, polygon_area
 from kcal.lens.plane import angle_over_distance, plane_from_points, rays_from_plane
 from kcal.lens.projection import from_pixels, to_pixels
 from kcal.lens.pupil import FAR, pupil_depth, ray_starts
-from kcal.lens.region import Region, in_region, surely_in_region
+from kcal.lens.region import in_region, surely_in_region
 
 
 class Camera(ConvertibleCamera):
@@ -63,18 +64,10 @@ class Camera(ConvertibleCamera):
         True
     """
 
-    valid_radius: Tensor
-    valid_edge: Tensor
-    valid_cuts: Tensor
-    inverse_start: Tensor
-
     def __init__(self, parameters: Tensor, *, size: tuple[int, int], model: LensModel | str = "opencv5") -> None:
         super().__init__(parameters, size, LensModel.named(model))
         self._fitted = FittedPolynomials()
-        # They follow from the parameters, so they are not part of the saved state.
-        for name, value in self._measured_region().items():
-            self.register_buffer(name, value, persistent=False)
-        self.register_load_state_dict_post_hook(_with_new_region)
+        self._measure_region()
 
     @classmethod
     def build(
@@ -101,9 +94,15 @@ class Camera(ConvertibleCamera):
         return Camera(parameters, size=self.size, model=self.model)
 
     @property
-    def valid_region(self) -> Region:
-        """The region where the lens is valid, on the plane z = 1 (for a fisheye, on the plane of angles)."""
-        return Region(self.valid_radius, self.valid_edge, self.valid_cuts)
+    def distortion(self) -> ExtendedDistortion:
+        """The distortion alone, as a module that shares this camera's parameters: what one learns, both have.
+
+        Example:
+            >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), coefficients=[-0.25])
+            >>> camera.distortion(torch.tensor([[0.5, 0.0]], dtype=torch.float64))[0].tolist()
+            [[0.46875, 0.0]]
+        """
+        return CameraDistortion(self)
 
     def valid_polygon(self) -> Tensor:
         """The part of the image whose pixels have a ray, as a polygon (V, 2) in pixels, clockwise as seen in the image.
@@ -121,20 +120,11 @@ class Camera(ConvertibleCamera):
             )
         return image_outline(self.params.detach(), self.model, self.valid_region, self.size)
 
-    def _measured_region(self) -> dict[str, Tensor]:
-        with torch.no_grad():
-            values = self.params.detach()
-            width, height = self.size
-            corners = values.new_tensor([[-0.5, -0.5], [width, -0.5], [-0.5, height], [width, height]])
-            x, y = from_pixels(corners[:, 0], corners[:, 1], values)
-            ready = prepare_inverse(values[..., 5:], self.model, torch.hypot(x, y).amax(-1))
-        radius, edge, cuts = ready.region
-        return {"valid_radius": radius, "valid_edge": edge, "valid_cuts": cuts, "inverse_start": ready.start}
-
-    def update_valid_region(self) -> None:
-        """Compute the valid region again; call this after changing parameters in place."""
-        for name, value in self._measured_region().items():
-            setattr(self, name, value)
+    def _reach(self) -> Tensor:
+        width, height = self.size
+        values = self.params.detach()
+        corners = values.new_tensor([[-0.5, -0.5], [width, -0.5], [-0.5, height], [width, height]])
+        return torch.hypot(*from_pixels(corners[:, 0], corners[:, 1], values)).amax(-1)
 
     def _taken(self, name: str, value: Tensor | ArrayLike, last: int) -> Tensor:
         """Points of a user as float64 (..., N, last) on this camera's device; its batch broadcasts with theirs."""
@@ -353,11 +343,6 @@ class Camera(ConvertibleCamera):
             return text
         share = polygon_area(self.valid_polygon()) / (self.size[0] * self.size[1])
         return f"{text}, valid={'whole image' if share > 1 - 1e-9 else f'{share:.1%} of the image'}"
-
-
-def _with_new_region(camera: Camera, _: Any) -> None:
-    """After a state was loaded, that of a network in the lens too."""
-    camera.update_valid_region()
 
 
 def pixels_to_plane(

@@ -10,7 +10,7 @@ from kcal.lens.camera import Camera
 
 
 class LearnedStart(Protocol):
-    """A module that guesses the inverse of a lens, such as `kcal.lens.InverseNet`."""
+    """A module that guesses the inverse of a lens, such as `kcal.nets.InverseNet`."""
 
     def guess(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """Return roughly undistorted coordinates for distorted ones (..., N)."""

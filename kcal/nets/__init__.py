@@ -1,1 +1,5 @@
-"""The learned inverse of a lens (Eq. 12 of the paper), with its network and fit."""
+"""Networks of the paper beside a calibrated camera: residual, field and inverse."""
+
+from kcal.doors import door
+
+__getattr__, __dir__ = door(__name__, __file__)

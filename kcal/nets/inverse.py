@@ -206,18 +206,22 @@ def train_inverse(camera: Camera, options: InverseNetOptions | None = None) -> I
     X, Y, Z = rays[valid].unbind(-1)
     truth = torch.stack(net.to_chart(*plane_from_points(X, Y, Z, camera.model)))
     guess = net.closed_form(*_distorted(camera, pixels[valid]))
-    net.reach.copy_(_largest_length(guess))
-    net.amplitude.copy_(_largest_length(truth - guess))
+    set_scales(net, guess, truth)
     problem = RegressionProblem(guess / net.reach, (truth - guess) / net.amplitude, net.widths)
     # A correction to 1e-9 of its largest value is more than any start needs.
     limits = LMOptions(max_iterations=options.iterations, tolerance=1e-6, residual_floor=1e-9)
     result = fit_weights(net, problem, (net.weights.detach(),), limits)
+    return judged_inverse(camera, net, int(result.iterations), SolverStatus(int(result.status)))
+
+
+@torch.no_grad()
+def judged_inverse(camera: Camera, net: InverseNet, iterations: int, status: SolverStatus) -> InverseFit:
+    """The errors of a net, and of the guess that it corrects, over the image of a camera."""
     # Between the training pixels, and dense enough to find the largest error to a few per cent.
     pixels = camera.grid(97, 55).reshape(-1, 2)
     pixels = pixels[camera.unproject(pixels)[1]]
     x, y = _distorted(camera, pixels)
-    p, q = net.closed_form(x, y)
-    before = _reprojection_errors(camera, pixels, *net.from_chart(p, q))
+    before = _reprojection_errors(camera, pixels, *net.from_chart(*net.closed_form(x, y).unbind(-2)))
     after = _reprojection_errors(camera, pixels, *net(torch.stack([x, y], -1)).unbind(-1))
     return InverseFit(
         net=net,
@@ -225,8 +229,8 @@ def train_inverse(camera: Camera, options: InverseNetOptions | None = None) -> I
         largest=float(after.max()),
         start_rms=_rms(before),
         start_largest=float(before.max()),
-        iterations=int(result.iterations),
-        status=SolverStatus(int(result.status)),
+        iterations=iterations,
+        status=status,
     )
 
 
@@ -251,9 +255,11 @@ def _reprojection_errors(camera: Camera, pixels: Tensor, x: Tensor, y: Tensor) -
     return torch.where(seen, torch.linalg.vector_norm(again - pixels, dim=-1), torch.inf)
 
 
-def _largest_length(values: Tensor) -> Tensor:
-    """Largest length of vectors (2, N); the floor only keeps a division by it finite."""
-    return torch.linalg.vector_norm(values, dim=0).amax().clamp(min=1e-12)
+def set_scales(net: InverseNet, guess: Tensor, truth: Tensor) -> None:
+    """Set `reach` and `amplitude` of a net to the largest lengths of guesses (2, N) and of their corrections."""
+    # The floor only keeps a division by it finite.
+    for scale, values in ((net.reach, guess), (net.amplitude, truth - guess)):
+        scale.copy_(torch.linalg.vector_norm(values, dim=0).amax().clamp(min=1e-12))
 
 
 def _rms(values: Tensor) -> float:

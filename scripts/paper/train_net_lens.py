@@ -28,14 +28,12 @@ from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.hybrid.base_fit import fit_projection
 from kcal.calibrate.problem.poses import poses_under
 from kcal.calibrate.problem.views import Views
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations, View
 from kcal.solve.lm import LMOptions, minimize
 from kcal.solve.result import State
 from scripts.paper.pure_lens import PureLensNet, PureLensProblem, train_pure_lens
 from scripts.shared.page import write_section
 from scripts.shared.timing import median, row, show, spread
-from scripts.shared.views import COLUMNS, NOISE, ROWS, SIZE, simulate
+from scripts.shared.views import NOISE, SIZE, observed, simulate
 
 PAGE = "paper.md"
 VIEWS, HELD_OUT = 20, 20
@@ -114,11 +112,7 @@ def held_out(board: Tensor, pixels: Tensor, lens: PureLensNet, state: State, pos
 
 def reference(board: Tensor, pixels: Tensor, others: Tensor) -> list[str]:
     """What the formula of 14 coefficients makes of the same views."""
-    observations = Observations(
-        board=Board(columns=COLUMNS, rows=ROWS, square=float(board[1, 0] - board[0, 0])),
-        image_size=SIZE,
-        views=tuple(View(name=str(i), pixels=tuple(map(tuple, view.tolist()))) for i, view in enumerate(pixels)),
-    )
+    observations = observed(pixels.tolist())
     clock = time.process_time()
     result = calibrate_camera(observations, CalibrationOptions(model="opencv14"))
     seconds = time.process_time() - clock

@@ -1,0 +1,16 @@
+# ruff: noqa: I001
+# Where each name is defined, for type checkers and for `door`; a comment begins a group of the reference page.
+
+# Residual
+from kcal.nets.residual import ResidualNet as ResidualNet
+
+# Inverse
+from kcal.nets.inverse import InverseNet as InverseNet
+from kcal.nets.inverse import train_inverse as train_inverse
+from kcal.nets.inverse import InverseNetOptions as InverseNetOptions
+from kcal.nets.inverse import InverseFit as InverseFit
+
+# Residual and inverse together
+from kcal.nets.joint import train_jointly as train_jointly
+from kcal.nets.joint import JointOptions as JointOptions
+from kcal.nets.joint import JointFit as JointFit
