@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from kcal.checks import as_points
+from kcal.dispatch import finite_or
 from kcal.errors import InputError
 from kcal.lens.camera_parameters import CameraParameters, LensParameters
-from kcal.lens.dispatch import finite_or
 from kcal.lens.distortion import distort_components
 from kcal.lens.inverse import InverseStart, PreparedInverse, undistort
 from kcal.lens.model import LensModel
