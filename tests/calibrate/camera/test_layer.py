@@ -258,7 +258,7 @@ class TestRefusals:
     def test_a_known_camera_that_requires_gradients(self) -> None:
         corners = pixels_of(camera("pinhole"), POSES)
         options = CalibrationOptions(camera=camera("pinhole").free("fx"))
-        with pytest.raises(InputError, match="options.camera"):
+        with pytest.raises(InputError, match="requires_grad_"):
             calibrate_views(corners, BOARD.points, SIZE, options)
         assert not calibrate_views(corners, BOARD.points, SIZE, options, backward="none").parameters.requires_grad
 
