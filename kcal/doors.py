@@ -4,6 +4,10 @@ A door is the `__init__.py` of a folder from which users import. Its stub `__ini
 defined: one table for type checkers, the reference and the door. A door imports nothing when it is opened, so that
 `import kcal` and `kcal --help` do not wait for torch, and it may name what rooms above it define without an import
 circle.
+
+What it gives out also names a slip: where a function or constructor fails and one of its arguments is no such thing as
+its annotation says, an `InputError` says which, and what makes one. Nothing is checked as long as nothing fails, and
+kcal itself, which does not import through doors, sees its own errors.
 """
 
 from __future__ import annotations
@@ -11,10 +15,29 @@ from __future__ import annotations
 import ast
 import functools
 import importlib
+import inspect
+import numbers
+import re
 import sys
-from collections.abc import Callable
+import types
+import typing
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
+
+from kcal.errors import InputError, KcalError
+
+_MANY, _NAMED = inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD
+# What makes the things that users most often pass something else for.
+_MAKERS = {
+    "Camera": "Camera.build, Camera.from_opencv, kcal.load_camera or kcal.calibrate_camera(...).camera",
+    "StereoRig": "kcal.StereoRig, kcal.load_rig or kcal.solve_rig(...).stereo()",
+    "CameraRig": "kcal.rig.CameraRig, kcal.rig.load_camera_rig or kcal.solve_rig(...).stations()",
+    "Observations": "kcal.detect or kcal.Observations.load",
+    "Board": "kcal.Board or kcal.Board.parse",
+    "RigData": "kcal.RigData",
+    "Tensor": "torch.as_tensor",
+}
 
 
 def door(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
@@ -39,7 +62,17 @@ def door(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], li
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         if modules()[name] == package:
             return importlib.import_module(f"{package}.{name}")
-        value = getattr(importlib.import_module(modules()[name]), name)
+        module = importlib.import_module(modules()[name])
+        value = getattr(module, name)
+        if inspect.isfunction(value):
+            value = _naming_slips(value)
+            setattr(module, name, value)  # one function, wherever it is imported from
+        elif inspect.isclass(value):
+            for word, member in list(vars(value).items()):
+                if word == "__init__":
+                    type.__setattr__(value, word, _naming_slips(member))
+                elif isinstance(member, classmethod) and not word.startswith("_"):
+                    type.__setattr__(value, word, classmethod(_naming_slips(member.__func__)))
         setattr(sys.modules[package], name, value)
         return value
 
@@ -48,3 +81,65 @@ def door(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], li
         return sorted({*(name for name in vars(sys.modules[package]) if name.startswith("__")), *modules()})
 
     return find, names
+
+
+def _naming_slips(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function, whose errors name an argument that is no such thing as its annotation says."""
+    if hasattr(function, "names_slips"):
+        return function
+
+    @functools.wraps(function)
+    def named(*args: Any, **kwargs: Any) -> Any:
+        try:
+            return function(*args, **kwargs)
+        except KcalError:
+            raise
+        except Exception as error:
+            if slip := _slip(function, args, kwargs):
+                raise InputError(slip) from error
+            raise
+
+    vars(named)["names_slips"] = True
+    return named
+
+
+def _slip(function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> str:
+    """Which argument is another thing than its annotation says, and what makes one; empty if none is."""
+    function = inspect.unwrap(function)
+    try:
+        given = inspect.signature(function).bind(*args, **kwargs)
+    except TypeError:  # of missing arguments: Python says which
+        return ""
+    for name, value in given.arguments.items():
+        word = function.__annotations__.get(name, "Any")
+        try:
+            fits = _fits(value, eval(word, function.__globals__))
+        except (NameError, AttributeError, TypeError):  # what only type checkers know
+            continue
+        if not fits and given.signature.parameters[name].kind not in (_MANY, _NAMED):
+            found = type(value).__name__
+            if isinstance(value, Sequence) and not isinstance(value, str):
+                found += f" of {', '.join(dict.fromkeys(type(one).__name__ for one in value)) or 'nothing'}"
+            makers = next((f"; {_MAKERS[made]} makes one" for made in _MAKERS if made in re.findall(r"\w+", word)), "")
+            return f"{function.__qualname__.removesuffix('.__init__')}: {name}: {word} is needed, got {found}{makers}"
+    return ""
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether a value is what an annotation says, as far as that can be told."""
+    origin, inside = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        return any(_fits(value, one) for one in inside)
+    if origin is typing.Literal:
+        return value in inside
+    if hint is None or hint in (int, float):
+        return value is None if hint is None else isinstance(value, numbers.Real)
+    kind = origin or hint
+    if not isinstance(kind, type) or kind is Any:
+        return True
+    if kind is Sequence or kind in (tuple, list):
+        if not isinstance(value, kind) or (isinstance(value, str) and inside[:1] != (str,)):
+            return False
+        each = inside[:1] * len(value) if kind is not tuple or ... in inside else inside
+        return len(each) in (0, len(value)) and all(map(_fits, value, each))
+    return isinstance(value, kind)

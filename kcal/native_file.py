@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Self
 
 import pydantic
 
-from kcal.errors import FileError, InputError
+from kcal.errors import FileError, InputError, warn_user
 from kcal.files import dump_json, read_bytes, write_atomic
 from kcal.strict_json import MOST_BYTES, read_json
 
@@ -29,6 +29,15 @@ def digest(content: Mapping[str, Any]) -> str:
 _DERIVED = "summary"
 
 
+def _listed(value: Any) -> Any:
+    """An array or tensor as lists, with None for rows that contain NaN, and without OpenCV's middle axis of one."""
+    rows = value.tolist() if hasattr(value, "tolist") else None
+    if not isinstance(rows, list):
+        return value if rows is None else rows
+    rows = [row[0] if isinstance(row, list) and len(row) == 1 else row for row in rows]
+    return [None if isinstance(row, list) and any(number != number for number in row) else row for row in rows]
+
+
 class Record(pydantic.BaseModel):
     """Base of the blocks inside kcal's files: unknown fields, NaN and infinity are refused.
 
@@ -38,6 +47,23 @@ class Record(pydantic.BaseModel):
 
     model_config = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
     _LATER: ClassVar[Mapping[str, Any]] = {}
+
+    def __init__(self, /, **data: Any) -> None:
+        try:
+            super().__init__(**{name: _listed(value) for name, value in data.items()})
+        except pydantic.ValidationError as error:
+            found = error.errors(include_url=False)[0]
+            got = f", got {found['input']!r:.60}" if not found["msg"].startswith("Value error") else ""
+            raise InputError(f"{type(self).__name__}: {fault_text(error)}{got}") from error
+        if doubt := self._doubt():
+            warn_user(doubt)
+
+    # As of pydantic's own: a record inside another one is not made by a call, and its fault gets the way to its field.
+    __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
+
+    def _doubt(self) -> str:
+        """Why what was passed is more likely a slip; empty if there is no reason to doubt it."""
+        return ""
 
     # No type for what it returns: in JSON schemas, pydantic would put that type in place of the fields.
     @pydantic.model_serializer(mode="wrap")
@@ -63,9 +89,16 @@ def storing(kind: str) -> Iterator[None]:
     """
     try:
         yield
-    except pydantic.ValidationError as error:
-        where, what = _first_fault(error.errors(include_input=False)[0])
-        raise InputError(": ".join(filter(None, [f"this {kind} cannot be stored", where, what]))) from error
+    except (InputError, pydantic.ValidationError) as error:
+        fault = error.__cause__ if isinstance(error, InputError) else error
+        if not isinstance(fault, pydantic.ValidationError):
+            raise
+        raise InputError(f"this {kind} cannot be stored: {fault_text(fault)}") from fault
+
+
+def fault_text(error: pydantic.ValidationError) -> str:
+    """The first field that is wrong, and what is wrong with it."""
+    return ": ".join(filter(None, _first_fault(error.errors(include_input=False)[0])))
 
 
 def _first_fault(found: Any) -> tuple[str, str]:

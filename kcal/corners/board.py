@@ -103,6 +103,10 @@ class Board(Record):
             since = f" from number {self.first} on" if self.first else ""
             raise ValueError(f"the board needs {self.markers} markers{since}, dictionary {dictionary} fewer")
 
+    def _doubt(self) -> str:
+        # Boards for drones have squares of a meter.
+        return f"Board: {self.square:g} is in meters; give 25 mm as square=0.025" if self.square >= 5.0 else ""
+
     @classmethod
     def parse(cls, size: str, square: str | None = None) -> Board:
         """Read `"9x6"` (inner corners, columns by rows) and `"25mm"` (units: mm, cm, m, in).
@@ -137,12 +141,9 @@ class Board(Record):
             fields = board_fields(size, square)
         try:
             return cls(**fields)
-        except pydantic.ValidationError as error:
-            found = error.errors()[0]
-            why = ": ".join([*map(str, found["loc"]), found["msg"].removeprefix("Value error, ")])
-            if is_file:
-                raise FileError(f"{size}: {why}") from error
-            raise InputError(f"board {size!r}: {why}") from error
+        except InputError as error:
+            why = str(error).removeprefix("Board: ")
+            raise FileError(f"{size}: {why}") if is_file else InputError(f"board {size!r}: {why}") from error
 
     @property
     def corners(self) -> int:

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pydantic
 
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
@@ -89,8 +88,8 @@ def import_corners(path: str | Path, board: Board, image_size: tuple[int, int] |
         if not found:
             raise FileError(f"{path}: no view with corners")
         return Observations(board=board, image_size=size, refinement="none", views=tuple(found))
-    except pydantic.ValidationError as error:
-        raise FileError(f"{path}: bad corners file: {error.errors()[0]['msg']}") from error
+    except InputError as error:
+        raise FileError(f"{path}: bad corners file: {error}") from error
 
 
 def _view(name: str, corners: Sequence[Corner], weighted: bool) -> View:

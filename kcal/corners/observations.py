@@ -10,7 +10,7 @@ import pydantic
 from kcal.corners.board import Board
 from kcal.errors import InputError
 from kcal.image_size import ImageSize
-from kcal.native_file import NativeFile
+from kcal.native_file import NativeFile, Record
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -24,19 +24,18 @@ PackedCovariance = tuple[float, float, float]
 _BEYOND = 2.0
 
 
-class View(pydantic.BaseModel):
+class View(Record):
     """One image in which the board was found.
 
     Args:
         name: unique name in the file, usually the image's file name; views of two cameras are paired by it.
         pixels: (u, v) of each board corner in the board's order, or None where a corner was not seen. Integer
-            coordinates are centers of pixels.
+            coordinates are centers of pixels. Also an array or tensor (N, 2), or (N, 1, 2) as OpenCV has it, with NaN
+            where a corner was not seen.
         covariance: (uu, uv, vv) in px² of each board corner, None where not seen; or None if unknown for all.
         image: path from which the image was read, relative or absolute.
         sha256: of the image file's bytes, to notice a changed image.
     """
-
-    model_config = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     name: str = pydantic.Field(min_length=1)
     pixels: tuple[Pixel | None, ...]
@@ -45,10 +44,8 @@ class View(pydantic.BaseModel):
     sha256: str | None = None
 
 
-class Failure(pydantic.BaseModel):
+class Failure(Record):
     """An image that gave no view, and why."""
-
-    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
 
     name: str
     reason: str

@@ -63,13 +63,6 @@ class StereoRig(nn.Module):
         right_from_left_translation: Tensor | ArrayLike,
     ) -> None:
         super().__init__()
-        for camera in (left, right):
-            if not hasattr(camera, "unproject"):
-                raise InputError(
-                    "StereoRig: left, right, rotation and translation are needed in this order, got a "
-                    f"{type(camera).__name__} for a camera; Camera.build, Camera.from_opencv and kcal.load_camera make "
-                    "cameras"
-                )
         like = getattr(left, "params", None)
         rotation = as_points("right_from_left_rotation", right_from_left_rotation, 3, like)
         translation = as_tensor("right_from_left_translation", right_from_left_translation)

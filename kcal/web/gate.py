@@ -23,6 +23,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp
 
 from kcal.errors import FileError, InputError, KcalError
+from kcal.native_file import fault_text
 
 _LARGEST_BODY = 1 << 20
 _DEEPEST = 32
@@ -140,9 +141,7 @@ def _static_page(content: bytes, kind: str) -> Callable[[Request], Awaitable[Res
 
 async def _refuse(_: Request, error: Exception) -> Response:
     if isinstance(error, pydantic.ValidationError):
-        first = error.errors()[0]
-        text = ": ".join(filter(None, [".".join(map(str, first["loc"])), first["msg"].removeprefix("Value error, ")]))
-        return JSONResponse({"error": text}, 422)
+        return JSONResponse({"error": fault_text(error)}, 422)
     # What this machine could not write may be possible later, and is then worth asking for again.
     failed = isinstance(error, FileError) and isinstance(error.__cause__, OSError)
     return JSONResponse({"error": " ".join(str(error).split())}, 503 if failed else 400)

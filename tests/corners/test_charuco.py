@@ -1,5 +1,4 @@
 import numpy as np
-import pydantic
 import pytest
 import torch
 from typer.testing import CliRunner
@@ -93,7 +92,7 @@ class TestBoard:
         assert "\n" not in str(caught.value)
 
     def test_half_a_description_is_refused(self):
-        with pytest.raises(pydantic.ValidationError, match="neither"):
+        with pytest.raises(InputError, match="neither"):
             Board(columns=4, rows=3, square=0.1, marker=0.05)
 
     def test_markers_have_a_black_border(self):

@@ -158,9 +158,3 @@ def test_rigs_that_are_not_doubted(shift: tuple[float, ...], turn: tuple[float, 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         make_rig(*shift, turn=turn)
-
-
-def test_arguments_in_another_order() -> None:
-    camera = Camera.from_opencv(K, None, SIZE)
-    with pytest.raises(InputError, match=r"in this order, got a ndarray for a camera; .*kcal\.load_camera"):
-        StereoRig(np.eye(3), np.zeros(3), camera, camera)  # type: ignore[arg-type]

@@ -1,0 +1,100 @@
+"""Slips of users get an `InputError` that names them: another type, another order, fields that do not fit."""
+
+from __future__ import annotations
+
+import pickle
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import kcal
+from kcal import Board, Camera, InputError, KcalWarning, Observations, Origin, StereoLocalizer, View
+from kcal.doors import _fits, _naming_slips
+from kcal.lens import camera_difference, rotation_from_vector
+
+CAMERA = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480))
+BOARD = Board(columns=3, rows=3, square=0.1)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: camera_difference(CAMERA, None), "second: Camera is needed, got NoneType; .*load_camera"),
+        (lambda: StereoLocalizer(CAMERA), r"rig: StereoRig is needed, got Camera; .*solve_rig\(...\).ster"),
+        (lambda: kcal.save_camera("a.json", CAMERA), "save_camera: camera: Camera is needed, got str"),
+        (lambda: kcal.calibrate_camera("a.obs.json"), "observations: Observations is needed, got str; kcal.detect or"),
+        (lambda: kcal.solve_rig([CAMERA, CAMERA]), "solve_rig: data: RigData is needed, got list of Camera"),
+        (lambda: Origin(lat="19", lon=72.0, height=0.0), "Origin: lat: float is needed, got str"),
+        (lambda: Camera.build(focal=None, center=(1, 2), size=(3, 4)), r"build: focal: Sequence\[float\] .*got None"),
+        (lambda: Camera.build(focal=("a", 2), center=(1, 2), size=(3, 4)), "focal: .* got tuple of str, int"),
+        (lambda: Board(columns=1, rows=6, square=0.025), "Board: columns: .*greater than or equal to 2, got 1"),
+        (lambda: Board(columns=9, rows=6, square="25mm"), "Board: square: .*valid number.*got '25mm'"),
+        (lambda: View(name="a", pixels=[(1.0, np.inf)]), "View: pixels.0.1: .*finite.*got inf"),
+        (lambda: View(name="a", pixels=np.zeros((4, 3))), "View: pixels.0: .*at most 2"),
+        (lambda: Observations(board=BOARD, image_size=(9, 9), views=[View(name="a", pixels=[])]), "has 0 corners"),
+    ],
+)  # fmt: skip
+def test_a_slip_is_named(call: Callable[[], Any], message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        call()
+    assert caught.value.__cause__ is not None
+
+
+def test_what_is_no_slip_keeps_its_error() -> None:
+    def ours(camera: Camera) -> None:
+        raise KeyError("ours")
+
+    with pytest.raises(KeyError, match="ours"):
+        _naming_slips(ours)(CAMERA)
+    with pytest.raises(InputError, match="ours: camera: Camera is needed, got int"):
+        _naming_slips(ours)(3)
+    with pytest.raises(TypeError, match="missing 1 required positional argument: 'second'"):
+        camera_difference(CAMERA)  # type: ignore[call-arg]
+
+
+def test_functions_stay_what_they_are() -> None:
+    from kcal.calibrate.camera.calibrate import calibrate_camera
+
+    assert calibrate_camera is kcal.calibrate_camera
+    assert pickle.loads(pickle.dumps(kcal.detect)) is kcal.detect
+    turn = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
+    compiled = torch.compile(rotation_from_vector, fullgraph=True, backend="eager")
+    assert torch.equal(compiled(turn), rotation_from_vector(turn))
+
+
+@pytest.mark.parametrize(
+    ("value", "hint", "fits"),
+    [
+        (None, None, True), (1, float, True), (np.float32(1), float, True), ("1", float, False), (True, bool, True),
+        (1, int | None, True), (None, int | None, True), ("a", "a", True), ([1, 2.0], list[float], True),
+        ([1, "a"], list[float], False), ((1, 2), tuple[int, int], True), ((1, 2, 3), tuple[int, int], False),
+        ((1, 2, 3), tuple[int, ...], True), ({}, dict[str, int], True), ([], dict[str, int], False), (3, Any, True),
+    ],
+)  # fmt: skip
+def test_annotations(value: Any, hint: Any, fits: bool) -> None:
+    assert _fits(value, hint) == fits
+
+
+def test_corners_of_opencv_are_views() -> None:
+    corners = np.arange(18, dtype=np.float32).reshape(9, 1, 2)
+    corners[4] = np.nan
+    view = View(name="a", pixels=corners)
+    assert view.pixels[:2] == ((0.0, 1.0), (2.0, 3.0))
+    assert view.pixels[4] is None
+    assert View(name="a", pixels=torch.from_numpy(corners)) == view
+    seen = Observations(board=BOARD, image_size=(20, 20), views=[view])
+    assert np.array_equal(seen.pixels()[0], corners[:, 0], equal_nan=True)
+
+
+def test_squares_of_25_meters_are_doubted() -> None:
+    with pytest.warns(KcalWarning, match="25 is in meters; give 25 mm as square=0.025") as caught:
+        board = Board(columns=9, rows=6, square=25)
+    assert caught[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Board.of(board.record)
+        Board(columns=9, rows=6, square=1.0)
