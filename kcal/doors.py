@@ -113,7 +113,7 @@ def _slip(function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str,
     for name, value in given.arguments.items():
         word = function.__annotations__.get(name, "Any")
         try:
-            fits = _fits(value, eval(word, function.__globals__))
+            fits = _is_kind(value, eval(word, function.__globals__))
         except (NameError, AttributeError, TypeError):  # what only type checkers know
             continue
         if not fits and given.signature.parameters[name].kind not in (_MANY, _NAMED):
@@ -125,11 +125,11 @@ def _slip(function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str,
     return ""
 
 
-def _fits(value: Any, hint: Any) -> bool:
+def _is_kind(value: Any, hint: Any) -> bool:
     """Whether a value is what an annotation says, as far as that can be told."""
     origin, inside = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
-        return any(_fits(value, one) for one in inside)
+        return any(_is_kind(value, one) for one in inside)
     if origin is typing.Literal:
         return value in inside
     if hint is None or hint in (int, float):
@@ -141,5 +141,5 @@ def _fits(value: Any, hint: Any) -> bool:
         if not isinstance(value, kind) or (isinstance(value, str) and inside[:1] != (str,)):
             return False
         each = inside[:1] * len(value) if kind is not tuple or ... in inside else inside
-        return len(each) in (0, len(value)) and all(map(_fits, value, each))
+        return len(each) in (0, len(value)) and all(map(_is_kind, value, each))
     return isinstance(value, kind)

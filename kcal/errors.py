@@ -30,8 +30,15 @@ class KcalWarning(UserWarning):
 
 def warn_user(message: str) -> None:
     """Warn with a `KcalWarning` where the caller was called, unless by kcal, which means what it does."""
-    if not sys._getframe(2).f_globals.get("__name__", "").startswith("kcal."):
-        warnings.warn(message, KcalWarning, stacklevel=3)
+
+    def module(level: int) -> str:
+        return str(sys._getframe(level + 1).f_globals.get("__name__", ""))
+
+    level = 2
+    while module(level) == "kcal.doors":
+        level += 1
+    if not module(level).startswith("kcal."):
+        warnings.warn(message, KcalWarning, stacklevel=level + 1)
 
 
 @contextmanager

@@ -13,7 +13,7 @@ import torch
 
 import kcal
 from kcal import Board, Camera, InputError, KcalWarning, Observations, Origin, StereoLocalizer, View
-from kcal.doors import _fits, _naming_slips
+from kcal.doors import _is_kind, _naming_slips
 from kcal.lens import camera_difference, rotation_from_vector
 
 CAMERA = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480))
@@ -76,7 +76,7 @@ def test_functions_stay_what_they_are() -> None:
     ],
 )  # fmt: skip
 def test_annotations(value: Any, hint: Any, fits: bool) -> None:
-    assert _fits(value, hint) == fits
+    assert _is_kind(value, hint) == fits
 
 
 def test_corners_of_opencv_are_views() -> None:
