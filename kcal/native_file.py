@@ -29,7 +29,7 @@ def digest(content: Mapping[str, Any]) -> str:
 _DERIVED = "summary"
 
 
-def _from_array(value: Any) -> Any:
+def _array_as_lists(value: Any) -> Any:
     """An array or tensor as lists, with None for rows that contain NaN, and without OpenCV's middle axis of one."""
     rows = value.tolist() if hasattr(value, "tolist") else None
     if not isinstance(rows, list):
@@ -50,7 +50,7 @@ class Record(pydantic.BaseModel):
 
     def __init__(self, /, **data: Any) -> None:
         try:
-            super().__init__(**{name: _from_array(value) for name, value in data.items()})
+            super().__init__(**{name: _array_as_lists(value) for name, value in data.items()})
         except pydantic.ValidationError as error:
             found = error.errors(include_url=False)[0]
             got = f", got {found['input']!r:.60}" if not found["msg"].startswith("Value error") else ""
