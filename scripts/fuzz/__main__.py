@@ -15,6 +15,7 @@ a case that was mended goes into tests/fuzz/corpus/HARNESS.
 from __future__ import annotations
 
 import argparse
+import functools
 import re
 import sys
 import tempfile
@@ -22,7 +23,7 @@ import time
 from pathlib import Path
 
 from kcal.files import make_folder
-from scripts.fuzz.harnesses import HARNESSES
+from scripts.fuzz.harnesses import HARNESSES, prepared
 from scripts.fuzz.hunt import corpus, hunt, replay
 from scripts.fuzz.readers import missing
 
@@ -52,10 +53,11 @@ def main() -> None:
             print(f"{name}: left out, {package} is not installed", flush=True)
             continue
         with tempfile.TemporaryDirectory() as folder:
+            harness = functools.partial(prepared, name)
             if kept is not None:
-                found, count = replay(HARNESSES[name], Path(folder), kept[name]), len(kept[name])
+                found, count = replay(harness, Path(folder), kept[name]), len(kept[name])
             else:
-                found, count = hunt(HARNESSES[name], Path(folder), chosen.seed, 60.0 * chosen.minutes / len(names))
+                found, count = hunt(harness, Path(folder), chosen.seed, 60.0 * chosen.minutes / len(names))
         total += len(found)
         print(f"{name}: {count} cases, {len(found)} findings", flush=True)
         for number, finding in enumerate(found):

@@ -1,7 +1,7 @@
 """Run one harness in a child process with limits, on damage that Hypothesis draws, until the time is over.
 
 A harness makes its whole files and servers in a folder, and returns the strategy of its cases (bytes) and the check
-that raises if a case breaks an invariant. Hypothesis makes each finding as small as it can; one that is known already
+that raises if a case breaks an invariant. It can be pickled: a function of a module, or `functools.partial` of one. Hypothesis makes each finding as small as it can; one that is known already
 does not stop the search for others. What ends the child (a crash, a hang inside a library) is a finding as well.
 """
 
@@ -19,12 +19,14 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import NamedTuple
 
 import hypothesis
-import torch
 from hypothesis.strategies import SearchStrategy
+
+from scripts.shared.children import children
 
 # What one case may take: seconds that its process computes, and bytes beyond what the process has when it begins.
 SECONDS, MEMORY = 10, 2 * 2**30
@@ -97,17 +99,18 @@ def hunt(
 
 def replay(harness: Harness, folder: Path, cases: list[bytes]) -> list[Finding]:
     """Findings of cases that were kept, all in one child."""
+    work = functools.partial(_repeat, harness, folder, cases)
+    return list(_child(work, folder, SECONDS * (1 + len(cases)))[0].values())
 
-    def run(write: Write) -> int:
-        prepared = harness(folder)
-        for case in cases:
-            (folder / "now").write_bytes(case)
-            key, text = _outcome(prepared, case)
-            if key:
-                write(key, Finding(text, case))
-        return len(cases)
 
-    return list(_child(run, folder, SECONDS * (1 + len(cases)))[0].values())
+def _repeat(harness: Harness, folder: Path, cases: list[bytes], write: Write) -> int:
+    prepared = harness(folder)
+    for case in cases:
+        (folder / "now").write_bytes(case)
+        key, text = _outcome(prepared, case)
+        if key:
+            write(key, Finding(text, case))
+    return len(cases)
 
 
 def _search(
@@ -171,9 +174,8 @@ def _child(work: Callable[[Write], int], folder: Path, seconds: float) -> tuple[
     out, now = folder / "findings.jsonl", folder / "now"
     out.write_bytes(b"")
     now.write_bytes(b"")
-    child = os.fork()
-    if child == 0:
-        _be_child(work, folder, out)
+    child = children().Process(target=_be_child, args=(work, folder, out), daemon=True)
+    child.start()
     status = _waited(child, now, seconds)
     found, count = {}, 0
     for line in out.read_text().splitlines():
@@ -194,8 +196,6 @@ def _be_child(work: Callable[[Write], int], folder: Path, out: Path) -> None:
         for stream in (1, 2):
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
         limit_memory()
-        # Threads of the parent are not here, and what waits for them waits for ever.
-        torch.set_num_threads(1)
         os.chdir(folder)
         with open(out, "a") as file:
 
@@ -212,20 +212,17 @@ def _be_child(work: Callable[[Write], int], folder: Path, out: Path) -> None:
         os._exit(code)
 
 
-def _waited(child: int, now: Path, seconds: float) -> str:
+def _waited(child: BaseProcess, now: Path, seconds: float) -> str:
     """How the child ended, "" if by itself; one that hangs inside a library is ended."""
     until = time.monotonic() + seconds + _STUCK
-    while True:
-        done, status = os.waitpid(child, os.WNOHANG)
-        if done:
-            code = os.waitstatus_to_exitcode(status)
-            return "" if code == 0 else f"code {code}"
+    while child.exitcode is None:
+        child.join(1.0)
         stuck = time.time() - now.stat().st_mtime > _STUCK and now.stat().st_size
-        if stuck or time.monotonic() > until:
-            os.kill(child, signal.SIGKILL)
-            os.waitpid(child, 0)
+        if child.exitcode is None and (stuck or time.monotonic() > until):
+            child.kill()
+            child.join()
             return f"a hang of more than {_STUCK} s"
-        time.sleep(0.05)
+    return f"code {child.exitcode}" if child.exitcode else ""
 
 
 def limit_memory(most: int = MEMORY) -> None:

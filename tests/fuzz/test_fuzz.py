@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import os
 import re
@@ -36,10 +37,7 @@ GROUPS = 6
 
 
 def counts(names: list[str], *options: str) -> dict[str, int]:
-    """Cases that were run of each harness that can run here; a finding fails.
-
-    In a process of its own: the children are forked, and other tests have left threads in this one.
-    """
+    """Cases that were run of each harness that can run here, as the command runs them; a finding fails."""
     there = [name for name in names if not missing(name)]
     command = [sys.executable, "-m", "scripts.fuzz", *options, *names]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
@@ -114,24 +112,25 @@ def rounded(found: torch.Tensor, path: Path) -> None:
     path.write_text(f"{min(float(found), 20.0)}")
 
 
-@pytest.mark.parametrize(
-    ("reader", "what"),
-    [
-        (Reader(lambda path: float(path.read_text()), ".txt", whole_text("15")), "ValueError"),
-        (Reader(first, ".txt", whole_text("15")), "AssertionError: (NaN|infinite): "),
-        (Reader(first, ".txt", whole_text("15"), rounded, infinite=("",), unknown=("",)), "saved and loaded:  differs"),
-        (Reader(nameless, ".txt", whole_text("15"), infinite=("",), unknown=("",)), "names no file"),
-        (Reader(crash, ".txt", whole_text("15"), infinite=("",), unknown=("",)), "ended with code -9"),
-        (Reader(hang, ".txt", whole_text("15"), infinite=("",), unknown=("",)), "longer than its limit"),
-        (Reader(hungry, ".txt", whole_text("15"), infinite=("",), unknown=("",)), "MemoryError"),
-    ],
-    ids=["traceback", "silent number", "saving", "name", "crash", "hang", "memory"],
-)
-def test_what_is_planted_is_found(reader: Reader, what: str, tmp_path: Path) -> None:
-    def harness(folder: Path) -> hunt.Prepared:
-        return reader.prepared(folder)._replace(seconds=0.3 if reader.read is hang else 60.0)
+PLANTED = {
+    "traceback": (Reader(lambda path: float(path.read_text()), ".txt", whole_text("15")), "ValueError"),
+    "silent number": (Reader(first, ".txt", whole_text("15")), "AssertionError: (NaN|infinite): "),
+    "saving": (Reader(first, ".txt", whole_text("15"), rounded, infinite=("",), unknown=("",)), "saved and loaded:  differs"),
+    "name": (Reader(nameless, ".txt", whole_text("15"), infinite=("",), unknown=("",)), "names no file"),
+    "crash": (Reader(crash, ".txt", whole_text("15"), infinite=("",), unknown=("",)), "ended with code -9"),
+    "hang": (Reader(hang, ".txt", whole_text("15"), infinite=("",), unknown=("",)), "longer than its limit"),
+    "memory": (Reader(hungry, ".txt", whole_text("15"), infinite=("",), unknown=("",)), "MemoryError"),
+}
 
+
+def planted(name: str, folder: Path) -> hunt.Prepared:
+    return PLANTED[name][0].prepared(folder)._replace(seconds=0.3 if name == "hang" else 60.0)
+
+
+@pytest.mark.parametrize("name", PLANTED)
+def test_what_is_planted_is_found(name: str, tmp_path: Path) -> None:
+    harness = functools.partial(planted, name)
     found, _ = hunt.hunt(harness, tmp_path, 1, 600.0, most=1)
-    assert re.search(what, found[0].what), found
+    assert re.search(PLANTED[name][1], found[0].what), found
     assert hunt.replay(harness, tmp_path, [found[0].case])
     assert hunt.replay(harness, tmp_path, [b"15"]) == []
