@@ -3,7 +3,7 @@
 Mistakes (`scripts/check/mutations.py`) are drawn at random and planted one at a time in memory; no file is changed. For
 each, those tests of the room's own folder run that execute its lines (`coverage` knows), the quickest first, until one
 fails, without the slow ones. What nobody noticed so far also meets the tests that came too late in a long file to be
-observed. A line that no test executes is not noticed. Each mistake costs a forked process that has kcal loaded.
+observed. A line that no test executes is not noticed. Each mistake costs a process that begins with kcal loaded.
 
     python -m scripts.check.mutants [ROOM ...] [--sample 8] [--seed 1] [--seconds 3600] [--budget 30] [--write]
 
@@ -22,7 +22,6 @@ from __future__ import annotations
 import argparse
 import ast
 import hashlib
-import importlib
 import importlib.machinery
 import inspect
 import json
@@ -38,7 +37,7 @@ import pytest
 
 from scripts.check.harmless import HARMLESS
 from scripts.check.mutations import Site, sites
-from scripts.check.traced_tests import FILE, ROOT, First, forked, observed, run_tests
+from scripts.check.traced_tests import FILE, ROOT, First, apart, observed, run_tests
 from scripts.shared.page import read_section, table, write_section
 
 STATE = ROOT / ".mutants"
@@ -49,7 +48,7 @@ ROOMS = (
     "calibrate/batch", "nets", "locate", "stars", "scene", "report", "mark", "capture", "web", "pipeline", "cli", "sim",
     TOP,
 )  # fmt: skip
-# Loaded once, before anything is forked.
+# Loaded once, in the server of the processes.
 LIBRARIES = ("torch", "kornia", "scipy.stats", "scipy.spatial", "skimage", "cv2", "hypothesis", "matplotlib.pyplot")
 # A mistake that makes tests so much slower is noticed, or after so many seconds of processor time.
 SLOWER, AT_LEAST = 3.0, 10.0
@@ -100,6 +99,11 @@ def with_mistake(path: str, number: int, tests: list[str]) -> str:
     return first.name or f"pytest ended with {code}" if code and not missing else ""
 
 
+def loaded() -> list[str]:
+    """Modules with which a process begins."""
+    return [*LIBRARIES, *(module.name for module in pkgutil.walk_packages([str(ROOT / "kcal")], "kcal."))]
+
+
 def modules(room: str) -> list[Path]:
     folder = ROOT / "kcal" / ("" if room == TOP else room)
     return [path for path in sorted(folder.glob("*.py")) if path.name != "__init__.py"]
@@ -119,7 +123,7 @@ def observe(room: str, stop: float) -> list[dict]:
         if known.get("digest") != digest:
             known = {}
         if not known and time.monotonic() < stop:
-            answer = forked(lambda name=name: observed(name), 3 * FILE)  # type: ignore[misc]
+            answer = apart(observed, name, seconds=3 * FILE, loaded=loaded())
             known = {
                 "digest": digest,
                 **(answer if isinstance(answer, dict) else {"seconds": {}, "lines": {}, "unseen": []}),
@@ -192,10 +196,11 @@ def rows_of_page() -> dict[str, tuple[str, ...]]:
 def judge(files: list[dict], path: str, number: int, site: Site, budget: float, seed: int) -> None:
     """Plant one mistake and run tests."""
     tests, left, seconds, unseen = chosen(files, path, site, budget)
-    by = forked(lambda: with_mistake(path, number, tests), AT_LEAST + SLOWER * seconds) if tests else ""
+    limit = AT_LEAST + SLOWER * seconds
+    by = apart(with_mistake, path, number, tests, seconds=limit, loaded=loaded()) if tests else ""
     if unseen and not by:
         # What they take is not known: to take long is no notice.
-        late = forked(lambda: with_mistake(path, number, unseen), AT_LEAST + budget)
+        late = apart(with_mistake, path, number, unseen, seconds=AT_LEAST + budget, loaded=loaded())
         by, left = ("", left + len(unseen)) if late == "too slow" else (late, left)
     entry = {
         "key": site.key,
@@ -317,10 +322,6 @@ def main() -> None:
         print(times(arguments.rooms))
         return
     STATE.mkdir(exist_ok=True)
-    for library in LIBRARIES:
-        importlib.import_module(library)
-    for module in pkgutil.walk_packages([str(ROOT / "kcal")], "kcal."):
-        importlib.import_module(module.name)
     stop = time.monotonic() + arguments.seconds
     for room in arguments.rooms:
         files, kept = observe(room, stop), results()

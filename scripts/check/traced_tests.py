@@ -10,12 +10,14 @@ import resource
 import signal
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import coverage
 import pytest
+
+from scripts.shared.children import children
 
 ROOT = Path(__file__).parents[2]
 # Seconds of the clock for each of processor time: on a busy machine.
@@ -25,35 +27,36 @@ MEMORY = 6 << 30
 FILE = 8.0
 
 
-def forked(work: Callable[[], object], seconds: float) -> Any:
-    """What `work` returns in a process of its own, or "too slow" or "crash"; seconds of processor time."""
+def apart(work: Callable[..., object], *arguments: object, seconds: float, loaded: Sequence[str]) -> Any:
+    """What `work` returns in a process of its own, or "too slow" or "crash"; seconds of processor time.
+
+    The process begins with the modules of `loaded`.
+    """
     with tempfile.TemporaryDirectory() as folder:
         answer = Path(folder, "answer.json")
-        pid = os.fork()
-        if pid == 0:
-            os.setpgid(0, 0)
-            used = math.ceil(time.process_time() + seconds)
-            resource.setrlimit(resource.RLIMIT_CPU, (used, used + 5))
-            resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
-            silence = os.open(os.devnull, os.O_RDWR)
-            for stream in (0, 1, 2):
-                os.dup2(silence, stream)
-            with contextlib.suppress(BaseException):
-                answer.write_text(json.dumps(work()))
-            os._exit(0)
-        end, status = time.monotonic() + CLOCK * seconds, None
-        while status is None and time.monotonic() < end:
-            done, code = os.waitpid(pid, os.WNOHANG)
-            status = code if done else None
-            time.sleep(0.02)
+        child = children(*loaded).Process(target=_write_answer, args=(answer, seconds, work, *arguments))
+        child.start()
+        child.join(CLOCK * seconds)
+        late, code = child.exitcode is None, child.exitcode
         with contextlib.suppress(ProcessLookupError):
-            os.killpg(pid, signal.SIGKILL)
-        if status is None:
-            os.waitpid(pid, 0)
+            os.killpg(child.pid or 0, signal.SIGKILL)
+        child.join()
         if answer.exists():
             return json.loads(answer.read_text())
-        slow = status is None or (os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGXCPU)
-        return "too slow" if slow else "crash"
+        return "too slow" if late or code == -signal.SIGXCPU else "crash"
+
+
+def _write_answer(answer: Path, seconds: float, work: Callable[..., object], *arguments: object) -> None:
+    os.setpgid(0, 0)
+    used = math.ceil(time.process_time() + seconds)
+    resource.setrlimit(resource.RLIMIT_CPU, (used, used + 5))
+    resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
+    silence = os.open(os.devnull, os.O_RDWR)
+    for stream in (0, 1, 2):
+        os.dup2(silence, stream)
+    with contextlib.suppress(BaseException):
+        answer.write_text(json.dumps(work(*arguments)))
+    os._exit(0)
 
 
 class Lines:

@@ -28,7 +28,7 @@ from scripts.fuzz.hunt import corpus, hunt, replay
 from scripts.fuzz.readers import missing
 
 
-def main() -> None:
+def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("harness", nargs="*", metavar="HARNESS", help="all if none is named")
     parser.add_argument("--minutes", type=float, default=5.0, help="for all harnesses together")
@@ -36,7 +36,7 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="for the smallest case of each finding")
     parser.add_argument("--replay", type=Path, metavar="FOLDER", help="run the cases that are kept there, once")
     parser.add_argument("--list", action="store_true", help="print the names of all harnesses")
-    chosen = parser.parse_args()
+    chosen = parser.parse_args(arguments)
     names = chosen.harness or list(HARNESSES)
     if unknown := [name for name in names if name not in HARNESSES]:
         parser.error(f"no harness is named {unknown[0]!r}; --list shows them")
@@ -66,7 +66,7 @@ def main() -> None:
                 place = make_folder(chosen.keep / name)
                 label = re.sub(r"\W+", "-", finding.what.splitlines()[-1])[:40]
                 (place / f"{chosen.seed}-{number}-{label}").write_bytes(finding.case)
-    sys.exit(bool(total))
+    sys.exit(int(bool(total)))
 
 
 if __name__ == "__main__":

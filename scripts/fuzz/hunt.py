@@ -1,8 +1,9 @@
 """Run one harness in a child process with limits, on damage that Hypothesis draws, until the time is over.
 
 A harness makes its whole files and servers in a folder, and returns the strategy of its cases (bytes) and the check
-that raises if a case breaks an invariant. It can be pickled: a function of a module, or `functools.partial` of one. Hypothesis makes each finding as small as it can; one that is known already
-does not stop the search for others. What ends the child (a crash, a hang inside a library) is a finding as well.
+that raises if a case breaks an invariant. It can be pickled: a function of a module, or `functools.partial` of one.
+Hypothesis makes each finding as small as it can; one that is known already does not stop the search for others. What
+ends the child (a crash, a hang inside a library) is a finding as well.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from unittest import mock
 def children(*imported: str) -> ForkServerContext:
     """Start children here; the first call of a process decides which modules these have imported already."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(list(imported or ("scripts.fuzz.harnesses",)))
+    context.set_forkserver_preload(list(imported or ("scripts.fuzz.harnesses", "pytest")))
     alone = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
     with mock.patch.dict(os.environ, alone):
         forkserver.ensure_running()

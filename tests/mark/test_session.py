@@ -2,10 +2,13 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import itertools
+import multiprocessing
 import os
 import random
-import signal
+import sys
 import time
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import pytest
@@ -16,6 +19,7 @@ from kcal.locate.marks import Marks, read_marks, write_marks
 from kcal.locate.survey import match_landmarks, read_survey
 from kcal.mark.items import Add, Drop, Mark, Place, Put, Rename, Side, Step, SurveyPlace, Take
 from kcal.mark.session import Session, pair_covariance
+from scripts.shared.children import children
 
 SURVEY = "name,lat,lon,height,sigma\npost,40.1,-113.9,1282,0.02\nroof,40.2,-113.8,1290,0.02\n"
 
@@ -280,7 +284,7 @@ def test_tables_that_a_full_disk_did_not_take_are_written_later(
     assert read_marks(session.files.marks, single=True).left[0].tolist() == [2.0, 1.0]
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="the limit is one of POSIX")
+@pytest.mark.skipif(sys.platform == "win32", reason="the limit is one of POSIX")
 def test_a_limit_of_the_system_is_a_full_disk(tmp_path: Path, survey: Path) -> None:
     """As with `ulimit -f`: the kernel writes a part of a line and refuses the rest."""
     import resource
@@ -337,32 +341,33 @@ def test_names_places_and_removals(tmp_path: Path, survey: Path) -> None:
         session.do(Drop(do="drop", name="truck"), "key-0011")
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked")
+def mark_for_ever(path: Path, turn: int, answered: Connection) -> None:
+    session = Session(path)
+    for number in itertools.count():
+        name = f"{turn}-{number}"
+        session.do(Add(do="add", name=name, kind="target"), f"add-{name}")
+        session.do(put(name, "left", mark(number, 1.0)), f"left-{name}")
+        session.do(put(name, "right", mark(number, 2.0)), f"right-{name}")
+        answered.send_bytes(name.encode())
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="children are of POSIX")
 def test_what_was_answered_survives_a_kill_at_any_moment(tmp_path: Path) -> None:
     """A child marks as fast as it can and tells what was answered; it is killed ten times, also within a write."""
     moments, answered = random.Random(0), []
     for turn in range(10):
-        reading, writing = os.pipe()
-        child = os.fork()
-        if child == 0:
-            with contextlib.suppress(BaseException):
-                session = Session(tmp_path / "marks.csv")
-                for number in range(10_000):
-                    name = f"{turn}-{number}"
-                    session.do(Add(do="add", name=name, kind="target"), f"add-{name}")
-                    session.do(put(name, "left", mark(number, 1.0)), f"left-{name}")
-                    session.do(put(name, "right", mark(number, 2.0)), f"right-{name}")
-                    os.write(writing, f"{name}\n".encode())
-            os._exit(0)
-        os.close(writing)
-        told = os.read(reading, 4096)
+        reading, writing = multiprocessing.Pipe(duplex=False)
+        child = children().Process(target=mark_for_ever, args=(tmp_path / "marks.csv", turn, writing))
+        child.start()
+        writing.close()
+        answered.append(reading.recv_bytes().decode())
         time.sleep(moments.uniform(0.0, 0.1))
-        os.kill(child, signal.SIGKILL)
-        os.waitpid(child, 0)
-        while part := os.read(reading, 4096):
-            told += part
-        os.close(reading)
-        answered += told.decode().split()
+        child.kill()
+        child.join()
+        with contextlib.suppress(EOFError):
+            while True:
+                answered.append(reading.recv_bytes().decode())
+        reading.close()
         session = Session(tmp_path / "marks.csv")
         points = read_marks(session.files.points)
         session.close()

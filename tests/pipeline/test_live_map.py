@@ -30,6 +30,7 @@ from kcal.pipeline.live_map import LiveMap
 from kcal.pipeline.track_columns import track_columns
 from kcal.pipeline.track_options import TrackOptions
 from kcal.pipeline.tracks import Tracker
+from scripts.shared.children import children
 
 SITE = tracked_site()
 
@@ -186,7 +187,7 @@ def serve(answer: Any) -> None:
 @needs_browser
 def test_a_lost_connection_is_not_an_end() -> None:
     here, there = multiprocessing.Pipe()
-    process = multiprocessing.get_context("fork").Process(target=serve, args=(there,), daemon=True)
+    process = children().Process(target=serve, args=(there,), daemon=True)
     process.start()
     with chromium_page() as tab:
         tab.goto(here.recv())

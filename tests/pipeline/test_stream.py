@@ -24,6 +24,7 @@ from ports import deaf_port
 from track_scenes import seen_by, tracked_site
 from waiting import PATIENCE
 
+import kcal.pipeline.stream
 from kcal.errors import FileError, InputError
 from kcal.locate.positions import located_by
 from kcal.locate.tabulate import Locator
@@ -34,6 +35,7 @@ from kcal.pipeline.shared_errors import ClockPrior
 from kcal.pipeline.stream import SourceItem, Stream, lines_of
 from kcal.pipeline.stream_journal import Ledger
 from kcal.pipeline.tracks import Tracker
+from scripts.shared.children import children
 
 SITE = tracked_site(0.002)
 
@@ -126,25 +128,23 @@ def kill_after(lines: int) -> None:
     sys.settrace(count)
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="kills a process")
-def test_killed_at_any_time_the_outputs_are_the_same(
-    whole: tuple[Path, dict[str, bytes]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def follow_until(lines: int, source: Path, folder: Path) -> None:
+    """Follow a stream with few moments in a checkpoint, and be killed after so many lines of code; 0 for never."""
+    kcal.pipeline.stream._CHECKPOINT = 9
+    if lines:
+        kill_after(lines)
+    new_stream(folder).follow(lines_of(source, read), waits=True, resumes=True)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="kills a process")
+def test_killed_at_any_time_the_outputs_are_the_same(whole: tuple[Path, dict[str, bytes]], tmp_path: Path) -> None:
     """At any line of what writes: six times early, so that there is always more to do, and then not any more."""
-    monkeypatch.setattr("kcal.pipeline.stream._CHECKPOINT", 9)
     chance = random.Random(1)
     for lines in [*(chance.randrange(50, 800) for _ in range(6)), 0]:
-        child = os.fork()
-        if child == 0:
-            try:
-                if lines:
-                    kill_after(lines)
-                new_stream(tmp_path).follow(lines_of(whole[0], read), waits=True, resumes=True)
-                os._exit(0)
-            except BaseException:
-                os._exit(3)
-        ended = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-        assert ended == (-signal.SIGKILL if lines else 0)
+        child = children().Process(target=follow_until, args=(lines, whole[0], tmp_path))
+        child.start()
+        child.join()
+        assert child.exitcode == (-signal.SIGKILL if lines else 0)
     assert contents(tmp_path) == whole[1]
 
 
