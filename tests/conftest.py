@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 
 import hypothesis
 import numpy as np
 import pytest
 import torch
+from waiting import Watch
 
 # The same examples each time: a failure belongs to the change that is tested. Time is not what is tested.
 hypothesis.settings.register_profile(
     "kcal", derandomize=True, deadline=None, print_blob=True, suppress_health_check=[hypothesis.HealthCheck.too_slow]
 )
 hypothesis.settings.load_profile("kcal")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """No test waits for more than a minute."""
+    if sys.platform == "linux":
+        config.pluginmanager.register(Watch(float(os.environ.get("KCAL_WAIT", "60"))))
 
 
 @pytest.hookimpl(tryfirst=True)

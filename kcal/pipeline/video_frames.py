@@ -39,11 +39,11 @@ class TimedFrame(NamedTuple):
 
     def colors(self) -> NDArray[np.uint8]:
         """(H, W, 3) red, green and blue."""
-        return np.asarray(self.picture.to_ndarray(format="rgb24"), np.uint8)
+        return np.asarray(self.picture.to_ndarray(format="rgb24", threads=1), np.uint8)
 
     def gray(self) -> Tensor:
         """(H, W) uint8 gray levels."""
-        return torch.from_numpy(self.picture.to_ndarray(format="gray"))
+        return torch.from_numpy(self.picture.to_ndarray(format="gray", threads=1))
 
 
 def check_size(frame: av.VideoFrame | VideoStream, size: tuple[int, int], name: str) -> None:
@@ -128,6 +128,9 @@ def _wound(
 def open_video(address: str, name: str, **options: str) -> InputContainer:
     """Open a file or address; `name` stands for it in messages, because an address may have a password.
 
+    The decoder has no threads of its own. Closing a video would wait for them, forever in a process that was forked
+    meanwhile, such as a worker of a `DataLoader`: threads are not there.
+
     Raises:
         FileError: it cannot be opened, or has no video.
     """
@@ -138,6 +141,7 @@ def open_video(address: str, name: str, **options: str) -> InputContainer:
     if not container.streams.video:
         container.close()
         raise FileError(f"{name}: no video in it")
+    container.streams.video[0].codec_context.thread_count = 1
     return container
 
 
