@@ -50,14 +50,16 @@ class Watch:
         signal.signal(signal.SIGUSR2, self._end)
         threading.Thread(target=self._look, daemon=True).start()
 
-    @pytest.hookimpl(wrapper=True)
-    def pytest_runtest_protocol(self, item: pytest.Item) -> Generator[None, object, object]:
-        """Name the test that runs."""
+    @pytest.hookimpl(wrapper=True, tryfirst=True)
+    def pytest_runtest_call(self, item: pytest.Item) -> Generator[None, object, object]:
+        """Name what runs; pytest reports an error that is raised meanwhile."""
         self.test = item.nodeid
         try:
             return (yield)
         finally:
             self.test = ""
+
+    pytest_runtest_setup = pytest_runtest_teardown = pytest_runtest_call
 
     def _look(self) -> None:
         test, since, before = "", time.monotonic(), 0.0
