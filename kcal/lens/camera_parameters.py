@@ -100,6 +100,15 @@ class LensParameters(Float64Module):
         self.params.requires_grad_(True)
         return self
 
+    def attached(self, parameters: Tensor) -> Self:
+        """Put parameters of autograd's graph in place of equal ones. Return the camera itself.
+
+        They are a buffer then, of the same name in `state_dict`.
+        """
+        del self.params
+        self.register_buffer("params", parameters)
+        return self
+
     @property
     def coefficients(self) -> Tensor:
         """(..., P) lens coefficients in the order of `model.names`."""

@@ -32,7 +32,7 @@ _CORNER_SIGMA = 0.2
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CalibratedViews:
-    """A camera and the poses of its boards, as tensors of autograd's graph.
+    """A camera and the poses of its boards, as tensors of autograd's graph, on the device of the corners.
 
     Args:
         parameters: (5 + P,) fx, fy, cx, cy, skew, coefficients.
@@ -68,14 +68,26 @@ class CalibratedViews:
         pixels = torch.where(seen.regular[..., None, :], seen.pixels, 0.0)
         return pixels.transpose(-1, -2), seen.regular
 
-    def camera(self) -> Camera:
-        """The camera, out of the graph."""
-        return Camera(self.parameters.detach(), size=self.size, model=self.model)
+    def camera(self, *, differentiable: bool = False) -> Camera:
+        """The camera; `differentiable`: in the graph, so that what is computed with it has gradients by the corners.
+
+        A differentiable camera has its parameters as a buffer: it is no leaf, so that an optimizer does not move it and
+        `deepcopy` refuses it.
+        """
+        camera = Camera(self.parameters.detach(), size=self.size, model=self.model)
+        return camera.attached(self.parameters) if differentiable else camera
+
+    def to(self, device: torch.device | str) -> CalibratedViews:
+        """The same on another device; `fit` and `hybrid`, from which a next calibration starts, stay on the CPU."""
+        moved = {each.name: getattr(self, each.name) for each in dataclasses.fields(self)}
+        return CalibratedViews(**{
+            name: value.to(device) if isinstance(value, Tensor) else value for name, value in moved.items()
+        })  # fmt: skip
 
     def state(self) -> BoardState:
         """As a state of `BoardProblem`, out of the graph."""
         pose = self.cam_from_board_rotation, self.cam_from_board_translation
-        return map_state(torch.detach, BoardState.still(self.parameters, self.board_warp, *pose))
+        return map_state(lambda part: part.detach().cpu(), BoardState.still(self.parameters, self.board_warp, *pose))
 
 
 def calibrate_views(
@@ -104,6 +116,9 @@ def calibrate_views(
     and memory grow linearly with the views, and nothing is computed before a gradient is requested.
     "unroll" records eight Gauss-Newton steps at the solution: nearly the same derivatives, and of any order. "none"
     carries no gradient.
+
+    The work is done on the CPU, whose small, dense systems are no work for a GPU; what is found, and the gradients, are
+    on the device of the corners.
 
     Args:
         pixels: (V, N, 2) corners; NaN where not seen.
@@ -142,11 +157,12 @@ def calibrate_views(
         [1.0, 0.0]
     """
     options = options or CalibrationOptions()
-    pixels, board_points, means = _checked(pixels, board_points, options, mask, prior_means, corner_sigma, backward)
+    checked = _checked(pixels, board_points, options, mask, prior_means, corner_sigma, backward)
+    device, (pixels, board_points, means) = pixels.device, (tensor.cpu() for tensor in checked)
     if start is not None and (start.hybrid is not None) != options.hybrid:
         raise InputError("calibrate_views: the start is of another lens model")
     if options.hybrid:
-        return _default_views(pixels, board_points, size, options, start, backward)
+        return _default_views(pixels, board_points, size, options, start, backward).to(device)
     sigma = _CORNER_SIGMA if corner_sigma is None else corner_sigma
     constraints = options.constraints(size)
     known = [parameter_names(options.lens).index(name) for name in options.priors]
@@ -184,7 +200,7 @@ def calibrate_views(
         model=options.lens,
         size=size,
         reach=reach,
-    )
+    ).to(device)
 
 
 def _default_views(
@@ -315,7 +331,7 @@ def _checked(
             raise InputError("calibrate_views: the mask includes corners that are not finite")
         pixels = torch.where(mask[..., None], pixels, torch.nan)
     if prior_means is None:
-        prior_means = torch.tensor([mean for mean, _ in options.priors.values()], dtype=torch.float64)
+        prior_means = pixels.new_tensor([mean for mean, _ in options.priors.values()])
     elif prior_means.shape != (len(options.priors),):
         raise InputError(
             f"calibrate_views: {len(options.priors)} prior means are needed, got shape {tuple(prior_means.shape)}"
