@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils import _pytree as pytree
+from torch.utils._mode_utils import no_dispatch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 # The only device without hardware for which autograd has a guard.
@@ -91,7 +92,11 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
         for value in tensors:
             if not isinstance(value, _There) and value.ndim:
                 raise RuntimeError(f"{func}: a tensor of the CPU of shape {tuple(value.shape)} meets one of the device")
-    assert all(isinstance(value, _There) or value.device != DEVICE for value in tensors), f"{func}: values were lost"
+    lost = any(not isinstance(value, _There) and value.device == DEVICE for value in tensors)
+    assert not (there and lost), f"{func}: values were lost"
+    # What autograd infers of the shapes of its zeros, on the device whose name is borrowed here.
+    if lost or func.overloadpacket is _aten.to:
+        return func(*args, **kwargs)
     there = there if wanted is None else torch.device(wanted) == DEVICE
     if func is _aten.copy_.default:
         there = isinstance(args[0], _There)
@@ -103,5 +108,8 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     out = func(*inner[0], **inner[1])
     if not there:
         return out
+    if torch.Tag.inplace_view in func.tags:
+        with no_dispatch():
+            return func(*args, **kwargs)  # the shape of the wrapper itself
     owner = {id(value.here): value for value in tensors if isinstance(value, _There)}
     return pytree.tree_map_only(Tensor, lambda value: owner[id(value)] if id(value) in owner else _There(value), out)
