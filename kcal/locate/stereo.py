@@ -54,7 +54,7 @@ def checked_rig(rig: StereoRig, pixel_sigma: float) -> float:
     if not 1e-6 <= pixel_sigma <= 1e6:
         # Beyond, squares of it leave the range of float64, or the accuracy of the arithmetic.
         raise InputError(f"pixel_sigma: a positive number of pixels, 1e-6 to 1e6, is needed, got {pixel_sigma}")
-    if not float(rig.baseline) > 0:
+    if not float(rig.baseline.detach()) > 0:
         raise DegenerateError("the rig's cameras stand in the same place: no range can be measured")
     return float(pixel_sigma)
 

@@ -294,7 +294,7 @@ def association_costs(
 
 
 def _nearest(rig: StereoRig, options: AssociationOptions) -> float:
-    return options.nearest if options.nearest is not None else 10.0 * float(rig.baseline)
+    return options.nearest if options.nearest is not None else 10.0 * float(rig.baseline.detach())
 
 
 def appearance(left: Tensor, boxes_left: Tensor, right: Tensor, boxes_right: Tensor) -> Tensor:

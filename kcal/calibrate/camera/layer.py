@@ -79,10 +79,9 @@ class CalibratedViews:
 
     def to(self, device: torch.device | str) -> CalibratedViews:
         """The same on another device; `fit` and `hybrid`, from which a next calibration starts, stay on the CPU."""
-        moved = {each.name: getattr(self, each.name) for each in dataclasses.fields(self)}
-        return CalibratedViews(**{
-            name: value.to(device) if isinstance(value, Tensor) else value for name, value in moved.items()
-        })  # fmt: skip
+        own = {each.name: getattr(self, each.name) for each in dataclasses.fields(self)}
+        moved: dict[str, Any] = {name: value.to(device) for name, value in own.items() if isinstance(value, Tensor)}
+        return dataclasses.replace(self, **moved)
 
     def state(self) -> BoardState:
         """As a state of `BoardProblem`, out of the graph."""
