@@ -17,6 +17,7 @@ import pydantic
 from kcal.errors import FileError, InputError, warn_user
 from kcal.files import dump_json, read_bytes, write_atomic
 from kcal.strict_json import MOST_BYTES, read_json
+from kcal.texts import brief
 
 
 def digest(content: Mapping[str, Any]) -> str:
@@ -44,6 +45,8 @@ class Record(pydantic.BaseModel):
     `_LATER`: fields that a version of the format got after files of it had been written, with the value that stands for
     "not said". A field that has this value is left out, so that an older kcal reads the file.
     """
+
+    __repr__ = brief
 
     model_config = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
     _LATER: ClassVar[Mapping[str, Any]] = {}

@@ -8,13 +8,15 @@ mathematics.
 from __future__ import annotations
 
 import base64
+import dataclasses
 import datetime
 import hashlib
 import html
 import json
 import math
 import re
-from collections.abc import Iterable
+import textwrap
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 # Control characters but tab and line feed (an escape sequence begins with U+001B or U+009B), separators of lines,
@@ -134,3 +136,50 @@ def page_policy(*, scripts: Iterable[str] = (), styles: Iterable[str] = (), imag
         "default-src 'none'; base-uri 'none'; form-action 'none'; "
         f"script-src {hashes(scripts)}; style-src {hashes(styles)}; img-src {images}"
     )
+
+
+def brief(record: Any, **said: str) -> str:
+    """The `repr` of a record in three lines at most: numbers and words first, then shapes of tensors and counts.
+
+    Args:
+        record: a dataclass, a named tuple or a pydantic model. Fields that are None, empty or as by default are left
+            out.
+        said: words in place of fields.
+
+    Example:
+        >>> import numpy as np
+        >>> from kcal.corners import Detection
+        >>> brief(Detection(np.zeros((54, 2)), reason="blurred"))
+        "Detection(reason='blurred', pixels=(54, 2))"
+    """
+    kind = type(record)
+    if dataclasses.is_dataclass(record):
+        defaults = {field.name: field.default for field in dataclasses.fields(record) if field.repr}
+    else:
+        fields = getattr(kind, "model_fields", None) or dict.fromkeys(record._fields)
+        defaults = {name: getattr(field, "default", None) for name, field in fields.items()}
+    plain: list[str] = []
+    rest: list[str] = []
+    for name, default in defaults.items():
+        value = getattr(record, name)
+        is_plain = isinstance(value, str | int | float)
+        text = said.get(name) or f"{name}={_brief_value(value)}"
+        if not (value is None or name.startswith("_") or text.endswith("=") or (is_plain and value == default)):
+            (plain if is_plain or name in said else rest).append(text)
+    text = f"{kind.__name__}({', '.join([*plain, *rest])})"
+    return "\n".join(textwrap.wrap(text, 116, subsequent_indent="  ", max_lines=3, placeholder=" ...)"))
+
+
+def _brief_value(value: Any) -> str:
+    if (shape := getattr(value, "shape", None)) is not None:
+        return _brief_value(value.tolist()) if shape in ((), (2,), (3,), (4,)) else f"{tuple(shape)}"
+    if isinstance(value, float) or hasattr(value, "name"):
+        return f"{value:.6g}" if isinstance(value, float) else str(value.name)
+    if isinstance(value, list | tuple) and not hasattr(value, "_fields"):
+        if len(value) <= 4 and all(isinstance(one, str | int | float | None) for one in value):
+            return f"({', '.join(map(_brief_value, value))})" if value else ""
+        return f"{len(value)} {type(value[0]).__name__}"
+    if isinstance(value, Mapping):
+        return f"{len(value)} entries" if value else ""
+    text = repr(value)
+    return text if len(text) <= 100 else f"{type(value).__name__}(...)"

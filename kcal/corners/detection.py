@@ -8,6 +8,7 @@ from typing import NamedTuple
 from torch import Tensor
 
 from kcal.corners.saddle import CornerStatus, Refined
+from kcal.texts import brief
 
 _STATUS_TEXTS = {
     CornerStatus.OUTSIDE: "too near the image's edge",
@@ -46,6 +47,9 @@ class Detection(NamedTuple):
     covariance: Tensor | None = None
     legacy: bool | None = None
     rejected: Tensor | None = None
+
+    def __repr__(self) -> str:
+        return brief(self)
 
 
 def too_few(refined: Refined, found: int) -> str:

@@ -24,6 +24,7 @@ from kcal.corners.patch_windows import ImageWindows, grid_of, has_samples, image
 from kcal.corners.shift_fit import fit_shifts
 from kcal.errors import InputError
 from kcal.lens.rig import StereoRig
+from kcal.texts import brief
 
 _SPACING = 0.5  # pixels between the places tried on the line
 _MAX_PLACES = 4000
@@ -61,6 +62,9 @@ class Matches(NamedTuple):
     status: Tensor
     score: Tensor
     off_line: Tensor
+
+    def __repr__(self) -> str:
+        return brief(self)
 
 
 @dataclass(frozen=True, kw_only=True)

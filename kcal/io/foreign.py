@@ -27,6 +27,7 @@ from kcal.lens.pose import nearest_rotation
 from kcal.lens.rig import StereoRig
 from kcal.strict_yaml import MOST_BYTES as MOST_YAML
 from kcal.strict_yaml import read_yaml
+from kcal.texts import brief
 
 # Rotations of files with six digits; beyond it they are no rotation but a mistake.
 _ROUNDED = 1e-4
@@ -94,6 +95,9 @@ class ImportedCameras:
             )
         left, right = self.cameras
         return StereoRig(left, right, *_second_from_first(self.poses))
+
+    def __repr__(self) -> str:
+        return brief(self)
 
 
 def _second_from_first(poses: Sequence[CameraPose]) -> CameraPose:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 from kcal.errors import InputError
 from kcal.quantities import setting_text
+from kcal.texts import brief
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -105,6 +106,8 @@ class CalibrationRecord:
         created: when, with its time zone.
     """
 
+    __repr__ = brief
+
     rms: float
     views: int
     points: int
@@ -183,6 +186,8 @@ class CameraCalibration:
         0.5
     """
 
+    __repr__ = brief
+
     name: str = ""
     sigma: Mapping[str, float | None] | None = None
     covariance: Tensor | None = None
@@ -249,6 +254,8 @@ class RigCalibration:
         kcal_version: the version that calibrated; see `kcal.io.camera_file.provenance`.
         created: when, with its time zone.
     """
+
+    __repr__ = brief
 
     rms: float
     rms_left: float

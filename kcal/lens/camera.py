@@ -338,7 +338,8 @@ class Camera(ConvertibleCamera):
 
     def extra_repr(self) -> str:
         """Model, size and focal length for `repr`."""
-        text = f"model={self.model}, size={self.size}, focal={self.focal.tolist()}"
+        values = ", ".join(f"{value:.6g}" for value in self.focal.flatten().tolist()[:6])
+        text = f"model={self.model}, size={self.size}, focal=({values})"
         if self.params.ndim > 1:
             return text
         share = polygon_area(self.valid_polygon()) / (self.size[0] * self.size[1])

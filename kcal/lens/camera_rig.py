@@ -16,6 +16,8 @@ from kcal.errors import InputError
 from kcal.lens.calibration import Exclusion, RigSource, UntilChanged
 from kcal.lens.camera import Camera
 from kcal.lens.mounting import REFRACTION, Origin, check_refraction
+from kcal.quantities import length_text
+from kcal.texts import brief
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -34,6 +36,8 @@ class CameraRigCalibration:
         kcal_version: the version that solved.
         created: when, with its time zone.
     """
+
+    __repr__ = brief
 
     rms: float
     rms_px: tuple[float | None, ...]
@@ -116,6 +120,11 @@ class CameraRig(Float64Module):
         self.refraction = float(refraction)
         self.register_buffer("rotation", rotation.detach().clone())
         self.register_buffer("center", center.detach().clone())
+
+    def extra_repr(self) -> str:
+        """Names, farthest distance of two cameras and origin, for `repr`."""
+        apart = length_text(float(torch.cdist(self.center, self.center).max()))
+        return ", ".join([*self.names, f"up to {apart} apart", *([] if self.origin is None else [str(self.origin)])])
 
     def __len__(self) -> int:
         """How many cameras there are."""

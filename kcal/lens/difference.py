@@ -19,6 +19,7 @@ from kcal.lens.projection import project_components
 from kcal.lens.pupil import FAR
 from kcal.lens.shift import PixelShift
 from kcal.lens.uncertainty import pixel_covariance, pixel_slopes
+from kcal.texts import brief
 
 # Cameras that agree differ by more than this in 5 % of cases, like the intervals of `kcal.locate`.
 _LEVEL = 0.05
@@ -50,6 +51,8 @@ class CameraDifference(PixelShift):
         >>> round(float(found.shift[..., 0].abs().max()), 1), round(found.rms, 2)  # most of it is a turn
         (0.1, 0.06)
     """
+
+    __repr__ = brief
 
     sigma: Tensor | None
     known: tuple[bool, bool]

@@ -12,6 +12,7 @@ from torch import Tensor
 from kcal.checks import as_covariance
 from kcal.errors import InputError
 from kcal.gaussian import Gaussian, Slots, numbered
+from kcal.texts import brief
 
 # Names of the unknowns: (LENS_SLOT, 0), ... of the camera, (BOARD_SLOT, 0), ... of its board.
 LENS_SLOT, BOARD_SLOT = "lens", "board"
@@ -44,6 +45,8 @@ class CameraInformation:
         >>> focal.slots, focal.rows.tolist()
         ((0, 1, -1, -1, -1), [[0.5, 0.0], [0.0, 0.5]])
     """
+
+    __repr__ = brief
 
     slots: tuple[int, ...]
     estimate: Tensor

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from kcal.errors import InputError
+from kcal.texts import brief
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -99,6 +100,8 @@ class Mounting:
         >>> Mounting(origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=35.0).pitch_deg
         0.0
     """
+
+    __repr__ = brief
 
     origin: Origin
     heading_deg: float

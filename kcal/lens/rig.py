@@ -18,6 +18,7 @@ from kcal.lens.calibration import RigCalibration, UntilChanged
 from kcal.lens.camera import Camera
 from kcal.lens.mounting import Mounting
 from kcal.quantities import length_text
+from kcal.texts import brief
 
 
 class StereoRig(nn.Module):
@@ -91,6 +92,11 @@ class StereoRig(nn.Module):
         """Distance between the cameras' centers, meters."""
         return torch.linalg.vector_norm(self.right_from_left_translation)
 
+    def extra_repr(self) -> str:
+        """Baseline, and what else is known, for `repr`."""
+        known = (word for word in ("covariance", "mounting", "calibration") if getattr(self, word) is not None)
+        return ", ".join([f"baseline={length_text(float(self.baseline))}", *known])
+
     @property
     def fingerprint(self) -> str:
         """Twelve hex digits that change with either camera and with the relative pose."""
@@ -161,6 +167,8 @@ class RigCovariance:
         >>> tuple(known.half.shape), tuple(known.matrix.shape)
         ((1, 16), (16, 16))
     """
+
+    __repr__ = brief
 
     half: Tensor
 

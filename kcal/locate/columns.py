@@ -11,6 +11,8 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
+from kcal.texts import brief
+
 # The numbers of a position, in the order of the columns of a file. Covariances are of east, north, up.
 NUMBERS = (
     "lat", "lon", "height_ellipsoidal_m", "geoid_height_m", "east_m", "north_m", "up_m",
@@ -78,6 +80,9 @@ class PositionColumns(NamedTuple):
     def located(self) -> NDArray[np.bool_]:
         """(N,) which pairs have a position."""
         return np.isfinite(self.numbers[:, 0])
+
+    def __repr__(self) -> str:
+        return brief(self)
 
 
 def number_lines(values: NDArray[np.float64]) -> list[str]:

@@ -13,6 +13,7 @@ from kcal.errors import InputError
 from kcal.lens.rectification import StereoRectification
 from kcal.locate.geodesy import Origin
 from kcal.locate.localizer import StereoLocalizer
+from kcal.texts import brief
 
 # Pixels for the derivatives of resampling, whose curvature is far below that of lenses over a pixel.
 _STEP = 0.25
@@ -37,6 +38,9 @@ class RangeImage(NamedTuple):
     low: Tensor
     high: Tensor
     valid: Tensor
+
+    def __repr__(self) -> str:
+        return brief(self)
 
 
 class DisparityRanges(nn.Module):

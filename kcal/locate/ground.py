@@ -21,7 +21,8 @@ from kcal.locate.ellipsoid import mean_radius
 from kcal.locate.geodesy import anchor, enu_from_cam, place_enu
 from kcal.locate.mounting import by_mounting
 from kcal.locate.ranges import QUANTILE
-from kcal.locate.stereo import PositionStatus
+from kcal.locate.stereo import PositionStatus, status_counts
+from kcal.texts import brief
 
 # Height above the ellipsoid, meters, of latitudes and longitudes (degrees, of one shape); NaN where it is not known.
 Ground = Callable[[Tensor, Tensor], Tensor]
@@ -56,6 +57,9 @@ class GroundPlaces(NamedTuple):
     range_high: Tensor
     bearing: Tensor
     status: Tensor
+
+    def __repr__(self) -> str:
+        return brief(self, status=status_counts(self.status))
 
 
 def level_ground(height: float) -> Ground:

@@ -29,7 +29,9 @@ from kcal.locate.stereo import (
     inverse_range,
     piece_by_piece,
     reprojection_errors,
+    status_counts,
 )
+from kcal.texts import brief
 
 
 @exportable
@@ -63,6 +65,9 @@ class Localization(NamedTuple):
     inverse_range: Tensor
     inverse_range_sigma: Tensor
     reprojection: Tensor
+
+    def __repr__(self) -> str:
+        return brief(self, status=status_counts(self.status))
 
 
 class Sensitivity(NamedTuple):
@@ -305,6 +310,14 @@ class StereoLocalizer(nn.Module):
             inverse_range=reach.value,
             inverse_range_sigma=reach.sigma,
             reprojection=reprojection_errors(fit.residual),
+        )
+
+    def extra_repr(self) -> str:
+        """Where it stands, and which errors its covariances contain, for `repr`."""
+        heading, pitch, roll = self.attitude_deg
+        return (
+            f"{self.origin}, heading={heading:.6g}°, pitch={pitch:.6g}°, roll={roll:.6g}°, "
+            f"pixel_sigma={self.pixel_sigma:g}, errors of {' and '.join(self.included)}"
         )
 
     @torch.no_grad()

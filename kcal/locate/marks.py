@@ -14,7 +14,7 @@ from torch import Tensor
 from kcal.errors import FileError
 from kcal.files import write_atomic
 from kcal.locate.tables import CHUNK_ROWS, TableChunk, TableRow, guarded, read_chunks
-from kcal.texts import csv_line
+from kcal.texts import brief, csv_line
 
 PIXELS = ("left_u", "left_v", "right_u", "right_v")
 # The ten entries of a pair's covariance (left_u, left_v, right_u, right_v) on and above its diagonal, row by row.
@@ -70,6 +70,9 @@ class Marks(NamedTuple):
         found = self.sigmas(sigma)
         known = found[found.isfinite()]
         return float(known.square().mean().sqrt()) if len(known) else sigma
+
+    def __repr__(self) -> str:
+        return brief(self)
 
 
 def filled(covariance: Tensor | None, sigma: float) -> Tensor | None:

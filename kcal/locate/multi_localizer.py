@@ -20,8 +20,9 @@ from kcal.locate.ground_ahead import EarthFrame, stated_ahead
 from kcal.locate.max_likelihood import inverse_variance
 from kcal.locate.multiview import checked_views_covariance
 from kcal.locate.ranges import BEARING_SIGMAS, range_interval
-from kcal.locate.stereo import PositionStatus, flag_positions, piece_by_piece, reprojection_errors
+from kcal.locate.stereo import PositionStatus, flag_positions, piece_by_piece, reprojection_errors, status_counts
 from kcal.locate.views import CommonErrors, PosedCameras, ViewsFit, fit_views
+from kcal.texts import brief
 
 # How seldom good views are taken for bad ones.
 _BAD, _DOUBTFUL = 1e-4, 1e-2
@@ -69,6 +70,9 @@ class ViewsLocalization(NamedTuple):
     bad: Tensor
     misfit: Tensor
     reprojection: Tensor
+
+    def __repr__(self) -> str:
+        return brief(self, status=status_counts(self.status))
 
 
 class MultiViewLocalizer(Float64Module):

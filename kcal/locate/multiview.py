@@ -14,8 +14,9 @@ from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.locate.angular import triangulate_angular
 from kcal.locate.linear import triangulate_linear
-from kcal.locate.stereo import PositionStatus, flag_positions, reprojection_errors
+from kcal.locate.stereo import PositionStatus, flag_positions, reprojection_errors, status_counts
 from kcal.locate.views import PosedCameras, fit_views
+from kcal.texts import brief
 
 Method = Literal["linear", "angular", "likelihood"]
 
@@ -37,6 +38,9 @@ class ViewsResult(NamedTuple):
     covariance: Tensor
     status: Tensor
     reprojection: Tensor
+
+    def __repr__(self) -> str:
+        return brief(self, status=status_counts(self.status))
 
 
 class TriangulateViews(nn.Module):

@@ -18,6 +18,7 @@ from kcal.locate.datum import Geoid
 from kcal.locate.stereo import PositionStatus, checked_pairs
 from kcal.locate.tables import CHUNK_ROWS
 from kcal.locate.tabulate import Locator, Viewpoint
+from kcal.texts import brief
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -68,6 +69,8 @@ class Located:
     `included` names the errors that intervals and covariances cover; `geoid` is the grid of the geoid heights, None
     without one. `rows` is the length of the table of which the positions are a sample, None if they are all.
     """
+
+    __repr__ = brief
 
     columns: PositionColumns
     cameras: tuple[Viewpoint, ...]

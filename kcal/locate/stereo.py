@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import enum
 import math
+from collections import Counter
 from collections.abc import Callable
 from typing import NamedTuple, TypeVar
 
@@ -42,6 +43,12 @@ class PositionStatus(enum.IntEnum):
     MASKED = 7
     BAD_COVARIANCE = 8
     CONTRADICTION = 9
+
+
+def status_counts(status: Tensor) -> str:
+    """How many points have each status, for people: `5 OK, 2 PARALLEL`."""
+    counts = Counter(status.flatten().tolist())
+    return ", ".join(f"{number} {PositionStatus(code).name}" for code, number in sorted(counts.items())) or "no points"
 
 
 def flag_positions(code: Tensor, condition: Tensor, status: PositionStatus) -> Tensor:

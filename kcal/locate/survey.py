@@ -20,7 +20,7 @@ from kcal.lens.mounting import Origin
 from kcal.locate.geodesy import geodetic_to_enu
 from kcal.locate.marks import PIXELS, Marks, pixel_of
 from kcal.locate.tables import TableRow, guarded, read_rows
-from kcal.texts import csv_line
+from kcal.texts import brief, csv_line
 
 EARTH, LOCAL = ("lat", "lon", "height"), ("east", "north", "up")
 FEATURE_COLUMNS = ("name", *PIXELS, "range", "range_sigma", "beyond", "note")
@@ -43,6 +43,9 @@ class Survey(NamedTuple):
     points: Tensor
     sigma: Tensor
     origin: Origin | None
+
+    def __repr__(self) -> str:
+        return brief(self)
 
 
 def read_survey(path: str | Path, origin: Origin | None = None, *, measured: bool = True) -> Survey:

@@ -19,7 +19,9 @@ from kcal.locate.stereo import (
     inverse_range,
     piece_by_piece,
     reprojection_errors,
+    status_counts,
 )
+from kcal.texts import brief
 
 
 @exportable
@@ -49,6 +51,9 @@ class Triangulation(NamedTuple):
     range_low: Tensor
     range_high: Tensor
     bearing_only: Tensor
+
+    def __repr__(self) -> str:
+        return brief(self, status=status_counts(self.status))
 
 
 class Triangulate(nn.Module):

@@ -18,6 +18,7 @@ from kcal.locate.distinct_keys import DistinctKeys, Doubled
 from kcal.locate.marks import read_marks
 from kcal.locate.survey import MarkedLandmarks, Survey, inverse_range_of, marked_places
 from kcal.locate.tables import TableChunk, TableRow, header_of, read_chunks
+from kcal.texts import brief
 
 _LONG = ("name", "camera", "u", "v")
 _HEADER = ",".join(_LONG)
@@ -45,6 +46,9 @@ class ViewMarks(NamedTuple):
     def sigmas(self, default: float) -> Tensor:
         """(N, C) px, `default` where none is stated."""
         return torch.where(self.sigma.isfinite(), self.sigma, default)
+
+    def __repr__(self) -> str:
+        return brief(self)
 
 
 def is_long(path: str | Path) -> bool:

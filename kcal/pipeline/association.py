@@ -27,6 +27,7 @@ from kcal.pipeline.detections import Detections, box_anchors
 from kcal.pipeline.epipolar_band import near_epipolar_lines
 from kcal.pipeline.one_to_one import assign_groups
 from kcal.pipeline.pair_costs import pair_costs
+from kcal.texts import brief
 
 # Spread of 1 - correlation between two views of one object; of two objects it is 0.5 to 1.
 _LOOKS_SPREAD = 0.25
@@ -53,6 +54,9 @@ class Association(NamedTuple):
     cost: Tensor
     ambiguous: Tensor
     possible: Tensor
+
+    def __repr__(self) -> str:
+        return brief(self)
 
 
 @torch.no_grad()
@@ -121,6 +125,9 @@ class BoxPairs(NamedTuple):
     ambiguous: Tensor
     left: Tensor
     right: Tensor
+
+    def __repr__(self) -> str:
+        return brief(self)
 
 
 class PairBoxes(nn.Module):

@@ -13,6 +13,7 @@ from kcal.checks import as_points, require_finite
 from kcal.errors import InputError
 from kcal.lens.image_transform import ImageTransform
 from kcal.pipeline.detectors import RawDetections, raw_detections
+from kcal.texts import brief
 
 Anchor = Literal["center", "bottom"] | int
 
@@ -45,6 +46,8 @@ class Detections:
         >>> found.boxes.tolist(), found.anchors("bottom").tolist()
         ([[99.5, 49.5, 111.5, 61.5]], [[105.5, 61.5]])
     """
+
+    __repr__ = brief
 
     boxes: Tensor
     score: Tensor

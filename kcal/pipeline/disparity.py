@@ -24,6 +24,7 @@ from kcal.corners.patch_windows import grid_of, has_samples, image_windows, samp
 from kcal.corners.shift_fit import fit_shifts
 from kcal.errors import InputError
 from kcal.lens.rig import StereoRig
+from kcal.texts import brief
 
 # Steps of a patch from its middle at most; larger objects get steps of powers of two pixels.
 _LARGEST_HALF = 24
@@ -83,6 +84,9 @@ class ObjectDisparities(NamedTuple):
     score: Tensor
     off_line: Tensor
     by_anchor: Tensor
+
+    def __repr__(self) -> str:
+        return brief(self)
 
 
 class ObjectDisparity(nn.Module):

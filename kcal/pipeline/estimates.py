@@ -11,9 +11,10 @@ from torch import Tensor
 from kcal.locate.geodesy import place_enu
 from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.locate.ranges import BEARING_SIGMAS, range_interval
-from kcal.locate.stereo import PositionStatus, flag_positions
+from kcal.locate.stereo import PositionStatus, flag_positions, status_counts
 from kcal.pipeline.imm_filter import Summary
 from kcal.pipeline.small_matrices import product, rooted, squared
+from kcal.texts import brief
 
 
 class TrackStates(NamedTuple):
@@ -50,6 +51,9 @@ class TrackStates(NamedTuple):
     inverse_range: Tensor
     inverse_range_sigma: Tensor
     anchor: Tensor
+
+    def __repr__(self) -> str:
+        return brief(self, status=status_counts(self.status))
 
 
 def track_states(

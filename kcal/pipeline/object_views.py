@@ -11,6 +11,7 @@ from torch import Tensor
 
 from kcal.checks import as_points
 from kcal.errors import InputError
+from kcal.texts import brief
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -39,6 +40,8 @@ class ObjectViews:
         >>> len(views), views.cameras
         (1, 3)
     """
+
+    __repr__ = brief
 
     pixels: Tensor
     seen: Tensor

@@ -12,6 +12,7 @@ from torch import Tensor
 from kcal.checks import as_points, require_finite
 from kcal.errors import InputError
 from kcal.pipeline.object_views import ObjectViews
+from kcal.texts import brief
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -40,6 +41,8 @@ class ObjectPairs:
         >>> len(pair), pair.left.dtype
         (1, torch.float64)
     """
+
+    __repr__ = brief
 
     left: Tensor
     right: Tensor

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from kcal.errors import InputError
 from kcal.files import read_bytes
+from kcal.texts import brief
 
 PACKED_FILE = Path(__file__).with_name("bright_stars.bin")
 # Angles are 2**-32 of a turn, proper motions milliarcseconds a year (in right ascension times cos δ).
@@ -63,6 +64,8 @@ class StarCatalog:
         >>> len(stars), stars.name_of(2491), round(float(stars.magnitude.min()), 2)
         (9096, 'Sirius', -1.46)
     """
+
+    __repr__ = brief
 
     number: NDArray[np.int64]
     ra: NDArray[np.float64]

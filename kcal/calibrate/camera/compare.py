@@ -26,6 +26,7 @@ from kcal.corners.observations import Observations
 from kcal.errors import InputError, KcalError
 from kcal.lens.model import LensModel
 from kcal.solve.lm import LMOptions
+from kcal.texts import brief
 
 _POSES = LMOptions(max_iterations=60, tolerance=1e-12)
 # Blocks are runs of at least five views, at most twenty of them.
@@ -51,6 +52,8 @@ class ComparisonResult:
         >>> [round(value, 4) for value in result.difference("b", "a")]
         [0.0224, 0.0154]
     """
+
+    __repr__ = brief
 
     models: tuple[str, ...]
     costs: Tensor

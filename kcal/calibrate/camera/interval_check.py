@@ -35,6 +35,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.difference import CameraDifference, camera_difference
 from kcal.lens.rig import half_of_covariance
 from kcal.lens.uncertainty import pixel_covariance, pixel_errors
+from kcal.texts import brief
 
 # A normal vector of two components has a squared length beyond this once in twenty times.
 CHI2 = -2.0 * math.log(0.05)
@@ -122,6 +123,9 @@ class IntervalCheck:
     def true(self) -> bool:
         """Whether the intervals hold at all ranges, as far as so many refits tell."""
         return all(share + 2.0 * error >= ENOUGH for share, error in self.shares)
+
+    def __repr__(self) -> str:
+        return brief(self)
 
 
 def _share_within(squares: Tensor, axes: int | tuple[int, ...]) -> Tensor:

@@ -25,6 +25,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.lens.projection import parameter_names, project_components
 from kcal.solve.result import map_state
+from kcal.texts import brief
 
 # Pixels of a corner's noise along an axis, against which priors of parametric models count.
 _CORNER_SIGMA = 0.2
@@ -46,6 +47,8 @@ class CalibratedViews:
         fit: with the default lens, the fit that set its amplitudes.
         hybrid: likewise, the state of camera, board, poses and motions under these.
     """
+
+    __repr__ = brief
 
     parameters: Tensor
     board_warp: Tensor

@@ -20,6 +20,7 @@ from kcal.lens.calibration import CalibrationRecord, CameraCalibration, Exclusio
 from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
 from kcal.solve.result import SolverStatus
+from kcal.texts import brief
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -105,6 +106,8 @@ class CameraCalibrationResult:
         shared_board: which cameras helped to measure the board, where several were calibrated together. Errors of such
             cameras are not quite independent of each other; a rig of them knows that.
     """
+
+    __repr__ = brief
 
     camera: Camera
     rms: float

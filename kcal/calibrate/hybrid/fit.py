@@ -33,6 +33,7 @@ from kcal.lens.hybrid_terms import LEADING
 from kcal.lens.information import CameraInformation
 from kcal.lens.model import LensModel
 from kcal.solve.schur import products_of
+from kcal.texts import brief
 
 # Pixels that a mode can move any point by, below which it is left out.
 _UNFELT = 1e-6
@@ -78,6 +79,8 @@ class HybridFit:
         >>> fit.converged, fit.effective < 20, fit.covariance.shape == 2 * fit.camera.params.shape
         (True, True, True)
     """
+
+    __repr__ = brief
 
     model: LensModel
     size: tuple[int, int]

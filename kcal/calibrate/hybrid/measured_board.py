@@ -18,6 +18,7 @@ from kcal.errors import InputError
 from kcal.gaussian import Gaussian, numbered
 from kcal.lens.information import BOARD_SLOT
 from kcal.native_file import NativeFile
+from kcal.texts import brief
 
 
 class Measured(NamedTuple):
@@ -141,6 +142,9 @@ class MeasuredBoard:
         fitted = torch.linalg.lstsq(basis[..., :count].flatten(1).T, shapes[..., :count].flatten(1).T).solution.T
         rest = shapes - torch.einsum("bg,gkn->bkn", fitted, basis)
         return fitted, rest if places is None else rest[..., count:]
+
+    def __repr__(self) -> str:
+        return brief(self)
 
 
 class BoardFile(NativeFile):

@@ -29,6 +29,7 @@ from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.lens.rig import StereoRig
 from kcal.solve.lm import LMOptions
+from kcal.texts import brief
 
 _NAMES = ("left", "right")
 _SOLVER = LMOptions(residual_floor=1e-8)
@@ -53,6 +54,8 @@ class Drift:
         items: residuals by item, those left out included: what moved, or is not the same thing.
         variance: by which covariances were multiplied, because residuals were larger than stated.
     """
+
+    __repr__ = brief
 
     left: Tensor | None
     right: Tensor | None

@@ -22,6 +22,7 @@ from kcal.lens.camera_rig import CameraRig, CameraRigCalibration
 from kcal.lens.mounting import Origin
 from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.solve.result import SolverStatus
+from kcal.texts import brief
 
 Source = Literal["boards", "landmarks", "features", "stars", "skyline", "baselines", "positions"]
 
@@ -112,6 +113,8 @@ class RigResult:
         status: why the solver stopped.
         warnings: one sentence for each thing that the user should doubt.
     """
+
+    __repr__ = brief
 
     data: RigData
     cameras: tuple[Camera, ...]

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from kcal.checks import require_finite
 from kcal.errors import InputError
+from kcal.texts import brief
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -33,6 +34,8 @@ class SkylineSource:
     Raises:
         InputError: shapes that do not fit each other.
     """
+
+    __repr__ = brief
 
     cameras: tuple[int, ...]
     names: tuple[str, ...]

@@ -23,6 +23,7 @@ from kcal.checks import as_points, require_finite
 from kcal.corners.board import Board
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
+from kcal.texts import brief
 
 
 def _positive(name: str, value: float) -> None:
@@ -60,6 +61,8 @@ class Boards:
         covariance: (V, C, N, 2, 2) px² of corners, by which they weigh; all alike if left out.
         sigma: of a corner along an axis, px; estimated from the residuals if left out.
     """
+
+    __repr__ = brief
 
     board: Board
     pixels: Tensor
@@ -131,6 +134,8 @@ class Landmarks:
         pixel_sigma: of a mark along an axis, px; one number for all, or (L, C) for each mark.
         effects: what shifts many of them together, beyond `sigma`.
     """
+
+    __repr__ = brief
 
     names: tuple[str, ...]
     points: Tensor
@@ -233,6 +238,8 @@ class Features:
         covariance: (F, C, 2, 2) px² of marks, in place of `pixel_sigma`.
         effects: errors that marks of many of them share, beyond these.
     """
+
+    __repr__ = brief
 
     names: tuple[str, ...]
     pixels: Tensor
@@ -346,6 +353,8 @@ class RigData:
         >>> RigData(cameras=(camera, camera), names=("left", "right")).absolute
         False
     """
+
+    __repr__ = brief
 
     cameras: tuple[Camera, ...]
     names: tuple[str, ...]
