@@ -123,9 +123,9 @@ def pieces(jobs: Sequence[CameraJob]) -> int:
 def sharing_jobs(jobs: Sequence[CameraJob]) -> list[list[int]]:
     """Which cameras may have seen one board: those with the hybrid lens and boards of one kind."""
     hybrid = [i for i, job in enumerate(jobs) if not job.error and job.model == HYBRID]
-    kinds: dict[str, list[int]] = {}
+    kinds: dict[Board | None, list[int]] = {}
     for i in hybrid:
-        kinds.setdefault(repr(jobs[i].board), []).append(i)
+        kinds.setdefault(jobs[i].board, []).append(i)
     return [numbers for numbers in kinds.values() if len(numbers) > 1]
 
 
