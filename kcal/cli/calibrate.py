@@ -84,8 +84,9 @@ def calibrate_command(
         str,
         typer.Option(
             metavar="NAME",
-            help="hybrid, which fits any camera, or for exchange a parametric lens: pinhole, opencv4, opencv5, "
-            "opencv8, opencv12, opencv14, ext16 ... ext24, fisheye4.",
+            help="hybrid, which fits any camera; network, the same with a small trained network as its field; or for "
+            "exchange a parametric lens: pinhole, opencv4, opencv5, opencv8, opencv12, opencv14, ext16 ... ext24, "
+            "fisheye4.",
         ),
     ] = "hybrid",
     require: Annotated[
@@ -188,7 +189,7 @@ def calibrate_command(
     if board not in ("printed", "exact"):
         check_file("--board-shape", board, BOARD)
     places = _camera_files(observations, output, picture, report, name)
-    if model != "hybrid":
+    if model not in ("hybrid", "network"):
         LensModel.named(model)
     known = None
     if camera is not None:

@@ -19,8 +19,7 @@ def print_calibration(result: CameraCalibrationResult, *, reject: bool, verbose:
     record = result.camera.calibration.record
     assert record is not None
     width, height = result.observations.image_size
-    model = "hybrid" if result.hybrid is not None else str(result.camera.model)
-    out.print(f"{record.views} views, {record.points} corners, {width}x{height} px, model {model}")
+    out.print(f"{record.views} views, {record.points} corners, {width}x{height} px, model {result.camera.model}")
     out.print(distances_text(result))
     # Warnings explain the others.
     ended = "converged" if result.status.name == "CONVERGED" else result.status.message
@@ -74,7 +73,7 @@ def calibration_numbers(result: CameraCalibrationResult) -> dict[str, Any]:
         noise_px=result.noise,
         views=int(result.per_view_rms.isfinite().sum()),
         corners=int(result.residuals[..., 0].isfinite().sum()),
-        model="hybrid" if result.hybrid is not None else str(result.camera.model),
+        model=str(result.camera.model),
         converged=result.status.name,
         sigma_px={"center": brief.center, "border": brief.border, "worst": brief.worst},
         unreached=brief.unreached,

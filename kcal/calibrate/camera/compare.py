@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.calibrate.camera.options import HYBRID, CalibrationOptions, Progress
+from kcal.calibrate.camera.options import HYBRID, NETWORK, CalibrationOptions, Progress
 from kcal.calibrate.hybrid.fit import HybridFit
 from kcal.calibrate.hybrid.moving_poses import moving_residuals
 from kcal.calibrate.problem.poses import poses_under
@@ -94,7 +94,8 @@ def compare_models(
 
     Args:
         observations: the views of one camera.
-        models: names of lens models, or `LensModel`s; "hybrid" is the lens that `calibrate_camera` fits by default.
+        models: names of lens models, or `LensModel`s; "hybrid" is the lens that `calibrate_camera` fits by default,
+            "network" the same with a small network as its field, or with that of `options`.
         groups: which views are held out together. "blocks": runs of views in their order, for videos and captures with
             similar neighbors; "views": each view for itself; or a label for each view. The result tells about new
             views that differ from the others as the groups differ from each other.
@@ -132,7 +133,7 @@ def compare_models(
     options = options or CalibrationOptions(model="opencv5", board_warp=True)
     if options.camera is not None:
         raise InputError("compare_models: a known camera leaves no models to compare")
-    names = tuple(str(model if model == HYBRID else LensModel.named(model)) for model in models)
+    names = tuple(str(model if model in (HYBRID, NETWORK) else LensModel.named(model)) for model in models)
     if not names or len(set(names)) < len(names):
         raise InputError(f"compare_models: one or more different models are needed, got {', '.join(names) or 'none'}")
     members = _groups(observations, groups, parts)
@@ -191,10 +192,11 @@ def _motion(observations: Observations, options: CalibrationOptions) -> HybridFi
 
 def _options(model: str | LensModel, options: CalibrationOptions) -> CalibrationOptions:
     """The options for one model; the hybrid takes those that are its own."""
-    if model != HYBRID:
-        return dataclasses.replace(options, model=model, board="printed")
-    own = ("board", "motion", "weighted", "focal", "field_of_view")
-    return CalibrationOptions(model=HYBRID, **{name: getattr(options, name) for name in own})
+    if model not in (HYBRID, NETWORK):
+        return dataclasses.replace(options, model=model, board="printed", field=None)
+    own = ["board", "motion", "weighted", "focal", "field_of_view"]
+    own += ["field", "training"] if model == NETWORK else []
+    return CalibrationOptions(model=str(model), **{name: getattr(options, name) for name in own})
 
 
 def _groups(

@@ -88,8 +88,9 @@ def hybrid_views(
     fixed = tuple(tensor.detach() for tensor in data)
     if start is None:
         fit = fit_hybrid(
-            fixed[1], fixed[0], size, board=options.board, motion=options.motion, focal=options.start_focal(size)
-        )
+            fixed[1], fixed[0], size, modes=options.modes, board=options.board, motion=options.motion,
+            focal=options.start_focal(size), training=None if options.modes is None else options.training,
+        )  # fmt: skip
         begin = fit.state
     else:
         fit, begin = start[0], BoardState(*(part.detach() for part in start[1]))

@@ -51,6 +51,7 @@ def calibrate_hybrid(
             options.motion,
             options.start_focal(observations.image_size),
             progress,
+            options.modes,
         )
         weights = corner_weights(observations, start.residuals)
     fit = _fit_views(observations, pixels, weights, start, options, progress)
@@ -71,11 +72,13 @@ def _fit_views(
         pixels,
         observations.image_size,
         weights,
+        options.modes,
         board=options.board,
         motion=options.motion,
         focal=options.start_focal(observations.image_size),
         start=start,
         robust=robust,
+        training=None if robust or options.modes is None else options.training,
         progress=progress,
     )
 

@@ -152,8 +152,8 @@ class SimulatedCapture(NamedTuple):
         """The camera that this capture gives, with its error bars; `warm`: the fit begins at that of the real one."""
         if self.fit is not None:
             fit = fit_hybrid(
-                self.seen.board.points, self.pixels, self.seen.image_size, self.fit.weights, board=options.board,
-                motion=options.motion, start=self.fit if warm else None,
+                self.seen.board.points, self.pixels, self.seen.image_size, self.fit.weights, options.modes,
+                board=options.board, motion=options.motion, start=self.fit if warm else None,
             )  # fmt: skip
             fit.camera.calibration = CameraCalibration(information=fit.information)
             return fit.camera

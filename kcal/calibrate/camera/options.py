@@ -7,18 +7,27 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Literal
 
+from torch import nn
+
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard
+from kcal.calibrate.hybrid.network_fit import FieldTraining
 from kcal.calibrate.problem.parameters import ParameterConstraints, natural_value
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
+from kcal.lens.field_modes import FieldModes
 from kcal.lens.model import LensModel
+from kcal.lens.network_modes import NetworkModes
 from kcal.solve.lm import LMOptions
 from kcal.solve.robust import RobustLoss
 
 Progress = Callable[[str], None]
 HYBRID = "hybrid"
+NETWORK = "network"
+# Features of the small network.
+_UNITS = 40
 # Of rich parametric models.
 _WEAK = 0.3
+_TRAINING = FieldTraining()
 _SOLVER = LMOptions(max_iterations=1000, tolerance=1e-12, flatness=2e-6)
 # Degrees across the image from which lenses are nearer to an equidistant image than to a perspective one.
 _WIDE = 90.0
@@ -46,8 +55,11 @@ class CalibrationOptions:
 
     Args:
         model: "hybrid", the default: a lens that fits any camera, whose amplitudes, entrance pupil and board the views
-            themselves determine (`kcal.calibrate.camera.hybrid`). Or a parametric lens model, by name or as a
-            `LensModel`, for exchange with other programs.
+            themselves determine (`kcal.calibrate.camera.hybrid`). "network": the same lens with a small network as its
+            residual field. Or a parametric lens model, by name or as a `LensModel`, for exchange with other programs.
+        field: a network of your own as residual field of the hybrid lens: any `nn.Module` from places (N, 2) on the
+            unit disc to corrections (N, 2). It stays as it is; the camera has a trained copy (`camera.field`).
+        training: how the network is trained; None: only its last layer is.
         board: "printed", the default: bending and print errors of the board are estimated with a hybrid lens. "exact":
             the board is a metrology plate. Or a `MeasuredBoard` (`measure_board`, `kcal board measure`), which is used
             as known, with what is not known of it.
@@ -84,6 +96,8 @@ class CalibrationOptions:
     """
 
     model: LensModel | str = HYBRID
+    field: nn.Module | None = None
+    training: FieldTraining | None = _TRAINING
     board: Literal["printed", "exact"] | MeasuredBoard = "printed"
     motion: bool = True
     board_warp: bool = False
@@ -122,7 +136,11 @@ class CalibrationOptions:
             )
         if self.hybrid:
             self._refuse_parametric()
+            if self.field is not None:
+                NetworkModes.of(self.field)
             return
+        if self.field is not None:
+            raise InputError(f"CalibrationOptions: a field belongs to the hybrid lens; leave the model {self.lens} out")
         if isinstance(self.board, MeasuredBoard):
             raise InputError("CalibrationOptions: a measured board is used with the hybrid lens; leave the model out")
         fixed = self._of_camera() or {name: 1.0 if value is None else value for name, value in self.fixed.items()}
@@ -131,7 +149,15 @@ class CalibrationOptions:
     @property
     def hybrid(self) -> bool:
         """Whether the lens is the hybrid one, fitted by evidence."""
-        return self.camera is None and (self.model == HYBRID or bool(LensModel.named(self.model).hybrid))
+        named = self.model in (HYBRID, NETWORK)
+        return self.camera is None and (named or bool(LensModel.named(self.model).hybrid))
+
+    @property
+    def modes(self) -> FieldModes | None:
+        """Of the field; None: those of the default lens."""
+        if self.field is not None:
+            return NetworkModes.of(self.field)[0]
+        return NetworkModes.random(_UNITS) if self.model == NETWORK else None
 
     def _refuse_parametric(self) -> None:
         names = ("board_warp", "loss", "fixed", "tied", "free", "priors")

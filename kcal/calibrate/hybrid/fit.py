@@ -19,6 +19,7 @@ from kcal.calibrate.hybrid.families import LEADING_UNKNOWNS, Hyperprior, PriorFa
 from kcal.calibrate.hybrid.fitted_views import Estimate
 from kcal.calibrate.hybrid.fleet import LensPrior
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard
+from kcal.calibrate.hybrid.network_fit import FieldTraining, train_network
 from kcal.calibrate.hybrid.quadratic import posterior_root
 from kcal.calibrate.hybrid.settled import FitStart, check_shown, settle
 from kcal.calibrate.hybrid.unknowns import hybrid_problem, hybrid_unknowns
@@ -194,6 +195,7 @@ def fit_hybrid(
     robust: bool = False,
     hyperprior: Hyperprior | None = None,
     lens: LensPrior | None = None,
+    training: FieldTraining | None = None,
     progress: Callable[[str], object] = lambda _: None,
 ) -> HybridFit:
     """Fit one camera.
@@ -214,6 +216,7 @@ def fit_hybrid(
             such a fit mean nothing; it tells which corners to leave out.
         hyperprior: of the amplitudes; the typical one if not given.
         lens: what is known of it from cameras of its type; its modes are used.
+        training: of the network that the field is; None: it is not trained.
         progress: called after each step.
 
     Raises:
@@ -227,6 +230,8 @@ def fit_hybrid(
         start=begun, robust=robust, hyperprior=hyperprior, lens=lens, progress=progress,
     )  # fmt: skip
     ordered, own = points, board_modes(points)
+    if training is not None:
+        rounds = train_network(rounds, never, hyperprior, training, progress)
     capture, likely = rounds.capture, rounds.estimate
     # Error bars are for amplitudes as they are to be expected (`kcal.calibrate.hybrid.amplitudes`).
     estimate = likely if robust else expected_estimate(rounds, hyperprior)

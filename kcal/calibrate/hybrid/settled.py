@@ -172,6 +172,7 @@ def rough_start(
     motion: bool = True,
     focal: float | None = None,
     progress: Callable[[str], object] = lambda _: None,
+    modes: FieldModes | None = None,
 ) -> FitStart:
     """With what a fit of these views under other weights begins: no error bars, and not entirely at rest.
 
@@ -180,8 +181,9 @@ def rough_start(
         DegenerateError: likewise.
     """
     rounds, never, _, known = settle(
-        points, pixels, size, weights, board=board, motion=motion, focal=focal, progress=progress, rough=True
-    )
+        points, pixels, size, weights, modes=modes, board=board, motion=motion, focal=focal, progress=progress,
+        rough=True,
+    )  # fmt: skip
     capture, estimate = rounds.capture, rounds.estimate
     errors = capture.problem(estimate, never).pixel_errors(estimate.state)
     check_shown(errors)

@@ -1,0 +1,194 @@
+"""The network of a field, trained together with camera, poses and board."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import functools
+import math
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from kcal.calibrate.camera.calibrate import calibrate_camera
+from kcal.calibrate.camera.layer import calibrate_views
+from kcal.calibrate.camera.options import CalibrationOptions
+from kcal.calibrate.hybrid.families import typical_hyperprior
+from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
+from kcal.calibrate.hybrid.fitted_views import Estimate
+from kcal.calibrate.hybrid.network_fit import FieldTraining, _flat, _gauss_newton, _Moved, _trunk, _Turn, _with_weights
+from kcal.calibrate.hybrid.settled import settle
+from kcal.corners.board import Board
+from kcal.corners.observations import Observations, View
+from kcal.errors import InputError
+from kcal.lens.camera import Camera
+from kcal.lens.gaussian_modes import GaussianModes
+from kcal.lens.hybrid_terms import HybridForm
+from kcal.lens.model import LensModel
+from kcal.lens.network_modes import NetworkModes
+from kcal.lens.pose import rotation_from_vector
+
+BOARD = Board(columns=9, rows=7, square=0.04)
+SIZE, NOISE = (800, 600), 0.05
+
+
+class Rings(nn.Module):
+    """A user's network."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.places, self.out = nn.Linear(2, 10), nn.Linear(10, 2)
+
+    def forward(self, places: Tensor) -> Tensor:
+        result: Tensor = self.out(torch.cos(2.0 * self.places(places)))
+        return result
+
+
+@functools.cache
+def truth() -> Camera:
+    """A local dent of three pixels off the middle, which no polynomial of the radius has."""
+    modes = GaussianModes(widths=(0.2,))
+    form = HybridForm(shape=0.9, radius=1.08 * 500.0 / 700.0, modes=modes)
+    values = torch.zeros(8 + len(modes), dtype=torch.float64)
+    values[:4] = torch.tensor([700.0, 700.0, 402.0, 297.0])
+    x = modes.columns(torch.tensor([0.45], dtype=torch.float64), torch.tensor([-0.2], dtype=torch.float64))[:, 0, 0]
+    values[8 + int(x.argmax())] = 3.0 / 700.0
+    return Camera(values, size=SIZE, model=LensModel(hybrid=form))
+
+
+@functools.cache
+def capture(count: int = 18) -> Observations:
+    random, middle, views = torch.Generator().manual_seed(5), BOARD.points.mean(0), list[View]()
+    while len(views) < count:
+        u = 2.0 * torch.rand(6, generator=random, dtype=torch.float64) - 1.0
+        turn = rotation_from_vector(torch.stack([0.5 * u[0], 0.5 * u[1], math.pi * u[2]]))
+        shift = torch.stack([0.2 * u[3], 0.14 * u[4], 0.5 + 0.06 * u[5]])
+        pixels, valid = truth().project((BOARD.points - middle) @ turn.T + shift)
+        if bool((valid & truth().inside(pixels)).all()):
+            noise = NOISE * torch.randn(pixels.shape, generator=random, dtype=torch.float64)
+            views.append(View(name=str(len(views)), pixels=(pixels + noise).tolist()))
+    return Observations(board=BOARD, image_size=SIZE, views=views)
+
+
+def network() -> nn.Module:
+    """Twenty waves, whose bends cross the image."""
+    torch.manual_seed(2)
+    chain = nn.Sequential(nn.Linear(2, 20), nn.Tanh(), nn.Linear(20, 2))
+    with torch.no_grad():
+        chain.get_parameter("0.weight").mul_(4.0)
+    return chain
+
+
+@functools.cache
+def fitted(training: FieldTraining | None) -> HybridFit:
+    modes = NetworkModes.of(network())[0]
+    return fit_hybrid(
+        BOARD.points, capture().pixels(), SIZE, modes=modes, board="exact", motion=False, square=True, training=training
+    )
+
+
+def options(training: FieldTraining | None, field: nn.Module | None = None) -> CalibrationOptions:
+    return CalibrationOptions(field=field or network(), training=training, board="exact", motion=False)
+
+
+def off(camera: Camera) -> float:
+    """RMS of the error at infinity over the middle of the image, pixels, after the best rotation."""
+    pixels = 0.75 * (truth().grid(21, 15).reshape(-1, 2) - truth().center) + truth().center
+    rays, found = truth().unproject(pixels)[0], camera.unproject(pixels)[0]
+    u, _, v = torch.linalg.svd(rays.T @ found)
+    return float((camera.project_rays(rays @ u @ v)[0] - pixels).square().sum(-1).mean().sqrt())
+
+
+def test_training_finds_what_fixed_features_and_twenty_coefficients_cannot() -> None:
+    """A dent, seen at places that no corner had; by Gauss-Newton sooner than by Adam."""
+    newton, adam, fixed = fitted(FieldTraining()), fitted(FieldTraining(optimizer="adam")), fitted(None)
+    ext20 = calibrate_camera(capture(), CalibrationOptions(model="ext20"))
+    assert off(newton.camera) < 0.5 * off(fixed.camera)
+    assert off(fixed.camera) < 0.5 * off(ext20.camera)
+    assert off(newton.camera) < 0.7 * off(adam.camera)
+    assert newton.log_evidence > adam.log_evidence >= fixed.log_evidence
+    # Corners have noise of 0.05 px along both axes.
+    assert newton.sigma == pytest.approx(NOISE, rel=0.1)
+
+
+def test_the_users_network_stays_and_the_camera_has_a_trained_copy() -> None:
+    torch.manual_seed(1)
+    given = Rings()
+    before = copy.deepcopy(given.state_dict())
+    result = calibrate_camera(capture(), options(FieldTraining(turns=1), given))
+    assert all(torch.equal(before[name], value) for name, value in given.state_dict().items())
+    assert isinstance(result.camera.field, Rings)
+    moved = result.camera.field.places.weight - given.places.weight
+    assert float(moved.abs().max()) > 0.01
+    assert str(result.camera.model) == "network"
+    # Each weight of the last layer has error bars; those before it count as known.
+    names = [name for name in result.sigma if name.startswith("n")]
+    assert len(names) == 20
+    assert all((result.sigma[name] or 0.0) > 0 for name in names)
+    assert result.hybrid is not None
+    still = fitted(None).camera.field
+    assert isinstance(still, nn.Sequential)
+    assert torch.equal(still.get_parameter("0.weight"), network().get_parameter("0.weight").double())
+
+
+def turn() -> tuple[_Turn, Estimate]:
+    pixels = capture(6).pixels()
+    modes = NetworkModes.of(Rings())[0]
+    found = settle(
+        BOARD.points, pixels, SIZE, torch.ones_like(pixels[..., 0]), modes=modes, board="exact", motion=False,
+        focal=None, hyperprior=typical_hyperprior(modes), progress=lambda _: None,
+    )  # fmt: skip
+    capture_, estimate = found.rounds.capture, found.rounds.estimate
+    flat = _flat(_trunk(estimate))
+    return _Turn(capture=capture_, never=found.never, initial=flat, spread=0.5), estimate
+
+
+def test_derivatives_by_the_networks_weights() -> None:
+    """Rows of Gauss-Newton against differences of the solver's own residuals."""
+    torch.manual_seed(4)
+    own, estimate = turn()
+    problem = own.capture.problem(estimate, own.never)
+    weights = _flat(_trunk(estimate))
+    rows = _Moved(own, problem, estimate).rows(weights, slice(1, 3))
+    for k in (0, 7, 25):
+        sides = []
+        for sign in (1.0, -1.0):
+            other = weights.clone()
+            other[k] += sign * 1e-5
+            changed = _with_weights(estimate, other)
+            sides.append(own.capture.problem(changed, own.never).pixel_errors(changed.state)[1:3].flatten(-2))
+        torch.testing.assert_close(rows[:, k], (sides[0] - sides[1]) / 2e-5, rtol=1e-4, atol=1e-7)
+
+
+def test_a_turn_lowers_the_cost_and_a_narrow_prior_holds_the_weights() -> None:
+    torch.manual_seed(4)
+    own, estimate = turn()
+    before = own.cost(own.capture.problem(estimate, own.never), estimate)
+    after, steps = _gauss_newton(own, estimate)
+    assert steps > 0
+    assert own.cost(own.capture.problem(after, own.never), after) < before
+    narrow, _ = _gauss_newton(dataclasses.replace(own, spread=1e-5), estimate)
+    moved = [_flat(_trunk(each)) - own.initial for each in (after, narrow)]
+    assert float(moved[1].abs().max()) < 1e-4 < 1e-2 < float(moved[0].abs().max())
+
+
+def test_the_layer_takes_it_too() -> None:
+    pixels = capture().pixels().requires_grad_()
+    found = calibrate_views(pixels, BOARD.points, SIZE, options(None))
+    assert str(found.model) == "network"
+    (gradient,) = torch.autograd.grad(found.parameters[2], pixels)
+    # All corners one pixel to the right; a prior holds the principal point a little.
+    assert float(gradient[..., 0].sum()) == pytest.approx(1.0, abs=0.1)
+
+
+def test_options_that_do_not_fit() -> None:
+    with pytest.raises(InputError, match="leave the model opencv5 out"):
+        CalibrationOptions(model="opencv5", field=network())
+    with pytest.raises(InputError, match="gauss-newton or adam"):
+        FieldTraining(optimizer="sgd")  # type: ignore[arg-type]
+    for bad in ({"turns": 0}, {"spread": 0.0}):
+        with pytest.raises(InputError, match="must be positive"):
+            FieldTraining(**bad)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"correction \(N, 2\)"):
+        CalibrationOptions(field=nn.Linear(2, 3))
