@@ -96,6 +96,7 @@ PUBLIC = {
     """,
     "kcal.nets": """
         InverseFit InverseNet InverseNetOptions JointFit JointOptions ResidualNet train_inverse train_jointly
+        FieldTraining NetworkModes
     """,
 }
 # Their place was `kcal.lens` in version 1.0, and stays so besides until 2.0.
@@ -155,7 +156,15 @@ NEW_NAMES = (
     }
     | {"save_siting_picture", "siting_figure"}
     | set(PUBLIC["kcal.stars"].split())
-    | {"ExtendedDistortion", "JointFit", "JointOptions", "ResidualNet", "train_jointly"}
+    | {
+        "ExtendedDistortion",
+        "FieldTraining",
+        "NetworkModes",
+        "JointFit",
+        "JointOptions",
+        "ResidualNet",
+        "train_jointly",
+    }
 )
 # Types of attributes in which only those look who work on kcal.
 INSIDE = {

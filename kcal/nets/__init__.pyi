@@ -4,6 +4,10 @@
 # Residual
 from kcal.nets.residual import ResidualNet as ResidualNet
 
+# Residual field of a camera
+from kcal.lens.network_modes import NetworkModes as NetworkModes
+from kcal.calibrate.hybrid.network_fit import FieldTraining as FieldTraining
+
 # Inverse
 from kcal.nets.inverse import InverseNet as InverseNet
 from kcal.nets.inverse import train_inverse as train_inverse
