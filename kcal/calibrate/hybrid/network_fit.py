@@ -84,7 +84,7 @@ class _Turn:
 
     def cost(self, problem: BoardProblem, estimate: Estimate) -> float:
         """Of everything, px²."""
-        return float(problem.cost(estimate.state) + estimate.variance * self.pull(_flat(_trunk(estimate))))
+        return float(problem.cost(estimate.state) + estimate.variance * self.pull(weights_of(_trunk(estimate))))
 
 
 def train_network(
@@ -106,7 +106,7 @@ def train_network(
     Returns:
         the rounds of largest evidence, prior of the network's weights included.
     """
-    initial = _flat(_trunk(rounds.estimate))
+    initial = weights_of(_trunk(rounds.estimate))
     if not len(initial):
         return rounds
     best, loss = rounds, rounds.untempered_loss
@@ -120,7 +120,7 @@ def train_network(
             best.capture, estimate, hyperprior, never,
             cold=False, spent=best.steps + spent, rough=False, progress=lambda _: None,
         )  # fmt: skip
-        value = found.untempered_loss + float(turn.pull(_flat(_trunk(found.estimate))))
+        value = found.untempered_loss + float(turn.pull(weights_of(_trunk(found.estimate))))
         progress(f"network, turn {number + 1}")
         if not value < loss - _WORTH:
             best = found if value < loss else best
@@ -135,7 +135,7 @@ def _trunk(estimate: Estimate) -> nn.Module:
     return network
 
 
-def _flat(trunk: nn.Module) -> Tensor:
+def weights_of(trunk: nn.Module) -> Tensor:
     """(T,) all weights of a network."""
     parts = [part.detach().flatten() for part in trunk.parameters()]
     return torch.cat(parts) if parts else torch.zeros(0, dtype=torch.float64)
@@ -212,8 +212,8 @@ def _gauss_newton(turn: _Turn, estimate: Estimate) -> tuple[Estimate, int]:
     problem = turn.capture.problem(estimate, turn.never)
     cost = turn.cost(problem, estimate)
     for _ in range(_STEPS):
-        weights = _flat(_trunk(estimate))
-        total = _normal_equations(turn, problem, estimate)
+        weights = weights_of(_trunk(estimate))
+        total = _joint_products(turn, problem, estimate)
         H, g = total[:-1, :-1], total[:-1, -1]
         for _ in range(4):
             # Weights that nothing depends on, and unknowns that are held, stay.
@@ -236,9 +236,9 @@ def _gauss_newton(turn: _Turn, estimate: Estimate) -> tuple[Estimate, int]:
     return estimate, spent
 
 
-def _normal_equations(turn: _Turn, problem: BoardProblem, estimate: Estimate) -> Tensor:
+def _joint_products(turn: _Turn, problem: BoardProblem, estimate: Estimate) -> Tensor:
     """(S + T + 1, S + T + 1) products of derivatives by the solver's unknowns, by the network's, and of residuals."""
-    state, weights = estimate.state, _flat(_trunk(estimate))
+    state, weights = estimate.state, weights_of(_trunk(estimate))
     moved, L = _Moved(turn, problem, estimate), problem.local_size
     kept = torch.cat([torch.arange(L), L + problem.moving])
     size, count = len(problem.moving), len(weights)
@@ -264,7 +264,7 @@ def _adam(turn: _Turn, estimate: Estimate) -> tuple[Estimate, int]:
     problem = turn.capture.problem(estimate, turn.never)
     cost = turn.cost(problem, estimate)
     for _ in range(_STEPS):
-        moved, weights = _Moved(turn, problem, estimate), _flat(_trunk(estimate)).requires_grad_()
+        moved, weights = _Moved(turn, problem, estimate), weights_of(_trunk(estimate)).requires_grad_()
         errors = problem.pixel_errors(estimate.state).transpose(-1, -2)
         with torch.no_grad():
             rest = torch.where(moved.factor[..., None] > 0, errors, 0.0) - moved.pixels(weights, moved.places)

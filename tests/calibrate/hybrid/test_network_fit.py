@@ -17,7 +17,15 @@ from kcal.calibrate.camera.options import CalibrationOptions
 from kcal.calibrate.hybrid.families import typical_hyperprior
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.fitted_views import Estimate
-from kcal.calibrate.hybrid.network_fit import FieldTraining, _flat, _gauss_newton, _Moved, _trunk, _Turn, _with_weights
+from kcal.calibrate.hybrid.network_fit import (
+    FieldTraining,
+    _gauss_newton,
+    _Moved,
+    _trunk,
+    _Turn,
+    _with_weights,
+    weights_of,
+)
 from kcal.calibrate.hybrid.settled import settle
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
@@ -140,7 +148,7 @@ def turn() -> tuple[_Turn, Estimate]:
         focal=None, hyperprior=typical_hyperprior(modes), progress=lambda _: None,
     )  # fmt: skip
     capture_, estimate = found.rounds.capture, found.rounds.estimate
-    flat = _flat(_trunk(estimate))
+    flat = weights_of(_trunk(estimate))
     return _Turn(capture=capture_, never=found.never, initial=flat, spread=0.5), estimate
 
 
@@ -149,7 +157,7 @@ def test_derivatives_by_the_networks_weights() -> None:
     torch.manual_seed(4)
     own, estimate = turn()
     problem = own.capture.problem(estimate, own.never)
-    weights = _flat(_trunk(estimate))
+    weights = weights_of(_trunk(estimate))
     rows = _Moved(own, problem, estimate).rows(weights, slice(1, 3))
     for k in (0, 7, 25):
         sides = []
@@ -169,7 +177,7 @@ def test_a_turn_lowers_the_cost_and_a_narrow_prior_holds_the_weights() -> None:
     assert steps > 0
     assert own.cost(own.capture.problem(after, own.never), after) < before
     narrow, _ = _gauss_newton(dataclasses.replace(own, spread=1e-5), estimate)
-    moved = [_flat(_trunk(each)) - own.initial for each in (after, narrow)]
+    moved = [weights_of(_trunk(each)) - own.initial for each in (after, narrow)]
     assert float(moved[1].abs().max()) < 1e-4 < 1e-2 < float(moved[0].abs().max())
 
 
