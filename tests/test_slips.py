@@ -5,8 +5,10 @@ from __future__ import annotations
 import pickle
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -98,3 +100,44 @@ def test_squares_of_25_meters_are_doubted() -> None:
         warnings.simplefilter("error")
         Board.of(board.record)
         Board(columns=9, rows=6, square=1.0)
+
+
+def painted(shift: int = 0) -> np.ndarray:
+    y, x = np.mgrid[:120, :160]
+    on = (x >= 20) & (x < 140) & (y >= 20) & (y < 100)
+    return np.roll(np.where(on & ((x // 20 + y // 20) % 2 == 0), 40, 220).astype(np.uint8), shift, 1)
+
+
+def test_images_to_detect_in(tmp_path: Path) -> None:
+    board = Board(columns=5, rows=3, square=0.02)
+    images = [painted(), painted(7)]
+    for number, image in enumerate(images):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), image)
+    files = sorted(tmp_path.iterdir())
+    expected = kcal.detect(files, board).pixels()
+    for given in (tmp_path, str(tmp_path), f"{tmp_path}/*.png", [tmp_path], images, np.stack(images)[:, None]):
+        seen = kcal.detect(given, board)
+        assert torch.equal(seen.pixels(), expected), given
+        assert seen.names in (("0.png", "1.png"), ("image 0", "image 1"))
+    for one in (files[0], str(files[0]), images[0], torch.from_numpy(images[0])):
+        assert torch.equal(kcal.detect(one, board).pixels(), expected[:1])
+    assert kcal.detect(images, board).views[0].image is None
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ([], "no images given"),
+        ("nowhere", "nowhere: no such file or folder"),
+        ("*.nothing", "no file matches"),
+        ("film.mp4", "film.mp4: a video; kcal.corners.detect_video"),
+        (["nowhere.png"], "no board in any of 1 images .*No such file"),
+        ([np.zeros((120, 160, 3), np.uint8)], r"image 0: a color image \(120, 160, 3\); .*cv2.COLOR_BGR2GRAY"),
+        (np.zeros((3, 120, 160), np.uint8), r"a batch \(B, 1, H, W\) or a list is needed, got \(3, 120, 160\)"),
+        (BOARD, "detect: paths: .* is needed, got Board"),
+        ([3], "detect: paths: .* is needed, got list of int"),
+    ],
+)
+def test_what_shows_no_images(given: Any, message: str) -> None:
+    with pytest.raises(kcal.KcalError, match=message):
+        kcal.detect(given, BOARD)

@@ -80,9 +80,9 @@ def detect_command(
     board = Board.parse(size, square)
 
     from kcal.corners.detect import Detection, detect
-    from kcal.corners.images import expand_images
+    from kcal.corners.images import VIDEO_SUFFIXES, expand_images
     from kcal.corners.orientation import turned_images
-    from kcal.corners.video import VIDEO_SUFFIXES, detect_video
+    from kcal.corners.video import detect_video
     from kcal.sources import is_stream, source_name
 
     failed: list[tuple[str, Path, Detection]] = []

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import glob
 import hashlib
+import os
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import cv2
 import numpy as np
 import torch
+from torch import Tensor
 
 from kcal.corners.board import Board
 from kcal.corners.charuco import MIN_CORNERS
@@ -18,7 +21,7 @@ from kcal.corners.detect_targets import detect_charuco, detect_target
 from kcal.corners.detection import Detection, too_few
 from kcal.corners.grid import MIN_SHARPNESS, local_side, sharpness
 from kcal.corners.grid_check import without_false_sides
-from kcal.corners.images import Gray, decode_gray, to_8bit, unique_names
+from kcal.corners.images import VIDEO_SUFFIXES, Gray, decode_gray, expand_images, to_8bit, unique_names
 from kcal.corners.observations import Failure, Observations, View
 from kcal.corners.refine import Refinement, refine_corners
 from kcal.corners.saddle import CornerStatus
@@ -28,6 +31,7 @@ from kcal.corners.sizes import common_size, rescaled, resized_alike
 from kcal.corners.time_limit import Limited, TookTooLongError
 from kcal.errors import FileError, InputError
 from kcal.files import read_bytes
+from kcal.sources import is_stream, source_name
 
 _THOROUGH = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
 MIN_GOOD = 0.5  # share of the corners that must be refined successfully
@@ -92,7 +96,7 @@ def detect_board(image: Gray, board: Board, refine: Refinement = "erf") -> Detec
 
 
 def detect(
-    paths: Sequence[str | Path],
+    paths: str | Path | Sequence[str | Path | Gray | Tensor] | Gray | Tensor,
     board: Board,
     refine: Refinement = "erf",
     progress: Callable[[str], None] | None = None,
@@ -107,18 +111,20 @@ def detect(
     to the size that most images have (`kcal.corners.sizes`).
 
     Args:
-        paths: image files, for example from `kcal.corners.images.expand_images`.
+        paths: a folder, a wildcard or an image file, or several of them; or images themselves, as `detect_board`
+            takes them: one (H, W), a list, or a batch with four dimensions. They are called `image 0` and so on.
         board: the board.
         refine: see `kcal.corners.refine.refine_corners`.
         progress: called with each image's name when it is done.
         time_limit: seconds after which an image becomes a failure; no limit by default. See
             `kcal.corners.time_limit.Limited`.
         note: called with what was done about images of several sizes; a Python warning by default.
-        on_failure: called with the name, path and detection of each readable image that shows no board, for example to
+        on_failure: called with the name, path and detection of each readable file that shows no board, for example to
             draw why (`kcal.report.gallery.FailedImage`).
 
     Raises:
         InputError: no images, images that were cropped or rotated, or no board in any image.
+        FileError: a folder without images, a wildcard without a match, or a single path that does not exist.
 
     Example:
         >>> import tempfile
@@ -131,10 +137,10 @@ def detect(
         >>> seen.names, seen.image_size, seen.failures[0].reason
         (('a.png',), (160, 120), 'the file is empty; copy it again')
     """
-    if not paths:
-        raise InputError("no images given")
-    files = [Path(path) for path in paths]
-    names = unique_names(files)
+    files = _files_and_images(paths)
+    short = iter(unique_names([file for file in files if isinstance(file, Path)]))
+    names = [next(short) if isinstance(file, Path) else f"image {i}" for i, file in enumerate(files)]
+    sources = dict(zip(names, files, strict=True))
     views: list[View] = []
     failures: list[Failure] = []
     sizes: list[tuple[int, int] | None] = []
@@ -142,8 +148,7 @@ def detect(
     with Limited(time_limit) as limited:
         for name, file in zip(names, files, strict=True):
             try:
-                data = read_bytes(file)
-                image = decode_gray(data, file)
+                image, digest = _image_and_hash(file)
             except FileError as error:
                 failures.append(Failure(name=name, reason=str(error).removeprefix(f"{file}: ")))
                 sizes.append(None)
@@ -159,19 +164,18 @@ def detect(
                     found = Detection(None, str(error))
                 if found.pixels is None:
                     failures.append(Failure(name=name, reason=found.reason))
-                    if on_failure is not None:
+                    if on_failure is not None and isinstance(file, Path):
                         on_failure(name, file, found)
                 else:
                     numberings.setdefault(found.legacy, []).append(name)
-                    digest = hashlib.sha256(data).hexdigest()
-                    views.append(view_of(found, name, image=str(file), sha256=digest))
+                    views.append(view_of(found, name, image=str(file) if digest else None, sha256=digest))
             if progress is not None:
                 progress(name)
     if not views:
         first = f"{failures[0].name}: {failures[0].reason}"
         raise InputError(f"no board in any of {len(files)} images ({first}){_hint(files, board)}")
     if True in numberings:
-        views = _renumbered(views, numberings, board, refine)
+        views = _renumbered(views, sources, numberings, board, refine)
     common = common_size(names, sizes)
     if common.note:
         note(common.note)
@@ -182,8 +186,49 @@ def detect(
     )
 
 
+def _files_and_images(paths: Any) -> list[Any]:
+    """Files as paths, in place of folders and wildcards, and images as they are; see `detect`."""
+    if hasattr(paths, "shape"):
+        if len(paths.shape) not in (2, 4):
+            raise InputError(f"images: one (H, W), a batch (B, 1, H, W) or a list is needed, got {tuple(paths.shape)}")
+        return [paths] if len(paths.shape) == 2 else list(paths)
+    if isinstance(paths, str | Path):
+        if is_stream(paths) or Path(paths).suffix.lower() in VIDEO_SUFFIXES:
+            raise InputError(f"{source_name(paths)}: a video; kcal.corners.detect_video searches its frames")
+        return list(expand_images([paths]))
+    found: list[Any] = []
+    for one in paths:
+        if hasattr(one, "shape"):
+            if len(one.shape) == 3 and one.shape[-1] in (3, 4):
+                raise InputError(
+                    f"image {len(found)}: a color image {tuple(one.shape)}; give its gray levels, for "
+                    "example cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)"
+                )
+            found.append(one)
+        elif os.path.isdir(one) or (glob.has_magic(str(one)) and not os.path.exists(one)):
+            found += expand_images([one])
+        else:
+            found.append(Path(one))
+    if not found:
+        raise InputError("no images given")
+    return found
+
+
+def _image_and_hash(source: Any) -> tuple[Any, str | None]:
+    """An image, and the hash of its file's bytes if it comes from one."""
+    if not isinstance(source, Path):
+        image = np.asarray(source)
+        return image[0] if image.ndim == 3 and len(image) == 1 else image, None
+    data = read_bytes(source)
+    return decode_gray(data, source), hashlib.sha256(data).hexdigest()
+
+
 def _renumbered(
-    views: Sequence[View], numberings: dict[bool | None, list[str]], board: Board, refine: Refinement
+    views: Sequence[View],
+    sources: dict[str, Any],
+    numberings: dict[bool | None, list[str]],
+    board: Board,
+    refine: Refinement,
 ) -> list[View]:
     """Views of a ChArUco board of the old numbering: images that do not tell it are read anew, as the others tell.
 
@@ -197,9 +242,8 @@ def _renumbered(
         )
     unclear, out = set(numberings.get(None, ())), []
     for view in views:
-        if view.name in unclear and view.image is not None:
-            image = decode_gray(read_bytes(Path(view.image)), view.image)
-            found = detect_charuco(image, board, refine, legacy=True)
+        if view.name in unclear:
+            found = detect_charuco(_image_and_hash(sources[view.name])[0], board, refine, legacy=True)
             if found.pixels is not None:
                 out.append(view_of(found, view.name, image=view.image, sha256=view.sha256))
             continue
@@ -229,22 +273,22 @@ def view_of(found: Detection, name: str, image: str | None = None, sha256: str |
     return View(name=name, pixels=pixels, covariance=spread, image=image, sha256=sha256)
 
 
-def _size(image: Gray) -> tuple[int, int]:
-    return image.shape[1], image.shape[0]
+def _size(image: Any) -> tuple[int, int]:
+    return image.shape[-1], image.shape[-2]
 
 
-def _size_of(file: Path) -> tuple[int, int] | None:
+def _size_of(file: Any) -> tuple[int, int] | None:
     try:
-        return _size(decode_gray(read_bytes(file), file))
+        return _size(_image_and_hash(file)[0])
     except FileError:
         return None
 
 
-def _hint(files: list[Path], board: Board) -> str:
+def _hint(files: list[Any], board: Board) -> str:
     """Which board the first images show, if they show another one."""
     for file in files[:3]:
         try:
-            image = to_8bit(decode_gray(read_bytes(file), file))
+            image = to_8bit(_image_and_hash(file)[0])
         except FileError:
             continue
         small = to_8bit(reduced(image, max(1.0, max(image.shape) / SEARCH_SIDES[0]), _size(image))[0])

@@ -27,6 +27,7 @@ from kcal.image_header import check_image_header
 Gray = npt.NDArray[np.uint8 | np.uint16]
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".pnm", ".jp2"})
+VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg"})
 MIN_IMAGE_SIDE = 16
 
 _decoding = threading.Lock()
@@ -108,7 +109,7 @@ def to_8bit(image: Gray) -> npt.NDArray[np.uint8]:
     return np.clip(np.rint(stretched), 0, 255).astype(np.uint8)
 
 
-def expand_images(inputs: Sequence[str | Path]) -> list[Path]:
+def expand_images(inputs: str | Path | Sequence[str | Path]) -> list[Path]:
     """List the image files that files, folders and wildcards stand for, each file once.
 
     A folder stands for the images directly inside it (by suffix), a wildcard for the files it matches; both in natural
@@ -125,6 +126,7 @@ def expand_images(inputs: Sequence[str | Path]) -> list[Path]:
         ...     [path.name for path in expand_images([folder])]
         ['2.jpg', '10.jpg']
     """
+    inputs = [inputs] if isinstance(inputs, str | Path) else inputs
     if not inputs:
         raise InputError("no images given; name image files, folders or wildcards")
     found: dict[Path, Path] = {}

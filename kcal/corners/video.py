@@ -24,7 +24,6 @@ from kcal.errors import FileError, InputError
 from kcal.files import write_atomic
 from kcal.sources import is_stream, source_name
 
-VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg"})
 MOST_VIEWS = 40
 DURATION = 120.0  # seconds: how long a live stream is read by default
 _STREAM_TIMEOUT_MS = 10_000  # for opening, and for each frame

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from kcal.calibrate.rig.pairs import pair_by_name
-from kcal.corners.images import Gray, expand_images, read_gray
-from kcal.corners.video import VIDEO_SUFFIXES, VideoFrames
+from kcal.corners.images import VIDEO_SUFFIXES, Gray, expand_images, read_gray
+from kcal.corners.video import VideoFrames
 from kcal.errors import InputError
 from kcal.mark.items import Side
 

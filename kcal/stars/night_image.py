@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcal.corners.image_time import DATE_IN_NAME
-from kcal.corners.images import expand_images, read_gray
-from kcal.corners.video import VIDEO_SUFFIXES, read_frames
+from kcal.corners.images import VIDEO_SUFFIXES, expand_images, read_gray
+from kcal.corners.video import read_frames
 from kcal.errors import FileError, InputError
 from kcal.files import read_bytes
 from kcal.stars.sky import parse_time
