@@ -64,6 +64,11 @@ class Camera(ConvertibleCamera):
         True
     """
 
+    results = {  # noqa: RUF012
+        "project": (((2,), torch.float64), ((), torch.bool)),
+        "unproject": (((3,), torch.float64), ((), torch.bool)),
+    }
+
     def __init__(self, parameters: Tensor, *, size: tuple[int, int], model: LensModel | str = "opencv5") -> None:
         super().__init__(parameters, size, LensModel.named(model))
         self._fitted = FittedPolynomials()
@@ -92,6 +97,10 @@ class Camera(ConvertibleCamera):
     def with_parameters(self, parameters: Tensor) -> Camera:
         """Make a camera of the same kind, size and model with other parameters; no memory is shared."""
         return Camera(parameters, size=self.size, model=self.model)
+
+    @property
+    def _long_graph(self) -> bool:
+        return self.model.hybrid is not None and self.params.ndim == 1
 
     @property
     def distortion(self) -> ExtendedDistortion:
@@ -156,6 +165,8 @@ class Camera(ConvertibleCamera):
             InputError: a wrong shape or an integer dtype.
         """
         points = self._taken("points_cam", points_cam, 3)
+        if self._long_graph and (found := self.as_operation("project", points)):
+            return found[0], found[1]
         if worth_fitting(points, self.params, self.model):
             polynomials = self._fitted.forward(self.params.detach(), self.model, self.valid_region)
             if polynomials is not None:
@@ -296,6 +307,8 @@ class Camera(ConvertibleCamera):
             InputError: a wrong shape or an integer dtype.
         """
         pixels = self._taken("pixels", pixels, 2)
+        if start is None and self._long_graph and (found := self.as_operation("unproject", pixels)):
+            return found[0], found[1]
         if start is None and worth_fitting(pixels, self.params, self.model):
             ready = PreparedInverse(self.valid_region, self.inverse_start)
             polynomials = self._fitted.backward(self.params.detach(), self.model, ready)

@@ -9,15 +9,16 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from kcal.checks import Float64Module, as_points, as_size, require_finite
+from kcal.checks import as_points, as_size, require_finite
 from kcal.errors import InputError
 from kcal.lens.inverse import prepare_inverse
 from kcal.lens.model import LensModel
 from kcal.lens.projection import parameter_names
 from kcal.lens.region import Region
+from kcal.operation import Operations
 
 
-class LensParameters(Float64Module):
+class LensParameters(Operations):
     """Named parameters that contain lens coefficients, which of them are free, and where their lens is valid.
 
     Args:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from kcal.checks import as_covariance, as_points, exportable, keep_float64
+from kcal.checks import as_covariance, as_points, exportable
 from kcal.dispatch import is_differentiated
 from kcal.errors import InputError
 from kcal.io.rig_file import load_rig
@@ -31,6 +30,7 @@ from kcal.locate.stereo import (
     reprojection_errors,
     status_counts,
 )
+from kcal.operation import Operations, shapes_of
 from kcal.texts import brief
 
 
@@ -83,7 +83,7 @@ class Sensitivity(NamedTuple):
     meters_per_degree: Tensor
 
 
-class StereoLocalizer(nn.Module):
+class StereoLocalizer(Operations):
     """Locate matched pixels of a calibrated rig on the Earth, with an error bar.
 
     Pixels are triangulated in closed form, refined to the maximum-likelihood position (Gauss-Newton on reprojection
@@ -140,6 +140,9 @@ class StereoLocalizer(nn.Module):
     ecef_from_enu: Tensor
     ecef_of_origin: Tensor
     geodetic_of_origin: Tensor
+    results = shapes_of(
+        Localization, enu=(3,), covariance=(3, 3), geodetic=(3,), status=torch.int8, bearing=(3,), reprojection=(2,)
+    )
     calibration_factor: Tensor | None
     mounting: Tensor | None
     link: Tensor | None
@@ -261,6 +264,8 @@ class StereoLocalizer(nn.Module):
             if mask.dtype != torch.bool:
                 raise InputError(f"mask: bool is needed, got {mask.dtype}")
             mask = mask.expand(left.shape[:-1])
+        if found := self.as_operation("forward", left, right, cov, mask):
+            return Localization(*found)
         differentiated = is_differentiated(left, right, cov, self)
 
         def locate(left: Tensor, right: Tensor, cov: Tensor | None, mask: Tensor | None) -> Localization:
@@ -340,9 +345,6 @@ class StereoLocalizer(nn.Module):
         by_camera = self.calibration_factor is not None
         found = fit_pairs(self.rig, *checked_pairs(pixels_left, pixels_right), by_camera=by_camera)
         return self._on_earth(found, self.pixel_sigma**2), _sensitivity(found)
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:
-        return super()._apply(keep_float64(fn), recurse)
 
 
 def _sensitivity(found: PairFit) -> Sensitivity:

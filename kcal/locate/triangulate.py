@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from kcal.checks import exportable
 from kcal.dispatch import is_differentiated
@@ -21,6 +21,7 @@ from kcal.locate.stereo import (
     reprojection_errors,
     status_counts,
 )
+from kcal.operation import Operations, shapes_of
 from kcal.texts import brief
 
 
@@ -56,7 +57,7 @@ class Triangulation(NamedTuple):
         return brief(self, status=status_counts(self.status))
 
 
-class Triangulate(nn.Module):
+class Triangulate(Operations):
     """Locate pixel pairs in the rig frame: the positions of `StereoLocalizer`, without the Earth.
 
     The status of a pair is decided from the two rays before anything is divided: `NOT_FINITE` (NaN or infinite
@@ -86,6 +87,10 @@ class Triangulate(nn.Module):
         (5000.0, 'OK')
     """
 
+    results = shapes_of(
+        Triangulation, points=(3,), status=torch.int8, rays=(3,), reprojection=(2,), bearing_only=torch.bool
+    )
+
     def __init__(self, rig: StereoRig, pixel_sigma: float = 0.3) -> None:
         super().__init__()
         self.pixel_sigma = checked_rig(rig, pixel_sigma)
@@ -98,6 +103,8 @@ class Triangulate(nn.Module):
             InputError: not floating point, or shapes that are wrong or unlike.
         """
         left, right = checked_pairs(pixels_left, pixels_right)
+        if found := self.as_operation("forward", left, right):
+            return Triangulation(*found)
         differentiated = is_differentiated(left, right, self)
 
         def triangulate(left: Tensor, right: Tensor) -> Triangulation:
