@@ -104,7 +104,7 @@ def _call(tensors: list[Tensor], name: str, method: str, given: str) -> list[Ten
 
 
 @_call.register_fake
-def _(tensors: list[Tensor], name: str, method: str, given: str) -> list[Tensor]:
+def _empty_results(tensors: list[Tensor], name: str, method: str, given: str) -> list[Tensor]:
     first = tensors[-given.count("x")]
     return [first.new_empty((*first.shape[:-1], *tail), dtype=kind) for tail, kind in _MODULES[name].results[method]]
 
@@ -133,7 +133,7 @@ def _call_backward(
 
 
 @_call_backward.register_fake
-def _(
+def _empty_slopes(
     slopes: list[Tensor], tensors: list[Tensor], name: str, method: str, given: str, has: str, wanted: str
 ) -> list[Tensor]:
     return [each.new_empty(each.shape) for each, by in zip(tensors, wanted, strict=True) if by == "x"]
@@ -158,7 +158,7 @@ _call.register_autograd(_backward, setup_context=_keep)
 
 
 @_call.register_vmap
-def _(info: Any, dims: Any, tensors: list[Tensor], name: str, method: str, given: str) -> Any:
+def _over_batch(info: Any, dims: Any, tensors: list[Tensor], name: str, method: str, given: str) -> Any:
     pairs = list(zip(tensors, dims[0], strict=True))
     rows = [
         _call([one if axis is None else one.select(axis, i) for one, axis in pairs], name, method, given)

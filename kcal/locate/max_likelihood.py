@@ -156,12 +156,16 @@ def most_likely(
     # After a step, the evaluation that finds nothing left to move is also the last one.
     later = fixed if differentiated or is_traced() else whole
     zero = torch.zeros_like(start[1])
+    # With gradients, an evaluation after which the step is short is also that of the first chord.
+    recorded = differentiated and torch.is_grad_enabled() and not is_traced()
+    inverse: Sequence[Tensor] = ()
     with torch.no_grad():
         theta = torch.stack([zero, zero, first], -2)
         best, step, cost = theta, torch.zeros_like(theta), torch.full_like(zero, torch.inf)
         length, noise = torch.full_like(zero, torch.inf), _least_noise(weight)
         for number in range(_TRACED_STEPS if is_traced() else _MOST_STEPS):
-            at = _evaluate(later if number else fixed, theta)
+            with torch.set_grad_enabled(recorded and number > 0):
+                at = _evaluate(later if number else fixed, theta)
             # After so short a step, rounding may raise the cost.
             better = (at.cost <= cost) | (length <= _SHORT_STEP * noise)
             every = known_true(better)
@@ -178,6 +182,8 @@ def most_likely(
                 length = torch.where(better, farthest, 0.25 * length)
             theta = best + step
             if every and known_true(length <= _SHORT_STEP * noise):
+                if recorded and number:
+                    theta, inverse = best, covariance
                 if differentiated or (by_camera and not number):
                     break
                 # So short a step is linear to rounding: it is taken without another evaluation.
@@ -187,9 +193,13 @@ def most_likely(
         else:
             theta = best
     if differentiated:
-        inverse = tuple(value.detach() for value in _covariance_at(_evaluate(fixed, theta), fixed))
-        for _ in range(_CHORDS):
-            at = _evaluate(fixed, theta)
+        known = bool(inverse)
+        if not known:
+            with torch.no_grad():
+                inverse = [value.detach() for value in _covariance_at(_evaluate(fixed, theta), fixed)]
+        for number in range(_CHORDS):
+            if number or not known:
+                at = _evaluate(fixed, theta)
             theta = theta - torch.where(usable[..., None, :], _product(inverse, at.slope), 0.0)
     at = _evaluate(whole, theta)
     return _fit_at(at, theta, sides, _covariance_at(at, fixed))
