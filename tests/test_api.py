@@ -42,6 +42,7 @@ PUBLIC = {
         load_lookup new_pinhole paraxial_focal pixel_covariance projection_sigma
         refit_camera rotation_from_vector save_lookup save_onnx train_inverse undistort_maps
         vector_from_rotation LensSetting ExtendedDistortion
+        CameraLike
     """,
     "kcal.corners": """
         Detection Failure MatchOptions MatchStatus Matches RefinedPoint detect_board detect_video expand_images

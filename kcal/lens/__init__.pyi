@@ -52,7 +52,8 @@ from kcal.calibrate.camera.export import ExportedCameras as ExportedCameras
 from kcal.calibrate.camera.misfit import Misfit as Misfit
 from kcal.io.onnx_file import save_onnx as save_onnx
 
-# Tables and learned inverses (these are also in kcal.nets)
+# Cameras of other makes, tables and learned inverses (these are also in kcal.nets)
+from kcal.lens.camera_like import CameraLike as CameraLike
 from kcal.lens.baking import bake as bake
 from kcal.lens.lookup import LookupCamera as LookupCamera
 from kcal.io.lookup_file import load_lookup as load_lookup

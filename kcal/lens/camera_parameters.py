@@ -58,6 +58,11 @@ class LensParameters(Operations):
         return self.model.names
 
     @property
+    def wide(self) -> bool:
+        """See `LensModel.wide`."""
+        return self.model.wide
+
+    @property
     def values(self) -> Tensor:
         """The parameters in the order of `names`; gradients reach only the free ones."""
         if not self.params.requires_grad:

@@ -15,6 +15,7 @@ from kcal.checks import Float64Module, as_points, require_finite
 from kcal.errors import InputError
 from kcal.lens.calibration import Exclusion, RigSource, UntilChanged
 from kcal.lens.camera import Camera
+from kcal.lens.camera_like import CameraLike, as_camera
 from kcal.lens.mounting import REFRACTION, Origin, check_refraction
 from kcal.quantities import length_text
 from kcal.texts import brief
@@ -88,7 +89,7 @@ class CameraRig(Float64Module):
 
     def __init__(
         self,
-        cameras: Sequence[Camera],
+        cameras: Sequence[Camera | CameraLike],
         names: Sequence[str],
         rotation: Tensor,
         center: Tensor,
@@ -114,7 +115,7 @@ class CameraRig(Float64Module):
             if not off <= 1e-6 or sign < 0:
                 raise InputError(f"camera {name}: not a rotation matrix (R Rᵀ must be 1 and det R = +1)")
         check_refraction(refraction, 0.0)
-        self.cameras = nn.ModuleList(cameras)
+        self.cameras = nn.ModuleList(map(as_camera, cameras))
         self.names = tuple(names)
         self.origin = origin
         self.refraction = float(refraction)

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from kcal.lens.camera import Camera, pixels_to_plane
+from kcal.lens.camera_like import AdaptedCamera
 from kcal.lens.inverse import PreparedInverse
 from kcal.lens.plane import rays_from_plane
 from kcal.lens.projection import Projection, project_components
@@ -22,6 +23,8 @@ from kcal.lens.region import Region
 def stackable(cameras: Sequence[Camera]) -> bool:
     """Whether cameras have one lens model and may be computed as one batch."""
     first = cameras[0]
+    if not all(isinstance(camera, Camera) for camera in cameras):
+        return False
     # Those of a hybrid lens have polynomials of their own.
     return not first.model.hybrid and all(
         camera.model == first.model
@@ -80,7 +83,9 @@ def project_each(
     """Project points (..., C, 3, N), each camera's own, with derivatives; see `project_components`."""
     if not stackable(cameras):
         return [
-            project_components(points[..., number, :, :], camera.values, camera.model, wanted[number], meter)
+            camera.projection(points[..., number, :, :])
+            if isinstance(camera, AdaptedCamera)
+            else project_components(points[..., number, :, :], camera.values, camera.model, wanted[number], meter)
             for number, camera in enumerate(cameras)
         ]
     values = torch.stack([camera.values for camera in cameras])

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from kcal.dispatch import is_differentiated
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
+from kcal.lens.camera_like import CameraLike, as_camera
 from kcal.lens.pinhole import TurnedCamera, new_pinhole, source_pixels
 from kcal.lens.views import Cylinder
 
@@ -43,7 +44,11 @@ class UndistortMaps(NamedTuple):
 
 
 def undistort_maps(
-    camera: Camera, new_camera: Camera | Cylinder | None = None, rotation: Tensor | None = None, *, at: float = math.inf
+    camera: Camera | CameraLike,
+    new_camera: Camera | Cylinder | None = None,
+    rotation: Tensor | None = None,
+    *,
+    at: float = math.inf,
 ) -> UndistortMaps:
     """Compute maps for `cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR)`.
 
@@ -73,8 +78,9 @@ def undistort_maps(
         >>> maps.map_x.shape, bool(maps.mask.all()), [round(float(maps.map_x[240, i]), 3) for i in (0, 639)]
         ((480, 640), True, [0.0, 639.0])
     """
+    source: Camera = as_camera(camera)
     with torch.no_grad():
-        pixels, mask = _source_positions(camera, new_camera or new_pinhole(camera), rotation, at)
+        pixels, mask = _source_positions(source, new_camera or new_pinhole(source), rotation, at)
     if mask.ndim != 2:
         raise InputError(f"undistort_maps: a single camera is needed, not a batch of {tuple(mask.shape[:-2])}")
     map_x, map_y = pixels.to("cpu", torch.float32).unbind(-1)
@@ -92,7 +98,7 @@ class Undistort(nn.Module):
     The new camera does not change with the old one.
 
     Args:
-        camera: the camera that took the images, or a batch of cameras.
+        camera: the camera that took the images, a batch of cameras, or a `CameraLike`.
         new_camera: the camera of the new images, single or a batch, or a `Cylinder`. By default `new_pinhole(camera)`,
             for which every new pixel is valid.
         rotation: (..., 3, 3) camera_from_new: where the new cameras look; by default where the cameras do.
@@ -118,18 +124,18 @@ class Undistort(nn.Module):
 
     def __init__(
         self,
-        camera: Camera,
+        camera: Camera | CameraLike,
         new_camera: Camera | Cylinder | None = None,
         rotation: Tensor | None = None,
         *,
         at: float = math.inf,
     ) -> None:
         super().__init__()
-        self.camera = camera
-        self.new_camera = new_pinhole(camera) if new_camera is None else new_camera
+        self.camera: Camera = as_camera(camera)
+        self.new_camera = new_pinhole(self.camera) if new_camera is None else new_camera
         self.at = at
         turn = torch.eye(3) if rotation is None else rotation
-        self.register_buffer("rotation", turn.detach().to(camera.params), persistent=rotation is not None)
+        self.register_buffer("rotation", turn.detach().to(self.camera.params), persistent=rotation is not None)
         for name, value in zip(("grid_x", "grid_y", "mask"), self._grid(torch.float32), strict=True):
             self.register_buffer(name, value.detach(), persistent=False)
         self.register_buffer("_made_from", self._camera_values(), persistent=False)
@@ -239,7 +245,7 @@ class UndistortImage(nn.Module):
     """
 
     def __init__(
-        self, camera: Camera, new_camera: Camera | Cylinder | None = None, rotation: Tensor | None = None
+        self, camera: Camera | CameraLike, new_camera: Camera | Cylinder | None = None, rotation: Tensor | None = None
     ) -> None:
         super().__init__()
         self.undistort = Undistort(camera, new_camera, rotation)

@@ -16,6 +16,7 @@ from kcal.checks import as_covariance, as_points, as_tensor, keep_float64, requi
 from kcal.errors import InputError, warn_user
 from kcal.lens.calibration import RigCalibration, UntilChanged
 from kcal.lens.camera import Camera
+from kcal.lens.camera_like import CameraLike, as_camera
 from kcal.lens.mounting import Mounting
 from kcal.quantities import length_text
 from kcal.texts import brief
@@ -32,7 +33,7 @@ class StereoRig(nn.Module):
     (a `RigCalibration`). Each is None until it is set, and again once a camera or the relative pose has changed.
 
     Args:
-        left: the first camera.
+        left: the first camera, or a `CameraLike`.
         right: the second camera.
         right_from_left_rotation: (3, 3) rotation matrix, such as R of `cv2.stereoCalibrate`.
         right_from_left_translation: (3,) or (3, 1) meters, such as T if the board was measured in meters.
@@ -58,8 +59,8 @@ class StereoRig(nn.Module):
 
     def __init__(
         self,
-        left: Camera,
-        right: Camera,
+        left: Camera | CameraLike,
+        right: Camera | CameraLike,
         right_from_left_rotation: Tensor | ArrayLike,
         right_from_left_translation: Tensor | ArrayLike,
     ) -> None:
@@ -80,8 +81,8 @@ class StereoRig(nn.Module):
         identity = torch.eye(3, dtype=torch.float64, device=rotation.device)
         if not torch.allclose(rotation @ rotation.T, identity, atol=1e-6) or torch.linalg.det(rotation) < 0:
             raise InputError("rig rotation: not a rotation matrix (R Rᵀ must be 1 and det R = +1)")
-        self.left = left
-        self.right = right
+        self.left: Camera = as_camera(left)
+        self.right: Camera = as_camera(right)
         self.register_buffer("right_from_left_rotation", rotation.detach().clone())
         self.register_buffer("right_from_left_translation", translation.detach().clone())
         if doubt := _pose_doubt(rotation.detach(), translation.detach()):
@@ -123,7 +124,7 @@ class StereoRig(nn.Module):
                 `Camera.normalize`, or undistort the images.
         """
         for word, camera in (("left", self.left), ("right", self.right)):
-            if camera.model.wide or bool((camera.coefficients != 0).any()):
+            if camera.wide or bool((camera.coefficients != 0).any()):
                 raise InputError(
                     f"the {word} lens distorts, so that epipolar lines are curves and there is no fundamental matrix; "
                     "use rig.essential with camera.normalize(pixels)"

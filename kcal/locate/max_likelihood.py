@@ -222,7 +222,7 @@ def _evaluate(fixed: _Fixed, theta: Tensor) -> _Evaluated:
         good = fixed.usable[..., None, :].expand(seen[..., 2, :].shape)
         if around.present is not None:
             good = good & around.present
-        wide = [camera.model.wide for camera in fixed.cameras]
+        wide = [camera.wide for camera in fixed.cameras]
         if not all(wide):
             # A perspective lens sees nothing beside and behind the camera.
             good = good & ((seen[..., 2, :] > 1e-6) | torch.tensor(wide, device=seen.device)[:, None])
