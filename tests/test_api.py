@@ -158,7 +158,7 @@ NEW_NAMES = (
     | {"save_siting_picture", "siting_figure"}
     | set(PUBLIC["kcal.stars"].split())
     | {
-        "ExtendedDistortion",
+        "CameraLike", "ExtendedDistortion",
         "FieldTraining",
         "NetworkModes",
         "JointFit",
