@@ -46,7 +46,7 @@ PUBLIC = {
     """,
     "kcal.corners": """
         Detection Failure MatchOptions MatchStatus Matches RefinedPoint detect_board detect_video expand_images
-        import_corners match_points read_gray refine_point save_board
+        import_corners match_points read_gray refine_point save_board RefineCorners Refined CornerStatus
     """,
     "kcal.calibrate": """
         CalibratedViews CalibrationLayer CalibrationSummary ComparisonResult Examination HalvesDifference
@@ -141,7 +141,7 @@ NEW_NAMES = (
     | {"pupil_shift", "ray_error", "IntervalCheck", "Refit", "against_capture", "interval_check", "simulated_refits"}
     | {"DisparityRanges", "RangeImage", "forgotten_yaw", "save_interval_picture"}
     | {"CameraRig", "CameraRigCalibration", "load_camera_rig", "save_camera_rig", "station_mounting", "stations_of"}
-    | {"ObjectViews", "group_objects", "PairBoxes", "BoxPairs"}
+    | {"ObjectViews", "group_objects", "PairBoxes", "BoxPairs", "RefineCorners", "Refined", "CornerStatus"}
     | {"MultiViewLocalizer", "ViewMarks", "ViewsLocalization", "locate_views", "read_views"}
     | {
         "Area",
@@ -215,6 +215,8 @@ RECORDS = {
     "ResidualStructure",
     "Association",
     "BoxPairs",
+    "Refined",
+    "CornerStatus",
     "Baseline",
     "ClockEstimate",
     "ClockPrior",

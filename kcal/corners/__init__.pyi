@@ -12,6 +12,9 @@ from kcal.corners.foreign_corners import import_corners as import_corners
 from kcal.corners.print_board import save_board as save_board
 
 # Refine and match points
+from kcal.corners.refine import RefineCorners as RefineCorners
+from kcal.corners.saddle import Refined as Refined
+from kcal.corners.saddle import CornerStatus as CornerStatus
 from kcal.corners.point import refine_point as refine_point
 from kcal.corners.point import RefinedPoint as RefinedPoint
 from kcal.corners.match import match_points as match_points

@@ -37,7 +37,7 @@ _THOROUGH = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMA
 MIN_GOOD = 0.5  # share of the corners that must be refined successfully
 
 
-def detect_board(image: Gray, board: Board, refine: Refinement = "erf") -> Detection:
+def detect_board(image: Gray | Tensor, board: Board, refine: Refinement = "erf") -> Detection:
     """Find the inner corners of a checkerboard, the visible ones of a ChArUco board or an AprilGrid, or circles.
 
     OpenCV's `findChessboardCorners` searches first; where it fails, `findChessboardCornersSB` (A. Duda and U. Frese,
@@ -46,7 +46,9 @@ def detect_board(image: Gray, board: Board, refine: Refinement = "erf") -> Detec
     (`kcal.corners.order.canonical_order`) and refined at the image's full size and depth.
 
     Args:
-        image: (H, W) uint8 or uint16.
+        image: (H, W) uint8 or uint16, as an array or a tensor; or a tensor (1, H, W) or (3, H, W), also in floating
+            point from 0 to 1. The search runs on the CPU; corners are on the tensor's device. They carry no gradient:
+            `RefineCorners` has those.
         board: at least 3 points each way, all of them in the image unless it has markers.
         refine: see `kcal.corners.refine.refine_corners`; `erf` of circles is `kcal.corners.circles.refine_circles`.
 
@@ -54,7 +56,7 @@ def detect_board(image: Gray, board: Board, refine: Refinement = "erf") -> Detec
         The corners, or None with a reason that a person can act on.
 
     Raises:
-        InputError: not a gray uint8 or uint16 image, a board with 2 inner corners in a row, an unknown `refine`.
+        InputError: an image of another shape, dtype or range, a board with 2 inner corners in a row, an unknown method.
 
     Example:
         >>> y, x = np.mgrid[:120, :160]
@@ -66,8 +68,13 @@ def detect_board(image: Gray, board: Board, refine: Refinement = "erf") -> Detec
         >>> detect_board(image, Board(columns=6, rows=5, square=0.02)).reason
         'a board of 5x3 inner corners was found, not 6x5: give --board 5x3'
     """
-    if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
-        raise InputError(f"image: (H, W) uint8 or uint16 is needed, got {image.shape} {image.dtype}")
+    if isinstance(image, Tensor):
+        found = detect_board(as_image(image), board, refine)
+        moved: dict[str, Any] = {
+            name: part.to(image.device) for name, part in found._asdict().items() if isinstance(part, Tensor)
+        }
+        return found._replace(**moved)
+    image = as_image(image)
     if min(board.columns, board.rows) < 3 and board.pattern != "aprilgrid":
         what = "inner corners" if board.pattern == "checkerboard" else "circles"
         raise InputError(
@@ -77,12 +84,12 @@ def detect_board(image: Gray, board: Board, refine: Refinement = "erf") -> Detec
         raise InputError(f"refine {refine!r}: choose one of {', '.join(get_args(Refinement))}")
     if board.pattern != "checkerboard" or board.dictionary is not None:
         return detect_target(image, board, refine)
-    found = find_board(to_8bit(image), board)
-    pixels = found.pixels
+    search = find_board(to_8bit(image), board)
+    pixels = search.pixels
     if pixels is None:
-        return Detection(None, found.reason, rejected=found.rejected)
+        return Detection(None, search.reason, rejected=search.rejected)
     if refine != "none":
-        pixels = refine_through_sizes(image, pixels, board, found.factor)
+        pixels = refine_through_sizes(image, pixels, board, search.factor)
     if sharpness(image, pixels, board.columns, board.rows) < MIN_SHARPNESS:
         blurred = "too blurred: edges are nearly as wide as the squares; focus, hold still or move closer"
         return Detection(None, blurred, rejected=pixels)
@@ -93,6 +100,45 @@ def detect_board(image: Gray, board: Board, refine: Refinement = "erf") -> Detec
     if good < max(MIN_GOOD * seen, min(MIN_CORNERS, board.corners)):
         return Detection(None, too_few(refined, seen), rejected=pixels)
     return Detection(refined.pixels, covariance=refined.covariance)
+
+
+def as_image(image: Gray | Tensor) -> Gray:
+    """Gray levels (H, W) as uint8 or uint16 of an array, or of a tensor (H, W), (1, H, W) or (3, H, W) of any device.
+
+    Red, green and blue become gray by OpenCV's weights. Floating point lies in 0 to 1: if all levels are whole shares
+    of 255, as after `ToTensor`, the result is the uint8 image, and otherwise uint16.
+
+    Raises:
+        InputError: another shape or dtype, levels that are not finite, or a range other than 0 to 1.
+
+    Example:
+        >>> as_image(torch.tensor([[[0.0, 0.2, 1.0]]])).tolist()
+        [[0, 51, 255]]
+    """
+    found: Any = image
+    if isinstance(image, Tensor):
+        found = (image.detach().float() if image.is_floating_point() else image.detach()).cpu().numpy()
+    shaped = found.ndim == 2 or (found.ndim == 3 and found.shape[0] in (1, 3))
+    if not shaped or not (found.dtype.kind == "f" or found.dtype in (np.uint8, np.uint16)):
+        raise InputError(
+            f"image: (H, W), (1, H, W) or (3, H, W) of uint8 or uint16, or of floating point from 0 to 1, is needed; "
+            f"got {found.shape} {found.dtype}"
+        )
+    if found.dtype.kind == "f":
+        low, high = (float(found.min()), float(found.max())) if found.size else (0.0, 0.0)
+        if not (low >= 0.0 and high <= 1.0):
+            raise InputError(
+                f"image: floating gray levels lie in 0 to 1, got {low:g} to {high:g}; divide by the brightest possible "
+                "level, undo a normalization by mean and deviation, or give uint8"
+            )
+        eight = np.rint(255.0 * found)
+        whole = np.abs(255.0 * found - eight).max(initial=0.0) < 1e-3
+        found = eight.astype(np.uint8) if whole else np.rint(65535.0 * found).astype(np.uint16)
+    if found.ndim == 3:
+        rows = np.ascontiguousarray(found.transpose(1, 2, 0))
+        found = found[0] if len(found) == 1 else cv2.cvtColor(rows, cv2.COLOR_RGB2GRAY)
+    result: Gray = np.ascontiguousarray(found)
+    return result
 
 
 def detect(

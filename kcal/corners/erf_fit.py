@@ -275,7 +275,9 @@ def _with_gradient(parameters: Tensor, inputs: _FitInputs, levels: Tensor) -> Te
 
     arguments = parameters, inputs.bend, *lines, prior.diagonal(), prior.value(), window.weight
     hessian = torch.func.vmap(torch.func.jacfwd(gradient))(*arguments, window.levels)
-    inverse, _ = torch.linalg.inv_ex(hessian)
+    inverse, _ = torch.linalg.inv_ex(hessian.detach())
+    # Windows without a corner have none, and NaN would spread to the gradients of others.
+    inverse = torch.where(torch.isfinite(inverse).all(-1).all(-1)[:, None, None], inverse, 0.0)
     residual = torch.func.vmap(gradient)(*arguments, levels)
-    change = -(inverse.detach() @ (residual - residual.detach())[..., None])[..., 0]
+    change = -(inverse @ (residual - residual.detach())[..., None])[..., 0]
     return parameters[:, :2] + torch.nan_to_num(change[:, :2])

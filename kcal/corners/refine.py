@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal, get_args
 
 import cv2
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from kcal.checks import as_points
+from kcal.checks import as_points, require_finite
 from kcal.corners.erf import erf_saddle
-from kcal.corners.grid import line_bend, neighbors
+from kcal.corners.grid import line_bend, local_side, neighbors
 from kcal.corners.images import Gray
 from kcal.corners.saddle import (
     MAX_MOVE,
@@ -84,8 +85,7 @@ def refine_corners(
     if method in ("erf", "saddle"):
         # Only the surroundings of the corners become float64; float32 holds 16 bits exactly.
         light = torch.from_numpy(image if image.dtype == np.uint8 else image.astype(np.float32))
-        found = saddle(light, pixels, side)
-        return found if method == "saddle" else _erf(light, pixels, found, side, image, grid)
+        return _refined(light, pixels, side, method, grid, _saturation_levels(int(image.max())))
 
     height, width = image.shape
     seen = torch.isfinite(pixels).all(-1)
@@ -111,23 +111,107 @@ def refine_corners(
     return Refined(*with_status(moved, checks))
 
 
-def _erf(
-    light: Tensor, start: Tensor, found: Refined, side: Tensor, image: Gray, grid: tuple[int, int] | None
+class RefineCorners(nn.Module):
+    """`refine_corners` as a module between a network's image or rough corners and `CalibrationLayer`.
+
+    Corners are differentiable by the image, with `erf` by the implicit function theorem; starts, covariance and blur
+    carry no gradient. What the corners of an image know together (light, bent and neighboring lines) counts as constant
+    of the gradient, which with `grid` is a fifth of what noise does to a corner. A corner that fails is NaN, which `CalibrationLayer` takes as not seen. Images are fitted one
+    after the other, each with what its own corners know together.
+
+    Args:
+        method: "erf", or "saddle", which is faster and states no covariance.
+        grid: (columns, rows) if the corners are all those of a board, row by row.
+
+    Raises:
+        InputError: another method; those of OpenCV and scikit-image have no gradients.
+
+    Example:
+        >>> x = torch.arange(40.0, dtype=torch.float64)
+        >>> image = torch.outer(torch.erf((x - 19.3) / 1.4), torch.erf((x - 20.6) / 1.4)) * 0.3 + 0.5
+        >>> image.requires_grad_(True)  # doctest: +ELLIPSIS
+        tensor(...)
+        >>> found = RefineCorners()(image[None, None], torch.tensor([[[20.5, 19.5]]]), torch.tensor([[15.0]]))
+        >>> [round(value, 6) for value in found.pixels[0, 0].tolist()], found.pixels.requires_grad
+        ([20.6, 19.3], True)
+    """
+
+    def __init__(self, method: Literal["erf", "saddle"] = "erf", grid: tuple[int, int] | None = None) -> None:
+        super().__init__()
+        if method not in ("erf", "saddle"):
+            raise InputError(f"RefineCorners: {method!r} has no gradients; choose erf or saddle, or use detect_board")
+        self.method, self.grid = method, grid
+
+    def forward(self, image: Tensor, pixels: Tensor, side: Tensor | None = None) -> Refined:
+        """Refine corners.
+
+        Args:
+            image: (B, 1, H, W) gray levels, uint8, or floating point of any scale.
+            pixels: (B, N, 2) starts, to about a pixel; NaN where a corner was not seen.
+            side: (B, N) smallest side in pixels of the squares around each corner; measured in `grid` if left out.
+
+        Returns:
+            Pixels (B, N, 2), status (B, N), covariance (B, N, 2, 2) and blur (B, N), on the device of the image.
+
+        Raises:
+            InputError: shapes or values that do not fit, or neither `side` nor `grid`.
+        """
+        pixels = as_points("pixels", pixels, 2).detach()
+        if not isinstance(image, Tensor) or image.ndim != 4 or image.shape[1] != 1 or len(image) != len(pixels):
+            found = tuple(image.shape) if isinstance(image, Tensor) else type(image).__name__
+            raise InputError(f"image (B, 1, H, W) and pixels (B, N, 2) are needed, got {found}, {tuple(pixels.shape)}")
+        if side is None and self.grid is None:
+            raise InputError("RefineCorners: side is needed, (B, N) pixels, or a module with a grid that tells it")
+        if image.is_floating_point():
+            require_finite("image", image.detach())
+        done = []
+        for number, light in enumerate(image[:, 0]):
+            known = side[number] if side is not None else local_side(pixels[number], *(self.grid or (0, 0)))
+            levels = None if light.is_floating_point() else _saturation_levels(int(light.max()))
+            done.append(_refined(light, pixels[number], known, self.method, self.grid, levels))
+        if not done:
+            return Refined(pixels, pixels[..., 0].long())
+        parts = {name: [getattr(each, name) for each in done] for name in Refined._fields}
+        return Refined(**{name: torch.stack(part) for name, part in parts.items() if part[0] is not None})
+
+    def extra_repr(self) -> str:
+        """One line for people."""
+        return f"method={self.method}, grid={self.grid}"
+
+
+def _refined(
+    light: Tensor,
+    start: Tensor,
+    side: Tensor,
+    method: str,
+    grid: tuple[int, int] | None,
+    levels: tuple[float, float] | None,
 ) -> Refined:
-    """The erf fit from the saddle's corners. Where the saddle failed, its reason stays, unless it is saturation."""
+    """Of one image (H, W): the saddle's corners, or the erf fit from there.
+
+    Where the saddle failed, its reason stays, unless it is saturation.
+    """
+    if method == "saddle":
+        return saddle(light, start, side)
+    with torch.no_grad():
+        found = saddle(light, start, side)
     settled = (found.status == CornerStatus.GOOD)[:, None]
 
     def fitted(known: Tensor) -> Refined:
         bend = line_bend(known, *grid) if grid is not None else None
         around = neighbors(known, *grid) if grid is not None else None
         begin = torch.where(settled, known, start)
-        return erf_saddle(light, begin, side, bend=bend, around=around, levels=_saturation_levels(image))
+        return erf_saddle(light, begin, side, bend=bend, around=around, levels=levels)
 
     fit = fitted(found.pixels)
     assert fit.blur is not None
     if _is_jagged(fit, settled[:, 0]):
         jagged, sharp = fit, light
-        light = torch.from_numpy(cv2.GaussianBlur(image.astype(np.float32), (0, 0), SMOOTHING))
+        from kornia.filters import gaussian_blur2d  # kornia takes long to load
+
+        whole = light if light.is_floating_point() else light.float()
+        reach = 2 * math.ceil(4.0 * SMOOTHING) - 1
+        light = gaussian_blur2d(whole[None, None], (reach, reach), (SMOOTHING, SMOOTHING))[0, 0]
         fit = fitted(found.pixels)
         saturated = jagged.status == CornerStatus.SATURATED
         fit = fit._replace(status=torch.where(saturated, int(CornerStatus.SATURATED), fit.status))
@@ -159,9 +243,8 @@ def _is_jagged(fit: Refined, settled: Tensor) -> bool:
     return bool(good.any()) and float(fit.blur[good].median()) < MIN_BLUR
 
 
-def _saturation_levels(image: Gray) -> tuple[float, float]:
+def _saturation_levels(brightest: int) -> tuple[float, float]:
     """The gray levels at which a pixel is saturated; a camera's 10, 12 or 14 bits may fill 16 or not."""
-    brightest = int(image.max())
     full = max(255, 2 ** brightest.bit_length() - 1)
     return 0.0, float(brightest if brightest > 0.999 * full else full)
 

@@ -152,7 +152,7 @@ def test_bad_arguments():
     with pytest.raises(InputError, match="at least 3"):
         detect_board(image, Board(columns=2, rows=5, square=1))
     with pytest.raises(InputError, match="uint8 or uint16"):
-        detect_board(image.astype(np.float32), BOARD)
+        detect_board(image.astype(np.int64), BOARD)
     with pytest.raises(InputError, match="uint8 or uint16"):
         detect_board(image[..., None], BOARD)
     with pytest.raises(InputError, match="choose one of"):

@@ -63,7 +63,7 @@ class _FromNumbers(TorchFunctionMode):
             return func(*args, **kwargs).to(device)
         if func in (Tensor.__getitem__, Tensor.__setitem__):
             parts = args[1] if isinstance(args[1], tuple) else (args[1],)
-            places = tuple(torch.tensor(p, dtype=torch.long) if isinstance(p, list) else p for p in parts)
+            places = tuple(torch.tensor(p, dtype=torch.long) if isinstance(p, list | tuple) else p for p in parts)
             args = (args[0], places if len(places) > 1 else places[0], *args[2:])
         return func(*args, **kwargs)
 
