@@ -116,8 +116,8 @@ class RefineCorners(nn.Module):
 
     Corners are differentiable by the image, with `erf` by the implicit function theorem; starts, covariance and blur
     carry no gradient. What the corners of an image know together (light, bent and neighboring lines) counts as constant
-    of the gradient, which with `grid` is a fifth of what noise does to a corner. A corner that fails is NaN, which `CalibrationLayer` takes as not seen. Images are fitted one
-    after the other, each with what its own corners know together.
+    of the gradient, which with `grid` is a fifth of what noise does to a corner. A corner that fails is NaN, which
+    `CalibrationLayer` takes as not seen. Images are fitted one after the other.
 
     Args:
         method: "erf", or "saddle", which is faster and states no covariance.
