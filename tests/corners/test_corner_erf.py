@@ -311,7 +311,7 @@ class TestRejection:
     )  # fmt: skip
     def test_a_pixel_is_saturated_at_the_end_of_its_bits(self, brightest, kind, level):
         """A camera's 10, 12 or 14 bits; a level nearly as high that is the brightest of all counts as the end."""
-        assert _saturation_levels(np.array([[0, brightest]], kind)) == (0.0, float(level))
+        assert _saturation_levels(brightest) == (0.0, float(level))
 
     def test_blurred_corners(self):
         image, _, start, side = scene(12, blur=5.0, noise=0.2)
