@@ -85,7 +85,7 @@ def refine_corners(
     if method in ("erf", "saddle"):
         # Only the surroundings of the corners become float64; float32 holds 16 bits exactly.
         light = torch.from_numpy(image if image.dtype == np.uint8 else image.astype(np.float32))
-        return _refined(light, pixels, side, method, grid, _saturation_levels(int(image.max())))
+        return _of_one_image(light, pixels, side, method, grid, _saturation_levels(int(image.max())))
 
     height, width = image.shape
     seen = torch.isfinite(pixels).all(-1)
@@ -168,7 +168,7 @@ class RefineCorners(nn.Module):
         for number, light in enumerate(image[:, 0]):
             known = side[number] if side is not None else local_side(pixels[number], *(self.grid or (0, 0)))
             levels = None if light.is_floating_point() else _saturation_levels(int(light.max()))
-            done.append(_refined(light, pixels[number], known, self.method, self.grid, levels))
+            done.append(_of_one_image(light, pixels[number], known, self.method, self.grid, levels))
         if not done:
             return Refined(pixels, pixels[..., 0].long())
         parts = {name: [getattr(each, name) for each in done] for name in Refined._fields}
@@ -179,7 +179,7 @@ class RefineCorners(nn.Module):
         return f"method={self.method}, grid={self.grid}"
 
 
-def _refined(
+def _of_one_image(
     light: Tensor,
     start: Tensor,
     side: Tensor,
