@@ -47,7 +47,7 @@ class CornerStatus(IntEnum):
 
 
 class Refined(NamedTuple):
-    """Refined corners.
+    """Corners that were refined, and how well they are known.
 
     Args:
         pixels: (..., N, 2) float64, NaN where `status` is not `CornerStatus.GOOD`.
