@@ -42,6 +42,7 @@ LOADER = """
 import gc, sys, threading, torch, cv2, numpy as np, scipy.linalg
 from kcal.pipeline.handover import Handover
 from kcal.pipeline.video_frames import file_frames
+from kcal.threads import one_thread
 from pathlib import Path
 
 size = (320, 240)
@@ -61,6 +62,9 @@ class Data(torch.utils.data.Dataset):
         global frames, running
         frames = running = None
         gc.collect()
+        with one_thread():
+            scipy.linalg.lstsq(np.eye(900), np.ones(900))
+            torch.ones(900, 900) @ torch.ones(900, 900)
         return k
 
 loader = torch.utils.data.DataLoader(Data(), num_workers=2, multiprocessing_context="fork")

@@ -21,6 +21,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import StereoRig
 from kcal.locate.stereo import PositionStatus, sight_lines
+from kcal.threads import in_one_thread
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -78,6 +79,7 @@ def planned_rig(
     return StereoRig(camera, camera, torch.eye(3, dtype=torch.float64), shift)
 
 
+@in_one_thread
 def range_errors(
     rig: StereoRig,
     distances: Tensor | Sequence[float],

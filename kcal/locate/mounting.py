@@ -15,6 +15,7 @@ from kcal.lens.mounting import Mounting, Origin
 from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.ellipsoid import ecef_from_enu_rotation
 from kcal.locate.geodesy import enu_to_geodetic
+from kcal.threads import in_one_thread
 
 
 def attitude(enu_from_cam: Tensor) -> tuple[float, float, float]:
@@ -79,6 +80,7 @@ def mounting_of(
     )
 
 
+@in_one_thread
 def placed_rig(result: RigResult, origin: Origin) -> StereoRig:
     """The rig of a result with everything that is known of it: also its mounting, if the data determine it.
 
@@ -108,6 +110,7 @@ def placed_rig(result: RigResult, origin: Origin) -> StereoRig:
     return rig
 
 
+@in_one_thread
 def mounting_covariance(
     *, origin_m: Sequence[float] = (0.0, 0.0, 0.0), attitude_deg: Sequence[float] = (0.0, 0.0, 0.0)
 ) -> Tensor:

@@ -15,6 +15,7 @@ from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.marks import Marks
 from kcal.locate.mounting import attitude
+from kcal.threads import in_one_thread
 
 
 def check_rig(rig: StereoRig, *, features: Features | None = None, landmarks: Landmarks | None = None) -> Drift:
@@ -86,6 +87,7 @@ def seen_again(then: Marks, now: Marks, sigma: float) -> Features:
     )
 
 
+@in_one_thread
 def relocked(rig: StereoRig, drift: Drift, note: str) -> StereoRig:
     """The rig with the attitudes that `check_rig` found; cameras and their places stay.
 

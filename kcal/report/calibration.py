@@ -16,11 +16,13 @@ from kcal.corners.observations import Observations
 from kcal.lens.uncertainty import image_sigma
 from kcal.report.colors import ACCENT, FAINT, INK, WARN
 from kcal.report.figures import HALO, draw_arrows, frame_image, new_figure, round_levels, save_picture, shortened
+from kcal.threads import in_one_thread
 
 # Of the width of axes: their color bar and the gap before it.
 COLORBAR_SHARE = 0.055
 
 
+@in_one_thread
 def calibration_figure(result: CameraCalibrationResult, name: str = "") -> Figure:
     """Draw a calibration: coverage with magnified residuals, uncertainty over the image, residuals, RMS of each view.
 

@@ -16,12 +16,14 @@ from kcal.lens.uncertainty import image_sigma
 from kcal.report.model_findings import model_findings
 from kcal.report.verdict import FAULTS, Finding, RangeAnswer, Requirement, Verdict, sorted_findings, weighed_findings
 from kcal.report.view_findings import record_findings, view_findings
+from kcal.threads import in_one_thread
 
 # Of the error bars: a camera that was calibrated again from its own views differs by less.
 _ITSELF = 0.5
 _BASIS = "in a rig of two such cameras, {:g} m apart, with marks to {:g} px, RMS over the image"
 
 
+@in_one_thread
 def camera_verdict(
     result: CameraCalibrationResult,
     options: CalibrationOptions | None = None,
@@ -96,6 +98,7 @@ def camera_verdict(
     )
 
 
+@in_one_thread
 def stored_verdict(
     camera: Camera,
     requirements: Sequence[Requirement] = (),

@@ -21,6 +21,7 @@ from kcal.locate.station_sigmas import station_sigmas
 from kcal.quantities import range_text
 from kcal.report.judge_camera import stored_findings
 from kcal.report.verdict import FAULTS, Finding, RangeAnswer, Requirement, Verdict, weighed_findings
+from kcal.threads import in_one_thread
 
 # Pairs disagree by this many times what noise explains: set on simulated pairs, where synchronous ones reach 1.5.
 _APART = 2.5
@@ -31,6 +32,7 @@ _LOOK = {False: "both cameras look", True: "two cameras or more look"}
 _MOST_VARIANCE = 9.0
 
 
+@in_one_thread
 def rig_verdict(
     rig: StereoRig | CameraRig,
     requirements: Sequence[Requirement] = (),

@@ -19,6 +19,7 @@ from kcal.locate.tabulate import middle_row_ends
 from kcal.quantities import length_text, measured_length, range_text
 from kcal.report.colors import CAMERA_COLORS, FAINT, WARN
 from kcal.report.figures import HALO, draw_north, field_outline, new_figure, save_picture, wrapped
+from kcal.threads import in_one_thread
 
 Array = NDArray[np.float64]
 
@@ -36,6 +37,7 @@ _ROWS = 45
 _WIDE = 0.1
 
 
+@in_one_thread
 def rig_figure(result: RigResult) -> Figure:
     """Draw a rig on the map, with what it was solved from, and each item's residual in sigmas.
 

@@ -30,6 +30,7 @@ from kcal.skyline.horizon import Horizon, terrain_horizon
 from kcal.skyline.raised import raised_horizon
 from kcal.skyline.raster_error import RasterError, SkylineErrors
 from kcal.skyline.seen_horizon import Columns, columns_of, compare
+from kcal.threads import in_one_thread
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -96,6 +97,7 @@ class SkylineAttitude:
     fit: SkylineFit
 
 
+@in_one_thread
 def skyline_attitude(
     image: NDArray[np.generic],
     camera: Camera,

@@ -24,6 +24,7 @@ from kcal.skyline.attitude import SkylineAttitude, attitude_against, horizon_aro
 from kcal.skyline.fit import COMMON, lens_errors, terrain_covariances
 from kcal.skyline.raster_error import RasterError
 from kcal.skyline.seen_horizon import Comparison
+from kcal.threads import in_one_thread
 
 Floats = NDArray[np.float64]
 
@@ -46,6 +47,7 @@ class SkylineImage:
     image: NDArray[np.generic]
 
 
+@in_one_thread
 def skyline_source(
     images: Sequence[SkylineImage],
     cameras: Sequence[Camera],

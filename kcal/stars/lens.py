@@ -23,6 +23,7 @@ from kcal.stars.night import SkyView
 from kcal.stars.sky import celestial_directions
 from kcal.stars.star_problem import StarField
 from kcal.stars.with_boards import Agreement, joint_calibration, refine_by_stars
+from kcal.threads import in_one_thread
 
 # Degrees between opposite corners: the widest and narrowest lens that is looked for, and steps between.
 _WIDEST, _NARROWEST, _STEP = 115.0, 6.0, 1.02
@@ -59,6 +60,7 @@ class StarCamera:
     joint: CameraCalibrationResult | None = None
 
 
+@in_one_thread
 def calibrate_by_stars(
     images: Sequence[DetectedStars],
     views: Sequence[SkyView],

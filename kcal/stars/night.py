@@ -31,6 +31,7 @@ from kcal.stars.sky import (
     pole_in_enu,
     refraction_sigma,
 )
+from kcal.threads import in_one_thread
 
 # px: how well calibrated lenses are known at infinity, at least where an attitude is first looked for.
 _LENS_PX = 2.5
@@ -144,6 +145,7 @@ class NamedStars:
         return east, north, up
 
 
+@in_one_thread
 def name_stars(
     image: NDArray[Any] | DetectedStars, camera: Camera, view: SkyView | None = None, catalog: StarCatalog | None = None
 ) -> NamedStars:

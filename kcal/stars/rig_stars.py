@@ -20,6 +20,7 @@ from kcal.stars.attitude import FAR
 from kcal.stars.catalog import StarCatalog
 from kcal.stars.night import NamedStars
 from kcal.stars.sky import EARTH_RATE, pole_in_enu, refraction_sigma
+from kcal.threads import in_one_thread
 
 # Radians: of the Yale catalogue along an axis, 1 second of arc.
 _CATALOG_SIGMA = math.radians(1.0 / 3600)
@@ -34,6 +35,7 @@ _DAY_BETWEEN, _LEAST_NIGHT = 6.0, 1.0
 Moment = Mapping[int, NamedStars]
 
 
+@in_one_thread
 def star_source(
     moments: Sequence[Moment],
     cameras: Sequence[Camera],

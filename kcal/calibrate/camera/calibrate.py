@@ -17,6 +17,7 @@ from kcal.calibrate.camera.sharing import ALONE, sharing
 from kcal.calibrate.camera.two_cameras import two_camera_warnings
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError, KcalError
+from kcal.threads import in_one_thread
 
 __all__ = ["CalibrationOptions", "CameraCalibrationResult", "calibrate_camera", "calibrate_cameras"]
 
@@ -25,6 +26,7 @@ def _silent(_: str) -> None:
     return None
 
 
+@in_one_thread
 def calibrate_camera(
     observations: Observations, options: CalibrationOptions | None = None, progress: Progress = _silent
 ) -> CameraCalibrationResult:
@@ -128,6 +130,7 @@ def _calibrate(observations: Observations, options: CalibrationOptions, progress
     return calibrate_parametric(observations, options, progress)
 
 
+@in_one_thread
 def calibrate_cameras(
     observations: Sequence[Observations],
     options: CalibrationOptions | None = None,

@@ -27,6 +27,7 @@ from kcal.errors import InputError, KcalError
 from kcal.lens.model import LensModel
 from kcal.solve.lm import LMOptions
 from kcal.texts import brief
+from kcal.threads import in_one_thread
 
 _POSES = LMOptions(max_iterations=60, tolerance=1e-12)
 # Blocks are runs of at least five views, at most twenty of them.
@@ -81,6 +82,7 @@ class ComparisonResult:
         return self.rms[one] - self.rms[other], error
 
 
+@in_one_thread
 def compare_models(
     observations: Observations,
     models: Sequence[str | LensModel],

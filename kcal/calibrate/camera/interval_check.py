@@ -36,6 +36,7 @@ from kcal.lens.difference import CameraDifference, camera_difference
 from kcal.lens.rig import half_of_covariance
 from kcal.lens.uncertainty import pixel_covariance, pixel_errors
 from kcal.texts import brief
+from kcal.threads import in_one_thread
 
 # A normal vector of two components has a squared length beyond this once in twenty times.
 CHI2 = -2.0 * math.log(0.05)
@@ -230,6 +231,7 @@ def simulated_refits(
             yield Refit(seed, lost[..., None].expand(-1, -1, 2), lost)
 
 
+@in_one_thread
 def interval_check(result: CameraCalibrationResult, ranges: Sequence[float], refits: Iterable[Refit]) -> IntervalCheck:
     """Compare refits with what a calibration states.
 
@@ -257,6 +259,7 @@ def interval_check(result: CameraCalibrationResult, ranges: Sequence[float], ref
     )
 
 
+@in_one_thread
 def against_capture(
     result: CameraCalibrationResult, second: Observations, options: CalibrationOptions, ranges: Sequence[float]
 ) -> list[CameraDifference]:

@@ -26,6 +26,7 @@ from kcal.lens.model import LensModel
 from kcal.lens.projection import parameter_names, project_components
 from kcal.solve.result import map_state
 from kcal.texts import brief
+from kcal.threads import in_one_thread
 
 # Pixels of a corner's noise along an axis, against which priors of parametric models count.
 _CORNER_SIGMA = 0.2
@@ -92,6 +93,7 @@ class CalibratedViews:
         return map_state(lambda part: part.detach().cpu(), BoardState.still(self.parameters, self.board_warp, *pose))
 
 
+@in_one_thread
 def calibrate_views(
     pixels: Tensor,
     board_points: Tensor,

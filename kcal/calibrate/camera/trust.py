@@ -27,6 +27,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.difference import CameraDifference, camera_difference
 from kcal.lens.paraxial import paraxial_focal
 from kcal.solve.lm import LMOptions
+from kcal.threads import in_one_thread
 
 # Views that each half must have: fewer often do not determine a camera.
 FEWEST_IN_HALF = 6
@@ -102,6 +103,7 @@ def unexplained(found: CameraDifference, level: float = 1e-3) -> float:
     return found.rms * math.sqrt(1.0 - found.ratio**-2)
 
 
+@in_one_thread
 def examine(
     result: CameraCalibrationResult, options: CalibrationOptions, progress: Progress = lambda _: None
 ) -> Examination:

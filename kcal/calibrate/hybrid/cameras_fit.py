@@ -25,6 +25,7 @@ from kcal.corners.observations import Observations
 from kcal.errors import InputError
 from kcal.gaussian import Gaussian, stacked
 from kcal.lens.zernike import ZernikeModes
+from kcal.threads import in_one_thread
 
 # Calls a function for each of the numbered argument lists; numbers and results come in any order.
 Run = Callable[[Callable[..., CameraFit], dict[int, tuple[Any, ...]]], Iterable[tuple[int, CameraFit]]]
@@ -148,6 +149,7 @@ def _one_by_one(
         yield i, function(*arguments)
 
 
+@in_one_thread
 def measure_board(
     sets: Sequence[Observations], *, names: Sequence[str] | None = None, advance: Callable[[str], None] | None = None
 ) -> tuple[MeasuredBoard, ...]:

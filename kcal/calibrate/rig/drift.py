@@ -30,6 +30,7 @@ from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.lens.rig import StereoRig
 from kcal.solve.lm import LMOptions
 from kcal.texts import brief
+from kcal.threads import in_one_thread
 
 _NAMES = ("left", "right")
 _SOLVER = LMOptions(residual_floor=1e-8)
@@ -88,6 +89,7 @@ class Drift:
         return tuple(item for item in self.items if not item.used)
 
 
+@in_one_thread
 def measure_drift(
     rig: StereoRig,
     *,

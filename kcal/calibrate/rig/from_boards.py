@@ -15,8 +15,10 @@ from kcal.calibrate.rig.sources import RigData
 from kcal.corners.observations import Observations
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
+from kcal.threads import in_one_thread
 
 
+@in_one_thread
 def calibrate_rig(
     left: Camera,
     right: Camera,

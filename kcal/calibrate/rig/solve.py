@@ -30,6 +30,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
 from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA, check_refraction
 from kcal.solve.lm import LMOptions
+from kcal.threads import in_one_thread
 
 # λ of a solve that begins at the robust solution.
 _NEAR_DAMPING = 1e-9
@@ -70,6 +71,7 @@ class RigOptions:
         check_refraction(self.refraction, self.refraction_sigma)
 
 
+@in_one_thread
 def solve_rig(
     data: RigData, options: RigOptions | None = None, progress: Callable[[str], None] = lambda _: None
 ) -> RigResult:

@@ -1,0 +1,151 @@
+"""Bound the threads of torch, BLAS and OpenCV in this process, and give the caller's own settings back."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import multiprocessing
+import os
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any, ParamSpec, TypeVar
+
+from threadpoolctl import ThreadpoolController
+
+P = ParamSpec("P")
+R = TypeVar("R")
+# What brings libraries with threads. To look for these takes milliseconds: only after one of them was imported.
+_BRING = ("torch", "numpy", "scipy.linalg", "cv2")
+_PROCESS = os.getpid()
+
+
+class _OpenCV:
+    """The threads of OpenCV, as threadpoolctl shows those of others."""
+
+    @property
+    def num_threads(self) -> int:
+        return int(sys.modules["cv2"].getNumThreads())
+
+    def set_num_threads(self, count: int) -> None:
+        sys.modules["cv2"].setNumThreads(count)
+
+
+class _Bounds:
+    """What bounds libraries in a process.
+
+    OpenMP, and with it torch and MKL, has a number of threads for each thread that calls it. OpenBLAS and OpenCV have
+    one for the process: the first block that bounds it keeps the number, the last one gives it back.
+    """
+
+    def __init__(self) -> None:
+        self.process, self.lock, self.loaded = os.getpid(), threading.Lock(), [False] * len(_BRING)
+        self.own: list[Any] = []
+        self.shared: list[Any] = []
+        self.inside: list[int] = []  # blocks that bound it, of each shared library
+        self.before: list[int] = []
+
+    def look(self) -> None:
+        """Find libraries that were loaded since the last look."""
+        if self.loaded == (now := loaded()):
+            return
+        known = {library.filepath for library in (*self.own, *self.shared) if not isinstance(library, _OpenCV)}
+        found = [one for one in ThreadpoolController().lib_controllers if one.filepath not in known]
+        self.own += [library for library in found if library.user_api == "openmp"]
+        more = [library for library in found if library.user_api == "blas"]
+        # In a process that was forked, OpenCV would wait for threads that are not there.
+        forked = os.getpid() != _PROCESS or multiprocessing.parent_process() is not None
+        if "cv2" in sys.modules and not self.loaded[-1] and not forked:
+            more.append(_OpenCV())
+        self.shared, self.loaded = self.shared + more, now
+        self.inside, self.before = self.inside + len(more) * [0], self.before + len(more) * [1]
+
+    def bound(self, count: int) -> Callable[[], None]:
+        """Set the number of threads; what gives the numbers of before back."""
+        if "torch" in sys.modules:  # sets its number for this thread when it is first asked
+            sys.modules["torch"].get_num_threads()
+        with self.lock:
+            self.look()
+            own = [(library, library.num_threads) for library in self.own]
+            for library in self.own:
+                set_threads(library, count)
+            taken = range(len(self.shared))
+            for k in taken:
+                if not self.inside[k]:
+                    self.before[k] = self.shared[k].num_threads
+                self.inside[k] += 1
+                set_threads(self.shared[k], count)
+
+        def give_back() -> None:
+            with self.lock:
+                for library, number in own:
+                    set_threads(library, number)
+                for k in taken:
+                    self.inside[k] -= 1
+                    if not self.inside[k]:
+                        set_threads(self.shared[k], self.before[k])
+
+        return give_back
+
+
+_bounds = _Bounds()
+_here = threading.local()
+
+
+def set_threads(library: Any, count: int) -> None:
+    """Set the number of a library, from whichever thread.
+
+    From version 3.8 on, threadpoolctl lets the first thread alone set that of OpenBLAS, and others silently do nothing.
+    """
+    release = getattr(library, "clear_controlling_thread", lambda **_: None)
+    release(force=True)
+    library.set_num_threads(count)
+    release(force=True)
+
+
+def loaded() -> list[bool]:
+    """Which of them were imported."""
+    return [name in sys.modules for name in _BRING]
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """Use one thread while many small systems are solved.
+
+    With threads, systems of some hundred unknowns take longer, because threads wait for each other, and by far longer
+    where something else runs on the machine. Blocks may be nested, and run in several threads at a time. What was set
+    before for torch, OpenMP, BLAS and OpenCV comes back at the end, also after an error.
+
+    Example:
+        >>> import torch
+        >>> torch.set_num_threads(2)
+        >>> with one_thread():
+        ...     torch.get_num_threads()
+        1
+        >>> torch.get_num_threads()
+        2
+    """
+    global _bounds
+    if _bounds.process != os.getpid():  # forked, maybe while another thread had the lock
+        _bounds = _Bounds()
+    outer = getattr(_here, "loaded", None)
+    if outer == (now := loaded()):
+        yield
+        return
+    give_back, _here.loaded = _bounds.bound(1), now
+    try:
+        yield
+    finally:
+        _here.loaded = outer
+        give_back()
+
+
+def in_one_thread(function: Callable[P, R]) -> Callable[P, R]:
+    """A function whose calls use `one_thread`."""
+
+    @functools.wraps(function)
+    def bounded(*arguments: P.args, **named: P.kwargs) -> R:
+        with one_thread():
+            return function(*arguments, **named)
+
+    return bounded
