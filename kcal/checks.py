@@ -100,6 +100,18 @@ def as_points(
     return points.to(torch.float64)
 
 
+def expanded(name: str, value: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """`value`, broadcast to a shape.
+
+    Raises:
+        InputError: its shape does not broadcast to that one.
+    """
+    own = tuple(value.shape)
+    if len(own) > len(shape) or not all(a in (1, b) for a, b in zip(reversed(own), reversed(shape), strict=False)):
+        raise InputError(f"{name}: a shape that broadcasts to {tuple(shape)} is needed, got {own}")
+    return value.expand(shape)
+
+
 def as_size(size: Any) -> tuple[int, int]:
     """Return (width, height) as two plain numbers.
 

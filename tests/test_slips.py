@@ -14,9 +14,12 @@ import pytest
 import torch
 
 import kcal
-from kcal import Board, Camera, InputError, KcalWarning, Observations, Origin, StereoLocalizer, View
+from kcal import Board, Camera, InputError, KcalWarning, Observations, Origin, StereoLocalizer, StereoRig, View
+from kcal.corners import refine_point
 from kcal.doors import _is_kind, _naming_slips
-from kcal.lens import camera_difference, rotation_from_vector
+from kcal.lens import camera_difference, pixel_covariance, rotation_from_vector, vector_from_rotation
+from kcal.locate import MultiViewLocalizer, Triangulate, TriangulateViews, enu_to_geodetic
+from kcal.rig import CameraRig
 
 CAMERA = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480))
 BOARD = Board(columns=3, rows=3, square=0.1)
@@ -141,3 +144,80 @@ def test_images_to_detect_in(tmp_path: Path) -> None:
 def test_what_shows_no_images(given: Any, message: str) -> None:
     with pytest.raises(kcal.KcalError, match=message):
         kcal.detect(given, BOARD)
+
+
+RIG = StereoRig(CAMERA, CAMERA, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
+LOOK = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]).repeat(2, 1, 1)
+STATIONS = CameraRig([CAMERA] * 2, ["a", "b"], LOOK, torch.tensor([[0.0, 0, 0], [1000.0, 0, 0]]))
+LOCALIZE = StereoLocalizer(RIG, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
+PIXELS = torch.full((4, 2), 200.0)
+NEXT = torch.tensor([[0.0, 0, 0, -1.0], [0, 0, 0, 0], [0, 0, 0, 0]])
+# Each with the last dimension that it needs.
+DOORS: dict[str, tuple[Callable[[Any], Any], int]] = {
+    "project": (CAMERA.project, 3),
+    "project_rays": (CAMERA.project_rays, 3),
+    "ray_origins": (CAMERA.ray_origins, 3),
+    "unproject": (CAMERA.unproject, 2),
+    "normalize": (CAMERA.normalize, 2),
+    "rig": (RIG, 3),
+    "right_from_left": (RIG.right_from_left, 3),
+    "stations": (STATIONS, 3),
+    "triangulate left": (lambda bad: Triangulate(RIG)(bad, PIXELS), 2),
+    "triangulate right": (lambda bad: Triangulate(RIG)(PIXELS, bad), 2),
+    "localize": (lambda bad: LOCALIZE(bad, PIXELS), 2),
+    "localize cov": (lambda bad: LOCALIZE(PIXELS, PIXELS, bad), 4),
+    "sensitivity": (lambda bad: LOCALIZE.sensitivity(PIXELS, bad), 2),
+    "locate_points": (lambda bad: kcal.locate_points(RIG, PIXELS, bad, origin=LOCALIZE.origin, heading_deg=0.0), 2),
+    "views": (TriangulateViews([CAMERA] * 2, torch.stack([torch.eye(3, 4), torch.eye(3, 4) + NEXT])), 2),
+    "multi": (MultiViewLocalizer(STATIONS), 2),
+    "geodetic": (lambda bad: enu_to_geodetic(bad, LOCALIZE.origin), 3),
+    "camera": (lambda bad: Camera(bad, size=(640, 480)), 10),
+    "rotation": (lambda bad: StereoRig(CAMERA, CAMERA, bad, torch.tensor([-1.0, 0, 0])), 3),
+    "translation": (lambda bad: StereoRig(CAMERA, CAMERA, torch.eye(3), bad), 3),
+    "center": (lambda bad: CameraRig([CAMERA] * 2, ["a", "b"], LOOK, bad), 3),
+    "refine": (lambda bad: refine_point(torch.rand(99, 99), bad), 2),
+    "pixel_covariance": (lambda bad: pixel_covariance(CAMERA, bad), 2),
+}
+# What makes something new, on whatever device; and what works on the CPU alone.
+ELSEWHERE = ("geodetic", "camera", "center", "refine", "pixel_covariance")
+BAD: dict[str, Callable[[int], Any]] = {
+    "integers": lambda last: torch.ones(4, last, dtype=torch.int64),
+    "integer array": lambda last: np.ones((4, last), dtype=np.int32),
+    "half": lambda last: torch.ones(4, last, dtype=torch.float16),
+    "bfloat16": lambda last: torch.ones(4, last, dtype=torch.bfloat16),
+    "complex": lambda last: torch.ones(4, last, dtype=torch.complex64),
+    "bool": lambda last: torch.ones(4, last, dtype=torch.bool),
+    "too wide": lambda last: torch.ones(4, last + 1),
+    "transposed": lambda last: torch.ones(last, 5 * last),
+    "flat": lambda last: torch.ones(7 * last + 1),
+    "number": lambda last: torch.tensor(1.0),
+    "nothing": lambda last: torch.ones(0),
+    "objects": lambda last: np.ones((4, last), dtype=object),
+    "words": lambda last: ["a"] * last,
+    "None": lambda last: [None] * last,
+    "ragged": lambda last: [[1.0] * last, [1.0]],
+    "camera": lambda last: CAMERA,
+    "elsewhere": lambda last: torch.ones(4, last, device="meta"),
+}
+
+
+@pytest.mark.parametrize("bad", BAD)
+@pytest.mark.parametrize("door", DOORS)
+def test_no_other_error_reaches_a_user(door: str, bad: str) -> None:
+    call, last = DOORS[door]
+    if bad == "elsewhere" and door in ELSEWHERE:
+        return
+    with pytest.raises(InputError):
+        call(BAD[bad](last))
+
+
+def test_shapes_that_would_mix_rows_are_refused() -> None:
+    with pytest.raises(InputError, match=r"vector: shape \(..., 3\) is needed, got \(3, 2\)"):
+        rotation_from_vector(torch.rand(3, 2))
+    with pytest.raises(InputError, match=r"rotation: shape \(..., 3, 3\) is needed, got \(3, 9\)"):
+        vector_from_rotation(torch.rand(3, 9))
+    with pytest.raises(InputError, match=r"mask: a shape that broadcasts to \(4,\) is needed, got \(3,\)"):
+        LOCALIZE(PIXELS, PIXELS, mask=torch.ones(3, dtype=torch.bool))
+    batch = Camera(CAMERA.params.detach().repeat(3, 1), size=(640, 480))
+    with pytest.raises(InputError, match=r"shape \(2, 4, 2\) does not fit a batch of \(3,\) cameras"):
+        batch.unproject(torch.zeros(2, 4, 2))

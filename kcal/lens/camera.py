@@ -332,6 +332,8 @@ class Camera(ConvertibleCamera):
 
     def grid(self, columns: int, rows: int) -> Tensor:
         """Pixels (rows, columns, 2) spread evenly over the image, including its outermost pixels."""
+        if not (columns >= 1 and rows >= 1 and columns == int(columns) and rows == int(rows)):
+            raise InputError(f"grid: whole numbers of columns and rows are needed, got {columns} and {rows}")
         width, height = self.size
         kind, place = torch.float64, self.params.device
         u = torch.linspace(0, width - 1, columns, dtype=kind, device=place)

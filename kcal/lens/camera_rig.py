@@ -105,7 +105,7 @@ class CameraRig(Float64Module):
                 f"{count} cameras: rotation ({count}, 3, 3) and center ({count}, 3) are needed, got "
                 f"{tuple(rotation.shape)} and {tuple(center.shape)}"
             )
-        if len(set(names)) != count or not all(names):
+        if len(names) != count or len(set(names)) != count or not all(names):
             raise InputError(f"cameras: {count} unlike names are needed, got {', '.join(names) or 'none'}")
         require_finite("rotation", rotation)
         require_finite("center", center)
@@ -197,7 +197,7 @@ class CameraRig(Float64Module):
 
     def forward(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Project points (..., N, 3) of the frame along straight lines: pixels (..., N, C, 2), and which are seen."""
-        points = as_points("points", points, 3)
+        points = as_points("points", points, 3, self.center)
         pixels, seen = [], []
         for camera, rotation, center in zip(self.each, self.rotation, self.center, strict=True):
             pixel, valid = camera.project((points - center) @ rotation.T)

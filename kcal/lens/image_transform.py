@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from kcal.checks import as_points
+from kcal.checks import as_points, as_size
 from kcal.errors import InputError
 from kcal.lens.calibration import CameraCalibration
 
@@ -79,6 +79,7 @@ class ImageTransform:
             centered: pad on both sides; otherwise to the right and below only.
             enlarge: also scale up images that are smaller than `size`.
         """
+        full, size = as_size(full), as_size(size)
         ratio = min(size[0] / full[0], size[1] / full[1])
         if not enlarge:
             ratio = min(ratio, 1.0)

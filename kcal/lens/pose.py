@@ -8,6 +8,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from kcal.checks import as_tensor
+from kcal.errors import InputError
+
 
 def rotation_from_vector(vector: Tensor) -> Tensor:
     """Convert rotation vectors (..., 3) in radians to matrices (..., 3, 3), differentiable also at zero.
@@ -16,6 +19,9 @@ def rotation_from_vector(vector: Tensor) -> Tensor:
         >>> rotation_from_vector(torch.zeros(3)).diagonal().tolist()
         [1.0, 1.0, 1.0]
     """
+    vector = as_tensor("vector", vector)
+    if vector.shape[-1:] != (3,):
+        raise InputError(f"vector: shape (..., 3) is needed, got {tuple(vector.shape)}")
     # Here and below: kornia takes long to load.
     from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 
@@ -30,6 +36,9 @@ def vector_from_rotation(rotation: Tensor) -> Tensor:
         >>> vector_from_rotation(torch.eye(3)).tolist()
         [0.0, 0.0, 0.0]
     """
+    rotation = as_tensor("rotation", rotation)
+    if rotation.shape[-2:] != (3, 3):
+        raise InputError(f"rotation: shape (..., 3, 3) is needed, got {tuple(rotation.shape)}")
     from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 
     flat: Tensor = rotation_matrix_to_axis_angle(rotation.reshape(-1, 3, 3))

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from kcal.checks import as_tensor
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pupil import FAR
@@ -77,7 +78,7 @@ class CameraRays(nn.Module):
         origins = torch.stack([zero, zero, self.depths], -1)
         rays = torch.cat([origins, self.directions], -1)
         if viewmats is not None:
-            count = len(self.cameras)
+            count, viewmats = len(self.cameras), as_tensor("viewmats", viewmats)
             if viewmats.shape[-3:] != (count, 4, 4):
                 raise InputError(f"viewmats: shape (..., {count}, 4, 4) is needed, got {tuple(viewmats.shape)}")
             rotation, translation = viewmats[..., :3, :3].double(), viewmats[..., :3, 3].double()
@@ -107,6 +108,10 @@ def ray_error(camera: Camera, rays: Tensor, near: float = 1.0) -> float:
         >>> ray_error(camera, CameraRays(camera)()[0]) < 1e-5
         True
     """
+    if rays.numel() != camera.size[0] * camera.size[1] * 6:
+        raise InputError(
+            f"rays: shape {(*camera.size[::-1], 6)} of this camera's image is needed, got {tuple(rays.shape)}"
+        )
     flat, pixels = rays.double().reshape(-1, 6), camera.grid(*camera.size).reshape(-1, 2)
     origin, direction = flat.split(3, -1)
     there = direction.abs().sum(-1) > 0

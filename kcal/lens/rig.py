@@ -135,7 +135,7 @@ class StereoRig(nn.Module):
 
     def right_from_left(self, points_left: Tensor) -> Tensor:
         """Move points (..., N, 3) from the left camera's frame into the right camera's."""
-        points = as_points("points_left", points_left, 3)
+        points = as_points("points_left", points_left, 3, self.right_from_left_translation)
         return points @ self.right_from_left_rotation.T + self.right_from_left_translation
 
     def forward(self, points_left: Tensor) -> tuple[Tensor, Tensor, Tensor]:

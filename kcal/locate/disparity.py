@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from kcal.checks import exportable
+from kcal.checks import as_tensor, exportable
 from kcal.errors import InputError
 from kcal.lens.rectification import StereoRectification
 from kcal.locate.geodesy import Origin
@@ -88,6 +88,7 @@ class DisparityRanges(nn.Module):
             InputError: not floating point, or another size.
         """
         width, height = self.rectification.camera.size
+        disparity = as_tensor("disparity", disparity)
         if not disparity.is_floating_point() or tuple(disparity.shape[-2:]) != (height, width):
             raise InputError(
                 f"disparity: floating point (..., {height}, {width}) is needed, got {disparity.dtype} "

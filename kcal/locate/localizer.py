@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Self
 import torch
 from torch import Tensor
 
-from kcal.checks import as_covariance, as_points, exportable
+from kcal.checks import as_covariance, as_points, expanded, exportable
 from kcal.dispatch import is_differentiated
 from kcal.errors import InputError
 from kcal.io.rig_file import load_rig
@@ -254,16 +254,17 @@ class StereoLocalizer(Operations):
         Raises:
             InputError: not floating point, or shapes that are wrong or unlike.
         """
-        left, right = checked_pairs(pixels_left, pixels_right)
+        left, right = checked_pairs(pixels_left, pixels_right, self.rig)
         if cov is not None:
-            cov = as_points("cov", cov, 4)
+            cov = as_points("cov", cov, 4, left)
             if cov.ndim < 2 or cov.shape[-2] != 4:
                 raise InputError(f"cov: shape (..., N, 4, 4) is needed, got {tuple(cov.shape)}")
-            cov = cov.expand(*left.shape[:-1], 4, 4)
+            cov = expanded("cov", cov, (*left.shape[:-1], 4, 4))
         if mask is not None:
+            mask = torch.as_tensor(mask, device=left.device)
             if mask.dtype != torch.bool:
                 raise InputError(f"mask: bool is needed, got {mask.dtype}")
-            mask = mask.expand(left.shape[:-1])
+            mask = expanded("mask", mask, left.shape[:-1])
         if found := self.as_operation("forward", left, right, cov, mask):
             return Localization(*found)
         differentiated = is_differentiated(left, right, cov, self)
@@ -333,7 +334,7 @@ class StereoLocalizer(Operations):
             pixels_left: (..., N, 2).
             pixels_right: (..., N, 2).
         """
-        return _sensitivity(fit_pairs(self.rig, *checked_pairs(pixels_left, pixels_right)))
+        return _sensitivity(fit_pairs(self.rig, *checked_pairs(pixels_left, pixels_right, self.rig)))
 
     def with_sensitivity(self, pixels_left: Tensor, pixels_right: Tensor) -> tuple[Localization, Sensitivity]:
         """`forward` and `sensitivity` for the work of one; without covariances, masks and derivatives.
@@ -343,7 +344,7 @@ class StereoLocalizer(Operations):
             pixels_right: (..., N, 2).
         """
         by_camera = self.calibration_factor is not None
-        found = fit_pairs(self.rig, *checked_pairs(pixels_left, pixels_right), by_camera=by_camera)
+        found = fit_pairs(self.rig, *checked_pairs(pixels_left, pixels_right, self.rig), by_camera=by_camera)
         return self._on_earth(found, self.pixel_sigma**2), _sensitivity(found)
 
 

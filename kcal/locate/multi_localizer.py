@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeAlias
 import torch
 from torch import Tensor
 
-from kcal.checks import Float64Module, as_points, exportable
+from kcal.checks import Float64Module, as_points, expanded, exportable
 from kcal.dispatch import is_differentiated, is_traced, known_true
 from kcal.errors import InputError
 from kcal.lens.camera_rig import CameraRig
@@ -190,18 +190,20 @@ class MultiViewLocalizer(Float64Module):
         Raises:
             InputError: not floating point, wrong shapes, a height where the rig has no place on the Earth.
         """
-        pixels, count = as_points("pixels", pixels, 2), len(self.rig)
+        pixels, count = as_points("pixels", pixels, 2, self.rig.center), len(self.rig)
         if pixels.ndim < 2 or pixels.shape[-2] != count:
             raise InputError(f"pixels: shape (..., {count}, 2) is needed, got {tuple(pixels.shape)}")
         lead = pixels.shape[:-2]
         if seen is None:
             seen = torch.ones(pixels.shape[:-1], dtype=torch.bool, device=pixels.device)
+        seen = torch.as_tensor(seen, device=pixels.device)
         if seen.dtype != torch.bool:
             raise InputError(f"seen: bool is needed, got {seen.dtype}")
-        seen = seen.expand(pixels.shape[:-1]).reshape(-1, count)
+        seen = expanded("seen", seen, pixels.shape[:-1]).reshape(-1, count)
         cov = checked_views_covariance(cov, pixels)
         if velocity is not None and self.clock_sigma:
-            moved = self.clock_sigma * as_points("velocity", velocity, 2).expand(pixels.shape).reshape(-1, count, 2)
+            moved = expanded("velocity", as_points("velocity", velocity, 2, pixels), pixels.shape)
+            moved = self.clock_sigma * moved.reshape(-1, count, 2)
             still = torch.eye(2, dtype=torch.float64, device=pixels.device)
             cov = self.pixel_sigma**2 * still.expand(*moved.shape, 2) if cov is None else cov
             cov = cov + moved[..., :, None] * moved[..., None, :]
@@ -211,7 +213,7 @@ class MultiViewLocalizer(Float64Module):
             if not 0.0 < height_sigma < math.inf:
                 raise InputError(f"height_sigma: a positive number of meters is needed, got {height_sigma}")
             if isinstance(height, Tensor):
-                height = height.to(torch.float64).expand(lead).reshape(-1)
+                height = expanded("height", height.to(torch.float64), lead).reshape(-1)
         pixels = pixels.reshape(-1, count, 2)
         ground, heights = (None, height) if isinstance(height, Tensor) else (height, None)
         differentiated = is_differentiated(pixels, cov, heights, self)

@@ -123,7 +123,7 @@ class TriangulateViews(nn.Module):
         Raises:
             InputError: not floating point, or wrong shapes.
         """
-        pixels = as_points("pixels", pixels, 2)
+        pixels = as_points("pixels", pixels, 2, self.cam_from_world)
         count, lead = len(self.cameras), pixels.shape[:-2]
         if pixels.ndim < 3 or pixels.shape[-2] != count:
             raise InputError(f"pixels: shape (..., N, {count}, 2) is needed, got {tuple(pixels.shape)}")

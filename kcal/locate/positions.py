@@ -172,7 +172,7 @@ def locate_points(
         >>> round(position.range_m, 3), round(position.lat, 6), round(position.range_high_m, 1)
         (1000.0, 19.079034, 1054.8)
     """
-    pixels_left, pixels_right = checked_pairs(pixels_left, pixels_right)
+    pixels_left, pixels_right = checked_pairs(pixels_left, pixels_right, rig)
     if pixels_left.ndim != 2:
         raise InputError(f"pixels_left: shape (N, 2) is needed, got {tuple(pixels_left.shape)}")
     if len(pixels_left) == 0:

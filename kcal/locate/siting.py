@@ -173,6 +173,8 @@ def area_of(
         >>> area_of((44.95, 5.95, 45.05, 6.05), level_ground(0.0), cells=11).points.shape
         torch.Size([11, 8, 3])
     """
+    if len(bounds) != 4:
+        raise InputError(f"bounds: south, west, north and east are needed, got {len(bounds)} numbers")
     south, west, north, east = bounds
     east = east + 360.0 if east < west else east
     if not (-90.0 < south < north < 90.0 and -180.0 <= west < east <= west + 180.0):

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import NamedTuple, TypeVar
 
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from kcal.checks import as_points
@@ -66,9 +67,12 @@ def checked_rig(rig: StereoRig, pixel_sigma: float) -> float:
     return float(pixel_sigma)
 
 
-def checked_pairs(pixels_left: Tensor, pixels_right: Tensor) -> tuple[Tensor, Tensor]:
-    """Both as float64 (..., N, 2), after checking types and shapes."""
-    left, right = as_points("pixels_left", pixels_left, 2), as_points("pixels_right", pixels_right, 2)
+def checked_pairs(
+    pixels_left: Tensor | ArrayLike, pixels_right: Tensor | ArrayLike, rig: StereoRig
+) -> tuple[Tensor, Tensor]:
+    """Both as float64 (..., N, 2) on the rig's device, after checking types and shapes."""
+    there = rig.right_from_left_translation
+    left, right = as_points("pixels_left", pixels_left, 2, there), as_points("pixels_right", pixels_right, 2, there)
     if left.shape != right.shape or left.ndim < 2:
         raise InputError(
             "pixels_left and pixels_right: the same shape (..., N, 2) is needed, "

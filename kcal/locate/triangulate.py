@@ -102,7 +102,7 @@ class Triangulate(Operations):
         Raises:
             InputError: not floating point, or shapes that are wrong or unlike.
         """
-        left, right = checked_pairs(pixels_left, pixels_right)
+        left, right = checked_pairs(pixels_left, pixels_right, self.rig)
         if found := self.as_operation("forward", left, right):
             return Triangulation(*found)
         differentiated = is_differentiated(left, right, self)

@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from kcal.checks import as_points
 from kcal.errors import InputError
 from kcal.lens.mounting import Origin
 from kcal.locate.localizer import StereoLocalizer
@@ -64,6 +65,9 @@ def position_errors(located: Located, truth: Tensor) -> list[tuple[float, float,
         >>> [round(value, 6) for value in position_errors(found, torch.tensor([[3.0, 996.0, 0.0]]).double())[0][:1]]
         [5.0]
     """
+    truth = as_points("truth", truth, 3)
+    if truth.ndim != 2 or len(truth) != len(located.positions):
+        raise InputError(f"truth: shape ({len(located.positions)}, 3) is needed, got {tuple(truth.shape)}")
     out: list[tuple[float, float, bool] | None] = []
     for position, true in zip(located.positions, truth, strict=True):
         if position.enu is None or position.range_m is None or not bool(torch.isfinite(true).all()):

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from kcal.checks import as_points, exportable, keep_float64, require_finite
+from kcal.checks import as_points, as_tensor, exportable, keep_float64, require_finite
 from kcal.corners.match import MatchStatus
 from kcal.corners.object_planes import object_planes, plane_pixels, plane_places
 from kcal.corners.patch_correlation import highest_peak, is_textured, weighted_correlation
@@ -147,7 +147,7 @@ class ObjectDisparity(nn.Module):
                 f"{tuple(starts.shape)}"
             )
         for word, image, camera in (("left", left, self.rig.left), ("right", right, self.rig.right)):
-            require_finite(f"{word} image", image.detach())
+            require_finite(f"{word} image", as_tensor(f"{word} image", image).detach())
             if tuple(image.shape) != camera.size[::-1]:
                 raise InputError(
                     f"{word} image {tuple(image.shape)}: the {word} camera needs (H, W) = {camera.size[::-1]}"
