@@ -158,7 +158,8 @@ NEW_NAMES = (
     | {"save_siting_picture", "siting_figure"}
     | set(PUBLIC["kcal.stars"].split())
     | {
-        "CameraLike", "ExtendedDistortion",
+        "CameraLike",
+        "ExtendedDistortion",
         "FieldTraining",
         "NetworkModes",
         "JointFit",
