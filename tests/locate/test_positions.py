@@ -126,7 +126,7 @@ def test_bad_input_is_refused() -> None:
         ((marks[0], marks[0]), "shape"),
         ((marks[:0], marks[:0]), "at least one"),
         ((marks, tensor([1.0, 2.0], [3.0, 4.0])), "same shape"),
-        (([[1.0, 2.0]], marks), "tensor"),
+        (("marks", marks), "tensor or array"),
     ):
         with pytest.raises(InputError, match=message):
             locate_points(RIG, *arguments, origin=ORIGIN, heading_deg=0.0)
