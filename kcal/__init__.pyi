@@ -21,7 +21,7 @@ from kcal.calibrate.camera.options import CalibrationOptions as CalibrationOptio
 from kcal.calibrate.camera.result import CameraCalibrationResult as CameraCalibrationResult
 
 # Solve a rig
-from kcal.calibrate.rig.from_boards import calibrate_rig as calibrate_rig
+from kcal.calibrate.rig.solve import calibrate_rig as calibrate_rig
 from kcal.calibrate.rig.solve import solve_rig as solve_rig
 from kcal.calibrate.rig.solve import RigOptions as RigOptions
 from kcal.calibrate.rig.result import RigResult as RigResult

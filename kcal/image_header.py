@@ -1,4 +1,4 @@
-"""Read the size of an image from its first bytes, before a decoder allocates memory for it."""
+"""The size of an image: as files have it, and from an image file's header alone."""
 
 from __future__ import annotations
 
@@ -6,9 +6,40 @@ import re
 import struct
 from collections.abc import Callable
 from pathlib import Path
+from typing import Annotated
+
+import pydantic
 
 from kcal.errors import FileError
-from kcal.image_size import MOST_PIXELS, check_pixel_count
+
+# The size of an image, as kcal's files have it; apart from other checks, because torch takes long to load.
+
+# Of one image. The largest sensors of 2025 have about 410 megapixels.
+MOST_PIXELS = 500_000_000
+
+
+def check_pixel_count(size: tuple[int, int]) -> tuple[int, int]:
+    """Return (width, height) unless no camera has so many pixels.
+
+    Raises:
+        ValueError: more than 500 megapixels.
+
+    Example:
+        >>> check_pixel_count((1920, 1080))
+        (1920, 1080)
+    """
+    width, height = size
+    if width * height > MOST_PIXELS:
+        shown = f"{width}x{height}" if max(size) < 1e12 else "more than 1e12"
+        raise ValueError(f"{shown} pixels; an image may have at most {MOST_PIXELS // 10**6} megapixels")
+    return size
+
+
+# (width, height) in pixels, in kcal's files.
+ImageSize = Annotated[tuple[pydantic.PositiveInt, pydantic.PositiveInt], pydantic.AfterValidator(check_pixel_count)]
+
+
+# Read the size of an image from its first bytes, before a decoder allocates memory for it.
 
 Size = tuple[int, int]
 

@@ -15,8 +15,7 @@ import numpy as np
 import yaml
 
 from kcal.errors import FileError
-from kcal.strict_json import read_json
-from kcal.strict_xml import read_xml
+from kcal.strict_json import read_json, read_xml
 from kcal.strict_yaml import MOST_BYTES as MOST_YAML
 
 MOST_DEPTH = 16

@@ -1,4 +1,4 @@
-"""Read JSON of unknown origin: limits on size, depth and numbers are checked before they can do harm."""
+"""Parsers of JSON and XML that hostile files do not harm."""
 
 from __future__ import annotations
 
@@ -6,8 +6,11 @@ import json
 import re
 from itertools import accumulate
 from typing import Any
+from xml.etree import ElementTree
 
 from kcal.errors import FileError
+
+# Read JSON of unknown origin: limits on size, depth and numbers are checked before they can do harm.
 
 # Far more than any file of kcal has: a thousand views of a large board take 50 MB, and a rig is 6 levels deep.
 MOST_BYTES, MOST_DEPTH = 128 * 2**20, 32
@@ -70,3 +73,46 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         twice = next(key for key in keys if keys.count(key) > 1)
         raise ValueError(f"the key {twice[:40]!r} occurs twice in one object")
     return found
+
+
+# Read XML of unknown origin: no document types, no entities, no deep nesting.
+
+# Far more than GPX and OpenCV's files have.
+MOST_XML_DEPTH, MOST_ELEMENTS = 32, 1_000_000
+
+
+class _Builder(ElementTree.TreeBuilder):
+    """Builds a tree and counts while it does."""
+
+    depth = count = 0
+
+    def start(self, tag: Any, attrs: Any, /) -> ElementTree.Element:
+        self.depth, self.count = self.depth + 1, self.count + 1
+        if self.depth > MOST_XML_DEPTH:
+            raise ValueError(f"nested deeper than {MOST_XML_DEPTH} levels")
+        if self.count > MOST_ELEMENTS:
+            raise ValueError(f"more than {MOST_ELEMENTS:,} elements")
+        return super().start(tag, attrs)
+
+    def end(self, tag: str, /) -> ElementTree.Element:
+        self.depth -= 1
+        return super().end(tag)
+
+    def doctype(self, name: str, public: str | None, system: str | None) -> None:
+        raise ValueError("document types and entities are not read")
+
+
+def read_xml(data: bytes | str, source: str) -> ElementTree.Element:
+    """The root element of an XML text.
+
+    Raises:
+        FileError: not XML, or refused; `source` names it.
+
+    Example:
+        >>> read_xml("<a><b>1</b></a>", "memory").findtext("b")
+        '1'
+    """
+    try:
+        return ElementTree.fromstring(data, ElementTree.XMLParser(target=_Builder()))
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise FileError(f"{source}: not XML that can be read: {error}") from error

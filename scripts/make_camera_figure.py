@@ -13,9 +13,8 @@ from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.hybrid.cameras_fit import measure_board
 from kcal.lens.pupil import pupil_depth
 from kcal.lens.uncertainty import image_sigma
-from kcal.report.board import save_board_picture
-from kcal.report.colors import ACCENT
-from kcal.report.figures import frame_image, new_figure, save_picture
+from kcal.report.calibration import save_board_picture
+from kcal.report.figures import ACCENT, frame_image, new_figure, save_picture
 from scripts.bench.one_camera import stereo_images
 from scripts.shared.wide_lens import load
 

@@ -31,12 +31,10 @@ from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.rig.sources import Landmarks
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
-from kcal.report.colors import ACCENT, FAINT, GRAY, INK, WARN
-from kcal.report.figures import new_figure, save_picture
+from kcal.report.figures import ACCENT, FAINT, GRAY, INK, WARN, new_figure, save_picture
 from kcal.sim.board import PrintedBoard
-from kcal.sim.captures import capture_corners
+from kcal.sim.captures import capture_corners, drawn_rig
 from kcal.sim.scene import FOCAL_MM, DemoScene, NamedPoints
-from kcal.sim.true_rig import drawn_rig
 from scripts.check.chain import FLAGS as CHAIN_FLAGS
 from scripts.check.chain_rig import localizer
 from scripts.make_assets import ASSETS

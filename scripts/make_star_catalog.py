@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from kcal.files import read_bytes, write_atomic
-from kcal.stars.catalog import PACKED, PACKED_FILE, StarCatalog
+from kcal.stars.sky import PACKED, PACKED_FILE, StarCatalog
 
 _ENTRY = np.dtype([
     ("number", "<f4"), ("ra", "<f8"), ("dec", "<f8"), ("kind", "S2"), ("magnitude", "<i2"), ("pm_ra", "<f4"),

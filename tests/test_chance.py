@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from kcal.chance import beyond_chance, chi2_quantile, variance_factor
+from kcal.checks import beyond_chance, chi2_quantile, variance_factor
 
 
 def test_quantiles_are_those_of_the_tables() -> None:

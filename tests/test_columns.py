@@ -9,9 +9,9 @@ import pytest
 
 from kcal.calibrate.batch.jobs import _COLUMNS
 from kcal.calibrate.batch.results import SummaryRow
-from kcal.locate.columns import NUMBERS, TEXTS
 from kcal.locate.marks import COVARIANCE, PIXELS
 from kcal.locate.survey import FEATURE_COLUMNS, PLACE_COLUMNS
+from kcal.locate.tables import NUMBERS, TEXTS
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "reference" / "columns.md").read_text(encoding="utf-8")

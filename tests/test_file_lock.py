@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 from kcal.errors import FileError
-from kcal.file_lock import FileLock, try_lock
+from kcal.files import FileLock, try_lock
 
 OTHER = (
-    "import sys\nfrom pathlib import Path\nfrom kcal.errors import FileError\nfrom kcal.file_lock import FileLock\n"
+    "import sys\nfrom pathlib import Path\nfrom kcal.errors import FileError\nfrom kcal.files import FileLock\n"
     "try: lock = FileLock([Path(part) for part in sys.argv[1:]], 'the other')\n"
     "except FileError as error: print(error)\n"
     "else: print('locked')\n"

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from kcal.quantities import length_text, length_unit, measured_length, measured_text, number_text, range_text
+from kcal.texts import length_text, length_unit, measured_length, measured_text, number_text, range_text
 
 
 @pytest.mark.parametrize(

@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from kcal import image_size, strict_json
+from kcal import image_header, strict_json
 from kcal.io import lookup_file
-from kcal.web import gate
+from kcal.web import serving
 from scripts.check import container
 from scripts.fuzz.harnesses import HARNESSES
 from scripts.fuzz.readers import READERS
@@ -25,9 +25,9 @@ def test_what_it_names_exists() -> None:
 def test_its_limits_are_those_of_the_code() -> None:
     rows = dict(re.findall(r"^\| ([^|]+) \| ([^|]+) \|$", TEXT, re.MULTILINE))
     assert rows["JSON files of kcal"].startswith(f"{strict_json.MOST_BYTES >> 20} MiB, {strict_json.MOST_DEPTH} levels")
-    assert rows["images"].startswith(f"{image_size.MOST_PIXELS // 10**6} megapixels")
+    assert rows["images"].startswith(f"{image_header.MOST_PIXELS // 10**6} megapixels")
     assert rows["lookup tables (.npz)"].startswith(f"{lookup_file._MOST_BYTES >> 20} MiB")
-    assert rows["requests to a local page"].startswith(f"{gate._LARGEST_BODY >> 20} MiB, {gate._DEEPEST} levels")
+    assert rows["requests to a local page"].startswith(f"{serving._LARGEST_BODY >> 20} MiB, {serving._DEEPEST} levels")
 
 
 def test_every_reader_and_server_is_fuzzed() -> None:

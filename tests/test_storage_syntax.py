@@ -14,8 +14,7 @@ from scipy.io import savemat
 from kcal.errors import FileError
 from kcal.mat_file import read_mat
 from kcal.opencv_storage import read_storage
-from kcal.strict_json import read_json
-from kcal.strict_xml import read_xml
+from kcal.strict_json import read_json, read_xml
 from kcal.strict_yaml import read_yaml
 
 

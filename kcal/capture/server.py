@@ -11,7 +11,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from kcal.capture.session import CaptureSession
-from kcal.web.gate import local_app, page_files
+from kcal.web.serving import local_app, page_files
 
 
 def capture_app(session: CaptureSession, stop: threading.Event, token: str, hosts: tuple[str, ...]) -> Starlette:

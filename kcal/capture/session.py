@@ -1,14 +1,16 @@
-"""Keep the useful frames of a board, calibrate as they come, and say what to photograph next."""
+"""Frames for a capture: keep the useful ones of a board, calibrate as they come, and say what to photograph next."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+import os
 import re
 import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -19,14 +21,87 @@ from kcal.calibrate.camera.calibrate import CameraCalibrationResult, calibrate_c
 from kcal.calibrate.camera.next_view import NextView, far_sigma, next_view, possible_views
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_board, view_of
-from kcal.corners.images import Gray
+from kcal.corners.images import IMAGE_SUFFIXES, Gray, decode_gray
 from kcal.corners.observations import Observations
 from kcal.corners.refine import Refinement
-from kcal.corners.video import NEW, is_new_view
-from kcal.errors import InputError, KcalError
-from kcal.files import make_folder, write_atomic
+from kcal.corners.video import NEW, is_new_view, read_frames, sharpest
+from kcal.errors import FileError, InputError, KcalError
+from kcal.files import is_stream, make_folder, read_bytes, source_name, write_atomic
 from kcal.io.images import encode_png
 from kcal.lens.camera import Camera
+from kcal.pipeline.handover import Handover
+
+# Frames for a capture: a camera or stream, a video, or a folder into which images come.
+
+# Seconds between two looks into a folder.
+_LOOK = 0.5
+
+
+class Shot(NamedTuple):
+    """A frame with a name; `moving` tells frames of a moving board from single images."""
+
+    name: str
+    image: Gray
+    moving: bool
+
+
+def shots(source: str, stopped: Callable[[], bool], tell: Callable[[str], None]) -> Iterator[Shot]:
+    """Frames of a source, until it ends or `stopped` says so.
+
+    Of a video or stream the sharpest of every few frames; of a folder the images that are there and those that come.
+
+    Args:
+        source: `camera:0`, `rtsp://...`, a video file, or a folder.
+        stopped: looked at before each frame.
+        tell: called with the reason for each image of a folder that cannot be read.
+
+    Raises:
+        FileError: no such file or folder, no video, or a stream that does not answer.
+    """
+    if not is_stream(source) and os.path.isdir(source):
+        yield from _of_folder(Path(source), stopped, tell)
+        return
+    name = source_name(source)
+    # A live source ends when it is told to.
+    frames = sharpest(read_frames(source, float("inf")))
+    # Of a stream, frames that come while one is looked at are left out.
+    newest = Handover(frames, 1, waits=False) if is_stream(source) else None
+    try:
+        for frame in newest or frames:
+            if stopped():
+                return
+            yield Shot(f"{name}#{frame.number:06d}", frame.image, True)
+    finally:
+        if newest is not None:
+            newest.close(wait=5.0)
+
+
+def _of_folder(folder: Path, stopped: Callable[[], bool], tell: Callable[[str], None]) -> Iterator[Shot]:
+    sizes: dict[str, int] = {}
+    done: set[str] = set()
+    while not stopped():
+        try:
+            entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
+            images = [entry for entry in entries if Path(entry.name).suffix.lower() in IMAGE_SUFFIXES]
+            found = {entry.name: entry.stat().st_size for entry in images if entry.is_file() and entry.name not in done}
+        except OSError as error:
+            raise FileError(f"{folder}: cannot be read: {error.strerror}") from error
+        # An image that still grows is looked at again when it has come to rest.
+        ready = [name for name, size in found.items() if size and sizes.get(name) == size]
+        for name in ready:
+            if stopped():
+                return
+            done.add(name)
+            try:
+                yield Shot(name, decode_gray(read_bytes(folder / name), name), False)
+            except FileError as error:
+                tell(str(error))
+        sizes = found
+        if not ready:
+            time.sleep(_LOOK)
+
+
+# Keep the useful frames of a board, calibrate as they come, and say what to photograph next.
 
 # Views before the first calibration: four tilts determine a focal length.
 FIRST_VIEWS = 4

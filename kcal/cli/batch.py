@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kcal.cli.board_options import Refine, RefineMethod
 from kcal.cli.console import err, out, print_table, print_wrote, steps
+from kcal.cli.inputs import Refine, RefineMethod
 from kcal.errors import DegenerateError, InputError
 
 if TYPE_CHECKING:

@@ -8,11 +8,9 @@ from typing import Annotated
 
 import typer
 
-from kcal.cli.board_options import BoardSize, SquareSide
-from kcal.cli.commands import Command
 from kcal.cli.console import out, print_wrote, steps, warn, with_json
-from kcal.cli.groups import group_with_default
-from kcal.cli.inputs import OBSERVATIONS, with_inputs
+from kcal.cli.inputs import OBSERVATIONS, BoardSize, SquareSide, with_inputs
+from kcal.cli.settings import Command, group_with_default
 from kcal.errors import InputError
 from kcal.files import check_picture, check_writable, write_atomic
 
@@ -103,7 +101,7 @@ def measure_command(
     from kcal.calibrate.hybrid.cameras_fit import fit_cameras
     from kcal.calibrate.hybrid.measured_board import save_measured_board
     from kcal.corners.observations import Observations
-    from kcal.report.board import board_text, save_board_picture
+    from kcal.report.calibration import board_text, save_board_picture
 
     check_writable(output, *observations)
     if picture is not None:

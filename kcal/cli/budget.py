@@ -8,10 +8,11 @@ from typing import Annotated
 import typer
 
 from kcal.cli.console import out, print_table, print_wrote
-from kcal.cli.inputs import RIG
-from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_of
+from kcal.cli.inputs import RIG, PixelSigma, pixel_sigma_of
+from kcal.cli.stars import print_star_budget
 from kcal.errors import InputError
 from kcal.files import check_picture
+from kcal.texts import length_text, range_text
 
 # Ranges in the table, if none are given.
 _BASELINES = (10.0, 25.0, 50.0, 100.0, 250.0, 500.0)
@@ -69,9 +70,7 @@ def budget_command(
     import math
 
     from kcal.io.rig_file import load_rig
-    from kcal.locate.budget import BudgetErrors, planned_rig, range_errors
-    from kcal.locate.range_sigmas import range_sigmas, usual_ranges
-    from kcal.quantities import length_text, range_text
+    from kcal.locate.budget import BudgetErrors, planned_rig, range_errors, range_sigmas, usual_ranges
     from kcal.report.tables import range_sigma_rows
 
     if picture is not None:
@@ -107,14 +106,12 @@ def budget_command(
         out.print(f"\nWhat the rig file knows, and {noise:g} px of noise in each mark:")
         print_table(range_sigma_rows(range_sigmas(chosen, far, pixel_sigma=noise)))
     if stars:
-        from kcal.cli.budget_stars import print_star_budget
-
         print_star_budget(
             float(chosen.left.params[0]), chosen.left.size, float(chosen.baseline), 5000.0, aperture, altitude,
             clock_sigma,
         )  # fmt: skip
     if picture is not None:
-        from kcal.report.budget import plotted_ranges, save_budget_picture
+        from kcal.report.positions import plotted_ranges, save_budget_picture
 
         sweep = plotted_ranges(far)
         save_budget_picture(picture, sweep, range_errors(chosen, sweep, errors), labels)

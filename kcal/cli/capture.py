@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kcal.cli.board_options import BoardSize, Refine, RefineMethod, SquareSide
 from kcal.cli.console import err, out, show_page
+from kcal.cli.inputs import BoardSize, Refine, RefineMethod, SquareSide
 from kcal.errors import InputError, KcalError, with_extra
 from kcal.files import check_writable
 
@@ -55,8 +55,7 @@ def capture_command(
 
     `kcal capture incoming/ --board 9x6 --square 25mm -o left.obs.json --until 0.05`
     """
-    from kcal.capture.session import CaptureOptions, CaptureSession, follow
-    from kcal.capture.sources import shots
+    from kcal.capture.session import CaptureOptions, CaptureSession, follow, shots
     from kcal.corners.board import Board
 
     check_writable(output)

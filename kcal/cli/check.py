@@ -13,7 +13,7 @@ import typer
 from kcal.cli.console import err, out, print_answer, print_table, print_wrote, steps, tell, warn
 from kcal.cli.inputs import CALIBRATED, OBSERVATIONS
 from kcal.cli.report import NO
-from kcal.cli.sides import check_views_of
+from kcal.cli.rig_sources import check_views_of
 from kcal.errors import FileError, InputError
 from kcal.files import check_picture, check_writable, read_bytes, write_atomic
 
@@ -95,7 +95,7 @@ def check_command(
         if against is not None:
             fine = _told_against(result, against, options, at) and fine
     if picture is not None:
-        from kcal.report.interval_map import save_interval_picture
+        from kcal.report.calibration import save_interval_picture
 
         print_wrote(save_interval_picture(picture, found, result.observations, camera.name))
     print_wrote(kept)
@@ -217,7 +217,7 @@ def _kept_refits(path: Path, key: str) -> list[Refit]:
 
 def _told_refits(found: IntervalCheck, count: int) -> bool:
     """Print the answer."""
-    from kcal.report.interval_map import range_label
+    from kcal.report.calibration import range_label
 
     rows = [["range", "refits inside, %", "±", "lowest place, %", "error px, RMS", "stated px, RMS", "σ should be"]]
     parts = zip(found.ranges, found.shares, found.coverage, found.rms, found.factors, strict=True)
@@ -254,7 +254,7 @@ def _told_refits(found: IntervalCheck, count: int) -> bool:
 
 def _told_views(result: CameraCalibrationResult, options: CalibrationOptions) -> bool:
     """Print whether the capture's own views contradict the intervals: by their halves, and by the default lens."""
-    from kcal.report.model_findings import fault_of_views
+    from kcal.report.judge_camera import fault_of_views
 
     with steps("examining the views", None) as advance:
         fault = fault_of_views(result, options, advance)
@@ -272,7 +272,7 @@ def _told_against(
     """Print whether a second capture gives the same camera."""
     from kcal.calibrate.camera.interval_check import against_capture
     from kcal.corners.observations import Observations
-    from kcal.report.interval_map import range_label
+    from kcal.report.calibration import range_label
 
     second = Observations.load(path)
     check_views_of([result.camera], [second], [path])

@@ -1,16 +1,25 @@
-"""`kcal compare`: how well lens models predict views that were held out."""
+"""Commands about a camera as a whole: `kcal compare`, `kcal diff`, `kcal interpolate` and `kcal bake`."""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kcal.cli.console import out, print_table, steps, warn
-from kcal.cli.inputs import OBSERVATIONS
+from kcal.cli.calibrate import named_numbers, stated_settings
+from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
+from kcal.cli.inputs import ANY_CAMERA, CALIBRATED, CAMERA, OBSERVATIONS, calibrated_camera, single_camera
 from kcal.errors import InputError
-from kcal.quantities import number_text
+from kcal.files import check_picture, check_writable
+from kcal.texts import number_text
+
+if TYPE_CHECKING:
+    from kcal.lens.camera import Camera
+
+
+# `kcal compare`: how well lens models predict views that were held out.
 
 
 def compare_command(
@@ -59,3 +68,201 @@ def compare_command(
     print_table(rows)
     for name, reason in result.failures.items():
         warn(f"{name} could not be fitted to some of the views: {reason}")
+
+
+# `kcal diff`: how differently two cameras see, against their error bars.
+
+
+def diff_command(
+    first: Annotated[
+        str, typer.Argument(metavar="CAMERA", help="Camera file of kcal or of another program."), ANY_CAMERA
+    ],
+    second: Annotated[
+        str, typer.Argument(metavar="CAMERA", help="Another one; RIG.json:left is a camera of a rig."), ANY_CAMERA
+    ],
+    at: Annotated[
+        float, typer.Option("--at", min=1e-3, metavar="METERS", help="Distance of what is seen; infinity if not given.")
+    ] = math.inf,
+    turn: Annotated[
+        bool, typer.Option("--turn/--no-turn", help="Turn the second camera until it agrees best with the first.")
+    ] = True,
+    picture: Annotated[Path | None, typer.Option(metavar="PNG", help="Map of the difference and of its sigma.")] = None,
+) -> None:
+    """Compare two calibrations of a camera: are they the same within their uncertainty?
+
+    Where the second camera sees what the first one sees, after the turn that no calibration determines. The error bars
+    of both tell how much of that is expected. Use it for one camera over time, or for two halves of its images.
+
+    **Examples**
+
+    `kcal diff june.camera.json december.camera.json --picture diff.png`
+
+    `kcal diff left.camera.json left.cameramodel`
+    """
+    import torch
+
+    from kcal.lens.difference import camera_difference
+    from kcal.report.difference_text import difference_text
+
+    if picture is not None:
+        check_picture(picture)
+    cameras = [single_camera(source) for source in (first, second)]
+    for source, camera in zip((first, second), cameras, strict=True):
+        out.print(f"{source}: {_history(camera)}", markup=False)
+    found = camera_difference(*cameras, at=at, rotation=None if turn else torch.eye(3))
+    tell(
+        at_m=None if math.isinf(at) else at,
+        rms_px=found.rms,
+        largest_px=found.largest,
+        turn_deg=found.turn_deg,
+        ratio=found.ratio,
+        probability=found.probability,
+        same=found.same,
+        temperature_c=[_temperature(camera) for camera in cameras],
+    )
+    then, now = (_temperature(camera) for camera in cameras)
+    if then is not None and now is not None and now != then:
+        out.print(f"{abs(now - then):g} °C {'warmer' if now > then else 'colder'}", markup=False)
+    for line in difference_text(found):
+        out.print(line, markup=False)
+    if picture is not None:
+        from kcal.report.difference import save_difference_picture
+
+        print_wrote(save_difference_picture(picture, found, title=f"{first} and {second}"))
+
+
+def _temperature(camera: Camera) -> float | None:
+    record = camera.calibration.record if camera.calibration else None
+    return record.temperature if record else None
+
+
+def _history(camera: Camera) -> str:
+    """Model, focal length and, if the file tells, when the camera was calibrated."""
+    from kcal.lens.paraxial import paraxial_focal
+
+    record = camera.calibration.record if camera.calibration else None
+    when = ""
+    if record:
+        when = f", {record.created:%Y-%m-%d %H:%M}, RMS {number_text(record.rms)} px from {record.views} views"
+    if camera.calibration and camera.calibration.setting:
+        when += f", {camera.calibration.setting}"
+    if record and record.temperature is not None:
+        when += f", at {record.temperature:g} °C"
+    return f"{camera.model}, focal length {paraxial_focal(camera)}{when}"
+
+
+# `kcal interpolate`: a camera at a setting of zoom or focus between those at which its lens was calibrated.
+
+
+def interpolate_command(
+    cameras: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="CAMERA...",
+            help="Camera file at each setting, from `kcal calibrate --setting`.",
+            show_default=False,
+        ),
+        CALIBRATED,
+    ],
+    setting: Annotated[
+        list[str], typer.Option(metavar="NAME=NUMBER", help="Setting of the camera to make; may be repeated.")
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Camera file to write.")],
+    setting_sigma: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=NUMBER",
+            help="Standard deviation with which the lens comes back to a setting (0 if not given).",
+        ),
+    ] = None,
+) -> None:
+    """Make a camera at a zoom or focus between those at which its lens was calibrated, with its error bars.
+
+    Error bars grow by what the curve between the settings may hide: three settings tell little of that, five tell more.
+    Outside the settings nothing is made. Commands take the file as they take any camera file.
+
+    **Example**
+
+    `kcal interpolate near.camera.json middle.camera.json far.camera.json --setting focus=4 -o now.camera.json`
+    """
+    check_writable(output, *cameras)
+    (wanted,) = stated_settings(setting, 1)
+    spread = {}
+    for name, values in named_numbers(setting_sigma, "--setting-sigma").items():
+        if len(values) > 1:
+            raise InputError(f"--setting-sigma {name}: one number is needed")
+        spread[name] = values[0]
+
+    from kcal.calibrate.camera.at_setting import camera_at_setting
+    from kcal.io.camera_file import load_camera, save_camera
+    from kcal.lens.calibration import LensSetting
+
+    loaded = [load_camera(path) for path in cameras]
+    found = camera_at_setting(loaded, wanted, setting_sigma=spread, names=[str(path) for path in cameras])
+    *stated, made = [camera.calibration and camera.calibration.setting for camera in (*loaded, found.camera)]
+    weights = [number_text(weight, 0.01, sign=True) for weight in found.weights]
+    rows = zip(map(str, cameras), map(str, stated), weights, strict=True)
+    print_table([["camera", "setting", "weight"], *map(list, rows)], left=(0, 1))
+    parts = {
+        "calibrations": found.calibration_px,
+        "interpolation": found.interpolation_px,
+        "setting": found.setting_px,
+        "misfit": found.misfit_px,
+    }
+    total = sum(value**2 for value in parts.values()) ** 0.5
+    if isinstance(made, LensSetting) and made.interpolated_from:
+        text = ", ".join(f"{number_text(value, digits=2)} by {name}" for name, value in parts.items() if value)
+        out.print(
+            f"{made}, interpolated: far directions ± {number_text(total, digits=2)} px (median): {text}", markup=False
+        )
+    else:
+        out.print(f"{made}, calibrated: far directions ± {number_text(total, digits=2)} px (median)", markup=False)
+    tell(setting=wanted, weights=list(found.weights), sigma_px={"median": total, **parts})
+    save_camera(found.camera, output, name=output.name.split(".")[0])
+    print_wrote(output)
+
+
+# `kcal bake`: a camera as lookup tables.
+
+
+def bake_command(
+    camera: Annotated[Path, typer.Argument(help="Camera file from `kcal calibrate`.", show_default=False), CAMERA],
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--output", metavar="FILE", help="File to write, .npz; beside the camera file if not given."
+        ),
+    ] = None,
+    tolerance: Annotated[
+        float, typer.Option("--tolerance", min=1e-8, help="Largest allowed error in pixels, in both directions.")
+    ] = 1e-3,
+) -> None:
+    """Turn a camera into lookup tables, for programs without lens models.
+
+    Writes one .npz file with two bicubic tables, pixels to rays and rays to pixels, as coarse as the tolerance allows.
+    `kcal/io/lookup_file.py` explains the arrays and how to read them with numpy alone.
+
+    **Example**
+
+    `kcal bake left.camera.json --tolerance 0.001 -o left.npz`
+    """
+    name = camera.name.removesuffix(".json").removesuffix(".camera")
+    path = check_writable(output or camera.with_name(f"{name}_lookup.npz"), camera)
+
+    from kcal.io.lookup_file import save_lookup
+    from kcal.lens.baking import bake
+
+    with steps("baking", None):
+        lookup = bake(calibrated_camera(camera), tolerance)
+    save_lookup(lookup, path)
+    for which, table, bound, coverage in zip(
+        ("pixels to rays", "rays to pixels"),
+        (lookup.chart_from_pixels, lookup.pixels_from_chart),
+        lookup.bound[::-1],
+        lookup.coverage[::-1],
+        strict=True,
+    ):
+        rows, columns = table.cells.shape
+        lost = "" if coverage == 1.0 else f"; answers for {coverage:.1%} of the image's valid pixels"
+        out.print(f"{which}: {columns} x {rows} cells, error at most {bound:.1e} px{lost}")
+    print_wrote(path)

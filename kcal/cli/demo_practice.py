@@ -1,15 +1,17 @@
-"""`kcal demo --practice`: a rendered site to mark, calibrate, solve and follow on, with its truth kept aside."""
+"""`kcal demo --practice` and `--score`: a rendered site to mark, calibrate and solve, and how well that was done."""
 
 from __future__ import annotations
 
+import datetime
 import functools
 import importlib
 import json
+import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from kcal.cli.console import err, out, steps
+from kcal.cli.console import err, out, print_table, steps, warn
 from kcal.errors import FileError
 from kcal.files import dump_json, make_folder, read_bytes, write_atomic
 from kcal.strict_json import MOST_BYTES, read_json
@@ -18,7 +20,115 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from kcal.lens.rig import StereoRig
     from kcal.sim.practice import PracticeSite, Side
+    from kcal.sim.scene import DemoScene
+
+
+# The texts of a practice site: what is where, the surveyor's list, and what is to be located.
+
+
+class Exercise(NamedTuple):
+    """A step of the exercise.
+
+    Attributes:
+        name: of the step.
+        makes: files of which one must be there when it is done.
+        commands: what to paste, in the folder of the site.
+        leads_on: whether its files serve the next step alone, so that they may have other names.
+    """
+
+    name: str
+    makes: tuple[str, ...]
+    commands: tuple[str, ...]
+    leads_on: bool = False
+
+
+STEPS = (
+    Exercise("find the board", ("left.obs.json", "right.obs.json"), tuple(
+        f"kcal detect boards/{side} --board 9x6 --square 60mm -o {side}.obs.json" for side in ("left", "right")), True),
+    Exercise("calibrate", ("left.camera.json", "right.camera.json"), tuple(
+        f"kcal calibrate {side}.obs.json -o {side}.camera.json" for side in ("left", "right"))),
+    Exercise("mark", ("marks.csv",), (
+        "kcal mark site/left.png site/right.png --cameras left.camera.json right.camera.json --landmarks survey.csv "
+        "-o marks.csv",), True),
+    Exercise("solve the rig", ("rig.json",), (
+        "kcal rig left.camera.json right.camera.json --landmarks survey.csv --marks marks.csv -o rig.json",)),
+    Exercise("locate", ("positions.geojson",), (
+        "kcal locate rig.json marks.points.csv -o positions.geojson --map map.html",)),
+    Exercise("follow", ("tracks.csv",), (
+        "kcal live rig.json video/left.mp4 video/right.mp4 --detector find_ships:find_ships -o tracks.csv",)),
+)  # fmt: skip
+
+
+# When the night's pictures were taken.
+NIGHT = datetime.datetime(2026, 11, 24, 20, 47, 26, tzinfo=datetime.UTC)
+
+
+def night_name(side: str) -> str:
+    """Name of a night's picture, which says when it was taken, in UTC."""
+    return f"{side}-{NIGHT:%Y-%m-%dT%H%M%S}.png"
+
+
+def readme_text(scene: DemoScene) -> str:
+    """What is in the folder, and the commands."""
+    commands = "\n".join(
+        f"{number}. {step.name}\n" + "\n".join(f"   {command}" for command in step.commands)
+        for number, step in enumerate(STEPS, 1)
+    )
+    place = f"--lat {scene.lat:g} --lon {scene.lon:g} --height {scene.height:g}"
+    return f"""A site to practise on
+=====================
+
+Two cameras stand 10 m apart on masts above a harbor. Everything is rendered, so the truth is known.
+
+boards/left, boards/right   photographs of a printed board: 9x6 inner corners, squares of 60 mm
+site/left.png, right.png    the site as both cameras see it, to be marked
+site/sketch.png             the surveyor's sketch: which landmark is which, and the targets
+night/                      the stars over both cameras; times in the names are UTC
+survey.csv                  surveyed places of the landmarks, with their sigma
+targets.csv                 what to locate, and which point of it is meant; use these names
+video/left.mp4, right.mp4   two minutes with ships that move
+video/detections.jsonl      the same ships as a detector would report them, if you cannot read videos
+find_ships.py               a detector for the videos
+
+Run the commands in this folder:
+
+{commands}
+
+   Without the extra `video`:
+   kcal live rig.json --detections video/detections.jsonl -o tracks.csv
+
+   How do the cameras look, by the stars?
+   kcal stars night/{night_name("left")} --camera left.camera.json --time name:Z {place}
+
+How well did you do? This may be asked after each step:
+   kcal demo --score .
+The truth is in the hidden folder .truth; look there afterwards.
+"""
+
+
+def survey_text(scene: DemoScene) -> str:
+    """The landmarks as a surveyor hands them over: latitude, longitude, ellipsoidal height, sigma in meters."""
+    from kcal.lens.mounting import Origin
+    from kcal.locate.geodesy import enu_to_geodetic
+
+    origin = Origin(lat=scene.lat, lon=scene.lon, height=scene.height)
+    surveyed = scene.surveyed(scene.landmarks)
+    lines = ["name,lat,lon,height,sigma"]
+    for name, (lat, lon, height) in zip(surveyed.names, enu_to_geodetic(surveyed.enu, origin).tolist(), strict=True):
+        lines.append(f"{name},{lat:.9f},{lon:.9f},{height:.3f},{scene.survey_sigma:g}")
+    return "\n".join(lines) + "\n"
+
+
+def targets_text() -> str:
+    """Names of what is to be located, and which point is meant."""
+    from kcal.sim.practice import TARGETS
+
+    return "".join(["name,mark\n", *(f"{thing.name},{thing.where}\n" for thing in TARGETS)])
+
+
+# `kcal demo --practice`: a rendered site to mark, calibrate, solve and follow on, with its truth kept aside.
 
 # Hidden, so that it is not read by accident.
 TRUTH = Path(".truth") / "truth.json"
@@ -138,9 +248,7 @@ _Write = Callable[[Path, Callable[[], None]], object]
 
 def _practice_parts(site: PracticeSite, frames: int) -> Iterator[tuple[Path, int, _Write]]:
     """Each file with the steps of its bar, and what writes it; the truth first, which says whose folder it is."""
-    from kcal.cli.practice_files import night_name, readme_text, survey_text, targets_text
-    from kcal.sim.practice import SIDES
-    from kcal.sim.practice_truth import practice_truth
+    from kcal.sim.practice import SIDES, practice_truth
 
     def text(make: Callable[[], str]) -> _Write:
         return lambda path, _: write_atomic(path, make())
@@ -184,12 +292,11 @@ def _picture(site: PracticeSite, side: Side, path: Path, _: Callable[[], None]) 
 
 def _night(site: PracticeSite, side: Side, path: Path, _: Callable[[], None]) -> None:
     importlib.import_module("erfa")
-    from kcal.cli.practice_files import NIGHT
     from kcal.io.images import write_png
     from kcal.lens.mounting import Origin
-    from kcal.sim.practice_night import night_picture
-    from kcal.stars.catalog import StarCatalog
+    from kcal.sim.practice import night_picture
     from kcal.stars.night import SkyView
+    from kcal.stars.sky import StarCatalog
 
     scene, catalog = site.scene, StarCatalog.bundled()
     view = SkyView(time=NIGHT, origin=Origin(lat=scene.lat, lon=scene.lon, height=scene.height))
@@ -197,7 +304,7 @@ def _night(site: PracticeSite, side: Side, path: Path, _: Callable[[], None]) ->
 
 
 def _sketch(site: PracticeSite, path: Path, _: Callable[[], None]) -> None:
-    from kcal.report.site_sketch import save_site_sketch
+    from kcal.report.siting import save_site_sketch
     from kcal.sim.practice import LANDMARKS, TARGETS
 
     scene = site.scene
@@ -209,8 +316,8 @@ def _sketch(site: PracticeSite, path: Path, _: Callable[[], None]) -> None:
 
 
 def _film(site: PracticeSite, side: Side, count: int, path: Path, step: Callable[[], None]) -> None:
-    from kcal.io.video_file import write_video
-    from kcal.sim.practice_film import RATE, frames
+    from kcal.io.images import write_video
+    from kcal.sim.practice import RATE, frames
 
     def told() -> Iterator[NDArray[np.uint8]]:
         for frame in frames(site, side, count):
@@ -224,9 +331,7 @@ def _detections(site: PracticeSite, frames: int) -> str:
     """The ships as pairs of marks with noise, one line for each moment, as a detector with a matcher writes them."""
     import numpy as np
 
-    from kcal.sim.practice import PASSAGES, SIDES
-    from kcal.sim.practice_film import RATE
-    from kcal.sim.practice_truth import ship_boxes
+    from kcal.sim.practice import PASSAGES, RATE, SIDES, ship_boxes
 
     random = np.random.default_rng([site.scene.seed, 3])
     left, right = (ship_boxes(site, side, frames) for side in SIDES)
@@ -238,3 +343,145 @@ def _detections(site: PracticeSite, frames: int) -> str:
         ]
         lines.append({"time": number / RATE, "left": marks[0], "right": marks[1], "sigma": _DETECTION_SIGMA})
     return "".join(json.dumps(line) + "\n" for line in lines)
+
+
+# `kcal demo --score`: how well somebody did on a practice site, in meters, and what comes next.
+
+# Names under which results are looked for, the first that is there.
+POSITIONS = ("positions.geojson", "positions.csv")
+TRACKS = ("tracks.csv", "tracks.geojsonl")
+
+
+def practice_score(folder: Path) -> None:
+    """Compare what is in a folder with its truth, step by step.
+
+    Raises:
+        FileError: no site is there, or a result that cannot be read.
+    """
+    truth = read_truth_file(folder)
+    _score_cameras(folder, truth)
+    rig = _score_rig(folder, truth)
+    if rig is not None:
+        _score_positions(folder, truth)
+        _score_tracks(folder, truth)
+    step = next_step(folder)
+    if step is None:
+        out.print("All steps are done.")
+        return
+    out.print(f"next: {step.name}, in {folder}:", markup=False)
+    for command in step.commands:
+        out.print(f"  {command}", markup=False)
+
+
+def next_step(folder: Path) -> Exercise | None:
+    """The first step whose files are not all there; what only leads to a step that is done counts as done."""
+    others = {"positions.geojson": POSITIONS, "tracks.csv": TRACKS}
+    done = [
+        all(any((folder / name).exists() for name in others.get(made, (made,))) for made in step.makes)
+        for step in STEPS
+    ]
+    for step, own, later in zip(STEPS, done, [*done[1:], False], strict=True):
+        if not own and not (step.leads_on and later):
+            return step
+    return None
+
+
+def _head(text: str) -> None:
+    out.print(f"\n[bold]{text}[/]")
+
+
+def _score_cameras(folder: Path, truth: dict[str, Any]) -> None:
+    from kcal.io.camera_file import load_camera
+    from kcal.report.practice_score import score_lens
+
+    rows = [["camera", "RMS px", "middle px", "largest px", "sideways at 5 km", "range at 5 km"]]
+    for side in ("left", "right"):
+        path = folder / f"{side}.camera.json"
+        if path.exists():
+            found = score_lens(load_camera(path), truth["cameras"][side], truth["baseline_m"])
+            pixels = [f"{value:.3f}" for value in (found.rms, found.middle, found.largest)]
+            rows.append([side, *pixels, f"{found.sideways_m:.2f} m", f"{found.range_m:.0f} m"])
+    _head("Cameras: error over the image after the best turn")
+    _print_or_missing(rows)
+
+
+def _score_rig(folder: Path, truth: dict[str, Any]) -> StereoRig | None:
+    from kcal.io.rig_file import load_rig
+    from kcal.report.practice_score import score_rig
+
+    _head("Rig: error of ranges over the image, with marks that have no noise")
+    path = folder / "rig.json"
+    if not path.exists():
+        out.print("not done yet")
+        return None
+    rig = load_rig(path)
+    rows = [["at", "mean m", "RMS m", "one sigma as stated m"]]
+    for found in score_rig(rig, truth):
+        stated = "none" if found.stated is None else _short_meters(found.stated)
+        rows.append([f"{found.range_m / 1000:g} km", _signed(found.mean), _short_meters(found.rms), stated])
+    print_table(rows)
+    true, own = truth["baseline_m"], float(rig.baseline)
+    out.print(f"baseline {own:.4f} m, {1e3 * (own - true):+.1f} mm off")
+    return rig
+
+
+def _score_positions(folder: Path, truth: dict[str, Any]) -> None:
+    from kcal.report.practice_score import score_positions
+
+    _head("Positions: against the truth")
+    path = _first(folder, POSITIONS)
+    if path is None:
+        out.print("not done yet")
+        return
+    scores = score_positions(path, truth)
+    rows = [["target", "range m", "off on the map m", "off in range m", "95 % interval contains it"]]
+    for found in scores:
+        cells = [f"{found.range_m:.0f}", _short_meters(found.level), _signed(found.range_off)]
+        rows.append([found.name, *cells, "yes" if found.contains else "no"])
+    _print_or_missing(rows)
+    if scores:
+        inside = sum(found.contains for found in scores)
+        out.print(f"{inside} of {len(scores)} intervals contain the true range; 95 % are to be expected")
+    missing = [name for name in truth["targets"] if name.casefold() not in {each.name.casefold() for each in scores}]
+    if missing:
+        out.print(f"not among the positions: {', '.join(missing)} (names as in targets.csv)", markup=False)
+
+
+def _score_tracks(folder: Path, truth: dict[str, Any]) -> None:
+    from kcal.report.practice_score import score_tracks
+
+    _head("Tracks: against the ships")
+    path = _first(folder, TRACKS)
+    if path is None:
+        out.print("not done yet")
+        return
+    scores, strays = score_tracks(path, truth)
+    rows = [["ship", "range m", "followed", "tracks", "off on the map m", "off in range m", "intervals with the truth"]]
+    for found in scores:
+        share = "" if math.isnan(found.contained) else f"{100 * found.contained:.0f} %"
+        counts = [f"{found.range_m:.0f}", f"{100 * found.followed:.0f} %", f"{found.tracks}"]
+        rows.append([found.name, *counts, _short_meters(found.level), _short_meters(found.range_off), share])
+    print_table(rows)
+    if strays:
+        warn(f"{strays} tracks are near no ship")
+
+
+def _first(folder: Path, names: tuple[str, ...]) -> Path | None:
+    return next((folder / name for name in names if (folder / name).exists()), None)
+
+
+def _print_or_missing(rows: list[list[str]]) -> None:
+    if len(rows) > 1:
+        print_table(rows)
+    else:
+        out.print("not done yet")
+
+
+def _short_meters(value: float) -> str:
+    if math.isnan(value):
+        return ""
+    return f"{value:.0f}" if abs(value) >= 10 else f"{value:.2g}" if abs(value) >= 0.01 else f"{value:.3f}"
+
+
+def _signed(value: float) -> str:
+    return f"{'-' if value < 0 else '+'}{_short_meters(abs(value))}"

@@ -7,13 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kcal.cli.demo_steps import SIDES
 from kcal.corners.observations import Observations
 from kcal.io.rig_file import RigFile
-from kcal.quantities import length_text
 from kcal.report.judge_rig import rig_verdict
-from kcal.report.summary import Part, save_summary
+from kcal.report.tables import Part, save_summary
 from kcal.report.verdict import Requirement
+from kcal.texts import length_text
 
 # What the rig of the simulated site must do.
 REQUIREMENT = "5km:10%"
@@ -34,7 +33,7 @@ def save_site_summary(
         chance: how many intervals contain the truth, and how many misses are usual.
         command: locates the targets again.
     """
-    seen = [Observations.load(output / f"{side}.obs.json") for side in SIDES]
+    seen = [Observations.load(output / f"{side}.obs.json") for side in ("left", "right")]
     found = sum(len(file.views) for file in seen)
     file = RigFile.load(output / "rig.json")
     rig = file.rig()
@@ -111,7 +110,7 @@ def save_pairs_summary(output: Path, table: Sequence[Sequence[str]], command: st
             text=(_residuals_text(file),),
             pictures=tuple(
                 (output / f"{side}.png", f"{side.capitalize()} camera: where corners were, and their residuals")
-                for side in SIDES
+                for side in ("left", "right")
             ),
         ),
         Part(
@@ -125,7 +124,7 @@ def save_pairs_summary(output: Path, table: Sequence[Sequence[str]], command: st
 
 
 def _residuals_text(file: RigFile) -> str:
-    cameras = zip(SIDES, (file.left.calibration, file.right.calibration), strict=True)
+    cameras = zip(("left", "right"), (file.left.calibration, file.right.calibration), strict=True)
     rms = ", ".join(f"{side} {record.rms:.3f} px" for side, record in cameras if record is not None)
     return f"RMS of the residuals: {rms}."
 

@@ -10,12 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from kcal.cli.board_options import BoardSize, Refine, RefineMethod, SquareSide
-from kcal.cli.console import err, out, steps, tell, warn
-from kcal.cli.cures import board_words, ending_with
-from kcal.cli.inputs import IMAGES, typed, typed_with
+from kcal.cli.console import board_words, ending_with, err, out, steps, tell, warn
+from kcal.cli.inputs import IMAGES, BoardSize, Refine, RefineMethod, SquareSide, typed, typed_with
 from kcal.errors import FileError, InputError
-from kcal.files import check_picture, check_writable
+from kcal.files import check_picture, check_writable, is_stream, source_name
 
 if TYPE_CHECKING:
     from kcal.corners.board import Board
@@ -83,7 +81,6 @@ def detect_command(
     from kcal.corners.images import VIDEO_SUFFIXES, expand_images
     from kcal.corners.orientation import turned_images
     from kcal.corners.video import detect_video
-    from kcal.sources import is_stream, source_name
 
     failed: list[tuple[str, Path, Detection]] = []
 
@@ -129,7 +126,7 @@ def detect_command(
         source = f"of {len(paths)} images"
     observations.save(output)
     if pictures:
-        from kcal.report.gallery import FailedImage, save_coverage, save_gallery
+        from kcal.report.calibration import FailedImage, save_coverage, save_gallery
 
         if gallery is not None:
             tiles = [FailedImage(name, path, found.reason, found.rejected) for name, path, found in failed]

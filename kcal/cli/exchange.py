@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kcal.cli.camera_sources import cameras_and_rig, named_source, parse_size, picked
 from kcal.cli.console import out, print_wrote, steps, warn
-from kcal.cli.inputs import CAMERA_OR_RIG, FOREIGN
+from kcal.cli.inputs import CAMERA_OR_RIG, FOREIGN, cameras_and_rig, named_source, parse_size, picked
 from kcal.errors import InputError
-from kcal.files import check_picture, check_writable
+from kcal.files import check_picture, check_writable, write_atomic
 
 if TYPE_CHECKING:
     from kcal.lens.camera import Camera
@@ -216,10 +215,8 @@ def _import_corners(
 
 
 def _import_survey(sources: list[Path], output: Path, sigma: float | None, geoid: float | None) -> None:
-    from kcal.files import write_atomic
     from kcal.locate.geodesy import enu_to_geodetic
-    from kcal.locate.survey import EARTH, places_csv
-    from kcal.locate.survey_files import import_survey
+    from kcal.locate.survey import EARTH, import_survey, places_csv
 
     if len(sources) != 1:
         raise InputError("places are read from one file")

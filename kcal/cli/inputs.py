@@ -1,4 +1,4 @@
-"""Check what was given before anything is loaded: is each file there, and is it what the command needs there?"""
+"""What commands are given: files, checked before anything is loaded, and options of several commands."""
 
 from __future__ import annotations
 
@@ -9,15 +9,112 @@ import itertools
 import os
 import shlex
 from collections.abc import Callable, Iterator, Sequence
+from enum import StrEnum
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeAlias
 
+import typer
 from typer.models import ArgumentInfo, OptionInfo
 
-from kcal.cli.camera_sources import named_source
-from kcal.errors import FileError
+from kcal.cli.console import err
+from kcal.errors import FileError, InputError
 from kcal.file_kind import WORDS, file_kind
-from kcal.sources import is_stream
+from kcal.files import is_stream
+
+if TYPE_CHECKING:
+    from kcal.io.foreign import ImportedCameras
+    from kcal.lens.camera import Camera
+    from kcal.lens.camera_rig import CameraRig
+    from kcal.lens.rig import StereoRig
+
+
+# Cameras from files of kcal or of other programs, as commands name them: FILE, or FILE:CAMERA.
+
+
+def named_source(source: str) -> tuple[Path, str | None]:
+    """Split `rig.json:left` into the file and the camera's name."""
+    path, colon, name = source.rpartition(":")
+    if colon and not Path(source).exists() and Path(path).exists():
+        return Path(path), name
+    return Path(source), None
+
+
+def picked(found: ImportedCameras, name: str | None, source: str) -> Camera:
+    """The only camera, or the one of that name; of a rig `left` and `right` name the cameras as well.
+
+    Raises:
+        InputError: several cameras and no name, or a name that none has.
+    """
+    if name is None and len(found.cameras) == 1:
+        return found.cameras[0]
+    names = list(found.names)
+    if len(names) == 2 and name in ("left", "right") and name not in names:
+        return found.cameras[("left", "right").index(name)]
+    if name is None or names.count(name) != 1:
+        wrong = f"no camera {name!r}" if name else f"{len(names)} cameras"
+        raise InputError(f"{source}: {wrong}; name one of {', '.join(map(repr, names))}")
+    return found.cameras[names.index(name)]
+
+
+def cameras_and_rig(path: Path) -> tuple[ImportedCameras, StereoRig | None]:
+    """The cameras of a file of any program, and the rig that they are, if they are one."""
+    from kcal.io.formats import import_cameras, recognized
+    from kcal.io.rig_file import load_rig
+
+    found = import_cameras(path)
+    if len(found.cameras) == 1:
+        return found, None
+    if recognized(path) == "kcal":
+        return found, load_rig(path)
+    return found, found.rig() if found.is_rig() else None
+
+
+def single_camera(source: str) -> Camera:
+    """The camera that FILE or FILE:CAMERA names."""
+    path, name = named_source(source)
+    # Without the readers of other programs' files, which take long to load.
+    if (file_kind(path), name) in (("camera", None), ("rig", "left"), ("rig", "right")):
+        return calibrated_camera(source)
+    from kcal.io.formats import import_cameras
+
+    return picked(import_cameras(path), name, source)
+
+
+def calibrated_camera(source: str | Path) -> Camera:
+    """The camera of a file of kcal, or one of a rig of kcal: `rig.json:left`.
+
+    Raises:
+        FileError: no such file.
+        InputError: the rig has no camera of that name.
+    """
+    path, name = named_source(str(source))
+    if name is None:
+        from kcal.io.camera_file import load_camera
+
+        return load_camera(path)
+    if name not in ("left", "right"):
+        raise InputError(f"{source}: a rig has the cameras left and right, and none named {name!r}")
+    from kcal.io.rig_file import load_rig
+
+    rig = load_rig(path)
+    return rig.left if name == "left" else rig.right
+
+
+def parse_size(text: str | None) -> tuple[int, int] | None:
+    """Read `1920x1080`.
+
+    Raises:
+        InputError: something else.
+    """
+    if text is None:
+        return None
+    width, _, height = text.lower().partition("x")
+    if not (width.isdigit() and height.isdigit()) or not (int(width) and int(height)):
+        raise InputError(f"--size {text}: write WIDTHxHEIGHT in pixels, for example 1920x1080")
+    return int(width), int(height)
+
+
+# Check what was given before anything is loaded: is each file there, and is it what the command needs there?
 
 
 @dataclasses.dataclass(frozen=True)
@@ -262,3 +359,78 @@ def _parameter_label(name: str, about: Sequence[Any]) -> str:
 def _unseen(text: str) -> bool:
     """Whether a text names no file to look into: the standard input, a wildcard or a stream."""
     return text in ("-", "") or is_stream(text) or (any(c in text for c in "*?[") and not os.path.lexists(text))
+
+
+# The noise of marks: one option of all commands, with the value that the rig's file states by default.
+
+# Of marks on sharp images, where nobody said.
+ASSUMED = 0.3
+PixelSigma: TypeAlias = Annotated[
+    float | None,
+    typer.Option(
+        "--pixel-sigma",
+        metavar="PX",
+        help="Noise of marks along each axis; that in the rig's file, or 0.3, if not given.",
+    ),
+]
+
+
+def pixel_sigma_of(given: float | None, rig: StereoRig | CameraRig | None = None) -> float:
+    """The noise of marks, px: as given, or as the rig's file states, or assumed; the last two are said."""
+    sigma, note = pixel_sigma_and_source(given, rig)
+    if note:
+        err.print(note)
+    return sigma
+
+
+def pixel_sigma_and_source(given: float | None, rig: StereoRig | CameraRig | None = None) -> tuple[float, str]:
+    """The same, and what there is to say of it.
+
+    Raises:
+        InputError: not a positive number.
+    """
+    if given is not None:
+        if not 0 < given < 100:
+            raise InputError(f"--pixel-sigma {given}: a positive number of pixels is needed")
+        return given, ""
+    record = None if rig is None else rig.calibration
+    if record is not None and record.pixel_sigma is not None:
+        return record.pixel_sigma, f"noise of marks: {record.pixel_sigma:g} px, from the rig's file"
+    return ASSUMED, f"noise of marks: {ASSUMED:g} px, assumed; --pixel-sigma states it"
+
+
+# Options of several commands that look for a board.
+
+
+class Refine(StrEnum):
+    """Names of the refinements, for the command line."""
+
+    erf = "erf"
+    saddle = "saddle"
+    opencv = "opencv"
+    skimage = "skimage"
+    none = "none"
+
+
+BoardSize: TypeAlias = Annotated[
+    str,
+    typer.Option(
+        "--board",
+        metavar="BOARD",
+        help="Inner corners, columns by rows: 9x6 has 10x7 squares; charuco:9x6[:DICTIONARY][:MARKER]; circles:7x6; "
+        "asymmetric:4x11; aprilgrid:6x6[:SPACING]; or a target file of Kalibr, april.yaml.",
+    ),
+]
+SquareSide: TypeAlias = Annotated[
+    str | None,
+    typer.Option(
+        "--square",
+        metavar="LENGTH",
+        help="Side of a square or tag, or distance of circles (of rows of asymmetric ones), with its unit: 25mm, "
+        "2.5cm, 1in. Not with a target file.",
+        show_default=False,
+    ),
+]
+RefineMethod: TypeAlias = Annotated[
+    Refine, typer.Option("--refine", metavar="METHOD", help="erf (most accurate), saddle, opencv, skimage or none.")
+]

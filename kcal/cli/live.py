@@ -12,20 +12,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kcal.cli.commands import rarely
 from kcal.cli.console import err, on_signals, steps
-from kcal.cli.inputs import RIG, VIDEO
-from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_of
-from kcal.cli.settings import taken
+from kcal.cli.inputs import RIG, VIDEO, PixelSigma, pixel_sigma_of
+from kcal.cli.settings import rarely, taken
 from kcal.errors import InputError, with_extra
-from kcal.quantities import measured_text
+from kcal.files import check_writable
+from kcal.texts import measured_text
 
 if TYPE_CHECKING:
     from kcal.lens.rig import StereoRig
-    from kcal.locate.columns import PositionColumns
     from kcal.locate.localizer import StereoLocalizer
     from kcal.locate.multi_localizer import MultiViewLocalizer
     from kcal.locate.positions import Located
+    from kcal.locate.tables import PositionColumns
     from kcal.pipeline.association_options import AssociationOptions
     from kcal.pipeline.live_map import LiveMap
     from kcal.pipeline.stream import StreamCounts
@@ -137,7 +136,6 @@ def live_command(
 
     `detector | kcal live rig.json --detections - -o tracks.csv --to udp://239.2.3.1:6969`
     """
-    from kcal.files import check_writable
     from kcal.locate.multi_localizer import MultiViewLocalizer
     from kcal.locate.stations import names_of_rig
     from kcal.pipeline.association_options import AssociationOptions
@@ -229,8 +227,7 @@ def _moments(
 ) -> tuple[Callable[[float], StereoLocalizer], int]:
     """The rig as it stands at each second, by a history that grows; and how many errors more that has."""
     from kcal.locate.localizer import StereoLocalizer
-    from kcal.watch.followed import Followed
-    from kcal.watch.watched import MORE_ERRORS
+    from kcal.watch.watched import MORE_ERRORS, Followed
 
     assert isinstance(localize, StereoLocalizer)
     return Followed(history, localize), MORE_ERRORS

@@ -2,17 +2,335 @@
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
+import json
+import math
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from kcal.cli.commands import rarely
-from kcal.cli.console import err, steps
-from kcal.cli.inputs import MARKS, RIG, SURVEY
-from kcal.cli.located_text import draw_positions, tell_located
-from kcal.cli.pixel_sigma import PixelSigma
+from kcal.cli.console import err, mark_again, out, print_table, print_wrote, steps, warn, with_command
+from kcal.cli.inputs import MARKS, RIG, SURVEY, PixelSigma, pixel_sigma_and_source, typed_with
+from kcal.cli.settings import rarely, taken
+from kcal.cli.stations import parse_height
+from kcal.errors import DegenerateError, InputError
 from kcal.files import check_picture, check_writable, written_files
+from kcal.texts import one_line
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from kcal.lens.mounting import Origin
+    from kcal.lens.rig import StereoRig
+    from kcal.locate.positions import Located
+    from kcal.locate.station_positions import PositionSample, ViewsLocator
+    from kcal.locate.tables import PositionColumns
+    from kcal.locate.tabulate import Locator
+
+    Locate = Callable[[Sequence[str], Tensor, Tensor | None, dict[str, list[str]] | None], PositionColumns]
+
+
+# Rows of a table that are located by a watched rig, each as the rig stood at its time.
+
+
+def located_at(history: Path, rig: StereoRig, locator: Callable[[StereoRig], Locator]) -> Locate:
+    """What locates rows with a column `time`: by the rig of that second.
+
+    Args:
+        history: of `kcal watch`.
+        rig: as it was solved and watched.
+        locator: makes what locates by a rig.
+    """
+    from kcal.locate.tables import PositionColumns
+    from kcal.watch.history import seconds_of
+    from kcal.watch.watched import Watched
+
+    watched: Watched | None = None
+
+    def locate(
+        names: Sequence[str], pixels: Tensor, cov: Tensor | None, extras: dict[str, list[str]] | None
+    ) -> PositionColumns:
+        nonlocal watched
+        texts = (extras or {}).get("time")
+        if texts is None:
+            raise InputError("--watch: the table needs a column time (Unix seconds, or like 2026-05-01T12:00:00Z)")
+        times = []
+        for name, text in zip(names, texts, strict=True):
+            try:
+                times.append(round(seconds_of(text)))
+            except InputError as error:
+                raise InputError(f"{name}: {error}") from None
+        if not times:
+            return locator(rig)(names, pixels, cov, extras)
+        if watched is None or min(times) < watched.since or max(times) > watched.until:
+            watched = Watched.read(history, rig, since=min(times), until=max(times))
+        parts = []
+        for time, group in itertools.groupby(range(len(times)), times.__getitem__):
+            rows = list(group)
+            part = slice(rows[0], rows[-1] + 1)
+            own = {name: cells[part] for name, cells in (extras or {}).items()}
+            standing = locator(watched.rig_at(float(time)))
+            parts.append(standing(names[part], pixels[part], None if cov is None else cov[part], own))
+        return PositionColumns.joined(parts)
+
+    return locate
+
+
+# What `kcal locate` prints and draws of positions.
+
+
+def draw_positions(
+    located: Located, true: Tensor | None, picture: Path | None, web_map: Path | None, **background: Any
+) -> None:
+    """Write the picture and the map, where they were asked for."""
+    if picture is not None:
+        from kcal.report.positions import save_positions_picture, save_stations_picture
+
+        (save_positions_picture if located.feet is None else save_stations_picture)(picture, located, true)
+    if web_map is not None:
+        from kcal.report.map_page import save_map
+
+        save_map(web_map, located, true, **background)
+
+
+def tell_located(
+    rig: Path,
+    points: Path,
+    located: Located,
+    true: Tensor | None,
+    sample: PositionSample,
+    written: Sequence[Path],
+    *,
+    as_json: bool,
+    streamed: bool,
+    stated: bool,
+    doubts: Sequence[str],
+) -> None:
+    """Print what was found.
+
+    Raises:
+        DegenerateError: nothing could be located.
+    """
+    if as_json:
+        summary = {
+            "table": str(points),
+            "rows": sample.count,
+            "statuses": sample.statuses,
+            "warnings": list(doubts),
+            "pixel_sigma": located.pixel_sigma,
+            "interval": located.interval_note,
+            "geoid": located.geoid,
+            "written": list(map(str, written)),
+        }
+        print(json.dumps(summary, indent=1))
+    elif streamed:
+        err.print(counts_text(sample.count, sample.statuses), markup=False)
+    else:
+        _print_positions(located, true, sample.statuses, stated=stated)
+        print_wrote(*written)
+    if "ok" not in sample.statuses:
+        rows = "pairs" if located.feet is None else "points"
+        text = f"{points}: none of the {sample.count} {rows} could be located; see the table"
+        raise DegenerateError(with_command(text, mark_again(None, None, rig=rig)))
+
+
+def counts_text(rows: int, statuses: dict[str, int]) -> str:
+    """How many rows have each status."""
+    return f"{rows:,} rows: " + ", ".join(f"{count:,} {name.replace('_', ' ')}" for name, count in statuses.items())
+
+
+def _print_positions(located: Located, true: Tensor | None, statuses: dict[str, int], *, stated: bool) -> None:
+    """Print the table with the reasons below it; of a long one the counts, and the rows that have a true position."""
+    from kcal.locate.positions import position_errors
+    from kcal.report.tables import position_rows
+
+    errors = None if true is None else position_errors(located, true)
+    rows = position_rows(located, errors)
+    shown: Sequence[int] = range(len(located.positions))
+    if located.rows is not None:
+        out.print(counts_text(located.rows, statuses), markup=False)
+        shown = [] if true is None else true.isfinite().all(-1).nonzero()[:, 0].tolist()
+        out.print(f"Pictures and maps show {len(located.positions):,} of them.", markup=False)
+    if shown:
+        print_table([rows[0], *(rows[i + 1] for i in shown)], left=(0, len(rows[0]) - 1))
+    for position in (located.positions[i] for i in shown):
+        if position.reason:
+            out.print(f"* {one_line(position.name)}: {position.reason}", markup=False)
+    noise = "the noise that the CSV states" if stated else f"{located.pixel_sigma:g} px of noise"
+    out.print(f"Interval: {located.interval_note}; marks have {noise}.")
+    out.print(f"Heights are ellipsoidal; geoid: {located.geoid or 'none found'}.")
+
+
+# What `kcal locate` does with a table, part by part: pairs of a rig of two cameras, or marks of any number of them.
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LocateOptions:
+    """What the user gave besides the files, as on the command line."""
+
+    pixel_sigma: float | None = None
+    place: Origin | None = None
+    heading: float | None = None
+    pitch: float = 0.0
+    roll: float = 0.0
+    grid: str | None = None
+    yaw_sigma: float = 0.0
+    aged: str | None = None
+    watch: Path | None = None
+    heading_sigma: float = 0.0
+    origin_sigma: float = 0.0
+    refraction: float | None = None
+    refraction_sigma: float | None = None
+    height: tuple[float, float] | None = None
+    terrain: Path | None = None
+    terrain_sigma: float = 3.0
+    geoid_height: float = 0.0
+    geoid: Path | None = None
+
+
+class LocatedPart(NamedTuple):
+    """Some rows of a table.
+
+    Attributes:
+        columns: their positions.
+        feet: (N, 3) where bearings count from, of several cameras; None: the left camera.
+        stated: whether the table says how noisy its marks are.
+        bytes_read: how far it has been read.
+    """
+
+    columns: PositionColumns
+    feet: Tensor | None
+    stated: bool
+    bytes_read: int
+
+
+class LocateRun(NamedTuple):
+    """A table that is about to be located.
+
+    Attributes:
+        locate: by which it is.
+        empty: what is known of all positions, without any.
+        parts: locates it, part by part.
+        doubts: what the rig's file warns of.
+        note: where the noise of marks is from, to be said if the table does not state it.
+    """
+
+    locate: Locator | ViewsLocator
+    empty: Located
+    parts: Iterator[LocatedPart]
+    doubts: Sequence[str]
+    note: str
+
+
+def locate_run(rig: Path, points: Path, options: LocateOptions) -> LocateRun:
+    """Read a rig and begin a table: marks of several cameras, or of one with a height or a terrain, or pairs."""
+    from kcal.locate.stations import names_of_rig
+    from kcal.locate.survey import is_long
+
+    alone = options.height is not None or options.terrain is not None
+    if alone or is_long(points) or len(names_of_rig(rig)) != 2:
+        return _of_stations(rig, points, options)
+    return _of_pairs(rig, points, options)
+
+
+def _of_stations(rig: Path, points: Path, options: LocateOptions) -> LocateRun:
+    from kcal.locate.raster import terrain
+    from kcal.locate.station_positions import ViewsLocator
+    from kcal.locate.stations import load_camera_rig
+    from kcal.locate.survey import read_view_chunks
+    from kcal.locate.tabulate import find_geoid
+
+    own = options
+    elsewhere = any(
+        (
+            own.place, own.yaw_sigma, own.heading_sigma, own.origin_sigma, own.refraction, own.refraction_sigma,
+            own.aged, own.watch,
+        )
+    )  # fmt: skip
+    if elsewhere and not {"origin", "heading"} & taken:
+        raise typer.BadParameter(
+            "of several cameras position, attitude and their errors come from the rig file: leave out --origin, "
+            "--heading, --yaw-sigma, --heading-sigma, --origin-sigma, --refraction, --aged and --watch"
+        )
+    if own.height is not None and own.terrain is not None:
+        raise typer.BadParameter("--height and --terrain both say where a thing that one camera saw stands: give one")
+    stations = load_camera_rig(rig)
+    noise, note = pixel_sigma_and_source(own.pixel_sigma, stations)
+    ground = None if own.terrain is None else terrain(own.terrain, own.geoid_height)
+    height = own.height if ground is None else (0.0, own.terrain_sigma)
+    locate = ViewsLocator(stations, pixel_sigma=noise, height=height, ground=ground, geoid=find_geoid(own.geoid))
+
+    def parts() -> Iterator[LocatedPart]:
+        for views, read in read_view_chunks(points, stations.names):
+            yield LocatedPart(*locate(views), bool(views.sigma.isfinite().any()), read)
+
+    doubts = _warned(rig, stations.calibration.warnings if stations.calibration else ())
+    return LocateRun(locate, locate.located(), parts(), doubts, note)
+
+
+def _of_pairs(rig: Path, points: Path, options: LocateOptions) -> LocateRun:
+    from kcal.io.rig_file import load_rig
+    from kcal.lens.rig import RigCovariance
+    from kcal.locate.marks import filled, read_mark_chunks
+    from kcal.locate.monitor import parse_aging
+    from kcal.locate.mounting import run_errors
+    from kcal.locate.positions import located_by
+    from kcal.locate.tabulate import Locator, find_geoid, true_from_grid
+
+    own = options
+    if own.aged and own.watch:
+        raise typer.BadParameter("--aged guesses what the history of --watch tells: give either")
+    yaw_sigma = math.hypot(own.yaw_sigma, parse_aging(own.aged))
+    solved, place, heading = load_rig(rig), own.place, own.heading
+    noise, note = pixel_sigma_and_source(own.pixel_sigma, solved)
+    if solved.mounting is not None and {"origin", "heading"} <= taken:
+        # What the rig was solved with is better known.
+        place = heading = None
+        err.print("the position of the rig is that in its file, not that in kcal.toml")
+    doubts = _warned(rig, solved.calibration.warnings if solved.calibration else ())
+    if place is None or heading is None:
+        if solved.mounting is None:
+            raise InputError(
+                f"{rig}: the file has no position of the rig; give --origin and --heading. If you only need meters "
+                "from the left camera, the columns east_m, north_m and up_m: "
+                + typed_with({}, "--origin", "0,0,0", "--heading", "0")
+            )
+    elif own.grid is not None:
+        heading = true_from_grid(heading, place, own.grid)
+
+    def locator(standing: StereoRig) -> Locator:
+        errors = run_errors(
+            standing, yaw_deg=yaw_sigma, heading_deg=own.heading_sigma, origin_m=own.origin_sigma,
+            elsewhere=place is not None,
+        )  # fmt: skip
+        return Locator(
+            standing, geoid=find_geoid(own.geoid), origin=place, heading_deg=heading, pitch_deg=own.pitch,
+            roll_deg=own.roll, pixel_sigma=noise, calibration=errors.calibration, mounting=errors.mounting,
+            link=errors.link, refraction=own.refraction, refraction_sigma=own.refraction_sigma,
+        )  # fmt: skip
+
+    if own.watch is not None and solved.covariance is None:
+        # Not exact: moments add what is not known of them.
+        solved.covariance = RigCovariance.of(solved)
+    locate = locator(solved)
+    by_moments = None if own.watch is None else located_at(own.watch, solved, locator)
+
+    def parts() -> Iterator[LocatedPart]:
+        for chunk in read_mark_chunks(points):
+            cov = filled(chunk.covariance, noise)
+            columns = (by_moments or locate)(chunk.names, chunk.pixels, cov, chunk.extras)
+            yield LocatedPart(columns, None, cov is not None, chunk.bytes_read)
+
+    return LocateRun(locate, located_by(locate), parts(), doubts, note)
+
+
+def _warned(rig: Path, doubts: Sequence[str]) -> Sequence[str]:
+    for text in doubts:
+        warn(f"{rig}: {text}")
+    return doubts
 
 
 def locate_command(
@@ -164,13 +482,11 @@ def locate_command(
 
     `kcal locate towers.rig.json smoke.csv --height 240±30 --map map.html`
     """
-    from kcal.cli.locate_runs import LocateOptions, locate_run
-    from kcal.cli.stations import parse_height
     from kcal.lens.mounting import Origin
     from kcal.locate.export import STREAM, check_format, open_writers
-    from kcal.locate.sample import PositionSample
+    from kcal.locate.positions import read_truth
+    from kcal.locate.station_positions import PositionSample
     from kcal.locate.survey import read_survey
-    from kcal.locate.truth import read_truth
 
     outputs = output or []
     streamed = STREAM in outputs

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import typer
 from rich.markup import escape
@@ -14,42 +15,95 @@ from typer.core import TyperGroup
 
 import kcal
 from kcal.cli import inputs
-from kcal.cli.bake import bake_command
 from kcal.cli.batch import batch_command
 from kcal.cli.board import app as board
 from kcal.cli.budget import budget_command
 from kcal.cli.calibrate import calibrate_command
 from kcal.cli.capture import capture_command
 from kcal.cli.check import check_command
-from kcal.cli.commands import Command
-from kcal.cli.compare import compare_command
-from kcal.cli.console import err, warn, with_json
-from kcal.cli.cures import option_for_each
+from kcal.cli.compare import bake_command, compare_command, diff_command, interpolate_command
+from kcal.cli.console import err, option_for_each, warn, with_json
 from kcal.cli.demo import demo_command
 from kcal.cli.detect import detect_command
-from kcal.cli.diff import diff_command
 from kcal.cli.exchange import export_command, import_command
-from kcal.cli.init import init_command
 from kcal.cli.inputs import with_inputs
-from kcal.cli.interpolate import interpolate_command
 from kcal.cli.live import live_command
 from kcal.cli.locate import locate_command
 from kcal.cli.mark import mark_command
-from kcal.cli.old_flags import with_new_names
-from kcal.cli.rays import rays_command
-from kcal.cli.rectify import rectify_command, undistort_command
+from kcal.cli.rectify import rays_command, rectify_command, undistort_command
 from kcal.cli.report import report_command
 from kcal.cli.rig import app as rig
 from kcal.cli.schema import schema_command
-from kcal.cli.settings import defaults_of, read_settings
+from kcal.cli.settings import Command, defaults_of, init_command, read_settings
 from kcal.cli.show import show_command
 from kcal.cli.sites import sites_command
 from kcal.cli.stars import stars_command
 from kcal.cli.stations import station_command
 from kcal.cli.watch import watch_command
-from kcal.errors import KcalError
+from kcal.errors import InputError, KcalError
 from kcal.files import written_files
 from kcal.texts import visible
+
+# Options that have another name now: the old one works in version 1, with a warning.
+
+
+class _Renamed(NamedTuple):
+    """What an old option is now; its value is divided by `divisor`."""
+
+    now: str
+    divisor: float = 1.0
+
+
+# By command, "" for all, and old name.
+_RENAMED = {
+    ("", "--mark-sigma"): _Renamed("--pixel-sigma"),
+    # Both marks of a pair err.
+    ("budget", "--disparity"): _Renamed("--pixel-sigma", math.sqrt(2.0)),
+    ("calibrate", "--board"): _Renamed("--board-shape"),
+    ("live", "--map"): _Renamed("--port"),
+}
+_NEEDLESS = {("calibrate", "--analog"): "the views tell whether pixels are square"}
+
+
+def with_new_names(words: list[str]) -> tuple[list[str], list[str]]:
+    """The words of a command line with the options' names of today, and warnings.
+
+    Example:
+        >>> with_new_names(["live", "rig.json", "--map", "8350"])
+        (['live', 'rig.json', '--port', '8350'], ['--map is called --port now; the old name goes in version 2.0'])
+    """
+    command = words[0] if words else ""
+    found: list[str] = []
+    warnings: list[str] = []
+    divisor = 1.0
+    for word in words:
+        if divisor != 1.0:
+            word, divisor = _divided(word, divisor), 1.0
+        option, equals, value = word.partition("=")
+        if reason := _NEEDLESS.get((command, option)):
+            warnings.append(f"{option} is not needed any more and goes in version 2.0: {reason}")
+            continue
+        renamed = _RENAMED.get((command, option)) or _RENAMED.get(("", option))
+        if renamed is None:
+            found.append(word)
+            continue
+        warnings.append(f"{option} is called {renamed.now} now; the old name goes in version 2.0")
+        if renamed.divisor != 1.0:
+            warnings[-1] += ", and the value of the new one is divided by √2: noise of one mark along each axis"
+        if equals:
+            value = _divided(value, renamed.divisor) if renamed.divisor != 1.0 else value
+            found.append(f"{renamed.now}={value}")
+        else:
+            found.append(renamed.now)
+            divisor = renamed.divisor
+    return found, warnings
+
+
+def _divided(value: str, divisor: float) -> str:
+    try:
+        return repr(float(value) / divisor)
+    except ValueError:
+        raise InputError(f"{value!r} is not a number of pixels") from None
 
 
 @contextmanager

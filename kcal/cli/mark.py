@@ -8,8 +8,7 @@ from typing import Annotated
 import typer
 
 from kcal.cli.console import err, out, show_page, warn
-from kcal.cli.inputs import CALIBRATED, IMAGES, MARKS, RIG, SURVEY
-from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_of
+from kcal.cli.inputs import CALIBRATED, IMAGES, MARKS, RIG, SURVEY, PixelSigma, pixel_sigma_of
 from kcal.errors import InputError, with_extra
 
 _PORT = 8347
@@ -68,9 +67,8 @@ def mark_command(
 
     from kcal.io.camera_file import load_camera
     from kcal.io.rig_file import load_rig
+    from kcal.mark.guide import Reference, open_pictures
     from kcal.mark.marking_service import Desk
-    from kcal.mark.pictures import open_pictures
-    from kcal.mark.reference import Reference
     from kcal.mark.session import Session
 
     if rig is not None and cameras is not None:

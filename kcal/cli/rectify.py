@@ -1,26 +1,159 @@
-"""`kcal rectify`: images as another camera takes them: without distortion, turned, in stereo, on a cylinder."""
+"""`kcal rectify`, `kcal undistort` and `kcal rays`: images as another camera takes them, and rays of their pixels."""
 
 from __future__ import annotations
 
+import hashlib
 import io
 import math
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.markup import escape
 
-from kcal.cli.camera_sources import cameras_and_rig, named_source, parse_size, single_camera
-from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
-from kcal.cli.converted import convert_images, prepare, targets_of
-from kcal.cli.inputs import CAMERA, CAMERA_OR_RIG, IMAGES
+from kcal.cli.console import err, out, print_table, print_wrote, steps, tell, warn
+from kcal.cli.inputs import CAMERA, CAMERA_OR_RIG, IMAGES, cameras_and_rig, named_source, parse_size, single_camera
 from kcal.errors import FileError, InputError
-from kcal.files import write_atomic
+from kcal.files import check_writable, dump_json, make_folder, read_bytes, write_atomic
+from kcal.strict_json import read_json
 
 if TYPE_CHECKING:
     from kcal.lens.camera import Camera
     from kcal.lens.images import Undistort
     from kcal.lens.rectification import StereoRectification
     from kcal.lens.rig import StereoRig
+
+
+# Images of one camera, resampled into a folder: image by image, so that a run that was interrupted continues.
+
+# In every folder of images: how they were made, and which are done.
+IMAGE_JOURNAL = "rectify.json"
+# Seconds between two writes of the journal.
+_OFTEN = 5.0
+
+
+def targets_of(paths: list[Path], folder: Path, others: list[Path]) -> list[Path]:
+    """Choose the file for each image: all different, and none of them an input or one of `others`."""
+    inputs = {path.resolve() for path in paths}
+    taken: dict[Path, str] = {path: "a file of this command" for path in others}
+    targets = []
+    for path in paths:
+        target = folder / f"{path.stem}.png"
+        if target.resolve() in inputs:
+            raise InputError(f"{target}: an input image would be overwritten; choose another folder")
+        if target in taken:
+            raise InputError(f"{target}: both {taken[target]} and {path} would become this file; use two folders")
+        taken[target] = str(path)
+        targets.append(target)
+    return targets
+
+
+def prepare(folder: Path, files: list[Path]) -> None:
+    """Make the folder, and refuse now what could not be written later."""
+    make_folder(folder)
+    for path in [*files, folder / IMAGE_JOURNAL]:
+        check_writable(path)
+
+
+class ImageJournal:
+    """Which images of a folder are done, by which views: nothing is taken for done that another view made.
+
+    Args:
+        folder: of the images.
+        module: that makes them.
+    """
+
+    def __init__(self, folder: Path, module: Undistort) -> None:
+        values = [value.tolist() for value in (module.camera.params, module.new_camera.params, module.rotation)]
+        kinds = repr((type(module.new_camera).__name__, str(module.camera.model), module.camera.model.hybrid))
+        text = repr((values, kinds, module.camera.size, module.new_camera.size, module.at))
+        self.path = folder / IMAGE_JOURNAL
+        self.view = hashlib.sha256(text.encode()).hexdigest()[:16]
+        self.done: dict[str, list[int]] = {}
+        self._saved = time.monotonic()
+        try:
+            content: Any = read_json(read_bytes(self.path), str(self.path)) if self.path.exists() else {}
+        except FileError:
+            content = {}
+        if isinstance(content, dict) and content.get("view") == self.view and isinstance(content.get("done"), dict):
+            self.done = content["done"]
+        else:
+            # Before the first image: a run that is killed must not leave images that an older journal calls done.
+            self.save()
+
+    def has(self, path: Path, target: Path) -> bool:
+        """Whether this image was made of this file, as it is now."""
+        return target.exists() and self.done.get(target.name) == _file_state(path)
+
+    def add(self, path: Path, target: Path) -> None:
+        """Note that an image is done."""
+        self.done[target.name] = _file_state(path)
+        if time.monotonic() - self._saved > _OFTEN:
+            self.save()
+
+    def save(self) -> None:
+        """Write the journal."""
+        write_atomic(self.path, dump_json({"view": self.view, "done": self.done}))
+        self._saved = time.monotonic()
+
+    def close(self) -> None:
+        """Write the journal; where no image could be made, none is left."""
+        if self.done:
+            self.save()
+        else:
+            self.path.unlink(missing_ok=True)
+
+
+def _file_state(path: Path) -> list[int]:
+    state = path.stat()
+    return [state.st_size, state.st_mtime_ns]
+
+
+def convert_images(
+    paths: list[Path], targets: list[Path], module: Undistort, advance: Callable[[str], None]
+) -> tuple[int, list[str]]:
+    """Resample images into files, a bad one not stopping the others.
+
+    Returns:
+        how many were done before, and what was wrong with those that failed.
+    """
+    journal = ImageJournal(targets[0].parent, module)
+    failures: list[str] = []
+    before = 0
+    try:
+        for path, target in zip(paths, targets, strict=True):
+            if journal.has(path, target):
+                before += 1
+            else:
+                try:
+                    _convert(path, target, module)
+                    journal.add(path, target)
+                except (FileError, InputError) as error:
+                    failures.append(str(error))
+                    err.print(f"[yellow]failed[/] {escape(str(error))}")
+            advance(path.name)
+    finally:
+        journal.close()
+    return before, failures
+
+
+def _convert(path: Path, target: Path, module: Undistort) -> None:
+    import torch
+
+    from kcal.corners.images import decode_image
+    from kcal.io.images import write_png
+
+    image = torch.from_numpy(decode_image(read_bytes(path), path))
+    (height, width), size = image.shape[:2], module.camera.size
+    if (width, height) != size:
+        raise InputError(f"{path}: the image is {width}x{height} px, the camera {size[0]}x{size[1]} px")
+    new, _ = module(image[None] if image.ndim == 2 else image.permute(2, 0, 1))
+    write_png(target, (new[0] if image.ndim == 2 else new.permute(1, 2, 0)).contiguous().numpy())
+
+
+# `kcal rectify`: images as another camera takes them: without distortion, turned, in stereo, on a cylinder.
 
 # Meters at which the effect of an entrance pupil is stated.
 _NEAR = 1.0
@@ -299,8 +432,8 @@ def _tell_ranges(module: StereoRectification) -> None:
     """Print what a disparity means in the middle of the image."""
     import torch
 
+    from kcal.locate.budget import usual_ranges
     from kcal.locate.disparity import DisparityRanges
-    from kcal.locate.range_sigmas import usual_ranges
 
     focal, _, cx, cy = module.camera.params[:4].tolist()
     width, height = module.camera.size
@@ -327,3 +460,75 @@ def _refuse_none(paths: list[Path], failures: list[str]) -> None:
 def _fail_at_end(paths: list[Path], failures: list[str]) -> None:
     if failures:
         raise FileError(f"{len(failures)} of {len(paths)} images could not be resampled: {failures[0]}")
+
+
+# `kcal rays`: the ray of every pixel, for renderers such as gsplat.
+
+
+def rays_command(
+    sources: Annotated[
+        list[str],
+        typer.Argument(metavar="CAMERA...", help="Camera files of one image size, or one rig file."),
+        CAMERA_OR_RIG,
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="NPZ", help="File to write.")],
+) -> None:
+    """Write the ray of every pixel, for Gaussian splatting and other renderers without lens models.
+
+    The file has `rays` (C, H, W, 6) in float32, as gsplat takes them from version 1.6 on: origin, in meters, and
+    direction of each pixel's ray. The origin lies on the camera's axis; for a lens with an entrance pupil that moves it
+    is not the same for all pixels. Also `mask` (C, H, W), `viewmats` (C, 4, 4) and `Ks` (C, 3, 3). Rays of single
+    cameras are in the camera's frame, those of a rig in the left camera's. Pixels without a ray have zeros.
+
+    **Examples**
+
+    `kcal rays left.camera.json -o rays.npz`
+
+    `kcal rays rig.json -o rays.npz`
+    """
+    paths = [named_source(source)[0] for source in sources]
+    check_writable(output, *paths)
+    if output.suffix.lower() != ".npz":
+        raise InputError(f"{output}: the name of the file must end with .npz")
+
+    import numpy as np
+    import torch
+
+    from kcal.lens.paraxial import paraxial_focal
+    from kcal.lens.rays import CameraRays, ray_error
+
+    rig = rig_of(sources[0]) if len(sources) == 1 else None
+    cameras = [single_camera(source) for source in sources] if rig is None else [rig.left, rig.right]
+    viewmats = torch.eye(4, dtype=torch.float64).repeat(len(cameras), 1, 1)
+    if rig is not None:
+        viewmats[1, :3, :3], viewmats[1, :3, 3] = rig.right_from_left_rotation, rig.right_from_left_translation
+    with steps("rays", 2) as advance:
+        module = CameraRays(cameras)
+        advance("rounding")
+        error = max(ray_error(camera, own) for camera, own in zip(cameras, module(), strict=True))
+        advance("writing")
+    # gsplat counts pixels from the corner of the first one.
+    Ks = torch.stack([camera.matrix.detach() for camera in cameras])
+    Ks[:, :2, 2] += 0.5
+    for matrix, camera in zip(Ks, cameras, strict=True):
+        matrix[[0, 1], [0, 1]] = paraxial_focal(camera).value.detach()
+    data = io.BytesIO()
+    np.savez(
+        data,
+        allow_pickle=False,
+        rays=module(viewmats).numpy(),
+        mask=module.mask.numpy(),
+        Ks=Ks.numpy(),
+        viewmats=viewmats.numpy(),
+    )
+    write_atomic(output, data.getvalue())
+    moved = float((module.depths * module.mask).abs().max())
+    width, height = cameras[0].size
+    share = float(module.mask.double().mean())
+    text = f"rays {len(cameras)} x {height} x {width} x 6, float32; {100 * share:.1f} % of the pixels have one"
+    out.print(text, markup=False)
+    out.print(f"rounding: at most {error:.1e} px from the pixel, at 1 m and far away")
+    if moved:
+        out.print(f"the rays start up to {1e3 * moved:.3g} mm from each other on the axis: the entrance pupil moves")
+    tell(cameras=len(cameras), valid=share, rounding_px=error, pupil_m=moved)
+    print_wrote(output)

@@ -8,11 +8,9 @@ from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 import typer
 
-from kcal.cli.camera_sources import single_camera
 from kcal.cli.console import out, print_answer, print_wrote, steps, tell
-from kcal.cli.inputs import CAMERA_OR_RIG, OBSERVATIONS
-from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_of
-from kcal.cli.sides import check_views_of
+from kcal.cli.inputs import CAMERA_OR_RIG, OBSERVATIONS, PixelSigma, pixel_sigma_of, single_camera
+from kcal.cli.rig_sources import cameras_of_files, check_views_of
 from kcal.errors import InputError
 from kcal.file_kind import file_kind
 from kcal.files import check_writable
@@ -191,7 +189,6 @@ def _judged_again(
 
 
 def _of_rig(path: Path, observations: list[Path], needs: tuple[Requirement, ...], pixel_sigma: float | None) -> Judged:
-    from kcal.cli.rig_sources import cameras_of_files
     from kcal.corners.observations import Observations
     from kcal.io.rig_file import load_rig
     from kcal.locate.stations import load_camera_rig, names_of_rig

@@ -8,17 +8,45 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from kcal.cli.commands import Command, rarely
-from kcal.cli.console import with_json
-from kcal.cli.groups import group_with_default
-from kcal.cli.inputs import CALIBRATED, MARKS, OBSERVATIONS, SURVEY, TABLE, with_inputs
-from kcal.cli.night_images import TIME_HELP
-from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_and_source
-from kcal.cli.report import NO, REQUIRE_HELP, required, told_usable
+from kcal.cli.console import (
+    ending_with,
+    look_at_views,
+    mark_again,
+    out,
+    print_table,
+    print_wrote,
+    steps,
+    tell,
+    warn,
+    with_json,
+)
+from kcal.cli.inputs import (
+    CALIBRATED,
+    MARKS,
+    OBSERVATIONS,
+    SURVEY,
+    TABLE,
+    PixelSigma,
+    pixel_sigma_and_source,
+    with_inputs,
+)
+from kcal.cli.report import NO, REQUIRE_HELP, judged_sides, required, side_pictures, stored_tables, told_usable
 from kcal.cli.rig_check import check
-from kcal.cli.rig_skyline import IMAGES_HELP, PICTURE_HELP, SIGMA_HELP, SKYLINE_HELP, skyline_options
-from kcal.cli.rig_text import print_rig, rig_lines
+from kcal.cli.rig_sources import (
+    IMAGES_HELP,
+    PICTURE_HELP,
+    SIGMA_HELP,
+    SKYLINE_HELP,
+    Sources,
+    check_sides,
+    read_sources,
+    skyline_options,
+)
+from kcal.cli.settings import Command, group_with_default, rarely
+from kcal.cli.stars import TIME_HELP, NightOptions, images_of_nights
+from kcal.cli.stations import print_rig, rig_lines, solve_stations
 from kcal.errors import InputError
+from kcal.files import check_picture, check_writable
 
 if TYPE_CHECKING:
     from kcal.lens.rig import StereoRig
@@ -212,17 +240,11 @@ def solve_command(
     `kcal rig mill.camera.json mast.camera.json church.camera.json --landmarks survey.csv --marks marks.csv -o rig.json`
     """
     from kcal.calibrate.rig.solve import RigOptions, solve_rig
-    from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
-    from kcal.cli.cures import ending_with, look_at_views, mark_again
-    from kcal.cli.rig_sources import Sources, read_sources
-    from kcal.cli.rig_stars import NightOptions, images_of_nights
-    from kcal.cli.sides import check_sides
     from kcal.corners.observations import Observations
-    from kcal.files import check_picture, check_writable
     from kcal.io.camera_file import load_camera
     from kcal.io.rig_file import save_rig
+    from kcal.locate.budget import range_sigmas
     from kcal.locate.mounting import placed_rig
-    from kcal.locate.range_sigmas import range_sigmas
     from kcal.report.tables import range_sigma_rows
 
     noise, _ = pixel_sigma_and_source(pixel_sigma)
@@ -257,8 +279,6 @@ def solve_command(
         refraction_sigma=refraction_sigma,
     )  # fmt: skip
     if others:
-        from kcal.cli.stations import solve_stations
-
         solve_stations([left, right, *others], sources, options, output, needs=needs, report=report, picture=picture)
         return
     if night:
@@ -307,7 +327,6 @@ def solve_command(
         warn(f"range errors are not split: {error}")
     print_wrote(output, picture)
     if needs or report is not None:
-        from kcal.cli.report import judged_sides, side_pictures, stored_tables
         from kcal.report.judge_rig import named_cameras, rig_verdict
         from kcal.report.rig import rig_figure
         from kcal.report.verdict_pictures import png_bytes

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from kcal.cli.console import err, out, print_table, print_wrote, warn
-from kcal.cli.inputs import MARKS, RIG, SURVEY
-from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_of
+from kcal.cli.inputs import MARKS, RIG, SURVEY, PixelSigma, pixel_sigma_of
 from kcal.errors import InputError
+from kcal.files import check_writable, write_atomic
 
 if TYPE_CHECKING:
     from kcal.calibrate.rig.drift import Drift
@@ -60,10 +60,9 @@ def check(
 
     `kcal rig check rig.json --landmarks survey.csv --marks now.csv --relock`
     """
-    from kcal.files import check_writable
     from kcal.io.rig_file import load_rig
     from kcal.locate.marks import read_marks
-    from kcal.locate.relock import check_rig, seen_again
+    from kcal.locate.monitor import check_rig, seen_again
 
     if reference is None and landmarks is None:
         raise InputError("give --reference (marks of the same things in old images) or --landmarks (a survey)")
@@ -140,9 +139,8 @@ def _relock(path: Path, old: StereoRig, drift: Drift, marks: Path) -> Path:
     """Replace the rig file; returns where the old one is kept."""
     import datetime
 
-    from kcal.files import write_atomic
     from kcal.io.rig_file import save_rig
-    from kcal.locate.relock import relocked
+    from kcal.locate.monitor import relocked
 
     stamp = datetime.datetime.now(datetime.UTC).strftime("%Y%m%dT%H%M%SZ")
     kept = path.with_name(f"{path.stem}.before-{stamp}{path.suffix}")

@@ -1,15 +1,38 @@
-"""Settings of a folder: `kcal.toml`, written by `kcal init`, gives options of the commands that are run there."""
+"""Commands with short help and subcommands, and their defaults from `kcal.toml`, which `kcal init` writes."""
 
 from __future__ import annotations
 
 import difflib
+import inspect
 import sys
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
-from kcal.errors import FileError
-from kcal.files import read_bytes
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+from kcal.cli.console import err, print_wrote
+from kcal.errors import FileError, InputError
+from kcal.files import check_writable, read_bytes, write_atomic
+
+# Commands that have subcommands and do their main work without one.
+
+
+def group_with_default(command: str) -> type[TyperGroup]:
+    """A group whose arguments go to `command` unless they begin with the name of another one."""
+
+    class DefaultGroup(TyperGroup):
+        def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+            if not args or args[0] not in self.commands:
+                args = [command, *args]
+            return super().parse_args(ctx, args)
+
+    return DefaultGroup
+
+
+# Settings of a folder: `kcal.toml`, written by `kcal init`, gives options of the commands that are run there.
 
 NAME = "kcal.toml"
 _MOST_BYTES = 2**20
@@ -130,3 +153,95 @@ def _toml(value: Any) -> str:
         return repr(float(value))
     escaped = value.replace("\\", "\\\\").replace('"', '\\"')
     return '"' + "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in escaped) + '"'
+
+
+# Commands with short help, and defaults from the `kcal.toml` of the folder.
+
+
+def rarely(metavar: str, about: str, *flags: str, panel: str | None = None, **more: Any) -> Any:
+    """An option that few people need: `--help-all` shows it."""
+    return typer.Option(*flags, metavar=metavar or None, help=about, hidden=True, rich_help_panel=panel, **more)
+
+
+class Command(TyperCommand):
+    """A command whose rare options are shown by `--help-all`, and that says what it took from kcal.toml."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.more = [param for param in self.params if getattr(param, "hidden", False)]
+        if self.more:
+            hint = f"`--help-all` shows {len(self.more)} more options."
+            self.epilog = f"{self.epilog}\n\n{hint}" if self.epilog else hint
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Show all options and stop, if that was asked for."""
+        if "--help-all" in args and self.more:
+            shown, self.epilog = self.epilog, None
+            try:
+                for param in self.more:
+                    param.hidden = False  # type: ignore[attr-defined]
+                text = self.get_help(ctx)
+            finally:
+                for param in self.more:
+                    param.hidden = True  # type: ignore[attr-defined]
+                self.epilog = shown
+            if text:
+                print(text)
+            ctx.exit()
+        return super().parse_args(ctx, ["--help" if word == "--help-all" else word for word in args])
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command; what it takes from kcal.toml is said first, in one line."""
+        names = [
+            param.name
+            for param in self.params
+            if getattr(ctx.get_parameter_source(param.name), "name", "") == "DEFAULT_MAP"
+        ]
+        taken.clear()
+        taken.update(names)
+        if names:
+            err.print(settings_text({name: ctx.params[name] for name in names}), markup=False)
+        return super().invoke(ctx)
+
+
+# `kcal init`: a kcal.toml for a folder, so that the commands that are run there are short.
+
+
+def _with_settings(command: Callable[..., None]) -> Callable[..., None]:
+    """The command with an option for each key of the file."""
+    parameters = [*inspect.signature(command, eval_str=True).parameters.values()][:-1]
+    for key, setting in SETTINGS.items():
+        about = typer.Option(metavar="VALUE", help=f"{setting.about[:-1]}, for example {setting.example}.")
+        kind: Any = setting.kind
+        annotation = Annotated[kind | None, about]
+        parameters.append(inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation))
+    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    return command
+
+
+@_with_settings
+def init_command(
+    folder: Annotated[Path, typer.Argument(help="Folder of the images.")] = Path("."),
+    force: Annotated[bool, typer.Option("--force", help="Write anew a file that is there.")] = False,
+    **given: Any,
+) -> None:
+    """Write a kcal.toml: board, camera and site, which the commands that are run in this folder then know.
+
+    What is typed on a command line goes before what the file says, and each command says in one line what it took from
+    it. Without options all lines are comments, to be filled in by hand.
+
+    **Examples**
+
+    `kcal init --board 9x6 --square 25mm --origin 19.07,72.87,14 --pixel-sigma 0.1`
+
+    `kcal detect left/ -o left.obs.json`
+    """
+    path = folder / NAME
+    if path.exists() and not force:
+        raise FileError(f"{path}: is there already; edit it, or write it anew: kcal init --force")
+    if not any(value is not None for value in given.values()) and not folder.is_dir():
+        raise InputError(f"{folder}: no such folder")
+    check_writable(path)
+    write_atomic(path, toml_text(given))
+    read_settings(folder)
+    print_wrote(path)

@@ -17,12 +17,13 @@ import typer
 
 from kcal.cli.console import out, print_table
 from kcal.cli.inputs import SHOWN
+from kcal.cli.stations import station_rows
 from kcal.errors import FileError
 from kcal.file_kind import CAMERA_RIG_VERSION, file_kind
 from kcal.files import read_bytes
 from kcal.native_file import digest
-from kcal.quantities import number_text, setting_text
 from kcal.strict_json import MOST_BYTES, read_json
+from kcal.texts import number_text, setting_text
 
 if TYPE_CHECKING:
     from kcal.lens.camera import Camera
@@ -276,7 +277,6 @@ def _show_pose(pose: _PoseFacts) -> None:
 
 
 def _show_stations(file: Path) -> None:
-    from kcal.cli.stations import station_rows
     from kcal.io.camera_rig_file import CameraRigFile
 
     rig = CameraRigFile.load(file).rig()

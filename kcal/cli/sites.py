@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
-from kcal.cli.inputs import SITES
-from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_of
+from kcal.cli.inputs import SITES, PixelSigma, pixel_sigma_of
 from kcal.errors import InputError
+from kcal.file_kind import file_kind
 from kcal.files import check_picture, check_writable, write_atomic
+from kcal.texts import length_text
 
 if TYPE_CHECKING:
     from kcal.locate.siting import Area, RankedSite, SitingMap
@@ -73,13 +74,10 @@ def sites_command(
 
     `kcal sites towers.rig.json --area 44.8,5.8,45.2,6.3 --ground 240 --above 50 -o map.csv`
     """
-    from kcal.file_kind import file_kind
     from kcal.locate.ground import level_ground
     from kcal.locate.raster import terrain as raster_of
-    from kcal.locate.site_tables import read_sites, sites_of
-    from kcal.locate.siting import area_of, rank_sites, siting_map
+    from kcal.locate.siting import area_of, rank_sites, read_sites, sites_of, siting_map
     from kcal.locate.stations import load_camera_rig
-    from kcal.quantities import length_text
 
     inputs = [path for path in (towers, candidates, terrain) if path is not None]
     if output is not None:
@@ -144,7 +142,6 @@ def _bounds(text: str) -> list[float]:
 
 
 def _print_towers(now: SitingMap) -> None:
-    from kcal.quantities import length_text
 
     two = now.seen_by > 1
     some = length_text(float(now.sigma[two].median()), digits=2) if bool(two.any()) else "nowhere known"
@@ -157,7 +154,6 @@ def _print_towers(now: SitingMap) -> None:
 
 
 def _ranked_rows(ranked: list[RankedSite]) -> list[list[str]]:
-    from kcal.quantities import length_text
 
     rows = [["candidate", "build", "heading °", "alone", "covered", "after"]]
     for one in ranked:

@@ -1,21 +1,411 @@
-"""`kcal stars`: name the stars of night images, and find how the camera looks."""
+"""Stars for commands: `kcal stars`, and the `--stars` of `kcal budget`, `kcal calibrate` and `kcal rig`."""
 
 from __future__ import annotations
 
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
-from kcal.cli.inputs import IMAGES
-from kcal.cli.night_images import TIME_HELP, sky_view
+from kcal.cli.inputs import IMAGES, single_camera
 from kcal.errors import InputError, KcalError
 from kcal.files import check_writable
 
 if TYPE_CHECKING:
-    from kcal.stars.catalog import StarCatalog
+    from kcal.calibrate.camera.result import CameraCalibrationResult
+    from kcal.calibrate.rig.sources import MeasuredPosition, StarSource
+    from kcal.lens.camera import Camera
+    from kcal.lens.mounting import Origin
+    from kcal.stars.detect import DetectedStars
+    from kcal.stars.lens import StarCamera
     from kcal.stars.night import NamedStars, SkyView
+    from kcal.stars.sky import StarCatalog
+
+
+# Night images as commands read them: when and where they were taken, and the lens that their stars tell.
+
+TIME_HELP = "When, with its zone: 2026-11-24T20:47:26Z; name:Z or name:+02:00 reads it from each file's name."
+
+
+def sky_view(
+    path: Path,
+    time: str | None,
+    lat: float | None,
+    lon: float | None,
+    height: float,
+    *,
+    dut1: float | None = None,
+    time_sigma: float = 0.1,
+    celsius: float | None = None,
+    pressure: float | None = None,
+) -> SkyView:
+    """When and where an image was taken, from options of the command line."""
+    from kcal.lens.mounting import Origin
+    from kcal.stars.detect import time_of
+    from kcal.stars.night import SkyView
+    from kcal.stars.sky import Air
+
+    if (lat is None) != (lon is None):
+        raise InputError("--lat and --lon belong together")
+    origin = None if lat is None or lon is None else Origin(lat=lat, lon=lon, height=height)
+    known = {} if celsius is None else {"celsius": celsius, "celsius_sigma": 1.0}
+    known |= {} if pressure is None else {"hectopascal": pressure, "hectopascal_sigma": 1.0}
+    air = None if origin is None else Air.at_height(origin.height, **known)
+    return SkyView(time=time_of(time, path), origin=origin, air=air, dut1=dut1, time_sigma=time_sigma)
+
+
+def camera_by_stars(
+    files: list[Path], views: list[SkyView], what: str, boards: CameraCalibrationResult | None = None
+) -> tuple[StarCamera, tuple[int, int]]:
+    """The camera of night images, and of what boards said of it before; and the images' size."""
+    from kcal.stars.detect import detect_stars, read_night
+    from kcal.stars.lens import calibrate_by_stars
+
+    stars: list[DetectedStars] = []
+    sizes = set()
+    with steps("finding stars", len(files)) as advance:
+        for path in files:
+            try:
+                image = read_night(path)
+                stars.append(detect_stars(image))
+            except KcalError as error:
+                raise InputError(f"{path.name}: {error}") from error
+            sizes.add((image.shape[1], image.shape[0]))
+            advance(path.name)
+    if len(sizes) > 1:
+        raise InputError(f"the images have several sizes ({sorted(sizes)}): one camera has one")
+    (size,) = sizes
+    with steps(what, None) as advance:
+        return calibrate_by_stars(stars, views, size, boards=boards, progress=advance), size
+
+
+# What stars would give a planned rig, for `kcal budget --stars`.
+
+# Exposures in the table, seconds, and pairs of images.
+_EXPOSURES, _PAIRS = (1 / 30, 0.25, 1.0, 4.0, 8.0), 20
+_SKIES = {"rural": 20.5, "suburb": 18.0}
+
+
+def print_star_budget(
+    focal: float,
+    size: tuple[int, int],
+    baseline: float,
+    distance: float,
+    aperture: float,
+    altitude: float,
+    clock: float,
+) -> None:
+    """Print how many stars a lens, an exposure and a sky give, and what range error follows from them.
+
+    Args:
+        focal: px.
+        size: of the image, px.
+        baseline: meters.
+        distance: meters, for which range errors are.
+        aperture: of the lens, mm.
+        altitude: of the middle of the image, degrees.
+        clock: sigma of the offset between the cameras' clocks, seconds.
+    """
+    from kcal.stars.budget import NightPlan, planned_stars
+
+    out.print(
+        f"stars: f {focal:g} px, {size[0]}x{size[1]}, aperture {aperture:g} mm, middle of the image {altitude:g}° up, "
+        f"clocks ± {clock:g} s; range errors at {distance:g} m from stars and clocks alone (lens and marks come on top)"
+    )
+    rows = [["sky", "exposure s", "stars", "faintest", "σ px", "trail px", "1 pair", f"{_PAIRS} pairs"]]
+    told = []
+    for sky, magnitude in _SKIES.items():
+        for seconds in _EXPOSURES:
+            plan = NightPlan(
+                focal_px=focal, size=size, aperture_mm=aperture, seconds=seconds, sky_magnitude=magnitude,
+                altitude_deg=altitude,
+            )  # fmt: skip
+            found = planned_stars(plan)
+            shares = [found.range_share(distance, baseline, pairs, clock) for pairs in (1, _PAIRS)]
+            some = math.isfinite(found.yaw_sigma)
+            rows.append([
+                sky, f"{seconds:.3g}", f"{found.stars:.0f}", f"{found.faintest:.1f}" if some else "",
+                f"{found.sigma_px:.2f}" if some else "", f"{found.trail_px:.2f}",
+                *(f"{100 * share:.2f} %" if some else "" for share in shares),
+            ])  # fmt: skip
+            told.append({
+                "sky_magnitude": magnitude, "seconds": seconds, "stars": found.stars, "trail_px": found.trail_px,
+                "range_share": shares if some else None,
+            })  # fmt: skip
+    tell(stars=told)
+    print_table(rows)
+    out.print("a photometric model, probably a magnitude too cautious; take an exposure with 20 stars or more")
+
+
+# `kcal calibrate --stars`: a camera from night images, alone or together with boards.
+
+# Parts of the image, across and down, whose stars are counted for the advice.
+_PARTS = 3
+_FEW_IN_A_PART = 3
+
+
+def by_night(
+    images: list[str] | None,
+    observations: list[Path] | None,
+    time: str | None,
+    place: str | None,
+    output: Path,
+    name: str,
+) -> bool:
+    """Calibrate a camera from the stars of night images alone, and write it.
+
+    Args:
+        images: files, folders and wildcards.
+        observations: of boards.
+        time: as `--time`.
+        place: as `--place`: latitude, longitude and height, for refraction.
+        output: camera file.
+        name: of the camera.
+
+    Returns:
+        whether that was done; not where there are boards.
+    """
+    from kcal.io.camera_file import save_camera
+
+    if observations:
+        if images and len(observations) > 1:
+            raise InputError("--stars are of one camera: calibrate each with its own boards and night images")
+        return False
+    if not images:
+        raise InputError("give observations of a board (from `kcal detect`), or night images with --stars")
+    found = _by_stars(images, time, place, output)
+    camera = found.lens.camera
+    if camera.calibration is not None and name:
+        import dataclasses
+
+        camera.calibration = dataclasses.replace(camera.calibration, name=name)
+    save_camera(camera, output)
+    out.print("at infinity, without an entrance pupil: for what is farther than some hundred pupil movements")
+    print_wrote(output)
+    return True
+
+
+def joined_by_stars(
+    boards: CameraCalibrationResult | KcalError, images: list[str], time: str | None, place: str | None, output: Path
+) -> CameraCalibrationResult | KcalError:
+    """The calibration by boards, refined by stars; a failure stays one. Other arguments as of `by_night`."""
+    if isinstance(boards, KcalError):
+        return boards
+    found = _by_stars(images, time, place, output, boards)
+    agreement, joint = found.agreement, found.joint
+    assert agreement is not None
+    assert joint is not None
+    share = agreement.chi2 / max(agreement.freedom, 1)
+    out.print(
+        f"boards and stars: χ² over its {agreement.freedom} directions {share:.2f}; stars move the lens by "
+        f"{agreement.moved_px:.3f} px, where boards stated ± {agreement.stated_px:.3f} px. From both:"
+    )
+    return joint
+
+
+def _by_stars(
+    images: list[str], time: str | None, place: str | None, output: Path, boards: CameraCalibrationResult | None = None
+) -> StarCamera:
+    """Read the images, calibrate, and tell what was found."""
+    from kcal.lens.mounting import Origin
+    from kcal.stars.detect import expand_nights
+
+    origin = None if place is None else Origin.parse(place)
+    if origin is not None and time is None:
+        raise InputError("--place without --time tells nothing: refraction depends on both")
+    where: tuple[Any, Any, float] = (None, None, 0.0)
+    if origin is not None:
+        where = (origin.lat, origin.lon, origin.height)
+    files = expand_nights(images)
+    check_writable(output, *files)
+    views = [sky_view(path, time, *where) for path in files]
+    found, size = camera_by_stars(files, views, "calibrating by stars", boards)
+    count = sum(int(use.sum()) for use in found.lens.used)
+    left_out = sum(len(use) for use in found.lens.used) - count
+    tell(
+        images={files[number].name: len(star) for number, star in zip(found.images, found.stars, strict=True)},
+        refused={files[number].name: why for number, why in found.refused.items()},
+        stars=count, left_out=left_out, rms_px=found.lens.rms_px, effective=found.lens.effective,
+        agreement=None if found.agreement is None else found.agreement._asdict(),
+    )  # fmt: skip
+    out.print(
+        f"{count} stars of {len(found.images)} images, {left_out} left out; RMS [bold]{found.lens.rms_px:.4f} px[/] "
+        f"along an axis; f {float(found.lens.camera.params[0]):.2f} px; the stars determine {found.lens.effective:.1f} "
+        "unknowns of the lens"
+    )
+    for number, why in found.refused.items():
+        warn(f"{files[number].name}: {why}")
+    for text in sparse_parts(found, size):
+        warn(text)
+    if origin is None:
+        warn(
+            "without --time and --place refraction stays in the lens: it shrinks heights by 0.03 % overhead, 0.12 % at "
+            "30° of altitude and 1 % at 10°; give both"
+        )
+    return found
+
+
+def sparse_parts(found: StarCamera, size: tuple[int, int]) -> list[str]:
+    """Which parts of the image saw too few stars, and what to do."""
+    counts = [[0] * _PARTS for _ in range(_PARTS)]
+    for pixels in found.pixels:
+        for u, v in pixels.tolist():
+            counts[min(int(v / size[1] * _PARTS), _PARTS - 1)][min(int(u / size[0] * _PARTS), _PARTS - 1)] += 1
+    rows, columns = ("top", "middle", "bottom"), ("left", "center", "right")
+    empty = [
+        f"{row} {column}" for row, own in zip(rows, counts, strict=True) for column, n in zip(columns, own, strict=True)
+        if n < _FEW_IN_A_PART
+    ]  # fmt: skip
+    if not empty:
+        return []
+    share = math.ceil(100 * len(empty) / _PARTS**2)
+    return [
+        f"{share} % of the image saw fewer than {_FEW_IN_A_PART} stars ({', '.join(empty)}): tilt the camera up and "
+        "take more images, so that bright stars fall there"
+    ]
+
+
+# Night images of the cameras of a rig, for `kcal rig --stars`.
+
+# m: how well the place of `--origin` is known to be that of the first camera, along each axis.
+_PLACE_SIGMA = 3.0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class NightOptions:
+    """What the user gave of night images, as on the command line."""
+
+    images: tuple[str, str] | Mapping[str, str]
+    time: str | None = None
+    clock_sigma: float = 0.1
+    drift_sigma: float = 0.05
+    celsius: float | None = None
+    hectopascal: float | None = None
+    dut1: float | None = None
+
+
+def read_stars(
+    cameras: Mapping[str, Camera],
+    night: NightOptions,
+    origin: Origin | None,
+    positions: tuple[MeasuredPosition, ...],
+    *,
+    placed: bool,
+) -> tuple[StarSource, tuple[MeasuredPosition, ...], list[str]]:
+    """The stars of all images, the positions with that of the first camera, and lines that say what was found.
+
+    Args:
+        cameras: by their names, in order.
+        night: what the user gave.
+        origin: of the rig's frame; None if nothing is known on the Earth.
+        positions: measured ones.
+        placed: whether landmarks or anything else places the rig already.
+    """
+    import torch
+
+    from kcal.calibrate.rig.sources import MeasuredPosition
+    from kcal.stars.rig_stars import moments_of, star_source
+
+    given = _images_by_camera(cameras, night.images)
+    images = [_named_images(name, given[name], camera, night, origin) if name in given else []
+              for name, camera in cameras.items()]  # fmt: skip
+    moments, alone = moments_of(images)
+    on_earth = all(image.on_earth for own in images for image in own)
+    if not any(len(moment) > 1 for moment in moments) and not (on_earth and len(cameras) > 2):
+        first, *_, last = cameras
+        raise InputError(
+            f"--stars: no image of the {first} camera was taken at the time of one of the {last}; "
+            "pairs are of one moment"
+        )
+    if on_earth and not placed and not positions:
+        there = torch.zeros(3, dtype=torch.float64)
+        positions = (MeasuredPosition(camera=0, point=there, sigma=torch.full_like(there, _PLACE_SIGMA)),)
+    frame = origin if placed or positions else None
+    source = star_source(
+        moments, list(cameras.values()), clock_sigma=night.clock_sigma, drift_sigma=night.drift_sigma, origin=frame
+    )
+    named = int(source.named.sum())
+    lines = [
+        f"stars: {len(moments)} moments, {len(source.names)} stars, {named} with a direction on the Earth"
+        + (f"; {alone} images without partner" if alone else ""),
+        f"clocks of the cameras against each other: ± {night.clock_sigma:g} s, which no residual shows: up to "
+        f"{math.degrees(7.292e-5 * night.clock_sigma):.5f}° of relative attitude, and part of every σ below",
+    ]
+    if any(effect.factor is not None for effect in source.effects):
+        lines.append(
+            f"their drift: ± {night.drift_sigma:g} s an hour since the night's first images (--clock-drift 0 where GPS "
+            "or a network keeps them)"
+        )
+    if on_earth and night.dut1 is None:
+        lines.append("UT1 - UTC is not known (--dut1): 8″ of heading, part of its σ")
+    return source, positions, lines
+
+
+def images_of_nights(pair: tuple[str, str] | None, named: Sequence[str]) -> tuple[str, str] | dict[str, str]:
+    """Where night images are: LEFT RIGHT of two cameras, or NAME=IMAGES, one for each of more.
+
+    Raises:
+        InputError: both, no name, or a name twice.
+    """
+    if pair is not None and not named:
+        return pair
+    found = {}
+    for text in named:
+        name, equals, images = text.partition("=")
+        if pair is not None or not (name and equals and images) or name in found:
+            raise InputError(f"--night {text!r}: write NAME=IMAGES, once for each camera, and no --stars")
+        found[name] = images
+    return found
+
+
+def _images_by_camera(cameras: Mapping[str, Camera], images: tuple[str, str] | Mapping[str, str]) -> dict[str, str]:
+    if isinstance(images, tuple):
+        if len(cameras) != 2:
+            raise InputError("--stars LEFT RIGHT is for rigs of two cameras; give --night NAME=IMAGES for each")
+        return dict(zip(cameras, images, strict=True))
+    if not set(images) <= set(cameras):
+        raise InputError(f"--night: the cameras are {', '.join(cameras)}, got {', '.join(images)}")
+    return dict(images)
+
+
+def _named_images(
+    side: str, given: str, camera: Camera, night: NightOptions, origin: Origin | None
+) -> list[NamedStars]:
+    from kcal.stars.detect import expand_nights, read_night
+    from kcal.stars.night import clock_doubts, name_stars
+
+    files = expand_nights([given])
+    found: list[NamedStars] = []
+    # A place without a time tells nothing.
+    place = origin if night.time is not None else None
+    where = (None, None, 0.0) if place is None else (place.lat, place.lon, place.height)
+    with steps(f"naming stars of {side}", len(files)) as advance:
+        for path in files:
+            view = sky_view(
+                path, night.time, *where, dut1=night.dut1, celsius=night.celsius,
+                pressure=night.hectopascal,
+            )  # fmt: skip
+            try:
+                image = name_stars(read_night(path), camera, view)
+            except KcalError as error:
+                warn(f"{side} {path.name}: {error}; left out")
+            else:
+                for text in image.warnings:
+                    warn(f"{side} {path.name}: {text}")
+                found.append(image)
+            advance(path.name)
+    for number, text in clock_doubts(found):
+        warn(f"{side}, image {number + 1} with names: {text}")
+    if not found:
+        raise InputError(f"--stars: in none of the {len(files)} images of {side} stars have names")
+    return found
+
+
+# `kcal stars`: name the stars of night images, and find how the camera looks.
 
 
 def stars_command(
@@ -65,11 +455,9 @@ def stars_command(
 
     `kcal stars night/0001.png --camera left.camera.json --picture named.png`
     """
-    from kcal.cli.camera_sources import single_camera
-    from kcal.stars.catalog import StarCatalog
-    from kcal.stars.contradictions import clock_doubts
-    from kcal.stars.night import name_stars
-    from kcal.stars.night_image import expand_nights, read_night
+    from kcal.stars.detect import expand_nights, read_night
+    from kcal.stars.night import clock_doubts, name_stars
+    from kcal.stars.sky import StarCatalog
 
     if picture is not None:
         from kcal.report.figures import check_picture
@@ -83,12 +471,7 @@ def stars_command(
         for path in files
     ]
     catalog = StarCatalog.bundled()
-    if camera is None:
-        from kcal.cli.night_images import camera_by_stars
-
-        lens = camera_by_stars(files, views, "finding the lens")[0].lens.camera
-    else:
-        lens = single_camera(camera)
+    lens = single_camera(camera) if camera else camera_by_stars(files, views, "finding the lens")[0].lens.camera
     told: list[dict[str, Any]] = []
     named: list[tuple[str, NamedStars]] = []
     rows = [["image", "stars", "named", "RMS px", *_heads(views[0])]]
@@ -164,7 +547,7 @@ def _told(path: Path, found: NamedStars) -> dict[str, Any]:
 
 
 def _draw(picture: Path, image: Any, found: NamedStars, catalog: StarCatalog, title: str) -> None:
-    from kcal.report.stars import save_stars_picture
+    from kcal.report.rig import save_stars_picture
 
     star = found.attitude.star.tolist()
     names = [catalog.name_of(int(catalog.number[i])) if i >= 0 else "" for i in star]

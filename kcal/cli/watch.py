@@ -14,14 +14,15 @@ from kcal.cli.console import err, on_signals, out, print_table, print_wrote, war
 from kcal.cli.inputs import RIG
 from kcal.cli.rig_check import DRIFTED
 from kcal.errors import InputError, with_extra
+from kcal.files import check_picture, check_writable
+from kcal.texts import measured_text
 
 if TYPE_CHECKING:
     from kcal.corners.images import Gray
     from kcal.lens.rig import StereoRig
     from kcal.pipeline.paired_frames import FramesTogether
-    from kcal.watch.alarm import Webhook
     from kcal.watch.watched import Watched
-    from kcal.watch.watcher import Noticed, Watcher
+    from kcal.watch.watcher import Noticed, Watcher, Webhook
 
 _EXIT = "exit"
 # Points of a picture.
@@ -83,13 +84,11 @@ def watch_command(
     `kcal watch rig.json rtsp://10.0.0.7/main rtsp://10.0.0.8/main -o history.csv --alarm https://example.org/rig`
     """
     from kcal.corners.images import read_gray
-    from kcal.files import check_picture, check_writable
     from kcal.io.rig_file import load_rig, save_rig
-    from kcal.watch.alarm import Webhook
-    from kcal.watch.relock import relock as relocked_by
-    from kcal.watch.temperature import Temperatures
+    from kcal.watch.history import Temperatures
     from kcal.watch.watched import Watched
-    from kcal.watch.watcher import Watcher
+    from kcal.watch.watched import relock as relocked_by
+    from kcal.watch.watcher import Watcher, Webhook
 
     if images and len(images) != 2:
         raise typer.BadParameter("two folders, videos or addresses, of the left and the right camera, are needed")
@@ -196,7 +195,6 @@ def _folder_pairs(watcher: Watcher, folders: tuple[str, str]) -> Iterator[tuple[
 
 
 def _turn_text(noticed: Noticed) -> str:
-    from kcal.quantities import measured_text
 
     angles = zip(("pitch", "yaw", "roll"), noticed.turn.tolist(), noticed.sigma.tolist(), strict=True)
     return ", ".join(
@@ -251,8 +249,8 @@ def _tell_turns(watched: Watched, limit: float) -> None:
 def _draw_turns(watched: Watched, picture: Path, limit: float, title: str) -> None:
     import numpy as np
 
-    from kcal.report.attitude import attitude_figure
     from kcal.report.figures import save_picture
+    from kcal.report.rig import attitude_figure
 
     step = -(-len(watched.times) // _DRAWN)
     times = watched.times[::step]

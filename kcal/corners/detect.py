@@ -30,8 +30,7 @@ from kcal.corners.seen_instead import seen_instead
 from kcal.corners.sizes import common_size, rescaled, resized_alike
 from kcal.corners.time_limit import Limited, TookTooLongError
 from kcal.errors import FileError, InputError
-from kcal.files import read_bytes
-from kcal.sources import is_stream, source_name
+from kcal.files import is_stream, read_bytes, source_name
 
 _THOROUGH = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
 MIN_GOOD = 0.5  # share of the corners that must be refined successfully
@@ -166,7 +165,7 @@ def detect(
             `kcal.corners.time_limit.Limited`.
         note: called with what was done about images of several sizes; a Python warning by default.
         on_failure: called with the name, path and detection of each readable file that shows no board, for example to
-            draw why (`kcal.report.gallery.FailedImage`).
+            draw why (`kcal.report.calibration.FailedImage`).
 
     Raises:
         InputError: no images, images that were cropped or rotated, or no board in any image.

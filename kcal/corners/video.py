@@ -21,8 +21,7 @@ from kcal.corners.observations import Failure, Observations, View
 from kcal.corners.refine import Refinement
 from kcal.corners.time_limit import Limited, TookTooLongError
 from kcal.errors import FileError, InputError
-from kcal.files import write_atomic
-from kcal.sources import is_stream, source_name
+from kcal.files import is_stream, source_name, write_atomic
 
 MOST_VIEWS = 40
 DURATION = 120.0  # seconds: how long a live stream is read by default

@@ -18,7 +18,7 @@ from torch import nn
 import kcal
 from kcal.checks import MOST_FOCAL
 from kcal.errors import InputError
-from kcal.image_size import ImageSize
+from kcal.image_header import ImageSize
 from kcal.io.file_summary import CameraSummary
 from kcal.io.information_record import InformationRecord
 from kcal.io.lens_record import LensOrders

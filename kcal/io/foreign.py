@@ -19,7 +19,7 @@ from torch import Tensor
 from kcal.checks import MOST_FOCAL
 from kcal.errors import FileError, InputError, KcalError
 from kcal.files import read_text
-from kcal.image_size import check_pixel_count
+from kcal.image_header import check_pixel_count
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel

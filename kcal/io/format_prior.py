@@ -29,7 +29,7 @@ from kcal.io.foreign import (
     plain,
     whole_size,
 )
-from kcal.io.format_colmap import WRITTEN
+from kcal.io.format_photos import WRITTEN
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.carry_over import square_root_information

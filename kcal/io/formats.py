@@ -13,23 +13,17 @@ import torch
 from kcal.errors import FileError, InputError
 from kcal.files import read_head, read_text
 from kcal.io import (
-    format_agisoft,
-    format_colmap,
     format_kalibr,
-    format_matlab,
     format_mrcal,
-    format_nerfstudio,
     format_opencv,
-    format_opensfm,
+    format_photos,
     format_prior,
-    format_qualisys,
-    format_ros,
-    format_toml,
 )
 from kcal.io.camera_file import load_camera
 from kcal.io.foreign import MOST_BYTES, CameraPose, Hints, ImportedCameras, reading, rig_poses
 from kcal.io.rig_file import load_rig
 from kcal.lens.camera import Camera
+from kcal.lens.camera_conversions import OPENCV_MODELS
 from kcal.lens.model import LensModel
 from kcal.strict_json import MOST_BYTES as MOST_JSON
 from kcal.strict_json import read_json
@@ -75,75 +69,75 @@ FORMATS = {
     "opencv": CameraFormat(
         title="OpenCV YAML, XML or JSON, one camera or a pair",
         suffixes=(".yml", ".yaml", ".xml"),
-        models=format_opencv.MODELS,
+        models=(*OPENCV_MODELS.values(), "fisheye4"),
         read=format_opencv.read_opencv,
         write=format_opencv.write_opencv,
     ),
     "ros": CameraFormat(
         title="ROS camera_info, a file per camera",
         suffixes=(),
-        models=format_ros.MODELS,
-        read=format_ros.read_ros,
-        write=format_ros.write_ros,
+        models=("pinhole", "opencv4", "opencv5", "opencv8", "fisheye4"),
+        read=format_opencv.read_ros,
+        write=format_opencv.write_ros,
     ),
     "kalibr": CameraFormat(
         title="Kalibr camchain",
         suffixes=(),
-        models=format_kalibr.MODELS,
+        models=("pinhole", "opencv4", "fisheye4"),
         read=format_kalibr.read_kalibr,
         write=format_kalibr.write_kalibr,
     ),
     "mrcal": CameraFormat(
         title="mrcal cameramodel, a file per camera",
         suffixes=(".cameramodel",),
-        models=format_mrcal.MODELS,
+        models=("pinhole", "opencv4", "opencv5", "opencv8", "opencv12"),
         read=format_mrcal.read_mrcal,
         write=format_mrcal.write_mrcal,
     ),
     "colmap": CameraFormat(
         title="COLMAP cameras.txt or cameras.bin",
         suffixes=(".txt", ".bin"),
-        models=format_colmap.MODELS,
-        read=format_colmap.read_colmap,
-        write=format_colmap.write_colmap,
+        models=("pinhole", "opencv4", "opencv8", "fisheye4"),
+        read=format_photos.read_colmap,
+        write=format_photos.write_colmap,
         pose=False,
     ),
     "nerfstudio": CameraFormat(
         title="nerfstudio transforms.json",
         suffixes=(".json",),
-        models=format_nerfstudio.MODELS,
-        read=format_nerfstudio.read_nerfstudio,
-        write=format_nerfstudio.write_nerfstudio,
+        models=("pinhole", "opencv4", "opencv5", "fisheye4"),
+        read=format_photos.read_nerfstudio,
+        write=format_photos.write_nerfstudio,
         pose=False,
     ),
     "matlab": CameraFormat(
         title="MATLAB struct of camera or stereo parameters",
         suffixes=(".mat",),
-        models=format_matlab.MODELS,
-        read=format_matlab.read_matlab,
-        write=format_matlab.write_matlab,
+        models=("pinhole", "opencv4", "opencv5"),
+        read=format_opencv.read_matlab,
+        write=format_opencv.write_matlab,
         skew=True,
     ),
     "opensfm": CameraFormat(
         title="OpenSfM camera_models.json",
         suffixes=(),
-        models=format_opensfm.MODELS,
-        read=format_opensfm.read_opensfm,
-        write=format_opensfm.write_opensfm,
+        models=("pinhole", "opencv4", "opencv5", "fisheye4"),
+        read=format_photos.read_opensfm,
+        write=format_photos.write_opensfm,
         pose=False,
     ),
     "toml": CameraFormat(
         title="TOML of aniposelib, pose2sim and Caliscope",
         suffixes=(".toml",),
-        models=format_toml.MODELS,
-        read=format_toml.read_toml,
-        write=format_toml.write_toml,
+        models=(*OPENCV_MODELS.values(), "fisheye4"),
+        read=format_opencv.read_toml,
+        write=format_opencv.write_toml,
     ),
     "qualisys": CameraFormat(
-        title="Qualisys .qca.txt", suffixes=(), models=(), read=format_qualisys.read_qualisys, pose=False
+        title="Qualisys .qca.txt", suffixes=(), models=(), read=format_photos.read_qualisys, pose=False
     ),
     "agisoft": CameraFormat(
-        title="Agisoft Metashape XML", suffixes=(), models=(), read=format_agisoft.read_agisoft, pose=False
+        title="Agisoft Metashape XML", suffixes=(), models=(), read=format_photos.read_agisoft, pose=False
     ),
     "gtsam": _prior_format("gtsam", "Values and noise model for GTSAM, JSON", format_prior.GTSAM_MODELS),
     "ceres": _prior_format("ceres", "A and b of Ceres's NormalPrior, JSON", format_prior.PLAIN_MODELS),

@@ -12,8 +12,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 from kcal.errors import InputError
-from kcal.quantities import setting_text
-from kcal.texts import brief
+from kcal.texts import brief, setting_text
 
 if TYPE_CHECKING:
     from torch import Tensor

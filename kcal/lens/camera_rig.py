@@ -17,8 +17,7 @@ from kcal.lens.calibration import Exclusion, RigSource, UntilChanged
 from kcal.lens.camera import Camera
 from kcal.lens.camera_like import CameraLike, as_camera
 from kcal.lens.mounting import REFRACTION, Origin, check_refraction
-from kcal.quantities import length_text
-from kcal.texts import brief
+from kcal.texts import brief, length_text
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

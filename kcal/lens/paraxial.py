@@ -20,7 +20,7 @@ from torch import Tensor
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.projection import project_components
-from kcal.quantities import measured_text
+from kcal.texts import measured_text
 
 # Standard deviations beyond which both focal lengths are told apart, and relative rounding.
 _UNEQUAL, _ROUNDING = 3.0, 1e-9

@@ -18,8 +18,7 @@ from kcal.lens.calibration import RigCalibration, UntilChanged
 from kcal.lens.camera import Camera
 from kcal.lens.camera_like import CameraLike, as_camera
 from kcal.lens.mounting import Mounting
-from kcal.quantities import length_text
-from kcal.texts import brief
+from kcal.texts import brief, length_text
 
 
 class StereoRig(nn.Module):

@@ -5,14 +5,14 @@
 from kcal.locate.localizer import Localization as Localization
 from kcal.locate.localizer import Sensitivity as Sensitivity
 from kcal.locate.positions import Position as Position
-from kcal.locate.columns import PositionColumns as PositionColumns
+from kcal.locate.tables import PositionColumns as PositionColumns
 from kcal.locate.tabulate import Viewpoint as Viewpoint
 from kcal.locate.marks import read_marks as read_marks
 from kcal.locate.marks import Marks as Marks
 from kcal.locate.export import write_positions as write_positions
-from kcal.locate.cep import circular_error as circular_error
-from kcal.locate.truth import read_truth as read_truth
-from kcal.locate.truth import position_errors as position_errors
+from kcal.locate.tabulate import circular_error as circular_error
+from kcal.locate.positions import read_truth as read_truth
+from kcal.locate.positions import position_errors as position_errors
 
 # Triangulate
 from kcal.locate.triangulate import Triangulate as Triangulate
@@ -26,8 +26,8 @@ from kcal.locate.disparity import RangeImage as RangeImage
 from kcal.locate.multi_localizer import MultiViewLocalizer as MultiViewLocalizer
 from kcal.locate.multi_localizer import ViewsLocalization as ViewsLocalization
 from kcal.locate.station_positions import locate_views as locate_views
-from kcal.locate.view_marks import read_views as read_views
-from kcal.locate.view_marks import ViewMarks as ViewMarks
+from kcal.locate.survey import read_views as read_views
+from kcal.locate.survey import ViewMarks as ViewMarks
 
 # Points on the ground
 from kcal.locate.ground import locate_on_ground as locate_on_ground
@@ -40,8 +40,8 @@ from kcal.locate.raster import Raster as Raster
 from kcal.locate.siting import area_of as area_of
 from kcal.locate.siting import Area as Area
 from kcal.locate.siting import Site as Site
-from kcal.locate.site_tables import read_sites as read_sites
-from kcal.locate.site_tables import sites_of as sites_of
+from kcal.locate.siting import read_sites as read_sites
+from kcal.locate.siting import sites_of as sites_of
 from kcal.locate.siting import siting_map as siting_map
 from kcal.locate.siting import SitingMap as SitingMap
 from kcal.locate.siting import rank_sites as rank_sites
@@ -51,12 +51,12 @@ from kcal.locate.siting import RankedSite as RankedSite
 from kcal.locate.geodesy import enu_from_cam as enu_from_cam
 from kcal.locate.geodesy import enu_to_geodetic as enu_to_geodetic
 from kcal.locate.geodesy import geodetic_to_enu as geodetic_to_enu
-from kcal.locate.datum import find_geoid as find_geoid
-from kcal.locate.datum import Geoid as Geoid
-from kcal.locate.datum import true_from_grid as true_from_grid
+from kcal.locate.tabulate import find_geoid as find_geoid
+from kcal.locate.tabulate import Geoid as Geoid
+from kcal.locate.tabulate import true_from_grid as true_from_grid
 
 # Range errors of a rig
 from kcal.locate.budget import range_errors as range_errors
 from kcal.locate.budget import RangeError as RangeError
 from kcal.locate.budget import BudgetErrors as BudgetErrors
-from kcal.locate.aging import forgotten_yaw as forgotten_yaw
+from kcal.locate.monitor import forgotten_yaw as forgotten_yaw

@@ -1,30 +1,278 @@
-"""Positions as files: GeoJSON (RFC 7946), CSV, KML and Cursor-on-Target; numbers keep every float64 digit.
-
-Rows are written in chunks, so that a table may be longer than memory.
-"""
+"""Write positions: KML, GeoJSON, Cursor on Target, CSV."""
 
 from __future__ import annotations
 
+import hashlib
+import math
 import re
 import shutil
 import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
+from xml.sax.saxutils import escape, quoteattr
+
+import numpy as np
+import orjson
 
 from kcal.errors import InputError
 from kcal.files import open_atomic
-from kcal.locate.columns import NUMBERS, TEXTS, PositionColumns, number_lines
-from kcal.locate.cot import COT_END, cot_events, cot_start
-from kcal.locate.geojson import camera_features, point_features, region_features
-from kcal.locate.kml import KML_END, kml_points, kml_regions, kml_start
-from kcal.locate.positions import Located
+from kcal.locate.positions import CORNER_DECIMALS, REGION_SHARE, Located, cut_at_antimeridian, ring_blocks
 from kcal.locate.stereo import PositionStatus
-from kcal.locate.tables import guarded, is_number
-from kcal.texts import csv_line
+from kcal.locate.tables import NUMBERS, TEXTS, PositionColumns, guarded, is_number, number_lines
+from kcal.texts import csv_line, one_line, visible
+
+# Positions as KML 2.2 (OGC 07-147r2), for Google Earth and every GIS: points, 95 % regions, cameras.
+#
+# KML counts absolute altitudes from the EGM96 geoid. With a geoid grid, positions are written with `altitudeMode`
+# absolute and their height above that geoid; without one they are `clampToGround`, because an ellipsoidal height taken
+# for a height above the sea would be wrong by up to 100 m. Regions lie on the ground.
+
+KML_END = " </Document>\n</kml>\n"
+_STYLES = """  <Style id="camera">
+   <IconStyle><color>ffb06c2b</color></IconStyle>
+  </Style>
+  <Style id="point">
+   <IconStyle><color>ff6b2ac0</color></IconStyle>
+  </Style>
+  <Style id="region">
+   <LineStyle><color>ff271811</color></LineStyle>
+   <PolyStyle><color>33271811</color></PolyStyle>
+  </Style>
+"""
+
+
+def kml_start(run: Located) -> str:
+    """The beginning of the document: styles and cameras."""
+    note = f"Regions: {run.interval_note}. Geoid: {run.geoid or 'none'}."
+    cameras = "".join(
+        _point(f"{camera.name} camera", "camera", f"{camera.geodetic[1]!r},{camera.geodetic[0]!r}", False, "")
+        for camera in run.cameras
+    )
+    return (
+        '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2">\n <Document>\n'
+        f"  <name>kcal positions</name>\n  <description>{_xml(note)}</description>\n{_STYLES}{cameras}"
+    )
+
+
+def kml_points(columns: PositionColumns) -> str:
+    """A placemark for each row that has a position."""
+    found = columns.rows(np.flatnonzero(columns.located))
+    height, geoid = found.column("height_ellipsoidal_m"), found.column("geoid_height_m")
+    places = number_lines(np.stack([found.column("lon"), found.column("lat"), height - geoid], -1))
+    ranges = np.stack([found.column(name) for name in ("range_m", "range_low_m", "range_high_m")], -1)
+    placemarks = []
+    for name, reason, place, (distance, low, high) in zip(
+        found.names, found.reasons, places, ranges.tolist(), strict=True
+    ):
+        text = f"range {distance:.1f} m, 95 %: {low:.1f} to {high:.1f} m"
+        known = not place.endswith(",")
+        text = f"{text}. {reason}" if reason else text
+        placemarks.append(_point(name, "point", place.removesuffix(","), known, text))
+    return "".join(placemarks)
+
+
+def kml_regions(columns: PositionColumns, run: Located) -> str:
+    """A polygon for each row that has a position."""
+    names = [columns.names[i] for i in np.flatnonzero(columns.located).tolist()]
+    placemarks = []
+    rings = (ring for block in ring_blocks(columns, run.origin, plain=run.feet is not None) for ring in block)
+    for name, ring in zip(names, rings, strict=True):
+        corners = np.stack([(ring[:, 1] + 180.0) % 360.0 - 180.0, ring[:, 0]], -1)
+        places = number_lines(corners.round(CORNER_DECIMALS))
+        placemarks.append(
+            f"  <Placemark>\n   <name>{_xml(name)}, 95 %</name>\n   <styleUrl>#region</styleUrl>\n   <Polygon>\n"
+            f"    <outerBoundaryIs><LinearRing><coordinates>{' '.join(places)}</coordinates></LinearRing>"
+            "</outerBoundaryIs>\n   </Polygon>\n  </Placemark>\n"
+        )
+    return "".join(placemarks)
+
+
+def _point(name: str, style: str, place: str, absolute: bool, description: str) -> str:
+    about = f"   <description>{_xml(description)}</description>\n" if description else ""
+    mode = "absolute" if absolute else "clampToGround"
+    return (
+        f"  <Placemark>\n   <name>{_xml(name)}</name>\n{about}   <styleUrl>#{style}</styleUrl>\n"
+        f"   <Point>\n    <altitudeMode>{mode}</altitudeMode>\n    <coordinates>{place}</coordinates>\n   </Point>\n"
+        "  </Placemark>\n"
+    )
+
+
+def _xml(text: str) -> str:
+    return escape(visible(text))
+
+
+# Positions as GeoJSON (RFC 7946): one file, or one feature a line.
+
+# What JSON calls a number; "007" is none, and stays a text.
+_JSON_NUMBER = re.compile(r"-?(0|[1-9][0-9]*)(\.[0-9]+)?([eE][+-]?[0-9]+)?")
+# Whole numbers beyond this lose digits in programs that read every number as a float64.
+_LARGEST_WHOLE = 2**53
+_POLYGON = (b'{"type":"Feature","geometry":{"type":"Polygon","coordinates":[', b']},"properties":')
+_PROPERTIES = ("kind", *TEXTS, *NUMBERS)
+_HEIGHT = NUMBERS.index("height_ellipsoidal_m")
+
+
+def camera_features(run: Located) -> list[bytes]:
+    """A feature for each camera; the left one says what holds for all positions."""
+    features = []
+    for camera in run.cameras:
+        properties: dict[str, Any] = {"name": f"{camera.name} camera", "kind": "camera"}
+        if camera.name == "left":
+            properties |= {
+                "heading_deg": run.heading_deg,
+                "pitch_deg": run.pitch_deg,
+                "roll_deg": run.roll_deg,
+                "pixel_sigma": run.pixel_sigma,
+                "range_interval": run.interval_note,
+                "geoid": run.geoid,
+            }
+        lat, lon, height = camera.geodetic
+        features.append(_feature({"type": "Point", "coordinates": [lon, lat, height]}, properties))
+    return features
+
+
+def point_features(columns: PositionColumns) -> Iterator[bytes]:
+    """A feature for each pair of marks; its geometry is null where there is no position."""
+    statuses = {int(status): status.name.lower() for status in PositionStatus}
+    infinite = set(np.flatnonzero(np.isinf(columns.numbers).any(1)).tolist())
+    extras = [(column, list(map(_json_value, cells))) for column, cells in columns.extras.items()]
+    rows = zip(columns.names, columns.status.tolist(), columns.reasons, columns.numbers.tolist(), strict=True)
+    for place, (name, status, reason, numbers) in enumerate(rows):
+        lat, lon, height = numbers[0], numbers[1], numbers[_HEIGHT]
+        # JSON has neither NaN nor infinity: both become null.
+        values = ("point", name, statuses[status], reason, *numbers)
+        properties: dict[str, Any] = dict(zip(_PROPERTIES, values, strict=True))
+        if place in infinite:
+            properties |= {
+                f"{column.removesuffix('_m')}_infinite": True
+                for column, value in zip(NUMBERS, numbers, strict=True)
+                if value == float("inf")
+            }
+        if extras:
+            properties.update((column, cells[place]) for column, cells in extras)
+        yield _feature({"type": "Point", "coordinates": [lon, lat, height]} if lat == lat else None, properties)
+
+
+def region_features(columns: PositionColumns, run: Located) -> Iterator[bytes]:
+    """A polygon for each position: its 95 % region, a long and slightly skewed ellipse."""
+    names = iter([columns.names[place] for place in np.flatnonzero(columns.located).tolist()])
+    for block in ring_blocks(columns, run.origin, plain=run.feet is not None):
+        corners = np.ascontiguousarray(block[..., ::-1]).round(CORNER_DECIMALS)
+        beyond = (np.abs(block[..., 1]).max(-1) > 180.0).tolist()
+        # Section 3.1.6: closed, counterclockwise; section 3.1.9: a polygon across the antimeridian is cut in two.
+        for lon_lat, cut, ring in zip(corners, beyond, block, strict=True):
+            properties = {"kind": "region", "name": next(names), "share": REGION_SHARE}
+            if cut:
+                yield _feature(_cut(ring.tolist()), properties)
+            else:
+                # Most of the file: copied once.
+                text = orjson.dumps(lon_lat, option=orjson.OPT_SERIALIZE_NUMPY)
+                yield b"".join([_POLYGON[0], text, _POLYGON[1], orjson.dumps(properties), b"}"])
+
+
+def _cut(ring: list[tuple[float, float]]) -> dict[str, Any]:
+    parts = [[[lon, lat] for lat, lon in part] for part in cut_at_antimeridian(ring)]
+    if len(parts) == 1:
+        return {"type": "Polygon", "coordinates": parts}
+    return {"type": "MultiPolygon", "coordinates": [[part] for part in parts]}
+
+
+def _feature(geometry: dict[str, Any] | None, properties: dict[str, Any]) -> bytes:
+    feature = {"type": "Feature", "geometry": geometry, "properties": properties}
+    return orjson.dumps(feature)
+
+
+def _json_value(cell: str) -> object:
+    """The cell of a further column: a number with all its digits where it is one, null where it is empty."""
+    if not cell:
+        return None
+    number = _JSON_NUMBER.fullmatch(cell)
+    # One beyond float64 is none for programs that read it.
+    if number and (_is_exact(cell) if not (number[2] or number[3]) else math.isfinite(float(cell))):
+        return orjson.Fragment(cell)
+    return cell
+
+
+def _is_exact(digits: str) -> bool:
+    """Of a whole number; Python refuses to read one of thousands of digits."""
+    return len(digits) <= len(str(-_LARGEST_WHOLE)) and abs(int(digits)) <= _LARGEST_WHOLE
+
+
+# Positions as Cursor-on-Target events, the XML of ATAK, WinTAK and their kin.
+
+COT_END = "</events>\n"
+# What Cursor-on-Target writes for a number that is not known.
+_UNKNOWN = "9999999.0"
+# Unknown affiliation, on the ground: kcal says where, not what.
+_TYPE = "a-u-G"
+# Machine-generated, estimated.
+_HOW = "m-g"
+
+
+def cot_start() -> str:
+    """The beginning of the document."""
+    return '<?xml version="1.0" encoding="UTF-8"?>\n<events>\n'
+
+
+def cot_events(columns: PositionColumns, run: Located, *, time: datetime | None = None, stale_s: float = 300.0) -> str:
+    """An event for each row that has a position.
+
+    `hae` is the ellipsoidal height. `ce` is the radius of the horizontal circle that contains the true position with
+    95 %, `le` half the vertical 95 % interval, both in meters; the format's definition names no probability, so that
+    the remark in each event states it. Pairs without a position are left out.
+
+    Args:
+        columns: the rows.
+        run: how they were located.
+        time: of the marks, with its time zone; now if left out.
+        stale_s: seconds for which an event counts.
+
+    Raises:
+        InputError: a time without a time zone, or a `stale_s` that is not positive.
+    """
+    moment = datetime.now(UTC) if time is None else time
+    if moment.tzinfo is None:
+        raise InputError("time: a time zone is needed; write for example datetime.now(datetime.UTC)")
+    if not 0 < stale_s < math.inf:
+        raise InputError(f"stale_s {stale_s}: a positive number of seconds is needed")
+    moment = moment.astimezone(UTC)
+    start, stale = _stamp(moment), _stamp(moment + timedelta(seconds=stale_s))
+    station = f"{run.origin.lat!r} {run.origin.lon!r}"
+    remark = escape(f"kcal: ce and le contain 95 %; {run.interval_note}")
+    found = columns.rows(np.flatnonzero(columns.located))
+    vertical = 1.96 * np.sqrt(np.maximum(found.column("cov_uu_m2"), 0.0))
+    errors = zip(found.column("cep95_m").tolist(), vertical.tolist(), strict=True)
+    events = []
+    for name, reason, (lat, lon, height, *_), (circle, up) in zip(
+        found.names, found.reasons, found.numbers.tolist(), errors, strict=True
+    ):
+        identity = hashlib.sha256(f"{station} {name}".encode()).hexdigest()[:16]
+        more = f". {escape(reason)}" if reason else ""
+        events.append(
+            f' <event version="2.0" uid="kcal-{identity}" type="{_TYPE}" how="{_HOW}" time="{start}" start="{start}" '
+            f'stale="{stale}">\n  <point lat="{lat!r}" lon="{lon!r}" hae="{_meters_text(height)}" '
+            f'ce="{_meters_text(circle)}" le="{_meters_text(up)}" />\n  <detail>\n'
+            f"   <contact callsign={quoteattr(one_line(name))} />\n   <remarks>{remark}{more}</remarks>\n"
+            "  </detail>\n </event>\n"
+        )
+    return "".join(events)
+
+
+def _meters_text(value: float) -> str:
+    return f"{value:.3f}" if math.isfinite(value) else _UNKNOWN
+
+
+def _stamp(moment: datetime) -> str:
+    return moment.strftime("%Y-%m-%dT%H:%M:%S.") + f"{moment.microsecond // 1000:03d}Z"
+
+
+# Positions as files: GeoJSON (RFC 7946), CSV, KML and Cursor-on-Target; numbers keep every float64 digit.
+#
+# Rows are written in chunks, so that a table may be longer than memory.
 
 # Rows at once, so that their texts fit the cache.
 _AT_ONCE = 1024

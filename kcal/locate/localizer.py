@@ -15,8 +15,7 @@ from kcal.errors import InputError
 from kcal.io.rig_file import load_rig
 from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA, Origin, check_refraction
 from kcal.lens.rig import RigCovariance, StereoRig
-from kcal.locate.ellipsoid import mean_radius
-from kcal.locate.geodesy import anchor, enu_from_cam, place_enu
+from kcal.locate.geodesy import anchor, enu_from_cam, mean_radius, place_enu
 from kcal.locate.max_likelihood import by_pose, calibration_effect, inverse_variance, position_slope, symmetric
 from kcal.locate.mounting import by_mounting
 from kcal.locate.stereo import (

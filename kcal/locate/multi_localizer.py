@@ -13,10 +13,8 @@ from kcal.checks import Float64Module, as_points, expanded, exportable
 from kcal.dispatch import is_differentiated, is_traced, known_true
 from kcal.errors import InputError
 from kcal.lens.camera_rig import CameraRig
-from kcal.locate.ellipsoid import ecef_from_enu_rotation, mean_radius
-from kcal.locate.geodesy import anchor, enu_to_geodetic, place_enu
-from kcal.locate.ground import Ground
-from kcal.locate.ground_ahead import EarthFrame, stated_ahead
+from kcal.locate.geodesy import anchor, ecef_from_enu_rotation, enu_to_geodetic, mean_radius, place_enu
+from kcal.locate.ground import EarthFrame, Ground, stated_ahead
 from kcal.locate.max_likelihood import inverse_variance
 from kcal.locate.multiview import checked_views_covariance
 from kcal.locate.ranges import BEARING_SIGMAS, range_interval

@@ -1,24 +1,32 @@
-"""`locate_points`: pixel pairs to positions on the Earth, with everything that is told to a user."""
+"""Positions of located points, their regions, their places on a map, and their errors against the truth."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import math
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from kcal.checks import as_points
 from kcal.errors import InputError
 from kcal.lens.mounting import Origin
 from kcal.lens.rig import RigCovariance, StereoRig
-from kcal.locate.columns import NUMBERS, PositionColumns
-from kcal.locate.datum import Geoid
+from kcal.locate.geodesy import anchor, enu_to_geodetic, latitude_longitude
+from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.stereo import PositionStatus, checked_pairs
-from kcal.locate.tables import CHUNK_ROWS
-from kcal.locate.tabulate import Locator, Viewpoint
+from kcal.locate.survey import read_survey
+from kcal.locate.tables import CHUNK_ROWS, NUMBERS, PositionColumns
+from kcal.locate.tabulate import Geoid, Locator, Viewpoint
 from kcal.texts import brief
+
+# `locate_points`: pixel pairs to positions on the Earth, with everything that is told to a user.
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -153,7 +161,7 @@ def locate_points(
         link: how calibration and mounting go together, see `StereoLocalizer`.
         refraction: bending of light as a share of the Earth's curvature, see `StereoLocalizer`.
         refraction_sigma: its standard deviation.
-        geoid: a grid from `kcal.locate.datum.find_geoid`.
+        geoid: a grid from `kcal.locate.tabulate.find_geoid`.
 
     Returns:
         A position, or the reason why there is none, for each pair. A pair whose parallax is below three sigma is
@@ -226,3 +234,259 @@ def _positions_of(columns: PositionColumns) -> Iterator[Position]:
             range_m=distance, range_low_m=low, range_high_m=high, azimuth_deg=azimuth, elevation_deg=elevation,
             reprojection_px=None if math.isnan(left) else (left, right),
         )  # fmt: skip
+
+
+# The 95 % region of a position as a ring on the map: an ellipse in inverse range, skewed outward in meters.
+
+REGION_SHARE = 0.95
+# In files, of the degrees of a region's corners: 0.1 mm (RFC 7946, section 11.2). Positions keep all digits. The last
+# digits of functions such as the arc tangent depend on how many values are computed at once.
+CORNER_DECIMALS = 9
+_RING_POINTS = 72
+# An ellipse that comes this close to the camera, in shares of the distance, has no inverse to speak of.
+_TOO_WIDE = 0.85
+# Regions at once: fewer cost more calls, more do not fit the cache.
+_AT_ONCE = 512
+
+Ring = list[tuple[float, float]]
+
+
+def region_outline(enu: Tensor, covariance: Tensor, share: float = REGION_SHARE, *, plain: bool = False) -> Tensor:
+    """Outlines of the horizontal regions that contain the true positions with a probability of `share`.
+
+    The ellipse is drawn where errors are Gaussian, in X / |X|² of the horizontal position, and carried back.
+
+    Args:
+        enu: (..., 3) meters from the left camera.
+        covariance: (..., 3, 3) to first order.
+        share: probability.
+        plain: ellipses in meters: of lines of sight from several places.
+
+    Returns:
+        (..., 72, 2) east, north in meters, counterclockwise.
+
+    Example:
+        >>> spread = torch.diag(torch.tensor([0.1, 200.0, 0.1], dtype=torch.float64) ** 2)
+        >>> outline = region_outline(torch.tensor([0.0, 5000.0, 0.0]), spread)
+        >>> outline[:, 1].min().round().item(), outline[:, 1].max().round().item()
+        (4554.0, 5543.0)
+    """
+    return torch.stack(_level_outline(enu[..., :2].double(), covariance[..., :2, :2].double(), share, plain), -1)
+
+
+def _level_outline(place: Tensor, spread: Tensor, share: float, plain: bool = False) -> tuple[Tensor, Tensor]:
+    """East and north (..., 72) each: one by one they take a third of the time. `plain`: ellipses in meters."""
+    squared = place.square().sum(-1)
+    some = torch.where(squared > 0, squared, 1.0)
+    reach = math.sqrt(-2.0 * math.log(1.0 - share))
+    along = (place * (spread @ place[..., None])[..., 0]).sum(-1)
+    wide = (squared == 0) | (reach * along.sqrt() > _TOO_WIDE * squared) | plain
+    still = torch.eye(2, dtype=torch.float64)
+    slope = (still - 2.0 * place[..., :, None] * place[..., None, :] / some[..., None, None]) / some[..., None, None]
+    root = _covariance_root(torch.where(wide[..., None, None], spread, slope @ spread @ slope.mT))
+    middle = torch.where(wide[..., None], place, place / some[..., None])
+    # The inversion turns the sense of rotation, and the root may.
+    clockwise = (torch.linalg.det(root) > 0) != wide
+    angle = torch.linspace(0, 2 * math.pi, _RING_POINTS + 1, dtype=torch.float64)[:-1]
+    cosine, sine = reach * torch.stack([angle, angle.flip(0)]).cos(), reach * torch.stack([angle, angle.flip(0)]).sin()
+    cosine, sine = cosine[clockwise.long()], sine[clockwise.long()]
+    east = middle[..., :1] + root[..., :1, 0] * cosine + root[..., :1, 1] * sine
+    north = middle[..., 1:] + root[..., 1:, 0] * cosine + root[..., 1:, 1] * sine
+    length = torch.where(wide[..., None], 1.0, (east * east + north * north).clamp_min(1e-300))
+    return east / length, north / length
+
+
+def _covariance_root(matrix: Tensor) -> Tensor:
+    values, vectors = torch.linalg.eigh(matrix)
+    return vectors * values.clamp_min(0.0).sqrt()[..., None, :]
+
+
+def region_rings(located: Located) -> list[Ring]:
+    """The ring of each position: (latitude, longitude), closed, counterclockwise, longitudes without a jump."""
+    blocks = ring_blocks(located.columns, located.origin, plain=located.feet is not None)
+    return [[(lat, lon) for lat, lon in ring] for block in blocks for ring in block.tolist()]
+
+
+def ring_blocks(columns: PositionColumns, origin: Origin, *, plain: bool = False) -> Iterator[NDArray[np.float64]]:
+    """The rings (M, 73, 2) of those rows that have a position, some rows at a time.
+
+    Only lines of sight from one place skew a region; `plain` ones are ellipses.
+    """
+    upper = NUMBERS.index("cov_ee_m2") + np.array([[0, 1], [1, 3]])
+    rotation, translation = anchor(origin)
+    located = torch.from_numpy(columns.numbers[columns.located])
+    # Splitting no rows gives one part, of no rows.
+    for part in located.split(_AT_ONCE) if len(located) else ():
+        east, north, up, lon_of_point = (part[:, NUMBERS.index(name)] for name in ("east_m", "north_m", "up_m", "lon"))
+        outline = _level_outline(torch.stack([east, north], -1), part[:, upper], REGION_SHARE, plain)
+        x, y, z = (
+            row[0] * outline[0] + row[1] * outline[1] + (row[2] * up[:, None] + offset)
+            for row, offset in zip(rotation, translation, strict=True)
+        )
+        lat, lon = latitude_longitude(x, y, z)
+        lon = lon + 360.0 * torch.round((lon_of_point[:, None] - lon) / 360.0)
+        yield torch.stack([torch.cat([value, value[:, :1]], 1) for value in (lat, lon)], -1).numpy()
+
+
+def near(lon: float, other: float) -> float:
+    """The longitude by which `lon` lies less than half a turn from `other`: beyond ±180 across the antimeridian."""
+    return lon + 360.0 * round((other - lon) / 360.0)
+
+
+def cut_at_antimeridian(ring: Sequence[tuple[float, float]]) -> list[Ring]:
+    """A ring whose longitudes run beyond ±180 as one or two rings within ±180 (RFC 7946, section 3.1.9)."""
+    edge = 180.0 if max(lon for _, lon in ring) > 180.0 else -180.0
+    sides = []
+    for outer in (False, True):
+        kept: Ring = []
+        for (lat0, lon0), (lat1, lon1) in itertools.pairwise(ring):
+            out0, out1 = abs(lon0) > 180.0, abs(lon1) > 180.0
+            if out0 == outer:
+                kept.append((lat0, lon0))
+            if out0 != out1:
+                share = (edge - lon0) / (lon1 - lon0)
+                kept.append((lat0 + share * (lat1 - lat0), edge))
+        if kept:
+            turn = -math.copysign(360.0, edge) if outer else 0.0
+            kept = [(lat, lon + turn) for lat, lon in kept]
+            sides.append([*kept, kept[0]])
+    return sides
+
+
+# Places and fields of view as a map draws them: latitude and longitude, computed on the ellipsoid.
+
+_RIM_POINTS = 60
+
+
+def map_places(enu: Tensor, origin: Origin) -> Ring:
+    """Latitude and longitude in degrees of places (N, 3) in meters east, north, up of the origin.
+
+    Longitudes lie within half a turn of the origin's: beyond ±180 across the antimeridian.
+
+    Example:
+        >>> lat, lon = map_places(torch.tensor([[0.0, 0.0, 0.0]]), Origin(lat=19.0, lon=72.9, height=0.0))[0]
+        >>> round(lat, 9), round(lon, 9)
+        (19.0, 72.9)
+    """
+    geodetic = enu_to_geodetic(enu.detach().cpu().double(), origin).tolist()
+    return [(lat, near(lon, origin.lon)) for lat, lon, _ in geodetic]
+
+
+def camera_place(camera: Viewpoint, origin: Origin) -> tuple[float, float]:
+    """Latitude and longitude in degrees of a camera, its longitude within half a turn of the origin's."""
+    return camera.geodetic[0], near(camera.geodetic[1], origin.lon)
+
+
+def level_rim(foot: tuple[float, float, float], azimuths_deg: Tensor, reach: float) -> Tensor:
+    """Places (N, 3) in meters east, north, up at a distance from a foot, in directions clockwise from north."""
+    angle = torch.deg2rad(azimuths_deg)
+    rim = torch.stack([angle.sin(), angle.cos(), torch.zeros_like(angle)], -1) * reach
+    return rim + torch.tensor(foot, dtype=torch.float64)
+
+
+def field_azimuths(camera: Viewpoint, count: int = _RIM_POINTS) -> Tensor | None:
+    """Azimuths (count,) in degrees from the left end of a camera's field of view to its right end, without a jump.
+
+    None if the lens model has no ray there.
+    """
+    if camera.azimuths_deg is None:
+        return None
+    first, last = camera.azimuths_deg
+    return torch.linspace(first, first + (last - first) % 360, count, dtype=torch.float64)
+
+
+def field_of_view(camera: Viewpoint, origin: Origin, reach: float) -> Ring | None:
+    """Outline of what a camera sees, up to a distance in meters: its foot and an arc; None if it is not known."""
+    sweep = field_azimuths(camera)
+    if sweep is None:
+        return None
+    foot = torch.tensor([camera.enu], dtype=torch.float64)
+    return map_places(torch.cat([foot, level_rim(camera.enu, sweep, reach)]), origin)
+
+
+# Compare positions with the truth where it is known.
+
+
+def read_truth(path: str | Path, located: Located) -> Tensor:
+    r"""True positions (N, 3) east, north, up of the left camera for the located points by name; NaN where unknown.
+
+    Args:
+        path: a CSV with name,lat,lon,height or name,east,north,up (of the left camera), other columns as a survey has.
+        located: what they are compared with.
+
+    Raises:
+        FileError: see `kcal.locate.survey.read_survey`.
+        InputError: no name is in both.
+
+    Example:
+        >>> import tempfile
+        >>> from kcal import locate_points
+        >>> from kcal.rig import planned_rig
+        >>> left, right, _ = planned_rig()(torch.tensor([[0.0, 0.0, 1000.0]]))
+        >>> located = locate_points(planned_rig(), left, right, names=["mast"], heading_deg=0.0,
+        ...                         origin=Origin(lat=19.07, lon=72.87, height=14.0))
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = Path(folder, "truth.csv").write_text("name,east,north,up\nmast,1,1000,0\n")
+        ...     read_truth(Path(folder, "truth.csv"), located).tolist()
+        [[1.0, 1000.0, 0.0]]
+    """
+    here = Origin(lat=located.origin.lat, lon=located.origin.lon, height=located.origin.height)
+    survey = read_survey(path, here, measured=False)
+    index = {name: i for i, name in enumerate(survey.names)}
+    names = [position.name for position in located.positions]
+    if not any(name in index for name in names):
+        raise InputError(f"{path}: none of its names ({', '.join(survey.names[:3])} ...) is among the points")
+    nowhere = torch.full((3,), math.nan, dtype=torch.float64)
+    return torch.stack([survey.points[index[name]] if name in index else nowhere for name in names])
+
+
+def position_errors(located: Located, truth: Tensor) -> list[tuple[float, float, bool] | None]:
+    """The error of each position; None where position or truth is unknown.
+
+    Returns:
+        for each position its horizontal distance from the truth and its range minus the true one (meters), and whether
+        the range interval contains the true range.
+
+    Example:
+        >>> from kcal import Camera, StereoRig, locate_points
+        >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
+        >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
+        >>> found = locate_points(rig, torch.tensor([[960.0, 540.0]]), torch.tensor([[944.0, 540.0]]),
+        ...                origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
+        >>> [round(value, 6) for value in position_errors(found, torch.tensor([[3.0, 996.0, 0.0]]).double())[0][:1]]
+        [5.0]
+    """
+    truth = as_points("truth", truth, 3)
+    if truth.ndim != 2 or len(truth) != len(located.positions):
+        raise InputError(f"truth: shape ({len(located.positions)}, 3) is needed, got {tuple(truth.shape)}")
+    out: list[tuple[float, float, bool] | None] = []
+    for position, true in zip(located.positions, truth, strict=True):
+        if position.enu is None or position.range_m is None or not bool(torch.isfinite(true).all()):
+            out.append(None)
+            continue
+        east, north, _ = (torch.tensor(position.enu, dtype=torch.float64) - true).tolist()
+        away = float(torch.linalg.vector_norm(true))
+        low, high = position.range_low_m or 0.0, position.range_high_m or math.inf
+        out.append((math.hypot(east, north), position.range_m - away, low <= away <= high))
+    return out
+
+
+@torch.no_grad()
+def interval_coverage(localize: StereoLocalizer, left: Tensor, right: Tensor, ranges: Tensor) -> float:
+    """The share of pairs whose 95 % range interval contains the true range.
+
+    Args:
+        localize: what locates them.
+        left: (N, 2) marks in the left image.
+        right: (N, 2) in the right one.
+        ranges: (N,) true ranges, meters.
+
+    Example:
+        >>> from kcal.rig import planned_rig
+        >>> points = torch.tensor([[0.0, 0.0, 500.0], [9.0, 0.0, 800.0], [0.0, 9.0, 900.0]]).double()
+        >>> localize = StereoLocalizer(planned_rig(), origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
+        >>> round(interval_coverage(localize, *planned_rig()(points)[:2], torch.tensor([500.0, 2000.0, 900.0])), 3)
+        0.667
+    """
+    found = localize(left, right)
+    return float(((found.range_low <= ranges) & (ranges <= found.range_high)).double().mean())

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from kcal.errors import FileError, InputError, with_extra
 from kcal.files import read_head, read_text
-from kcal.locate.ellipsoid import mean_radius
+from kcal.locate.geodesy import mean_radius
 
 # Of a raster, 1.6 GB as they are kept.
 _MOST_CELLS = 200_000_000

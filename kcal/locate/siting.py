@@ -1,27 +1,142 @@
-"""Where to put the next camera: a map of errors and coverage over an area, and the best of candidate sites.
-
-A camera knows the direction to a thing, off by its marks, its attitude, its position and by refraction. Directions of
-several cameras are added as information; what no camera knows is the size of the area. The measure of a set of sites is
-the mean variance of level positions over the area (A-optimality), which covers hidden parts before it refines others.
-"""
+"""Where to put cameras: what they see of a terrain, how well they locate it, and tables of it."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from kcal.errors import InputError
+from kcal.errors import FileError, InputError
 from kcal.lens.camera import Camera
+from kcal.lens.camera_rig import CameraRig
 from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA, Origin
-from kcal.locate.ellipsoid import ecef_from_enu_rotation, mean_radius
-from kcal.locate.geodesy import anchor, enu_from_cam, geodetic_to_enu
+from kcal.locate.geodesy import anchor, ecef_from_enu_rotation, enu_from_cam, geodetic_to_enu, mean_radius, place_enu
 from kcal.locate.ground import Ground
-from kcal.locate.viewshed import GroundSurface, eye_height, seen_over, surface_of
+from kcal.locate.multi_localizer import errors_by_camera
+from kcal.locate.stations import station_mounting
+from kcal.locate.tables import TableRow, read_rows
+from kcal.locate.views import CommonErrors, PosedCameras, shared_pixels
+
+# What the ground hides: lines of sight over a surface of heights, with the Earth's curve and bent light.
+
+# Samples of the ground, and along the rays of one place: beyond, the steps get coarser.
+_MOST_SAMPLES = 16_000_000
+# Where the ground is, from a point on the tangent plane: each step leaves a thousandth.
+_STEPS = 2
+
+
+class GroundSurface(NamedTuple):
+    """Ground in the axes east, north, up of an origin, on a grid of equal steps.
+
+    Attributes:
+        up: (rows, columns) meters up of the tangent plane, NaN where the ground is not known.
+        corner: east and north of `up[0, 0]`, meters.
+        step: meters.
+        below: (rows, columns) meters above the ellipsoid.
+    """
+
+    up: Tensor
+    corner: tuple[float, float]
+    step: float
+    below: Tensor
+
+    def at(self, east: Tensor, north: Tensor, heights: bool = False) -> Tensor:
+        """`up` (or heights above the ellipsoid) between the points of the grid; NaN outside."""
+        rows, columns = self.up.shape
+        x = 2.0 * (east - self.corner[0]) / (self.step * (columns - 1)) - 1.0
+        y = 2.0 * (north - self.corner[1]) / (self.step * (rows - 1)) - 1.0
+        table = (self.below if heights else self.up)[None, None]
+        found = torch.nn.functional.grid_sample(table, torch.stack([x, y], -1).reshape(1, 1, -1, 2), align_corners=True)
+        inside = (x.abs() <= 1.0) & (y.abs() <= 1.0)
+        return torch.where(inside, found.reshape(x.shape), math.nan)
+
+
+def surface_of(ground: Ground, origin: Origin, low: Tensor, high: Tensor, step: float) -> GroundSurface:
+    """Sample ground over a rectangle.
+
+    Args:
+        ground: from `kcal.locate.level_ground` or `terrain`.
+        origin: of the axes.
+        low: (2,) east and north of its southwestern corner, meters.
+        high: (2,) of its northeastern corner.
+        step: meters between samples; larger where there would be more than 16 million.
+
+    Example:
+        >>> from kcal.locate.ground import level_ground
+        >>> there = Origin(lat=45.0, lon=6.0, height=0.0)
+        >>> sea = surface_of(level_ground(0.0), there, torch.tensor([-9e3, -9e3]), torch.tensor([9e3, 9e3]), 1e3)
+        >>> sea.at(torch.tensor([0.0, 8000.0]).double(), torch.zeros(2).double()).round(decimals=1).abs().tolist()
+        [0.0, 5.0]
+    """
+    span = (high - low).double()
+    step = max(step, math.sqrt(float(span.prod()) / _MOST_SAMPLES))
+    columns, rows = (math.ceil(float(side) / step) + 1 for side in span)
+    east = float(low[0]) + step * torch.arange(columns, dtype=torch.float64)
+    north = float(low[1]) + step * torch.arange(rows, dtype=torch.float64)
+    y, x = torch.meshgrid(north, east, indexing="ij")
+    up, place = torch.zeros_like(x), anchor(origin)
+    for _ in range(_STEPS):
+        lat, lon, height = place_enu(torch.stack([x, y, up], -1), *place).unbind(-1)
+        below = ground(lat, lon)
+        up = torch.where(below.isfinite(), up + below - height, up)
+    return GroundSurface(torch.where(below.isfinite(), up, math.nan), (float(low[0]), float(low[1])), step, below)
+
+
+@torch.no_grad()
+def seen_over(surface: GroundSurface, eye: Tensor, points: Tensor, bending: float) -> Tensor:
+    """(N,) whether points are seen from an eye over the ground; unknown ground hides nothing.
+
+    The highest slope up to each distance is found along rays in all directions, as far apart as the grid's points;
+    a point is compared with the nearest ray, up to one step before it.
+
+    Args:
+        surface: the ground.
+        eye: (3,) east, north, up, meters.
+        points: (N, 3).
+        bending: k / 2R, 1/m: light from the level distance d comes from bending · d² too high.
+    """
+    away = points[:, :2] - eye[:2]
+    distance = torch.linalg.vector_norm(away, dim=-1)
+    farthest = float(distance.nan_to_num().max())
+    step = max(surface.step, math.sqrt(2.0 * math.pi / _MOST_SAMPLES) * farthest)
+    if farthest <= step:
+        return torch.ones_like(distance, dtype=torch.bool)
+    rays = math.ceil(2.0 * math.pi * farthest / step)
+    angle = 2.0 * math.pi / rays * torch.arange(rays, dtype=torch.float64)
+    reach = step * torch.arange(1, int(farthest / step) + 1, dtype=torch.float64)
+    up = surface.at(eye[0] + angle.sin()[:, None] * reach, eye[1] + angle.cos()[:, None] * reach)
+    slope = ((up - eye[2]) / reach + bending * reach).nan_to_num(nan=-math.inf, neginf=-math.inf)
+    highest = slope.cummax(-1).values
+    known = distance.isfinite()
+    way = torch.where(known, torch.atan2(away[:, 0], away[:, 1]), 0.0)
+    ray = (way * (rays / (2.0 * math.pi))).round().long() % rays
+    before = (torch.where(known, distance, 0.0) / step).long() - 2
+    own = (points[:, 2] - eye[2]) / distance.clamp_min(1e-9) + bending * distance
+    horizon = highest[ray, before.clamp(0, len(reach) - 1)]
+    return known & ((before < 0) | (own >= horizon))
+
+
+def eye_height(surface: GroundSurface, name: str, eye: Tensor) -> None:
+    """Raise `InputError` if an eye (3,) is below the ground."""
+    ground = float(surface.at(eye[:1], eye[1:2])[0])
+    if float(eye[2]) < ground:
+        raise InputError(
+            f"site {name}: it stands {ground - float(eye[2]):.1f} m below the ground of the terrain; is its height "
+            "above the ellipsoid, as the terrain's is? A column mast (meters above the ground) needs no height"
+        )
+
+
+# Where to put the next camera: a map of errors and coverage over an area, and the best of candidate sites.
+#
+# A camera knows the direction to a thing, off by its marks, its attitude, its position and by refraction. Directions of
+# several cameras are added as information; what no camera knows is the size of the area. The measure of a set of sites
+# is the mean variance of level positions over the area (A-optimality), which covers hidden parts before it refines
+# others.
 
 # Headings that are tried for a candidate that does not look all around and has none.
 _HEADINGS = 36
@@ -367,3 +482,129 @@ def _checked_weights(area: Area, weights: Tensor | None) -> Tensor:
     if weights.shape != known.shape or not bool((weights[known] >= 0).all()) or not float(weights[known].sum()) > 0:
         raise InputError(f"weights: {tuple(known.shape)} of them are needed, none negative and not all zero")
     return weights[known] / weights[known].sum()
+
+
+# Sites from a table, and from a rig of stations with what is known of it.
+
+_HEADER = "name,lat,lon,height"
+_COLUMNS = (
+    "name", "lat", "lon", "height", "mast", "heading", "field", "sigma", "elevation_sigma", "position_sigma", "reach",
+)  # fmt: skip
+# Pixels along each axis at which a rig's directions are judged.
+_PLACES = 7
+# Meters: so far away that errors of positions do not count.
+_FAR = 1e8
+
+
+def read_sites(path: str | Path, ground: Ground | None = None) -> list[Site]:
+    r"""Read `name,lat,lon,height` and, if they are there, the other columns of a `Site`.
+
+    These are heading, field, sigma and elevation_sigma (degrees), position_sigma and reach (meters); empty cells are as
+    in `Site`. In place of height (of the camera, above the ellipsoid) there may be mast: meters above the ground.
+
+    Raises:
+        FileError: see `kcal.locate.read_marks`; a height and a mast, or neither; a mast where no ground is known.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder, "sites.csv")
+        ...     _ = path.write_text("name,lat,lon,height,heading,field\nmill,45,6,812,90,60\n")
+        ...     site = read_sites(path)[0]
+        >>> site.name, site.heading_deg, site.field_deg
+        ('mill', 90.0, 60.0)
+    """
+    return [_table_site(row, ground) for row in read_rows(path, _HEADER, _COLUMNS, ("name", "lat", "lon"))]
+
+
+def _table_site(row: TableRow, ground: Ground | None) -> Site:
+    stated = {column: row.number(column) for column in _COLUMNS[1:] if row.cells.get(column)}
+    if ("height" in stated) == ("mast" in stated):
+        raise FileError(
+            f"{row.where}: {row.name!r} needs a height (of the camera, above the ellipsoid) or a mast (above the "
+            "ground), and one of them only"
+        )
+    lat, lon = row.number("lat"), row.number("lon")
+    if "mast" in stated:
+        below = math.nan if ground is None else float(ground(*torch.tensor([[lat], [lon]], dtype=torch.float64)))
+        if not math.isfinite(below):
+            why = "no terrain was given" if ground is None else "the terrain has no height there"
+            raise FileError(f"{row.where}: {row.name!r} has a mast, and {why}; write its height")
+        stated["height"] = below + stated["mast"]
+    names = {
+        "heading": "heading_deg", "field": "field_deg", "sigma": "sigma_deg", "reach": "reach_m",
+        "elevation_sigma": "elevation_sigma_deg", "position_sigma": "position_m",
+    }  # fmt: skip
+    more = {names[column]: value for column, value in stated.items() if column in names}
+    try:
+        origin = Origin(lat=lat, lon=lon, height=stated["height"])
+        return Site(name=row.name, origin=origin, **more)  # type: ignore[arg-type]
+    except InputError as error:
+        raise FileError(f"{row.where}: {error}") from error
+
+
+@torch.no_grad()
+def sites_of(rig: CameraRig, pixel_sigma: float = 0.3) -> list[Site]:
+    """The cameras of a rig as sites, with what is known of lens and attitude together, half-way over the image.
+
+    What errors of several cameras have in common is not part of it: `MultiViewLocalizer` knows it.
+
+    Args:
+        rig: with an origin.
+        pixel_sigma: of a mark along each axis, px.
+
+    Raises:
+        InputError: a rig without an origin.
+
+    Example:
+        >>> from kcal import Camera
+        >>> from kcal.locate import enu_from_cam
+        >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
+        >>> rig = CameraRig([camera], ["mill"], enu_from_cam(90.0).T[None], torch.zeros(1, 3),
+        ...                 origin=Origin(lat=45.0, lon=6.0, height=812.0))
+        >>> rig.root = rig.with_errors(attitude_deg=(0.01, 0.01, 0.2))
+        >>> site = sites_of(rig, pixel_sigma=1.0)[0]
+        >>> round(site.heading_deg), round(site.sigma_deg, 2), round(site.elevation_sigma_deg, 2)
+        (90, 0.2, 0.04)
+    """
+    sites = []
+    for c, (name, camera) in enumerate(zip(rig.names, rig.each, strict=True)):
+        stands = station_mounting(rig, c)
+        width, height = camera.size
+        across, down = (
+            torch.linspace(0.25, 0.75, _PLACES, dtype=torch.float64) * (side - 1) for side in (width, height)
+        )
+        pixels = torch.cartesian_prod(across, down)
+        rays, valid = camera.unproject(pixels)
+        pixels, rays = pixels[valid], rays[valid]
+        # Degrees that a pixel is wide and high there.
+        steps = [
+            torch.rad2deg((camera.unproject(pixels + step)[0] - rays).norm(dim=-1)) for step in torch.eye(2).double()
+        ]
+        spread = torch.full((len(rays), 2), pixel_sigma**2, dtype=torch.float64)
+        position = 0.0
+        if rig.root is not None:
+            position = float((stands.covariance[:2, :2].trace() / 2).sqrt()) if stands.covariance is not None else 0.0
+            alone = CameraRig([camera], [name], rig.rotation[c : c + 1], rig.center[c : c + 1], refraction=0.0)
+            first = sum(rig.sizes[:c])
+            columns = torch.cat([rig.root[:, first : first + rig.sizes[c]], rig.root[:, rig.pose_columns(c)]], 1)
+            root = torch.nn.functional.pad(columns, (0, 1))
+            half, bending, lens = errors_by_camera(alone, root)
+            if half is not None and bending is not None:
+                spread = spread + _common_variance(alone, CommonErrors(lens, half, bending), rays @ rig.rotation[c])
+        sigma = [float((spread[:, axis].sqrt() * steps[axis]).median()) for axis in (0, 1)]
+        sites.append(Site(
+            name=name, origin=stands.origin, heading_deg=stands.heading_deg, pitch_deg=stands.pitch_deg,
+            roll_deg=stands.roll_deg, camera=camera, sigma_deg=sigma[0], elevation_sigma_deg=sigma[1],
+            position_m=position,
+        ))  # fmt: skip
+    return sites
+
+
+def _common_variance(alone: CameraRig, common: CommonErrors, rays: Tensor) -> Tensor:
+    """(N, 2) variance that common errors of one camera give its pixels of things far away, in px²."""
+    posed = PosedCameras(alone.each, alone.rotation, alone.center)
+    used = torch.ones(len(rays), 1, dtype=torch.bool)
+    place, inverse = alone.center.expand(len(rays), 3), torch.full((len(rays),), 1.0 / _FAR, dtype=torch.float64)
+    moved = shared_pixels(posed, common, (place, rays, inverse), used, posed.scale)
+    return moved.square().sum(0).T

@@ -1,26 +1,32 @@
-"""Read what was surveyed or is known of the surroundings of a rig from CSV files into its local frame.
-
-Latitudes and longitudes go through Earth-centered coordinates, so that the Earth's curvature is included; heights are
-above the WGS84 ellipsoid. Local meters are east, north, up of the same origin.
-"""
+"""Surveyed landmarks and marks of them: the survey, its files, and tables of marks of many views."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+import xml.etree.ElementTree
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from kcal.calibrate.rig.sources import Features, Landmarks, MeasuredPosition, inverse_range_beyond
 from kcal.errors import FileError, InputError
+from kcal.files import read_text
 from kcal.lens.mounting import Origin
 from kcal.locate.geodesy import geodetic_to_enu
-from kcal.locate.marks import PIXELS, Marks, pixel_of
-from kcal.locate.tables import TableRow, guarded, read_rows
+from kcal.locate.marks import PIXELS, Marks, pixel_of, read_marks
+from kcal.locate.tables import DistinctKeys, Doubled, TableChunk, TableRow, guarded, header_of, read_chunks, read_rows
+from kcal.strict_json import MOST_BYTES, read_json, read_xml
 from kcal.texts import brief, csv_line
+
+# Read what was surveyed or is known of the surroundings of a rig from CSV files into its local frame.
+#
+# Latitudes and longitudes go through Earth-centered coordinates, so that the Earth's curvature is included; heights are
+# above the WGS84 ellipsoid. Local meters are east, north, up of the same origin.
 
 EARTH, LOCAL = ("lat", "lon", "height"), ("east", "north", "up")
 FEATURE_COLUMNS = ("name", *PIXELS, "range", "range_sigma", "beyond", "note")
@@ -236,4 +242,367 @@ def camera_positions(survey: Survey, cameras: Sequence[str]) -> tuple[MeasuredPo
     return tuple(
         MeasuredPosition(camera=numbers[name], point=point, sigma=sigma)
         for name, point, sigma in zip(survey.names, survey.points, survey.sigma, strict=True)
+    )
+
+
+# Read surveyed places from GeoJSON and GPX, which state no accuracy: it must be given.
+#
+# GeoJSON (RFC 7946): Point features `[longitude, latitude, height]`, heights above the WGS84 ellipsoid, `name` and,
+# optionally, `sigma` and `sigma_up` among the properties. GPX: waypoints with `name` and `ele`, which is above sea
+# level unless its writer says otherwise, so a geoid's height must be given.
+
+
+class _Place(NamedTuple):
+    name: str
+    origin: Origin
+    sigma: tuple[float, float] | None
+
+
+def import_survey(
+    path: str | Path, origin: Origin | None = None, *, sigma: float | None = None, geoid: float | None = None
+) -> Survey:
+    r"""Read surveyed places from `.geojson`, `.json` or `.gpx`; any other file is read as CSV by `read_survey`.
+
+    Args:
+        path: of the file.
+        origin: of the frame; the first place if left out.
+        sigma: standard deviation along each axis in meters, where the file states none.
+        geoid: height of the geoid above the WGS84 ellipsoid in meters, which is added to the elevations of a GPX file.
+
+    Raises:
+        FileError: it cannot be read, or a place without name, height or accuracy; the place is named.
+        InputError: a GPX file without `geoid`.
+
+    Example:
+        >>> import json, tempfile
+        >>> place = {"type": "Feature", "properties": {"name": "mast", "sigma": 0.02},
+        ...          "geometry": {"type": "Point", "coordinates": [72.87, 19.07, 14.0]}}
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder, "survey.geojson")
+        ...     _ = path.write_text(json.dumps({"type": "FeatureCollection", "features": [place]}))
+        ...     survey = import_survey(path)
+        >>> survey.names, survey.origin
+        (('mast',), Origin(lat=19.07, lon=72.87, height=14.0))
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in (".geojson", ".json", ".gpx"):
+        return read_survey(path, origin)
+    if suffix == ".gpx" and geoid is None:
+        raise InputError(
+            f"{path}: elevations of GPX are above sea level; give the geoid's height there (0 if they are ellipsoidal)"
+        )
+    try:
+        text = read_text(path, MOST_BYTES)
+        if suffix == ".gpx":
+            places = _from_gpx(read_xml(text, str(path)), geoid or 0.0)
+        else:
+            places = _from_geojson(read_json(text.encode(), str(path)))
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
+        raise FileError(f"{path}: bad survey: {error}") from error
+    if not places:
+        raise FileError(f"{path}: no places")
+    names = [place.name for place in places]
+    for name, count in Counter(names).items():
+        if count > 1:
+            raise FileError(f"{path}: the name {name!r} occurs twice; names must differ")
+    spreads = [_spread(place, sigma, path) for place in places]
+    origin = origin or places[0].origin
+    geodetic = torch.tensor([[p.origin.lat, p.origin.lon, p.origin.height] for p in places], dtype=torch.float64)
+    return Survey(tuple(names), geodetic_to_enu(geodetic, origin), torch.tensor(spreads, dtype=torch.float64), origin)
+
+
+def _spread(place: _Place, sigma: float | None, path: Path) -> tuple[float, float, float]:
+    level, up = place.sigma or (sigma, sigma)
+    if level is None or up is None:
+        raise FileError(f"{path}: {place.name!r} has no sigma; say how well the places are known, meters")
+    if not (0 < level < math.inf and 0 < up < math.inf):
+        raise FileError(f"{path}: the sigma of {place.name!r} is {level}, {up}; positive meters are needed")
+    return level, level, up
+
+
+def _from_geojson(content: Any) -> list[_Place]:
+    if content.get("crs"):
+        raise ValueError("it has a member crs; RFC 7946 allows WGS84 longitude and latitude only")
+    places = []
+    for number, feature in enumerate(content["features"], 1):
+        properties = feature.get("properties") or {}
+        name = str(properties.get("name") or feature.get("id") or number)
+        geometry = feature["geometry"]
+        if geometry["type"] != "Point":
+            raise ValueError(f"{name}: a {geometry['type']}; points are needed")
+        position = _position_in(geometry["coordinates"], name)
+        places.append(_Place(name, _origin(name, *position), _stated(properties, name)))
+    return places
+
+
+def _position_in(coordinates: Sequence[Any], name: str) -> tuple[float, float, float]:
+    if len(coordinates) != 3:
+        raise ValueError(f"{name}: [longitude, latitude, height] are needed, got {len(coordinates)} numbers")
+    lon, lat, height = (_stated_number(value, f"a coordinate of {name!r}") for value in coordinates)
+    return lat, lon, height
+
+
+def _origin(name: str, lat: float, lon: float, height: float) -> Origin:
+    try:
+        return Origin(lat=lat, lon=lon, height=height)
+    except InputError as error:
+        raise ValueError(f"{name}: {str(error).removeprefix('origin: ')}") from None
+
+
+def _stated(properties: dict[str, Any], name: str) -> tuple[float, float] | None:
+    if properties.get("sigma") in (None, ""):
+        return None
+    level = _stated_number(properties["sigma"], f"the sigma of {name!r}")
+    up = properties.get("sigma_up")
+    return level, level if up in (None, "") else _stated_number(up, f"the sigma_up of {name!r}")
+
+
+def _stated_number(value: Any, what: str) -> float:
+    """A number, also one that a program has written as a text."""
+    try:
+        if isinstance(value, int | float | str) and not isinstance(value, bool):
+            return float(value)
+    except ValueError:
+        pass
+    raise ValueError(f"{what} is {value!r:.40}; a number is needed")
+
+
+def _from_gpx(root: xml.etree.ElementTree.Element, geoid: float) -> list[_Place]:
+    places = []
+    for number, element in enumerate(root.iter(), 1):
+        if element.tag.rpartition("}")[2] != "wpt":
+            continue
+        parts = {child.tag.rpartition("}")[2]: (child.text or "").strip() for child in element}
+        name = parts.get("name") or str(number)
+        if not parts.get("ele"):
+            raise ValueError(f"{name}: no elevation (ele)")
+        height = float(parts["ele"]) + geoid
+        places.append(
+            _Place(name, _origin(name, float(element.attrib["lat"]), float(element.attrib["lon"]), height), None)
+        )
+    return places
+
+
+# Read marks of any number of cameras: long tables with one line for each thing that each camera saw.
+
+_LONG = ("name", "camera", "u", "v")
+_HEADER = ",".join(_LONG)
+_KNOWN = (*_LONG, "time", "sigma", "note")
+_RANGES = ("range", "range_sigma", "beyond")
+# Bytes of a table that is read whole: some 500,000 lines.
+_WHOLE = 1 << 24
+
+
+class ViewMarks(NamedTuple):
+    """What several cameras saw.
+
+    Attributes:
+        names: one for each row; with the moment where a thing was seen at several.
+        pixels: (N, C, 2) float64; NaN where a camera has no mark.
+        sigma: (N, C) px as the table states it; NaN where it does not.
+        extras: `time`, where the table has it, and other columns, as in the first line of each.
+    """
+
+    names: tuple[str, ...]
+    pixels: Tensor
+    sigma: Tensor
+    extras: dict[str, list[str]]
+
+    def sigmas(self, default: float) -> Tensor:
+        """(N, C) px, `default` where none is stated."""
+        return torch.where(self.sigma.isfinite(), self.sigma, default)
+
+    def __repr__(self) -> str:
+        return brief(self)
+
+
+def is_long(path: str | Path) -> bool:
+    """Whether a table has a column `camera`."""
+    return "camera" in header_of(path)
+
+
+def read_views(path: str | Path, cameras: Sequence[str], *, ranges: bool = False, others: bool = False) -> ViewMarks:
+    r"""Read `name,camera,u,v` and, if they are there, `time` (seconds or text), `sigma` (px) and `note`.
+
+    Lines of one name, and one time, belong together; a camera is named once for each. The table of pairs
+    (`name,left_u,left_v,right_u,right_v`) is read too, where there are two cameras.
+
+    Args:
+        path: of the file.
+        cameras: their names, in the order of the result.
+        ranges: accept the columns range, range_sigma and beyond, and no others; otherwise any are kept.
+        others: skip marks of other cameras, where they are otherwise an error.
+
+    Raises:
+        FileError: a camera that is not there, two marks of one thing in one camera; the line is named.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder, "marks.csv")
+        ...     _ = path.write_text("name,camera,u,v\nmast,a,10,20\nmill,b,5,6\nmast,c,30,40\n")
+        ...     views = read_views(path, ("a", "b", "c"))
+        >>> views.names, views.pixels[0, :, 0].tolist()
+        (('mast', 'mill'), [10.0, nan, 30.0])
+    """
+    if not is_long(path):
+        if len(cameras) != 2:
+            raise FileError(f"{path}: marks of {len(cameras)} cameras need the columns {_HEADER}, one line each")
+        pairs = read_marks(path, single=True)
+        return ViewMarks(pairs.names, pairs.pixels, pairs.sigmas(math.nan), {})
+    reader = _Gather(cameras, others)
+    more: list[str] = []
+    for chunk in _view_chunks(path, ranges):
+        more = [column for column in chunk.columns if column not in _KNOWN]
+        for row in chunk.rows():
+            reader.add(row)
+    if not reader.first:
+        raise FileError(f"{path}: no mark of {', '.join(cameras)}; the column camera needs its file's name")
+    return reader.marks(more)
+
+
+def read_view_chunks(path: str | Path, cameras: Sequence[str]) -> Iterator[tuple[ViewMarks, int]]:
+    """The same for a table that may be longer than memory: some things at a time, and how many bytes were read.
+
+    Tables of up to 16 MB are read whole, in any order of their lines. In longer ones the lines of one thing, and one
+    time, stand together; names come with their time, if there is one.
+
+    Raises:
+        FileError: as `read_views`; a thing whose lines do not stand together.
+    """
+    path = Path(path)
+    if not is_long(path) or path.stat().st_size <= _WHOLE:
+        yield read_views(path, cameras, others=False), path.stat().st_size
+        return
+    reader, more = _Gather(cameras), list[str]()
+    open_key: tuple[str, str] | None = None
+    with closing(DistinctKeys(path, lambda: _things(path))) as earlier:
+        for chunk in _view_chunks(path, False):
+            more = [column for column in chunk.columns if column not in _KNOWN]
+            for row in chunk.rows():
+                key = row.name, row.cells.get("time", "")
+                if key != open_key and key in reader.rows:
+                    raise FileError(_not_together(row.where, row.name))
+                reader.add(row)
+                open_key = key
+            # The last thing may go on.
+            done, reader = reader, _Gather(cameras)
+            if open_key is not None:
+                done.move(open_key, reader)
+            if done.first:
+                _refuse_apart(path, earlier.add(done.rows))
+                yield done.marks(more, timed=True), chunk.bytes_read
+        _refuse_apart(path, earlier.add(reader.rows))
+        _refuse_apart(path, earlier.finish())
+    yield reader.marks(more, timed=True), path.stat().st_size
+
+
+def _refuse_apart(path: Path, found: Doubled | None) -> None:
+    if found is not None:
+        raise FileError(_not_together(f"{path}: line {found.again}", found.key[0]))
+
+
+def _not_together(where: str, name: str) -> str:
+    return (
+        f"{where}: lines of {name!r} stand at several places; in a table this long they must stand together: "
+        "sort it by name and time"
+    )
+
+
+def _things(path: Path) -> Iterator[tuple[tuple[str, str], int]]:
+    """Name and time of each thing, and the first of its lines that stand together."""
+    last = None
+    for chunk in _view_chunks(path, False):
+        times = chunk.columns.get("time", [""] * len(chunk.names))
+        for name, time, line in zip(chunk.names, times, chunk.lines, strict=True):
+            if (name, time) != last:
+                last = name, time
+                yield last, line
+
+
+def _view_chunks(path: str | Path, ranges: bool) -> Iterator[TableChunk]:
+    known = (*_KNOWN, *(_RANGES if ranges else ()))
+    return read_chunks(path, _HEADER, known, _LONG, extras=not ranges, unique=False)
+
+
+class _Gather:
+    """Lines of one thing at one time, put together into rows."""
+
+    def __init__(self, cameras: Sequence[str], others: bool = False) -> None:
+        self.number: Mapping[str, int] = {name: c for c, name in enumerate(cameras)}
+        self.others, self.cameras = others, cameras
+        self.rows: dict[tuple[str, str], int] = {}
+        self.placed: dict[tuple[int, int], tuple[float, float, float]] = {}
+        self.first: list[TableRow] = []
+
+    def add(self, row: TableRow) -> None:
+        camera = row.cells["camera"]
+        if camera not in self.number:
+            if self.others:
+                return
+            raise FileError(f"{row.where}: no camera is named {camera!r}; they are {', '.join(self.cameras)}")
+        key = row.name, row.cells.get("time", "")
+        place = self.rows.setdefault(key, len(self.rows)), self.number[camera]
+        if place[0] == len(self.first):
+            self.first.append(row)
+        if place in self.placed:
+            raise FileError(f"{row.where}: {row.name!r} was marked in {camera} before; one mark each is needed")
+        sigma = row.positive("sigma") or math.nan
+        self.placed[place] = row.number("u", "a pixel coordinate"), row.number("v", "a pixel coordinate"), sigma
+
+    def move(self, key: tuple[str, str], other: _Gather) -> None:
+        """Take the last thing away, and give it to another."""
+        last = self.rows.pop(key)
+        other.rows[key], other.first = 0, [self.first.pop()]
+        for camera in range(len(self.cameras)):
+            if (found := self.placed.pop((last, camera), None)) is not None:
+                other.placed[0, camera] = found
+
+    def marks(self, more: Sequence[str], timed: bool = False) -> ViewMarks:
+        table = torch.full((len(self.rows), len(self.cameras), 3), math.nan, dtype=torch.float64)
+        if self.placed:
+            at, values = torch.tensor(list(self.placed)), torch.tensor(list(self.placed.values()), dtype=torch.float64)
+            table[at[:, 0], at[:, 1]] = values
+        times = [time for _, time in self.rows]
+        names = [name for name, _ in self.rows]
+        several = {name for name, count in Counter(names).items() if timed or count > 1} if any(times) else set()
+        extras = {column: [row.cells[column] for row in self.first] for column in more}
+        if any(times):
+            extras = {"time": times, **extras}
+        return ViewMarks(
+            tuple(f"{name} {time}" if name in several else name for name, time in self.rows), table[..., :2],
+            table[..., 2], extras,
+        )  # fmt: skip
+
+
+def match_views(survey: Survey, views: ViewMarks, pixel_sigma: float) -> MarkedLandmarks:
+    """Match surveyed places and marks by name; see `kcal.rig.match_landmarks`.
+
+    Raises:
+        InputError: no name is in both.
+    """
+    return marked_places(survey, views.names, views.pixels, views.sigmas(pixel_sigma))
+
+
+def read_feature_views(path: str | Path, cameras: Sequence[str], pixel_sigma: float) -> Features:
+    """Things of unknown position, seen by any two or more cameras; their ranges as in `kcal.rig.read_features`.
+
+    Raises:
+        FileError: see `read_views`.
+    """
+    views = read_views(path, cameras, ranges=True)
+    count = len(views.names)
+    cells = {column: views.extras.get(column, [""] * count) for column in _RANGES}
+    rows = [
+        TableRow(f"{path}: {name}", name, {column: cells[column][i] for column in _RANGES})
+        for i, name in enumerate(views.names)
+    ]
+    known = torch.tensor([inverse_range_of(row) for row in rows], dtype=torch.float64).reshape(-1, 2)
+    return Features(
+        names=views.names,
+        pixels=views.pixels,
+        inverse_range=known[:, 0],
+        inverse_range_sigma=known[:, 1],
+        pixel_sigma=pixel_sigma,
     )

@@ -1,4 +1,4 @@
-"""Comma-separated tables with named rows, read strictly: an error names the line and what to write there."""
+"""Tables of marks, survey and positions: their columns, their keys, and how they are read."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ import itertools
 import math
 import os
 import re
-from collections.abc import Iterable, Iterator, Sequence
+import sys
+import tempfile
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from io import TextIOWrapper
 from operator import methodcaller
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 import orjson
@@ -22,7 +24,215 @@ from numpy.typing import NDArray
 from kcal.dispatch import CHUNK
 from kcal.errors import FileError
 from kcal.files import read_head
-from kcal.locate.distinct_keys import DistinctKeys, Doubled
+from kcal.texts import brief
+
+# Located pairs column by column: what files and tables are made of, without an object for each row.
+
+# The numbers of a position, in the order of the columns of a file. Covariances are of east, north, up.
+NUMBERS = (
+    "lat", "lon", "height_ellipsoidal_m", "geoid_height_m", "east_m", "north_m", "up_m",
+    "range_m", "range_low_m", "range_high_m",
+    "cov_ee_m2", "cov_en_m2", "cov_eu_m2", "cov_nn_m2", "cov_nu_m2", "cov_uu_m2",
+    "cep50_m", "cep95_m", "range_m_per_px", "range_m_per_deg_yaw", "azimuth_deg", "elevation_deg",
+    "reprojection_left_px", "reprojection_right_px",
+)  # fmt: skip
+# Columns of a file before the numbers.
+TEXTS = ("name", "status", "reason")
+_LARGEST = sys.float_info.max
+
+
+class PositionColumns(NamedTuple):
+    """Located pairs, column by column.
+
+    Attributes:
+        names: one for each pair.
+        status: (N,) codes of `PositionStatus`.
+        reasons: empty, or why there is no position, or a warning.
+        numbers: (N, 24) float64, the columns `NUMBERS`; NaN where unknown, and `range_high_m` may be infinite.
+        extras: the cells of further columns of the table of marks, by name.
+    """
+
+    names: Sequence[str]
+    status: NDArray[np.int8]
+    reasons: Sequence[str]
+    numbers: NDArray[np.float64]
+    extras: dict[str, list[str]]
+
+    def column(self, name: str) -> NDArray[np.float64]:
+        """(N,) one of the numbers."""
+        return self.numbers[:, NUMBERS.index(name)]
+
+    def rows(self, which: NDArray[np.intp]) -> PositionColumns:
+        """Some of the pairs."""
+        places = which.tolist()
+        return PositionColumns(
+            [self.names[i] for i in places],
+            self.status[which],
+            [self.reasons[i] for i in places],
+            self.numbers[which],
+            {name: [cells[i] for i in places] for name, cells in self.extras.items()},
+        )
+
+    def pieces(self, size: int) -> Iterator[PositionColumns]:
+        """The same rows in turn, `size` at a time."""
+        for start in range(0, len(self.names), size):
+            part = slice(start, start + size)
+            extras = {name: cells[part] for name, cells in self.extras.items()}
+            yield PositionColumns(self.names[part], self.status[part], self.reasons[part], self.numbers[part], extras)
+
+    @classmethod
+    def joined(cls, parts: Sequence[PositionColumns]) -> PositionColumns:
+        """The rows of some columns, one after the other, with the further columns of the first."""
+        if not parts:
+            return cls((), np.zeros(0, np.int8), (), np.zeros((0, len(NUMBERS))), {})
+        names, status, reasons, numbers, extras = zip(*parts, strict=True)
+        return cls(
+            [*itertools.chain(*names)], np.concatenate(status), [*itertools.chain(*reasons)], np.concatenate(numbers),
+            {name: [*itertools.chain(*(each[name] for each in extras))] for name in extras[0]},
+        )  # fmt: skip
+
+    @property
+    def located(self) -> NDArray[np.bool_]:
+        """(N,) which pairs have a position."""
+        return np.isfinite(self.numbers[:, 0])
+
+    def __repr__(self) -> str:
+        return brief(self)
+
+
+def number_lines(values: NDArray[np.float64]) -> list[str]:
+    """Each row (K numbers) as text with commas between; every digit of a float64, nothing for NaN, `inf`.
+
+    Example:
+        >>> number_lines(np.array([[1.0, np.nan], [0.1, np.inf]]))
+        ['1.0,', '0.1,inf']
+    """
+    if len(values) == 0:
+        return []
+    # JSON has neither NaN, which becomes null, nor infinity: the largest float stands for it meanwhile.
+    infinite = np.isinf(values)
+    some = bool(infinite.any())
+    finite = np.ascontiguousarray(np.where(infinite, _LARGEST, values) if some else values)
+    text = orjson.dumps(finite, option=orjson.OPT_SERIALIZE_NUMPY)
+    # Without the letters of null, which no number has.
+    text = text[2:-2].translate(None, b"nul")
+    text = text.replace(orjson.dumps(_LARGEST), b"inf") if some else text
+    return text.decode().split("],[")
+
+
+# Keys of a table of any length that must differ, checked in constant memory.
+
+# Hashes in memory (8 MB), and the parts in which those on the disk are compared: of 10⁸ keys, 1 MB each.
+_IN_MEMORY, _PARTS = 1 << 20, 1 << 10
+_EDGES = np.arange(1 - _PARTS // 2, _PARTS // 2, dtype=np.int64) << 54
+# Equal hashes that are looked up in the table at once. Unlike keys with equal hashes are far fewer.
+_AT_ONCE = 1 << 16
+
+
+class Doubled(NamedTuple):
+    """A key that was used before, and the lines of its first and its second use."""
+
+    key: Any
+    first: int
+    again: int
+
+
+class DistinctKeys:
+    """Finds a key that comes twice: at once if few came since, in `finish` if it is far from its first use.
+
+    Eight bytes are kept for each key, its hash: the latest million in memory, the others sorted in a temporary file.
+    Whether keys with equal hashes are really equal, the table says, which is read again up to there.
+
+    Args:
+        path: of the table, for messages.
+        walk: reads it from the beginning: each key and its line.
+
+    Example:
+        >>> names = DistinctKeys(Path("marks.csv"), lambda: [("a", 2), ("b", 3), ("a", 4)])
+        >>> names.add(["a", "b"]), names.add(["a"])
+        (None, Doubled(key='a', first=2, again=4))
+    """
+
+    def __init__(self, path: Path, walk: Callable[[], Iterable[tuple[Hashable, int]]]) -> None:
+        self._path, self._walk = path, walk
+        self._latest = np.empty(0, np.int64)
+        self._file: IO[bytes] | None = None
+        self._starts: list[NDArray[np.int64]] = []  # of the parts of each sorted run in the file
+
+    def add(self, keys: Collection[Hashable]) -> Doubled | None:
+        """Take the next keys; one that was used before among the latest.
+
+        Raises:
+            FileError: no room on the disk.
+        """
+        hashes = np.fromiter(map(hash, keys), np.int64, len(keys))
+        # Almost sorted, which the stable sort makes use of.
+        self._latest = np.sort(np.concatenate([self._latest, hashes]), kind="stable")
+        twice = self._latest[1:][self._latest[1:] == self._latest[:-1]]
+        if len(twice):
+            if found := self._really(twice):
+                return found
+            self._latest = np.unique(self._latest)
+        if len(self._latest) >= _IN_MEMORY:
+            self._put_away()
+        return None
+
+    def finish(self) -> Doubled | None:
+        """A key that was used twice, of all that came.
+
+        Raises:
+            FileError: no room on the disk.
+        """
+        if self._file is None:
+            return None
+        self._put_away()
+        suspects = np.empty(0, np.int64)
+        for part in range(_PARTS):
+            hashes = np.sort(np.concatenate([self._stored(starts[part : part + 2]) for starts in self._starts]))
+            suspects = np.union1d(suspects, hashes[1:][hashes[1:] == hashes[:-1]])
+            if len(suspects) > _AT_ONCE:
+                break
+        return self._really(suspects) if len(suspects) else None
+
+    def close(self) -> None:
+        """Remove the temporary file."""
+        if self._file is not None:
+            self._file.close()
+
+    def _really(self, suspects: NDArray[np.int64]) -> Doubled | None:
+        wanted = frozenset(suspects.tolist())
+        lines: dict[Hashable, int] = {}
+        for key, line in self._walk():
+            if hash(key) in wanted:
+                if key in lines:
+                    return Doubled(key, lines[key], line)
+                lines[key] = line
+        return None
+
+    def _put_away(self) -> None:
+        try:
+            if self._file is None:
+                self._file = tempfile.TemporaryFile()  # noqa: SIM115
+            start = self._file.seek(0, 2) // 8
+            self._file.write(self._latest.data)
+            self._file.flush()
+        except OSError as error:
+            raise FileError(
+                f"{self._path}: to find names that are used twice, 8 bytes for each are kept in "
+                f"{tempfile.gettempdir()}: {error.strerror or error}; set TMPDIR to a folder with more room"
+            ) from error
+        edges = np.searchsorted(self._latest, _EDGES)
+        self._starts.append(np.concatenate([[start], start + edges, [start + len(self._latest)]]))
+        self._latest = self._latest[:0]
+
+    def _stored(self, span: NDArray[np.int64]) -> NDArray[np.int64]:
+        assert self._file is not None
+        first, end = span.tolist()
+        self._file.seek(8 * first)
+        return np.frombuffer(self._file.read(8 * (end - first)), np.int64)
+
+
+# Comma-separated tables with named rows, read strictly: an error names the line and what to write there.
 
 # The pieces in which the localizer does many points: a table is located as in one call, to the last bit.
 CHUNK_ROWS = CHUNK

@@ -15,7 +15,7 @@ from starlette.routing import Route
 from kcal.corners.point import enlarge
 from kcal.mark.items import ACTION, Mark, Side
 from kcal.mark.marking_service import Desk
-from kcal.web.gate import json_body, local_app, page_files
+from kcal.web.serving import json_body, local_app, page_files
 
 _Coordinate = Annotated[float, pydantic.Field(allow_inf_nan=False, ge=-1e6, le=1e6)]
 _Number = Annotated[int, pydantic.Field(ge=0, le=10_000_000)]

@@ -11,9 +11,9 @@ import av
 from av.container import InputContainer
 
 from kcal.errors import FileError
+from kcal.files import source_name
 from kcal.pipeline.stream import CALENDAR
 from kcal.pipeline.video_frames import TimedFrame, check_size, decoded, open_video
-from kcal.sources import source_name
 
 # Seconds before the first and the last attempts to connect again.
 _FIRST_WAIT, _LAST_WAIT = 1.0, 30.0

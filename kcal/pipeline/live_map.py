@@ -20,13 +20,10 @@ from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
 
-from kcal.locate.columns import PositionColumns
-from kcal.locate.map_places import camera_place, field_of_view
-from kcal.locate.positions import Located
-from kcal.locate.region import CORNER_DECIMALS, near, ring_blocks
-from kcal.quantities import length_text
-from kcal.web.gate import local_app, page_files
-from kcal.web.serving import LocalServer
+from kcal.locate.positions import CORNER_DECIMALS, Located, camera_place, field_of_view, near, ring_blocks
+from kcal.locate.tables import PositionColumns
+from kcal.texts import length_text
+from kcal.web.serving import LocalServer, local_app, page_files
 
 # Seconds between looks for news, between signs of life while there is none, and for which the end waits for pages.
 _POLL, _ALIVE, _FAREWELL = 0.1, 10.0, 3.0

@@ -8,11 +8,11 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 from kcal.errors import FileError, InputError
+from kcal.files import is_stream, source_name
 from kcal.pipeline.frame_pairs import frames_together, paired_by_time
 from kcal.pipeline.handover import Handover
 from kcal.pipeline.live_frames import live_frames
 from kcal.pipeline.video_frames import TimedFrame, file_frames
-from kcal.sources import is_stream, source_name
 
 # Seconds of the first frame, and what each camera has.
 Together = tuple[float, list[TimedFrame | None]]

@@ -17,10 +17,9 @@ from typing import Any, Protocol
 from urllib.parse import urlsplit
 
 from kcal.errors import InputError, with_extra
-from kcal.locate.columns import PositionColumns
-from kcal.locate.cot import cot_events
-from kcal.locate.geojson import point_features
+from kcal.locate.export import cot_events, point_features
 from kcal.locate.positions import Located
+from kcal.locate.tables import PositionColumns
 
 _EVENT = re.compile(r" <event.*?</event>\n", re.DOTALL)
 # Seconds: a receiver that does not answer must not stop the stream, and is tried again after a while; a broker has some

@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from kcal.errors import FileError, InputError
-from kcal.locate.columns import PositionColumns
 from kcal.locate.export import APPENDED, appended
 from kcal.locate.positions import Located
+from kcal.locate.tables import PositionColumns
 from kcal.pipeline.handover import Handover
 from kcal.pipeline.lines import Moment
 from kcal.pipeline.moment_order import MOST_SECONDS, MomentOrder, Released

@@ -16,8 +16,7 @@ from typing import Any, BinaryIO, NamedTuple
 import orjson
 
 from kcal.errors import FileError
-from kcal.file_lock import FileLock
-from kcal.files import read_bytes, write_atomic
+from kcal.files import FileLock, read_bytes, write_atomic
 
 
 class StreamPlace(NamedTuple):

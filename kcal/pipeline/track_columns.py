@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 
 from kcal.lens.camera_rig import CameraRig
-from kcal.locate.columns import PositionColumns
 from kcal.locate.localizer import Localization
 from kcal.locate.station_positions import own_axes
 from kcal.locate.stereo import PositionStatus
+from kcal.locate.tables import PositionColumns
 from kcal.locate.tabulate import number_table
 from kcal.pipeline.estimates import TrackStates
 from kcal.pipeline.track_options import Tracks

@@ -14,9 +14,8 @@ from torch import Tensor
 
 from kcal.calibrate.camera.misfit import Misfit
 from kcal.lens.difference import CameraDifference
-from kcal.report.colors import INK
 from kcal.report.difference_text import difference_text
-from kcal.report.figures import draw_arrows, frame_image, new_figure, save_picture, wrapped
+from kcal.report.figures import INK, draw_arrows, frame_image, new_figure, save_picture, wrapped
 
 # Arrows per row of the picture, at most.
 _ARROWS = 17

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from kcal.lens.difference import CameraDifference
-from kcal.quantities import length_text, number_text, range_text
+from kcal.texts import length_text, number_text, range_text
 
 
 def difference_text(found: CameraDifference) -> list[str]:

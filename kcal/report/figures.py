@@ -24,6 +24,12 @@ from numpy.typing import ArrayLike, NDArray
 from kcal.files import check_picture, write_atomic
 from kcal.texts import visible
 
+INK, GRAY, FAINT, ACCENT, WARN = "#111827", "#4b5563", "#9aa3af", "#2b6cb0", "#c02a6b"
+CAMERA_COLORS = ("#2b6cb0", "#dd7a1f", "#0f766e", "#7c3aed")
+
+
+# Shared parts of all pictures: colors, axes of an image, magnified arrows, and PNG or SVG files written whole.
+
 # White around text that lies on lines.
 HALO = [patheffects.withStroke(linewidth=2.5, foreground="white")]
 

@@ -1,4 +1,4 @@
-"""Draw located points: a map with a logarithmic range scale, and the range intervals side by side."""
+"""Pictures of located points, of stations that locate them, and of a budget of ranges."""
 
 from __future__ import annotations
 
@@ -7,18 +7,34 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.locate.positions import Located, Position
+from kcal.locate.budget import RangeError
+from kcal.locate.positions import Located, Position, field_azimuths, region_outline
 from kcal.locate.stereo import PositionStatus
-from kcal.quantities import Unit, length_text, range_text
-from kcal.report.colors import CAMERA_COLORS, FAINT, GRAY, INK, WARN
-from kcal.report.figures import HALO, draw_north, field_outline, new_figure, save_picture
+from kcal.report.figures import (
+    CAMERA_COLORS,
+    FAINT,
+    GRAY,
+    HALO,
+    INK,
+    WARN,
+    draw_north,
+    field_outline,
+    new_figure,
+    plain_number,
+    save_picture,
+)
 from kcal.report.tables import range_sigma, range_unit
+from kcal.texts import Unit, length_text, range_text
+
+# Draw located points: a map with a logarithmic range scale, and the range intervals side by side.
 
 Array = NDArray[np.float64]
 
@@ -315,3 +331,133 @@ def _interval_footer(located: Located) -> str:
     if len(failed) > 3:
         lines.append(f"and {len(failed) - 3} more")
     return "\n".join(lines)
+
+
+# A plan of stations: towers with what they see, positions with their 95 % ellipses, bearings of single cameras.
+
+# Of the larger side of what is shown: how far fields of view and bearings are drawn.
+_REACH = 0.9
+
+
+def stations_figure(located: Located, truth: Tensor | None = None) -> Figure:
+    """Draw a plan, kilometers east and north of the origin.
+
+    Args:
+        located: from `kcal.locate.station_positions.locate_views`.
+        truth: (N, 3) true east, north, up in meters, NaN where unknown.
+    """
+    figure = new_figure(8.0, 7.0)
+    axes = figure.add_subplot()
+    towers = torch.tensor([camera.enu[:2] for camera in located.cameras], dtype=torch.float64)
+    found = located.enu[located.enu.isfinite().all(-1)]
+    shown = torch.cat([towers, found[:, :2]])
+    reach = _REACH * max(float((shown.amax(0) - shown.amin(0)).amax()), 1.0)
+    for number, camera in enumerate(located.cameras):
+        x, y = (value / 1e3 for value in camera.enu[:2])
+        sweep = field_azimuths(camera)
+        if sweep is not None:
+            angle = torch.deg2rad(sweep)
+            east, north = x + reach / 1e3 * angle.sin(), y + reach / 1e3 * angle.cos()
+            axes.fill([x, *east.tolist()], [y, *north.tolist()], color=f"C{number % 10}", alpha=0.10, linewidth=0)
+        axes.plot([x], [y], "^", color=f"C{number % 10}", markersize=9)
+        axes.annotate(camera.name, (x, y), xytext=(6, 6), textcoords="offset points")
+    feet = torch.zeros(len(located.positions), 3) if located.feet is None else located.feet
+    for position, foot in zip(located.positions, feet.tolist(), strict=True):
+        if position.enu is not None and position.covariance is not None:
+            center, spread = torch.tensor(position.enu).double(), torch.tensor(position.covariance).double()
+            ring = region_outline(center, spread, plain=True) / 1e3
+            axes.fill(ring[:, 0], ring[:, 1], facecolor="none", edgecolor="black", linewidth=1.2)
+            axes.plot([position.enu[0] / 1e3], [position.enu[1] / 1e3], "k.", markersize=4)
+            axes.annotate(
+                position.name, (position.enu[0] / 1e3, position.enu[1] / 1e3), xytext=(5, -11),
+                textcoords="offset points", fontsize="small",
+            )  # fmt: skip
+        elif position.azimuth_deg is not None and position.status == PositionStatus.BEARING_ONLY:
+            way = math.radians(position.azimuth_deg)
+            ends = [foot[0], foot[0] + reach * math.sin(way)], [foot[1], foot[1] + reach * math.cos(way)]
+            axes.plot(*([value / 1e3 for value in end] for end in ends), "--", color="gray", linewidth=1)
+    if truth is not None:
+        known = truth[truth.isfinite().all(-1)] / 1e3
+        axes.plot(known[:, 0], known[:, 1], "r+", markersize=8)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel("km east")
+    axes.set_ylabel("km north")
+    axes.set_title(f"{located.count_note}; outlines: 95 % regions", fontsize="medium")
+    return figure
+
+
+def save_stations_picture(path: str | Path, located: Located, truth: Tensor | None = None) -> Path:
+    """Write the plan to a .png or .svg file.
+
+    Raises:
+        InputError: another suffix.
+        FileError: the file cannot be written.
+    """
+    return save_picture(path, stations_figure(located, truth))
+
+
+# Draw a depth budget: range errors against range, on logarithmic scales.
+
+_SOURCE_COLORS = {"disparity": "#2b6cb0", "yaw": "#c02a6b", "baseline": "#4b5563", "timing": "#dd7a1f"}
+
+
+def plotted_ranges(distances: Sequence[float]) -> Tensor:
+    """(121,) ranges for a plot, evenly spaced on a logarithmic scale from the nearest to the farthest.
+
+    Raises:
+        InputError: fewer than two distances.
+
+    Example:
+        >>> plotted_ranges([100.0, 10000.0])[[0, 60, 120]].tolist()
+        [100.0, 1000.0, 10000.0]
+    """
+    if len(distances) < 2:
+        raise InputError("distances: a plot needs at least two")
+    near, far = min(distances), max(distances)
+    # The ends themselves, which rounding of the logarithm may push out of view.
+    return torch.logspace(math.log10(near), math.log10(far), 121, dtype=torch.float64).clamp(near, far)
+
+
+def budget_figure(distances: Tensor, found: dict[str, RangeError], labels: dict[str, str]) -> Figure:
+    """Draw lines for each source: outward error solid, inward dotted, first order thin and dashed.
+
+    Args:
+        distances: (D,) meters.
+        found: errors by source, from `range_errors`.
+        labels: source -> text in the legend.
+    """
+    figure = new_figure(8.6, 6.0)
+    axes = figure.add_subplot()
+    far = distances.numpy()
+    for name, error in found.items():
+        color = _SOURCE_COLORS.get(name, "#111827")
+        outward = error.farther.clone()
+        # Infinite errors are not drawn: the line leaves the picture there.
+        outward[~outward.isfinite()] = float("nan")
+        axes.plot(far, outward.numpy(), color=color, linewidth=2.0, label=labels.get(name, name))
+        axes.plot(far, error.nearer.abs().numpy(), color=color, linewidth=1.4, linestyle=":")
+        axes.plot(far, error.first_order.numpy(), color=color, linewidth=0.8, linestyle=(0, (6, 4)), alpha=0.8)
+    axes.plot([], [], color="#6b7280", linewidth=1.4, linestyle=":", label="inward")
+    axes.plot([], [], color="#6b7280", linewidth=0.8, linestyle=(0, (6, 4)), label="first order")
+    axes.set(xscale="log", yscale="log", xlim=(far.min(), far.max()), xlabel="range, m", ylabel="error of the range, m")
+    low = min(float(error.nearer.abs()[error.nearer.abs() > 0].min()) for error in found.values())
+    axes.set_ylim(max(low, 1e-4), float(far.max()) * 2)
+    for axis in (axes.xaxis, axes.yaxis):
+        low, high = axis.get_view_interval()
+        axis.set_major_formatter(plain_number)
+        axis.set_minor_formatter(NullFormatter() if high > 10 * low else plain_number)
+    axes.grid(which="major", color="#e5e7eb", linewidth=0.8)
+    axes.grid(which="minor", color="#f3f4f6", linewidth=0.5)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, fontsize=9, loc="upper left")
+    axes.set_title("Range error by source: outward, inward, and to first order", fontsize=11, color="#374151")
+    figure.subplots_adjust(left=0.1, right=0.98, top=0.94, bottom=0.09)
+    return figure
+
+
+def save_budget_picture(
+    path: str | Path, distances: Tensor, found: dict[str, RangeError], labels: dict[str, str]
+) -> Path:
+    """Write a picture of range errors over the distance as PNG or SVG; see `budget_figure`."""
+    return save_picture(path, budget_figure(distances, found, labels))

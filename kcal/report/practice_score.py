@@ -22,9 +22,9 @@ from kcal.lens.camera import Camera
 from kcal.lens.mounting import Origin
 from kcal.lens.pose import nearest_rotation
 from kcal.lens.rig import StereoRig
+from kcal.locate.budget import range_sigmas
 from kcal.locate.geodesy import geodetic_to_enu
 from kcal.locate.localizer import StereoLocalizer
-from kcal.locate.range_sigmas import range_sigmas
 
 Floats = NDArray[np.float64]
 _FAR = 5000.0  # meters, at which errors of lenses are told
@@ -55,7 +55,7 @@ def score_lens(camera: Camera, truth: dict[str, Any], baseline: float) -> LensSc
 
     Args:
         camera: calibrated.
-        truth: of one camera, see `kcal.sim.practice_truth`.
+        truth: of one camera, see `kcal.sim.practice`.
         baseline: meters.
 
     Raises:

@@ -1,9 +1,11 @@
-"""A picture of a solved rig: the site from above, and how well each source and each item agrees with the rest."""
+"""Pictures of a solved rig, of what tells its attitude, and of its attitude over time."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +18,26 @@ from numpy.typing import NDArray
 from kcal.calibrate.rig.result import ItemResidual, RigResult
 from kcal.lens.camera import Camera
 from kcal.locate.tabulate import middle_row_ends
-from kcal.quantities import length_text, measured_length, range_text
-from kcal.report.colors import CAMERA_COLORS, FAINT, WARN
-from kcal.report.figures import HALO, draw_north, field_outline, new_figure, save_picture, wrapped
+from kcal.report.figures import (
+    ACCENT,
+    CAMERA_COLORS,
+    FAINT,
+    HALO,
+    INK,
+    WARN,
+    draw_arrows,
+    draw_north,
+    field_outline,
+    frame_image,
+    new_figure,
+    save_picture,
+    wrapped,
+)
+from kcal.skyline.attitude import SkylineAttitude
+from kcal.texts import length_text, measured_length, range_text
 from kcal.threads import in_one_thread
+
+# A picture of a solved rig: the site from above, and how well each source and each item agrees with the rest.
 
 Array = NDArray[np.float64]
 
@@ -230,3 +248,197 @@ def _footer(result: RigResult) -> str:
         parts.append(f"{source.source}: {', '.join(values)}, {source.sigmas:.2f} sigma")
     texts = ["   ".join(parts), *(f"{item.label}: {item.reason}" for item in result.left_out[:2])]
     return "\n".join(line for text in texts for line in wrapped(text, 12.6, 9.0))
+
+
+# Draw a night image with the names of its stars, and the residuals of all of them as magnified arrows.
+
+# Names of more stars would cover each other.
+_MOST_NAMES = 30
+# Share of the width from which on names stand to the left of their stars.
+_NEAR_EDGE = 0.92
+# px over which the sky's brightness hardly changes.
+_BLOCK = 64
+
+
+def stars_figure(
+    image: NDArray[Any],
+    pixels: NDArray[np.float64],
+    names: Sequence[str],
+    residual: NDArray[np.float64],
+    title: str = "",
+) -> Figure:
+    """Draw the stars (N, 2) over the image (H, W), its gray levels turned over; the first stars get their names.
+
+    Args:
+        image: gray levels.
+        pixels: (N, 2) stars, the brightest first.
+        names: of each; empty for stars without one.
+        residual: (N, 2) projected minus seen; NaN for those.
+        title: the line above.
+    """
+    height, width = image.shape
+    figure = new_figure(9.0, 9.0 * height / width + 0.9)
+    axes = figure.add_axes((0.07, 0.07, 0.91, 0.86))
+    # Turned over: stars are dark on a bright sky, so that marks and names can be read.
+    axes.imshow(-_above_sky(image), cmap="gray", vmin=-30.0, vmax=2.0, interpolation="nearest")
+    frame_image(axes, (width, height))
+    known = np.array([bool(name) for name in names], bool)
+    axes.plot(*pixels[~known].T, "x", color=WARN, markersize=4, label=f"{int((~known).sum())} without a name")
+    axes.plot(
+        *pixels[known].T, "o", markersize=9, markerfacecolor="none", color=ACCENT, label=f"{int(known.sum())} named"
+    )
+    for place, name in [(at, name) for at, name in zip(pixels, names, strict=True) if name][:_MOST_NAMES]:
+        beside = (7, "left") if place[0] < _NEAR_EDGE * width else (-7, "right")
+        axes.annotate(name, place, (beside[0], -3), textcoords="offset points", fontsize=7, color=INK, ha=beside[1])
+    if known.any():
+        longest = max(float(np.linalg.norm(residual[known], axis=1).max()), 1e-3)
+        scale = draw_arrows(axes, pixels[known], residual[known], 0.04 * width / longest, color=WARN, width=0.0015)
+        axes.set_title(f"{title}  arrows: residuals x {scale:g}".strip(), fontsize=9, color=INK, loc="left")
+    axes.legend(loc="lower right", fontsize=8)
+    return figure
+
+
+def _above_sky(image: NDArray[Any]) -> NDArray[np.float64]:
+    """(H, W) gray levels above the sky, whose brightness changes slowly over the image, in units of its noise."""
+    levels = image.astype(np.float64)
+    sky = levels
+    for axis in (0, 1):
+        parts = np.array_split(sky, max(1, image.shape[axis] // _BLOCK), axis)
+        places = np.cumsum([0, *(part.shape[axis] for part in parts)])
+        middles = 0.5 * (places[:-1] + places[1:] - 1)
+        medians = np.stack([np.median(part, axis) for part in parts], axis)
+        sky = np.apply_along_axis(partial(_interpolated, middles, int(places[-1])), axis, medians)
+    above = levels - sky
+    return above / max(1.4826 * float(np.median(np.abs(above))), 1e-9)
+
+
+def _interpolated(places: NDArray[np.float64], count: int, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.interp(np.arange(count), places, values)
+
+
+def save_stars_picture(
+    path: str | Path,
+    image: NDArray[Any],
+    pixels: NDArray[np.float64],
+    names: Sequence[str],
+    residual: NDArray[np.float64],
+    title: str = "",
+) -> Path:
+    """Write a picture of named stars over a night image as PNG or SVG; see `stars_figure`."""
+    return save_picture(path, stars_figure(image, pixels, names, residual, title))
+
+
+# Draw the skyline of a terrain raster over an image, and how far the image's own is from it.
+
+# Images that are drawn at most; inches of one.
+_MOST, _WIDTH = 6, 9.0
+
+
+def skyline_figure(images: Sequence[tuple[str, NDArray[Any]]], found: Sequence[SkylineAttitude]) -> Figure:
+    """Draw each image with the raster's skyline over it, and below what is left of it in the columns.
+
+    Args:
+        images: name and gray levels (H, W) of each.
+        found: the attitude from each.
+    """
+    shown = list(zip(images, found, strict=True))[:_MOST]
+    # The band around the skyline is what there is to see.
+    bands = [_band(image.shape[0], one) for (_, image), one in shown]
+    sizes = [
+        0.92 * _WIDTH * (high - low) / image.shape[1] for ((_, image), _), (low, high) in zip(shown, bands, strict=True)
+    ]
+    total = sum(sizes) + 2.3 * len(shown)
+    figure = new_figure(_WIDTH, total)
+    top = 1.0
+    for ((name, image), one), (low, high), size in zip(shown, bands, sizes, strict=True):
+        width = image.shape[1]
+        axes = figure.add_axes((0.07, top - (0.4 + size) / total, 0.91, size / total))
+        below = figure.add_axes((0.07, top - (0.7 + size + 1.1) / total, 0.91, 1.1 / total))
+        top -= (2.3 + size) / total
+        axes.imshow(image, cmap="gray", interpolation="nearest")
+        frame_image(axes, (width, image.shape[0]))
+        axes.set_ylim(high - 0.5, low - 0.5)
+        axes.set_xlabel("")
+        column = np.arange(width)
+        axes.plot(column, one.expected, color=ACCENT, linewidth=1.0, label="raster")
+        left_out = one.border.clear & ~one.used
+        axes.plot(column[left_out], one.border.row[left_out], ".", color=WARN, markersize=2, label="image, left out")
+        axes.legend(loc="lower right", fontsize=7)
+        heading, pitch, roll = one.sigma_deg
+        axes.set_title(
+            f"{name}: heading {one.heading_deg:.3f} ± {heading:.3f}°, pitch {one.pitch_deg:.3f} ± {pitch:.3f}°, roll "
+            f"{one.roll_deg:.3f} ± {roll:.3f}°",
+            fontsize=9, color=INK, loc="left",
+        )  # fmt: skip
+        off = one.expected - one.border.row
+        below.plot(column, np.where(one.used, off, np.nan), ".", color=ACCENT, markersize=2)
+        below.plot(column, np.where(left_out, off, np.nan), ".", color=WARN, markersize=2)
+        below.axhline(0.0, color=INK, linewidth=0.5)
+        most = float(np.nanquantile(np.abs(off[one.used]), 0.99)) * 1.6
+        below.set(xlim=(-0.5, width - 0.5), ylim=(-most, most))
+        below.set_xlabel("u, pixels", fontsize=7)
+        below.set_ylabel("image above\nraster, px", fontsize=7)
+        below.tick_params(labelsize=7)
+    return figure
+
+
+def _band(height: int, found: SkylineAttitude) -> tuple[int, int]:
+    rows = np.concatenate([found.expected[np.isfinite(found.expected)], found.border.row[found.border.clear]])
+    beside = max(0.08 * height, 20.0)
+    return max(int(rows.min() - beside), 0), min(int(rows.max() + beside), height)
+
+
+def save_skyline_picture(
+    path: str | Path, images: Sequence[tuple[str, NDArray[Any]]], found: Sequence[SkylineAttitude]
+) -> Path:
+    """Write a picture of skylines as PNG or SVG; see `skyline_figure`."""
+    return save_picture(path, skyline_figure(images, found))
+
+
+# Draw the attitude of a watched rig over time, with its 95 % bands.
+
+_ANGLES = ("pitch", "yaw", "roll")
+_SPANS = ((86400.0 * 3, 86400.0, "days"), (7200.0, 3600.0, "hours"), (0.0, 60.0, "minutes"))
+
+
+def attitude_figure(
+    time: NDArray[np.float64],
+    angle: NDArray[np.float64],
+    sigma: NDArray[np.float64],
+    seen: NDArray[np.bool_],
+    limit: float,
+    title: str = "",
+) -> Figure:
+    """Draw pitch, yaw and roll of the right camera against the left one, each in its own axes.
+
+    Args:
+        time: (T,) seconds.
+        angle: (T, 3) degrees.
+        sigma: (T, 3) degrees.
+        seen: (T,) looks at which both cameras saw something.
+        limit: degrees of the alarm.
+        title: the line above.
+    """
+    span = float(time[-1] - time[0]) if len(time) else 0.0
+    unit, word = next((unit, word) for least, unit, word in _SPANS if span >= least)
+    along = (time - (time[0] if len(time) else 0.0)) / unit
+    figure = new_figure(9.0, 6.5)
+    for k, name in enumerate(_ANGLES):
+        axes = figure.add_axes((0.1, 0.7 - 0.3 * k, 0.88, 0.24))
+        middle, wide = angle[:, k], 1.96 * sigma[:, k]
+        axes.fill_between(along, middle - wide, middle + wide, color=ACCENT, alpha=0.25, linewidth=0, label="95 %")
+        axes.plot(along, middle, color=ACCENT, linewidth=1.0)
+        for sign in (-1.0, 1.0):
+            axes.axhline(sign * limit, color=WARN, linewidth=0.8, linestyle="--", label="limit" if sign > 0 else None)
+        if not seen.all():
+            low = axes.get_ylim()[0]
+            axes.plot(along[~seen], np.full(int((~seen).sum()), low), "|", color=INK, markersize=6, label="not seen")
+            axes.set_ylim(bottom=low)
+        axes.set_ylabel(f"{name}, degrees", color=INK, fontsize=9)
+        axes.tick_params(labelsize=8, colors=INK)
+        if k == 0:
+            axes.set_title(title, fontsize=9, color=INK, loc="left")
+            axes.legend(loc="upper right", fontsize=8, ncols=3)
+        if k == 2:
+            axes.set_xlabel(word, color=INK, fontsize=9)
+    return figure

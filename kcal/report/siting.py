@@ -1,4 +1,4 @@
-"""A picture of sites: how well an area is seen and located today, and with the candidates that are worth most."""
+"""Pictures of sites: how well an area is seen and located, and a sketch of what to mark."""
 
 from __future__ import annotations
 
@@ -18,8 +18,10 @@ from numpy.typing import NDArray
 from kcal.locate.geodesy import geodetic_to_enu
 from kcal.locate.siting import Area, RankedSite, Site, SitingMap, siting_map
 from kcal.locate.tabulate import middle_row_ends
-from kcal.quantities import length_text
-from kcal.report.figures import HALO, new_figure, round_levels, save_picture
+from kcal.report.figures import ACCENT, HALO, WARN, new_figure, round_levels, save_picture
+from kcal.texts import length_text
+
+# A picture of sites: how well an area is seen and located today, and with the candidates that are worth most.
 
 # From good to poor; blind and single are told apart by the blind eye too.
 _RAMP = LinearSegmentedColormap.from_list("sigma", ["#0b5d4f", "#3aa17e", "#a6d69b", "#f3e79b", "#e9a857", "#c8553d"])
@@ -200,3 +202,34 @@ def _siting_footer(today: SitingMap, ranked: Sequence[RankedSite]) -> str:
     return "standard deviation over the whole area, where what nobody sees may be anywhere in it: " + ", then ".join(
         [f"{length_text(today.mean_sigma, digits=3)} today", *steps]
     )
+
+
+# A surveyor's sketch: the picture of a site with the names of what to mark.
+
+Named = tuple[list[str], NDArray[np.float64]]
+
+
+def save_site_sketch(path: str | Path, image: NDArray[np.uint8], landmarks: Named, targets: Named) -> Path:
+    """Write a picture with named landmarks and targets.
+
+    Args:
+        path: of the .png or .svg file.
+        image: (H, W, 3) of the site.
+        landmarks: names, and pixels (N, 2).
+        targets: the same of what is to be located.
+    """
+    height, width = image.shape[:2]
+    figure = new_figure(width / 160, height / 160, 100)
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    axes.imshow(image)
+    axes.set_axis_off()
+    for (names, pixels), color in ((landmarks, ACCENT), (targets, WARN)):
+        for name, (u, v) in zip(names, pixels, strict=True):
+            axes.plot(u, v, "o", mfc="none", mec=color, ms=9)
+            axes.annotate(
+                name, (u, v), (4, 14), textcoords="offset points", color=color, fontsize=11, path_effects=HALO,
+                rotation=55, arrowprops={"arrowstyle": "-", "color": color, "lw": 0.8},
+            )  # fmt: skip
+    where = 0.01 * width, 0.97 * height
+    axes.text(*where, "blue: surveyed landmarks    red: targets to locate", fontsize=12, path_effects=HALO)
+    return save_picture(path, figure)

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from kcal.errors import InputError
 from kcal.locate.ranges import BEARING_SIGMAS
-from kcal.quantities import range_text
+from kcal.texts import range_text
 
 Severity = Literal["stop", "doubt", "fine"]
 # The source of what a camera is wrong by beyond its error bars.

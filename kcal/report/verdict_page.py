@@ -13,9 +13,8 @@ import kcal
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.files import write_atomic
 from kcal.lens.camera import Camera
-from kcal.quantities import length_text, number_text, range_text
 from kcal.report.verdict import RangeAnswer, Verdict
-from kcal.texts import page_policy, visible
+from kcal.texts import length_text, number_text, page_policy, range_text, visible
 
 _HERE = Path(__file__).parent
 CAPTIONS = {

@@ -15,12 +15,10 @@ from kcal.calibrate.camera.advice import board_tilts
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.camera.trust import Examination
 from kcal.lens.difference import CameraDifference
-from kcal.quantities import range_text
-from kcal.report.board import board_figure
-from kcal.report.calibration import draw_coverage, draw_residuals, draw_uncertainty, draw_view_rms
-from kcal.report.colors import ACCENT, FAINT, GRAY, INK, WARN
-from kcal.report.figures import draw_arrows, frame_image, new_figure
+from kcal.report.calibration import board_figure, draw_coverage, draw_residuals, draw_uncertainty, draw_view_rms
+from kcal.report.figures import ACCENT, FAINT, GRAY, INK, WARN, draw_arrows, frame_image, new_figure
 from kcal.report.verdict import FAULTS, RangeAnswer
+from kcal.texts import range_text
 
 _PART_COLORS = {"marks": ACCENT, "lenses": "#dd7a1f", "relative pose": "#0f766e", FAULTS: WARN}
 

@@ -1,19 +1,218 @@
-"""Simulate the corners of a board in many views, with noise, without rendering images."""
+"""Simulated captures of boards: poses, observations, and rigs with their truth."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.sim.board import BoardLike, BoardSize, LensLike, board_points, project_board
-from kcal.sim.poses import PoseOptions, sample_board_poses
-from kcal.sim.prescription import PRESCRIPTIONS
-from kcal.sim.raytrace import Misalignment
+from kcal.lens.pose import rotation_from_vector
+from kcal.sim.board import BoardLike, BoardPose, BoardSize, LensLike, board_points, project_board
+from kcal.sim.raytrace import PRESCRIPTIONS, Misalignment
 from kcal.sim.truth import TruthLens
+
+# Choose poses of a board that are completely visible, tilted in all directions, and spread over image and depth.
+#
+# Poses are drawn at random, those that are not completely visible are dropped, and of the rest the ones farthest from
+# each other are chosen (T. Gonzalez, "Clustering to minimize the maximum intercluster distance", 1985). Extreme poses
+# come first, as a calibration needs them, and the number of draws is fixed.
+
+_POSE_DRAWS = 4096
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseOptions:
+    """How boards are held.
+
+    Args:
+        max_tilt: largest angle between the board's normal and the line of sight, radians.
+        max_roll: largest turn of the board about its normal, radians.
+        border: squares around the inner corners that must be in the image too; 1 keeps all squares whole.
+        margin: pixels between them and the image's edge.
+
+    Raises:
+        InputError: a value out of range.
+    """
+
+    max_tilt: float = math.radians(45.0)
+    max_roll: float = math.radians(25.0)
+    border: int = 1
+    margin: float = 4.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.max_tilt <= math.radians(80.0):
+            raise InputError("pose option max_tilt: radians from 0 to 80 degrees are needed")
+        if not 0 <= self.max_roll <= math.pi:
+            raise InputError("pose option max_roll: radians from 0 to pi are needed")
+        if not isinstance(self.border, int) or self.border < 0 or not 0 <= self.margin < math.inf:
+            raise InputError("pose options border and margin: a whole number of squares and pixels, not negative")
+
+
+def sample_board_poses(
+    camera: LensLike,
+    board: BoardLike,
+    count: int,
+    generator: torch.Generator,
+    *,
+    fill: tuple[float, float] = (0.4, 0.9),
+    options: PoseOptions | None = None,
+) -> list[BoardPose]:
+    """Choose poses to calibrate one camera: over the whole image, at several distances, tilted in all directions.
+
+    Args:
+        camera: a single camera, or a true lens.
+        board: its size.
+        count: how many poses.
+        generator: source of the draws; the same state gives the same poses.
+        fill: smallest and largest share of the image's width or height that the board takes when it is not tilted.
+        options: limits of tilt, roll and margins.
+
+    Returns:
+        cam_from_board poses; the first lies near the middle of all.
+
+    Raises:
+        InputError: fewer than `count` of 4096 drawn boards are completely seen, or an argument out of range.
+
+    Example:
+        >>> from kcal import Camera
+        >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480))
+        >>> from kcal.sim.board import BoardSize, project_board
+        >>> board = BoardSize(9, 6, 0.025)
+        >>> poses = sample_board_poses(camera, board, 12, torch.Generator().manual_seed(1))
+        >>> all(bool(project_board(camera, pose, board)[1].all()) for pose in poses)
+        True
+    """
+    options = options or PoseOptions()
+    check_draws(count, "fill", fill)
+    width, height = camera.size
+    extent = ((board.columns + 1) * board.square, (board.rows + 1) * board.square)
+    focal = camera.focal.detach()
+    unit = max(float(focal[0]) * extent[0] / width, float(focal[1]) * extent[1] / height)
+    drawn = draw_poses(camera, board, (unit / fill[1], unit / fill[0]), None, generator, options)
+    still = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+    return choose_poses(drawn, [(camera, *still)], board, count, options)
+
+
+def check_draws(count: int, name: str, limits: tuple[float, float]) -> None:
+    """Raise `InputError` for a number of poses, or limits called `name`, that cannot be."""
+    if not isinstance(count, int) or not 1 <= count <= _POSE_DRAWS:
+        raise InputError(f"count: a whole number from 1 to {_POSE_DRAWS} is needed, got {count!r}")
+    if not 0 < limits[0] <= limits[1] < math.inf:
+        raise InputError(f"{name} {limits}: two positive numbers are needed, the smaller first")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DrawnPoses:
+    """Random poses, and where they lie in the space in which they are to be spread out (draws, 3)."""
+
+    rotation: Tensor
+    translation: Tensor
+    features: Tensor
+
+
+def draw_poses(
+    camera: LensLike,
+    board: BoardLike,
+    distance: tuple[float, float],
+    eye: Tensor | None,
+    generator: torch.Generator,
+    options: PoseOptions,
+) -> DrawnPoses:
+    """Draw poses over the image, at distances of the board's center, tilted against the line from `eye` (3,)."""
+    random = torch.rand((_POSE_DRAWS, 6), dtype=torch.float64, generator=generator)
+    with torch.no_grad():
+        aim = random[:, :2] * torch.tensor(camera.size, dtype=torch.float64) - 0.5
+        # A pixel without a ray gives the optical axis: one more board in the middle.
+        rays, _ = camera.unproject(aim)
+    near, far = distance
+    depth = near * (far / near) ** random[:, 2]
+    center = rays * depth[:, None]
+    sight = center - eye if eye is not None else center
+    # Between a quarter of the largest tilt and all of it: untilted boards do not determine the focal length.
+    tilt, towards = options.max_tilt * (0.25 + 0.75 * random[:, 3]), 2 * math.pi * random[:, 4]
+    roll = options.max_roll * (2 * random[:, 5] - 1)
+    zero = torch.zeros_like(tilt)
+    axis = torch.stack([torch.cos(towards), torch.sin(towards), zero], -1)
+    rotation = _turn_to(sight) @ rotation_from_vector(tilt[:, None] * axis)
+    rotation = rotation @ rotation_from_vector(torch.stack([zero, zero, roll], -1))
+    points = board_points(board)
+    middle = 0.5 * (points[0] + points[-1])
+    translation = center - rotation @ middle
+    features = [
+        tilt / max(options.max_tilt, 1e-9) * torch.cos(towards),
+        tilt / max(options.max_tilt, 1e-9) * torch.sin(towards),
+        random[:, 2],
+    ]
+    return DrawnPoses(rotation=rotation, translation=translation, features=0.4 * torch.stack(features, -1))
+
+
+def choose_poses(
+    drawn: DrawnPoses,
+    cameras: list[tuple[LensLike, Tensor, Tensor]],
+    board: BoardLike,
+    count: int,
+    options: PoseOptions,
+) -> list[BoardPose]:
+    """Choose drawn poses, far from each other, that all cameras (lens, rotation, translation) see completely."""
+    points = board_points(board, options.border)
+    columns = board.columns + 2 * options.border
+    # Most draws end here: the outermost four points are a few percent of the work.
+    seen, _ = _see(drawn, torch.arange(_POSE_DRAWS), cameras, points[[0, columns - 1, -columns, -1]], options)
+    index = seen.nonzero()[:, 0]
+    whole, places = _see(drawn, index, cameras, points, options)
+    index, places = index[whole], places[whole]
+    found = len(index)
+    if found < count:
+        raise InputError(
+            f"only {found} of {_POSE_DRAWS} drawn boards are completely seen and {count} are needed; "
+            "use a smaller board, another distance, less tilt or a smaller margin"
+        )
+    rotation, translation = drawn.rotation[index], drawn.translation[index]
+    chosen = [int(torch.linalg.vector_norm(places - places.mean(0), dim=-1).argmin())]
+    apart = torch.full((found,), math.inf, dtype=torch.float64)
+    while len(chosen) < count:
+        apart = torch.minimum(apart, torch.linalg.vector_norm(places - places[chosen[-1]], dim=-1))
+        chosen.append(int(apart.argmax()))
+    return [BoardPose(rotation[i].clone(), translation[i].clone()) for i in chosen]
+
+
+def _see(
+    drawn: DrawnPoses,
+    index: Tensor,
+    cameras: list[tuple[LensLike, Tensor, Tensor]],
+    points: Tensor,
+    options: PoseOptions,
+) -> tuple[Tensor, Tensor]:
+    """Which draws show all points to all cameras (D,), and where the draws lie among the others (D, F)."""
+    points_rig = points @ drawn.rotation[index].transpose(-1, -2) + drawn.translation[index][:, None]
+    seen = torch.ones(len(index), dtype=torch.bool)
+    features = [drawn.features[index]]
+    for camera, rotation, translation in cameras:
+        with torch.no_grad():
+            pixels, valid = camera.project(points_rig @ rotation.T + translation)
+        size = torch.tensor(camera.size, dtype=torch.float64)
+        inside = (pixels >= options.margin) & (pixels <= size - 1 - options.margin)
+        seen &= (valid & inside.all(-1)).all(-1)
+        # The right camera adds nothing to the left one but the parallax.
+        features.append(pixels.mean(1) / size / len(cameras))
+    return seen, torch.cat(features, -1)
+
+
+def _turn_to(sight: Tensor) -> Tensor:
+    """The smallest rotations that turn the z axis to directions (N, 3), which must not point straight back."""
+    direction = sight / torch.linalg.vector_norm(sight, dim=-1, keepdim=True)
+    x, y, z = direction.unbind(-1)
+    sine = torch.hypot(x, y)
+    safe = sine.clamp_min(1e-12)
+    angle = torch.atan2(sine, z) / safe
+    return rotation_from_vector(torch.stack([-y * angle, x * angle, torch.zeros_like(x)], -1))
+
+
+# Simulate the corners of a board in many views, with noise, without rendering images.
 
 # The board of the paper: 6 x 7 corners, squares of 5 cm.
 PAPER_BOARD = BoardSize(7, 6, 0.05)
@@ -128,4 +327,72 @@ def capture_corners(
         torch.stack([pose.rotation for pose in poses]),
         torch.stack([pose.translation for pose in poses]),
         board_points(board),
+    )
+
+
+# Two ray-traced cameras, rigidly joined.
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrueRig:
+    """Two ray-traced cameras; the convention is `StereoRig`'s.
+
+    Args:
+        left: the first camera, whose frame is the rig's.
+        right: the second camera.
+        right_from_left_rotation: (3, 3).
+        right_from_left_translation: (3,) meters.
+    """
+
+    left: TruthLens
+    right: TruthLens
+    right_from_left_rotation: Tensor
+    right_from_left_translation: Tensor
+
+    @property
+    def baseline(self) -> Tensor:
+        """Distance between the cameras' origins, meters."""
+        return torch.linalg.vector_norm(self.right_from_left_translation)
+
+    def right_from_left(self, points_left: Tensor) -> Tensor:
+        """Move points (..., N, 3) from the left camera's frame into the right camera's."""
+        return points_left @ self.right_from_left_rotation.T + self.right_from_left_translation
+
+    def __call__(self, points_left: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Project points (..., N, 3) of the left frame: pixels_left, pixels_right (..., N, 2), valid in both."""
+        pixels_left, valid_left = self.left.project(points_left)
+        pixels_right, valid_right = self.right.project(self.right_from_left(points_left))
+        return pixels_left, pixels_right, valid_left & valid_right
+
+
+def drawn_rig(
+    lens: str, strength: float, seed: int, *, focal_mm: float = 2.8, wander: float = 0.1, scale: float = 1.0
+) -> TrueRig:
+    """Draw two cameras 10 m apart whose lenses have one design and separate errors of assembly.
+
+    The right camera is toed in by 0.34 degrees, and turned by 0.17 degrees in pitch and 0.46 in roll.
+
+    Args:
+        lens: name of a prescription.
+        strength: of the misalignment, see `drawn_lens`.
+        seed: of both draws.
+        focal_mm: see `TruthLens`.
+        wander: see `TruthLens`.
+        scale: of the image, see `drawn_lens`.
+
+    Example:
+        >>> rig = drawn_rig("surveillance", 1.0, 3)
+        >>> round(float(rig.baseline), 3), rig.left.size
+        (10.0, (1920, 1080))
+    """
+    rotation = rotation_from_vector(torch.tensor([0.003, 0.006, -0.008], dtype=torch.float64))
+    center = torch.tensor([10.0, 0.04, -0.06], dtype=torch.float64)
+    left, right = (
+        drawn_lens(lens, strength, 2 * seed + side, focal_mm=focal_mm, wander=wander, scale=scale) for side in (0, 1)
+    )
+    return TrueRig(
+        left=left,
+        right=right,
+        right_from_left_rotation=rotation,
+        right_from_left_translation=-rotation @ center,
     )

@@ -1,40 +1,53 @@
-"""A coast to practise on: two cameras on masts, surveyed landmarks, targets out to 5 km, and moving ships.
-
-All of it is made of flat pieces whose geometry is exact (`kcal.sim.facets`), behind the ray-traced lenses of
-`kcal.sim.scene`. Light is bent as in life.
-"""
+"""A practice site: its pictures, its film, its night, and its truth."""
 
 from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from kcal.sim.backdrop import Coast, backdrop, exposed, rotation_of
 from kcal.sim.board import PrintedBoard
-from kcal.sim.coast_objects import (
+from kcal.sim.captures import drawn_rig
+from kcal.sim.coast import (
     BLACK,
     GRASS,
     RED,
     ROCK,
     WHITE,
+    Coast,
+    Color,
+    Cut,
+    Eye,
+    Facet,
+    backdrop,
     box_outline,
     building,
+    cut,
+    exposed,
+    eye,
+    facet_windows,
     facing,
     ground,
+    paint,
     panel,
     pole,
     ridge,
+    rotation_of,
     ship,
 )
-from kcal.sim.facets import Color, Eye, Facet, cut, eye, facet_windows, paint
 from kcal.sim.scene import FOCAL_MM, DemoScene
-from kcal.sim.true_rig import drawn_rig
+from kcal.sim.truth import TruthLens
+
+# A coast to practise on: two cameras on masts, surveyed landmarks, targets out to 5 km, and moving ships.
+#
+# All of it is made of flat pieces whose geometry is exact (`kcal.sim.coast`), behind the ray-traced lenses of
+# `kcal.sim.scene`. Light is bent as in life.
 
 Floats = NDArray[np.float64]
 Side = Literal["left", "right"]
@@ -88,7 +101,7 @@ class Passage:
 
     Args:
         name: of the ship.
-        style: see `kcal.sim.coast_objects.ship`.
+        style: see `kcal.sim.coast.ship`.
         length: meters.
         start: distance and bearing of its middle at the start, meters and degrees.
         end: at the end.
@@ -335,3 +348,232 @@ def _car(foot: Floats, color: Color) -> list[Facet]:
         facing(foot, cabin, (64.0, 76.0, 88.0)),
         *tires,
     ]
+
+
+# The truth of a practice site as plain numbers, which results are compared with later without the simulator.
+
+DISTANCES = (1000.0, 2000.0, 5000.0)
+_GRID, _COARSE = (33, 19), (11, 5)
+
+
+def practice_truth(site: PracticeSite, frames: int) -> dict[str, Any]:
+    """What `kcal.report.practice_score` compares with.
+
+    Args:
+        site: the coast.
+        frames: of the film.
+    """
+    scene, rig = site.scene, site.scene.rig
+    things = {**_places_by_name(scene.landmarks), **_places_by_name(scene.targets)}
+    pixels = {side: site.true_pixels(side, np.array([*things.values()])) for side in SIDES}
+    return {
+        "kcal": "practice truth",
+        "version": 1,
+        "seed": scene.seed,
+        "origin": {"lat": scene.lat, "lon": scene.lon, "height": scene.height},
+        "heading_deg": scene.heading_deg,
+        "cameras": {side: _lens_record(getattr(rig, side)) for side in SIDES},
+        "baseline_m": float(rig.baseline),
+        "pairs": [_pairs_record(site, distance) for distance in DISTANCES],
+        "landmarks": _places_by_name(scene.landmarks),
+        "targets": _places_by_name(scene.targets),
+        "marks": {
+            name: [*pixels["left"][row].tolist(), *pixels["right"][row].tolist()] for row, name in enumerate(things)
+        },
+        "ships": {
+            "times": [number / RATE for number in range(frames)],
+            "places": _ship_places(site, frames),
+        },
+    }
+
+
+def ship_boxes(site: PracticeSite, side: Side, frames: int) -> NDArray[np.float64]:
+    """Middles of the boxes around the ships in the images of one camera: (frames, ships, 2) pixels, nearest last."""
+    camera = site.eyes[side]
+    ships = [each for number in range(frames) for each in ships_at(site, number / max(frames - 1, 1))]
+    points = np.stack([site.coast.apparent(each.middle) for each in ships])
+    return camera.project(points)[0].reshape(frames, -1, 2)
+
+
+def _places_by_name(points: Any) -> dict[str, list[float]]:
+    return dict(zip(points.names, points.enu.tolist(), strict=True))
+
+
+def _lens_record(lens: TruthLens) -> dict[str, Any]:
+    x, y = (np.linspace(0.0, size - 1.0, count) for size, count in zip(lens.size, _GRID, strict=True))
+    pixels = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+    rays, _ = lens.unproject(torch.from_numpy(pixels))
+    return {"size": list(lens.size), "pixels": pixels.tolist(), "rays": rays.tolist()}
+
+
+def _pairs_record(site: PracticeSite, distance: float) -> dict[str, Any]:
+    """Exact marks, over the image, of points at a distance."""
+    rig = site.scene.rig
+    width, height = rig.left.size
+    x, y = np.linspace(0.03 * width, 0.97 * width, _COARSE[0]), np.linspace(0.1 * height, 0.9 * height, _COARSE[1])
+    rays, _ = rig.left.unproject(torch.from_numpy(np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)))
+    left, right, valid = rig(distance * rays)
+    seen = valid & rig.left.inside(left) & rig.right.inside(right)
+    return {"range_m": distance, "left": left[seen].tolist(), "right": right[seen].tolist()}
+
+
+def _ship_places(site: PracticeSite, frames: int) -> dict[str, list[list[float]]]:
+    places: dict[str, list[list[float]]] = {}
+    for number in range(frames):
+        for each in ships_at(site, number / max(frames - 1, 1)):
+            places.setdefault(each.passage.name, []).append(each.middle.tolist())
+    return places
+
+
+# A film of the coast: ships that move before a still picture, and where they truly are.
+
+RATE, SECONDS = 5, 120
+_LUMA = np.array([0.299, 0.587, 0.114])
+_AT_ONCE = 60  # frames whose ships are projected together
+_AROUND = 4  # pixels that blur mixes into a ship's part of the image
+
+
+class ShipAt(NamedTuple):
+    """A ship at a moment.
+
+    Attributes:
+        passage: which one.
+        middle: (3,) of the box around it, east, north, up of the left camera in meters, where it truly is.
+        facets: its pieces, where they seem to be.
+    """
+
+    passage: Passage
+    middle: Floats
+    facets: list[Facet]
+
+
+def ships_at(site: PracticeSite, share: float) -> list[ShipAt]:
+    """All ships when a share of the film is over, the farthest first.
+
+    Example:
+        >>> from kcal.sim.practice import practice_scene
+        >>> ships = ships_at(PracticeSite(practice_scene()), 0.5)
+        >>> [round(float(np.hypot(*each.middle[:2])), -2) for each in ships]
+        [3200.0, 900.0, 700.0, 600.0]
+    """
+    found = []
+    for passage in PASSAGES:
+        distance, bearing = (a + share * (b - a) for a, b in zip(passage.start, passage.end, strict=True))
+        distance += passage.bow * 4.0 * share * (1.0 - share)
+        forward = math.copysign(1.0, passage.end[1] - passage.start[1])
+        facets = ship(site.sea_at(distance, bearing), passage.length, passage.style, forward)
+        corners = np.concatenate([facet.outline for facet in facets])
+        across, up = 0.5 * (corners.min(0) + corners.max(0))
+        angle = math.radians(site.scene.heading_deg + bearing)
+        water = site.coast.surface(distance)
+        place = np.array([distance * math.sin(angle), distance * math.cos(angle), water + up])
+        found.append(ShipAt(passage, place + across * facets[0].along, facets))
+    return sorted(found, key=lambda each: -each.facets[0].distance)
+
+
+def frames(site: PracticeSite, side: Side, count: int = RATE * SECONDS) -> Iterator[NDArray[np.uint8]]:
+    """Frames (H, W) of one camera, in gray; what does not move has the same noise in all of them, which films smaller.
+
+    Args:
+        site: the coast.
+        side: which camera.
+        count: how many.
+    """
+    camera, light = site.eyes[side], site.light(side)
+    random = np.random.default_rng([site.scene.seed, SIDES.index(side), 2])
+    still = exposed(light @ _LUMA, BLUR, NOISE, random)
+    windows = facet_windows(camera, site.facets)
+    fixed = [(facet, window) for facet, window in zip(site.facets, windows, strict=True) if window is not None]
+    for first in range(0, count, _AT_ONCE):
+        moments = [ships_at(site, n / max(count - 1, 1)) for n in range(first, min(first + _AT_ONCE, count))]
+        pieces = [facet for ships in moments for each in ships for facet in each.facets]
+        places = iter(facet_windows(camera, pieces))
+        for ships in moments:
+            frame = still.copy()
+            moving = [(facet, place) for each in ships for facet in each.facets if (place := next(places)) is not None]
+            for each in ships:
+                own = [place for facet, place in moving if facet in each.facets]
+                if own:
+                    window = _ship_window(own, frame.shape)
+                    light = _with_ships(site, side, window, fixed, moving)
+                    seen = exposed(light @ _LUMA, BLUR, NOISE, random)
+                    inner = tuple(slice(_AROUND, size - _AROUND) for size in seen.shape)
+                    frame[window][inner] = seen[inner]
+            yield frame
+
+
+_Placed = tuple[Facet, tuple[slice, slice]]
+
+
+def _with_ships(
+    site: PracticeSite, side: Side, window: tuple[slice, slice], fixed: list[_Placed], moving: list[_Placed]
+) -> Floats:
+    """Light (H, W, 3) in a window with all ships in it, and over them what is nearer than they are."""
+    camera, part = site.eyes[side], site.light(side)[window].copy()
+    ships = [each for each in moving if _meet(each[1], window)]
+    farthest = max(facet.distance for facet, _ in ships)
+    nearer = [each for each in fixed if each[0].distance < farthest and _meet(each[1], window)]
+    cuts: dict[bytes, Cut] = {}
+    for facet, place in sorted((*ships, *nearer), key=lambda each: -each[0].distance):
+        # All pieces of a ship lie on one plane.
+        plane = facet.origin.tobytes() + facet.along.tobytes() + facet.up.tobytes()
+        cuts[plane] = at = cuts.get(plane) or cut(camera, facet, window, small=facet.up[2] == 1)
+        inner = tuple(
+            slice(max(own.start - whole.start, 0), max(own.stop - whole.start, 0))
+            for own, whole in zip(place, window, strict=True)
+        )
+        paint(part[inner], facet, at.part(inner), site.coast.haze)
+    return part
+
+
+def _ship_window(windows: list[tuple[slice, slice]], shape: tuple[int, ...]) -> tuple[slice, slice]:
+    sides = [
+        slice(
+            max(0, min(window[axis].start for window in windows) - _AROUND),
+            min(shape[axis], max(window[axis].stop for window in windows) + _AROUND),
+        )
+        for axis in (0, 1)
+    ]
+    return sides[0], sides[1]
+
+
+def _meet(first: tuple[slice, slice], second: tuple[slice, slice]) -> bool:
+    return all(a.start < b.stop and b.start < a.stop for a, b in zip(first, second, strict=True))
+
+
+# The night above a practice site: stars as the cameras see them, wherever a catalogue says that they stand.
+
+# Gray levels of the dark sky, and all of a star of magnitude 0.
+_SKY, _BRIGHTEST = 14.0, 60_000.0
+_STAR_BLUR = 1.1  # px: sigma of a star's image
+_HALF = 6  # pixels around a star that it lights
+
+
+def night_picture(site: PracticeSite, side: Side, directions: Floats, magnitudes: Floats) -> NDArray[np.uint8]:
+    """A picture (H, W) of the night sky in gray; the ground is dark.
+
+    Args:
+        site: cameras.
+        side: which of them.
+        directions: (N, 3) unit vectors east, north, up to where stars seem to be, refraction included.
+        magnitudes: (N,) visual; 2.5 of it are a factor of ten.
+    """
+    camera = site.eyes[side]
+    height, width = camera.looks.shape[:2]
+    light = np.full((height, width), _SKY)
+    up = directions[:, 2] > 0.0
+    pixels, valid = camera.project(1e9 * directions[up])
+    inside = valid & (pixels > -_HALF).all(-1) & (pixels < np.array([width, height]) + _HALF).all(-1)
+    for (u, v), magnitude in zip(pixels[inside], magnitudes[up][inside], strict=True):
+        column, row = round(u), round(v)
+        x, y = np.arange(column - _HALF, column + _HALF + 1), np.arange(row - _HALF, row + _HALF + 1)
+        x, y = x[(x >= 0) & (x < width)], y[(y >= 0) & (y < height)]
+        if len(x) and len(y):
+            profile = np.exp(-0.5 * (((x - u) ** 2) + ((y - v) ** 2)[:, None]) / _STAR_BLUR**2)
+            flux = _BRIGHTEST * 10.0 ** (-0.4 * magnitude) / (2 * np.pi * _STAR_BLUR**2)
+            light[y[0] : y[-1] + 1, x[0] : x[-1] + 1] += flux * profile
+    random = np.random.default_rng([site.scene.seed, SIDES.index(side), 4])
+    levels: NDArray[np.uint8] = np.clip(np.rint(light + NOISE * random.standard_normal(light.shape)), 0, 255).astype(
+        np.uint8
+    )
+    return levels

@@ -19,9 +19,8 @@ from torch import Tensor
 from kcal.checks import as_points, require_finite
 from kcal.errors import InputError
 from kcal.sim.board import BoardLike, BoardPose, PrintedBoard, project_board
-from kcal.sim.poses import sample_board_poses
+from kcal.sim.captures import TrueRig, drawn_rig, sample_board_poses
 from kcal.sim.render import RenderOptions, render_board
-from kcal.sim.true_rig import TrueRig, drawn_rig
 
 # Name, horizontal distance in meters, degrees to the right of the heading, meters above the rig.
 _TARGETS = (

@@ -1,27 +1,270 @@
-"""`TruthLens`: a camera behind a ray-traced lens, for simulations whose truth is no lens model of kcal.
-
-Each pixel has a chief ray, and with it a line of sight in front of the camera (`kcal.sim.chief`). These lines do not
-meet in one point: the entrance pupil moves with the angle, as in any wide lens, and more if pieces of glass are
-decentered. The camera's origin is the point nearest to all lines. At infinity only their directions matter.
-
-The lines are stored as Chebyshev sums over the image and a margin. `unproject` evaluates them, and `project` solves
-them by Newton's method. `table_error` is their difference from direct tracing, measured when the lens is built.
-"""
+"""Simulated cameras as truth: traced lenses as exact fields, their chief rays and their Chebyshev form."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from kcal.checks import as_points
 from kcal.errors import InputError
-from kcal.sim.chebyshev import tabulate
-from kcal.sim.chief import ChiefRays, LinesOfSight, solve_2x2
-from kcal.sim.prescription import PRESCRIPTIONS, Prescription
-from kcal.sim.raytrace import Misalignment
-from kcal.sim.rectangle import PixelRectangle
+from kcal.lens.pose import rotation_from_vector
+from kcal.sim.raytrace import PRESCRIPTIONS, Misalignment, Placed, Prescription, focal_length, place, trace
+
+# Rectangles of pixels.
+
+
+class PixelRectangle(NamedTuple):
+    """A rectangle of pixels; it may reach beyond the image."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+
+def pixel_axes(window: PixelRectangle) -> tuple[Tensor, Tensor]:
+    """Return the positions x of every column (width,) and y of every row (height,), float64."""
+    x = window.left + torch.arange(window.width, dtype=torch.float64)
+    y = window.top + torch.arange(window.height, dtype=torch.float64)
+    return x, y
+
+
+def grow(window: PixelRectangle, by: int) -> PixelRectangle:
+    """Add `by` pixels on every side."""
+    return PixelRectangle(window.left - by, window.top - by, window.width + 2 * by, window.height + 2 * by)
+
+
+# Tabulate smooth functions of a pixel as sums of Chebyshev polynomials, exact to rounding, with derivatives.
+
+
+def nodes(degree: int) -> Tensor:
+    """(degree + 1,) Chebyshev points of the first kind on [-1, 1]."""
+    return torch.cos(math.pi * (torch.arange(degree + 1, dtype=torch.float64) + 0.5) / (degree + 1))
+
+
+@dataclass(frozen=True, eq=False)
+class ChebyshevTable:
+    """K functions on a rectangle of pixels; see `tabulate`.
+
+    Args:
+        window: the rectangle.
+        coefficients: (degree + 1, K, degree + 1), of x and of y.
+    """
+
+    window: PixelRectangle
+    coefficients: Tensor
+
+    def values(self, pixels: Tensor) -> Tensor:
+        """Return the values (N, K) at pixels (N, 2)."""
+        across, down = (self._basis(pixels, axis)[0] for axis in (0, 1))
+        return self._sum(across, down)
+
+    def with_slopes(self, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return values (N, K), and their derivatives by x and by y, per pixel."""
+        (across, across_slope), (down, down_slope) = (self._basis(pixels, axis) for axis in (0, 1))
+        left, left_slope = (basis @ self.coefficients.flatten(1) for basis in (across, across_slope))
+        left, left_slope = (value.unflatten(-1, self.coefficients.shape[1:]) for value in (left, left_slope))
+        sums = [
+            (part @ basis[..., None])[..., 0] for part, basis in ((left, down), (left_slope, down), (left, down_slope))
+        ]
+        return sums[0], sums[1], sums[2]
+
+    def _sum(self, across: Tensor, down: Tensor) -> Tensor:
+        left = (across @ self.coefficients.flatten(1)).unflatten(-1, self.coefficients.shape[1:])
+        return (left @ down[..., None])[..., 0]
+
+    def _basis(self, pixels: Tensor, axis: int) -> tuple[Tensor, Tensor]:
+        """Chebyshev polynomials (N, degree + 1) along an axis, and their derivatives per pixel."""
+        start, extent = (self.window.left, self.window.width) if axis == 0 else (self.window.top, self.window.height)
+        half = 0.5 * (extent - 1)
+        t = (pixels[:, axis] - start) / half - 1
+        degree = len(self.coefficients) - 1
+        values, slopes = [torch.ones_like(t), t], [torch.zeros_like(t), torch.ones_like(t)]
+        for _ in range(degree - 1):
+            values.append(2 * t * values[-1] - values[-2])
+            slopes.append(2 * values[-2] + 2 * t * slopes[-1] - slopes[-2])
+        return torch.stack(values[: degree + 1], -1), torch.stack(slopes[: degree + 1], -1) / half
+
+
+def tabulate(function: Callable[[Tensor], Tensor], window: PixelRectangle, degree: int) -> ChebyshevTable:
+    """Interpolate a function of pixels, (N, 2) to (N, K), over a window at Chebyshev points.
+
+    Example:
+        >>> table = tabulate(lambda pixels: torch.exp(pixels / 100), PixelRectangle(-10, -10, 120, 80), 12)
+        >>> [round(value, 9) for value in table.values(torch.tensor([[50.0, 20.0]]).double())[0].tolist()]
+        [1.648721271, 1.221402758]
+    """
+    t = nodes(degree)
+    x = window.left + 0.5 * (window.width - 1) * (t + 1)
+    y = window.top + 0.5 * (window.height - 1) * (t + 1)
+    grid = torch.stack(torch.meshgrid(x, y, indexing="ij"), -1)
+    sampled = function(grid.reshape(-1, 2)).unflatten(0, grid.shape[:2])
+    order = torch.arange(degree + 1, dtype=torch.float64)
+    # The discrete cosine transform: T_j at node i is cos(j θ_i).
+    angles = math.pi * (order + 0.5) / (degree + 1)
+    transform = torch.cos(order[:, None] * angles) * (2.0 / (degree + 1))
+    transform[0] *= 0.5
+    coefficients = torch.einsum("ai,ijk,bj->akb", transform, sampled, transform)
+    return ChebyshevTable(window, coefficients.contiguous())
+
+
+# Trace chief rays: from a pixel through the middle of the aperture stop to its line of sight in front of the lens.
+
+_AIM_STEPS = 40
+_SLOPE_NUDGE = 1e-6  # of a slope, for derivatives
+_LONGEST_STEP = 0.2  # change of a slope in one step
+_AIM_GOAL, _AIM_ERROR = 1e-8, 1e-6  # pixels
+
+
+class LinesOfSight(NamedTuple):
+    """The line of sight of each pixel: the points (x, y) + z (slope_x, slope_y) at every depth z.
+
+    Attributes:
+        origins: (N, 2) meters, where it crosses the plane z = 0.
+        slopes: (N, 2).
+    """
+
+    origins: Tensor
+    slopes: Tensor
+
+    def spatial(self) -> tuple[Tensor, Tensor]:
+        """A point (N, 3) and the unit direction (N, 3) of each line."""
+        return torch.nn.functional.pad(self.origins, (0, 1)), _unit(self.slopes)
+
+    def nearest_point(self) -> Tensor:
+        """(3,) the point nearest to all lines, by least squares."""
+        at, heading = self.spatial()
+        across = torch.eye(3, dtype=torch.float64) - heading[:, :, None] * heading[:, None, :]
+        return torch.linalg.solve(across.sum(0), (across @ at[..., None])[..., 0].sum(0))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ChiefRays:
+    """A lens with its sensor; see `build`.
+
+    Convention: the camera frame (x right, y down, z forward, meters) has its origin in the front vertex.
+
+    Args:
+        surfaces: of the lens, in meters.
+        stop: place of the aperture stop among them.
+        sensor: its vertex (3,) and rotation (3, 3) in the lens's frame.
+        axis: (2,) pixel at that vertex.
+        pitch: meters per pixel.
+        name: for messages.
+    """
+
+    surfaces: list[Placed]
+    stop: int
+    sensor: tuple[Tensor, Tensor]
+    axis: Tensor
+    pitch: float
+    name: str
+
+    @staticmethod
+    def build(
+        prescription: Prescription,
+        *,
+        focal: float,
+        focal_mm: float,
+        axis: tuple[float, float],
+        misalignment: Misalignment,
+        sensor_tilt: tuple[float, float],
+    ) -> ChiefRays:
+        """Place a lens of `focal_mm` millimeters before a sensor on which that is `focal` pixels."""
+        scale = 1e-3 * focal_mm / focal_length(prescription)
+        surfaces = place(prescription, 1e-3 * focal_mm, scale, misalignment)
+        # Misalignment moves pieces of glass, not the barrel.
+        length = scale * sum(surface.thickness for surface in prescription.surfaces)
+        return ChiefRays(
+            surfaces=surfaces,
+            stop=prescription.stop,
+            sensor=(
+                torch.tensor([0.0, 0.0, length], dtype=torch.float64),
+                rotation_from_vector(torch.tensor([*sensor_tilt, 0.0], dtype=torch.float64)),
+            ),
+            axis=torch.tensor(axis, dtype=torch.float64),
+            pitch=1e-3 * focal_mm / focal,
+            name=prescription.name,
+        )
+
+    def lines(self, pixels: Tensor) -> LinesOfSight:
+        """Find the lines of sight of pixels (N, 2), in front of the lens.
+
+        The chief ray that lands on a pixel is found by Newton's method in its slopes at the stop; from there it is
+        traced backward through the front of the lens.
+
+        Raises:
+            InputError: no chief ray reaches a pixel.
+        """
+        slopes = (pixels - self.axis) / self._pixels_per_slope()
+        for _ in range(_AIM_STEPS):
+            landed, valid = self.land(slopes)
+            error = landed - pixels
+            off = torch.linalg.vector_norm(error, dim=-1)
+            if bool((off < _AIM_GOAL).all()):
+                break
+            across, down = (
+                (self.land(slopes + slopes.new_tensor(nudge))[0] - landed) / _SLOPE_NUDGE
+                for nudge in ((_SLOPE_NUDGE, 0.0), (0.0, _SLOPE_NUDGE))
+            )
+            step = solve_2x2(across, down, error)
+            length = torch.linalg.vector_norm(step, dim=-1, keepdim=True)
+            slopes = slopes - step * (_LONGEST_STEP / length.clamp_min(1e-300)).clamp_max(1.0)
+        missed = ~(valid & (off < _AIM_ERROR))
+        stop = self.surfaces[self.stop].vertex.expand(len(pixels), 3)
+        rays = trace(self.surfaces[: self.stop], stop, -_unit(slopes), backward=True)
+        missed |= ~rays.valid | ~(rays.directions[:, 2] < 0)
+        if bool(missed.any()):
+            raise InputError(
+                f"lens {self.name}: no chief ray reaches {int(missed.sum())} of {len(pixels)} pixels; a smaller image, "
+                "a longer focal length or less misalignment is needed"
+            )
+        # Light travels along +z, but the camera looks along -z: mirroring changes nothing in a lens.
+        points = rays.points * rays.points.new_tensor([1.0, 1.0, -1.0])
+        slopes = -rays.directions[:, :2] / rays.directions[:, 2:]
+        return LinesOfSight(points[:, :2] - points[:, 2:] * slopes, slopes)
+
+    def land(self, slopes: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels (N, 2) of the chief rays that leave the stop with slopes (N, 2), and whether they get there."""
+        stop = self.surfaces[self.stop].vertex.expand(len(slopes), 3)
+        rays = trace(self.surfaces[self.stop + 1 :], stop, _unit(slopes))
+        vertex, rotation = self.sensor
+        local, heading = (rays.points - vertex) @ rotation, rays.directions @ rotation
+        at = local - heading * (local[:, 2:] / heading[:, 2:])
+        # The image is upside down.
+        return self.axis - at[:, :2] / self.pitch, rays.valid
+
+    def _pixels_per_slope(self) -> float:
+        small = torch.tensor([[1e-4, 0.0], [-1e-4, 0.0]], dtype=torch.float64)
+        landed, _ = self.land(small)
+        return float(landed[0, 0] - landed[1, 0]) / 2e-4
+
+
+def solve_2x2(across: Tensor, down: Tensor, right: Tensor) -> Tensor:
+    """Solve for (N, 2) steps, the columns of whose matrices are `across` and `down`, each (N, 2)."""
+    determinant = across[:, 0] * down[:, 1] - across[:, 1] * down[:, 0]
+    x = down[:, 1] * right[:, 0] - down[:, 0] * right[:, 1]
+    y = across[:, 0] * right[:, 1] - across[:, 1] * right[:, 0]
+    return torch.stack([x, y], -1) / determinant[:, None]
+
+
+def _unit(slopes: Tensor) -> Tensor:
+    return torch.nn.functional.normalize(torch.cat([slopes, torch.ones_like(slopes[:, :1])], -1), dim=-1)
+
+
+# `TruthLens`: a camera behind a ray-traced lens, for simulations whose truth is no lens model of kcal.
+#
+# Each pixel has a chief ray, and with it a line of sight in front of the camera. These lines do not
+# meet in one point: the entrance pupil moves with the angle, as in any wide lens, and more if pieces of glass are
+# decentered. The camera's origin is the point nearest to all lines. At infinity only their directions matter.
+#
+# The lines are stored as Chebyshev sums over the image and a margin. `unproject` evaluates them, and `project` solves
+# them by Newton's method. `table_error` is their difference from direct tracing, measured when the lens is built.
 
 _TABLE_MARGIN = 64  # pixels around the image that are tabulated too: blurred images look past the edge
 _DEGREES = (20, 28, 36, 48)

@@ -1,13 +1,10 @@
-"""The horizon of a terrain from one place: how high it stands in each azimuth, and how far away.
-
-Along each azimuth the ground is sampled in half cells. Places of samples are smooth functions of the distance, so they
-are computed exactly in a few distances and joined by a polynomial; heights are the raster's own, interpolated between
-the middles of its cells, not those of a second grid.
-"""
+"""The horizon of a terrain, errors of its raster, and how it compares with the border that an image shows."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,12 +12,93 @@ import torch
 from numpy.typing import NDArray
 
 from kcal.errors import InputError
-from kcal.lens.mounting import REFRACTION, Origin
-from kcal.locate.ellipsoid import geodetic_to_ecef, mean_radius
-from kcal.locate.geodesy import anchor, place_enu
+from kcal.lens.camera import Camera
+from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA, Origin, check_refraction
+from kcal.lens.pose import step_rows
+from kcal.lens.projection import project_components
+from kcal.locate.geodesy import anchor, geodetic_to_ecef, mean_radius, place_enu
 from kcal.locate.raster import Raster
 
+# Errors that a skyline has beside the noise of the image: of the raster's heights, and of light's refraction.
+
 Floats = NDArray[np.float64]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RasterError:
+    """How well the heights of a raster, and the bending of light, are known.
+
+    Errors of neighboring heights are alike: with the correlation exp(-d / `correlation`) over the distance d. So
+    a hundred columns that look at one ridge are not a hundred measurements of it, and more images do not help.
+
+    Args:
+        sigma: meters, of a height. Copernicus GLO-30 states 4 m at 90 % for all its errors, 2.2 m with `offset`.
+        correlation: meters.
+        offset: meters, of all heights together: datum, geoid, the height of what grows there.
+        refraction: coefficient k.
+        refraction_sigma: its standard deviation.
+
+    Raises:
+        InputError: sigmas that are negative, or a correlation that is not positive.
+
+    Example:
+        >>> lidar = RasterError(sigma=0.3, correlation=50.0, offset=0.1)
+        >>> lidar.heights(np.array([[0.0, 0, 0], [50.0, 0, 0]])).round(3).tolist()
+        [[0.1, 0.043], [0.043, 0.1]]
+    """
+
+    sigma: float = 2.0
+    correlation: float = 150.0
+    offset: float = 1.0
+    refraction: float = REFRACTION
+    refraction_sigma: float = REFRACTION_SIGMA
+
+    def __post_init__(self) -> None:
+        for name in ("sigma", "offset"):
+            if not 0.0 <= getattr(self, name) < np.inf:
+                raise InputError(f"raster {name} {getattr(self, name)}: meters, not below 0, are needed")
+        if not 0.0 < self.correlation < np.inf:
+            raise InputError(f"raster correlation {self.correlation}: a positive number of meters is needed")
+        check_refraction(self.refraction, self.refraction_sigma)
+
+    def heights(self, points: Floats, blunted: Floats | float = 0.0) -> Floats:
+        """(M, M) m², covariance of the raster's heights at places (M, 3) of one frame, meters.
+
+        With `blunted` (M,) meters, by which cells lower a crest, that is one more standard deviation.
+        """
+        level = points[:, :2]
+        apart = np.hypot(*(level[:, None] - level).transpose(2, 0, 1))
+        own = np.hypot(np.broadcast_to(self.sigma, len(points)), blunted)
+        found: Floats = own[:, None] * own * np.exp(-apart / self.correlation) + self.offset**2
+        return found
+
+    def alike(self, distance: Floats, spacing: Floats) -> Floats:
+        """(M,) how many columns share one error of the raster: columns `spacing` radians apart that see `distance`."""
+        return np.maximum(2.0 * self.correlation / np.maximum(distance * spacing, 1e-9), 1.0)
+
+
+class SkylineErrors(NamedTuple):
+    """All errors of a skyline but the image's noise.
+
+    Attributes:
+        raster: of heights and refraction.
+        place: (3,) meters, sigma of the camera's place, east, north, up.
+        lens: (P, K) changes of the camera's parameters at one sigma of what its calibration does not know.
+        radius: of the Earth, meters.
+    """
+
+    raster: RasterError
+    place: Floats
+    lens: Floats
+    radius: float
+
+
+# The horizon of a terrain from one place: how high it stands in each azimuth, and how far away.
+#
+# Along each azimuth the ground is sampled in half cells. Places of samples are smooth functions of the distance, so
+# they are computed exactly in a few distances and joined by a polynomial; heights are the raster's own, interpolated
+# between the middles of its cells, not those of a second grid.
+
 Bools = NDArray[np.bool_]
 
 # Distances between which places are joined by a polynomial: within 200 km that errs by less than a millimeter.
@@ -48,7 +126,7 @@ class Horizon(NamedTuple):
             the way.
         reach: (A,) meters to which the raster is known.
         doubtful: (A,) whether ground as high as the raster's highest, just beyond `reach`, would stand above it.
-        raised: (A,) radians by which errors of the raster change it on average; see `kcal.skyline.raised`.
+        raised: (A,) radians by which errors of the raster change it on average; see `kcal.skyline.attitude`.
         blunted: (A,) meters by which it stands lower in a raster with cells of twice the size.
     """
 
@@ -207,3 +285,158 @@ def _highest(rays: TerrainRays, azimuth: Floats, distance: Floats) -> tuple[Floa
     elevation = np.where(some, np.arctan(near[pick]), np.nan)
     reach = np.where(gap < len(distance), distance[np.maximum(np.minimum(gap, last + 1) - 1, 0)], distance[-1])
     return elevation, level[pick], point, known, reach
+
+
+# Compare the border of an image with the horizon of a terrain: residuals in pixels and how they change.
+
+# Meters: so far away a camera sees a horizon; entrance pupils do not matter there.
+_FAR = 1e9
+
+
+class Columns(NamedTuple):
+    """Clear columns of a border with their rays.
+
+    Attributes:
+        pixel: (N, 2).
+        sigma: (N,) px, along the column.
+        ray: (N, 3) unit vectors in the camera's axes.
+    """
+
+    pixel: Floats
+    sigma: Floats
+    ray: Floats
+
+    def some(self, chosen: Bools | NDArray[np.int64]) -> Columns:
+        """Some of them."""
+        return Columns(*(part[chosen] for part in self))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Comparison:
+    """Residuals of columns across the skyline, positive where the image's is above the raster's.
+
+    Args:
+        residual: (N,) px.
+        sigma: (N,) px, of the image.
+        by_turn: (N, 3) derivatives by a turn about the camera's axes, which comes after the rotation.
+        by_elevation: (N,) by a higher horizon, px/rad.
+        by_shift: (N, 3) by a camera that stands elsewhere, px/m, along east, north, up of the eye.
+        by_lens: (N, P) by the parameters of the camera; none if they were not asked for.
+        elevation: (N,) radians, of the horizon.
+        distance: (N,) level meters to it.
+        point: (N, 3) meters, where it stands from the eye.
+        raised: (N,) radians by which errors of the raster change it on average.
+        blunted: (N,) meters by which its cells may have lowered it.
+        known: (N,) whether the raster has a horizon there.
+    """
+
+    residual: Floats
+    sigma: Floats
+    by_turn: Floats
+    by_elevation: Floats
+    by_shift: Floats
+    by_lens: Floats
+    elevation: Floats
+    distance: Floats
+    point: Floats
+    raised: Floats
+    blunted: Floats
+    known: Bools
+
+    @classmethod
+    def together(cls, parts: Sequence[Comparison]) -> Comparison:
+        """Columns of several images after each other, without derivatives by their lenses."""
+        names = [field.name for field in dataclasses.fields(cls) if field.name != "by_lens"]
+        found = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+        return cls(**found, by_lens=np.zeros((len(found["residual"]), 0)))
+
+    def by_height(self) -> Floats:
+        """(N,) by the raster's height there, px/m."""
+        found: Floats = self.by_elevation * np.square(np.cos(self.elevation)) / self.distance
+        return found
+
+    def by_refraction(self, radius: float) -> Floats:
+        """(N,) by the coefficient of refraction, px, over the Earth's radius in meters."""
+        found: Floats = self.by_elevation * self.distance / (2.0 * radius)
+        return found
+
+
+def compare(columns: Columns, horizon: Horizon, rotation: Floats, camera: Camera, *, lens: bool = False) -> Comparison:
+    """Compare borders with a horizon.
+
+    Args:
+        columns: of the border.
+        horizon: in the axes of the eye.
+        rotation: (3, 3) the camera's axes from east, north, up of the eye.
+        camera: which lens.
+        lens: also find derivatives by its parameters.
+    """
+    heading = columns.ray @ rotation
+    step = horizon.azimuth[1] - horizon.azimuth[0]
+    begin = horizon.azimuth[0]
+    azimuth = begin + np.remainder(np.arctan2(heading[:, 0], heading[:, 1]) - begin, 2.0 * math.pi)
+    at = (azimuth - begin) / step
+    left = np.clip(np.floor(at), 0, len(horizon.azimuth) - 2).astype(int)
+    share = at - left
+    inside = (share >= 0.0) & (share <= 1.0)
+    share = np.clip(share, 0.0, 1.0)
+    elevation = (1.0 - share) * horizon.elevation[left] + share * horizon.elevation[left + 1]
+    slope = (horizon.elevation[left + 1] - horizon.elevation[left]) / step
+    near = left + (share > 0.5)
+    known = inside & horizon.known[left] & horizon.known[left + 1] & np.isfinite(elevation)
+    elevation = np.where(known, elevation, np.arcsin(np.clip(heading[:, 2], -1.0, 1.0)))
+    slope = np.where(known, slope, 0.0)
+    sine, cosine, low, up = np.sin(azimuth), np.cos(azimuth), np.cos(elevation), np.sin(elevation)
+    toward = np.stack([sine * low, cosine * low, up])
+    by_azimuth = np.stack([cosine * low, -sine * low, 0.0 * low])
+    by_elevation = np.stack([-sine * up, -cosine * up, low])
+    turned = torch.from_numpy(_FAR * rotation @ toward)
+    wanted = range(camera.params.shape[-1]) if lens else ()
+    seen = project_components(turned, camera.params.detach(), camera.model, wanted)
+    known &= seen.regular.numpy()
+    off = columns.pixel.T - seen.pixels.numpy()
+    # (3, 2, N) of pixels by a direction in east, north, up.
+    by_toward = np.einsum("jk,jun->kun", _FAR * rotation, seen.by_point.numpy())
+
+    def moved(direction: Floats) -> Floats:
+        found: Floats = np.einsum("kun,kn->un", by_toward, direction)
+        return found
+
+    # Across the skyline as the camera sees it, and upwards.
+    along, higher = moved(by_azimuth + slope * by_elevation), moved(by_elevation)
+    across = np.stack([along[1], -along[0]]) / np.maximum(np.hypot(*along), 1e-12)
+    across = across * np.where((across * higher).sum(0) < 0.0, -1.0, 1.0)
+
+    def of(motion: Floats) -> Floats:
+        found: Floats = -np.einsum("...un,un->n...", motion, across)
+        return found
+
+    # A column's border has its error along the column.
+    distance = np.where(known, horizon.distance[near], 1.0)
+    # A camera farther in the east, north, up sees what stands still turned and lower, and what it nears higher.
+    aside = (-cosine, sine, np.zeros_like(sine))
+    risen = (low * up * sine, low * up * cosine, -np.square(low))
+    shift = [(by_azimuth * a + by_elevation * e) / distance for a, e in zip(aside, risen, strict=True)]
+    return Comparison(
+        residual=(off * across).sum(0),
+        sigma=columns.sigma * np.abs(across[1]),
+        by_turn=of(step_rows(seen.by_point, turned)[:3].numpy()),
+        by_elevation=of(higher),
+        by_shift=np.stack([of(moved(one)) for one in shift], -1),
+        by_lens=of(seen.by_camera.numpy()) if lens else np.zeros((len(azimuth), 0)),
+        elevation=elevation,
+        distance=distance,
+        point=np.where(known[:, None], horizon.point[near], 0.0),
+        raised=horizon.raised[near],
+        blunted=horizon.blunted[near],
+        known=known,
+    )
+
+
+def columns_of(row: Floats, sigma: Floats, camera: Camera) -> Columns:
+    """Clear columns of a border (W,), those with a ray."""
+    clear = np.isfinite(row)
+    pixel = np.stack([np.flatnonzero(clear).astype(np.float64), row[clear]], -1)
+    rays, valid = camera.unproject(torch.from_numpy(pixel))
+    found = Columns(pixel, sigma[clear], (rays / rays.norm(dim=-1, keepdim=True)).numpy())
+    return found.some(valid.numpy())

@@ -8,11 +8,11 @@ from kcal.stars.identification import identify as identify
 from kcal.stars.identification import Identification as Identification
 from kcal.stars.night import name_stars as name_stars
 from kcal.stars.night import NamedStars as NamedStars
-from kcal.stars.attitude import Attitude as Attitude
-from kcal.stars.contradictions import clock_doubts as clock_doubts
+from kcal.stars.night import Attitude as Attitude
+from kcal.stars.night import clock_doubts as clock_doubts
 
 # Catalogue and sky
-from kcal.stars.catalog import StarCatalog as StarCatalog
+from kcal.stars.sky import StarCatalog as StarCatalog
 from kcal.stars.night import SkyView as SkyView
 from kcal.stars.sky import Air as Air
 from kcal.stars.sky import observed_directions as observed_directions
@@ -22,14 +22,14 @@ from kcal.stars.sky import parse_time as parse_time
 # What rigs are solved from
 from kcal.stars.rig_stars import star_source as star_source
 from kcal.stars.rig_stars import moments_of as moments_of
-from kcal.calibrate.rig.star_source import StarSource as StarSource
-from kcal.calibrate.rig.star_source import StarEffect as StarEffect
+from kcal.calibrate.rig.sources import StarSource as StarSource
+from kcal.calibrate.rig.sources import StarEffect as StarEffect
 
 # Lenses, and what to expect
 from kcal.stars.lens import calibrate_by_stars as calibrate_by_stars
 from kcal.stars.lens import StarCamera as StarCamera
 from kcal.stars.lens_fit import StarLens as StarLens
-from kcal.stars.with_boards import Agreement as Agreement
+from kcal.stars.lens import Agreement as Agreement
 from kcal.stars.budget import planned_stars as planned_stars
 from kcal.stars.budget import NightPlan as NightPlan
 from kcal.stars.budget import PlannedStars as PlannedStars

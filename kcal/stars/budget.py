@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcal.errors import InputError
-from kcal.stars.catalog import StarCatalog
-from kcal.stars.sky import EARTH_RATE
+from kcal.stars.sky import EARTH_RATE, StarCatalog
 
 # Electrons a second and cm² of a star of magnitude 0: silicon, 400 to 900 nm, behind color filters and glass.
 _ELECTRONS = 1.0e6

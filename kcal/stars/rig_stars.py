@@ -12,14 +12,12 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from kcal.calibrate.rig.star_source import StarEffect, StarSource
+from kcal.calibrate.rig.sources import StarEffect, StarSource
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.mounting import Origin
-from kcal.stars.attitude import FAR
-from kcal.stars.catalog import StarCatalog
-from kcal.stars.night import NamedStars
-from kcal.stars.sky import EARTH_RATE, pole_in_enu, refraction_sigma
+from kcal.stars.night import FAR, NamedStars
+from kcal.stars.sky import EARTH_RATE, StarCatalog, pole_in_enu, refraction_sigma
 from kcal.threads import in_one_thread
 
 # Radians: of the Yale catalogue along an axis, 1 second of arc.

@@ -1,21 +1,56 @@
-"""The history of a watched rig as a growing CSV file: what each look measured, and what it made of it."""
+"""Tables that grow while they are read: the history of a watched rig, and temperatures."""
 
 from __future__ import annotations
 
+import bisect
 import csv
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from kcal.errors import FileError
-from kcal.texts import csv_line
-from kcal.watch.growing_file import GrowingFile
+from kcal.errors import FileError, InputError
+from kcal.texts import csv_line, unix_seconds
 from kcal.watch.state import Look
+
+# Lines of a text file that another process writes, as they become whole.
+
+
+class GrowingFile:
+    """Read what has been added since the last time.
+
+    Args:
+        path: of the file.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path, self.number, self._offset = path, 0, 0
+
+    def lines(self) -> Iterator[str]:
+        """The whole lines that have come, without their ends; `number` is that of the line, from 1.
+
+        Raises:
+            FileError: the file cannot be read.
+        """
+        try:
+            with open(self.path, "rb") as file:
+                file.seek(self._offset)
+                for line in file:
+                    # One that is still being written is left out.
+                    if not line.endswith(b"\n"):
+                        break
+                    self._offset += len(line)
+                    self.number += 1
+                    yield line.decode("utf-8-sig" if self.number == 1 else "utf-8", "replace").rstrip("\r\n")
+        except OSError as error:
+            raise FileError(f"{self.path}: cannot read: {error.strerror or error}") from error
+
+
+# The history of a watched rig as a growing CSV file: what each look measured, and what it made of it.
 
 _ANGLES = ("pitch", "yaw", "roll")
 _SIDES = ("left", "right")
@@ -200,3 +235,86 @@ def _from_upper(upper: Tensor, size: int) -> Tensor:
     if not bool(torch.linalg.eigvalsh(matrix)[0] > 0):
         raise ValueError("a covariance is not positive definite")
     return matrix
+
+
+# Temperatures from a table (time,temperature) that may grow while it is read.
+
+# Seconds beyond which the nearest temperature is not that of a moment.
+_NEAR = 3600.0
+_KEPT = 100_000
+
+
+def seconds_of(text: str) -> float:
+    """Unix seconds of a number or of an ISO time with its zone.
+
+    Raises:
+        InputError: neither.
+
+    Example:
+        >>> seconds_of("12.5"), seconds_of("1970-01-01T00:01:00Z")
+        (12.5, 60.0)
+    """
+    value = unix_seconds(text)
+    if not math.isfinite(value):
+        raise InputError(f"time {text!r}: write seconds, or a time with its zone: 2026-05-01T12:00:00Z")
+    return value
+
+
+class Temperatures:
+    """Temperatures of a growing file with the columns time and temperature (°C).
+
+    Args:
+        path: of the file.
+
+    Raises:
+        FileError: no such file, or other columns.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = GrowingFile(path)
+        self._times: list[float] = []
+        self._values: list[float] = []
+        self._columns: list[str] = []
+        self._take_all()
+        if not {"time", "temperature"} <= set(self._columns):
+            raise FileError(f"{path}: the columns time and temperature are needed")
+
+    def at(self, time: float) -> float:
+        """°C at a moment, between the two nearest; NaN where the nearest is more than an hour away.
+
+        Raises:
+            FileError: a damaged line.
+        """
+        self._take_all()
+        k = bisect.bisect_right(self._times, time)
+        around = [i for i in (k - 1, k) if 0 <= i < len(self._times) and abs(self._times[i] - time) <= _NEAR]
+        if len(around) < 2:
+            return self._values[around[0]] if around else math.nan
+        first, second = around
+        share = (time - self._times[first]) / (self._times[second] - self._times[first])
+        return (1.0 - share) * self._values[first] + share * self._values[second]
+
+    def _take_all(self) -> None:
+        for line in self._file.lines():
+            self._take(line.strip())
+
+    def _take(self, line: str) -> None:
+        cells = [cell.strip() for cell in line.split(",")]
+        if not self._columns:
+            self._columns = cells
+            return
+        if not line or not {"time", "temperature"} <= set(self._columns):
+            return
+        try:
+            row = dict(zip(self._columns, cells, strict=True))
+            time, value = seconds_of(row["time"]), float(row["temperature"])
+            if not -100.0 < value < 150.0:
+                raise InputError(f"temperature {value:g}: °C are needed")
+        except (ValueError, InputError) as error:
+            raise FileError(f"{self._file.path}: line {self._file.number}: {error}") from error
+        if self._times and time <= self._times[-1]:
+            return
+        self._times.append(time)
+        self._values.append(value)
+        if len(self._times) > _KEPT:
+            del self._times[: _KEPT // 2], self._values[: _KEPT // 2]

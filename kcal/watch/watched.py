@@ -1,4 +1,4 @@
-"""`Watched`: a rig and the history of its attitude; the rig of any moment, with the errors of that moment."""
+"""A rig and the history of its attitude: the rig of any moment, a stream that follows it, and a new rig file."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
@@ -18,10 +18,24 @@ from kcal.calibrate.rig.drift import Drift, drift_of_turns
 from kcal.errors import InputError
 from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.geodesy import enu_from_cam
-from kcal.locate.relock import relocked
-from kcal.watch.history import HistoryRow, read_history
-from kcal.watch.model import AngleSeries, TurnModel, learned
-from kcal.watch.state import Turns, TurnState, between_rows, first_state, passed, smoothed, taken, turns_of
+from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.monitor import relocked
+from kcal.watch.history import MOST_ROWS, HistoryRow, HistoryTail, read_history
+from kcal.watch.state import (
+    AngleSeries,
+    TurnModel,
+    Turns,
+    TurnState,
+    between_rows,
+    first_state,
+    learned,
+    passed,
+    smoothed,
+    taken,
+    turns_of,
+)
+
+# `Watched`: a rig and the history of its attitude; the rig of any moment, with the errors of that moment.
 
 # Shared errors that a moment has beside those of the rig file.
 MORE_ERRORS = 6
@@ -166,3 +180,98 @@ def model_of(rows: Sequence[HistoryRow]) -> TurnModel:
         lasting=array(share * own),
         kelvin=array(torch.stack([look.kelvin for look in looks])[:, None].expand(-1, 6)),
     ))  # fmt: skip
+
+
+# A new rig file from a history, and only where the history proves that the old one is wrong for good.
+
+# Seconds of a history before a swing of the day is known, and looks at its end that were not used for the proof.
+_DAY, _HELD_OUT = 86400.0, 20
+
+
+class Relock(NamedTuple):
+    """The corrected rig, None where it would not be surely better; and why."""
+
+    rig: StereoRig | None
+    reason: str
+
+
+def relock(watched: Watched) -> Relock:
+    """The rig with the mean attitude of the last day, if that differs from the rig file's beyond the swing of a day.
+
+    A new file is used without the watch: its covariance contains the swing. It must explain the last looks, which take
+    no part in the mean, better than the old one.
+    """
+    if not watched.times or watched.times[-1] - watched.times[0] < _DAY:
+        return Relock(None, "a day of history is needed, so that a swing is not taken for a drift")
+    end = watched.times[-_HELD_OUT - 1]
+    chosen = [end - _DAY * k / 48.0 for k in range(48)]
+    turns = [watched.turns_at(time, gusts=False) for time in chosen if time >= watched.times[0]]
+    mean = torch.stack([turn.mean for turn in turns]).mean(0)
+    apart = torch.stack([turn.mean - mean for turn in turns])
+    # Half-hours agree with each other: the mean is as good as the best known one, not better.
+    best = min((turn.covariance for turn in turns), key=lambda matrix: float(matrix.trace()))
+    gust = torch.diag(watched.model.gust**2)
+    drift = drift_of_turns(watched.rig, mean, best + apart.T @ apart / len(turns) + gust, watched.cam_from_local)
+    if not drift.significant:
+        return Relock(None, "the attitude does not differ from the rig file's beyond its swing and chance")
+    new, old = 0.0, 0.0
+    for time in watched.times[-_HELD_OUT:]:
+        now = watched.drift_at(time)
+        weight = torch.linalg.inv(now.relative_covariance)
+        off = now.relative - drift.relative
+        old += float(now.relative @ weight @ now.relative)
+        new += float(off @ weight @ off)
+    if new >= old:
+        return Relock(None, f"the last {_HELD_OUT} looks fit the old rig file better")
+    better = relocked(watched.rig, drift, f"mean of the day before {end:.0f} s")
+    return Relock(better, f"χ² {drift.chi2:.0f} of the turn; the last looks: {old:.0f} before, {new:.0f} after")
+
+
+# A watched rig in a stream: the localizer of each moment, from a history that another process writes.
+
+# Seconds for which an attitude counts, and rows that are kept.
+_STEP_S, _KEPT = 10.0, MOST_ROWS // 4
+
+
+class Followed:
+    """Call it with a time: the localizer of that moment; the same one for ten seconds.
+
+    Args:
+        history: of `kcal watch`, which may grow.
+        localize: the rig as it was solved, and where it stands.
+
+    Raises:
+        FileError: no history, or one of another rig.
+    """
+
+    def __init__(self, history: Path, localize: StereoLocalizer) -> None:
+        self._tail, self._solved = HistoryTail(history, localize.rig.fingerprint), localize
+        self._watched = Watched(localize.rig, self._tail.rows())
+        self._now, self._until = localize, -math.inf
+
+    def __call__(self, time: float) -> StereoLocalizer:
+        """The localizer of a moment.
+
+        Raises:
+            InputError: a moment before the history begins.
+        """
+        if self._until - _STEP_S <= time < self._until:
+            return self._now
+        for row in self._tail.rows():
+            self._watched.take(row, _KEPT)
+        if not self._watched.times:
+            raise InputError("--watch: the history has no rows yet: let `kcal watch` look at the scene first")
+        self._now = standing(self._solved, self._watched, time)
+        self._until = time + _STEP_S
+        return self._now
+
+
+def standing(solved: StereoLocalizer, watched: Watched, time: float) -> StereoLocalizer:
+    """A localizer as the rig stands at a moment; its place stays where it was given."""
+    rig = watched.rig_at(time)
+    if solved.rig.mounting is not None and solved.origin == solved.rig.mounting.origin:
+        return StereoLocalizer(rig, pixel_sigma=solved.pixel_sigma)
+    heading, pitch, roll = solved.attitude_deg
+    return StereoLocalizer(
+        rig, origin=solved.origin, heading_deg=heading, pitch_deg=pitch, roll_deg=roll, pixel_sigma=solved.pixel_sigma
+    )

@@ -14,7 +14,7 @@ from kcal.corners.board import Board
 from kcal.corners.pattern_shapes import pattern_shapes
 from kcal.lens.camera import Camera
 from kcal.sim.board import BoardPose, BoardSize
-from kcal.sim.poses import PoseOptions, sample_board_poses
+from kcal.sim.captures import PoseOptions, sample_board_poses
 from kcal.sim.render import RenderOptions, render_light
 from scripts.shared.printed_board import Paper, light_of, points_of, through_lens
 

@@ -24,10 +24,10 @@ from kcal.lens.pose import rotation_from_vector
 from kcal.lens.projection import project_components
 from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.angular import triangulate_pairs
-from kcal.locate.cep import circular_error
 from kcal.locate.geodesy import enu_to_geodetic
 from kcal.locate.linear import triangulate_linear
 from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.tabulate import circular_error
 from scripts.shared.long_range import ORIGIN, RANGES, rig
 from scripts.shared.page import write_section
 from scripts.shared.timing import median, ratio, row, show, times

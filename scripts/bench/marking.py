@@ -32,10 +32,9 @@ from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import StereoRig
 from kcal.locate.marks import Marks
 from kcal.locate.survey import Survey
+from kcal.mark.guide import open_pictures
 from kcal.mark.items import SIDES, Mark, Put
-from kcal.mark.live import solve_live
-from kcal.mark.marking_service import Desk
-from kcal.mark.pictures import open_pictures
+from kcal.mark.marking_service import Desk, solve_live
 from kcal.mark.session import Session
 from scripts.shared.simulated import simulated
 

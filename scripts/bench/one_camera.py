@@ -30,8 +30,7 @@ from torch import Tensor
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.hybrid.fit import fit_hybrid
-from kcal.calibrate.rig.from_boards import calibrate_rig
-from kcal.calibrate.rig.solve import RigOptions
+from kcal.calibrate.rig.solve import RigOptions, calibrate_rig
 from kcal.corners.board import Board
 from kcal.corners.detect import detect
 from kcal.corners.images import expand_images

@@ -5,7 +5,7 @@
     python -m scripts.bench.traced_lenses --out sigmas.jsonl --models hybrid --views 60 30 --noise .03 .1 .2 \
         --seeds $(seq 200 211)                                             # error bars alone; --write-sigmas
 
-Truth: three lenses of `kcal.sim.prescription`, decentered by their tolerances, whose entrance pupil moves as in life
+Truth: three lenses of `kcal.sim.raytrace`, decentered by their tolerances, whose entrance pupil moves as in life
 (`wander` 1); views of the paper's board (6 x 7 corners, 5 cm), exact or printed (stretch 0.15 %, shear 0.02 %,
 bent along an oblique axis by 0.7 mm, smooth errors of 0.03 mm), with Gaussian corner noise. Measure: how far from the
 truth each camera sees infinitely distant points, all over the image, after the best turn; RMS in pixels. Coverage: how

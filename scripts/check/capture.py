@@ -5,7 +5,7 @@
 
 Each seed has a lens with five coefficients of its own, 1280 x 720, and a board of 9 x 6 corners 25 mm apart. Frames are
 rendered, with noise and a little blur, and corners are detected in them. *Random*: 20 views drawn by
-`kcal.sim.poses.sample_board_poses`: over the whole image, near and far, tilted and rolled. *Guided*: the first four
+`kcal.sim.captures.sample_board_poses`: over the whole image, near and far, tilted and rolled. *Guided*: the first four
 views and each next one as `kcal capture` asks for them, held by a person: off by 5 % of the distance across and by 10 %
 along, by 8 degrees of tilt and 10 degrees of roll. A view that is not seen whole is held again.
 
@@ -36,7 +36,7 @@ from kcal.corners.observations import Observations, View
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.sim.board import BoardPose, BoardSize
-from kcal.sim.poses import sample_board_poses
+from kcal.sim.captures import sample_board_poses
 from kcal.sim.render import RenderOptions, render_board
 from scripts.shared.page import table, write_section
 from scripts.shared.timing import show

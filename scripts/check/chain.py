@@ -3,7 +3,7 @@
     python -m scripts.check.chain --out cells.jsonl --draws 10 --boards printed --pupil 3   # cells in the file are kept
     python -m scripts.check.chain --out *.jsonl --write                                     # docs/measured/chain.md
 
-Truth: two ray-traced surveillance lenses (`kcal.sim.prescription`), f 1600 px, 1920 x 1080, each with errors of
+Truth: two ray-traced surveillance lenses (`kcal.sim.raytrace`), f 1600 px, 1920 x 1080, each with errors of
 assembly of its own, 10 m apart and nearly parallel. Their entrance pupils move by 0, 1 or 3 mm/rad²: with a focal
 length of 6.163 mm the prescription itself has 3 (`scripts.shared.traced.pupil_of` measures it), and for less its
 movement is scaled down, off-axis parts included (`wander` of `TruthLens`).
@@ -43,7 +43,7 @@ from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.corners.observations import Observations
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera
-from kcal.sim.true_rig import TrueRig
+from kcal.sim.captures import TrueRig
 from scripts.check.chain_page import conclude, failures, tables
 from scripts.check.chain_rig import How, judge, targets, true_rig
 from scripts.shared.timing import show

@@ -18,7 +18,7 @@ from kcal.lens.camera import Camera
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.mounting import placed_rig
-from kcal.sim.true_rig import TrueRig, drawn_rig
+from kcal.sim.captures import TrueRig, drawn_rig
 from scripts.shared.long_range import ORIGIN, RANGES, range_sigma
 
 How = Literal["held", "prior"]

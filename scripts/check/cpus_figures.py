@@ -21,10 +21,9 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.calibrate.rig.from_boards import calibrate_rig
 from kcal.calibrate.rig.pairs import pair_by_name
 from kcal.calibrate.rig.result import RigResult
-from kcal.calibrate.rig.solve import RigOptions, solve_rig
+from kcal.calibrate.rig.solve import RigOptions, calibrate_rig, solve_rig
 from kcal.corners.board import Board
 from kcal.corners.detect import detect
 from kcal.corners.observations import Observations

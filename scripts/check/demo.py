@@ -21,10 +21,9 @@ from typing import Any
 
 import torch
 
-from kcal.cli.demo_site import simulated_site
+from kcal.cli.demo import simulated_site
 from kcal.io.rig_file import load_rig
-from kcal.locate.positions import locate_points
-from kcal.locate.truth import position_errors
+from kcal.locate.positions import locate_points, position_errors
 from kcal.sim.scene import DemoScene
 from scripts.shared.page import table, write_section
 from scripts.shared.timing import show

@@ -19,15 +19,14 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.from_boards import calibrate_rig
-from kcal.calibrate.rig.solve import RigOptions
+from kcal.calibrate.rig.solve import RigOptions, calibrate_rig
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.sim.board import BoardPose, BoardSize
-from kcal.sim.poses import sample_board_poses
+from kcal.sim.captures import sample_board_poses
 from scripts.shared.moving_captures import Hands, MovingCapture, moving_capture
 from scripts.shared.page import table, write_section
 from scripts.shared.records import Record, finish, read, seeds

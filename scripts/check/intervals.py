@@ -36,7 +36,7 @@ from kcal.calibrate.camera.interval_check import (
 from kcal.calibrate.camera.options import CalibrationOptions
 from kcal.errors import KcalError
 from kcal.lens.uncertainty import pixel_covariance, pixel_errors
-from kcal.report.model_findings import fault_of_views
+from kcal.report.judge_camera import fault_of_views
 from scripts.shared.infinity import error_at_infinity
 from scripts.shared.page import table, write_section
 from scripts.shared.records import Record, finish, read, seeds

@@ -21,7 +21,7 @@ import torch
 from kcal.errors import InputError
 from kcal.lens.rig import StereoRig
 from kcal.mark.guide import at_shape, propose
-from kcal.mark.snap import snap
+from kcal.mark.shapes import snap
 from scripts.shared.marking_scene import KINDS, Floats, background, finished, inside_of, paint, seen, site_rig
 from scripts.shared.page import table, write_section
 

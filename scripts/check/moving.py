@@ -27,8 +27,7 @@ from kcal.calibrate.rig.sources import Baseline, MeasuredPosition, RigData
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
-from kcal.locate.moving import MovingTrack, Sighting
-from kcal.locate.moving_match import CLOCK, MovingOptions, match_moving
+from kcal.locate.moving import CLOCK, MovingOptions, MovingTrack, Sighting, match_moving
 from scripts.shared.page import table, write_section
 
 CAMERA = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")

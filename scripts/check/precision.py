@@ -38,8 +38,7 @@ from kcal.lens.rig import StereoRig
 from kcal.locate.geodesy import enu_to_geodetic, geodetic_to_enu
 from kcal.locate.stereo import PositionStatus
 from kcal.locate.triangulate import Triangulate
-from kcal.stars.catalog import StarCatalog
-from kcal.stars.sky import Air, observed_directions
+from kcal.stars.sky import Air, StarCatalog, observed_directions
 from scripts.shared.page import table, write_section
 from scripts.shared.timing import show
 

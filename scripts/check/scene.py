@@ -4,7 +4,7 @@
     python -m scripts.check.scene ranges --seeds 0-29 --out build/ranges.jsonl [--write]
     python -m scripts.check.scene matches common speed picture [--write]
 
-Pictures of a terrain (`kcal.sim.terrain`) by two traced lenses 10 m apart. `yaw`: each seed is another terrain, and its
+Pictures of a terrain (`scripts.shared.terrain`) by two traced lenses. `yaw`: each seed is another terrain, and its
 ten pairs of a minute and of a day are rendered and matched; --scale makes the pictures smaller (1: 1920 x 1080, f 1600
 px) and so affordable. `matches`: what is found under several conditions, beside OpenCV's SIFT and USAC. `common`:
 errors that matches share. `ranges`: places and covariances are those of one rendered pair, and errors are drawn anew
@@ -40,16 +40,15 @@ from kcal.lens.camera import Camera
 from kcal.lens.pose import vector_from_rotation
 from kcal.lens.rig import StereoRig
 from kcal.locate.localizer import StereoLocalizer
-from kcal.scene.common_errors import with_common_errors
-from kcal.scene.line_errors import line_errors
+from kcal.scene.common_errors import line_errors, with_common_errors
 from kcal.scene.match import ImagePair, MatchedPair, counted, match_scene, scene_of, still_matches
 from kcal.scene.match import _posed as posed
+from kcal.sim.captures import TrueRig, drawn_rig
 from kcal.sim.scene import FOCAL_MM
-from kcal.sim.terrain import Terrain, Weather
-from kcal.sim.true_rig import TrueRig, drawn_rig
 from scripts.shared.long_range import ORIGIN
 from scripts.shared.page import DOCS, table, write_row, write_section
 from scripts.shared.records import Record, finish, read, seeds
+from scripts.shared.terrain import Terrain, Weather
 from scripts.shared.timing import show
 from scripts.shared.traced import as_camera, capture
 

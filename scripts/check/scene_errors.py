@@ -2,9 +2,9 @@
 
     python -m scripts.check.scene_errors --seeds 700-711 [--write]
 
-Each seed is a terrain (`kcal.sim.terrain`, 960 x 540) with exact lenses. Keypoints are matched along the true epipolar
-lines of pictures with noise, and refined in these and in the same without noise: what then is left comes again in every
-pair of that light. Weights are those of noise and of 0.08 px. With --write docs/measured/scene.md is made.
+Each seed is a terrain (`scripts.shared.terrain`, 960 x 540) with exact lenses. Keypoints are matched along the true
+epipolar lines of pictures with noise, and refined in these and in the same without noise: what then is left comes again
+in every pair of that light. Weights are those of noise and of 0.08 px. With --write docs/measured/scene.md is made.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from torch import Tensor
 
 from kcal.corners.keypoints import keypoints
 from kcal.lens.rig import StereoRig
-from kcal.scene.guided import guided_matches
-from kcal.scene.line_errors import line_errors
+from kcal.scene.common_errors import line_errors
+from kcal.scene.match import guided_matches
 from kcal.scene.refine import refine_matches
-from kcal.sim.terrain import Terrain, Weather
 from scripts.check.scene import HALF, WRONG, exact, rig_of
 from scripts.shared.page import table, write_section
 from scripts.shared.records import seeds
+from scripts.shared.terrain import Terrain, Weather
 from scripts.shared.timing import show
 
 KINDS = ("level ground", "hills and walls", "edges before something farther")

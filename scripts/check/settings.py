@@ -34,8 +34,7 @@ from kcal.corners.observations import Observations
 from kcal.lens.calibration import LensSetting
 from kcal.lens.camera import Camera
 from kcal.lens.uncertainty import pixel_covariance, pixel_errors
-from kcal.sim.prescription import PRESCRIPTIONS, focal_length, system_matrix
-from kcal.sim.raytrace import Misalignment
+from kcal.sim.raytrace import PRESCRIPTIONS, Misalignment, focal_length, system_matrix
 from kcal.sim.truth import TruthLens
 from scripts.shared.page import table, write_section
 from scripts.shared.records import Record, finish

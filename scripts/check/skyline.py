@@ -30,9 +30,8 @@ from kcal.lens.camera import Camera
 from kcal.lens.mounting import Origin
 from kcal.lens.pose import step_rows
 from kcal.lens.projection import project_components
-from kcal.skyline.attitude import skyline_attitude
-from kcal.skyline.raster_error import RasterError
-from kcal.skyline.rig_skyline import SkylineImage, skyline_source
+from kcal.skyline.attitude import SkylineImage, skyline_attitude, skyline_source
+from kcal.skyline.horizon import RasterError
 from scripts.check.stars import kept
 from scripts.shared.page import table, write_section
 from scripts.shared.skyline_trials import (

@@ -24,13 +24,11 @@ import numpy as np
 import torch
 
 from kcal.lens.mounting import Origin
-from kcal.stars.attitude import fit_attitude
-from kcal.stars.catalog import StarCatalog
-from kcal.stars.detect import detect_stars
+from kcal.stars.detect import detect_stars, read_night, time_of
 from kcal.stars.identification import identify
 from kcal.stars.lens import StarCamera, calibrate_by_stars
-from kcal.stars.night import SkyView, name_stars
-from kcal.stars.night_image import read_night, time_of
+from kcal.stars.night import SkyView, fit_attitude, name_stars
+from kcal.stars.sky import StarCatalog
 from scripts.shared.page import write_section
 
 # Trials that are done already, one a line; a run continues where another one ended.

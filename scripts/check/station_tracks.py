@@ -25,8 +25,7 @@ from torch import Tensor
 
 from kcal.lens.camera import Camera
 from kcal.lens.camera_rig import CameraRig
-from kcal.locate.ellipsoid import ecef_from_enu_rotation
-from kcal.locate.geodesy import anchor, enu_from_cam, enu_to_geodetic, geodetic_to_enu
+from kcal.locate.geodesy import anchor, ecef_from_enu_rotation, enu_from_cam, enu_to_geodetic, geodetic_to_enu
 from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.pipeline.association_options import AssociationOptions
 from kcal.pipeline.detections import Detections

@@ -338,8 +338,8 @@ def real() -> list[str]:
 def picture() -> None:
     """Towers and smoke, for the how-to page."""
     from kcal.locate.station_positions import locate_views
-    from kcal.locate.view_marks import ViewMarks
-    from kcal.report.stations import save_stations_picture
+    from kcal.locate.survey import ViewMarks
+    from kcal.report.positions import save_stations_picture
 
     rig, generator = ring(3, 12_000.0), torch.Generator().manual_seed(5)
     rig = CameraRig(

@@ -15,9 +15,7 @@ from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.lens.pose import rotation_from_vector
 from kcal.sim.board import BoardPose
-from kcal.sim.captures import drawn_lens
-from kcal.sim.poses import PoseOptions, sample_board_poses
-from kcal.sim.true_rig import TrueRig, drawn_rig
+from kcal.sim.captures import PoseOptions, TrueRig, drawn_lens, drawn_rig, sample_board_poses
 from kcal.sim.truth import TruthLens
 from scripts.shared.pair_poses import sample_pair_poses
 from scripts.shared.traced import printed

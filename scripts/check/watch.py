@@ -28,10 +28,9 @@ from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.budget import planned_rig
 from kcal.locate.localizer import StereoLocalizer
-from kcal.locate.relock import relocked
-from kcal.watch.alarm import LIMIT, exceeded
-from kcal.watch.model import AngleSeries, TurnModel, learned
-from kcal.watch.state import Look, between_rows, first_state, passed, taken, turns_of
+from kcal.locate.monitor import relocked
+from kcal.watch.state import AngleSeries, Look, TurnModel, between_rows, first_state, learned, passed, taken, turns_of
+from kcal.watch.watcher import LIMIT, exceeded
 from scripts.shared.page import table, write_section
 
 RIG = planned_rig()

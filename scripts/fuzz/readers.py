@@ -36,17 +36,15 @@ from kcal.locate.marks import COVARIANCE, read_marks, write_marks
 from kcal.locate.positions import locate_points
 from kcal.locate.raster import terrain
 from kcal.locate.stations import load_camera_rig
-from kcal.locate.survey import read_features, read_survey
-from kcal.locate.survey_files import import_survey
-from kcal.locate.view_marks import read_views
-from kcal.mark.journal import Journal
+from kcal.locate.survey import import_survey, read_features, read_survey, read_views
+from kcal.mark.session import Journal
 from kcal.pipeline.association_options import AssociationOptions
 from kcal.pipeline.detections import Detections
 from kcal.pipeline.lines import read_moment
 from kcal.pipeline.stream_journal import Ledger
-from kcal.report.backdrop import local_image
+from kcal.report.map_page import local_image
 from kcal.report.practice_score import located_rows
-from kcal.stars.night_image import read_night
+from kcal.stars.detect import read_night
 from scripts.fuzz import foreign_readers
 from scripts.fuzz.foreign_readers import BOARD, CAMERA, board_points
 from scripts.fuzz.reader import PROMISED, Reader, whole_text

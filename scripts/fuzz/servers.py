@@ -30,8 +30,8 @@ from kcal.io.images import write_png
 from kcal.locate.marks import read_marks
 from kcal.locate.positions import located_by
 from kcal.locate.tabulate import Locator
+from kcal.mark.guide import Pictures, open_pictures
 from kcal.mark.marking_service import Desk
-from kcal.mark.pictures import Pictures, open_pictures
 from kcal.mark.server import marking_app
 from kcal.mark.session import Session
 from kcal.pipeline.live_map import LiveMap

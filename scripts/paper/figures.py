@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from kcal.quantities import range_text
 from kcal.report.figures import new_figure, save_picture
+from kcal.texts import range_text
 from scripts.paper.numbers import (
     DISTANCES,
     SHOWN,

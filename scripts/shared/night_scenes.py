@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from kcal.lens.camera import Camera
 from kcal.lens.mounting import Origin
 from kcal.locate.geodesy import enu_from_cam
-from kcal.stars.attitude import FAR
-from kcal.stars.catalog import StarCatalog
-from kcal.stars.sky import observed_directions
+from kcal.stars.night import FAR
+from kcal.stars.sky import StarCatalog, observed_directions
 
 TIME = datetime.datetime(2026, 11, 24, 4, 0, tzinfo=datetime.UTC)
 PLACE = Origin(lat=40.762, lon=-113.896, height=1282.0)

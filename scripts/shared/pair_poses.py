@@ -1,4 +1,4 @@
-"""Poses of a board that both cameras of a rig see, as `kcal.sim.poses` chooses them for one."""
+"""Poses of a board that both cameras of a rig see, as `kcal.sim.captures` chooses them for one."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from torch import Tensor
 
 from kcal.lens.rig import StereoRig
 from kcal.sim.board import BoardLike, BoardPose
-from kcal.sim.poses import PoseOptions, check_draws, choose_poses, draw_poses
-from kcal.sim.true_rig import TrueRig
+from kcal.sim.captures import PoseOptions, TrueRig, check_draws, choose_poses, draw_poses
 
 
 def sample_pair_poses(

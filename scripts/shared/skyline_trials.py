@@ -17,9 +17,9 @@ from kcal.lens.mounting import Origin
 from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic
 from kcal.locate.raster import Raster
 from kcal.sim.captures import drawn_lens
-from kcal.sim.skyline import Hills, HillWeather, Skyline, skyline_image
 from kcal.sim.truth import TruthLens
-from kcal.skyline.raster_error import RasterError
+from kcal.skyline.horizon import RasterError
+from scripts.shared.skyline_scenes import Hills, HillWeather, Skyline, skyline_image
 from scripts.shared.traced import as_camera
 
 Floats = NDArray[np.float64]

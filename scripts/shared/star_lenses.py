@@ -16,13 +16,10 @@ from kcal.locate.geodesy import enu_from_cam
 from kcal.sim.board import LensLike
 from kcal.sim.captures import drawn_lens
 from kcal.sim.truth import TruthLens
-from kcal.stars.attitude import FAR
-from kcal.stars.catalog import StarCatalog
 from kcal.stars.detect import DetectedStars
-from kcal.stars.lens import StarCamera, calibrate_by_stars
-from kcal.stars.night import SkyView
-from kcal.stars.sky import observed_directions
-from kcal.stars.with_boards import Agreement
+from kcal.stars.lens import Agreement, StarCamera, calibrate_by_stars
+from kcal.stars.night import FAR, SkyView
+from kcal.stars.sky import StarCatalog, observed_directions
 from scripts.shared.infinity import error_at_infinity
 from scripts.shared.night_scenes import PLACE, TIME
 from scripts.shared.simulated import CHI2, LENSES

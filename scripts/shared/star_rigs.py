@@ -9,13 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.sources import Baseline, Features, MeasuredPosition, RigData
-from kcal.calibrate.rig.star_source import StarEffect, StarSource
+from kcal.calibrate.rig.sources import Baseline, Features, MeasuredPosition, RigData, StarEffect, StarSource
 from kcal.lens.camera import Camera
 from kcal.locate.geodesy import enu_from_cam
-from kcal.stars.attitude import FAR
-from kcal.stars.catalog import StarCatalog
-from kcal.stars.sky import EARTH_RATE, observed_directions, pole_in_enu
+from kcal.stars.night import FAR
+from kcal.stars.sky import EARTH_RATE, StarCatalog, observed_directions, pole_in_enu
 from scripts.shared.night_scenes import PLACE, TIME
 
 BASELINE = 10.0

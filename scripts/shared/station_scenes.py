@@ -11,8 +11,14 @@ from kcal.lens.camera import Camera
 from kcal.lens.camera_rig import CameraRig
 from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector
-from kcal.locate.ellipsoid import ecef_from_enu_rotation, mean_radius
-from kcal.locate.geodesy import anchor, enu_from_cam, enu_to_geodetic, geodetic_to_enu
+from kcal.locate.geodesy import (
+    anchor,
+    ecef_from_enu_rotation,
+    enu_from_cam,
+    enu_to_geodetic,
+    geodetic_to_enu,
+    mean_radius,
+)
 
 ORIGIN = Origin(lat=45.0, lon=6.0, height=800.0)
 

@@ -15,18 +15,15 @@ from torch import Tensor
 from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.calibrate.rig.sources import Baseline, Features, MeasuredPosition, RigData
-from kcal.calibrate.rig.star_source import StarSource
+from kcal.calibrate.rig.sources import Baseline, Features, MeasuredPosition, RigData, StarSource
 from kcal.lens.camera import Camera
 from kcal.locate.localizer import StereoLocalizer
-from kcal.sim.true_rig import TrueRig
-from kcal.stars.attitude import FAR, Attitude
-from kcal.stars.catalog import StarCatalog
+from kcal.sim.captures import TrueRig
 from kcal.stars.detect import DetectedStars
 from kcal.stars.lens import calibrate_by_stars
-from kcal.stars.night import NamedStars, SkyView
+from kcal.stars.night import FAR, Attitude, NamedStars, SkyView
 from kcal.stars.rig_stars import star_source
-from kcal.stars.sky import Air, celestial_directions, observed_directions
+from kcal.stars.sky import Air, StarCatalog, celestial_directions, observed_directions
 from scripts.check.chain_rig import ENU_FROM_RIG, Targets, landmarks, targets, true_rig
 from scripts.shared.long_range import ORIGIN, RANGES
 from scripts.shared.night_scenes import PLACE, TIME

@@ -12,8 +12,7 @@ import pytest
 from capture_frames import BOARD, images
 from typer.testing import CliRunner
 
-from kcal.capture.session import FIRST_VIEWS, CaptureOptions, CaptureSession, follow
-from kcal.capture.sources import Shot, shots
+from kcal.capture.session import FIRST_VIEWS, CaptureOptions, CaptureSession, Shot, follow, shots
 from kcal.cli.main import app
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations
@@ -115,7 +114,7 @@ def test_of_a_stream_the_newest_frame_is_looked_at(monkeypatch: pytest.MonkeyPat
         ended.set()
         raise FileError("the stream ended")
 
-    monkeypatch.setattr("kcal.capture.sources.read_frames", frames)
+    monkeypatch.setattr("kcal.capture.session.read_frames", frames)
     found = shots("camera:0", lambda: False, print)
     first = next(found)
     taken.set()

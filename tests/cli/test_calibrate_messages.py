@@ -13,7 +13,7 @@ from calibrate_scenes import camera, motions, observe, pixels_of
 from typer.testing import CliRunner
 
 from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.cli.cures import more_views
+from kcal.cli.console import more_views
 from kcal.cli.main import app
 from kcal.corners.board import Board
 from kcal.errors import DegenerateError

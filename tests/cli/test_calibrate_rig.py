@@ -23,7 +23,7 @@ from kcal.io.rig_file import RigFile
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import StereoRig
-from kcal.quantities import number_text
+from kcal.texts import number_text
 
 BOARD = Board(columns=7, rows=6, square=0.05)
 SIZE = (640, 480)
@@ -387,7 +387,7 @@ class TestRig:
         def fails(*_: object) -> None:
             raise DegenerateError("no side of a square could be triangulated")
 
-        monkeypatch.setattr("kcal.locate.check.triangulated_sides", fails)
+        monkeypatch.setattr("kcal.locate.monitor.triangulated_sides", fails)
         arguments = ["rig", "left.camera.json", "right.camera.json", *PAIRS, "-o", "rig.json"]
         assert "no side of a square" in refuse(cameras, monkeypatch, capsys, *arguments)
 

@@ -39,7 +39,7 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     def nothing(*_: object) -> Iterator[None]:
         return iter(())
 
-    monkeypatch.setattr("kcal.capture.sources.shots", nothing)
+    monkeypatch.setattr("kcal.capture.session.shots", nothing)
     monkeypatch.setattr("kcal.web.serving.LocalServer", Server)
     monkeypatch.setattr("webbrowser.open", found.append)
     monkeypatch.setattr("time.sleep", lambda seconds: None)
@@ -89,7 +89,7 @@ def test_an_interruption_before_all_has_started(
             raise KeyboardInterrupt
         start(thread)
 
-    monkeypatch.setattr("kcal.capture.sources.shots", endless)
+    monkeypatch.setattr("kcal.capture.session.shots", endless)
     with monkeypatch.context() as patched:
         patched.setattr(threading.Thread, "start", interrupted)
         done = capture(tmp_path, "--no-page")

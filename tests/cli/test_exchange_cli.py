@@ -10,7 +10,7 @@ import torch
 from typer.testing import CliRunner
 
 from kcal.cli.main import app
-from kcal.cli.rig_text import _exact_line
+from kcal.cli.stations import _exact_line
 from kcal.corners.observations import Observations
 from kcal.errors import InputError
 from kcal.io.camera_file import load_camera, save_camera

@@ -15,11 +15,8 @@ from practice_marks import mark_practice
 from typer.testing import CliRunner
 
 import kcal.io.images
-import kcal.io.video_file
-from kcal.cli.demo_practice import TRUTH, practice_site
-from kcal.cli.demo_score import next_step, practice_score
+from kcal.cli.demo_practice import STEPS, TRUTH, next_step, night_name, practice_score, practice_site
 from kcal.cli.main import app
-from kcal.cli.practice_files import STEPS, night_name
 from kcal.errors import FileError
 from kcal.lens.mounting import Origin
 from kcal.locate.geodesy import enu_to_geodetic
@@ -135,7 +132,7 @@ def test_without_the_extra_for_videos_the_rest_is_made(
 
     (folder / "video" / "left.mp4").unlink()
     (folder / "survey.csv").unlink()
-    monkeypatch.setattr(kcal.io.video_file, "write_video", missing)
+    monkeypatch.setattr(kcal.io.images, "write_video", missing)
     make(folder)
     said = capsys.readouterr()
     assert "wrote 1 files" in said.out

@@ -11,8 +11,7 @@ from typer.main import get_command
 from typer.testing import CliRunner, Result
 
 from kcal import load_rig
-from kcal.cli.main import app
-from kcal.cli.old_flags import with_new_names
+from kcal.cli.main import app, with_new_names
 from kcal.cli.settings import SETTINGS, defaults_of, read_settings, toml_text
 from kcal.errors import FileError, InputError
 

@@ -19,8 +19,8 @@ from kcal.io.camera_rig_file import save_camera_rig
 from kcal.lens.camera import Camera
 from kcal.lens.camera_rig import CameraRig
 from kcal.lens.pose import rotation_from_vector
+from kcal.locate.budget import station_sigmas
 from kcal.locate.geodesy import enu_to_geodetic
-from kcal.locate.station_sigmas import station_sigmas
 from kcal.locate.stations import load_camera_rig
 from scripts.shared.station_scenes import ORIGIN, marks, ring, targets
 

@@ -19,8 +19,8 @@ from kcal.cli.main import app
 from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.mounting import Mounting, Origin
 from kcal.locate.budget import planned_rig
-from kcal.watch.alarm import Webhook
 from kcal.watch.history import history_head, history_line
+from kcal.watch.watcher import Webhook
 from tests.helpers.scene_pairs import pair, small_rig
 from tests.helpers.watched_looks import START, row_of, yaw_turn
 
@@ -146,7 +146,7 @@ def test_live_tracks_have_the_sigma_of_the_moment(watched: Path) -> None:
 
 
 def test_a_webhook_gets_the_alarm_and_is_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("kcal.watch.alarm._PATIENCE", PATIENCE)
+    monkeypatch.setattr("kcal.watch.watcher._PATIENCE", PATIENCE)
     got: list[dict[str, object]] = []
 
     class Hook(BaseHTTPRequestHandler):

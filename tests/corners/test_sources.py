@@ -15,7 +15,7 @@ from kcal.corners.observations import Observations
 from kcal.corners.orientation import exif_orientation, turned_images
 from kcal.corners.video import detect_video, read_frames
 from kcal.errors import FileError, InputError
-from kcal.report.gallery import coverage_figure, gallery_figure
+from kcal.report.calibration import coverage_figure, gallery_figure
 
 BOARD = Board(columns=6, rows=5, square=0.02)
 SIZE = (240, 200)

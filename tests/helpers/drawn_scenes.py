@@ -33,19 +33,12 @@ from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.ground import level_ground
 from kcal.locate.positions import Located, locate_points
 from kcal.locate.siting import Area, RankedSite, Site, area_of, rank_sites
-from kcal.report.attitude import attitude_figure
-from kcal.report.board import board_figure
-from kcal.report.budget import budget_figure
-from kcal.report.calibration import calibration_figure
+from kcal.report.calibration import board_figure, calibration_figure, coverage_figure, gallery_figure, interval_figure
 from kcal.report.difference import difference_figure
 from kcal.report.difference_text import difference_text
-from kcal.report.gallery import coverage_figure, gallery_figure
-from kcal.report.interval_map import interval_figure
-from kcal.report.positions import positions_figure
-from kcal.report.rig import rig_figure
+from kcal.report.positions import budget_figure, positions_figure, stations_figure
+from kcal.report.rig import attitude_figure, rig_figure, stars_figure
 from kcal.report.siting import siting_figure
-from kcal.report.stars import stars_figure
-from kcal.report.stations import stations_figure
 
 PLACES = tensor([20.0, 0.0, 100.0], [-300.0, 5.0, 1000.0], [900.0, 0.0, 5000.0], [0.0, 0.0, 60_000.0])
 PLACE = Origin(lat=10.0, lon=20.0, height=0.0)
@@ -103,7 +96,7 @@ def stations() -> Located:
     """Things seen by three towers, one of them by one tower alone."""
     from kcal.lens.camera_rig import CameraRig
     from kcal.locate.station_positions import locate_views
-    from kcal.locate.view_marks import ViewMarks
+    from kcal.locate.survey import ViewMarks
 
     lens = Camera.build(focal=(900, 900), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
     centers = tensor([0.0, 0.0, 30.0], [3000.0, 200.0, 40.0], [1500.0, -900.0, 35.0])

@@ -27,9 +27,9 @@ from kcal.io.images import write_png
 from kcal.lens.mounting import Origin
 from kcal.locate.positions import locate_points, located_by
 from kcal.locate.tabulate import Locator
+from kcal.mark.guide import open_pictures
 from kcal.mark.items import Add, Mark, Put
 from kcal.mark.marking_service import Desk
-from kcal.mark.pictures import open_pictures
 from kcal.mark.server import marking_app
 from kcal.mark.session import Session
 from kcal.pipeline.live_map import LiveMap
@@ -37,7 +37,7 @@ from kcal.pipeline.track_columns import track_columns
 from kcal.pipeline.track_options import TrackOptions
 from kcal.pipeline.tracks import Tracker
 from kcal.report.map_page import save_map
-from kcal.report.summary import Part, save_summary
+from kcal.report.tables import Part, save_summary
 from kcal.web.serving import LocalServer
 from scripts.shared.marking_scene import LANDMARKS, TARGETS, MarkingSite, marking_site
 

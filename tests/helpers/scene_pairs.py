@@ -10,8 +10,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import StereoRig
 from kcal.scene.match import ImagePair
-from kcal.sim.backdrop import exposed
-from kcal.sim.noise import smooth_noise
+from kcal.sim.coast import exposed, smooth_noise
 
 SIZE = (480, 320)
 # Distance, left and right edge, upper and lower edge, meters; y is down.

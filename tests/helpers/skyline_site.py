@@ -13,8 +13,8 @@ from kcal.lens.camera import Camera
 from kcal.lens.mounting import Origin
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.raster import Raster
-from kcal.sim.skyline import Hills, HillWeather, skyline_image
-from kcal.skyline.raster_error import RasterError
+from kcal.skyline.horizon import RasterError
+from scripts.shared.skyline_scenes import Hills, HillWeather, skyline_image
 from scripts.shared.skyline_trials import level_system, raster_around
 
 HILLS = Hills(seed=3, relief=260.0, clear=700.0, far=4_500.0)

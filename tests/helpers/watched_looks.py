@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from kcal.watch.history import HistoryRow, no_look
-from kcal.watch.model import LASTING_S, TurnModel
-from kcal.watch.state import Look
+from kcal.watch.state import LASTING_S, Look, TurnModel
 
 SIGMA, SHARE = 4e-6, 0.3
 START = 1_777_636_800.0

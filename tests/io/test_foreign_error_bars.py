@@ -11,8 +11,8 @@ import torch
 from scipy.io import savemat
 
 from kcal.errors import FileError
+from kcal.io.format_kalibr import project_omni
 from kcal.io.formats import import_cameras, recognized
-from kcal.io.kalibr_omni import project_omni
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 

@@ -10,8 +10,7 @@ import pytest
 
 from kcal.corners.images import decode_image
 from kcal.errors import FileError, InputError
-from kcal.io.images import encode_png, write_png
-from kcal.io.video_file import write_video
+from kcal.io.images import encode_png, write_png, write_video
 
 DRAW = np.random.default_rng(1)
 

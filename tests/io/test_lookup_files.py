@@ -13,7 +13,7 @@ from scipy.io import loadmat, savemat
 from kcal.errors import FileError
 from kcal.io import lookup_file
 from kcal.io.foreign import rig_poses
-from kcal.io.format_matlab import write_matlab
+from kcal.io.format_opencv import write_matlab
 from kcal.io.formats import import_cameras
 from kcal.io.lookup_file import load_lookup, save_lookup
 from kcal.lens.baking import bake

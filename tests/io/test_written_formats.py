@@ -11,11 +11,10 @@ import yaml
 from scipy.io import loadmat
 
 from kcal.io.foreign import rig_poses
-from kcal.io.format_kalibr import write_omni
-from kcal.io.format_matlab import write_matlab
+from kcal.io.format_kalibr import fit_omni, project_omni, write_omni
 from kcal.io.format_mrcal import fit_spline, project_spline
+from kcal.io.format_opencv import write_matlab
 from kcal.io.formats import import_cameras
-from kcal.io.kalibr_omni import fit_omni, project_omni
 from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
 

@@ -8,8 +8,8 @@ from locate_rigs import pinhole_rig, tensor
 
 from kcal.errors import InputError
 from kcal.lens.mounting import Origin
-from kcal.locate.cep import circular_error
 from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.tabulate import circular_error
 
 
 def test_circles_lines_and_ellipses() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from kcal.errors import FileError, InputError
 from kcal.lens.mounting import Origin
-from kcal.locate.datum import find_geoid, geoid_column, true_from_grid
+from kcal.locate.tabulate import find_geoid, geoid_column, true_from_grid
 
 
 def grid(path: Path) -> Path:

@@ -14,15 +14,14 @@ from typer.testing import CliRunner
 from kcal.cli.main import app
 from kcal.errors import FileError
 from kcal.io.rig_file import save_rig
-from kcal.locate import distinct_keys, tables, view_marks
-from kcal.locate.distinct_keys import DistinctKeys, Doubled
-from kcal.locate.tables import read_chunks
-from kcal.locate.view_marks import read_view_chunks
+from kcal.locate import survey, tables
+from kcal.locate.survey import read_view_chunks
+from kcal.locate.tables import DistinctKeys, Doubled, read_chunks
 
 
 @pytest.fixture(autouse=True)
 def little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(distinct_keys, "_IN_MEMORY", 16)
+    monkeypatch.setattr(tables, "_IN_MEMORY", 16)
 
 
 def found(keys: list[str], step: int) -> Doubled | None:
@@ -43,7 +42,7 @@ def test_a_doubled_key_is_found_wherever_it_is(
     """Also where unlike keys have equal hashes."""
     if unlike is not None:
         own = lambda key: (hash(key) % unlike - unlike // 2) << 56  # noqa: E731
-        monkeypatch.setattr(distinct_keys, "hash", own, raising=False)
+        monkeypatch.setattr(tables, "hash", own, raising=False)
     keys = [f"thing {i}" for i in range(count)]
     assert found(keys, step) is None
     draw = random.Random(count)
@@ -65,8 +64,8 @@ def test_a_table_that_is_longer_than_memory(tmp_path: Path) -> None:
 
 
 def test_a_long_table_of_views(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(view_marks, "_WHOLE", 0)
-    monkeypatch.setattr(view_marks, "read_chunks", lambda *given, **more: read_chunks(*given, **more, at_once=8))
+    monkeypatch.setattr(survey, "_WHOLE", 0)
+    monkeypatch.setattr(survey, "read_chunks", lambda *given, **more: read_chunks(*given, **more, at_once=8))
     path = tmp_path / "views.csv"
     lines = ["name,camera,u,v,time", *(f"a{i // 2 % 50},{'lr'[i % 2]},{i},1,{i // 100}" for i in range(300))]
     path.write_text("\n".join(lines) + "\n")

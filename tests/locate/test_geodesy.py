@@ -15,8 +15,17 @@ from locate_rigs import tensor
 from kcal.errors import InputError
 from kcal.io.onnx_file import save_onnx
 from kcal.lens.mounting import Origin
-from kcal.locate.ellipsoid import arc_tangent, ecef_to_geodetic, geodetic_to_ecef
-from kcal.locate.geodesy import anchor, azimuth_elevation, enu_from_cam, enu_to_geodetic, geodetic_to_enu, place_enu
+from kcal.locate.geodesy import (
+    anchor,
+    arc_tangent,
+    azimuth_elevation,
+    ecef_to_geodetic,
+    enu_from_cam,
+    enu_to_geodetic,
+    geodetic_to_ecef,
+    geodetic_to_enu,
+    place_enu,
+)
 
 ORIGINS = [
     Origin(lat=0.0, lon=0.0, height=0.0),

@@ -20,17 +20,16 @@ from kcal.errors import FileError, InputError
 from kcal.io.rig_file import save_rig
 from kcal.lens.mounting import Origin
 from kcal.lens.rig import RigCovariance
-from kcal.locate import distinct_keys, marks, stereo, tables, tabulate
-from kcal.locate.cep import circular_error
-from kcal.locate.columns import NUMBERS, number_lines
+from kcal.locate import marks, stereo, tables, tabulate
 from kcal.locate.export import PositionWriter, write_positions
 from kcal.locate.geodesy import azimuth_elevation
 from kcal.locate.marks import read_mark_chunks, read_marks
 from kcal.locate.mounting import mounting_covariance
 from kcal.locate.positions import locate_points, located_by
-from kcal.locate.sample import PositionSample
+from kcal.locate.station_positions import PositionSample
 from kcal.locate.stereo import PositionStatus
-from kcal.locate.tabulate import Locator
+from kcal.locate.tables import NUMBERS, number_lines
+from kcal.locate.tabulate import Locator, circular_error
 
 ORIGIN = Origin(lat=-33.9, lon=151.2, height=40.0)
 ROWS = 250
@@ -287,7 +286,7 @@ def test_plain_lines_are_read_like_any(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def test_equal_hashes_of_unlike_names_are_no_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(distinct_keys, "hash", lambda name: 1, raising=False)
+    monkeypatch.setattr(tables, "hash", lambda name: 1, raising=False)
     path = table(tmp_path / "points.csv")
     assert sum(len(chunk.names) for chunk in read_mark_chunks(path, at_once=64)) == ROWS
 

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from kcal.calibrate.rig.sources import MeasuredPosition
 from kcal.errors import FileError, InputError
-from kcal.locate.moving import MovingTrack, Sighting, read_sightings, read_tracks
-from kcal.locate.moving_match import MovingOptions, match_moving
+from kcal.locate.moving import MovingOptions, MovingTrack, Sighting, match_moving, read_sightings, read_tracks
 from scripts.check.moving import CAMERA, CENTERS, LATE, NAMES, one_draw, path_of
 
 HEAD = "name,time,lat,lon,height,sigma,sigma_up,constant_sigma,latency_sigma\n"

@@ -18,12 +18,11 @@ from locate_rigs import pinhole_rig, real_rig, spread_points, tensor
 from kcal.errors import FileError, InputError
 from kcal.lens.mounting import Origin
 from kcal.lens.rig import RigCovariance
-from kcal.locate.cot import cot_events
-from kcal.locate.datum import find_geoid
-from kcal.locate.export import write_positions
+from kcal.locate.export import cot_events, write_positions
 from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic, geodetic_to_enu
 from kcal.locate.positions import Located, Position, locate_points
 from kcal.locate.stereo import PositionStatus
+from kcal.locate.tabulate import find_geoid
 
 ORIGIN = Origin(lat=-33.9, lon=151.2, height=40.0)
 RIG = pinhole_rig()  # f b = 16 000 px m, center (959.5, 539.5)

@@ -11,10 +11,9 @@ from locate_rigs import real_rig, tensor
 from kcal.errors import InputError
 from kcal.lens.mounting import Mounting, Origin
 from kcal.lens.rig import RigCovariance, StereoRig
-from kcal.locate.budget import planned_rig
+from kcal.locate.budget import planned_rig, range_sigmas, usual_ranges
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.mounting import mounting_covariance
-from kcal.locate.range_sigmas import range_sigmas, usual_ranges
 from kcal.report.tables import range_sigma_rows
 
 ORIGIN = Origin(lat=-33.9, lon=151.2, height=40.0)

@@ -9,7 +9,7 @@ import torch
 from locate_rigs import tensor
 from torch import Tensor
 
-from kcal.locate.region import region_outline
+from kcal.locate.positions import region_outline
 
 # East, north; not along an axis, and an ellipse that is oblique to the line of sight.
 PLACE = tensor(1500.0, 2500.0, 40.0)

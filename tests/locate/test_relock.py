@@ -18,8 +18,7 @@ from kcal.lens.mounting import Mounting, Origin
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.geodesy import enu_from_cam
-from kcal.locate.monitor import drift_effect
-from kcal.locate.relock import check_rig, relocked
+from kcal.locate.monitor import check_rig, drift_effect, relocked
 
 # Sigmas of the origin (east, north, up) and of turns about these axes, all unlike; simulated light goes straight.
 STANDING = torch.diag(tensor(0.1, 0.2, 0.3, 1e-5, 2e-5, 3e-5, 0.0) ** 2)

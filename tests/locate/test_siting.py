@@ -13,14 +13,11 @@ from torch import Tensor
 
 from kcal.errors import FileError, InputError
 from kcal.lens.mounting import REFRACTION_SIGMA, Origin
-from kcal.locate.ellipsoid import mean_radius
-from kcal.locate.geodesy import anchor, enu_to_geodetic, geodetic_to_enu, place_enu
+from kcal.locate.geodesy import anchor, enu_to_geodetic, geodetic_to_enu, mean_radius, place_enu
 from kcal.locate.ground import level_ground
 from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.locate.raster import terrain
-from kcal.locate.site_tables import read_sites, sites_of
-from kcal.locate.siting import Area, Site, area_of, rank_sites, siting_map
-from kcal.locate.viewshed import seen_over, surface_of
+from kcal.locate.siting import Area, Site, area_of, rank_sites, read_sites, seen_over, sites_of, siting_map, surface_of
 from scripts.shared.station_scenes import ORIGIN, marks, ring
 
 BOUNDS = (44.96, 5.95, 45.04, 6.05)

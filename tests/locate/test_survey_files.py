@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from kcal.errors import FileError, InputError
-from kcal.locate.survey import read_survey
-from kcal.locate.survey_files import import_survey
+from kcal.locate.survey import import_survey, read_survey
 
 GPX = """<?xml version="1.0"?>
 <gpx xmlns="http://www.topografix.com/GPX/1/1" version="1.1">

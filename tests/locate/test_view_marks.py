@@ -12,18 +12,16 @@ import torch
 from typer.testing import CliRunner
 
 from kcal.cli.main import app
-from kcal.cli.rig_stars import images_of_nights
+from kcal.cli.stars import images_of_nights
 from kcal.errors import FileError, InputError
 from kcal.io.camera_rig_file import save_camera_rig
-from kcal.locate import view_marks
+from kcal.locate import survey
+from kcal.locate.budget import range_sigmas, station_sigmas
 from kcal.locate.geodesy import enu_to_geodetic, geodetic_to_enu
-from kcal.locate.range_sigmas import range_sigmas
-from kcal.locate.sample import PositionSample
-from kcal.locate.station_positions import ViewsLocator
-from kcal.locate.station_sigmas import station_sigmas
+from kcal.locate.station_positions import PositionSample, ViewsLocator
 from kcal.locate.stations import stations_of
+from kcal.locate.survey import ViewMarks, read_feature_views, read_view_chunks, read_views
 from kcal.locate.tables import read_chunks
-from kcal.locate.view_marks import ViewMarks, read_feature_views, read_view_chunks, read_views
 from kcal.rig import RigCovariance, planned_rig
 from scripts.shared.station_scenes import ORIGIN, marks, ring, targets
 
@@ -52,8 +50,8 @@ def joined(path: Path) -> ViewMarks:
 
 
 def small_parts(monkeypatch: pytest.MonkeyPatch, rows: int) -> None:
-    monkeypatch.setattr(view_marks, "_WHOLE", 0)
-    monkeypatch.setattr(view_marks, "read_chunks", lambda *given, **more: read_chunks(*given, **more, at_once=rows))
+    monkeypatch.setattr(survey, "_WHOLE", 0)
+    monkeypatch.setattr(survey, "read_chunks", lambda *given, **more: read_chunks(*given, **more, at_once=rows))
 
 
 @pytest.mark.parametrize("times", [1, 3])

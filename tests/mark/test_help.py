@@ -19,18 +19,14 @@ from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.marks import Marks, write_marks
+from kcal.locate.monitor import check_rig, seen_again
 from kcal.locate.positions import locate_points
-from kcal.locate.relock import check_rig, seen_again
 from kcal.locate.survey import Survey
-from kcal.mark.guide import RigBand, at_shape, propose
+from kcal.mark.guide import Reference, RigBand, at_shape, open_pictures, propose
 from kcal.mark.items import Add, Mark, MarkingState, Place, Put, Side, SurveyPlace
-from kcal.mark.live import Promise, solve_live, verdict
-from kcal.mark.marking_service import Desk
-from kcal.mark.overview import map_content
-from kcal.mark.pictures import open_pictures
-from kcal.mark.reference import Reference
+from kcal.mark.marking_service import Desk, Promise, map_content, solve_live, verdict
 from kcal.mark.session import Session
-from kcal.mark.snap import snap
+from kcal.mark.shapes import snap
 from scripts.shared.marking_scene import (
     LANDMARKS,
     MarkingSite,

@@ -8,7 +8,7 @@ import pytest
 
 from kcal.errors import InputError
 from kcal.io.images import write_png
-from kcal.mark.pictures import TILE, Pyramid, open_pictures, top_level
+from kcal.mark.guide import TILE, Pyramid, open_pictures, top_level
 
 
 def noise(height: int, width: int, dtype: type = np.uint8) -> np.ndarray:

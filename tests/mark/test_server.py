@@ -17,11 +17,10 @@ from starlette.testclient import TestClient
 
 from kcal.errors import FileError
 from kcal.io.images import write_png
-from kcal.mark.journal import Journal
+from kcal.mark.guide import open_pictures
 from kcal.mark.marking_service import Desk
-from kcal.mark.pictures import open_pictures
 from kcal.mark.server import marking_app, marking_files
-from kcal.mark.session import Session
+from kcal.mark.session import Journal, Session
 
 TOKEN = "secret-of-this-start"
 HOST = "127.0.0.1:8347"
@@ -138,7 +137,7 @@ def test_a_full_disk_is_told_and_what_was_answered_stays(
 
     answers = []
     with monkeypatch.context() as patched:
-        patched.setattr("kcal.mark.journal.os.write", write)
+        patched.setattr("kcal.mark.session.os.write", write)
         for number in range(60):
             left[0] = int(random.integers(0, 400))
             action = {"do": "put", "name": "a", "side": "left", "mark": {**MARK, "u": float(number)}}

@@ -187,7 +187,7 @@ class FullDisk:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, left: int) -> None:
         self.left, self._write, self._sync = left, os.write, os.fsync
-        monkeypatch.setattr("kcal.mark.journal.os.write", self.write)
+        monkeypatch.setattr("kcal.mark.session.os.write", self.write)
 
     def write(self, file: int, data: bytes) -> int:
         if not self.left:
@@ -211,7 +211,7 @@ def test_a_full_disk_loses_nothing_that_was_acknowledged(
             def unsynced(_: int) -> None:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-            patched.setattr("kcal.mark.journal.os.fsync", unsynced)
+            patched.setattr("kcal.mark.session.os.fsync", unsynced)
         for number in range(3):
             with pytest.raises(FileError, match="the disk is full; this was not done"):
                 session.do(put("post", "left", mark(77.0, 1.0)), f"key-full{number}")
@@ -244,7 +244,7 @@ def test_nothing_is_left_where_even_cutting_off_fails(
             calls.append(length)
             (whole if len(calls) == 1 else failing)(file, length)
 
-        patched.setattr("kcal.mark.journal.os.ftruncate", once)
+        patched.setattr("kcal.mark.session.os.ftruncate", once)
         for number in range(2):
             with pytest.raises(FileError, match="cannot write"):
                 session.do(put("post", "left", mark(77.0, 1.0)), f"key-full{number}")

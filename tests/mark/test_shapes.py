@@ -11,7 +11,7 @@ from scipy import stats
 from scipy.special import ndtr
 
 from kcal.errors import FileError
-from kcal.mark.places import places_text, read_places
+from kcal.mark.session import places_text, read_places
 from kcal.mark.shapes import SHAPES, ShapeFit, _both_positive, fit_shape, slopes, starts_at
 
 AXIS = np.arange(-9.0, 10.0)

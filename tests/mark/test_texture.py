@@ -7,8 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from kcal.mark.shapes import SHAPES, ShapeFit, fit_shape
-from kcal.mark.texture import _fours, _likelihood, fit_before_texture, texture_of
+from kcal.mark.shapes import SHAPES, ShapeFit, _fours, _likelihood, fit_before_texture, fit_shape, texture_of
 
 AXIS = np.arange(-12.0, 13.0)
 WHERE = np.stack([part.ravel() for part in np.meshgrid(AXIS, AXIS)], -1)

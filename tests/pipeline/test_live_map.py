@@ -22,9 +22,9 @@ pytest.importorskip("uvicorn")
 from pages import crowded_map
 
 from kcal.lens.mounting import Origin
-from kcal.locate.columns import PositionColumns
 from kcal.locate.geodesy import geodetic_to_enu
 from kcal.locate.positions import located_by
+from kcal.locate.tables import PositionColumns
 from kcal.locate.tabulate import Locator
 from kcal.pipeline.live_map import LiveMap
 from kcal.pipeline.track_columns import track_columns

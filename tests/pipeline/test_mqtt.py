@@ -14,8 +14,8 @@ from track_scenes import tracked_site
 
 pytest.importorskip("paho.mqtt.client")
 from kcal.errors import InputError
-from kcal.locate.columns import NUMBERS, PositionColumns
 from kcal.locate.positions import located_by
+from kcal.locate.tables import NUMBERS, PositionColumns
 from kcal.locate.tabulate import Locator
 from kcal.pipeline.senders import Sender, sender_to
 

@@ -6,7 +6,7 @@ import warnings
 
 import pytest
 
-from kcal.cli.old_flags import _NEEDLESS, _RENAMED
+from kcal.cli.main import _NEEDLESS, _RENAMED
 from kcal.old_names import GONE, PLACES
 from scripts.make_promises import command_lines, python_lines, stored
 

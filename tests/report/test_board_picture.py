@@ -12,7 +12,7 @@ from matplotlib.quiver import Quiver
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard
 from kcal.corners.board import Board
 from kcal.errors import InputError
-from kcal.report.board import board_figure, board_text, save_board_picture
+from kcal.report.calibration import board_figure, board_text, save_board_picture
 
 
 def bent_board(scale: float) -> MeasuredBoard:

@@ -20,8 +20,7 @@ from kcal.errors import FileError, InputError
 from kcal.lens.mounting import Origin
 from kcal.locate.geodesy import enu_from_cam, geodetic_to_enu
 from kcal.locate.positions import Located, locate_points
-from kcal.report.backdrop import local_image, local_tiles
-from kcal.report.map_page import map_page, save_map
+from kcal.report.map_page import local_image, local_tiles, map_page, save_map
 
 ORIGIN = Origin(lat=19.07, lon=72.87, height=14.0)
 TRUTH = tensor([20.0, 0.0, 100.0], [-300.0, 5.0, 1000.0], [900.0, 0.0, 5000.0], [0.0, 0.0, 60_000.0])

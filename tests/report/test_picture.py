@@ -15,9 +15,8 @@ from kcal.lens.mounting import Origin
 from kcal.locate.budget import RangeError
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.positions import Located, locate_points
-from kcal.report.budget import budget_figure
 from kcal.report.figures import new_figure
-from kcal.report.positions import positions_figure, save_positions_picture
+from kcal.report.positions import budget_figure, positions_figure, save_positions_picture
 
 HEADING = 300.0
 TRUTH = tensor([20.0, 0.0, 100.0], [-300.0, 5.0, 1000.0], [900.0, 0.0, 5000.0], [0.0, 0.0, 60_000.0])

@@ -16,9 +16,8 @@ from kcal.calibrate.camera.misfit import Misfit
 from kcal.corners.observations import Observations, View
 from kcal.lens.camera import Camera
 from kcal.lens.difference import camera_difference
-from kcal.report.calibration import calibration_figure
+from kcal.report.calibration import calibration_figure, coverage_figure, gallery_figure
 from kcal.report.difference import difference_figure, difference_text
-from kcal.report.gallery import coverage_figure, gallery_figure
 
 LONG = "/home/somebody/a long folder of a site/with the date 2026-11-24/and more of it/rig.json: the left camera"
 

@@ -17,9 +17,9 @@ from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import StereoRig
 from kcal.locate.positions import locate_points
-from kcal.report.budget import plotted_ranges
 from kcal.report.difference import difference_figure
 from kcal.report.difference_text import difference_text
+from kcal.report.positions import plotted_ranges
 from kcal.report.practice_score import score_lens, score_rig
 from kcal.report.tables import chance_text
 from kcal.report.verdict import RangeAnswer, Requirement, Verdict

@@ -17,7 +17,6 @@ from locate_rigs import pinhole_rig
 from PIL import Image, TiffImagePlugin
 
 from kcal.calibrate.camera.trust import Examination, HalvesDifference, ResidualStructure
-from kcal.calibrate.rig.synchrony import Synchrony
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.errors import InputError
@@ -27,26 +26,35 @@ from kcal.lens.difference import camera_difference
 from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import RigCovariance
+from kcal.locate.budget import range_sigmas
 from kcal.locate.geodesy import geodetic_to_enu
-from kcal.locate.map_places import map_places
-from kcal.locate.range_sigmas import range_sigmas
-from kcal.locate.region import region_rings
-from kcal.report.backdrop import _placing, _tile, _warp, local_image
-from kcal.report.judge_camera import _camera_answer, _image_rms, other_views
-from kcal.report.judge_rig import _pairs_compared, _synchrony_finding, _worst_of_pair, named_cameras, rig_verdict
-from kcal.report.map_page import _box, _content, arcs_within
-from kcal.report.model_findings import _changed, _prediction_finding, model_findings
+from kcal.locate.positions import map_places, region_rings
+from kcal.report.judge_camera import (
+    _blur_finding,
+    _blurred_share,
+    _camera_answer,
+    _changed,
+    _coverage_finding,
+    _image_rms,
+    _pose_findings,
+    _prediction_finding,
+    _repetition_finding,
+    _sides_finding,
+    model_findings,
+    other_views,
+)
+from kcal.report.judge_rig import (
+    Synchrony,
+    _pairs_compared,
+    _synchrony_finding,
+    _worst_of_pair,
+    named_cameras,
+    rig_verdict,
+)
+from kcal.report.map_page import _box, _content, _placing, _tile, _warp, arcs_within, local_image
 from kcal.report.verdict import FAULTS, Requirement
 from kcal.report.verdict_page import _caption, _correlations, camera_tables
 from kcal.report.verdict_pictures import _PART_COLORS
-from kcal.report.view_findings import (
-    _blur_finding,
-    _blurred_share,
-    _coverage_finding,
-    _pose_findings,
-    _repetition_finding,
-    _sides_finding,
-)
 
 CAMERA = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480), model="pinhole")
 

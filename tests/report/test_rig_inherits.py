@@ -14,14 +14,14 @@ from typer.testing import CliRunner
 from kcal import Board, Observations, View
 from kcal.cli import report
 from kcal.cli.main import app
-from kcal.cli.sides import check_views_of
+from kcal.cli.rig_sources import check_views_of
 from kcal.errors import InputError
 from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.calibration import BoardRecord, CalibrationRecord, CameraCalibration, RigCalibration, RigSource
 from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.report.judge_camera import record_findings
 from kcal.report.judge_rig import rig_verdict
 from kcal.report.verdict import FAULTS, Finding, Requirement, Verdict
-from kcal.report.view_findings import record_findings
 
 NEED = Requirement.parse("1km:5%")
 NOW = datetime.datetime(2026, 1, 1, tzinfo=datetime.UTC)

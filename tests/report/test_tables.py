@@ -10,10 +10,9 @@ from locate_rigs import pinhole_rig, tensor
 
 from kcal.corners.board import Board
 from kcal.lens.rig import StereoRig
+from kcal.locate.budget import range_sigmas
 from kcal.locate.geodesy import Origin
-from kcal.locate.positions import locate_points
-from kcal.locate.range_sigmas import range_sigmas
-from kcal.locate.truth import position_errors
+from kcal.locate.positions import locate_points, position_errors
 from kcal.report.tables import diagonal_rows, position_rows, range_sigma_rows, truth_rows
 
 ORIGIN = Origin(lat=10.0, lon=20.0, height=0.0)

@@ -14,18 +14,15 @@ from torch import Tensor
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
 from kcal.calibrate.camera.trust import Examination, examine, residual_structure
-from kcal.calibrate.rig.synchrony import synchrony
 from kcal.corners.observations import Observations, View
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import StereoRig
-from kcal.report.judge_camera import camera_verdict, stored_verdict
-from kcal.report.judge_rig import rig_verdict
-from kcal.report.model_findings import model_findings
+from kcal.report.judge_camera import camera_verdict, model_findings, stored_verdict, view_findings
+from kcal.report.judge_rig import rig_verdict, synchrony
 from kcal.report.verdict import Finding, RangeAnswer, Requirement, Verdict
 from kcal.report.verdict_page import range_rows, verdict_page
-from kcal.report.view_findings import view_findings
 
 VIEWS, NOISE = 14, 0.08
 # Fast: an opencv5 truth, fitted with opencv5 unless a test plants another model.

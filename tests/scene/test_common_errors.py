@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from kcal.scene import common_errors
-from kcal.scene.common_errors import with_common_errors
-from kcal.scene.line_errors import line_errors
+from kcal.scene.common_errors import line_errors, with_common_errors
 from tests.helpers.scene_pairs import SIZE, small_rig
 
 RIG = small_rig()

@@ -13,7 +13,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import StereoRig
 from kcal.scene import common_errors as parts
-from kcal.scene.line_errors import line_errors
+from kcal.scene.common_errors import line_errors
 
 DRAW = torch.Generator().manual_seed(8)
 FLAT = torch.zeros(3, dtype=torch.float64)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kcal.corners.keypoints import Keypoints
 from kcal.errors import InputError
-from kcal.scene.guided import BAND, guided_matches, rough_rig
+from kcal.scene.match import BAND, guided_matches, rough_rig
 from kcal.scene.refine import refine_matches
 from tests.helpers.scene_pairs import pair, small_rig, true_right
 
@@ -69,7 +69,7 @@ def test_matches_are_those_of_a_search_by_hand(monkeypatch: pytest.MonkeyPatch) 
     wanted = by_hand(points)
     assert len(wanted) > 100
     for size in (1024, 37):
-        monkeypatch.setattr("kcal.scene.guided._AT_ONCE", size)
+        monkeypatch.setattr("kcal.scene.match._AT_ONCE", size)
         found = {(int(i), int(j)) for i, j in guided_matches(RIG, points)}
         assert found == wanted
     none = Keypoints(torch.zeros(0, 2, dtype=torch.float64), torch.zeros(0, 128))

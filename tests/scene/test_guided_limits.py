@@ -12,8 +12,7 @@ from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
 from kcal.scene import refine
-from kcal.scene.guided import _both_ways, guided_matches
-from kcal.scene.match import ImagePair, match_scene
+from kcal.scene.match import ImagePair, _both_ways, guided_matches, match_scene
 from tests.helpers.scene_pairs import small_rig
 
 CAMERA = Camera.build(focal=(500, 500), center=(240, 160), size=(481, 321), model="pinhole")

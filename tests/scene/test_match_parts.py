@@ -11,10 +11,9 @@ from torch import Tensor
 from kcal.corners.object_planes import object_planes, plane_pixels
 from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
-from kcal.scene import match, still
+from kcal.scene import match, refine
 from kcal.scene.match import ImagePair, MatchedPair, PairCounts
-from kcal.scene.refine import HALF, RefinedMatches, _patch, refine_matches
-from kcal.scene.still import SWAY, Stillness, still_there, whole_shifts
+from kcal.scene.refine import HALF, SWAY, RefinedMatches, Stillness, _patch, refine_matches, still_there, whole_shifts
 from tests.helpers.scene_pairs import small_rig
 
 RIG = small_rig()
@@ -177,8 +176,8 @@ def test_still_is_what_lies_between_both_pixels(monkeypatch: pytest.MonkeyPatch)
         covariance = (0.03**2 * torch.eye(2).double()).expand(len(first), 2, 2)
         return RefinedMatches(second + both_turned + off[there], covariance, good[there], torch.zeros(len(first)))
 
-    monkeypatch.setattr(still, "whole_shifts", shifts)
-    monkeypatch.setattr(still, "refine_matches", refined)
+    monkeypatch.setattr(refine, "whole_shifts", shifts)
+    monkeypatch.setattr(refine, "refine_matches", refined)
     covariance = (0.04**2 * torch.eye(2).double()).expand(count, 2, 2)
     images = [torch.tensor(float(k)) for k in (1, 2, 3)]
     verdicts = still_there(RIG, images[0], (images[1], images[2]), pixels, covariance)

@@ -4,9 +4,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal.scene import neighbors
-from kcal.scene.line_errors import LineErrors, line_errors
-from kcal.scene.neighbors import pose_variance_ratio
+from kcal.scene import common_errors
+from kcal.scene.common_errors import LineErrors, line_errors, pose_variance_ratio
 from tests.helpers.scene_pairs import SIZE, drawn_pixels, small_rig
 
 RIG = small_rig()
@@ -36,7 +35,7 @@ def ratio(pixels: Tensor, error: Tensor) -> float:
 
 def unbounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ratios below one are to be seen, too."""
-    monkeypatch.setattr(neighbors, "max", lambda _, found: found, raising=False)
+    monkeypatch.setattr(common_errors, "max", lambda _, found: found, raising=False)
 
 
 def test_independent_errors(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ from kcal.calibrate.rig.sources import Baseline, RigData
 from kcal.errors import InputError
 from kcal.lens.pose import vector_from_rotation
 from kcal.scene.match import ImagePair, MatchedPair, match_scene, scene_features, scene_of
-from kcal.scene.still import Stillness, still_there
+from kcal.scene.refine import Stillness, still_there
 from tests.helpers.scene_pairs import pair, small_rig, true_right
 
 RIG = small_rig()

@@ -9,15 +9,14 @@ from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.sources import Baseline, FeatureEffect, Features, RigData
 from kcal.lens.pose import rotation_from_vector, side_axes
 from kcal.lens.rig import StereoRig
-from kcal.scene import smooth_errors
-from kcal.scene.line_errors import line_errors
+from kcal.scene import common_errors
+from kcal.scene.common_errors import line_errors, smooth_effects
 from kcal.scene.match import MatchedPair, PairCounts, counted
-from kcal.scene.smooth_errors import smooth_effects
 from tests.helpers.scene_pairs import SIZE, drawn_pixels, small_rig
 
 RIG = small_rig()
 SIGMA = 0.05
-SIZE_OF_EACH = smooth_errors._SMOOTH_PX
+SIZE_OF_EACH = common_errors._SMOOTH_PX
 
 
 def some_pixels(count: int) -> Tensor:

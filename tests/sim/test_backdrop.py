@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from kcal.sim import backdrop
-from kcal.sim.noise import _random_lattice, smooth_noise
+from kcal.sim import coast
+from kcal.sim.coast import _random_lattice, smooth_noise
 
 
 def test_noise_joins_its_random_values_smoothly() -> None:
@@ -39,20 +39,20 @@ def test_octaves_have_half_the_weight_and_twice_the_detail() -> None:
 
 
 def test_water_mirrors_the_sky_more_the_flatter_it_is_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(backdrop, "smooth_noise", lambda x, y, octaves: np.zeros_like(x))
+    monkeypatch.setattr(coast, "smooth_noise", lambda x, y, octaves: np.zeros_like(x))
     haze = SimpleNamespace(color=np.array([200.0, 210.0, 220.0]), seen=lambda color, distance: color)
-    coast = SimpleNamespace(water=(40.0, 60.0, 80.0), haze=haze)
+    shore = SimpleNamespace(water=(40.0, 60.0, 80.0), haze=haze)
     down = np.array([0.0, -0.05, -1.0])
     heading = np.stack([np.sqrt(1 - down**2), 0 * down, down], -1)[:, None] * np.ones((1, 2, 1))
     camera = SimpleNamespace(center=(0.0, 0.0, 10.0))
-    found = backdrop._sea(camera, heading, np.ones((3, 2)), coast)[:, 0]  # type: ignore[arg-type]
+    found = coast._sea(camera, heading, np.ones((3, 2)), shore)[:, 0]  # type: ignore[arg-type]
     for color, share in zip(found, 0.45 * np.exp(down / 0.05), strict=True):
-        np.testing.assert_allclose(color, np.array(coast.water) + share * (haze.color - coast.water))
+        np.testing.assert_allclose(color, np.array(shore.water) + share * (haze.color - shore.water))
 
 
 def test_values_of_every_fourth_pixel_are_joined_by_lines() -> None:
     few = np.add.outer(10.0 * np.arange(4), np.arange(3.0))
-    found = backdrop._joined_values(few, (13, 9))
+    found = coast._joined_values(few, (13, 9))
     np.testing.assert_allclose(found, np.add.outer(2.5 * np.arange(13), 0.25 * np.arange(9)))
     # Beyond the last one nothing changes.
-    np.testing.assert_allclose(backdrop._joined_values(few, (15, 11))[12:, 8:], found[12, 8])
+    np.testing.assert_allclose(coast._joined_values(few, (15, 11))[12:, 8:], found[12, 8])

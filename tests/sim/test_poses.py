@@ -9,7 +9,7 @@ from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
 from kcal.sim.board import BoardSize, board_points, project_board
-from kcal.sim.poses import PoseOptions, sample_board_poses
+from kcal.sim.captures import PoseOptions, sample_board_poses
 from kcal.sim.scene import demo_rig
 from scripts.shared.pair_poses import rig_pose, sample_pair_poses
 

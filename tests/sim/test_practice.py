@@ -8,14 +8,22 @@ import numpy as np
 import pytest
 import torch
 
-from kcal.mark.snap import snap
-from kcal.sim.backdrop import EARTH, Coast, exposed
-from kcal.sim.coast_objects import WHITE, box_outline, facing
-from kcal.sim.facets import cut, facet_windows, paint
-from kcal.sim.practice import BLUR, LANDMARKS, SIDES, TARGETS, PracticeSite, Side, practice_scene
-from kcal.sim.practice_film import frames, ships_at
-from kcal.sim.practice_night import night_picture
-from kcal.sim.practice_truth import practice_truth, ship_boxes
+from kcal.mark.shapes import snap
+from kcal.sim.coast import EARTH, WHITE, Coast, box_outline, cut, exposed, facet_windows, facing, paint
+from kcal.sim.practice import (
+    BLUR,
+    LANDMARKS,
+    SIDES,
+    TARGETS,
+    PracticeSite,
+    Side,
+    frames,
+    night_picture,
+    practice_scene,
+    practice_truth,
+    ship_boxes,
+    ships_at,
+)
 
 THINGS = (*LANDMARKS, *TARGETS)
 LUMA = np.array([0.299, 0.587, 0.114])

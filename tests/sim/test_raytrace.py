@@ -10,8 +10,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kcal.errors import InputError
-from kcal.sim.prescription import PRESCRIPTIONS, Prescription, Surface, focal_length, system_matrix
-from kcal.sim.raytrace import Misalignment, meet, normals, place, refract, trace
+from kcal.sim.raytrace import (
+    PRESCRIPTIONS,
+    Misalignment,
+    Prescription,
+    Surface,
+    focal_length,
+    meet,
+    normals,
+    place,
+    refract,
+    system_matrix,
+    trace,
+)
 
 NAMES = sorted(PRESCRIPTIONS)
 

@@ -8,10 +8,8 @@ from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.sim.board import BoardPose, BoardSize, PrintedBoard, board_points, project_board
-from kcal.sim.rectangle import PixelRectangle, pixel_axes
-from kcal.sim.render import RenderOptions, render_board, render_light
-from kcal.sim.truth import TruthLens
-from kcal.sim.window import invert_window
+from kcal.sim.render import RenderOptions, invert_window, render_board, render_light
+from kcal.sim.truth import PixelRectangle, TruthLens, pixel_axes
 
 BOARD = BoardSize(9, 6, 0.06)
 CLEAN = RenderOptions(noise=0, vignetting=0, blur=1.0)

@@ -9,9 +9,9 @@ import pytest
 import torch
 from scipy.ndimage import map_coordinates
 
+from kcal.sim.captures import drawn_rig
 from kcal.sim.scene import FOCAL_MM
-from kcal.sim.terrain import Terrain, Weather
-from kcal.sim.true_rig import drawn_rig
+from scripts.shared.terrain import Terrain, Weather
 
 
 @functools.cache

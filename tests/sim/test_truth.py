@@ -7,8 +7,7 @@ import torch
 
 from kcal.errors import InputError
 from kcal.sim.captures import PAPER_BOARD, capture_corners, drawn_lens
-from kcal.sim.prescription import PRESCRIPTIONS
-from kcal.sim.raytrace import Misalignment
+from kcal.sim.raytrace import PRESCRIPTIONS, Misalignment
 from kcal.sim.truth import TruthLens
 
 NAMES = sorted(PRESCRIPTIONS)

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.mounting import Origin
 from kcal.locate.geodesy import enu_from_cam
-from kcal.sim.skyline import Hills, HillWeather, skyline_image
 from kcal.skyline import attitude
 from kcal.skyline.attitude import SkylineAttitude, skyline_attitude
-from kcal.skyline.heading import Candidate
-from kcal.skyline.raster_error import RasterError
+from kcal.skyline.fit import Candidate
+from kcal.skyline.horizon import RasterError
+from scripts.shared.skyline_scenes import Hills, HillWeather, skyline_image
 from tests.helpers.skyline_site import (
     ANGLES,
     CELL,

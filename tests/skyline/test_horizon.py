@@ -12,9 +12,8 @@ from kcal.errors import InputError
 from kcal.lens.mounting import Origin
 from kcal.locate.geodesy import geodetic_to_enu
 from kcal.locate.raster import Raster
-from kcal.skyline.horizon import terrain_horizon
-from kcal.skyline.raised import raised_horizon
-from kcal.skyline.raster_error import RasterError
+from kcal.skyline.attitude import raised_horizon
+from kcal.skyline.horizon import RasterError, terrain_horizon
 from tests.helpers.skyline_site import CELL, heights, raster_of, small_site
 
 RADIUS = 6_371_000.0

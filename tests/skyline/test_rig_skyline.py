@@ -11,21 +11,20 @@ import torch
 from numpy.typing import NDArray
 
 from kcal.calibrate.rig.blocks import PosedCamera
+from kcal.calibrate.rig.problem import SkylineTerm
 from kcal.calibrate.rig.result import RigResult
-from kcal.calibrate.rig.skyline_source import SkylineSource
-from kcal.calibrate.rig.skyline_term import SkylineTerm
 from kcal.calibrate.rig.solve import solve_rig
-from kcal.calibrate.rig.sources import MeasuredPosition, RigData
+from kcal.calibrate.rig.sources import MeasuredPosition, RigData, SkylineSource
 from kcal.errors import InputError
 from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.raster import Raster
 from kcal.locate.stations import station_mounting
-from kcal.sim.skyline import HillWeather
 from kcal.skyline import attitude
+from kcal.skyline.attitude import SkylineImage, skyline_source
 from kcal.skyline.horizon import Horizon, terrain_horizon
-from kcal.skyline.rig_skyline import SkylineImage, skyline_source
+from scripts.shared.skyline_scenes import HillWeather
 from tests.helpers.skyline_site import ANGLES, ERROR, camera, image, small_site
 
 SIGMA = torch.full((2, 3), 0.02).double()

@@ -9,8 +9,7 @@ import pytest
 
 from kcal.errors import InputError
 from kcal.lens.mounting import Origin
-from kcal.stars.catalog import _NAMES, StarCatalog
-from kcal.stars.sky import Air, celestial_directions, observed_directions, parse_time
+from kcal.stars.sky import _NAMES, Air, StarCatalog, celestial_directions, observed_directions, parse_time
 
 SIRIUS, POLARIS = 2491, 424
 CATALOG = StarCatalog.bundled()

@@ -15,15 +15,10 @@ from kcal.errors import FileError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.mounting import Origin
 from kcal.locate.geodesy import enu_from_cam
-from kcal.stars.attitude import field_angle
-from kcal.stars.catalog import StarCatalog
-from kcal.stars.contradictions import clock_doubts
-from kcal.stars.detect import detect_stars
-from kcal.stars.identification import identify
-from kcal.stars.night import SkyView, name_stars
-from kcal.stars.night_image import read_night
-from kcal.stars.pair_table import _table_of, cache_folder, pair_table
-from kcal.stars.sky import observed_directions
+from kcal.stars.detect import detect_stars, read_night
+from kcal.stars.identification import _table_of, cache_folder, identify, pair_table
+from kcal.stars.night import SkyView, clock_doubts, field_angle, name_stars
+from kcal.stars.sky import StarCatalog, observed_directions
 from scripts.shared.night_scenes import PLACE, TIME, night_camera, rendered, star_pixels
 
 CATALOG = StarCatalog.bundled()

@@ -12,16 +12,14 @@ import pytest
 import torch
 
 from kcal.errors import InputError
-from kcal.io.images import write_png
-from kcal.io.video_file import write_video
+from kcal.io.images import write_png, write_video
 from kcal.lens.camera import Camera
-from kcal.stars.attitude import _names_at, field_angle
 from kcal.stars.budget import NightPlan, PlannedStars, planned_stars
-from kcal.stars.catalog import StarCatalog
-from kcal.stars.detect import _night_sky, _uncrowded, detect_stars
+from kcal.stars.detect import _night_sky, _uncrowded, detect_stars, expand_nights, read_night, time_of
 from kcal.stars.identification import Identification
-from kcal.stars.night_image import expand_nights, read_night, time_of
+from kcal.stars.night import _names_at, field_angle
 from kcal.stars.rig_stars import moments_of
+from kcal.stars.sky import StarCatalog
 
 CAMERA = Camera.build(focal=(1000, 1000), center=(319.5, 239.5), size=(640, 480), model="pinhole")
 ROWS, COLUMNS = np.mgrid[0:240, 0:320].astype(float)

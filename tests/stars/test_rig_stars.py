@@ -22,10 +22,9 @@ from kcal.io.images import write_png
 from kcal.io.rig_file import load_rig
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.locate.geodesy import enu_from_cam
-from kcal.stars.catalog import StarCatalog
 from kcal.stars.night import NamedStars, SkyView, name_stars
 from kcal.stars.rig_stars import moments_of, star_source
-from kcal.stars.sky import pole_in_enu
+from kcal.stars.sky import StarCatalog, pole_in_enu
 from scripts.shared.night_scenes import PLACE, TIME, night_camera, rendered, star_pixels
 from scripts.shared.star_rigs import LOOKS, star_rig
 

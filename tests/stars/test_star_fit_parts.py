@@ -17,18 +17,36 @@ from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
 from kcal.lens.pose import rotation_from_vector
 from kcal.locate.geodesy import enu_from_cam
-from kcal.stars.attitude import Attitude, fit_attitude, refraction_doubt, star_rows
 from kcal.stars.budget import NightPlan, _signal
-from kcal.stars.catalog import StarCatalog, unit_vectors
-from kcal.stars.contradictions import clock_doubts
 from kcal.stars.detect import DetectedStars
-from kcal.stars.identification import _triangles, turn_between
-from kcal.stars.lens import _ahead, _by_camera, _directions, _near_middle, _rays, _search
-from kcal.stars.night import NamedStars, SkyView, _by_air, _by_clock, _part, _reach
-from kcal.stars.pair_table import pair_table
-from kcal.stars.sky import EARTH_RATE, celestial_directions, observed_directions, pole_in_enu
-from kcal.stars.star_problem import StarField, StarProblem, free_unknowns, independent_lens
-from kcal.stars.with_boards import Agreement, _agreement_with, _star_noise, _with_star_rows
+from kcal.stars.identification import _triangles, pair_table, turn_between
+from kcal.stars.lens import (
+    Agreement,
+    _agreement_with,
+    _ahead,
+    _by_camera,
+    _directions,
+    _near_middle,
+    _rays,
+    _search,
+    _star_noise,
+    _with_star_rows,
+)
+from kcal.stars.lens_fit import StarField, StarProblem, free_unknowns, independent_lens
+from kcal.stars.night import (
+    Attitude,
+    NamedStars,
+    SkyView,
+    _by_air,
+    _by_clock,
+    _part,
+    _reach,
+    clock_doubts,
+    fit_attitude,
+    refraction_doubt,
+    star_rows,
+)
+from kcal.stars.sky import EARTH_RATE, StarCatalog, celestial_directions, observed_directions, pole_in_enu, unit_vectors
 from scripts.shared.night_scenes import PLACE, TIME, night_camera, star_pixels
 
 CATALOG = StarCatalog.bundled()

@@ -17,8 +17,7 @@ from kcal.io.camera_file import load_camera
 from kcal.stars.budget import NightPlan, planned_stars
 from kcal.stars.detect import DetectedStars
 from kcal.stars.lens import calibrate_by_stars
-from kcal.stars.lens_fit import fit_star_lens
-from kcal.stars.star_problem import StarField
+from kcal.stars.lens_fit import StarField, fit_star_lens
 from scripts.shared.star_lenses import SIZE, lens_difference, star_images, true_lens
 
 REAL = Path(os.environ.get("KCAL_DATA", ""), "stars")

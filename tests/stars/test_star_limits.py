@@ -17,8 +17,6 @@ from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector
-from kcal.stars.attitude import _names_at, fit_attitude
-from kcal.stars.catalog import StarCatalog, unit_vectors
 from kcal.stars.detect import _reasons, _windowed, detect_stars
 from kcal.stars.identification import (
     _angle,
@@ -26,20 +24,23 @@ from kcal.stars.identification import (
     _kabsch_turns,
     _met,
     _middle,
+    _table_on_disk,
     identify,
+    pair_table,
     turn_between,
 )
 from kcal.stars.lens import _near_middle
-from kcal.stars.night import SkyView
-from kcal.stars.pair_table import _table_on_disk, pair_table
+from kcal.stars.night import SkyView, _names_at, fit_attitude
 from kcal.stars.sky import (
     EARTH_RATE,
     Air,
+    StarCatalog,
     _julian,
     parse_time,
     pole_in_enu,
     refraction_sigma,
     require_erfa,
+    unit_vectors,
     year_of,
 )
 

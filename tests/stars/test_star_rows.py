@@ -14,12 +14,10 @@ from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector
-from kcal.stars.attitude import Attitude
-from kcal.stars.catalog import StarCatalog
 from kcal.stars.detect import DetectedStars
-from kcal.stars.night import NamedStars, SkyView
+from kcal.stars.night import Attitude, NamedStars, SkyView
 from kcal.stars.rig_stars import Moment, moments_of, star_source
-from kcal.stars.sky import EARTH_RATE, pole_in_enu, refraction_sigma
+from kcal.stars.sky import EARTH_RATE, StarCatalog, pole_in_enu, refraction_sigma
 
 CAMERA = Camera.build(focal=(1000, 1000), center=(320, 240), size=(641, 481), model="pinhole")
 CATALOG = StarCatalog.bundled()

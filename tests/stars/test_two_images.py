@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kcal.stars.catalog import StarCatalog
+from kcal.stars.identification import cache_folder, pair_table
 from kcal.stars.lens import StarCamera, calibrate_by_stars
-from kcal.stars.pair_table import cache_folder, pair_table
+from kcal.stars.sky import StarCatalog
 from scripts.shared.star_lenses import SIZE, lens_difference, star_images, true_lens
 
 

@@ -17,9 +17,8 @@ from kcal.errors import InputError
 from kcal.io.camera_file import load_camera
 from kcal.io.images import write_png
 from kcal.stars.detect import DetectedStars
-from kcal.stars.lens import StarCamera, calibrate_by_stars
+from kcal.stars.lens import StarCamera, calibrate_by_stars, refine_by_stars
 from kcal.stars.night import SkyView
-from kcal.stars.with_boards import refine_by_stars
 from scripts.shared.infinity import error_at_infinity
 from scripts.shared.night_scenes import PLACE, rendered
 from scripts.shared.star_lenses import SIZE, star_images, true_lens

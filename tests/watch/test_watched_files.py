@@ -13,12 +13,9 @@ import torch
 from kcal.corners.image_time import image_time
 from kcal.errors import FileError, InputError
 from kcal.locate.budget import planned_rig
-from kcal.watch.alarm import alarm_sigmas, exceeded
-from kcal.watch.history import HistoryRow, HistoryTail, history_head, history_line, read_history
-from kcal.watch.relock import relock
-from kcal.watch.temperature import Temperatures
-from kcal.watch.watched import Watched
-from kcal.watch.watcher import Watcher
+from kcal.watch.history import HistoryRow, HistoryTail, Temperatures, history_head, history_line, read_history
+from kcal.watch.watched import Watched, relock
+from kcal.watch.watcher import Watcher, alarm_sigmas, exceeded
 from tests.helpers.scene_pairs import pair, small_rig
 from tests.helpers.watched_looks import row_of, steady_model, yaw_turn
 

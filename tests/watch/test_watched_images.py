@@ -9,14 +9,17 @@ import torch
 
 from kcal.errors import FileError, InputError
 from kcal.scene.match import ImagePair, match_scene
-from kcal.watch.measure import AnotherCameraError, between_turn, measured, seen_by
-from kcal.watch.reference import (
+from kcal.watch.measure import (
     MEMORY,
+    AnotherCameraError,
     FixedFeatures,
+    between_turn,
     load_references,
+    measured,
     new_reference,
     renewed,
     save_references,
+    seen_by,
     with_look,
 )
 from kcal.watch.state import between_rows

@@ -17,7 +17,7 @@ from starlette.routing import Route
 from starlette.testclient import TestClient
 
 from kcal.errors import FileError, InputError
-from kcal.web.gate import json_body, local_app, new_token, page_files
+from kcal.web.serving import json_body, local_app, new_token, page_files
 
 TOKEN = "secret-of-this-start"
 HOST = "127.0.0.1:8347"

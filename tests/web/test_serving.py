@@ -14,9 +14,7 @@ pytest.importorskip("starlette", reason="the extra `mark` is not installed")
 pytest.importorskip("uvicorn", reason="the extra `mark` is not installed")
 
 from kcal.errors import InputError
-from kcal.web.gate import local_app
-from kcal.web.listening import listening_socket
-from kcal.web.serving import LocalServer
+from kcal.web.serving import LocalServer, listening_socket, local_app
 
 
 def test_a_port_in_use_is_refused_or_replaced() -> None:

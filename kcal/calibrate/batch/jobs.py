@@ -29,7 +29,7 @@ from kcal.corners.refine import Refinement
 from kcal.corners.sizes import common_size, rescaled
 from kcal.errors import FileError, InputError, KcalError
 from kcal.files import read_bytes
-from kcal.image_size import ImageSize
+from kcal.image_header import ImageSize
 from kcal.io.camera_file import CameraFile
 from kcal.native_file import NativeFile
 

@@ -23,12 +23,11 @@ from kcal.calibrate.camera.refit import refit_camera
 from kcal.errors import DegenerateError, InputError
 from kcal.files import write_atomic
 from kcal.io.foreign import CameraPose, camera_name, paths_for, plain, rig_poses
-from kcal.io.format_kalibr import write_omni
+from kcal.io.format_kalibr import NAME as OMNI
+from kcal.io.format_kalibr import fit_omni, project_omni, write_omni
 from kcal.io.format_mrcal import fit_spline, project_spline, write_model, write_mrcal
 from kcal.io.format_prior import prior_of, write_priors
 from kcal.io.formats import FORMATS, CameraFormat, format_named, held_exactly
-from kcal.io.kalibr_omni import NAME as OMNI
-from kcal.io.kalibr_omni import fit_omni, project_omni
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.carry_over import carried_covariance

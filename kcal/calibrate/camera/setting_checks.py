@@ -13,7 +13,7 @@ from kcal.errors import InputError
 from kcal.lens.calibration import LensSetting
 from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
-from kcal.quantities import setting_text
+from kcal.texts import setting_text
 
 
 def usable_information(camera: Camera, first: Camera, name: str, first_name: str) -> CameraInformation:

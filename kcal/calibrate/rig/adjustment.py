@@ -1,4 +1,4 @@
-"""The state of a joint adjustment in which some items take part and others do not, and how well each item fits."""
+"""Adjust a rig: minimize all blocks together, and leave out what is beyond its limit."""
 
 from __future__ import annotations
 
@@ -8,22 +8,40 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.blocks import KINDS, Block, BoardBlock, Effects, FeatureBlock, Kind, PerKind, RigState
+from kcal.calibrate.rig.blocks import (
+    KINDS,
+    LOCAL_SIZE,
+    Block,
+    BoardBlock,
+    Effects,
+    FeatureBlock,
+    Kind,
+    LandmarkBlock,
+    PerKind,
+    RigState,
+    StarBlock,
+)
 from kcal.calibrate.rig.initial_poses import Start
-from kcal.calibrate.rig.landmark_block import LandmarkBlock
 from kcal.calibrate.rig.motion import BoardMotion, RigRows, SeenBoards, WithoutMotion, board_motion
-from kcal.calibrate.rig.own_fit import own_fits
-from kcal.calibrate.rig.problem import DistanceTerm, PlaceTerm, RigProblem, SharedTerm
-from kcal.calibrate.rig.skyline_term import SkylineTerm
-from kcal.calibrate.rig.sources import Features, Landmarks, RigData, with_effects
-from kcal.calibrate.rig.star_block import StarBlock
-from kcal.calibrate.rig.star_source import StarSource
-from kcal.calibrate.rig.unknowns import SharedUnknowns
-from kcal.calibrate.rig.unknowns import held as nothing
-from kcal.chance import beyond_chance, chi2_quantile
+from kcal.calibrate.rig.problem import (
+    DistanceTerm,
+    PlaceTerm,
+    RigProblem,
+    SharedTerm,
+    SharedUnknowns,
+    SkylineTerm,
+    held,
+    own_fits,
+)
+from kcal.calibrate.rig.problem import held as nothing
+from kcal.calibrate.rig.sources import Features, Landmarks, RigData, StarSource, with_effects
+from kcal.checks import beyond_chance, chi2_quantile
+from kcal.errors import InputError
 from kcal.solve.lm import LMOptions, minimize
 from kcal.solve.result import Result
 from kcal.solve.robust import RobustLoss
+
+# The state of a joint adjustment in which some items take part and others do not, and how well each item fits.
 
 # px, of a corner: noise-free corners would otherwise weigh infinitely much.
 _LEAST_SIGMA = 1e-3
@@ -349,3 +367,162 @@ def _feature_start(data: RigData, start: Start, anchor: Tensor) -> tuple[Tensor,
     inverse = torch.where(torch.isfinite(features.inverse_range_sigma), features.inverse_range, 0.0)
     direction = _first_rays(data, start, features.pixels, inverse, anchor)
     return direction / torch.linalg.vector_norm(direction, dim=-1, keepdim=True), inverse
+
+
+# Tell which items of a joint adjustment do not belong: compare their χ² with what noise, and lenses, explain.
+#
+# A board's χ² has two parts. What each camera alone leaves over, with a board pose of its own, is due to corners and
+# lens: a lens that is not quite its model fits one board worse than another, which no noise explains and no rig can
+# mend. The rest, six degrees of freedom for every further camera, is what the board says about the rig. Only that part
+# tells of a board that moved between two exposures.
+
+# Probability that any good item at all is taken for a wrong one.
+FALSE_ALARM = 1e-3
+# px along an axis, RMS of a board, that lenses which are not quite their models may add to each of the two parts.
+# Measured: five coefficients on simulated ray-traced wide lenses, ordinarily put together, add 0.04 and 0.017.
+_LENS, _BETWEEN = 0.1, 0.02
+# With fewer boards nobody can say what is typical: one does not belong if its residuals are so many times as large as
+# their noise.
+_FEW_BOARDS, _WORSE_BOARD = 4, 3.0
+# A board pose needs that many corners.
+_CORNERS = 4
+_POSES = LMOptions(max_iterations=30, tolerance=1e-8, residual_floor=1e-8)
+
+
+def over_limit(work: Adjustment, masks: PerKind, values: PerKind, probability: float | None = None) -> PerKind:
+    """χ² of every item over the largest that noise and lenses explain; 0 outside the masks.
+
+    Args:
+        work: the adjustment as it stands.
+        masks: the items.
+        values: their χ², or by how much it would fall without them.
+        probability: that a good item stays below 1, judged by the sigmas as they are. Left out: all items together
+            nearly always do, and where a kind as a whole fits worse than stated, its items are judged by that.
+    """
+    squares, freedom = work.squares(masks), work.freedom(masks)
+    level = probability or 1.0 - FALSE_ALARM / max(sum(int((dof > 0).sum()) for dof in freedom), 1)
+    boards = _boards_over_limit(work, masks.boards, values.boards, squares.boards, freedom.boards, level, probability)
+    found = [boards]
+    for mask, value, square, dof in list(zip(masks, values, squares, freedom, strict=True))[1:]:
+        scale = 1.0 if probability else max(1.0, typical_ratio(square, dof))
+        found.append(torch.where(mask, value / (scale * chi2_quantile(dof, level)), 0.0))
+    return PerKind(*found)
+
+
+def _boards_over_limit(
+    work: Adjustment, mask: Tensor, value: Tensor, square: Tensor, dof: Tensor, level: float, probability: float | None
+) -> Tensor:
+    """Each board by the part of its χ² that is farther over its limit."""
+    if not bool(mask.any()):
+        return torch.zeros(mask.shape, dtype=torch.float64)
+    alone, further = _each_camera_alone(work, mask)
+    lens, between = (share**2 * dof / work.sigma_corner**2 for share in (_LENS, _BETWEEN))
+    own = (dof - further).clamp_min(0)
+    scales = (1.0, 1.0) if probability else (typical_ratio(alone, own), typical_ratio(square - alone, further))
+    first = max(1.0, scales[0]) * chi2_quantile(own, level) + lens
+    second = max(1.0, scales[1]) * chi2_quantile(further, level) + between
+    if int((dof > 0).sum()) < _FEW_BOARDS:
+        first, second = (torch.maximum(limit, _WORSE_BOARD**2 * dof) for limit in (first, second))
+    return torch.where(mask, torch.maximum(alone / first, (value - alone) / second), 0.0)
+
+
+def _each_camera_alone(work: Adjustment, mask: Tensor) -> tuple[Tensor, Tensor]:
+    """χ² of every board with a pose of its own for each camera, and how many degrees of freedom that costs."""
+    boards, cameras = work.data.boards, work.data.cameras
+    assert boards is not None
+    squares = torch.full(mask.shape, torch.nan, dtype=torch.float64)
+    squares[mask] = 0.0
+    further = torch.zeros(mask.shape, dtype=torch.int64)
+    whitening, still = work.corner_whitening(), [False] * len(cameras)
+    for c in range(len(cameras)):
+        some = mask & (torch.isfinite(boards.pixels[:, c]).all(-1).sum(-1) >= _CORNERS)
+        if not bool(some.any()):
+            continue
+        pixels = torch.full_like(boards.pixels[some], torch.nan)
+        pixels[:, c] = boards.pixels[some, c]
+        block = BoardBlock(pixels, whitening[some], boards.points, work.unknowns.shapes)
+        problem = RigProblem(cameras, [block], (), held(cameras), still, still)
+        start = work.part(work.none()._replace(boards=some))
+        found = RigState(*minimize(problem, start, _POSES).state)
+        squares[some] += problem.item_squares(found)[0]
+        further[some] += LOCAL_SIZE
+    return squares, (further - LOCAL_SIZE).clamp_min(0)
+
+
+# Find what contradicts the rest of a joint adjustment: worst first, and back in what does not after all.
+
+# Of the root of an item's mean square: an item three times worse than stated counts half.
+LOSS = RobustLoss(kind="cauchy", scale=3.0)
+# Robust solutions only tell what is wrong; they need no digits.
+ROUGHLY = LMOptions(max_iterations=100, tolerance=1e-6, residual_floor=1e-8)
+# If more than this share of a source is wrong, it is not a few items that are.
+MOST_WRONG = 0.4
+# A source whose typical item is off by so many times its sigma is wrong as a whole.
+WRONG_AS_A_WHOLE = 20.0
+_ROUNDS = 30
+
+
+def without_wrong(work: Adjustment, masks: PerKind, solver: LMOptions) -> PerKind:
+    """Solve without the items that contradict the rest: the worst is left out first; what fits after all returns.
+
+    Args:
+        work: at a robust solution; it is left at the solution without the wrong items.
+        masks: items that may take part.
+        solver: options of the solver.
+
+    Returns:
+        masks of the items that agree.
+
+    Raises:
+        InputError: not a few items are wrong but a source as a whole.
+    """
+    squares, freedom = work.squares(masks), work.freedom(masks)
+    for kind, square, dof in zip(KINDS, squares, freedom, strict=True):
+        if (times := math.sqrt(typical_ratio(square, dof))) > WRONG_AS_A_WHOLE:
+            more = ", and time, zone and place of the night images" if kind == "stars" else ""
+            raise InputError(
+                f"the {kind} contradict each other or the rest: typically they are {times:.0f} times as far off as "
+                f"their sigmas say; check names, units, heights, sigmas and that the cameras are these{more}"
+            )
+    over = over_limit(work, masks, squares)
+    kept = PerKind(*(mask & ~(ratio > 1.0) for mask, ratio in zip(masks, over, strict=True)))
+    _refuse_many(work, kept, masks)
+    returned: set[tuple[int, int]] = set()
+    for _ in range(_ROUNDS):
+        work.solve(kept, solver)
+        work.fit_corners(kept)
+        # Each item by the fall of χ² without it, which sees leverage, but against what is typical of the plain χ².
+        found = over_limit(work, kept, work.deletions(kept))
+        worst = max(range(len(found)), key=lambda k: float(found[k].max()) if len(found[k]) else 0.0)
+        if len(found[worst]) and float(found[worst].max()) > 1.0:
+            kept[worst][int(found[worst].argmax())] = False
+            _refuse_many(work, kept, masks)
+            continue
+        # With the cameras held where they are now, try again what was left out.
+        outside = PerKind(*(before & ~after for before, after in zip(masks, kept, strict=True)))
+        work.solve(outside, solver, held=True)
+        again = False
+        for k, ratio in enumerate(over_limit(work, outside, work.squares(outside), 0.999)):
+            for i in (outside[k] & (ratio < 1.0)).nonzero()[:, 0].tolist():
+                if (k, i) not in returned:
+                    returned.add((k, i))
+                    kept[k][i] = again = True
+        if not again:
+            break
+    return kept
+
+
+def possible(work: Adjustment, masks: PerKind) -> PerKind:
+    """Masks without what has no projection at the present state: behind a camera, or beyond what its lens shows."""
+    return PerKind(*(mask & torch.isfinite(square) for mask, square in zip(masks, work.squares(masks), strict=True)))
+
+
+def _refuse_many(work: Adjustment, kept: PerKind, masks: PerKind) -> None:
+    for kind, after, before in zip(KINDS, kept, masks, strict=True):
+        gone, total = int((before & ~after).sum()), int(before.sum())
+        if gone > max(1, MOST_WRONG * total):
+            names: Sequence[str] = [work.names(kind)[i] for i in (before & ~after).nonzero()[:, 0].tolist()]
+            raise InputError(
+                f"{gone} of {total} {kind} contradict the rest ({', '.join(names[:6])}{' ...' if gone > 6 else ''}): "
+                "these are not a few wrong ones; check names, units, heights, sigmas and that the cameras are these"
+            )

@@ -1,12 +1,4 @@
-"""What the cameras of a rig see, as blocks of least squares: boards, and features of unknown position.
-
-A camera with rotation R and center c sees the pixel of R q, q = y - w c. For points, w = 1 and y is the point. A
-feature in direction d at inverse range ρ from a place a near the rig has y = d + ρ a and w = ρ, so that
-q = d + ρ (a - c) is as regular at infinity as anywhere (Civera, Davison, Montiel 2008). In its units a meter is w,
-which entrance pupils that move depend on.
-
-Residuals are divided by their standard deviations: their squares add up to χ².
-"""
+"""Blocks of rows of the rig problem: what each kind of source says, with derivatives."""
 
 from __future__ import annotations
 
@@ -18,11 +10,19 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.problem.twist import apply_twist
-from kcal.calibrate.rig.camera_rows import CameraRows
-from kcal.calibrate.rig.motion import WithoutMotion
+from kcal.calibrate.rig.motion import CameraRows, WithoutMotion
 from kcal.lens.camera import Camera
 from kcal.lens.pose import side_axes, step_rows
 from kcal.lens.projection import Projection, project_components
+
+# What the cameras of a rig see, as blocks of least squares: boards, and features of unknown position.
+#
+# A camera with rotation R and center c sees the pixel of R q, q = y - w c. For points, w = 1 and y is the point. A
+# feature in direction d at inverse range ρ from a place a near the rig has y = d + ρ a and w = ρ, so that q = d + ρ (a
+# - c) is as regular at infinity as anywhere (Civera, Davison, Montiel 2008). In its units a meter is w, which entrance
+# pupils that move depend on.
+#
+# Residuals are divided by their standard deviations: their squares add up to χ².
 
 Kind = Literal["boards", "landmarks", "features", "stars"]
 KINDS: tuple[Kind, ...] = ("boards", "landmarks", "features", "stars")
@@ -44,7 +44,7 @@ class RigState(NamedTuple):
 
     Attributes:
         parameters: of all cameras, one after the other.
-        unknown: (K,) of cameras, board and air together; see `kcal.calibrate.rig.unknowns`.
+        unknown: (K,) of cameras, board and air together; see `kcal.calibrate.rig.problem`.
         refraction: () coefficient of refraction.
         rotation: (C, 3, 3) cam_from_world.
         center: (C, 3) meters, in the world.
@@ -398,3 +398,148 @@ class FeatureBlock(Block):
         moved = state.direction + step[:, :1] * first + step[:, 1:2] * second
         direction = moved / torch.linalg.vector_norm(moved, dim=-1, keepdim=True)
         return state._replace(direction=direction, inverse_range=state.inverse_range + step[:, 2])
+
+
+# Surveyed landmarks as a block of least squares: positions that the survey knows, light that bends, shared effects.
+#
+# Light bends downward: a landmark at the level distance d is seen k d² / 2R higher than it stands, k being the
+# coefficient of refraction and R the Earth's radius.
+
+# 1/m: half the curvature of the Earth, of the mean radius (IUGG) everywhere: a third of a percent of the bending.
+_HALF_CURVATURE = 0.5 / 6_371_008.8
+_UP = 2
+
+
+class LandmarkBlock(Block):
+    """Surveyed points, whose adjusted positions are the unknowns.
+
+    Args:
+        pixels: (V, C, 2), see `Block`.
+        whitening: (V, C, 2, 2), see `Block`.
+        points: (V, 3) meters, as surveyed; the third axis is up.
+        sigma: (V, 3) meters.
+        by_refraction: (K,) of the coefficient of refraction by the unknowns; None: it is held.
+        effects: see `Block`.
+        shifts: (E, V, C, 3) see `LandmarkEffect`; needed with effects.
+    """
+
+    kind: Kind = "landmarks"
+    size = 3
+
+    def __init__(
+        self,
+        pixels: Tensor,
+        whitening: Tensor,
+        points: Tensor,
+        sigma: Tensor,
+        by_refraction: Tensor | None = None,
+        effects: Effects | None = None,
+        shifts: Tensor | None = None,
+    ) -> None:
+        super().__init__(pixels[:, :, None], whitening[:, :, None], effects)
+        self._surveyed, self._sigma, self._by_refraction, self._shifts = points, sigma, by_refraction, shifts
+
+    def _prior_count(self) -> Tensor:
+        return torch.full((len(self),), 3)
+
+    def _place(self, state: RigState) -> tuple[Tensor, Tensor]:
+        return state.points[..., None], state.points.new_ones(len(self), 1, 1)
+
+    def _moves(self, state: RigState, camera: int) -> Tensor:
+        return super()._moves(state, camera) if self._shifts is None else self._shifts[:, :, camera]
+
+    def _bent(self, state: RigState, offset: Tensor, camera: int) -> Tensor:
+        level, up = offset[:, :_UP], offset[:, _UP:]
+        return torch.cat([level, up + state.refraction * _HALF_CURVATURE * level.square().sum(1, keepdim=True)], 1)
+
+    def _by_offset(self, state: RigState, by_q: Tensor, offset: Tensor) -> Tensor:
+        slope = 2.0 * state.refraction * _HALF_CURVATURE * offset[:, :_UP, None]
+        return torch.cat([by_q[:, :_UP] + slope * by_q[:, _UP:], by_q[:, _UP:]], 1)
+
+    def _through(self) -> Tensor | None:
+        return None if self._by_refraction is None else self._by_refraction[None]
+
+    def _by_board_or_air(self, state: RigState, by_q: Tensor, offset: Tensor) -> Tensor:
+        lift = _HALF_CURVATURE * offset[:, :_UP, None].square().sum(1, keepdim=True)
+        return lift * by_q[:, _UP:]
+
+    def _by_local(self, state: RigState, by_q: Tensor, center: Tensor, by_w: Tensor | None) -> Tensor:
+        return by_q
+
+    def _prior(self, state: RigState) -> Tensor | None:
+        # The survey.
+        error = (state.points - self._surveyed) / self._sigma
+        return torch.cat([torch.diag_embed(1.0 / self._sigma), error[:, None]], 1)
+
+    def retract(self, state: RigState, step: Tensor) -> RigState:
+        """See `Block.retract`."""
+        return state._replace(points=state.points + step)
+
+
+# Stars as a block of least squares: directions at infinity, which clocks and the air shift together.
+
+
+class StarBlock(Block):
+    """Stars, each with a direction of its own that the catalogue knows, if the star has a name.
+
+    Camera c sees star i in the direction d_i + Σ_e u_e (t_ec × d_i + s_ei) with the unknowns u_e of clocks and air,
+    which are standard normal beforehand.
+
+    Args:
+        pixels: (V, C, 2), see `Block`.
+        whitening: (V, C, 2, 2), see `Block`.
+        direction: (V, 3) of the catalogue; anything for stars without a name.
+        sigma: (V,) radians; infinite for these.
+        turns: (E, C, 3), see `StarSource.by_effects`.
+        factors: (E, V), see `StarSource.factors`.
+        shifts: (E, V, 3), see `StarSource.shifts`.
+        effects: see `Block`; its amounts are the u_e.
+    """
+
+    kind: Kind = "stars"
+    size = 2
+
+    def __init__(
+        self,
+        pixels: Tensor,
+        whitening: Tensor,
+        direction: Tensor,
+        sigma: Tensor,
+        turns: Tensor,
+        factors: Tensor,
+        shifts: Tensor,
+        effects: Effects | None = None,
+    ) -> None:
+        super().__init__(pixels[:, :, None], whitening[:, :, None], effects)
+        named = torch.isfinite(sigma)
+        self._weight = torch.where(named, 1.0 / sigma, 0.0)
+        self._known = torch.where(named[:, None], direction, 0.0)
+        # (E, C, V, 3).
+        self._turns = turns[:, :, None] * factors[:, None, :, None]
+        self._shifts = shifts
+
+    def _prior_count(self) -> Tensor:
+        return 2 * (self._weight > 0).long()
+
+    def _place(self, state: RigState) -> tuple[Tensor, Tensor]:
+        return state.star[..., None], state.star.new_zeros(len(self), 1, 1)
+
+    def _moves(self, state: RigState, camera: int) -> Tensor:
+        turned = torch.linalg.cross(self._turns[:, camera], state.star.expand(len(self._turns), -1, -1))
+        return turned + self._shifts
+
+    def _by_local(self, state: RigState, by_q: Tensor, center: Tensor, by_w: Tensor | None) -> Tensor:
+        return torch.einsum("vjun,vlj->vlun", by_q, torch.stack(side_axes(state.star), 1))
+
+    def _prior(self, state: RigState) -> Tensor | None:
+        # The catalogue: along the two axes across the star's direction.
+        axes = torch.stack(side_axes(state.star), 1)
+        error = torch.einsum("vlj,vj->vl", axes, state.star - self._known) * self._weight[:, None]
+        rows = torch.diag_embed(self._weight[:, None].expand(-1, 2))
+        return torch.cat([rows, torch.where(self._weight[:, None] > 0, error, 0.0)[:, None]], 1)
+
+    def retract(self, state: RigState, step: Tensor) -> RigState:
+        """See `Block.retract`."""
+        first, second = side_axes(state.star)
+        moved = state.star + step[:, :1] * first + step[:, 1:2] * second
+        return state._replace(star=moved / torch.linalg.vector_norm(moved, dim=-1, keepdim=True))

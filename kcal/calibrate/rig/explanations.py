@@ -1,28 +1,359 @@
-"""Look for other explanations of a contradiction: measurements, and with few landmarks any of these.
-
-Of many landmarks the wrong ones are in the minority and stand out. Of five, one that is wrong may make two good ones
-look worse, and three that are left fit anything. So every choice of landmarks and measurements to leave out is tried,
-fewest first, as long as something is left over to check the rest with.
-"""
+"""Which items of a rig contradict the others, and what explains it: mix-ups, wrong places, too little redundancy."""
 
 from __future__ import annotations
 
 import copy
 import itertools
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
+from torch import Tensor
 
-from kcal.calibrate.rig.adjustment import Adjustment
-from kcal.calibrate.rig.blocks import KINDS, Kind, PerKind, RigState
-from kcal.calibrate.rig.contradictions import still_determined
-from kcal.calibrate.rig.outliers import LOSS, MOST_WRONG, ROUGHLY, without_wrong
-from kcal.calibrate.rig.redundancy import least_redundancy
-from kcal.calibrate.rig.resection import consensus_pose
-from kcal.calibrate.rig.uncertainty import goodness_of_fit
-from kcal.errors import InputError
+from kcal.calibrate.rig.adjustment import LOSS, MOST_WRONG, ROUGHLY, Adjustment, without_wrong
+from kcal.calibrate.rig.blocks import KINDS, Block, FeatureBlock, Kind, LandmarkBlock, PerKind, RigState
+from kcal.calibrate.rig.initial_poses import consensus_pose
+from kcal.calibrate.rig.problem import RigProblem, least
+from kcal.calibrate.rig.sources import RigData
+from kcal.calibrate.rig.uncertainty import SharedCovariance, goodness_of_fit
+from kcal.checks import variance_factor
+from kcal.errors import DegenerateError, InputError
 from kcal.solve.lm import LMOptions
+
+# Recognize cameras that were mixed up: the same one given twice, or left and right swapped throughout.
+#
+# A swap of cameras against their data contradicts itself (`kcal.calibrate.rig.board_consensus.check_cameras`). A swap
+# of everything does not: the rig is solved as well as any, with the right camera on the left side. Only the names tell.
+
+# The right camera is on the wrong side if it is to the left by more than this share of the baseline: cameras above each
+# other have no left and right.
+_SIDEWAYS = 0.5
+# A feature is behind the cameras if its inverse range is negative by so many of its standard deviations.
+_BEHIND_SIGMAS = 4.0
+# A single wrong match counts no more than an item that is three times worse than its sigmas.
+_MOST_BEHIND = 9.0
+# Fewer equal pixels may be equal by chance.
+_EQUAL_PIXELS = 4
+
+
+def refuse_same_camera(data: RigData) -> None:
+    """Raise `InputError` if two cameras have the same pixels of everything that both saw."""
+    for one in range(len(data.cameras)):
+        for other in range(one):
+            pairs = [
+                source.pixels[:, [other, one]].movedim(1, -2).flatten(0, -3)
+                for kind in KINDS
+                if (source := getattr(data, kind)) is not None
+            ]
+            # Skylines and measured positions have no pixels in common.
+            if not pairs:
+                continue
+            both = torch.cat([pair[torch.isfinite(pair).all(-1).all(-1)] for pair in pairs])
+            if len(both) >= _EQUAL_PIXELS and torch.equal(both[:, 0], both[:, 1]):
+                raise InputError(
+                    f"{data.names[other]} and {data.names[one]} have the same pixels everywhere: this is the same "
+                    "camera twice; give the observations and marks of two cameras"
+                )
+
+
+def swap_warnings(data: RigData, problem: RigProblem, state: RigState, covariance: SharedCovariance) -> list[str]:
+    """Warn if left and right are swapped: by the side on which the right camera is, and by features behind both.
+
+    Args:
+        data: only cameras named `left` and `right` have sides.
+        problem: the problem.
+        state: its solution.
+        covariance: of the solution.
+    """
+    found = []
+    if {"left", "right"} <= set(data.names):
+        left, right = data.names.index("left"), data.names.index("right")
+        shift = state.center[right] - state.center[left]
+        side = float(shift @ _rightward(data, state, left, right))
+        length = float(torch.linalg.vector_norm(shift))
+        if side < -_SIDEWAYS * length:
+            # Without a vertical, right is where the left camera has it.
+            otherwise = "" if data.absolute else " (or both cameras hang upside down)"
+            found.append(
+                f"the right camera is {-side:.3g} m to the left of the left camera: left and right are swapped"
+                f"{otherwise}; exchange their cameras, observations and marks"
+            )
+    behind, seen = _features_behind(problem, state, covariance)
+    if behind > seen / 2:
+        found.append(
+            f"{behind} of {seen} features have negative parallax, as if they were behind the cameras: left and right "
+            "marks are swapped, or are not of the same things"
+        )
+    return found
+
+
+def cost_of_features_behind(problem: RigProblem, state: RigState) -> float:
+    """Half the squares, in sigmas, of how far marks of features behind the cameras are from those at infinity.
+
+    A rig and its mirror image, in which the baseline is reversed and inverse ranges are negative, fit features of
+    unknown range alike. This cost tells them apart.
+    """
+    posed, cost = problem.posed(state), 0.0
+    for block in problem.blocks:
+        if isinstance(block, FeatureBlock):
+            by_inverse_range = block.rows(posed, state, problem.shared_size)[:, block.size - 1]
+            squares = (state.inverse_range.clamp_max(0.0)[:, None] * by_inverse_range).square().sum(-1)
+            cost += 0.5 * float(squares.clamp_max(_MOST_BEHIND).sum())
+    return cost
+
+
+def _rightward(data: RigData, state: RigState, left: int, right: int) -> Tensor:
+    """To the right of where both cameras look, level where the frame knows what is up."""
+    if not data.absolute:
+        return state.rotation[left, 0]
+    ahead = state.rotation[[left, right], 2].mean(0)
+    # Ahead × up.
+    across = torch.stack([ahead[1], -ahead[0], torch.zeros_like(ahead[0])])
+    return across / torch.linalg.vector_norm(across)
+
+
+def _features_behind(problem: RigProblem, state: RigState, covariance: SharedCovariance) -> tuple[int, int]:
+    """How many features have an inverse range that is negative beyond chance, and how many there are."""
+    for block in problem.blocks:
+        if isinstance(block, FeatureBlock):
+            # The last local unknown is the inverse range; what the cameras' errors make of it is added.
+            follow, own = (value[:, -1] for value in problem.response(state, block))
+            variance = covariance.variances(follow) + own[:, -1]
+            return int((state.inverse_range < -_BEHIND_SIGMAS * variance.sqrt()).sum()), len(block)
+    return 0, 0
+
+
+# Count what is left over to check where each camera of a rig stands.
+
+
+def redundancy(problem: RigProblem) -> list[int | None]:
+    """How many residuals more than unknowns each camera adds to the others; None for one that stands still.
+
+    With 0 a camera is determined exactly, and no residual would tell that it stands elsewhere.
+    """
+    added = torch.zeros(len(problem.cameras), dtype=torch.long)
+    for block in problem.blocks:
+        added += _added(block)
+    for term in problem.terms:
+        added[list(term.cameras)] += term.count
+    unknown = [
+        0 if (turn, shift) == (None, None) else 3 * (turn is not None) + 3 * (shift is not None)
+        for turn, shift in zip(problem.turn, problem.shift, strict=True)
+    ]
+    return [count - own if own else None for count, own in zip(added.tolist(), unknown, strict=True)]
+
+
+def least_redundancy(problem: RigProblem) -> int:
+    """The smallest `redundancy` of a camera."""
+    return min(count for count in redundancy(problem) if count is not None)
+
+
+def _added(block: Block) -> torch.Tensor:
+    """(C,) residuals that a block's items have more with each camera than without it."""
+    seen = block.seen.sum(-1)
+    by_others = seen.sum(1, keepdim=True) - seen
+    if isinstance(block, LandmarkBlock):
+        return 2 * seen.sum(0)
+    if isinstance(block, FeatureBlock):
+        # What nobody else sees tells a camera nothing; what one other sees has a direction from it.
+        beyond = (block.counts - 2 * seen.sum(1) - block.size)[:, None]
+        before, after = (2 * count + beyond for count in (by_others, by_others + seen))
+        return torch.where(seen > 0, after.clamp_min(0) - before.clamp_min(0), 0).sum(0)
+    return (2 * seen * (by_others > 0)).sum(0)
+
+
+def refuse_exact(problem: RigProblem, names: Sequence[str], freedom: int) -> None:
+    """Raise `DegenerateError` where nothing is left over to check a camera with.
+
+    Args:
+        problem: of what agrees.
+        names: of the cameras.
+        freedom: degrees of freedom of all of it.
+    """
+    exact = [name for name, count in zip(names, redundancy(problem), strict=True) if count is not None and count <= 0]
+    if not exact and freedom > 0:
+        return
+    marks = [block.seen.any(-1).sum(0).tolist() for block in problem.blocks if isinstance(block, LandmarkBlock)]
+    counted = [f"{marks[0][c]} landmarks" for c, name in enumerate(names) if marks and name in exact]
+    who = " and ".join(exact) or "the cameras"
+    why = f" ({', '.join(counted)}; three fit up to four places)" if counted else ""
+    raise DegenerateError(
+        f"the data determine where {who} stand{'s' if len(exact) == 1 else ''} exactly{why}: nothing is left over to "
+        "check it with, and a wrong measurement, or another place that fits as well, could not be noticed. Mark at "
+        "least one more surveyed landmark in both images (six or more are good), or add boards or features seen by "
+        "both, a measured baseline or measured positions"
+    )
+
+
+# Test each source of a rig against all the others, and name the one that contradicts.
+#
+# A source that is stated too precisely bends the solution towards itself, and its error shows as slightly larger
+# residuals of everything. So it is compared with what the others say without it: the least χ² of all together exceeds
+# the sum of the least χ² of the source alone and of the others alone by χ² with as many degrees of freedom as both
+# determine. All three follow from the normal matrices of the sources at the solution, without solving again.
+
+# Standard deviations of a normal variable as unlikely as what is found: a doubt, and beyond reasonable doubt.
+_DOUBT, CERTAIN = 3.5, 4.5
+
+
+class Contradiction(NamedTuple):
+    """A source that contradicts the others.
+
+    Attributes:
+        text: one sentence with numbers.
+        sigmas: standard deviations of a normal variable that is as unlikely.
+        stated: whether it is a measured baseline or position, which nothing but itself supports.
+    """
+
+    text: str
+    sigmas: float
+    stated: bool
+
+
+class _Part(NamedTuple):
+    """A source, or a single baseline or position.
+
+    Attributes:
+        name: of it.
+        gram: (S + 1, S + 1) products of its rows, residuals last.
+        rows: how many residuals it has beyond its items' own unknowns.
+        term: its index among the problem's terms; None for boards, landmarks and features.
+    """
+
+    name: str
+    gram: Tensor
+    rows: int
+    term: int | None
+
+
+class _Test(NamedTuple):
+    """One source against the others: χ² of their difference, its freedom, and how unlikely it is."""
+
+    chi2: float
+    freedom: int
+    sigmas: float
+
+
+def contradictions(work: Adjustment, problem: RigProblem, state: RigState) -> list[Contradiction]:
+    """The source that contradicts the others, or both of two that contradict each other; empty where all agree."""
+    prior = problem.prior_rows(state)
+    known = _Part("", prior @ prior.T, prior.shape[1], None)
+    parts = _parts(work, problem, state)
+    groups: list[tuple[int, ...]] = [(i,) for i in range(len(parts))]
+    placed = tuple(i for i, part in enumerate(parts) if part.name.startswith("the position"))
+    if len(placed) > 1:
+        groups.append(placed)
+    if len(parts) < 2:
+        return []
+    everything = tuple(range(len(parts)))
+    tests = {group: _test(parts, group, everything, known) for group in groups if len(group) < len(parts)}
+    found = {group: test for group, test in tests.items() if test.sigmas > _DOUBT}
+    if not found:
+        return []
+    suspects = [group for group in found if not _quarrel(parts, set(everything) - set(group), known)]
+    own = {group: sum(parts[i].rows for i in group) - least(_sum(parts, group)).rank for group in found}
+    suspects = suspects or [max(found, key=lambda group: found[group].sigmas)]
+    suspects.sort(key=lambda group: (own[group], len(group), -found[group].sigmas))
+    named = suspects[0]
+    # What supports itself no more, or no less, is as likely to be wrong.
+    equal = [other for other in suspects[1:] if not set(other) & set(named) and (own[other] <= 0 or own[named] > 0)]
+    rest = [part.name for i, part in enumerate(parts) if i not in named]
+    text = _what_contradicts(parts, named, found[named], problem, state, known, rest)
+    if equal:
+        names = " and ".join(_name(parts, group) for group in equal)
+        text += f"; it may as well be {names} that is wrong"
+    return [Contradiction(text, found[named].sigmas, own[named] <= 0)]
+
+
+def still_determined(problem: RigProblem, state: RigState) -> list[bool]:
+    """For each of the problem's terms whether the others determine as much without it."""
+    whole = torch.stack([*problem.block_grams(state), *_term_grams(problem, state)]).sum(0)
+    return [least(whole - gram).rank == least(whole).rank for gram in _term_grams(problem, state)]
+
+
+def _term_grams(problem: RigProblem, state: RigState) -> list[Tensor]:
+    posed = problem.posed(state)
+    return [rows @ rows.T for rows in (term.rows(posed, problem.shared_size) for term in problem.terms)]
+
+
+def _parts(work: Adjustment, problem: RigProblem, state: RigState) -> list[_Part]:
+    counted = [int((block.counts - block.size).sum()) for block in problem.blocks]
+    parts = [
+        _Part(f"the {block.kind}", gram, rows, None)
+        for block, gram, rows in zip(problem.blocks, problem.block_grams(state), counted, strict=True)
+    ]
+    labels = [label for i, label in enumerate(work.term_labels) if i not in work.without]
+    for number, (label, gram) in enumerate(zip(labels, _term_grams(problem, state), strict=True)):
+        parts.append(_Part(label, gram, problem.terms[number].count, number))
+    return parts
+
+
+def _sum(parts: list[_Part], chosen: tuple[int, ...] | set[int], known: _Part | None = None) -> Tensor:
+    grams = [parts[i].gram for i in chosen] + ([] if known is None else [known.gram])
+    return torch.stack(grams).sum(0)
+
+
+def _test(parts: list[_Part], group: tuple[int, ...], within: tuple[int, ...], known: _Part) -> _Test:
+    """A group of parts against the rest of `within` and what is known beforehand."""
+    rest = tuple(i for i in within if i not in group)
+    own, others = _sum(parts, group), _sum(parts, rest, known)
+    alone, without, together = least(own), least(others), least(own + others)
+    freedom = alone.rank + without.rank - together.rank
+    if freedom <= 0:
+        return _Test(0.0, 0, 0.0)
+    rows = sum(parts[i].rows for i in within) + known.rows
+    inner, left = alone.chi2 + without.chi2, rows - alone.rank - without.rank
+    # Where stated sigmas are too small throughout, a difference counts by what residuals really are.
+    chi2 = max(together.chi2 - inner, 0.0) / variance_factor(inner, left)
+    if freedom == 1:
+        return _Test(chi2, 1, math.sqrt(chi2))
+    # Wilson and Hilferty (1931).
+    spread = 2.0 / (9.0 * freedom)
+    return _Test(chi2, freedom, ((chi2 / freedom) ** (1 / 3) - 1.0 + spread) / math.sqrt(spread))
+
+
+def _quarrel(parts: list[_Part], within: set[int], known: _Part) -> bool:
+    """Whether some parts contradict each other."""
+    some = tuple(sorted(within))
+    return len(some) > 1 and any(_test(parts, (i,), some, known).sigmas > _DOUBT for i in some)
+
+
+def _name(parts: list[_Part], group: tuple[int, ...]) -> str:
+    return parts[group[0]].name if len(group) == 1 else "the measured positions"
+
+
+def _what_contradicts(
+    parts: list[_Part],
+    group: tuple[int, ...],
+    test: _Test,
+    problem: RigProblem,
+    state: RigState,
+    known: _Part,
+    rest: list[str],
+) -> str:
+    """What contradicts what, with numbers, and what to do."""
+    others = f"{', '.join(rest[:-1])} and {rest[-1]}" if len(rest) > 1 else rest[0]
+    verb = "contradicts" if parts[group[0]].term is not None and len(group) == 1 else "contradict"
+    term = parts[group[0]].term
+    apart = f"what they say of the cameras differs by {math.sqrt(test.chi2 / test.freedom):.1f} times what their"
+    how = f"{apart} sigmas explain"
+    if term is not None and len(group) == 1:
+        without = least(_sum(parts, set(range(len(parts))) - set(group), known))
+        rows = problem.terms[term].rows(problem.posed(state), problem.shared_size)
+        off = rows[-1] + without.step @ rows[:-1]
+        how = problem.terms[term].against(off, (rows[:-1].T @ without.root).square().sum(1).sqrt())
+    return (
+        f"{_name(parts, group)} {verb} {others}: {how} ({test.sigmas:.1f} standard deviations); measure again, correct "
+        "the value or its sigma, or leave it out"
+    )
+
+
+# Look for other explanations of a contradiction: measurements, and with few landmarks any of these.
+#
+# Of many landmarks the wrong ones are in the minority and stand out. Of five, one that is wrong may make two good ones
+# look worse, and three that are left fit anything. So every choice of landmarks and measurements to leave out is tried,
+# fewest first, as long as something is left over to check the rest with.
 
 # Up to so many landmarks every explanation is tried, if there are not more of them than this.
 _FEW, _MOST_TRIED = 9, 64
@@ -42,7 +373,7 @@ class _Explanation(NamedTuple):
 
 
 def explained(work: Adjustment, masks: PerKind, solver: LMOptions) -> PerKind:
-    """As `kcal.calibrate.rig.outliers.without_wrong`, but other explanations are compared.
+    """As `kcal.calibrate.rig.adjustment.without_wrong`, but other explanations are compared.
 
     A measurement that is wrong can make good items look worse; so it is asked whether fewer are wrong without it. Where
     few landmarks decide, all explanations are compared.

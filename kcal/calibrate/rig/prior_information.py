@@ -18,7 +18,7 @@ from kcal.calibrate.hybrid.board_modes import BoardModes, board_modes
 from kcal.calibrate.hybrid.board_orders import CLEAR, mode_turn, quarter_turns, turned
 from kcal.calibrate.hybrid.board_prior import printed_board, printed_prior
 from kcal.calibrate.hybrid.families import BOARD, typical_hyperprior
-from kcal.calibrate.rig.unknowns import SharedUnknowns, held
+from kcal.calibrate.rig.problem import SharedUnknowns, held
 from kcal.corners.board import Board
 from kcal.gaussian import Gaussian, Slots, stacked, unit_scale, whitened
 from kcal.lens.camera import Camera

@@ -1,26 +1,160 @@
-"""The least-squares problem of a rig: cameras that move or are held, what they see, and what was measured besides.
-
-Shared unknowns: those of lenses, board and air (`kcal.calibrate.rig.unknowns`), then for each camera its rotation and
-its center. Those of boards, landmarks and features are eliminated item by item (`kcal.solve.schur`).
-"""
+"""The least-squares problem of a rig: its unknowns, its blocks, and what ties views."""
 
 from __future__ import annotations
 
+import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.blocks import LOCAL_SIZE, Block, PosedCamera, RigState
-from kcal.calibrate.rig.camera_rows import CameraRows, summed_products
-from kcal.calibrate.rig.unknowns import SharedUnknowns
+from kcal.calibrate.problem.state import warp_modes
+from kcal.calibrate.problem.views import free_parameters
+from kcal.calibrate.rig.blocks import LOCAL_SIZE, Block, Kind, PosedCamera, RigState
+from kcal.calibrate.rig.motion import CameraRows, summed_products
+from kcal.calibrate.rig.sources import SkylineSource
+from kcal.errors import InputError
+from kcal.gaussian import inverse_root
 from kcal.lens.camera import Camera
-from kcal.lens.pose import nearest_rotation, rotation_from_vector
+from kcal.lens.mounting import check_refraction
+from kcal.lens.pose import nearest_rotation, rotation_from_vector, vector_from_rotation
 from kcal.solve.eliminated import EliminatedItems, PartlyEliminated
 from kcal.solve.result import State
 from kcal.solve.robust import RobustLoss
 from kcal.solve.schur import SchurLinearization
+
+# What a rig's adjustment may change of its cameras, its board and the air: linear functions of a few unknowns.
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class SharedUnknowns:
+    """Unknowns y (K,): parameters of camera c change with them by cameras[c] y, the board by shapes · (board y).
+
+    Args:
+        cameras: (5 + P, K) of each.
+        shapes: (B, 3, N) displacements of the board's corners, meters.
+        board: (B, K).
+        begin: (K,) what they are for cameras and board as given.
+        known: (K,) whether an unknown is a standard normal beforehand; nothing is known of the others.
+        labels: (K,) names of those that have one.
+        refraction: coefficient of refraction of light for the unknowns as they begin.
+        by_refraction: (K,) of it by each unknown; None: it is held.
+        by_effects: (E, K) of what shifts stars (`StarEffect`), then landmarks (`LandmarkEffect`), and then features
+            (`FeatureEffect`) together, by each unknown; None: there is nothing.
+    """
+
+    cameras: tuple[Tensor, ...]
+    shapes: Tensor
+    board: Tensor
+    begin: Tensor
+    known: Tensor
+    labels: tuple[str, ...]
+    refraction: float = 0.0
+    by_refraction: Tensor | None = None
+    by_effects: Tensor | None = None
+
+    @property
+    def refine_lenses(self) -> bool:
+        """Whether lenses or board may change within what is known of them."""
+        return bool(torch.cat([*self.cameras, self.board])[:, self.known].any())
+
+    def __len__(self) -> int:
+        """How many unknowns there are."""
+        return len(self.known)
+
+    def and_warp(self, board_points: Tensor) -> SharedUnknowns:
+        """These, and two parabolas by which the board bends."""
+        shapes = warp_modes(board_points)
+        board = torch.cat([torch.zeros(2, len(self), dtype=torch.float64), torch.eye(2, dtype=torch.float64)], 1)
+        more = self._and("the board's warp along its rows", "the board's warp along its columns", known=False)
+        return dataclasses.replace(more, shapes=shapes, board=board)
+
+    def and_refraction(self, refraction: float, sigma: float) -> SharedUnknowns:
+        """These, and the coefficient of refraction with its standard deviation; with none, it is held."""
+        check_refraction(refraction, sigma)
+        if not sigma:
+            return dataclasses.replace(self, refraction=refraction)
+        more = self._and("the coefficient of refraction", known=True)
+        slope = torch.zeros(len(more), dtype=torch.float64)
+        slope[-1] = sigma
+        return dataclasses.replace(more, refraction=refraction, by_refraction=slope)
+
+    def and_effects(self, *names: str) -> SharedUnknowns:
+        """These, and amounts of what shifts stars, landmarks or features together, in standard deviations."""
+        more = self._and(*names, known=True)
+        count = len(names)
+        select = torch.zeros(count, len(more), dtype=torch.float64)
+        select[:, len(more) - count :] = torch.eye(count, dtype=torch.float64)
+        return dataclasses.replace(more, by_effects=select)
+
+    def _and(self, *labels: str, known: bool) -> SharedUnknowns:
+        """These, and more that change nothing yet."""
+
+        def wider(part: Tensor) -> Tensor:
+            return torch.nn.functional.pad(part, (0, len(labels)))
+
+        return SharedUnknowns(
+            cameras=tuple(map(wider, self.cameras)),
+            shapes=self.shapes,
+            board=wider(self.board),
+            begin=wider(self.begin),
+            known=torch.cat([self.known, torch.full((len(labels),), known)]),
+            labels=(*self.labels, *labels),
+            refraction=self.refraction,
+            by_refraction=None if self.by_refraction is None else wider(self.by_refraction),
+            by_effects=None if self.by_effects is None else wider(self.by_effects),
+        )
+
+
+def held(cameras: Sequence[Camera]) -> SharedUnknowns:
+    """Nothing: cameras and board are as they are, and light is straight."""
+    return SharedUnknowns(
+        cameras=tuple(torch.zeros(camera.params.shape[-1], 0, dtype=torch.float64) for camera in cameras),
+        shapes=torch.zeros(0, 3, 0, dtype=torch.float64),
+        board=torch.zeros(0, 0, dtype=torch.float64),
+        begin=torch.zeros(0, dtype=torch.float64),
+        known=torch.zeros(0, dtype=torch.bool),
+        labels=(),
+    )
+
+
+def free(cameras: Sequence[Camera], names: Sequence[str]) -> SharedUnknowns:
+    """All parameters of all cameras; nothing is known of them.
+
+    Raises:
+        InputError: hybrid cameras, whose parameters have meaning only with what their calibrations know.
+    """
+    if any(camera.model.hybrid for camera in cameras):
+        raise InputError(
+            "hybrid cameras cannot be refined without what their own calibrations know: hold them, take what their "
+            "calibrations know as prior, or calibrate parametric cameras"
+        )
+    chosen = [free_parameters(camera.model) for camera in cameras]
+    count = sum(len(own) for own in chosen)
+    maps, labels, end = [], [], 0
+    for camera, own, name in zip(cameras, chosen, names, strict=True):
+        part = torch.zeros(len(camera.names), count, dtype=torch.float64)
+        for column, index in enumerate(own, start=end):
+            part[index, column] = 1.0
+            labels.append(f"{camera.names[index]} of {name}")
+        end += len(own)
+        maps.append(part)
+    return dataclasses.replace(
+        held(cameras),
+        cameras=tuple(maps),
+        board=torch.zeros(0, count, dtype=torch.float64),
+        begin=torch.zeros(count, dtype=torch.float64),
+        known=torch.zeros(count, dtype=torch.bool),
+        labels=tuple(labels),
+    )
+
+
+# The least-squares problem of a rig: cameras that move or are held, what they see, and what was measured besides.
+#
+# Shared unknowns: those of lenses, board and air, then for each camera its rotation and
+# its center. Those of boards, landmarks and features are eliminated item by item (`kcal.solve.schur`).
 
 # Share of a residual that the others must leave open for an item to be tested by them; less is rounding.
 _LEAST_LEFT = 1e-9
@@ -335,3 +469,99 @@ def _few_others_fall(total: Tensor, rows: Tensor) -> Tensor:
     testable = values[:, -1] < 1.0 - _LEAST_LEFT
     fall = (along.square() * values / (1.0 - values).clamp_min(_LEAST_LEFT)).sum(-1)
     return torch.where(testable, fall, 0.0)
+
+
+# The skylines of a rig as a term of its adjustment.
+
+
+class SkylineTerm(SharedTerm):
+    """The skylines of all images, as residuals of attitudes, centers and lenses."""
+
+    def __init__(self, source: SkylineSource) -> None:
+        self.cameras, self.count = tuple(sorted(set(source.cameras))), len(source.residual)
+        self._source = source
+        count = len(source.rotation)
+        sizes = [3] * (2 * count) + [len(one) for one in source.parameters]
+        parts = source.rows.split(sizes, 1)
+        self._turn, self._center, self._lens = parts[:count], parts[count : 2 * count], parts[2 * count :]
+
+    def rows(self, cameras: Sequence[PosedCamera], shared_size: int) -> Tensor:
+        """See `SharedTerm.rows`."""
+        out = self._source.residual.new_zeros((shared_size + 1, self.count))
+        out[-1] = self._source.residual
+        for c in self.cameras:
+            posed, source = cameras[c], self._source
+            turn, center, lens = self._turn[c], self._center[c], self._lens[c]
+            out[-1] += turn @ vector_from_rotation(posed.rotation @ source.rotation[c].T)
+            out[-1] += center @ (posed.center - source.center[c]) + lens @ (posed.parameters - source.parameters[c])
+            known = posed.by_unknown.shape[1]
+            out[:known] += (lens @ posed.by_unknown).T
+            if posed.turn is not None:
+                out[posed.turn] += turn.T
+            if posed.shift is not None:
+                out[posed.shift] += center.T
+        return out
+
+    def against(self, off: Tensor, sigma: Tensor) -> str:
+        """See `SharedTerm.against`."""
+        times = float((off.square() / (1.0 + sigma.square())).mean().sqrt())
+        return f"without it the cameras look elsewhere than their skylines say, by {times:.1f} times its sigmas"
+
+
+# How well each source of a rig fits itself: what its items leave over where nothing else is known of the cameras.
+#
+# Marks by hand are often worse than their sigmas say. Beside a thousand good matches that hardly shows in the χ² of
+# all, yet the marks pull at the cameras as if they were right, and what they contradict then looks wrong. So each
+# source is asked alone, with what is known of the lenses: what the others say of the cameras, right or wrong, does not
+# enter. Its sigmas are multiplied by what its own residuals tell (a variance component, Förstner 1979, of each source
+# by itself).
+
+# Eigenvalues of a scaled normal matrix below this share of the largest are rounding.
+_RANK_TOLERANCE = 1e-10
+
+
+class Least(NamedTuple):
+    """The least χ² of some rows, how many unknowns they determine, and where it is.
+
+    Attributes:
+        chi2: the least.
+        rank: number of unknowns that are determined.
+        step: (S,) to the minimum.
+        root: (S, R) of the covariance there.
+    """
+
+    chi2: float
+    rank: int
+    step: Tensor
+    root: Tensor
+
+
+def least(gram: Tensor) -> Least:
+    """The minimum of rows whose products (S + 1, S + 1) are given, residuals last."""
+    N, g = gram[:-1, :-1], gram[:-1, -1]
+    scale = torch.where(N.diagonal() > 0, N.diagonal(), 1.0).rsqrt()
+    root, _ = inverse_root(N * scale[:, None] * scale, scale, _RANK_TOLERANCE)
+    pull = g @ root
+    return Least(float(gram[-1, -1] - pull.square().sum()), root.shape[1], -root @ pull, root)
+
+
+class OwnFit(NamedTuple):
+    """The χ² of a source alone, and its degrees of freedom."""
+
+    chi2: float
+    freedom: int
+
+
+def own_fits(problem: RigProblem, state: RigState) -> dict[Kind, OwnFit]:
+    """The fit of each source of items alone, with what is known beforehand, from their rows at a solution of all.
+
+    Boards have none: their corners' noise is estimated as it is.
+    """
+    prior, found = problem.prior_rows(state), dict[Kind, OwnFit]()
+    known = prior @ prior.T
+    for block, gram in zip(problem.blocks, problem.block_grams(state), strict=True):
+        if block.kind != "boards":
+            alone = least(gram + known)
+            rows = int((block.counts - block.size).sum()) + prior.shape[1]
+            found[block.kind] = OwnFit(alone.chi2, rows - alone.rank)
+    return found

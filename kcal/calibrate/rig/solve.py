@@ -1,36 +1,176 @@
-"""Solve a rig in one joint adjustment of boards, landmarks, far features, baselines and measured positions."""
+"""Solve a rig from its sources, and from images of boards."""
 
 from __future__ import annotations
 
 import copy
 import dataclasses
 import functools
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 import torch
+from torch import Tensor
 
-from kcal.calibrate.rig.adjustment import Adjustment
+from kcal.calibrate.hybrid.board_modes import board_modes
+from kcal.calibrate.problem.board_problem import BoardProblem
+from kcal.calibrate.problem.closed_form import spread_out
+from kcal.calibrate.problem.parameters import FreeParameters
+from kcal.calibrate.problem.state import BoardState
+from kcal.calibrate.rig.adjustment import LOSS, ROUGHLY, Adjustment, possible
 from kcal.calibrate.rig.assess import rig_result
 from kcal.calibrate.rig.blocks import KINDS, PerKind
-from kcal.calibrate.rig.explanations import explained
+from kcal.calibrate.rig.board_consensus import MINIMUM_CORNERS, evenly, pose_alone
+from kcal.calibrate.rig.explanations import cost_of_features_behind, explained, refuse_same_camera
 from kcal.calibrate.rig.initial_poses import InitialPoses, first_poses
-from kcal.calibrate.rig.mixups import refuse_same_camera
-from kcal.calibrate.rig.outliers import ROUGHLY, possible
-from kcal.calibrate.rig.prior_information import gathered, joint_unknowns
-from kcal.calibrate.rig.rayless import without_rayless
-from kcal.calibrate.rig.records import Reasons, item_records
-from kcal.calibrate.rig.repeated_views import without_repeated
-from kcal.calibrate.rig.result import RigResult
-from kcal.calibrate.rig.robust_start import robust_solution
-from kcal.calibrate.rig.sources import RigData
-from kcal.calibrate.rig.unknowns import SharedUnknowns, free, held
+from kcal.calibrate.rig.pairs import Pair, paired_boards
+from kcal.calibrate.rig.prior_information import gathered, joint_unknowns, less
+from kcal.calibrate.rig.problem import SharedUnknowns, free, held
+from kcal.calibrate.rig.result import Reasons, RigResult, item_records
+from kcal.calibrate.rig.sources import Boards, RigData
+from kcal.corners.observations import Observations
 from kcal.errors import InputError
+from kcal.gaussian import triangular
 from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
 from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA, check_refraction
 from kcal.solve.lm import LMOptions
 from kcal.threads import in_one_thread
+
+# Leave out marks and corners at which a lens model has no ray.
+
+
+def without_rayless(data: RigData) -> tuple[RigData, list[str]]:
+    """The data with pixels at which a lens model has no ray taken as unseen, and warnings that count them.
+
+    Raises:
+        InputError: most corners of a board are such pixels.
+    """
+    warnings, changed = [], {}
+    for kind in KINDS:
+        source = getattr(data, kind)
+        if source is None:
+            continue
+        pixels = source.pixels.clone()
+        for c, camera in enumerate(data.cameras):
+            seen = torch.isfinite(pixels[:, c]).all(-1)
+            _, valid = camera.unproject(pixels[:, c])
+            lost = seen & ~valid
+            if not bool(lost.any()):
+                continue
+            if kind == "boards":
+                few = (seen.sum(-1) >= MINIMUM_CORNERS) & ((seen & valid).sum(-1) < MINIMUM_CORNERS)
+                for i in few.nonzero()[:, 0].tolist():
+                    raise InputError(
+                        f"board {source.names[i]}: the {data.names[c]} camera's lens model has no ray at most of its "
+                        "corners: it folds inside the image; calibrate with views nearer the image's border or with a "
+                        "smaller model"
+                    )
+            warnings.append(f"{int(lost.sum())} pixels of {kind} left out where {data.names[c]}'s lens has no ray")
+            pixels[:, c] = torch.where(lost[..., None], torch.nan, pixels[:, c])
+        changed[kind] = dataclasses.replace(source, pixels=pixels)
+    return dataclasses.replace(data, **changed), warnings
+
+
+# The best robust solution of a rig from several initial poses.
+
+# px: a corner's noise before the boards themselves tell it.
+_CORNER_SIGMA = 0.2
+# Enough steps, and features, to tell which of several starts is best.
+_SCREENING, _SCREENED = LMOptions(max_iterations=25, tolerance=1e-6, residual_floor=1e-8), 300
+
+
+def robust_solution(initial: InitialPoses, masks: PerKind, unknowns: SharedUnknowns) -> Adjustment:
+    """The best robust solution from all starts."""
+    boards = initial.data.boards
+    sigma = _CORNER_SIGMA if boards is None or boards.sigma is None else boards.sigma
+    best: tuple[float, Adjustment] | None = None
+    some = masks._replace(features=_evenly_taken(masks.features, _SCREENED))
+    for start in initial.starts:
+        work = Adjustment(initial.data, start, unknowns, sigma)
+        if unknowns.refine_lenses:
+            # From poses that are far off, lenses would bend towards them, beyond their folds even.
+            work.unknowns = held(initial.data.cameras)
+        here = possible(work, some)
+        work.fit_corners(here, robust=True)
+        problem, result = work.solve(here, _SCREENING, LOSS)
+        cost = float(result.cost) + cost_of_features_behind(problem, work.part(here))
+        cost += 1e6 * sum(int((a & ~b).sum()) for a, b in zip(some, here, strict=True))
+        if best is None or cost < best[0]:
+            best = (cost, work)
+    assert best is not None
+    work, here = best[1], possible(best[1], masks)
+    work.unknowns = unknowns
+    work.fit_corners(here, robust=True)
+    work.solve(here, ROUGHLY, LOSS)
+    return work
+
+
+def _evenly_taken(mask: Tensor, most: int) -> Tensor:
+    """The mask with `most` of its items at most, evenly taken."""
+    chosen, out = mask.nonzero()[:, 0], torch.zeros_like(mask)
+    out[chosen[evenly(len(chosen), most)]] = True
+    return out
+
+
+# Take views of a rig out of what the cameras' calibrations know of them, so that no corner counts twice.
+
+# A view of a calibration has the residuals that its record says, whatever corners were left out.
+_SAME_RMS = 0.25
+
+
+def without_repeated(
+    known: CameraInformation, camera: Camera, boards: Boards, number: int, solver: LMOptions
+) -> CameraInformation:
+    """What a calibration knows from other views than the rig's.
+
+    Views are the same if name and residuals are.
+
+    Args:
+        known: what the calibration knows from all its views.
+        camera: the camera, with its calibration.
+        boards: of the rig, as they were read.
+        number: of the camera in the rig.
+        solver: options for poses.
+    """
+    record = None if camera.calibration is None else camera.calibration.record
+    names = () if boards.views is None else boards.views[number]
+    if record is None or record.noise is None or not names:
+        return known
+    named = torch.tensor([name in record.per_view_rms for name in names])
+    named &= torch.isfinite(boards.pixels[:, number]).all(-1).sum(-1) >= MINIMUM_CORNERS
+    if not bool(named.any()):
+        return known
+    pixels, parameters = boards.pixels[named, number], camera.params.detach()
+    sigma = record.noise * math.sqrt(record.tempering or 1.0)
+    free = [i for i, slot in enumerate(known.slots) if slot >= 0]
+    with_board = known.board_size > 0
+    # Unknowns of the calibration: of the camera, and of the board as it was ordered.
+    problem = BoardProblem(
+        boards.board.points if with_board else boards.points,
+        pixels,
+        camera.model,
+        FreeParameters(tuple(free), tuple(known.slots[i] for i in free)),
+        shapes=board_modes(boards.board.points).shapes if with_board else pixels.new_zeros(0, 3, pixels.shape[1]),
+        free_board=with_board,
+        weights=boards.whitening(sigma)[named, number],
+    )
+    amplitudes = known.estimate[known.lens_size :]
+    seen = problem.board_points + torch.einsum("b,bcn->nc", amplitudes, problem.shapes)
+    poses, _ = pose_alone(seen, pixels, camera, solver)
+    state = BoardState.still(parameters, amplitudes, poses.rotation, poses.translation)
+    rms = problem.corner_residuals(state).square().sum(-1).nanmean(-1).sqrt()
+    then = torch.tensor([record.per_view_rms[name] for name, used in zip(names, named.tolist(), strict=True) if used])
+    same = (rms - then).abs() <= _SAME_RMS * then
+    if int(same.sum()) == record.views:
+        # Only what was assumed is left.
+        return dataclasses.replace(known, rows=known.rows[:0], residuals=known.residuals[:0])
+    if not bool(same.any()):
+        return known
+    return less(known, triangular(problem.off_poses(state)[same].transpose(0, 1).flatten(1).T))
+
+
+# Solve a rig in one joint adjustment of boards, landmarks, far features, baselines and measured positions.
 
 # λ of a solve that begins at the robust solution.
 _NEAR_DAMPING = 1e-9
@@ -234,3 +374,63 @@ def _suspicions(work: Adjustment, masks: PerKind, reasons: Reasons, solver: LMOp
         for item in item_records(trial, kept, reasons)
         if not item.used and (item.source, item.name) not in named
     ]
+
+
+# Solve a stereo rig from boards that both cameras have seen.
+
+
+@in_one_thread
+def calibrate_rig(
+    left: Camera,
+    right: Camera,
+    left_observations: Observations,
+    right_observations: Observations,
+    pairs: Sequence[Pair],
+    options: RigOptions | None = None,
+) -> RigResult:
+    """Find the pose of the right camera in the left one's frame: `solve_rig` with boards alone.
+
+    Each camera's board poses are found alone; every pair then proposes a relative pose, in the corner order as read
+    and with the right image's order turned by 180°. The proposal that the other pairs agree with best tells which
+    pairs were read from the other end and which do not belong. The others are refined jointly: one board pose for each
+    pair, one relative pose, least squares over both images.
+
+    Args:
+        left: the left camera, calibrated.
+        right: the right camera, calibrated.
+        left_observations: views of the left camera.
+        right_observations: views of the right camera.
+        pairs: names of views taken at the same moment (see `kcal.calibrate.rig.pairs`).
+        options: see `RigOptions`.
+
+    Raises:
+        InputError: boards or image sizes that differ, cameras that do not fit their observations, views with too few
+            corners for a pose.
+        DegenerateError: no pair is left.
+
+    Example:
+        >>> from kcal import Board, StereoRig, View
+        >>> from kcal.lens import rotation_from_vector
+        >>> board = Board(columns=7, rows=6, square=0.05)
+        >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480))
+        >>> truth = StereoRig(camera, camera, torch.eye(3), torch.tensor([-0.2, 0.0, 0.0]))
+        >>> tilts = torch.tensor([[0.4, 0, 0], [-0.4, 0.1, 0], [0, 0.4, 0.2]], dtype=torch.float64)
+        >>> sides = ([], [])
+        >>> for i, rotation in enumerate(rotation_from_vector(tilts)):
+        ...     points = board.points @ rotation.T + torch.tensor([-0.1, -0.1, 1.0], dtype=torch.float64)
+        ...     for views, pixels in zip(sides, truth(points)[:2]):
+        ...         views.append(View(name=f"{i}.png", pixels=pixels.tolist()))
+        >>> left, right = (Observations(board=board, image_size=(640, 480), views=views) for views in sides)
+        >>> pairs = [(name, name) for name in left.names]
+        >>> result = calibrate_rig(camera, camera, left, right, pairs)
+        >>> [round(value, 6) + 0.0 for value in result.stereo().right_from_left_translation.tolist()]
+        [-0.2, 0.0, 0.0]
+    """
+    boards = paired_boards((left, right), (left_observations, right_observations), pairs)
+    for pair, counts in zip(pairs, torch.isfinite(boards.pixels).all(-1).sum(-1).tolist(), strict=True):
+        if min(counts) < MINIMUM_CORNERS:
+            raise InputError(f"pair {pair[0]}, {pair[1]}: at least {MINIMUM_CORNERS} corners are needed in each view")
+    for side in (0, 1):
+        for i in (~spread_out(boards.points, boards.pixels[:, side])).nonzero()[:, 0].tolist():
+            raise InputError(f"{pairs[i][side]}: all its corners, or all but one, lie on one line; leave the pair out")
+    return solve_rig(RigData(cameras=(left, right), names=("left", "right"), boards=boards), options)

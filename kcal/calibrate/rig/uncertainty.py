@@ -11,7 +11,7 @@ from torch import Tensor
 
 from kcal.calibrate.rig.blocks import RigState
 from kcal.calibrate.rig.problem import RigProblem
-from kcal.chance import variance_factor
+from kcal.checks import variance_factor
 from kcal.gaussian import inverse_root
 
 # Eigenvalues of the scaled information below this share of the largest are rounding, not information.

@@ -9,7 +9,7 @@ from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
 from kcal.lens.camera import Camera
 from kcal.lens.zernike import ZernikeModes
 from kcal.sim.board import BoardSize, board_points
-from kcal.sim.poses import sample_board_poses
+from kcal.sim.captures import sample_board_poses
 from scripts.shared.moving_captures import Hands, moving_capture
 
 BOARD = BoardSize(9, 6, 0.05)

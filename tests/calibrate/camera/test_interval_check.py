@@ -21,7 +21,7 @@ from kcal.corners.observations import Observations
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.uncertainty import pixel_covariance, pixel_errors
-from kcal.report.model_findings import fault_of_views
+from kcal.report.judge_camera import fault_of_views
 from kcal.report.verdict import Finding
 from scripts.shared.views import observed, simulate
 
@@ -121,7 +121,7 @@ def test_command(
             yield refit
 
     monkeypatch.setattr(module, "simulated_refits", interrupted)
-    monkeypatch.setattr("kcal.report.model_findings.fault_of_views", lambda *_: None)
+    monkeypatch.setattr("kcal.report.judge_camera.fault_of_views", lambda *_: None)
     assert run(monkeypatch, "left.camera.json", "--refits", "11") == 130
     printed = capsys.readouterr()
     assert "of 10 refits" in printed.out
@@ -136,7 +136,7 @@ def test_command(
     assert "10 refits are done already" in told["text"][0]
     assert Path("map.png").stat().st_size > 10_000
     fault = Finding(name="model", severity="doubt", text="halves differ", action="take more views")
-    monkeypatch.setattr("kcal.report.model_findings.fault_of_views", lambda *_: fault)
+    monkeypatch.setattr("kcal.report.judge_camera.fault_of_views", lambda *_: fault)
     assert run(monkeypatch, "left.camera.json", "--refits", "11", "--against", "wrong.obs.json") == 3
     printed = capsys.readouterr()
     assert "the second capture contradicts the stated intervals" in printed.out

@@ -9,15 +9,14 @@ import pytest
 import torch
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
-from kcal.calibrate.rig.from_boards import calibrate_rig
 from kcal.calibrate.rig.pairs import pair_by_name
 from kcal.calibrate.rig.result import RigResult
-from kcal.calibrate.rig.solve import RigOptions
+from kcal.calibrate.rig.solve import RigOptions, calibrate_rig
 from kcal.corners.board import Board
 from kcal.corners.detect import detect
 from kcal.corners.observations import Observations
 from kcal.lens.camera import Camera
-from kcal.locate.check import triangulated_sides
+from kcal.locate.monitor import triangulated_sides
 
 cv2 = pytest.importorskip("cv2")
 

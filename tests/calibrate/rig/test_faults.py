@@ -10,16 +10,14 @@ import torch
 from rig_scenes import CAMERAS, CENTER, NAMES, boards, features, landmarks, normal, tensor
 from torch import Tensor
 
-from kcal.calibrate.rig import other_places
+from kcal.calibrate.rig import assess
 from kcal.calibrate.rig.adjustment import Adjustment
 from kcal.calibrate.rig.blocks import PerKind
-from kcal.calibrate.rig.contradictions import contradictions
-from kcal.calibrate.rig.initial_poses import first_poses
-from kcal.calibrate.rig.redundancy import redundancy
-from kcal.calibrate.rig.resection import distinct_poses, poses_from_three
+from kcal.calibrate.rig.explanations import contradictions, redundancy
+from kcal.calibrate.rig.initial_poses import distinct_poses, first_poses, poses_from_three
+from kcal.calibrate.rig.problem import held
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.sources import Baseline, Landmarks, MeasuredPosition, RigData
-from kcal.calibrate.rig.unknowns import held
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.pose import rotation_from_vector
 from kcal.report.judge_rig import rig_verdict
@@ -131,7 +129,7 @@ class TestSeveralSolutions:
         assert off == sorted(off)
 
     def test_nothing_is_tried_where_boards_tie_the_cameras(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(other_places, "_other_places", None)
+        monkeypatch.setattr(assess, "_other_places", None)
         assert solve_rig(data(landmarks=marked(count=5), boards=boards(noise=0.1)), STRAIGHT).left_out == ()
 
 

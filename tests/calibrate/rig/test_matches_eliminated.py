@@ -10,9 +10,8 @@ from torch import Tensor
 from kcal.calibrate.rig.adjustment import Adjustment
 from kcal.calibrate.rig.blocks import LOCAL_SIZE, PerKind
 from kcal.calibrate.rig.initial_poses import Start
-from kcal.calibrate.rig.problem import RigProblem, _few_others_fall, _others_fall
+from kcal.calibrate.rig.problem import RigProblem, _few_others_fall, _others_fall, held
 from kcal.calibrate.rig.sources import Baseline, Features, Landmarks, RigData
-from kcal.calibrate.rig.unknowns import held
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.solve.lm import LMOptions

@@ -14,18 +14,16 @@ from torch import Tensor
 from kcal.calibrate.hybrid.evidence import EvidenceLoss
 from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies
 from kcal.calibrate.hybrid.quadratic import view_data
-from kcal.calibrate.rig.camera_rows import CameraRows
-from kcal.calibrate.rig.from_boards import calibrate_rig
-from kcal.calibrate.rig.motion import RigRows, WithoutMotion
+from kcal.calibrate.rig.motion import CameraRows, RigRows, WithoutMotion
 from kcal.calibrate.rig.result import RigResult
-from kcal.calibrate.rig.solve import RigOptions
+from kcal.calibrate.rig.solve import RigOptions, calibrate_rig
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.sim.board import BoardPose, BoardSize
-from kcal.sim.poses import sample_board_poses
+from kcal.sim.captures import sample_board_poses
 from kcal.solve.schur import Products, without_local
 from scripts.shared.moving_captures import Hands, moving_capture
 

@@ -10,7 +10,7 @@ import torch
 from rig_scenes import CAMERAS, CENTER, NAMES, ROTATION, features, landmarks
 from torch import Tensor
 
-from kcal.calibrate.rig.own_fit import own_fits
+from kcal.calibrate.rig.problem import own_fits
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.sources import Baseline, Landmarks, RigData

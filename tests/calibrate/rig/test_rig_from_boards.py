@@ -14,10 +14,9 @@ from rig_scenes import CAMERAS, landmarks, tensor
 from torch import Tensor
 
 from kcal.calibrate.problem.state import warp_modes
-from kcal.calibrate.rig.from_boards import calibrate_rig
 from kcal.calibrate.rig.pairs import pair_by_name, read_pairs
 from kcal.calibrate.rig.result import RigResult
-from kcal.calibrate.rig.solve import RigOptions, solve_rig
+from kcal.calibrate.rig.solve import RigOptions, calibrate_rig, solve_rig
 from kcal.calibrate.rig.sources import RigData
 from kcal.corners.board import Board
 from kcal.errors import FileError, InputError

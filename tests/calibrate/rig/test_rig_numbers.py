@@ -24,21 +24,17 @@ from rig_scenes import (
 from torch import Tensor
 
 from kcal.calibrate.rig.adjustment import _first_rays, typical_ratio
-from kcal.calibrate.rig.blocks import Block, BoardBlock, FeatureBlock, RigState
-from kcal.calibrate.rig.camera_rows import CameraRows, summed_products
-from kcal.calibrate.rig.contradictions import _Part, _test
+from kcal.calibrate.rig.assess import _advice, _Targets
+from kcal.calibrate.rig.blocks import Block, BoardBlock, FeatureBlock, LandmarkBlock, RigState
 from kcal.calibrate.rig.drift import drift_of_turns
+from kcal.calibrate.rig.explanations import _Part, _test, least_redundancy, redundancy, refuse_exact
 from kcal.calibrate.rig.initial_poses import Start
-from kcal.calibrate.rig.landmark_block import LandmarkBlock
-from kcal.calibrate.rig.own_fit import least
+from kcal.calibrate.rig.motion import CameraRows, summed_products
 from kcal.calibrate.rig.prior_information import _moving
-from kcal.calibrate.rig.problem import DistanceTerm, PlaceTerm, RigProblem, _of_item
-from kcal.calibrate.rig.redundancy import least_redundancy, redundancy, refuse_exact
+from kcal.calibrate.rig.problem import DistanceTerm, PlaceTerm, RigProblem, _of_item, held, least
 from kcal.calibrate.rig.sources import RigData
 from kcal.calibrate.rig.uncertainty import SharedCovariance, mounting_rows, relative_rows
-from kcal.calibrate.rig.unknowns import held
-from kcal.calibrate.rig.weak_geometry import _advice, _Targets
-from kcal.chance import chi2_quantile
+from kcal.checks import chi2_quantile
 from kcal.errors import DegenerateError
 from kcal.lens.pose import vector_from_rotation
 from kcal.locate.budget import planned_rig

@@ -23,11 +23,16 @@ from rig_scenes import (
 from torch import Tensor
 
 from kcal.calibrate.rig.board_consensus import Poses, _median_rms, _view_rms, consensus, evenly, half_turn
-from kcal.calibrate.rig.initial_poses import Start, _baseline, _in_all_places, _into_frame, _level_starts, _starts
-from kcal.calibrate.rig.resection import (
+from kcal.calibrate.rig.initial_poses import (
+    Start,
+    _baseline,
+    _in_all_places,
+    _into_frame,
+    _level_starts,
     _real_roots,
     _samples,
     _score,
+    _starts,
     consensus_pose,
     consensus_rotation,
     distinct_poses,
@@ -35,10 +40,10 @@ from kcal.calibrate.rig.resection import (
     rotation_between,
 )
 from kcal.calibrate.rig.sources import Baseline, MeasuredPosition, RigData
-from kcal.calibrate.rig.synchrony import synchrony
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import StereoRig
+from kcal.report.judge_rig import synchrony
 
 
 def rays_to(points: Tensor, camera: int = 0) -> Tensor:

@@ -26,17 +26,14 @@ from rig_scenes import (
 )
 from torch import Tensor
 
-from kcal.calibrate.rig import initial_poses, limits, solve
-from kcal.calibrate.rig.blocks import BoardBlock, FeatureBlock, PosedCamera, RigState
-from kcal.calibrate.rig.initial_poses import Start
-from kcal.calibrate.rig.landmark_block import LandmarkBlock
+from kcal.calibrate.rig import adjustment, initial_poses, solve
+from kcal.calibrate.rig.blocks import BoardBlock, FeatureBlock, LandmarkBlock, PosedCamera, RigState
+from kcal.calibrate.rig.initial_poses import Start, consensus_pose, poses_from_three
 from kcal.calibrate.rig.prior_information import joint_unknowns
-from kcal.calibrate.rig.problem import DistanceTerm, PlaceTerm, RigProblem
-from kcal.calibrate.rig.resection import consensus_pose, poses_from_three
+from kcal.calibrate.rig.problem import DistanceTerm, PlaceTerm, RigProblem, SharedUnknowns
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.sources import Baseline, MeasuredPosition, RigData, inverse_range_beyond
-from kcal.calibrate.rig.unknowns import SharedUnknowns
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
@@ -531,7 +528,7 @@ class TestWrong:
         assert solve_rig(data(boards=shown)).left_out == ()
         with monkeypatch.context() as without:
             for name in ("_LENS", "_BETWEEN"):
-                without.setattr(limits, name, 0.0)
+                without.setattr(adjustment, name, 0.0)
             assert len(solve_rig(data(boards=shown)).left_out) > 0
         # One that moved is found all the same.
         shown.pixels[5, 1] += tensor(1.0, 0.0)

@@ -18,8 +18,7 @@ from scipy.interpolate import RectBivariateSpline
 from torch import Tensor
 
 from kcal.lens.camera import Camera
-from kcal.sim.backdrop import exposed
-from kcal.sim.noise import smooth_noise
+from kcal.sim.coast import exposed, smooth_noise
 from kcal.sim.truth import TruthLens
 
 Floats = NDArray[np.float64]

@@ -1,6 +1,6 @@
 """Pictures of a terrain by both cameras of a rig: ground, hills, blocks from 50 m to 20 km, in any light and weather.
 
-It is made of flat pieces (`kcal.sim.facets`), so that the truth of every pixel is known, and each moment has vehicles
+It is made of flat pieces (`kcal.sim.coast`), so that the truth of every pixel is known, and each moment has vehicles
 elsewhere. The finest texture is four pixels wide, so that one line of sight for each pixel is enough.
 """
 
@@ -17,11 +17,22 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcal.sim.backdrop import exposed, rotation_of
-from kcal.sim.coast_objects import box_outline, facing
-from kcal.sim.facets import Cut, Eye, Facet, Haze, cut, eye, facet_windows, paint
-from kcal.sim.noise import smooth_noise
-from kcal.sim.true_rig import TrueRig
+from kcal.sim.captures import TrueRig
+from kcal.sim.coast import (
+    Cut,
+    Eye,
+    Facet,
+    Haze,
+    box_outline,
+    cut,
+    exposed,
+    eye,
+    facet_windows,
+    facing,
+    paint,
+    rotation_of,
+    smooth_noise,
+)
 
 Floats = NDArray[np.float64]
 EYE_HEIGHT = 14.0  # meters of the left camera above the ground
@@ -98,7 +109,7 @@ class Terrain:
         seed: of the terrain.
 
     Example:
-        >>> from kcal.sim.true_rig import drawn_rig
+        >>> from kcal.sim.captures import drawn_rig
         >>> rig = drawn_rig("surveillance", 1.0, 1, focal_mm=4.64, wander=1.0, scale=0.125)
         >>> left, right = Terrain(rig, 1).images(1, Weather(hour=9.0, haze=8000.0))
         >>> left.shape, left.dtype

@@ -1,0 +1,387 @@
+"""Formats of photogrammetry programs: Metashape, COLMAP, Nerfstudio, OpenSfM and Qualisys."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+from xml.etree.ElementTree import Element
+
+import numpy as np
+import torch
+
+from kcal.errors import InputError
+from kcal.files import dump_json, read_bytes, read_text, write_atomic
+from kcal.io.foreign import (
+    MOST_BYTES,
+    CameraPose,
+    Hints,
+    ImportedCameras,
+    camera_name,
+    checked_pose,
+    named_camera,
+    numbers,
+    whole_size,
+)
+from kcal.lens.calibration import CameraCalibration
+from kcal.lens.camera import Camera
+from kcal.lens.model import LensModel
+from kcal.strict_json import read_json, read_xml
+
+# Agisoft Metashape's XML: a calibration, or the sensors of exported cameras with the covariances of their parameters.
+#
+#     x' = x (1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸) + p1 (r² + 2x²) + 2 p2 x y,   u = width / 2 + cx + x' (f + b1) + y' b2
+#     y' = y (1 + ...) + p2 (r² + 2y²) + 2 p1 x y,                            v = height / 2 + cy + y' f
+#
+# Pixel (0.5, 0.5) is the center of the first pixel there. p1 and p2 are OpenCV's p2 and p1 (Metashape's manual,
+# appendix D). A fisheye has θ in place of r = tan θ.
+
+# What of kcal's parameters changes with each of Metashape's.
+_FRAME = {"f": ("fx", "fy"), "b1": ("fx",), "b2": ("skew",), "cx": ("cx",), "cy": ("cy",), "p1": ("p2",), "p2": ("p1",),
+          "k1": ("k1",), "k2": ("k2",), "k3": ("k3",), "k4": ("k7",)}  # fmt: skip
+_FISHEYE = {name: own for name, own in _FRAME.items() if name[0] != "p"} | {"k4": ("k4",)}
+_OTHERS = ("p3", "p4")
+
+
+def read_agisoft(path: Path, hints: Hints) -> ImportedCameras:
+    """Read the adjusted calibration of every sensor; poses are in a frame of the chunk and not read."""
+    root = read_xml(read_bytes(path, MOST_BYTES), str(path))
+    sensors = [part for part in root.iter("sensor") if part.find("calibration") is not None] or [root]
+    cameras = tuple(_agisoft_camera(part, number) for number, part in enumerate(sensors))
+    notes = ("the poses of images are not read",) if root.find(".//camera/transform") is not None else ()
+    return ImportedCameras(format="agisoft", cameras=cameras, notes=notes)
+
+
+def _agisoft_camera(sensor: Element, number: int) -> Camera:
+    name = sensor.get("label") or f"sensor {sensor.get('id', number)}"
+    found = [sensor] if sensor.tag == "calibration" else sensor.findall("calibration")
+    if not found:
+        raise ValueError("no sensor with a calibration")
+    best = next((part for part in found if part.get("class") == "adjusted"), found[0])
+    kind = best.get("type") or best.findtext("projection") or "frame"
+    if kind not in ("frame", "fisheye"):
+        raise ValueError(f"{name}: a lens of type {kind}: kcal reads frame and fisheye")
+    own = _FISHEYE if kind == "fisheye" else _FRAME
+    size = best.find("resolution")
+    if size is not None:
+        width, height = whole_size(size.get("width"), size.get("height"))
+    else:
+        width, height = whole_size(best.findtext("width"), best.findtext("height"))
+    given = {tag: numbers([best.findtext(tag, "0")], 1, tag)[0] for tag in (*_FRAME, *_OTHERS)}
+    strange = [tag for tag, value in given.items() if value and tag not in own]
+    if strange:
+        raise ValueError(f"{name}: {', '.join(strange)} of a {kind} lens: no lens of kcal holds it")
+    if kind == "fisheye":
+        model = LensModel.named("fisheye4")
+    else:
+        model = LensModel(numerator=4, tangential=True) if given["k4"] else LensModel.named("opencv5")
+    names = ("fx", "fy", "cx", "cy", "skew", *model.names)
+    values = dict.fromkeys(names, 0.0)
+    for tag, changed in own.items():
+        for target in changed:
+            if target in values:
+                values[target] += given[tag]
+    fx, fy, cx, cy, skew, *lens = values.values()
+    center = cx + 0.5 * width - 0.5, cy + 0.5 * height - 0.5
+    camera = named_camera(name, (fx, fy, *center), (width, height), model, lens, skew)
+    covariance = _sensor_covariance(sensor, own, names)
+    if covariance is not None:
+        camera.calibration = CameraCalibration(name=name, covariance=covariance)
+    return camera
+
+
+def _sensor_covariance(sensor: Element, own: dict[str, tuple[str, ...]], names: tuple[str, ...]) -> torch.Tensor | None:
+    stated = sensor.find("covariance")
+    if stated is None:
+        return None
+    tags = (stated.findtext("params") or "").split()
+    strange = [tag for tag in tags if tag not in own]
+    if not tags or len(tags) > len(own) or strange:
+        raise ValueError(f"covariance: its parameters are {' '.join(tags)[:80]!r}")
+    matrix = numbers((stated.findtext("coeffs") or "").split(), len(tags) ** 2, "covariance")
+    moved = torch.zeros(len(names), len(tags), dtype=torch.float64)
+    for column, tag in enumerate(tags):
+        for target in own[tag]:
+            if target in names:
+                moved[names.index(target), column] = 1.0
+    spread = torch.tensor(matrix, dtype=torch.float64).reshape(len(tags), len(tags))
+    return moved @ (0.5 * (spread + spread.T)) @ moved.T
+
+
+# COLMAP's `cameras.txt` and `cameras.bin`. Pixel (0.5, 0.5) is the center of the first pixel there.
+
+# Pixel (0.5, 0.5) is the center of the first pixel in files of COLMAP and nerfstudio.
+_HALF = 0.5
+
+
+class ColmapModel(NamedTuple):
+    """A model of COLMAP: its number in binary files, the names of its parameters, and kcal's model."""
+
+    number: int
+    parameters: tuple[str, ...]
+    model: str
+
+
+_CENTER, _TWO = ("cx", "cy"), ("fx", "fy", "cx", "cy")
+COLMAP_MODELS = {
+    "SIMPLE_PINHOLE": ColmapModel(0, ("f", *_CENTER), "pinhole"),
+    "PINHOLE": ColmapModel(1, _TWO, "pinhole"),
+    "SIMPLE_RADIAL": ColmapModel(2, ("f", *_CENTER, "k1"), "opencv4"),
+    "RADIAL": ColmapModel(3, ("f", *_CENTER, "k1", "k2"), "opencv4"),
+    "OPENCV": ColmapModel(4, (*_TWO, "k1", "k2", "p1", "p2"), "opencv4"),
+    "OPENCV_FISHEYE": ColmapModel(5, (*_TWO, "k1", "k2", "k3", "k4"), "fisheye4"),
+    "FULL_OPENCV": ColmapModel(6, (*_TWO, "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), "opencv8"),
+    "SIMPLE_RADIAL_FISHEYE": ColmapModel(8, ("f", *_CENTER, "k1"), "fisheye4"),
+    "RADIAL_FISHEYE": ColmapModel(9, ("f", *_CENTER, "k1", "k2"), "fisheye4"),
+}
+WRITTEN = {"pinhole": "PINHOLE", "opencv4": "OPENCV", "opencv8": "FULL_OPENCV", "fisheye4": "OPENCV_FISHEYE"}
+
+
+def read_colmap(path: Path, hints: Hints) -> ImportedCameras:
+    """Read all cameras of a reconstruction; they are named by their numbers."""
+    entries = _from_binary(read_bytes(path, MOST_BYTES)) if path.suffix.lower() == ".bin" else _from_text(path)
+    if not entries:
+        raise ValueError("no cameras")
+    cameras = tuple(_colmap_camera(*entry) for entry in entries)
+    return ImportedCameras(format="colmap", cameras=cameras)
+
+
+def _colmap_camera(number: int, name: str, size: tuple[int, int], values: Sequence[float]) -> Camera:
+    known = COLMAP_MODELS[name]
+    given = dict(zip(known.parameters, values, strict=True))
+    fx = given.pop("fx", None) or given["f"]
+    fy = given.pop("fy", None) or given.pop("f")
+    cx, cy = given.pop("cx") - _HALF, given.pop("cy") - _HALF
+    # What is left are coefficients, and kcal has the same names in the same order.
+    return named_camera(str(number), (fx, fy, cx, cy), size, known.model, list(given.values()))
+
+
+def _known(name: str) -> ColmapModel:
+    if name not in COLMAP_MODELS:
+        raise ValueError(f"camera model {name}: kcal reads {', '.join(COLMAP_MODELS)}")
+    return COLMAP_MODELS[name]
+
+
+def _from_text(path: Path) -> list[tuple[int, str, tuple[int, int], list[float]]]:
+    entries = []
+    for number, line in enumerate(read_text(path, MOST_BYTES).splitlines(), 1):
+        fields = line.split()
+        if not fields or fields[0].startswith("#"):
+            continue
+        if len(fields) < 5 or len(fields) != 4 + len(_known(fields[1]).parameters):
+            raise ValueError(f"line {number}: ID MODEL WIDTH HEIGHT and the model's parameters are needed")
+        values = [float(field) for field in fields[4:]]
+        entries.append((int(fields[0]), fields[1], whole_size(fields[2], fields[3]), values))
+    return entries
+
+
+def _from_binary(data: bytes) -> list[tuple[int, str, tuple[int, int], list[float]]]:
+    by_number = {known.number: name for name, known in COLMAP_MODELS.items()}
+    try:
+        (count,), place, entries = struct.unpack_from("<Q", data), 8, []
+        for _ in range(count):
+            number, kind, width, height = struct.unpack_from("<IiQQ", data, place)
+            if kind not in by_number:
+                raise ValueError(f"camera {number} has the model number {kind}, which kcal does not read")
+            name = by_number[kind]
+            size = len(COLMAP_MODELS[name].parameters)
+            values = list(struct.unpack_from(f"<{size}d", data, place + 24))
+            place += 24 + 8 * size
+            entries.append((number, name, whole_size(width, height), values))
+    except struct.error as error:
+        raise ValueError(f"the file ends too early: {error}") from None
+    if place != len(data):
+        raise ValueError(f"{len(data) - place} bytes after the last camera")
+    return entries
+
+
+def write_colmap(cameras: Sequence[Camera], poses: Sequence[CameraPose], path: Path) -> list[Path]:
+    """Write the cameras, numbered from 1, as text or, for the suffix .bin, in binary."""
+    entries = []
+    for number, camera in enumerate(cameras, 1):
+        fx, fy, cx, cy, _, *lens = camera.params.tolist()
+        entries.append((number, WRITTEN[str(camera.model)], camera.size, [fx, fy, cx + _HALF, cy + _HALF, *lens]))
+    if path.suffix.lower() == ".bin":
+        data = struct.pack("<Q", len(entries))
+        for number, name, size, values in entries:
+            data += struct.pack(f"<IiQQ{len(values)}d", number, COLMAP_MODELS[name].number, *size, *values)
+        return [write_atomic(path, data)]
+    lines = ["# Camera list with one line of data per camera:", "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
+    lines.append(f"# Number of cameras: {len(entries)}")
+    for number, name, (width, height), values in entries:
+        lines.append(f"{number} {name} {width} {height} {' '.join(map(repr, values))}")
+    return [write_atomic(path, "\n".join(lines) + "\n")]
+
+
+# nerfstudio's `transforms.json`: intrinsics of one camera, or of each frame. Pixel (0.5, 0.5) is the first center.
+
+_FIELDS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_model", "k1", "k2", "k3", "k4", "p1", "p2")
+
+
+def read_nerfstudio(path: Path, hints: Hints) -> ImportedCameras:
+    """Read the cameras; frames with intrinsics of their own that are equal are one camera."""
+    content = read_json(read_bytes(path, MOST_BYTES), str(path))
+    frames = content.get("frames", [])
+    shared = {key: content[key] for key in _FIELDS if key in content}
+    found: dict[str, dict[str, Any]] = {}
+    for i, frame in enumerate(frames or [{}]):
+        values = shared | {key: frame[key] for key in _FIELDS if key in frame}
+        found.setdefault(json.dumps(values, sort_keys=True), values | {"name": str(frame.get("file_path", i))})
+    single = len(found) == 1
+    cameras = tuple(_nerfstudio_camera(values, path.stem if single else values["name"]) for values in found.values())
+    notes = ("the poses of the frames are not kept",) if any("transform_matrix" in frame for frame in frames) else ()
+    return ImportedCameras(format="nerfstudio", cameras=cameras, notes=notes)
+
+
+def _nerfstudio_camera(values: dict[str, Any], name: str) -> Camera:
+    kind = str(values.get("camera_model", "OPENCV"))
+    if kind not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FISHEYE"):
+        raise ValueError(f"camera_model {kind}: kcal reads OPENCV, PINHOLE and OPENCV_FISHEYE")
+    size = whole_size(values["w"], values["h"])
+    fx, cx, cy = numbers([values["fl_x"], values["cx"], values["cy"]], 3, "fl_x, cx, cy")
+    fy = float(values.get("fl_y", fx))
+    k1, k2, k3, k4, p1, p2 = (float(values.get(key, 0.0)) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    intrinsics = (fx, fy, cx - _HALF, cy - _HALF)
+    if kind == "OPENCV_FISHEYE":
+        return named_camera(name, intrinsics, size, "fisheye4", [k1, k2, k3, k4])
+    if k4:
+        raise ValueError("k4 is a fourth radial coefficient here, which kcal's models with OpenCV's names do not have")
+    lens = [k1, k2, p1, p2, k3] if kind == "OPENCV" else []
+    while lens and lens[-1] == 0.0 and len(lens) > 4:
+        lens.pop()
+    return named_camera(name, intrinsics, size, {0: "pinhole", 4: "opencv4", 5: "opencv5"}[len(lens)], lens)
+
+
+def write_nerfstudio(cameras: Sequence[Camera], poses: Sequence[CameraPose], path: Path) -> list[Path]:
+    """Write the intrinsics of one camera, and no frames."""
+    if len(cameras) != 1:
+        raise InputError("transforms.json has one camera; write the cameras one by one")
+    camera = cameras[0]
+    fx, fy, cx, cy = camera.params[:4].tolist()
+    lens = dict(zip(camera.model.names, camera.coefficients.tolist(), strict=True))
+    content: dict[str, Any] = {
+        "w": camera.size[0],
+        "h": camera.size[1],
+        "fl_x": fx,
+        "fl_y": fy,
+        "cx": cx + _HALF,
+        "cy": cy + _HALF,
+        "camera_model": "OPENCV_FISHEYE" if camera.model.fisheye else "OPENCV",
+        **lens,
+        "frames": [],
+    }
+    return [write_atomic(path, dump_json(content))]
+
+
+# OpenSfM's and OpenDroneMap's `camera_models.json` and `cameras.json`: lengths in units of the image's longer side.
+
+# Coefficients by projection type, in kcal's order, and kcal's model.
+_OPENSFM_LENSES = {
+    "perspective": (("k1", "k2"), "opencv4"),
+    "simple_radial": (("k1",), "opencv4"),
+    "radial": (("k1", "k2"), "opencv4"),
+    "brown": (("k1", "k2", "p1", "p2", "k3"), "opencv5"),
+    "fisheye": (("k1", "k2"), "fisheye4"),
+    "fisheye_opencv": (("k1", "k2", "k3", "k4"), "fisheye4"),
+}
+
+
+def read_opensfm(path: Path, hints: Hints) -> ImportedCameras:
+    """Read all cameras, by their names."""
+    content = read_json(read_bytes(path, MOST_BYTES), str(path))
+    if isinstance(content, list):
+        content = content[0]
+    content = content.get("cameras", content)
+    cameras = tuple(_opensfm_camera(name, value) for name, value in content.items())
+    if not cameras:
+        raise ValueError("no cameras")
+    return ImportedCameras(format="opensfm", cameras=cameras)
+
+
+def _opensfm_camera(name: str, value: Mapping[str, Any]) -> Camera:
+    kind = str(value["projection_type"])
+    if kind not in _OPENSFM_LENSES:
+        raise ValueError(f"{name}: projection_type {kind}: kcal reads {', '.join(_OPENSFM_LENSES)}")
+    names, model = _OPENSFM_LENSES[kind]
+    size = whole_size(value["width"], value["height"])
+    longer = max(size)
+    fx = longer * float(value.get("focal_x", value.get("focal")))
+    fy = longer * float(value["focal_y"]) if "focal_y" in value else fx
+    cx, cy = (
+        longer * float(value.get(key, 0.0)) + 0.5 * (side - 1) for key, side in zip(("c_x", "c_y"), size, strict=True)
+    )
+    return named_camera(name, (fx, fy, cx, cy), size, model, [float(value.get(key, 0.0)) for key in names])
+
+
+def write_opensfm(cameras: Sequence[Camera], poses: Sequence[CameraPose], path: Path) -> list[Path]:
+    """Write all cameras, by their names."""
+    content: dict[str, Any] = {}
+    for i, camera in enumerate(cameras):
+        fx, fy, cx, cy = camera.params[:4].tolist()
+        (width, height), longer = camera.size, max(camera.size)
+        lens = dict(zip(camera.model.names, camera.coefficients.tolist(), strict=True))
+        kind = "fisheye_opencv" if camera.model.fisheye else "brown"
+        content[camera_name(camera, f"camera {i}")] = {
+            "projection_type": kind,
+            "width": width,
+            "height": height,
+            "focal_x": fx / longer,
+            "focal_y": fy / longer,
+            "c_x": (cx - 0.5 * (width - 1)) / longer,
+            "c_y": (cy - 0.5 * (height - 1)) / longer,
+            **{key: lens.get(key, 0.0) for key in _OPENSFM_LENSES[kind][0]},
+        }
+    return [write_atomic(path, dump_json(content))]
+
+
+# Qualisys Track Manager's `.qca.txt`: XML with OpenCV's five coefficients of each camera, and its pose in millimeters.
+#
+# Lengths in the image are 1/64 px; the center of the first pixel is at 31.5/64 px of the sensor, and `fov_video` says
+# which part of the sensor the video is. Cameras look along -z there, with y upwards.
+
+_UNITS = 64.0
+_FIRST = 31.5 / _UNITS
+_CORE = ("focalLengthU", "focalLengthV", "centerPointU", "centerPointV", "skew")
+_LENS = ("radialDistortion1", "radialDistortion2", "tangentalDistortion1", "tangentalDistortion2", "radialDistortion3")
+
+
+def read_qualisys(path: Path, hints: Hints) -> ImportedCameras:
+    """Read all cameras; those that were not calibrated are left out, with a note."""
+    root = read_xml(read_bytes(path, MOST_BYTES), str(path))
+    cameras, poses, notes = [], [], []
+    for number, part in enumerate(root.iterfind(".//cameras/camera"), 1):
+        name = part.get("serial") or f"camera {number}"
+        if part.find("intrinsic") is None or part.get("calibrated") == "false":
+            notes.append(f"camera {name} is not calibrated")
+            continue
+        cameras.append(_qualisys_camera(part, name))
+        poses.append(_qualisys_pose(part))
+    if not cameras:
+        raise ValueError("no calibrated camera")
+    return ImportedCameras(format="qualisys", cameras=tuple(cameras), poses=tuple(poses), notes=tuple(notes))
+
+
+def _attributes(part: Element, tag: str, names: tuple[str, ...]) -> list[float]:
+    found = part.find(tag)
+    if found is None:
+        raise ValueError(f"a camera has no {tag}")
+    return numbers([found.attrib[name] for name in names], len(names), tag)
+
+
+def _qualisys_camera(part: Element, name: str) -> Camera:
+    left, top, right, bottom = _attributes(part, "fov_video", ("left", "top", "right", "bottom"))
+    fx, fy, cx, cy, skew = (value / _UNITS for value in _attributes(part, "intrinsic", _CORE))
+    size = whole_size(right - left + 1.0, bottom - top + 1.0)
+    center = cx - _FIRST - left, cy - _FIRST - top
+    return named_camera(name, (fx, fy, *center), size, "opencv5", _attributes(part, "intrinsic", _LENS), skew)
+
+
+def _qualisys_pose(part: Element) -> CameraPose:
+    names = tuple(f"r{row}{column}" for row in "123" for column in "123")
+    axes = np.array(_attributes(part, "transform", names)).reshape(3, 3)
+    # From axes to the right, up and backwards to those to the right, down and ahead.
+    rotation = np.diag([1.0, -1.0, -1.0]) @ axes
+    center = 1e-3 * np.array(_attributes(part, "transform", ("x", "y", "z")))
+    return checked_pose(rotation.tolist(), (-rotation @ center).tolist())
