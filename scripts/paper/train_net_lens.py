@@ -41,6 +41,7 @@ VIEWS, HELD_OUT = 20, 20
 REACH = 0.65
 RATES = [10.0**e for e in range(-4, 6)]
 TRIAL = 0.1
+LM_STEPS = 1000
 METHODS = {"gradient descent": torch.optim.SGD, "Adam": torch.optim.Adam}
 LM = "Levenberg-Marquardt"
 
@@ -60,7 +61,7 @@ def rms_of(problem: PureLensProblem, cost: Tensor) -> np.ndarray:
 
 def by_lm(lens: PureLensNet, board: Tensor, pixels: Tensor, poses: tuple[Tensor, Tensor]) -> Run:
     clock = time.process_time()
-    result = train_pure_lens(lens, board, pixels, poses, LMOptions(max_iterations=1000, tolerance=1e-9))
+    result = train_pure_lens(lens, board, pixels, poses, LMOptions(max_iterations=LM_STEPS, tolerance=1e-9))
     return Run(rms_of(PureLensProblem(board, pixels, lens), result.history), time.process_time() - clock, result.state)
 
 

@@ -1,0 +1,165 @@
+"""The paper's chain beside kcal's default camera, on its simulated site and on real captures (docs/measured/paper.md).
+
+    KCAL_DATA=DATA python -m scripts.paper.chain --work FOLDER [--write]
+
+Lenses: 20 coefficients (Eq. 10); the same with the residual net as written (Eq. 11, trained on Eq. 12 by least
+squares); kcal's lens with a network as its field, which depends on the position as Fig. 8 draws it, with its first
+layer fixed and trained; and the default. Each is fitted to all views, and to the first and the second half of them. A
+half judges the camera of the other half, which has seen none of its views, by its projection alone, with poses and
+board refitted (`scripts.shared.held_out`), without and with each view's own motion. Error bars are honest where these
+two cameras differ by no more than both state (`kcal.lens.camera_difference`). What FOLDER has is not made again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import statistics
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import torch
+
+from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+from kcal.corners.observations import Observations
+from kcal.errors import KcalError
+from kcal.lens.camera import Camera
+from kcal.lens.difference import camera_difference
+from scripts.paper.site import KINDS, observe, paper_scene
+from scripts.paper.train_eq12 import by_least_squares
+from scripts.shared.held_out import held_out
+from scripts.shared.infinity import error_at_infinity
+from scripts.shared.page import table, write_section
+from scripts.shared.real_captures import data_folder, load, names
+from scripts.shared.records import Record, finish
+from scripts.shared.timing import show
+
+PAGE, SITE, VIEWS = "paper.md", "site ", 30
+RESIDUAL = "ext20 + Eq. 11"
+LENSES = {
+    "ext20": CalibrationOptions(model="ext20"),
+    RESIDUAL: CalibrationOptions(model="ext20"),
+    "network, first layer fixed": CalibrationOptions(model="network", training=None),
+    "network, trained": CalibrationOptions(model="network"),
+    "default": CalibrationOptions(),
+}
+HEADS = ["views of", "lens", "RMS, px", "held out, px", "moving, px", "halves: ratio (p)", "at infinity, px", "CPU s"]
+
+
+def fitted(seen: Observations, lens: str) -> tuple[Camera, float]:
+    """A camera and its RMS, pixels."""
+    result = calibrate_camera(seen, LENSES[lens])
+    if lens != RESIDUAL:
+        return result.camera, result.rms
+    fit = by_least_squares(result)
+    return fit.camera, fit.rms
+
+
+def observed(capture: str, work: Path, views: int = VIEWS) -> Observations:
+    """The views of a real capture, or of the left camera of a kind of the paper's site."""
+    if not capture.startswith(SITE):
+        return load(capture, data_folder(), work / "corners").seen
+    name, folder = capture.removeprefix(SITE), work / capture.replace(" ", "-")
+    path = folder / "left.kcal.json"
+    if not path.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        observe(folder, name, paper_scene(KINDS[name], 0), "left", views)
+    return Observations.load(path)
+
+
+def measured(capture: str, lens: str, work: Path, views: int = VIEWS) -> Record:
+    """One lens on one capture."""
+    seen, record = observed(capture, work, views), Record()
+    start = time.process_time()
+    try:
+        camera, record["rms"] = fitted(seen, lens)
+    except KcalError as error:
+        return record | {"refused": str(error)}
+    record["cpu_s"] = time.process_time() - start
+    if capture.startswith(SITE):
+        truth = paper_scene(KINDS[capture.removeprefix(SITE)], 0).rig.left
+        record["infinity"] = error_at_infinity(camera, truth).rms
+    middle = len(seen.names) // 2
+    halves = [seen.subset(list(part)) for part in (seen.names[:middle], seen.names[middle:])]
+    try:
+        cameras = [fitted(half, lens)[0] for half in halves]
+    except KcalError as error:
+        return record | {"half_refused": str(error)}
+    judged = [held_out(c, o.board.points, o.pixels()) for c, o in zip(cameras, halves[::-1], strict=True)]
+    lost, corners = sum(one.lost for one in judged), sum(one.corners for one in judged)
+    for key in ("still", "moved"):
+        record[key] = math.sqrt(sum(getattr(one, key) for one in judged) / max(1, corners - lost))
+    found = camera_difference(*cameras)
+    return record | {"lost": lost, "ratio": found.ratio, "probability": found.probability}
+
+
+def cells(record: Record) -> list[str]:
+    """A row of the table."""
+    if "rms" not in record:
+        return ["refused", "", "", "", "", ""]
+    infinity = f"{record['infinity']:.3f}" if "infinity" in record else ""
+    head, tail = f"{record['rms']:.4f}", [infinity, f"{record['cpu_s']:.1f}"]
+    if "still" not in record:
+        return [head, "a half is refused", "", "", *tail]
+    lost = f", {record['lost']} lost" if record["lost"] else ""
+    honest = "none stated" if record["ratio"] is None else f"{record['ratio']:.2f} ({record['probability']:.2g})"
+    return [head, f"{record['still']:.4f}{lost}", f"{record['moved']:.4f}", honest, *tail]
+
+
+def summary(records: Sequence[Record]) -> list[str]:
+    """Medians over real captures, of those that all lenses have a judgment of."""
+    by_key = {tuple(record["key"]): record for record in records}
+    real = {capture for capture, _ in by_key if not capture.startswith(SITE)}
+    whole = sorted(c for c in real if all("still" in by_key.get((c, lens), {}) for lens in LENSES))
+    rows = []
+    for lens in LENSES:
+        of = [by_key[capture, lens] for capture in whole]
+        if not of:
+            return []
+        over = [
+            record["moved"] / by_key[capture, "default"]["moved"] for capture, record in zip(whole, of, strict=True)
+        ]
+        chances = [record["probability"] for record in of if record["probability"] is not None]
+        honest = f"{sum(p >= 0.01 for p in chances)} of {len(chances)}" if chances else "none stated"
+        lost = sum(record["lost"] for record in of)
+        cpu = statistics.median(record["cpu_s"] for record in of)
+        rows.append(
+            [lens, f"{statistics.median(over):.3f} ({min(over):.3f} to {max(over):.3f})", lost, honest, f"{cpu:.1f}"]
+        )
+    heads = ["lens", "held out over that of the default", "corners lost", "halves with p ≥ 0.01", "CPU s"]
+    return [f"Real captures that every lens can be judged on: {len(whole)}.", "", *table(heads, rows), ""]
+
+
+def lines(records: Sequence[Record]) -> list[str]:
+    """The section of the page."""
+    order = list(LENSES)
+    ordered = sorted(records, key=lambda record: (record["key"][0], order.index(record["key"][1])))
+    return [*summary(records), *table(HEADS, [[*record["key"], *cells(record)] for record in ordered])]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--work", type=Path, required=True, help="folder for corners and results; kept")
+    parser.add_argument("--captures", nargs="+", help="names, or 'site glass' and so on; all if left out")
+    parser.add_argument("--lenses", nargs="+", default=list(LENSES))
+    parser.add_argument("--write", action="store_true", help=f"also write the section of docs/measured/{PAGE}")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)  # sums in one order, so that a run can be repeated
+    captures = arguments.captures or [*(SITE + kind for kind in KINDS), *names(data_folder())]
+    keys = [(capture, lens) for capture in captures for lens in arguments.lenses]
+    records = finish(
+        arguments.work / "chain.jsonl",
+        keys,
+        lambda *key: measured(*key, arguments.work),
+        lambda r: " | ".join(cells(r)),
+    )
+    show(lines(records))
+    if arguments.write:
+        write_section(PAGE, "chain", "\n".join(lines(records)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,106 @@
+"""The scripts that make docs/measured/paper.md run, at sizes at which their figures mean nothing."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calibrate_scenes import camera, motions, observe, pixels_of
+
+from kcal.calibrate.camera.options import CalibrationOptions
+from scripts.paper import chain, figures, locate, reproduce, solve, train_eq12, train_net_lens
+from scripts.paper.numbers import TABLE_3
+from scripts.shared import page
+
+
+@pytest.fixture
+def written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A page that scripts may write to."""
+    monkeypatch.setattr(page, "DOCS", tmp_path)
+    monkeypatch.setattr(figures, "DOCS", tmp_path)
+    path = tmp_path / "paper.md"
+    path.write_text("# Page\n", encoding="utf-8")
+    return path
+
+
+def ran(monkeypatch: pytest.MonkeyPatch, module: object, *arguments: object) -> None:
+    monkeypatch.setattr(sys, "argv", ["script", *map(str, arguments), "--write"])
+    module.main()  # type: ignore[attr-defined]
+
+
+def test_joint_training(monkeypatch: pytest.MonkeyPatch, written: Path) -> None:
+    monkeypatch.setattr(train_eq12, "MODEL", "opencv5")
+    monkeypatch.setattr(train_eq12, "RATES", [1e-4, 1e-3])
+    ran(monkeypatch, train_eq12, "--steps", 5, "--views", 6)
+    rows = [line.split(" | ") for line in page.read_section("paper.md", "eq 12").splitlines()[2:]]
+    assert [len(row) for row in rows] == 5 * [len(train_eq12.HEADS)]
+    assert float(rows[2][1]) < float(rows[1][1])  # least squares ends lower than Adam
+    assert float(rows[0][3]) < 0.5  # the noise is 0.28 px
+
+
+def test_the_network_alone(monkeypatch: pytest.MonkeyPatch, written: Path, tmp_path: Path) -> None:
+    monkeypatch.setattr(train_net_lens, "VIEWS", 4)
+    monkeypatch.setattr(train_net_lens, "HELD_OUT", 1)
+    monkeypatch.setattr(train_net_lens, "RATES", [1.0, 10.0])
+    monkeypatch.setattr(train_net_lens, "LM_STEPS", 5)
+    ran(monkeypatch, train_net_lens, "--steps", 3, "--seeds", 1, "--picture", tmp_path / "steps.png")
+    assert len(page.read_section("paper.md", "net lens").splitlines()) == 2 + 7
+    assert (tmp_path / "steps.png").stat().st_size > 10_000
+
+
+def test_the_chain(monkeypatch: pytest.MonkeyPatch, written: Path, tmp_path: Path) -> None:
+    truth = camera("opencv5", 1500.0, size := (1920, 1080))  # as the site's images
+    seen = observe(pixels_of(truth, motions(truth, 10, 5), noise=0.1, seed=2), size=size)
+    monkeypatch.setattr(chain, "observed", lambda *_: seen)
+    monkeypatch.setattr(
+        chain, "LENSES", dict.fromkeys(["default", chain.RESIDUAL], CalibrationOptions(model="opencv4"))
+    )
+    monkeypatch.setattr(chain, "by_least_squares", lambda result: train_eq12.by_least_squares(result, 3))
+    ran(monkeypatch, chain, "--work", tmp_path, "--captures", "a", "site glass", "--lenses", "default", chain.RESIDUAL)
+    records = {tuple(r["key"]): r for r in map(json.loads, (tmp_path / "chain.jsonl").read_text().splitlines())}
+    plain, residual = records["a", "default"], records["a", chain.RESIDUAL]
+    assert plain["still"] == pytest.approx(0.1 * 2**0.5, rel=0.2)
+    assert (plain["lost"], residual["ratio"]) == (0, None)
+    assert 0.2 < plain["ratio"] < 3.0
+    assert "infinity" in records["site glass", "default"]
+    text = page.read_section("paper.md", "chain")
+    assert "judged on: 1." in text
+    assert text.count("none stated") == 3  # of both captures, and in the summary
+
+
+def test_halves_are_blocks_of_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neighbors are alike: a half must not judge views among those that it has seen."""
+    truth, judged = camera(), []
+    seen = observe(pixels_of(truth, motions(truth, 8, 5), noise=0.1, seed=2))
+    monkeypatch.setattr(chain, "observed", lambda *_: seen)
+    monkeypatch.setattr(chain, "fitted", lambda part, _: (judged.append(part.names) or truth, 0.1))
+    chain.measured("a", "ext20", Path())
+    assert judged == [seen.names, seen.names[:4], seen.names[4:]]
+
+
+def test_the_experiment(monkeypatch: pytest.MonkeyPatch, written: Path, tmp_path: Path) -> None:
+    """Every stage once; models that are left out take the results of the first one."""
+    monkeypatch.setattr(solve, "ALL", {"14": "opencv5"})
+    monkeypatch.setattr(locate, "DRAWS", 1)
+    monkeypatch.setattr(locate, "MARKINGS", 1)
+    real = solve.run_seed
+
+    def run_seed(folder: Path, *arguments: object) -> dict:
+        result = real(folder, *arguments)  # type: ignore[arg-type]
+        for part in ("cameras", "located", "held_out"):
+            result[part] |= {label: result[part]["14"] for label in (*TABLE_3, "hybrid")}
+        return result
+
+    monkeypatch.setattr(reproduce, "run_seed", run_seed)
+    # The lens whose images are made quickest; five views, each of which is held out once.
+    ran(monkeypatch, reproduce, "--work", tmp_path / "work", "--seeds", 1, "--views", 5, "--kinds", "vision")
+    kept = json.loads((tmp_path / "work" / "vision-0-5" / "result.json").read_text())
+    assert kept["failed"] == []
+    assert kept["cameras"]["14"]["left"]["rms"] < 1.0
+    assert np.isfinite(kept["located"]["OpenCV"]["range_error"]).all()
+    for name in ("split", "table 1", "table 2", "table 3", "models", "marks", "distance", "choice", "edges"):
+        assert page.read_section("paper.md", name), name
+    assert len(list(tmp_path.glob("paper-*.png"))) == 4
