@@ -52,7 +52,7 @@ _MOVED = {
         LMOptions LevenbergMarquardt RobustLoss SolverStatus
     """,
     "kcal.nets": """
-        InverseFit InverseNet InverseNetOptions train_inverse
+        InverseFit InverseNet InverseNetOptions NetworkModes train_inverse
     """,
 }
 _RENAMED = {"detect_images": "kcal.detect"}
@@ -64,7 +64,6 @@ _INTERNAL = {
     "kcal.calibrate.problem.readout": "Readout",
     "kcal.lens.field_modes": "FieldModes",
     "kcal.lens.gaussian_modes": "GaussianModes",
-    "kcal.lens.network_modes": "NetworkModes",
     "kcal.lens.spline": "Spline",
 }
 _PUBLIC = {name: f"{module}.{name}" for module, names in _MOVED.items() for name in names.split()} | _RENAMED

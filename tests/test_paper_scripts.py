@@ -11,6 +11,8 @@ import pytest
 from calibrate_scenes import camera, motions, observe, pixels_of
 
 from kcal.calibrate.camera.options import CalibrationOptions
+from kcal.corners.observations import Observations
+from kcal.lens.camera import Camera
 from scripts.paper import chain, figures, locate, reproduce, solve, train_eq12, train_net_lens
 from scripts.paper.numbers import TABLE_3
 from scripts.shared import page
@@ -73,10 +75,15 @@ def test_the_chain(monkeypatch: pytest.MonkeyPatch, written: Path, tmp_path: Pat
 
 def test_halves_are_blocks_of_views(monkeypatch: pytest.MonkeyPatch) -> None:
     """Neighbors are alike: a half must not judge views among those that it has seen."""
-    truth, judged = camera(), []
+    truth, judged = camera(), list[tuple[str, ...]]()
     seen = observe(pixels_of(truth, motions(truth, 8, 5), noise=0.1, seed=2))
     monkeypatch.setattr(chain, "observed", lambda *_: seen)
-    monkeypatch.setattr(chain, "fitted", lambda part, _: (judged.append(part.names) or truth, 0.1))
+
+    def fitted(part: Observations, _: str) -> tuple[Camera, float]:
+        judged.append(part.names)
+        return truth, 0.1
+
+    monkeypatch.setattr(chain, "fitted", fitted)
     chain.measured("a", "ext20", Path())
     assert judged == [seen.names, seen.names[:4], seen.names[4:]]
 

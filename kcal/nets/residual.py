@@ -44,11 +44,10 @@ class ResidualNet(Network):
         >>> bool((net.camera().params == start.params).all())
         True
 
-        Gradients reach the weights through any function of the camera:
+        Gradients reach the weights through any method of the camera:
 
-        >>> point = torch.tensor([[0.1, 0.2, 1.0]])
-        >>> pixels, _ = torch.func.functional_call(start, {"params": net.requires_grad_()()}, (point,))
-        >>> pixels.sum().backward()
+        >>> camera = net.requires_grad_().camera(differentiable=True)
+        >>> camera.project(torch.tensor([[0.1, 0.2, 1.0]]))[0].sum().backward()
         >>> bool((net.weights.grad != 0).any())
         True
     """
@@ -89,6 +88,8 @@ class ResidualNet(Network):
         """Derivatives (C, W) of the C corrected parameters by the weights."""
         return self.units[:, None] * evaluate_with_slopes(self.inputs, weights, self.widths).by_weights[..., 0].T
 
-    def camera(self) -> Camera:
-        """The corrected camera: an ordinary one, out of the graph."""
-        return Camera(self().detach(), size=self.size, model=self.model)
+    def camera(self, *, differentiable: bool = False) -> Camera:
+        """The corrected camera: an ordinary one; `differentiable`: in the graph of this net's weights."""
+        values = self()
+        camera = Camera(values.detach(), size=self.size, model=self.model)
+        return camera.attached(values) if differentiable else camera

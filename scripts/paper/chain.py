@@ -153,7 +153,7 @@ def main() -> None:
     records = finish(
         arguments.work / "chain.jsonl",
         keys,
-        lambda *key: measured(*key, arguments.work),
+        lambda capture, lens: measured(capture, lens, arguments.work),
         lambda r: " | ".join(cells(r)),
     )
     show(lines(records))
