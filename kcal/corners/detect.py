@@ -262,8 +262,7 @@ def _files_and_images(paths: Any) -> list[Any]:
 def _image_and_hash(source: Any) -> tuple[Any, str | None]:
     """An image, and the hash of its file's bytes if it comes from one."""
     if not isinstance(source, Path):
-        image = np.asarray(source)
-        return image[0] if image.ndim == 3 and len(image) == 1 else image, None
+        return as_image(source), None
     data = read_bytes(source)
     return decode_gray(data, source), hashlib.sha256(data).hexdigest()
 

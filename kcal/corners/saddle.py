@@ -15,7 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.checks import as_points
+from kcal.checks import as_points, exportable
 from kcal.errors import InputError
 
 # Pixels: radius of the disc and sigma of the blur before the fit. On rendered boards with squares of 10 to 40 px these
@@ -46,6 +46,7 @@ class CornerStatus(IntEnum):
     BLURRED = 8  # the edges are too wide for the squares
 
 
+@exportable
 class Refined(NamedTuple):
     """Corners that were refined, and how well they are known.
 

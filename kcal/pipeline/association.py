@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from kcal.checks import as_points
+from kcal.checks import as_points, exportable
 from kcal.corners.filters import as_gray
 from kcal.dispatch import is_differentiated
 from kcal.errors import InputError
@@ -107,6 +107,7 @@ def associate(
     return Association(rows, columns, found.cost[0, rows, columns], found.ambiguous[0, rows], found.possible[0])
 
 
+@exportable
 class BoxPairs(NamedTuple):
     """Pairs of boxes of B moments; nothing in it is NaN.
 
