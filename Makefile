@@ -14,8 +14,6 @@ VENV := .venv
 BIN := $(VENV)/bin
 OUT := demo-output
 
-# One thread a process: the matrices are small, and tests run two processes.
-export OMP_NUM_THREADS := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := demo
@@ -30,8 +28,8 @@ check: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# The folder kcal is there for the examples in its docstrings. One thread in each of the processes, or they would wait
-# for each other.
+# The folder kcal is there for the examples in its docstrings. One thread in each of the two processes: commands and
+# calibrations take one by themselves (kcal/threads.py), and what else tests compute would wait for each other.
 test test-all: export OMP_NUM_THREADS = 1
 test test-all: export OPENBLAS_NUM_THREADS = 1
 test: check

@@ -22,7 +22,6 @@ FOLDER = Path(__file__).resolve().parent.parent / "docs" / "explanation"
 
 
 def main() -> None:
-    torch.set_num_threads(1)
     figure = new_figure(11.0, 4.4)
     left, right = figure.subplots(1, 2, gridspec_kw={"width_ratios": [1.0, 1.2], "wspace": 0.22})
     seen, _ = load()

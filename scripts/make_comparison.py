@@ -193,7 +193,6 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=10, help="of lenses, boards, poses and noise")
     parser.add_argument("--out", type=Path, default=Path("comparison.jsonl"), help="draws in it are kept")
     arguments = parser.parse_args()
-    torch.set_num_threads(1)
     records = [json.loads(line) for line in arguments.out.read_text().splitlines()] if arguments.out.exists() else []
     for number in range(FIRST + len(records), FIRST + arguments.draws):
         records.append(measured(number))

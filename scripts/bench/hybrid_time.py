@@ -38,11 +38,8 @@ DEFAULT, MANY, SINGLE = "default camera", "one call", "single calls"
 
 def work(way: str, views: int, cameras: int) -> None:
     """In a process of its own: calibrate, and print processor seconds and peak memory."""
-    import torch
-
     from kcal.calibrate.camera.calibrate import calibrate_camera, calibrate_cameras
 
-    torch.set_num_threads(1)
     sets = [observed(simulate(views, seed=50_000 + i)["pixels"].tolist()) for i in range(cameras)]
     calibrate_camera(observed(simulate(8)["pixels"].tolist()))
     before, start = peak_megabytes(), time.process_time()

@@ -88,7 +88,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--dry", action="store_true", help="print only")
     arguments = parser.parse_args()
-    torch.set_num_threads(1)
     lines = [
         row("views", "lens", "from nothing, s", "again, s", "gradient, s", "error", "Gauss-Newton"),
         "|---|---|---|---|---|---|---|",

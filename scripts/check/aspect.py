@@ -88,7 +88,6 @@ def main() -> None:
     parser.add_argument("--stretch", type=float, default=1.0, help="of the rows, or its inverse, in turn")
     parser.add_argument("--write", action="store_true", help="write the table into the page")
     arguments = parser.parse_args()
-    torch.set_num_threads(1)
     if arguments.seeds is not None:
         finish(arguments.out[0], [(arguments.stretch, seed) for seed in arguments.seeds], judged, line)
     text = show(lines(read(arguments.out)))

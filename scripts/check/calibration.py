@@ -204,7 +204,6 @@ def main() -> None:
     folder = os.environ.get("KCAL_DATA")
     if not folder:
         sys.exit("KCAL_DATA is not set: it names the folder with the real images and corners")
-    torch.set_num_threads(1)
     sets = real_sets(Path(folder), arguments.sets)
     if arguments.only != "starts":
         text = ladder(sets)

@@ -304,7 +304,6 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--dry", action="store_true", help="print only")
     arguments = parser.parse_args()
-    torch.set_num_threads(1)
     text = constructed(arguments.lenses, arguments.seed, arguments.compared, arguments.minutes)
     if arguments.ordinary:
         text += ["", *ordinary(arguments.ordinary, arguments.seed)]

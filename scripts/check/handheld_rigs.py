@@ -108,7 +108,6 @@ def main() -> None:
     parser.add_argument("--seeds", type=seeds, help="for example 0-99")
     parser.add_argument("--write", action="store_true", help="write the table into the page")
     arguments = parser.parse_args()
-    torch.set_num_threads(1)
     if arguments.seeds is not None:
         keys = list(itertools.product(("hand", "stand"), arguments.seeds, ("default", "still")))
         finish(arguments.out[0], keys, captured, line)

@@ -24,8 +24,6 @@ import statistics
 import time
 from pathlib import Path
 
-import torch
-
 from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.camera.interval_check import (
     against_capture,
@@ -159,7 +157,6 @@ def main() -> None:
     parser.add_argument("--cold", type=int, default=0, metavar="REFITS", help="only compare warm and cold refits")
     parser.add_argument("--write", action="store_true", help="write the table in docs/measured, and stop")
     arguments = parser.parse_args()
-    torch.set_num_threads(1)
     if arguments.cold:
         text = show(cold_and_warm(arguments.cold))
         if arguments.write:

@@ -139,7 +139,6 @@ def main() -> None:
     parser.add_argument("--coefficients", type=int, nargs="*", default=[5, 8, 14], choices=[5, 8, 14])
     parser.add_argument("--dry", action="store_true", help="print only")
     arguments = parser.parse_args()
-    torch.set_num_threads(1)
     lines = table(
         ["coefficients", "cx: error, px", "cx: σ / error", "fx: σ / error",
          "corner of the image, turned: σ / error, medians", "in 95 %, %", "turned, %", "warned of",

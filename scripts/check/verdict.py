@@ -166,7 +166,6 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", help="kinds of captures")
     parser.add_argument("--write", action="store_true", help="write the table into the page")
     arguments = parser.parse_args()
-    torch.set_num_threads(1)
     lines = []
     if arguments.out.exists():
         lines = [json.loads(text) for text in arguments.out.read_text().splitlines()]

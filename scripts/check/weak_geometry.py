@@ -268,7 +268,6 @@ def main() -> None:
     parser.add_argument("--share", type=float, default=1.0, help="of the sets")
     parser.add_argument("--write", action="store_true", help="write the table into the page")
     arguments = parser.parse_args()
-    torch.set_num_threads(1)
     out = arguments.out
     records = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
     done = {(record["kind"], record["seed"]) for record in records}
