@@ -78,6 +78,7 @@ PUBLIC = {
         Association AssociationOptions ClockEstimate ClockPrior Detections DisparityOptions Motion
         ObjectDisparities ObjectDisparity ObjectPairs SmoothedTrack TrackOptions TrackStates Tracker Tracks
         associate pair_objects group_objects ObjectViews PairBoxes BoxPairs
+        PixelPairs matched_pixels
     """,
     "kcal.report": """
         FailedImage Finding RangeAnswer Requirement Verdict calibration_figure camera_verdict positions_figure
@@ -141,7 +142,17 @@ NEW_NAMES = (
     | {"pupil_shift", "ray_error", "IntervalCheck", "Refit", "against_capture", "interval_check", "simulated_refits"}
     | {"DisparityRanges", "RangeImage", "forgotten_yaw", "save_interval_picture"}
     | {"CameraRig", "CameraRigCalibration", "load_camera_rig", "save_camera_rig", "station_mounting", "stations_of"}
-    | {"ObjectViews", "group_objects", "PairBoxes", "BoxPairs", "RefineCorners", "Refined", "CornerStatus"}
+    | {
+        "ObjectViews",
+        "group_objects",
+        "PairBoxes",
+        "BoxPairs",
+        "PixelPairs",
+        "matched_pixels",
+        "RefineCorners",
+        "Refined",
+        "CornerStatus",
+    }
     | {"MultiViewLocalizer", "ViewMarks", "ViewsLocalization", "locate_views", "read_views"}
     | {
         "Area",
@@ -216,6 +227,7 @@ RECORDS = {
     "ResidualStructure",
     "Association",
     "BoxPairs",
+    "PixelPairs",
     "Refined",
     "CornerStatus",
     "Baseline",

@@ -89,6 +89,43 @@ class ImageTransform:
         scale = inner[0] / full[0], inner[1] / full[1]
         return cls(full=full, size=size, scale=scale, offset=(pads[0], pads[1]))
 
+    @classmethod
+    def from_matrices(
+        cls, matrices: Tensor, full: tuple[int, int], size: tuple[int, int]
+    ) -> tuple[ImageTransform, ...]:
+        """Those of a batch (B, 3, 3) of matrices between pixels, such as `transform_matrix` of kornia's augmentations.
+
+        Kornia counts pixels from the center of the first one, too, and its matrices are those of its sampling, also
+        where `Resize(align_corners=True)` lets centers coincide instead of edges. Only scales and shifts are held.
+
+        Args:
+            matrices: u_input = matrix @ u_full, both homogeneous.
+            full: (width, height) of the full image.
+            size: (width, height) of the input.
+
+        Raises:
+            InputError: another shape, or a matrix that turns, mirrors, shears or tilts: no camera sees such an image.
+
+        Example:
+            >>> half = torch.tensor([[[0.5, 0.0, -0.25], [0.0, 0.5, -0.25], [0.0, 0.0, 1.0]]])
+            >>> (found,) = ImageTransform.from_matrices(half, (640, 480), (320, 240))
+            >>> found == ImageTransform.resize((640, 480), (320, 240))
+            True
+        """
+        matrices = as_points("matrices", matrices, 3)
+        if matrices.ndim != 3 or matrices.shape[1] != 3:
+            raise InputError(f"matrices: shape (B, 3, 3) is needed, got {tuple(matrices.shape)}")
+        made = []
+        for number, ((a, skew, u), (turn, b, v), last) in enumerate((matrices / matrices[:, 2:, 2:]).tolist()):
+            # Kornia computes them in float32.
+            if max(abs(skew), abs(turn), 1e3 * abs(last[0]), 1e3 * abs(last[1])) > 1e-5 or not min(a, b) > 0:
+                raise InputError(
+                    f"matrices: number {number} turns, mirrors, shears or tilts the image; move pixels back by "
+                    "kornia.geometry.transform_points(matrix.inverse(), pixels), and keep the full image's camera"
+                )
+            made.append(cls(full=full, size=size, scale=(a, b), offset=(u + 0.5 - 0.5 * a, v + 0.5 - 0.5 * b)))
+        return tuple(made)
+
     def then(self, other: ImageTransform) -> ImageTransform:
         """This and after it another one, as one.
 

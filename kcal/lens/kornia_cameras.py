@@ -87,6 +87,29 @@ def parameters_from_kornia(camera: Any) -> tuple[Tensor, tuple[int, int], LensMo
     return values, _one_size(camera.image_size.width, camera.image_size.height), model
 
 
+def posed_pinholes(left: CameraParameters, right: CameraParameters, turn: Tensor, shift: Tensor) -> tuple[Any, Any]:
+    """Cameras of a rig, and their poses in the first one's frame; see `StereoRig.to_kornia`."""
+    made = kornia_camera(left), kornia_camera(right)
+    for word, camera in zip(("left", "right"), made, strict=True):
+        if not isinstance(camera, PinholeCamera):
+            raise InputError(
+                f"to_kornia: the {word} camera has a lens, and kornia's cameras with one have no pose; undistort the "
+                "images, and give the rig of `StereoRectification`, or convert each camera by itself"
+            )
+    pose = torch.cat([turn, shift[:, None]], 1)
+    pose = torch.cat([pose, pose.new_tensor([[0.0, 0.0, 0.0, 1.0]])])[None]
+    return made[0], PinholeCamera(made[1].intrinsics, pose, made[1].height, made[1].width)
+
+
+def unposed_pinhole(camera: Any) -> tuple[Any, Tensor]:
+    """A single posed camera of kornia without its pose, and the pose (4, 4) in float64; see `StereoRig.from_kornia`."""
+    if not isinstance(camera, PinholeCamera) or camera.extrinsics.shape != (1, 4, 4):
+        found = tuple(camera.extrinsics.shape) if isinstance(camera, PinholeCamera) else type(camera).__name__
+        raise InputError(f"from_kornia: a PinholeCamera with extrinsics (1, 4, 4) is needed, got {found}")
+    still = torch.eye(4).to(camera.extrinsics)[None]
+    return PinholeCamera(camera.intrinsics, still, camera.height, camera.width), camera.extrinsics[0].double()
+
+
 def _one_size(width: Any, height: Any) -> tuple[int, int]:
     widths, heights = (torch.as_tensor(value).flatten() for value in (width, height))
     if not (bool((widths == widths[0]).all()) and bool((heights == heights[0]).all())):

@@ -103,6 +103,35 @@ class StereoRig(nn.Module):
         pose = self.right_from_left_rotation.tolist(), self.right_from_left_translation.tolist()
         return hashlib.sha256(repr((self.left.fingerprint, self.right.fingerprint, pose)).encode()).hexdigest()[:12]
 
+    def to_kornia(self) -> tuple[Any, Any]:
+        """Both cameras as `PinholeCamera`s of kornia, posed in the left camera's frame.
+
+        Raises:
+            InputError: a lens, which a posed camera of kornia does not hold; rectify the images first.
+
+        Example:
+            >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
+            >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
+            >>> float(StereoRig.from_kornia(*rig.to_kornia()).baseline)
+            1.0
+        """
+        from kcal.lens.kornia_cameras import posed_pinholes  # kornia takes long to load
+
+        return posed_pinholes(self.left, self.right, self.right_from_left_rotation, self.right_from_left_translation)
+
+    @classmethod
+    def from_kornia(cls, left: Any, right: Any) -> StereoRig:
+        """The rig of two `PinholeCamera`s of kornia with poses, whose extrinsics lead from one frame into the cameras.
+
+        Raises:
+            InputError: other classes, batches, or a pose that is no rotation.
+        """
+        from kcal.lens.kornia_cameras import unposed_pinhole
+
+        (first, one), (second, other) = unposed_pinhole(left), unposed_pinhole(right)
+        turn = other[:3, :3] @ one[:3, :3].mT
+        return cls(Camera.from_kornia(first), Camera.from_kornia(second), turn, other[:3, 3] - turn @ one[:3, 3])
+
     @property
     def essential(self) -> Tensor:
         """(3, 3) essential matrix E: rayᵀ_right E ray_left = 0 for rays of `Camera.unproject` that meet.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -119,7 +120,7 @@ class ObjectPairs:
         if not 0 < pixel_sigma < math.inf:
             raise InputError(f"pixel_sigma: a positive number of pixels is needed, got {pixel_sigma}")
         if bool((matches.get("batch_indexes", torch.zeros(1)) != 0).any()):
-            raise InputError("matches: one pair of images at a time is needed, not a batch")
+            raise InputError("matches: one pair of images at a time is needed; `matched_pixels` takes a batch")
         count, place = len(matches["keypoints0"]), matches["keypoints0"].device
         return cls(
             left=matches["keypoints0"],
@@ -131,6 +132,71 @@ class ObjectPairs:
             track=(None,) * count,
             ambiguous=torch.zeros(count, dtype=torch.bool, device=place),
         )
+
+
+class PixelPairs(NamedTuple):
+    """Matches of a batch of B pairs of images, padded to K each, for `StereoLocalizer(left, right, mask=mask)`.
+
+    Attributes:
+        left: (B, K, 2) pixels of the left images; 0 where `mask` is False.
+        right: (B, K, 2) likewise.
+        score: (B, K) as the matcher has it; 0 where there is none.
+        mask: (B, K) bool.
+    """
+
+    left: Tensor
+    right: Tensor
+    score: Tensor
+    mask: Tensor
+
+
+def matched_pixels(matches: Mapping[str, Tensor], batch: int) -> PixelPairs:
+    """Matches of kornia's `LoFTR` or `LocalFeatureMatcher` as padded batches, in the graph of the keypoints.
+
+    For descriptors that were matched one pair of images at a time, give `lafs0`, `lafs1` (1, N, 2, 3) and `idxs` (M, 2)
+    as `kornia.feature.match_smnn` returns them: each is then a match of image 0.
+
+    Args:
+        matches: `keypoints0` and `keypoints1` (M, 2), `confidence` (M,), `batch_indexes` (M,); or `lafs0`, `lafs1`,
+            `idxs` and, if there are any, `confidence`.
+        batch: B, how many pairs of images there were.
+
+    Raises:
+        InputError: a key is missing, or a match of an image beyond the batch.
+
+    Example:
+        >>> found = {"keypoints0": torch.tensor([[9.0, 5.0], [7.0, 6.0], [3.0, 2.0]]), "keypoints1": torch.rand(3, 2),
+        ...          "confidence": torch.tensor([0.9, 0.8, 0.7]), "batch_indexes": torch.tensor([1, 0, 1])}
+        >>> pairs = matched_pixels(found, 2)
+        >>> pairs.mask.tolist(), pairs.left[1].tolist()
+        ([[True, False], [True, True]], [[9.0, 5.0], [3.0, 2.0]])
+    """
+    if "idxs" in matches:
+        numbers = matches["idxs"]
+        centers = [matches[name][0, :, :, 2] for name in ("lafs0", "lafs1") if name in matches]
+        if len(centers) != 2:
+            raise InputError("matches: idxs need lafs0 and lafs1, (1, N, 2, 3) each")
+        left, right = (center[numbers[:, side]] for side, center in enumerate(centers))
+        own = {"confidence": torch.ones_like(left[:, 0]), **matches, "keypoints0": left, "keypoints1": right}
+        matches = {**own, "batch_indexes": torch.zeros_like(numbers[:, 0])}
+    missing = [key for key in ("keypoints0", "keypoints1", "confidence", "batch_indexes") if key not in matches]
+    if missing:
+        raise InputError(f"matches: {missing[0]} is missing; the dictionary of a matcher of kornia is needed")
+    image = matches["batch_indexes"].long()
+    if bool(((image < 0) | (image >= batch)).any()):
+        raise InputError(f"matches: batch_indexes reach {int(image.max())}; the batch has {batch} pairs of images")
+    of = image[:, None] == torch.arange(batch, device=image.device)
+    # How many matches of the same image come before.
+    place = (of.cumsum(0) - 1).gather(1, image[:, None])[:, 0]
+    most = int(of.sum(0).max()) if batch else 0
+
+    def padded(name: str, last: int) -> Tensor:
+        values = as_points(name, matches[name].reshape(-1, last), last)
+        return values.new_zeros(batch, most, last).index_put((image, place), values)
+
+    mask = torch.zeros(batch, most, dtype=torch.bool, device=image.device)
+    mask[image, place] = True
+    return PixelPairs(padded("keypoints0", 2), padded("keypoints1", 2), padded("confidence", 1)[..., 0], mask)
 
 
 def _require_covariances(covariance: Tensor) -> None:

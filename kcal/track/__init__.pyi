@@ -5,6 +5,8 @@
 from kcal.pipeline.detections import Detections as Detections
 from kcal.pipeline.pairing import pair_objects as pair_objects
 from kcal.pipeline.pairs import ObjectPairs as ObjectPairs
+from kcal.pipeline.pairs import PixelPairs as PixelPairs
+from kcal.pipeline.pairs import matched_pixels as matched_pixels
 from kcal.pipeline.grouping import group_objects as group_objects
 from kcal.pipeline.object_views import ObjectViews as ObjectViews
 from kcal.pipeline.association import associate as associate

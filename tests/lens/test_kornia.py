@@ -9,7 +9,14 @@ import kornia.geometry.epipolar as epi
 import numpy as np
 import pytest
 import torch
-from kornia.augmentation import ImageSequential, RandomHorizontalFlip, VideoSequential
+from kornia.augmentation import (
+    ImageSequential,
+    RandomCrop,
+    RandomHorizontalFlip,
+    RandomResizedCrop,
+    Resize,
+    VideoSequential,
+)
 from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.vector import Vector2, Vector3
 from kornia.image import ImageSize
@@ -18,6 +25,7 @@ from lenses import HYBRID, strong
 
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
+from kcal.lens.image_transform import ImageTransform
 from kcal.lens.images import Undistort, UndistortImage
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import StereoRig
@@ -142,6 +150,56 @@ def test_a_rig_with_lenses_by_rays() -> None:
     assert torch.allclose(pose[1][0, :, 0], shift / shift.norm(), atol=1e-9)
     with pytest.raises(InputError, match="left lens distorts"):
         _ = rig.fundamental
+
+
+def test_a_posed_rig_goes_to_kornia_and_comes_back() -> None:
+    rig = rig_with([])
+    left, right = rig.to_kornia()
+    points = POINTS * 5
+    seen = rig(points)
+    for camera, pixels in zip((left, right), seen[:2], strict=True):
+        assert torch.allclose(camera.project(points[None])[0], pixels, rtol=0, atol=1e-9)
+    # The frame may stand anywhere.
+    moved = torch.eye(4).double()
+    moved[:3, :3], moved[:3, 3] = rotation_from_vector(torch.tensor([0.3, -0.5, 1.0]).double()), torch.tensor([5, 6, 7])
+    placed = [PinholeCamera(c.intrinsics, c.extrinsics @ moved, c.height, c.width) for c in (left, right)]
+    again = StereoRig.from_kornia(*placed)
+    assert torch.allclose(again.right_from_left_rotation, rig.right_from_left_rotation, atol=1e-14)
+    assert torch.allclose(again.right_from_left_translation, rig.right_from_left_translation, atol=1e-13)
+    assert torch.equal(again.left.params, Camera.from_kornia(camera_with("pinhole", []).to_kornia()).params)
+    with pytest.raises(InputError, match="left camera has a lens"):
+        rig_with([-0.2]).to_kornia()
+    with pytest.raises(InputError, match=r"extrinsics \(1, 4, 4\) is needed, got Tensor"):
+        StereoRig.from_kornia(torch.eye(3), right)
+
+
+@pytest.mark.parametrize(
+    "augment",
+    [Resize((120, 200), align_corners=True), Resize((120, 200), align_corners=False), RandomCrop((90, 110)),
+     RandomResizedCrop((96, 128), scale=(0.4, 0.6), cropping_mode="resample")],
+    ids=["resize, centers", "resize, edges", "crop", "crop and resize"],
+)  # fmt: skip
+def test_transforms_of_augmentations_are_those_of_their_pixels(augment: torch.nn.Module) -> None:
+    """A ramp of columns and one of rows: the value at an input pixel is where it lies in the full image."""
+    torch.manual_seed(3)
+    x, y = torch.meshgrid(torch.arange(160.0), torch.arange(120.0), indexing="xy")
+    ramps = torch.stack([x, y])[None].repeat(2, 1, 1, 1)
+    seen = augment(ramps)
+    size = seen.shape[3], seen.shape[2]
+    transforms = ImageTransform.from_matrices(augment.transform_matrix, (160, 120), size)  # type: ignore[arg-type]
+    pixels = torch.tensor([[40.0, 30.0], [61.0, 52.0], [70.0, 44.0]])
+    for image, transform in zip(seen, transforms, strict=True):
+        wanted = image[:, pixels[:, 1].long(), pixels[:, 0].long()].T.double()
+        assert torch.allclose(transform.to_full(pixels), wanted, rtol=0, atol=2e-3)
+
+
+def test_what_no_camera_sees_is_refused() -> None:
+    turned = RandomHorizontalFlip(p=1.0)
+    turned(torch.rand(1, 1, 48, 64))
+    with pytest.raises(InputError, match="number 0 turns, mirrors"):
+        ImageTransform.from_matrices(turned.transform_matrix, (64, 48), (64, 48))
+    with pytest.raises(InputError, match=r"\(B, 3, 3\)"):
+        ImageTransform.from_matrices(torch.eye(3), (64, 48), (64, 48))
 
 
 def test_undistort_in_sequences() -> None:

@@ -4,11 +4,11 @@ import dataclasses
 
 import pytest
 import torch
-from kornia.feature import DescriptorMatcher, LocalFeatureMatcher, SIFTFeature
+from kornia.feature import DescriptorMatcher, LocalFeatureMatcher, SIFTFeature, get_laf_center, match_smnn
 from kornia.filters import gaussian_blur2d
 
 from kcal.errors import InputError
-from kcal.pipeline.pairs import ObjectPairs
+from kcal.pipeline.pairs import ObjectPairs, matched_pixels
 
 
 def pairs(**changes: object) -> ObjectPairs:
@@ -88,3 +88,31 @@ def test_what_is_no_match_is_refused(change: dict, message: str) -> None:
     given = {"keypoints0": torch.ones(2, 2), "keypoints1": torch.ones(2, 2), "confidence": torch.ones(2)} | change
     with pytest.raises(InputError, match=message):
         ObjectPairs.from_matches({key: value for key, value in given.items() if value is not None})
+
+
+def test_batched_matches_of_kornia_reach_the_localizer() -> None:
+    """Of a real matcher's dictionaries, and of descriptors; in the graph of the keypoints."""
+    g = torch.Generator().manual_seed(0)
+    image = torch.tensor([1, 0, 1, 1, 0])
+    points = torch.rand(5, 2, generator=g).requires_grad_(True)
+    found = matched_pixels(
+        {"keypoints0": points, "keypoints1": points - 3, "confidence": torch.arange(5.0), "batch_indexes": image}, 3
+    )
+    assert found.mask.tolist() == [[True, True, False], [True] * 3, [False] * 3]
+    assert found.score.tolist() == [[1, 4, 0], [0, 2, 3], [0, 0, 0]]
+    assert torch.equal(found.left[1], points[[0, 2, 3]].double())
+    assert torch.equal(found.right[found.mask], found.left[found.mask].float().sub(3).double())
+    found.left.sum().backward()
+    assert points.grad is not None
+    assert bool((points.grad == 1).all())
+    lafs = torch.rand(2, 1, 6, 2, 3, generator=g)
+    _, numbers = match_smnn(torch.eye(6), torch.eye(6).flip(0), 0.9)
+    found = matched_pixels({"lafs0": lafs[0], "lafs1": lafs[1], "idxs": numbers}, 1)
+    assert torch.equal(found.left[0].float(), get_laf_center(lafs[0])[0, numbers[:, 0]])
+    assert torch.equal(found.right[0].float(), get_laf_center(lafs[1])[0].flip(0)[numbers[:, 0]])
+    with pytest.raises(InputError, match="batch has 1 pairs"):
+        matched_pixels(
+            {"keypoints0": points, "keypoints1": points, "confidence": points[:, 0], "batch_indexes": image}, 1
+        )
+    with pytest.raises(InputError, match="batch_indexes is missing"):
+        matched_pixels({"keypoints0": points, "keypoints1": points, "confidence": points[:, 0]}, 1)
