@@ -73,7 +73,7 @@ PLACES["HybridState"] = "kcal.calibrate.problem.state.BoardState"
 # Old names that mean nothing any more, and what takes their place.
 GONE = {
     "projection_covariance": "kcal.lens.pixel_covariance and kcal.lens.projection_sigma",
-    "train_features": "scripts/shared/field_features.py of the repository",
+    "train_features": "kcal.nets.FieldTraining and CalibrationOptions(field=...)",
 }
 
 

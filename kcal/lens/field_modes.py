@@ -1,7 +1,8 @@
 """What the field of a hybrid lens is made of: features with weights, whose prior widths the evidence of the views sets.
 
 Three kinds exist: `kcal.lens.zernike.ZernikeModes`, the default, `kcal.lens.gaussian_modes.GaussianModes` and
-`kcal.lens.network_modes.NetworkModes`. All are constants, can be compared and hashed; only the weights are fitted.
+`kcal.lens.network_modes.NetworkModes`. All can be compared and hashed. They are constants of a fit, which finds the
+weights; only the inside of a network may be trained.
 """
 
 from __future__ import annotations

@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
+from kcal.calibrate.hybrid.network_fit import FieldTraining
 from kcal.corners.board import Board
 from kcal.corners.detect import detect
 from kcal.corners.images import expand_images
@@ -28,9 +29,7 @@ from kcal.corners.observations import Observations
 from kcal.lens.field_modes import FieldModes
 from kcal.lens.gaussian_modes import GaussianModes
 from kcal.lens.network_modes import NetworkModes
-from kcal.lens.projection import from_pixels
 from kcal.lens.zernike import ZernikeModes
-from scripts.shared.field_features import train_features
 from scripts.shared.page import table, write_section
 from scripts.shared.timing import show
 from scripts.shared.wide_lens import folds, held_out, load
@@ -48,26 +47,11 @@ class Case(NamedTuple):
     parts: Sequence[np.ndarray]
 
 
-def with_modes(modes: FieldModes) -> Fitter:
+def with_modes(modes: FieldModes, training: FieldTraining | None = None) -> Fitter:
     def fit(seen: Observations, weight: Tensor) -> HybridFit:
-        return fit_hybrid(seen.board.points, seen.pixels(), seen.image_size, weight, modes=modes)
+        return fit_hybrid(seen.board.points, seen.pixels(), seen.image_size, weight, modes=modes, training=training)
 
     return fit
-
-
-def trained(seen: Observations, weight: Tensor) -> HybridFit:
-    """A first fit; a network trained on its field and its residuals; the last layer with everything else again."""
-    first = with_modes(ZernikeModes())(seen, weight)
-    form, camera = first.camera.model.hybrid, first.camera
-    assert form is not None
-    pixels = seen.pixels()[(weight > 0) & torch.isfinite(seen.pixels()).all(-1)]
-    x, y = (part / form.radius for part in from_pixels(pixels[:, 0], pixels[:, 1], camera.params))
-    field = torch.stack(form.modes.field(camera.coefficients[3:], x, y, slopes=False), -1)
-    # Projected minus observed; inside the network's unit the residuals are a small part.
-    residuals = first.residuals[torch.isfinite(first.residuals).all(-1)]
-    corrections = field - residuals / camera.focal
-    modes = train_features(torch.stack([x, y], -1), corrections, count=TRAINED, iterations=40)
-    return with_modes(modes)(seen, weight)
 
 
 KINDS: dict[str, Fitter] = {
@@ -75,7 +59,7 @@ KINDS: dict[str, Fitter] = {
     "gaussian, 3 widths": with_modes(GaussianModes()),
     "gaussian, 4 widths": with_modes(GaussianModes(widths=(1.0, 0.5, 0.25, 0.125))),
     "network, 60 random features": with_modes(NetworkModes.random(60)),
-    f"network, {TRAINED} trained features": trained,
+    f"network, {TRAINED} trained features": with_modes(NetworkModes.random(TRAINED), FieldTraining()),
 }
 
 

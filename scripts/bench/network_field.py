@@ -19,6 +19,7 @@ from kcal.calibrate.camera.compare import compare_models
 from kcal.calibrate.camera.options import CalibrationOptions
 from kcal.calibrate.hybrid.network_fit import FieldTraining
 from kcal.corners.observations import Observations
+from kcal.errors import KcalError
 
 CAPTURES = ("gavin_l", "gavin_r", "st1_l", "lanhp_l", "luisa39", "carnd18", "fish_l", "kaidan", "ch1280", "sq1280")
 # Name -> lens model and training.
@@ -48,8 +49,13 @@ def table(captures: list[str], parts: int, tell: Callable[[str], object]) -> str
         seen = Observations.load(Path(os.environ["KCAL_DATA"], "captures", f"{capture}.obs.json"))
         cells = []
         for name in FITS:
-            held, seconds = measure(seen, name, parts)
-            cells.append(f"{held:.4f} ({seconds:.1f})")
+            try:
+                held, seconds = measure(seen, name, parts)
+                cells.append(f"{held:.4f} ({seconds:.1f})")
+            except KcalError as error:
+                # A lens that does not fit is a result, too.
+                tell(f"{capture}, {name}: {error}")
+                cells.append("does not fit")
             tell(f"{capture}, {name}: {cells[-1]}")
         lines.append(f"| {capture} | {len(seen.views)} | {' | '.join(cells)} |")
     return "\n".join(lines)

@@ -150,6 +150,27 @@ def test_weights_train_when_asked_and_only_then(kind: str) -> None:
         Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480)).free("field")
 
 
+def test_a_users_own_loop_trains_it_through_rays() -> None:
+    """From pixels to rays, whose gradients come by the implicit function theorem."""
+    truth, own = camera("waves"), camera("waves")
+    pixels = truth.grid(6, 5).reshape(-1, 2)
+    rays = truth.unproject(pixels)[0]
+    assert own.field is not None
+    with torch.no_grad():
+        for part in own.field.parameters():
+            part.add_(0.3 * torch.randn(part.shape, generator=torch.Generator().manual_seed(1)))
+    own.update_valid_region()
+    own.free("field")
+    optimizer, losses = torch.optim.Adam(own.field.parameters(), lr=0.03), []
+    for _ in range(60):
+        optimizer.zero_grad()
+        loss = (own.unproject(pixels)[0] - rays).square().sum()
+        loss.backward()
+        optimizer.step()
+        losses.append(float(loss))
+    assert losses[-1] < 0.02 * losses[0]
+
+
 def test_positions_carry_gradients_to_the_weights() -> None:
     """Of triangulation and of the localizer, against differences."""
     rig = StereoRig(camera("waves"), camera("waves"), torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))

@@ -20,7 +20,6 @@ from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.network_modes import NetworkModes
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.zernike import ZernikeModes
-from scripts.shared.field_features import train_features
 
 BOARD = Board(columns=8, rows=6, square=0.05)
 SIZE, NOISE = (1280, 960), 0.05
@@ -75,23 +74,6 @@ def test_a_camera_is_found_with_each(kind: str) -> None:
     assert off(found.camera) < (2.5 if kind == "zernike" else 6.0) * NOISE
     assert len(found.hyperparameters) == len(KINDS[kind].hyperprior) + 5
     assert 8 < found.effective < 80
-
-
-def test_trained_features() -> None:
-    """Corrections of a first fit train the hidden layer; the last layer is fitted again with everything else."""
-    first = fitted(KINDS["zernike"])
-    form = first.camera.model.hybrid
-    assert form is not None
-    x, y = 0.7 * torch.rand(2, 400, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) - 0.35
-    corrections = torch.stack(form.modes.field(first.camera.coefficients[3:], x, y, slopes=False), -1)
-    modes = train_features(torch.stack([x, y], -1), corrections, count=12)
-    again = train_features(torch.stack([x, y], -1), corrections, count=12)
-    assert modes == again
-    columns = modes.columns(x, y).flatten(1).T
-    solution = torch.linalg.lstsq(columns, corrections.T.flatten()[:, None], driver="gelsd").solution
-    left = (columns @ solution)[:, 0] - corrections.T.flatten()
-    assert float(left.norm()) < 0.02 * float(corrections.norm())
-    assert off(fitted(modes).camera) < 6 * NOISE
 
 
 def test_priors_of_gaussian_units_fall_by_octaves() -> None:

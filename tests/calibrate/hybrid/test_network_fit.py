@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from kcal.calibrate.camera.calibrate import calibrate_camera
+from kcal.calibrate.camera.compare import compare_models
 from kcal.calibrate.camera.layer import calibrate_views
 from kcal.calibrate.camera.options import CalibrationOptions
 from kcal.calibrate.hybrid.families import typical_hyperprior
@@ -47,32 +48,34 @@ class Rings(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.places, self.out = nn.Linear(2, 10), nn.Linear(10, 2)
+        with torch.no_grad():
+            self.places.weight.mul_(3.0)
 
     def forward(self, places: Tensor) -> Tensor:
-        result: Tensor = self.out(torch.cos(2.0 * self.places(places)))
+        result: Tensor = self.out(torch.cos(self.places(places)))
         return result
 
 
 @functools.cache
-def truth() -> Camera:
+def truth(dent: float = 3.0) -> Camera:
     """A local dent of three pixels off the middle, which no polynomial of the radius has."""
     modes = GaussianModes(widths=(0.2,))
     form = HybridForm(shape=0.9, radius=1.08 * 500.0 / 700.0, modes=modes)
     values = torch.zeros(8 + len(modes), dtype=torch.float64)
     values[:4] = torch.tensor([700.0, 700.0, 402.0, 297.0])
     x = modes.columns(torch.tensor([0.45], dtype=torch.float64), torch.tensor([-0.2], dtype=torch.float64))[:, 0, 0]
-    values[8 + int(x.argmax())] = 3.0 / 700.0
+    values[8 + int(x.argmax())] = dent / 700.0
     return Camera(values, size=SIZE, model=LensModel(hybrid=form))
 
 
 @functools.cache
-def capture(count: int = 18) -> Observations:
+def capture(count: int = 18, dent: float = 3.0) -> Observations:
     random, middle, views = torch.Generator().manual_seed(5), BOARD.points.mean(0), list[View]()
     while len(views) < count:
         u = 2.0 * torch.rand(6, generator=random, dtype=torch.float64) - 1.0
         turn = rotation_from_vector(torch.stack([0.5 * u[0], 0.5 * u[1], math.pi * u[2]]))
         shift = torch.stack([0.2 * u[3], 0.14 * u[4], 0.5 + 0.06 * u[5]])
-        pixels, valid = truth().project((BOARD.points - middle) @ turn.T + shift)
+        pixels, valid = truth(dent).project((BOARD.points - middle) @ turn.T + shift)
         if bool((valid & truth().inside(pixels)).all()):
             noise = NOISE * torch.randn(pixels.shape, generator=random, dtype=torch.float64)
             views.append(View(name=str(len(views)), pixels=(pixels + noise).tolist()))
@@ -124,7 +127,7 @@ def test_the_users_network_stays_and_the_camera_has_a_trained_copy() -> None:
     torch.manual_seed(1)
     given = Rings()
     before = copy.deepcopy(given.state_dict())
-    result = calibrate_camera(capture(), options(FieldTraining(turns=1), given))
+    result = calibrate_camera(capture(8, 0.3), options(FieldTraining(turns=1), given))
     assert all(torch.equal(before[name], value) for name, value in given.state_dict().items())
     assert isinstance(result.camera.field, Rings)
     moved = result.camera.field.places.weight - given.places.weight
@@ -188,6 +191,12 @@ def test_the_layer_takes_it_too() -> None:
     (gradient,) = torch.autograd.grad(found.parameters[2], pixels)
     # All corners one pixel to the right; a prior holds the principal point a little.
     assert float(gradient[..., 0].sum()) == pytest.approx(1.0, abs=0.1)
+
+
+def test_it_is_compared_by_its_name() -> None:
+    found = compare_models(capture(), ["network"], groups="views", parts=2, options=options(None))
+    assert found.models == ("network",)
+    assert NOISE < found.rms["network"] < 1.0
 
 
 def test_options_that_do_not_fit() -> None:
