@@ -17,7 +17,9 @@ from locate_rigs import pinhole_rig
 from torch import Tensor, nn
 
 import kcal
-from kcal.locate.triangulate import Triangulate
+from kcal.lens.mounting import Origin
+from kcal.lens.rig import RigCovariance
+from kcal.locate.localizer import StereoLocalizer
 
 
 def named_tuples(kind: object) -> set[type[tuple]]:
@@ -68,20 +70,23 @@ def test_every_result_is_saved_and_loaded() -> None:
 @pytest.mark.slow
 def test_a_program_runs_in_another_process(tmp_path: Path) -> None:
     """It needs the name of its result there, and nothing else of kcal."""
-    module, path = Triangulate(pinhole_rig()), tmp_path / "triangulate.pt2"
+    rig = pinhole_rig()
+    rig.covariance = RigCovariance.of(rig, pose=1e-8 * torch.eye(6).double())
+    origin = Origin(lat=19.0, lon=72.0, height=10.0)
+    module, path = StereoLocalizer(rig, origin=origin, heading_deg=20.0), tmp_path / "locate.pt2"
     left = torch.tensor([[980.0, 540.0], [960.0, 540.0], [950.0, 530.0]], dtype=torch.float64)
     right = left - torch.tensor([9.0, 0.1], dtype=torch.float64)
     count = torch.export.Dim("count", min=2)
     torch.export.save(torch.export.export(module, (left, right), dynamic_shapes=({0: count}, {0: count})), path)
     lines = (
-        "import sys, torch; from kcal.locate import Triangulation",
+        "import sys, torch; from kcal.locate import Localization",
         "run = torch.export.load(sys.argv[1]).module()",
         "left = torch.tensor([[980.0, 540.0], [960.0, 540.0]], dtype=torch.float64)",
         "found = run(left, left - torch.tensor([9.0, 0.1], dtype=torch.float64))",
-        "assert isinstance(found, Triangulation)",
-        "torch.save(found.points, sys.argv[2])",
+        "assert isinstance(found, Localization)",
+        "torch.save(found.enu, sys.argv[2])",
     )
     subprocess.run(
         [sys.executable, "-c", "\n".join(lines), str(path), str(tmp_path / "points")], check=True, timeout=120
     )
-    torch.testing.assert_close(torch.load(tmp_path / "points"), module(left[:2], right[:2]).points, rtol=0, atol=1e-9)
+    torch.testing.assert_close(torch.load(tmp_path / "points"), module(left[:2], right[:2]).enu, rtol=0, atol=1e-9)

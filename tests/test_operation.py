@@ -99,6 +99,21 @@ def test_gradients_by_marks_covariances_and_cameras() -> None:
         torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12)
 
 
+def test_an_earlier_call_runs_once_more() -> None:
+    """Only the last call is kept: of two, the first is repeated in the backward pass."""
+    module = camera()
+    run, _ = compiled(module)
+    one, two = (torch.rand(4, 3, generator=torch.Generator().manual_seed(i)).double() + 0.5 for i in (1, 2))
+    found, wanted = (
+        torch.autograd.grad(first.sum() + 2.0 * second.sum(), leaves)
+        for call in (run, module)
+        for leaves in [[one.clone().requires_grad_(), two.clone().requires_grad_()]]
+        for first, second in [[call(leaf)[0] for leaf in leaves]]
+    )
+    for a, b in zip(found, wanted, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
+
+
 def test_triangulation_of_rays_through_a_network() -> None:
     module = Triangulate(stereo(NetworkModes.random(6)))
     assert_equal(compiled(module)[0](*marks(module.rig)), module(*marks(module.rig)))

@@ -15,6 +15,7 @@ SLAM"; the optimum is the one of Hartley and Sturm (1997).
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -164,7 +165,8 @@ def most_likely(
         best, step, cost = theta, torch.zeros_like(theta), torch.full_like(zero, torch.inf)
         length, noise = torch.full_like(zero, torch.inf), _least_noise(weight)
         for number in range(_TRACED_STEPS if is_traced() else _MOST_STEPS):
-            with torch.set_grad_enabled(recorded and number > 0):
+            # An exported graph must have no change of mode without any operation: it could not be loaded.
+            with torch.enable_grad() if recorded and number else contextlib.nullcontext():
                 at = _evaluate(later if number else fixed, theta)
             # After so short a step, rounding may raise the cost.
             better = (at.cost <= cost) | (length <= _SHORT_STEP * noise)

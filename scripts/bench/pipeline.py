@@ -2,8 +2,10 @@
 
     python -m scripts.bench.pipeline --write           docs/measured/pairing.md, section latency
     python -m scripts.bench.pipeline --calls 20 --no-compile
+    python -m scripts.bench.pipeline --gradients --write   section gradients: compiling, and derivatives
 
-One thread. `localize` is `StereoLocalizer` alone, with a covariance for each pair, compiled with `cpp_wrapper`;
+One thread. `localize` is `StereoLocalizer` alone, with a covariance for each pair, compiled step by step
+(`whole_graph`) with `cpp_wrapper`;
 `associate` pairs as many detections of both images; `match` is `ObjectDisparity` on boxes of 12 px, all of which have
 their image in both. One graph is compiled for any number of pairs from two; a single pair goes twice.
 """
@@ -11,16 +13,23 @@ their image in both. One graph is compiled for any number of pairs from two; a s
 from __future__ import annotations
 
 import argparse
+import resource
 import time
 from collections.abc import Callable
 
 import numpy as np
 import torch
+from kornia.geometry.calibration import distort_points, undistort_points
+from kornia.geometry.epipolar import triangulate_points
 from torch import Tensor
 
+from kcal.io.rig_file import load_rig
+from kcal.lens.camera import Camera
 from kcal.lens.mounting import Origin
+from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.budget import planned_rig
 from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.triangulate import Triangulate
 from kcal.pipeline.association import associate
 from kcal.pipeline.detections import Detections
 from kcal.pipeline.disparity import ObjectDisparity
@@ -28,6 +37,8 @@ from scripts.check.pairing import OPTIONS, SIZE, site_rig
 from scripts.shared.page import table, write_section
 
 COUNTS = (1, 10, 100)
+PAIRS = 4096
+LENSES = {"pinhole": [], "opencv5": [-0.1, 0.02, 1e-4, 1e-4, 0.001], "default": None}
 SHIFT = 16
 
 
@@ -44,6 +55,110 @@ def milliseconds(call: Callable[[], object], calls: int) -> str:
     return f"{np.median(found):.2f} / {np.quantile(found, 0.99):.2f} ({spent:.2f})"
 
 
+def processor() -> float:
+    """Seconds of processor time, with those of compilers that were started."""
+    both = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return sum(each.ru_utime + each.ru_stime for each in both)
+
+
+def spent(calls: list[Callable[[], object]], rounds: int = 9) -> list[str]:
+    """Median milliseconds of processor time of each call; in each round every call runs once."""
+    found: list[list[float]] = [[] for _ in calls]
+    for _ in range(rounds + 1):
+        for call, each in zip(calls, found, strict=True):
+            start = time.process_time()
+            call()
+            each.append(1e3 * (time.process_time() - start))
+    return [
+        f"{np.median(each[1:]):.2g}" if np.median(each[1:]) < 10 else f"{np.median(each[1:]):.0f}" for each in found
+    ]
+
+
+def localizer(lens: str) -> tuple[StereoLocalizer, Tensor, Tensor]:
+    """The sample rig or one with other lenses, with a covariance of the cameras, and marks of points from 100 m on."""
+    rig = load_rig("assets/sample-rig.json")
+    values = LENSES[lens]
+    if values is not None:
+        camera = Camera.build(focal=(1600, 1605), center=(957, 541), size=SIZE, coefficients=values, model=lens)
+        whole = StereoRig(camera, camera, rig.right_from_left_rotation, rig.right_from_left_translation)
+        own = torch.diag(torch.tensor([0.1, 0.1, 0.1, 0.1, 1e-3, *([1e-4] * len(values))], dtype=torch.float64) ** 2)
+        whole.covariance = RigCovariance.of(whole, left=own, right=own, pose=1e-9 * torch.eye(6).double())
+        rig = whole
+    localize = StereoLocalizer(rig, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=35.0)
+    random = torch.Generator().manual_seed(0)
+    depth = 10 ** (2.0 + 1.5 * torch.rand(PAIRS, 1, generator=random).double())
+    place = (torch.rand(PAIRS, 2, generator=random).double() - 0.5) * torch.tensor([0.9, 0.5])
+    left, right, _ = rig(torch.cat([place, torch.ones(PAIRS, 1)], -1) * depth)
+    return localize, left.detach() + 0.1, right.detach() + 0.1
+
+
+def backward(call: Callable[..., Tensor], *inputs: Tensor) -> None:
+    """Forward and backward by all inputs."""
+    call(*(value.detach().clone().requires_grad_() for value in inputs)).sum().backward()
+
+
+def gradients() -> str:
+    """Tables: compiling, and derivatives beside kornia."""
+    made = {lens: localizer(lens) for lens in LENSES}
+    rows, compiled = [], {}
+    for lens, (localize, left, right) in made.items():
+        torch.compiler.reset()
+        run = compiled[lens] = torch.compile(localize, fullgraph=True, dynamic=True)
+        costs = []
+        for count in (100, 200):
+            start = processor()
+            run(left[:count], right[:count])
+            costs.append(processor() - start)
+        start = processor()
+        backward(lambda a, b: run(a, b).enu, left, right)  # noqa: B023
+        costs.append(processor() - start)
+        calls: list[Callable[[], object]] = []
+        for count in (100, PAIRS):
+            pair = left[:count], right[:count]
+            calls += [lambda f=f, p=pair: f(*p) for f in (localize, run)]  # type: ignore[misc]
+        calls += [lambda f=f: backward(lambda a, b: f(a, b).enu, left, right) for f in (localize, run)]  # type: ignore[misc]  # noqa: B023
+        rows.append([lens, *(f"{cost:.1f}" for cost in costs), *spent(calls)])
+        print(*rows[-1], sep=" | ", flush=True)
+    heads = ["lens", "compiling, s", "second shape, s", "with gradients, s"]
+    heads += [
+        f"{what}, {how}, ms" for what in ("100", PAIRS, f"{PAIRS} with gradients") for how in ("eager", "compiled")
+    ]
+    text = "Processor time of `StereoLocalizer`, one thread. Made by `scripts/bench/pipeline.py --gradients`.\n\n"
+    text += "\n".join(table(heads, rows))
+    camera = made["opencv5"][0].rig.left
+    pixels, K, d = made["opencv5"][1], camera.matrix, camera.coefficients
+    rays = camera.unproject(pixels)[0]
+    flat = rays[:, :2] / rays[:, 2:] * camera.focal + camera.center
+    rig = made["pinhole"][0].rig
+    seen = torch.cat([rig.right_from_left_rotation, rig.right_from_left_translation[:, None]], -1)
+    P, Q = rig.left.matrix @ torch.eye(3, 4).double(), rig.right.matrix @ seen
+    a, b = made["pinhole"][1:]
+    each: dict[str, list[Callable[[], object]]] = {
+        "project, 5 coefficients": [
+            lambda: backward(lambda x: camera.project(x)[0], rays),
+            lambda: backward(lambda x: distort_points(x, K, d), flat),
+        ],
+        "unproject, 5 coefficients": [
+            lambda: backward(lambda x: camera.unproject(x)[0], pixels),
+            lambda: backward(lambda x: undistort_points(x, K, d, num_iters=20), pixels),
+        ],
+        "triangulate, pinhole": [
+            lambda: backward(lambda x, y: Triangulate(rig)(x, y).points, a, b),
+            lambda: backward(lambda x, y: triangulate_points(P[None], Q[None], x[None], y[None]), a, b),
+        ],
+    }
+    rates = []
+    for name, both in each.items():
+        found = [float(value) for value in spent(both)]
+        rates.append([name, *(f"{1e-3 * PAIRS / value:.2g}" for value in found)])
+        print(*rates[-1], sep=" | ", flush=True)
+    return (
+        text
+        + "\n\nMillions of points a second, forward and backward:\n\n"
+        + "\n".join(table(["", "kcal", "kornia"], rates))
+    )
+
+
 def boxes(pixels: Tensor) -> Detections:
     """Detections of 12 px around pixels."""
     return Detections.read(torch.cat([pixels - 6, pixels + 6], -1), size=SIZE, first_pixel=0.0)
@@ -54,12 +169,19 @@ def main() -> None:
     parser.add_argument("--calls", type=int, default=200)
     parser.add_argument("--no-compile", action="store_true")
     parser.add_argument("--write", action="store_true")
+    parser.add_argument("--gradients", action="store_true")
     options = parser.parse_args()
     torch.set_num_threads(1)
+    if options.gradients:
+        text = gradients()
+        if options.write:
+            write_section("pairing.md", "gradients", text)
+        return
     rig = site_rig()
     localize = StereoLocalizer(rig, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=35.0)
     compiled = None
     if not options.no_compile:
+        localize.whole_graph = True
         compiled = torch.compile(localize, fullgraph=True, dynamic=True, options={"cpp_wrapper": True})
     match = ObjectDisparity(planned_rig())
     random = torch.Generator().manual_seed(0)
