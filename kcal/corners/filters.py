@@ -1,4 +1,8 @@
-"""Check single gray images and filter them with separable Gaussian kernels."""
+"""Check single gray images and filter them with separable Gaussian kernels.
+
+`kornia.filters.filter2d_separable` gives the same numbers. It takes three times as long for a patch of 40 pixels, as
+long for whole images, and 0.3 s to load, also for commands that filter nothing.
+"""
 
 from __future__ import annotations
 

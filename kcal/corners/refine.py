@@ -50,8 +50,9 @@ def refine_corners(
     * `saddle`: `kcal.corners.saddle.saddle` alone. Faster, and nearly as accurate on squares below 10 px.
     * `opencv`: `cv2.cornerSubPix` (W. Förstner's condition that gradients point at the corner) with a half-window of
       0.35 of the smallest square at each corner, within 2 to 11 px. Results have float32 precision.
-    * `skimage`: `skimage.feature.corner_subpix` (W. Förstner and E. Gülch 1987, with a statistical test). A slow,
-      independent cross-check, which fails on blurred corners.
+    * `skimage`: `skimage.feature.corner_subpix` (W. Förstner and E. Gülch 1987, with a statistical test). An
+      independent cross-check: a calibration of real images ends at 0.19 px for 0.16 of `erf` (OpenCV's samples) and
+      0.55 for 0.38 (a small camera), and where the two disagree tells nothing of a corner's residual.
     * `none`: the starts as they are.
 
     Args:
