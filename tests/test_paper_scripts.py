@@ -69,7 +69,7 @@ def test_the_chain(monkeypatch: pytest.MonkeyPatch, written: Path, tmp_path: Pat
     assert 0.2 < plain["ratio"] < 3.0
     assert "infinity" in records["site glass", "default"]
     text = page.read_section("paper.md", "chain")
-    assert "judged on: 1." in text
+    assert "| default | 1 of 1 | 1.00 (1.00 to 1.00) | 0 | 1 of 1 |" in text
     assert text.count("none stated") == 3  # of both captures, and in the summary
 
 

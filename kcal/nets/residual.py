@@ -27,8 +27,8 @@ class ResidualNet(Network):
     Convention: parameters in the order of `Camera.names`; skew is not corrected. The network's input is K* divided by
     its largest coefficient. Its outputs are scaled to thousandths of the focal length (fx, fy, cx, cy) and hundredths
     of each coefficient, because coefficients differ by powers of ten. A new network corrects nothing: its last layer is
-    zero. Float64; the weights do not require gradients until asked. `train_jointly` trains them on corners; it gains
-    nothing over a calibration of the same lens model (see the module's docstring).
+    zero. Float64; the weights do not require gradients until asked. `train_jointly` trains them on corners; what
+    that changes comes of its loss, not of the net, which fits nothing that a calibration of the same model cannot.
 
     Args:
         camera: a single camera: A* and K*.

@@ -109,27 +109,24 @@ def cells(record: Record) -> list[str]:
 
 
 def summary(records: Sequence[Record]) -> list[str]:
-    """Medians over real captures, of those that all lenses have a judgment of."""
+    """Medians over the real captures on which a lens and the default were both judged."""
     by_key = {tuple(record["key"]): record for record in records}
-    real = {capture for capture, _ in by_key if not capture.startswith(SITE)}
-    whole = sorted(c for c in real if all("still" in by_key.get((c, lens), {}) for lens in LENSES))
+    real = sorted({capture for capture, _ in by_key if not capture.startswith(SITE)})
+    base = {c: by_key[c, "default"] for c in real if "still" in by_key.get((c, "default"), {})}
     rows = []
     for lens in LENSES:
-        of = [by_key[capture, lens] for capture in whole]
+        tried = {c: by_key[c, lens] for c in base if (c, lens) in by_key}
+        of = {c: record for c, record in tried.items() if "still" in record}
         if not of:
-            return []
-        over = [
-            record["moved"] / by_key[capture, "default"]["moved"] for capture, record in zip(whole, of, strict=True)
-        ]
-        chances = [record["probability"] for record in of if record["probability"] is not None]
+            continue
+        over = [record["moved"] / base[c]["moved"] for c, record in of.items()]
+        chances = [record["probability"] for record in of.values() if record["probability"] is not None]
         honest = f"{sum(p >= 0.01 for p in chances)} of {len(chances)}" if chances else "none stated"
-        lost = sum(record["lost"] for record in of)
-        cpu = statistics.median(record["cpu_s"] for record in of)
-        rows.append(
-            [lens, f"{statistics.median(over):.3f} ({min(over):.3f} to {max(over):.3f})", lost, honest, f"{cpu:.1f}"]
-        )
-    heads = ["lens", "held out over that of the default", "corners lost", "halves with p ≥ 0.01", "CPU s"]
-    return [f"Real captures that every lens can be judged on: {len(whole)}.", "", *table(heads, rows), ""]
+        cells = [f"{len(of)} of {len(tried)}", f"{statistics.median(over):.2f} ({min(over):.2f} to {max(over):.2f})"]
+        cpu = f"{statistics.median(record['cpu_s'] for record in of.values()):.1f}"
+        rows.append([lens, *cells, sum(record["lost"] for record in of.values()), honest, cpu])
+    heads = ["lens", "captures", "held out over the default's", "corners lost", "halves with p ≥ 0.01", "CPU s"]
+    return [*table(heads, rows), ""]
 
 
 def lines(records: Sequence[Record]) -> list[str]:
