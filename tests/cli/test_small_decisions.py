@@ -103,7 +103,7 @@ class TestSources:
             told.append((list(cameras), placed))
             return None, positions, ["a note of the stars"]
 
-        monkeypatch.setattr("kcal.cli.stars.read_stars", stars)
+        monkeypatch.setattr("kcal.cli.rig_sources.read_stars", stars)
         survey, marks = tmp_path / "survey.csv", tmp_path / "marks.csv"
         survey.write_text("name,east,north,up,sigma\n" + "".join(f"p{k},{k},{100 + k},2,0.02\n" for k in range(3)))
         marks.write_text("name,left_u,left_v,right_u,right_v\n" + "".join(f"p{k},{k},1,2,3\n" for k in range(3)))

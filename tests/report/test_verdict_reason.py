@@ -97,7 +97,7 @@ def test_findings_are_called_by_words() -> None:
     folder = Path(kcal.report.__file__).parent
     names = {
         name
-        for module in folder.glob("*_findings.py")
+        for module in folder.glob("judge_*.py")
         for name in re.findall(r'Finding\(\s*name="([\w-]+)"', module.read_text(encoding="utf-8"))
     }
     assert {"halves", "tilt", "unsteady", "coverage"} <= names
