@@ -168,12 +168,13 @@ def as_covariance(name: str, matrix: Tensor | ArrayLike | None, size: int) -> Te
     matrix = as_tensor(name, matrix)
     if tuple(matrix.shape) != (size, size):
         raise InputError(f"{name}: a covariance of shape ({size}, {size}) is needed, got {tuple(matrix.shape)}")
-    matrix = matrix.detach().to(torch.float64)
-    require_finite(name, matrix)
+    matrix = matrix.to(torch.float64)
+    plain = matrix.detach()
+    require_finite(name, plain)
     # Entries have different units: compare them as correlations.
-    scale = matrix.diagonal().clamp_min(0.0).sqrt()
+    scale = plain.diagonal().clamp_min(0.0).sqrt()
     scale = torch.where(scale > 0, scale, 1.0)
-    unit = matrix / scale[:, None] / scale
+    unit = plain / scale[:, None] / scale
     # Rounding stays below 1e-9 per row.
     if not torch.allclose(unit, unit.T, atol=1e-9) or (size and float(torch.linalg.eigvalsh(unit)[0]) < -1e-9 * size):
         raise InputError(f"{name}: not a covariance; it must be symmetric and have no negative eigenvalue")
@@ -185,6 +186,45 @@ class Float64Module(nn.Module):
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:
         return super()._apply(keep_float64(fn), recurse)
+
+
+def scalar(value: float | Tensor, like: Tensor) -> Tensor:
+    """A float64 number beside a tensor; one with a graph keeps it."""
+    return torch.as_tensor(value, dtype=torch.float64, device=like.device)
+
+
+class StatedModule(Float64Module):
+    """A module whose state also says what it is made for, and refuses the state of one that was made otherwise.
+
+    `constants` are what results depend on besides tensors. They are stored as a tensor of their text, so that a state
+    is safe to load and fits into safetensors. A state of version 1.0 has none and is taken as it is.
+    """
+
+    @property
+    def constants(self) -> object:
+        """Plain numbers, words and options."""
+        raise NotImplementedError
+
+    def get_extra_state(self) -> Tensor:
+        """The text of the constants, as bytes."""
+        return torch.tensor(list(repr(self.constants).encode()), dtype=torch.uint8)
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Refuse other constants.
+
+        Raises:
+            InputError: the state is that of a module that was made otherwise.
+        """
+        found, own = bytes(state.tolist()).decode(), repr(self.constants)
+        if found != own:
+            raise InputError(
+                f"{type(self).__name__}: the state is of one made with {found}, this one was made with {own}; make it "
+                "in the same way before the state is loaded"
+            )
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
+        state_dict.setdefault(f"{prefix}_extra_state", self.get_extra_state())
+        super()._load_from_state_dict(state_dict, prefix, *rest)
 
 
 # How large a sum of squared residuals may be by chance: the χ² distribution, by SciPy.

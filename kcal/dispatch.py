@@ -5,7 +5,9 @@ Under `torch.compile`, `torch.export` and `vmap` no branch may depend on values,
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -15,6 +17,7 @@ from torch.autograd import forward_ad
 
 from kcal.errors import InputError
 
+Module = TypeVar("Module", bound=nn.Module)
 # Points per piece: large enough to outweigh the cost of a call, small enough for the caches of one core.
 CHUNK = 16384
 
@@ -87,6 +90,14 @@ def _below_vmap(tensor: Tensor) -> Tensor:
     while functorch.is_batchedtensor(tensor):
         tensor = functorch.get_unwrapped(tensor)
     return tensor
+
+
+def still(module: Module) -> Module:
+    """The module, or where anything of it is differentiated, a copy with the same values out of every graph."""
+    if not is_differentiated(module):
+        return module
+    tensors = [*module.parameters(), *module.buffers()]
+    return copy.deepcopy(module, {id(tensor): tensor.detach() for tensor in tensors})
 
 
 def host_values(tensor: Tensor) -> np.ndarray:

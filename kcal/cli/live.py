@@ -173,7 +173,7 @@ def live_command(
     moments, moving = (None, 0) if watch is None else _moments(watch, localize)
     tracker = Tracker(localize, follow, clock=clock, compiled=compiled, moments=moments, moving=moving)
     frames = _videos(videos, detector, solved, tracker, options, match_sigma) if videos and detector else None
-    source = frames or lines_of(lines, lambda line: read_moment(line, solved, options, localize.pixel_sigma))
+    source = frames or lines_of(lines, lambda line: read_moment(line, solved, options, float(localize.pixel_sigma)))
     log = journal if journal is not None else output[0].with_name(output[0].name + ".journal")
     with steps("live", lines.stat().st_size if lines is not None and lines.is_file() else None) as advance:
         stream = Stream(

@@ -110,7 +110,7 @@ def camera_rig_to_file(rig: CameraRig) -> CameraRigFile:
                 for turn, center in zip(rig.rotation.tolist(), rig.center.tolist(), strict=True)
             ),
             origin=None if origin is None else FrameOrigin(lat=origin.lat, lon=origin.lon, height=origin.height),
-            refraction=rig.refraction,
+            refraction=float(rig.refraction),
             root=None if root is None else Packed.of(root),
             calibration=rig.calibration,
         )

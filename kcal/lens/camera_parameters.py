@@ -9,7 +9,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from kcal.checks import as_points, as_size, require_finite
+from kcal.checks import StatedModule, as_points, as_size, require_finite
 from kcal.errors import InputError
 from kcal.lens.inverse import prepare_inverse
 from kcal.lens.model import LensModel
@@ -18,7 +18,7 @@ from kcal.lens.region import Region
 from kcal.operation import Operations
 
 
-class LensParameters(Operations):
+class LensParameters(Operations, StatedModule):
     """Named parameters that contain lens coefficients, which of them are free, and where their lens is valid.
 
     Args:
@@ -51,6 +51,12 @@ class LensParameters(Operations):
         for name, value in self._measured_region().items():
             self.register_buffer(name, value, persistent=False)
         self.register_load_state_dict_post_hook(_with_new_region)
+
+    @property
+    def constants(self) -> object:
+        """The lens model, without the weights of a network in it, which are part of the state."""
+        form = self.model.hybrid
+        return self.model.names, form if form is None or self.model.network is None else (form.shape, form.radius)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -162,6 +168,11 @@ class CameraParameters(LensParameters):
         self.size = as_size(size)
         if not bool((self.params[..., :2] > 0).all()):
             raise InputError("camera parameters: focal lengths must be positive, in pixels")
+
+    @property
+    def constants(self) -> object:
+        """Size and lens model."""
+        return self.size, super().constants
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -7,16 +7,18 @@ import datetime
 import hashlib
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from kcal.checks import Float64Module, as_points, require_finite
+from kcal.checks import StatedModule, as_points, require_finite, scalar
 from kcal.errors import InputError
 from kcal.lens.calibration import Exclusion, RigSource, UntilChanged
 from kcal.lens.camera import Camera
 from kcal.lens.camera_like import CameraLike, as_camera
 from kcal.lens.mounting import REFRACTION, Origin, check_refraction
+from kcal.lens.pose import Movable, rotation_from_vector
 from kcal.texts import brief, length_text
 
 
@@ -51,7 +53,7 @@ class CameraRigCalibration:
     created: datetime.datetime
 
 
-class CameraRig(Float64Module):
+class CameraRig(Movable, StatedModule):
     """Any number of cameras: `points_cam = rotation[c] @ (points - center[c])`, meters.
 
     The frame is east, north, up of `origin`; without one it is any right-handed frame, without refraction.
@@ -61,6 +63,8 @@ class CameraRig(Float64Module):
     a small turn of it (3, radians), both along and about the frame's axes; last the coefficient of refraction. None:
     nothing is known, so that cameras and poses count as exact. It is None again once a camera or a pose has changed.
     `calibration` (a `CameraRigCalibration`) tells how the rig was solved.
+
+    Poses may be freed: `rig.free("pose")` all of them, `rig.free("mill")` that of one camera, as in `StereoRig.free`.
 
     Args:
         cameras: C of them, one or more.
@@ -81,8 +85,8 @@ class CameraRig(Float64Module):
         (('a', 'b', 'c'), 34)
     """
 
-    rotation: Tensor
-    center: Tensor
+    refraction: Tensor
+    place: Tensor | None
     root = UntilChanged[Tensor](lambda rig, value: rig.check_root(value))
     calibration = UntilChanged[CameraRigCalibration]()
 
@@ -116,10 +120,40 @@ class CameraRig(Float64Module):
         check_refraction(refraction, 0.0)
         self.cameras = nn.ModuleList(map(as_camera, cameras))
         self.names = tuple(names)
-        self.origin = origin
-        self.refraction = float(refraction)
-        self.register_buffer("rotation", rotation.detach().clone())
-        self.register_buffer("center", center.detach().clone())
+        self.register_buffer("place", None if origin is None else origin.geodetic.to(rotation.device))
+        self.register_buffer("refraction", scalar(refraction, rotation))
+        self._keep("rotation", rotation, turns=True)
+        self._keep("center", center)
+
+    @property
+    def rotation(self) -> Tensor:
+        """(C, 3, 3) cam_from_frame, with the steps of `free`."""
+        kept, step = self._kept("rotation"), self.freed_step
+        return kept if step is None else kept @ rotation_from_vector(-step[1])
+
+    @property
+    def center(self) -> Tensor:
+        """(C, 3) meters, likewise."""
+        kept, step = self._kept("center"), self.freed_step
+        return kept if step is None else kept + step[0]
+
+    @property
+    def origin(self) -> Origin | None:
+        """Where the frame is anchored on the Earth."""
+        return None if self.place is None else Origin.at(self.place)
+
+    @property
+    def constants(self) -> object:
+        """Names, in order."""
+        return self.names
+
+    @property
+    def pose_slots(self) -> dict[str, Any]:
+        """What `free` takes: `pose` for all cameras, or names of cameras; a step is that of `root`: center, turn."""
+        return {"pose": slice(None), **{name: number for number, name in enumerate(self.names)}}
+
+    def _zero_step(self) -> Tensor:
+        return torch.zeros(len(self), 6, dtype=torch.float64, device=self._kept("center").device)
 
     def extra_repr(self) -> str:
         """Names, farthest distance of two cameras and origin, for `repr`."""
@@ -139,7 +173,7 @@ class CameraRig(Float64Module):
     def fingerprint(self) -> str:
         """Twelve hex digits that change with any camera and any pose."""
         own = [camera.fingerprint for camera in self.each]
-        text = repr((own, self.rotation.tolist(), self.center.tolist(), self.origin, self.refraction))
+        text = repr((own, self.rotation.tolist(), self.center.tolist(), self.origin, float(self.refraction)))
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
     @property

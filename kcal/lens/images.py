@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from kcal.dispatch import is_differentiated
+from kcal.checks import StatedModule
+from kcal.dispatch import is_differentiated, may_branch
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.camera_like import CameraLike, as_camera
@@ -87,7 +88,7 @@ def undistort_maps(
     return UndistortMaps(map_x.contiguous().numpy(), map_y.contiguous().numpy(), mask.cpu().numpy())
 
 
-class Undistort(nn.Module):
+class Undistort(StatedModule):
     """Resample images as another camera, usually a pinhole, would have taken them.
 
     Sampling is bilinear, by kornia's `remap` with `align_corners=True`: integer coordinates are pixel centers. Where
@@ -135,7 +136,8 @@ class Undistort(nn.Module):
         self.new_camera = new_pinhole(self.camera) if new_camera is None else new_camera
         self.at = at
         turn = torch.eye(3) if rotation is None else rotation
-        self.register_buffer("rotation", turn.detach().to(self.camera.params), persistent=rotation is not None)
+        turn = turn if is_differentiated(turn) else turn.detach()
+        self.register_buffer("rotation", turn.to(self.camera.params), persistent=rotation is not None)
         for name, value in zip(("grid_x", "grid_y", "mask"), self._grid(torch.float32), strict=True):
             self.register_buffer(name, value.detach(), persistent=False)
         self.register_buffer("_made_from", self._camera_values(), persistent=False)
@@ -176,6 +178,11 @@ class Undistort(nn.Module):
             sampled = sampled.round()
         return sampled.to(image.dtype).reshape(*lead, *sampled.shape[1:]), mask
 
+    @property
+    def constants(self) -> object:
+        """Range of what is seen."""
+        return self.at
+
     def _check(self, image: Tensor) -> None:
         if not isinstance(image, Tensor):
             raise InputError(f"image: a torch tensor is needed, got {type(image).__name__}")
@@ -195,7 +202,7 @@ class Undistort(nn.Module):
         return torch.cat([part.detach().flatten().to(torch.float64) for part in parts])
 
     def _maps(self, precision: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
-        live = is_differentiated(self)
+        live = is_differentiated(self) or not (torch.compiler.is_compiling() or may_branch(self.camera.params))
         compiling = torch.compiler.is_compiling()
         if live or (compiling and self.grid_x.dtype != precision):
             return self._grid(precision)

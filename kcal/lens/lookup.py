@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import ast
+
 import torch
 from torch import Tensor
 
-from kcal.checks import Float64Module, as_points
+from kcal.checks import StatedModule, as_points
 from kcal.dispatch import finite_or, in_chunks, is_differentiated
 from kcal.errors import InputError
 from kcal.lens.spline import Spline, evaluate_spline
@@ -13,7 +15,7 @@ from kcal.lens.spline import Spline, evaluate_spline
 _PARTS = Spline._fields
 
 
-class LookupCamera(Float64Module):
+class LookupCamera(StatedModule):
     """A camera as bicubic tables of both directions, made by `bake`.
 
     A valid answer lies in the image, is also valid for the camera that was baked, and is off by at most `bound` pixels.
@@ -73,6 +75,15 @@ class LookupCamera(Float64Module):
                 )
             for part, value in zip(_PARTS, table, strict=True):
                 self.register_buffer(f"{name}_{part}", value.detach().clone())
+
+    @property
+    def constants(self) -> object:
+        """Size, errors, coverage and source, which come with the tables."""
+        return self.size, self.bound, self.coverage, self.source
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Take the constants of the tables that are loaded."""
+        self.size, self.bound, self.coverage, self.source = ast.literal_eval(bytes(state.tolist()).decode())
 
     @property
     def pixels_from_chart(self) -> Spline:

@@ -61,6 +61,12 @@ class Origin:
             raise InputError(f"origin {text!r}: write three numbers LAT,LON,HEIGHT, for example 19.07,72.87,14")
         return cls(lat=values[0], lon=values[1], height=values[2])
 
+    @classmethod
+    def at(cls, geodetic: Tensor) -> Origin:
+        """Of (3,) latitude, longitude, height."""
+        lat, lon, height = geodetic.tolist()
+        return cls(lat=lat, lon=lon, height=height)
+
     @property
     def geodetic(self) -> Tensor:
         """(3,) float64: latitude, longitude, height."""

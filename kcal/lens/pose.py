@@ -5,10 +5,13 @@ A step is six numbers: a rotation vector ω (radians) and a translation v (meter
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor
+from typing import Any, Self
 
-from kcal.checks import as_tensor
+import torch
+from torch import Tensor, nn
+
+from kcal.checks import Float64Module, as_tensor
+from kcal.dispatch import is_differentiated
 from kcal.errors import InputError
 
 
@@ -85,3 +88,85 @@ def side_axes(rays: Tensor) -> tuple[Tensor, Tensor]:
     b = x * y * a
     first = torch.stack([1.0 + sign * x * x * a, sign * b, -sign * x], -1)
     return first, torch.stack([b, sign + y * y * a, -y], -1)
+
+
+class Movable(Float64Module):
+    """A module with poses that may be freed, as the parameters of a camera are.
+
+    What is stored stays; the parameter `pose_step`, six numbers a pose and zeros at first, moves it: a rotation vector
+    in radians and a shift in meters. So a rotation stays a rotation under any optimizer. Without `free` there is no
+    step, in the state neither; a state with one is loaded as frozen.
+    """
+
+    pose_step: nn.Parameter | None
+    pose_mask: Tensor | None
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_parameter("pose_step", None)
+        self.register_buffer("pose_mask", None)
+
+    @property
+    def pose_slots(self) -> dict[str, Any]:
+        """Name -> index into `pose_step`; the first name means all of it."""
+        raise NotImplementedError
+
+    def _zero_step(self) -> Tensor:
+        raise NotImplementedError
+
+    def free(self, *names: str) -> Self:
+        """Let gradients reach these poses only; without names, all of them. Return the module itself.
+
+        `requires_grad_(False)` freezes it again. See `pose_slots` for the names.
+
+        Raises:
+            InputError: an unknown name.
+        """
+        slots = self.pose_slots
+        for name in names:
+            if name not in slots:
+                raise InputError(f"unknown pose {name!r}: {type(self).__name__} has {', '.join(slots)}")
+        if self.pose_step is None:
+            self.pose_step = nn.Parameter(self._zero_step())
+        mask = torch.zeros_like(self.pose_step, dtype=torch.bool)
+        for name in names or tuple(slots)[:1]:
+            mask[slots[name]] = True
+        self.pose_mask = mask
+        self.pose_step.requires_grad_(True)
+        return self
+
+    @property
+    def freed_step(self) -> tuple[Tensor, Tensor] | None:
+        """The first and the last three numbers of each step (..., 3), with gradients for what was freed; or None."""
+        if self.pose_step is None or self.pose_mask is None:
+            return None
+        step = torch.where(self.pose_mask, self.pose_step, self.pose_step.detach())
+        return step[..., :3], step[..., 3:]
+
+    def _keep(self, name: str, value: Tensor, *, turns: bool = False) -> None:
+        """Store a part of a pose: a parameter as itself, what has a graph with it, anything else as a copy."""
+        if isinstance(value, nn.Parameter) and turns:
+            raise InputError(
+                f"{name}: an optimizer would not keep this parameter a rotation; give its .detach() and call "
+                f"{type(self).__name__}.free()"
+            )
+        if isinstance(value, nn.Parameter):
+            self._parameters[name] = value
+        else:
+            self._buffers[name] = value if is_differentiated(value) else value.detach().clone()
+
+    def _kept(self, name: str) -> Tensor:
+        """What `_keep` stored, before any step."""
+        found = self._parameters[name] if name in self._parameters else self._buffers[name]
+        assert found is not None
+        return found
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
+        if f"{prefix}pose_step" in state_dict and self.pose_step is None:
+            step = self.free().pose_step
+            assert step is not None
+            step.requires_grad_(False)
+        elif self.pose_step is not None and self.pose_mask is not None:
+            state_dict.setdefault(f"{prefix}pose_step", self._zero_step())
+            state_dict.setdefault(f"{prefix}pose_mask", self.pose_mask)
+        super()._load_from_state_dict(state_dict, prefix, *rest)

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from kcal.checks import as_tensor
+from kcal.dispatch import is_differentiated, is_traced, may_branch
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pupil import FAR
@@ -25,7 +27,8 @@ _BAND = 1 << 18
 class CameraRays(nn.Module):
     """Rays of all pixels of one or several cameras, in the cameras' frames or in the world's.
 
-    Row v and column u of the result are the ray through the center of pixel (u, v).
+    Row v and column u of the result are the ray through the center of pixel (u, v). Rays are kept and made anew when a
+    camera changes, and at each call while one is differentiated.
 
     Args:
         cameras: one camera, or several with images of one size.
@@ -56,14 +59,26 @@ class CameraRays(nn.Module):
             sizes = ", ".join(f"{width}x{height}" for width, height in (camera.size for camera in several))
             raise InputError(f"rays: images of one size are needed in one array, got {sizes} px; write one file each")
         self.cameras = nn.ModuleList(several)
-        for name, value in zip(
-            ("depths", "directions", "mask"),
-            map(torch.stack, zip(*map(_pixel_rays, several), strict=True)),
-            strict=True,
-        ):
-            self.register_buffer(name, value, persistent=False)
+        with torch.no_grad():
+            for name, value in zip(("depths", "directions", "mask"), self._measured(), strict=True):
+                self.register_buffer(name, value.detach(), persistent=False)
+        self._made_from = self._fingerprints()
 
-    @torch.no_grad()
+    def _measured(self) -> tuple[Tensor, ...]:
+        return tuple(map(torch.stack, zip(*(_pixel_rays(camera) for camera in self.cameras), strict=True)))
+
+    def _fingerprints(self) -> list[str]:
+        return [camera.fingerprint for camera in self.cameras]  # type: ignore[misc]
+
+    def _current(self) -> tuple[Tensor, ...]:
+        """Depths, directions and mask: kept ones, unless a camera is differentiated, mapped, or has changed."""
+        if is_differentiated(self.cameras) or not (is_traced() or may_branch(*self.cameras.parameters())):
+            return self._measured()
+        if not is_traced() and self._made_from != self._fingerprints():
+            self.depths, self.directions, self.mask = self._measured()
+            self._made_from = self._fingerprints()
+        return self.depths, self.directions, self.mask
+
     def forward(self, viewmats: Tensor | None = None, dtype: torch.dtype = torch.float32) -> Tensor:
         """Rays as (..., C, H, W, 6): origin, then direction of length one.
 
@@ -74,24 +89,26 @@ class CameraRays(nn.Module):
         Raises:
             InputError: matrices of another shape, or whose left part is no rotation.
         """
-        zero = torch.zeros_like(self.depths)
-        origins = torch.stack([zero, zero, self.depths], -1)
-        rays = torch.cat([origins, self.directions], -1)
+        depths, directions, mask = self._current()
+        zero = torch.zeros_like(depths)
+        origins = torch.stack([zero, zero, depths], -1)
+        rays = torch.cat([origins, directions], -1)
         if viewmats is not None:
             count, viewmats = len(self.cameras), as_tensor("viewmats", viewmats)
             if viewmats.shape[-3:] != (count, 4, 4):
                 raise InputError(f"viewmats: shape (..., {count}, 4, 4) is needed, got {tuple(viewmats.shape)}")
             rotation, translation = viewmats[..., :3, :3].double(), viewmats[..., :3, 3].double()
-            if not torch.allclose(rotation @ rotation.mT, torch.eye(3).to(rotation), atol=1e-5):
+            off = (rotation @ rotation.mT - torch.eye(3).to(rotation)).abs() > 1e-5
+            if not is_traced() and may_branch(off) and bool(off.any()):
                 raise InputError("viewmats: the left part of a matrix is no rotation; scales belong into the scene")
             turn, shift = rotation[..., None, None, :, :], translation[..., None, None, :]
             # Row vectors times R are Rᵀ v: from the camera to the world.
             moved = (
                 ((origins - shift)[..., None, :] @ turn)[..., 0, :],
-                (self.directions[..., None, :] @ turn)[..., 0, :],
+                (directions[..., None, :] @ turn)[..., 0, :],
             )
             rays = torch.cat(moved, -1)
-        return torch.where(self.mask[..., None], rays, 0.0).to(dtype)
+        return torch.where(mask[..., None], rays, 0.0).to(dtype)
 
 
 @torch.no_grad()
@@ -123,13 +140,12 @@ def ray_error(camera: Camera, rays: Tensor, near: float = 1.0) -> float:
     return worst
 
 
-def _pixel_rays(camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
+def _pixel_rays(camera: Any) -> tuple[Tensor, Tensor, Tensor]:
     """Depth of the start (H, W), direction (H, W, 3) and mask (H, W)."""
     width, height = camera.size
     parts = []
-    with torch.no_grad():
-        for pixels in camera.grid(width, height).flatten(0, 1).split(_BAND):
-            rays, valid = camera.unproject(pixels)
-            parts.append((camera.ray_origins(rays)[:, 2], rays, valid))
+    for pixels in camera.grid(width, height).flatten(0, 1).split(_BAND):
+        rays, valid = camera.unproject(pixels)
+        parts.append((camera.ray_origins(rays)[:, 2], rays, valid))
     depth, rays, valid = (torch.cat(each) for each in zip(*parts, strict=True))
     return depth.reshape(height, width), rays.reshape(height, width, 3), valid.reshape(height, width)

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from kcal.checks import as_points
+from kcal.dispatch import still
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.images import Undistort
@@ -29,6 +30,8 @@ class StereoRectification(nn.Module):
 
     Convention: the rectified frame has its origin in the left camera; points_left = rotation @ points_rectified, and
     the right pinhole stands at (baseline, 0, 0). Disparity is the column in the left minus that in the right image.
+    The frame and the new camera are chosen once, from the rig as it stands: they have no gradients by it. Images have
+    gradients by images and by the cameras' parameters.
 
     Args:
         rig: two cameras.
@@ -65,7 +68,7 @@ class StereoRectification(nn.Module):
         at: float = math.inf,
     ) -> None:
         super().__init__()
-        self.rig = rig
+        self.rig, rig = rig, still(rig)
         turn = _rectified_frame(rig)
         left, right = turn, rig.right_from_left_rotation @ turn
         size = rig.left.size if size is None else size
@@ -73,8 +76,8 @@ class StereoRectification(nn.Module):
             self.camera = pinhole_view(field_of_view, size).to(turn.device)
         else:
             self.camera = _common_pinhole((TurnedCamera(rig.left, left), TurnedCamera(rig.right, right)), alpha, size)
-        self.left = Undistort(rig.left, self.camera, left, at=at)
-        self.right = Undistort(rig.right, self.camera, right, at=at)
+        self.left = Undistort(self.rig.left, self.camera, left, at=at)
+        self.right = Undistort(self.rig.right, self.camera, right, at=at)
         self.register_buffer("rotation", turn)
 
     def forward(self, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -83,18 +86,22 @@ class StereoRectification(nn.Module):
         return new_left, new_right, mask_left, mask_right
 
     @property
+    def _baseline(self) -> Tensor:
+        return self.rig.baseline.detach()
+
+    @property
     def depth_matrix(self) -> Tensor:
         """(4, 4) Q of OpenCV: (X, Y, Z, W) = Q (u, v, disparity, 1), the point being (X, Y, Z) / W, in meters."""
         focal, _, cx, cy, _ = self.camera.params.detach().unbind()
         Q = torch.zeros(4, 4, dtype=torch.float64, device=focal.device)
-        Q[0, 0], Q[1, 1], Q[0, 3], Q[1, 3], Q[2, 3], Q[3, 2] = 1.0, 1.0, -cx, -cy, focal, 1.0 / self.rig.baseline
+        Q[0, 0], Q[1, 1], Q[0, 3], Q[1, 3], Q[2, 3], Q[3, 2] = 1.0, 1.0, -cx, -cy, focal, 1.0 / self._baseline
         return Q
 
     def depth(self, disparity: Tensor) -> Tensor:
         """Depth Z along the rectified axis, meters, of disparities in pixels; infinite where these are not positive."""
         disparity = torch.as_tensor(disparity, dtype=torch.float64)
         ahead = disparity > 0
-        reach = self.camera.params.detach()[0] * self.rig.baseline
+        reach = self.camera.params.detach()[0] * self._baseline
         return torch.where(ahead, reach / torch.where(ahead, disparity, 1.0), torch.inf)
 
     def points(self, pixels: Tensor, disparity: Tensor) -> Tensor:

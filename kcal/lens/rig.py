@@ -5,23 +5,24 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import math
-from collections.abc import Callable
 from typing import Any
 
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
-from kcal.checks import as_covariance, as_points, as_tensor, keep_float64, require_finite
+from kcal.checks import as_covariance, as_points, as_tensor, require_finite
+from kcal.dispatch import is_differentiated
 from kcal.errors import InputError, warn_user
 from kcal.lens.calibration import RigCalibration, UntilChanged
 from kcal.lens.camera import Camera
 from kcal.lens.camera_like import CameraLike, as_camera
 from kcal.lens.mounting import Mounting
+from kcal.lens.pose import Movable, rotation_from_vector
 from kcal.texts import brief, length_text
 
 
-class StereoRig(nn.Module):
+class StereoRig(Movable):
     """Two cameras, rigidly joined.
 
     Convention: the rig frame is the left camera's frame, and `points_right = rotation @ points_left + translation`
@@ -40,6 +41,10 @@ class StereoRig(nn.Module):
     Raises:
         InputError: wrong shapes, values that are not finite, or a matrix that is no rotation.
 
+    The pose may be freed: `rig.free("pose")`, `rig.free("rotation")` or `rig.free("translation")` let gradients reach
+    it, through a step on top of what is stored (the parameter `pose_step`), so that a rotation stays one under any
+    optimizer. A pose with a graph keeps it, and a translation that is an `nn.Parameter` is used as it is.
+
     A `KcalWarning` says where the right camera stands to the left of the left one, and where the baseline is beyond
     1 mm to 1 km.
 
@@ -50,8 +55,6 @@ class StereoRig(nn.Module):
         10.0
     """
 
-    right_from_left_rotation: Tensor
-    right_from_left_translation: Tensor
     covariance = UntilChanged["RigCovariance"](lambda rig, value: value.check(rig))
     mounting = UntilChanged[Mounting]()
     calibration = UntilChanged[RigCalibration]()
@@ -82,10 +85,32 @@ class StereoRig(nn.Module):
             raise InputError("rig rotation: not a rotation matrix (R Rᵀ must be 1 and det R = +1)")
         self.left: Camera = as_camera(left)
         self.right: Camera = as_camera(right)
-        self.register_buffer("right_from_left_rotation", rotation.detach().clone())
-        self.register_buffer("right_from_left_translation", translation.detach().clone())
+        if isinstance(right_from_left_translation, nn.Parameter) and translation is not right_from_left_translation:
+            raise InputError("right_from_left_translation: as a parameter it must be float64 of shape (3,)")
+        self._keep("right_from_left_rotation", rotation, turns=isinstance(right_from_left_rotation, nn.Parameter))
+        self._keep("right_from_left_translation", translation)
         if doubt := _pose_doubt(rotation.detach(), translation.detach()):
             warn_user(doubt)
+
+    @property
+    def right_from_left_rotation(self) -> Tensor:
+        """(3, 3) rotation matrix, with the step of `free`."""
+        kept, step = self._kept("right_from_left_rotation"), self.freed_step
+        return kept if step is None else rotation_from_vector(step[0]) @ kept
+
+    @property
+    def right_from_left_translation(self) -> Tensor:
+        """(3,) meters, likewise."""
+        kept, step = self._kept("right_from_left_translation"), self.freed_step
+        return kept if step is None else kept + step[1]
+
+    @property
+    def pose_slots(self) -> dict[str, Any]:
+        """What `free` takes: `pose`, or `rotation` and `translation`; the step is that of `RigCovariance`."""
+        return {"pose": slice(0, 6), "rotation": slice(0, 3), "translation": slice(3, 6)}
+
+    def _zero_step(self) -> Tensor:
+        return torch.zeros(6, dtype=torch.float64, device=self._kept("right_from_left_rotation").device)
 
     @property
     def baseline(self) -> Tensor:
@@ -171,9 +196,6 @@ class StereoRig(nn.Module):
         pixels_left, valid_left = self.left.project(points_left)
         pixels_right, valid_right = self.right.project(self.right_from_left(points_left))
         return pixels_left, pixels_right, valid_left & valid_right
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:
-        return super()._apply(keep_float64(fn), recurse)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -289,6 +311,8 @@ def _pose_doubt(rotation: Tensor, translation: Tensor) -> str:
 
 def half_of_covariance(matrix: Tensor) -> Tensor:
     """(K, P) with halfᵀ half = matrix (P, P), K being its rank."""
+    if is_differentiated(matrix):
+        raise InputError("the root of a covariance has no derivatives; give RigCovariance(half=...)")
     scale = matrix.diagonal().sqrt()
     safe = torch.where(scale > 0, scale, 1.0)
     values, vectors = torch.linalg.eigh(matrix / safe[:, None] / safe[None, :])

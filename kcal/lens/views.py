@@ -9,9 +9,9 @@ import math
 from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from kcal.checks import as_points, keep_float64
+from kcal.checks import StatedModule, as_points, keep_float64
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
@@ -22,7 +22,7 @@ _WIDEST_PINHOLE = 170.0
 _GRID = (65, 49)
 
 
-class Cylinder(nn.Module):
+class Cylinder(StatedModule):
     """A picture on an upright cylinder around the camera: columns are angles, and vertical lines stay straight.
 
     Convention: the axis of the cylinder is the y axis. Column u sees the azimuth (u - cx) / f, row v the height
@@ -55,6 +55,11 @@ class Cylinder(nn.Module):
             raise InputError(f"cylinder: {size[0]} columns at {focal:g} px a radian are more than a whole turn")
         self.size = size
         self.register_buffer("params", torch.tensor([focal, *center], dtype=torch.float64))
+
+    @property
+    def constants(self) -> object:
+        """Size."""
+        return self.size
 
     def grid(self, columns: int, rows: int) -> Tensor:
         """Pixels (rows, columns, 2) spread evenly over the picture, as `Camera.grid`."""

@@ -24,7 +24,7 @@ class Surroundings(NamedTuple):
 
     present: Tensor | None = None
     up: Tensor | None = None
-    bending: float = 0.0
+    bending: Tensor | float = 0.0
     held: Tensor | None = None
     held_off: Tensor | float = 0.0
 

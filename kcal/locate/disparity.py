@@ -6,9 +6,9 @@ import math
 from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from kcal.checks import as_tensor, exportable
+from kcal.checks import Float64Module, as_tensor, exportable, scalar
 from kcal.errors import InputError
 from kcal.lens.rectification import StereoRectification
 from kcal.locate.geodesy import Origin
@@ -43,11 +43,12 @@ class RangeImage(NamedTuple):
         return brief(self)
 
 
-class DisparityRanges(nn.Module):
+class DisparityRanges(Float64Module):
     """Map disparities of rectified images to ranges and their standard deviations.
 
     Every pixel is located by `StereoLocalizer` in the images as they were taken, so that lenses, entrance pupils and
-    the joint covariance of the rig (`StereoRig.covariance`, exact if there is none) count in full.
+    the joint covariance of the rig (`StereoRig.covariance`, exact if there is none) count in full. Results carry no
+    gradients; those of `StereoRectification.points` and `StereoLocalizer` do.
 
     Args:
         rectification: of the images.
@@ -67,12 +68,14 @@ class DisparityRanges(nn.Module):
         (100.0, 5.0)
     """
 
+    disparity_sigma: Tensor
+
     def __init__(self, rectification: StereoRectification, *, disparity_sigma: float = 0.3) -> None:
         super().__init__()
         if not 0 < disparity_sigma < math.inf:
             raise InputError(f"disparity_sigma {disparity_sigma}: positive pixels are needed")
         self.rectification = rectification
-        self.disparity_sigma = disparity_sigma
+        self.register_buffer("disparity_sigma", scalar(disparity_sigma, rectification.rotation))
         # Ranges do not depend on where the rig stands. Light is taken to be straight, which moves ranges by nothing
         # that can be measured.
         self.localize = StereoLocalizer(
@@ -119,10 +122,11 @@ class DisparityRanges(nn.Module):
         found = self.localize(left, right, torch.where(valid[:, None, None], cov, eye), valid)
         valid = valid & (found.inverse_range > 0) & found.range_low.isfinite()
         inverse = torch.where(valid, found.inverse_range, 1.0)
-        return RangeImage(
+        found = RangeImage(
             range=torch.where(valid, 1.0 / inverse, torch.inf),
             sigma=torch.where(valid, found.inverse_range_sigma / inverse**2, torch.inf),
             low=torch.where(valid, found.range_low, torch.nan),
             high=torch.where(valid, found.range_high, torch.nan),
             valid=valid,
         )
+        return RangeImage(*(value.detach() for value in found))

@@ -264,8 +264,8 @@ class EarthFrame(NamedTuple):
     heights: Tensor
     ecef_from_enu: Tensor
     ecef_of_origin: Tensor
-    refraction: float
-    half_curvature: float
+    refraction: Tensor
+    half_curvature: Tensor
 
 
 def stated_ahead(

@@ -9,15 +9,16 @@ from typing import Any, NamedTuple, Self
 import torch
 from torch import Tensor
 
-from kcal.checks import as_covariance, as_points, expanded, exportable
+from kcal.checks import as_covariance, as_points, expanded, exportable, scalar
 from kcal.dispatch import is_differentiated
 from kcal.errors import InputError
 from kcal.io.rig_file import load_rig
 from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA, Origin, check_refraction
+from kcal.lens.pose import Movable, rotation_from_vector
 from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.geodesy import anchor, enu_from_cam, mean_radius, place_enu
 from kcal.locate.max_likelihood import by_pose, calibration_effect, inverse_variance, position_slope, symmetric
-from kcal.locate.mounting import by_mounting
+from kcal.locate.mounting import attitude, by_mounting
 from kcal.locate.stereo import (
     PairFit,
     PositionStatus,
@@ -26,6 +27,7 @@ from kcal.locate.stereo import (
     fit_pairs,
     inverse_range,
     piece_by_piece,
+    range_where_ok,
     reprojection_errors,
     status_counts,
 )
@@ -68,6 +70,11 @@ class Localization(NamedTuple):
     def __repr__(self) -> str:
         return brief(self, status=status_counts(self.status))
 
+    @property
+    def range(self) -> Tensor:
+        """(..., N) meters from the left camera; infinite unless the status is OK."""
+        return range_where_ok(self.status, self.inverse_range)
+
 
 class Sensitivity(NamedTuple):
     """Slopes of the range, infinite where there is no range; at long range they are valid for small errors only.
@@ -82,13 +89,14 @@ class Sensitivity(NamedTuple):
     meters_per_degree: Tensor
 
 
-class StereoLocalizer(Operations):
+class StereoLocalizer(Operations, Movable):
     """Locate matched pixels of a calibrated rig on the Earth, with an error bar.
 
     Pixels are triangulated in closed form, refined to the maximum-likelihood position (Gauss-Newton on reprojection
     errors, weighed by the pixels' covariances), and carried with their covariance to east, north, up and to WGS84.
     Geometry runs in float64 whatever the pipeline around it uses. There is no branch on values under `torch.compile`
-    and `torch.export`; gradients by pixels, covariances and freed camera parameters are exact and finite.
+    and `torch.export`; gradients by pixels, covariances, cameras, poses and errors are exact and finite.
+    `free("origin")` and `free("attitude")` let them reach the mounting, as `StereoRig.free` the rig's pose.
 
     The covariance of a position is the sum of four parts: noise in the marks, errors in the calibration
     (`calibration`, a joint covariance of cameras and rig), errors in the mounting (`mounting`) and, upward, what is not
@@ -135,7 +143,9 @@ class StereoLocalizer(Operations):
         (983.0, 1017.6, 'OK')
     """
 
-    enu_from_rig: Tensor
+    pixel_sigma: Tensor
+    refraction: Tensor
+    half_curvature: Tensor
     ecef_from_enu: Tensor
     ecef_of_origin: Tensor
     geodetic_of_origin: Tensor
@@ -162,7 +172,8 @@ class StereoLocalizer(Operations):
         refraction_sigma: float | None = None,
     ) -> None:
         super().__init__()
-        self.pixel_sigma = checked_rig(rig, pixel_sigma)
+        place = rig.right_from_left_translation
+        self.register_buffer("pixel_sigma", scalar(checked_rig(rig, pixel_sigma), place))
         stored, own = rig.covariance, refraction is not None or refraction_sigma is not None
         bending = (
             REFRACTION if refraction is None else refraction,
@@ -185,15 +196,13 @@ class StereoLocalizer(Operations):
                 link = stands.link if link is None and calibration is None else link
         calibration = stored if calibration is None else calibration
         self.rig = rig
-        self.origin = origin
-        self.attitude_deg = (heading_deg, pitch_deg, roll_deg)
         errors = (("marks", True), ("calibration", calibration is not None), ("mounting", mounting is not None))
         self.included = tuple(name for name, there in errors if there)
-        self.half_curvature = 0.5 / mean_radius(origin.lat)
-        self.drop = bending[0] * self.half_curvature
-        device = rig.right_from_left_rotation.device
+        device = place.device
+        self.register_buffer("refraction", scalar(bending[0], place))
+        self.register_buffer("half_curvature", scalar(0.5 / mean_radius(origin.lat), place))
         rotation, translation = anchor(origin, device)
-        self.register_buffer("enu_from_rig", enu_from_cam(heading_deg, pitch_deg, roll_deg).to(device))
+        self._keep("enu_from_rig", enu_from_cam(heading_deg, pitch_deg, roll_deg).to(device))
         self.register_buffer("ecef_from_enu", rotation)
         self.register_buffer("ecef_of_origin", translation)
         self.register_buffer("geodetic_of_origin", origin.geodetic.to(device))
@@ -216,6 +225,32 @@ class StereoLocalizer(Operations):
             mounting = mounting.to(device)
         self.register_buffer("mounting", mounting)
         self.register_buffer("link", None if link is None else link.to(device))
+
+    @property
+    def enu_from_rig(self) -> Tensor:
+        """(3, 3) how the left camera looks, with the step of `free`."""
+        kept, step = self._kept("enu_from_rig"), self.freed_step
+        return kept if step is None else rotation_from_vector(step[1]) @ kept
+
+    @property
+    def origin(self) -> Origin:
+        """Position of the left camera's projection center."""
+        step, place = self.freed_step, self.geodetic_of_origin
+        return Origin.at(place if step is None else place_enu(step[0], self.ecef_from_enu, self.ecef_of_origin))
+
+    @property
+    def attitude_deg(self) -> tuple[float, float, float]:
+        """Heading, pitch and roll of the left camera."""
+        heading, pitch, roll = (round(angle, 11) for angle in attitude(self.enu_from_rig))
+        return heading, pitch, roll
+
+    @property
+    def pose_slots(self) -> dict[str, Any]:
+        """What `free` takes: `mounting`, or `origin` and `attitude`; the step is that of `Mounting.covariance`."""
+        return {"mounting": slice(0, 6), "origin": slice(0, 3), "attitude": slice(3, 6)}
+
+    def _zero_step(self) -> Tensor:
+        return torch.zeros_like(self.ecef_of_origin).repeat(2)
 
     @classmethod
     def from_file(cls, path: str | Path, **options: Any) -> Self:
@@ -275,7 +310,7 @@ class StereoLocalizer(Operations):
 
         return piece_by_piece(locate, left, right, cov, mask, differentiated=differentiated)
 
-    def _on_earth(self, found: PairFit, variance: float) -> Localization:
+    def _on_earth(self, found: PairFit, variance: Tensor | float) -> Localization:
         """Positions and all their errors; `variance` is that of the pixels if it is the same for all, or else one."""
         fit, scale, _, usable = found
         spread = [variance * entry for entry in fit.covariance]
@@ -294,8 +329,7 @@ class StereoLocalizer(Operations):
         slope = self.enu_from_rig @ position_slope(fit, scale, ok)
         covariance = slope @ symmetric(spread) @ slope.mT
         up = torch.stack([*torch.zeros_like(enu[..., :2]).unbind(-1), enu[..., :2].square().sum(-1)], -1)
-        if self.drop:
-            enu = enu - self.drop * up
+        enu = enu - self.refraction * self.half_curvature * up
         if self.mounting is not None:
             turn = torch.cat([by_mounting(enu), -self.half_curvature * up[..., None]], -1)
             covariance = covariance + turn @ self.mounting @ turn.mT
@@ -303,7 +337,9 @@ class StereoLocalizer(Operations):
                 mixed = slope @ by_link.movedim(-1, -3) @ turn.mT
                 covariance = covariance + mixed + mixed.mT
         covariance = torch.where(ok[..., None, None], covariance, torch.diag(covariance.new_full((3,), math.inf)))
-        geodetic = place_enu(enu, self.ecef_from_enu, self.ecef_of_origin)
+        step = self.freed_step
+        shifted = enu if step is None else enu + step[0]
+        geodetic = place_enu(shifted, self.ecef_from_enu, self.ecef_of_origin)
         return Localization(
             enu=enu,
             covariance=covariance,

@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeAlias
 import torch
 from torch import Tensor
 
-from kcal.checks import Float64Module, as_points, expanded, exportable
+from kcal.checks import StatedModule, as_points, expanded, exportable, scalar
 from kcal.dispatch import is_differentiated, is_traced, known_true
 from kcal.errors import InputError
 from kcal.lens.camera_rig import CameraRig
@@ -18,7 +18,14 @@ from kcal.locate.ground import EarthFrame, Ground, stated_ahead
 from kcal.locate.max_likelihood import inverse_variance
 from kcal.locate.multiview import checked_views_covariance
 from kcal.locate.ranges import BEARING_SIGMAS, range_interval
-from kcal.locate.stereo import PositionStatus, flag_positions, piece_by_piece, reprojection_errors, status_counts
+from kcal.locate.stereo import (
+    PositionStatus,
+    flag_positions,
+    piece_by_piece,
+    range_where_ok,
+    reprojection_errors,
+    status_counts,
+)
 from kcal.locate.views import CommonErrors, PosedCameras, ViewsFit, fit_views
 from kcal.texts import brief
 
@@ -72,8 +79,13 @@ class ViewsLocalization(NamedTuple):
     def __repr__(self) -> str:
         return brief(self, status=status_counts(self.status))
 
+    @property
+    def range(self) -> Tensor:
+        """(...) meters from the camera `anchor`; infinite unless the status is OK."""
+        return range_where_ok(self.status, self.inverse_range)
 
-class MultiViewLocalizer(Float64Module):
+
+class MultiViewLocalizer(StatedModule):
     """Locate what any of several cameras saw, each row on its own, with an error bar and a check of each view.
 
     A point is the most likely one given the noise of its pixels and the errors that a camera's pixels share: lens,
@@ -110,6 +122,9 @@ class MultiViewLocalizer(Float64Module):
         ([[0.0, 5000.0, 100.0]], 1.05)
     """
 
+    pixel_sigma: Tensor
+    clock_sigma: Tensor
+    half_curvature: Tensor
     up: Tensor | None
     heights: Tensor
     ecef_from_enu: Tensor | None
@@ -139,17 +154,18 @@ class MultiViewLocalizer(Float64Module):
         if root is not None:
             rig.check_root(root)
         self.rig = rig
-        self.pixel_sigma = float(pixel_sigma)
-        self.clock_sigma = float(clock_sigma)
-        self.half_curvature = 0.0
+        for name, value in (("pixel_sigma", pixel_sigma), ("clock_sigma", clock_sigma)):
+            self.register_buffer(name, scalar(value, rig.center))
+        half_curvature = 0.0
         device = rig.center.device
         up = heights = place = None
         if rig.origin is not None:
-            self.half_curvature = 0.5 / mean_radius(rig.origin.lat)
+            half_curvature = 0.5 / mean_radius(rig.origin.lat)
             place = anchor(rig.origin, device)
-            geodetic = enu_to_geodetic(rig.center, rig.origin)
+            geodetic = enu_to_geodetic(rig.center.detach(), rig.origin)
             ups = [ecef_from_enu_rotation(lat, lon)[:, 2].to(device) for lat, lon, _ in geodetic.tolist()]
             up, heights = torch.stack(ups) @ place[0], geodetic[:, 2]
+        self.register_buffer("half_curvature", scalar(half_curvature, rig.center))
         self.register_buffer("up", up)
         self.register_buffer("heights", heights)
         self.register_buffer("ecef_from_enu", None if place is None else place[0])
@@ -158,10 +174,15 @@ class MultiViewLocalizer(Float64Module):
         self.register_buffer("geodetic_of_origin", zero.to(device))
         errors, bending, self.lens = errors_by_camera(rig, root)
         self.register_buffer("errors", errors)
-        self.register_buffer("bending_errors", None if bending is None else bending * self.half_curvature)
+        self.register_buffer("bending_errors", None if bending is None else bending * half_curvature)
         freedom = 2.0 * torch.arange(len(rig) + 1, dtype=torch.float64) - 3.0
         limits = [[float(chdtri(max(float(f), 1.0), p)) for f in freedom] for p in (_BAD, _DOUBTFUL)]
         self.register_buffer("limits", torch.tensor(limits, dtype=torch.float64, device=device))
+
+    @property
+    def constants(self) -> object:
+        """By which parameters of each camera its marks have errors in common."""
+        return self.lens
 
     def forward(
         self,
@@ -199,14 +220,14 @@ class MultiViewLocalizer(Float64Module):
             raise InputError(f"seen: bool is needed, got {seen.dtype}")
         seen = expanded("seen", seen, pixels.shape[:-1]).reshape(-1, count)
         cov = checked_views_covariance(cov, pixels)
-        if velocity is not None and self.clock_sigma:
+        if velocity is not None:
             moved = expanded("velocity", as_points("velocity", velocity, 2, pixels), pixels.shape)
             moved = self.clock_sigma * moved.reshape(-1, count, 2)
             still = torch.eye(2, dtype=torch.float64, device=pixels.device)
             cov = self.pixel_sigma**2 * still.expand(*moved.shape, 2) if cov is None else cov
             cov = cov + moved[..., :, None] * moved[..., None, :]
         if height is not None:
-            if self.rig.origin is None:
+            if self.ecef_from_enu is None:
                 raise InputError("height: this rig has no place on the Earth; give its origin")
             if not 0.0 < height_sigma < math.inf:
                 raise InputError(f"height_sigma: a positive number of meters is needed, got {height_sigma}")

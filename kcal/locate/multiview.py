@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor, nn
 
-from kcal.checks import as_points, exportable, keep_float64, require_finite
+from kcal.checks import StatedModule, as_points, exportable, require_finite, scalar
 from kcal.dispatch import is_differentiated
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
+from kcal.lens.pose import Movable, rotation_from_vector
 from kcal.locate.angular import triangulate_angular
 from kcal.locate.linear import triangulate_linear
 from kcal.locate.stereo import PositionStatus, flag_positions, reprojection_errors, status_counts
@@ -43,7 +44,7 @@ class ViewsResult(NamedTuple):
         return brief(self, status=status_counts(self.status))
 
 
-class TriangulateViews(nn.Module):
+class TriangulateViews(Movable, StatedModule):
     """Points from their pixels in any two or more of several cameras, with a covariance and a status each.
 
     Methods: `linear` is Eq. 9 by singular values, `angular` the closed form in angles, three to ten times faster and
@@ -70,7 +71,7 @@ class TriangulateViews(nn.Module):
         (1000.0, 4.42)
     """
 
-    cam_from_world: Tensor
+    pixel_sigma: Tensor
 
     def __init__(
         self,
@@ -100,17 +101,39 @@ class TriangulateViews(nn.Module):
             raise InputError(f"pixel_sigma: a positive number of pixels is needed, got {pixel_sigma}")
         self.cameras = nn.ModuleList(cameras)
         self.method = method
-        self.pixel_sigma = float(pixel_sigma)
-        self.register_buffer("cam_from_world", poses.detach().clone())
+        self.register_buffer("pixel_sigma", scalar(pixel_sigma, poses))
+        self._keep("cam_from_world", poses, turns=True)
         center = self.posed.center
         if not float((center - center[0]).norm(dim=-1).amax()) > 0:
             raise DegenerateError("all cameras stand in the same place: no range can be measured")
 
     @property
+    def cam_from_world(self) -> Tensor:
+        """(C, 3, 4) matrices [R | t], with the steps of `free`."""
+        kept, step = self._kept("cam_from_world"), self.freed_step
+        if step is None:
+            return kept
+        return torch.cat([rotation_from_vector(step[0]) @ kept[..., :3], kept[..., 3:] + step[1][..., None]], -1)
+
+    @property
+    def constants(self) -> object:
+        """The method."""
+        return self.method
+
+    @property
+    def pose_slots(self) -> dict[str, Any]:
+        """What `free` takes; a step is that of `kcal.lens.pose`."""
+        return {"pose": slice(None)}
+
+    def _zero_step(self) -> Tensor:
+        return torch.zeros_like(self._kept("cam_from_world")[:, :2].flatten(1)[:, :6])
+
+    @property
     def posed(self) -> PosedCameras:
         """The cameras as they stand."""
         cameras: list[Camera] = list(self.cameras)  # type: ignore[arg-type]
-        turn, shift = self.cam_from_world[:, :, :3], self.cam_from_world[:, :, 3]
+        poses = self.cam_from_world
+        turn, shift = poses[:, :, :3], poses[:, :, 3]
         return PosedCameras(cameras, turn, -(turn.mT @ shift[..., None])[..., 0])
 
     def forward(self, pixels: Tensor, cov: Tensor | None = None) -> ViewsResult:
@@ -170,9 +193,6 @@ class TriangulateViews(nn.Module):
             seen = torch.where(used[..., c, None], seen, seen.new_tensor([0.0, 0.0, 1.0]))
             misses.append(torch.where(used[..., c, None], camera.project(seen)[0] - marks[..., c, :], 0.0))
         return found + posed.center[0], reprojection_errors(torch.cat(misses, -1).mT)
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:
-        return super()._apply(keep_float64(fn), recurse)
 
 
 def checked_views_covariance(cov: Tensor | None, pixels: Tensor) -> Tensor | None:

@@ -211,7 +211,7 @@ def located_by(locate: Locator, columns: PositionColumns | None = None) -> Locat
         heading_deg=heading,
         pitch_deg=pitch,
         roll_deg=roll,
-        pixel_sigma=locate.localize.pixel_sigma,
+        pixel_sigma=float(locate.localize.pixel_sigma),
         included=locate.localize.included,
         geoid=None if locate.geoid is None else locate.geoid.name,
     )

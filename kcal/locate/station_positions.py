@@ -105,7 +105,7 @@ class ViewsLocator:
     @torch.no_grad()
     def __call__(self, views: ViewMarks) -> tuple[PositionColumns, Tensor]:
         """The columns of some rows, and (N, 3) where their bearings and ranges count from."""
-        rig, sigma = self.rig, views.sigmas(self.localize.pixel_sigma)
+        rig, sigma = self.rig, views.sigmas(float(self.localize.pixel_sigma))
         cov = sigma.square()[..., None, None] * torch.eye(2, dtype=torch.float64)
         stated: Tensor | Ground | None = self.ground
         if self.ground is None and self.height is not None:
@@ -169,7 +169,7 @@ def stations_head(localize: MultiViewLocalizer) -> Located:
         heading_deg=first.heading_deg,
         pitch_deg=first.pitch_deg,
         roll_deg=first.roll_deg,
-        pixel_sigma=localize.pixel_sigma,
+        pixel_sigma=float(localize.pixel_sigma),
         included=("marks",) if localize.errors is None else ("marks", "calibration", "mounting"),
         feet=torch.zeros(0, 3, dtype=torch.float64),
     )

@@ -107,8 +107,8 @@ def stations_at(localize: StereoLocalizer, *, errors: int | None = None) -> Mult
         half = torch.cat([half, torch.nn.functional.pad(own, (size, 0))])
         half = torch.nn.functional.pad(half, (0, 0, 0, max((errors or 0) - len(half), 0)))
     left = localize.enu_from_rig.T
-    stations = _two_stations(rig, left, localize.origin, localize.drop / localize.half_curvature, half)
-    return MultiViewLocalizer(stations, pixel_sigma=localize.pixel_sigma)
+    stations = _two_stations(rig, left, localize.origin, float(localize.refraction), half)
+    return MultiViewLocalizer(stations, pixel_sigma=float(localize.pixel_sigma))
 
 
 @torch.no_grad()
@@ -193,4 +193,6 @@ def station_mounting(rig: CameraRig, camera: int) -> Mounting:
     if rig.root is not None:
         own = torch.cat([rig.root[:, rig.pose_columns(camera)], rig.root[:, -1:]], 1)
         covariance = own.T @ own
-    return mounting_of(rig.rotation[camera], rig.center[camera], covariance, rig.origin, refraction=rig.refraction)
+    return mounting_of(
+        rig.rotation[camera], rig.center[camera], covariance, rig.origin, refraction=float(rig.refraction)
+    )

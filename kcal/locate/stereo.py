@@ -288,6 +288,12 @@ def inverse_range(found: PairFit, variance: Tensor, weak_status: PositionStatus)
     return InverseRange(value, sigma, range_interval(value, sigma, known), weak, code)
 
 
+def range_where_ok(status: Tensor, inverse_range: Tensor) -> Tensor:
+    """(..., N) one over `inverse_range`; infinite unless the status is OK."""
+    ok = status == int(PositionStatus.OK)
+    return torch.where(ok, 1.0 / torch.where(ok, inverse_range, 1.0), torch.inf)
+
+
 def reprojection_errors(residual: Tensor) -> Tensor:
     """Residuals (..., 2 C, N) to distances in px (..., N, C), with a gradient of zero where there is no error."""
     squared = residual.unflatten(-2, (-1, 2)).square().sum(-2)

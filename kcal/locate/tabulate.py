@@ -412,7 +412,7 @@ class Locator:
             found, slopes = self.localize(left, right, cov), self.localize.sensitivity(left, right)
         found = Localization(*(value.cpu() for value in found))
         numbers = self._numbers(found, Sensitivity(*(value.cpu() for value in slopes)))
-        sigmas = np.full(len(names), self.localize.pixel_sigma) if cov is None else _marks_sigma(cov, len(names))
+        sigmas = np.full(len(names), float(self.localize.pixel_sigma)) if cov is None else _marks_sigma(cov, len(names))
         reasons = self._reasons(found, sigmas)
         return PositionColumns(names, found.status.numpy(), reasons, numbers, extras or {})
 

@@ -7,10 +7,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.checks import exportable
+from kcal.checks import exportable, scalar
 from kcal.dispatch import is_differentiated
 from kcal.lens.rig import StereoRig
-from kcal.locate.max_likelihood import inverse_variance
+from kcal.locate.max_likelihood import inverse_variance, position_slope, symmetric
 from kcal.locate.stereo import (
     PositionStatus,
     checked_pairs,
@@ -18,6 +18,7 @@ from kcal.locate.stereo import (
     fit_pairs,
     inverse_range,
     piece_by_piece,
+    range_where_ok,
     reprojection_errors,
     status_counts,
 )
@@ -41,6 +42,8 @@ class Triangulation(NamedTuple):
         range_high: (..., N) its upper end, infinite where the point may be at infinity. The interval is 0 to infinity
             unless the status is OK or PARALLEL.
         bearing_only: (..., N) true where the parallax is below three sigma: trust the bearing, not the range.
+        covariance: (..., N, 3, 3) of `points` from the marks' noise, to first order; an infinite diagonal unless OK. At
+            long range a point is skewed along the line of sight: quote the range interval.
     """
 
     points: Tensor
@@ -52,6 +55,12 @@ class Triangulation(NamedTuple):
     range_low: Tensor
     range_high: Tensor
     bearing_only: Tensor
+    covariance: Tensor = torch.empty(0)  # its place is the last: programs may build this result, or unpack it
+
+    @property
+    def range(self) -> Tensor:
+        """(..., N) meters from the left camera; infinite unless the status is OK."""
+        return range_where_ok(self.status, self.inverse_range)
 
     def __repr__(self) -> str:
         return brief(self, status=status_counts(self.status))
@@ -70,8 +79,8 @@ class Triangulate(Operations):
 
     Args:
         rig: two cameras and their relative pose; its covariance is not used.
-        pixel_sigma: standard deviation of the marks, px along each axis, for the range interval. The interval covers
-            the marks' noise only; `StereoLocalizer` adds the errors of the calibration.
+        pixel_sigma: standard deviation of the marks, px along each axis. Covariance and range interval cover the marks'
+            noise only; `StereoLocalizer` adds the errors of the calibration.
 
     Raises:
         InputError: a `pixel_sigma` that is not positive.
@@ -88,12 +97,14 @@ class Triangulate(Operations):
     """
 
     results = shapes_of(
-        Triangulation, points=(3,), status=torch.int8, rays=(3,), reprojection=(2,), bearing_only=torch.bool
-    )
+        Triangulation, points=(3,), status=torch.int8, rays=(3,), reprojection=(2,), bearing_only=torch.bool,
+        covariance=(3, 3),
+    )  # fmt: skip
+    pixel_sigma: Tensor
 
     def __init__(self, rig: StereoRig, pixel_sigma: float = 0.3) -> None:
         super().__init__()
-        self.pixel_sigma = checked_rig(rig, pixel_sigma)
+        self.register_buffer("pixel_sigma", scalar(checked_rig(rig, pixel_sigma), rig.right_from_left_translation))
         self.rig = rig
 
     def forward(self, pixels_left: Tensor, pixels_right: Tensor) -> Triangulation:
@@ -114,6 +125,9 @@ class Triangulate(Operations):
             )
             ok = reach.status == int(PositionStatus.OK)
             depth = found.scale / torch.where(ok, found.fit.inverse, 1.0)
+            slope = position_slope(found.fit, found.scale, ok)
+            covariance = self.pixel_sigma**2 * (slope @ symmetric(found.fit.covariance) @ slope.mT)
+            unknown = torch.diag(covariance.new_full((3,), torch.inf))
             return Triangulation(
                 points=torch.where(ok[..., None], depth[..., None] * found.fit.direction.mT, 0.0),
                 status=reach.status,
@@ -124,6 +138,7 @@ class Triangulate(Operations):
                 range_low=reach.interval.low,
                 range_high=reach.interval.high,
                 bearing_only=reach.weak,
+                covariance=torch.where(ok[..., None, None], covariance, unknown),
             )
 
         return piece_by_piece(triangulate, left, right, differentiated=differentiated)

@@ -48,7 +48,7 @@ class PosedCameras(NamedTuple):
     rotation: Tensor
     center: Tensor
     up: Tensor | None = None
-    bending: float = 0.0
+    bending: Tensor | float = 0.0
 
     @property
     def scale(self) -> Tensor:
@@ -128,7 +128,7 @@ class ViewsFit(NamedTuple):
     status: Tensor
     fitted: Tensor
     weight: Tensor | None
-    variance: float
+    variance: Tensor | float
     alone: Tensor | None
 
     def points(self, ok: Tensor) -> Tensor:
@@ -201,7 +201,7 @@ def fit_views(
     pixels: Tensor,
     seen: Tensor,
     *,
-    noise: float,
+    noise: Tensor | float,
     cov: Tensor | None = None,
     shared: CommonErrors | None = None,
     height: Callable[[Tensor, Tensor, Tensor, Tensor], StatedHeight] | None = None,
@@ -272,7 +272,8 @@ def fit_views(
         off = ((place - place.detach()) * stated.up).sum(-1) + stated.off
         around = around._replace(held=held, held_off=torch.where(alone, off / stated.sigma, 0.0))
     fitted = code == int(PositionStatus.OK)
-    weight, variance = None, noise**2
+    weight: Tensor | None = None
+    variance: Tensor | float = noise**2
     if cov is not None or shared is not None:
         moved = None if shared is None else shared_pixels(posed, shared, (place, ahead, inverse), used, scale)
         weight, variance = _weight(cov, noise, used, moved), 1.0
@@ -337,7 +338,7 @@ def shared_pixels(
     return torch.cat(moved, -2)
 
 
-def _weight(cov: Tensor | None, noise: float, used: Tensor, moved: Tensor | None) -> Tensor:
+def _weight(cov: Tensor | None, noise: Tensor | float, used: Tensor, moved: Tensor | None) -> Tensor:
     """(2 C, 2 C, N) inverse covariance of the pixels of used views; the identity for the others."""
     still = torch.eye(2, dtype=torch.float64, device=used.device)
     own = noise**2 * still if cov is None else cov

@@ -78,6 +78,11 @@ class InverseNet(Network):
         self.register_buffer("coefficients", values[5:].clone())
         self.register_buffer("start", camera.inverse_start.clone())
 
+    @property
+    def constants(self) -> object:
+        """Widths, lens model, and what is corrected."""
+        return self.widths, self.model.names, self.radial
+
     def closed_form(self, x: Tensor, y: Tensor) -> Tensor:
         """The guess that the network corrects: (..., 2, N) on the chart, for distorted coordinates x, y (..., N)."""
         if self.radial:

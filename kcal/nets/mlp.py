@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from kcal.checks import Float64Module
+from kcal.checks import StatedModule
 from kcal.errors import InputError
 
 Widths = tuple[int, ...]
@@ -30,7 +30,7 @@ class NetValues(NamedTuple):
     by_weights: Tensor
 
 
-class Network(Float64Module):
+class Network(StatedModule):
     """Base of networks: one vector of float64 weights, without gradients until asked."""
 
     weights: Tensor
@@ -39,6 +39,11 @@ class Network(Float64Module):
         super().__init__()
         self.widths = widths
         self.weights = nn.Parameter(weights, requires_grad=False)
+
+    @property
+    def constants(self) -> object:
+        """Widths of the layers."""
+        return self.widths
 
 
 def weight_count(widths: Widths) -> int:

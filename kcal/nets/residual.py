@@ -74,6 +74,11 @@ class ResidualNet(Network):
         self.register_buffer("inputs", (lens / lens.abs().max().clamp(min=1e-12))[:, None])
         self.register_buffer("units", units[list(corrected)])
 
+    @property
+    def constants(self) -> object:
+        """Widths, size, lens model, and what is corrected."""
+        return self.widths, self.size, self.model.names, self.corrected
+
     def forward(self) -> Tensor:
         """Corrected parameters (5 + P,): A* + δA and K* + δK."""
         return self.parameters_at(self.weights)

@@ -13,11 +13,11 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from kcal.checks import as_points, exportable
+from kcal.checks import StatedModule, as_points, exportable
 from kcal.corners.filters import as_gray
-from kcal.dispatch import is_differentiated
+from kcal.dispatch import is_differentiated, still
 from kcal.errors import InputError
 from kcal.lens.rig import StereoRig
 from kcal.locate.multi_localizer import MultiViewLocalizer
@@ -131,12 +131,12 @@ class BoxPairs(NamedTuple):
         return brief(self)
 
 
-class PairBoxes(nn.Module):
+class PairBoxes(StatedModule):
     """Pair the boxes of both images, for a batch of moments: `associate` as a module between detector and localizer.
 
     Matches are those of `associate`, moment by moment. Pixels and scores are differentiable by the boxes, with the
-    pairing held as it is. The assignment itself runs on the CPU, whatever the device; inside `torch.compile` this
-    module runs eagerly, and its batch stands for `vmap`.
+    pairing and the rig held as they are. The assignment itself runs on the CPU, whatever the device; inside
+    `torch.compile` this module runs eagerly, and its batch stands for `vmap`.
 
     Args:
         rig: the calibrated cameras; with its `covariance`, errors of the calibration widen the epipolar gate.
@@ -156,6 +156,11 @@ class PairBoxes(nn.Module):
         self.rig, self.options = rig, options or AssociationOptions()
         if isinstance(self.options.anchor, int):
             raise InputError("PairBoxes: boxes have no keypoints; anchor 'center' or 'bottom' is needed")
+
+    @property
+    def constants(self) -> object:
+        """Options."""
+        return self.options
 
     @torch.compiler.disable
     def forward(
@@ -203,7 +208,7 @@ class PairBoxes(nn.Module):
         )
         cost = found.cost[moments, rows, columns]
         if is_differentiated(both) and len(rows):
-            fitted = _costs(self.rig, pixels, both, self.options)
+            fitted = _costs(still(self.rig), pixels, both, self.options)
             cost = cost + torch.nan_to_num(fitted - fitted.detach())
         middles = [0.5 * (score.new_tensor(camera.size) - 1.0) for camera in (self.rig.left, self.rig.right)]
         seen = [middle.expand(*mask.shape, 2).index_put((moments, rows), pixel)

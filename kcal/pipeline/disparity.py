@@ -14,14 +14,15 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from kcal.checks import as_points, as_tensor, exportable, keep_float64, require_finite
+from kcal.checks import StatedModule, as_points, as_tensor, exportable, require_finite
 from kcal.corners.match import MatchStatus
 from kcal.corners.object_planes import object_planes, plane_pixels, plane_places
 from kcal.corners.patch_correlation import highest_peak, is_textured, weighted_correlation
 from kcal.corners.patch_windows import grid_of, has_samples, image_windows, sample
 from kcal.corners.shift_fit import fit_shifts
+from kcal.dispatch import still
 from kcal.errors import InputError
 from kcal.lens.rig import StereoRig
 from kcal.texts import brief
@@ -89,10 +90,11 @@ class ObjectDisparities(NamedTuple):
         return brief(self)
 
 
-class ObjectDisparity(nn.Module):
+class ObjectDisparity(StatedModule):
     """Match the image inside boxes: the module between a detector's boxes and `StereoLocalizer`.
 
-    Gradients reach both images by the implicit function theorem; the scale of the biweight counts as constant.
+    Gradients of `pixels` reach both images by the implicit function theorem; the scale of the biweight, the rig and the
+    boxes count as constants. The other results carry none.
 
     Args:
         rig: the calibrated cameras.
@@ -180,7 +182,7 @@ class ObjectDisparity(nn.Module):
         return found
 
     def _match(self, left: Tensor, right: Tensor, objects: _Objects) -> ObjectDisparities:
-        rig, options, level = self.rig, self.options, objects.level
+        rig, options, level = still(self.rig), self.options, objects.level
         device = objects.boxes.device
         rotation = rig.right_from_left_rotation
         with torch.no_grad():
@@ -261,8 +263,10 @@ class ObjectDisparity(nn.Module):
             torch.where(good, off_line, 0.0), torch.where(good[:, None, None], by_anchor, torch.eye(2).to(by_anchor)),
         )  # fmt: skip
 
-    def _apply(self, fn, recurse: bool = True):  # type: ignore[no-untyped-def]
-        return super()._apply(keep_float64(fn), recurse)
+    @property
+    def constants(self) -> object:
+        """Options."""
+        return self.options
 
 
 class _Objects(NamedTuple):

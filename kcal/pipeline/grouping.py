@@ -227,7 +227,14 @@ class _Scene:
             sigma[own] = (slope * self.options.box_sigma**2 + turned[c].square()).sqrt()
         up = torch.zeros_like(posed.center) if posed.up is None else posed.up
         return StationSights(
-            self.camera, ray.numpy(), sigma.numpy(), moved.numpy(), air, posed.center.numpy(), up.numpy(), posed.bending
+            self.camera,
+            ray.numpy(),
+            sigma.numpy(),
+            moved.numpy(),
+            air,
+            posed.center.numpy(),
+            up.numpy(),
+            float(posed.bending),
         )
 
     def _remaining(self) -> tuple[list[tuple[int, ...]], list[bool]]:

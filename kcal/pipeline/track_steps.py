@@ -65,7 +65,7 @@ def track_steps(localize: MultiViewLocalizer, lasting_px: float) -> TrackSteps:
     centers, errors, bending = localize.rig.center, localize.errors, localize.bending_errors
     turned = None if errors is None else errors[:, :, 3:6].movedim(-1, 0)
     cameras, known = SeenFrom(centers, turned), known_sightings(localize)
-    k = known.posed.bending
+    k = float(known.posed.bending)
 
     def measure(pixels: Tensor, seen: Tensor, covariance: Tensor, time: Tensor) -> Sightings:
         return sightings(known, pixels, seen, covariance, time, lasting_px)

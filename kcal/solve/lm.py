@@ -8,9 +8,9 @@ from typing import Any, Generic, Literal
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from kcal.checks import require_finite
+from kcal.checks import StatedModule, require_finite
 from kcal.dispatch import host_values, is_differentiated, is_traced, may_branch
 from kcal.errors import InputError
 from kcal.solve.dense import DenseProblem
@@ -240,7 +240,7 @@ class _WholeBatch(Generic[S]):
         return out
 
 
-class LevenbergMarquardt(nn.Module):
+class LevenbergMarquardt(StatedModule):
     """Levenberg-Marquardt for any residual function, batched over leading dimensions.
 
     Args:
@@ -317,6 +317,11 @@ class LevenbergMarquardt(nn.Module):
             x = attach_implicit_gradient(self.residual, result.x, result.converged, data)
             result = dataclasses.replace(result, state=(x,))
         return result
+
+    @property
+    def constants(self) -> object:
+        """Options; the residual, if it is a module, has a state of its own."""
+        return self.options, self.backward
 
     def __call__(self, *args: Any, **kwargs: Any) -> Result:
         """See `forward`."""

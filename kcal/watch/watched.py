@@ -270,8 +270,13 @@ def standing(solved: StereoLocalizer, watched: Watched, time: float) -> StereoLo
     """A localizer as the rig stands at a moment; its place stays where it was given."""
     rig = watched.rig_at(time)
     if solved.rig.mounting is not None and solved.origin == solved.rig.mounting.origin:
-        return StereoLocalizer(rig, pixel_sigma=solved.pixel_sigma)
+        return StereoLocalizer(rig, pixel_sigma=float(solved.pixel_sigma))
     heading, pitch, roll = solved.attitude_deg
     return StereoLocalizer(
-        rig, origin=solved.origin, heading_deg=heading, pitch_deg=pitch, roll_deg=roll, pixel_sigma=solved.pixel_sigma
+        rig,
+        origin=solved.origin,
+        heading_deg=heading,
+        pitch_deg=pitch,
+        roll_deg=roll,
+        pixel_sigma=float(solved.pixel_sigma),
     )

@@ -343,7 +343,12 @@ def picture() -> None:
 
     rig, generator = ring(3, 12_000.0), torch.Generator().manual_seed(5)
     rig = CameraRig(
-        rig.each, ("mill", "church", "mast"), rig.rotation, rig.center, origin=rig.origin, refraction=rig.refraction
+        rig.each,
+        ("mill", "church", "mast"),
+        rig.rotation,
+        rig.center,
+        origin=rig.origin,
+        refraction=float(rig.refraction),
     )
     rig.root = rig.with_errors(attitude_deg=(0.05, 0.05, 0.3), refraction=0.1)
     points = torch.tensor([[-3500.0, 2500, 150], [1000, 0, 120], [4500, 3500, 200], [6000, -2500, 100]]).double()

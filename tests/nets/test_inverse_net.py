@@ -210,7 +210,7 @@ class TestModule:
         wanted = fit.net(points)
         assert torch.equal(other.half()(points.float()), other(points.float().double()))
         assert torch.equal(other(points), wanted)
-        assert {t.dtype for t in other.state_dict().values()} == {torch.float64}
+        assert {t.dtype for t in (*other.parameters(), *other.buffers())} == {torch.float64}
 
     def test_compiles_as_one_graph(self) -> None:
         torch.compiler.reset()

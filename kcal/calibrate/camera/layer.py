@@ -6,7 +6,7 @@ import dataclasses
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from kcal.calibrate.camera.differentiated import Backward, differentiated, hybrid_views
 from kcal.calibrate.camera.exact_minimum import exact_minimum
@@ -18,7 +18,7 @@ from kcal.calibrate.problem.coefficient_prior import CoefficientPrior, is_overpa
 from kcal.calibrate.problem.priors import GaussianPrior, Term
 from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.views import Views
-from kcal.checks import as_points, require_finite
+from kcal.checks import StatedModule, as_points, require_finite
 from kcal.dispatch import is_differentiated
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
@@ -238,7 +238,7 @@ def _default_views(
     )
 
 
-class CalibrationLayer(nn.Module):
+class CalibrationLayer(StatedModule):
     """`calibrate_views` as a module: calibrates in its forward pass, carries gradients in its backward pass.
 
     Args:
@@ -287,6 +287,11 @@ class CalibrationLayer(nn.Module):
             start=start,
             backward=self.backward,
         )
+
+    @property
+    def constants(self) -> object:
+        """All that it is made with."""
+        return self.size, self.options, self.backward, self.corner_sigma
 
     def __call__(self, *args: Any, **kwargs: Any) -> CalibratedViews:
         """See `forward`."""
