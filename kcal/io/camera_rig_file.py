@@ -14,6 +14,7 @@ import pydantic
 import torch
 from torch import nn
 
+from kcal.dispatch import still
 from kcal.file_kind import CAMERA_RIG_VERSION
 from kcal.io.camera_file import RETIRED_FIELDS, CameraFile, named_camera_file
 from kcal.io.record import Packed
@@ -100,6 +101,7 @@ def camera_rig_to_file(rig: CameraRig) -> CameraRigFile:
     Raises:
         InputError: values that do not fit together.
     """
+    rig = still(rig)
     root, origin = rig.root, rig.origin
     with storing("rig"):
         return CameraRigFile(

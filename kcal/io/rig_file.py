@@ -18,6 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from kcal.checks import as_covariance
+from kcal.dispatch import still
 from kcal.errors import FileError
 from kcal.file_kind import CAMERA_RIG_VERSION
 from kcal.io.camera_file import RETIRED_FIELDS, CameraFile, named_camera_file
@@ -238,6 +239,7 @@ def rig_to_file(rig: StereoRig) -> RigFile:
         >>> rig_to_file(rig).right_from_left.translation
         (-1.0, 0.0, 0.0)
     """
+    rig = still(rig)
     covariance, mounting = rig.covariance, rig.mounting
     with storing("rig"):
         file = RigFile(

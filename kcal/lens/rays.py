@@ -72,7 +72,7 @@ class CameraRays(nn.Module):
 
     def _current(self) -> tuple[Tensor, ...]:
         """Depths, directions and mask: kept ones, unless a camera is differentiated, mapped, or has changed."""
-        if is_differentiated(self.cameras) or not (is_traced() or may_branch(*self.cameras.parameters())):
+        if is_differentiated(self) or not (is_traced() or may_branch(*self.cameras.parameters())):
             return self._measured()
         if not is_traced() and self._made_from != self._fingerprints():
             self.depths, self.directions, self.mask = self._measured()
