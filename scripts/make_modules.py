@@ -57,6 +57,7 @@ PAGE = Path(__file__).resolve().parents[1] / "docs" / "reference" / "modules.md"
 # What only others are made of.
 BASES = {
     "Float64Module", "StatedModule", "Movable", "LensParameters", "CameraParameters", "ConvertibleCamera", "Network",
+    "Operations", "_Method",
 }  # fmt: skip
 STEPS = (1e-3, 1e-4, 1e-5, 1e-6)
 # Meters by which heights on the ellipsoid are rounded.

@@ -291,7 +291,7 @@ def stated_ahead(
         sigma: of the height, meters.
         differentiated: derivatives by heights and frame are wanted; `StatedHeight.off` has them.
     """
-    still = frame._replace(**{name: v.detach() for name, v in frame._asdict().items() if isinstance(v, Tensor)})  # type: ignore[arg-type]
+    still = frame._replace(**{name: v.detach() for name, v in frame._asdict().items() if isinstance(v, Tensor)})
     at = still, place.detach(), ray.detach(), first, alone
     found = (
         _height_ahead(*at, height.detach(), sigma) if isinstance(height, Tensor) else _ground_ahead(*at, height, sigma)
