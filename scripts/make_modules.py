@@ -473,7 +473,7 @@ def kinds(case: Case, names: set[str]) -> str:
 def close(one: Values, other: Values, rtol: float = 1e-9) -> bool:
     """Whether two calls gave the same, measured by the largest finite number of each result."""
     for name, part in one.items():
-        size = float(torch.where(part.isfinite(), part, 0.0).abs().max()) if part.numel() else 0.0
+        size = float(torch.where(part.isfinite(), part, 0.0).abs().max().detach()) if part.numel() else 0.0
         if not torch.allclose(part, other[name].to(part), rtol=rtol, atol=rtol * size, equal_nan=True):
             return False
     return True
