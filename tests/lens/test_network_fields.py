@@ -160,7 +160,8 @@ def test_a_users_own_loop_trains_it_through_rays() -> None:
         for part in own.field.parameters():
             part.add_(0.3 * torch.randn(part.shape, generator=torch.Generator().manual_seed(1)))
     own.update_valid_region()
-    own.free("field")
+    # These alone: the camera's parameters stay frozen.
+    own.field.requires_grad_(True)
     optimizer, losses = torch.optim.Adam(own.field.parameters(), lr=0.03), []
     for _ in range(60):
         optimizer.zero_grad()

@@ -21,6 +21,7 @@ from kcal.calibrate.hybrid.fitted_views import Estimate
 from kcal.calibrate.hybrid.network_fit import (
     FieldTraining,
     _gauss_newton,
+    _joint_products,
     _Moved,
     _trunk,
     _Turn,
@@ -170,6 +171,15 @@ def test_derivatives_by_the_networks_weights() -> None:
             changed = _with_weights(estimate, other)
             sides.append(own.capture.problem(changed, own.never).pixel_errors(changed.state)[1:3].flatten(-2))
         torch.testing.assert_close(rows[:, k], (sides[0] - sides[1]) / 2e-5, rtol=1e-4, atol=1e-7)
+
+    # The prior of the weights, about their initial values, is part of the step.
+    near, far = (
+        _joint_products(dataclasses.replace(own, initial=weights - shift, spread=spread), problem, estimate)
+        for shift, spread in ((0.0, 1e9), (0.1, 0.5))
+    )
+    pull, hold = (far - near)[-1 - len(weights) : -1, -1], (far - near).diagonal()[-1 - len(weights) : -1]
+    torch.testing.assert_close(hold, torch.full_like(hold, estimate.variance / 0.25), rtol=1e-6, atol=1e-9)
+    torch.testing.assert_close(pull, 0.1 * hold, rtol=1e-6, atol=1e-9)
 
 
 def test_a_turn_lowers_the_cost_and_a_narrow_prior_holds_the_weights() -> None:
