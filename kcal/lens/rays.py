@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from kcal.checks import as_tensor
+from kcal.checks import Float64Module, as_tensor
 from kcal.dispatch import is_differentiated, is_traced, may_branch
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
@@ -24,7 +24,7 @@ from kcal.lens.pupil import FAR
 _BAND = 1 << 18
 
 
-class CameraRays(nn.Module):
+class CameraRays(Float64Module):
     """Rays of all pixels of one or several cameras, in the cameras' frames or in the world's.
 
     Row v and column u of the result are the ray through the center of pixel (u, v). Rays are kept and made anew when a

@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from kcal.checks import as_points
+from kcal.checks import Float64Module, as_points
 from kcal.dispatch import still
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
@@ -25,7 +25,7 @@ from kcal.lens.views import pinhole_view
 _LEAST_ANGLE = 20.0
 
 
-class StereoRectification(nn.Module):
+class StereoRectification(Float64Module):
     """Resample both images of a rig so that the same thing is in the same row of both.
 
     Convention: the rectified frame has its origin in the left camera; points_left = rotation @ points_rectified, and
