@@ -8,10 +8,13 @@ from calibrate_scenes import BOARD, SIZE, camera, motions, pixels_of
 from elsewhere import DEVICE, Elsewhere
 from torch import Tensor
 
-from kcal.calibrate.camera.layer import CalibrationLayer
+from kcal.calibrate.camera.layer import CalibratedViews, CalibrationLayer
 from kcal.calibrate.camera.options import CalibrationOptions
 from kcal.lens.camera import Camera
+from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector
+from kcal.lens.rig import StereoRig
+from kcal.locate.localizer import StereoLocalizer
 
 TURN = rotation_from_vector(torch.tensor([0.01, -0.03, 0.02], dtype=torch.float64))
 SHIFT = torch.tensor([-0.06, 0.01, 0.02], dtype=torch.float64)
@@ -23,6 +26,38 @@ def corners_of_both() -> tuple[Tensor, Tensor]:
     rotation, translation = left
     right = TURN @ rotation, translation @ TURN.T + SHIFT
     return tuple(pixels_of(camera("opencv4"), poses, noise=0.1) for poses in (left, right))  # type: ignore[return-value]
+
+
+def located(layer: CalibrationLayer, corners: tuple[Tensor, Tensor], start: list[CalibratedViews | None]) -> Tensor:
+    """Inverse range and position of a pair of pixels, from the corners of calibration images alone."""
+    found = [layer(one, BOARD.points, start=first) for one, first in zip(corners, start, strict=True)]
+    start[:] = found
+    left, right = found
+    turn = right.cam_from_board_rotation[0] @ left.cam_from_board_rotation[0].mT
+    shift = right.cam_from_board_translation[0] - turn @ left.cam_from_board_translation[0]
+    rig = StereoRig(left.camera(differentiable=True), right.camera(differentiable=True), turn, shift)
+    localize = StereoLocalizer(rig, origin=Origin(lat=45.0, lon=6.0, height=0.0), heading_deg=0.0)
+    pixels = [torch.tensor([[330.0, 250.0]], dtype=torch.float64), torch.tensor([[300.0, 238.0]], dtype=torch.float64)]
+    where = localize(*pixels)
+    return torch.cat([where.enu[0], where.inverse_range])
+
+
+@pytest.mark.parametrize("model", ["opencv4", None])
+def test_a_position_is_differentiable_by_the_corners_of_calibration_images(model: str | None) -> None:
+    options = CalibrationOptions() if model is None else CalibrationOptions(model=model)
+    layer, corners = CalibrationLayer(SIZE, options), corners_of_both()
+    start: list[CalibratedViews | None] = [None, None]
+    located(layer, corners, start)
+    amount = torch.zeros(2, dtype=torch.float64, requires_grad=True)
+    g = torch.Generator().manual_seed(1)
+    along = [torch.randn(one.shape, generator=g).double() for one in corners]
+
+    def solve(amount: Tensor) -> Tensor:
+        # From the same start each time: with the default lens, it also holds the amplitudes.
+        moved = tuple(one + share * way for one, share, way in zip(corners, amount, along, strict=True))
+        return located(layer, moved, list(start))
+
+    assert torch.autograd.gradcheck(solve, (amount,), eps=1e-3, atol=1e-5, rtol=1e-3)
 
 
 def test_a_differentiable_camera_is_a_camera() -> None:
