@@ -7,17 +7,8 @@ they are first used.
 
 from __future__ import annotations
 
-from typing import Any
-
 from kcal.doors import door
-from kcal.old_names import GONE, PLACES, find_old
 
 __version__ = "1.0.0"
 
-_find, __dir__ = door(__name__, __file__)
-
-
-def __getattr__(name: str) -> Any:
-    if name in GONE:
-        raise AttributeError(f"kcal.{name} is gone; in its place: {GONE[name]}")
-    return find_old(name) if name in PLACES else _find(name)
+__getattr__, __dir__ = door(__name__, __file__)

@@ -122,14 +122,11 @@ def _not_finite(value: Any) -> list[str] | None:
 class NativeFile(Record):
     """Base of kcal's files: a pydantic model that is stored with its `kind` and `version`.
 
-    Subclasses set `KIND`, `VERSION`, in `OLDER` the versions that they read as well, and in `RETIRED` what to say of
-    fields that are read no more. The JSON text begins `{"kcal": KIND, "version": VERSION, ...}`.
+    Subclasses set `KIND` and `VERSION`. The JSON text begins `{"kcal": KIND, "version": VERSION, ...}`.
     """
 
     KIND: ClassVar[str]
     VERSION: ClassVar[int]
-    OLDER: ClassVar[tuple[int, ...]] = ()
-    RETIRED: ClassVar[Mapping[str, str]] = {}
 
     def dump(self) -> dict[str, Any]:
         """The content as it is stored: plain dicts, lists and numbers, kind and version first."""
@@ -148,10 +145,11 @@ class NativeFile(Record):
         kind, version = content.pop("kcal"), content.pop("version", None)
         if kind != cls.KIND:
             raise FileError(f"{source}: this is a kcal {kind!s:.40} file; a kcal {cls.KIND} file is needed here")
-        known = (*cls.OLDER, cls.VERSION)
-        if type(version) is not int or version not in known:
-            reads = " or ".join(map(str, known))
-            raise FileError(f"{source}: version {version!s:.40} of the {kind} format; this kcal reads version {reads}")
+        if type(version) is not int or version != cls.VERSION:
+            says = f"{source}: version {version!s:.40} of the {kind} format"
+            if type(version) is int and version == 1:
+                says += f", which kcal 0.1 wrote; kcal 1.0 converts it: save_{kind}(load_{kind}(path), path)"
+            raise FileError(f"{says}; this kcal reads version {cls.VERSION}")
         text = json.dumps(content)
         try:
             # As JSON, not as Python values: in strict mode only JSON's numbers are numbers, but arrays are tuples.
@@ -161,12 +159,7 @@ class NativeFile(Record):
             wrong = {one["loc"][: one["loc"].index(_DERIVED)] for one in found if _DERIVED in one["loc"]}
             if wrong:
                 return cls.parse({"kcal": kind, "version": version, **_underived(content, wrong)}, source)
-            retired = [one for one in found if one["type"] == "extra_forbidden" and one["loc"][-1] in cls.RETIRED]
-            where, what = _first_fault((retired or found)[0])
-            if retired:
-                where, _, name = where.rpartition(".")
-                what = cls.RETIRED[name]
-            raise FileError(": ".join(filter(None, [source, f"bad {kind} file", where, what]))) from error
+            raise FileError(": ".join(filter(None, [source, f"bad {kind} file", *_first_fault(found[0])]))) from error
         if (place := _not_finite(content)) is not None:
             raise FileError(
                 f"{source}: bad {kind} file: {'.'.join(place)}: not finite: JSON has neither NaN nor infinity"

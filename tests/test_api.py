@@ -6,7 +6,6 @@ import dataclasses
 import importlib
 import importlib.metadata
 import inspect
-import re
 import subprocess
 import sys
 import tomllib
@@ -23,7 +22,6 @@ import torch
 import kcal
 from kcal.lens.information import CameraInformation
 from kcal.locate.max_likelihood import PointFit
-from kcal.old_names import GONE, PLACES
 
 # Taking a name away breaks users; adding one is a promise. Either is a line here and one in CHANGELOG.md.
 PUBLIC = {
@@ -36,11 +34,11 @@ PUBLIC = {
     "kcal.lens": """
         BoardRecord CalibrationRecord CameraCalibration CameraDifference CameraInformation CameraPose CameraRays
         Cylinder Exclusion StereoRectification cylinder_view looking pinhole_view pixel_errors pupil_shift ray_error
-        ExportedCameras HybridForm ImageTransform ImportedCameras InverseFit InverseNet InverseNetOptions
-        LearnedStart LensModel LookupCamera Misfit ParaxialFocal RefittedCamera Undistort UndistortImage
+        ExportedCameras HybridForm ImageTransform ImportedCameras LearnedStart LensModel LookupCamera Misfit
+        ParaxialFocal RefittedCamera Undistort UndistortImage
         UndistortMaps Unproject ZernikeModes bake camera_difference export_cameras image_sigma import_cameras
         load_lookup new_pinhole paraxial_focal pixel_covariance projection_sigma
-        refit_camera rotation_from_vector save_lookup save_onnx train_inverse undistort_maps
+        refit_camera rotation_from_vector save_lookup save_onnx undistort_maps
         vector_from_rotation LensSetting ExtendedDistortion
         CameraLike
     """,
@@ -101,84 +99,8 @@ PUBLIC = {
         FieldTraining NetworkModes
     """,
 }
-# Their place was `kcal.lens` in version 1.0, and stays so besides until 2.0.
-TWO_PLACES = ["InverseFit", "InverseNet", "InverseNetOptions", "train_inverse"]
 NAMES = [(door, name) for door, names in PUBLIC.items() for name in names.split()]
 NAMESPACES = {door.removeprefix("kcal.") for door in PUBLIC} - {"kcal"}
-# Names that were not in `kcal` itself before there were namespaces.
-NEW_NAMES = (
-    {
-        "RasterError",
-        "SkylineAttitude",
-        "SkylineImage",
-        "SkylineSource",
-        "skyline_attitude",
-        "skyline_source",
-        "Watched",
-        "LensSetting",
-        "InterpolatedCamera",
-        "camera_at_setting",
-        "Identity",
-        "FeatureEffect",
-        "LandmarkEffect",
-        "MovingControl",
-        "MovingOptions",
-        "MovingTrack",
-        "Sighting",
-        "match_moving",
-        "read_sightings",
-        "read_tracks",
-        "ImagePair",
-        "PairCounts",
-        "SceneMatches",
-        "scene_features",
-        "PositionColumns",
-        "calibrate_views",
-        "detect",
-        "rotation_from_vector",
-        "vector_from_rotation",
-    }
-    | {"CameraRays", "Cylinder", "StereoRectification", "cylinder_view", "looking", "pinhole_view", "pixel_errors"}
-    | {"pupil_shift", "ray_error", "IntervalCheck", "Refit", "against_capture", "interval_check", "simulated_refits"}
-    | {"DisparityRanges", "RangeImage", "forgotten_yaw", "save_interval_picture"}
-    | {"CameraRig", "CameraRigCalibration", "load_camera_rig", "save_camera_rig", "station_mounting", "stations_of"}
-    | {
-        "ObjectViews",
-        "group_objects",
-        "PairBoxes",
-        "BoxPairs",
-        "PixelPairs",
-        "matched_pixels",
-        "RefineCorners",
-        "Refined",
-        "CornerStatus",
-    }
-    | {"MultiViewLocalizer", "ViewMarks", "ViewsLocalization", "locate_views", "read_views"}
-    | {
-        "Area",
-        "RankedSite",
-        "Raster",
-        "Site",
-        "SitingMap",
-        "area_of",
-        "rank_sites",
-        "read_sites",
-        "siting_map",
-        "sites_of",
-    }
-    | {"save_siting_picture", "siting_figure"}
-    | set(PUBLIC["kcal.stars"].split())
-    | {
-        "CameraLike",
-        "ExtendedDistortion",
-        "FieldTraining",
-        "NetworkModes",
-        "JointFit",
-        "JointOptions",
-        "ResidualNet",
-        "train_jointly",
-    }
-)
 # Types of attributes in which only those look who work on kcal.
 INSIDE = {
     "Border",
@@ -328,7 +250,7 @@ def test_the_list(door: str) -> None:
 
 def test_a_name_has_one_place() -> None:
     names = [name for _, name in NAMES]
-    assert sorted(names) == sorted([*set(names), *TWO_PLACES])
+    assert sorted(names) == sorted(set(names))
 
 
 @pytest.mark.parametrize(("door", "name"), NAMES)
@@ -394,30 +316,6 @@ def test_no_name_hides_a_module(door: str) -> None:
     folder = Path(str(importlib.import_module(door).__file__)).parent
     inside = {path.stem for path in folder.glob("*.py")} | {path.parent.name for path in folder.glob("*/__init__.py")}
     assert inside.isdisjoint(PUBLIC[door].split())
-
-
-@pytest.mark.parametrize("name", sorted(PLACES))
-def test_an_old_name_warns_and_works(name: str) -> None:
-    now, _, new_name = PLACES[name].rpartition(".")
-    public = (now, new_name) in NAMES
-    with pytest.warns(DeprecationWarning, match=rf"^kcal\.{name} is (now {PLACES[name]};|internal,)") as caught:
-        value = getattr(kcal, name)
-    assert value is getattr(importlib.import_module(now), new_name)
-    assert ("is now" in str(caught[0].message)) == public
-    assert caught[0].filename == __file__  # where the old name is used
-    assert name not in vars(kcal)  # so that each place of use is warned of
-
-
-def test_every_name_that_moved_has_an_old_one() -> None:
-    moved = {name: f"{door}.{name}" for door, name in NAMES if door != "kcal" and name not in NEW_NAMES}
-    assert {name: place for name, place in PLACES.items() if name in moved} == moved
-    assert PLACES["detect_images"] == "kcal.detect"
-
-
-def test_names_that_are_gone_say_what_takes_their_place() -> None:
-    for name, instead in GONE.items():
-        with pytest.raises(AttributeError, match=re.escape(instead)):
-            getattr(kcal, name)
 
 
 def test_unknown_names() -> None:

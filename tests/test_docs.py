@@ -14,7 +14,6 @@ from pathlib import Path
 import pytest
 
 from kcal.cli.settings import NAME as SETTINGS_FILE
-from kcal.old_names import PLACES
 from scripts.docs_site import commands_page, navigation, ordered, with_descriptions
 from scripts.make_reference import DOORS, groups, page, page_of
 
@@ -60,12 +59,10 @@ def missing_names(text: str) -> list[str]:
 
 
 def exists(name: str) -> bool:
-    """Whether a dotted name is a module or something in one, and not an old name of `kcal`."""
+    """Whether a dotted name is a module or something in one."""
     first, *parts = name.split(".")
     found: object = importlib.import_module(first)
     for number, part in enumerate(parts):
-        if number == 0 and part in PLACES:
-            return False
         try:
             found = getattr(found, part)
         except AttributeError:

@@ -44,7 +44,7 @@ IMAGE_ROOMS = {"corners", "io"}
 MOST_LINES = 700
 # Doors name what users import, whichever room defines it, and have no floor: they import nothing but `kcal.doors`.
 DOORS = {stub.with_suffix(".py") for stub in PACKAGE.rglob("__init__.pyi")}
-# These two have no floor, too: one has the version and old names besides, the other runs the command line.
+# These two have no floor, too: one has the version besides, the other runs the command line.
 WITHOUT_FLOOR = DOORS | {PACKAGE / "__main__.py"}
 # Folders that are a door alone.
 EMPTY_ROOMS = {"rig", "track"}
@@ -134,7 +134,7 @@ def test_module_keeps_the_rules(path: Path) -> None:
 
 @pytest.mark.parametrize("path", sorted(DOORS), ids=public_module)
 def test_a_door_imports_nothing(path: Path) -> None:
-    allowed = {"kcal.doors"} | ({"kcal.old_names", "__future__", "typing"} if path.parent == PACKAGE else set())
+    allowed = {"kcal.doors"} | ({"__future__"} if path.parent == PACKAGE else set())
     assert imported_modules(ast.parse(path.read_text(encoding="utf-8")), public_module(path)) == allowed
     stub = ast.parse(path.with_suffix(".pyi").read_text(encoding="utf-8"))
     homes = {line.module for line in stub.body if isinstance(line, ast.ImportFrom)}

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
@@ -22,7 +21,7 @@ from kcal.cli.calibrate import calibrate_command
 from kcal.cli.capture import capture_command
 from kcal.cli.check import check_command
 from kcal.cli.compare import bake_command, compare_command, diff_command, interpolate_command
-from kcal.cli.console import err, option_for_each, warn, with_json
+from kcal.cli.console import err, option_for_each, with_json
 from kcal.cli.demo import demo_command
 from kcal.cli.detect import detect_command
 from kcal.cli.exchange import export_command, import_command
@@ -30,7 +29,7 @@ from kcal.cli.inputs import with_inputs
 from kcal.cli.live import live_command
 from kcal.cli.locate import locate_command
 from kcal.cli.mark import mark_command
-from kcal.cli.rectify import rays_command, rectify_command, undistort_command
+from kcal.cli.rectify import rays_command, rectify_command
 from kcal.cli.report import report_command
 from kcal.cli.rig import app as rig
 from kcal.cli.schema import schema_command
@@ -40,70 +39,9 @@ from kcal.cli.sites import sites_command
 from kcal.cli.stars import stars_command
 from kcal.cli.stations import station_command
 from kcal.cli.watch import watch_command
-from kcal.errors import InputError, KcalError
+from kcal.errors import KcalError
 from kcal.files import written_files
 from kcal.texts import visible
-
-# Options that have another name now: the old one works in version 1, with a warning.
-
-
-class _Renamed(NamedTuple):
-    """What an old option is now; its value is divided by `divisor`."""
-
-    now: str
-    divisor: float = 1.0
-
-
-# By command, "" for all, and old name.
-_RENAMED = {
-    ("", "--mark-sigma"): _Renamed("--pixel-sigma"),
-    # Both marks of a pair err.
-    ("budget", "--disparity"): _Renamed("--pixel-sigma", math.sqrt(2.0)),
-    ("calibrate", "--board"): _Renamed("--board-shape"),
-    ("live", "--map"): _Renamed("--port"),
-}
-_NEEDLESS = {("calibrate", "--analog"): "the views tell whether pixels are square"}
-
-
-def with_new_names(words: list[str]) -> tuple[list[str], list[str]]:
-    """The words of a command line with the options' names of today, and warnings.
-
-    Example:
-        >>> with_new_names(["live", "rig.json", "--map", "8350"])
-        (['live', 'rig.json', '--port', '8350'], ['--map is called --port now; the old name goes in version 2.0'])
-    """
-    command = words[0] if words else ""
-    found: list[str] = []
-    warnings: list[str] = []
-    divisor = 1.0
-    for word in words:
-        if divisor != 1.0:
-            word, divisor = _divided(word, divisor), 1.0
-        option, equals, value = word.partition("=")
-        if reason := _NEEDLESS.get((command, option)):
-            warnings.append(f"{option} is not needed any more and goes in version 2.0: {reason}")
-            continue
-        renamed = _RENAMED.get((command, option)) or _RENAMED.get(("", option))
-        if renamed is None:
-            found.append(word)
-            continue
-        warnings.append(f"{option} is called {renamed.now} now; the old name goes in version 2.0")
-        if renamed.divisor != 1.0:
-            warnings[-1] += ", and the value of the new one is divided by √2: noise of one mark along each axis"
-        if equals:
-            value = _divided(value, renamed.divisor) if renamed.divisor != 1.0 else value
-            found.append(f"{renamed.now}={value}")
-        else:
-            found.append(renamed.now)
-            divisor = renamed.divisor
-    return found, warnings
-
-
-def _divided(value: str, divisor: float) -> str:
-    try:
-        return repr(float(value) / divisor)
-    except ValueError:
-        raise InputError(f"{value!r} is not a number of pixels") from None
 
 
 @contextmanager
@@ -124,9 +62,6 @@ def usage_errors_shown() -> Iterator[None]:
 class _Commands(TyperGroup):
     def make_context(self, *arguments: Any, **options: Any) -> Any:
         name, words, *rest = *arguments, *(options.pop(key) for key in ("info_name", "args") if key in options)
-        words, notes = with_new_names(list(words))
-        for note in notes:
-            warn(note)
         inputs.typed[:] = words
         if words[:1] != ["init"] and not {"--help", "--help-all"} & set(words):
             options.setdefault("default_map", defaults_of(read_settings()))
@@ -196,7 +131,6 @@ app.command("watch", cls=Command)(with_inputs(watch_command))
 app.command("budget", cls=Command)(with_json(with_inputs(budget_command)))
 app.command("sites", cls=Command)(with_json(with_inputs(sites_command)))
 app.command("rectify", cls=Command)(with_json(with_inputs(rectify_command)))
-app.command("undistort", cls=Command, hidden=True)(with_json(with_inputs(undistort_command)))
 app.command("rays", cls=Command)(with_json(with_inputs(rays_command)))
 app.command("bake", cls=Command)(with_json(with_inputs(bake_command)))
 app.command("export", cls=Command)(with_json(with_inputs(export_command)))

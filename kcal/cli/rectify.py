@@ -1,4 +1,4 @@
-"""`kcal rectify`, `kcal undistort` and `kcal rays`: images as another camera takes them, and rays of their pixels."""
+"""`kcal rectify` and `kcal rays`: images as another camera takes them, and rays of their pixels."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import typer
 from rich.markup import escape
 
 from kcal.cli.console import err, out, print_table, print_wrote, steps, tell, warn
-from kcal.cli.inputs import CAMERA, CAMERA_OR_RIG, IMAGES, cameras_and_rig, named_source, parse_size, single_camera
+from kcal.cli.inputs import CAMERA_OR_RIG, IMAGES, cameras_and_rig, named_source, parse_size, single_camera
 from kcal.errors import FileError, InputError
 from kcal.files import check_writable, dump_json, make_folder, read_bytes, write_atomic
 from kcal.strict_json import read_json
@@ -226,28 +226,12 @@ def rectify_command(
     shape = parse_size(size)
     if rig is None:
         _rectify_camera(
-            source, images or [], output, fov, cylinder, (pan, tilt), maps, mask, "rectified", alpha=alpha, size=shape,
-            at=at,
-        )  # fmt: skip
+            source, images or [], output, fov, cylinder, (pan, tilt), maps, mask, alpha=alpha, size=shape, at=at
+        )
     elif cylinder or pan or tilt:
         raise InputError("--cylinder, --pan and --tilt are for a camera, not for a rig; RIG.json:left is a camera")
     else:
         _rectify_rig(rig, images or [], output, fov, maps, mask, alpha=alpha, size=shape, at=at)
-
-
-def undistort_command(
-    images: Annotated[list[str], typer.Argument(metavar="IMAGES", help="Images of one camera."), IMAGES],
-    camera: Annotated[Path, typer.Argument(help="Camera file from `kcal calibrate`."), CAMERA],
-    output: _OUTPUT,
-    alpha: _ALPHA = 0.0,
-    mask: _MASK = False,
-) -> None:
-    """`kcal rectify CAMERA IMAGES` under its old name and with the old order of arguments."""
-    warn("kcal undistort is called kcal rectify CAMERA IMAGES now; the old name goes in version 2.0")
-    _rectify_camera(
-        str(camera), images, output, None, False, (0.0, 0.0), False, mask, "undistorted", alpha=alpha, size=None,
-        at=math.inf,
-    )  # fmt: skip
 
 
 def rig_of(source: str) -> StereoRig | None:
@@ -265,7 +249,6 @@ def _rectify_camera(
     look: tuple[float, float],
     maps: bool,
     mask: bool,
-    suffix: str,
     *,
     alpha: float,
     size: tuple[int, int] | None,
@@ -280,7 +263,7 @@ def _rectify_camera(
     paths = expand_images(images) if images else []
     path, part = named_source(source)
     name = part or path.name.removesuffix(".json").removesuffix(".camera")
-    camera_path = folder / f"{name}_{suffix}.json"
+    camera_path = folder / f"{name}_rectified.json"
     extras = [*([] if cylinder else [camera_path]), *_extra_paths(folder, name, maps, mask)]
     targets = targets_of(paths, folder, extras)
 
@@ -301,9 +284,9 @@ def _rectify_camera(
         before, failures = convert_images(paths, targets, module, advance) if paths else (0, [])
     _refuse_none(paths, failures)
     if not cylinder:
-        save_camera(view, camera_path, name=f"{name} {suffix}")
+        save_camera(view, camera_path, name=f"{name} rectified")
     _write_extras(folder, name, module, maps, mask)
-    _tell_images(len(paths), before, failures, view.size, suffix)
+    _tell_images(len(paths), before, failures, view.size)
     if cylinder:
         focal, cx, cy = view.params.tolist()
         out.print(f"cylinder: {focal:.2f} px a radian; straight ahead is {cx:.2f}, {cy:.2f}")
@@ -361,7 +344,7 @@ def _rectify_rig(
     _save_array(matrix_path, module.depth_matrix)
     for name, side in zip(names, (module.left, module.right), strict=True):
         _write_extras(folder, name, side, maps, mask)
-    _tell_images(len(paths), before, failures, module.camera.size, "rectified")
+    _tell_images(len(paths), before, failures, module.camera.size)
     focal, _, cx, cy = module.camera.params[:4].tolist()
     out.print(f"both cameras: focal length {focal:.2f} px, cx {cx:.2f}, cy {cy:.2f}, baseline {rig.baseline:.6g} m")
     for name, side in zip(names, (module.left, module.right), strict=True):
@@ -399,10 +382,10 @@ def _save_array(path: Path, values: Any) -> None:
     write_atomic(path, data.getvalue())
 
 
-def _tell_images(count: int, before: int, failures: list[str], size: tuple[int, int], word: str) -> None:
+def _tell_images(count: int, before: int, failures: list[str], size: tuple[int, int]) -> None:
     if count:
         more = f" ({before} of them before)" if before else ""
-        out.print(f"{count - len(failures)} of {count} images {word}{more}, {size[0]}x{size[1]} px")
+        out.print(f"{count - len(failures)} of {count} images rectified{more}, {size[0]}x{size[1]} px")
 
 
 def _tell_view(camera: Camera, module: Undistort, label: str) -> None:

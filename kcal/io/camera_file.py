@@ -1,6 +1,6 @@
 """kcal's own camera file: every parameter by its name, its error bars, and where it came from.
 
-JSON, `"kcal": "camera"`, version 2; version 1, of kcal 0.1, had no `information`. Numbers are float64 and read back to
+JSON, `"kcal": "camera"`, version 2. Numbers are float64 and read back to
 the last bit. Parameters are stored by name, so that a value cannot slip into another one's place.
 """
 
@@ -55,12 +55,6 @@ class ValidRegion(Record):
     polygon: tuple[tuple[float, float], ...]
 
 
-RETIRED_FIELDS = {
-    "residual": "its lens has a residual field, which this version cannot read: a hybrid of kcal 0.1; calibrate again: "
-    "kcal calibrate OBS -o CAMERA"
-}
-
-
 class CameraFile(NativeFile):
     """One camera (file kind `camera`, version 2).
 
@@ -75,7 +69,7 @@ class CameraFile(NativeFile):
         coefficients: name -> value, exactly the names of the model.
         standard_deviations: name -> one sigma of the parameter, None where it was held fixed; the whole is None
             when none was computed.
-        covariance: of all parameters together, where that is all that is known of them; files of version 0.1 have it.
+        covariance: of all parameters together, where that is all that is known of them.
         information: what the calibration says of all parameters together, and of its board; None if that was not
             computed.
         valid_region: where the lens is valid; None if whoever wrote the file did not say.
@@ -95,8 +89,6 @@ class CameraFile(NativeFile):
 
     KIND: ClassVar[str] = "camera"
     VERSION: ClassVar[int] = 2
-    OLDER: ClassVar[tuple[int, ...]] = (1,)
-    RETIRED: ClassVar[Mapping[str, str]] = RETIRED_FIELDS
     _LATER: ClassVar[Mapping[str, Any]] = {"setting": None}
 
     name: str

@@ -1,12 +1,11 @@
 """kcal's rig file of any number of cameras: each camera whole, where it stands, and what is known of all together.
 
-JSON, `"kcal": "rig"`, version 3. Two cameras are stored as `kcal.io.rig_file` has them (version 2), which kcal 0.1
-and maps of pairs read too.
+JSON, `"kcal": "rig"`, version 3. Two cameras are stored as `kcal.io.rig_file` has them (version 2), which maps of
+pairs read too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import ClassVar
 
@@ -16,7 +15,7 @@ from torch import nn
 
 from kcal.dispatch import still
 from kcal.file_kind import CAMERA_RIG_VERSION
-from kcal.io.camera_file import RETIRED_FIELDS, CameraFile, named_camera_file
+from kcal.io.camera_file import CameraFile, named_camera_file
 from kcal.io.record import Packed
 from kcal.lens.camera_rig import CameraRig, CameraRigCalibration
 from kcal.lens.mounting import Origin
@@ -62,7 +61,6 @@ class CameraRigFile(NativeFile):
 
     KIND: ClassVar[str] = "rig"
     VERSION: ClassVar[int] = CAMERA_RIG_VERSION
-    RETIRED: ClassVar[Mapping[str, str]] = RETIRED_FIELDS
 
     names: tuple[str, ...]
     cameras: tuple[CameraFile, ...]

@@ -1,6 +1,6 @@
 """kcal's own rig file: two whole cameras, where the second stands, and how that was found.
 
-JSON, `"kcal": "rig"`, version 2; version 1, of kcal 0.1, had the covariance as a matrix. The cameras are embedded, not
+JSON, `"kcal": "rig"`, version 2. The cameras are embedded, not
 referred to: relative yaw of 0.01° is 436 m at 5 km, so a rig must never be combined with cameras that were solved again
 after it.
 """
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -21,13 +20,13 @@ from kcal.checks import as_covariance
 from kcal.dispatch import still
 from kcal.errors import FileError
 from kcal.file_kind import CAMERA_RIG_VERSION
-from kcal.io.camera_file import RETIRED_FIELDS, CameraFile, named_camera_file
+from kcal.io.camera_file import CameraFile, named_camera_file
 from kcal.io.file_summary import RigSummary
 from kcal.io.record import Packed
 from kcal.lens.calibration import RigCalibration
 from kcal.lens.mounting import Mounting, Origin
 from kcal.lens.projection import INTRINSICS
-from kcal.lens.rig import RigCovariance, StereoRig, half_of_covariance
+from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.native_file import NativeFile, Record, storing
 
 Triple = tuple[float, float, float]
@@ -141,9 +140,9 @@ class RigFile(NativeFile):
         left: the first camera, whole; its frame is the rig's.
         right: the second camera, whole.
         right_from_left: where the right camera stands.
-        covariance: of both cameras' parameters and the relative pose together, in the order of
-            `RigCovariance`; what was held has zeros. Files of version 1 have it.
-        half: (K, P) root of it: halfᵀ half is the covariance.
+        covariance: always None; files of version 1 had the matrix.
+        half: (K, P) root of the covariance of both cameras' parameters and the relative pose together, in the order of
+            `RigCovariance`: halfᵀ half is the covariance; what was held has zeros.
         mounting: where the rig stands on the Earth, if that was solved.
         calibration: how the rig was solved, if it was.
         summary: what `kcal show` prints of the relative pose without computing.
@@ -158,13 +157,11 @@ class RigFile(NativeFile):
 
     KIND: ClassVar[str] = "rig"
     VERSION: ClassVar[int] = 2
-    OLDER: ClassVar[tuple[int, ...]] = (1,)
-    RETIRED: ClassVar[Mapping[str, str]] = RETIRED_FIELDS
 
     left: CameraFile
     right: CameraFile
     right_from_left: RigPose
-    covariance: Matrix | None = None
+    covariance: None = None
     half: Packed | None = None
     mounting: RigMounting | None = None
     calibration: RigCalibration | None = None
@@ -172,9 +169,8 @@ class RigFile(NativeFile):
 
     @pydantic.model_validator(mode="after")
     def _measured(self) -> RigFile:
-        link, size = None if self.mounting is None else self.mounting.link, self._size()
-        if self.covariance is not None:
-            as_covariance("the rig's covariance", _tensor(self.covariance, size, size, "the rig's covariance"), size)
+        link = None if self.mounting is None else self.mounting.link
+        size = len(self.left.coefficients) + len(self.right.coefficients) + 2 * len(INTRINSICS) + 6
         if self.half is not None and (len(self.half.shape) != 2 or self.half.shape[1] != size):
             raise ValueError(f"half: a root (K, {size}) is needed, got the shape {list(self.half.shape)}")
         known = self.known()
@@ -202,15 +198,9 @@ class RigFile(NativeFile):
             )
         return super().parse(content, source)
 
-    def _size(self) -> int:
-        return len(self.left.coefficients) + len(self.right.coefficients) + 2 * len(INTRINSICS) + 6
-
     def known(self) -> RigCovariance | None:
         """The stored covariance."""
-        if self.half is not None:
-            return RigCovariance(half=self.half.tensor())
-        matrix = _loaded(self.covariance)
-        return None if matrix is None else RigCovariance(half=half_of_covariance(matrix))
+        return None if self.half is None else RigCovariance(half=self.half.tensor())
 
     def rig(self, field: nn.Module | None = None) -> StereoRig:
         """The rig, equal to the stored one to the last bit, with its covariance, mounting and calibration.

@@ -52,7 +52,7 @@ from kcal.calibrate.camera.export import ExportedCameras as ExportedCameras
 from kcal.calibrate.camera.misfit import Misfit as Misfit
 from kcal.io.onnx_file import save_onnx as save_onnx
 
-# Cameras of other makes, tables and learned inverses (these are also in kcal.nets)
+# Cameras of other makes, tables and learned starts
 from kcal.lens.camera_like import CameraLike as CameraLike
 from kcal.lens.baking import bake as bake
 from kcal.lens.lookup import LookupCamera as LookupCamera
@@ -60,10 +60,6 @@ from kcal.io.lookup_file import load_lookup as load_lookup
 from kcal.io.lookup_file import save_lookup as save_lookup
 from kcal.lens.modules import Unproject as Unproject
 from kcal.lens.modules import LearnedStart as LearnedStart
-from kcal.nets.inverse import train_inverse as train_inverse
-from kcal.nets.inverse import InverseNet as InverseNet
-from kcal.nets.inverse import InverseNetOptions as InverseNetOptions
-from kcal.nets.inverse import InverseFit as InverseFit
 
 # Rotations
 from kcal.lens.pose import rotation_from_vector as rotation_from_vector

@@ -25,7 +25,7 @@ MOUNTING_ERRORS = 7
 
 
 def load_camera_rig(path: str | Path) -> CameraRig:
-    """Read any rig file: one of many cameras, or one of two (also of kcal 0.1), named left and right.
+    """Read any rig file: one of many cameras, or one of two, named left and right.
 
     Raises:
         FileError: missing, not JSON, another kind of file, or a field that is wrong; it names the path.

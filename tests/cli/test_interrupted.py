@@ -56,7 +56,7 @@ def test_an_old_file_stays_until_the_new_one_is_whole(folder: Path) -> None:
         ("compare left.obs.json pinhole opencv5", ["step:2"]),
         ("board measure left.obs.json -o plate.board.json --picture plate.png", ["step:1", "write:2"]),
         ("detect images --board 7x6 --square 50mm -o new.obs.json --refine saddle", ["step:1", "write:1"]),
-        ("undistort images near.camera.json -o straight", ["write:2"]),
+        ("rectify near.camera.json images -o straight", ["write:2"]),
         ("rig left.camera.json right.camera.json --landmarks survey.csv --marks marks.csv -o rig.json", ["step:4"]),
         ("bake left.camera.json -o table.npz", ["write:1"]),
         ("demo -o site", ["step:1", "write:2"]),

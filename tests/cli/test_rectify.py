@@ -134,19 +134,6 @@ def test_new_camera_file_is_a_pinhole(folder: Path, monkeypatch: pytest.MonkeyPa
     assert content["coefficients"] == {}
 
 
-def test_the_old_command(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """It warns, and makes the same images under the old names."""
-    (folder / "in" / "a.png").write_bytes(encode_png(picture(np.uint8, 1)))
-    assert run(monkeypatch, "left.camera.json", "in", "-o", "new") == 0
-    monkeypatch.setattr(sys, "argv", ["kcal", "undistort", "in", "left.camera.json", "-o", "old"])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    assert not stop.value.code
-    assert "kcal rectify CAMERA IMAGES" in capsys.readouterr().err
-    assert (folder / "old" / "a.png").read_bytes() == (folder / "new" / "a.png").read_bytes()
-    assert (folder / "old" / "left_undistorted.json").exists()
-
-
 def test_done_images_are_not_made_again(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -11,9 +11,9 @@ from typer.main import get_command
 from typer.testing import CliRunner, Result
 
 from kcal import load_rig
-from kcal.cli.main import app, with_new_names
+from kcal.cli.main import app
 from kcal.cli.settings import SETTINGS, defaults_of, read_settings, toml_text
-from kcal.errors import FileError, InputError
+from kcal.errors import FileError
 
 ASSETS = Path(__file__).parents[2] / "assets"
 EXAMPLE = {"board": "9x6", "square": "25mm", "camera": "camera:0", "origin": "1,2,3", "heading": 4.0,
@@ -107,32 +107,6 @@ def test_the_noise_of_marks_is_that_of_the_rig(folder: Path) -> None:
     assert stated.stdout != kcal("locate", "rig.json", "points.csv", "--pixel-sigma", "0.3").stdout
     assert "noise of marks: 0.3 px, assumed; --pixel-sigma states it" in kcal("budget").stderr
     assert "noise of marks 0.1 px along each axis" in kcal("show", "rig.json").stdout
-
-
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        ("rig check r.json --mark-sigma 0.1", "rig check r.json --pixel-sigma 0.1"),
-        ("report r.json --mark-sigma=0.1", "report r.json --pixel-sigma=0.1"),
-        ("budget --disparity 0.2", f"budget --pixel-sigma {0.2 / 2**0.5}"),
-        ("budget --disparity=0.2", f"budget --pixel-sigma={0.2 / 2**0.5}"),
-        ("calibrate a --board exact", "calibrate a --board-shape exact"),
-        ("live r.json --map 0", "live r.json --port 0"),
-        ("calibrate a --analog -o b", "calibrate a -o b"),
-        ("detect a --board 9x6", "detect a --board 9x6"),
-        ("locate r.json p.csv --map m.html", "locate r.json p.csv --map m.html"),
-    ],
-)
-def test_old_names_work_and_warn(old: str, new: str) -> None:
-    words, warnings = with_new_names(old.split())
-    assert words == new.split()
-    assert len(warnings) == (old != new)
-    assert all("in version 2.0" in text for text in warnings)
-
-
-def test_an_old_name_without_a_number_is_refused() -> None:
-    with pytest.raises(InputError, match="is not a number of pixels"):
-        with_new_names(["budget", "--disparity", "much"])
 
 
 @pytest.mark.parametrize("words", [["calibrate"], ["rig", "solve"], ["locate"], ["live"]])

@@ -139,7 +139,7 @@ def test_two_cameras_take_the_long_table_too(folder: Path) -> None:
 
 
 def test_show_says_how_each_camera_stands() -> None:
-    stored = Path(__file__).parents[1] / "promises" / "files" / "0.2-camera-rig" / "camera-rig.json"
+    stored = Path(__file__).parents[1] / "promises" / "files" / "1.0" / "camera-rig.json"
     text = CliRunner().invoke(app, ["show", str(stored)]).stdout
     assert text.count("\ncamera ") == 4  # three cameras and the head of the table
     (line,) = [line for line in text.splitlines() if line.startswith("fisheye4 ")]

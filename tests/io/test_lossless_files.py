@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import pickle
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,25 +14,21 @@ import torch
 
 from kcal.errors import FileError, InputError
 from kcal.io.camera_file import CameraFile, load_camera, save_camera
-from kcal.io.record import Packed
 from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.locate.stations import load_camera_rig
 
-# Written by version 0.1: cameras, covariances, mounting with link, sources, records.
-SAMPLE = Path(__file__).parent / "rig-version-1.json"
+# Cameras, covariances, mounting with link, sources, records.
+SAMPLE = Path(__file__).parent / "rig.json"
 
 
 def assert_same(before: Any, after: Any, where: str = "") -> None:
     """Equal to the last bit; what is derived on writing (the valid region) to rounding."""
-    if where == ".version":
-        assert after == 2
-    elif isinstance(before, dict):
-        # Later versions have further fields, which are empty for files of earlier ones.
-        assert [key for key in after if key in before] == list(before), where
-        assert all(after[key] in (None, []) for key in after if key not in (*before, "summary")), where
-        for key in before:
+    if isinstance(before, dict):
+        assert list(after) == list(before), where
+        for key in set(before) - {"summary"}:
             assert_same(before[key], after[key], f"{where}.{key}")
     elif isinstance(before, list):
         assert len(before) == len(after), where
@@ -43,23 +40,24 @@ def assert_same(before: Any, after: Any, where: str = "") -> None:
         assert before == after, where
 
 
-def test_rig_file_of_version_01(tmp_path: Path) -> None:
+def test_rig_file(tmp_path: Path) -> None:
     again = save_rig(load_rig(SAMPLE), tmp_path / "rig.json")
-    before, after = json.loads(SAMPLE.read_text()), json.loads(again.read_text())
-    # The covariance is stored as its root now.
-    matrix, half = before.pop("covariance"), Packed.model_validate(after.pop("half")).tensor()
-    sigma = half.norm(dim=0).clamp_min(1e-300)
-    stored = torch.tensor(matrix, dtype=torch.float64)
-    torch.testing.assert_close(
-        half.T @ half / sigma / sigma[:, None], stored / sigma / sigma[:, None], rtol=0, atol=1e-12
-    )
-    assert_same(before, after)
+    assert_same(json.loads(SAMPLE.read_text()), json.loads(again.read_text()))
     assert save_rig(load_rig(again), tmp_path / "third.json").read_bytes() == again.read_bytes()
 
 
+@pytest.mark.parametrize(("kind", "load"), [("rig", load_rig), ("rig", load_camera_rig), ("camera", load_camera)])
+def test_files_of_0_1_are_refused_with_what_to_do(kind: str, load: Callable[[Path], object], tmp_path: Path) -> None:
+    path = tmp_path / "old.json"
+    path.write_text(json.dumps({"kcal": kind, "version": 1}))
+    complaint = rf"old\.json: version 1 of the {kind} format, which kcal 0\.1 wrote; kcal 1\.0 converts it: save_"
+    with pytest.raises(FileError, match=complaint):
+        load(path)
+
+
 @pytest.mark.parametrize("side", ["left", "right"])
-def test_camera_file_of_version_01(side: str, tmp_path: Path) -> None:
-    content = {"kcal": "camera", "version": 1, **json.loads(SAMPLE.read_text())[side]}
+def test_camera_file(side: str, tmp_path: Path) -> None:
+    content = {"kcal": "camera", "version": 2, **json.loads(SAMPLE.read_text())[side]}
     path = tmp_path / "camera.json"
     path.write_text(json.dumps(content))
     camera = load_camera(path)
@@ -72,9 +70,9 @@ def test_camera_file_of_version_01(side: str, tmp_path: Path) -> None:
 
 
 def test_files_with_little_in_them(tmp_path: Path) -> None:
-    """No error bars, no record, no name: the oldest files."""
+    """No error bars, no record, no name."""
     content = json.loads(SAMPLE.read_text())
-    for key in ("covariance", "mounting", "calibration"):
+    for key in ("half", "mounting", "calibration"):
         content[key] = None
     for side in ("left", "right"):
         content[side] |= {"standard_deviations": None, "covariance": None, "calibration": None}
@@ -84,7 +82,7 @@ def test_files_with_little_in_them(tmp_path: Path) -> None:
     assert (rig.covariance, rig.mounting, rig.calibration) == (None, None, None)
     assert_same(content, json.loads(save_rig(rig, tmp_path / "again.json").read_text()))
     content["left"] |= {"name": ""}
-    bare = {"kcal": "camera", "version": 1, **content["left"]}
+    bare = {"kcal": "camera", "version": 2, **content["left"]}
     path.write_text(json.dumps(bare))
     assert load_camera(path).calibration is None
     assert_same(bare, json.loads(save_camera(load_camera(path), tmp_path / "again.json").read_text()))

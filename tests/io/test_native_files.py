@@ -367,29 +367,3 @@ def test_a_wrong_summary_counts_as_none(damage: str, at: list[str], rig: StereoR
     shown = [CliRunner().invoke(app, ["show", str(path)]).output.splitlines()[1:] for path in paths]
     assert shown[0] == shown[1]
     assert len(shown[0]) > 10
-
-
-# A camera with a residual field as kcal 0.1 stored it.
-HYBRID_OF_0_1 = """{
- "kcal": "camera", "version": 1, "name": "left", "image_size": [640, 480],
- "model": {"numerator": 1, "denominator": 0, "tangential": false, "prism": 0, "tilt": false, "fisheye": false},
- "intrinsics": {"fx": 500.0, "fy": 500.0, "cx": 319.5, "cy": 239.5, "skew": 0.0},
- "coefficients": {"k1": -0.1}, "standard_deviations": null, "covariance": null,
- "residual": [{"width": 0.5, "left": -0.2, "top": -0.2, "columns": 2, "rows": 1,
-               "along_x": [0.001, 0.0], "along_y": [0.0, 0.002]}],
- "valid_region": null, "calibration": null
-}"""
-
-
-def test_a_hybrid_of_0_1_is_refused_with_what_to_do(tmp_path: Path) -> None:
-    path = tmp_path / "left.camera.json"
-    path.write_text(HYBRID_OF_0_1)
-    complaint = r"bad camera file: its lens .* a hybrid of kcal 0\.1; calibrate again: kcal calibrate OBS -o CAMERA$"
-    with pytest.raises(FileError, match=complaint) as caught:
-        load_camera(path)
-    assert len(str(caught.value).splitlines()) == 1
-    # Without its field the same file is a camera, which no one fitted.
-    content = json.loads(HYBRID_OF_0_1)
-    del content["residual"]
-    path.write_text(json.dumps(content))
-    assert load_camera(path).names[-1] == "k1"

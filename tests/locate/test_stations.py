@@ -23,7 +23,7 @@ from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.locate.stations import load_camera_rig, station_mounting, stations_of
 from scripts.shared.station_scenes import ORIGIN, marks, ring, targets
 
-OLD_RIG = Path(__file__).parents[1] / "io" / "rig-version-1.json"
+RIG = Path(__file__).parents[1] / "io" / "rig.json"
 
 
 def survey(count: int = 4, seed: int = 0) -> tuple[CameraRig, RigData, Tensor]:
@@ -124,10 +124,10 @@ def test_file_of_many_cameras(tmp_path: Path) -> None:
         load_camera_rig(path)
 
 
-def test_rigs_of_two_and_of_version_1_load() -> None:
-    old = load_camera_rig(OLD_RIG)
-    assert old.names == ("left", "right")
-    assert float((old.center[1] - old.center[0]).norm()) == pytest.approx(float(load_rig(OLD_RIG).baseline))
+def test_rigs_of_two_load() -> None:
+    two = load_camera_rig(RIG)
+    assert two.names == ("left", "right")
+    assert float((two.center[1] - two.center[0]).norm()) == pytest.approx(float(load_rig(RIG).baseline))
 
 
 @pytest.mark.parametrize("mounted", [True, False])

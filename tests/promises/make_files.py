@@ -19,19 +19,19 @@ import torch
 import kcal
 from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.camera.options import CalibrationOptions
+from kcal.calibrate.hybrid.measured_board import load_measured_board, save_measured_board
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.io.camera_file import load_camera, save_camera
+from kcal.io.camera_rig_file import save_camera_rig
 from kcal.io.lookup_file import load_lookup, save_lookup
 from kcal.io.rig_file import load_rig, save_rig
+from kcal.lens.baking import bake
 from kcal.lens.camera import Camera
+from kcal.lens.camera_rig import CameraRig
+from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import StereoRig
-
-try:
-    from kcal.lens.baking import bake
-except ImportError:  # before it had this name
-    from kcal.lens.bake import bake
 
 SIZE = (640, 480)
 MODELS = ("hybrid", "opencv5", "opencv14", "fisheye4")
@@ -67,13 +67,7 @@ def computed(camera: Camera) -> dict[str, object]:
 
 
 def camera_rig(folder: Path, out: dict[str, object]) -> None:
-    """A rig of three cameras with error bars, from the version that has such rigs on."""
-    try:
-        from kcal.io.camera_rig_file import save_camera_rig
-        from kcal.lens.camera_rig import CameraRig
-        from kcal.lens.mounting import Origin
-    except ImportError:
-        return
+    """A rig of three cameras with error bars."""
     lens = {"opencv5": [-0.2, 0.05, 1e-3, -5e-4, 0.01], "fisheye4": [0.02, -0.003], "pinhole": []}
     cameras = [
         Camera.build(focal=(520 + i, 521), center=(322, 238), size=SIZE, coefficients=values, model=model)
@@ -103,24 +97,19 @@ def main(folder: Path) -> None:
     out["observations.json"] = {"sum": float(sum(sum(map(sum, view.pixels)) for view in seen.views))}
     cameras, boards = {}, {}
     for model in MODELS:
-        try:
-            found = calibrate_camera(seen, CalibrationOptions(model=model))
-        except Exception as error:
-            print(f"{model}: {error}")
-            continue
+        found = calibrate_camera(seen, CalibrationOptions(model=model))
         name = f"{model}.camera.json"
-        boards[model] = getattr(found, "measured_board", None)
+        boards[model] = found.measured_board
         save_camera(found.camera, folder / name)
         cameras[model] = load_camera(folder / name)
         out[name] = computed(cameras[model])
     if boards.get("hybrid") is not None:
-        from kcal.calibrate.hybrid.measured_board import load_measured_board, save_measured_board
-
         save_measured_board(boards["hybrid"], folder / "board.json")
         out["board.json"] = {"points": load_measured_board(folder / "board.json").points.tolist()}
     turned = rotation_from_vector(torch.tensor([0.01, -0.02, 0.005], dtype=torch.float64))
-    left = cameras.get("hybrid", cameras["opencv5"])
-    save_rig(StereoRig(left, cameras["opencv14"], turned, torch.tensor([-10.0, 0.02, 0.1])), folder / "rig.json")
+    save_rig(
+        StereoRig(cameras["hybrid"], cameras["opencv14"], turned, torch.tensor([-10.0, 0.02, 0.1])), folder / "rig.json"
+    )
     rig = load_rig(folder / "rig.json")
     out["rig.json"] = {
         "rotation": rig.right_from_left_rotation.tolist(),

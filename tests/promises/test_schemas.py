@@ -20,11 +20,11 @@ from kcal.locate.stations import load_camera_rig
 
 STORED = Path(__file__).parent / "files"
 WRITTEN = {
-    "camera": "0.1-format2/hybrid.camera.json",
-    "rig": "0.1-format2/rig.json",
-    "camera-rig": "0.2-camera-rig/camera-rig.json",
-    "observations": "0.1-format2/observations.json",
-    "board": "0.1-format2/board.json",
+    "camera": "1.0/hybrid.camera.json",
+    "rig": "1.0/rig.json",
+    "camera-rig": "1.0/camera-rig.json",
+    "observations": "1.0/observations.json",
+    "board": "1.0/board.json",
 }
 
 

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import warnings
-
 import pytest
 
-from kcal.cli.main import _NEEDLESS, _RENAMED
-from kcal.old_names import GONE, PLACES
 from scripts.make_promises import command_lines, python_lines, stored
 
 ADD = "python -m scripts.make_promises writes the lists"
@@ -47,18 +43,10 @@ def broken(then: list[str], now: list[str]) -> str | None:
 
 
 def test_python() -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
-        now = dict(map(split, python_lines()))
-        then = [split(line) for line in stored("python.txt")]
-    faults = []
-    for name, arguments in then:
-        if name not in now:
-            old = name.removeprefix("kcal.")
-            faults += [] if old in PLACES or old in GONE else [f"{name} is gone without a warning"]
-        elif why := broken(arguments, now[name]):
-            faults.append(f"{name}: {why}")
-    assert faults == []
+    now = dict(map(split, python_lines()))
+    then = [split(line) for line in stored("python.txt")]
+    assert [name for name, _ in then if name not in now] == []
+    assert [f"{name}: {why}" for name, each in then if (why := broken(each, now[name]))] == []
     assert sorted(now.keys() - {name for name, _ in then}) == [], ADD
 
 
@@ -69,16 +57,9 @@ def limits(line: str) -> tuple[str, float, float]:
     return name, float(low), float("inf" if high == "any number" else high)
 
 
-def warned(line: str) -> bool:
-    """Whether an option still works, with a warning."""
-    words = line.split()
-    flag = next(word for word in words if word.startswith("-"))
-    return any((command, flag) in {**_RENAMED, **_NEEDLESS} for command in ("", words[1]))
-
-
 def test_options_of_commands() -> None:
     now, then = ({line for line in lines if " -" in line} for lines in (command_lines(), stored("commands.txt")))
-    assert sorted(line for line in then - now if not warned(line)) == []
+    assert sorted(then - now) == []
     assert sorted(now - then) == [], ADD
 
 

@@ -208,7 +208,7 @@ def test_the_command(tmp_path: Path) -> None:
     lines = [",".join(map(str, row)) for row in (at + 0.1 * torch.from_numpy(draw.normal(size=at.shape))).tolist()]
     (tmp_path / "far.csv").write_text("\n".join(["left_u,left_v,right_u,right_v", *lines]))
     common = [
-        "rig", *files, "--features", str(tmp_path / "far.csv"), "--baseline", "10.000±0.002", "--mark-sigma", "0.1",
+        "rig", *files, "--features", str(tmp_path / "far.csv"), "--baseline", "10.000±0.002", "--pixel-sigma", "0.1",
         "--refraction", "0", "--refraction-sigma", "0",
     ]  # fmt: skip
     stars = ["--stars", str(tmp_path / "left"), str(tmp_path / "right"), "--json"]
