@@ -17,7 +17,7 @@ from kcal.corners.detect import detect as detect
 
 # Calibrate a camera
 from kcal.calibrate.camera.calibrate import calibrate_camera as calibrate_camera
-from kcal.calibrate.camera.options import CalibrationOptions as CalibrationOptions
+from kcal.calibrate.camera.result import CalibrationOptions as CalibrationOptions
 from kcal.calibrate.camera.result import CameraCalibrationResult as CameraCalibrationResult
 
 # Solve a rig
@@ -37,7 +37,7 @@ from kcal.locate.localizer import StereoLocalizer as StereoLocalizer
 from kcal.locate.positions import locate_points as locate_points
 from kcal.locate.positions import Located as Located
 from kcal.locate.stereo import PositionStatus as PositionStatus
-from kcal.lens.mounting import Origin as Origin
+from kcal.lens.rig import Origin as Origin
 
 # Errors
 from kcal.errors import KcalError as KcalError

@@ -11,7 +11,7 @@ import torch
 
 from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.hybrid.cameras_fit import measure_board
-from kcal.lens.pupil import pupil_depth
+from kcal.lens.projection import pupil_depth
 from kcal.lens.uncertainty import image_sigma
 from kcal.report.calibration import save_board_picture
 from kcal.report.figures import ACCENT, frame_image, new_figure, save_picture

@@ -27,18 +27,13 @@ from torch.func import functional_call, jvp, stack_module_state, vjp, vmap
 import kcal
 from kcal import Board, Camera, StereoRig
 from kcal.calibrate.camera.layer import CalibrationLayer
-from kcal.calibrate.camera.options import CalibrationOptions
+from kcal.calibrate.camera.result import CalibrationOptions
 from kcal.lens import rotation_from_vector
-from kcal.lens.baking import bake
-from kcal.lens.camera_rig import CameraRig
-from kcal.lens.extended_distortion import CameraDistortion, ExtendedDistortion
-from kcal.lens.images import Undistort, UndistortImage
-from kcal.lens.lookup import LookupCamera
-from kcal.lens.modules import Unproject
-from kcal.lens.mounting import Origin
-from kcal.lens.rays import CameraRays
-from kcal.lens.rectification import StereoRectification
-from kcal.lens.rig import RigCovariance
+from kcal.lens.baking import LookupCamera, bake
+from kcal.lens.camera_parameters import CameraDistortion, ExtendedDistortion
+from kcal.lens.images import StereoRectification, Undistort, UndistortImage
+from kcal.lens.rays import CameraRays, Unproject
+from kcal.lens.rig import CameraRig, Origin, RigCovariance
 from kcal.lens.views import Cylinder
 from kcal.locate.disparity import DisparityRanges
 from kcal.locate.geodesy import enu_from_cam
@@ -46,11 +41,11 @@ from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.mounting import mounting_covariance
 from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.locate.multiview import TriangulateViews
-from kcal.locate.triangulate import Triangulate
+from kcal.locate.stereo import Triangulate
 from kcal.nets.inverse import InverseNet
-from kcal.nets.residual import ResidualNet
+from kcal.nets.joint import ResidualNet
 from kcal.pipeline.association import PairBoxes
-from kcal.pipeline.disparity import ObjectDisparity
+from kcal.pipeline.pairing import ObjectDisparity
 from kcal.solve.lm import LevenbergMarquardt
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "reference" / "modules.md"

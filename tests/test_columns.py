@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 from pathlib import Path
 
@@ -12,10 +13,11 @@ from kcal.calibrate.batch.results import SummaryRow
 from kcal.locate.marks import COVARIANCE, PIXELS
 from kcal.locate.survey import FEATURE_COLUMNS, PLACE_COLUMNS
 from kcal.locate.tables import NUMBERS, TEXTS
+from kcal.pipeline.stream import track_columns
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "reference" / "columns.md").read_text(encoding="utf-8")
-TRACKS = (ROOT / "kcal" / "pipeline" / "track_columns.py").read_text(encoding="utf-8")
+SOURCE = inspect.getsource(track_columns)
 
 
 def tables(section: str) -> list[list[str]]:
@@ -41,7 +43,7 @@ def test_places() -> None:
 def test_positions_and_tracks() -> None:
     positions, tracks = tables("Positions")
     assert positions == [*TEXTS, *NUMBERS]
-    assert tracks == re.findall(r'^        (?:extras\[)?"(\w+)"(?:: |\] = )', TRACKS, re.MULTILINE)
+    assert tracks == re.findall(r'^        (?:extras\[)?"(\w+)"(?:: |\] = )', SOURCE, re.MULTILINE)
 
 
 def test_batches() -> None:

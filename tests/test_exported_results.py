@@ -17,8 +17,7 @@ from locate_rigs import pinhole_rig
 from torch import Tensor, nn
 
 import kcal
-from kcal.lens.mounting import Origin
-from kcal.lens.rig import RigCovariance
+from kcal.lens.rig import Origin, RigCovariance
 from kcal.locate.localizer import StereoLocalizer
 
 

@@ -14,13 +14,12 @@ from whole_graphs import traced_whole
 from kcal.lens.camera import Camera
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.model import LensModel
-from kcal.lens.modules import Unproject
-from kcal.lens.mounting import Origin
 from kcal.lens.network_modes import NetworkModes
-from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.lens.rays import Unproject
+from kcal.lens.rig import Origin, RigCovariance, StereoRig
 from kcal.lens.zernike import ZernikeModes
 from kcal.locate.localizer import StereoLocalizer
-from kcal.locate.triangulate import Triangulate
+from kcal.locate.stereo import Triangulate
 
 pytestmark = traced_whole
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from calibrate_scenes import camera, motions, observe, pixels_of
 
-from kcal.calibrate.camera.options import CalibrationOptions
+from kcal.calibrate.camera.result import CalibrationOptions
 from kcal.corners.observations import Observations
 from kcal.lens.camera import Camera
 from scripts.paper import chain, figures, locate, reproduce, solve, train_eq12, train_net_lens

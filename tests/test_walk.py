@@ -24,7 +24,7 @@ from marking_browser import click_at, on_screen, settled
 from pages import desk_of, served
 
 from kcal.io.rig_file import save_rig
-from kcal.lens.mounting import Mounting
+from kcal.lens.rig import Mounting
 from kcal.mark.server import marking_app
 
 pytestmark = needs_browser

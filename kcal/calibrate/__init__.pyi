@@ -12,7 +12,7 @@ from kcal.calibrate.camera.at_setting import camera_at_setting as camera_at_sett
 from kcal.calibrate.camera.at_setting import InterpolatedCamera as InterpolatedCamera
 
 # Outliers
-from kcal.calibrate.camera.options import OutlierRejection as OutlierRejection
+from kcal.calibrate.camera.result import OutlierRejection as OutlierRejection
 from kcal.calibrate.camera.result import RejectedCorner as RejectedCorner
 from kcal.calibrate.camera.result import RejectedView as RejectedView
 

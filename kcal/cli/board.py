@@ -54,8 +54,7 @@ def print_command(
     `kcal board --board asymmetric:4x11 --square 20mm --page A4 -o circles.pdf`
     """
     from kcal.corners.board import Board
-    from kcal.corners.drawing import to_pdf, to_svg
-    from kcal.corners.print_board import board_sheet
+    from kcal.corners.print_board import board_sheet, to_pdf, to_svg
 
     suffix = output.suffix.lower()
     if suffix not in (".svg", ".pdf"):

@@ -328,7 +328,7 @@ def calibrate_command(
     from kcal.calibrate.hybrid.measured_board import load_measured_board
     from kcal.corners.observations import Observations
     from kcal.lens.calibration import LensSetting
-    from kcal.solve.robust import RobustLoss
+    from kcal.solve.problem import RobustLoss
 
     options = CalibrationOptions(
         model=model,

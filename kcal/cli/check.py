@@ -19,8 +19,7 @@ from kcal.files import check_picture, check_writable, read_bytes, write_atomic
 
 if TYPE_CHECKING:
     from kcal.calibrate.camera.interval_check import IntervalCheck, Refit
-    from kcal.calibrate.camera.options import CalibrationOptions
-    from kcal.calibrate.camera.result import CameraCalibrationResult
+    from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult
     from kcal.lens.camera import Camera
 
 # Exit code of a run that was interrupted, as in all commands.

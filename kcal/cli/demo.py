@@ -84,7 +84,7 @@ def real_pairs(
     """Calibrate from a folder of pairs, and locate two opposite corners of each board, whose distance is known."""
     from kcal.cli.demo_summary import save_pairs_summary
     from kcal.io.rig_file import load_rig
-    from kcal.lens.mounting import Origin
+    from kcal.lens.rig import Origin
     from kcal.locate.marks import read_marks, write_marks
     from kcal.locate.positions import locate_points
     from kcal.report.tables import diagonal_rows

@@ -110,7 +110,7 @@ The truth is in the hidden folder .truth; look there afterwards.
 
 def survey_text(scene: DemoScene) -> str:
     """The landmarks as a surveyor hands them over: latitude, longitude, ellipsoidal height, sigma in meters."""
-    from kcal.lens.mounting import Origin
+    from kcal.lens.rig import Origin
     from kcal.locate.geodesy import enu_to_geodetic
 
     origin = Origin(lat=scene.lat, lon=scene.lon, height=scene.height)
@@ -293,7 +293,7 @@ def _picture(site: PracticeSite, side: Side, path: Path, _: Callable[[], None]) 
 def _night(site: PracticeSite, side: Side, path: Path, _: Callable[[], None]) -> None:
     importlib.import_module("erfa")
     from kcal.io.images import write_png
-    from kcal.lens.mounting import Origin
+    from kcal.lens.rig import Origin
     from kcal.sim.practice import night_picture
     from kcal.stars.night import SkyView
     from kcal.stars.sky import StarCatalog

@@ -24,8 +24,7 @@ from kcal.files import is_stream
 if TYPE_CHECKING:
     from kcal.io.foreign import ImportedCameras
     from kcal.lens.camera import Camera
-    from kcal.lens.camera_rig import CameraRig
-    from kcal.lens.rig import StereoRig
+    from kcal.lens.rig import CameraRig, StereoRig
 
 
 # Cameras from files of kcal or of other programs, as commands name them: FILE, or FILE:CAMERA.

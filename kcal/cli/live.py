@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from kcal.locate.multi_localizer import MultiViewLocalizer
     from kcal.locate.positions import Located
     from kcal.locate.tables import PositionColumns
-    from kcal.pipeline.association_options import AssociationOptions
-    from kcal.pipeline.live_map import LiveMap
+    from kcal.pipeline.association import AssociationOptions
+    from kcal.pipeline.senders import LiveMap
     from kcal.pipeline.stream import StreamCounts
     from kcal.pipeline.track_options import Tracks
     from kcal.pipeline.tracks import Tracker
@@ -138,7 +138,7 @@ def live_command(
     """
     from kcal.locate.multi_localizer import MultiViewLocalizer
     from kcal.locate.stations import names_of_rig
-    from kcal.pipeline.association_options import AssociationOptions
+    from kcal.pipeline.association import AssociationOptions
     from kcal.pipeline.lines import read_moment
     from kcal.pipeline.senders import sender_to
     from kcal.pipeline.shared_errors import ClockPrior
@@ -253,7 +253,7 @@ def _mast(
 ) -> tuple[StereoLocalizer, Located]:
     """Two cameras, and how positions of them are told."""
     from kcal.io.rig_file import load_rig
-    from kcal.lens.mounting import Origin
+    from kcal.lens.rig import Origin
     from kcal.locate.positions import located_by
     from kcal.locate.tabulate import Locator
 
@@ -291,7 +291,7 @@ def _videos(
 ) -> Videos:
     with with_extra("video", "videos need"):
         from kcal.pipeline.video_source import Videos
-    from kcal.pipeline.detector_call import load_detector
+    from kcal.pipeline.detections import load_detector
 
     # As `python -m` does: a detector beside which the command is run is found.
     sys.path.insert(0, os.getcwd())
@@ -308,7 +308,7 @@ def _videos(
 
 def _live_map(run: Located, port: int) -> LiveMap:
     with with_extra("mark", "--port needs"):
-        from kcal.pipeline.live_map import LiveMap
+        from kcal.pipeline.senders import LiveMap
     page = LiveMap(run, port)
     err.print(f"live map: {page.address}", markup=False)
     return page

@@ -23,8 +23,7 @@ from kcal.texts import one_line
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from kcal.lens.mounting import Origin
-    from kcal.lens.rig import StereoRig
+    from kcal.lens.rig import Origin, StereoRig
     from kcal.locate.positions import Located
     from kcal.locate.station_positions import PositionSample, ViewsLocator
     from kcal.locate.tables import PositionColumns
@@ -482,7 +481,7 @@ def locate_command(
 
     `kcal locate towers.rig.json smoke.csv --height 240±30 --map map.html`
     """
-    from kcal.lens.mounting import Origin
+    from kcal.lens.rig import Origin
     from kcal.locate.export import STREAM, check_format, open_writers
     from kcal.locate.positions import read_truth
     from kcal.locate.station_positions import PositionSample

@@ -21,8 +21,7 @@ from kcal.strict_json import read_json
 
 if TYPE_CHECKING:
     from kcal.lens.camera import Camera
-    from kcal.lens.images import Undistort
-    from kcal.lens.rectification import StereoRectification
+    from kcal.lens.images import StereoRectification, Undistort
     from kcal.lens.rig import StereoRig
 
 
@@ -269,8 +268,7 @@ def _rectify_camera(
 
     from kcal.io.camera_file import save_camera
     from kcal.lens.images import Undistort
-    from kcal.lens.pinhole import new_pinhole
-    from kcal.lens.views import cylinder_view, looking, pinhole_view
+    from kcal.lens.views import cylinder_view, looking, new_pinhole, pinhole_view
 
     old = single_camera(source)
     prepare(folder, [*targets, *extras])
@@ -323,7 +321,7 @@ def _rectify_rig(
     import torch
 
     from kcal.io.rig_file import save_rig
-    from kcal.lens.rectification import StereoRectification
+    from kcal.lens.images import StereoRectification
     from kcal.lens.rig import StereoRig
 
     prepare(folder, extras)

@@ -18,11 +18,9 @@ from kcal.files import check_writable
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from kcal.calibrate.camera.options import CalibrationOptions
-    from kcal.calibrate.camera.result import CameraCalibrationResult
+    from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult
     from kcal.lens.camera import Camera
-    from kcal.lens.camera_rig import CameraRig
-    from kcal.lens.rig import StereoRig
+    from kcal.lens.rig import CameraRig, StereoRig
     from kcal.report.verdict import Requirement, Verdict
 
 # A verdict, how the pictures of its page are drawn, and its tables.

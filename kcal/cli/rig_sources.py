@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from kcal.corners.observations import Observations
     from kcal.lens.calibration import CalibrationRecord
     from kcal.lens.camera import Camera
-    from kcal.lens.mounting import Origin
+    from kcal.lens.rig import Origin
     from kcal.locate.moving import MovingControl, MovingOptions
     from kcal.skyline.attitude import SkylineAttitude, SkylineImage
     from kcal.skyline.horizon import RasterError
@@ -468,7 +468,7 @@ def parse_baselines(text: str, names: Sequence[str] = CAMERAS) -> tuple[Baseline
 def read_sources(cameras: Sequence[Camera], sources: Sources) -> RigInput:
     """Read everything; warnings about it are printed. Two cameras are left and right, one or more have their names."""
     from kcal.calibrate.rig.sources import RigData
-    from kcal.lens.mounting import Origin
+    from kcal.lens.rig import Origin
     from kcal.locate.marks import read_marks
     from kcal.locate.survey import (
         camera_positions,

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from kcal.calibrate.camera.result import CameraCalibrationResult
     from kcal.calibrate.rig.sources import MeasuredPosition, StarSource
     from kcal.lens.camera import Camera
-    from kcal.lens.mounting import Origin
+    from kcal.lens.rig import Origin
     from kcal.stars.detect import DetectedStars
     from kcal.stars.lens import StarCamera
     from kcal.stars.night import NamedStars, SkyView
@@ -44,7 +44,7 @@ def sky_view(
     pressure: float | None = None,
 ) -> SkyView:
     """When and where an image was taken, from options of the command line."""
-    from kcal.lens.mounting import Origin
+    from kcal.lens.rig import Origin
     from kcal.stars.detect import time_of
     from kcal.stars.night import SkyView
     from kcal.stars.sky import Air
@@ -211,7 +211,7 @@ def _by_stars(
     images: list[str], time: str | None, place: str | None, output: Path, boards: CameraCalibrationResult | None = None
 ) -> StarCamera:
     """Read the images, calibrate, and tell what was found."""
-    from kcal.lens.mounting import Origin
+    from kcal.lens.rig import Origin
     from kcal.stars.detect import expand_nights
 
     origin = None if place is None else Origin.parse(place)

@@ -29,8 +29,7 @@ from kcal.texts import length_text, measured_length, measured_text, number_text
 if TYPE_CHECKING:
     from kcal.calibrate.rig.result import RigResult
     from kcal.calibrate.rig.solve import RigOptions
-    from kcal.lens.camera_rig import CameraRig
-    from kcal.lens.rig import StereoRig
+    from kcal.lens.rig import CameraRig, StereoRig
     from kcal.report.verdict import Requirement
 
 

@@ -181,7 +181,7 @@ def _of_frames(watcher: Watcher, frames: FramesTogether) -> Iterator[tuple[float
 
 def _folder_pairs(watcher: Watcher, folders: tuple[str, str]) -> Iterator[tuple[float, Gray, Gray]]:
     from kcal.calibrate.rig.pairs import pair_by_name
-    from kcal.corners.image_time import image_time
+    from kcal.corners.image_tags import image_time
     from kcal.corners.images import expand_images, read_gray
 
     files = [{path.name: path for path in expand_images([folder])} for folder in folders]

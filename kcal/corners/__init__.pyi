@@ -3,7 +3,7 @@
 
 # Find boards
 from kcal.corners.detect import detect_board as detect_board
-from kcal.corners.detection import Detection as Detection
+from kcal.corners.detect import Detection as Detection
 from kcal.corners.video import detect_video as detect_video
 from kcal.corners.observations import Failure as Failure
 from kcal.corners.images import expand_images as expand_images

@@ -1,21 +1,209 @@
-"""Describe a calibration board: its points, the size of its squares, its markers."""
+"""Describe a calibration board: its points, squares and markers, also from short texts and Kalibr's target files."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import pydantic
 
-from kcal.corners.board_text import DICTIONARIES, MOST, board_fields
-from kcal.corners.kalibr_target import target_fields
 from kcal.errors import FileError, InputError
+from kcal.files import read_text
 from kcal.lens.calibration import BoardRecord
 from kcal.native_file import Record
+from kcal.strict_yaml import MOST_BYTES, read_yaml
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+
+# Read what a board is from short texts, such as `charuco:9x6:5x5_100:15mm` and `25mm`.
+
+# Markers in OpenCV's dictionaries, by name.
+DICTIONARIES = {
+    **{f"{bits}x{bits}_{count}": count for bits in (4, 5, 6, 7) for count in (50, 100, 250, 1000)},
+    "aruco_original": 1024,
+    "aruco_mip_36h12": 250,
+    "apriltag_16h5": 30,
+    "apriltag_25h9": 35,
+    "apriltag_36h10": 2320,
+    "apriltag_36h11": 587,
+}  # fmt: skip
+_DEFAULT_DICTIONARY, _MARKER_SHARE = "4x4_50", 0.7
+_SPACING = 0.3  # of the tag's side: that of the boards that Kalibr offers for download
+_UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
+MOST = 500  # points in a row or a column
+_FORMS = {
+    "": "COLUMNSxROWS",
+    "charuco": "charuco:COLUMNSxROWS[:DICTIONARY][:MARKER][:idFIRST]",
+    "circles": "circles:COLUMNSxROWS[:DIAMETER]",
+    "asymmetric": "asymmetric:COLUMNSxROWS[:DIAMETER]",
+    "aprilgrid": "aprilgrid:TAGSxTAGS[:SPACING][:idFIRST]",
+}
+
+
+def board_fields(text: str, square: str) -> dict[str, Any]:
+    """The fields of `Board` that two texts describe; see `Board.parse`.
+
+    Raises:
+        InputError: a text that cannot be read.
+
+    Example:
+        >>> board_fields("9x6", "25mm")
+        {'columns': 9, 'rows': 6, 'square': 0.025}
+    """
+    kind, _, rest = text.strip().rpartition(":") if ":" not in text else text.strip().partition(":")
+    if kind not in _FORMS:
+        kinds = ", ".join(name for name in _FORMS if name)
+        raise InputError(f"board {text!r}: {kind!r} is no kind of board; choose one of {kinds}")
+    size, *more = rest.split(":")
+    form = f"board {text!r}: write {_FORMS[kind]}"
+    match = re.fullmatch(r"\s*(\d+)\s*[xX×]\s*(\d+)\s*", size)
+    if not match:
+        counted = "inner corners as " if kind in ("", "charuco") else ""
+        raise InputError(f"board {text!r}: write {counted}{_FORMS[kind]}, for example {kind and kind + ':'}9x6")
+    columns, rows = int(match.group(1)), int(match.group(2))
+    each = 2 if kind == "aprilgrid" else 1
+    if not (2 <= each * columns <= MOST and 2 <= each * rows <= MOST):
+        what = "tags" if kind == "aprilgrid" else "circles" if kind in ("circles", "asymmetric") else "inner corners"
+        raise InputError(f"board {text!r}: {2 // each} to {MOST // each} {what} each way are needed")
+    side = parse_length("square", square)
+    fields: dict[str, Any] = {"columns": each * columns, "rows": each * rows, "square": side}
+    if kind == "":
+        if more:
+            raise InputError(form)
+    elif kind == "charuco":
+        fields |= _charuco_fields(more, side, form)
+    elif kind == "aprilgrid":
+        fields |= {"pattern": "aprilgrid"} | _april_fields(more, side, form)
+    else:
+        if len(more) > 1:
+            raise InputError(form)
+        fields |= {"pattern": kind} | ({"diameter": parse_length("diameter", more[0])} if more else {})
+    return fields
+
+
+def _charuco_fields(parts: list[str], side: float, form: str) -> dict[str, Any]:
+    fields: dict[str, Any] = {}
+    for part in parts:
+        name = part.strip().lower().removeprefix("dict_")
+        if (first := _first_id(part)) is not None:
+            new: dict[str, Any] = {"first": first}
+        elif name in DICTIONARIES or (not fields and not re.match(r"[\d.]+\s*[a-z]+$", name)):
+            new = {"dictionary": name}
+        elif "marker" in fields:
+            raise InputError(form)
+        else:
+            new = {"marker": parse_length("marker", part)}
+        if new.keys() & fields.keys():
+            raise InputError(form)
+        fields |= new
+    return {"dictionary": _DEFAULT_DICTIONARY, "marker": _MARKER_SHARE * side} | fields
+
+
+def _april_fields(parts: list[str], side: float, form: str) -> dict[str, Any]:
+    fields: dict[str, Any] = {}
+    for part in parts:
+        if (first := _first_id(part)) is not None:
+            new: dict[str, Any] = {"first": first}
+        elif re.fullmatch(r"\s*\d*\.?\d+\s*", part):
+            new = {"gap": float(part) * side}
+        else:
+            new = {"gap": parse_length("spacing", part)}
+        if new.keys() & fields.keys():
+            raise InputError(form)
+        fields |= new
+    return {"gap": _SPACING * side} | fields
+
+
+def _first_id(text: str) -> int | None:
+    match = re.fullmatch(r"\s*id(\d{1,6})\s*", text, re.IGNORECASE)
+    return int(match.group(1)) if match else None
+
+
+def parse_length(name: str, text: str) -> float:
+    """A text such as `25mm` in meters.
+
+    Raises:
+        InputError: no positive number with a unit.
+
+    Example:
+        >>> parse_length("square", "2.5cm")
+        0.025
+    """
+    length = re.fullmatch(r"\s*([0-9.]+(?:[eE][-+]?\d+)?)\s*([a-z]*)\s*", text)
+    try:
+        value = float(length.group(1)) if length else float("nan")
+    except ValueError:
+        value = float("nan")
+    if length is None or not value > 0 or length.group(2) not in _UNITS:
+        raise InputError(f"{name} {text!r}: write a length with its unit (mm, cm, m, in), for example 25mm")
+    # Division by the exact inverse keeps 25 mm at 0.025 to the last bit.
+    unit = _UNITS[length.group(2)]
+    return value / round(1 / unit) if unit in (1e-3, 1e-2) else value * unit
+
+
+# Read the target files of Kalibr (https://github.com/ethz-asl/kalibr, wiki page "Calibration targets").
+
+
+def target_fields(path: str | Path) -> dict[str, Any]:
+    r"""The fields of `Board` that a target file of Kalibr describes.
+
+    `aprilgrid` (`tagCols`, `tagRows`, `tagSize`, `tagSpacing`), `checkerboard` (`targetCols`, `targetRows`,
+    `rowSpacingMeters`, `colSpacingMeters`) and `circlegrid` (`targetCols`, `targetRows`, `spacingMeters`,
+    `asymmetricGrid`). `tagSpacing` is a share of `tagSize`.
+
+    Raises:
+        FileError: it cannot be read, or a field is missing or wrong.
+
+    Example:
+        >>> import tempfile
+        >>> text = "target_type: aprilgrid\ntagCols: 6\ntagRows: 4\ntagSize: 0.08\ntagSpacing: 0.25"
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder, "april.yaml")
+        ...     _ = path.write_text(text)
+        ...     target_fields(path)
+        {'pattern': 'aprilgrid', 'columns': 12, 'rows': 8, 'square': 0.08, 'gap': 0.02}
+    """
+    content = read_yaml(read_text(path, MOST_BYTES), str(path))
+    if "target_type" not in content:
+        raise FileError(f"{path}: not a target file of Kalibr: target_type is missing")
+    kind = content["target_type"]
+
+    def number(name: str) -> float:
+        value = content.get(name)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 1e3:
+            raise FileError(f"{path}: {name} must be a positive number, it is {value!r:.40}")
+        return float(value)
+
+    def count(name: str) -> int:
+        value = content.get(name)
+        if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= 500:
+            raise FileError(f"{path}: {name} must be a whole number from 1 to 500, it is {value!r:.40}")
+        return value
+
+    if kind == "aprilgrid":
+        size = number("tagSize")
+        columns, rows = 2 * count("tagCols"), 2 * count("tagRows")
+        gap = number("tagSpacing") * size
+        return {"pattern": "aprilgrid", "columns": columns, "rows": rows, "square": size, "gap": gap}
+    if kind not in ("checkerboard", "circlegrid"):
+        raise FileError(f"{path}: target_type {kind!r:.40}: kcal reads aprilgrid, checkerboard and circlegrid")
+    grid = {"columns": count("targetCols"), "rows": count("targetRows")}
+    if kind == "checkerboard":
+        across, down = number("colSpacingMeters"), number("rowSpacingMeters")
+        if abs(across - down) > 1e-9:
+            raise FileError(f"{path}: rowSpacingMeters {down:g} and colSpacingMeters {across:g}: squares are needed")
+        return grid | {"square": across}
+    asymmetric = content.get("asymmetricGrid")
+    if not isinstance(asymmetric, bool):
+        raise FileError(f"{path}: asymmetricGrid must be true or false, it is {asymmetric!r:.40}")
+    return {"pattern": "asymmetric" if asymmetric else "circles"} | grid | {"square": number("spacingMeters")}
+
+
+# Describe a calibration board: its points, the size of its squares, its markers.
 
 Pattern = Literal["checkerboard", "circles", "asymmetric", "aprilgrid"]
 TAGS = "apriltag_36h11"  # the dictionary of an AprilGrid
@@ -29,7 +217,7 @@ class Board(Record):
     `row * columns + column` lies
 
     * on a checkerboard at `(column * square, row * square, 0)` meters. The square diagonally outside corner 0 is dark
-      (light on a ChArUco board of the old numbering, see `kcal.corners.charuco`);
+      (light on a ChArUco board of the old numbering, see `kcal.corners.marker_boards`);
     * of `circles` likewise, the points being centers;
     * of `asymmetric` circles at `((2 * column + row % 2) * square, row * square, 0)`, as OpenCV counts them;
     * of an `aprilgrid` where Kalibr puts it, in Kalibr's order: rows count upward from the lower left corner of the

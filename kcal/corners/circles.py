@@ -1,12 +1,8 @@
-"""Find grids of circles and the images of their centers.
-
-OpenCV's `findCirclesGrid` finds the grid. kcal fits the edge of each circle as a blurred ellipse
-(`kcal.corners.ellipse`) and corrects the ellipse's center, which is not the image of the circle's center
-(`kcal.corners.circle_bias`). All circles must be in the image.
-"""
+"""Find grids of circles and the images of their centers."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
@@ -18,10 +14,312 @@ import torch
 from torch import Tensor
 
 from kcal.corners.board import Board
-from kcal.corners.circle_bias import center_shift, homography, local_maps
-from kcal.corners.ellipse import Ellipses, fit_ellipses
 from kcal.corners.images import Gray
 from kcal.corners.saddle import CornerStatus, Refined, with_status
+
+# Fit the edge of a blurred dark or light ellipse: its center with covariance, its shape, its blur.
+#
+# Light is `out + (in - out) Φ(-d / blur)` plus a ramp, with d the distance from the ellipse |B (p - c)| = 1 to first
+# order, (ρ² - ρ) / |B B (p - c)| with ρ = |B (p - c)| and B symmetric. A small batched Levenberg-Marquardt estimates
+# the ten parameters of all ellipses at once from the pixels around each.
+
+# cx, cy, B00, B01, B11, light outside, contrast, blur, ramp x, ramp y
+PARAMETERS = 10
+_STEPS = 30
+_CONVERGED = 1e-4  # pixels: the last step of a center that converged is shorter
+_LEAST_BLUR = 0.2  # pixels: the pixel's own area alone gives 0.29
+_MOST_PIXELS = 1500  # of one ellipse: beyond, every other row and column tells nearly as much
+
+
+class Ellipses(NamedTuple):
+    """Fitted ellipses.
+
+    Args:
+        center: (M, 2) pixels.
+        shape: (M, 2, 2) B: the ellipse is |B (p - center)| = 1.
+        covariance: (M, 2, 2) px² of the centers.
+        blur: (M,) pixels.
+        contrast: (M,) gray levels by which the inside is lighter.
+        misfit: (M,) RMS residual over the contrast.
+        converged: (M,).
+    """
+
+    center: Tensor
+    shape: Tensor
+    covariance: Tensor
+    blur: Tensor
+    contrast: Tensor
+    misfit: Tensor
+    converged: Tensor
+
+
+def fit_ellipses(image: npt.NDArray[np.generic], center: Tensor, shape: Tensor, reach: Tensor) -> Ellipses:
+    """Fit one ellipse near each start.
+
+    Args:
+        image: (H, W) gray levels.
+        center: (M, 2) starts, good to a third of the radius; all finite.
+        shape: (M, 2, 2) symmetric positive starts of B.
+        reach: (M,) pixels are used where |B (p - c)| is at most this: beyond the edge, short of the next ellipse.
+
+    Example:
+        >>> y, x = np.mgrid[:40, :40]
+        >>> image = 200 - 150 / (1 + np.exp(3 * (np.hypot(x - 19.3, y - 20.6) - 8)))
+        >>> start = torch.tensor([[20.0, 20.0]], dtype=torch.float64)
+        >>> found = fit_ellipses(image, start, torch.eye(2, dtype=torch.float64)[None] / 7, torch.tensor([1.7]))
+        >>> [round(value, 2) for value in found.center[0].tolist()]
+        [19.3, 20.6]
+    """
+    where, levels, weight = _pixels(image, center, shape, reach)
+    p = torch.zeros(len(center), PARAMETERS, dtype=torch.float64)
+    p[:, 2], p[:, 3], p[:, 4] = shape[:, 0, 0], shape[:, 0, 1], shape[:, 1, 1]
+    rho = torch.linalg.vector_norm(torch.einsum("mij,mkj->mki", shape, where), dim=-1)
+    inside, outside = weight * (rho < 0.7), weight * (rho > 1.25)
+    dark, light = ((share * levels).sum(-1) / share.sum(-1).clamp_min(1e-9) for share in (inside, outside))
+    p[:, 5], p[:, 6], p[:, 7] = light, dark - light, 0.8
+    # Lengths are in units of the radius, for the normal equations.
+    size = torch.linalg.det(shape).clamp_min(1e-12).rsqrt()
+    lam = torch.full((len(p),), 1e-3, dtype=torch.float64)
+    cost, normal, gradient = _system(p, where, levels, weight)
+    step = torch.full((len(p), 2), math.inf, dtype=torch.float64)
+    done = torch.zeros(len(p), dtype=torch.bool)
+    for _ in range(_STEPS):
+        diagonal = normal.diagonal(dim1=-2, dim2=-1)
+        damped = normal + torch.diag_embed(
+            lam[:, None] * diagonal + 1e-9 * diagonal.amax(-1, keepdim=True).clamp_min(1e-30)
+        )
+        move = -torch.linalg.solve_ex(damped, gradient[..., None])[0][..., 0]
+        move[:, :2] *= (0.3 * size / move[:, :2].norm(dim=-1).clamp_min(1e-12)).clamp_max(1.0)[:, None]
+        trial = p + move
+        trial[:, 7] = trial[:, 7].clamp(_LEAST_BLUR, None)
+        new_cost, new_normal, new_gradient = _system(trial, where, levels, weight)
+        better = (new_cost < cost) & _is_ellipse(trial)
+        step = torch.where(better[:, None], move[:, :2], step)
+        p = torch.where(better[:, None], trial, p)
+        cost = torch.where(better, new_cost, cost)
+        normal = torch.where(better[:, None, None], new_normal, normal)
+        gradient = torch.where(better[:, None], new_gradient, gradient)
+        lam = torch.where(better, lam / 4, lam * 6).clamp(1e-9, 1e9)
+        # Where no damping improves a step, the fit has converged as well.
+        done |= (better & (step.norm(dim=-1) < 0.1 * _CONVERGED)) | (lam > 1e6)
+        if bool(done.all()):
+            break
+    freedom = (weight.sum(-1) - PARAMETERS).clamp_min(1.0)
+    noise = cost / freedom
+    unit = normal.diagonal(dim1=-2, dim2=-1).clamp_min(1e-30).sqrt()
+    scaled = normal / (unit[:, :, None] * unit[:, None, :]) + 1e-12 * torch.eye(PARAMETERS, dtype=torch.float64)
+    covariance = torch.linalg.inv(scaled)[:, :2, :2] / (unit[:, :2, None] * unit[:, None, :2]) * noise[:, None, None]
+    return Ellipses(
+        center + p[:, :2],
+        _shape(p),
+        covariance,
+        p[:, 7],
+        p[:, 6],
+        noise.sqrt() / p[:, 6].abs().clamp_min(1e-9),
+        step.norm(dim=-1) < _CONVERGED,
+    )
+
+
+def _shape(p: Tensor) -> Tensor:
+    return p[:, [2, 3, 3, 4]].unflatten(-1, (2, 2))
+
+
+def _is_ellipse(p: Tensor) -> Tensor:
+    return (p[:, 2] > 0) & (p[:, 2] * p[:, 4] > p[:, 3] ** 2) & torch.isfinite(p).all(-1)
+
+
+def _pixels(
+    image: npt.NDArray[np.generic], center: Tensor, shape: Tensor, reach: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Offsets (M, K, 2) of pixels from the starts, their levels and their weights (M, K): 0 outside reach or image."""
+    height, width = image.shape
+    # The box around |B p| <= reach: its half-widths are the rows' norms of the inverse.
+    half = (torch.linalg.vector_norm(torch.linalg.inv(shape), dim=-1) * reach[:, None]).amax()
+    size = int(half.ceil()) + 1
+    stride = max(1, math.isqrt(int(math.pi * size**2) // _MOST_PIXELS))
+    axis = torch.arange(-size, size + 1, stride)
+    y, x = torch.meshgrid(axis, axis, indexing="ij")
+    base = center.round().long()
+    places = base[:, None] + torch.stack([x, y], -1).reshape(1, -1, 2)
+    u, v = places.unbind(-1)
+    within = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    levels = torch.from_numpy(image[v.clamp(0, height - 1).numpy(), u.clamp(0, width - 1).numpy()].astype(np.float64))
+    where = places - center[:, None]
+    rho = torch.linalg.vector_norm(torch.einsum("mij,mkj->mki", shape, where), dim=-1)
+    weight = ((rho <= reach[:, None]) & within).double()
+    used = (weight > 0).any(0)
+    return where[:, used], levels[:, used], weight[:, used]
+
+
+def _system(p: Tensor, where: Tensor, levels: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Sum of squared residuals (M,), normal matrices (M, P, P) and gradients (M, P)."""
+    b = _shape(p)
+    q = where - p[:, None, :2]
+    w = q @ b  # B is symmetric
+    rho = torch.linalg.vector_norm(w, dim=-1).clamp_min(1e-6)
+    g = w @ b
+    length = torch.linalg.vector_norm(g, dim=-1).clamp_min(1e-9)
+    top = rho**2 - rho
+    distance = top / length
+    blur = p[:, 7:8]
+    t = distance / blur
+    share = 0.5 * torch.erfc(t / math.sqrt(2.0))
+    density = torch.exp(-0.5 * t.square()) / (math.sqrt(2.0 * math.pi) * blur)
+    ramp = torch.einsum("mkj,mj->mk", where, p[:, 8:])
+    model = p[:, 5:6] + p[:, 6:7] * share + ramp
+    # d distance by q: (2 - 1/ρ) Bw / |g| - top / |g|³ B B g, and by an element of B likewise.
+    slope = 2.0 - 1.0 / rho
+    bbg = (g @ b) @ b
+    by_q = (slope / length)[..., None] * g - (top / length**3)[..., None] * bbg
+    columns = [-by_q[..., 0], -by_q[..., 1]]
+    bg = g @ b
+    for i, j in ((0, 0), (0, 1), (1, 1)):
+        # dB = E: dw = E q, d ρ = w·dw / ρ, dg = E w + B dw.
+        dw = torch.zeros_like(q)
+        ew = torch.zeros_like(q)
+        dw[..., i], ew[..., i] = q[..., j], w[..., j]
+        if i != j:
+            dw[..., j], ew[..., j] = q[..., i], w[..., i]
+        d_top = slope * (w * dw).sum(-1)
+        d_length = ((g * ew).sum(-1) + (bg * dw).sum(-1)) / length
+        columns.append(d_top / length - top / length**2 * d_length)
+    scale = -p[:, 6:7] * density
+    one = torch.ones_like(share)
+    jacobian = torch.stack(
+        [*(scale * column for column in columns), one, share, p[:, 6:7] * density * t, where[..., 0], where[..., 1]], -1
+    )
+    residual = model - levels
+    weighted = weight[..., None] * jacobian
+    return (
+        (weight * residual.square()).sum(-1),
+        weighted.transpose(1, 2) @ jacobian,
+        torch.einsum("mkp,mk->mp", weighted, residual),
+    )
+
+
+# The image of a circle's center is not the center of its image: by how much, from the map of board to image around it.
+#
+# Around a point the image is `J q + ½ K q q` with `q` on the board. A circle of radius r then looks like an ellipse
+# whose center is shifted by ½ r² J (m + n), with m and n from K (below). Of a homography this is what the projected
+# conic says (J. Heikkilä, "Geometric camera calibration using circular control points", PAMI 2000), to third order in
+# r; a lens that bends lines shifts it as well, through its own second derivatives.
+
+_MOST_DEGREE = 5  # of the polynomial that follows the lens
+_POINTS_PER_TERM = 2
+
+
+class LocalMaps(NamedTuple):
+    """The map from board to image around N points: first (N, 2, 2) and second derivatives (N, 2, 2, 2)."""
+
+    first: Tensor
+    second: Tensor
+
+
+def local_maps(points: Tensor, pixels: Tensor, known: Tensor | None = None) -> LocalMaps:
+    """Derivatives, at points of the board (N, 2), of the map that brings them to pixels (N, 2).
+
+    Those of the homography of all points, which perspective follows exactly, and of a polynomial through what the
+    homography leaves, which is the lens.
+
+    Args:
+        points: meters.
+        pixels: finite where known.
+        known: (N,) which of them determine the map; all if not given.
+
+    Example:
+        >>> axis = torch.arange(5, dtype=torch.float64)
+        >>> points = torch.cartesian_prod(axis, axis)
+        >>> maps = local_maps(points, 10 * points / (1 + 0.1 * points[:, :1]))
+        >>> [round(value, 3) + 0.0 for value in maps.second[0].flatten().tolist()]  # x: -2 x 10 x 0.1; y: -10 x 0.1
+        [-2.0, 0.0, 0.0, 0.0, 0.0, -1.0, -1.0, 0.0]
+    """
+    known = torch.ones(len(points), dtype=torch.bool) if known is None else known
+    h = homography(points[known], pixels[known])
+    there = torch.nn.functional.pad(points, (0, 1), value=1.0) @ h.T
+    seen = there[:, :2] / there[:, 2:]
+    # (a q + b) / (c q + d): J = (A - p cᵀ) / w, K = -(J_i c_j + J_j c_i) / w.
+    slope = h[2, :2]
+    first = (h[:2, :2] - seen[:, :, None] * slope) / there[:, 2, None, None]
+    second = -(first[:, :, :, None] * slope + first[:, :, None, :] * slope[:, None]) / there[:, 2, None, None, None]
+    low, high = points.amin(0), points.amax(0)
+    scale = 2.0 / (high - low).clamp_min(1e-12)
+    terms = [(i, j) for degree in range(_degree(int(known.sum())) + 1) for i in range(degree + 1) for j in [degree - i]]
+    values = _term_values((points - low) * scale - 1.0, terms)
+    found = torch.linalg.lstsq(values[0][known], (pixels - seen)[known], driver="gelsd").solution  # (terms, 2)
+    by_x, by_y, xx, xy, yy = (value @ found for value in values[1:])
+    first = first + torch.stack([by_x, by_y], -1) * scale
+    second = second + torch.stack([xx, xy, xy, yy], -1).unflatten(-1, (2, 2)) * scale[:, None] * scale
+    return LocalMaps(first, second)
+
+
+def center_shift(maps: LocalMaps, radius: float) -> Tensor:
+    """(N, 2) pixels from the image of each circle's center to the center of the ellipse that it looks like.
+
+    Args:
+        maps: of `local_maps`.
+        radius: of the circles, in the units of the board's points.
+    """
+    k = torch.linalg.solve(maps.first, maps.second.flatten(2)).unflatten(-1, (2, 2))
+    # Along the edge (cos t, sin t) the displacement is ½ r² (mean + half difference cos 2t + mixed sin 2t); its normal
+    # part has the first harmonics that a shift has.
+    mean, half, mixed = 0.5 * (k[..., 0, 0] + k[..., 1, 1]), 0.5 * (k[..., 0, 0] - k[..., 1, 1]), k[..., 0, 1]
+    x = mean[:, 0] + 0.5 * half[:, 0] + 0.5 * mixed[:, 1]
+    y = mean[:, 1] - 0.5 * half[:, 1] + 0.5 * mixed[:, 0]
+    return 0.5 * radius**2 * (maps.first @ torch.stack([x, y], -1)[..., None])[..., 0]
+
+
+def _degree(points: int) -> int:
+    """The highest degree with at least two points for each term; 0 for few points, where only the homography counts."""
+    degrees = range(_MOST_DEGREE + 1)
+    return max((d for d in degrees if _POINTS_PER_TERM * (d + 1) * (d + 2) // 2 <= points), default=0)
+
+
+def _term_values(at: Tensor, terms: list[tuple[int, int]]) -> list[Tensor]:
+    """Values, first (x, y) and second derivatives (xx, xy, yy) of x^i y^j at (N, 2): each (N, terms)."""
+    x, y = at.unbind(-1)
+
+    def power(t: Tensor, n: int, derivative: int) -> Tensor:
+        factor = 1
+        for k in range(derivative):
+            factor *= n - k
+        return factor * t ** (n - derivative) if n >= derivative else torch.zeros_like(t)
+
+    orders = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
+    return [torch.stack([power(x, i, a) * power(y, j, b) for i, j in terms], -1) for a, b in orders]
+
+
+def homography(points: Tensor, pixels: Tensor) -> Tensor:
+    """(3, 3) image from board of points (N, 2), by linear least squares in normalized coordinates (R. Hartley)."""
+    from_points, a = _normalized(points)
+    from_pixels, b = _normalized(pixels)
+    x, y = a.unbind(-1)
+    u, v = b.unbind(-1)
+    one, zero = torch.ones_like(x), torch.zeros_like(x)
+    rows = torch.cat(
+        [
+            torch.stack([x, y, one, zero, zero, zero, -u * x, -u * y, -u], -1),
+            torch.stack([zero, zero, zero, x, y, one, -v * x, -v * y, -v], -1),
+        ]
+    )
+    h = torch.linalg.svd(rows)[2][-1].reshape(3, 3)
+    found = torch.linalg.solve(from_pixels, h @ from_points)
+    return found / found[2, 2]
+
+
+def _normalized(points: Tensor) -> tuple[Tensor, Tensor]:
+    middle = points.mean(0)
+    scale = 1.0 / (points - middle).norm(dim=-1).mean().clamp_min(1e-12)
+    transform = torch.eye(3, dtype=torch.float64)
+    transform[0, 0] = transform[1, 1] = scale
+    transform[:2, 2] = -scale * middle
+    return transform, (points - middle) * scale
+
+
+# Find grids of circles and the images of their centers.
+#
+# OpenCV's `findCirclesGrid` finds the grid. kcal fits the edge of each circle as a blurred ellipse
+# and corrects the ellipse's center, which is not the image of the circle's center.
+# All circles must be in the image.
 
 SEARCH_SIDES = (1200, 2400)  # pixels: longer sides of the searched image, small first
 _MOST_REACH = 1.8  # radii from the center to where pixels tell of the edge and of the light outside

@@ -1,4 +1,4 @@
-"""Find a board in one image, or in all images of a camera."""
+"""Find a board in one image, or in all images of a camera, and say which other board is seen instead."""
 
 from __future__ import annotations
 
@@ -6,31 +6,273 @@ import glob
 import hashlib
 import os
 import warnings
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, NamedTuple, get_args
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from kcal.corners.board import Board
-from kcal.corners.charuco import MIN_CORNERS
-from kcal.corners.detect_targets import detect_charuco, detect_target
-from kcal.corners.detection import Detection, too_few
-from kcal.corners.grid import MIN_SHARPNESS, local_side, sharpness
-from kcal.corners.grid_check import without_false_sides
+from kcal.corners.board import DICTIONARIES, TAGS, Board
+from kcal.corners.circles import find_circles, refine_circles, round_blobs, wrong_size
+from kcal.corners.grid import MIN_SHARPNESS, local_side, sharpness, without_false_sides
 from kcal.corners.images import VIDEO_SUFFIXES, Gray, decode_gray, expand_images, to_8bit, unique_names
-from kcal.corners.observations import Failure, Observations, View
+from kcal.corners.marker_boards import BORDERS, MIN_CORNERS, enough, find_aprilgrid, find_charuco, free_side
+from kcal.corners.markers import opencv_dictionary
+from kcal.corners.observations import Failure, Observations, View, common_size, rescaled, resized_alike
 from kcal.corners.refine import Refinement, refine_corners
-from kcal.corners.saddle import CornerStatus
+from kcal.corners.saddle import CornerStatus, Refined
 from kcal.corners.search import SEARCH_SIDES, find_board, largest_grid, reduced, refine_through_sizes
-from kcal.corners.seen_instead import seen_instead
-from kcal.corners.sizes import common_size, rescaled, resized_alike
 from kcal.corners.time_limit import Limited, TookTooLongError
 from kcal.errors import FileError, InputError
 from kcal.files import is_stream, read_bytes, source_name
+from kcal.texts import brief
+
+# What the search for a board in one image gives.
+
+_STATUS_TEXTS = {
+    CornerStatus.OUTSIDE: "too near the image's edge",
+    CornerStatus.NO_SADDLE: "not a corner",
+    CornerStatus.MOVED: "moved too far",
+    CornerStatus.NOT_CONVERGED: "did not converge",
+    CornerStatus.SATURATED: "over- or underexposed",
+    CornerStatus.OCCLUDED: "covered or glaring",
+    CornerStatus.BLURRED: "too blurred",
+}
+_CURES = {
+    CornerStatus.OUTSIDE: "keep the whole board in the image",
+    CornerStatus.NO_SADDLE: "hold still and focus",
+    CornerStatus.MOVED: "hold still and focus",
+    CornerStatus.NOT_CONVERGED: "hold still, focus, and switch off the camera's sharpening",
+    CornerStatus.SATURATED: "expose less",
+    CornerStatus.OCCLUDED: "light more evenly, and keep hands off the squares",
+    CornerStatus.BLURRED: "focus, hold still or move closer",
+}
+
+
+class Detection(NamedTuple):
+    """What was found of a board in an image.
+
+    Args:
+        pixels: (corners, 2) float64 in the board's order, NaN where not seen; None if no board was found.
+        reason: why none was found.
+        covariance: (corners, 2, 2) px², if the refinement estimates it.
+        legacy: of a ChArUco board, whether its numbering is that of OpenCV before 4.6; None where it makes no
+            difference.
+        rejected: (N, 2) corners that were found where no board was, if any; NaN for those that were not.
+    """
+
+    pixels: Tensor | None
+    reason: str = ""
+    covariance: Tensor | None = None
+    legacy: bool | None = None
+    rejected: Tensor | None = None
+
+    def __repr__(self) -> str:
+        return brief(self)
+
+
+def too_few(refined: Refined, found: int) -> str:
+    """Why too few of the points found could be refined, and what to do."""
+    good = int((refined.status == CornerStatus.GOOD).sum())
+    counts = Counter(refined.status.tolist())
+    why = ", ".join(f"{counts[code]} {text}" for code, text in _STATUS_TEXTS.items() if counts[code])
+    worst = max(_CURES, key=lambda code: counts[code])
+    cure = f"; {_CURES[worst]}" if counts[worst] else ""
+    return f"only {good} of {found} corners could be refined ({why}){cure}"
+
+
+# Detect boards other than plain checkerboards: ChArUco boards, AprilGrids and circles.
+
+MIN_CIRCLES = 0.5  # share of the circles that must be fitted successfully
+
+
+def detect_target(image: Gray, board: Board, refine: Refinement) -> Detection:
+    """Find a board that is no plain checkerboard.
+
+    Raises:
+        InputError: a refinement that circles do not have.
+    """
+    if board.pattern == "aprilgrid":
+        return _detect_tags(image, board, refine)
+    if board.pattern == "checkerboard":
+        return detect_charuco(image, board, refine)
+    return _detect_circles(image, board, refine)
+
+
+def detect_charuco(image: Gray, board: Board, refine: Refinement, legacy: bool | None = None) -> Detection:
+    """Find the visible corners of a ChArUco board; `legacy` is the numbering where the image does not tell it."""
+    pixels, reason, told = find_charuco(to_8bit(image), board, legacy)
+    if pixels is None:
+        return Detection(None, reason)
+    seen = torch.isfinite(pixels).all(-1)
+    refined = refine_corners(image, pixels, free_side(pixels, board), refine, (board.columns, board.rows))
+    if not enough(refined.pixels, board):
+        return Detection(None, too_few(refined, int(seen.sum())))
+    return Detection(refined.pixels, covariance=refined.covariance, legacy=told)
+
+
+def _detect_tags(image: Gray, board: Board, refine: Refinement) -> Detection:
+    found = find_aprilgrid(to_8bit(image), board)
+    if found.pixels is None:
+        return Detection(None, found.reason)
+    seen = torch.isfinite(found.pixels).all(-1)
+    refined = refine_corners(image, found.pixels, torch.where(seen, found.side, 1.0), refine)
+    if not enough(refined.pixels, board):
+        none = (CornerStatus.NO_SADDLE, CornerStatus.MOVED, CornerStatus.NOT_CONVERGED, CornerStatus.OCCLUDED)
+        lacking = sum(int((refined.status == status).sum()) for status in none) > 0.5 * int(seen.sum())
+        more = "; the small squares between the tags are needed, as Kalibr draws them" if lacking else ""
+        return Detection(None, too_few(refined, int(seen.sum())) + more)
+    return Detection(refined.pixels, covariance=refined.covariance)
+
+
+def _detect_circles(image: Gray, board: Board, refine: Refinement) -> Detection:
+    if refine not in ("erf", "none"):
+        raise InputError(
+            f"refine {refine!r}: circles are fitted at their edges (erf), or left as OpenCV finds them (none)"
+        )
+    found = find_circles(to_8bit(image), board)
+    if found.pixels is None or refine == "none":
+        return Detection(found.pixels, found.reason)
+    refined, radius = refine_circles(image, found.pixels, board, found.radius)
+    if (reason := wrong_size(board, radius)) or int(
+        (refined.status == CornerStatus.GOOD).sum()
+    ) < MIN_CIRCLES * board.corners:
+        return Detection(None, reason or too_few(refined, board.corners))
+    return Detection(refined.pixels, covariance=refined.covariance)
+
+
+# Say which other board an image shows, where the one that was asked for is not found.
+
+# Larger dictionaries contain the smaller ones of their family, and take seconds to search.
+_FAMILIES = (
+    TAGS, "4x4_250", "5x5_250", "6x6_250", "7x7_250", "aruco_original", "aruco_mip_36h12", "apriltag_25h9",
+    "apriltag_16h5",
+)  # fmt: skip
+_ENOUGH = 8  # markers of one dictionary, after which no other is searched
+_MIN_MARKERS = 4  # fewer are found in pictures without any: markers of 16 cells have few errors to correct
+_MIN_CIRCLES = 12
+_ROUND = 0.83  # 4 pi area / perimeter²: squares have 0.79, circles seen from 45 degrees 0.94
+_SIZES = (0.6, 1.6)  # of the median: sizes of circles of one grid, seen from aside
+
+
+def seen_instead(
+    image: npt.NDArray[np.uint8],
+    board: Board,
+    seen_size: Callable[[npt.NDArray[np.uint8]], tuple[int, int] | None],
+) -> str:
+    """Which board an image shows that is not the one asked for; empty if it shows none.
+
+    Args:
+        image: (H, W).
+        board: that was asked for.
+        seen_size: `seen_size`.
+    """
+    if markers := seen_markers(image, board):
+        return markers
+    if has_own_markers(image, board):
+        return ""
+    circles = seen_circles(image, board)
+    if circles is not None:
+        return circles
+    found = seen_size(image)
+    own = (max(board.columns, board.rows), min(board.columns, board.rows))
+    plain = board.pattern == "checkerboard"
+    if found is None or (found == own and plain and board.dictionary is None):
+        return ""
+    squares = found == (own[0] - 1, own[1] - 1) and plain
+    advice = "count inner corners, not squares" if squares else f"give --board {found[0]}x{found[1]}"
+    return f"a board of {found[0]}x{found[1]} was found: {advice}"
+
+
+def seen_markers(image: npt.NDArray[np.uint8], board: Board) -> str:
+    """Which markers an image shows that are not the board's; empty if it shows none.
+
+    Example:
+        >>> page = np.full((200, 200), 255, np.uint8)
+        >>> for k in range(4):
+        ...     x, y = 20 + 90 * (k % 2), 20 + 90 * (k // 2)
+        ...     page[y : y + 70, x : x + 70] = opencv_dictionary("5x5_50").generateImageMarker(k, 70)
+        >>> seen_markers(page, Board(columns=9, rows=6, square=0.025))
+        'markers 0 to 3 of dictionary 5x5_50 were found: give --board charuco:COLUMNSxROWS:5x5_50'
+    """
+    name, border, numbers = _most_markers(image)
+    if numbers:
+        own = (name == board.dictionary and border == 1) or (name == TAGS and board.pattern == "aprilgrid")
+        if own and any(board.first <= number < board.first + board.markers for number in numbers):
+            return ""  # it may be this board, and the image's own reason says what is wrong
+        found = f"markers {numbers[0]} to {numbers[-1]} of dictionary {name} were found"
+        if name == TAGS and border == BORDERS[0]:
+            return f"{found}: give --board aprilgrid:COLUMNSxROWS"
+        return f"{found}: give --board charuco:COLUMNSxROWS:{name}"
+    return ""
+
+
+def seen_circles(image: npt.NDArray[np.uint8], board: Board) -> str | None:
+    """What to say of a grid of circles in an image; None if there is none, empty if it may be the board's own."""
+    count = _like_sized(image)
+    if count < _MIN_CIRCLES:
+        return None
+    if board.pattern not in ("circles", "asymmetric"):
+        return f"some {count} circles were found: give --board circles:COLUMNSxROWS or asymmetric:COLUMNSxROWS"
+    if count == board.corners:
+        return ""
+    return (
+        f"some {count} circles were found, the board has {board.corners}: check its columns and rows, and whether they "
+        "are asymmetric"
+    )
+
+
+def has_own_markers(image: npt.NDArray[np.uint8], board: Board) -> bool:
+    """Whether an image shows any marker of a ChArUco board or tag of an AprilGrid."""
+    name = TAGS if board.pattern == "aprilgrid" else board.dictionary
+    own = {*range(board.first, board.first + board.markers)}
+    borders = BORDERS if board.pattern == "aprilgrid" else (1,)
+    return name is not None and any(own & set(_read(image, name, border)) for border in borders)
+
+
+def _most_markers(image: npt.NDArray[np.uint8]) -> tuple[str, int, list[int]]:
+    """The dictionary of which most markers are seen, their border in cells, and their numbers."""
+    best: tuple[str, int, list[int]] = ("", 1, [])
+    for family in _FAMILIES:
+        for border in BORDERS if family == TAGS else (1,):
+            numbers = _read(image, family, border)
+            if len(numbers) >= max(_MIN_MARKERS, len(best[2]) + 1):
+                best = _smallest(family, numbers[-1]), border, numbers
+            if len(numbers) >= _ENOUGH:
+                return best
+    return best
+
+
+def _read(image: npt.NDArray[np.uint8], name: str, border: int) -> list[int]:
+    options = cv2.aruco.DetectorParameters()
+    options.markerBorderBits = border
+    _, numbers, _ = cv2.aruco.ArucoDetector(opencv_dictionary(name), options).detectMarkers(image)
+    return [] if numbers is None else sorted({int(number) for number in numbers.reshape(-1).tolist()})
+
+
+def _smallest(family: str, highest: int) -> str:
+    """The smallest dictionary of a family that contains a number."""
+    stem = family.removesuffix("_250")
+    sizes = [name for name in DICTIONARIES if name.startswith(f"{stem}_") and name[3:4] == "_"]
+    return min((name for name in sizes if DICTIONARIES[name] > highest), key=DICTIONARIES.__getitem__, default=family)
+
+
+def _like_sized(image: npt.NDArray[np.uint8]) -> int:
+    """How many round spots of like size are seen, dark or light; a checkerboard has as many of both."""
+    counts = []
+    for picture in (image, 255 - image):
+        sizes = np.array([blob.size for blob in round_blobs(picture, _ROUND)])
+        middle = float(np.median(sizes)) if len(sizes) else 0.0
+        counts.append(int(((sizes > _SIZES[0] * middle) & (sizes < _SIZES[1] * middle)).sum()))
+    return max(counts) if min(counts) < max(counts) / 3 else 0
+
+
+# Find a board in one image, or in all images of a camera.
 
 _THOROUGH = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
 MIN_GOOD = 0.5  # share of the corners that must be refined successfully
@@ -41,8 +283,8 @@ def detect_board(image: Gray | Tensor, board: Board, refine: Refinement = "erf")
 
     OpenCV's `findChessboardCorners` searches first; where it fails, `findChessboardCornersSB` (A. Duda and U. Frese,
     BMVC 2018). Images above 1200 px are searched at a reduced size and refined in steps of two. The grid found must
-    look like the whole board (`kcal.corners.grid_check.grid_trouble`). It is put into the board's order
-    (`kcal.corners.order.canonical_order`) and refined at the image's full size and depth.
+    look like the whole board (`kcal.corners.grid.grid_trouble`). It is put into the board's order
+    (`kcal.corners.search.canonical_order`) and refined at the image's full size and depth.
 
     Args:
         image: (H, W) uint8 or uint16, as an array or a tensor; or a tensor (1, H, W) or (3, H, W), also in floating
@@ -153,7 +395,7 @@ def detect(
 
     An image that cannot be read or shows no board becomes a `Failure` with its reason. The others become views, named
     by their file names (with folders where two files share one). Corners in images that were resized alike are scaled
-    to the size that most images have (`kcal.corners.sizes`).
+    to the size that most images have (`kcal.corners.observations`).
 
     Args:
         paths: a folder, a wildcard or an image file, or several of them; or images themselves, as `detect_board`

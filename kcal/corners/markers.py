@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from kcal.corners.board import Board
-from kcal.corners.board_text import DICTIONARIES
+from kcal.corners.board import DICTIONARIES, Board
 from kcal.errors import InputError
 
 

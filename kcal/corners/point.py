@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from kcal.checks import as_points, require_finite
-from kcal.corners.filters import as_gray, filtered, gaussian_kernel
+from kcal.corners.patches import as_gray, filtered, gaussian_kernel
 from kcal.errors import InputError
 
 FACTOR = 10

@@ -15,8 +15,7 @@ import numpy.typing as npt
 from torch import Tensor
 
 from kcal.corners.board import Board
-from kcal.corners.detect import detect_board, view_of
-from kcal.corners.detection import Detection
+from kcal.corners.detect import Detection, detect_board, view_of
 from kcal.corners.observations import Failure, Observations, View
 from kcal.corners.refine import Refinement
 from kcal.corners.time_limit import Limited, TookTooLongError

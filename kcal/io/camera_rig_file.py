@@ -17,8 +17,7 @@ from kcal.dispatch import still
 from kcal.file_kind import CAMERA_RIG_VERSION
 from kcal.io.camera_file import CameraFile, named_camera_file
 from kcal.io.record import Packed
-from kcal.lens.camera_rig import CameraRig, CameraRigCalibration
-from kcal.lens.mounting import Origin
+from kcal.lens.rig import CameraRig, CameraRigCalibration, Origin
 from kcal.native_file import NativeFile, Record, storing
 
 Triple = tuple[float, float, float]

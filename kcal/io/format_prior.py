@@ -32,9 +32,9 @@ from kcal.io.foreign import (
 from kcal.io.format_photos import WRITTEN
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
-from kcal.lens.carry_over import square_root_information
 from kcal.lens.model import LensModel
 from kcal.lens.projection import parameter_names
+from kcal.lens.uncertainty import square_root_information
 from kcal.strict_json import read_json
 from kcal.strict_npz import read_npz
 

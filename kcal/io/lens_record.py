@@ -13,8 +13,7 @@ import safetensors.torch
 from torch import Tensor, nn
 
 from kcal.errors import InputError
-from kcal.lens.field_modes import FieldModes
-from kcal.lens.gaussian_modes import GaussianModes
+from kcal.lens.field_modes import FieldModes, GaussianModes
 from kcal.lens.hybrid_terms import LEADING, HybridForm
 from kcal.lens.model import LensModel
 from kcal.lens.network_modes import SLOPES, NetworkModes, known_chain, network_names
@@ -32,7 +31,7 @@ class ZernikeRecord(Record):
 
 
 class GaussianRecord(Record):
-    """Gaussian units by their widths (`kcal.lens.gaussian_modes.GaussianModes`)."""
+    """Gaussian units by their widths (`kcal.lens.field_modes.GaussianModes`)."""
 
     widths: tuple[float, ...]
 

@@ -39,8 +39,7 @@ import torch
 from kcal.errors import FileError, InputError
 from kcal.files import read_bytes, write_atomic
 from kcal.image_header import check_pixel_count
-from kcal.lens.lookup import LookupCamera
-from kcal.lens.spline import Spline
+from kcal.lens.baking import LookupCamera, Spline
 from kcal.strict_npz import read_npz
 
 KIND, VERSION = "lookup", 1

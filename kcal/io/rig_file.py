@@ -24,9 +24,8 @@ from kcal.io.camera_file import CameraFile, named_camera_file
 from kcal.io.file_summary import RigSummary
 from kcal.io.record import Packed
 from kcal.lens.calibration import RigCalibration
-from kcal.lens.mounting import Mounting, Origin
 from kcal.lens.projection import INTRINSICS
-from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.lens.rig import Mounting, Origin, RigCovariance, StereoRig
 from kcal.native_file import NativeFile, Record, storing
 
 Triple = tuple[float, float, float]

@@ -3,14 +3,14 @@
 
 # Lens models
 from kcal.lens.model import LensModel as LensModel
-from kcal.lens.extended_distortion import ExtendedDistortion as ExtendedDistortion
+from kcal.lens.camera_parameters import ExtendedDistortion as ExtendedDistortion
 from kcal.lens.hybrid_terms import HybridForm as HybridForm
 from kcal.lens.zernike import ZernikeModes as ZernikeModes
 from kcal.lens.paraxial import paraxial_focal as paraxial_focal
 from kcal.lens.paraxial import ParaxialFocal as ParaxialFocal
-from kcal.lens.pinhole import new_pinhole as new_pinhole
-from kcal.calibrate.camera.refit import refit_camera as refit_camera
-from kcal.calibrate.camera.refit import RefittedCamera as RefittedCamera
+from kcal.lens.views import new_pinhole as new_pinhole
+from kcal.calibrate.camera.export import refit_camera as refit_camera
+from kcal.calibrate.camera.export import RefittedCamera as RefittedCamera
 from kcal.lens.difference import camera_difference as camera_difference
 from kcal.lens.difference import CameraDifference as CameraDifference
 
@@ -24,10 +24,10 @@ from kcal.lens.views import cylinder_view as cylinder_view
 from kcal.lens.views import pinhole_view as pinhole_view
 from kcal.lens.views import looking as looking
 from kcal.lens.views import pupil_shift as pupil_shift
-from kcal.lens.rectification import StereoRectification as StereoRectification
+from kcal.lens.images import StereoRectification as StereoRectification
 from kcal.lens.rays import CameraRays as CameraRays
 from kcal.lens.rays import ray_error as ray_error
-from kcal.lens.image_transform import ImageTransform as ImageTransform
+from kcal.lens.camera_conversions import ImageTransform as ImageTransform
 
 # Error bars
 from kcal.lens.uncertainty import projection_sigma as projection_sigma
@@ -55,11 +55,11 @@ from kcal.io.onnx_file import save_onnx as save_onnx
 # Cameras of other makes, tables and learned starts
 from kcal.lens.camera_like import CameraLike as CameraLike
 from kcal.lens.baking import bake as bake
-from kcal.lens.lookup import LookupCamera as LookupCamera
+from kcal.lens.baking import LookupCamera as LookupCamera
 from kcal.io.lookup_file import load_lookup as load_lookup
 from kcal.io.lookup_file import save_lookup as save_lookup
-from kcal.lens.modules import Unproject as Unproject
-from kcal.lens.modules import LearnedStart as LearnedStart
+from kcal.lens.rays import Unproject as Unproject
+from kcal.lens.rays import LearnedStart as LearnedStart
 
 # Rotations
 from kcal.lens.pose import rotation_from_vector as rotation_from_vector

@@ -1,7 +1,8 @@
-"""Tabulate a camera, with a measured error bound."""
+"""`LookupCamera`: a camera as two tables, for programs that know neither lens formulas nor networks."""
 
 from __future__ import annotations
 
+import ast
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -9,10 +10,291 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kcal.checks import StatedModule, as_points
+from kcal.dispatch import finite_or, in_chunks, is_differentiated
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
-from kcal.lens.lookup import LookupCamera, chart_from_points, rays_from_chart
-from kcal.lens.spline import RINGS, Spline, evaluate_spline, extend_nodes, filter_nodes
+
+# Tabulate smooth functions of two variables by uniform bicubic B-splines, twice continuously differentiable.
+#
+# A spline is a table of coefficients c[j, i] of basis functions at origin + (i, j) · step. With t = (x - origin) /
+# step, i = floor(t) and f = t - i, the four basis functions i - 1 to i + 2 count along each axis, with the weights
+#
+#     (1 - f)³ / 6,  (3 f³ - 6 f² + 4) / 6,  (-3 f³ + 3 f² + 3 f + 1) / 6,  f³ / 6
+#
+# Coefficients are computed from values at the same places by a short filter, c = v - δ²v / 6 + δ⁴v / 36 along each axis
+# (de Boor's quasi-interpolant). Its error falls with the fourth power of the step like that of interpolation, which
+# would need a system of equations. It is also local: unknown values in one corner of a table do not spread.
+
+_FILTER = (1 / 36, -10 / 36, 54 / 36, -10 / 36, 1 / 36)
+# Values needed beyond the outermost cell on each side: one for the basis functions, two for the filter.
+RINGS = 3
+# How a cubic, whose fourth differences vanish, continues beyond its last four values.
+_CUBIC_STEP = (4.0, -6.0, 4.0, -1.0)
+
+
+class Spline(NamedTuple):
+    """A bicubic B-spline and the cells in which it may be used.
+
+    Attributes:
+        coefficients: (K, rows + 3, columns + 3) for a grid of rows x columns cells.
+        origin: (2,) x and y of the first basis function; the first cell begins one step farther.
+        step: (2,) width and height of a cell.
+        cells: (rows, columns) bool, which cells may be used.
+    """
+
+    coefficients: Tensor
+    origin: Tensor
+    step: Tensor
+    cells: Tensor
+
+
+def filter_nodes(values: Tensor) -> Tensor:
+    """Compute coefficients (..., R - 4, C - 4) from values (..., R, C) at the same places."""
+    rows, columns = values.shape[-2] - 4, values.shape[-1] - 4
+    along = sum(weight * values[..., k : k + columns] for k, weight in enumerate(_FILTER))
+    assert isinstance(along, Tensor)
+    down = sum(weight * along[..., k : k + rows, :] for k, weight in enumerate(_FILTER))
+    assert isinstance(down, Tensor)
+    return down
+
+
+def extend_nodes(values: Tensor, known: Tensor, rings: int = 2 * RINGS) -> tuple[Tensor, Tensor]:
+    """Continue values (K, R, C) beyond where they are `known` (R, C), by cubics along rows and columns.
+
+    Each ring takes the mean over those of the four directions that have four known values in a row. A corner needs as
+    many rings as its two sides together.
+
+    Returns:
+        values and known, extended by up to `rings` nodes; zero where still not known.
+    """
+    values = torch.where(known, values, 0.0)
+    for _ in range(rings):
+        total, count = torch.zeros_like(values), torch.zeros(known.shape, dtype=values.dtype, device=values.device)
+        for axis in (-2, -1):
+            for way in (1, -1):
+                four = [_shifted(values, known, axis, way * k) for k in (1, 2, 3, 4)]
+                usable = four[0][1] & four[1][1] & four[2][1] & four[3][1]
+                ahead = sum(weight * value for weight, (value, _) in zip(_CUBIC_STEP, four, strict=True))
+                total, count = total + torch.where(usable, ahead, 0.0), count + usable
+        new = ~known & (count > 0)
+        values = torch.where(new, total / count.clamp(min=1.0), values)
+        known = known | new
+    return values, known
+
+
+def _shifted(values: Tensor, known: Tensor, axis: int, by: int) -> tuple[Tensor, Tensor]:
+    """Shift values and mask along an axis; what enters from the other side is not known."""
+    count = known.shape[axis]
+    place = torch.arange(count, device=known.device)
+    fresh = (place - by >= 0) & (place - by < count)
+    fresh = fresh if axis == -1 else fresh[:, None]
+    return values.roll(by, axis), known.roll(by, axis) & fresh
+
+
+def _basis_weights(f: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The four weights at fractions f of a cell."""
+    g = 1.0 - f
+    first, last = g * g * g, f * f * f
+    # The other two by symmetry: 4 - 6 f² + 3 f³ and the same of g.
+    second = 4.0 - 6.0 * (f * f) + 3.0 * last
+    third = 4.0 - 6.0 * (g * g) + 3.0 * first
+    return first / 6.0, second / 6.0, third / 6.0, last / 6.0
+
+
+def evaluate_spline(spline: Spline, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """Evaluate the spline: values (K, ...) at finite x, y (...), and (...) whether these lie in usable cells.
+
+    Elsewhere the values are finite but meaningless.
+    """
+    rows, columns = spline.cells.shape
+    u = (x - spline.origin[0]) / spline.step[0]
+    v = (y - spline.origin[1]) / spline.step[1]
+    # The far edge belongs to the last cell. Clamped positions have no gradient and are not valid.
+    inside = (u >= 1.0) & (u <= columns + 1.0) & (v >= 1.0) & (v <= rows + 1.0)
+    u, v = torch.clamp(u, 1.0, columns + 1.0), torch.clamp(v, 1.0, rows + 1.0)
+    i = torch.clamp(torch.floor(u.detach()), max=columns)
+    j = torch.clamp(torch.floor(v.detach()), max=rows)
+    across, down = _basis_weights(u - i), _basis_weights(v - j)
+    i, j = i.to(torch.int64) - 1, j.to(torch.int64) - 1
+    width = columns + 3
+    table = spline.coefficients.flatten(-2)
+    first = j * width + i
+    value = torch.zeros_like(x)
+    for k, weight in enumerate(down):
+        line = sum(table[:, first + (k * width + m)] * w for m, w in enumerate(across))
+        value = value + weight * line
+    return value, inside & spline.cells.flatten()[j * columns + i]
+
+
+# `LookupCamera`: a camera as two tables, for programs that know neither lens formulas nor networks.
+
+_PARTS = Spline._fields
+
+
+class LookupCamera(StatedModule):
+    """A camera as bicubic tables of both directions, made by `bake`.
+
+    A valid answer lies in the image, is also valid for the camera that was baked, and is off by at most `bound` pixels.
+    Tables end where the image ends. They leave out a strip along a fold of the lens, so that `coverage` may be less
+    than one.
+
+    Convention: as `Camera`: x right, y down, z forward; pixel (0, 0) is the center of the first pixel. Directions are
+    tabulated on the stereographic chart, where (X, Y, Z) with R = √(X² + Y² + Z²) lies at p = 2 X / (R + Z),
+    q = 2 Y / (R + Z). Equal steps on it are about equal steps in the image for every lens, also beyond 90° off axis.
+    With s = (p² + q²) / 4, the direction is (p, q, 1 - s) / (1 + s). The tables are float64 buffers of the state.
+
+    Args:
+        size: (width, height) of the image in pixels.
+        pixels_from_chart: table of pixels (u, v) over the chart.
+        chart_from_pixels: table of chart positions (p, q) over the image.
+        center: (2,) principal point, the value of pixels that are not valid.
+        bound: largest errors in pixels of `project` and of `unproject`.
+        coverage: share of the pixels with a ray for which `project` and `unproject` are valid.
+        source: fingerprint of the camera that was baked.
+
+    Raises:
+        InputError: tables whose shapes do not fit.
+
+    Example:
+        >>> from kcal import Camera
+        >>> from kcal.lens import bake
+        >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), coefficients=[-0.2, 0.05])
+        >>> lookup = bake(camera, tolerance=1e-3)
+        >>> point = torch.tensor([[0.3, 0.2, 1.0]], dtype=torch.float64)
+        >>> pixels, valid = lookup.project(point)
+        >>> bool(valid), bool((pixels - camera.project(point)[0]).norm() < lookup.bound[0])
+        (True, True)
+    """
+
+    center: Tensor
+
+    def __init__(
+        self,
+        *,
+        size: tuple[int, int],
+        pixels_from_chart: Spline,
+        chart_from_pixels: Spline,
+        center: Tensor,
+        bound: tuple[float, float],
+        coverage: tuple[float, float],
+        source: str = "",
+    ) -> None:
+        super().__init__()
+        self.size = (int(size[0]), int(size[1]))
+        self.bound, self.coverage, self.source = bound, coverage, source
+        self.register_buffer("center", as_points("center", center, 2).detach().clone())
+        for name, table in (("pixels_from_chart", pixels_from_chart), ("chart_from_pixels", chart_from_pixels)):
+            if table.cells.ndim != 2 or table.coefficients.shape != (2, *(n + 3 for n in table.cells.shape)):
+                raise InputError(
+                    f"{name}: coefficients (2, rows + 3, columns + 3) are needed for cells (rows, columns), got "
+                    f"{tuple(table.coefficients.shape)} and {tuple(table.cells.shape)}"
+                )
+            for part, value in zip(_PARTS, table, strict=True):
+                self.register_buffer(f"{name}_{part}", value.detach().clone())
+
+    @property
+    def constants(self) -> object:
+        """Size, errors, coverage and source, which come with the tables."""
+        return self.size, self.bound, self.coverage, self.source
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Take the constants of the tables that are loaded."""
+        self.size, self.bound, self.coverage, self.source = ast.literal_eval(bytes(state.tolist()).decode())
+
+    @property
+    def pixels_from_chart(self) -> Spline:
+        """The table of `project`."""
+        return Spline(*(getattr(self, f"pixels_from_chart_{part}") for part in _PARTS))
+
+    @property
+    def chart_from_pixels(self) -> Spline:
+        """The table of `unproject`."""
+        return Spline(*(getattr(self, f"chart_from_pixels_{part}") for part in _PARTS))
+
+    def project(self, points_cam: Tensor) -> tuple[Tensor, Tensor]:
+        """Map points (..., N, 3) to pixels (..., N, 2) and valid (..., N): in the image, and in a usable cell.
+
+        Pixels that are not valid are set to the principal point. Gradients are those of the table.
+
+        Raises:
+            InputError: a wrong shape or an integer dtype.
+        """
+        points = as_points("points_cam", points_cam, 3)
+        table = self.pixels_from_chart
+
+        def one(points: Tensor) -> tuple[Tensor, Tensor]:
+            p, q, usable = chart_from_points(points)
+            pixels, valid = evaluate_spline(table, p, q)
+            pixels = pixels.movedim(0, -1)
+            valid = valid & usable & self.inside(pixels.detach())
+            return torch.where(valid[..., None], pixels, self.center), valid
+
+        return in_chunks(one, points, 1, differentiated=is_differentiated(points, self))
+
+    def unproject(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        """Map pixels (..., N, 2) of the image to rays (..., N, 3) of length one and valid (..., N).
+
+        Rays that are not valid are set to the optical axis. Gradients are those of the table.
+
+        Raises:
+            InputError: a wrong shape or an integer dtype.
+        """
+        pixels = as_points("pixels", pixels, 2)
+        table = self.chart_from_pixels
+
+        def one(pixels: Tensor) -> tuple[Tensor, Tensor]:
+            u, v, finite = finite_or(pixels[..., 0], pixels[..., 1], self.center[0], self.center[1])
+            chart, valid = evaluate_spline(table, u, v)
+            valid = valid & finite
+            return rays_from_chart(torch.where(valid, chart, 0.0).movedim(0, -1)), valid
+
+        return in_chunks(one, pixels, 1, differentiated=is_differentiated(pixels, self))
+
+    def inside(self, pixels: Tensor) -> Tensor:
+        """Whether pixels (..., N, 2) lie in the image, whose edges are half a pixel beyond the outer pixel centers."""
+        u, v = as_points("pixels", pixels, 2).unbind(-1)
+        width, height = self.size
+        return (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)
+
+    def forward(self, points_cam: Tensor) -> tuple[Tensor, Tensor]:
+        """The same as `project`."""
+        return self.project(points_cam)
+
+    def extra_repr(self) -> str:
+        """Size, tables and errors, for `repr`."""
+        cells = [f"{t.cells.shape[1]}x{t.cells.shape[0]}" for t in (self.pixels_from_chart, self.chart_from_pixels)]
+        return f"size={self.size}, cells={' and '.join(cells)}, error at most {max(self.bound):.2g} px"
+
+
+def chart_from_points(points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Map points (..., N, 3) to the stereographic chart: p, q (..., N), and a mask (..., N) of those on it.
+
+    The origin, points straight behind the camera, and points that are not finite have no place; they get the axis's.
+    """
+    length = torch.linalg.vector_norm(points.detach(), dim=-1)
+    behind = length + points[..., 2].detach() <= 1e-12 * length
+    usable = (length > 0) & (length < torch.inf) & ~behind
+    ahead = points.new_tensor([0.0, 0.0, 1.0])
+    X, Y, Z = torch.where(usable[..., None], points, ahead).unbind(-1)
+    scale = 2.0 / (torch.sqrt(X * X + Y * Y + Z * Z) + Z)
+    return X * scale, Y * scale, usable
+
+
+def rays_from_chart(chart: Tensor) -> Tensor:
+    """Map positions (..., N, 2) on the chart to rays (..., N, 3) of length one.
+
+    Example:
+        >>> rays_from_chart(torch.tensor([[2.0, 0.0], [0.0, 0.0]], dtype=torch.float64)).tolist()
+        [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+    p, q = chart.unbind(-1)
+    s = 0.25 * (p * p + q * q)
+    scale = (1.0 + s).reciprocal()
+    return torch.stack([p * scale, q * scale, (1.0 - s) * scale], -1)
+
+
+# Tabulate a camera, with a measured error bound.
 
 # Errors are measured on a lattice this many times finer than the cells; in between they may be larger by no more than
 # the safety factor.

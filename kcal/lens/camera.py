@@ -14,17 +14,22 @@ from kcal.checks import as_points
 from kcal.dispatch import finite_or, in_chunks, is_differentiated, known_true, split_coordinates
 from kcal.errors import InputError
 from kcal.lens.camera_conversions import ConvertibleCamera
+from kcal.lens.camera_parameters import CameraDistortion, ExtendedDistortion
 from kcal.lens.distortion import distort_components
-from kcal.lens.extended_distortion import CameraDistortion, ExtendedDistortion
-from kcal.lens.hybrid_points import map_points
-from kcal.lens.hybrid_points_fit import FittedPolynomials, worth_fitting
+from kcal.lens.hybrid_points import FittedPolynomials, map_points, worth_fitting
 from kcal.lens.inverse import InverseStart, PreparedInverse, undistort_components
 from kcal.lens.model import LensModel
-from kcal.lens.outline import image_outline, polygon_area
-from kcal.lens.plane import angle_over_distance, plane_from_points, rays_from_plane
-from kcal.lens.projection import from_pixels, to_pixels
-from kcal.lens.pupil import FAR, pupil_depth, ray_starts
-from kcal.lens.region import in_region, surely_in_region
+from kcal.lens.projection import (
+    FAR,
+    angle_over_distance,
+    from_pixels,
+    plane_from_points,
+    pupil_depth,
+    ray_starts,
+    rays_from_plane,
+    to_pixels,
+)
+from kcal.lens.region import image_outline, in_region, polygon_area, surely_in_region
 
 
 class Camera(ConvertibleCamera):
@@ -211,7 +216,7 @@ class Camera(ConvertibleCamera):
         return self.project(self._taken("rays", rays, 3) * FAR)
 
     def ray_origins(self, rays: Tensor | ArrayLike) -> Tensor:
-        """Find where rays start: (0, 0, ζ₁ θ² + ζ₂ θ⁴) for a hybrid lens (`kcal.lens.pupil`), the origin for others.
+        """Find where rays start: (0, 0, ζ₁ θ² + ζ₂ θ⁴) for a hybrid lens, the origin for others.
 
         With a ray of `unproject`, every point `ray_origin + t * ray` with t > 0 is projected to the pixel of the ray,
         except for t of the order of the pupil's movement, where rays intersect each other.

@@ -1,8 +1,4 @@
-"""How differently two cameras see the same things, after the turn that best undoes it, against what is known of both.
-
-No calibration determines how a camera's frame is turned in its housing. So the second camera is turned until it sees
-what the first one sees as well as it can (mrcal: the implied rotation), with weights from the error bars of both.
-"""
+"""How differently two cameras see the same things, over the image, against what is known of both."""
 
 from __future__ import annotations
 
@@ -15,11 +11,45 @@ from torch import Tensor
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import nearest_rotation, rotation_from_vector, step_rows
-from kcal.lens.projection import project_components
-from kcal.lens.pupil import FAR
-from kcal.lens.shift import PixelShift
+from kcal.lens.projection import FAR, project_components
 from kcal.lens.uncertainty import pixel_covariance, pixel_slopes
 from kcal.texts import brief
+
+# How far pixels are shifted, over an image.
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class PixelShift:
+    """Where something is seen in place of `pixels`.
+
+    Args:
+        pixels: (rows, columns, 2).
+        shift: (rows, columns, 2) pixels, from there; NaN where nothing is seen.
+    """
+
+    pixels: Tensor
+    shift: Tensor
+
+    @property
+    def length(self) -> Tensor:
+        """(rows, columns) length of the shift, pixels."""
+        return torch.linalg.vector_norm(self.shift, dim=-1)
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the length over the image, pixels."""
+        return float(self.length[self.length.isfinite()].square().mean().sqrt())
+
+    @property
+    def largest(self) -> float:
+        """Largest length, pixels."""
+        return float(self.length[self.length.isfinite()].max())
+
+
+# How differently two cameras see the same things, after the turn that best undoes it, against what is known of both.
+#
+# No calibration determines how a camera's frame is turned in its housing. So the second camera is turned until it sees
+# what the first one sees as well as it can (mrcal: the implied rotation), with weights from the error bars of both.
 
 # Cameras that agree differ by more than this in 5 % of cases, like the intervals of `kcal.locate`.
 _LEVEL = 0.05

@@ -10,7 +10,7 @@ Convention: `normalized` points are (x, y) on the plane z = 1 of the camera, y d
 
 The last two lines are OpenCV's tilted-sensor homography multiplied out. Sources: the paper's Eq. 4 and 10; OpenCV's
 camera-calibration documentation for the tilt. A fisheye uses g alone, on points whose distance from the origin is the
-angle from the axis (`kcal.lens.plane`): the model of Kannala and Brandt (2006) in the form of `cv2.fisheye`.
+angle from the axis (`kcal.lens.projection`): the model of Kannala and Brandt (2006) in the form of `cv2.fisheye`.
 
 Coordinates are separate tensors (..., N), because these loops are bound by memory and so touch each number once.
 """

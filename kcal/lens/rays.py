@@ -1,15 +1,10 @@
-"""The ray of every pixel, for renderers that take rays in place of a camera model: gsplat, splatting and NeRFs.
-
-gsplat from 1.6 on takes `rays` (..., C, H, W, 6) in the world's frame: where each pixel's ray starts, and its direction
-(gsplat issues 718, 801 and 1035; `rasterization(..., rays=..., with_eval3d=True, with_ut=True, packed=False)`). So any
-lens can be rendered, an entrance pupil that moves included. Pixels without a ray have zeros.
-"""
+"""The ray of every pixel: as the `forward` of a module, and for renderers that take rays in place of a camera model."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -18,7 +13,55 @@ from kcal.checks import Float64Module, as_tensor
 from kcal.dispatch import is_differentiated, is_traced, may_branch
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.lens.pupil import FAR
+from kcal.lens.projection import FAR
+
+# `Unproject`: `Camera.unproject` as the `forward` of a module, for pipelines, `torch.export` and ONNX.
+
+
+class LearnedStart(Protocol):
+    """A module that guesses the inverse of a lens, such as `kcal.nets.InverseNet`."""
+
+    def guess(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        """Return roughly undistorted coordinates for distorted ones (..., N)."""
+        ...
+
+
+class Unproject(nn.Module):
+    """Map pixels to rays: `Camera.unproject` as a module.
+
+    The module of the other direction is `Camera` itself. Compiled and exported graphs take a fixed number of Newton
+    steps for every point. The few pixels next to a fold that have not converged by then are not valid there, although
+    an eager call may find their rays.
+
+    `kcal.io.onnx_file.save_onnx` writes the module as ONNX.
+
+    Args:
+        camera: the camera, kept as a submodule.
+        start: a trained `InverseNet`; its guess is where Newton's method starts. It affects run time only.
+
+    Example:
+        >>> import torch
+        >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), coefficients=[-0.1])
+        >>> rays, valid = Unproject(camera)(torch.tensor([[320.0, 240.0]]))
+        >>> rays.tolist(), valid.tolist()
+        ([[0.0, 0.0, 1.0]], [True])
+    """
+
+    def __init__(self, camera: Camera, start: LearnedStart | None = None) -> None:
+        super().__init__()
+        self.camera = camera
+        self.start = start
+
+    def forward(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        """Map pixels (..., N, 2) to rays (..., N, 3) of length one, and valid (..., N)."""
+        return self.camera.unproject(pixels, start=None if self.start is None else self.start.guess)
+
+
+# The ray of every pixel, for renderers that take rays in place of a camera model: gsplat, splatting and NeRFs.
+#
+# gsplat from 1.6 on takes `rays` (..., C, H, W, 6) in the world's frame: where each pixel's ray starts, and its
+# direction (gsplat issues 718, 801 and 1035; `rasterization(..., rays=..., with_eval3d=True, with_ut=True,
+# packed=False)`). So any lens can be rendered, an entrance pupil that moves included. Pixels without a ray have zeros.
 
 # Pixels computed at a time, so that temporary values stay small for any image.
 _BAND = 1 << 18

@@ -1,21 +1,4 @@
-"""Find the region where a lens model is valid: the part around the optical axis before it folds or meets a pole.
-
-The distortion of Eq. 4 is no bijection of the plane. Along every direction from the axis there is a first place where
-the Jacobian's determinant, the radial denominator or the tilt's w is no longer positive. Beyond it the formula does not
-describe the lens. `valid_region` walks outward along 64 directions to that place. A map without folds that takes the
-edge of a region once around the origin is one-to-one inside. Where the edge does not (two folds can meet in a cusp,
-inside which a pixel has several preimages), the region is shrunk until it does.
-
-A walk in steps misses narrow folds. So it is then proven that each direction has no fold before the end of the region
-or a single one (`kcal.lens.fold_proof`). Where this cannot be proven, narrow wedges are cut out of the region, or it is
-shrunk. For a lens without prism terms that is all within a disc: its Jacobian is symmetric, and a disc where it is
-positive definite is one-to-one. With prism terms, and beyond the disc, samples of the edge, 1024 around, tell
-whether it goes once around.
-
-For a lens without tangential, prism and tilt terms the region is a disc. For others it is the union of the largest disc
-about the axis and the regular part of what a short Fourier series encloses. The series describes the reciprocal of the
-limit as a function of the direction, rounded up so that it stays inside the 64 places.
-"""
+"""Find the region where a lens model is valid, around the axis before a fold or pole, and its outline."""
 
 from __future__ import annotations
 
@@ -29,8 +12,26 @@ from kcal.dispatch import known_true, may_branch
 from kcal.lens.distortion import Distorted, check_coefficients, distort_components
 from kcal.lens.fold_proof import SECTORS, prove_regular
 from kcal.lens.model import LensModel
-from kcal.lens.plane import largest_radius
+from kcal.lens.projection import INTRINSICS, largest_radius, to_pixels
 from kcal.lens.zernike import unbind_last
+
+# Find the region where a lens model is valid: the part around the optical axis before it folds or meets a pole.
+#
+# The distortion of Eq. 4 is no bijection of the plane. Along every direction from the axis there is a first place where
+# the Jacobian's determinant, the radial denominator or the tilt's w is no longer positive. Beyond it the formula does
+# not describe the lens. `valid_region` walks outward along 64 directions to that place. A map without folds that takes
+# the edge of a region once around the origin is one-to-one inside. Where the edge does not (two folds can meet in a
+# cusp, inside which a pixel has several preimages), the region is shrunk until it does.
+#
+# A walk in steps misses narrow folds. So it is then proven that each direction has no fold before the end of the region
+# or a single one (`kcal.lens.fold_proof`). Where this cannot be proven, narrow wedges are cut out of the region, or it
+# is shrunk. For a lens without prism terms that is all within a disc: its Jacobian is symmetric, and a disc where it is
+# positive definite is one-to-one. With prism terms, and beyond the disc, samples of the edge, 1024 around, tell whether
+# it goes once around.
+#
+# For a lens without tangential, prism and tilt terms the region is a disc. For others it is the union of the largest
+# disc about the axis and the regular part of what a short Fourier series encloses. The series describes the reciprocal
+# of the limit as a function of the direction, rounded up so that it stays inside the 64 places.
 
 DIRECTIONS = 64
 _HARMONICS = 6
@@ -330,3 +331,52 @@ def in_region(
 def surely_in_region(x: Tensor, y: Tensor, region: Region) -> Tensor:
     """Whether points (..., N) lie so far inside that no further check is needed."""
     return region.covers(x, y, SURE)
+
+
+# The valid region of a lens as a polygon in the image.
+
+
+def image_outline(parameters: Tensor, model: LensModel, region: Region, size: tuple[int, int]) -> Tensor:
+    """Map the valid region to the image (width, height): a polygon (V, 2) in pixels.
+
+    Args:
+        parameters: (5 + P,) of a single camera.
+        model: its lens model.
+        region: its valid region.
+        size: (width, height) of the image.
+    """
+    # A little inside the edge: at a pole the edge itself is mapped to infinity.
+    x, y = (region.outline(256) * (1.0 - 1e-6)).unbind(-1)
+    lens = distort_components(x, y, parameters[len(INTRINSICS) :], model, slopes=False)
+    polygon = torch.stack(to_pixels(lens.x, lens.y, parameters), -1)
+    return clip_to_image(polygon, size) if bool(region.radius > 0) else polygon[:0]
+
+
+def clip_to_image(polygon: Tensor, size: tuple[int, int]) -> Tensor:
+    """Clip a polygon (V, 2) to the image, whose edges lie half a pixel beyond the outer pixel centers.
+
+    Source: Sutherland and Hodgman (1974), one edge of the image after the other.
+
+    Example:
+        >>> triangle = torch.tensor([[-0.5, -0.5], [9.5, -0.5], [-0.5, 9.5]], dtype=torch.float64)
+        >>> clip_to_image(triangle, (5, 10)).tolist()
+        [[-0.5, -0.5], [4.5, -0.5], [4.5, 4.5], [-0.5, 9.5]]
+    """
+    width, height = size
+    for axis, edge, sign in ((0, -0.5, 1.0), (0, width - 0.5, -1.0), (1, -0.5, 1.0), (1, height - 0.5, -1.0)):
+        height_over = sign * (polygon[:, axis] - edge)
+        following, height_after = polygon.roll(-1, 0), height_over.roll(-1, 0)
+        weight = (height_over / (height_over - height_after))[:, None]
+        crossing = polygon + weight * (following - polygon)
+        crossing[:, axis] = edge
+        keep = torch.stack([height_over >= 0, (height_over > 0) != (height_after > 0)], -1)
+        # A corner on the edge is kept as such; its crossing would repeat it.
+        keep[:, 1] &= (height_over != 0) & (height_after != 0)
+        polygon = torch.stack([polygon, crossing], 1)[keep]
+    return polygon
+
+
+def polygon_area(polygon: Tensor) -> float:
+    """Area of a polygon (V, 2) whose corners run clockwise as seen in the image (x right, y down)."""
+    (x, y), (next_x, next_y) = polygon.T, polygon.roll(-1, 0).T
+    return float(0.5 * (x * next_y - y * next_x).sum())

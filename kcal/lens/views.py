@@ -1,12 +1,9 @@
-"""Views that images are resampled to: a pinhole of a chosen field of view, a cylinder, and what of the image they show.
-
-A view is a camera or a `Cylinder`, and a rotation: where it looks.
-"""
+"""Views that images are resampled to: pinholes, cylinders, and what of the image they show."""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -15,6 +12,267 @@ from kcal.checks import StatedModule, as_points, keep_float64
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
+
+# Choose a pinhole camera for undistorted images: OpenCV's alpha, restricted to the valid region of the lens.
+#
+# A pinhole camera stretches a rectangle of the plane z = 1 over its image. Every point of the inner rectangle (alpha 0)
+# has a source pixel; the outer rectangle (alpha 1) contains every source pixel that has a ray.
+
+# Source positions this far outside the outer pixel centers still count, in pixels, so that rounding does not lose an
+# undistorted pixel that lies exactly on the image's edge.
+_SLACK = 1e-6
+# Points per side of the image in the search for its extremes.
+_SIDE_SAMPLES = 129
+# Rays farther from the axis count for neither rectangle: on a pinhole's plane they lie too far out.
+_WIDEST = math.radians(89.0)
+
+
+class Sees(Protocol):
+    """What choosing a pinhole asks of a camera; `TurnedCamera` is one, too."""
+
+    @property
+    def params(self) -> Tensor:
+        """(..., 5 + P), for their batch shape, dtype and device."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of the image."""
+
+    def unproject(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        """As `Camera.unproject`."""
+
+    def project_rays(self, rays: Tensor) -> tuple[Tensor, Tensor]:
+        """As `Camera.project_rays`."""
+
+
+class TurnedCamera:
+    """A camera whose rays are those of a frame that is turned against its own; far away, or at a range.
+
+    Args:
+        camera: a camera or a batch.
+        rotation: (..., 3, 3) camera_from_frame.
+        at: range of what is seen, meters.
+    """
+
+    def __init__(self, camera: Camera, rotation: Tensor, at: float = math.inf) -> None:
+        self.camera, self.rotation, self.at = camera, rotation, at
+        self.params, self.size = camera.params, camera.size
+
+    def unproject(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        """As `Camera.unproject`, in the turned frame."""
+        rays, valid = self.camera.unproject(pixels)
+        return rays @ self.rotation, valid
+
+    def project_rays(self, rays: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels of what is seen in directions (..., N, 3) of the turned frame, at the range."""
+        rays = rays @ self.rotation.mT
+        if math.isinf(self.at):
+            return self.camera.project_rays(rays)
+        return self.camera.project(self.at * rays / rays.norm(dim=-1, keepdim=True))
+
+
+def source_pixels(camera: Sees, rays: Tensor) -> tuple[Tensor, Tensor]:
+    """Project directions to pixels, and say whether the image has a value there.
+
+    Args:
+        camera: the camera that took the image.
+        rays: (..., N, 3) of any length.
+
+    Returns:
+        pixels (..., N, 2) and seen (..., N): valid for the lens, and between the centers of the outer pixels, so that
+        bilinear interpolation has all its neighbors. Pixels up to 1e-6 px outside are moved onto the edge.
+
+    Example:
+        >>> camera = Camera.build(focal=(100, 100), center=(50, 40), size=(101, 81), model="pinhole")
+        >>> pixels, seen = source_pixels(camera, torch.tensor([[1.0, 0.0, 4.0], [4.0, 3.0, 8.0], [51.0, 0.0, 100.0]]))
+        >>> pixels[0].tolist(), seen.tolist()
+        ([75.0, 40.0], [True, True, False])
+    """
+    pixels, valid = camera.project_rays(rays)
+    last = torch.tensor(camera.size, dtype=pixels.dtype, device=pixels.device) - 1
+    near = ((pixels >= -_SLACK) & (pixels <= last + _SLACK)).all(-1)
+    # On the bounds themselves, clamp still passes gradients.
+    return torch.clamp(pixels, torch.zeros_like(last), last), valid & near
+
+
+@torch.no_grad()
+def new_pinhole(camera: Camera, alpha: float = 0.0, size: tuple[int, int] | None = None) -> Camera:
+    """Choose the pinhole camera for undistorted images, like OpenCV's `getOptimalNewCameraMatrix`.
+
+    Convention: the centers of the outer pixels lie on the sides of the rectangle that the new image shows.
+
+    With alpha 0 every pixel of the new image is valid; with alpha 1 every source pixel is kept that has a ray less than
+    89° from the axis. In between, focal lengths and principal point are interpolated linearly. As with OpenCV, fx and
+    fy differ even if those of the source are equal, because the new image shows a rectangle of another shape. OpenCV
+    looks at 9 x 9 points; this function searches for the extremes along the image's border, and with alpha 0 checks
+    every border pixel of the new image.
+
+    Parts of the image where the lens model folds or has no preimage do not count. A pinhole cannot show 180°: with a
+    very wide lens and alpha 1, the middle of the image becomes small. For such a lens, above all a fisheye, choose the
+    new focal length yourself: `Camera.build(..., model="pinhole")`.
+
+    Args:
+        camera: a camera or a batch of cameras.
+        alpha: 0 (only valid pixels) to 1 (all source pixels).
+        size: (width, height) of the new image; by default that of `camera`.
+
+    Returns:
+        A camera with the model `"pinhole"` and the batch shape of `camera`.
+
+    Raises:
+        InputError: alpha outside 0 to 1, or an image less than two pixels wide or high.
+        DegenerateError: the pixel at the image's center or those around it have no valid ray.
+
+    Example:
+        >>> camera = Camera.build(focal=(500, 500), center=(319.5, 239.5), size=(640, 480), coefficients=[-0.2])
+        >>> [round(value) for value in new_pinhole(camera, alpha=0).focal.tolist()]
+        [449, 475]
+        >>> [round(value) for value in new_pinhole(camera, alpha=1).focal.tolist()]
+        [401, 401]
+    """
+    if not 0.0 <= alpha <= 1.0:
+        raise InputError(f"alpha {alpha}: a number from 0 (only valid pixels) to 1 (all source pixels) is needed")
+    width, height = camera.size if size is None else (int(size[0]), int(size[1]))
+    if min(width, height, *camera.size) < 2:
+        raise InputError(f"images of {camera.size} and ({width}, {height}): at least 2 pixels each way are needed")
+
+    values = torch.zeros_like(camera.params[..., :5])
+    if alpha < 1:
+        values = values + (1 - alpha) * _pinhole_parameters(*inner_rectangle(camera, (width, height)), (width, height))
+    if alpha > 0:
+        values = values + alpha * _pinhole_parameters(*outer_rectangle(camera), (width, height))
+    return Camera(values, size=(width, height), model="pinhole")
+
+
+def _pinhole_parameters(low: Tensor, high: Tensor, size: tuple[int, int]) -> Tensor:
+    """Stretch the rectangle from low (..., 2) to high (..., 2) over an image: (..., 5) fx, fy, cx, cy and no skew."""
+    if not bool((high > low).all()):
+        raise DegenerateError("new_pinhole: no valid pixels around the image's center; check the coefficients")
+    last = torch.tensor(size, dtype=low.dtype, device=low.device) - 1
+    focal = last / (high - low)
+    return torch.cat([focal, -focal * low, torch.zeros_like(focal[..., :1])], -1)
+
+
+def _points_on_sides(low: Tensor, high: Tensor, along: Tensor) -> Tensor:
+    """Points (..., 4, N, 2) on the left, right, top and bottom side of a rectangle; `along` (..., 4, N) is 0 to 1."""
+    x, y = (low[..., i, None, None] + (high - low)[..., i, None, None] * along for i in (0, 1))
+    side = torch.tensor([0.0, 1.0], dtype=along.dtype, device=along.device)[:, None]
+    x_side, y_side = (low[..., i, None, None] + (high - low)[..., i, None, None] * side for i in (0, 1))
+    return torch.stack(
+        [
+            torch.cat([x_side.expand_as(x[..., :2, :]), x[..., 2:, :]], -2),
+            torch.cat([y[..., :2, :], y_side.expand_as(y[..., 2:, :])], -2),
+        ],
+        -1,
+    )
+
+
+def _side_extremes(camera: Sees, outermost: bool) -> Tensor:
+    """Innermost (or outermost) x of the left and right side and y of the top and bottom side of the image, (..., 4).
+
+    Infinite for a side on which no pixel has a ray.
+    """
+    vector = camera.params
+    last = torch.tensor(camera.size, dtype=vector.dtype, device=vector.device) - 1
+    step = torch.linspace(0, 1, _SIDE_SAMPLES, dtype=vector.dtype, device=vector.device)
+    # Inward is +x on the left and -x on the right.
+    inward = torch.tensor([1.0, -1.0, 1.0, -1.0], dtype=vector.dtype, device=vector.device)
+    sign = -inward if outermost else inward
+    start, end = torch.zeros_like(sign), torch.ones_like(sign)
+    value = torch.zeros_like(sign)
+    # 129 samples per side, then twice the two steps around the best one: the remaining error is below 1e-9 px.
+    for _ in range(3):
+        along = start[..., None] + (end - start)[..., None] * step
+        pixels = _points_on_sides(torch.zeros_like(last), last, along)
+        rays, valid = camera.unproject(pixels.flatten(-3, -2))
+        rays, valid = rays.unflatten(-2, (4, _SIDE_SAMPLES)), valid.unflatten(-1, (4, _SIDE_SAMPLES))
+        valid = valid & (rays[..., 2] > math.cos(_WIDEST))
+        reach = torch.cat([rays[..., :2, :, 0], rays[..., 2:, :, 1]], -2) / rays[..., 2] * sign[:, None]
+        best, index = torch.where(valid, reach, -math.inf).max(-1)
+        value = best * sign
+        along = along.expand(reach.shape)
+        start = torch.gather(along, -1, (index - 1).clamp(min=0)[..., None])[..., 0]
+        end = torch.gather(along, -1, (index + 1).clamp(max=_SIDE_SAMPLES - 1)[..., None])[..., 0]
+    return value
+
+
+def inner_rectangle(camera: Sees, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """The rectangle in which every pixel of a new image of this size has a source."""
+    vector = camera.params
+    shape = torch.tensor(size, dtype=vector.dtype, device=vector.device) - 1
+    # A side without rays lies beyond the fold. There the limit is the rectangle of the image's shape in the valid disc.
+    disc = torch.linalg.vector_norm(_valid_rim(camera), dim=-1).amin(-1, keepdim=True) * shape / shape.norm()
+    sides = _side_extremes(camera, outermost=False)
+    low = torch.where(sides[..., 0::2].isfinite(), sides[..., 0::2], -disc)
+    high = torch.where(sides[..., 1::2].isfinite(), sides[..., 1::2], disc)
+
+    middle = (torch.tensor(camera.size, dtype=vector.dtype, device=vector.device) - 1) / 2
+    rays, valid = camera.unproject(middle[None])
+    ray, valid = rays[..., 0, :], valid[..., 0]
+    center = ray[..., :2] / ray[..., 2:]
+    if not bool((valid & (ray[..., 2] > 0) & (center > low).all(-1) & (center < high).all(-1)).all()):
+        raise DegenerateError(
+            "new_pinhole: the image's center has no valid ray; check the camera, or make the new one by `Camera.build`"
+        )
+
+    columns, rows = (torch.linspace(0, 1, n, dtype=vector.dtype, device=vector.device) for n in size)
+    longest = max(size)
+    along = torch.stack([torch.nn.functional.pad(t, (0, longest - t.numel())) for t in (rows, rows, columns, columns)])
+
+    def all_seen(scale: Tensor) -> Tensor:
+        """Whether all pixels along the border have a source, after the rectangle is shrunk towards the center."""
+        border = _points_on_sides(*_shrunk(center, low, high, scale), along)
+        return source_pixels(camera, _on_plane(border.flatten(-3, -2)))[1].all(-1)
+
+    good, bad = torch.zeros_like(center[..., 0]), torch.ones_like(center[..., 0])
+    good = torch.where(all_seen(bad), bad, good)
+    while bool((bad - good > 1e-9).any()):
+        trial = (good + bad) / 2
+        passed = all_seen(trial) | (good == bad)
+        good, bad = torch.where(passed, trial, good), torch.where(passed, bad, trial)
+    return _shrunk(center, low, high, good)
+
+
+def _shrunk(center: Tensor, low: Tensor, high: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
+    """Shrink a rectangle towards a point: scale 1 leaves it as it is, 0 gives the point."""
+    scale = scale[..., None]
+    return center + scale * (low - center), center + scale * (high - center)
+
+
+def outer_rectangle(camera: Sees) -> tuple[Tensor, Tensor]:
+    """The rectangle around every source pixel that has a ray."""
+    sides = _side_extremes(camera, outermost=True)
+    low, high = sides[..., 0::2], sides[..., 1::2]
+    # Where the fold crosses the image, the valid region ends there and not at the image's border.
+    rim = _valid_rim(camera)
+    _, seen = source_pixels(camera, _on_plane(rim))
+    low = torch.minimum(low, torch.where(seen[..., None], rim, math.inf).amin(-2))
+    high = torch.maximum(high, torch.where(seen[..., None], rim, -math.inf).amax(-2))
+    return low, high
+
+
+def _valid_rim(camera: Sees) -> Tensor:
+    """Last valid points (..., 1440, 2) of the plane z = 1 along as many directions from the axis."""
+    vector = camera.params
+    turn = torch.arange(1440, dtype=vector.dtype, device=vector.device) * (2 * math.pi / 1440)
+    circle = torch.stack([torch.cos(turn), torch.sin(turn)], -1)
+    low, high = torch.zeros_like(turn), torch.full_like(turn, _WIDEST)
+    # Bisection to rounding.
+    for _ in range(52):
+        middle = (low + high) / 2
+        _, valid = camera.project_rays(_on_plane(circle * torch.tan(middle)[..., None]))
+        low, high = torch.where(valid, middle, low), torch.where(valid, high, middle)
+    return circle * torch.tan(low)[..., None]
+
+
+def _on_plane(normalized: Tensor) -> Tensor:
+    """Points (..., 3) on the plane z = 1 from their x, y (..., 2)."""
+    return torch.cat([normalized, torch.ones_like(normalized[..., :1])], -1)
+
+
+# Views that images are resampled to: a pinhole of a chosen field of view, a cylinder, and what of the image they show.
+#
+# A view is a camera or a `Cylinder`, and a rotation: where it looks.
 
 # Pinholes with wider fields of view stretch their borders beyond use.
 _WIDEST_PINHOLE = 170.0

@@ -15,8 +15,8 @@ from kcal.locate.positions import read_truth as read_truth
 from kcal.locate.positions import position_errors as position_errors
 
 # Triangulate
-from kcal.locate.triangulate import Triangulate as Triangulate
-from kcal.locate.triangulate import Triangulation as Triangulation
+from kcal.locate.stereo import Triangulate as Triangulate
+from kcal.locate.stereo import Triangulation as Triangulation
 from kcal.locate.multiview import TriangulateViews as TriangulateViews
 from kcal.locate.multiview import ViewsResult as ViewsResult
 from kcal.locate.disparity import DisparityRanges as DisparityRanges

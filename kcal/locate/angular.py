@@ -1,13 +1,4 @@
-"""Triangulation in closed form, without a decomposition: the point that needs the smallest turns of the rays.
-
-Two rays that do not meet are each turned into a common plane through both cameras, where they do. The plane that makes
-the sum of squared sines of the two angles smallest is an eigenvector of a 2x2 matrix, so that the whole is some fifty
-multiplications a point. More than two rays give three linear equations in the position, weighed so that angles and not
-meters are made small. Both work in a local frame and stay regular for points at infinity.
-
-Unlike the mid-point of the two lines, which a vertical error between the rays pulls nearer, neither is biased by what
-the rays miss each other across the epipolar plane.
-"""
+"""Triangulation in closed form by the smallest turns of the rays, and what there is besides pixels."""
 
 from __future__ import annotations
 
@@ -21,6 +12,16 @@ from kcal.checks import as_points
 from kcal.dispatch import CHUNK, is_differentiated, is_traced, known_true
 from kcal.errors import InputError
 from kcal.lens.pose import side_axes
+
+# Triangulation in closed form, without a decomposition: the point that needs the smallest turns of the rays.
+#
+# Two rays that do not meet are each turned into a common plane through both cameras, where they do. The plane that
+# makes the sum of squared sines of the two angles smallest is an eigenvector of a 2x2 matrix, so that the whole is some
+# fifty multiplications a point. More than two rays give three linear equations in the position, weighed so that angles
+# and not meters are made small. Both work in a local frame and stay regular for points at infinity.
+#
+# Unlike the mid-point of the two lines, which a vertical error between the rays pulls nearer, neither is biased by what
+# the rays miss each other across the epipolar plane.
 
 # Sine of the angle between a ray and the baseline: below, both rays meet everywhere on the line through the cameras.
 EPIPOLE = 1e-9
@@ -234,3 +235,41 @@ def _across_ray(w: Tensor, columns: tuple[Tensor, Tensor, Tensor, Tensor], weigh
         product = (columns[i] * columns[j]).sum(-1) - on[i] * on[j]
         found.append(product if weight is None else product * weight)
     return found
+
+
+# What there is besides pixels when a point is sought: who saw it, how light bends, which height it has.
+
+# Meters: light from beyond is bent as if it came from there; nothing on the Earth is seen so far.
+LIGHT_HORIZON = 5e5
+
+
+class Surroundings(NamedTuple):
+    """What there may be besides pixels.
+
+    Attributes:
+        present: (..., C, N) bool: which camera saw what; all of them if None.
+        up: (C, 3) the vertical at each camera, in its axes; straight lines of sight if None.
+        bending: 1/m: light from the level distance d comes from bending * d² too high: k / 2R.
+        held: (..., 3, N) row of (a, b, ρ) that stays as it is at the start, over its sigma: a stated height.
+        held_off: (..., N) by how much it is too high, over its sigma: zeros, with derivatives.
+    """
+
+    present: Tensor | None = None
+    up: Tensor | None = None
+    bending: Tensor | float = 0.0
+    held: Tensor | None = None
+    held_off: Tensor | float = 0.0
+
+
+def length_of_one(scale: Tensor, inverse: Tensor) -> Tensor:
+    """Meters of one in the units of ρ-scaled points, at most as far as anything on the Earth is seen."""
+    return scale / torch.maximum(inverse.abs(), scale / LIGHT_HORIZON)
+
+
+def lifted(seen: Tensor, around: Surroundings, unit: Tensor | float) -> Tensor:
+    """By how much (..., C, 3, N) things are seen higher than `seen` in each camera's axes; one of it is `unit` m."""
+    assert around.up is not None
+    up = around.up[..., None]
+    along = (seen * up).sum(-2, keepdim=True)
+    level = seen.square().sum(-2, keepdim=True) - along * along
+    return around.bending * unit * level * up

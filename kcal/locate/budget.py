@@ -13,15 +13,13 @@ from torch import Tensor
 from kcal.checks import as_points
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.lens.camera_rig import CameraRig
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import CameraRig, StereoRig
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.max_likelihood import calibration_effect
 from kcal.locate.mounting import by_mounting
 from kcal.locate.multi_localizer import MultiViewLocalizer, ViewsLocalization
-from kcal.locate.ranges import BEARING_SIGMAS
-from kcal.locate.stereo import PositionStatus, checked_rig, fit_pairs, sight_lines
+from kcal.locate.stereo import BEARING_SIGMAS, PositionStatus, checked_rig, fit_pairs, sight_lines
 from kcal.threads import in_one_thread
 
 # What a stereo rig will do before it is built: range errors against distance, exactly and not to first order.

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kcal.checks import Float64Module, as_tensor, exportable, scalar
 from kcal.errors import InputError
-from kcal.lens.rectification import StereoRectification
+from kcal.lens.images import StereoRectification
 from kcal.locate.geodesy import Origin
 from kcal.locate.localizer import StereoLocalizer
 from kcal.texts import brief

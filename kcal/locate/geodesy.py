@@ -9,8 +9,8 @@ from torch import Tensor
 
 from kcal.checks import as_points, require_finite
 from kcal.errors import InputError
-from kcal.lens.mounting import Origin
-from kcal.lens.plane import angle_over_distance
+from kcal.lens.projection import angle_over_distance
+from kcal.lens.rig import Origin
 
 # WGS84 in closed form: geodetic, Earth-centered (ECEF) and local east-north-up coordinates, in torch, differentiable.
 #

@@ -12,11 +12,10 @@ from torch import Tensor
 from kcal.checks import as_points
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA, Mounting
+from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Mounting
 from kcal.locate.geodesy import anchor, enu_from_cam, mean_radius, place_enu
 from kcal.locate.mounting import by_mounting
-from kcal.locate.ranges import QUANTILE
-from kcal.locate.stereo import PositionStatus, status_counts
+from kcal.locate.stereo import QUANTILE, PositionStatus, status_counts
 from kcal.locate.views import StatedHeight
 from kcal.texts import brief
 

@@ -13,9 +13,8 @@ from kcal.checks import as_covariance, as_points, expanded, exportable, scalar
 from kcal.dispatch import is_differentiated
 from kcal.errors import InputError
 from kcal.io.rig_file import load_rig
-from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA, Origin, check_refraction
 from kcal.lens.pose import Movable, rotation_from_vector
-from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Origin, RigCovariance, StereoRig, check_refraction
 from kcal.locate.geodesy import anchor, enu_from_cam, mean_radius, place_enu
 from kcal.locate.max_likelihood import by_pose, calibration_effect, inverse_variance, position_slope, symmetric
 from kcal.locate.mounting import attitude, by_mounting

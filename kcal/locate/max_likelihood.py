@@ -24,10 +24,10 @@ from torch import Tensor
 
 from kcal.dispatch import is_traced, known_true
 from kcal.lens.camera import Camera
-from kcal.lens.camera_stack import project_each
+from kcal.lens.camera_like import project_each
 from kcal.lens.pose import side_axes, step_rows
 from kcal.lens.projection import Projection
-from kcal.locate.bent_light import Surroundings, length_of_one, lifted
+from kcal.locate.angular import Surroundings, length_of_one, lifted
 
 # Evaluations. Graphs cannot stop early: with three they err by 4e-6 of the noise where marks are 10 px off, with two by
 # 1e-2.

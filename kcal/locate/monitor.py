@@ -15,15 +15,13 @@ from kcal.calibrate.rig.drift import Drift, measure_drift
 from kcal.calibrate.rig.sources import Features, Landmarks
 from kcal.checks import as_points
 from kcal.errors import DegenerateError, InputError
-from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, RigCovariance, StereoRig
 from kcal.locate.budget import usual_ranges
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.marks import Marks
 from kcal.locate.mounting import attitude
-from kcal.locate.stereo import PositionStatus, sight_lines
-from kcal.locate.triangulate import Triangulate
+from kcal.locate.stereo import PositionStatus, Triangulate, sight_lines
 from kcal.threads import in_one_thread
 
 # What a rig that was right once still knows of its relative yaw: masts bend with the sun, and creep with time.

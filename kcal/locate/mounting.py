@@ -11,8 +11,7 @@ from torch import Tensor
 
 from kcal.calibrate.rig.result import RigResult
 from kcal.errors import InputError
-from kcal.lens.mounting import Mounting, Origin
-from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.lens.rig import Mounting, Origin, RigCovariance, StereoRig
 from kcal.locate.geodesy import ecef_from_enu_rotation, enu_to_geodetic
 from kcal.threads import in_one_thread
 

@@ -19,7 +19,7 @@ from kcal.calibrate.rig.initial_poses import consensus_pose, consensus_rotation
 from kcal.calibrate.rig.sources import LandmarkEffect, Landmarks, MeasuredPosition
 from kcal.errors import FileError, InputError
 from kcal.lens.camera import Camera
-from kcal.lens.mounting import Origin
+from kcal.lens.rig import Origin
 from kcal.locate.survey import EARTH, LOCAL, place_sigma, places_of
 from kcal.locate.tables import TableRow, read_chunks
 from kcal.texts import unix_seconds

@@ -12,16 +12,17 @@ from torch import Tensor
 from kcal.checks import StatedModule, as_points, expanded, exportable, scalar
 from kcal.dispatch import is_differentiated, is_traced, known_true
 from kcal.errors import InputError
-from kcal.lens.camera_rig import CameraRig
+from kcal.lens.rig import CameraRig
 from kcal.locate.geodesy import anchor, ecef_from_enu_rotation, enu_to_geodetic, mean_radius, place_enu
 from kcal.locate.ground import EarthFrame, Ground, stated_ahead
 from kcal.locate.max_likelihood import inverse_variance
 from kcal.locate.multiview import checked_views_covariance
-from kcal.locate.ranges import BEARING_SIGMAS, range_interval
 from kcal.locate.stereo import (
+    BEARING_SIGMAS,
     PositionStatus,
     flag_positions,
     piece_by_piece,
+    range_interval,
     range_where_ok,
     reprojection_errors,
     status_counts,
@@ -109,7 +110,7 @@ class MultiViewLocalizer(StatedModule):
 
     Example:
         >>> from kcal import Camera
-        >>> from kcal.lens.mounting import Origin
+        >>> from kcal.lens.rig import Origin
         >>> from kcal.locate import enu_from_cam
         >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
         >>> look = torch.stack([enu_from_cam(heading).T for heading in (0.0, 315.0, 45.0)])

@@ -16,8 +16,7 @@ from torch import Tensor
 
 from kcal.checks import as_points
 from kcal.errors import InputError
-from kcal.lens.mounting import Origin
-from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.lens.rig import Origin, RigCovariance, StereoRig
 from kcal.locate.geodesy import anchor, enu_to_geodetic, latitude_longitude
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.stereo import PositionStatus, checked_pairs

@@ -13,8 +13,7 @@ from torch import Tensor
 
 from kcal.errors import FileError, InputError
 from kcal.lens.camera import Camera
-from kcal.lens.camera_rig import CameraRig
-from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA, Origin
+from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, CameraRig, Origin
 from kcal.locate.geodesy import anchor, ecef_from_enu_rotation, enu_from_cam, geodetic_to_enu, mean_radius, place_enu
 from kcal.locate.ground import Ground
 from kcal.locate.multi_localizer import errors_by_camera

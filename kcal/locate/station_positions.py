@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.lens.camera_rig import CameraRig
+from kcal.lens.rig import CameraRig
 from kcal.locate.geodesy import anchor, ecef_from_enu_rotation, enu_to_geodetic
 from kcal.locate.ground import Ground
 from kcal.locate.localizer import Localization

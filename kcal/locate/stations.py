@@ -11,9 +11,7 @@ from kcal.errors import InputError
 from kcal.files import read_bytes
 from kcal.io.camera_rig_file import CameraRigFile
 from kcal.io.rig_file import RigFile
-from kcal.lens.camera_rig import CameraRig
-from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA, Mounting, Origin
-from kcal.lens.rig import StereoRig, half_of_covariance
+from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, CameraRig, Mounting, Origin, StereoRig, half_of_covariance
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.mounting import mounting_of

@@ -1,7 +1,4 @@
-"""Pixel pairs of a stereo rig to points with errors: statuses, the most likely point, the interval of its range.
-
-`Triangulate` and `StereoLocalizer` share what is here.
-"""
+"""Pixel pairs of a stereo rig to points with errors: statuses, the most likely point, the interval of its range."""
 
 from __future__ import annotations
 
@@ -15,14 +12,74 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from kcal.checks import as_points
-from kcal.dispatch import CHUNK, is_traced, known_true
+from kcal.checks import as_points, exportable, scalar
+from kcal.dispatch import CHUNK, is_differentiated, is_traced, known_true
 from kcal.errors import DegenerateError, InputError
-from kcal.lens.camera_stack import unproject_each
+from kcal.lens.camera_like import unproject_each
 from kcal.lens.rig import StereoRig
 from kcal.locate.angular import EPIPOLE, triangulate_pairs
-from kcal.locate.max_likelihood import PointFit, RelativeCamera, inverse_covariances, most_likely
-from kcal.locate.ranges import BEARING_SIGMAS, RangeInterval, range_interval
+from kcal.locate.max_likelihood import (
+    PointFit,
+    RelativeCamera,
+    inverse_covariances,
+    inverse_variance,
+    most_likely,
+    position_slope,
+    symmetric,
+)
+from kcal.operation import Operations, shapes_of
+from kcal.texts import brief
+
+# The 95 % interval of a range, from one over the range and its standard deviation.
+#
+# A range is skewed: at 5 km with 3.2 px of disparity, half a pixel too many puts a point 0.7 km nearer and half a pixel
+# too few 0.9 km farther, and the far end is infinite once the disparity may be zero. A standard deviation of the range
+# hides both. One over the range has nearly Gaussian errors, so its interval is carried over.
+
+# Two-sided 95 % of a normal distribution.
+QUANTILE = 1.959963984540054
+# A parallax below this many standard deviations gives a bearing, but no range worth the name.
+BEARING_SIGMAS = 3.0
+
+
+class RangeInterval(NamedTuple):
+    """Ends of the 95 % interval in meters from the left camera, (..., N) each.
+
+    Attributes:
+        low: nearest range; infinite if the rays diverge by more than the noise explains.
+        high: farthest range; infinite if the point may be at infinity.
+    """
+
+    low: Tensor
+    high: Tensor
+
+
+def range_interval(inverse_range: Tensor, sigma: Tensor, known: Tensor | None = None) -> RangeInterval:
+    """The 95 % interval of the range, from the interval inverse_range ± 1.96 sigma.
+
+    Args:
+        inverse_range: (..., N) one over meters, negative where the rays diverge.
+        sigma: (..., N) its standard deviation.
+        known: (..., N) bool; where it is False the interval is 0 to infinity.
+
+    Example:
+        >>> f, baseline, disparity = 1600.0, 10.0, torch.tensor([3.2], dtype=torch.float64)
+        >>> sigma = torch.tensor([0.5 / (f * baseline)], dtype=torch.float64)
+        >>> interval = range_interval(disparity / (f * baseline), sigma)
+        >>> round(interval.low.item(), 1), round(interval.high.item(), 1)
+        (3827.8, 7207.1)
+    """
+    ends = []
+    for inverse, unknown in ((inverse_range + QUANTILE * sigma, 0.0), (inverse_range - QUANTILE * sigma, math.inf)):
+        ahead = inverse > 0
+        reach = torch.where(ahead, 1.0 / torch.where(ahead, inverse, 1.0), math.inf)
+        ends.append(reach if known is None else torch.where(known, reach, unknown))
+    return RangeInterval(*ends)
+
+
+# Pixel pairs of a stereo rig to points with errors: statuses, the most likely point, the interval of its range.
+#
+# `Triangulate` and `StereoLocalizer` share what is here.
 
 # Radians. A smaller parallax is parallel for any camera: the point would be a billion baselines away.
 _PARALLEL = 1e-9
@@ -299,3 +356,124 @@ def reprojection_errors(residual: Tensor) -> Tensor:
     squared = residual.unflatten(-2, (-1, 2)).square().sum(-2)
     some = squared > 0
     return torch.where(some, torch.sqrt(torch.where(some, squared, 1.0)), 0.0).mT
+
+
+# `Triangulate`: pixel pairs of a stereo rig to points in the rig's own frame, without the Earth.
+
+
+@exportable
+class Triangulation(NamedTuple):
+    """Result of `Triangulate`; no tensor contains NaN, whatever went in.
+
+    Attributes:
+        points: (..., N, 3) meters in the rig frame (the left camera's); zeros unless the status is OK.
+        status: (..., N) int8, codes of `PositionStatus`; never BEARING_ONLY: see `bearing_only`.
+        rays: (..., N, 3) unit vectors of the most likely direction from the left camera; its optical axis where the
+            lens has no ray.
+        reprojection: (..., N, 2) distance in px between mark and reprojected point, left and right; zeros unless OK.
+        inverse_range: (..., N) one over meters from the left camera, negative where the rays diverge.
+        inverse_range_sigma: (..., N) its standard deviation from the marks' noise; zero where nothing is known.
+        range_low: (..., N) meters from the left camera, lower end of the 95 % interval of the marks' noise.
+        range_high: (..., N) its upper end, infinite where the point may be at infinity. The interval is 0 to infinity
+            unless the status is OK or PARALLEL.
+        bearing_only: (..., N) true where the parallax is below three sigma: trust the bearing, not the range.
+        covariance: (..., N, 3, 3) of `points` from the marks' noise, to first order; an infinite diagonal unless OK. At
+            long range a point is skewed along the line of sight: quote the range interval.
+    """
+
+    points: Tensor
+    status: Tensor
+    rays: Tensor
+    reprojection: Tensor
+    inverse_range: Tensor
+    inverse_range_sigma: Tensor
+    range_low: Tensor
+    range_high: Tensor
+    bearing_only: Tensor
+    covariance: Tensor = torch.empty(0)  # its place is the last: programs may build this result, or unpack it
+
+    @property
+    def range(self) -> Tensor:
+        """(..., N) meters from the left camera; infinite unless the status is OK."""
+        return range_where_ok(self.status, self.inverse_range)
+
+    def __repr__(self) -> str:
+        return brief(self, status=status_counts(self.status))
+
+
+class Triangulate(Operations):
+    """Locate pixel pairs in the rig frame: the positions of `StereoLocalizer`, without the Earth.
+
+    The status of a pair is decided from the two rays before anything is divided: `NOT_FINITE` (NaN or infinite
+    pixels), `OUTSIDE_IMAGE` (more than half a pixel outside), `OUTSIDE_LENS` (the lens model has no ray there),
+    `BEHIND` (the rays' lines cross behind exactly one camera), `PARALLEL` (parallel or diverging rays: at or beyond
+    infinity, or along the baseline), else `OK`. Points near infinity are `OK` with a wide range interval.
+
+    There is no branch on values, so that the module compiles and exports. Geometry runs in float64 whatever the
+    pixels' type; derivatives by the pixels are exact and finite, and zero for pairs that are not OK.
+
+    Args:
+        rig: two cameras and their relative pose; its covariance is not used.
+        pixel_sigma: standard deviation of the marks, px along each axis. Covariance and range interval cover the marks'
+            noise only; `StereoLocalizer` adds the errors of the calibration.
+
+    Raises:
+        InputError: a `pixel_sigma` that is not positive.
+        DegenerateError: a rig without a baseline.
+
+    Example:
+        >>> from kcal import Camera
+        >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
+        >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
+        >>> left = torch.tensor([[960.0, 540.0]], dtype=torch.float64)
+        >>> result = Triangulate(rig)(left, left - torch.tensor([3.2, 0.0], dtype=torch.float64))
+        >>> round(result.points[0, 2].item(), 3), PositionStatus(int(result.status[0])).name
+        (5000.0, 'OK')
+    """
+
+    results = shapes_of(
+        Triangulation, points=(3,), status=torch.int8, rays=(3,), reprojection=(2,), bearing_only=torch.bool,
+        covariance=(3, 3),
+    )  # fmt: skip
+    pixel_sigma: Tensor
+
+    def __init__(self, rig: StereoRig, pixel_sigma: float = 0.3) -> None:
+        super().__init__()
+        self.register_buffer("pixel_sigma", scalar(checked_rig(rig, pixel_sigma), rig.right_from_left_translation))
+        self.rig = rig
+
+    def forward(self, pixels_left: Tensor, pixels_right: Tensor) -> Triangulation:
+        """Triangulate matched pixels, both (..., N, 2), integer coordinates at pixel centers.
+
+        Raises:
+            InputError: not floating point, or shapes that are wrong or unlike.
+        """
+        left, right = checked_pairs(pixels_left, pixels_right, self.rig)
+        if found := self.as_operation("forward", left, right):
+            return Triangulation(*found)
+        differentiated = is_differentiated(left, right, self)
+
+        def triangulate(left: Tensor, right: Tensor) -> Triangulation:
+            found = fit_pairs(self.rig, left, right, differentiated=differentiated)
+            reach = inverse_range(
+                found, self.pixel_sigma**2 * inverse_variance(found.fit, found.fit.covariance), PositionStatus.OK
+            )
+            ok = reach.status == int(PositionStatus.OK)
+            depth = found.scale / torch.where(ok, found.fit.inverse, 1.0)
+            slope = position_slope(found.fit, found.scale, ok)
+            covariance = self.pixel_sigma**2 * (slope @ symmetric(found.fit.covariance) @ slope.mT)
+            unknown = torch.diag(covariance.new_full((3,), torch.inf))
+            return Triangulation(
+                points=torch.where(ok[..., None], depth[..., None] * found.fit.direction.mT, 0.0),
+                status=reach.status,
+                rays=(found.fit.direction / found.length[..., None, :]).mT,
+                reprojection=torch.where(ok[..., None], reprojection_errors(found.fit.residual), 0.0),
+                inverse_range=reach.value,
+                inverse_range_sigma=reach.sigma,
+                range_low=reach.interval.low,
+                range_high=reach.interval.high,
+                bearing_only=reach.weak,
+                covariance=torch.where(ok[..., None, None], covariance, unknown),
+            )
+
+        return piece_by_piece(triangulate, left, right, differentiated=differentiated)

@@ -16,7 +16,7 @@ from torch import Tensor
 from kcal.calibrate.rig.sources import Features, Landmarks, MeasuredPosition, inverse_range_beyond
 from kcal.errors import FileError, InputError
 from kcal.files import read_text
-from kcal.lens.mounting import Origin
+from kcal.lens.rig import Origin
 from kcal.locate.geodesy import geodetic_to_enu
 from kcal.locate.marks import PIXELS, Marks, pixel_of, read_marks
 from kcal.locate.tables import DistinctKeys, Doubled, TableChunk, TableRow, guarded, header_of, read_chunks, read_rows

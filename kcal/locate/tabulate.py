@@ -20,8 +20,7 @@ from torch import Tensor
 from kcal.checks import as_points
 from kcal.errors import FileError, InputError
 from kcal.lens.camera import Camera
-from kcal.lens.mounting import Origin
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Origin, StereoRig
 from kcal.locate.geodesy import azimuth_elevation, enu_to_geodetic
 from kcal.locate.localizer import Localization, Sensitivity, StereoLocalizer
 from kcal.locate.stereo import PositionStatus

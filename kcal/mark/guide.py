@@ -17,13 +17,11 @@ from torch import Tensor
 
 from kcal.calibrate.rig.pairs import pair_by_name
 from kcal.corners.images import VIDEO_SUFFIXES, Gray, expand_images, read_gray
-from kcal.corners.match import MatchOptions, MatchStatus, match_points
-from kcal.corners.refind import find_again
+from kcal.corners.match import MatchOptions, MatchStatus, find_again, match_points
 from kcal.corners.video import VideoFrames
 from kcal.errors import InputError
 from kcal.lens.pose import side_axes, step_rows
-from kcal.lens.projection import project_components
-from kcal.lens.pupil import FAR
+from kcal.lens.projection import FAR, project_components
 from kcal.lens.rig import StereoRig
 from kcal.locate.marks import Marks, read_marks
 from kcal.mark.items import Side

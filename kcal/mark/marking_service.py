@@ -14,8 +14,7 @@ from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.sources import RigData
 from kcal.errors import InputError, KcalError
 from kcal.lens.camera import Camera
-from kcal.lens.mounting import Origin
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Origin, StereoRig
 from kcal.locate.budget import range_sigmas
 from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic
 from kcal.locate.marks import Marks

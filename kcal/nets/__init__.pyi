@@ -2,7 +2,7 @@
 # Where each name is defined, for type checkers and for `door`; a comment begins a group of the reference page.
 
 # Residual
-from kcal.nets.residual import ResidualNet as ResidualNet
+from kcal.nets.joint import ResidualNet as ResidualNet
 
 # Residual field of a camera
 from kcal.lens.network_modes import NetworkModes as NetworkModes

@@ -1,7 +1,7 @@
 """The learned inverse of a lens: the paper's Inv_NN (Fig. 8, Eq. 12), as a start for Newton's method.
 
 Three layers map a distorted position to a correction of a closed-form guess: the tilt undone and the radial polynomial
-of `kcal.lens.inverse_start`, or, as in the paper, the distorted position itself. A network is never exact and does not
+of `kcal.lens.inverse`, or, as in the paper, the distorted position itself. A network is never exact and does not
 know where a lens folds, so it only gives `Camera.unproject` a first guess. Newton's method and the valid region decide
 about the answer.
 """
@@ -17,13 +17,11 @@ from torch import Tensor
 from kcal.checks import as_points
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
-from kcal.lens.inverse_start import start_from, undo_tilt
-from kcal.lens.plane import plane_from_points, rays_from_plane
-from kcal.lens.projection import from_pixels
-from kcal.nets.fit import RegressionProblem, fit_weights
-from kcal.nets.mlp import Network, evaluate, initial_weights
+from kcal.lens.inverse import start_from, undo_tilt
+from kcal.lens.projection import from_pixels, plane_from_points, rays_from_plane
+from kcal.nets.mlp import Network, RegressionProblem, evaluate, fit_weights, initial_weights
 from kcal.solve.lm import LMOptions
-from kcal.solve.result import SolverStatus
+from kcal.solve.problem import SolverStatus
 
 # 1 - |p|² / 4 on the chart at 89.9° off axis, the smallest divisor on the way back to the plane z = 1.
 _SMALLEST_DIVISOR = 1.0 - math.tan(math.radians(89.9 / 2)) ** 2

@@ -1,9 +1,4 @@
-"""Small fully connected networks as functions of one vector of weights, with closed-form Jacobians.
-
-Convention: features come first and points last, (..., F, N). Hidden layers are tanh, the last layer is linear.
-`widths` lists the features of each stage: (2, 8, 8, 2) has three layers. All weights are one vector: for each layer the
-matrix (out, in) row by row, then the bias (out,).
-"""
+"""Small fully connected networks as functions of one vector of weights, and the fit that all of them share."""
 
 from __future__ import annotations
 
@@ -15,6 +10,14 @@ from torch import Tensor, nn
 
 from kcal.checks import StatedModule
 from kcal.errors import InputError
+from kcal.solve.lm import DenseLinearization, DenseProblem, LMOptions, minimize
+from kcal.solve.problem import Problem, Result, State
+
+# Small fully connected networks as functions of one vector of weights, with closed-form Jacobians.
+#
+# Convention: features come first and points last, (..., F, N). Hidden layers are tanh, the last layer is linear.
+# `widths` lists the features of each stage: (2, 8, 8, 2) has three layers. All weights are one vector: for each layer
+# the matrix (out, in) row by row, then the bias (out,).
 
 Widths = tuple[int, ...]
 # Standard deviations of the initial first-layer weights, whose inputs lie in [-1, 1], and of the hidden biases: wide
@@ -116,3 +119,36 @@ def evaluate_with_slopes(inputs: Tensor, weights: Tensor, widths: Widths) -> Net
         if stage is not inputs:
             slope = slope * (1.0 - stage * stage)[..., None, :]
     return NetValues(values, slope, torch.cat(columns[::-1], -3))
+
+
+# The fit that all networks share: least squares over their weights by Levenberg-Marquardt.
+
+
+@torch.no_grad()
+def fit_weights(net: Network, problem: Problem, start: State, options: LMOptions | None = None) -> Result:
+    """Minimize a problem whose states begin with the network's weights, and copy the weights found into `net`."""
+    result = minimize(problem, start, options)
+    net.weights.copy_(result.state[0])
+    return result
+
+
+class RegressionProblem(DenseProblem):
+    """Residuals net(inputs) - targets, with the Jacobian in closed form. The state is the vector of weights (P,).
+
+    Args:
+        inputs: (in, N).
+        targets: (out, N).
+        widths: features of each stage.
+    """
+
+    def __init__(self, inputs: Tensor, targets: Tensor, widths: Widths) -> None:
+        super().__init__(lambda weights: (evaluate(inputs, weights, widths) - targets).flatten(), ())
+        self._inputs, self._targets, self._widths = inputs, targets, widths
+
+    def linearize(self, state: State) -> DenseLinearization:
+        """See `Problem.linearize`."""
+        net = evaluate_with_slopes(self._inputs, state[0], self._widths)
+        residuals = (net.values - self._targets).flatten()
+        self.residual_count = len(residuals)
+        # Contiguous with the weights last, as the normal equations read it.
+        return DenseLinearization(residuals, net.by_weights.flatten(-2).T.contiguous())

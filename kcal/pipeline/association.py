@@ -1,14 +1,10 @@
-"""Which detection of the left image is which of the right one: geometry, size, category and looks, one to one.
-
-Pairs near one epipolar line (`kcal.pipeline.epipolar_band`) get their most likely point, at once on tensors. What no
-point explains is the epipolar error; it is judged by the noise of the boxes and by what is not known of the rig. The
-assignment with the least sum of costs is exact (`kcal.pipeline.one_to_one`); a detection may stay alone.
-"""
+"""Which object of the left image is which of the right one: bands, costs, and one assignment."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -16,18 +12,327 @@ import torch
 from torch import Tensor
 
 from kcal.checks import StatedModule, as_points, exportable
-from kcal.corners.filters import as_gray
+from kcal.corners.patches import as_gray
 from kcal.dispatch import is_differentiated, still
 from kcal.errors import InputError
+from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
-from kcal.locate.multi_localizer import MultiViewLocalizer
+from kcal.lens.uncertainty import pixel_slopes
+from kcal.locate.multi_localizer import MultiViewLocalizer, common_errors, posed_cameras
 from kcal.locate.stations import stations_of
-from kcal.pipeline.association_options import AssociationOptions
-from kcal.pipeline.detections import Detections, box_anchors
-from kcal.pipeline.epipolar_band import near_epipolar_lines
+from kcal.locate.views import CommonErrors, PosedCameras, ViewsFit, fit_views
+from kcal.pipeline.detections import Anchor, Detections, box_anchors
 from kcal.pipeline.one_to_one import assign_groups
-from kcal.pipeline.pair_costs import pair_costs
 from kcal.texts import brief
+
+# `AssociationOptions`: which detections may be of one object.
+
+
+@dataclass(frozen=True, kw_only=True)
+class AssociationOptions:
+    """Options of `associate`.
+
+    Args:
+        box_sigma: standard deviation of a box's middle along each axis, pixels.
+        nearest: smallest range, meters; 10 baselines if None.
+        farthest: largest range, meters.
+        gate: a pair is possible up to this many standard deviations, epipolar error, size and looks together.
+        odds: a pair is ambiguous unless the best assignment with it is this many times as likely as the best one that
+            pairs one of its members otherwise.
+        same_category: whether only detections of the same category may be paired.
+        anchor: pixel that stands for an object; see `Detections.anchors`.
+
+    Raises:
+        InputError: a value out of range.
+    """
+
+    box_sigma: float = 2.0
+    nearest: float | None = None
+    farthest: float = math.inf
+    gate: float = 4.0
+    odds: float = 20.0
+    same_category: bool = True
+    anchor: Anchor = "center"
+
+    def __post_init__(self) -> None:
+        if not (0 < self.box_sigma < math.inf and 0 < self.gate < math.inf and 1 <= self.odds < math.inf):
+            raise InputError("association: box_sigma and gate are positive, and odds at least 1")
+        if not 0 < (self.nearest or 1e-9) < self.farthest:
+            raise InputError(f"association: 0 < nearest < farthest is needed, got {self.nearest} and {self.farthest}")
+
+
+# Which pairs of pixels can be of one object at all: a cheap test that comes before any point is fitted.
+#
+# Two rays meet where rayᵀ_right E ray_left is zero. How far it may be from zero follows, to first order, from the noise
+# of the pixels and the errors of the rig. Rays and their derivatives are computed once for each pixel, and a pair costs
+# a few products. Far from the line, the fit of a point may also stop at a false optimum; such pairs end here.
+
+# The band is this many times as wide as the errors to first order say, for lenses that bend within it.
+_SLACK = 1.5
+
+
+# Ranges from the left camera and from the rig's middle differ by this ratio at most, from 2 baselines on.
+_MIDDLE = 1.25
+# Numbers that are held at once.
+_AT_ONCE = 1 << 20
+
+
+class _Rays(NamedTuple):
+    """N rays of a camera, in the frame of the right one.
+
+    Attributes:
+        ray: (N, 3).
+        by_pixel: (N, 3, 2) turns of it by a pixel.
+        by_error: (N, 3, K) turns of it by the errors of the rig.
+    """
+
+    ray: Tensor
+    by_pixel: Tensor
+    by_error: Tensor
+
+    def at(self, which: Tensor | tuple[Tensor, Tensor]) -> _Rays:
+        return _Rays(*(value[which] for value in self))
+
+    def split(self, moments: int) -> _Rays:
+        """Those of so many moments: (B, N / B, ...)."""
+        return _Rays(*(value.unflatten(0, (moments, -1)) for value in self))
+
+
+def near_epipolar_lines(
+    rig: StereoRig,
+    left: Tensor,
+    right: Tensor,
+    sigma: float,
+    gate: float,
+    ranges: tuple[float, float] | None = None,
+) -> Tensor:
+    """(..., N, M) bool: False only where the epipolar error is beyond `gate` standard deviations for certain.
+
+    Args:
+        rig: the calibrated cameras; errors of its `covariance` widen the band.
+        left: (..., N, 2) float64 pixels.
+        right: (..., M, 2), with the same leading dimensions: moments, whose pixels are not compared with each other's.
+        sigma: standard deviation of every pixel along each axis.
+        gate: standard deviations.
+        ranges: nearest and farthest, meters: pairs beyond them by as many standard deviations are left out, too.
+
+    Example:
+        >>> from kcal.rig import planned_rig
+        >>> left = torch.tensor([[960.0, 540.0]], dtype=torch.float64)
+        >>> right = torch.tensor([[944.0, 541.0], [944.0, 640.0]], dtype=torch.float64)
+        >>> near_epipolar_lines(planned_rig(), left, right, 1.0, 4.0).tolist()
+        [[True, False]]
+    """
+    rotation, shift = rig.right_from_left_rotation, rig.right_from_left_translation
+    sizes = (rig.left.values.shape[-1], rig.right.values.shape[-1], 3, 3)
+    known = shift.new_zeros(0, sum(sizes)) if rig.covariance is None else rig.covariance.half.to(shift)
+    own = known.T.split(sizes)
+    near = torch.zeros(*left.shape[:-1], right.shape[-2], dtype=torch.bool, device=left.device)
+    if not near.numel():
+        return near
+    whole = near.reshape(-1, *near.shape[-2:])
+    ray, by_pixel, by_error = _turns(rig.left, left.reshape(-1, 2), own[0])
+    first = _Rays(ray @ rotation.T, rotation @ by_pixel, own[2] - rotation @ by_error).split(len(whole))
+    other = _Rays(*_turns(rig.right, right.reshape(-1, 2), own[1])).split(len(whole))
+    shifts = shift, own[3]
+    errors, pairs = max(1, own[3].shape[1]), whole[0].numel()
+    for moments in torch.arange(len(whole), device=left.device).split(_AT_ONCE // (32 * pairs) + 1):
+        seen = other.at(moments)
+        for rows in torch.arange(left.shape[-2], device=left.device).split(_AT_ONCE // (32 * right.shape[-2]) + 1):
+            part = first.at((moments[:, None], rows))
+            block = _possible(part, seen, shifts, sigma, _SLACK * gate, ranges)
+            if len(known):
+                # Exact where the bound on what the errors of the rig do leaves it open.
+                for at, some, columns in (which.T for which in block.nonzero().split(_AT_ONCE // (8 * errors) + 1)):
+                    certain = _certain(part.at((at, some)), seen.at((at, columns)), shifts, sigma, _SLACK * gate)
+                    block[at, some, columns] = certain
+            whole[moments[:, None], rows] = block
+    return near
+
+
+def _possible(
+    first: _Rays,
+    other: _Rays,
+    shifts: tuple[Tensor, Tensor],
+    sigma: float,
+    gate: float,
+    ranges: tuple[float, float] | None,
+) -> Tensor:
+    """(B, N, M) bool: each error of the rig as large as it can be beside the others."""
+    shift, by_shift = shifts
+    turned, rays = first.ray[..., None, :], other.ray[:, None]
+    across = torch.linalg.cross(rays, shift.expand_as(rays))
+    shifted = torch.linalg.cross(*torch.broadcast_tensors(turned, rays))
+    error = (turned * across).sum(-1)
+    # Derivatives of the error (B, N, M, 3) by turns of the left rays about the right camera's axes, and of right rays.
+    by_turn = torch.linalg.cross(*torch.broadcast_tensors(turned, across))
+    by_other = torch.linalg.cross(*torch.broadcast_tensors(rays, torch.linalg.cross(shift.expand_as(turned), turned)))
+    marks = (by_turn @ first.by_pixel).square().sum(-1)
+    marks = marks + (by_other.transpose(1, 2) @ other.by_pixel).square().sum(-1).mT
+    moved = _length(by_turn, first.by_error) + _length(by_other.transpose(1, 2), other.by_error).mT
+    moved = moved + _length(shifted, by_shift)
+    # What products of two turns add at most.
+    turns = first.by_pixel.square().sum((-2, -1))[..., None], other.by_pixel.square().sum((-2, -1))[:, None]
+    second = (gate * sigma) ** 2 * (turns[0] + turns[1])
+    baseline = torch.linalg.vector_norm(shift)
+    near = error.abs() <= gate * ((sigma**2 * marks).sqrt() + moved) + second * baseline
+    if ranges is None:
+        return near
+    # A point at the inverse distance q is seen where the cross product of its rays is q times that with the baseline.
+    length = torch.linalg.vector_norm(across, dim=-1).clamp_min(1e-12)
+    inverse = (shifted * across).sum(-1) / length.square()
+    errors = first.by_error.square().sum((-2, -1))[..., None], other.by_error.square().sum((-2, -1))[:, None]
+    own = [(sigma**2 * turn).sqrt() + error.sqrt() for turn, error in zip(turns, errors, strict=True)]
+    stretch = (own[1] * baseline + by_shift.square().sum().sqrt()) / length
+    reach = gate * ((own[0] + own[1]) / length + inverse.abs() * stretch) + second / length
+    beyond = inverse + reach < 1.0 / (_MIDDLE * ranges[1])
+    before = inverse - reach > _MIDDLE / ranges[0]
+    # Near the baseline's own direction nothing is said of the distance.
+    return near & ~((beyond | before) & (gate * stretch < 0.3))
+
+
+def _length(by: Tensor, errors: Tensor) -> Tensor:
+    """Of by (..., M, 3) times errors (..., 3, K), by the products of the errors with each other: no K for each pair."""
+    return ((by @ (errors @ errors.mT)) * by).sum(-1).clamp_min(0.0).sqrt()
+
+
+def _certain(first: _Rays, other: _Rays, shifts: tuple[Tensor, Tensor], sigma: float, gate: float) -> Tensor:
+    """(L,) bool: the same of L pairs, with the errors of the rig together."""
+    shift, by_shift = shifts
+    across = torch.linalg.cross(other.ray, shift.expand_as(other.ray))
+    by_turn = torch.linalg.cross(first.ray, across)[:, None]
+    by_other = torch.linalg.cross(other.ray, torch.linalg.cross(shift.expand_as(first.ray), first.ray))[:, None]
+    shifted = torch.linalg.cross(first.ray, other.ray)[:, None]
+    marks = torch.cat([by_turn @ first.by_pixel, by_other @ other.by_pixel], -1)
+    moved = by_turn @ first.by_error - by_other @ other.by_error + shifted @ by_shift
+    variance = sigma**2 * marks.square().sum((1, 2)) + moved.square().sum((1, 2))
+    turns = sum(ray.by_pixel.square().sum((1, 2)) for ray in (first, other))
+    second = (gate * sigma) ** 2 * turns * torch.linalg.vector_norm(shift)
+    return (first.ray * across).sum(-1).abs() <= gate * variance.sqrt() + second
+
+
+def _turns(camera: Camera, pixels: Tensor, half: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Rays (N, 3), turns of them (N, 3, 2) by a pixel and (N, 3, K) by the K errors of the camera's parameters."""
+    rays, _ = camera.unproject(pixels)
+    by_camera, by_motion, _ = pixel_slopes(camera, rays, torch.inf, list(range(len(half))))
+    by_turn = by_motion[..., :3]
+    turns = by_turn.mT @ torch.linalg.inv_ex(by_turn @ by_turn.mT)[0]
+    return rays, turns, turns @ (by_camera @ half)
+
+
+# What a pair of detections costs: squared standard deviations of what no point explains, of its range and its size.
+
+# Spread of the logarithm of an object's size between two views, besides what boxes err: it is seen from two sides.
+_SIZE_SPREAD = 0.15
+# Numbers that are held at once while pairs are compared, some 100 MB with what is derived from them.
+_PAIRS_AT_ONCE = 1 << 19
+
+
+class PairCosts(NamedTuple):
+    """Of L pairs of detections.
+
+    Attributes:
+        cost: (L,) squared standard deviations: minus twice the logarithm of the likelihood; infinite where impossible.
+        inverse: (L,) one over meters, from the first camera.
+        sigma: (L,) its standard deviation.
+    """
+
+    cost: Tensor
+    inverse: Tensor
+    sigma: Tensor
+
+
+def fit_some(localize: MultiViewLocalizer, cameras: list[int], pixels: Tensor, seen: Tensor, noise: float) -> ViewsFit:
+    """Points of pixels (N, C, 2) of some cameras, with all errors that each camera's marks share."""
+    posed, common = posed_cameras(localize), common_errors(localize)
+    part = PosedCameras(
+        [posed.cameras[c] for c in cameras], posed.rotation[cameras], posed.center[cameras],
+        None if posed.up is None else posed.up[cameras], posed.bending,
+    )  # fmt: skip
+    if common is not None:
+        common = CommonErrors(tuple(common.lens[c] for c in cameras), common.half[:, cameras], common.bending)
+    return fit_views(part, pixels, seen, noise=noise, shared=common, differentiated=is_differentiated(pixels))
+
+
+def pair_costs(
+    localize: MultiViewLocalizer,
+    cameras: Tensor,
+    pixels: Tensor,
+    boxes: Tensor,
+    options: AssociationOptions,
+    nearest: float | None,
+) -> PairCosts:
+    """Compare pairs of detections of any two cameras; differentiable by pixels and boxes.
+
+    Args:
+        localize: the rig and how well it is known.
+        cameras: (L, 2) numbers of two cameras each, on the CPU; pairs of the same two stand together.
+        pixels: (L, 2, 2) what stands for the objects.
+        boxes: (L, 2, 4) x1, y1, x2, y2.
+        options: of the association.
+        nearest: smallest range, meters; None: any.
+
+    Example:
+        >>> from kcal.locate.stations import stations_of
+        >>> from kcal.rig import planned_rig
+        >>> rig, pixels = stations_of(planned_rig()), torch.tensor([[[960.0, 540.0], [944.0, 540.0]]]).double()
+        >>> boxes, both = torch.cat([pixels - 5.0, pixels + 5.0], -1), torch.tensor([[0, 1]])
+        >>> found = pair_costs(MultiViewLocalizer(rig), both, pixels, boxes, AssociationOptions(), 100.0)
+        >>> round(float(found.cost), 6), round(1.0 / float(found.inverse))
+        (0.0, 1000)
+    """
+    errors = 0 if localize.errors is None else len(localize.errors)
+    count = _PAIRS_AT_ONCE // (16 + 8 * errors) + 1
+    if len(cameras) > count:
+        each = zip(cameras.split(count), pixels.split(count), boxes.split(count), strict=True)
+        parts = [pair_costs(localize, *some, options, nearest) for some in each]
+        return PairCosts(*(torch.cat(values) for values in zip(*parts, strict=True)))
+    which, place = np.unique(cameras.numpy(), return_inverse=True)
+    at = torch.from_numpy(place).reshape(-1, 2).to(pixels.device)
+    rows = torch.arange(len(cameras), device=pixels.device)[:, None]
+    spread = pixels.new_zeros(len(cameras), len(which), 2).index_put((rows, at), pixels)
+    seen = torch.zeros(spread.shape[:2], dtype=torch.bool, device=pixels.device)
+    seen[rows, at] = True
+    found = fit_some(localize, which.tolist(), spread, seen, options.box_sigma)
+    fit = found.fit
+    total = found.chi2
+    length = fit.direction.square().sum(0).sqrt()
+    inverse = fit.inverse / (found.scale * length)
+    variance = found.variance * fit.covariance[5]
+    known = variance.detach() > 0
+    sigma = torch.where(known, torch.where(known, variance, 1.0).sqrt() / (found.scale * length), 0.0)
+    beyond = (1.0 / options.farthest - inverse).clamp_min(0.0)
+    before = (inverse - 1.0 / nearest).clamp_min(0.0) if nearest else torch.zeros_like(inverse)
+    total = total + (torch.maximum(beyond, before) / torch.where(known, sigma, 1.0)).square()
+    magnified = torch.stack([torch.linalg.vector_norm(p.by_point, dim=(-3, -2)) for p in fit.projections], 1)
+    rays = found.rays[rows, at]
+    parallax = torch.linalg.vector_norm(torch.linalg.cross(rays[:, 0], rays[:, 1]), dim=-1)
+    total = total + size_cost(magnified[rows, at], boxes, options.box_sigma, parallax)
+    # On different sides of the line that joins the cameras, lines of sight meet nowhere: a false optimum.
+    apart = localize.rig.center[cameras[:, 1].to(rays.device)] - localize.rig.center[cameras[:, 0].to(rays.device)]
+    along = (rays * apart[:, None]).sum(-1).prod(-1)
+    one_side = apart.square().sum(-1) * (rays[:, 0] * rays[:, 1]).sum(-1) > along
+    good = found.fitted & one_side & known & (found.used.sum(-1) == 2)
+    return PairCosts(torch.where(good, total, torch.inf), inverse, sigma)
+
+
+def size_cost(magnified: Tensor, boxes: Tensor, box_sigma: float, parallax: Tensor) -> Tensor:
+    """(L,) squared standard deviations between the sizes of boxes (L, 2, 4), given how much cameras magnify (L, 2).
+
+    `parallax` (L,): sine of the angle between the lines of sight. From another side, an object may have another size.
+    """
+    sizes = boxes[..., 2:] - boxes[..., :2]
+    ratio = (sizes[:, 0] / sizes[:, 1]).log() - (magnified[:, 0] / magnified[:, 1]).log()[:, None]
+    # Middles of boxes err by box_sigma, so edges by √2 and sizes by twice as much.
+    spread = (2.0 * box_sigma / sizes).square().sum(1) + _SIZE_SPREAD**2 + parallax.square()[:, None]
+    return (ratio.square() / spread).sum(-1)
+
+
+# Which detection of the left image is which of the right one: geometry, size, category and looks, one to one.
+#
+# Pairs near one epipolar line get their most likely point, at once on tensors. What no
+# point explains is the epipolar error; it is judged by the noise of the boxes and by what is not known of the rig. The
+# assignment with the least sum of costs is exact (`kcal.pipeline.one_to_one`); a detection may stay alone.
 
 # Spread of 1 - correlation between two views of one object; of two objects it is 0.5 to 1.
 _LOOKS_SPREAD = 0.25

@@ -9,7 +9,8 @@ Of a rig of many cameras, those that have an image are named:
 
     {"cameras": {"mill": {"time": 12.50, "boxes": [...], ...}, "mast": {...}}}
 
-Detections are those of `kcal.pipeline.detectors`. In lines of pairs, `time` may be one number for both; `sigma` (px) or
+Detections are those of `kcal.pipeline.detections`.
+In lines of pairs, `time` may be one number for both; `sigma` (px) or
 `covariance` (N x 4 x 4), `scores`, `categories` and `ambiguous` may be left out, and pixel (0, 0) is the center of the
 first pixel.
 """
@@ -25,12 +26,11 @@ from torch import Tensor
 from kcal.errors import InputError
 from kcal.lens.rig import StereoRig
 from kcal.locate.multi_localizer import MultiViewLocalizer
-from kcal.pipeline.association_options import AssociationOptions
+from kcal.pipeline.association import AssociationOptions
 from kcal.pipeline.detections import Detections
 from kcal.pipeline.grouping import group_objects
-from kcal.pipeline.object_views import ObjectViews
 from kcal.pipeline.pairing import pair_objects
-from kcal.pipeline.pairs import ObjectPairs
+from kcal.pipeline.pairs import ObjectPairs, ObjectViews
 
 _PAIR_KEYS = {"time", "left", "right", "sigma", "covariance", "scores", "categories", "ambiguous"}
 

@@ -1,6 +1,6 @@
 """Turn pixels of one moment into what a filter measures: rows of unit noise, with every error's effect on them.
 
-Where the lines of sight of the cameras that saw an object meet (`kcal.locate.view_rows`) is told by three numbers: two
+Where the lines of sight of the cameras that saw an object meet (`kcal.locate.views`) is told by three numbers: two
 across the line of sight of the first of them, and the inverse range from it. The pixels are nearly linear in them at
 any range. They are rows, whitened, so that those of cameras that saw nothing are zeros beside a noise of one and change
 nothing. One camera alone gives two rows: its inverse range is then that of the track.
@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from kcal.locate.multi_localizer import MultiViewLocalizer, common_errors, posed_cameras
-from kcal.locate.view_rows import ALONE_M, KnownViews, known_views, view_rows
+from kcal.locate.views import ALONE_M, KnownViews, known_views, view_rows
 from kcal.pipeline.small_matrices import outer, product
 
 

@@ -1,18 +1,326 @@
-"""`pair_objects`: from the detections of both images to pairs of pixels with covariance, in one call."""
+"""`pair_objects`: from detections of both images to pairs of pixels, and `ObjectDisparity` from all their pixels."""
 
 from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from kcal.checks import StatedModule, as_points, as_tensor, exportable, require_finite
 from kcal.corners.match import MatchStatus
+from kcal.corners.patches import (
+    fit_shifts,
+    grid_of,
+    has_samples,
+    highest_peak,
+    image_windows,
+    is_textured,
+    object_planes,
+    plane_pixels,
+    plane_places,
+    sample,
+    weighted_correlation,
+)
+from kcal.dispatch import still
 from kcal.errors import InputError
 from kcal.lens.rig import StereoRig
-from kcal.pipeline.association import associate
-from kcal.pipeline.association_options import AssociationOptions
+from kcal.pipeline.association import AssociationOptions, associate
 from kcal.pipeline.detections import Detections
-from kcal.pipeline.disparity import ObjectDisparity
 from kcal.pipeline.pairs import ObjectPairs
+from kcal.texts import brief
+
+# `ObjectDisparity`: where an object of the left image is in the right one, from all its pixels, to a fraction of one.
+#
+# The box or mask of the left image says which pixels count. They are compared on a common plane
+# (`kcal.corners.patches`): correlation finds the shift, and a least-squares fit with contrast and brightness
+# refines it (W. Förstner 1982; F. Ackermann, "Digital image correlation", 1984). Pixels that do not fit, of the
+# background or of what stands in front, lose their weight (J. W. Tukey's biweight).
+
+# Steps of a patch from its middle at most; larger objects get steps of powers of two pixels.
+_LARGEST_HALF = 24
+# Radii of the ellipse in a box, in halves of its sides, between which the weight falls from one to zero.
+_FULL, _NONE = 0.85, 1.15
+
+
+@dataclass(frozen=True, kw_only=True)
+class DisparityOptions:
+    """Options of `ObjectDisparity`.
+
+    Args:
+        search: pixels along the epipolar line, to each side of the right anchor, that are searched.
+        max_off_line: largest accepted distance from the epipolar line, pixels.
+        min_score: smallest accepted correlation.
+        max_rival: largest accepted ratio of another place's correlation to the best one.
+        max_sigma: largest accepted standard deviation of the disparity, pixels.
+        min_share: smallest share of the object that must be seen unhidden and unsaturated in both images.
+        brightest: gray level from which a pixel is saturated; that of the image's dtype if None, and none for floating
+            point.
+
+    Raises:
+        InputError: a value out of range.
+    """
+
+    search: float = 9.0
+    max_off_line: float = 2.0
+    min_score: float = 0.6
+    max_rival: float = 0.95
+    max_sigma: float = 0.5
+    min_share: float = 0.5
+    brightest: float | None = None
+
+    def __post_init__(self) -> None:
+        if not (1 <= self.search <= 200 and 0 < self.max_off_line <= 20 and 0 < self.max_sigma < math.inf):
+            raise InputError("disparity options: search 1 to 200 px, max_off_line up to 20 px, positive max_sigma")
+        if not all(0 < share <= 1 for share in (self.min_score, self.max_rival, self.min_share)):
+            raise InputError("disparity options: min_score, max_rival and min_share lie between 0 and 1")
+
+
+@exportable
+class ObjectDisparities(NamedTuple):
+    """Objects found in the right image; nothing in it is NaN.
+
+    Attributes:
+        pixels: (N, 2) float64 in the right image, of what is at the left anchors; the right anchors unless GOOD.
+        covariance: (N, 2, 2) px² of `pixels`, given the left anchors; an infinite diagonal unless GOOD.
+        status: (N,) int64 of `MatchStatus`.
+        score: (N,) best correlation, -1 to 1; 0 where there is none.
+        off_line: (N,) px, distance from the epipolar line; 0 where there is none.
+        by_anchor: (N, 2, 2) derivatives of `pixels` by the left anchors.
+    """
+
+    pixels: Tensor
+    covariance: Tensor
+    status: Tensor
+    score: Tensor
+    off_line: Tensor
+    by_anchor: Tensor
+
+    def __repr__(self) -> str:
+        return brief(self)
+
+
+class ObjectDisparity(StatedModule):
+    """Match the image inside boxes: the module between a detector's boxes and `StereoLocalizer`.
+
+    Gradients of `pixels` reach both images by the implicit function theorem; the scale of the biweight, the rig and the
+    boxes count as constants. The other results carry none.
+
+    Args:
+        rig: the calibrated cameras.
+        options: see `DisparityOptions`.
+
+    Example:
+        >>> from kcal.rig import planned_rig
+        >>> texture = torch.rand(135, 240, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+        >>> left = torch.nn.functional.interpolate(255 * texture[None, None], scale_factor=8, mode="bicubic")[0, 0]
+        >>> match = ObjectDisparity(planned_rig())
+        >>> boxes = torch.tensor([[939.5, 519.5, 963.5, 543.5]])
+        >>> found = match(left, left.roll(-16, 1), boxes, torch.tensor([[934.0, 532.0]]))  # a box is off by 1.5 px
+        >>> [round(value, 2) for value in found.pixels[0].tolist()], MatchStatus(int(found.status[0])).name
+        ([935.5, 531.5], 'GOOD')
+    """
+
+    def __init__(self, rig: StereoRig, options: DisparityOptions | None = None) -> None:
+        super().__init__()
+        self.rig = rig
+        self.options = options or DisparityOptions()
+
+    def forward(
+        self,
+        left: Tensor,
+        right: Tensor,
+        boxes: Tensor,
+        anchors_right: Tensor,
+        *,
+        anchors_left: Tensor | None = None,
+        masks: Tensor | None = None,
+    ) -> ObjectDisparities:
+        """Find the objects of the left image in the right one.
+
+        Args:
+            left: (H, W) gray levels of the left camera.
+            right: (H, W) of the right camera.
+            boxes: (N, 4) left, top, right, bottom edge in the left image.
+            anchors_right: (N, 2) roughly where the boxes' middles are in the right image: the middles of its boxes.
+            anchors_left: (N, 2) points of the left image, as far away as the objects, that are wanted in the right one;
+                the middles of the boxes if left out.
+            masks: (N, H, W) bool of the left image, in place of an ellipse in each box.
+
+        Raises:
+            InputError: images that do not fit the cameras or are not finite, or shapes that are wrong or unlike.
+        """
+        boxes, aims = as_points("boxes", boxes, 4).detach(), as_points("anchors_right", anchors_right, 2).detach()
+        middle = 0.5 * (boxes[..., :2] + boxes[..., 2:])
+        starts = middle if anchors_left is None else as_points("anchors_left", anchors_left, 2).detach()
+        if boxes.ndim != 2 or aims.shape != middle.shape or starts.shape != middle.shape:
+            raise InputError(
+                f"boxes (N, 4) and anchors (N, 2) are needed, got {tuple(boxes.shape)}, {tuple(aims.shape)} and "
+                f"{tuple(starts.shape)}"
+            )
+        for word, image, camera in (("left", left, self.rig.left), ("right", right, self.rig.right)):
+            require_finite(f"{word} image", as_tensor(f"{word} image", image).detach())
+            if tuple(image.shape) != camera.size[::-1]:
+                raise InputError(
+                    f"{word} image {tuple(image.shape)}: the {word} camera needs (H, W) = {camera.size[::-1]}"
+                )
+        wanted = (len(boxes), *self.rig.left.size[::-1])
+        if masks is not None and tuple(masks.shape) != wanted:
+            raise InputError(f"masks: shape {wanted} is needed, got {tuple(masks.shape)}")
+        found = ObjectDisparities(
+            pixels=aims.clone(),
+            covariance=torch.diag(aims.new_full((2,), math.inf)).repeat(len(aims), 1, 1),
+            status=torch.full((len(aims),), int(MatchStatus.NO_RAY), device=aims.device),
+            score=aims.new_zeros(len(aims)),
+            off_line=aims.new_zeros(len(aims)),
+            by_anchor=torch.eye(2).to(aims).repeat(len(aims), 1, 1),
+        )
+        finite = (boxes.isfinite().all(-1) & aims.isfinite().all(-1) & starts.isfinite().all(-1)).nonzero()[:, 0]
+        size = (boxes[:, 2:] - boxes[:, :2]).amax(-1)
+        halves = (0.5 * _NONE * size).clamp_min(3.0)
+        levels = (halves / _LARGEST_HALF).log2().ceil().clamp_min(0.0)
+        for level in levels[finite].unique().tolist():
+            chosen = finite[levels[finite] == level]
+            part = _Objects(
+                boxes[chosen], middle[chosen], starts[chosen], aims[chosen], None if masks is None else masks[chosen],
+                math.ceil(float(halves[chosen].max()) / 2**level), int(level),
+            )  # fmt: skip
+            done = self._match(left, right, part)
+            found = ObjectDisparities(*(
+                whole.index_put((chosen,), some) for whole, some in zip(found, done, strict=True)
+            ))  # fmt: skip
+        return found
+
+    def _match(self, left: Tensor, right: Tensor, objects: _Objects) -> ObjectDisparities:
+        rig, options, level = still(self.rig), self.options, objects.level
+        device = objects.boxes.device
+        rotation = rig.right_from_left_rotation
+        with torch.no_grad():
+            planes = object_planes(rig, objects.left, objects.right, torch.full_like(objects.left[:, 0], level))
+            step = planes.step[:, None, None, None]
+            grid = grid_of((objects.half,) * 2, device)
+            here, seen = plane_pixels(rig.left, planes, planes.left[:, None, None] + step * grid)
+            here = torch.where(seen[..., None], here, objects.left[:, None, None])
+            search = math.ceil(options.search / 2**level) + 1, math.ceil(options.max_off_line / 2**level) + 1
+            wide = grid_of((objects.half + search[0], objects.half + search[1]), device)
+            # On the epipolar line: the row of the left anchor.
+            aim = torch.stack([planes.right[:, 0], torch.zeros_like(planes.step)], -1)
+            there, shown = plane_pixels(rig.right, planes, aim[:, None, None] + step * wide, rotation)
+            there = torch.where(shown[..., None], there, objects.right[:, None, None])
+        first = image_windows(left, here, level, _brightest(left, options))
+        second = image_windows(right, there, level, _brightest(right, options))
+        template = sample(first, here)
+        with torch.no_grad():
+            base = objects.weight(here) * (seen & has_samples(first, here))
+            outside = planes.valid & (base.sum((1, 2)) < options.min_share * objects.weight(here).sum((1, 2)))
+            saturated = (sample(first, here, saturated=True) > 0.02) & (base > 0)
+            clear = torch.where(saturated, 0.0, base)
+            usable = shown & has_samples(second, there)
+            scores = weighted_correlation(template, clear, sample(second, there), usable)
+            _, best, score, rival, edge = highest_peak(scores, grid_of(search, device))
+            start = aim + planes.step[:, None] * best
+            beyond = grid_of((objects.half + 1,) * 2, device)
+            places, _ = plane_pixels(rig.right, planes, start[:, None, None] + step * beyond, rotation)
+            moved = places[:, 1:-1, 1:-1]
+            slopes = torch.stack(
+                [
+                    0.5 * (places[:, 1:-1, 2:] - places[:, 1:-1, :-2]),
+                    0.5 * (places[:, 2:, 1:-1] - places[:, :-2, 1:-1]),
+                ],
+                -1,
+            )
+            saturated |= (sample(second, moved, saturated=True) > 0.02) & (base > 0)
+            weight = torch.where(saturated | ~has_samples(second, moved), 0.0, base)
+            wanted, named = plane_places(rig.left, planes, objects.anchors)
+            bright = (base * saturated).sum((1, 2)) / base.sum((1, 2)).clamp_min(1e-12)
+            searched = (scores > -1.0).flatten(1).any(1)
+            textured = is_textured(template, weight)
+            # What is named last counts first.
+            status = _flagged(torch.full_like(score, int(MatchStatus.GOOD), dtype=torch.int64), (
+                (rival > options.max_rival * score, MatchStatus.AMBIGUOUS),
+                (edge | (score < options.min_score), MatchStatus.NO_MATCH),
+                (~textured, MatchStatus.FLAT),
+                (bright > 1.0 - options.min_share, MatchStatus.SATURATED),
+                (outside | ~searched & textured, MatchStatus.OUTSIDE),
+                (~(planes.valid & named), MatchStatus.NO_RAY),
+            ))  # fmt: skip
+            found = status == int(MatchStatus.GOOD)
+        fit = fit_shifts(template, second, moved, slopes, weight, found)
+        column = start + planes.step[:, None] * fit.shift
+        pixels, _ = plane_pixels(rig.right, planes, (wanted + column - planes.left)[:, None], rotation)
+        with torch.no_grad():
+            at = objects.half
+            middle = slopes[:, at, at]
+            covariance = middle @ fit.covariance @ middle.mT
+            own = 0.5 * torch.stack(
+                [here[:, at, at + 1] - here[:, at, at - 1], here[:, at + 1, at] - here[:, at - 1, at]], -1
+            )
+            by_anchor = middle @ torch.linalg.inv_ex(own)[0]
+            off_line = (column[:, 1] / planes.step).abs() * 2**level
+            sigma = covariance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
+            status = _flagged(status, (
+                (found & (off_line > options.max_off_line), MatchStatus.OFF_LINE),
+                (found & ~(sigma < options.max_sigma), MatchStatus.FLAT),
+                (found & (fit.share < options.min_share), MatchStatus.OCCLUDED),
+                (found & ~fit.converged, MatchStatus.NOT_CONVERGED),
+            ))  # fmt: skip
+            good = status == int(MatchStatus.GOOD)
+            score = torch.where(score > -1.0, score, 0.0)
+            infinite = torch.diag(covariance.new_full((2,), math.inf))
+            covariance = torch.where(good[:, None, None], covariance, infinite)
+        return ObjectDisparities(
+            torch.where(good[:, None], pixels[:, 0], objects.right), covariance, status, score,
+            torch.where(good, off_line, 0.0), torch.where(good[:, None, None], by_anchor, torch.eye(2).to(by_anchor)),
+        )  # fmt: skip
+
+    @property
+    def constants(self) -> object:
+        """Options."""
+        return self.options
+
+
+class _Objects(NamedTuple):
+    """Objects of one level of blur: boxes, middles, left anchors, right middles, masks; patches reach `half` steps."""
+
+    boxes: Tensor
+    left: Tensor
+    anchors: Tensor
+    right: Tensor
+    masks: Tensor | None
+    half: int
+    level: int
+
+    def weight(self, pixels: Tensor) -> Tensor:
+        """(N, h, w) how much pixels (N, h, w, 2) of the left image belong to the object, 0 to 1."""
+        if self.masks is not None:
+            height, width = self.masks.shape[1:]
+            column = pixels[..., 0].round().long().clamp(0, width - 1)
+            row = pixels[..., 1].round().long().clamp(0, height - 1)
+            number = torch.arange(len(pixels), device=pixels.device)[:, None, None]
+            return self.masks[number, row, column].double()
+        middle = 0.5 * (self.boxes[:, :2] + self.boxes[:, 2:])[:, None, None]
+        half = 0.5 * (self.boxes[:, 2:] - self.boxes[:, :2])[:, None, None]
+        radius = torch.linalg.vector_norm((pixels - middle) / half, dim=-1)
+        return ((_NONE - radius) / (_NONE - _FULL)).clamp(0.0, 1.0)
+
+
+def _flagged(status: Tensor, conditions: Sequence[tuple[Tensor, MatchStatus]]) -> Tensor:
+    """(N,) the status with the code of each condition (N,) in turn where it is true."""
+    for condition, code in conditions:
+        status = torch.where(condition, int(code), status)
+    return status
+
+
+def _brightest(image: Tensor, options: DisparityOptions) -> float:
+    if options.brightest is not None:
+        return options.brightest
+    return math.inf if image.dtype.is_floating_point else float(torch.iinfo(image.dtype).max)
+
+
+# `pair_objects`: from the detections of both images to pairs of pixels with covariance, in one call.
 
 
 def pair_objects(

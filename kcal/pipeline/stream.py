@@ -1,34 +1,253 @@
-"""The stream: lines or frames in, tracks out, moment by moment, in bounded memory, and stopped at any time.
-
-One thread reads and puts moments into a short queue; when it is full, reading waits (a file or pipe), or the oldest
-moment is dropped and counted (a camera, which does not wait).
-"""
+"""The stream: lines or frames in, tracks out, moment by moment, in bounded memory, and stopped at any time."""
 
 from __future__ import annotations
 
+import base64
 import dataclasses
 import datetime
+import hashlib
 import math
 import os
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
 
 from kcal.errors import FileError, InputError
+from kcal.lens.rig import CameraRig
 from kcal.locate.export import APPENDED, appended
+from kcal.locate.localizer import Localization
 from kcal.locate.positions import Located
+from kcal.locate.station_positions import own_axes
+from kcal.locate.stereo import PositionStatus
 from kcal.locate.tables import PositionColumns
+from kcal.locate.tabulate import number_table
+from kcal.pipeline.estimates import TrackStates
 from kcal.pipeline.handover import Handover
+from kcal.pipeline.imm_filter import Beliefs
 from kcal.pipeline.lines import Moment
-from kcal.pipeline.moment_order import MOST_SECONDS, MomentOrder, Released
 from kcal.pipeline.senders import Sender
-from kcal.pipeline.snapshots import restore, snapshot
 from kcal.pipeline.stream_journal import Ledger
-from kcal.pipeline.track_columns import track_columns
-from kcal.pipeline.track_options import Tracks
+from kcal.pipeline.track_options import TrackRecord, Tracks
 from kcal.pipeline.tracks import Tracker
+
+# Times of a stream in their order: one that its neighbors contradict is left out, a clock that was set is followed.
+
+# Seconds: a step ahead beyond it, and beyond ten times the last step, waits until later times bear it out.
+_AHEAD_S, _STEPS = 1.0, 10.0
+# Seconds: times that go back by less are of moments that came before, once more or out of order; less ahead is a gap.
+_BACK_S = 15.0
+# Moments in their order that make a jump true.
+_RUN = 3
+# Seconds, the year 5138: a larger number is no time in seconds.
+MOST_SECONDS = 1e11
+T = TypeVar("T")
+
+
+class Released(NamedTuple, Generic[T]):
+    """What is to be done after one more moment.
+
+    Attributes:
+        moments: to be taken in now, in the order in which they came.
+        jump_s: by how many seconds the clock was set before the first of them; 0 if it was not, or by a short gap.
+        contradicted: how many that waited are left out.
+        repeated: whether this moment is left out, because its time is not after the last one.
+    """
+
+    moments: list[T]
+    jump_s: float = 0.0
+    contradicted: int = 0
+    repeated: bool = False
+
+
+class MomentOrder(Generic[T]):
+    """Decide moment by moment which are taken in.
+
+    A time that jumps, ahead or back, waits. If the next ones go on from where the clock was, it is left out. If they go
+    on from it, the clock was set (or nothing was seen for a while), and they are taken in.
+
+    Args:
+        time: seconds of the last moment; -inf before the first.
+        step: seconds between the last two.
+        until: times up to this one are repeated, until one is later: a source that begins somewhat earlier again.
+
+    Example:
+        >>> order = MomentOrder[str]()
+        >>> [order.put(name, time).moments for name, time in (("a", 1.0), ("b", 1.1), ("wrong", 9e4), ("c", 1.2))]
+        [['a'], ['b'], [], ['c']]
+        >>> [order.put(name, time).moments for name, time in (("d", 9e4), ("e", 90000.1), ("f", 90000.2))]
+        [[], [], ['d', 'e', 'f']]
+    """
+
+    def __init__(self, time: float = -math.inf, step: float = 0.0, until: float = -math.inf) -> None:
+        self.time, self.step, self.until = max(time, until), step, until
+        self._waiting: list[tuple[T, float]] = []
+
+    @property
+    def waiting(self) -> int:
+        """Moments whose times nothing has borne out yet."""
+        return len(self._waiting)
+
+    def put(self, moment: T, time: float) -> Released[T]:
+        """Take one more moment."""
+        ahead = time - self.time
+        if 0.0 < ahead <= max(_AHEAD_S, _STEPS * self.step) or self.time == -math.inf:
+            return self._release([(moment, time)], contradicted=len(self._waiting))
+        if -_BACK_S <= ahead <= 0.0 or time <= self.until:
+            return Released([], repeated=True)
+        contradicted = 0
+        if self._waiting and time <= self._waiting[-1][1]:
+            contradicted, self._waiting = len(self._waiting), []
+        self._waiting.append((moment, time))
+        if len(self._waiting) < _RUN:
+            return Released([], contradicted=contradicted)
+        jump = self._waiting[0][1] - self.time
+        return self._release(self._waiting, 0.0 if 0.0 < jump <= _BACK_S else jump)
+
+    def end(self) -> Released[T]:
+        """The source has ended: a short gap before what waits needs no proof; what jumped waits for the next run."""
+        if self._waiting and 0.0 < self._waiting[0][1] - self.time <= _BACK_S:
+            return self._release(self._waiting)
+        return Released([])
+
+    def _release(self, run: list[tuple[T, float]], jump: float = 0.0, contradicted: int = 0) -> Released[T]:
+        before = run[-2][1] if len(run) > 1 else self.time
+        self.time, self._waiting, self.until = run[-1][1], [], -math.inf
+        self.step = self.time - before if math.isfinite(before) else 0.0
+        return Released([moment for moment, _ in run], jump, contradicted)
+
+
+# A tracker's whole state as JSON, to the last bit, and back: an interrupted stream goes on as if it was not.
+
+# Of the tensors: a journal of another one is of no use.
+_LAYOUT = "tracks last, of any cameras"
+_SHARED = ("information", "score", "values", "root")
+
+
+def settings_of(tracker: Tracker) -> str:
+    """Hex digits that change with the rig, its errors and all options."""
+    localize, shared = tracker.solved, tracker.shared
+    parts = [
+        _LAYOUT,
+        localize.rig.fingerprint,
+        repr(tracker.options),
+        repr(shared.scale.tolist()),
+    ]
+    known = (localize.errors, localize.bending_errors)
+    parts += ["none" if value is None else _packed(value)["data"] for value in known]
+    parts += [] if tracker.moments is None else ["watched"]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+
+
+def snapshot(tracker: Tracker) -> dict[str, Any]:
+    """Everything that the next call depends on; a recorded history is left out."""
+    return {
+        "settings": settings_of(tracker),
+        "time": tracker.time if math.isfinite(tracker.time) else None,
+        "next": [tracker.next_number, tracker.next_key],
+        "start": tracker.shared.start,
+        "records": [dataclasses.asdict(record) for record in tracker.records],
+        "beliefs": [_packed(value) for value in tracker.beliefs],
+        "frame": _packed(tracker.frame),
+        "home": tracker.home.tolist(),
+        "shared": {name: _packed(getattr(tracker.shared, name)) for name in _SHARED},
+    }
+
+
+def restore(tracker: Tracker, state: dict[str, Any]) -> None:
+    """Bring a new tracker to the state of a snapshot.
+
+    Raises:
+        FileError: it is of another rig or other options, or damaged.
+    """
+    if state.get("settings") != settings_of(tracker):
+        raise FileError("the journal is of another rig or other options; delete it to begin anew, or restore them")
+    try:
+        tracker.time = -math.inf if state["time"] is None else float(state["time"])
+        tracker.next_number, tracker.next_key = state["next"]
+        tracker.shared.start = state["start"]
+        tracker.records = [TrackRecord(**record) for record in state["records"]]
+        tracker.beliefs = Beliefs(*(_unpacked(value) for value in state["beliefs"]))
+        tracker.frame = _unpacked(state["frame"])
+        tracker.home = torch.tensor(state["home"], dtype=torch.long)
+        for name in _SHARED:
+            setattr(tracker.shared, name, _unpacked(state["shared"][name]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise FileError(f"the journal is damaged ({error}); delete it to begin anew") from error
+
+
+def _packed(value: Tensor) -> dict[str, Any]:
+    array = np.ascontiguousarray(value.detach().cpu().numpy().astype("<f8"))
+    return {"shape": list(array.shape), "data": base64.b64encode(array.tobytes()).decode()}
+
+
+def _unpacked(value: dict[str, Any]) -> Tensor:
+    array = np.frombuffer(base64.b64decode(value["data"]), dtype="<f8").reshape(value["shape"])
+    return torch.from_numpy(array.astype(np.float64))
+
+
+# Tracks as the columns that files and maps of positions are made of.
+
+_REASONS = {
+    int(PositionStatus.OK): "",
+    int(PositionStatus.BEARING_ONLY): "the parallax is below three sigma: only the bearing is known",
+    int(PositionStatus.PARALLEL): "the lines of sight do not meet: only the bearing is known",
+}
+
+
+def track_columns(tracks: Tracks, sequence: int, stations: CameraRig | None = None) -> PositionColumns:
+    """One row for each track; velocities, hits and times are further columns.
+
+    Args:
+        tracks: of one moment.
+        sequence: number of the moment, which together with the name is never used twice.
+        stations: cameras far apart: bearings are then those at the anchor's own vertical, and two more columns tell
+            from which camera a track is told, and which see it now.
+    """
+    state = TrackStates(*(value.cpu() for value in tracks.state))
+    ok = state.status == int(PositionStatus.OK)
+    count = len(tracks.number)
+    if stations is not None:
+        state = state._replace(bearing=(own_axes(stations).cpu()[state.anchor] @ state.bearing[..., None])[..., 0])
+    shared = {name: value for name, value in state._asdict().items() if name in Localization._fields}
+    numbers = number_table(Localization(**shared, reprojection=torch.zeros(count, 2)))
+    velocity = [_texts(state.velocity[:, i], ok) for i in range(3)]
+    sigma = state.velocity_covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
+    extras = {
+        "sequence": [str(sequence)] * count,
+        "time_s": [repr(tracks.time)] * count,
+        "category": list(tracks.category),
+        "hits": [str(hits) for hits in tracks.hits.tolist()],
+        "unseen_s": [f"{seconds:.3f}" for seconds in tracks.unseen_s.tolist()],
+        "velocity_east_mps": velocity[0],
+        "velocity_north_mps": velocity[1],
+        "velocity_up_mps": velocity[2],
+        "velocity_east_sigma_mps": _texts(sigma[:, 0], ok),
+        "velocity_north_sigma_mps": _texts(sigma[:, 1], ok),
+        "velocity_up_sigma_mps": _texts(sigma[:, 2], ok),
+    }
+    if stations is not None:
+        extras["told_from"] = [stations.names[camera] for camera in state.anchor.tolist()]
+        extras["cameras"] = [
+            " ".join(name for name, one in zip(stations.names, row, strict=True) if one) for row in tracks.seen.tolist()
+        ]
+    names, status = [f"track {number}" for number in tracks.number], state.status.numpy()
+    return PositionColumns(names, status, [_REASONS[int(code)] for code in status], numbers, extras)
+
+
+def _texts(values: torch.Tensor, ok: torch.Tensor) -> list[str]:
+    return [repr(value) if there else "" for value, there in zip(values.tolist(), ok.tolist(), strict=True)]
+
+
+# The stream: lines or frames in, tracks out, moment by moment, in bounded memory, and stopped at any time.
+#
+# One thread reads and puts moments into a short queue; when it is full, reading waits (a file or pipe), or the oldest
+# moment is dropped and counted (a camera, which does not wait).
 
 # Moments that wait, and moments between checkpoints: about ten seconds of video.
 _WAITING, _CHECKPOINT = 32, 250
@@ -127,7 +346,7 @@ class Stream:
     def follow(self, source: Callable[[int], Iterator[SourceItem]], *, waits: bool, resumes: bool) -> StreamCounts:
         """Follow a source until it ends or `stop` is called.
 
-        A time that jumps is followed once two later moments go on from it (`kcal.pipeline.moment_order`); tracks then
+        A time that jumps is followed once two later moments go on from it; tracks then
         begin anew.
 
         Args:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kcal.errors import InputError
 from kcal.pipeline.estimates import TrackStates
-from kcal.pipeline.motion import MOTIONS, Motion
+from kcal.pipeline.imm_filter import MOTIONS, Motion
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -11,18 +11,14 @@ import torch
 from kcal.errors import InputError
 from kcal.lens.rig import StereoRig
 from kcal.locate.multi_localizer import MultiViewLocalizer
-from kcal.pipeline.association_options import AssociationOptions
-from kcal.pipeline.detections import Detections
-from kcal.pipeline.detector_call import Detector, detect_in
-from kcal.pipeline.disparity import ObjectDisparity
+from kcal.pipeline.association import AssociationOptions
+from kcal.pipeline.detections import Detections, Detector, detect_in
 from kcal.pipeline.grouping import group_objects
 from kcal.pipeline.lines import Moment
-from kcal.pipeline.object_views import ObjectViews
-from kcal.pipeline.paired_frames import FramesTogether
-from kcal.pipeline.pairing import pair_objects
-from kcal.pipeline.pairs import ObjectPairs
+from kcal.pipeline.paired_frames import FramesTogether, TimedFrame
+from kcal.pipeline.pairing import ObjectDisparity, pair_objects
+from kcal.pipeline.pairs import ObjectPairs, ObjectViews
 from kcal.pipeline.stream import SourceItem
-from kcal.pipeline.video_frames import TimedFrame
 
 
 class Videos:

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from kcal.calibrate.camera.advice import ROLL_SPAN, board_tilts, reached, roll_span, unreached_share, what_to_photograph
 from kcal.calibrate.camera.checks import mirrored_views
-from kcal.calibrate.camera.options import CalibrationOptions, Progress
-from kcal.calibrate.camera.result import CameraCalibrationResult
+from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult, Progress
 from kcal.calibrate.camera.summary import summarize
 from kcal.calibrate.camera.trust import Examination, HalvesDifference, examine, seen_pixels, unexplained
 from kcal.calibrate.camera.warnings import REPEATING

@@ -16,10 +16,9 @@ from kcal.calibrate.rig.result import RigResult
 from kcal.errors import InputError
 from kcal.lens.calibration import RigCalibration
 from kcal.lens.camera import Camera
-from kcal.lens.camera_rig import CameraRig, CameraRigCalibration
 from kcal.lens.pose import step_rows, vector_from_rotation
 from kcal.lens.projection import project_components
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import CameraRig, CameraRigCalibration, StereoRig
 from kcal.locate.budget import RangeSigmas, range_sigmas, station_sigmas
 from kcal.report.judge_camera import stored_findings
 from kcal.report.verdict import FAULTS, Finding, RangeAnswer, Requirement, Verdict, weighed_findings

@@ -19,9 +19,8 @@ from torch import Tensor
 from kcal.errors import FileError, InputError
 from kcal.files import read_bytes
 from kcal.lens.camera import Camera
-from kcal.lens.mounting import Origin
 from kcal.lens.pose import nearest_rotation
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Origin, StereoRig
 from kcal.locate.budget import range_sigmas
 from kcal.locate.geodesy import geodetic_to_enu
 from kcal.locate.localizer import StereoLocalizer

@@ -40,7 +40,7 @@ def siting_figure(
         weights: (rows, columns), as for `rank_sites`; counted in the titles.
 
     Example:
-        >>> from kcal.lens.mounting import Origin
+        >>> from kcal.lens.rig import Origin
         >>> from kcal.locate.ground import level_ground
         >>> from kcal.locate.siting import area_of
         >>> towers = [Site(name=name, origin=Origin(lat=45.0, lon=lon, height=99.0)) for name, lon in
@@ -94,7 +94,7 @@ def save_siting_picture(
 
     Example:
         >>> import tempfile
-        >>> from kcal.lens.mounting import Origin
+        >>> from kcal.lens.rig import Origin
         >>> from kcal.locate.ground import level_ground
         >>> from kcal.locate.siting import area_of
         >>> mill = Site(name="mill", origin=Origin(lat=45.0, lon=6.0, height=99.0))

@@ -15,7 +15,7 @@ from kcal.errors import InputError
 from kcal.files import read_bytes, write_atomic
 from kcal.locate.budget import RangeSigmas
 from kcal.locate.positions import Located, Position, position_errors
-from kcal.locate.ranges import QUANTILE
+from kcal.locate.stereo import QUANTILE
 from kcal.texts import M, Unit, length_text, length_unit, number_text, page_policy, page_text, range_text
 
 # Tables of located points as rows of cells, the heads first: for the screen and for pages.

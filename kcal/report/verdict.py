@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from kcal.errors import InputError
-from kcal.locate.ranges import BEARING_SIGMAS
+from kcal.locate.stereo import BEARING_SIGMAS
 from kcal.texts import range_text
 
 Severity = Literal["stop", "doubt", "fine"]

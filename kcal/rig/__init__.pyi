@@ -48,14 +48,14 @@ from kcal.locate.monitor import triangulated_sides as triangulated_sides
 from kcal.locate.monitor import Sides as Sides
 
 # Place and plan rigs
-from kcal.lens.mounting import Mounting as Mounting
+from kcal.lens.rig import Mounting as Mounting
 from kcal.locate.mounting import placed_rig as placed_rig
 from kcal.locate.mounting import mounting_covariance as mounting_covariance
 from kcal.locate.budget import planned_rig as planned_rig
 
 # Any number of cameras
-from kcal.lens.camera_rig import CameraRig as CameraRig
-from kcal.lens.camera_rig import CameraRigCalibration as CameraRigCalibration
+from kcal.lens.rig import CameraRig as CameraRig
+from kcal.lens.rig import CameraRigCalibration as CameraRigCalibration
 from kcal.locate.stations import load_camera_rig as load_camera_rig
 from kcal.io.camera_rig_file import save_camera_rig as save_camera_rig
 from kcal.locate.stations import station_mounting as station_mounting

@@ -9,16 +9,27 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.corners.object_planes import ObjectPlanes, object_planes, plane_pixels
-from kcal.corners.patch_correlation import highest_peak, weighted_correlation
-from kcal.corners.patch_windows import ImageWindows, grid_of, has_samples, image_windows, sample, warped_blur_windows
-from kcal.corners.shift_fit import ShiftFit, fit_shifts
+from kcal.corners.patches import (
+    ImageWindows,
+    ObjectPlanes,
+    ShiftFit,
+    fit_shifts,
+    grid_of,
+    has_samples,
+    highest_peak,
+    image_windows,
+    object_planes,
+    plane_pixels,
+    sample,
+    warped_blur_windows,
+    weighted_correlation,
+)
 from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
 
 # Refine matches to a fraction of a pixel: patches are compared through both lenses on one plane.
 #
-# On that plane (`kcal.corners.object_planes`) a flat piece of the scene differs between the images by a shift, and by a
+# On that plane (`kcal.corners.patches`) a flat piece of the scene differs between the images by a shift, and by a
 # scale and a shear along the baseline, whatever its slope. These, contrast, brightness and its slope are fitted by
 # least squares (A. Gruen, "Adaptive least squares correlation", 1985).
 #

@@ -17,8 +17,8 @@ from kcal.calibrate.rig.sources import SkylineSource
 from kcal.checks import variance_factor
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
-from kcal.lens.mounting import Origin
 from kcal.lens.pose import vector_from_rotation
+from kcal.lens.rig import Origin
 from kcal.locate.geodesy import ecef_from_enu_rotation, enu_to_geodetic, mean_radius
 from kcal.locate.mounting import attitude
 from kcal.locate.raster import Raster

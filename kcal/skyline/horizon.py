@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA, Origin, check_refraction
 from kcal.lens.pose import step_rows
 from kcal.lens.projection import project_components
+from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Origin, check_refraction
 from kcal.locate.geodesy import anchor, geodetic_to_ecef, mean_radius, place_enu
 from kcal.locate.raster import Raster
 

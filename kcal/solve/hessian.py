@@ -11,7 +11,7 @@ from torch import Tensor
 
 from kcal.errors import DegenerateError
 from kcal.solve.lm import LMOptions, minimize
-from kcal.solve.result import S, State
+from kcal.solve.problem import S, State
 from kcal.solve.schur import SchurLinearization
 
 # A cost (scalar) of a shared step (S,), a local step (V, L) and data.
@@ -143,7 +143,7 @@ def _dot(one: State, other: State) -> Tensor:
 def implicit_step(cost: SteppedCost, found: HessianSolve, data: tuple[Tensor, ...]) -> State:
     """Steps of zero from a minimum that carry the derivatives of the minimum by the data.
 
-    As `kcal.solve.implicit.attach_implicit_gradient`, for many local blocks: dx/dd = -H⁻¹ ∂g/∂d. Nothing is computed
+    As `kcal.solve.lm.attach_implicit_gradient`, for many local blocks: dx/dd = -H⁻¹ ∂g/∂d. Nothing is computed
     unless a gradient is requested; that takes one solve with the Hessian and two passes through the cost.
 
     Args:

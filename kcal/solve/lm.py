@@ -1,7 +1,8 @@
-"""Levenberg-Marquardt with trust-region damping, and its `nn.Module` for any residual function."""
+"""Levenberg-Marquardt with trust-region damping, for problems and residual functions, and gradients through it."""
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Callable
 from typing import Any, Generic, Literal
@@ -13,10 +14,124 @@ from torch import Tensor
 from kcal.checks import StatedModule, require_finite
 from kcal.dispatch import host_values, is_differentiated, is_traced, may_branch
 from kcal.errors import InputError
-from kcal.solve.dense import DenseProblem
-from kcal.solve.implicit import attach_implicit_gradient
-from kcal.solve.problem import Problem
-from kcal.solve.result import Result, S, SolverStatus, blend, map_state, pick
+from kcal.solve.problem import Problem, Result, S, SolverStatus, State, blend, map_state, pick
+
+# Gradients through a solution by the implicit function theorem, not through the iterations.
+
+
+def attach_implicit_gradient(
+    residual: Callable[..., Tensor], solution: Tensor, converged: Tensor, data: tuple[Tensor, ...]
+) -> Tensor:
+    """Return the solution with its exact first derivatives by the data.
+
+    At a minimum the gradient of the cost vanishes: g(x, d) = Jᵀr = 0. Hence dx/dd = -H⁻¹ ∂g/∂d with the full Hessian H
+    of the cost; Gauss and Newton's JᵀJ would be wrong wherever residuals remain. The derivative is that of one Newton
+    step from the solution, without the value of that step.
+
+    Args:
+        residual: maps x (P,) and the data of one element to residuals (R,).
+        solution: (..., P), detached.
+        converged: (...) where the solution is a minimum; elsewhere no gradient flows.
+        data: tensors that begin with the batch shape.
+
+    Returns:
+        (..., P), equal to `solution`. Derivatives of higher order are not those of the solution.
+    """
+
+    def cost(x: Tensor, *element: Tensor) -> Tensor:
+        r = residual(x, *element)
+        return 0.5 * (r * r).sum()
+
+    gradient, hessian = torch.func.grad(cost), torch.func.hessian(cost)
+    for _ in range(solution.ndim - 1):
+        gradient, hessian = torch.func.vmap(gradient), torch.func.vmap(hessian)
+    with torch.no_grad():
+        inverse = torch.linalg.pinv(hessian(solution, *data), hermitian=True)
+    step = -(inverse @ gradient(solution, *data)[..., None])[..., 0]
+    step = torch.where(converged[..., None], step, 0.0)
+    return solution + (step - step.detach())
+
+
+# Dense least squares for any residual function, batched, with Jacobians from `torch.func`.
+
+
+class DenseLinearization:
+    """Normal equations of one dense Jacobian (..., R, P), columns scaled to length one."""
+
+    def __init__(self, residuals: Tensor, jacobian: Tensor) -> None:
+        norm = torch.linalg.vector_norm(jacobian, dim=-2)
+        # A zero column belongs to a parameter without effect, which never moves.
+        scale = torch.where(norm > 0, 1.0 / norm, 1.0)
+        scaled = jacobian * scale[..., None, :]
+        normal, gradient = scaled.transpose(-1, -2) @ scaled, (scaled * residuals[..., None]).sum(-2)
+        self._parts = 0.5 * (residuals * residuals).sum(-1), scale, normal, gradient
+
+    @property
+    def cost(self) -> Tensor:
+        """See `Linearization`."""
+        return self._parts[0]
+
+    def blend(self, mask: Tensor, other: DenseLinearization) -> DenseLinearization:
+        """See `Linearization.blend`."""
+        out = copy.copy(self)
+        out._parts = blend(mask, self._parts, other._parts)
+        return out
+
+    def step(self, damping: Tensor) -> tuple[State, Tensor]:
+        """See `Linearization.step`."""
+        _, scale, normal, gradient = self._parts
+        identity = torch.eye(normal.shape[-1], dtype=normal.dtype, device=normal.device)
+        factor, info = torch.linalg.cholesky_ex(normal + damping[..., None, None] * identity)
+        delta = -torch.cholesky_solve(gradient[..., None], factor)[..., 0]
+        predicted = 0.5 * (damping * (delta * delta).sum(-1) - (gradient * delta).sum(-1))
+        return (delta * scale,), torch.where(info == 0, predicted, torch.nan)
+
+
+class DenseProblem:
+    """Residuals r(x, data) for x (..., P), the leading dimensions a batch of independent problems."""
+
+    joint = False
+
+    def __init__(self, residual: Callable[..., Tensor], batch: tuple[int, ...], data: tuple[Tensor, ...] = ()) -> None:
+        self.batch = tuple(batch)
+        self._residual, self._data = residual, tuple(data)
+        value, jacobian = residual, torch.func.jacfwd(residual)
+        for _ in self.batch:
+            value, jacobian = torch.func.vmap(value), torch.func.vmap(jacobian)
+        self._value, self._jacobian = value, jacobian
+        self.residual_count = 1
+
+    def cost(self, state: State) -> Tensor:
+        """See `Problem.cost`."""
+        residuals = self.residuals(state)
+        return 0.5 * (residuals * residuals).sum(-1)
+
+    def linearize(self, state: State) -> DenseLinearization:
+        """See `Problem.linearize`."""
+        return DenseLinearization(self.residuals(state), self._jacobian(state[0], *self._data))
+
+    def residuals(self, state: State) -> Tensor:
+        """(..., R) at a state."""
+        residuals = self._value(state[0], *self._data)
+        if residuals.ndim != len(self.batch) + 1 or residuals.dtype != torch.float64:
+            shape = tuple(residuals.shape[len(self.batch) :])
+            raise InputError(
+                f"residual function: a float64 vector (R,) is needed for each element, got {residuals.dtype} of shape "
+                f"{shape}"
+            )
+        self.residual_count = residuals.shape[-1]
+        return residuals
+
+    def retract(self, state: State, step: State) -> State:
+        """Plain addition."""
+        return (state[0] + step[0],)
+
+    def select(self, elements: Tensor) -> DenseProblem:
+        """See `Problem.select`."""
+        return DenseProblem(self._residual, (len(elements),), tuple(tensor[elements] for tensor in self._data))
+
+
+# Levenberg-Marquardt with trust-region damping, and its `nn.Module` for any residual function.
 
 # Called after each trial step with (trial, cost (...)); returning True stops.
 Callback = Callable[[int, Tensor], bool | None]
@@ -79,7 +194,7 @@ def minimize(
     and its own reason for stopping.
 
     Args:
-        problem: anything that follows `kcal.solve.problem.Problem`. Ready-made: `kcal.solve.dense.DenseProblem` for a
+        problem: anything that follows `kcal.solve.problem.Problem`. Ready-made: `DenseProblem` for a
             residual function, `kcal.calibrate.problem.board_problem.BoardProblem` for views of a board (example there).
         start: the state to begin with: a tuple of tensors, for a `BoardProblem` a `BoardState`.
         options: see `LMOptions`.

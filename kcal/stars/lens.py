@@ -14,11 +14,10 @@ from scipy import stats
 from torch import Tensor
 
 from kcal.calibrate.camera.result import CameraCalibrationResult
-from kcal.calibrate.hybrid.evidence import maximize_evidence
+from kcal.calibrate.hybrid.evidence import maximize_evidence, still_data
 from kcal.calibrate.hybrid.families import PriorFamilies, typical_hyperprior
 from kcal.calibrate.hybrid.fit import HybridFit
-from kcal.calibrate.hybrid.quadratic import still_data
-from kcal.calibrate.hybrid.unknowns import hybrid_unknowns
+from kcal.calibrate.hybrid.fitted_views import hybrid_unknowns
 from kcal.calibrate.problem.parameters import FreeParameters
 from kcal.errors import InputError
 from kcal.gaussian import Gaussian, numbered

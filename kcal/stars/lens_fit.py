@@ -11,10 +11,9 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.hybrid.board_modes import BoardModes
-from kcal.calibrate.hybrid.evidence import maximize_evidence
+from kcal.calibrate.hybrid.evidence import maximize_evidence, still_data
 from kcal.calibrate.hybrid.families import PriorFamilies, prior_families, typical_hyperprior
-from kcal.calibrate.hybrid.quadratic import still_data
-from kcal.calibrate.hybrid.unknowns import hybrid_unknowns
+from kcal.calibrate.hybrid.fitted_views import hybrid_unknowns
 from kcal.calibrate.problem.parameters import FreeParameters
 from kcal.errors import InputError
 from kcal.gaussian import Gaussian, numbered, posterior_half, triangular

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector, step_rows, vector_from_rotation
 from kcal.lens.projection import project_components
+from kcal.lens.rig import Origin
 from kcal.locate.mounting import attitude
 from kcal.stars.detect import DetectedStars, detect_stars
 from kcal.stars.identification import identify, turn_between

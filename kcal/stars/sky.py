@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from kcal.errors import InputError
 from kcal.files import read_bytes
-from kcal.lens.mounting import Origin
+from kcal.lens.rig import Origin
 from kcal.texts import brief
 
 # The bright stars: positions, proper motions and magnitudes, and names for the brightest.

@@ -8,22 +8,22 @@ from kcal.pipeline.pairs import ObjectPairs as ObjectPairs
 from kcal.pipeline.pairs import PixelPairs as PixelPairs
 from kcal.pipeline.pairs import matched_pixels as matched_pixels
 from kcal.pipeline.grouping import group_objects as group_objects
-from kcal.pipeline.object_views import ObjectViews as ObjectViews
+from kcal.pipeline.pairs import ObjectViews as ObjectViews
 from kcal.pipeline.association import associate as associate
-from kcal.pipeline.association_options import AssociationOptions as AssociationOptions
+from kcal.pipeline.association import AssociationOptions as AssociationOptions
 from kcal.pipeline.association import Association as Association
 from kcal.pipeline.association import PairBoxes as PairBoxes
 from kcal.pipeline.association import BoxPairs as BoxPairs
-from kcal.pipeline.disparity import ObjectDisparity as ObjectDisparity
-from kcal.pipeline.disparity import ObjectDisparities as ObjectDisparities
-from kcal.pipeline.disparity import DisparityOptions as DisparityOptions
+from kcal.pipeline.pairing import ObjectDisparity as ObjectDisparity
+from kcal.pipeline.pairing import ObjectDisparities as ObjectDisparities
+from kcal.pipeline.pairing import DisparityOptions as DisparityOptions
 
 # Tracks
 from kcal.pipeline.tracks import Tracker as Tracker
 from kcal.pipeline.track_options import TrackOptions as TrackOptions
-from kcal.pipeline.motion import Motion as Motion
+from kcal.pipeline.imm_filter import Motion as Motion
 from kcal.pipeline.track_options import Tracks as Tracks
 from kcal.pipeline.estimates import TrackStates as TrackStates
-from kcal.pipeline.smoothing import SmoothedTrack as SmoothedTrack
+from kcal.pipeline.estimates import SmoothedTrack as SmoothedTrack
 from kcal.pipeline.shared_errors import ClockPrior as ClockPrior
 from kcal.pipeline.shared_errors import ClockEstimate as ClockEstimate

@@ -26,7 +26,7 @@ from torch import Tensor
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_board, limit_threads
 from kcal.corners.images import expand_images, read_gray, to_8bit
-from kcal.corners.order import canonical_order
+from kcal.corners.search import canonical_order
 from scripts.bench.hard_boards import BOARD, HARD, NOT_THE_BOARD, Picture, large, pictures
 from scripts.shared.page import table, write_section
 from scripts.shared.timing import row, show

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcal.corners.board import Board
-from kcal.corners.pattern_shapes import pattern_shapes
+from kcal.corners.print_board import pattern_shapes
 from kcal.lens.camera import Camera
 from kcal.sim.board import BoardPose, BoardSize
 from kcal.sim.captures import PoseOptions, sample_board_poses

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.camera.layer import CalibratedViews, calibrate_views
-from kcal.calibrate.camera.options import CalibrationOptions
+from kcal.calibrate.camera.result import CalibrationOptions
 from kcal.calibrate.problem.board_problem import BoardProblem
 from scripts.shared.page import write_section
 from scripts.shared.timing import row, show

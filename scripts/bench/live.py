@@ -21,8 +21,7 @@ import orjson
 import torch
 
 from kcal.io.rig_file import save_rig
-from kcal.lens.mounting import Mounting, Origin
-from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.lens.rig import Mounting, Origin, RigCovariance, StereoRig
 from kcal.locate.budget import planned_rig
 from kcal.locate.localizer import StereoLocalizer
 from kcal.pipeline.pairs import ObjectPairs

@@ -20,7 +20,7 @@ import torch
 
 import kcal
 from kcal.io.rig_file import save_rig
-from kcal.lens.mounting import Mounting
+from kcal.lens.rig import Mounting
 from kcal.locate.mounting import mounting_covariance
 from scripts.bench.locate import known_to, some_points
 from scripts.shared.long_range import ORIGIN, rig

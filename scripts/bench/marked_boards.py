@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcal.corners.board import Board
-from kcal.corners.charuco import MIN_CORNERS
 from kcal.corners.detect import detect_board, limit_threads
+from kcal.corners.marker_boards import MIN_CORNERS
 from scripts.bench.hard_boards import (
     Picture,
     blurred,

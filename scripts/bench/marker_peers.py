@@ -19,7 +19,7 @@ from torch import Tensor
 
 from kcal.corners.board import TAGS, Board
 from kcal.corners.markers import opencv_dictionary
-from kcal.corners.pattern_shapes import TAG_BORDER
+from kcal.corners.print_board import TAG_BORDER
 
 HAS_APRILTAG = importlib.util.find_spec("pupil_apriltags") is not None
 Detector = Callable[[NDArray[np.uint8], Board], Tensor]  # (corners, 2), NaN where not found

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.camera.compare import compare_models
-from kcal.calibrate.camera.options import CalibrationOptions
+from kcal.calibrate.camera.result import CalibrationOptions
 from kcal.calibrate.hybrid.network_fit import FieldTraining
 from kcal.corners.observations import Observations
 from kcal.errors import KcalError

@@ -25,14 +25,13 @@ from torch import Tensor
 
 from kcal.io.rig_file import load_rig
 from kcal.lens.camera import Camera
-from kcal.lens.mounting import Origin
-from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.lens.rig import Origin, RigCovariance, StereoRig
 from kcal.locate.budget import planned_rig
 from kcal.locate.localizer import StereoLocalizer
-from kcal.locate.triangulate import Triangulate
+from kcal.locate.stereo import Triangulate
 from kcal.pipeline.association import associate
 from kcal.pipeline.detections import Detections
-from kcal.pipeline.disparity import ObjectDisparity
+from kcal.pipeline.pairing import ObjectDisparity
 from scripts.check.pairing import OPTIONS, SIZE, site_rig
 from scripts.shared.page import table, write_section
 

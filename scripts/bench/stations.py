@@ -39,10 +39,8 @@ from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.io.camera_rig_file import save_camera_rig
 from kcal.lens.camera import Camera
-from kcal.lens.camera_rig import CameraRig
-from kcal.lens.mounting import Mounting, Origin
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import RigCovariance
+from kcal.lens.rig import CameraRig, Mounting, Origin, RigCovariance
 from kcal.locate.budget import planned_rig
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.multi_localizer import MultiViewLocalizer

@@ -23,8 +23,7 @@ import torch
 from kornia.geometry.calibration import undistort_image
 
 from kcal.lens.camera import Camera
-from kcal.lens.images import Undistort, UndistortMaps, undistort_maps
-from kcal.lens.rectification import StereoRectification
+from kcal.lens.images import StereoRectification, Undistort, UndistortMaps, undistort_maps
 from kcal.lens.rig import StereoRig
 from kcal.lens.views import cylinder_view, looking, pinhole_view
 from scripts.shared.page import write_section

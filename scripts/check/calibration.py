@@ -32,7 +32,7 @@ from kcal.lens.model import LensModel
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.projection import INTRINSICS
 from kcal.solve.lm import minimize
-from kcal.solve.result import SolverStatus, State
+from kcal.solve.problem import SolverStatus, State
 from scripts.shared.page import write_section
 from scripts.shared.timing import show
 

@@ -34,7 +34,7 @@ from kcal.lens.difference import camera_difference
 from kcal.lens.rig import RigCovariance
 from kcal.lens.uncertainty import projection_sigma
 from kcal.locate.localizer import StereoLocalizer
-from kcal.solve.result import SolverStatus
+from kcal.solve.problem import SolverStatus
 from scripts.check import rig as site
 from scripts.shared.views import observed, simulate
 

@@ -24,8 +24,7 @@ from kcal.io.onnx_file import save_onnx
 from kcal.lens.camera import Camera
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.model import LensModel
-from kcal.lens.mounting import Origin
-from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.lens.rig import Origin, RigCovariance, StereoRig
 from kcal.lens.zernike import ZernikeModes
 from kcal.locate.localizer import Localization, StereoLocalizer
 from scripts.shared.page import table, write_section

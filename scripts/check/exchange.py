@@ -25,8 +25,7 @@ from scipy.io import loadmat
 
 from kcal import Camera, StereoRig
 from kcal.lens import camera_difference, export_cameras, import_cameras
-from kcal.lens.base_map import radius_over_angle
-from kcal.lens.hybrid_terms import HybridForm
+from kcal.lens.hybrid_terms import HybridForm, radius_over_angle
 from kcal.lens.model import LensModel
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.zernike import ZernikeModes

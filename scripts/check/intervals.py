@@ -31,7 +31,7 @@ from kcal.calibrate.camera.interval_check import (
     simulated_capture,
     simulated_refits,
 )
-from kcal.calibrate.camera.options import CalibrationOptions
+from kcal.calibrate.camera.result import CalibrationOptions
 from kcal.errors import KcalError
 from kcal.lens.uncertainty import pixel_covariance, pixel_errors
 from kcal.report.judge_camera import fault_of_views

@@ -21,10 +21,9 @@ from kcal.corners.match import MatchStatus
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import RigCovariance, StereoRig
-from kcal.pipeline.association import associate
-from kcal.pipeline.association_options import AssociationOptions
+from kcal.pipeline.association import AssociationOptions, associate
 from kcal.pipeline.detections import Detections
-from kcal.pipeline.disparity import ObjectDisparity
+from kcal.pipeline.pairing import ObjectDisparity
 from scripts.shared.marking_scene import Floats, background
 from scripts.shared.object_scene import Plate, exposed, paint_plate, plate, texture_gradient, true_box
 from scripts.shared.page import table, write_section

@@ -31,13 +31,11 @@ from kcal.io.rig_file import load_rig
 from kcal.lens.baking import bake
 from kcal.lens.camera import Camera
 from kcal.lens.images import undistort_maps
-from kcal.lens.mounting import Origin
-from kcal.lens.pinhole import new_pinhole
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Origin, StereoRig
+from kcal.lens.views import new_pinhole
 from kcal.locate.geodesy import enu_to_geodetic, geodetic_to_enu
-from kcal.locate.stereo import PositionStatus
-from kcal.locate.triangulate import Triangulate
+from kcal.locate.stereo import PositionStatus, Triangulate
 from kcal.stars.sky import Air, StarCatalog, observed_directions
 from scripts.shared.page import table, write_section
 from scripts.shared.timing import show

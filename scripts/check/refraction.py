@@ -20,7 +20,7 @@ from torch import Tensor
 
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.sources import Landmarks, RigData
-from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA
+from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA
 from kcal.locate.geodesy import enu_from_cam, mean_radius
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.mounting import placed_rig

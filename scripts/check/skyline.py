@@ -27,9 +27,9 @@ from kcal.calibrate.rig.sources import MeasuredPosition, RigData
 from kcal.calibrate.rig.uncertainty import SharedCovariance
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera
-from kcal.lens.mounting import Origin
 from kcal.lens.pose import step_rows
 from kcal.lens.projection import project_components
+from kcal.lens.rig import Origin
 from kcal.skyline.attitude import SkylineImage, skyline_attitude, skyline_source
 from kcal.skyline.horizon import RasterError
 from scripts.check.stars import kept

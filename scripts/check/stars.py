@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from kcal.lens.mounting import Origin
+from kcal.lens.rig import Origin
 from kcal.stars.detect import detect_stars, read_night, time_of
 from kcal.stars.identification import identify
 from kcal.stars.lens import StarCamera, calibrate_by_stars

@@ -24,14 +24,14 @@ import torch
 from torch import Tensor
 
 from kcal.lens.camera import Camera
-from kcal.lens.camera_rig import CameraRig
+from kcal.lens.rig import CameraRig
 from kcal.locate.geodesy import anchor, ecef_from_enu_rotation, enu_from_cam, enu_to_geodetic, geodetic_to_enu
 from kcal.locate.multi_localizer import MultiViewLocalizer
-from kcal.pipeline.association_options import AssociationOptions
+from kcal.pipeline.association import AssociationOptions
 from kcal.pipeline.detections import Detections
 from kcal.pipeline.grouping import group_objects
-from kcal.pipeline.motion import Motion
-from kcal.pipeline.object_views import ObjectViews
+from kcal.pipeline.imm_filter import Motion
+from kcal.pipeline.pairs import ObjectViews
 from kcal.pipeline.shared_errors import ClockPrior
 from kcal.pipeline.track_options import TrackOptions
 from kcal.pipeline.tracks import Tracker

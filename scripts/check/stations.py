@@ -38,7 +38,7 @@ import torch
 from torch import Tensor
 
 from kcal.lens.camera import Camera
-from kcal.lens.camera_rig import CameraRig
+from kcal.lens.rig import CameraRig
 from kcal.locate.multi_localizer import MultiViewLocalizer, ViewsLocalization
 from kcal.locate.multiview import TriangulateViews
 from kcal.locate.stereo import PositionStatus

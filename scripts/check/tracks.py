@@ -17,12 +17,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.lens.rig import Origin, RigCovariance, StereoRig
 from kcal.locate.budget import planned_rig
 from kcal.locate.localizer import StereoLocalizer
-from kcal.pipeline.motion import Motion
+from kcal.pipeline.imm_filter import Motion
 from kcal.pipeline.pairs import ObjectPairs
 from kcal.pipeline.shared_errors import ClockPrior
 from kcal.pipeline.track_options import TrackOptions, Tracks

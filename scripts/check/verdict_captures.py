@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from kcal.calibrate.camera.options import CalibrationOptions
+from kcal.calibrate.camera.result import CalibrationOptions
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.lens.pose import rotation_from_vector

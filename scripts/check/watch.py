@@ -23,9 +23,8 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.rig.drift import drift_of_turns
-from kcal.lens.mounting import Mounting, Origin
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.lens.rig import Mounting, Origin, RigCovariance, StereoRig
 from kcal.locate.budget import planned_rig
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.monitor import relocked

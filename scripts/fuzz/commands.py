@@ -35,8 +35,7 @@ from kcal.io.lookup_file import load_lookup, save_lookup
 from kcal.io.rig_file import save_rig
 from kcal.lens.baking import bake
 from kcal.lens.camera import Camera
-from kcal.lens.mounting import Mounting, Origin
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Mounting, Origin, StereoRig
 from scripts.fuzz.damage import damage_bytes, damage_json, damage_table
 from scripts.fuzz.hunt import Overtime, Prepared, within
 from scripts.shared.small_photographs import photographs

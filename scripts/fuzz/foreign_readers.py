@@ -13,9 +13,8 @@ import torch
 from scipy.io import savemat
 
 from kcal.calibrate.camera.export import export_cameras
-from kcal.corners.board import Board
+from kcal.corners.board import Board, target_fields
 from kcal.corners.foreign_corners import import_corners
-from kcal.corners.kalibr_target import target_fields
 from kcal.corners.observations import Observations
 from kcal.errors import InputError
 from kcal.files import read_bytes

@@ -13,8 +13,7 @@ from pydantic import BaseModel
 from torch import Tensor, nn
 
 from kcal.lens.camera import Camera
-from kcal.lens.mounting import Origin
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Origin, StereoRig
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.stereo import PositionStatus
 

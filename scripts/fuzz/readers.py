@@ -18,9 +18,9 @@ from kcal.calibrate.batch.jobs import read_jobs
 from kcal.calibrate.hybrid.measured_board import load_measured_board, save_measured_board
 from kcal.calibrate.rig.pairs import read_pairs
 from kcal.cli.settings import read_settings, toml_text
+from kcal.corners.image_tags import turned_images
 from kcal.corners.images import read_gray
 from kcal.corners.observations import Observations, View
-from kcal.corners.orientation import turned_images
 from kcal.corners.video import VideoFrames, read_frames
 from kcal.file_kind import file_kind
 from kcal.files import read_bytes
@@ -29,8 +29,7 @@ from kcal.io.camera_rig_file import save_camera_rig
 from kcal.io.lookup_file import load_lookup, save_lookup
 from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.baking import bake
-from kcal.lens.mounting import Mounting, Origin
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Mounting, Origin, StereoRig
 from kcal.locate.export import write_positions
 from kcal.locate.marks import COVARIANCE, read_marks, write_marks
 from kcal.locate.positions import locate_points
@@ -38,7 +37,7 @@ from kcal.locate.raster import terrain
 from kcal.locate.stations import load_camera_rig
 from kcal.locate.survey import import_survey, read_features, read_survey, read_views
 from kcal.mark.session import Journal
-from kcal.pipeline.association_options import AssociationOptions
+from kcal.pipeline.association import AssociationOptions
 from kcal.pipeline.detections import Detections
 from kcal.pipeline.lines import read_moment
 from kcal.pipeline.stream_journal import Ledger

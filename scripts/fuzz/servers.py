@@ -34,7 +34,7 @@ from kcal.mark.guide import Pictures, open_pictures
 from kcal.mark.marking_service import Desk
 from kcal.mark.server import marking_app
 from kcal.mark.session import Session
-from kcal.pipeline.live_map import LiveMap
+from kcal.pipeline.senders import LiveMap
 from scripts.fuzz.damage import ODD_NUMBERS, ODD_TEXTS, damage_bytes, damaged
 from scripts.fuzz.hunt import Prepared
 from scripts.fuzz.readers import ACTIONS, BOARD, placed_rig

@@ -29,7 +29,7 @@ from kcal.calibrate.hybrid.base_fit import fit_projection
 from kcal.calibrate.problem.poses import poses_under
 from kcal.calibrate.problem.views import Views
 from kcal.solve.lm import LMOptions, minimize
-from kcal.solve.result import State
+from kcal.solve.problem import State
 from scripts.paper.pure_lens import PureLensNet, PureLensProblem, train_pure_lens
 from scripts.shared.page import write_section
 from scripts.shared.timing import median, row, show, spread

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from kcal.lens.camera import Camera
-from kcal.lens.mounting import Origin
+from kcal.lens.rig import Origin
 from kcal.locate.geodesy import enu_from_cam
 from kcal.stars.night import FAR
 from kcal.stars.sky import StarCatalog, observed_directions

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcal.lens.camera import Camera
-from kcal.lens.mounting import Origin
+from kcal.lens.rig import Origin
 from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic
 from kcal.locate.raster import Raster
 from kcal.sim.captures import drawn_lens

@@ -8,9 +8,8 @@ import torch
 from torch import Tensor
 
 from kcal.lens.camera import Camera
-from kcal.lens.camera_rig import CameraRig
-from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector
+from kcal.lens.rig import CameraRig, Origin
 from kcal.locate.geodesy import (
     anchor,
     ecef_from_enu_rotation,

@@ -10,9 +10,8 @@ from torch import Tensor
 
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
-from kcal.lens.base_map import radius_over_angle
 from kcal.lens.camera import Camera
-from kcal.lens.hybrid_terms import HybridForm
+from kcal.lens.hybrid_terms import HybridForm, radius_over_angle
 from kcal.lens.model import LensModel
 from kcal.lens.projection import project_components
 from kcal.lens.zernike import ZernikeModes

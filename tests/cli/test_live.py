@@ -17,7 +17,7 @@ from kcal.cli.main import app
 from kcal.errors import FileError, InputError
 from kcal.io.camera_rig_file import save_camera_rig
 from kcal.io.rig_file import save_rig
-from kcal.lens.mounting import Mounting
+from kcal.lens.rig import Mounting
 from kcal.pipeline.stream import Stream
 from kcal.pipeline.track_options import TrackOptions
 from scripts.shared.station_scenes import marks, ring
@@ -87,7 +87,7 @@ def test_sigterm_ends_it_and_the_next_run_continues(folder: Path, monkeypatch: p
 @pytest.mark.parametrize("how", ["finished", "stopped", "ended by an error: see the terminal"])
 def test_the_map_is_told_how_it_ended(folder: Path, how: str, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("uvicorn")
-    from kcal.pipeline.live_map import LiveMap
+    from kcal.pipeline.senders import LiveMap
 
     close, write, told, shown = LiveMap.close, Stream._write, [], []
 

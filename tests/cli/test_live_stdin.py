@@ -11,7 +11,7 @@ import pytest
 from waiting import PATIENCE, wait_for
 
 from kcal.io.rig_file import save_rig
-from kcal.lens.mounting import Mounting, Origin
+from kcal.lens.rig import Mounting, Origin
 from kcal.rig import planned_rig
 
 

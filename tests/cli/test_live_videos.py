@@ -25,9 +25,7 @@ from kcal.cli.main import app
 from kcal.errors import FileError, InputError
 from kcal.io.camera_rig_file import save_camera_rig
 from kcal.io.rig_file import save_rig
-from kcal.lens.camera_rig import CameraRig
-from kcal.lens.mounting import Origin
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import CameraRig, Origin, StereoRig
 from kcal.pipeline.handover import Handover
 from kcal.pipeline.stream import Stream
 

@@ -14,8 +14,7 @@ from kcal.io.camera_file import provenance
 from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.calibration import RigCalibration
 from kcal.lens.camera import Camera
-from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, StereoRig
 
 HEADER = "name,left_u,left_v,right_u,right_v\n"
 ORIGIN = "-33.9,151.2,10"

@@ -18,7 +18,7 @@ import kcal.io.images
 from kcal.cli.demo_practice import STEPS, TRUTH, next_step, night_name, practice_score, practice_site
 from kcal.cli.main import app
 from kcal.errors import FileError
-from kcal.lens.mounting import Origin
+from kcal.lens.rig import Origin
 from kcal.locate.geodesy import enu_to_geodetic
 from kcal.report.practice_score import score_positions, score_tracks
 

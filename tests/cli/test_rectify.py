@@ -18,8 +18,8 @@ from kcal.io.images import encode_png
 from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.camera import Camera
 from kcal.lens.images import Undistort
-from kcal.lens.pinhole import new_pinhole
 from kcal.lens.rig import StereoRig
+from kcal.lens.views import new_pinhole
 
 CAMERA = Camera.build(focal=(60, 60), center=(31, 24), size=(64, 48), coefficients=[-0.2, 0.02, 1e-3, -1e-3])
 

@@ -17,8 +17,8 @@ from kcal.cli.rig_sources import Sources, read_sources
 from kcal.io.camera_file import camera_to_file
 from kcal.io.rig_file import RigFile
 from kcal.lens.camera import Camera
-from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
+from kcal.lens.rig import Origin
 from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic
 from kcal.locate.marks import read_marks, write_marks
 

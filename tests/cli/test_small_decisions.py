@@ -21,8 +21,7 @@ from kcal.io.camera_file import save_camera
 from kcal.io.images import write_png
 from kcal.io.rig_file import save_rig
 from kcal.lens.camera import Camera
-from kcal.lens.mounting import Origin
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Origin, StereoRig
 
 CAMERAS = [
     Camera.build(focal=(1600 + 5 * k, 1600), center=(960, 540), size=(1920, 1080), model="pinhole") for k in range(2)

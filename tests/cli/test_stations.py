@@ -17,8 +17,8 @@ from kcal.errors import FileError, InputError
 from kcal.io.camera_file import save_camera
 from kcal.io.camera_rig_file import save_camera_rig
 from kcal.lens.camera import Camera
-from kcal.lens.camera_rig import CameraRig
 from kcal.lens.pose import rotation_from_vector
+from kcal.lens.rig import CameraRig
 from kcal.locate.budget import station_sigmas
 from kcal.locate.geodesy import enu_to_geodetic
 from kcal.locate.stations import load_camera_rig

@@ -17,7 +17,7 @@ from waiting import PATIENCE
 
 from kcal.cli.main import app
 from kcal.io.rig_file import load_rig, save_rig
-from kcal.lens.mounting import Mounting, Origin
+from kcal.lens.rig import Mounting, Origin
 from kcal.locate.budget import planned_rig
 from kcal.watch.history import history_head, history_line
 from kcal.watch.watcher import Webhook

@@ -3,11 +3,11 @@ import numpy as np
 import pytest
 import torch
 
-from kcal.corners.aprilgrid import find_aprilgrid
 from kcal.corners.board import Board
 from kcal.corners.detect import detect, detect_board
+from kcal.corners.marker_boards import find_aprilgrid
 from kcal.corners.markers import opencv_dictionary
-from kcal.corners.pattern_shapes import pattern_shapes
+from kcal.corners.print_board import pattern_shapes
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from scripts.shared.printed_board import Paper, add, errors, expose, light_of, points_of, pose

@@ -6,8 +6,8 @@ from typer.testing import CliRunner
 from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.cli.main import app
 from kcal.corners.board import Board
-from kcal.corners.charuco import free_side
 from kcal.corners.detect import detect_board, view_of
+from kcal.corners.marker_boards import free_side
 from kcal.corners.markers import marker_cells
 from kcal.corners.observations import Observations
 from kcal.corners.print_board import board_sheet

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from kcal.corners.board import Board
-from kcal.corners.charuco import _opencv_board, find_charuco
 from kcal.corners.detect import detect, detect_board
+from kcal.corners.marker_boards import _opencv_board, find_charuco
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from scripts.shared.printed_board import Paper, errors, expose, light_of, points_of, pose

@@ -4,10 +4,17 @@ import pytest
 import torch
 
 from kcal.corners.board import Board
-from kcal.corners.circle_bias import center_shift, homography, local_maps
-from kcal.corners.circles import _with_statuses, circle_order, find_circles, refine_circles
+from kcal.corners.circles import (
+    _with_statuses,
+    center_shift,
+    circle_order,
+    find_circles,
+    fit_ellipses,
+    homography,
+    local_maps,
+    refine_circles,
+)
 from kcal.corners.detect import detect, detect_board
-from kcal.corners.ellipse import fit_ellipses
 from kcal.corners.saddle import CornerStatus
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
@@ -174,7 +181,7 @@ def test_refinements_for_corners_are_refused(papers):
 
 
 def test_ellipse_derivatives():
-    from kcal.corners.ellipse import _system
+    from kcal.corners.circles import _system
 
     p = torch.tensor([[0.3, -0.2, 0.12, 0.02, 0.15, 200.0, -150.0, 0.9, 0.1, -0.2]], dtype=torch.float64)
     axis = torch.arange(-12.0, 13.0, dtype=torch.float64)

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.corners.board import Board
-from kcal.corners.crossing import NAMES, LineDistances, crossing
 from kcal.corners.detect import detect
 from kcal.corners.erf import erf_saddle
+from kcal.corners.erf_board import NAMES, LineDistances, crossing
 from kcal.corners.grid import line_bend, local_side, neighbors
 from kcal.corners.refine import _saturation_levels, refine_corners
 from kcal.corners.saddle import CornerStatus

@@ -7,9 +7,8 @@ from hypothesis import strategies as st
 
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_board
-from kcal.corners.grid import as_grid, cell_levels, first_square_dark, local_side
-from kcal.corners.grid_check import goes_on, grid_trouble
-from kcal.corners.order import canonical_order
+from kcal.corners.grid import as_grid, cell_levels, first_square_dark, goes_on, grid_trouble, local_side
+from kcal.corners.search import canonical_order
 from kcal.errors import InputError
 
 SIZE = (220, 220)

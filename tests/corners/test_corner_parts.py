@@ -13,38 +13,51 @@ from torch import Tensor
 
 from kcal.corners.board import Board
 from kcal.corners.circles import _goes_on, _symmetric, wrong_size
-from kcal.corners.erf_board import RAMP_WEIGHT, UNKNOWN_RAMP, RampPrior, curvatures, light_slope, neighbor_lines
-from kcal.corners.erf_spread import _bounded, _odd, _pixel_pairs
-from kcal.corners.erf_window import CornerWindow
+from kcal.corners.detect import _like_sized, _smallest
+from kcal.corners.erf import _bounded, _odd, _pixel_pairs
+from kcal.corners.erf_board import (
+    RAMP_WEIGHT,
+    UNKNOWN_RAMP,
+    CornerWindow,
+    RampPrior,
+    curvatures,
+    light_slope,
+    neighbor_lines,
+)
 from kcal.corners.grid import (
     Neighbors,
+    _bend,
     _beyond,
     _change,
-    _curvature,
-    _smooth,
-    cell_levels,
-    first_square_dark,
-    levels_at,
-    neighbors,
-    sharpness,
-)
-from kcal.corners.grid_check import (
-    _bend,
     _contrast,
     _corner_areas,
+    _curvature,
     _ratio,
+    _smooth,
+    cell_levels,
     false_sides,
+    first_square_dark,
     goes_on,
     grid_trouble,
+    levels_at,
     levels_beside,
+    neighbors,
+    sharpness,
     skips,
     without_false_sides,
 )
-from kcal.corners.grow import _predicted, checkered, filled_grid, grown_grid, local_steps
-from kcal.corners.layout import in_place, inliers
-from kcal.corners.patch_correlation import highest_peak, is_textured, weighted_correlation
-from kcal.corners.search import _factors, reduced, to_full_size
-from kcal.corners.seen_instead import _like_sized, _smallest
+from kcal.corners.marker_boards import in_place, inliers
+from kcal.corners.patches import highest_peak, is_textured, weighted_correlation
+from kcal.corners.search import (
+    _factors,
+    _predicted,
+    checkered,
+    filled_grid,
+    grown_grid,
+    local_steps,
+    reduced,
+    to_full_size,
+)
 from kcal.corners.video import Frame, _sharpness, is_new_view, sharpest
 
 

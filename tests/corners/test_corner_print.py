@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_board
-from kcal.corners.drawing import Drawing, Rectangle, Text, to_pdf, to_svg
-from kcal.corners.print_board import EDGE, PAGES, board_sheet
+from kcal.corners.print_board import EDGE, PAGES, Drawing, Rectangle, Text, board_sheet, to_pdf, to_svg
 from kcal.errors import InputError
 
 A4 = Board(columns=9, rows=6, square=0.025)

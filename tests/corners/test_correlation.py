@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal.corners.patch_correlation import RIVAL_DISTANCE, highest_peak, is_textured, weighted_correlation
+from kcal.corners.patches import RIVAL_DISTANCE, highest_peak, is_textured, weighted_correlation
 
 DRAW = torch.Generator().manual_seed(6)
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from scipy import ndimage
 
-from kcal.corners.filters import filtered, gaussian_kernel
+from kcal.corners.patches import filtered, gaussian_kernel
 
 
 @pytest.mark.parametrize("sigma", [0.8, 1.5, 3.0])

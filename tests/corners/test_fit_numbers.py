@@ -11,13 +11,9 @@ from numpy.typing import NDArray
 from scipy.special import erfc
 from torch import Tensor
 
-from kcal.corners.circles import _with_statuses
-from kcal.corners.crossing import LineDistances, crossing
-from kcal.corners.ellipse import Ellipses, _pixels, _system, fit_ellipses
-from kcal.corners.erf_board import light_at, line_covariance
-from kcal.corners.erf_fit import _start, fit_crossings
-from kcal.corners.erf_spread import center_covariance
-from kcal.corners.erf_window import CornerWindow, cut_windows
+from kcal.corners.circles import Ellipses, _pixels, _system, _with_statuses, fit_ellipses
+from kcal.corners.erf import _start, center_covariance, fit_crossings
+from kcal.corners.erf_board import CornerWindow, LineDistances, crossing, cut_windows, light_at, line_covariance
 from kcal.corners.grid import Neighbors
 from kcal.corners.saddle import CornerStatus
 

@@ -12,16 +12,21 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcal.corners.board import Board
-from kcal.corners.circle_bias import _degree, homography, local_maps
-from kcal.corners.grid import sides
-from kcal.corners.grid_check import false_sides, goes_on, grid_trouble, skips, uneven
-from kcal.corners.grow import filled_grid, grown_grid
+from kcal.corners.circles import _degree, homography, local_maps
+from kcal.corners.grid import false_sides, goes_on, grid_trouble, sides, skips, uneven
 from kcal.corners.match import MatchOptions, MatchStatus, PatchMatch, fit_peak, joined
-from kcal.corners.order import uprightness
-from kcal.corners.part import _grown, _hidden_sides, _placements, _symmetries, board_ends
-from kcal.corners.patch_correlation import Peak
-from kcal.corners.patch_windows import grid_of, image_windows
+from kcal.corners.patches import Peak, grid_of, image_windows
 from kcal.corners.saddle import _disc, _fits, _stationary, cut_patches
+from kcal.corners.search import (
+    _grown,
+    _hidden_sides,
+    _placements,
+    _symmetries,
+    board_ends,
+    filled_grid,
+    grown_grid,
+    uprightness,
+)
 from kcal.errors import InputError
 
 MIDDLE, CONTRAST = 120.0, 80.0

@@ -11,11 +11,17 @@ from locate_rigs import real_rig, spread_points, tensor
 from torch import Tensor
 
 from kcal.corners.keypoints import Keypoints, keypoints, pose_between
-from kcal.corners.match import MatchOptions, MatchStatus
-from kcal.corners.object_planes import object_planes, plane_pixels, plane_places
-from kcal.corners.patch_windows import grid_of, image_windows, sample
-from kcal.corners.refind import find_again
-from kcal.corners.shift_fit import ShiftFit, fit_shifts
+from kcal.corners.match import MatchOptions, MatchStatus, find_again
+from kcal.corners.patches import (
+    ShiftFit,
+    fit_shifts,
+    grid_of,
+    image_windows,
+    object_planes,
+    plane_pixels,
+    plane_places,
+    sample,
+)
 from kcal.errors import InputError
 from kcal.lens.pose import rotation_from_vector
 

@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from kcal.corners.board import Board
-from kcal.corners.detect import view_of
-from kcal.corners.detection import Detection
+from kcal.corners.detect import Detection, view_of
 from kcal.corners.observations import Observations, View
 from kcal.errors import FileError, InputError
 

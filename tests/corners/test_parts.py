@@ -11,9 +11,9 @@ from board_render import homography, render
 
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_board
-from kcal.corners.grid_check import false_sides, skips, without_false_sides
+from kcal.corners.grid import false_sides, skips, without_false_sides
 from kcal.corners.images import read_gray
-from kcal.corners.part import board_ends
+from kcal.corners.search import board_ends
 
 BOARD = Board(columns=9, rows=6, square=0.025)
 SIZE = (480, 360)

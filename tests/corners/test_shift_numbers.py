@@ -10,9 +10,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcal.corners.filters import gaussian_kernel
-from kcal.corners.patch_windows import ImageWindows, grid_of
-from kcal.corners.shift_fit import _biweight, _covariance, _Patches, _residual, _scale
+from kcal.corners.patches import (
+    ImageWindows,
+    _biweight,
+    _covariance,
+    _Patches,
+    _residual,
+    _scale,
+    gaussian_kernel,
+    grid_of,
+)
 
 UNUSED = torch.zeros(0)
 

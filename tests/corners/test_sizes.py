@@ -9,8 +9,7 @@ import torch
 
 from kcal.corners.board import Board
 from kcal.corners.detect import detect
-from kcal.corners.observations import View
-from kcal.corners.sizes import common_size, rescaled, resized_alike
+from kcal.corners.observations import View, common_size, rescaled, resized_alike
 from kcal.errors import InputError
 
 BOARD = Board(columns=6, rows=5, square=0.02)

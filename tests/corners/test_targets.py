@@ -8,13 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from kcal.corners.board import Board
-from kcal.corners.board_text import DICTIONARIES
-from kcal.corners.drawing import Circle, Drawing, to_pdf, to_svg
+from kcal.corners.board import DICTIONARIES, Board
 from kcal.corners.markers import opencv_dictionary
 from kcal.corners.observations import Observations, View
-from kcal.corners.pattern_shapes import pattern_shapes, tag_cells
-from kcal.corners.print_board import board_sheet
+from kcal.corners.print_board import Circle, Drawing, board_sheet, pattern_shapes, tag_cells, to_pdf, to_svg
 from kcal.errors import FileError, InputError
 from kcal.lens.calibration import BoardRecord
 

@@ -12,7 +12,7 @@ from elsewhere import DEVICE, Elsewhere
 from torch import Tensor
 
 from kcal.calibrate.camera.layer import CalibrationLayer
-from kcal.calibrate.camera.options import CalibrationOptions
+from kcal.calibrate.camera.result import CalibrationOptions
 from kcal.corners.board import Board
 from kcal.corners.detect import as_image, detect_board
 from kcal.corners.grid import local_side

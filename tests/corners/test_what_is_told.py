@@ -13,13 +13,11 @@ from PIL import ExifTags, Image
 
 from kcal.corners.board import Board
 from kcal.corners.circles import find_circles
-from kcal.corners.detect import seen_size
-from kcal.corners.detection import too_few
-from kcal.corners.image_time import image_time
+from kcal.corners.detect import has_own_markers, seen_circles, seen_instead, seen_markers, seen_size, too_few
+from kcal.corners.image_tags import image_time
 from kcal.corners.markers import opencv_dictionary
 from kcal.corners.refine import refine_corners
 from kcal.corners.saddle import CornerStatus, Refined
-from kcal.corners.seen_instead import has_own_markers, seen_circles, seen_instead, seen_markers
 from kcal.corners.video import VideoFrames
 from kcal.errors import FileError
 

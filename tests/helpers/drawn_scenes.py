@@ -27,7 +27,7 @@ from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.lens.camera import Camera
 from kcal.lens.difference import camera_difference
-from kcal.lens.mounting import Origin
+from kcal.lens.rig import Origin
 from kcal.locate.budget import RangeError
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.ground import level_ground
@@ -94,7 +94,7 @@ def calibrated() -> CameraCalibrationResult:
 
 def stations() -> Located:
     """Things seen by three towers, one of them by one tower alone."""
-    from kcal.lens.camera_rig import CameraRig
+    from kcal.lens.rig import CameraRig
     from kcal.locate.station_positions import locate_views
     from kcal.locate.survey import ViewMarks
 

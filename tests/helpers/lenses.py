@@ -7,10 +7,9 @@ import math
 import torch
 from torch import Tensor
 
-from kcal.lens.base_map import radius_over_angle
 from kcal.lens.camera import Camera
 from kcal.lens.distortion import distort_components
-from kcal.lens.hybrid_terms import HybridForm
+from kcal.lens.hybrid_terms import HybridForm, radius_over_angle
 from kcal.lens.model import LensModel
 from kcal.lens.zernike import ASPECT, ASTIGMATIC, DECENTERED, OTHER, RADIAL, TILTED, ZernikeModes
 

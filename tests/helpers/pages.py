@@ -24,7 +24,7 @@ from kcal.capture.session import CaptureSession
 from kcal.cli.main import app
 from kcal.corners.observations import Observations, View
 from kcal.io.images import write_png
-from kcal.lens.mounting import Origin
+from kcal.lens.rig import Origin
 from kcal.locate.positions import locate_points, located_by
 from kcal.locate.tabulate import Locator
 from kcal.mark.guide import open_pictures
@@ -32,8 +32,8 @@ from kcal.mark.items import Add, Mark, Put
 from kcal.mark.marking_service import Desk
 from kcal.mark.server import marking_app
 from kcal.mark.session import Session
-from kcal.pipeline.live_map import LiveMap
-from kcal.pipeline.track_columns import track_columns
+from kcal.pipeline.senders import LiveMap
+from kcal.pipeline.stream import track_columns
 from kcal.pipeline.track_options import TrackOptions
 from kcal.pipeline.tracks import Tracker
 from kcal.report.map_page import save_map

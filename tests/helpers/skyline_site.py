@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcal.lens.camera import Camera
-from kcal.lens.mounting import Origin
+from kcal.lens.rig import Origin
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.raster import Raster
 from kcal.skyline.horizon import RasterError

@@ -13,9 +13,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from kcal.solve.dense import DenseProblem
-from kcal.solve.lm import LMOptions, minimize
-from kcal.solve.result import Result, State
+from kcal.solve.lm import DenseProblem, LMOptions, minimize
+from kcal.solve.problem import Result, State
 from kcal.solve.schur import SchurProblem
 
 Residual = Callable[[Tensor], Tensor]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcal.calibrate.hybrid.quadratic import Quadratic, ViewData
+from kcal.calibrate.hybrid.evidence import Quadratic, ViewData
 
 
 def quadratic(rows: Tensor, target: Tensor, at: Tensor) -> Quadratic:

@@ -8,9 +8,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.lens.rig import Origin, RigCovariance, StereoRig
 from kcal.locate.budget import planned_rig
 from kcal.locate.localizer import StereoLocalizer
 from kcal.pipeline.pairs import ObjectPairs

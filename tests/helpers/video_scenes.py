@@ -14,8 +14,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from kcal.lens.camera import Camera
-from kcal.lens.mounting import Mounting, Origin
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Mounting, Origin, StereoRig
 from scripts.shared.object_scene import Plate, exposed, paint_plate, plate
 
 SIZE = (320, 240)

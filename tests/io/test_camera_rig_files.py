@@ -14,9 +14,8 @@ from kcal.errors import FileError
 from kcal.io.camera_rig_file import CameraRigFile, camera_rig_to_file, save_camera_rig
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
-from kcal.lens.camera_rig import CameraRig, CameraRigCalibration
-from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector
+from kcal.lens.rig import CameraRig, CameraRigCalibration, Origin
 
 
 def rig() -> CameraRig:

@@ -14,13 +14,11 @@ from kcal.io.rig_file import save_rig
 from kcal.lens.baking import bake
 from kcal.lens.camera import Camera
 from kcal.lens.camera_like import CameraLike
-from kcal.lens.camera_rig import CameraRig
 from kcal.lens.images import Undistort, undistort_maps
-from kcal.lens.mounting import Origin
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import CameraRig, Origin, StereoRig
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.multi_localizer import MultiViewLocalizer
-from kcal.locate.triangulate import Triangulate
+from kcal.locate.stereo import Triangulate
 
 MODEL = Camera.build(focal=(900, 900), center=(322, 238), size=(640, 480), coefficients=[-0.1, 0.02, 1e-3, -5e-4, 0.0])
 

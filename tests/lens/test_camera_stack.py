@@ -8,7 +8,7 @@ from lenses import HYBRID, strong
 from torch import Tensor
 
 from kcal.lens.camera import Camera
-from kcal.lens.camera_stack import project_each, stackable, unproject_each
+from kcal.lens.camera_like import project_each, stackable, unproject_each
 from kcal.lens.model import PRESETS
 from kcal.lens.projection import project_components
 

@@ -16,7 +16,7 @@ from kcal.errors import FileError, InputError
 from kcal.io.onnx_file import save_onnx
 from kcal.lens.camera import Camera
 from kcal.lens.model import PRESETS
-from kcal.lens.modules import Unproject
+from kcal.lens.rays import Unproject
 from kcal.lens.rig import StereoRig
 
 # In front, beside the axis, off the image but in the lens, behind, and not a number.

@@ -15,7 +15,7 @@ from lenses import hybrid_camera
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.lens.extended_distortion import ExtendedDistortion
+from kcal.lens.camera_parameters import ExtendedDistortion
 from kcal.lens.model import PRESETS
 
 MODELS = ["opencv4", "opencv5", "opencv8", "opencv12", "opencv14", "ext16", "ext18", "ext20", "ext22", "ext24"]

@@ -14,8 +14,7 @@ from torch.func import jacfwd
 from kcal.lens.camera import Camera
 from kcal.lens.distortion import distort
 from kcal.lens.model import PRESETS, LensModel
-from kcal.lens.plane import angle_over_distance
-from kcal.lens.projection import project_components
+from kcal.lens.projection import angle_over_distance, project_components
 
 FISHEYE = PRESETS["fisheye4"]
 COEFFICIENTS = [0.03, -0.012, 0.004, -0.0007]

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from kcal import Camera, StereoLocalizer, StereoRig, load_rig, save_rig
 from kcal.errors import InputError
 from kcal.lens import rotation_from_vector
-from kcal.lens.mounting import Mounting, Origin
+from kcal.lens.rig import Mounting, Origin
 from kcal.locate import Triangulate
 from scripts.make_modules import PLACES, pairs, rig, stations, stereo
 

@@ -14,14 +14,12 @@ from torch.func import functional_call
 
 from kcal.errors import InputError
 from kcal.lens.baking import bake
-from kcal.lens.base_map import growth_by_shape, largest_base_radius
 from kcal.lens.camera import Camera
 from kcal.lens.distortion import distort_components
-from kcal.lens.hybrid_terms import HybridForm
+from kcal.lens.hybrid_terms import HybridForm, growth_by_shape, largest_base_radius
 from kcal.lens.model import LensModel
-from kcal.lens.pinhole import source_pixels
-from kcal.lens.plane import plane_from_points, rays_from_plane
-from kcal.lens.projection import project_components
+from kcal.lens.projection import plane_from_points, project_components, rays_from_plane
+from kcal.lens.views import source_pixels
 from kcal.lens.zernike import ZernikeModes
 
 SMALL = ZernikeModes(radial=5, decentered=2, astigmatic=1, other=0)

@@ -13,10 +13,9 @@ from torch import Tensor
 from whole_graphs import traced_whole
 
 from kcal.lens.camera import Camera
-from kcal.lens.hybrid_points import FEWEST, PIECE, Forward
+from kcal.lens.hybrid_points import FEWEST, PIECE, Forward, fit_plane_map, polynomials_of, trim
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.model import LensModel
-from kcal.lens.plane_map import fit_plane_map, polynomials_of, trim
 from kcal.lens.zernike import ZernikeModes
 
 COUNT = PIECE + 1000

@@ -11,7 +11,7 @@ from lenses import HYBRID, strong
 from kcal.errors import InputError
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
-from kcal.lens.image_transform import ImageTransform
+from kcal.lens.camera_conversions import ImageTransform
 from kcal.lens.model import PRESETS
 
 FULL = (1920, 1080)

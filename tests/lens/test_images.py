@@ -15,7 +15,7 @@ from torch import Tensor
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.images import Undistort, undistort_maps
-from kcal.lens.pinhole import new_pinhole, source_pixels
+from kcal.lens.views import new_pinhole, source_pixels
 
 
 def ramp(size: tuple[int, int]) -> Tensor:

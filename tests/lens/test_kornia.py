@@ -25,7 +25,7 @@ from lenses import HYBRID, strong
 
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.lens.image_transform import ImageTransform
+from kcal.lens.camera_conversions import ImageTransform
 from kcal.lens.images import Undistort, UndistortImage
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import StereoRig

@@ -18,10 +18,18 @@ from torch import Tensor
 from kcal.errors import DegenerateError, FileError, InputError
 from kcal.io.lookup_file import load_lookup, save_lookup
 from kcal.io.onnx_file import save_onnx
-from kcal.lens.baking import bake
+from kcal.lens.baking import (
+    RINGS,
+    LookupCamera,
+    Spline,
+    bake,
+    chart_from_points,
+    evaluate_spline,
+    extend_nodes,
+    filter_nodes,
+    rays_from_chart,
+)
 from kcal.lens.camera import Camera
-from kcal.lens.lookup import LookupCamera, chart_from_points, rays_from_chart
-from kcal.lens.spline import RINGS, Spline, evaluate_spline, extend_nodes, filter_nodes
 
 _BARREL = [-0.28, 0.1, 5e-4, -3e-4, 0.02, 0.05, 0.02, 0.01, 4e-4, -2e-4, -3e-4, 1e-4, 0.004, -0.006]
 _HD: dict[str, Any] = {"focal": (1600, 1605), "center": (957, 541), "size": (1920, 1080)}

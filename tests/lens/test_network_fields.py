@@ -19,16 +19,14 @@ from kcal.io.camera_rig_file import CameraRigFile, save_camera_rig
 from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.baking import bake
 from kcal.lens.camera import Camera
-from kcal.lens.camera_rig import CameraRig
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.images import Undistort
 from kcal.lens.model import LensModel
-from kcal.lens.mounting import Origin
 from kcal.lens.network_modes import NetworkModes
 from kcal.lens.rays import CameraRays
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import CameraRig, Origin, StereoRig
 from kcal.locate.localizer import StereoLocalizer
-from kcal.locate.triangulate import Triangulate
+from kcal.locate.stereo import Triangulate
 
 
 class Waves(nn.Module):

@@ -15,8 +15,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
 from kcal.lens.model import PRESETS
 from kcal.lens.paraxial import ParaxialFocal, paraxial_focal
-from kcal.lens.projection import project_components
-from kcal.lens.pupil import FAR
+from kcal.lens.projection import FAR, project_components
 
 PLAIN = [name for name, model in PRESETS.items() if not model.tilt]
 

@@ -12,7 +12,7 @@ from image_cameras import BARREL, F64, FOLDING, PINCUSHION, build
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.images import NOWHERE, undistort_maps
-from kcal.lens.pinhole import new_pinhole
+from kcal.lens.views import new_pinhole
 
 
 class TestNewPinhole:

@@ -7,7 +7,7 @@ import torch
 from locate_rigs import pinhole_rig, tensor
 
 from kcal.errors import InputError
-from kcal.lens.mounting import Origin
+from kcal.lens.rig import Origin
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.tabulate import circular_error
 

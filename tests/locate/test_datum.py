@@ -8,7 +8,7 @@ import pyproj
 import pytest
 
 from kcal.errors import FileError, InputError
-from kcal.lens.mounting import Origin
+from kcal.lens.rig import Origin
 from kcal.locate.tabulate import find_geoid, geoid_column, true_from_grid
 
 

@@ -11,8 +11,8 @@ import torch
 from locate_rigs import pinhole_rig, real_rig, spread_points, tensor
 
 from kcal.errors import InputError
-from kcal.lens.mounting import Origin
-from kcal.lens.rectification import StereoRectification
+from kcal.lens.images import StereoRectification
+from kcal.lens.rig import Origin
 from kcal.locate.disparity import DisparityRanges
 from kcal.locate.export import APPENDED, appended
 from kcal.locate.localizer import StereoLocalizer

@@ -12,8 +12,7 @@ from typer.testing import CliRunner
 from kcal.cli.main import app
 from kcal.errors import InputError
 from kcal.io.rig_file import load_rig
-from kcal.lens.mounting import Mounting, Origin
-from kcal.lens.rig import RigCovariance
+from kcal.lens.rig import Mounting, Origin, RigCovariance
 from kcal.locate.localizer import StereoLocalizer
 
 SAMPLE = Path(__file__).parents[2] / "assets" / "sample-rig.json"

@@ -14,7 +14,7 @@ from locate_rigs import tensor
 
 from kcal.errors import InputError
 from kcal.io.onnx_file import save_onnx
-from kcal.lens.mounting import Origin
+from kcal.lens.rig import Origin
 from kcal.locate.geodesy import (
     anchor,
     arc_tangent,

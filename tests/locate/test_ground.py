@@ -12,8 +12,7 @@ import torch
 
 from kcal.errors import FileError, InputError
 from kcal.lens.camera import Camera
-from kcal.lens.camera_rig import CameraRig
-from kcal.lens.mounting import Mounting, Origin
+from kcal.lens.rig import CameraRig, Mounting, Origin
 from kcal.locate.geodesy import enu_from_cam, geodetic_to_enu
 from kcal.locate.ground import level_ground, locate_on_ground
 from kcal.locate.mounting import mounting_covariance

@@ -10,15 +10,13 @@ from whole_graphs import traced_whole
 
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
-from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.projection import project_components
-from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.lens.rig import Origin, RigCovariance, StereoRig
 from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic
 from kcal.locate.localizer import Localization, StereoLocalizer
 from kcal.locate.mounting import mounting_covariance
-from kcal.locate.stereo import PositionStatus
-from kcal.locate.triangulate import Triangulate
+from kcal.locate.stereo import PositionStatus, Triangulate
 
 ORIGIN = Origin(lat=-33.9, lon=151.2, height=40.0)
 RIG = real_rig()

@@ -18,8 +18,7 @@ from locate_rigs import real_rig, spread_points
 from kcal.cli.main import main
 from kcal.errors import FileError, InputError
 from kcal.io.rig_file import save_rig
-from kcal.lens.mounting import Origin
-from kcal.lens.rig import RigCovariance
+from kcal.lens.rig import Origin, RigCovariance
 from kcal.locate import marks, stereo, tables, tabulate
 from kcal.locate.export import PositionWriter, write_positions
 from kcal.locate.geodesy import azimuth_elevation

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.lens.camera_rig import CameraRig
+from kcal.lens.rig import CameraRig
 from kcal.locate.geodesy import enu_to_geodetic
 from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.locate.stereo import PositionStatus

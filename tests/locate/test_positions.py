@@ -16,8 +16,7 @@ import torch
 from locate_rigs import pinhole_rig, real_rig, spread_points, tensor
 
 from kcal.errors import FileError, InputError
-from kcal.lens.mounting import Origin
-from kcal.lens.rig import RigCovariance
+from kcal.lens.rig import Origin, RigCovariance
 from kcal.locate.export import cot_events, write_positions
 from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic, geodetic_to_enu
 from kcal.locate.positions import Located, Position, locate_points

@@ -9,8 +9,7 @@ import torch
 from locate_rigs import real_rig, tensor
 
 from kcal.errors import InputError
-from kcal.lens.mounting import Mounting, Origin
-from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.lens.rig import Mounting, Origin, RigCovariance, StereoRig
 from kcal.locate.budget import planned_rig, range_sigmas, usual_ranges
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.mounting import mounting_covariance

@@ -6,9 +6,7 @@ import pytest
 import torch
 from locate_rigs import pinhole_rig, real_rig, tensor
 
-from kcal.locate.ranges import range_interval
-from kcal.locate.stereo import PositionStatus
-from kcal.locate.triangulate import Triangulate
+from kcal.locate.stereo import PositionStatus, Triangulate, range_interval
 
 N = 20_000
 

@@ -15,7 +15,7 @@ from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.sources import Landmarks, RigData
 from kcal.errors import InputError
 from kcal.io.rig_file import load_rig, save_rig
-from kcal.lens.mounting import Mounting, Origin
+from kcal.lens.rig import Mounting, Origin
 from kcal.locate.geodesy import enu_to_geodetic
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.monitor import check_rig

@@ -14,9 +14,8 @@ from kcal.calibrate.rig.sources import Landmarks
 from kcal.errors import InputError
 from kcal.io.camera_file import provenance
 from kcal.lens.calibration import RigCalibration
-from kcal.lens.mounting import Mounting, Origin
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.lens.rig import Mounting, Origin, RigCovariance, StereoRig
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.monitor import check_rig, drift_effect, relocked
 

@@ -9,9 +9,8 @@ import torch
 from locate_rigs import real_rig, tensor
 
 from kcal.errors import InputError
-from kcal.lens.mounting import Mounting, Origin
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.lens.rig import Mounting, Origin, RigCovariance, StereoRig
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.mounting import run_errors

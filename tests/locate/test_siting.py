@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from kcal.errors import FileError, InputError
-from kcal.lens.mounting import REFRACTION_SIGMA, Origin
+from kcal.lens.rig import REFRACTION_SIGMA, Origin
 from kcal.locate.geodesy import anchor, enu_to_geodetic, geodetic_to_enu, mean_radius, place_enu
 from kcal.locate.ground import level_ground
 from kcal.locate.multi_localizer import MultiViewLocalizer

@@ -14,9 +14,7 @@ from kcal.calibrate.rig.sources import Landmarks, MeasuredPosition, RigData
 from kcal.errors import DegenerateError, FileError
 from kcal.io.camera_rig_file import save_camera_rig
 from kcal.io.rig_file import load_rig, save_rig
-from kcal.lens.camera_rig import CameraRig
-from kcal.lens.mounting import Mounting
-from kcal.lens.rig import RigCovariance
+from kcal.lens.rig import CameraRig, Mounting, RigCovariance
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.mounting import placed_rig
 from kcal.locate.multi_localizer import MultiViewLocalizer

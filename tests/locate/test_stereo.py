@@ -13,8 +13,7 @@ from whole_graphs import traced_whole
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
-from kcal.locate.stereo import PositionStatus, fit_pairs
-from kcal.locate.triangulate import Triangulate
+from kcal.locate.stereo import PositionStatus, Triangulate, fit_pairs
 
 RIG = real_rig()
 

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from kcal.errors import FileError, InputError
-from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector
+from kcal.lens.rig import Origin
 from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic
 from kcal.locate.marks import read_marks
 from kcal.locate.mounting import attitude, mounting_of

@@ -5,12 +5,10 @@ from __future__ import annotations
 import torch
 
 from kcal.lens.camera import Camera
-from kcal.lens.camera_rig import CameraRig
-from kcal.lens.mounting import Origin
+from kcal.lens.rig import CameraRig, Origin
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.multi_localizer import MultiViewLocalizer, common_errors, posed_cameras
-from kcal.locate.view_rows import ALONE_M, known_views, view_rows
-from kcal.locate.views import shared_pixels
+from kcal.locate.views import ALONE_M, known_views, shared_pixels, view_rows
 
 
 def mixed_stations() -> CameraRig:

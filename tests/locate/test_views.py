@@ -10,7 +10,7 @@ import torch
 from locate_rigs import tensor
 
 from kcal.errors import FileError, InputError
-from kcal.lens.camera_rig import CameraRig
+from kcal.lens.rig import CameraRig
 from kcal.locate.geodesy import enu_to_geodetic
 from kcal.locate.marks import Marks
 from kcal.locate.monitor import seen_again

@@ -11,13 +11,11 @@ import torch
 from lenses import FEW_MODES, hybrid_camera
 from waiting import wait_for
 
-from kcal.corners.match import Matches, MatchStatus
-from kcal.corners.refind import find_again
+from kcal.corners.match import Matches, MatchStatus, find_again
 from kcal.errors import InputError
 from kcal.io.images import write_png
-from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.lens.rig import Origin, RigCovariance, StereoRig
 from kcal.locate.marks import Marks, write_marks
 from kcal.locate.monitor import check_rig, seen_again
 from kcal.locate.positions import locate_points

@@ -12,12 +12,10 @@ from torch import Tensor
 
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
-from kcal.lens.plane import plane_from_points
-from kcal.lens.projection import from_pixels
+from kcal.lens.projection import from_pixels, plane_from_points
 from kcal.nets.inverse import InverseNet, train_inverse
-from kcal.nets.joint import JointFit, JointOptions, _JointProblem, train_jointly
-from kcal.nets.residual import ResidualNet
-from kcal.solve.result import SolverStatus
+from kcal.nets.joint import JointFit, JointOptions, ResidualNet, _JointProblem, train_jointly
+from kcal.solve.problem import SolverStatus
 
 BALANCE = 0.7
 

@@ -8,14 +8,12 @@ from elsewhere import DEVICE, Elsewhere
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.lens.mounting import Mounting, Origin
-from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.lens.rig import Mounting, Origin, RigCovariance, StereoRig
 from kcal.locate.budget import planned_rig
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.locate.stations import stations_of
-from kcal.pipeline.association import PairBoxes, associate
-from kcal.pipeline.association_options import AssociationOptions
+from kcal.pipeline.association import AssociationOptions, PairBoxes, associate
 from kcal.pipeline.detections import Detections
 from kcal.pipeline.grouping import group_objects
 from kcal.pipeline.pairing import pair_objects

@@ -9,7 +9,7 @@ import torch
 from track_scenes import pairs_of, seen_by, tracked_site
 
 from kcal.errors import InputError
-from kcal.pipeline.motion import Motion
+from kcal.pipeline.imm_filter import Motion
 from kcal.pipeline.shared_errors import ClockPrior
 from kcal.pipeline.track_options import TrackOptions
 from kcal.pipeline.tracks import Tracker

@@ -11,8 +11,7 @@ from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.stations import stations_at
 from kcal.pipeline.imm_filter import no_beliefs
 from kcal.pipeline.shared_errors import ClockPrior
-from kcal.pipeline.track_steps import compiled_steps, track_steps
-from kcal.pipeline.tracks import Tracker
+from kcal.pipeline.tracks import Tracker, compiled_steps, track_steps
 
 
 def scene(localize: StereoLocalizer, frame: int) -> tuple[torch.Tensor, torch.Tensor]:

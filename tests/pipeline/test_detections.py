@@ -10,7 +10,7 @@ import supervision
 import torch
 
 from kcal.errors import InputError
-from kcal.lens.image_transform import ImageTransform
+from kcal.lens.camera_conversions import ImageTransform
 from kcal.pipeline.detections import Detections
 
 EDGES = [[100.0, 50.0, 112.0, 62.0], [10.0, 20.0, 40.5, 60.0]]

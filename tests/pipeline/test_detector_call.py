@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from kcal.errors import InputError
-from kcal.pipeline.detector_call import detect_in, load_detector
+from kcal.pipeline.detections import detect_in, load_detector
 
 IMAGE = np.zeros((30, 50, 3), np.uint8)
 BOX = [[1.0, 2.0, 5.0, 6.0]]

@@ -8,11 +8,11 @@ import torch
 from object_cases import SIZE, Case, case, rig_of
 from torch import Tensor
 
-from kcal.corners import shift_fit
+from kcal.corners import patches
 from kcal.corners.match import MatchStatus
 from kcal.errors import InputError
-from kcal.locate.triangulate import Triangulate
-from kcal.pipeline.disparity import DisparityOptions, ObjectDisparities, ObjectDisparity
+from kcal.locate.stereo import Triangulate
+from kcal.pipeline.pairing import DisparityOptions, ObjectDisparities, ObjectDisparity
 
 
 def match(scene: Case, **changes: Tensor) -> ObjectDisparities:
@@ -178,7 +178,7 @@ class TestRefusals:
 def test_gradients_to_both_images(monkeypatch: pytest.MonkeyPatch) -> None:
     """Against differences, in the direction of the gradient and in random ones, at a constant scale of residuals."""
     scene = case(4, noise=0.1, amplitude=0.0)
-    monkeypatch.setattr(shift_fit, "_scale", lambda residual, weight: residual.new_full((len(residual),), 0.25))
+    monkeypatch.setattr(patches, "_scale", lambda residual, weight: residual.new_full((len(residual),), 0.25))
     images = [scene.left.clone().requires_grad_(), scene.right.clone().requires_grad_()]
     module = ObjectDisparity(scene.rig)
     found = module(*images, scene.boxes, scene.aims)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from kcal.corners.match import MatchStatus
 from kcal.errors import InputError
-from kcal.pipeline.disparity import (
+from kcal.pipeline.pairing import (
     DisparityOptions,
     ObjectDisparities,
     ObjectDisparity,

@@ -11,13 +11,11 @@ import torch
 from torch import Tensor
 
 from kcal.pipeline.assignment import SeenFrom, looks_of, nearby
-from kcal.pipeline.association import appearance
-from kcal.pipeline.imm_filter import Beliefs, Timing, fit_of, innovations, updated
+from kcal.pipeline.association import appearance, size_cost
+from kcal.pipeline.imm_filter import Beliefs, Timing, by_rates, fit_of, innovations, rates, updated
 from kcal.pipeline.measurements import Anchored
-from kcal.pipeline.moment_order import MomentOrder
-from kcal.pipeline.motion import by_rates, rates
-from kcal.pipeline.pair_costs import size_cost
 from kcal.pipeline.shared_errors import ClockEstimate, ClockPrior, SharedErrors
+from kcal.pipeline.stream import MomentOrder
 
 
 def draw(*shape: int, seed: int = 0) -> Tensor:

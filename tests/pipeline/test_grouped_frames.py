@@ -10,8 +10,7 @@ import pytest
 
 from kcal.errors import FileError, InputError
 from kcal.pipeline import paired_frames
-from kcal.pipeline.frame_pairs import frames_together
-from kcal.pipeline.paired_frames import FramesTogether, VideoCounts
+from kcal.pipeline.paired_frames import FramesTogether, VideoCounts, frames_together
 
 
 class Frame(NamedTuple):

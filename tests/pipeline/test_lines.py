@@ -9,7 +9,7 @@ from track_scenes import tracked_site
 from kcal.errors import InputError
 from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.locate.stations import stations_of
-from kcal.pipeline.association_options import AssociationOptions
+from kcal.pipeline.association import AssociationOptions
 from kcal.pipeline.lines import Moment, read_moment
 
 RIG = tracked_site().rig

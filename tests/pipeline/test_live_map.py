@@ -21,13 +21,13 @@ from waiting import PATIENCE, wait_for
 pytest.importorskip("uvicorn")
 from pages import crowded_map
 
-from kcal.lens.mounting import Origin
+from kcal.lens.rig import Origin
 from kcal.locate.geodesy import geodetic_to_enu
 from kcal.locate.positions import located_by
 from kcal.locate.tables import PositionColumns
 from kcal.locate.tabulate import Locator
-from kcal.pipeline.live_map import LiveMap
-from kcal.pipeline.track_columns import track_columns
+from kcal.pipeline.senders import LiveMap
+from kcal.pipeline.stream import track_columns
 from kcal.pipeline.track_options import TrackOptions
 from kcal.pipeline.tracks import Tracker
 from scripts.shared.children import children

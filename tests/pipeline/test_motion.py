@@ -9,7 +9,7 @@ import torch
 
 from kcal.errors import InputError
 from kcal.lens.pose import rotation_from_vector
-from kcal.pipeline.motion import MOTIONS, Motion, Transition, by_rates, moved, rates, step_numbers, transition
+from kcal.pipeline.imm_filter import MOTIONS, Motion, Transition, by_rates, moved, rates, step_numbers, transition
 
 UP = torch.tensor([[0.0], [-1.0], [0.0]], dtype=torch.float64)
 

@@ -8,11 +8,10 @@ import torch
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.lens.mounting import Origin
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Origin, StereoRig
 from kcal.locate.budget import planned_rig
 from kcal.locate.localizer import StereoLocalizer
-from kcal.pipeline.association_options import AssociationOptions
+from kcal.pipeline.association import AssociationOptions
 from kcal.pipeline.detections import Detections
 from kcal.pipeline.pairing import pair_objects
 from scripts.shared.object_scene import exposed, paint_plate, plate, true_box

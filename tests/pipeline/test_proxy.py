@@ -22,7 +22,7 @@ import httpx
 
 from kcal.locate.positions import located_by
 from kcal.locate.tabulate import Locator
-from kcal.pipeline.live_map import LiveMap
+from kcal.pipeline.senders import LiveMap
 
 NGINX, OPENSSL = (shutil.which(name, path="/usr/sbin:/usr/bin:/usr/local/bin") for name in ("nginx", "openssl"))
 PAGE = Path(__file__).parents[2] / "docs" / "howto" / "proxy.md"

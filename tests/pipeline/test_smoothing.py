@@ -7,7 +7,7 @@ import math
 import torch
 from track_scenes import pairs_of, seen_by, tracked_site, yawed_rig
 
-from kcal.pipeline.motion import Motion
+from kcal.pipeline.imm_filter import Motion
 from kcal.pipeline.shared_errors import ClockPrior
 from kcal.pipeline.track_options import TrackOptions
 from kcal.pipeline.tracks import Tracker

@@ -15,8 +15,7 @@ from kcal.errors import InputError
 from kcal.io.onnx_file import save_onnx
 from kcal.lens.camera import Camera
 from kcal.lens.model import PRESETS
-from kcal.lens.mounting import Origin
-from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.lens.rig import Origin, RigCovariance, StereoRig
 from kcal.locate.localizer import StereoLocalizer
 
 

@@ -10,17 +10,15 @@ import torch
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.lens.camera_rig import CameraRig
-from kcal.lens.mounting import Mounting
+from kcal.lens.rig import CameraRig, Mounting
 from kcal.locate.budget import planned_rig
 from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.locate.stations import stations_of
-from kcal.pipeline.association import associate
-from kcal.pipeline.association_options import AssociationOptions
+from kcal.pipeline.association import AssociationOptions, associate
 from kcal.pipeline.detections import Detections
 from kcal.pipeline.grouping import group_objects
-from kcal.pipeline.motion import Motion
-from kcal.pipeline.object_views import ObjectViews
+from kcal.pipeline.imm_filter import Motion
+from kcal.pipeline.pairs import ObjectViews
 from kcal.pipeline.shared_errors import ClockPrior
 from kcal.pipeline.track_options import TrackOptions
 from kcal.pipeline.tracks import Tracker

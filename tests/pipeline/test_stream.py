@@ -28,7 +28,7 @@ import kcal.pipeline.stream
 from kcal.errors import FileError, InputError
 from kcal.locate.positions import located_by
 from kcal.locate.tabulate import Locator
-from kcal.pipeline.association_options import AssociationOptions
+from kcal.pipeline.association import AssociationOptions
 from kcal.pipeline.lines import Moment, read_moment
 from kcal.pipeline.senders import CotSender, sender_to
 from kcal.pipeline.shared_errors import ClockPrior

@@ -20,10 +20,9 @@ from track_scenes import seen_by, tracked_site
 from kcal.errors import FileError, InputError
 from kcal.locate.positions import located_by
 from kcal.locate.tabulate import Locator
-from kcal.pipeline.association_options import AssociationOptions
+from kcal.pipeline.association import AssociationOptions
 from kcal.pipeline.lines import Moment, read_moment
-from kcal.pipeline.moment_order import MomentOrder
-from kcal.pipeline.stream import SourceItem, Stream, StreamCounts, lines_of
+from kcal.pipeline.stream import MomentOrder, SourceItem, Stream, StreamCounts, lines_of
 from kcal.pipeline.tracks import Tracker
 
 SITE = tracked_site(0.002)

@@ -15,9 +15,8 @@ from track_scenes import pairs_of, tracked_site
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import StereoRig
-from kcal.pipeline.association import _patches, appearance
-from kcal.pipeline.epipolar_band import near_epipolar_lines
-from kcal.pipeline.motion import Motion
+from kcal.pipeline.association import _patches, appearance, near_epipolar_lines
+from kcal.pipeline.imm_filter import Motion
 from kcal.pipeline.pairs import ObjectPairs
 from kcal.pipeline.track_options import TrackOptions, TrackRecord
 from kcal.pipeline.tracks import Tracker, _toward

@@ -15,9 +15,8 @@ from kcal.lens.rig import RigCovariance
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.stations import stations_at
 from kcal.pipeline.estimates import track_states
-from kcal.pipeline.imm_filter import Timing, born
+from kcal.pipeline.imm_filter import Motion, Timing, born
 from kcal.pipeline.measurements import anchored, known_sightings, sightings
-from kcal.pipeline.motion import Motion
 from kcal.pipeline.track_options import TrackOptions, Tracks
 from kcal.pipeline.tracks import Tracker
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from track_scenes import pairs_of, seen_by, tracked_site
 
-from kcal.pipeline.motion import Motion
+from kcal.pipeline.imm_filter import Motion
 from kcal.pipeline.track_options import TrackOptions
 from kcal.pipeline.tracks import Tracker
 

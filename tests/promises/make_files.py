@@ -18,7 +18,7 @@ import torch
 
 import kcal
 from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.calibrate.camera.options import CalibrationOptions
+from kcal.calibrate.camera.result import CalibrationOptions
 from kcal.calibrate.hybrid.measured_board import load_measured_board, save_measured_board
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
@@ -28,10 +28,8 @@ from kcal.io.lookup_file import load_lookup, save_lookup
 from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.baking import bake
 from kcal.lens.camera import Camera
-from kcal.lens.camera_rig import CameraRig
-from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import CameraRig, Origin, StereoRig
 
 SIZE = (640, 480)
 MODELS = ("hybrid", "opencv5", "opencv14", "fisheye4")

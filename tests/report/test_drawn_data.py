@@ -30,7 +30,7 @@ from matplotlib.quiver import Quiver
 from kcal.calibrate.camera.advice import board_tilts
 from kcal.lens.camera import Camera
 from kcal.lens.difference import camera_difference
-from kcal.lens.mounting import Origin
+from kcal.lens.rig import Origin
 from kcal.locate.geodesy import geodetic_to_enu
 from kcal.locate.siting import Site, siting_map
 from kcal.report import siting as siting_module

@@ -18,7 +18,7 @@ from matplotlib.colors import to_hex
 from kcal.corners.observations import Failure, Observations, View
 from kcal.errors import FileError
 from kcal.io.images import write_png
-from kcal.lens.mounting import Origin
+from kcal.lens.rig import Origin
 from kcal.locate.geodesy import enu_to_geodetic
 from kcal.locate.positions import locate_points
 from kcal.report import siting

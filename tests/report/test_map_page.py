@@ -17,7 +17,7 @@ from PIL import Image, TiffImagePlugin
 from waiting import wait_for
 
 from kcal.errors import FileError, InputError
-from kcal.lens.mounting import Origin
+from kcal.lens.rig import Origin
 from kcal.locate.geodesy import enu_from_cam, geodetic_to_enu
 from kcal.locate.positions import Located, locate_points
 from kcal.report.map_page import local_image, local_tiles, map_page, save_map

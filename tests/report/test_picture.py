@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from kcal.errors import InputError
-from kcal.lens.mounting import Origin
+from kcal.lens.rig import Origin
 from kcal.locate.budget import RangeError
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.positions import Located, locate_points

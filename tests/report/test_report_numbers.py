@@ -13,9 +13,8 @@ from kcal.errors import InputError
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.difference import camera_difference
-from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Origin, StereoRig
 from kcal.locate.positions import locate_points
 from kcal.report.difference import difference_figure
 from kcal.report.difference_text import difference_text

@@ -23,9 +23,8 @@ from kcal.errors import InputError
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.difference import camera_difference
-from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import RigCovariance
+from kcal.lens.rig import Origin, RigCovariance
 from kcal.locate.budget import range_sigmas
 from kcal.locate.geodesy import geodetic_to_enu
 from kcal.locate.positions import map_places, region_rings

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal.corners.object_planes import object_planes, plane_pixels
+from kcal.corners.patches import object_planes, plane_pixels
 from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
 from kcal.scene import match, refine

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal.corners.patch_windows import image_windows, sample, warped_blur_windows
+from kcal.corners.patches import image_windows, sample, warped_blur_windows
 from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
 from kcal.scene import refine

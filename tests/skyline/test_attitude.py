@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from kcal.errors import DegenerateError, InputError
-from kcal.lens.mounting import Origin
+from kcal.lens.rig import Origin
 from kcal.locate.geodesy import enu_from_cam
 from kcal.skyline import attitude
 from kcal.skyline.attitude import SkylineAttitude, skyline_attitude

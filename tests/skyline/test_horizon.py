@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from kcal.errors import InputError
-from kcal.lens.mounting import Origin
+from kcal.lens.rig import Origin
 from kcal.locate.geodesy import geodetic_to_enu
 from kcal.locate.raster import Raster
 from kcal.skyline.attitude import raised_horizon

@@ -16,8 +16,8 @@ from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import solve_rig
 from kcal.calibrate.rig.sources import MeasuredPosition, RigData, SkylineSource
 from kcal.errors import InputError
-from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
+from kcal.lens.rig import Origin
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.raster import Raster
 from kcal.locate.stations import station_mounting

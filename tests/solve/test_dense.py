@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from kcal.solve.dense import DenseLinearization
+from kcal.solve.lm import DenseLinearization
 
 GENERATOR = torch.Generator().manual_seed(3)
 JACOBIAN = torch.randn(2, 9, 4, generator=GENERATOR, dtype=torch.float64) * torch.tensor([1e3, 1.0, 1e-3, 1.0])

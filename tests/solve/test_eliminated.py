@@ -6,8 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal.solve.eliminated import EliminatedItems, PartlyEliminated
-from kcal.solve.schur import SchurLinearization, without_local
+from kcal.solve.schur import EliminatedItems, PartlyEliminated, SchurLinearization, without_local
 
 ITEMS, OWN, SHARED, RESIDUALS = 6, 3, 4, 5
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from kcal.errors import DegenerateError
 from kcal.solve.hessian import HessianSolve, implicit_step, newton_minimum
 from kcal.solve.lm import LMOptions
-from kcal.solve.result import State
+from kcal.solve.problem import State
 from kcal.solve.schur import SchurLinearization, SchurProblem
 
 

@@ -11,9 +11,8 @@ from solve_problems import KNOWN, MISRA_X, MISRA_Y, SOLVERS, Known, beale, freud
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.solve.dense import DenseLinearization, DenseProblem
-from kcal.solve.lm import LevenbergMarquardt, LMOptions, minimize
-from kcal.solve.result import SolverStatus
+from kcal.solve.lm import DenseLinearization, DenseProblem, LevenbergMarquardt, LMOptions, minimize
+from kcal.solve.problem import SolverStatus
 
 
 def vector(*values: float) -> Tensor:

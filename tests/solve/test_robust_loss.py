@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from kcal.errors import InputError
-from kcal.solve.robust import RobustLoss
+from kcal.solve.problem import RobustLoss
 
 KINDS = ("huber", "cauchy", "tukey")
 

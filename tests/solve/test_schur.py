@@ -6,9 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal.solve.dense import DenseLinearization
-from kcal.solve.lm import LevenbergMarquardt, minimize
-from kcal.solve.result import SolverStatus, State
+from kcal.solve.lm import DenseLinearization, LevenbergMarquardt, minimize
+from kcal.solve.problem import SolverStatus, State
 from kcal.solve.schur import SchurLinearization, SchurProblem
 
 # (batch, views, local, shared, residuals a view)

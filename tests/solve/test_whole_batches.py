@@ -9,9 +9,8 @@ import torch
 from solve_problems import rosenbrock
 from torch import Tensor
 
-from kcal.solve.dense import DenseProblem
-from kcal.solve.lm import LMOptions, minimize
-from kcal.solve.result import SolverStatus
+from kcal.solve.lm import DenseProblem, LMOptions, minimize
+from kcal.solve.problem import SolverStatus
 
 STARTS = torch.tensor([[1.0, 1.0], [-1.2, 1.0], [-12.0, 10.0], [0.5, 2.0], [3.0, -4.0]], dtype=torch.float64)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from kcal.errors import InputError
-from kcal.lens.mounting import Origin
+from kcal.lens.rig import Origin
 from kcal.stars.sky import _NAMES, Air, StarCatalog, celestial_directions, observed_directions, parse_time
 
 SIRIUS, POLARIS = 2491, 424

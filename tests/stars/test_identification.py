@@ -13,7 +13,7 @@ import torch
 
 from kcal.errors import FileError, InputError
 from kcal.lens.camera import Camera
-from kcal.lens.mounting import Origin
+from kcal.lens.rig import Origin
 from kcal.locate.geodesy import enu_from_cam
 from kcal.stars.detect import detect_stars, read_night
 from kcal.stars.identification import _table_of, cache_folder, identify, pair_table

@@ -15,8 +15,8 @@ from scipy.spatial import cKDTree
 
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector
+from kcal.lens.rig import Origin
 from kcal.stars.detect import _reasons, _windowed, detect_stars
 from kcal.stars.identification import (
     _angle,

@@ -12,8 +12,8 @@ import torch
 
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector
+from kcal.lens.rig import Origin
 from kcal.stars.detect import DetectedStars
 from kcal.stars.night import Attitude, NamedStars, SkyView
 from kcal.stars.rig_stars import Moment, moments_of, star_source

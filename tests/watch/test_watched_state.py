@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from kcal.errors import InputError
-from kcal.lens.mounting import Mounting, Origin
+from kcal.lens.rig import Mounting, Origin
 from kcal.locate.budget import planned_rig
 from kcal.watch.state import AngleSeries, between_rows, first_state, learned, passed, taken, turns_of
 from kcal.watch.watched import MORE_ERRORS, Watched

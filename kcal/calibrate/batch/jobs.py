@@ -20,13 +20,12 @@ from typing import ClassVar
 
 import kcal
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
-from kcal.calibrate.camera.options import HYBRID
+from kcal.calibrate.camera.result import HYBRID
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_board, view_of
 from kcal.corners.images import decode_gray, expand_images, unique_names
-from kcal.corners.observations import Failure, Observations, PackedCovariance, Pixel, View
+from kcal.corners.observations import Failure, Observations, PackedCovariance, Pixel, View, common_size, rescaled
 from kcal.corners.refine import Refinement
-from kcal.corners.sizes import common_size, rescaled
 from kcal.errors import FileError, InputError, KcalError
 from kcal.files import read_bytes
 from kcal.image_header import ImageSize

@@ -26,9 +26,8 @@ from kcal.calibrate.batch.jobs import (
     sharing_jobs,
 )
 from kcal.calibrate.batch.workers import Pool, Task, WorkerDiedError, pool, run_tasks
-from kcal.calibrate.camera.options import HYBRID
-from kcal.calibrate.camera.result import CameraCalibrationResult
-from kcal.calibrate.camera.sharing import ALONE, sharing
+from kcal.calibrate.camera.calibrate import ALONE, sharing
+from kcal.calibrate.camera.result import HYBRID, CameraCalibrationResult
 from kcal.corners.observations import Observations
 from kcal.errors import FileError, KcalError
 from kcal.files import dump_json, make_folder, read_bytes, write_atomic

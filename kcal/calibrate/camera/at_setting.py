@@ -1,26 +1,313 @@
-"""A camera at a setting of zoom or focus between those at which its lens was calibrated.
-
-What is interpolated is the image itself: for each pixel of a grid, the ray that it sees and where on the axis that ray
-starts, whatever lens models the calibrations have. A lens is fitted to the rays, and errors go the same way: those of
-the calibrations, that of the curve between them (`kcal.calibrate.camera.setting_spline`), and that of the motor.
-"""
+"""A camera at a setting of zoom or focus between those at which its lens was calibrated."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import torch
+from scipy.optimize import nnls
+from scipy.special import ndtri, stdtrit
 from torch import Tensor
 
-from kcal.calibrate.camera.fitted_lines import FittedLines, LinesSeen
-from kcal.calibrate.camera.setting_checks import setting_sigmas, spline_between, usable_information, varied_settings
 from kcal.errors import InputError
 from kcal.gaussian import triangular
 from kcal.lens.calibration import CameraCalibration, LensSetting
 from kcal.lens.camera import Camera
+from kcal.lens.hybrid_terms import radius_over_angle
 from kcal.lens.information import CameraInformation
-from kcal.lens.uncertainty import pixel_covariance
+from kcal.lens.model import LensModel
+from kcal.lens.projection import FAR, project_components
+from kcal.lens.uncertainty import FIT_PX, fitted_errors, inverse_half, pixel_covariance
+from kcal.texts import setting_text
+
+# How values between settings follow from values at settings: the smoothest curve through them, with its error.
+#
+# The prior is a straight line (in several settings a plane) of any slope, plus a Gaussian process of the generalized
+# covariance |h|³ / 12. In one setting that is a Wiener process as second derivative, and the curve is the natural cubic
+# spline (Wahba, Spline Models for Observational Data, 1990, section 1.4; Cressie, Statistics for Spatial Data, 1993,
+# section 5.4, for generalized covariances). The curve does not depend on the size of the process, but its error does.
+
+# Quantile up to which a normal distribution of the stated standard deviation is as wide as Student's: that of the
+# 95 % intervals.
+_QUANTILE = 0.975
+# In widths of the settings: rounding.
+_SAME = 1e-9
+
+
+class SettingSpline:
+    """Weights of settings (n, D) at any place between them; each axis is scaled to its range.
+
+    Attributes:
+        degrees: of freedom that tell the size of the process: settings beyond those that a plane goes through.
+
+    Example:
+        >>> spline = SettingSpline(torch.tensor([[0.0], [1.0], [2.0], [4.0]]).double())
+        >>> [round(value, 3) for value in spline.weights(torch.tensor([1.5]).double()).tolist()]
+        [-0.082, 0.614, 0.492, -0.024]
+        >>> spline.inside(torch.tensor([4.1]).double()), spline.degrees
+        (False, 2)
+    """
+
+    def __init__(self, settings: Tensor) -> None:
+        self._low, self._width = settings.amin(0), settings.amax(0) - settings.amin(0)
+        self._places = (settings - self._low) / self._width
+        count, self._plane = len(settings), torch.cat([torch.ones_like(settings[:, :1]), self._places], 1)
+        self.degrees = count - self._plane.shape[1]
+        process, plane = _process(self._places, self._places), self._plane
+        corner = plane.new_zeros(plane.shape[1], plane.shape[1])
+        self._system = torch.cat([torch.cat([process, plane], 1), torch.cat([plane.T, corner], 1)])
+        open_ways = torch.linalg.qr(plane, mode="complete")[0][:, plane.shape[1] :]
+        root = torch.linalg.cholesky(open_ways.T @ process @ open_ways)
+        # (m, n): unit normal under the prior, whatever the plane is.
+        self._contrasts = torch.linalg.solve_triangular(root, open_ways.T, upper=False)
+
+    @staticmethod
+    def flat(settings: Tensor) -> bool:
+        """Whether all settings (n, D) lie in a space of fewer dimensions, or are fewer than D + 2."""
+        count, axes = settings.shape
+        scaled = (settings - settings.mean(0)) / (settings.amax(0) - settings.amin(0))
+        return count < axes + 2 or int(torch.linalg.matrix_rank(scaled, atol=_SAME)) < axes
+
+    def inside(self, at: Tensor) -> bool:
+        """Whether a setting (D,) lies between the others: in their convex hull."""
+        place = torch.cat([at.new_ones(1), (at - self._low) / self._width])
+        return bool(nnls(self._plane.T.numpy(), place.numpy())[1] < _SAME)
+
+    def _solved(self, at: Tensor) -> tuple[Tensor, Tensor]:
+        place = (at - self._low) / self._width
+        right = torch.cat([_process(self._places, place[None])[:, 0], at.new_ones(1), place])
+        return torch.linalg.solve(self._system, right), right
+
+    def weights(self, at: Tensor) -> Tensor:
+        """(n,) of the values at the settings, whose sum is the value there."""
+        return self._solved(at)[0][: len(self._places)]
+
+    def slopes(self, at: Tensor) -> Tensor:
+        """(n, D) derivatives of the weights by the setting."""
+        apart = (at - self._low) / self._width - self._places
+        rates = apart.norm(dim=1, keepdim=True) * apart / 4.0
+        plane = torch.cat([torch.zeros_like(apart[:1]), torch.eye(len(at), dtype=at.dtype)])
+        return torch.linalg.solve(self._system, torch.cat([rates, plane]))[: len(apart)] / self._width
+
+    def errors(self, at: Tensor) -> Tensor:
+        """(m, n) of the values at the settings: independent errors of the value there, one sigma each.
+
+        The size of the process is what the m contrasts of the values show, for each value by itself. As it is only
+        estimated, errors have Student's distribution of m degrees of freedom; they are stated as normal ones that
+        are as wide at 95 %.
+        """
+        solution, right = self._solved(at)
+        widen = float(stdtrit(self.degrees, _QUANTILE) / ndtri(_QUANTILE))
+        variance = (-(solution @ right)).clamp_min(0.0) / self.degrees
+        return widen * variance.sqrt() * self._contrasts
+
+
+def _process(one: Tensor, other: Tensor) -> Tensor:
+    distance = (one[:, None] - other).square().sum(-1).clamp_min(1e-300).sqrt()
+    return distance**3 / 12.0
+
+
+# Which cameras at which settings can be interpolated; what cannot is refused with its cause and cure.
+
+
+def usable_information(camera: Camera, first: Camera, name: str, first_name: str) -> CameraInformation:
+    """What is known of a camera that can be used."""
+    if camera.params.ndim != 1:
+        raise InputError(f"{name}: a batch of cameras; a single one is needed")
+    if camera.size != first.size:
+        sizes = [f"{width}x{height} px" for width, height in (camera.size, first.size)]
+        raise InputError(f"{name}: its image is {sizes[0]}, that of {first_name} {sizes[1]}: not one camera")
+    known = camera.calibration
+    if known is None or known.setting is None:
+        raise InputError(
+            f"{name}: it does not say at which setting it was calibrated: kcal calibrate OBS --setting ..."
+        )
+    if known.setting.interpolated_from:
+        raise InputError(f"{name}: it is interpolated itself; use the cameras that it came from")
+    information = known.known(camera.params.detach())
+    if information is None:
+        raise InputError(
+            f"{name}: it has no error bars: calibrate it with kcal calibrate OBS --setting {known.setting}"
+        )
+    return information
+
+
+def varied_settings(
+    cameras: Sequence[Camera], setting: Mapping[str, float], names: Sequence[str]
+) -> tuple[list[str], Tensor]:
+    """Which kinds of settings vary, and the settings of the cameras (n, D)."""
+    LensSetting(values=dict(setting))
+    stated = [
+        camera.calibration.setting.values for camera in cameras if camera.calibration and camera.calibration.setting
+    ]
+    for name, values in zip(names, stated, strict=True):
+        if values.keys() != setting.keys():
+            raise InputError(f"{name}: it states {', '.join(values)}, but {', '.join(setting)} is asked for")
+    axes = [axis for axis in setting if len({values[axis] for values in stated} | {setting[axis]}) > 1]
+    return axes, torch.tensor([[values[axis] for axis in axes] for values in stated], dtype=torch.float64)
+
+
+def setting_sigmas(axes: list[str], setting: Mapping[str, float], sigma: Mapping[str, float]) -> Tensor:
+    """(D,) standard deviations with which the lens comes back to the settings that vary."""
+    for name, value in sigma.items():
+        if name not in setting or not 0 <= value < math.inf:
+            raise InputError(f"setting sigma {name}={value:g}: a number, not negative, of one of {', '.join(setting)}")
+        if value and name not in axes:
+            raise InputError(f"setting sigma {name}={value:g}: all cameras have one {name}, so its effect is unknown")
+    return torch.tensor([sigma.get(axis, 0.0) for axis in axes], dtype=torch.float64)
+
+
+def spline_between(axes: list[str], places: Tensor, at: Tensor, names: Sequence[str]) -> SettingSpline:
+    """Refuse what cannot be interpolated."""
+    if len(places) < len(axes) + 2:
+        raise InputError(
+            f"{len(places)} cameras do not tell how the lens changes between settings of {' and '.join(axes)}: "
+            f"{len(axes) + 2} are needed, 5 are better"
+        )
+    for i, place in enumerate(places):
+        if len(again := (places[:i] == place).all(1).nonzero()):
+            raise InputError(f"{names[i]} and {names[int(again[0])]} are at one setting: leave one of them out")
+    lowest, highest = places.amin(0).tolist(), places.amax(0).tolist()
+    for axis, low, high, value in zip(axes, lowest, highest, at.tolist(), strict=True):
+        if not low <= value <= high:
+            raise InputError(
+                f"{axis}={value:g} is outside the calibrated {axis} of {low:g} to {high:g}: a lens is not "
+                f"extrapolated; calibrate it at {axis}={value:g} or beyond"
+            )
+    if SettingSpline.flat(places):
+        raise InputError(f"{' and '.join(axes)} change together in these cameras: calibrate other combinations as well")
+    spline = SettingSpline(places)
+    if not spline.inside(at):
+        text = setting_text(dict(zip(axes, at.tolist(), strict=True)))
+        raise InputError(f"{text} does not lie between these calibrations (in their convex hull): calibrate near it")
+    return spline
+
+
+# The lens that shows given lines of sight at given pixels, and how errors of the lines become its own.
+
+# Steps of the fit at most (three are usual), and the one in pixels below which it has converged.
+_STEPS, _SMALL = 20, 1e-7
+_PUPIL = ("pupil1", "pupil2")
+
+
+class LinesSeen(NamedTuple):
+    """What a camera sees at N pixels.
+
+    Attributes:
+        lines: (N, 3) the ray in the stereographic chart (x, y) / (1 + z), and where on the axis it starts, meters.
+        by_camera: (N, 3, C) their derivatives by the camera's parameters.
+        valid: (N,) which pixels have a ray.
+    """
+
+    lines: Tensor
+    by_camera: Tensor
+    valid: Tensor
+
+    @classmethod
+    def by(cls, camera: Camera, pixels: Tensor, wanted: list[int]) -> LinesSeen:
+        """Of a camera, with the derivatives by the `wanted` numbers of its parameters."""
+        rays, valid = camera.unproject(pixels)
+        chart = rays[:, :2] / (1.0 + rays[:, 2:])
+        _, by_chart, by_camera = _image(chart, camera.params.detach(), camera.model, wanted)
+        angle = 2.0 * torch.atan(chart.norm(dim=-1))
+        powers = {name: angle ** (2 * i) for i, name in enumerate(_PUPIL, 1)}
+        zero = torch.zeros_like(angle)
+        starts = torch.stack([powers.get(camera.names[i], zero) for i in wanted], -1)
+        return cls(
+            torch.cat([chart, camera.ray_origins(rays)[:, 2:]], 1),
+            torch.cat([-torch.linalg.solve(by_chart, by_camera), starts[:, None]], 1),
+            valid,
+        )
+
+    def changes(self, half: Tensor) -> Tensor:
+        """(K, N, 3) of the lines with changes (K, C) of the parameters."""
+        return torch.einsum("kp,ncp->knc", half, self.by_camera)
+
+
+def _image(chart: Tensor, params: Tensor, model: LensModel, wanted: list[int]) -> tuple[Tensor, Tensor, Tensor]:
+    """Pixels (N, 2) of rays in the chart, and their derivatives by it (N, 2, 2) and by parameters (N, 2, C)."""
+    size = 1.0 + chart.square().sum(-1, keepdim=True)
+    rays = torch.cat([2.0 * chart / size, 2.0 / size - 1.0], 1)
+    seen = project_components(FAR * rays.T, params, model, wanted)
+    outer = chart[:, :, None] * chart[:, None] / size[..., None]
+    across = 2.0 * (torch.eye(2, dtype=chart.dtype) - 2.0 * outer) / size[..., None]
+    ray_by_chart = torch.cat([across, -4.0 * (chart / size.square())[:, None]], 1)
+    by_chart = FAR * seen.by_point.permute(2, 1, 0) @ ray_by_chart
+    return seen.pixels.T, by_chart, seen.by_camera.permute(2, 1, 0)
+
+
+@dataclasses.dataclass(frozen=True)
+class FittedLines:
+    """The lens that shows given lines at given pixels, and how its parameters follow theirs."""
+
+    camera: Camera
+    misfit: float
+    by_chart: Tensor
+    slopes: Tensor
+    selection: Tensor
+    limits: Tensor
+    starts: Tensor
+
+    @classmethod
+    def of(cls, first: Camera, known: CameraInformation, pixels: Tensor, lines: Tensor) -> FittedLines:
+        """Of the kind of a similar camera, from which what the image does not show is taken over."""
+        chart, start = lines.split((2, 1), 1)
+        if len(pixels) < len(first.names):
+            raise InputError(f"the cameras have rays in common at only {len(pixels)} places of the image")
+        params, names = first.params.detach().clone(), first.names
+        # The focal length of the base that shows the image as large.
+        rays, _ = first.unproject(pixels)
+        own = rays[:, :2] / (1.0 + rays[:, 2:])
+        params[:2] *= (own.square().sum() / chart.square().sum()).sqrt()
+        form = first.model.hybrid
+        if form is not None:
+            # The disc of the nearest calibration, or as much more as the image needs.
+            angle = 2.0 * torch.atan(chart.norm(dim=-1))
+            needed = float((angle * radius_over_angle(form.shape * angle.square())).max())
+            scaled = form.radius * float(first.params[0] / params[0])
+            form = dataclasses.replace(form, radius=max(scaled, needed))
+        model = dataclasses.replace(first.model, hybrid=form)
+        pupil = [i for i, name in enumerate(names) if name in _PUPIL]
+        chosen = [slot for slot in range(known.lens_size) if not any(known.slots[i] == slot for i in pupil)]
+        selection = known.selection()[:, chosen]
+        free = selection.any(1).nonzero()[:, 0].tolist()
+        limits, begin = 1.0 / known.sigma[chosen], params.clone()
+        for _ in range(_STEPS):
+            image, by_chart, by_camera = _image(chart, params, model, free)
+            slopes, off = (by_camera @ selection[free]).flatten(0, 1), (pixels - image).flatten()
+            half, _ = inverse_half(slopes, FIT_PX * limits)
+            moved = torch.linalg.lstsq(selection, (begin - params)[:, None]).solution[:, 0]
+            step = half.T @ (half @ (slopes.T @ off + (FIT_PX * limits).square() * moved))
+            params = params + selection @ step
+            if float((slopes @ step).abs().max()) < _SMALL:
+                break
+        powers = (2.0 * torch.atan(chart.norm(dim=-1)))[:, None] ** chart.new_tensor([2.0, 4.0][: len(pupil)])
+        starts = first.params.new_zeros(len(names), len(pixels))
+        if pupil and all(known.slots[i] >= 0 for i in pupil):
+            starts[pupil] = torch.linalg.pinv(powers)
+            params = torch.where(starts.any(1), starts @ start[:, 0], params)
+        camera = Camera(params, size=first.size, model=model)
+        image, by_chart, _ = _image(chart, params, model, [])
+        misfit = float((pixels - image).square().sum(-1).mean().sqrt())
+        return cls(camera, misfit, by_chart, slopes, selection, limits, starts)
+
+    def errors(self, changes: Tensor) -> Tensor:
+        """(K', 5 + P) of the parameters, of changes (K, N, 3) of the lines; the last rows are of the misfit."""
+        by_image = -torch.einsum("nab,knb->kna", self.by_chart, changes[..., :2]).flatten(1)
+        half = fitted_errors(by_image, self.slopes, self.limits, self.misfit, len(self.by_chart)) @ self.selection.T
+        half[: len(changes)] += changes[..., 2] @ self.starts.T
+        return half
+
+
+# A camera at a setting of zoom or focus between those at which its lens was calibrated.
+#
+# What is interpolated is the image itself: for each pixel of a grid, the ray that it sees and where on the axis that
+# ray starts, whatever lens models the calibrations have. A lens is fitted to the rays, and errors go the same way:
+# those of the calibrations, that of the curve between them, and that of the
+# motor.
 
 _GRID = (41, 25)
 

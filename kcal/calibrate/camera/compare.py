@@ -16,12 +16,11 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.calibrate.camera.options import HYBRID, NETWORK, CalibrationOptions, Progress
+from kcal.calibrate.camera.result import HYBRID, NETWORK, CalibrationOptions, Progress
 from kcal.calibrate.hybrid.fit import HybridFit
-from kcal.calibrate.hybrid.moving_poses import moving_residuals
+from kcal.calibrate.hybrid.fitted_views import moving_residuals
 from kcal.calibrate.problem.poses import poses_under
-from kcal.calibrate.problem.views import Views
-from kcal.calibrate.problem.weights import whitening
+from kcal.calibrate.problem.views import Views, whitening
 from kcal.corners.observations import Observations
 from kcal.errors import InputError, KcalError
 from kcal.lens.model import LensModel

@@ -14,19 +14,22 @@ import math
 import torch
 from torch import Tensor
 
-from kcal.calibrate.camera.advice import roll_warnings, what_to_photograph
-from kcal.calibrate.camera.capture_warnings import motion_warnings, pixel_warnings
+from kcal.calibrate.camera.advice import check_directions, roll_warnings, what_to_photograph
 from kcal.calibrate.camera.checks import MINIMUM_VIEWS, check_views
-from kcal.calibrate.camera.determined import check_directions
-from kcal.calibrate.camera.options import CalibrationOptions, OutlierRejection, Progress
 from kcal.calibrate.camera.outliers import leave_out_outliers, noise_scale
-from kcal.calibrate.camera.pupil_check import pupil_warnings
-from kcal.calibrate.camera.result import CameraCalibrationResult
-from kcal.calibrate.camera.warnings import general_warnings, hybrid_warnings, outlier_warnings
+from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult, OutlierRejection, Progress
+from kcal.calibrate.camera.warnings import (
+    general_warnings,
+    hybrid_warnings,
+    motion_warnings,
+    outlier_warnings,
+    pixel_warnings,
+    pupil_warnings,
+)
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.settled import FitStart, rough_start
 from kcal.corners.observations import Observations
-from kcal.solve.result import SolverStatus
+from kcal.solve.problem import SolverStatus
 
 # The unknowns that the views alone must determine: focal length, principal point, shape of the base projection.
 _UNKNOWNS = 4

@@ -23,11 +23,10 @@ from torch import Tensor
 
 from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.camera.hybrid import corner_weights
-from kcal.calibrate.camera.options import CalibrationOptions
 from kcal.calibrate.camera.parametric import calibrate_parametric
-from kcal.calibrate.camera.result import CameraCalibrationResult
+from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
-from kcal.calibrate.hybrid.unknowns import hybrid_unknowns
+from kcal.calibrate.hybrid.fitted_views import hybrid_unknowns
 from kcal.corners.observations import Observations
 from kcal.errors import InputError, KcalError
 from kcal.lens.calibration import CameraCalibration

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kcal.errors import DegenerateError
 from kcal.lens.camera import Camera
-from kcal.lens.shift import PixelShift
+from kcal.lens.difference import PixelShift
 
 # Columns and rows on which a misfit is measured: four times as dense as the fit's, reaching to the image's edge.
 _DENSE = (129, 97)

@@ -10,9 +10,14 @@ from typing import Generic, TypeVar
 import torch
 from torch import Tensor
 
-from kcal.calibrate.camera.options import OutlierRejection, Progress
-from kcal.calibrate.camera.result import CameraCalibrationResult, RejectedCorner, RejectedView
-from kcal.calibrate.problem.closed_form import spread_out
+from kcal.calibrate.camera.result import (
+    CameraCalibrationResult,
+    OutlierRejection,
+    Progress,
+    RejectedCorner,
+    RejectedView,
+)
+from kcal.calibrate.problem.poses import spread_out
 from kcal.calibrate.problem.views import LEAST_NOISE
 from kcal.corners.observations import Observations
 from kcal.errors import InputError

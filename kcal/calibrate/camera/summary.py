@@ -8,8 +8,8 @@ import math
 import torch
 
 from kcal.calibrate.camera.advice import unreached_share
-from kcal.calibrate.camera.pupil_check import corner_pupil
 from kcal.calibrate.camera.result import CameraCalibrationResult
+from kcal.calibrate.camera.warnings import corner_pupil
 from kcal.lens.paraxial import ParaxialFocal, paraxial_focal
 from kcal.lens.uncertainty import image_sigma
 

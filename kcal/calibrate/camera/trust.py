@@ -16,9 +16,8 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.calibrate.camera.options import CalibrationOptions, OutlierRejection, Progress
-from kcal.calibrate.camera.result import CameraCalibrationResult
-from kcal.calibrate.hybrid.moving_poses import moving_residuals
+from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult, OutlierRejection, Progress
+from kcal.calibrate.hybrid.fitted_views import moving_residuals
 from kcal.calibrate.problem.poses import poses_under
 from kcal.calibrate.problem.views import Views
 from kcal.corners.observations import Observations

@@ -11,16 +11,14 @@ from torch import Tensor
 
 from kcal.calibrate.hybrid.board_modes import BoardModes
 from kcal.calibrate.hybrid.families import PriorFamilies, prior_families, typical_hyperprior
-from kcal.calibrate.hybrid.fitted_views import NO_MOTION, Estimate, FittedViews
+from kcal.calibrate.hybrid.fitted_views import NO_MOTION, Estimate, FittedViews, hybrid_unknowns
 from kcal.calibrate.hybrid.fleet import LensPrior
-from kcal.calibrate.hybrid.unknowns import hybrid_unknowns
-from kcal.calibrate.problem.closed_form import homographies, poses_from_homographies
+from kcal.calibrate.problem.poses import homographies, poses_from_homographies
 from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.views import LEAST_NOISE
 from kcal.errors import DegenerateError, InputError
-from kcal.lens.base_map import angle_over_radius, radius_over_angle
 from kcal.lens.field_modes import FieldModes
-from kcal.lens.hybrid_terms import HybridForm
+from kcal.lens.hybrid_terms import HybridForm, angle_over_radius, radius_over_angle
 from kcal.lens.model import LensModel
 from kcal.lens.zernike import ZernikeModes
 from kcal.solve.lm import LMOptions, minimize

@@ -1,31 +1,258 @@
-"""Fit several cameras together: they share the boards that they saw, and what lenses of one type have in common.
-
-Each camera is fitted alone first. What its data say about the board is a Gaussian message; cameras whose messages agree
-better than two separate boards would explain saw one board. Then each camera is fitted again, with the messages of the
-others as its prior of the board.
-"""
+"""Fit several cameras together: they share the boards that they saw, and what lenses of one type have in common."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, Literal, cast
 
 import torch
 from torch import Tensor
 
-from kcal.calibrate.hybrid.board_groups import compared, grouped, others_of
-from kcal.calibrate.hybrid.board_prior import BoardPrior, printed_board
-from kcal.calibrate.hybrid.families import typical_hyperprior
-from kcal.calibrate.hybrid.fit import HybridFit
-from kcal.calibrate.hybrid.fleet import LEAST_CAMERAS, LensPrior, fleet_priors, typical_lens
-from kcal.calibrate.hybrid.measured_board import MeasuredBoard
-from kcal.calibrate.hybrid.turned_fit import CameraFit, Shape, fit_turned
+from kcal.calibrate.hybrid.board_orders import CLEAR, find_turns, quarter_turns, turned, turned_corners
+from kcal.calibrate.hybrid.evidence import Quadratic
+from kcal.calibrate.hybrid.families import BOARD, typical_hyperprior
+from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
+from kcal.calibrate.hybrid.fleet import LEAST_CAMERAS, LensPrior, fleet_priors, hyper_likelihood, typical_lens
+from kcal.calibrate.hybrid.measured_board import BoardPrior, MeasuredBoard, evidence, printed_board, printed_prior
+from kcal.corners.board import Board
 from kcal.corners.observations import Observations
 from kcal.errors import InputError
-from kcal.gaussian import Gaussian, stacked
+from kcal.gaussian import Gaussian, numbered, stacked
+from kcal.lens.information import BOARD_SLOT, LENS_SLOT
 from kcal.lens.zernike import ZernikeModes
 from kcal.threads import in_one_thread
+
+# Fit one camera of several: views turned to one order, and what its data say about board, amplitudes and lens.
+
+# How a board differs from the one that was ordered: as printers err, not at all, or as others tell.
+Shape = Literal["printed", "exact"] | BoardPrior
+
+# Until no view is to be turned: two are enough as a rule.
+_MOST_FITS = 5
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class CameraFit:
+    """One of several cameras.
+
+    Args:
+        fit: the camera, with poses of the corners as they are turned.
+        turns: (V,) quarter turns of the board by which the corners of each view were read from another end.
+        message: what its data say about the board.
+        hyper: what its data say about the amplitudes of lenses; None unless it is one of a type.
+        lens: likewise about its own lens, in the form of the fit.
+        board: which of the boards it saw; -1 for an exact one.
+        nats: log evidence that it shares its board with the others of that board, against a board of its own. Of a
+            camera that shares none: the same with the board that is most like its own, negative. With a measured board:
+            that it is this one. NaN if there is nothing to compare.
+    """
+
+    fit: HybridFit
+    turns: Tensor
+    message: Gaussian
+    hyper: Gaussian | None = None
+    lens: Gaussian | None = None
+    board: int = -1
+    nats: float = math.nan
+
+
+def fit_turned(
+    seen: Observations,
+    weights: Tensor | None,
+    modes: ZernikeModes | None,
+    turns: Tensor | None,
+    shape: Shape,
+    one_type: bool = False,
+    lens: LensPrior | None = None,
+    start: HybridFit | None = None,
+    first: HybridFit | None = None,
+) -> CameraFit:
+    """Fit one camera, turn its views that were read from another end, and fit again until none is left.
+
+    Args:
+        seen: what it saw.
+        weights: (V, N) of the corners; one if not given.
+        modes: of the field.
+        turns: (V,) quarter turns that are known already.
+        shape: of the board.
+        one_type: the camera is one of a type, so that it tells of its lens, too.
+        lens: what is known of the lens.
+        start: an earlier fit of the views with these turns, to begin with.
+        first: such a fit with these weights, board and lens, which is taken as it is.
+    """
+    board, pixels = seen.board, seen.pixels()
+    weights = torch.ones_like(pixels[..., 0]) if weights is None else weights
+    turns = torch.zeros(len(pixels), dtype=torch.long) if turns is None else turns
+    for attempt in range(_MOST_FITS):
+        ordered, weighted = (turned_corners(values, board, turns) for values in (pixels, weights))
+        if first is not None and attempt == 0:
+            fit = first
+        else:
+            fit = fit_hybrid(board.points, ordered, seen.image_size, weighted, modes, shape, lens=lens, start=start)
+        if shape == "exact" or len(quarter_turns(board)) == 1 or attempt == _MOST_FITS - 1:
+            break
+        prior = printed_prior(fit.board_shapes, fit.expected[BOARD:]) if shape == "printed" else shape.whole
+        deviation = fit.families.deviation(fit.expected)[: -len(fit.state.board)]
+        more = find_turns(_absolute_rows(fit, board.points, ordered, weighted), board, prior, deviation, fit.sigma**2)
+        if not bool(more.any()):
+            break
+        turns, start = (turns + more) % 4, None
+    message = fit.information.board_message.weighted(math.sqrt(fit.wider))
+    found = CameraFit(fit=fit, turns=turns, message=message)
+    return _with_its_type(found, board.points, ordered, weighted, shape) if one_type else found
+
+
+def _with_its_type(camera: CameraFit, points: Tensor, pixels: Tensor, weights: Tensor, shape: Shape) -> CameraFit:
+    """With what its data say about the amplitudes of lenses, and about its lens."""
+    fit = camera.fit
+    deviation = fit.families.deviation(fit.expected)
+    of_board = numbered(BOARD_SLOT, len(fit.state.board))
+    of_lens = numbered(LENS_SLOT, len(deviation) - len(of_board))
+    mean = fit.families.mean[: len(of_lens)]
+    flat = _absolute_rows(fit, points, pixels, weights).transpose(1, 2).flatten(0, 1)
+    # The target is absolute, so that the residuals at the mean of lens and board are its negative.
+    flat[:, -1] *= -1.0
+    pixels_of = Gaussian((*of_lens, *of_board), torch.cat([mean, torch.zeros_like(fit.state.board)]), flat)
+    data = pixels_of.weighted(1.0 / fit.sigma)
+    if shape == "exact":
+        lens_alone = data.conditioned(of_board).compressed()
+        pixels_of = pixels_of.conditioned(of_board).placed(pixels_of.slots, pixels_of.at)
+    elif shape == "printed":
+        sigma = deviation[len(of_lens) :]
+        lens_alone = (data + Gaussian.independent(of_board, torch.zeros_like(sigma), sigma)).marginal(of_lens)
+    else:
+        lens_alone = (data + shape.whole).marginal(of_lens)
+        # In the variables of the fit's priors.
+        at, half = shape.whole.mean_and_half()
+        pixels_of = pixels_of.replaced(of_board, at, half.T, of_board)
+    freedom = 2 * int((torch.isfinite(pixels).all(-1) & (weights > 0)).sum()) - 6 * len(pixels)
+    hyper = _about_hyperparameters(fit, pixels_of.weighted(fit.tempering**-0.5), freedom / fit.tempering)
+    return dataclasses.replace(camera, hyper=hyper, lens=lens_alone)
+
+
+def _absolute_rows(fit: HybridFit, points: Tensor, pixels: Tensor, weights: Tensor) -> Tensor:
+    """(V, S + 1, R) derivatives by lens and board off poses and motions, and the target of these rows, pixels."""
+    count = len(fit.state.board)
+    mean = torch.cat([fit.families.mean[:-count], torch.zeros_like(fit.state.board)])
+    problem = fit.problem(points, pixels, weights, mean, torch.zeros_like(mean))
+    rows = problem.off_poses(fit.state)
+    rows[:, -1] = torch.einsum("s,vsn->vn", problem.unknowns(fit.state) - mean, rows[:, :-1]) - rows[:, -1]
+    return rows
+
+
+def _about_hyperparameters(fit: HybridFit, data: Gaussian, freedom: float) -> Gaussian:
+    """What the data say, in pixels and about the mean of the fit's priors."""
+    quadratic = Quadratic(data.products, freedom, torch.zeros_like(fit.families.mean))
+    return hyper_likelihood(quadratic, fit.families, fit.hyperparameters, fit.sigma**2 / fit.tempering)
+
+
+# Which cameras saw one board: their messages about it agree better than those about two boards would.
+
+
+def grouped(cameras: Sequence[CameraFit], kinds: Sequence[Board]) -> list[CameraFit]:
+    """Put each camera to the board, among those of its kind, that it shares with most evidence, or to a new one.
+
+    Whether one board is better than two is asked of messages alone. Nothing is fitted again, and the evidence of each
+    camera and of each group is found once.
+    """
+    out, groups = list(cameras), list[_SharedBoard]()
+    # Those that know most begin: they have most to lose from another's board.
+    known = [float(camera.message.rows[:, :-1].square().sum()) for camera in cameras]
+    # Boards as printers make them look alike from all ends: turned messages have the same evidence.
+    alone = [_evidence([camera.message], camera) for camera in cameras]
+    for i in sorted(range(len(out)), key=lambda i: -known[i]):
+        best: tuple[float, CameraFit, _SharedBoard | None, float] = (0.0, out[i], None, alone[i])
+        for group in groups:
+            if kinds[group.members[0]] == kinds[i]:
+                for turn in quarter_turns(kinds[i]):
+                    camera = _turned(cameras[i], turn)
+                    together = _evidence([camera.message, group.said], camera)
+                    # Read from another end only where that is clear.
+                    gain = together - alone[i] - group.evidence - (CLEAR if turn else 0.0)
+                    best = max(best, (gain, camera, group, together), key=lambda found: found[0])
+        _, out[i], home, together = best
+        if home is None:
+            groups.append(_SharedBoard([i], out[i].message, together))
+        else:
+            home.members.append(i)
+            home.said, home.evidence = _merged([home.said, out[i].message]), together
+    # Boards are numbered by their first cameras.
+    for k, group in enumerate(sorted(groups, key=lambda group: min(group.members))):
+        but_one = _but_one([out[i].message for i in group.members])
+        for i, others in zip(group.members, but_one, strict=True):
+            if others is not None:
+                gains = [group.evidence - alone[i] - _evidence([others], out[i])]
+            else:
+                rivals = [g for g in groups if g is not group and kinds[g.members[0]] == kinds[i]]
+                gains = [_evidence([out[i].message, g.said], out[i]) - alone[i] - g.evidence for g in rivals]
+            out[i] = dataclasses.replace(out[i], board=k, nats=max(gains, default=math.nan))
+    return out
+
+
+@dataclasses.dataclass
+class _SharedBoard:
+    """Cameras that saw one board, what they say of it, and the log evidence of that."""
+
+    members: list[int]
+    said: Gaussian
+    evidence: float
+
+
+def compared(camera: CameraFit, known: Gaussian, kind: Board) -> CameraFit:
+    """With the evidence that the board is the measured one, and all views turned if it was read from another end."""
+
+    def nats(camera: CameraFit) -> float:
+        return evidence(known, [camera.message]) - _evidence([camera.message], camera)
+
+    best = camera
+    for turn in quarter_turns(kind)[1:]:
+        best = max(best, _turned(camera, turn), key=lambda found: nats(found) + CLEAR * (found is camera))
+    return dataclasses.replace(best, board=0, nats=nats(best))
+
+
+def others_of(cameras: Sequence[CameraFit], board: int) -> dict[int, Gaussian | None]:
+    """For each camera that saw a board: what all others say of it."""
+    members = [i for i, camera in enumerate(cameras) if camera.board == board]
+    said = _but_one([cameras[i].message for i in members])
+    return dict(zip(members, said, strict=True))
+
+
+def _but_one(messages: Sequence[Gaussian]) -> list[Gaussian | None]:
+    """For each message, all others merged; None where there is no other. As many merges as there are messages."""
+
+    def running(messages: Sequence[Gaussian]) -> list[Gaussian | None]:
+        out: list[Gaussian | None] = [None]
+        for message in messages[:-1]:
+            out.append(_merged([m for m in (out[-1], message) if m is not None]))
+        return out
+
+    before, after = running(messages), running(messages[::-1])[::-1]
+    both = [[m for m in pair if m is not None] for pair in zip(before, after, strict=True)]
+    return [_merged(some) if some else None for some in both]
+
+
+def _merged(messages: Sequence[Gaussian]) -> Gaussian:
+    """All that they say, in few rows."""
+    return stacked(messages).compressed()
+
+
+def _evidence(messages: Sequence[Gaussian], like: CameraFit) -> float:
+    """Log evidence of messages about one printed board."""
+    return printed_board(like.fit.board_shapes, messages)[1]
+
+
+def _turned(camera: CameraFit, turn: int) -> CameraFit:
+    """With all views read from another end."""
+    return dataclasses.replace(camera, turns=(camera.turns + turn) % 4, message=turned(camera.message, turn))
+
+
+# Fit several cameras together: they share the boards that they saw, and what lenses of one type have in common.
+#
+# Each camera is fitted alone first. What its data say about the board is a Gaussian message; cameras whose messages
+# agree better than two separate boards would explain saw one board. Then each camera is fitted again, with the messages
+# of the others as its prior of the board.
 
 # Calls a function for each of the numbered argument lists; numbers and results come in any order.
 Run = Callable[[Callable[..., CameraFit], dict[int, tuple[Any, ...]]], Iterable[tuple[int, CameraFit]]]

@@ -11,12 +11,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.hybrid.amplitudes import expected_maximum
-from kcal.calibrate.hybrid.evidence import WORTH, Maximum, evidence_of_motion, maximize_evidence, with_tempering
+from kcal.calibrate.hybrid.evidence import (
+    WORTH,
+    Maximum,
+    ViewData,
+    evidence_of_motion,
+    expected_maximum,
+    maximize_evidence,
+    overdispersion,
+    with_tempering,
+)
 from kcal.calibrate.hybrid.families import Hyperprior
 from kcal.calibrate.hybrid.fitted_views import NO_MOTION, Estimate, FittedViews
-from kcal.calibrate.hybrid.quadratic import ViewData, overdispersion
-from kcal.calibrate.problem.readout import AMPLITUDES, LARGEST, MOTION, Readout, motion_sigma
+from kcal.calibrate.problem.state import AMPLITUDES, LARGEST, MOTION, Readout, motion_sigma
 
 _ROUNDS = 12
 # Rounds after which the evidence of one compares with that of another: the first begins with typical amplitudes.

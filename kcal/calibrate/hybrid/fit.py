@@ -13,20 +13,17 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.hybrid.board_modes import BoardModes, board_modes
-from kcal.calibrate.hybrid.board_prior import BoardPrior
+from kcal.calibrate.hybrid.evidence import posterior_root
 from kcal.calibrate.hybrid.evidence_rounds import LAST, expected_estimate
 from kcal.calibrate.hybrid.families import LEADING_UNKNOWNS, Hyperprior, PriorFamilies
-from kcal.calibrate.hybrid.fitted_views import Estimate
+from kcal.calibrate.hybrid.fitted_views import Estimate, hybrid_problem, hybrid_unknowns
 from kcal.calibrate.hybrid.fleet import LensPrior
-from kcal.calibrate.hybrid.measured_board import MeasuredBoard
+from kcal.calibrate.hybrid.measured_board import BoardPrior, MeasuredBoard
 from kcal.calibrate.hybrid.network_fit import FieldTraining, train_network
-from kcal.calibrate.hybrid.quadratic import posterior_root
 from kcal.calibrate.hybrid.settled import FitStart, check_shown, settle
-from kcal.calibrate.hybrid.unknowns import hybrid_problem, hybrid_unknowns
 from kcal.calibrate.problem.board_problem import BoardProblem
-from kcal.calibrate.problem.information import information_of
-from kcal.calibrate.problem.readout import MotionSigma, Readout, motion_sigma, stillness, widening
-from kcal.calibrate.problem.state import BoardState
+from kcal.calibrate.problem.covariance import information_of
+from kcal.calibrate.problem.state import BoardState, MotionSigma, Readout, motion_sigma, stillness, widening
 from kcal.calibrate.problem.views import among
 from kcal.lens.camera import Camera
 from kcal.lens.field_modes import FieldModes
@@ -233,7 +230,7 @@ def fit_hybrid(
     if training is not None:
         rounds = train_network(rounds, never, hyperprior, training, progress)
     capture, likely = rounds.capture, rounds.estimate
-    # Error bars are for amplitudes as they are to be expected (`kcal.calibrate.hybrid.amplitudes`).
+    # Error bars are for amplitudes as they are to be expected (`kcal.calibrate.hybrid.evidence`).
     estimate = likely if robust else expected_estimate(rounds, hyperprior)
     model, families, state, h, _, variance, tempering = estimate
     # Modes that the evidence holds so closely to zero that no pixel feels them are left out, error bars included.

@@ -1,4 +1,4 @@
-"""Views to which a hybrid camera is fitted, where a fit stands, and the least squares of both."""
+"""Views to which a hybrid camera is fitted, what is unknown of it, and the least squares of both."""
 
 from __future__ import annotations
 
@@ -11,17 +11,80 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.hybrid.board_modes import BoardModes
+from kcal.calibrate.hybrid.evidence import ViewData, view_data
 from kcal.calibrate.hybrid.families import PriorFamilies
-from kcal.calibrate.hybrid.quadratic import ViewData, view_data
-from kcal.calibrate.hybrid.unknowns import hybrid_prior, hybrid_problem
-from kcal.calibrate.problem.board_images import POSE
-from kcal.calibrate.problem.board_problem import BoardProblem
-from kcal.calibrate.problem.readout import Readout, stillness
-from kcal.calibrate.problem.state import BoardState
+from kcal.calibrate.problem.board_problem import POSE, BoardProblem
+from kcal.calibrate.problem.parameters import FreeParameters, GaussianPrior
+from kcal.calibrate.problem.state import MOTION, BoardState, Readout, stillness
 from kcal.calibrate.problem.views import LEAST_NOISE
+from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.solve.lm import LMOptions, minimize
-from kcal.solve.robust import RobustLoss
+from kcal.solve.problem import RobustLoss
+
+# What is unknown of a hybrid camera and of the board that it saw, and the least squares of both under their priors.
+
+
+def hybrid_unknowns(model: LensModel, square: bool = True) -> FreeParameters:
+    """What is free of a hybrid camera: focal length, principal point, and all coefficients; no skew.
+
+    Square pixels have one focal length; others have that of the rows as the last of the camera's unknowns.
+    """
+    rest = range(5, 5 + model.size)
+    rows = 0 if square else 3 + model.size
+    return FreeParameters((0, 1, 2, 3, *rest), (0, rows, 1, 2, *(i - 2 for i in rest)))
+
+
+def hybrid_problem(
+    points: Tensor,
+    shapes: Tensor,
+    pixels: Tensor,
+    weights: Tensor,
+    model: LensModel,
+    mean: Tensor,
+    precision: Tensor,
+    readout: Readout | None = None,
+    stillness: Tensor | None = None,
+    square: bool = True,
+) -> BoardProblem:
+    """Residuals of boards under a hybrid lens, with a normal prior on each unknown of lens and board.
+
+    Args:
+        points: (N, 3) the board's corners as ordered, meters.
+        shapes: (B, 3, N) modes of the board.
+        pixels: (V, N, 2), NaN where not seen.
+        weights: (V, N) by which residuals are multiplied.
+        model: of a hybrid lens.
+        mean: (S,) of the prior on the unknowns of the camera and on the board.
+        precision: (S,) its weight: the squared noise over the prior's variance. Infinite: held.
+        readout: how views move while they are read; None: they stand still.
+        stillness: (12,) the squared noise over the variance of each number of a motion.
+        square: whether pixels are square; others have two focal lengths.
+    """
+    held = torch.isinf(precision)
+    return BoardProblem(
+        points,
+        pixels,
+        model,
+        hybrid_unknowns(model, square),
+        shapes=shapes,
+        free_board=True,
+        held=held,
+        weights=weights,
+        terms=[hybrid_prior(model, len(shapes), mean, precision, square)],
+        readout=readout,
+        stillness=stillness,
+    )
+
+
+def hybrid_prior(model: LensModel, shapes: int, mean: Tensor, precision: Tensor, square: bool = True) -> GaussianPrior:
+    """The prior of `hybrid_problem`, with so many modes of the board."""
+    leading, count, held = hybrid_unknowns(model, square).leading, 5 + model.size, torch.isinf(precision)
+    index = torch.cat([torch.tensor(leading), torch.arange(count, count + shapes)])[~held]
+    return GaussianPrior(index, mean[~held], precision[~held].sqrt())
+
+
+# Views to which a hybrid camera is fitted, where a fit stands, and the least squares of both.
 
 # The logarithms of motions' standard deviations over the noise, of views that stand still.
 NO_MOTION = np.zeros(0)
@@ -150,3 +213,53 @@ def _cauchy_weights(problem: BoardProblem, state: BoardState, weights: Tensor) -
     # Of two normal components, the median length is 1.18 standard deviations.
     scale = max(3.0 * float(length[shown].median()) / 1.18, LEAST_NOISE)
     return torch.where(shown, weights * RobustLoss(kind="cauchy", scale=scale).weight(length.square()).sqrt(), 0.0)
+
+
+# Poses and motions of views that were held out, under a camera and a board that stay as they are.
+
+_EFFORT = LMOptions(max_iterations=60, tolerance=1e-12, initial_damping=1e-6)
+
+
+def moving_residuals(
+    camera: Camera,
+    board_points: Tensor,
+    pixels: Tensor,
+    rotation: Tensor,
+    translation: Tensor,
+    readout: Readout,
+    stillness: Tensor,
+) -> Tensor:
+    """Residuals of views whose poses and motions are solved for, the camera and its board being held.
+
+    A lens is judged by views that were not fitted. Of views that moved while they were read the motion is unknown too,
+    and would be counted as an error of the lens.
+
+    Args:
+        camera: of any model.
+        board_points: (N, 3) the board, meters.
+        pixels: (V, N, 2), NaN where not seen.
+        rotation: (V, 3, 3) cam_from_board, to begin with; a view without a pose is NaN and stays so.
+        translation: (V, 3) meters.
+        readout: how views are read.
+        stillness: (12,) the squared noise over the variance of each number of a motion.
+
+    Returns:
+        (V, N, 2) projected minus seen, pixels; NaN where not seen.
+    """
+    posed = rotation.flatten(1).isfinite().all(1)
+    out = torch.full_like(pixels, torch.nan)
+    if not bool(posed.any()):
+        return out
+    params = camera.params.detach()
+    some = pixels[posed]
+    problem = BoardProblem(
+        board_points,
+        some,
+        camera.model,
+        readout=readout,
+        stillness=stillness,
+    )
+    motion = rotation.new_zeros(len(some), MOTION)
+    state = BoardState.flat(params, rotation[posed], translation[posed])._replace(motion=motion)
+    out[posed] = problem.corner_residuals(minimize(problem, state, _EFFORT).state)
+    return out

@@ -15,9 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.hybrid.evidence import negative_log_evidence
+from kcal.calibrate.hybrid.evidence import Quadratic, negative_log_evidence
 from kcal.calibrate.hybrid.families import LEADING_UNKNOWNS, Hyperprior, PriorFamilies
-from kcal.calibrate.hybrid.quadratic import Quadratic
 from kcal.gaussian import Gaussian, numbered
 from kcal.lens.hybrid_terms import HybridForm
 

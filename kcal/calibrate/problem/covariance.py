@@ -1,4 +1,4 @@
-"""Covariances of a solution, and which parameters the data do not determine."""
+"""What corners and priors say of a camera and its board, and which parameters the data do not determine."""
 
 from __future__ import annotations
 
@@ -7,7 +7,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kcal.calibrate.problem.board_problem import BoardProblem
+from kcal.calibrate.problem.parameters import GaussianPrior
+from kcal.calibrate.problem.state import BoardState
+from kcal.gaussian import triangular
+from kcal.lens.information import CameraInformation
 from kcal.solve.schur import SchurLinearization
+
+# Covariances of a solution, and which parameters the data do not determine.
 
 # Eigenvalues of the scaled information below this share of the largest are rounding errors.
 _RANK_TOLERANCE = 1e-13
@@ -68,3 +75,40 @@ def _invert(linear: SchurLinearization) -> tuple[Tensor, Tensor, Tensor]:
 def noise_variance(linear: SchurLinearization, residual_count: int, parameter_count: int) -> Tensor:
     """Variance of a residual, estimated from the cost."""
     return 2.0 * linear.cost / max(residual_count - parameter_count, 1)
+
+
+# What corners and priors say of a camera and of its board, for every lens alike.
+
+
+def information_of(
+    problem: BoardProblem, state: BoardState, noise: float, reduced: Tensor | None = None
+) -> CameraInformation:
+    """Square roots of information about all unknowns that are not held, poses and motions eliminated.
+
+    Args:
+        problem: with the Gaussian priors that count; barriers are no information.
+        state: its minimum.
+        noise: px, of a corner of weight one.
+        reduced: `BoardProblem.reduced_rows`, if these are known already.
+    """
+    reduced = problem.reduced_rows(state) if reduced is None else reduced
+    moving = problem.moving
+    rows = reduced[:, [*moving.tolist(), -1]] / noise
+    triangle = triangular(rows)[:-1]
+    precision = rows.new_zeros(len(moving))
+    mean = torch.zeros_like(precision)
+    for term in problem.terms:
+        if isinstance(term, GaussianPrior):
+            place, weight = problem.slots[term.index], (term.weight / noise).square()
+            free = place >= 0
+            # Parameters that are equal may have a prior each: the product of both.
+            precision.index_add_(0, place[free], weight[free])
+            mean.index_add_(0, place[free], (weight * term.mean)[free])
+    return CameraInformation(
+        slots=tuple(problem.slots[: len(state.parameters)].tolist()),
+        estimate=problem.unknowns(state)[moving],
+        rows=triangle[:, :-1],
+        residuals=triangle[:, -1],
+        mean=torch.where(precision > 0, mean / precision, 0.0),
+        sigma=precision.rsqrt(),
+    )

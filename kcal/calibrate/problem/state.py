@@ -1,12 +1,173 @@
-"""What the problem of one camera is solved for: camera, board, poses and motions."""
+"""What the problem of one camera is solved for: camera, board, poses, and motions while rows are read."""
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
+
+# How a view moves while its rows are read: a rolling shutter before a camera, or a board, that is held by hand.
+#
+# Row v is read at the time g = (v + ½) / H - ½, from -½ to ½. Beside its pose each view has a motion, of first and of
+# second order in g: a turn ω of the board about its centroid c and a shift of it by a multiple of the typical distance
+# d,
+#
+#     X = R (P + ω × (P - c)) + t + d s,   ω = g ω₁ + g² ω₂,   s = g s₁ + g² s₂
+#
+# ω (radians) is in the board's frame and s in the camera's. Twelve numbers for each view are many; they are integrated
+# out under a normal prior, whose four standard deviations the evidence of all views sets: of turns and of shifts, of
+# first and of second order (hands turn by more than they shift). Rows that are read upward are the same with another
+# sign; where a picture was turned, columns stand for rows.
+
+# Numbers of a motion: for each order three of the turn and three of the shift, of which each three have an amplitude.
+MOTION = 12
+ORDERS = 2
+AMPLITUDES = 4
+# Median and standard deviation of the logarithm of a motion's standard deviation: radians, and distances of the board,
+# while an image is read. A hand that turns by 1 rad/s moves by 0.03 in 30 ms: beyond it is no motion. Below the
+# smallest no pixel feels it.
+MEDIAN, SPREAD, SMALLEST, LARGEST = 2e-4, 2.0, 1e-6, 0.03
+# A motion is worth a stand if it moves corners by so many standard deviations of their noise.
+FELT = 5.0
+
+
+# Error bars of few views that moved are too small by themselves: amplitudes of motions are known only roughly, and what
+# follows from them is not linear. Views at which variances are doubled, and the power with which this fades: errors of
+# 900 simulated captures of 3 to 8 views by hand were 2.1 to 1.1 times what was stated (docs/measured/ordinary.md).
+_DOUBLED, _FADES = 5.2, 3.0
+
+
+def widening(views: int) -> float:
+    """How many times larger variances are than the posterior's, where so many views moved.
+
+    Example:
+        >>> round(widening(3), 1), round(widening(8), 2), round(widening(60), 3)
+        (6.2, 1.27, 1.001)
+    """
+    return 1.0 + float((_DOUBLED / views) ** _FADES)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Readout:
+    """The order in which an image is read, and the units of motions.
+
+    Args:
+        center: (3,) of the board, about which it turns, meters.
+        distance: of the board, typically, by which shifts are divided, meters.
+        size: of the image.
+        columns: whether columns are read one after the other instead of rows, as in a picture that was turned.
+
+    Example:
+        >>> readout = Readout(center=torch.zeros(3), distance=1.0, size=(640, 480))
+        >>> readout.time(torch.tensor([[10.0, -0.5], [300.0, 239.5]])).tolist()
+        [-0.5, 0.0]
+    """
+
+    center: Tensor
+    distance: float
+    size: tuple[int, int]
+    columns: bool = False
+
+    def time(self, pixels: Tensor) -> Tensor:
+        """(...) when pixels (..., 2) were read: -½ at the first edge of the image, ½ at the last; 0 where NaN."""
+        axis = 0 if self.columns else 1
+        return ((pixels[..., axis] + 0.5) / self.size[axis] - 0.5).nan_to_num(0.0)
+
+    def reach(self, points: Tensor) -> float:
+        """How far corners (N, 3) of the board, meters, are from its middle at most, in distances of the board."""
+        return float((points - self.center).norm(dim=-1).max()) / self.distance
+
+    def moved(self, motion: Tensor, time: Tensor, points: Tensor) -> MovedBoard:
+        """Boards as they stand when their corners are read.
+
+        Args:
+            motion: (V, 12) of each view: ω₁, s₁, ω₂, s₂.
+            time: (V, N) of each corner.
+            points: (3, N) the board, meters.
+        """
+        powers = torch.stack([time, time * time], -1)
+        turn, shift = torch.einsum("vno,vokj->kvjn", powers, motion.unflatten(1, (ORDERS, 2, 3)))
+        about = (points - self.center[:, None]).expand_as(turn)
+        return MovedBoard(points + torch.linalg.cross(turn, about, dim=1), self.distance * shift, turn)
+
+    def columns_of(self, by_point: Tensor, rotation: Tensor, time: Tensor, points: Tensor) -> Tensor:
+        """(V, 12, 2, N) derivatives of pixels by motions.
+
+        Args:
+            by_point: (V, 3, 2, N) of pixels by points in the camera's frame.
+            rotation: (V, 3, 3) cam_from_board.
+            time: (V, N).
+            points: (3, N) the board, meters.
+        """
+        by_board = torch.einsum("vkun,vkl->vlun", by_point, rotation)
+        about = (points - self.center[:, None])[None, :, None].expand_as(by_board)
+        both = torch.cat([torch.linalg.cross(about, by_board, dim=1), self.distance * by_point], 1)
+        g = time[:, None, None]
+        return torch.cat([g * both, g * g * both], 1)
+
+
+def stillness(log_ratio: np.ndarray) -> Tensor:
+    """(12,) weights of a motion's numbers, from the logarithms (4,) of their deviations over the noise; or none, ()."""
+    return torch.from_numpy(np.exp(-2.0 * log_ratio)).repeat_interleave(MOTION // AMPLITUDES)
+
+
+class MotionSigma(NamedTuple):
+    """Standard deviations of motions along each axis, while an image is read.
+
+    Attributes:
+        turn: of first order, radians.
+        shift: of first order, distances of the board.
+        turn_twice: of second order.
+        shift_twice: of second order.
+    """
+
+    turn: float
+    shift: float
+    turn_twice: float
+    shift_twice: float
+
+    def moved(self, focal: float, reach: float) -> float:
+        """Pixels by which a corner moves from the first row to the last.
+
+        Args:
+            focal: length, pixels.
+            reach: of the board about its middle, distances of the board.
+        """
+        # The second order covers a quarter of that, as it is the same at both ends.
+        turn, shift = math.hypot(self.turn, 0.25 * self.turn_twice), math.hypot(self.shift, 0.25 * self.shift_twice)
+        return focal * math.hypot(shift, reach * turn)
+
+
+def motion_sigma(log_ratio: np.ndarray, variance: float) -> MotionSigma:
+    """Standard deviations of motions.
+
+    Args:
+        log_ratio: (4,) their logarithms over the noise.
+        variance: of the noise.
+    """
+    return MotionSigma(*(np.exp(log_ratio) * np.sqrt(variance)).tolist())
+
+
+class MovedBoard(NamedTuple):
+    """Boards while they are read.
+
+    Attributes:
+        points: (V, 3, N) in the board's frame, turned, meters.
+        shift: (V, 3, N) of them in the camera's frame, meters.
+        turn: (V, 3, N) ω of each corner.
+    """
+
+    points: Tensor
+    shift: Tensor
+    turn: Tensor
+
+
+# What the problem of one camera is solved for: camera, board, poses and motions.
 
 
 class BoardState(NamedTuple):
@@ -17,7 +178,7 @@ class BoardState(NamedTuple):
         board: (..., B) amplitudes of the board's modes, meters.
         rotation: (..., V, 3, 3) cam_from_board.
         translation: (..., V, 3) cam_from_board, meters.
-        motion: (..., V, 12) of each view while it is read (`kcal.calibrate.problem.readout`); (..., V, 0): they stand
+        motion: (..., V, 12) of each view while it is read; (..., V, 0): they stand
             still.
 
     Example:

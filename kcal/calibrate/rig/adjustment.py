@@ -38,8 +38,7 @@ from kcal.calibrate.rig.sources import Features, Landmarks, RigData, StarSource,
 from kcal.checks import beyond_chance, chi2_quantile
 from kcal.errors import InputError
 from kcal.solve.lm import LMOptions, minimize
-from kcal.solve.result import Result
-from kcal.solve.robust import RobustLoss
+from kcal.solve.problem import Result, RobustLoss
 
 # The state of a joint adjustment in which some items take part and others do not, and how well each item fits.
 

@@ -33,7 +33,7 @@ from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.pose import vector_from_rotation
 from kcal.solve.lm import LMOptions
-from kcal.solve.result import Result, SolverStatus
+from kcal.solve.problem import Result, SolverStatus
 
 # Refuse rigs whose baseline is so open that intervals of ranges are wrong; widen intervals where that helps.
 #

@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.calibrate.problem.twist import apply_twist
+from kcal.calibrate.problem.board_problem import apply_twist
 from kcal.calibrate.rig.motion import CameraRows, WithoutMotion
 from kcal.lens.camera import Camera
 from kcal.lens.pose import side_axes, step_rows

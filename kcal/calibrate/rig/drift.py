@@ -29,11 +29,9 @@ from kcal.calibrate.rig.uncertainty import SharedCovariance, goodness_of_fit, re
 from kcal.checks import as_points, beyond_chance, chi2_quantile, variance_factor
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
-from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA
 from kcal.lens.pose import rotation_from_vector, step_rows, vector_from_rotation
-from kcal.lens.projection import project_components
-from kcal.lens.pupil import FAR
-from kcal.lens.rig import StereoRig
+from kcal.lens.projection import FAR, project_components
+from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, StereoRig
 from kcal.solve.lm import LMOptions
 from kcal.texts import brief
 from kcal.threads import in_one_thread
@@ -203,7 +201,7 @@ class Drift:
         left: (3,) turn of the left camera; None where only the relative attitude can be told.
         right: (3,) of the right camera; likewise.
         relative: (3,) of right_from_left about the right camera's axes, as in
-            `kcal.calibrate.problem.twist.apply_twist`.
+            `kcal.calibrate.problem.board_problem.apply_twist`.
         left_covariance: (3, 3), None as above.
         right_covariance: (3, 3), None as above.
         relative_covariance: (3, 3).

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.calibrate.problem.closed_form import spread_out
+from kcal.calibrate.problem.poses import spread_out
 from kcal.calibrate.rig.board_consensus import (
     MINIMUM_CORNERS,
     Poses,

@@ -10,11 +10,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.hybrid.amplitudes import expected_maximum
-from kcal.calibrate.hybrid.evidence import WORTH, evidence_of_motion, maximize_evidence
+from kcal.calibrate.hybrid.evidence import (
+    WORTH,
+    Quadratic,
+    ViewData,
+    evidence_of_motion,
+    expected_maximum,
+    maximize_evidence,
+)
 from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies
-from kcal.calibrate.hybrid.quadratic import Quadratic, ViewData
-from kcal.calibrate.problem.readout import AMPLITUDES, FELT, MEDIAN, MOTION, MotionSigma, Readout, motion_sigma
+from kcal.calibrate.problem.state import AMPLITUDES, FELT, MEDIAN, MOTION, MotionSigma, Readout, motion_sigma
 from kcal.lens.model import LensModel
 from kcal.lens.projection import project_components
 from kcal.solve.schur import Products, column_scale
@@ -61,7 +66,7 @@ def summed_products(parts: Sequence[CameraRows], size: int, shared_size: int) ->
 
 # Boards that move while the rows of a rig's images are read: how much by evidence, and taken out of the residuals.
 #
-# Each board has, in each camera, a motion of its own beside its pose (`kcal.calibrate.problem.readout`). Integrated out
+# Each board has, in each camera, a motion of its own beside its pose (`kcal.calibrate.problem.state`). Integrated out
 # under a normal prior, whitened residuals r have the covariance I + U Uᵀ, U being their derivatives by the motion times
 # its standard deviations, and (I + U Uᵀ)^-½ r takes the place of r.
 

@@ -16,15 +16,14 @@ from torch import Tensor
 
 from kcal.calibrate.hybrid.board_modes import BoardModes, board_modes
 from kcal.calibrate.hybrid.board_orders import CLEAR, mode_turn, quarter_turns, turned
-from kcal.calibrate.hybrid.board_prior import printed_board, printed_prior
 from kcal.calibrate.hybrid.families import BOARD, typical_hyperprior
+from kcal.calibrate.hybrid.measured_board import printed_board, printed_prior
 from kcal.calibrate.rig.problem import SharedUnknowns, held
 from kcal.corners.board import Board
 from kcal.gaussian import Gaussian, Slots, stacked, unit_scale, whitened
 from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
-from kcal.lens.projection import project_components
-from kcal.lens.pupil import FAR
+from kcal.lens.projection import FAR, project_components
 
 # px that a direction must move something seen, for it to be an unknown of the rig.
 _FELT = 1e-3

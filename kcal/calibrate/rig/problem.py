@@ -18,12 +18,10 @@ from kcal.calibrate.rig.sources import SkylineSource
 from kcal.errors import InputError
 from kcal.gaussian import inverse_root
 from kcal.lens.camera import Camera
-from kcal.lens.mounting import check_refraction
 from kcal.lens.pose import nearest_rotation, rotation_from_vector, vector_from_rotation
-from kcal.solve.eliminated import EliminatedItems, PartlyEliminated
-from kcal.solve.result import State
-from kcal.solve.robust import RobustLoss
-from kcal.solve.schur import SchurLinearization
+from kcal.lens.rig import check_refraction
+from kcal.solve.problem import RobustLoss, State
+from kcal.solve.schur import EliminatedItems, PartlyEliminated, SchurLinearization
 
 # What a rig's adjustment may change of its cameras, its board and the air: linear functions of a few unknowns.
 

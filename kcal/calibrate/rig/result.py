@@ -20,11 +20,9 @@ from kcal.calibrate.rig.uncertainty import SharedCovariance, mounting_rows, para
 from kcal.io.rig_file import save_rig
 from kcal.lens.calibration import Exclusion, RigCalibration, RigSource
 from kcal.lens.camera import Camera
-from kcal.lens.camera_rig import CameraRig, CameraRigCalibration
-from kcal.lens.mounting import Origin
-from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.lens.rig import CameraRig, CameraRigCalibration, Origin, RigCovariance, StereoRig
 from kcal.solve.lm import LMOptions
-from kcal.solve.result import SolverStatus
+from kcal.solve.problem import SolverStatus
 from kcal.texts import brief
 
 # The result of solving a rig: cameras, residuals by source and by item, what was left out and why, covariances.

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from kcal.calibrate.hybrid.board_modes import board_modes
 from kcal.calibrate.problem.board_problem import BoardProblem
-from kcal.calibrate.problem.closed_form import spread_out
 from kcal.calibrate.problem.parameters import FreeParameters
+from kcal.calibrate.problem.poses import spread_out
 from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.rig.adjustment import LOSS, ROUGHLY, Adjustment, possible
 from kcal.calibrate.rig.assess import rig_result
@@ -33,7 +33,7 @@ from kcal.errors import InputError
 from kcal.gaussian import triangular
 from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
-from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA, check_refraction
+from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, check_refraction
 from kcal.solve.lm import LMOptions
 from kcal.threads import in_one_thread
 

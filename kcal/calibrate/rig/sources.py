@@ -11,7 +11,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from kcal.calibrate.problem.weights import whitening
+from kcal.calibrate.problem.views import whitening
 from kcal.checks import as_points, require_finite
 from kcal.corners.board import Board
 from kcal.errors import InputError

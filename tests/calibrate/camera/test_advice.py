@@ -18,7 +18,7 @@ from kcal.calibrate.camera.advice import (
     unreached_share,
     what_to_photograph,
 )
-from kcal.calibrate.camera.pupil_check import corner_pupil, pupil_warnings
+from kcal.calibrate.camera.warnings import corner_pupil, pupil_warnings
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.lens.camera import Camera

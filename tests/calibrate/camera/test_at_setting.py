@@ -15,9 +15,8 @@ from calibrate_scenes import camera, motions, observe, pixels_of
 from scipy.interpolate import CubicSpline
 from torch import Tensor
 
-from kcal.calibrate.camera.at_setting import _errors, camera_at_setting
+from kcal.calibrate.camera.at_setting import SettingSpline, _errors, camera_at_setting
 from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.calibrate.camera.setting_spline import SettingSpline
 from kcal.errors import InputError
 from kcal.io.camera_file import load_camera, save_camera
 from kcal.io.rig_file import load_rig, save_rig

@@ -18,7 +18,7 @@ from kcal.calibrate.problem.views import free_parameters
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.solve.lm import LMOptions, minimize
-from kcal.solve.result import SolverStatus
+from kcal.solve.problem import SolverStatus
 
 
 def solve(pixels: Tensor, model: str = "opencv5", **options: object) -> CameraCalibrationResult:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from kcal.calibrate.camera.capture_warnings import motion_warnings
+from kcal.calibrate.camera.warnings import motion_warnings
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
 from kcal.lens.camera import Camera
 from kcal.lens.zernike import ZernikeModes

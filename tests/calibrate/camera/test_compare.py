@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.camera.compare import ComparisonResult, compare_models
-from kcal.calibrate.camera.options import CalibrationOptions
+from kcal.calibrate.camera.result import CalibrationOptions
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.errors import DegenerateError, InputError

@@ -9,15 +9,14 @@ import torch
 from calibrate_scenes import BOARD, SIZE, camera, motions, observe, pixels_of
 from lenses import hybrid_camera
 
+from kcal.calibrate.camera.advice import check_directions, direction_share
 from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.calibrate.camera.determined import check_directions, direction_share
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.lens.paraxial import paraxial_focal
-from kcal.lens.projection import project_components
-from kcal.lens.pupil import FAR
+from kcal.lens.projection import FAR, project_components
 
 
 def rays_of(lens: Camera) -> torch.Tensor:

@@ -16,8 +16,7 @@ from kcal.calibrate.camera.export import export_cameras
 from kcal.io.formats import FORMATS, import_cameras
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
-from kcal.lens.carry_over import carried_covariance, square_root_information
-from kcal.lens.uncertainty import pixel_slopes
+from kcal.lens.uncertainty import carried_covariance, pixel_slopes, square_root_information
 
 PAGE = Path(__file__).parents[3] / "docs" / "howto" / "bundle-adjustment.md"
 COLMAP, GTSAM = re.findall(r"^```py\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
@@ -89,7 +88,7 @@ def test_parameters_that_are_equal_stay_so() -> None:
 
 def test_a_misfit_is_in_the_covariance() -> None:
     """The image's mean variance is the calibration's and the squared misfit, wherever the truth of a fitted lens is."""
-    from kcal.calibrate.camera.refit import refit_camera
+    from kcal.calibrate.camera.export import refit_camera
 
     subject = hybrid_camera("webcam")
     count = len(subject.params)

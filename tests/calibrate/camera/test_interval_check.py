@@ -14,8 +14,7 @@ import torch
 import kcal.calibrate.camera.interval_check as module
 from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.camera.interval_check import interval_check, simulated_refits
-from kcal.calibrate.camera.options import CalibrationOptions
-from kcal.calibrate.camera.result import CameraCalibrationResult
+from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult
 from kcal.cli.main import main
 from kcal.corners.observations import Observations
 from kcal.lens.calibration import CameraCalibration

@@ -9,11 +9,10 @@ from elsewhere import DEVICE, Elsewhere
 from torch import Tensor
 
 from kcal.calibrate.camera.layer import CalibratedViews, CalibrationLayer
-from kcal.calibrate.camera.options import CalibrationOptions
+from kcal.calibrate.camera.result import CalibrationOptions
 from kcal.lens.camera import Camera
-from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Origin, StereoRig
 from kcal.locate.localizer import StereoLocalizer
 
 TURN = rotation_from_vector(torch.tensor([0.01, -0.03, 0.02], dtype=torch.float64))

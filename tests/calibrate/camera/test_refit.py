@@ -7,7 +7,7 @@ import torch
 from calibrate_scenes import SIZE, camera
 from lenses import HYBRID, strong
 
-from kcal.calibrate.camera.refit import refit_camera
+from kcal.calibrate.camera.export import refit_camera
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 

@@ -12,7 +12,7 @@ import torch
 from calibrate_scenes import BOARD, camera, motions, observe, pixels_of
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.calibrate.camera.repeats import copied_views, repeated_poses
+from kcal.calibrate.camera.checks import copied_views, repeated_poses
 from kcal.corners.board import Board
 from kcal.corners.detect import detect
 from kcal.errors import DegenerateError

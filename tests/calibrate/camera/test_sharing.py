@@ -18,10 +18,10 @@ from kcal.calibrate.camera.calibrate import (
     CameraCalibrationResult,
     calibrate_camera,
     calibrate_cameras,
+    sharing,
 )
-from kcal.calibrate.camera.options import OutlierRejection
-from kcal.calibrate.camera.sharing import sharing
-from kcal.calibrate.camera.two_cameras import AUTOFOCUS
+from kcal.calibrate.camera.leave_out import AUTOFOCUS
+from kcal.calibrate.camera.result import OutlierRejection
 from kcal.calibrate.hybrid.board_orders import turned_corners
 from kcal.calibrate.rig.prior_information import gathered, joint_unknowns
 from kcal.cli.main import app
@@ -223,7 +223,7 @@ def test_cameras_that_saw_other_boards_are_not_fitted_together(monkeypatch: pyte
     def never(*_: object, **__: object) -> None:
         raise AssertionError("fitted together")
 
-    monkeypatch.setattr("kcal.calibrate.camera.sharing.fit_cameras", never)
+    monkeypatch.setattr("kcal.calibrate.camera.calibrate.fit_cameras", never)
     found = [calibrate_camera(seen_by(number)) for number in (1, 2)]
     other = Board(columns=BOARD.columns, rows=BOARD.rows, square=0.031)
     found[1] = dataclasses.replace(found[1], observations=found[1].observations.model_copy(update={"board": other}))
@@ -236,7 +236,7 @@ def test_cameras_that_cannot_be_fitted_together_stay_as_they_are_alone(monkeypat
     def fails(*_: object, **__: object) -> None:
         raise DegenerateError("nothing fits")
 
-    monkeypatch.setattr("kcal.calibrate.camera.sharing.fit_cameras", fails)
+    monkeypatch.setattr("kcal.calibrate.camera.calibrate.fit_cameras", fails)
     found = calibrate_cameras([seen_by(1), seen_by(2)])
     alone = calibrate_camera(seen_by(1))
     assert isinstance(found[0], CameraCalibrationResult)

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 from kcal.calibrate.camera.next_view import possible_views
 from kcal.cli.main import app
 from kcal.corners.board import Board
-from kcal.corners.charuco import _opencv_board
+from kcal.corners.marker_boards import _opencv_board
 from kcal.corners.observations import Observations
 from kcal.io.camera_file import load_camera
 from kcal.lens.camera import Camera

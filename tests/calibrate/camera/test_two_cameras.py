@@ -9,10 +9,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal.calibrate.camera import two_cameras as module
+from kcal.calibrate.camera import leave_out as module
 from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.calibrate.camera.options import CalibrationOptions
-from kcal.calibrate.camera.two_cameras import two_camera_warnings
+from kcal.calibrate.camera.leave_out import two_camera_warnings
+from kcal.calibrate.camera.result import CalibrationOptions
 from kcal.calibrate.hybrid.fit import fit_hybrid
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View

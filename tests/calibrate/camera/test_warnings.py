@@ -13,14 +13,13 @@ from torch import Tensor
 
 from kcal.calibrate.camera.advice import reached, roll_warnings, what_to_photograph
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.calibrate.camera.pupil_check import corner_pupil, pupil_warnings
-from kcal.calibrate.camera.warnings import general_warnings
+from kcal.calibrate.camera.warnings import corner_pupil, general_warnings, pupil_warnings
 from kcal.corners.board import Board
 from kcal.corners.detect import detect
 from kcal.corners.observations import Observations, View
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
-from kcal.solve.result import SolverStatus
+from kcal.solve.problem import SolverStatus
 
 
 def rolled(*degrees: float) -> Tensor:

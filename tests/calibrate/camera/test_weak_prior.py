@@ -8,7 +8,7 @@ from calibrate_scenes import camera, motions, observe, pixels_of
 from torch import Tensor
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
-from kcal.calibrate.problem.coefficient_prior import CoefficientPrior, is_overparameterized
+from kcal.calibrate.problem.parameters import CoefficientPrior, is_overparameterized
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel

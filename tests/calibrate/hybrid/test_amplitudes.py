@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import integrate
 
-from kcal.calibrate.hybrid.amplitudes import expected_amplitudes
+from kcal.calibrate.hybrid.evidence import expected_amplitudes
 
 WIDE: list[tuple[float, float | None]] = [(-12.0, 12.0), (-12.0, 12.0), (-40.0, None)]
 

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from kcal.calibrate.hybrid.board_modes import board_modes
 from kcal.calibrate.hybrid.board_orders import find_turns, mode_turn, quarter_turns, turned, turned_corners
-from kcal.calibrate.hybrid.board_prior import BoardPrior, evidence, printed_board, printed_prior
 from kcal.calibrate.hybrid.families import BOARD, typical_hyperprior
+from kcal.calibrate.hybrid.measured_board import BoardPrior, evidence, printed_board, printed_prior
 from kcal.corners.board import Board
 from kcal.gaussian import Gaussian, numbered
 from kcal.lens.information import BOARD_SLOT

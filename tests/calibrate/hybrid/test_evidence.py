@@ -9,10 +9,17 @@ import pytest
 import torch
 from scipy import stats
 
-from kcal.calibrate.hybrid.evidence import EvidenceLoss, Maximum, evidence_of_motion, hyper_bounds, maximize_evidence
+from kcal.calibrate.hybrid.evidence import (
+    EvidenceLoss,
+    Maximum,
+    ViewData,
+    evidence_of_motion,
+    hyper_bounds,
+    maximize_evidence,
+    view_data,
+)
 from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies
-from kcal.calibrate.hybrid.quadratic import ViewData, view_data
-from kcal.calibrate.problem.readout import AMPLITUDES, MEDIAN, MOTION, SPREAD
+from kcal.calibrate.problem.state import AMPLITUDES, MEDIAN, MOTION, SPREAD
 from kcal.solve.schur import Products
 
 F64 = torch.float64

@@ -13,23 +13,19 @@ import torch
 from printed_boards import shown
 from torch import Tensor
 
-from kcal.calibrate.hybrid import aspect, settled
+from kcal.calibrate.hybrid import settled
 from kcal.calibrate.hybrid.base_fit import fit_projection
-from kcal.calibrate.hybrid.board_groups import compared
 from kcal.calibrate.hybrid.board_modes import board_modes
 from kcal.calibrate.hybrid.board_orders import turned
-from kcal.calibrate.hybrid.board_prior import evidence, printed_board
-from kcal.calibrate.hybrid.cameras_fit import _begun_fleet, _learned_fleet
+from kcal.calibrate.hybrid.cameras_fit import CameraFit, _begun_fleet, _learned_fleet, compared
 from kcal.calibrate.hybrid.evidence import WORTH
 from kcal.calibrate.hybrid.families import Hyperprior, prior_families, typical_hyperprior
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
-from kcal.calibrate.hybrid.fitted_views import _cauchy_weights
+from kcal.calibrate.hybrid.fitted_views import _cauchy_weights, moving_residuals
 from kcal.calibrate.hybrid.fleet import LensPrior, fleet_priors, typical_lens
-from kcal.calibrate.hybrid.measured_board import MeasuredBoard
-from kcal.calibrate.hybrid.moving_poses import moving_residuals
+from kcal.calibrate.hybrid.measured_board import MeasuredBoard, evidence, printed_board
 from kcal.calibrate.hybrid.settled import rough_start
-from kcal.calibrate.hybrid.turned_fit import CameraFit
-from kcal.calibrate.problem.readout import Readout
+from kcal.calibrate.problem.state import Readout
 from kcal.corners.board import Board
 from kcal.gaussian import Gaussian, numbered
 from kcal.lens.camera import Camera
@@ -278,14 +274,14 @@ def test_pixels_that_amplitudes_to_be_expected_leave_square(monkeypatch: pytest.
         assert (rounds.estimate, hyperprior) == ("likely", beforehand)
         return "expected"
 
-    monkeypatch.setattr(aspect, "expected_estimate", expected)
-    monkeypatch.setattr(aspect, "_standing", lambda rounds, never: scores[rounds.estimate])
+    monkeypatch.setattr(settled, "expected_estimate", expected)
+    monkeypatch.setattr(settled, "_standing", lambda rounds, never: scores[rounds.estimate])
     begin = cast(Any, Rounds("likely"))
-    assert aspect.aspect_score(begin, beforehand, torch.zeros(0)) == 2.5
+    assert settled.aspect_score(begin, beforehand, torch.zeros(0)) == 2.5
     scores["expected"] = -4.0
-    assert aspect.aspect_score(begin, beforehand, torch.zeros(0)) == -4.0
+    assert settled.aspect_score(begin, beforehand, torch.zeros(0)) == -4.0
     scores["likely"] = -3.0
-    assert aspect.aspect_score(begin, beforehand, torch.zeros(0)) == -3.0
+    assert settled.aspect_score(begin, beforehand, torch.zeros(0)) == -3.0
 
 
 def test_motion_is_looked_for_again_where_the_aspect_may_have_hidden_it(monkeypatch: pytest.MonkeyPatch) -> None:

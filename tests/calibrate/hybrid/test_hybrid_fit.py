@@ -12,12 +12,11 @@ from standing_views import quadratic, standing
 from torch import Tensor
 
 from kcal.calibrate.hybrid.board_modes import BENDING, PRINT, STRETCH, TRAPEZOID, board_modes
-from kcal.calibrate.hybrid.evidence import maximize_evidence, negative_log_evidence, with_tempering
+from kcal.calibrate.hybrid.evidence import Quadratic, maximize_evidence, negative_log_evidence, with_tempering
 from kcal.calibrate.hybrid.families import PriorFamilies, prior_families, typical_hyperprior
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
-from kcal.calibrate.hybrid.quadratic import Quadratic
+from kcal.calibrate.hybrid.fitted_views import hybrid_problem
 from kcal.calibrate.hybrid.settled import rough_start
-from kcal.calibrate.hybrid.unknowns import hybrid_problem
 from kcal.calibrate.problem.state import BoardState
 from kcal.corners.board import Board
 from kcal.errors import InputError
@@ -127,7 +126,7 @@ def test_errors_are_as_large_as_predicted() -> None:
     pixels = seen_pixels(true)
     rays = true.unproject(pixels)[0]
     camera, model = found.camera, found.camera.model
-    from kcal.calibrate.hybrid.unknowns import hybrid_unknowns
+    from kcal.calibrate.hybrid.fitted_views import hybrid_unknowns
     from kcal.lens.pose import step_rows
     from kcal.lens.projection import project_components
 

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.camera.compare import compare_models
 from kcal.calibrate.camera.layer import calibrate_views
-from kcal.calibrate.camera.options import CalibrationOptions
+from kcal.calibrate.camera.result import CalibrationOptions
 from kcal.calibrate.hybrid.families import typical_hyperprior
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.fitted_views import Estimate
@@ -33,7 +33,7 @@ from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.lens.gaussian_modes import GaussianModes
+from kcal.lens.field_modes import GaussianModes
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.model import LensModel
 from kcal.lens.network_modes import NetworkModes

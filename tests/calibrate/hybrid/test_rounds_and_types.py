@@ -15,14 +15,13 @@ from calibrate_scenes import observe
 from printed_boards import printed_points, printed_views
 from torch import Tensor
 
-from kcal.calibrate.hybrid import evidence_rounds, fitted_views, turned_fit
+from kcal.calibrate.hybrid import cameras_fit, evidence_rounds, fitted_views
 from kcal.calibrate.hybrid.board_modes import board_modes
-from kcal.calibrate.hybrid.board_prior import printed_board
-from kcal.calibrate.hybrid.cameras_fit import _measured
+from kcal.calibrate.hybrid.cameras_fit import CameraFit, _measured, fit_turned
 from kcal.calibrate.hybrid.evidence_rounds import Rounds, columns_may_be_read
 from kcal.calibrate.hybrid.families import typical_hyperprior
-from kcal.calibrate.hybrid.turned_fit import CameraFit, fit_turned
-from kcal.calibrate.problem.readout import Readout, motion_sigma
+from kcal.calibrate.hybrid.measured_board import printed_board
+from kcal.calibrate.problem.state import Readout, motion_sigma
 from kcal.corners.board import Board
 from kcal.gaussian import Gaussian, numbered
 from kcal.lens.camera import Camera
@@ -139,13 +138,13 @@ def shots() -> Tensor:
 def test_what_a_camera_tells_of_its_lens(shape: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its data alone: with the priors of the fit they give the fit. Their freedom: residuals that count, less poses."""
     freedoms: list[float] = []
-    about = turned_fit._about_hyperparameters
+    about = cameras_fit._about_hyperparameters
 
     def noted(fit: Any, data: Gaussian, freedom: float) -> Gaussian:
         freedoms.append(freedom * fit.tempering)
         return about(fit, data, freedom)
 
-    monkeypatch.setattr(turned_fit, "_about_hyperparameters", noted)
+    monkeypatch.setattr(cameras_fit, "_about_hyperparameters", noted)
     pixels = shots().clone()
     pixels[2, 5] = torch.nan
     weights = torch.ones(9, 48).double()

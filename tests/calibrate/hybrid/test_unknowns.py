@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from kcal.calibrate.hybrid.unknowns import hybrid_problem, hybrid_unknowns
+from kcal.calibrate.hybrid.fitted_views import hybrid_problem, hybrid_unknowns
 from kcal.corners.board import Board
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.model import LensModel

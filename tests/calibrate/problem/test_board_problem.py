@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kcal.calibrate.problem import board_problem
 from kcal.calibrate.problem.board_problem import BoardProblem
-from kcal.calibrate.problem.priors import GaussianPrior
+from kcal.calibrate.problem.parameters import GaussianPrior
 from kcal.calibrate.problem.state import BoardState, warp_modes
 from kcal.corners.board import Board
 from kcal.lens.camera import Camera
@@ -18,8 +18,7 @@ from kcal.lens.model import LensModel
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.projection import parameter_names
 from kcal.solve.lm import LevenbergMarquardt, LMOptions, minimize
-from kcal.solve.result import SolverStatus, map_state
-from kcal.solve.robust import RobustLoss
+from kcal.solve.problem import RobustLoss, SolverStatus, map_state
 from kcal.solve.schur import SchurLinearization
 
 BOARD = Board(columns=4, rows=3, square=0.1)

@@ -7,13 +7,15 @@ import torch
 from calibrate_scenes import BOARD, SIZE, Motions, camera, motions, pixels_of
 from torch import Tensor
 
-from kcal.calibrate.problem.closed_form import (
+from kcal.calibrate.problem.poses import (
     flipped_poses,
     homographies,
     poses_from_homographies,
+    poses_under,
+    refine_poses,
     spread_out,
+    unflip,
 )
-from kcal.calibrate.problem.poses import poses_under, refine_poses, unflip
 from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.views import Views
 from kcal.corners.board import Board

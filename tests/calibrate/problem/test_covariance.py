@@ -9,12 +9,11 @@ import torch
 from calibrate_scenes import BOARD, SIZE, camera, motions, observe, pixels_of
 from torch import Tensor
 
-from kcal.calibrate.camera import assess
+from kcal.calibrate.camera import parametric
+from kcal.calibrate.camera.advice import check_directions
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.calibrate.camera.determined import check_directions
 from kcal.calibrate.problem.board_problem import BoardProblem
-from kcal.calibrate.problem.covariance import Uncertainty, noise_variance, uncertainty_of
-from kcal.calibrate.problem.information import information_of
+from kcal.calibrate.problem.covariance import Uncertainty, information_of, noise_variance, uncertainty_of
 from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.views import free_parameters
 from kcal.errors import DegenerateError
@@ -181,8 +180,8 @@ class TestWhatCannotBeComputed:
             return _uncertainty(*given, **named)  # type: ignore[arg-type]
 
         # Only after the solution was found.
-        _uncertainty = assess._uncertainty
-        monkeypatch.setattr(assess, "_uncertainty", count)
+        _uncertainty = parametric._uncertainty
+        monkeypatch.setattr(parametric, "_uncertainty", count)
         monkeypatch.setattr(BoardProblem, "linearize", folded)
         result = calibrate_camera(seen, CalibrationOptions(weak_prior=None, model="opencv14"))
         assert calls

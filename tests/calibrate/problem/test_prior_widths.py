@@ -7,9 +7,9 @@ import math
 import pytest
 import torch
 
-from kcal.calibrate.problem.coefficient_prior import CoefficientPrior, is_overparameterized
-from kcal.calibrate.problem.twist import apply_twist
-from kcal.calibrate.problem.weights import whitening
+from kcal.calibrate.problem.board_problem import apply_twist
+from kcal.calibrate.problem.parameters import CoefficientPrior, is_overparameterized
+from kcal.calibrate.problem.views import whitening
 from kcal.lens.camera_parameters import parameter_names
 from kcal.lens.model import LensModel
 from kcal.lens.pose import rotation_from_vector

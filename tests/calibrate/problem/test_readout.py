@@ -12,29 +12,26 @@ from torch import Tensor
 
 from kcal.calibrate.hybrid.base_fit import fit_base
 from kcal.calibrate.hybrid.board_modes import board_modes
-from kcal.calibrate.hybrid.evidence import maximize_evidence
+from kcal.calibrate.hybrid.evidence import Quadratic, ViewData, maximize_evidence, view_data
 from kcal.calibrate.hybrid.evidence_rounds import motion_is_worth, run_rounds
 from kcal.calibrate.hybrid.families import prior_families, typical_hyperprior
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
-from kcal.calibrate.hybrid.fitted_views import FittedViews
-from kcal.calibrate.hybrid.quadratic import Quadratic, ViewData, view_data
-from kcal.calibrate.hybrid.unknowns import hybrid_problem
-from kcal.calibrate.problem import board_images
-from kcal.calibrate.problem.board_images import POSE
-from kcal.calibrate.problem.board_problem import BoardProblem
-from kcal.calibrate.problem.readout import (
+from kcal.calibrate.hybrid.fitted_views import FittedViews, hybrid_problem
+from kcal.calibrate.problem import board_problem
+from kcal.calibrate.problem.board_problem import POSE, BoardProblem
+from kcal.calibrate.problem.state import (
     AMPLITUDES,
     LARGEST,
     MEDIAN,
     MOTION,
     SMALLEST,
     SPREAD,
+    BoardState,
     Readout,
     motion_sigma,
     stillness,
     widening,
 )
-from kcal.calibrate.problem.state import BoardState
 from kcal.corners.board import Board
 from kcal.lens.camera import Camera
 from kcal.lens.hybrid_terms import HybridForm
@@ -244,8 +241,8 @@ def test_corners_of_a_trial_are_projected_once(monkeypatch: pytest.MonkeyPatch) 
     """Its cost and its linearization share them; another state, and one that is differentiated, do not."""
     problem, state = moving_problem(True)
     calls = []
-    project = board_images.project_components
-    monkeypatch.setattr(board_images, "project_components", lambda *a: calls.append(1) or project(*a))
+    project = board_problem.project_components
+    monkeypatch.setattr(board_problem, "project_components", lambda *a: calls.append(1) or project(*a))
     cost = problem.cost(state)
     torch.testing.assert_close(problem.linearize(state).cost, cost, rtol=1e-12, atol=0.0)
     assert len(calls) == 1

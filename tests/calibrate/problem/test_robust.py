@@ -12,7 +12,7 @@ from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.views import free_parameters
 from kcal.errors import InputError
 from kcal.solve.lm import LMOptions, minimize
-from kcal.solve.robust import RobustLoss
+from kcal.solve.problem import RobustLoss
 
 KINDS = ("huber", "cauchy", "tukey")
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal.calibrate.problem.priors import FoldBarrier, GaussianPrior, Term
-from kcal.calibrate.problem.twist import apply_twist
+from kcal.calibrate.problem.board_problem import apply_twist
+from kcal.calibrate.problem.parameters import FoldBarrier, GaussianPrior, Term
 from kcal.lens.model import LensModel
 from kcal.lens.pose import rotation_from_vector
 

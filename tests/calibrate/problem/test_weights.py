@@ -5,7 +5,7 @@ from calibrate_scenes import camera, motions, observe, pixels_of
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.state import BoardState
-from kcal.calibrate.problem.weights import whitening
+from kcal.calibrate.problem.views import whitening
 from kcal.corners.observations import Observations
 from kcal.lens.pose import rotation_from_vector
 

@@ -11,9 +11,8 @@ import torch
 from calibrate_scenes import observe
 from torch import Tensor
 
-from kcal.calibrate.hybrid.evidence import EvidenceLoss
+from kcal.calibrate.hybrid.evidence import EvidenceLoss, view_data
 from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies
-from kcal.calibrate.hybrid.quadratic import view_data
 from kcal.calibrate.rig.motion import CameraRows, RigRows, WithoutMotion
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, calibrate_rig

@@ -23,7 +23,7 @@ from kcal.errors import FileError, InputError
 from kcal.io.rig_file import load_rig
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
-from kcal.solve.result import SolverStatus
+from kcal.solve.problem import SolverStatus
 
 # 8 x 6 corners: the colors are the same after half a turn, so that a detector cannot know the first corner.
 AMBIGUOUS = Board(columns=8, rows=6, square=0.04)

@@ -39,7 +39,7 @@ from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
-from kcal.solve.result import SolverStatus
+from kcal.solve.problem import SolverStatus
 
 APART = float((CENTER[0] - CENTER[1]).norm())
 BASELINE = (Baseline(first=0, second=1, length=APART, sigma=0.005),)
@@ -69,7 +69,7 @@ def off(found: RigResult) -> float:
 
 
 def pose_error(found: RigResult) -> Tensor:
-    """(6,) of the relative pose, as `kcal.calibrate.problem.twist.apply_twist` counts it."""
+    """(6,) of the relative pose, as `kcal.calibrate.problem.board_problem.apply_twist` counts it."""
     rotation = ROTATION[1] @ ROTATION[0].T
     rig = found.stereo()
     shift = rig.right_from_left_translation - ROTATION[1] @ (CENTER[0] - CENTER[1])

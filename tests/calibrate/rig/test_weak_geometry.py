@@ -18,8 +18,7 @@ from kcal.errors import DegenerateError
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
-from kcal.lens.mounting import Origin
-from kcal.lens.rig import RigCovariance
+from kcal.lens.rig import Origin, RigCovariance
 from kcal.locate.localizer import StereoLocalizer
 
 HELD = RigOptions(intrinsics="fixed")

@@ -1,16 +1,20 @@
-"""When an image was taken: from its name, or from what the camera wrote into it."""
+"""What a camera wrote into an image besides its pixels: when it was taken, and how it was held."""
 
 from __future__ import annotations
 
 import datetime
 import io
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 from PIL import ExifTags, Image, UnidentifiedImageError
+from PIL.JpegImagePlugin import JpegImageFile
 
 from kcal.errors import FileError
 from kcal.files import read_head
+
+# When an image was taken: from its name, or from what the camera wrote into it.
 
 # 20260501T120000, 2026-05-01_12-00-00 and the like, perhaps with a fraction of a second; or Unix seconds.
 DATE_IN_NAME = re.compile(r"(\d{4})-?(\d{2})-?(\d{2})[T_ -](\d{2})[-_:]?(\d{2})[-_:]?(\d{2})(?:\.(\d{1,6})(?!\d))?")
@@ -52,3 +56,41 @@ def image_time(path: Path) -> float:
             f"{path}: no time of capture, neither in its name nor in it; name it like 20260501T120000Z.png (UTC)"
         ) from None
     return moment.timestamp()
+
+
+# Read the EXIF orientation of JPEG files. kcal ignores it, and says so.
+
+_EXIF_HEAD = 1 << 17  # bytes: the EXIF block is among the first 64 KiB, another block may precede it
+
+
+def exif_orientation(data: bytes) -> int:
+    """The orientation (1 to 8) that a JPEG's EXIF block asks viewers for; 1 (as stored) where there is none.
+
+    3 is turned by 180°, 6 and 8 by 90°; 2, 4, 5 and 7 are mirrored as well. Pixels in kcal are always as stored.
+    Source: JEITA CP-3451 (Exif 2.3), tag 0x0112.
+
+    Args:
+        data: the file's bytes, or the first of them.
+
+    Example:
+        >>> exif_orientation(b"no JPEG")
+        1
+    """
+    try:
+        orientation = JpegImageFile(io.BytesIO(data)).getexif().get(ExifTags.Base.Orientation, 1)
+    except (SyntaxError, OSError, ValueError):  # no JPEG, or a damaged one: `decode_gray` reports it
+        return 1
+    return int(orientation) if orientation in range(1, 9) else 1
+
+
+def turned_images(paths: Sequence[str | Path]) -> list[Path]:
+    """Those of the files whose EXIF block asks viewers to turn or mirror them.
+
+    Raises:
+        FileError: a file that cannot be read.
+    """
+    found = []
+    for path in map(Path, paths):
+        if exif_orientation(read_head(path, _EXIF_HEAD)) != 1:
+            found.append(path)
+    return found
