@@ -140,7 +140,7 @@ def follow_until(lines: int, source: Path, folder: Path) -> None:
 def test_killed_at_any_time_the_outputs_are_the_same(whole: tuple[Path, dict[str, bytes]], tmp_path: Path) -> None:
     """At any line of what writes: six times early, so that there is always more to do, and then not any more."""
     chance = random.Random(1)
-    for lines in [*(chance.randrange(50, 800) for _ in range(6)), 0]:
+    for lines in [*(chance.randrange(50, 2000) for _ in range(6)), 0]:
         child = children().Process(target=follow_until, args=(lines, whole[0], tmp_path))
         child.start()
         child.join()
