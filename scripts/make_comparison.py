@@ -33,13 +33,14 @@ from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.report.figures import ACCENT, FAINT, GRAY, INK, WARN, new_figure, save_picture
 from kcal.sim.board import PrintedBoard
-from kcal.sim.captures import capture_corners, drawn_rig
+from kcal.sim.captures import drawn_rig
 from kcal.sim.scene import FOCAL_MM, DemoScene, NamedPoints
 from scripts.check.chain import FLAGS as CHAIN_FLAGS
 from scripts.check.chain_rig import localizer
 from scripts.make_assets import ASSETS
 from scripts.paper.locate import SIDES
 from scripts.paper.locate import by_opencv as opencv_rig
+from scripts.shared.captures import capture_corners
 from scripts.shared.timing import show
 
 RANGES, BEARINGS = (1000.0, 5000.0), (-32.0, -24.0, -16.0, -8.0, 0.0, 8.0, 16.0, 24.0, 32.0)

@@ -9,21 +9,41 @@ import json
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from kcal.cli.console import err, out, print_table, steps, warn
 from kcal.errors import FileError
 from kcal.files import dump_json, make_folder, read_bytes, write_atomic
+from kcal.io.camera_file import load_camera
+from kcal.io.images import write_png, write_video
+from kcal.io.rig_file import load_rig
+from kcal.lens.rig import Origin
+from kcal.lens.rig import StereoRig
+from kcal.locate.geodesy import enu_to_geodetic
+from kcal.report.practice_score import score_lens, score_positions, score_rig, score_tracks
+from kcal.report.siting import save_site_sketch
+from kcal.sim.practice import (
+    LANDMARKS,
+    PASSAGES,
+    RATE,
+    SIDES,
+    TARGETS,
+    PracticeSite,
+    Side,
+    frames,
+    night_picture,
+    practice_scene,
+    practice_truth,
+    ship_boxes,
+)
+from kcal.sim.render import render_board
+from kcal.sim.scene import DemoScene, scene_views
+from kcal.stars.night import SkyView
+from kcal.stars.sky import StarCatalog
 from kcal.strict_json import MOST_BYTES, read_json
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from kcal.lens.rig import StereoRig
-    from kcal.sim.practice import PracticeSite, Side
-    from kcal.sim.scene import DemoScene
-
 
 # The texts of a practice site: what is where, the surveyor's list, and what is to be located.
 
@@ -110,9 +130,6 @@ The truth is in the hidden folder .truth; look there afterwards.
 
 def survey_text(scene: DemoScene) -> str:
     """The landmarks as a surveyor hands them over: latitude, longitude, ellipsoidal height, sigma in meters."""
-    from kcal.lens.rig import Origin
-    from kcal.locate.geodesy import enu_to_geodetic
-
     origin = Origin(lat=scene.lat, lon=scene.lon, height=scene.height)
     surveyed = scene.surveyed(scene.landmarks)
     lines = ["name,lat,lon,height,sigma"]
@@ -123,8 +140,6 @@ def survey_text(scene: DemoScene) -> str:
 
 def targets_text() -> str:
     """Names of what is to be located, and which point is meant."""
-    from kcal.sim.practice import TARGETS
-
     return "".join(["name,mark\n", *(f"{thing.name},{thing.where}\n" for thing in TARGETS)])
 
 
@@ -182,8 +197,6 @@ def practice_site(folder: Path, seed: int, *, views: int = 12, frames: int = 600
         FileError: the folder has other files, or a site of another seed.
     """
     check_folder(folder, seed)
-    from kcal.sim.practice import PracticeSite, practice_scene
-
     scene = practice_scene(seed, views, scale)
     site = PracticeSite(scene)
     parts = list(_practice_parts(site, frames))
@@ -248,7 +261,6 @@ _Write = Callable[[Path, Callable[[], None]], object]
 
 def _practice_parts(site: PracticeSite, frames: int) -> Iterator[tuple[Path, int, _Write]]:
     """Each file with the steps of its bar, and what writes it; the truth first, which says whose folder it is."""
-    from kcal.sim.practice import SIDES, practice_truth
 
     def text(make: Callable[[], str]) -> _Write:
         return lambda path, _: write_atomic(path, make())
@@ -269,10 +281,6 @@ def _practice_parts(site: PracticeSite, frames: int) -> Iterator[tuple[Path, int
 
 
 def _board_parts(site: PracticeSite) -> Iterator[tuple[Path, int, _Write]]:
-    from kcal.io.images import write_png
-    from kcal.sim.render import render_board
-    from kcal.sim.scene import scene_views
-
     scene = site.scene
     for index, (side, name, pose) in enumerate(scene_views(scene)):
 
@@ -285,28 +293,17 @@ def _board_parts(site: PracticeSite) -> Iterator[tuple[Path, int, _Write]]:
 
 
 def _picture(site: PracticeSite, side: Side, path: Path, _: Callable[[], None]) -> None:
-    from kcal.io.images import write_png
-
     write_png(path, site.picture(side))
 
 
 def _night(site: PracticeSite, side: Side, path: Path, _: Callable[[], None]) -> None:
     importlib.import_module("erfa")
-    from kcal.io.images import write_png
-    from kcal.lens.rig import Origin
-    from kcal.sim.practice import night_picture
-    from kcal.stars.night import SkyView
-    from kcal.stars.sky import StarCatalog
-
     scene, catalog = site.scene, StarCatalog.bundled()
     view = SkyView(time=NIGHT, origin=Origin(lat=scene.lat, lon=scene.lon, height=scene.height))
     write_png(path, night_picture(site, side, view.directions(catalog), catalog.magnitude))
 
 
 def _sketch(site: PracticeSite, path: Path, _: Callable[[], None]) -> None:
-    from kcal.report.siting import save_site_sketch
-    from kcal.sim.practice import LANDMARKS, TARGETS
-
     scene = site.scene
     groups = [
         ([thing.name for thing in things], site.true_pixels("left", points.enu))
@@ -316,9 +313,6 @@ def _sketch(site: PracticeSite, path: Path, _: Callable[[], None]) -> None:
 
 
 def _film(site: PracticeSite, side: Side, count: int, path: Path, step: Callable[[], None]) -> None:
-    from kcal.io.images import write_video
-    from kcal.sim.practice import RATE, frames
-
     def told() -> Iterator[NDArray[np.uint8]]:
         for frame in frames(site, side, count):
             yield frame
@@ -329,10 +323,6 @@ def _film(site: PracticeSite, side: Side, count: int, path: Path, step: Callable
 
 def _detections(site: PracticeSite, frames: int) -> str:
     """The ships as pairs of marks with noise, one line for each moment, as a detector with a matcher writes them."""
-    import numpy as np
-
-    from kcal.sim.practice import PASSAGES, RATE, SIDES, ship_boxes
-
     random = np.random.default_rng([site.scene.seed, 3])
     left, right = (ship_boxes(site, side, frames) for side in SIDES)
     lines = []
@@ -391,9 +381,6 @@ def _head(text: str) -> None:
 
 
 def _score_cameras(folder: Path, truth: dict[str, Any]) -> None:
-    from kcal.io.camera_file import load_camera
-    from kcal.report.practice_score import score_lens
-
     rows = [["camera", "RMS px", "middle px", "largest px", "sideways at 5 km", "range at 5 km"]]
     for side in ("left", "right"):
         path = folder / f"{side}.camera.json"
@@ -406,9 +393,6 @@ def _score_cameras(folder: Path, truth: dict[str, Any]) -> None:
 
 
 def _score_rig(folder: Path, truth: dict[str, Any]) -> StereoRig | None:
-    from kcal.io.rig_file import load_rig
-    from kcal.report.practice_score import score_rig
-
     _head("Rig: error of ranges over the image, with marks that have no noise")
     path = folder / "rig.json"
     if not path.exists():
@@ -426,8 +410,6 @@ def _score_rig(folder: Path, truth: dict[str, Any]) -> StereoRig | None:
 
 
 def _score_positions(folder: Path, truth: dict[str, Any]) -> None:
-    from kcal.report.practice_score import score_positions
-
     _head("Positions: against the truth")
     path = _first(folder, POSITIONS)
     if path is None:
@@ -448,8 +430,6 @@ def _score_positions(folder: Path, truth: dict[str, Any]) -> None:
 
 
 def _score_tracks(folder: Path, truth: dict[str, Any]) -> None:
-    from kcal.report.practice_score import score_tracks
-
     _head("Tracks: against the ships")
     path = _first(folder, TRACKS)
     if path is None:

@@ -21,7 +21,7 @@ from typing import Any
 
 import torch
 
-from kcal.cli.demo import simulated_site
+from kcal.cli.demo_run import simulated_site
 from kcal.io.rig_file import load_rig
 from kcal.locate.positions import locate_points, position_errors
 from kcal.sim.scene import DemoScene

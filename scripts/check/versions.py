@@ -41,14 +41,17 @@ import torch
 import kcal
 assert "site-packages" in kcal.__file__, kcal.__file__
 from kcal import Board, Camera, Observations, View
-from kcal.sim.board import BoardSize
-from kcal.sim.captures import capture_corners
+from kcal.sim.board import BoardSize, board_points
+from kcal.sim.captures import sample_board_poses
 
 true = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080), coefficients=[-0.2, 0.05])
-seen = capture_corners(true, 12, sigma=0.05, seed=1, board=BoardSize(9, 6, 0.06), fill=(0.3, 0.7))
+size, generator = BoardSize(9, 6, 0.06), torch.Generator().manual_seed(1)
+poses = sample_board_poses(true, size, 12, generator, fill=(0.3, 0.7))
 apart = torch.tensor([-0.1, 0.0, 0.0], dtype=torch.float64)
-points = seen.points @ seen.rotation.mT + seen.translation[:, None]
-for name, pixels in (("left", seen.pixels), ("right", true.project(points + apart)[0])):
+points = torch.stack([board_points(size) @ pose.rotation.T + pose.translation for pose in poses])
+seen = true.project(points)[0]
+seen = seen + 0.05 * torch.randn(seen.shape, dtype=torch.float64, generator=generator)
+for name, pixels in (("left", seen), ("right", true.project(points + apart)[0])):
     views = tuple(
         View(name=str(i), pixels=tuple((u, v) if 0 < u < 1919 and 0 < v < 1079 else None for u, v in view))
         for i, view in enumerate(pixels.tolist())

@@ -19,7 +19,7 @@ from torch import Tensor
 from kcal.errors import InputError
 from kcal.lens.pose import rotation_from_vector
 from kcal.sim.board import BoardLike, BoardPose, LensLike, true_corners
-from kcal.sim.captures import PAPER_BOARD
+from scripts.shared.captures import PAPER_BOARD
 
 # Width of an edge in a sharp image, pixels (standard deviation). Where motion of length L widens it to s, an edge is
 # located with a variance that grows by s over this: the information of a blurred step is proportional to 1 / s.

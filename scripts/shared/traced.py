@@ -16,8 +16,8 @@ from kcal.lens.model import LensModel
 from kcal.lens.projection import project_components
 from kcal.lens.zernike import ZernikeModes
 from kcal.sim.board import LensLike, PrintedBoard
-from kcal.sim.captures import capture_corners
 from kcal.sim.truth import TruthLens
+from scripts.shared.captures import capture_corners
 
 BOARD = Board(columns=7, rows=6, square=0.05)
 

@@ -14,6 +14,7 @@ import torch
 from practice_marks import mark_practice
 from typer.testing import CliRunner
 
+import kcal.cli.demo_practice
 import kcal.io.images
 from kcal.cli.demo_practice import STEPS, TRUTH, next_step, night_name, practice_score, practice_site
 from kcal.cli.main import app
@@ -132,7 +133,7 @@ def test_without_the_extra_for_videos_the_rest_is_made(
 
     (folder / "video" / "left.mp4").unlink()
     (folder / "survey.csv").unlink()
-    monkeypatch.setattr(kcal.io.images, "write_video", missing)
+    monkeypatch.setattr(kcal.cli.demo_practice, "write_video", missing)
     make(folder)
     said = capsys.readouterr()
     assert "wrote 1 files" in said.out

@@ -6,9 +6,10 @@ import pytest
 import torch
 
 from kcal.errors import InputError
-from kcal.sim.captures import PAPER_BOARD, capture_corners, drawn_lens
+from kcal.sim.captures import drawn_lens
 from kcal.sim.raytrace import PRESCRIPTIONS, Misalignment
 from kcal.sim.truth import TruthLens
+from scripts.shared.captures import PAPER_BOARD, capture_corners
 
 NAMES = sorted(PRESCRIPTIONS)
 

@@ -397,10 +397,14 @@ def measure_board(
 
     Example:
         >>> from kcal import Board, Camera, View
-        >>> from kcal.sim.captures import capture_corners
+        >>> from kcal.sim.board import BoardSize, project_board
+        >>> from kcal.sim.captures import sample_board_poses
         >>> camera = Camera.build(focal=(500, 500), center=(320, 240), size=(640, 480), coefficients=[-0.1])
-        >>> shots = capture_corners(camera, 6, sigma=0.1, seed=3).pixels.tolist()
-        >>> views = tuple(View(name=str(i), pixels=pixels) for i, pixels in enumerate(shots))
+        >>> size, generator = BoardSize(7, 6, 0.05), torch.Generator().manual_seed(3)
+        >>> poses = sample_board_poses(camera, size, 6, generator, fill=(0.25, 0.8))
+        >>> pixels = torch.stack([project_board(camera, pose, size)[0] for pose in poses])
+        >>> pixels = pixels + 0.1 * torch.randn(pixels.shape, dtype=torch.float64, generator=generator)
+        >>> views = tuple(View(name=str(i), pixels=shot) for i, shot in enumerate(pixels.tolist()))
         >>> seen = Observations(board=Board(columns=7, rows=6, square=0.05), image_size=(640, 480), views=views)
         >>> board, = measure_board([seen])
         >>> board.bending.value < 3 * board.bending.sigma, tuple(board.points.shape)

@@ -25,8 +25,9 @@ from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.model import LensModel
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.zernike import ZernikeModes
-from kcal.sim.captures import capture_corners, drawn_lens
+from kcal.sim.captures import drawn_lens
 from kcal.solve.lm import LMOptions, minimize
+from scripts.shared.captures import capture_corners
 
 BOARD = Board(columns=9, rows=7, square=0.04)
 SIZE = (1280, 960)

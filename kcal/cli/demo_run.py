@@ -1,0 +1,387 @@
+"""What `kcal demo` runs: the main job from images to positions, and the page that says what came out."""
+
+from __future__ import annotations
+
+import math
+import shlex
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+import typer
+from rich.markup import escape
+from typer.main import get_command
+
+from kcal.calibrate.rig.pairs import pair_by_name
+from kcal.cli.calibrate import calibrate_command
+from kcal.cli.console import err, out, print_table, steps
+from kcal.cli.detect import detect_command
+from kcal.cli.locate import locate_command
+from kcal.cli.report import report_command
+from kcal.cli.rig import app as rig
+from kcal.corners.board import Board
+from kcal.corners.images import expand_images
+from kcal.corners.observations import Observations
+from kcal.errors import FileError
+from kcal.files import make_folder, write_atomic
+from kcal.io.images import write_png
+from kcal.io.rig_file import RigFile, load_rig
+from kcal.lens.rig import StereoRig
+from kcal.locate.geodesy import Origin
+from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.marks import Marks, read_marks, write_marks
+from kcal.locate.positions import interval_coverage, locate_points
+from kcal.report.judge_rig import rig_verdict
+from kcal.report.tables import Part, chance_text, diagonal_rows, save_summary, truth_rows
+from kcal.report.verdict import Requirement
+from kcal.sim.scene import DemoScene, NamedPoints, mark_points, render_demo
+from kcal.texts import length_text
+
+# What the rig of the simulated site must do.
+REQUIREMENT = "5km:10%"
+
+
+def save_site_summary(
+    output: Path, scene: DemoScene, table: Sequence[Sequence[str]], chance: str, command: str
+) -> None:
+    """Write `summary.html` for the simulated site.
+
+    Args:
+        output: folder with the results.
+        scene: the truth.
+        table: true and estimated positions.
+        chance: how many intervals contain the truth, and how many misses are usual.
+        command: locates the targets again.
+    """
+    seen = [Observations.load(output / f"{side}.obs.json") for side in ("left", "right")]
+    found = sum(len(file.views) for file in seen)
+    file = RigFile.load(output / "rig.json")
+    rig = file.rig()
+    (answer,) = rig_verdict(rig, Requirement.parse(REQUIREMENT), mark_sigma=scene.mark_sigma).answers
+    calibration = math.hypot(answer.parts["lenses"], answer.parts["relative pose"])
+    true = float(scene.rig.baseline)
+    parts = [
+        Part(
+            heading="What came out",
+            text=(
+                f"May this rig be used? {'Yes' if answer.ok else 'No'}: {answer.text}. Noise in the marks makes "
+                f"±{length_text(answer.parts['marks'], digits=2)} of it, lenses and relative pose "
+                f"±{length_text(calibration, digits=2)}.",
+                f'{chance} "Across" is the error across the line of sight. The last column is the error that is left '
+                "when the marks have no noise: the share of the calibration.",
+            ),
+            table=tuple(map(tuple, table)),
+        ),
+        _map_part(output, "True positions, estimates, and the error of each range"),
+        Part(
+            heading="1. Each camera was calibrated",
+            text=(
+                f"A printed board was photographed {scene.near_views} times by each camera, and found in {found} of "
+                f"{2 * scene.near_views} pictures. The board is bent by 1 mm and stretched by 0.15 %; kcal measures "
+                f"that on the way. {_residuals_text(file)} The truth is a lens traced ray by ray through seven "
+                "pieces of glass that are not quite centered.",
+            ),
+            pictures=(
+                (output / "images" / "left-near" / "near-02.png", "One of the pictures"),
+                (output / "left.png", "Left camera: where corners were, and their residuals"),
+            ),
+        ),
+        Part(
+            heading="2. The rig was solved",
+            text=(
+                f"{len(scene.landmarks.names)} landmarks, surveyed to {100 * scene.survey_sigma:g} cm and marked in "
+                f"both images, tell where the cameras stand and look. Baseline: "
+                f"{length_text(float(rig.baseline), digits=5)} (true {length_text(true, digits=5)}).",
+            ),
+            pictures=((output / "rig.png", "Residuals by source"),),
+        ),
+        _yourself_part(command),
+    ]
+    lead = (
+        "kcal rendered a site whose truth is known, calibrated two cameras from their own pictures of a printed board, "
+        "solved the rig, and located seven targets. Nothing but the pictures and a surveyor's list was used; the truth "
+        "comes in only here, for the comparison."
+    )
+    save_summary(output / "summary.html", "Two cameras, seven targets, 100 m to 5 km", lead, parts)
+
+
+def save_pairs_summary(output: Path, table: Sequence[Sequence[str]], command: str) -> None:
+    """Write `summary.html` for a folder of pairs.
+
+    Args:
+        output: folder with the results.
+        table: the board's diagonal in each pair, known and located.
+        command: locates the corners again.
+    """
+    file = RigFile.load(output / "rig.json")
+    pairs = 0 if file.calibration is None else file.calibration.pairs
+    parts = [
+        Part(
+            heading="What came out",
+            text=(
+                "Two opposite corners of the board were located in each pair. Their distance is known, so the table "
+                "shows how accurate the rig is at the distance of the board.",
+            ),
+            table=tuple(map(tuple, table)),
+        ),
+        _map_part(output, "The located corners, and the interval of each range"),
+        Part(
+            heading="1. Each camera was calibrated",
+            text=(_residuals_text(file),),
+            pictures=tuple(
+                (output / f"{side}.png", f"{side.capitalize()} camera: where corners were, and their residuals")
+                for side in ("left", "right")
+            ),
+        ),
+        Part(
+            heading="2. The rig was solved",
+            text=(f"From {pairs} pairs: baseline {length_text(float(file.rig().baseline), digits=5)}.",),
+        ),
+        _yourself_part(command),
+    ]
+    lead = "kcal found the board in your pictures, calibrated both cameras, solved the rig, and located its corners."
+    save_summary(output / "summary.html", f"Two cameras, {pairs} pairs of pictures", lead, parts)
+
+
+def _residuals_text(file: RigFile) -> str:
+    cameras = zip(("left", "right"), (file.left.calibration, file.right.calibration), strict=True)
+    rms = ", ".join(f"{side} {record.rms:.3f} px" for side, record in cameras if record is not None)
+    return f"RMS of the residuals: {rms}."
+
+
+def _map_part(output: Path, caption: str) -> Part:
+    return Part(
+        heading="The map",
+        text=(
+            "Seen from above, north up; ranges are on a logarithmic scale. map.html beside this page can be moved "
+            "and zoomed.",
+        ),
+        pictures=((output / "map.png", caption),),
+    )
+
+
+def _yourself_part(command: str) -> Part:
+    return Part(
+        heading="3. Do it yourself",
+        text=(
+            "Print a board (kcal board), photograph it (kcal capture helps), and go on as the tutorial shows. This "
+            "locates the points again, from the files in this folder:",
+        ),
+        code=command,
+    )
+
+
+# Steps that both demonstrations share: run a command, locate the points, list the results.
+
+SIDES = ("left", "right")
+
+
+def run(name: str, *arguments: object) -> None:
+    """Print a command as a user would type it, and run it: detect, calibrate, rig, locate or report."""
+    words = [str(argument) for argument in arguments]
+    out.print(f"\n[bold]kcal {escape(shlex.join([name, *words]))}[/]")
+    app = rig
+    if name != "rig":
+        app = typer.Typer()
+        commands = {
+            "detect": detect_command,
+            "calibrate": calibrate_command,
+            "locate": locate_command,
+            "report": report_command,
+        }
+        app.command()(commands[name])  # type: ignore[type-var]
+    get_command(app).main(words, standalone_mode=False)
+
+
+def locate_again(output: Path, *options: object) -> str:
+    """Locate `points.csv`, write positions and maps, and return the command that locates the points once more."""
+    words = [output / "rig.json", output / "points.csv", *options]
+    files = ["-o", output / "points.geojson", "-o", output / "positions.csv"]
+    run("locate", *words, *files, "--picture", output / "map.png", "--map", output / "map.html")
+    return shlex.join(map(str, ["kcal", "locate", *words, "-o", "again.geojson"]))
+
+
+def print_results(output: Path, command: str) -> None:
+    """Print where the results are, what they are, and the command that locates the points once more."""
+    out.print(f"\nResults are in {output.resolve()}:", markup=False)
+    for name, what in (
+        ("summary.html", "what was done and what came out, on one page"),
+        ("map.png", "the map"),
+        ("map.html", "the map, interactive, for any browser"),
+        ("points.geojson", "positions for a GIS"),
+        ("positions.csv", "the same as a table"),
+        ("left.png, right.png", "coverage and residuals of each camera"),
+        ("rig.json", "the rig; left.camera.json and right.camera.json are its cameras"),
+    ):
+        out.print(f"  {name:22s} {what}", markup=False)
+    out.print(f"Locate again by hand:\n  {command}", markup=False)
+
+
+# `kcal demo --images`: the whole chain on a folder of real stereo pairs of a board.
+
+
+def real_pairs(
+    output: Path, folder: Path, size: str, square: str, board: Board, origin: Origin | None, heading: float
+) -> None:
+    """Calibrate from a folder of pairs, and locate two opposite corners of each board, whose distance is known."""
+    for side in SIDES:
+        images = _side_images(folder, side)
+        run("detect", *images, "--board", size, "--square", square, "-o", output / f"{side}.obs.json")
+    for side in SIDES:
+        camera, picture = output / f"{side}.camera.json", output / f"{side}.png"
+        run("calibrate", output / f"{side}.obs.json", "-o", camera, "--picture", picture)
+    cameras, seen = ([output / f"{side}.{kind}.json" for side in SIDES] for kind in ("camera", "obs"))
+    # Few pairs: none is left out, so that each board can be compared.
+    run("rig", *cameras, "--pairs", *seen, "--keep-all", "-o", output / "rig.json")
+
+    write_marks(output / "points.csv", _board_ends(output, board))
+    where = origin or Origin(lat=0.0, lon=0.0, height=0.0)
+    command = locate_again(output, f"--origin={where.lat},{where.lon},{where.height}", f"--heading={heading}")
+    marks = read_marks(output / "points.csv")
+    rig = load_rig(output / "rig.json")
+    located = locate_points(rig, marks.left, marks.right, origin=where, heading_deg=heading, names=marks.names)
+    out.print("\nThe board's diagonal, true against estimated", markup=False)
+    rows = diagonal_rows(located, board)
+    print_table(rows)
+    save_pairs_summary(output, rows, command)
+    if origin is None:
+        err.print("[yellow]note:[/] no --origin was given: positions are placed at latitude 0, longitude 0")
+    print_results(output, command)
+
+
+def _side_images(folder: Path, side: str) -> list[Path]:
+    """Images of one camera: the subfolder of that name, or the files whose name begins with it."""
+    if (folder / side).is_dir():
+        return expand_images([folder / side])
+    found = [path for path in expand_images([folder]) if path.name.lower().startswith(side)]
+    if not found:
+        raise FileError(f"{folder}: no folder {side}/ and no image whose name begins with {side!r}")
+    return found
+
+
+def _board_ends(output: Path, board: Board) -> Marks:
+    """The first and last corner of each board of the rig, where both cameras saw them."""
+    left, right = (Observations.load(output / f"{side}.obs.json") for side in SIDES)
+    record = RigFile.load(output / "rig.json").calibration
+    assert record is not None
+    # A board that one camera read from its other end has other corners there: its marks would not be the same thing.
+    used = set(record.per_pair_rms) - set(record.flipped)
+    pairs = [
+        pair
+        for pair in pair_by_name(left.names, right.names)
+        if any(name in used for name in (" ".join(pair), " ".join(dict.fromkeys(pair))))
+    ]
+    ends = [0, board.corners - 1]
+    marks = [
+        file.subset([pair[side] for pair in pairs]).pixels()[:, ends].reshape(-1, 2)
+        for side, file in enumerate((left, right))
+    ]
+    names = [f"{Path(pair[0]).stem} {word}" for pair in pairs for word in ("first", "last")]
+    both = torch.isfinite(torch.cat(marks, 1)).all(-1)
+    chosen = tuple(name for name, seen in zip(names, both.tolist(), strict=True) if seen)
+    return Marks(chosen, marks[0][both], marks[1][both])
+
+
+# `kcal demo` without images: a simulated site from rendered boards to positions, and a page that explains it.
+
+
+def simulated_site(output: Path, seed: int) -> None:
+    """Render the site of a seed, run the whole chain, compare with the truth, and write everything to a folder."""
+    clock = _Clock()
+    scene = DemoScene(seed=seed)
+    out.print(
+        f"A simulated site: two cameras {float(scene.rig.baseline):.3f} m apart behind ray-traced lenses, "
+        f"{scene.near_views} views of a printed board by each, {len(scene.landmarks.names)} surveyed landmarks, "
+        f"{len(scene.targets.names)} targets."
+    )
+    _render(scene, output / "images")
+    clock.lap("rendering")
+    board = scene.near_board
+    size = "--board", f"{board.columns}x{board.rows}", "--square", f"{1e3 * board.square:g}mm"
+    for side in SIDES:
+        run("detect", output / "images" / f"{side}-near", *size, "-o", output / f"{side}.obs.json")
+    clock.lap("detection")
+    for side in SIDES:
+        camera, picture = output / f"{side}.camera.json", output / f"{side}.png"
+        run("calibrate", output / f"{side}.obs.json", "-o", camera, "--name", side, "--picture", picture)
+    clock.lap("calibration")
+    _write_places(output / "survey.csv", scene.surveyed(scene.landmarks), sigma=scene.survey_sigma)
+    marks = scene.landmark_marks
+    write_marks(output / "landmarks.csv", Marks(scene.landmarks.names, marks.left, marks.right))
+    run(
+        "rig", *(output / f"{side}.camera.json" for side in SIDES),
+        "--landmarks", output / "survey.csv", "--marks", output / "landmarks.csv", "--pixel-sigma", scene.mark_sigma,
+        f"--origin={scene.lat},{scene.lon},{scene.height}", "-o", output / "rig.json", "--picture", output / "rig.png",
+        # The simulated light goes straight.
+        "--refraction=0", "--refraction-sigma=0",
+    )  # fmt: skip
+    clock.lap("rig")
+
+    marks, targets = scene.target_marks, scene.targets
+    write_marks(output / "points.csv", Marks(targets.names, marks.left, marks.right))
+    _write_places(output / "truth.csv", targets)
+    command = locate_again(output, "--pixel-sigma", scene.mark_sigma, "--truth", output / "truth.csv")
+    rig = load_rig(output / "rig.json")
+    located, exact = (
+        locate_points(rig, *pixels, pixel_sigma=scene.mark_sigma, names=targets.names)
+        for pixels in ((marks.left, marks.right), (marks.true_left, marks.true_right))
+    )
+    clock.lap("positions and maps")
+    rows, chance = truth_rows(located, exact, targets.enu), chance_text(located, targets.enu)
+    out.print("\nTrue against estimated positions", markup=False)
+    print_table(rows)
+    out.print(
+        f"Marks have {scene.mark_sigma:g} px of noise in each image; the interval includes it and the errors of the "
+        "rig. The last column is the error with marks that have no noise: the calibration's share."
+    )
+    chance += f" {_more_draws(scene, rig)}"
+    out.print(chance, markup=False)
+    run("report", output / "rig.json", "--require", REQUIREMENT, "--pixel-sigma", scene.mark_sigma)
+    save_site_summary(output, scene, rows, chance, command)
+    out.print(f"Time: {clock.text()}.")
+    print_results(output, command)
+
+
+def _more_draws(scene: DemoScene, rig: StereoRig) -> str:
+    """How many intervals of this rig contain the true range over many draws of the noise in the marks."""
+    draws, targets = 200, scene.points_rig(scene.targets)
+    marks = mark_points(scene.rig, targets.repeat(draws, 1), scene.mark_sigma, scene.generator(-30))
+    ranges = targets.norm(dim=-1).repeat(draws)
+    localize = StereoLocalizer(rig, pixel_sigma=scene.mark_sigma)
+    share = interval_coverage(localize, marks.left, marks.right, ranges)
+    return f"With {draws} other draws of the noise in the marks, {100 * share:.0f} % of the intervals contain it."
+
+
+class _Clock:
+    """Seconds of each stage."""
+
+    def __init__(self) -> None:
+        self._laps: list[tuple[str, float]] = []
+        self._last = time.perf_counter()
+
+    def lap(self, name: str) -> None:
+        now = time.perf_counter()
+        self._laps.append((name, now - self._last))
+        self._last = now
+
+    def text(self) -> str:
+        parts = [f"{name} {seconds:.1f} s" for name, seconds in self._laps]
+        return ", ".join([*parts, f"together {sum(seconds for _, seconds in self._laps):.1f} s"])
+
+
+def _render(scene: DemoScene, folder: Path) -> None:
+    """Write the site's images, a folder for each camera."""
+    with steps("rendering", scene.images) as advance:
+        for view in render_demo(scene, advance):
+            place = make_folder(folder / f"{view.camera}-near")
+            write_png(place / f"{view.name}.png", view.image.numpy())
+
+
+def _write_places(path: Path, points: NamedPoints, sigma: float | None = None) -> None:
+    """Write places as a surveyor hands them over, to a millimeter with a sigma, and exactly without."""
+    lines = ["name,east,north,up" if sigma is None else "name,east,north,up,sigma"]
+    for name, place in zip(points.names, points.enu.tolist(), strict=True):
+        exact = map(repr, place)
+        lines.append(",".join([name, *(exact if sigma is None else (*(f"{v:.3f}" for v in place), f"{sigma:g}"))]))
+    write_atomic(path, "\n".join(lines) + "\n")
