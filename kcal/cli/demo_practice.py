@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+import kcal.sim.practice as practice
 from kcal.cli.console import err, out, print_table, steps, warn
 from kcal.errors import FileError
 from kcal.files import dump_json, make_folder, read_bytes, write_atomic
@@ -25,20 +26,6 @@ from kcal.lens.rig import StereoRig
 from kcal.locate.geodesy import enu_to_geodetic
 from kcal.report.practice_score import score_lens, score_positions, score_rig, score_tracks
 from kcal.report.siting import save_site_sketch
-from kcal.sim.practice import (
-    LANDMARKS,
-    PASSAGES,
-    RATE,
-    SIDES,
-    TARGETS,
-    PracticeSite,
-    Side,
-    frames,
-    night_picture,
-    practice_scene,
-    practice_truth,
-    ship_boxes,
-)
 from kcal.sim.render import render_board
 from kcal.sim.scene import DemoScene, scene_views
 from kcal.stars.night import SkyView
@@ -140,7 +127,7 @@ def survey_text(scene: DemoScene) -> str:
 
 def targets_text() -> str:
     """Names of what is to be located, and which point is meant."""
-    return "".join(["name,mark\n", *(f"{thing.name},{thing.where}\n" for thing in TARGETS)])
+    return "".join(["name,mark\n", *(f"{thing.name},{thing.where}\n" for thing in practice.TARGETS)])
 
 
 # `kcal demo --practice`: a rendered site to mark, calibrate, solve and follow on, with its truth kept aside.
@@ -197,8 +184,8 @@ def practice_site(folder: Path, seed: int, *, views: int = 12, frames: int = 600
         FileError: the folder has other files, or a site of another seed.
     """
     check_folder(folder, seed)
-    scene = practice_scene(seed, views, scale)
-    site = PracticeSite(scene)
+    scene = practice.practice_scene(seed, views, scale)
+    site = practice.PracticeSite(scene)
     parts = list(_practice_parts(site, frames))
     missing = [(path, work, write) for path, work, write in parts if not (folder / path).exists()]
     done = 0
@@ -259,28 +246,28 @@ def read_truth_file(folder: Path) -> dict[str, Any]:
 _Write = Callable[[Path, Callable[[], None]], object]
 
 
-def _practice_parts(site: PracticeSite, frames: int) -> Iterator[tuple[Path, int, _Write]]:
+def _practice_parts(site: practice.PracticeSite, frames: int) -> Iterator[tuple[Path, int, _Write]]:
     """Each file with the steps of its bar, and what writes it; the truth first, which says whose folder it is."""
 
     def text(make: Callable[[], str]) -> _Write:
         return lambda path, _: write_atomic(path, make())
 
-    yield TRUTH, 1, text(lambda: dump_json(practice_truth(site, frames)))
+    yield TRUTH, 1, text(lambda: dump_json(practice.practice_truth(site, frames)))
     yield Path("README.txt"), 1, text(lambda: readme_text(site.scene))
     yield Path("survey.csv"), 1, text(lambda: survey_text(site.scene))
     yield Path("targets.csv"), 1, text(targets_text)
     yield Path("find_ships.py"), 1, text(lambda: _DETECTOR)
     yield from _board_parts(site)
-    for side in SIDES:
+    for side in practice.SIDES:
         yield Path("site", f"{side}.png"), _PICTURE_STEPS, functools.partial(_picture, site, side)
-    yield from ((Path("night", night_name(side)), 1, functools.partial(_night, site, side)) for side in SIDES)
+    yield from ((Path("night", night_name(side)), 1, functools.partial(_night, site, side)) for side in practice.SIDES)
     yield Path("site", "sketch.png"), 1, functools.partial(_sketch, site)
     yield Path("video", "detections.jsonl"), 1, text(lambda: _detections(site, frames))
-    for side in SIDES:
+    for side in practice.SIDES:
         yield Path("video", f"{side}.mp4"), frames, functools.partial(_film, site, side, frames)
 
 
-def _board_parts(site: PracticeSite) -> Iterator[tuple[Path, int, _Write]]:
+def _board_parts(site: practice.PracticeSite) -> Iterator[tuple[Path, int, _Write]]:
     scene = site.scene
     for index, (side, name, pose) in enumerate(scene_views(scene)):
 
@@ -292,46 +279,46 @@ def _board_parts(site: PracticeSite) -> Iterator[tuple[Path, int, _Write]]:
         yield Path("boards", side, f"{name.removeprefix('near-')}.png"), _BOARD_STEPS, write
 
 
-def _picture(site: PracticeSite, side: Side, path: Path, _: Callable[[], None]) -> None:
+def _picture(site: practice.PracticeSite, side: practice.Side, path: Path, _: Callable[[], None]) -> None:
     write_png(path, site.picture(side))
 
 
-def _night(site: PracticeSite, side: Side, path: Path, _: Callable[[], None]) -> None:
+def _night(site: practice.PracticeSite, side: practice.Side, path: Path, _: Callable[[], None]) -> None:
     importlib.import_module("erfa")
     scene, catalog = site.scene, StarCatalog.bundled()
     view = SkyView(time=NIGHT, origin=Origin(lat=scene.lat, lon=scene.lon, height=scene.height))
-    write_png(path, night_picture(site, side, view.directions(catalog), catalog.magnitude))
+    write_png(path, practice.night_picture(site, side, view.directions(catalog), catalog.magnitude))
 
 
-def _sketch(site: PracticeSite, path: Path, _: Callable[[], None]) -> None:
+def _sketch(site: practice.PracticeSite, path: Path, _: Callable[[], None]) -> None:
     scene = site.scene
     groups = [
         ([thing.name for thing in things], site.true_pixels("left", points.enu))
-        for things, points in ((LANDMARKS, scene.landmarks), (TARGETS, scene.targets))
+        for things, points in ((practice.LANDMARKS, scene.landmarks), (practice.TARGETS, scene.targets))
     ]
     save_site_sketch(path, site.picture("left", noise=0.0), *groups)
 
 
-def _film(site: PracticeSite, side: Side, count: int, path: Path, step: Callable[[], None]) -> None:
+def _film(site: practice.PracticeSite, side: practice.Side, count: int, path: Path, step: Callable[[], None]) -> None:
     def told() -> Iterator[NDArray[np.uint8]]:
-        for frame in frames(site, side, count):
+        for frame in practice.frames(site, side, count):
             yield frame
             step()
 
-    write_video(path, told(), RATE)
+    write_video(path, told(), practice.RATE)
 
 
-def _detections(site: PracticeSite, frames: int) -> str:
+def _detections(site: practice.PracticeSite, frames: int) -> str:
     """The ships as pairs of marks with noise, one line for each moment, as a detector with a matcher writes them."""
     random = np.random.default_rng([site.scene.seed, 3])
-    left, right = (ship_boxes(site, side, frames) for side in SIDES)
+    left, right = (practice.ship_boxes(site, side, frames) for side in practice.SIDES)
     lines = []
     for number in range(frames):
         marks = [
-            (pixels[number] + _DETECTION_SIGMA * random.standard_normal((len(PASSAGES), 2))).round(3).tolist()
+            (pixels[number] + _DETECTION_SIGMA * random.standard_normal((len(practice.PASSAGES), 2))).round(3).tolist()
             for pixels in (left, right)
         ]
-        lines.append({"time": number / RATE, "left": marks[0], "right": marks[1], "sigma": _DETECTION_SIGMA})
+        lines.append({"time": number / practice.RATE, "left": marks[0], "right": marks[1], "sigma": _DETECTION_SIGMA})
     return "".join(json.dumps(line) + "\n" for line in lines)
 
 

@@ -8,40 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from kcal.cli.console import (
-    ending_with,
-    look_at_views,
-    mark_again,
-    out,
-    print_table,
-    print_wrote,
-    steps,
-    tell,
-    warn,
-    with_json,
-)
-from kcal.cli.inputs import (
-    CALIBRATED,
-    MARKS,
-    OBSERVATIONS,
-    SURVEY,
-    TABLE,
-    PixelSigma,
-    pixel_sigma_and_source,
-    with_inputs,
-)
+import kcal.cli.console as console
+import kcal.cli.inputs as inputs
+import kcal.cli.rig_sources as rig_sources
 from kcal.cli.report import NO, REQUIRE_HELP, judged_sides, required, side_pictures, stored_tables, told_usable
 from kcal.cli.rig_check import check
-from kcal.cli.rig_sources import (
-    IMAGES_HELP,
-    PICTURE_HELP,
-    SIGMA_HELP,
-    SKYLINE_HELP,
-    Sources,
-    check_sides,
-    read_sources,
-    skyline_options,
-)
 from kcal.cli.settings import Command, group_with_default, rarely
 from kcal.cli.stars import TIME_HELP, NightOptions, images_of_nights
 from kcal.cli.stations import print_rig, rig_lines, solve_stations
@@ -56,28 +27,28 @@ app = typer.Typer(cls=group_with_default("solve"), rich_markup_mode="markdown", 
 
 
 def solve_command(
-    left: Annotated[Path, typer.Argument(help="Camera file of the left camera."), CALIBRATED],
-    right: Annotated[Path, typer.Argument(help="Camera file of the right camera."), CALIBRATED],
+    left: Annotated[Path, typer.Argument(help="Camera file of the left camera."), inputs.CALIBRATED],
+    right: Annotated[Path, typer.Argument(help="Camera file of the right camera."), inputs.CALIBRATED],
     output: Annotated[Path, typer.Option("-o", "--output", help="Rig file to write.")],
     others: Annotated[
         list[Path] | None,
         typer.Argument(metavar="[CAMERA]...", help="More cameras; each is named by its file, up to the first dot."),
-        CALIBRATED,
+        inputs.CALIBRATED,
     ] = None,
     pairs: Annotated[
         tuple[Path, Path] | None,
         typer.Option("--pairs", metavar="LEFT.obs.json RIGHT.obs.json", help="Observations of boards seen by both."),
-        OBSERVATIONS,
+        inputs.OBSERVATIONS,
     ] = None,
     observations: Annotated[
         list[Path] | None,
         rarely("OBS.json", "Of three cameras and more: boards seen by any two, once for each camera, named as it is."),
-        OBSERVATIONS,
+        inputs.OBSERVATIONS,
     ] = None,
     match: Annotated[
         Path | None,
         rarely("CSV", "Which views belong together: columns left,right. By name if not given."),
-        TABLE,
+        inputs.TABLE,
     ] = None,
     landmarks: Annotated[
         Path | None,
@@ -85,7 +56,7 @@ def solve_command(
             metavar="FILE",
             help="Surveyed places: CSV (name,lat,lon,height,sigma or name,east,north,up,sigma), GeoJSON, GPX.",
         ),
-        SURVEY,
+        inputs.SURVEY,
     ] = None,
     marks: Annotated[
         Path | None,
@@ -94,7 +65,7 @@ def solve_command(
             help="Where they are in the images: name,left_u,left_v,right_u,right_v, or one line for each camera: "
             "name,camera,u,v.",
         ),
-        MARKS,
+        inputs.MARKS,
     ] = None,
     features: Annotated[
         Path | None,
@@ -103,14 +74,14 @@ def solve_command(
             "Far things matched between the images: left_u,left_v,right_u,right_v and range,range_sigma or "
             "beyond (meters), if known.",
         ),
-        MARKS,
+        inputs.MARKS,
     ] = None,
     positions: Annotated[
         Path | None,
         typer.Option(
             metavar="CSV", help="Measured camera positions (GNSS): as --landmarks, names left and right, or of files."
         ),
-        SURVEY,
+        inputs.SURVEY,
     ] = None,
     baseline: Annotated[
         str | None,
@@ -147,10 +118,12 @@ def solve_command(
             "seen by both determine how the cameras are turned; a length must come from elsewhere (--baseline).",
         ),
     ] = None,
-    skyline: Annotated[Path | None, rarely("DEM", SKYLINE_HELP)] = None,
-    skyline_images: Annotated[list[str] | None, rarely("NAME=IMAGES", IMAGES_HELP, "--skyline-images")] = None,
-    skyline_sigma: Annotated[float | None, rarely("M", SIGMA_HELP, "--skyline-sigma", min=0)] = None,
-    skyline_picture: Annotated[Path | None, rarely("", PICTURE_HELP, "--skyline-picture")] = None,
+    skyline: Annotated[Path | None, rarely("DEM", rig_sources.SKYLINE_HELP)] = None,
+    skyline_images: Annotated[
+        list[str] | None, rarely("NAME=IMAGES", rig_sources.IMAGES_HELP, "--skyline-images")
+    ] = None,
+    skyline_sigma: Annotated[float | None, rarely("M", rig_sources.SIGMA_HELP, "--skyline-sigma", min=0)] = None,
+    skyline_picture: Annotated[Path | None, rarely("", rig_sources.PICTURE_HELP, "--skyline-picture")] = None,
     night: Annotated[
         list[str] | None,
         rarely(
@@ -165,7 +138,7 @@ def solve_command(
             "Where drones, ships or aircraft were (name,time,lat,lon,height,sigma), and what the cameras followed "
             "(name,camera,time,u,v): landmarks that move.",
         ),
-        TABLE,
+        inputs.TABLE,
     ] = None,
     tracks_clock: Annotated[
         float,
@@ -189,7 +162,7 @@ def solve_command(
         str, typer.Option(metavar="RANGE:ERROR", help=f"{REQUIRE_HELP} Exit code 3 if it is not met.")
     ] = "",
     report: Annotated[Path | None, typer.Option(help="HTML page to write: may it be used, and why not.")] = None,
-    pixel_sigma: PixelSigma = None,
+    pixel_sigma: inputs.PixelSigma = None,
     intrinsics: Annotated[
         Literal["prior", "fixed", "free"],
         rarely(
@@ -247,19 +220,19 @@ def solve_command(
     from kcal.locate.mounting import placed_rig
     from kcal.report.tables import range_sigma_rows
 
-    noise, _ = pixel_sigma_and_source(pixel_sigma)
+    noise, _ = inputs.pixel_sigma_and_source(pixel_sigma)
     nights = None
     if stars is not None or night:
         nights = NightOptions(
             images=images_of_nights(stars, night or ()), time=star_time, clock_sigma=clock_sigma,
             drift_sigma=clock_drift, celsius=celsius, hectopascal=hectopascal, dut1=dut1,
         )  # fmt: skip
-    sources = Sources(
+    sources = rig_sources.Sources(
         pairs=pairs, match=match, landmarks=landmarks, marks=marks, features=features, positions=positions,
         baseline=baseline, origin=origin, mark_sigma=noise, survey_sigma=survey_sigma, geoid=geoid,
         stars=nights, scene=scene, observations=tuple(observations or ()), tracks=tracks, tracks_clock=tracks_clock,
         clock_sigma=clock_sigma,
-        skyline=skyline_options(
+        skyline=rig_sources.skyline_options(
             skyline, skyline_images or (), scene, geoid, skyline_sigma, (refraction, refraction_sigma), skyline_picture
         ),
         names=tuple(path.name.split(".")[0] for path in (left, right)),
@@ -286,26 +259,26 @@ def solve_command(
     if observations:
         raise typer.BadParameter("--observations is for three cameras and more; give --pairs LEFT RIGHT")
     calibrated = load_camera(left), load_camera(right)
-    check_sides(calibrated, (left, right))
+    rig_sources.check_sides(calibrated, (left, right))
 
     def cure(error: object) -> str:
         if pairs is not None and landmarks is None and isinstance(error, InputError):
-            return look_at_views(Observations.load(pairs[0]), pairs[0])
-        return mark_again(landmarks, marks, cameras=(left, right))
+            return console.look_at_views(Observations.load(pairs[0]), pairs[0])
+        return console.mark_again(landmarks, marks, cameras=(left, right))
 
-    with ending_with(cure):
-        data, frame, unpaired, notes, stated, told = read_sources(calibrated, sources)
-        with steps("solving the rig", None) as advance:
+    with console.ending_with(cure):
+        data, frame, unpaired, notes, stated, told = rig_sources.read_sources(calibrated, sources)
+        with console.steps("solving the rig", None) as advance:
             result = solve_rig(data, options, advance)
         notes = (*notes, *told(result))
     rig = result.stereo() if frame is None else placed_rig(result, frame)
     known = stated if pixel_sigma is None else pixel_sigma
     if rig.calibration is not None and known is not None:
         rig.calibration = dataclasses.replace(rig.calibration, pixel_sigma=known)
-    noise, note = pixel_sigma_and_source(pixel_sigma, rig)
+    noise, note = inputs.pixel_sigma_and_source(pixel_sigma, rig)
     # Everything that can fail comes before the file.
     lines = rig_lines(result, rig, unpaired)
-    tell(
+    console.tell(
         rms_px=result.rms,
         baseline_m=float(rig.baseline),
         baseline_sigma_m=result.sigma_baseline,
@@ -320,12 +293,12 @@ def solve_command(
         save_rig_picture(picture, result)
     print_rig(result, [*lines, *notes])
     try:
-        print_table(range_sigma_rows(range_sigmas(rig, pixel_sigma=noise), rig.covariance is not None))
+        console.print_table(range_sigma_rows(range_sigmas(rig, pixel_sigma=noise), rig.covariance is not None))
         if note:
-            out.print(note)
+            console.out.print(note)
     except InputError as error:
-        warn(f"range errors are not split: {error}")
-    print_wrote(output, picture)
+        console.warn(f"range errors are not split: {error}")
+    console.print_wrote(output, picture)
     if needs or report is not None:
         from kcal.report.judge_rig import named_cameras, rig_verdict
         from kcal.report.rig import rig_figure
@@ -338,7 +311,7 @@ def solve_command(
             subject=output.name.split(".")[0],
         )  # fmt: skip
         tables = stored_tables(rig)
-        tell(verdict=verdict.to_dict())
+        console.tell(verdict=verdict.to_dict())
 
         def drawn() -> dict[str, bytes]:
             return {"rig": png_bytes(rig_figure(result)), **side_pictures(cameras)}
@@ -358,5 +331,5 @@ def _calibrated_from(rig: StereoRig, pairs: tuple[Path, Path]) -> bool:
     )
 
 
-app.command("solve", hidden=True, cls=Command)(with_json(with_inputs(solve_command)))
-app.command("check", cls=Command)(with_json(with_inputs(check)))
+app.command("solve", hidden=True, cls=Command)(console.with_json(inputs.with_inputs(solve_command)))
+app.command("check", cls=Command)(console.with_json(inputs.with_inputs(check)))

@@ -10,18 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+import kcal.cli.rig_sources as rig_sources
 from kcal.cli.console import err, out, print_table, print_wrote, steps, tell
 from kcal.cli.inputs import ASSUMED, CALIBRATED, MARKS, SURVEY, PixelSigma
 from kcal.cli.report import NO, stored_tables, told_usable
-from kcal.cli.rig_sources import (
-    IMAGES_HELP,
-    PICTURE_HELP,
-    SIGMA_HELP,
-    SKYLINE_HELP,
-    Sources,
-    read_sources,
-    skyline_options,
-)
 from kcal.errors import InputError
 from kcal.files import check_writable
 from kcal.texts import length_text, measured_length, measured_text, number_text
@@ -143,8 +135,8 @@ def camera_names(paths: Sequence[Path]) -> tuple[str, ...]:
 
 
 def solve_stations(
-    paths: Sequence[Path], sources: Sources, options: RigOptions, output: Path, *, needs: tuple[Requirement, ...] = (),
-    report: Path | None = None, picture: Path | None = None,
+    paths: Sequence[Path], sources: rig_sources.Sources, options: RigOptions, output: Path, *,
+    needs: tuple[Requirement, ...] = (), report: Path | None = None, picture: Path | None = None,
 ) -> None:  # fmt: skip
     """Solve one camera, or three and more, write the rig, print how each stands and whether it may be used."""
     from kcal.calibrate.rig.solve import solve_rig
@@ -161,7 +153,7 @@ def solve_stations(
             raise InputError(f"{option} is for rigs of two cameras; {instead}")
     check_writable(output, *paths, *sources.files)
     sources = dataclasses.replace(sources, names=names)
-    data, origin, _, notes, _, told = read_sources(tuple(map(load_camera, paths)), sources)
+    data, origin, _, notes, _, told = rig_sources.read_sources(tuple(map(load_camera, paths)), sources)
     with steps("solving the stations", None) as advance:
         result = solve_rig(data, options, advance)
     rig = result.stations(origin)
@@ -266,12 +258,14 @@ def station_command(
     origin: Annotated[
         str | None, typer.Option(metavar="LAT,LON,HEIGHT", help="Of the local frame, if the places have none.")
     ] = None,
-    skyline: Annotated[Path | None, typer.Option(metavar="DEM", help=SKYLINE_HELP)] = None,
+    skyline: Annotated[Path | None, typer.Option(metavar="DEM", help=rig_sources.SKYLINE_HELP)] = None,
     skyline_images: Annotated[
-        list[str] | None, typer.Option("--skyline-images", metavar="IMAGES", help=IMAGES_HELP)
+        list[str] | None, typer.Option("--skyline-images", metavar="IMAGES", help=rig_sources.IMAGES_HELP)
     ] = None,
-    skyline_sigma: Annotated[float | None, typer.Option("--skyline-sigma", metavar="M", help=SIGMA_HELP, min=0)] = None,
-    skyline_picture: Annotated[Path | None, typer.Option("--skyline-picture", help=PICTURE_HELP)] = None,
+    skyline_sigma: Annotated[
+        float | None, typer.Option("--skyline-sigma", metavar="M", help=rig_sources.SIGMA_HELP, min=0)
+    ] = None,
+    skyline_picture: Annotated[Path | None, typer.Option("--skyline-picture", help=rig_sources.PICTURE_HELP)] = None,
     geoid: Annotated[
         float | None, typer.Option(metavar="M", help="Height of the geoid above the WGS84 ellipsoid, for --skyline.")
     ] = None,
@@ -294,10 +288,10 @@ def station_command(
     if landmarks is None and skyline is None:
         raise typer.BadParameter("give surveyed places and --marks, or a raster of the terrain (--skyline)")
     options = RigOptions()
-    sources = Sources(
+    sources = rig_sources.Sources(
         landmarks=landmarks, marks=marks, positions=position, origin=origin, mark_sigma=pixel_sigma or ASSUMED,
         geoid=geoid,
-        skyline=skyline_options(
+        skyline=rig_sources.skyline_options(
             skyline, skyline_images or (), None, geoid, skyline_sigma, (options.refraction, options.refraction_sigma),
             skyline_picture,
         ),

@@ -10,20 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+import kcal.corners.saddle as saddles
 from kcal.checks import as_points, require_finite
 from kcal.corners.erf import erf_saddle
 from kcal.corners.grid import line_bend, local_side, neighbors
 from kcal.corners.images import Gray
-from kcal.corners.saddle import (
-    MAX_MOVE,
-    MOVE_SHARE,
-    SQUARE_SHARE,
-    CornerStatus,
-    Refined,
-    inside_image,
-    saddle,
-    with_status,
-)
 from kcal.errors import InputError
 
 Refinement = Literal["erf", "saddle", "opencv", "skimage", "none"]
@@ -42,7 +33,7 @@ def refine_corners(
     side: Tensor,
     method: Refinement = "erf",
     grid: tuple[int, int] | None = None,
-) -> Refined:
+) -> saddles.Refined:
     """Refine corners to a fraction of a pixel.
 
     * `erf`: `kcal.corners.saddle.saddle`, then `kcal.corners.erf.erf_saddle` from there. The most accurate of these on
@@ -93,8 +84,8 @@ def refine_corners(
     if method == "none":
         moved, margin = pixels, torch.zeros_like(side)
     else:
-        margin = (SQUARE_SHARE * side).floor().clamp(2, 11 if method == "opencv" else 6)
-        usable = seen & inside_image(pixels, margin, width, height)
+        margin = (saddles.SQUARE_SHARE * side).floor().clamp(2, 11 if method == "opencv" else 6)
+        usable = seen & saddles.inside_image(pixels, margin, width, height)
         step = _opencv if method == "opencv" else _skimage
         moved = pixels.clone()
         for half in margin[usable].unique().int().tolist():
@@ -104,12 +95,12 @@ def refine_corners(
     place = torch.where((seen & failed)[:, None], pixels, moved)
     distance = torch.linalg.vector_norm(moved - pixels, dim=-1)
     checks = (
-        (CornerStatus.MISSING, seen),
-        (CornerStatus.OUTSIDE, inside_image(place, margin, width, height)),
-        (CornerStatus.NO_SADDLE, ~failed),
-        (CornerStatus.MOVED, distance < (MOVE_SHARE * side).clamp(max=MAX_MOVE)),
+        (saddles.CornerStatus.MISSING, seen),
+        (saddles.CornerStatus.OUTSIDE, saddles.inside_image(place, margin, width, height)),
+        (saddles.CornerStatus.NO_SADDLE, ~failed),
+        (saddles.CornerStatus.MOVED, distance < (saddles.MOVE_SHARE * side).clamp(max=saddles.MAX_MOVE)),
     )
-    return Refined(*with_status(moved, checks))
+    return saddles.Refined(*saddles.with_status(moved, checks))
 
 
 class RefineCorners(nn.Module):
@@ -143,7 +134,7 @@ class RefineCorners(nn.Module):
             raise InputError(f"RefineCorners: {method!r} has no gradients; choose erf or saddle, or use detect_board")
         self.method, self.grid = method, grid
 
-    def forward(self, image: Tensor, pixels: Tensor, side: Tensor | None = None) -> Refined:
+    def forward(self, image: Tensor, pixels: Tensor, side: Tensor | None = None) -> saddles.Refined:
         """Refine corners.
 
         Args:
@@ -171,9 +162,9 @@ class RefineCorners(nn.Module):
             levels = None if light.is_floating_point() else _saturation_levels(int(light.max()))
             done.append(_of_one_image(light, pixels[number], known, self.method, self.grid, levels))
         if not done:
-            return Refined(pixels, pixels[..., 0].long())
-        parts = {name: [getattr(each, name) for each in done] for name in Refined._fields}
-        return Refined(**{name: torch.stack(part) for name, part in parts.items() if part[0] is not None})
+            return saddles.Refined(pixels, pixels[..., 0].long())
+        parts = {name: [getattr(each, name) for each in done] for name in saddles.Refined._fields}
+        return saddles.Refined(**{name: torch.stack(part) for name, part in parts.items() if part[0] is not None})
 
     def extra_repr(self) -> str:
         """One line for people."""
@@ -187,18 +178,18 @@ def _of_one_image(
     method: str,
     grid: tuple[int, int] | None,
     levels: tuple[float, float] | None,
-) -> Refined:
+) -> saddles.Refined:
     """Of one image (H, W): the saddle's corners, or the erf fit from there.
 
     Where the saddle failed, its reason stays, unless it is saturation.
     """
     if method == "saddle":
-        return saddle(light, start, side)
+        return saddles.saddle(light, start, side)
     with torch.no_grad():
-        found = saddle(light, start, side)
-    settled = (found.status == CornerStatus.GOOD)[:, None]
+        found = saddles.saddle(light, start, side)
+    settled = (found.status == saddles.CornerStatus.GOOD)[:, None]
 
-    def fitted(known: Tensor) -> Refined:
+    def fitted(known: Tensor) -> saddles.Refined:
         bend = line_bend(known, *grid) if grid is not None else None
         around = neighbors(known, *grid) if grid is not None else None
         begin = torch.where(settled, known, start)
@@ -214,20 +205,22 @@ def _of_one_image(
         reach = 2 * math.ceil(4.0 * SMOOTHING) - 1
         light = gaussian_blur2d(whole[None, None], (reach, reach), (SMOOTHING, SMOOTHING))[0, 0]
         fit = fitted(found.pixels)
-        saturated = jagged.status == CornerStatus.SATURATED
-        fit = fit._replace(status=torch.where(saturated, int(CornerStatus.SATURATED), fit.status))
-        if int((fit.status == CornerStatus.GOOD).sum()) < int((jagged.status == CornerStatus.GOOD).sum()):
+        saturated = jagged.status == saddles.CornerStatus.SATURATED
+        fit = fit._replace(status=torch.where(saturated, int(saddles.CornerStatus.SATURATED), fit.status))
+        if int((fit.status == saddles.CornerStatus.GOOD).sum()) < int(
+            (jagged.status == saddles.CornerStatus.GOOD).sum()
+        ):
             fit, light = jagged, sharp
     assert fit.blur is not None
     if grid is not None and bool((settled[:, 0] & (fit.blur > SECOND_BLUR * side)).any()):
         # There a corner depends on where its neighbors are, and errors of the saddle would pass between them.
-        fit = fitted(torch.where((fit.status == CornerStatus.GOOD)[:, None], fit.pixels, found.pixels))
+        fit = fitted(torch.where((fit.status == saddles.CornerStatus.GOOD)[:, None], fit.pixels, found.pixels))
     assert fit.covariance is not None
     assert fit.blur is not None
     nan = float("nan")
-    status = torch.where(settled[:, 0] | (fit.status == CornerStatus.SATURATED), fit.status, found.status)
-    good = status == CornerStatus.GOOD
-    return Refined(
+    status = torch.where(settled[:, 0] | (fit.status == saddles.CornerStatus.SATURATED), fit.status, found.status)
+    good = status == saddles.CornerStatus.GOOD
+    return saddles.Refined(
         torch.where(good[:, None], fit.pixels, nan),
         status,
         torch.where(good[:, None, None], fit.covariance, nan),
@@ -235,10 +228,10 @@ def _of_one_image(
     )
 
 
-def _is_jagged(fit: Refined, settled: Tensor) -> bool:
+def _is_jagged(fit: saddles.Refined, settled: Tensor) -> bool:
     assert fit.blur is not None
-    unsettled = settled & (fit.status == CornerStatus.NOT_CONVERGED)
-    good = fit.status == CornerStatus.GOOD
+    unsettled = settled & (fit.status == saddles.CornerStatus.NOT_CONVERGED)
+    good = fit.status == saddles.CornerStatus.GOOD
     if int(unsettled.sum()) > MAX_UNSETTLED * int(settled.sum()):
         return True
     return bool(good.any()) and float(fit.blur[good].median()) < MIN_BLUR

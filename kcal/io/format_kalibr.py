@@ -12,20 +12,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+import kcal.io.foreign as foreign
 from kcal.files import read_text, write_atomic
-from kcal.io.foreign import (
-    CameraPose,
-    Hints,
-    ImportedCameras,
-    checked_pose,
-    dump_yaml,
-    known_size,
-    named_camera,
-    numbers,
-    plain,
-    whole_size,
-    with_sigmas,
-)
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.fitted_hybrid import hybrid_through
@@ -105,7 +93,7 @@ def omni_camera(name: str, values: Sequence[float], size: tuple[int, int]) -> tu
     xi, fu, fv, pu, pv, *lens = map(float, values)
     if not -1.0 < xi < _MOST_XI:
         raise ValueError(f"{name}: xi is {xi:g}; from -1 to {_MOST_XI:g} is possible")
-    inner = named_camera(name, (fu, fv, pu, pv), size, "opencv4", lens)
+    inner = foreign.named_camera(name, (fu, fv, pu, pv), size, "opencv4", lens)
 
     def lines(grid: tuple[int, int]) -> tuple[torch.Tensor, torch.Tensor]:
         pixels = inner.grid(*grid).reshape(-1, 2)
@@ -141,47 +129,47 @@ _GEOMETRIES = {"DistortedPinholeCamera": "opencv4", "EquidistantDistortedPinhole
 _RESULTS = re.compile(r"^\s*(distortion|projection): \[([^\]\n]*)\] \+- \[([^\]\n]*)\]", re.MULTILINE)
 
 
-def read_kalibr(path: Path, hints: Hints) -> ImportedCameras:
+def read_kalibr(path: Path, hints: foreign.Hints) -> foreign.ImportedCameras:
     """Read all cameras of a chain, with poses from the first camera's frame; or of a `results-cam.txt`, with σ."""
     text = read_text(path, MOST_YAML)
     if _RESULTS.search(text):
         return _read_results(text, hints)
     content = read_yaml(text, str(path))
     cameras: list[Camera] = []
-    poses: list[CameraPose] = []
+    poses: list[foreign.CameraPose] = []
     lost: set[str] = set()
     whole = np.eye(4)
     while (name := f"cam{len(cameras)}") in content:
         part = content[name]
         kind, lens = str(part["camera_model"]), str(part["distortion_model"])
         if kind == "omni" and lens in ("radtan", "none"):
-            core = numbers(part["intrinsics"], 5, f"{name} intrinsics")
-            terms = numbers(part.get("distortion_coeffs", []), (0, 4), f"{name} distortion_coeffs") or [0.0] * 4
-            camera, note = omni_camera(name, [*core, *terms], whole_size(*part["resolution"]))
+            core = foreign.numbers(part["intrinsics"], 5, f"{name} intrinsics")
+            terms = foreign.numbers(part.get("distortion_coeffs", []), (0, 4), f"{name} distortion_coeffs") or [0.0] * 4
+            camera, note = omni_camera(name, [*core, *terms], foreign.whole_size(*part["resolution"]))
             cameras.append(camera)
             lost.add(note)
         elif kind != "pinhole" or lens not in _LENSES:
             raise ValueError(f"{name}: camera_model {kind} with distortion_model {lens}: kcal reads pinhole with "
                              f"{', '.join(_LENSES)}, and omni with radtan or none")  # fmt: skip
         else:
-            coefficients = numbers(
+            coefficients = foreign.numbers(
                 part.get("distortion_coeffs", []), 0 if lens == "none" else 4, f"{name} distortion_coeffs"
             )
-            intrinsics = numbers(part["intrinsics"], 4, f"{name} intrinsics")
-            size = whole_size(*part["resolution"])
-            cameras.append(named_camera(name, intrinsics, size, _LENSES[lens], coefficients))
+            intrinsics = foreign.numbers(part["intrinsics"], 4, f"{name} intrinsics")
+            size = foreign.whole_size(*part["resolution"])
+            cameras.append(foreign.named_camera(name, intrinsics, size, _LENSES[lens], coefficients))
         if "T_cn_cnm1" in part:
-            step = np.array(numbers(part["T_cn_cnm1"], 16, f"{name} T_cn_cnm1")).reshape(4, 4)
+            step = np.array(foreign.numbers(part["T_cn_cnm1"], 16, f"{name} T_cn_cnm1")).reshape(4, 4)
             whole = step @ whole
         elif len(cameras) > 1:
             poses = []
             lost.add(f"{name} has no T_cn_cnm1")
             continue
-        poses.append(checked_pose(whole[:3, :3].tolist(), whole[:3, 3].tolist()))
+        poses.append(foreign.checked_pose(whole[:3, :3].tolist(), whole[:3, 3].tolist()))
         lost |= {f"{key} is not kept" for key in ("T_cam_imu", "timeshift_cam_imu") if key in part}
     if not cameras:
         raise ValueError("no cam0")
-    return ImportedCameras(
+    return foreign.ImportedCameras(
         format="kalibr",
         cameras=tuple(cameras),
         poses=tuple(poses) if len(poses) == len(cameras) > 1 else (),
@@ -189,22 +177,22 @@ def read_kalibr(path: Path, hints: Hints) -> ImportedCameras:
     )
 
 
-def _read_results(text: str, hints: Hints) -> ImportedCameras:
+def _read_results(text: str, hints: foreign.Hints) -> foreign.ImportedCameras:
     """The cameras of Kalibr's text of results, which has standard deviations and no image size."""
-    size = known_size(hints.size)
+    size = foreign.known_size(hints.size)
     cameras, notes = [], {"poses are read from the camchain, not from the text of results"}
     for part in re.split(r"^(?=cam\d+ \()", text, flags=re.MULTILINE)[1:]:
         name, found = part.split(" ", 1)[0], {key: (value, sigma) for key, value, sigma in _RESULTS.findall(part)}
         kind = re.search(r"type:.*?\.(\w+)Geometry", part)
         if kind is None or kind[1] not in _GEOMETRIES:
             raise ValueError(f"{name}: {kind[1] if kind else 'no type'}: kcal reads {', '.join(_GEOMETRIES)}")
-        lens = numbers(found["distortion"][0].split(), 4, f"{name} distortion")
-        core = numbers(found["projection"][0].split(), 4, f"{name} projection")
-        camera = named_camera(name, core, size, _GEOMETRIES[kind[1]], lens)
-        sigmas = [numbers(found[key][1].split(), 4, f"{name} {key}") for key in ("projection", "distortion")]
-        notes.add(with_sigmas(camera, [*sigmas[0], *sigmas[1]]))
+        lens = foreign.numbers(found["distortion"][0].split(), 4, f"{name} distortion")
+        core = foreign.numbers(found["projection"][0].split(), 4, f"{name} projection")
+        camera = foreign.named_camera(name, core, size, _GEOMETRIES[kind[1]], lens)
+        sigmas = [foreign.numbers(found[key][1].split(), 4, f"{name} {key}") for key in ("projection", "distortion")]
+        notes.add(foreign.with_sigmas(camera, [*sigmas[0], *sigmas[1]]))
         cameras.append(camera)
-    return ImportedCameras(format="kalibr", cameras=tuple(cameras), notes=tuple(sorted(notes)))
+    return foreign.ImportedCameras(format="kalibr", cameras=tuple(cameras), notes=tuple(sorted(notes)))
 
 
 class KalibrLens(NamedTuple):
@@ -217,7 +205,7 @@ class KalibrLens(NamedTuple):
     resolution: tuple[int, int]
 
 
-def write_kalibr(cameras: Sequence[Camera], poses: Sequence[CameraPose], path: Path) -> list[Path]:
+def write_kalibr(cameras: Sequence[Camera], poses: Sequence[foreign.CameraPose], path: Path) -> list[Path]:
     """Write a chain of cameras."""
     names = {model: name for name, model in _LENSES.items()}
     lenses = [
@@ -234,7 +222,7 @@ def write_kalibr(cameras: Sequence[Camera], poses: Sequence[CameraPose], path: P
 
 
 def write_omni(
-    cameras: Sequence[Camera], values: Sequence[Sequence[float]], poses: Sequence[CameraPose], path: Path
+    cameras: Sequence[Camera], values: Sequence[Sequence[float]], poses: Sequence[foreign.CameraPose], path: Path
 ) -> list[Path]:
     """Write a chain of cameras as omni-radtan, with the nine numbers of `fit_omni` for each."""
     lenses = [
@@ -244,7 +232,7 @@ def write_omni(
     return write_chain(lenses, poses, path)
 
 
-def write_chain(lenses: Sequence[KalibrLens], poses: Sequence[CameraPose], path: Path) -> list[Path]:
+def write_chain(lenses: Sequence[KalibrLens], poses: Sequence[foreign.CameraPose], path: Path) -> list[Path]:
     """Write lenses, and the pose of each from the one before, as a camchain."""
     content: dict[str, Any] = {}
     for i, lens in enumerate(lenses):
@@ -262,7 +250,7 @@ def write_chain(lenses: Sequence[KalibrLens], poses: Sequence[CameraPose], path:
             rotation = here.rotation @ before.rotation.T
             translation = here.translation - rotation @ before.translation
             step = np.eye(4)
-            step[:3, :3], step[:3, 3] = np.array(plain(rotation)), plain(translation)
+            step[:3, :3], step[:3, 3] = np.array(foreign.plain(rotation)), foreign.plain(translation)
             part["T_cn_cnm1"] = step.tolist()
         content[f"cam{i}"] = part
-    return [write_atomic(path, dump_yaml(content))]
+    return [write_atomic(path, foreign.dump_yaml(content))]

@@ -14,22 +14,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+import kcal.io.foreign as foreign
 from kcal.errors import InputError
 from kcal.files import read_text, write_atomic
 from kcal.gaussian import posterior_half, triangular
-from kcal.io.foreign import (
-    MOST_BYTES,
-    CameraPose,
-    Hints,
-    ImportedCameras,
-    camera_name,
-    checked_pose,
-    named_camera,
-    numbers,
-    paths_for,
-    plain,
-    whole_size,
-)
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector, step_rows, vector_from_rotation
@@ -168,9 +156,9 @@ _MOST_NUMBERS = 2**20
 _LENSES = {"LENSMODEL_PINHOLE": "pinhole"} | {f"LENSMODEL_OPENCV{n}": f"opencv{n}" for n in (4, 5, 8, 12)}
 
 
-def read_mrcal(path: Path, hints: Hints) -> ImportedCameras:
+def read_mrcal(path: Path, hints: foreign.Hints) -> foreign.ImportedCameras:
     """Read one camera and its pose."""
-    text = read_text(path, MOST_BYTES)
+    text = read_text(path, foreign.MOST_BYTES)
     # What a model was made from is stored as long texts; numbers take Python a hundred times their length in memory.
     if len(_TEXT.sub("", text)) > _MOST_NUMBERS:
         raise ValueError(f"more than {_MOST_NUMBERS // 2**20} MiB of numbers and names")
@@ -187,12 +175,12 @@ def read_mrcal(path: Path, hints: Hints) -> ImportedCameras:
             f"{kind}: kcal reads {', '.join(_LENSES)}; mrcal-convert-lensmodel --to LENSMODEL_OPENCV8 fits one of them"
         )
     model = _LENSES[kind]
-    size = whole_size(*content["imagersize"])
+    size = foreign.whole_size(*content["imagersize"])
     count = {"pinhole": 4}.get(model) or 4 + int(model.removeprefix("opencv"))
-    fx, fy, cx, cy, *lens = numbers(content["intrinsics"], count, "intrinsics")
-    camera = named_camera(path.stem, (fx, fy, cx, cy), size, model, lens)
+    fx, fy, cx, cy, *lens = foreign.numbers(content["intrinsics"], count, "intrinsics")
+    camera = foreign.named_camera(path.stem, (fx, fy, cx, cy), size, model, lens)
     key = "rt_cam_ref" if "rt_cam_ref" in content else "extrinsics"
-    *turn, x, y, z = numbers(content[key], 6, key)
+    *turn, x, y, z = foreign.numbers(content[key], 6, key)
     rotation = rotation_from_vector(torch.tensor(turn, dtype=torch.float64))
     lost = []
     if packed := content.get("optimization_inputs"):
@@ -202,28 +190,33 @@ def read_mrcal(path: Path, hints: Hints) -> ImportedCameras:
             lost = ["error bars are those of the corners in the file; the corners themselves are not kept"]
         except NoInformationError as reason:
             lost = [f"no error bars: {reason}"]
-    return ImportedCameras(
-        format="mrcal", cameras=(camera,), poses=(checked_pose(plain(rotation), [x, y, z]),), notes=tuple(lost)
+    return foreign.ImportedCameras(
+        format="mrcal",
+        cameras=(camera,),
+        poses=(foreign.checked_pose(foreign.plain(rotation), [x, y, z]),),
+        notes=tuple(lost),
     )
 
 
-def write_mrcal(cameras: Sequence[Camera], poses: Sequence[CameraPose], path: Path) -> list[Path]:
+def write_mrcal(cameras: Sequence[Camera], poses: Sequence[foreign.CameraPose], path: Path) -> list[Path]:
     """Write a file for each camera."""
     lenses = {model: name for name, model in _LENSES.items()}
-    paths = paths_for(path, len(cameras))
+    paths = foreign.paths_for(path, len(cameras))
     for i, (camera, target) in enumerate(zip(cameras, paths, strict=True)):
         values = [*camera.params[:4].tolist(), *camera.coefficients.tolist()]
         write_model(target, camera, lenses[str(camera.model)], values, poses[i] if poses else None)
     return paths
 
 
-def write_model(path: Path, camera: Camera, lens: str, values: Sequence[float], pose: CameraPose | None) -> Path:
+def write_model(
+    path: Path, camera: Camera, lens: str, values: Sequence[float], pose: foreign.CameraPose | None
+) -> Path:
     """Write a camera whose intrinsics in mrcal's lens model are given, with as many digits as they have."""
     motion = [0.0] * 6
     if pose is not None:
-        motion = [*plain(vector_from_rotation(pose.rotation)), *plain(pose.translation)]
+        motion = [*foreign.plain(vector_from_rotation(pose.rotation)), *foreign.plain(pose.translation)]
     lines = [
-        f"# {' '.join(camera_name(camera, 'camera').split())}, written by kcal",
+        f"# {' '.join(foreign.camera_name(camera, 'camera').split())}, written by kcal",
         "{",
         f"    'lensmodel': '{lens}',",
         "    # fx, fy, cx, cy, then the lens",

@@ -12,19 +12,9 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import torch
 
+import kcal.io.foreign as foreign
 from kcal.errors import InputError
 from kcal.files import dump_json, read_bytes, read_text, write_atomic
-from kcal.io.foreign import (
-    MOST_BYTES,
-    CameraPose,
-    Hints,
-    ImportedCameras,
-    camera_name,
-    checked_pose,
-    named_camera,
-    numbers,
-    whole_size,
-)
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
@@ -45,13 +35,13 @@ _FISHEYE = {name: own for name, own in _FRAME.items() if name[0] != "p"} | {"k4"
 _OTHERS = ("p3", "p4")
 
 
-def read_agisoft(path: Path, hints: Hints) -> ImportedCameras:
+def read_agisoft(path: Path, hints: foreign.Hints) -> foreign.ImportedCameras:
     """Read the adjusted calibration of every sensor; poses are in a frame of the chunk and not read."""
-    root = read_xml(read_bytes(path, MOST_BYTES), str(path))
+    root = read_xml(read_bytes(path, foreign.MOST_BYTES), str(path))
     sensors = [part for part in root.iter("sensor") if part.find("calibration") is not None] or [root]
     cameras = tuple(_agisoft_camera(part, number) for number, part in enumerate(sensors))
     notes = ("the poses of images are not read",) if root.find(".//camera/transform") is not None else ()
-    return ImportedCameras(format="agisoft", cameras=cameras, notes=notes)
+    return foreign.ImportedCameras(format="agisoft", cameras=cameras, notes=notes)
 
 
 def _agisoft_camera(sensor: Element, number: int) -> Camera:
@@ -66,10 +56,10 @@ def _agisoft_camera(sensor: Element, number: int) -> Camera:
     own = _FISHEYE if kind == "fisheye" else _FRAME
     size = best.find("resolution")
     if size is not None:
-        width, height = whole_size(size.get("width"), size.get("height"))
+        width, height = foreign.whole_size(size.get("width"), size.get("height"))
     else:
-        width, height = whole_size(best.findtext("width"), best.findtext("height"))
-    given = {tag: numbers([best.findtext(tag, "0")], 1, tag)[0] for tag in (*_FRAME, *_OTHERS)}
+        width, height = foreign.whole_size(best.findtext("width"), best.findtext("height"))
+    given = {tag: foreign.numbers([best.findtext(tag, "0")], 1, tag)[0] for tag in (*_FRAME, *_OTHERS)}
     strange = [tag for tag, value in given.items() if value and tag not in own]
     if strange:
         raise ValueError(f"{name}: {', '.join(strange)} of a {kind} lens: no lens of kcal holds it")
@@ -85,7 +75,7 @@ def _agisoft_camera(sensor: Element, number: int) -> Camera:
                 values[target] += given[tag]
     fx, fy, cx, cy, skew, *lens = values.values()
     center = cx + 0.5 * width - 0.5, cy + 0.5 * height - 0.5
-    camera = named_camera(name, (fx, fy, *center), (width, height), model, lens, skew)
+    camera = foreign.named_camera(name, (fx, fy, *center), (width, height), model, lens, skew)
     covariance = _sensor_covariance(sensor, own, names)
     if covariance is not None:
         camera.calibration = CameraCalibration(name=name, covariance=covariance)
@@ -100,7 +90,7 @@ def _sensor_covariance(sensor: Element, own: dict[str, tuple[str, ...]], names: 
     strange = [tag for tag in tags if tag not in own]
     if not tags or len(tags) > len(own) or strange:
         raise ValueError(f"covariance: its parameters are {' '.join(tags)[:80]!r}")
-    matrix = numbers((stated.findtext("coeffs") or "").split(), len(tags) ** 2, "covariance")
+    matrix = foreign.numbers((stated.findtext("coeffs") or "").split(), len(tags) ** 2, "covariance")
     moved = torch.zeros(len(names), len(tags), dtype=torch.float64)
     for column, tag in enumerate(tags):
         for target in own[tag]:
@@ -139,13 +129,13 @@ COLMAP_MODELS = {
 WRITTEN = {"pinhole": "PINHOLE", "opencv4": "OPENCV", "opencv8": "FULL_OPENCV", "fisheye4": "OPENCV_FISHEYE"}
 
 
-def read_colmap(path: Path, hints: Hints) -> ImportedCameras:
+def read_colmap(path: Path, hints: foreign.Hints) -> foreign.ImportedCameras:
     """Read all cameras of a reconstruction; they are named by their numbers."""
-    entries = _from_binary(read_bytes(path, MOST_BYTES)) if path.suffix.lower() == ".bin" else _from_text(path)
+    entries = _from_binary(read_bytes(path, foreign.MOST_BYTES)) if path.suffix.lower() == ".bin" else _from_text(path)
     if not entries:
         raise ValueError("no cameras")
     cameras = tuple(_colmap_camera(*entry) for entry in entries)
-    return ImportedCameras(format="colmap", cameras=cameras)
+    return foreign.ImportedCameras(format="colmap", cameras=cameras)
 
 
 def _colmap_camera(number: int, name: str, size: tuple[int, int], values: Sequence[float]) -> Camera:
@@ -155,7 +145,7 @@ def _colmap_camera(number: int, name: str, size: tuple[int, int], values: Sequen
     fy = given.pop("fy", None) or given.pop("f")
     cx, cy = given.pop("cx") - _HALF, given.pop("cy") - _HALF
     # What is left are coefficients, and kcal has the same names in the same order.
-    return named_camera(str(number), (fx, fy, cx, cy), size, known.model, list(given.values()))
+    return foreign.named_camera(str(number), (fx, fy, cx, cy), size, known.model, list(given.values()))
 
 
 def _known(name: str) -> ColmapModel:
@@ -166,14 +156,14 @@ def _known(name: str) -> ColmapModel:
 
 def _from_text(path: Path) -> list[tuple[int, str, tuple[int, int], list[float]]]:
     entries = []
-    for number, line in enumerate(read_text(path, MOST_BYTES).splitlines(), 1):
+    for number, line in enumerate(read_text(path, foreign.MOST_BYTES).splitlines(), 1):
         fields = line.split()
         if not fields or fields[0].startswith("#"):
             continue
         if len(fields) < 5 or len(fields) != 4 + len(_known(fields[1]).parameters):
             raise ValueError(f"line {number}: ID MODEL WIDTH HEIGHT and the model's parameters are needed")
         values = [float(field) for field in fields[4:]]
-        entries.append((int(fields[0]), fields[1], whole_size(fields[2], fields[3]), values))
+        entries.append((int(fields[0]), fields[1], foreign.whole_size(fields[2], fields[3]), values))
     return entries
 
 
@@ -189,7 +179,7 @@ def _from_binary(data: bytes) -> list[tuple[int, str, tuple[int, int], list[floa
             size = len(COLMAP_MODELS[name].parameters)
             values = list(struct.unpack_from(f"<{size}d", data, place + 24))
             place += 24 + 8 * size
-            entries.append((number, name, whole_size(width, height), values))
+            entries.append((number, name, foreign.whole_size(width, height), values))
     except struct.error as error:
         raise ValueError(f"the file ends too early: {error}") from None
     if place != len(data):
@@ -197,7 +187,7 @@ def _from_binary(data: bytes) -> list[tuple[int, str, tuple[int, int], list[floa
     return entries
 
 
-def write_colmap(cameras: Sequence[Camera], poses: Sequence[CameraPose], path: Path) -> list[Path]:
+def write_colmap(cameras: Sequence[Camera], poses: Sequence[foreign.CameraPose], path: Path) -> list[Path]:
     """Write the cameras, numbered from 1, as text or, for the suffix .bin, in binary."""
     entries = []
     for number, camera in enumerate(cameras, 1):
@@ -220,9 +210,9 @@ def write_colmap(cameras: Sequence[Camera], poses: Sequence[CameraPose], path: P
 _FIELDS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_model", "k1", "k2", "k3", "k4", "p1", "p2")
 
 
-def read_nerfstudio(path: Path, hints: Hints) -> ImportedCameras:
+def read_nerfstudio(path: Path, hints: foreign.Hints) -> foreign.ImportedCameras:
     """Read the cameras; frames with intrinsics of their own that are equal are one camera."""
-    content = read_json(read_bytes(path, MOST_BYTES), str(path))
+    content = read_json(read_bytes(path, foreign.MOST_BYTES), str(path))
     frames = content.get("frames", [])
     shared = {key: content[key] for key in _FIELDS if key in content}
     found: dict[str, dict[str, Any]] = {}
@@ -232,29 +222,29 @@ def read_nerfstudio(path: Path, hints: Hints) -> ImportedCameras:
     single = len(found) == 1
     cameras = tuple(_nerfstudio_camera(values, path.stem if single else values["name"]) for values in found.values())
     notes = ("the poses of the frames are not kept",) if any("transform_matrix" in frame for frame in frames) else ()
-    return ImportedCameras(format="nerfstudio", cameras=cameras, notes=notes)
+    return foreign.ImportedCameras(format="nerfstudio", cameras=cameras, notes=notes)
 
 
 def _nerfstudio_camera(values: dict[str, Any], name: str) -> Camera:
     kind = str(values.get("camera_model", "OPENCV"))
     if kind not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FISHEYE"):
         raise ValueError(f"camera_model {kind}: kcal reads OPENCV, PINHOLE and OPENCV_FISHEYE")
-    size = whole_size(values["w"], values["h"])
-    fx, cx, cy = numbers([values["fl_x"], values["cx"], values["cy"]], 3, "fl_x, cx, cy")
+    size = foreign.whole_size(values["w"], values["h"])
+    fx, cx, cy = foreign.numbers([values["fl_x"], values["cx"], values["cy"]], 3, "fl_x, cx, cy")
     fy = float(values.get("fl_y", fx))
     k1, k2, k3, k4, p1, p2 = (float(values.get(key, 0.0)) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     intrinsics = (fx, fy, cx - _HALF, cy - _HALF)
     if kind == "OPENCV_FISHEYE":
-        return named_camera(name, intrinsics, size, "fisheye4", [k1, k2, k3, k4])
+        return foreign.named_camera(name, intrinsics, size, "fisheye4", [k1, k2, k3, k4])
     if k4:
         raise ValueError("k4 is a fourth radial coefficient here, which kcal's models with OpenCV's names do not have")
     lens = [k1, k2, p1, p2, k3] if kind == "OPENCV" else []
     while lens and lens[-1] == 0.0 and len(lens) > 4:
         lens.pop()
-    return named_camera(name, intrinsics, size, {0: "pinhole", 4: "opencv4", 5: "opencv5"}[len(lens)], lens)
+    return foreign.named_camera(name, intrinsics, size, {0: "pinhole", 4: "opencv4", 5: "opencv5"}[len(lens)], lens)
 
 
-def write_nerfstudio(cameras: Sequence[Camera], poses: Sequence[CameraPose], path: Path) -> list[Path]:
+def write_nerfstudio(cameras: Sequence[Camera], poses: Sequence[foreign.CameraPose], path: Path) -> list[Path]:
     """Write the intrinsics of one camera, and no frames."""
     if len(cameras) != 1:
         raise InputError("transforms.json has one camera; write the cameras one by one")
@@ -288,16 +278,16 @@ _OPENSFM_LENSES = {
 }
 
 
-def read_opensfm(path: Path, hints: Hints) -> ImportedCameras:
+def read_opensfm(path: Path, hints: foreign.Hints) -> foreign.ImportedCameras:
     """Read all cameras, by their names."""
-    content = read_json(read_bytes(path, MOST_BYTES), str(path))
+    content = read_json(read_bytes(path, foreign.MOST_BYTES), str(path))
     if isinstance(content, list):
         content = content[0]
     content = content.get("cameras", content)
     cameras = tuple(_opensfm_camera(name, value) for name, value in content.items())
     if not cameras:
         raise ValueError("no cameras")
-    return ImportedCameras(format="opensfm", cameras=cameras)
+    return foreign.ImportedCameras(format="opensfm", cameras=cameras)
 
 
 def _opensfm_camera(name: str, value: Mapping[str, Any]) -> Camera:
@@ -305,17 +295,17 @@ def _opensfm_camera(name: str, value: Mapping[str, Any]) -> Camera:
     if kind not in _OPENSFM_LENSES:
         raise ValueError(f"{name}: projection_type {kind}: kcal reads {', '.join(_OPENSFM_LENSES)}")
     names, model = _OPENSFM_LENSES[kind]
-    size = whole_size(value["width"], value["height"])
+    size = foreign.whole_size(value["width"], value["height"])
     longer = max(size)
     fx = longer * float(value.get("focal_x", value.get("focal")))
     fy = longer * float(value["focal_y"]) if "focal_y" in value else fx
     cx, cy = (
         longer * float(value.get(key, 0.0)) + 0.5 * (side - 1) for key, side in zip(("c_x", "c_y"), size, strict=True)
     )
-    return named_camera(name, (fx, fy, cx, cy), size, model, [float(value.get(key, 0.0)) for key in names])
+    return foreign.named_camera(name, (fx, fy, cx, cy), size, model, [float(value.get(key, 0.0)) for key in names])
 
 
-def write_opensfm(cameras: Sequence[Camera], poses: Sequence[CameraPose], path: Path) -> list[Path]:
+def write_opensfm(cameras: Sequence[Camera], poses: Sequence[foreign.CameraPose], path: Path) -> list[Path]:
     """Write all cameras, by their names."""
     content: dict[str, Any] = {}
     for i, camera in enumerate(cameras):
@@ -323,7 +313,7 @@ def write_opensfm(cameras: Sequence[Camera], poses: Sequence[CameraPose], path: 
         (width, height), longer = camera.size, max(camera.size)
         lens = dict(zip(camera.model.names, camera.coefficients.tolist(), strict=True))
         kind = "fisheye_opencv" if camera.model.fisheye else "brown"
-        content[camera_name(camera, f"camera {i}")] = {
+        content[foreign.camera_name(camera, f"camera {i}")] = {
             "projection_type": kind,
             "width": width,
             "height": height,
@@ -347,9 +337,9 @@ _CORE = ("focalLengthU", "focalLengthV", "centerPointU", "centerPointV", "skew")
 _LENS = ("radialDistortion1", "radialDistortion2", "tangentalDistortion1", "tangentalDistortion2", "radialDistortion3")
 
 
-def read_qualisys(path: Path, hints: Hints) -> ImportedCameras:
+def read_qualisys(path: Path, hints: foreign.Hints) -> foreign.ImportedCameras:
     """Read all cameras; those that were not calibrated are left out, with a note."""
-    root = read_xml(read_bytes(path, MOST_BYTES), str(path))
+    root = read_xml(read_bytes(path, foreign.MOST_BYTES), str(path))
     cameras, poses, notes = [], [], []
     for number, part in enumerate(root.iterfind(".//cameras/camera"), 1):
         name = part.get("serial") or f"camera {number}"
@@ -360,28 +350,28 @@ def read_qualisys(path: Path, hints: Hints) -> ImportedCameras:
         poses.append(_qualisys_pose(part))
     if not cameras:
         raise ValueError("no calibrated camera")
-    return ImportedCameras(format="qualisys", cameras=tuple(cameras), poses=tuple(poses), notes=tuple(notes))
+    return foreign.ImportedCameras(format="qualisys", cameras=tuple(cameras), poses=tuple(poses), notes=tuple(notes))
 
 
 def _attributes(part: Element, tag: str, names: tuple[str, ...]) -> list[float]:
     found = part.find(tag)
     if found is None:
         raise ValueError(f"a camera has no {tag}")
-    return numbers([found.attrib[name] for name in names], len(names), tag)
+    return foreign.numbers([found.attrib[name] for name in names], len(names), tag)
 
 
 def _qualisys_camera(part: Element, name: str) -> Camera:
     left, top, right, bottom = _attributes(part, "fov_video", ("left", "top", "right", "bottom"))
     fx, fy, cx, cy, skew = (value / _UNITS for value in _attributes(part, "intrinsic", _CORE))
-    size = whole_size(right - left + 1.0, bottom - top + 1.0)
+    size = foreign.whole_size(right - left + 1.0, bottom - top + 1.0)
     center = cx - _FIRST - left, cy - _FIRST - top
-    return named_camera(name, (fx, fy, *center), size, "opencv5", _attributes(part, "intrinsic", _LENS), skew)
+    return foreign.named_camera(name, (fx, fy, *center), size, "opencv5", _attributes(part, "intrinsic", _LENS), skew)
 
 
-def _qualisys_pose(part: Element) -> CameraPose:
+def _qualisys_pose(part: Element) -> foreign.CameraPose:
     names = tuple(f"r{row}{column}" for row in "123" for column in "123")
     axes = np.array(_attributes(part, "transform", names)).reshape(3, 3)
     # From axes to the right, up and backwards to those to the right, down and ahead.
     rotation = np.diag([1.0, -1.0, -1.0]) @ axes
     center = 1e-3 * np.array(_attributes(part, "transform", ("x", "y", "z")))
-    return checked_pose(rotation.tolist(), (-rotation @ center).tolist())
+    return foreign.checked_pose(rotation.tolist(), (-rotation @ center).tolist())

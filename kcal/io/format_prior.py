@@ -17,18 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+import kcal.io.foreign as foreign
 from kcal.files import read_bytes, write_atomic
-from kcal.io.foreign import (
-    MOST_BYTES,
-    CameraPose,
-    Hints,
-    ImportedCameras,
-    camera_name,
-    named_camera,
-    numbers,
-    plain,
-    whole_size,
-)
 from kcal.io.format_photos import WRITTEN
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
@@ -111,12 +101,12 @@ def prior_of(program: str, camera: Camera, misfit: tuple[float, float] | None = 
     found = square_root_information(camera, chosen)
     root, held = (None, ()) if found is None else found
     values = (
-        camera_name(camera, "camera"),
+        foreign.camera_name(camera, "camera"),
         model,
         list(camera.size),
         [parameter.name for parameter in order],
-        plain(camera.params[chosen] * scale + offset),
-        None if root is None else plain(root / scale),
+        foreign.plain(camera.params[chosen] * scale + offset),
+        None if root is None else foreign.plain(root / scale),
         [parameter.name for parameter in order if parameter.kcal in held],
         None if misfit is None else dict(zip(("rms", "largest"), misfit, strict=True)),
         {"model": str(camera.model), "parameters": [list(parameter[1:]) for parameter in order]},
@@ -142,15 +132,15 @@ def write_priors(program: str, priors: Sequence[dict[str, Any]], path: Path) -> 
 def prior_writer(program: str) -> Any:
     """A writer of cameras as `CameraFormat.write` is one, for programs without a file format of cameras."""
 
-    def write(cameras: Sequence[Camera], poses: Sequence[CameraPose], path: Path) -> list[Path]:
+    def write(cameras: Sequence[Camera], poses: Sequence[foreign.CameraPose], path: Path) -> list[Path]:
         return [write_priors(program, [prior_of(program, camera) for camera in cameras], path)]
 
     return write
 
 
-def read_prior(path: Path, hints: Hints) -> ImportedCameras:
+def read_prior(path: Path, hints: foreign.Hints) -> foreign.ImportedCameras:
     """Read the cameras of such a file, with their covariances."""
-    data = read_bytes(path, MOST_BYTES)
+    data = read_bytes(path, foreign.MOST_BYTES)
     content = _from_archive(data, path) if data[:2] == b"PK" else read_json(data, str(path))
     if not isinstance(content, dict) or content.get("kcal_prior") != 1 or not isinstance(content.get("cameras"), list):
         raise ValueError("no prior that kcal wrote: kcal_prior must be 1")
@@ -159,15 +149,15 @@ def read_prior(path: Path, hints: Hints) -> ImportedCameras:
     program = str(content["program"])
     cameras = tuple(_camera_of(part) for part in content["cameras"])
     fitted = [
-        f"{camera_name(camera, 'camera')}: a fit to another lens, RMS {float(part['misfit_px']['rms']):.2g} px"
+        f"{foreign.camera_name(camera, 'camera')}: a fit to another lens, RMS {float(part['misfit_px']['rms']):.2g} px"
         for camera, part in zip(cameras, content["cameras"], strict=True)
         if part.get("misfit_px")
     ]
-    return ImportedCameras(format=program, cameras=cameras, notes=tuple(fitted))
+    return foreign.ImportedCameras(format=program, cameras=cameras, notes=tuple(fitted))
 
 
 def _from_archive(data: bytes, path: Path) -> dict[str, Any]:
-    stored = read_npz(data, str(path), MOST_BYTES, "prior")
+    stored = read_npz(data, str(path), foreign.MOST_BYTES, "prior")
     count = int(stored["cameras"])
     if count > _MOST_CAMERAS:
         raise ValueError(f"more than {_MOST_CAMERAS} cameras")
@@ -181,19 +171,21 @@ def _from_archive(data: bytes, path: Path) -> dict[str, Any]:
 
 def _camera_of(part: dict[str, Any]) -> Camera:
     model = LensModel.named(str(part["kcal"]["model"]))
-    order = [Parameter("", str(own), *numbers(rest, 2, "kcal")) for own, *rest in part["kcal"]["parameters"]]
+    order = [Parameter("", str(own), *foreign.numbers(rest, 2, "kcal")) for own, *rest in part["kcal"]["parameters"]]
     count, names = len(order), parameter_names(model)
     if count > _MOST_PARAMETERS or len({each.kcal for each in order}) != count:
         raise ValueError("kcal names a parameter twice, or too many")
-    mean = numbers(part["mean"], count, "mean")
+    mean = foreign.numbers(part["mean"], count, "mean")
     given = {each.kcal: (value - each.offset) / each.scale for each, value in zip(order, mean, strict=True)}
     values = [given.pop(name, 0.0) for name in names]
     if given:
         raise ValueError(f"{model} has no parameter {next(iter(given))}")
-    (fx, fy, cx, cy, skew, *lens), size = values, whole_size(*part["size"])
-    camera = named_camera(str(part["name"]), (fx, fy, cx, cy), size, model, lens, skew)
+    (fx, fy, cx, cy, skew, *lens), size = values, foreign.whole_size(*part["size"])
+    camera = foreign.named_camera(str(part["name"]), (fx, fy, cx, cy), size, model, lens, skew)
     if part.get("sqrt_information") is not None:
-        root = np.array(numbers(part["sqrt_information"], count * count, "sqrt_information")).reshape(count, count)
+        root = np.array(foreign.numbers(part["sqrt_information"], count * count, "sqrt_information")).reshape(
+            count, count
+        )
         scale = np.array([each.scale for each in order])
         half = np.linalg.inv(root).T / scale
         held = {str(name) for name in part.get("held", [])}

@@ -16,27 +16,12 @@ from typing import IO, NamedTuple
 import torch
 from torch import Tensor
 
+import kcal.mark.items as marking
 from kcal.errors import FileError, InputError
 from kcal.files import check_writable, try_lock, write_atomic
 from kcal.locate.marks import Marks, marks_text, read_marks
 from kcal.locate.survey import EARTH, LOCAL, PLACE_COLUMNS, places_csv, read_survey
 from kcal.locate.tables import read_rows
-from kcal.mark.items import (
-    ACTION,
-    Add,
-    Change,
-    Item,
-    Kind,
-    Load,
-    Mark,
-    MarkingState,
-    Place,
-    Places,
-    Put,
-    Side,
-    Step,
-    applied,
-)
 
 # The undo log: every action is one line of a file, written through to the disk before it is answered.
 #
@@ -62,9 +47,9 @@ class Journal:
     """
 
     def __init__(self, path: Path) -> None:
-        self._states = [MarkingState()]
-        self._undone: list[MarkingState] = []
-        self._earlier: list[MarkingState] = []
+        self._states = [marking.MarkingState()]
+        self._undone: list[marking.MarkingState] = []
+        self._earlier: list[marking.MarkingState] = []
         self._seen: set[str] = set()
         self.count = 0
         self.notes: list[str] = []
@@ -74,11 +59,11 @@ class Journal:
         self._file = self._opened()
 
     @property
-    def state(self) -> MarkingState:
+    def state(self) -> marking.MarkingState:
         """The present one."""
         return self._states[-1]
 
-    def earlier(self) -> Iterator[MarkingState]:
+    def earlier(self) -> Iterator[marking.MarkingState]:
         """States after earlier actions, latest first."""
         return reversed(self._earlier)
 
@@ -92,7 +77,7 @@ class Journal:
         """Whether anything was undone last."""
         return bool(self._undone)
 
-    def do(self, action: Change | Step, key: str) -> bool:
+    def do(self, action: marking.Change | marking.Step, key: str) -> bool:
         """Apply an action and write it down; False if an action with this key was done before.
 
         Args:
@@ -118,7 +103,7 @@ class Journal:
         """Close the file, which unlocks it."""
         self._file.close()
 
-    def _take(self, states: list[MarkingState], undone: list[MarkingState], key: str) -> None:
+    def _take(self, states: list[marking.MarkingState], undone: list[marking.MarkingState], key: str) -> None:
         self._earlier.append(self.state)
         self._states, self._undone = states, undone
         self._seen.add(key)
@@ -140,11 +125,15 @@ class Journal:
             raise
         self._end += len(line)
 
-    def _after(self, action: Change | Step) -> tuple[list[MarkingState], list[MarkingState]]:
-        if isinstance(action, Places):
-            return [applied(state, action) for state in self._states], [applied(s, action) for s in self._undone]
-        if not isinstance(action, Step):
-            return [*self._states, applied(self.state, action)], []
+    def _after(
+        self, action: marking.Change | marking.Step
+    ) -> tuple[list[marking.MarkingState], list[marking.MarkingState]]:
+        if isinstance(action, marking.Places):
+            return [marking.applied(state, action) for state in self._states], [
+                marking.applied(s, action) for s in self._undone
+            ]
+        if not isinstance(action, marking.Step):
+            return [*self._states, marking.applied(self.state, action)], []
         if action.do == "undo":
             if not self.can_undo:
                 raise InputError("there is nothing to undo")
@@ -192,7 +181,7 @@ class Journal:
                     if content != _HEAD:
                         raise FileError(f"{self.path}: not a log of `kcal mark` of this version; give another -o")
                     continue
-                action, key = ACTION.validate_python(content["action"]), str(content["key"])
+                action, key = marking.ACTION.validate_python(content["action"]), str(content["key"])
                 states, undone = self._after(self._named(action))
             except (ValueError, KeyError, TypeError, RecursionError) as error:
                 # Also of errors of pydantic and of kcal, both of which are values that cannot be.
@@ -206,10 +195,10 @@ class Journal:
             raise FileError(f"{self.path}: not a log of `kcal mark`, or nothing of it can be read; give another -o")
         self.notes += [f"{self.path}: {text}" for text in damaged]
 
-    def _named(self, action: Change | Step) -> Change | Step:
+    def _named(self, action: marking.Change | marking.Step) -> marking.Change | marking.Step:
         """The action; marks of a thing whose own line was lost bring the thing back."""
-        if isinstance(action, Put) and action.name not in self.state.items:
-            states, _ = self._after(Add(do="add", name=action.name, kind="target"))
+        if isinstance(action, marking.Put) and action.name not in self.state.items:
+            states, _ = self._after(marking.Add(do="add", name=action.name, kind="target"))
             self._states[-1] = states[-1]
         return action
 
@@ -228,7 +217,7 @@ class SurveyedPlaces(NamedTuple):
     """Places by name, and which three columns their coordinates stand in."""
 
     columns: tuple[str, str, str]
-    places: Mapping[str, Place]
+    places: Mapping[str, marking.Place]
 
 
 NO_PLACES = SurveyedPlaces(EARTH, {})
@@ -248,7 +237,7 @@ def read_places(path: Path) -> SurveyedPlaces:
     places = {}
     for row in rows:
         first, second, third = (row.number(column) for column in columns)
-        places[row.name] = Place(
+        places[row.name] = marking.Place(
             at=(first, second, third), sigma=row.number("sigma"), sigma_up=row.positive("sigma_up")
         )
     return SurveyedPlaces(columns, places)
@@ -263,7 +252,7 @@ def places_text(survey: SurveyedPlaces) -> str:
 
 # The files of a session: marks, points and landmarks as CSV, rewritten after every action, and the undo log.
 
-_MARKED: tuple[Kind, ...] = ("landmark", "feature")
+_MARKED: tuple[marking.Kind, ...] = ("landmark", "feature")
 _LOADED = "loaded from a file"
 
 
@@ -326,7 +315,7 @@ class Session:
             raise
 
     @property
-    def state(self) -> MarkingState:
+    def state(self) -> marking.MarkingState:
         """The present one."""
         return self._journal.state
 
@@ -340,7 +329,7 @@ class Session:
         """Whether there is something to undo and something to redo."""
         return self._journal.can_undo, self._journal.can_redo
 
-    def do(self, action: Change | Step, key: str) -> MarkingState:
+    def do(self, action: marking.Change | marking.Step, key: str) -> marking.MarkingState:
         """Apply an action, write the log and the files, and return the new state; see `Journal.do`.
 
         What is in the log is done. Files that cannot be written then are written after a later action, or at the next
@@ -358,7 +347,7 @@ class Session:
                 self._write()
             self._journal.close()
 
-    def marks(self, *kinds: Kind, single: bool = True) -> Marks:
+    def marks(self, *kinds: marking.Kind, single: bool = True) -> Marks:
         """The marks of these kinds; of things marked in both images only, if not `single`."""
         return marks_of(self.state, kinds, single=single)
 
@@ -388,12 +377,12 @@ class Session:
             columns = read_places(self.files.landmarks).columns
         new = {name: place for name, place in places.places.items() if self.state.survey.get(name) != place}
         if new:
-            self._journal.do(Places(do="places", places=new), f"{_LOADED} {self.version}")
+            self._journal.do(marking.Places(do="places", places=new), f"{_LOADED} {self.version}")
         return columns
 
     def _take_over_changes(self) -> None:
         """Load files of marks that are not as any action of the log left them."""
-        groups: tuple[tuple[Path, tuple[Kind, ...], bool], ...] = (
+        groups: tuple[tuple[Path, tuple[marking.Kind, ...], bool], ...] = (
             (self.files.marks, _MARKED, True), (self.files.points, ("target",), False),
         )  # fmt: skip
         for path, kinds, single in groups:
@@ -410,12 +399,12 @@ class Session:
                 continue
             self._journal.do(self._load(read_marks(path, single=single), kinds), f"{_LOADED} {self.version}")
 
-    def _load(self, marks: Marks, kinds: tuple[Kind, ...]) -> Load:
-        items: dict[str, tuple[Kind, Mark | None, Mark | None]] = {}
+    def _load(self, marks: Marks, kinds: tuple[marking.Kind, ...]) -> marking.Load:
+        items: dict[str, tuple[marking.Kind, marking.Mark | None, marking.Mark | None]] = {}
         covariance = marks.covariance_or(self.hand_sigma)
         for row, name in enumerate(marks.names):
             old = self.state.items.get(name)
-            kind: Kind = old.kind if old is not None and old.kind in kinds else kinds[-1]
+            kind: marking.Kind = old.kind if old is not None and old.kind in kinds else kinds[-1]
             both = []
             for side, pixel in enumerate((marks.left[row], marks.right[row])):
                 block = (
@@ -425,16 +414,16 @@ class Session:
                 )
                 cov = (float(block[0, 0]), float(block[0, 1]), float(block[1, 1]))
                 seen = bool(torch.isfinite(pixel).all())
-                both.append(Mark(u=float(pixel[0]), v=float(pixel[1]), cov=cov, how="file") if seen else None)
+                both.append(marking.Mark(u=float(pixel[0]), v=float(pixel[1]), cov=cov, how="file") if seen else None)
             items[name] = (kind, both[0], both[1])
         # Landmarks without marks stay where they are.
         for name, item in self.state.items.items():
             if item.kind in kinds and name not in items and name in self.state.survey:
                 items[name] = (item.kind, None, None)
-        return Load(do="load", items=items, kinds=kinds)
+        return marking.Load(do="load", items=items, kinds=kinds)
 
 
-def marks_of(state: MarkingState, kinds: tuple[Kind, ...], *, single: bool = True) -> Marks:
+def marks_of(state: marking.MarkingState, kinds: tuple[marking.Kind, ...], *, single: bool = True) -> Marks:
     """Marks of the things of some kinds, with their covariance where both images have one."""
     chosen = {
         name: item
@@ -442,7 +431,7 @@ def marks_of(state: MarkingState, kinds: tuple[Kind, ...], *, single: bool = Tru
         if item.kind in kinds and (item.left and item.right if not single else item.left or item.right)
     }
 
-    def pixels(side: Side) -> Tensor:
+    def pixels(side: marking.Side) -> Tensor:
         found = [item.mark(side) for item in chosen.values()]
         rows = [(math.nan, math.nan) if mark is None else (mark.u, mark.v) for mark in found]
         return torch.tensor(rows, dtype=torch.float64).reshape(-1, 2)
@@ -451,7 +440,7 @@ def marks_of(state: MarkingState, kinds: tuple[Kind, ...], *, single: bool = Tru
     return Marks(tuple(chosen), pixels("left"), pixels("right"), covariance)
 
 
-def pair_covariance(item: Item) -> Tensor:
+def pair_covariance(item: marking.Item) -> Tensor:
     """(4, 4) px² of left u, v and right u, v; NaN where it is not marked.
 
     A mark that was matched has the error of the mark that it was matched to, and that of the match besides.

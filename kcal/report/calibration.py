@@ -18,6 +18,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
+import kcal.report.figures as figures
 from kcal.calibrate.camera.advice import reached, unreached_share
 from kcal.calibrate.camera.calibrate import CameraCalibrationResult
 from kcal.calibrate.camera.interval_check import IntervalCheck
@@ -26,20 +27,6 @@ from kcal.corners.images import read_gray, to_8bit
 from kcal.corners.observations import Observations, View
 from kcal.errors import FileError
 from kcal.lens.uncertainty import image_sigma
-from kcal.report.figures import (
-    ACCENT,
-    FAINT,
-    GRAY,
-    HALO,
-    INK,
-    WARN,
-    draw_arrows,
-    frame_image,
-    new_figure,
-    round_levels,
-    save_picture,
-    shortened,
-)
 from kcal.texts import measured_text
 from kcal.threads import in_one_thread
 
@@ -85,7 +72,7 @@ def calibration_figure(result: CameraCalibrationResult, name: str = "") -> Figur
     wide = 5.9  # inches, as all of the following
     tall = wide * observations.image_size[1] / observations.image_size[0]
     size = 13.5, 4.75 + tall
-    figure = new_figure(*size)
+    figure = figures.new_figure(*size)
 
     def axes(left: float, bottom: float, across: float, up: float) -> Axes:
         return figure.add_axes((left / size[0], bottom / size[1], across / size[0], up / size[1]))
@@ -94,7 +81,7 @@ def calibration_figure(result: CameraCalibrationResult, name: str = "") -> Figur
     draw_coverage(images[0], observations, result)
     draw_uncertainty(images[1], observations, result)
     for drawn in images:
-        frame_image(drawn, observations.image_size, margin=0.005)
+        figures.frame_image(drawn, observations.image_size, margin=0.005)
         drawn.set(xticks=[], yticks=[], xlabel="", ylabel="")
         drawn.spines[:].set_visible(False)
     draw_residuals(axes(0.95, 0.75, 2.5, 2.5), result)
@@ -103,19 +90,19 @@ def calibration_figure(result: CameraCalibrationResult, name: str = "") -> Figur
         drawn.set_title(drawn.get_title(loc="left") or drawn.get_title(), fontsize=12, loc="left")
         drawn.set_title("", loc="center")
     model = "" if result.hybrid is not None else f", model {result.camera.model}"
-    whose = f"{shortened(name, 60)}: " if name else ""
+    whose = f"{figures.shortened(name, 60)}: " if name else ""
     total = len(observations.views)
     used = total - len({view.view for view in result.rejected_views})
     views = f"{used} of {total} views" if used < total else f"{total} views"
     text = f"{whose}{views}{model}, RMS {result.rms:.3f} px"
     place = 0.3 / size[0], 1.0 - 0.2 / size[1]
-    figure.text(*place, text, ha="left", va="top", fontsize=17, fontweight="bold", color=INK)
+    figure.text(*place, text, ha="left", va="top", fontsize=17, fontweight="bold", color=figures.INK)
     return figure
 
 
 def save_calibration_picture(path: str | Path, result: CameraCalibrationResult, name: str = "") -> Path:
     """Write the picture of `calibration_figure` as PNG or SVG, atomically."""
-    return save_picture(path, calibration_figure(result, name))
+    return figures.save_picture(path, calibration_figure(result, name))
 
 
 def draw_coverage(axes: Axes, observations: Observations, result: CameraCalibrationResult) -> None:
@@ -126,26 +113,26 @@ def draw_coverage(axes: Axes, observations: Observations, result: CameraCalibrat
     # Views that were left out have corners and no residuals.
     seen = np.isfinite(pixels + errors).all(-1)
     where, error = pixels[seen], errors[seen]
-    axes.add_patch(Rectangle((-0.5, -0.5), width, height, fill=False, edgecolor=INK, linewidth=1.2))
+    axes.add_patch(Rectangle((-0.5, -0.5), width, height, fill=False, edgecolor=figures.INK, linewidth=1.2))
     view = np.broadcast_to(np.arange(len(pixels))[:, None], seen.shape)[seen]
     # A typical residual is drawn as long as a sixtieth of the image.
     wanted = width / 60 / max(float(np.sqrt(np.mean(error**2))), 1e-9)
-    scale = draw_arrows(axes, where, error, wanted, view, cmap="turbo", width=0.0015)
+    scale = figures.draw_arrows(axes, where, error, wanted, view, cmap="turbo", width=0.0015)
     axes.scatter(where[:, 0], where[:, 1], c=view, cmap="turbo", s=4, linewidths=0)
     grid = result.camera.grid(97, 73)
     valid = result.camera.unproject(grid)[1].numpy()
     if not valid.all():
-        axes.contourf(*grid.unbind(-1), ~valid, levels=[0.5, 1.5], colors=[WARN], alpha=0.25)
-        axes.text(0.02, 0.02, "shaded: no valid ray", transform=axes.transAxes, color=WARN, fontsize=9)
-    frame_image(axes, observations.image_size, margin=0.03)
+        axes.contourf(*grid.unbind(-1), ~valid, levels=[0.5, 1.5], colors=[figures.WARN], alpha=0.25)
+        axes.text(0.02, 0.02, "shaded: no valid ray", transform=axes.transAxes, color=figures.WARN, fontsize=9)
+    figures.frame_image(axes, observations.image_size, margin=0.03)
     axes.set_title(f"Corners, one color per view; arrows: observed minus modeled, x {scale:g}", fontsize=10, loc="left")
 
 
 def draw_uncertainty(axes: Axes, observations: Observations, result: CameraCalibrationResult) -> None:
     """Draw σ of far directions over the image."""
     width, height = observations.image_size
-    frame_image(axes, observations.image_size, margin=0.03)
-    axes.add_patch(Rectangle((-0.5, -0.5), width, height, fill=False, edgecolor=INK, linewidth=1.2))
+    figures.frame_image(axes, observations.image_size, margin=0.03)
+    axes.add_patch(Rectangle((-0.5, -0.5), width, height, fill=False, edgecolor=figures.INK, linewidth=1.2))
     known = result.camera.calibration
     if known is None or known.known(result.camera.params) is None:
         axes.set_title("No covariance: σ in the image is not known", fontsize=10, loc="left")
@@ -155,7 +142,7 @@ def draw_uncertainty(axes: Axes, observations: Observations, result: CameraCalib
     places = result.camera.grid(columns, rows).numpy()
     good = np.isfinite(sigma)
     low, high = np.quantile(sigma[good], [0.0, 0.98])
-    levels = round_levels(max(low, 1e-6), max(high, 2e-6))
+    levels = figures.round_levels(max(low, 1e-6), max(high, 2e-6))
     shown = axes.contourf(
         places[..., 0], places[..., 1], np.where(good, sigma, np.nan), levels=levels, cmap="viridis_r",
         norm=LogNorm(levels[0], levels[-1]), extend="both",
@@ -165,7 +152,7 @@ def draw_uncertainty(axes: Axes, observations: Observations, result: CameraCalib
     seen = reached(observations, 4 * columns, 4 * rows).numpy()
     if not seen.all():
         x, y = (np.linspace(-0.5, size - 0.5, count) for size, count in ((width, 4 * columns), (height, 4 * rows)))
-        axes.contour(x, y, seen, levels=[0.5], colors=INK, linewidths=1.0, linestyles="dashed")
+        axes.contour(x, y, seen, levels=[0.5], colors=figures.INK, linewidths=1.0, linestyles="dashed")
     axes.set_title("σ of far directions, pixels; dashed: what boards reached", fontsize=10, loc="left")
     axes.figure.colorbar(shown, ax=axes, fraction=COLORBAR_SHARE - 0.02, pad=0.02, format="%g")
 
@@ -176,28 +163,30 @@ def draw_residuals(axes: Axes, result: CameraCalibrationResult) -> None:
     error = error[np.isfinite(error).all(-1)]
     sigma = float(np.sqrt(np.mean(error**2)))
     limit = max(5.0 * sigma, 1e-9)
-    axes.scatter(error[:, 0], error[:, 1], s=5, color=ACCENT, alpha=0.45, linewidths=0)
+    axes.scatter(error[:, 0], error[:, 1], s=5, color=figures.ACCENT, alpha=0.45, linewidths=0)
     turn = np.linspace(0, 2 * np.pi, 200)
     # 95 % of a circular Gaussian lie within 2.45 σ.
-    axes.plot(2.448 * sigma * np.cos(turn), 2.448 * sigma * np.sin(turn), color=INK, linewidth=1)
+    axes.plot(2.448 * sigma * np.cos(turn), 2.448 * sigma * np.sin(turn), color=figures.INK, linewidth=1)
     outside = float(np.mean(np.hypot(*error.T) > 2.448 * sigma))
-    axes.axhline(0, color=FAINT, linewidth=0.6)
-    axes.axvline(0, color=FAINT, linewidth=0.6)
+    axes.axhline(0, color=figures.FAINT, linewidth=0.6)
+    axes.axvline(0, color=figures.FAINT, linewidth=0.6)
     axes.set(xlim=(-limit, limit), ylim=(limit, -limit), aspect="equal", xlabel="u, pixels", ylabel="v, pixels")
     axes.locator_params(nbins=5)
     axes.set_title(f"Residuals: σ {sigma:.3f} px per axis", fontsize=10, loc="left")
     text = f"{100 * outside:.1f} % outside the 95 % circle"
-    axes.text(0.03, 0.97, text, transform=axes.transAxes, fontsize=9, color=INK, va="top", path_effects=HALO)
+    axes.text(
+        0.03, 0.97, text, transform=axes.transAxes, fontsize=9, color=figures.INK, va="top", path_effects=figures.HALO
+    )
 
 
 def draw_view_rms(axes: Axes, observations: Observations, result: CameraCalibrationResult) -> None:
     """Draw the RMS of each view as bars."""
     rms = result.per_view_rms.numpy()
     typical = float(np.nanmedian(rms))
-    colors = [WARN if value > 2 * typical else ACCENT for value in rms]
+    colors = [figures.WARN if value > 2 * typical else figures.ACCENT for value in rms]
     place = np.arange(len(rms))
     axes.bar(place, rms, color=colors, width=0.8)
-    axes.axhline(typical, color=INK, linewidth=0.8)
+    axes.axhline(typical, color=figures.INK, linewidth=0.8)
     axes.set_ylabel("RMS, pixels")
     axes.set_title("RMS of each view; line: median", fontsize=10, loc="left")
     if len(rms) <= 40:
@@ -239,28 +228,30 @@ def board_figure(board: MeasuredBoard) -> Figure:
     heights = 1e3 * board.displacements(1e-3 * places)[:, 2].view(down, _ACROSS).numpy()
     moved = 1e3 * board.displacements()[:, :2].numpy()
     square = 1e3 * board.board.square
-    figure = new_figure(9.0, min(12.0, 7.4 * (tall + 2 * square) / (wide + 2 * square) + 2.0))
+    figure = figures.new_figure(9.0, min(12.0, 7.4 * (tall + 2 * square) / (wide + 2 * square) + 2.0))
     axes = figure.add_axes((0.08, 0.08, 0.78, 0.9 - 1.25 / figure.get_figheight()))
     most = max(float(np.abs(heights).max()), _LEAST)
     levels = MaxNLocator(nbins=20, symmetric=True).tick_values(-1.0001 * most, 1.0001 * most)
     drawn = axes.contourf(x.numpy(), y.numpy(), heights, levels=levels, cmap="RdBu_r", alpha=0.8)
     beside = axes.inset_axes((1.02, 0.0, 0.025, 1.0))
     figure.colorbar(drawn, cax=beside, label="height, mm (positive: away from the cameras)", ticks=levels[::2])
-    axes.plot(corners[:, 0], corners[:, 1], ".", color=GRAY, markersize=3)
+    axes.plot(corners[:, 0], corners[:, 1], ".", color=figures.GRAY, markersize=3)
     longest = max(float(np.linalg.norm(moved, axis=-1).max()), _LEAST)
     # The longest arrow is about as long as the corners are apart.
-    scale = draw_arrows(axes, corners[:, :2].numpy(), moved, 0.9 * square / longest, color=INK, width=0.0028)
+    scale = figures.draw_arrows(
+        axes, corners[:, :2].numpy(), moved, 0.9 * square / longest, color=figures.INK, width=0.0028
+    )
     axes.set(xlim=(low[0] - square, high[0] + square), ylim=(high[1] + square, low[1] - square), aspect="equal")
     axes.set(xlabel="x, mm", ylabel="y, mm")
     axes.spines[["top", "right"]].set_visible(False)
     head = [f"{board.name}: {board.board}", *board_text(board), f"arrows: displacement in the plane x {scale:g}"]
-    figure.text(0.08, 1.0 - 0.12 / figure.get_figheight(), "\n".join(head), va="top", fontsize=9, color=INK)
+    figure.text(0.08, 1.0 - 0.12 / figure.get_figheight(), "\n".join(head), va="top", fontsize=9, color=figures.INK)
     return figure
 
 
 def save_board_picture(path: str | Path, board: MeasuredBoard) -> Path:
     """Write a picture of how a measured board differs from the ordered one as PNG or SVG; see `board_figure`."""
-    return save_picture(path, board_figure(board))
+    return figures.save_picture(path, board_figure(board))
 
 
 # Draw where stated intervals contain the truth: maps of the image, from repeated captures.
@@ -293,7 +284,7 @@ def interval_figure(check: IntervalCheck, observations: Observations, title: str
     shown = list(zip(check.ranges, check.coverage, check.shares, strict=True))[:_MOST]
     tall = _WIDE * height / width
     across, down = (_WIDE + _BESIDE) * len(shown) + 1.0, tall + _BELOW + _ABOVE
-    figure = new_figure(across, down)
+    figure = figures.new_figure(across, down)
     places = check.pixels.numpy()
     seen = reached(observations, 256, max(2, round(256 * height / width))).numpy()
     columns, rows = (np.linspace(-0.5, size - 0.5, count) for size, count in ((width, 256), (height, len(seen))))
@@ -309,8 +300,8 @@ def interval_figure(check: IntervalCheck, observations: Observations, title: str
             norm=BoundaryNorm(_LEVELS, 256),
         )
         if not seen.all():
-            axes.contour(columns, rows, seen, levels=[0.5], colors=INK, linewidths=1.0, linestyles="dashed")
-        frame_image(axes, observations.image_size)
+            axes.contour(columns, rows, seen, levels=[0.5], colors=figures.INK, linewidths=1.0, linestyles="dashed")
+        figures.frame_image(axes, observations.image_size)
         axes.set_title(f"{range_label(at)}: {100 * share:.1f} ± {100 * error:.1f} %", fontsize=10, loc="left")
         if i:
             axes.set(ylabel="")
@@ -318,7 +309,7 @@ def interval_figure(check: IntervalCheck, observations: Observations, title: str
     figure.colorbar(drawn, cax=beside, format=lambda value, _: f"{100 * value:g} %", ticks=_LEVELS)
     text = f"{title}\n" if title else ""
     text += f"Share of {len(check.errors)} refits within the stated 95 % ellipse; dashed: what boards reached"
-    figure.text(0.2 / across, 1.0 - 0.1 / down, text, va="top", fontsize=10, color=INK)
+    figure.text(0.2 / across, 1.0 - 0.1 / down, text, va="top", fontsize=10, color=figures.INK)
     return figure
 
 
@@ -329,7 +320,7 @@ def save_interval_picture(path: str | Path, check: IntervalCheck, observations: 
         InputError: a suffix other than .png and .svg.
         FileError: the file cannot be written.
     """
-    return save_picture(path, interval_figure(check, observations, title))
+    return figures.save_picture(path, interval_figure(check, observations, title))
 
 
 # Draw a detection: every view with its corners, worst first, and where in the image corners were seen.
@@ -381,7 +372,7 @@ def gallery_figure(observations: Observations, failed: Sequence[FailedImage] = (
     foot = 0.22 * len(listed) + 0.15
     gap = 0.32 + (0.35 if drawn else 0.0)  # room for reasons
     tall = down * (3.6 * height / width + gap) + 0.7 + foot
-    figure = new_figure(3.6 * across + 0.3, tall, dpi=110)
+    figure = figures.new_figure(3.6 * across + 0.3, tall, dpi=110)
     between = gap / (3.6 * height / width)
     grid = figure.add_gridspec(
         down, across, left=0.02, right=0.98, top=1 - 0.7 / tall, bottom=foot / tall, hspace=between, wspace=0.04
@@ -397,9 +388,9 @@ def gallery_figure(observations: Observations, failed: Sequence[FailedImage] = (
         title += f" ({_MOST_VIEWS} are shown)"
     if observations.failures:
         title += f"; without a board: {len(observations.failures)}"
-    figure.text(0.02, 1 - 0.25 / tall, title, fontsize=13, color=INK, va="center")
+    figure.text(0.02, 1 - 0.25 / tall, title, fontsize=13, color=figures.INK, va="center")
     for row, text in enumerate(listed):
-        figure.text(0.02, (foot - 0.15 - 0.22 * row) / tall, text[:130], fontsize=8, color=WARN, va="center")
+        figure.text(0.02, (foot - 0.15 - 0.22 * row) / tall, text[:130], fontsize=8, color=figures.WARN, va="center")
     return figure
 
 
@@ -423,7 +414,7 @@ def coverage_figure(observations: Observations) -> Figure:
             v[mine], u[mine], bins=(rows, columns), range=((-0.5, height - 0.5), (-0.5, width - 0.5))
         )
         cells += once > 0
-    figure = new_figure(9.0, 9.0 * height / width * 0.86 + 1.2)
+    figure = figures.new_figure(9.0, 9.0 * height / width * 0.86 + 1.2)
     axes = figure.add_subplot()
     figure.subplots_adjust(left=0.07, right=0.99, bottom=0.09, top=0.9)
     axes.imshow(
@@ -435,10 +426,10 @@ def coverage_figure(observations: Observations) -> Figure:
     )
     if outside.any():
         hatched = axes.contourf(x, y, outside, levels=[0.5, 1.5], colors="none", hatches=["///"])
-        hatched.set_edgecolor((WARN, 0.5))
+        hatched.set_edgecolor((figures.WARN, 0.5))
         hatched.set_linewidth(0.0)
     axes.scatter(u, v, c=views, cmap="turbo", s=7, linewidths=0)
-    frame_image(axes, observations.image_size)
+    figures.frame_image(axes, observations.image_size)
     share = 100.0 * (1.0 - unreached_share(observations))
     axes.set_title(
         f"{len(pixels)} views, {int(seen.sum())} corners; boards reached {share:.0f} % of the image, hatched: not",
@@ -450,12 +441,12 @@ def coverage_figure(observations: Observations) -> Figure:
 
 def save_gallery(path: str | Path, observations: Observations, failed: Sequence[FailedImage] = ()) -> Path:
     """Write a picture of failed images and of views with their corners as PNG or SVG; see `gallery_figure`."""
-    return save_picture(path, gallery_figure(observations, failed))
+    return figures.save_picture(path, gallery_figure(observations, failed))
 
 
 def save_coverage(path: str | Path, observations: Observations) -> Path:
     """Write a picture of where in the image corners were seen as PNG or SVG; see `coverage_figure`."""
-    return save_picture(path, coverage_figure(observations))
+    return figures.save_picture(path, coverage_figure(observations))
 
 
 def _order(views: Sequence[View]) -> tuple[list[int], int]:
@@ -481,16 +472,16 @@ def _draw_view(axes: Axes, observations: Observations, view: View) -> None:
     axes.imshow(_thumbnail(view.image, (width, height)), cmap="gray", vmin=0, vmax=255, extent=whole)
     places = np.array([(math.nan, math.nan) if pixel is None else pixel for pixel in view.pixels])
     first = places[: observations.board.columns]
-    axes.plot(first[:, 0], first[:, 1], color=ACCENT, linewidth=1.2)
-    axes.scatter(places[:, 0], places[:, 1], s=9, color=WARN, linewidths=0)
-    axes.scatter(places[:1, 0], places[:1, 1], s=60, facecolors="none", edgecolors=ACCENT, linewidths=1.6)
-    frame_image(axes, (width, height))
+    axes.plot(first[:, 0], first[:, 1], color=figures.ACCENT, linewidth=1.2)
+    axes.scatter(places[:, 0], places[:, 1], s=9, color=figures.WARN, linewidths=0)
+    axes.scatter(places[:1, 0], places[:1, 1], s=60, facecolors="none", edgecolors=figures.ACCENT, linewidths=1.6)
+    figures.frame_image(axes, (width, height))
     axes.set(xticks=[], yticks=[], xlabel="", ylabel="")
     sigma, unseen = _predicted_sigma(view), view.pixels.count(None)
     text = view.name if len(view.name) <= 34 else "…" + view.name[-33:]
     text += f"  σ {sigma:.3f} px" if sigma is not None else ""
     text += f"  {unseen} left out" if unseen else ""
-    axes.set_title(text, fontsize=8.5, loc="left", pad=3, color=WARN if unseen else INK)
+    axes.set_title(text, fontsize=8.5, loc="left", pad=3, color=figures.WARN if unseen else figures.INK)
 
 
 def _draw_failed(axes: Axes, failed: FailedImage, size: tuple[int, int]) -> None:
@@ -499,14 +490,14 @@ def _draw_failed(axes: Axes, failed: FailedImage, size: tuple[int, int]) -> None
     axes.imshow(_thumbnail(failed.path, size), cmap="gray", vmin=0, vmax=255, extent=whole)
     if failed.rejected is not None:
         u, v = failed.rejected.numpy().T
-        axes.scatter(u, v, s=16, marker="x", color=WARN, linewidths=1.0)
-    frame_image(axes, size)
+        axes.scatter(u, v, s=16, marker="x", color=figures.WARN, linewidths=1.0)
+    figures.frame_image(axes, size)
     axes.set(xticks=[], yticks=[], xlabel="", ylabel="")
     for spine in axes.spines.values():
-        spine.set(visible=True, color=WARN, linewidth=2.0)
+        spine.set(visible=True, color=figures.WARN, linewidth=2.0)
     name = failed.name if len(failed.name) <= 34 else "…" + failed.name[-33:]
     text = textwrap.wrap(f"failed: {name}: {failed.reason}", 66)[:3]
-    axes.set_title("\n".join(text), fontsize=7.5, loc="left", pad=3, color=WARN)
+    axes.set_title("\n".join(text), fontsize=7.5, loc="left", pad=3, color=figures.WARN)
 
 
 def _thumbnail(path: str | Path | None, size: tuple[int, int]) -> npt.NDArray[np.uint8]:

@@ -14,23 +14,11 @@ from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 from torch import Tensor
 
+import kcal.report.figures as figures
 from kcal.errors import InputError
 from kcal.locate.budget import RangeError
 from kcal.locate.positions import Located, Position, field_azimuths, region_outline
 from kcal.locate.stereo import PositionStatus
-from kcal.report.figures import (
-    CAMERA_COLORS,
-    FAINT,
-    GRAY,
-    HALO,
-    INK,
-    WARN,
-    draw_north,
-    field_outline,
-    new_figure,
-    plain_number,
-    save_picture,
-)
 from kcal.report.tables import range_sigma, range_unit
 from kcal.texts import Unit, length_text, range_text
 
@@ -86,7 +74,7 @@ def positions_figure(located: Located, truth: Tensor | None = None) -> Figure:
         raise InputError(f"truth: shape ({len(located.positions)}, 3) is needed, got {true_enu.shape}")
     shown = [i for i, position in enumerate(located.positions) if position.range_low_m is not None]
     scale = _RangeScale(located, true_enu)
-    figure = new_figure(13.0, 7.4)
+    figure = figures.new_figure(13.0, 7.4)
     plan, ranges = figure.subplots(1, 2, width_ratios=[1.45, 1.0])
     _draw_map(plan, located, true_enu, shown, scale)
     _draw_ranges(ranges, located, true_enu, shown)
@@ -97,7 +85,7 @@ def positions_figure(located: Located, truth: Tensor | None = None) -> Figure:
         ha="left",
         fontsize=14,
     )
-    figure.text(0.015, 0.02, _interval_footer(located), fontsize=9, color=GRAY, va="bottom", linespacing=1.4)
+    figure.text(0.015, 0.02, _interval_footer(located), fontsize=9, color=figures.GRAY, va="bottom", linespacing=1.4)
     figure.subplots_adjust(left=0.015, right=0.975, top=0.91, bottom=0.17, wspace=0.14)
     return figure
 
@@ -109,7 +97,7 @@ def save_positions_picture(path: str | Path, located: Located, truth: Tensor | N
         InputError: a suffix other than .png and .svg, or a truth of the wrong shape.
         FileError: the file cannot be written.
     """
-    return save_picture(path, positions_figure(located, truth))
+    return figures.save_picture(path, positions_figure(located, truth))
 
 
 class _RangeScale:
@@ -166,21 +154,21 @@ def _draw_map(axes: Axes, located: Located, true_enu: Array | None, shown: list[
     for arc in scale.arcs():
         line = scale.polar(sweep, arc)
         extent.append(line)
-        axes.plot(*line.T, color=FAINT, linewidth=0.8, linestyle=(0, (4, 3)), zorder=1)
+        axes.plot(*line.T, color=figures.FAINT, linewidth=0.8, linestyle=(0, (4, 3)), zorder=1)
         direction = line[-1] - line[-2]
         place = line[-1] + direction / np.hypot(*direction) * 0.012
         turn = (90.0 - sweep[-1]) - 90.0
         turn = (turn + 90) % 180 - 90
         outward = direction[0] >= 0
         axes.text(
-            place[0], place[1], range_text(arc), fontsize=8.5, color=GRAY, rotation=turn, rotation_mode="anchor",
-            ha="left" if outward else "right", va="center",
+            place[0], place[1], range_text(arc), fontsize=8.5, color=figures.GRAY, rotation=turn,
+            rotation_mode="anchor", ha="left" if outward else "right", va="center",
         )  # fmt: skip
-    for camera, color in zip(located.cameras, CAMERA_COLORS, strict=False):
+    for camera, color in zip(located.cameras, figures.CAMERA_COLORS, strict=False):
         foot = np.asarray(camera.enu[:2])
         if camera.azimuths_deg is not None:
             first, last = camera.azimuths_deg
-            wedge = scale.place(field_outline(foot, math.radians(first), math.radians(last), scale.rim))
+            wedge = scale.place(figures.field_outline(foot, math.radians(first), math.radians(last), scale.rim))
             extent.append(wedge)
             axes.fill(*wedge.T, facecolor=color, alpha=0.07, edgecolor="none", zorder=0)
             axes.plot(*wedge.T, color=color, alpha=0.55, linewidth=0.9, zorder=1)
@@ -193,17 +181,23 @@ def _draw_map(axes: Axes, located: Located, true_enu: Array | None, shown: list[
     points = [scale.place(np.asarray(located.positions[i].enu)) for i in shown if located.positions[i].enu]
     if points:
         axes.plot(
-            *np.stack(points).T, "o", color=INK, markerfacecolor="white", markersize=6, zorder=7, label="estimated"
+            *np.stack(points).T,
+            "o",
+            color=figures.INK,
+            markerfacecolor="white",
+            markersize=6,
+            zorder=7,
+            label="estimated",
         )
     if true_enu is not None:
-        axes.plot([], [], "x", color=WARN, markeredgewidth=1.6, label="true (arrow to estimated)")
+        axes.plot([], [], "x", color=figures.WARN, markeredgewidth=1.6, label="true (arrow to estimated)")
     if len(shown) <= _NAMED:
         _draw_names(axes, located, shown, scale, float(sweep[-1]))
     box = np.concatenate(extent)
     (left, bottom), (right, top) = box.min(0) - 0.05, box.max(0) + 0.05
     axes.set(xlim=(left - 0.04, right + 0.08), ylim=(bottom, top), aspect="equal", anchor="C")
     axes.axis("off")
-    draw_north(axes, 0.03)
+    figures.draw_north(axes, 0.03)
     axes.legend(
         loc="upper center", bbox_to_anchor=(0.5, -0.005), ncols=4, fontsize=9, frameon=False, handletextpad=0.3,
         columnspacing=1.4,
@@ -219,7 +213,7 @@ def _draw_sight(axes: Axes, position: Position, scale: _RangeScale) -> None:
     tilt = math.cos(math.radians(position.elevation_deg or 0.0))
     known = position.status == PositionStatus.OK
     start, end = scale.polar(azimuth, low * tilt), scale.polar(azimuth, min(high * tilt, scale.rim))
-    color = INK if known else _UNSURE
+    color = figures.INK if known else _UNSURE
     style = {"linewidth": 2.6, "alpha": 0.45} if known else {"linewidth": 1.4, "linestyle": (0, (3, 2))}
     axes.plot(*np.stack([start, end]).T, color=color, solid_capstyle="butt", zorder=3, **style)
     if high * tilt > scale.rim:
@@ -230,13 +224,13 @@ def _draw_sight(axes: Axes, position: Position, scale: _RangeScale) -> None:
 
 
 def _draw_truth(axes: Axes, position: Position, true: Array, scale: _RangeScale) -> None:
-    axes.plot(*true, "x", color=WARN, markersize=7, markeredgewidth=1.6, zorder=8)
+    axes.plot(*true, "x", color=figures.WARN, markersize=7, markeredgewidth=1.6, zorder=8)
     if position.enu is not None:
         estimate = scale.place(np.asarray(position.enu))
         if np.hypot(*(estimate - true)) > 0.012:
             axes.annotate(
                 "", _xy(estimate), _xy(true), zorder=8,
-                arrowprops={"arrowstyle": "->", "color": WARN, "linewidth": 1.3, "shrinkA": 0, "shrinkB": 2},
+                arrowprops={"arrowstyle": "->", "color": figures.WARN, "linewidth": 1.3, "shrinkA": 0, "shrinkB": 2},
             )  # fmt: skip
 
 
@@ -257,7 +251,7 @@ def _draw_names(axes: Axes, located: Located, shown: list[int], scale: _RangeSca
         side = -1 if crowded or labeled else 1
         axes.annotate(
             located.positions[i].name, _xy(anchor), (8 * side, 0), textcoords="offset points", fontsize=9, zorder=9,
-            ha="left" if side > 0 else "right", va="center", path_effects=HALO,
+            ha="left" if side > 0 else "right", va="center", path_effects=figures.HALO,
         )  # fmt: skip
 
 
@@ -270,20 +264,20 @@ def _draw_ranges(axes: Axes, located: Located, true_enu: Array | None, shown: li
     limit = min(max([0.02, *finite]) * 1.3, 2.0)
     for row, (i, (low, high, true)) in enumerate(zip(order, spans, strict=True)):
         position = located.positions[i]
-        color = INK if position.status == PositionStatus.OK else _UNSURE
+        color = figures.INK if position.status == PositionStatus.OK else _UNSURE
         ends = max(low, -limit), min(high, limit)
         axes.plot(ends, [row, row], color=color, linewidth=5, alpha=0.4, solid_capstyle="butt")
         if high > limit:
             axes.plot(limit, row, ">", color=color, markersize=7, clip_on=False)
         if position.range_m is not None:
-            axes.plot(0.0, row, "o", color=INK, markerfacecolor="white", markersize=6, zorder=3)
+            axes.plot(0.0, row, "o", color=figures.INK, markerfacecolor="white", markersize=6, zorder=3)
         if true is not None:
             beyond = abs(true) > limit
             axes.plot(
                 math.copysign(min(abs(true), limit), true),
                 row,
                 (">" if true > 0 else "<") if beyond else "x",
-                color=WARN,
+                color=figures.WARN,
                 markersize=7,
                 markeredgewidth=1.6,
                 zorder=4,
@@ -346,7 +340,7 @@ def stations_figure(located: Located, truth: Tensor | None = None) -> Figure:
         located: from `kcal.locate.station_positions.locate_views`.
         truth: (N, 3) true east, north, up in meters, NaN where unknown.
     """
-    figure = new_figure(8.0, 7.0)
+    figure = figures.new_figure(8.0, 7.0)
     axes = figure.add_subplot()
     towers = torch.tensor([camera.enu[:2] for camera in located.cameras], dtype=torch.float64)
     found = located.enu[located.enu.isfinite().all(-1)]
@@ -393,7 +387,7 @@ def save_stations_picture(path: str | Path, located: Located, truth: Tensor | No
         InputError: another suffix.
         FileError: the file cannot be written.
     """
-    return save_picture(path, stations_figure(located, truth))
+    return figures.save_picture(path, stations_figure(located, truth))
 
 
 # Draw a depth budget: range errors against range, on logarithmic scales.
@@ -426,7 +420,7 @@ def budget_figure(distances: Tensor, found: dict[str, RangeError], labels: dict[
         found: errors by source, from `range_errors`.
         labels: source -> text in the legend.
     """
-    figure = new_figure(8.6, 6.0)
+    figure = figures.new_figure(8.6, 6.0)
     axes = figure.add_subplot()
     far = distances.numpy()
     for name, error in found.items():
@@ -444,8 +438,8 @@ def budget_figure(distances: Tensor, found: dict[str, RangeError], labels: dict[
     axes.set_ylim(max(low, 1e-4), float(far.max()) * 2)
     for axis in (axes.xaxis, axes.yaxis):
         low, high = axis.get_view_interval()
-        axis.set_major_formatter(plain_number)
-        axis.set_minor_formatter(NullFormatter() if high > 10 * low else plain_number)
+        axis.set_major_formatter(figures.plain_number)
+        axis.set_minor_formatter(NullFormatter() if high > 10 * low else figures.plain_number)
     axes.grid(which="major", color="#e5e7eb", linewidth=0.8)
     axes.grid(which="minor", color="#f3f4f6", linewidth=0.5)
     axes.set_axisbelow(True)
@@ -460,4 +454,4 @@ def save_budget_picture(
     path: str | Path, distances: Tensor, found: dict[str, RangeError], labels: dict[str, str]
 ) -> Path:
     """Write a picture of range errors over the distance as PNG or SVG; see `budget_figure`."""
-    return save_picture(path, budget_figure(distances, found, labels))
+    return figures.save_picture(path, budget_figure(distances, found, labels))

@@ -12,35 +12,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+import kcal.sim.coast as shore
 from kcal.sim.board import PrintedBoard
 from kcal.sim.captures import drawn_rig
-from kcal.sim.coast import (
-    BLACK,
-    GRASS,
-    RED,
-    ROCK,
-    WHITE,
-    Coast,
-    Color,
-    Cut,
-    Eye,
-    Facet,
-    backdrop,
-    box_outline,
-    building,
-    cut,
-    exposed,
-    eye,
-    facet_windows,
-    facing,
-    ground,
-    paint,
-    panel,
-    pole,
-    ridge,
-    rotation_of,
-    ship,
-)
 from kcal.sim.scene import FOCAL_MM, DemoScene
 from kcal.sim.truth import TruthLens
 
@@ -154,20 +128,20 @@ class PracticeSite:
         coast: sky, sea and air.
     """
 
-    def __init__(self, scene: DemoScene, coast: Coast | None = None) -> None:
+    def __init__(self, scene: DemoScene, coast: shore.Coast | None = None) -> None:
         self.scene = scene
-        self.coast = coast or Coast()
+        self.coast = coast or shore.Coast()
         self.facets = sorted(self._facets(), key=lambda facet: -facet.distance)
 
     @functools.cached_property
-    def eyes(self) -> dict[Side, Eye]:
+    def eyes(self) -> dict[Side, shore.Eye]:
         """Both cameras, with the lines of sight of all pixels."""
         rig, into_enu = self.scene.rig, self.scene.enu_from_rig
         turn, shift = rig.right_from_left_rotation, rig.right_from_left_translation
-        center = rotation_of(into_enu) @ rotation_of(-turn.T @ shift)
+        center = shore.rotation_of(into_enu) @ shore.rotation_of(-turn.T @ shift)
         return {
-            "left": eye(rig.left, rotation_of(into_enu.T), np.zeros(3)),
-            "right": eye(rig.right, rotation_of(turn @ into_enu.T), center),
+            "left": shore.eye(rig.left, shore.rotation_of(into_enu.T), np.zeros(3)),
+            "right": shore.eye(rig.right, shore.rotation_of(turn @ into_enu.T), center),
         }
 
     def true_pixels(self, side: Side, enu: torch.Tensor | Floats) -> Floats:
@@ -180,16 +154,16 @@ class PracticeSite:
     def light(self, side: Side) -> Floats:
         """The site without ships as light on a sensor, before blur and noise: (H, W, 3) gray levels."""
         camera = self.eyes[side]
-        image = backdrop(camera, self.coast)
-        for facet, window in zip(self.facets, facet_windows(camera, self.facets), strict=True):
+        image = shore.backdrop(camera, self.coast)
+        for facet, window in zip(self.facets, shore.facet_windows(camera, self.facets), strict=True):
             if window is not None:
-                paint(image[window], facet, cut(camera, facet, window), self.coast.haze)
+                shore.paint(image[window], facet, shore.cut(camera, facet, window), self.coast.haze)
         return image
 
     def picture(self, side: Side, noise: float = NOISE) -> NDArray[np.uint8]:
         """The site in color, (H, W, 3), with blur and noise."""
         random = np.random.default_rng([self.scene.seed, SIDES.index(side), 1])
-        return exposed(self.light(side), BLUR, noise, random)
+        return shore.exposed(self.light(side), BLUR, noise, random)
 
     def at(self, distance: float, bearing: float, up: float) -> Floats:
         """East, north, up of a place, as it seems to be."""
@@ -200,61 +174,66 @@ class PracticeSite:
         """A place on the sea, as it seems to be."""
         return self.at(distance, bearing, self.coast.surface(distance))
 
-    def _facets(self) -> list[Facet]:
+    def _facets(self) -> list[shore.Facet]:
         place = {thing.name: self.at(*thing[1:4]) for thing in (*LANDMARKS, *TARGETS)}
         return [*self._land(), *self._landmarks(place), *self._targets(place)]
 
-    def _land(self) -> list[Facet]:
+    def _land(self) -> list[shore.Facet]:
         heading, sea = self.scene.heading_deg, -self.coast.sea
         concrete, gravel = (150.0, 146.0, 138.0), (128.0, 120.0, 106.0)
         return [
-            ridge((-60.0, 75.0), 14000.0, ((0.0, 330.0), (0.2, 180.0), (0.3, -60.0), (0.56, -60.0), (0.68, 120.0),
+            shore.ridge((-60.0, 75.0), 14000.0, ((0.0, 330.0), (0.2, 180.0), (0.3, -60.0), (0.56, -60.0), (0.68, 120.0),
                   (1.0, 420.0)), -34.0,
                   (74.0, 84.0, 92.0), heading=heading, rough=50.0, grain=260.0, seed=3.0),
-            ridge((22.0, 70.0), 3500.0, ((0.0, -25.0), (0.12, 30.0), (0.25, 75.0), (1.0, 160.0)), -25.0,
+            shore.ridge((22.0, 70.0), 3500.0, ((0.0, -25.0), (0.12, 30.0), (0.25, 75.0), (1.0, 160.0)), -25.0,
                   (82.0, 96.0, 74.0), heading=heading, rough=14.0, grain=60.0, seed=8.0),
-            ridge((8.0, 70.0), 2100.0, ((0.0, -22.0), (0.06, 30.0), (0.18, 112.0), (0.3, 80.0), (0.45, 30.0),
-                  (1.0, 60.0)), -22.0, GRASS, heading=heading, rough=12.0, grain=40.0, seed=5.0),
-            ridge((-75.0, -12.0), 2000.0, ((0.0, 120.0), (0.62, 48.0), (0.9, 12.0), (1.0, -24.0)), -22.0,
+            shore.ridge((8.0, 70.0), 2100.0, ((0.0, -22.0), (0.06, 30.0), (0.18, 112.0), (0.3, 80.0), (0.45, 30.0),
+                  (1.0, 60.0)), -22.0, shore.GRASS, heading=heading, rough=12.0, grain=40.0, seed=5.0),
+            shore.ridge((-75.0, -12.0), 2000.0, ((0.0, 120.0), (0.62, 48.0), (0.9, 12.0), (1.0, -24.0)), -22.0,
                   (88.0, 100.0, 76.0), heading=heading, rough=9.0, grain=35.0, seed=1.0),
-            ridge((-75.0, -17.0), 1500.0, ((0.0, 100.0), (0.7, 35.0), (0.93, 16.0), (1.0, -22.0)), -20.0, GRASS,
-                  heading=heading, rough=6.0, grain=25.0, seed=2.0),
-            ridge((1.9, 5.3), 2600.0, ((0.0, -22.0), (0.3, -12.0), (0.6, -10.0), (1.0, -22.0)), -22.0, ROCK,
+            shore.ridge((-75.0, -17.0), 1500.0, ((0.0, 100.0), (0.7, 35.0), (0.93, 16.0), (1.0, -22.0)), -20.0,
+                  shore.GRASS, heading=heading, rough=6.0, grain=25.0, seed=2.0),
+            shore.ridge((1.9, 5.3), 2600.0, ((0.0, -22.0), (0.3, -12.0), (0.6, -10.0), (1.0, -22.0)), -22.0, shore.ROCK,
                   heading=heading, rough=3.0, grain=18.0, seed=6.0),
-            ridge((-16.0, -7.6), 1160.0, ((0.0, -14.0), (0.95, -14.5), (1.0, -19.0)), sea - 1, ROCK, heading=heading,
-                  rough=1.2, grain=4.0, seed=9.0),
-            ridge((10.5, 18.5), 905.0, ((0.0, -19.0), (0.15, -14.0), (0.85, -13.0), (1.0, -19.0)), sea - 1, ROCK,
-                  heading=heading, rough=1.5, grain=5.0, seed=4.0),
-            ridge((-16.0, -9.5), 655.0, ((0.0, -19.0), (0.2, -15.0), (0.8, -14.0), (1.0, -19.0)), sea - 1, ROCK,
-                  heading=heading, rough=1.2, grain=4.0, seed=7.0),
-            *ground((-420.0, 150.0, -10.0, 385.0), _QUAY, gravel, heading=heading),
-            *ground((130.0, 190.0, 420.0, 450.0), _QUAY, gravel, heading=heading),
-            *ground((-300.0, 15.0, 300.0, 205.0), _QUAY, concrete, heading=heading),
+            shore.ridge((-16.0, -7.6), 1160.0, ((0.0, -14.0), (0.95, -14.5), (1.0, -19.0)), sea - 1, shore.ROCK,
+                  heading=heading, rough=1.2, grain=4.0, seed=9.0),
+            shore.ridge((10.5, 18.5), 905.0, ((0.0, -19.0), (0.15, -14.0), (0.85, -13.0), (1.0, -19.0)), sea - 1,
+                  shore.ROCK, heading=heading, rough=1.5, grain=5.0, seed=4.0),
+            shore.ridge((-16.0, -9.5), 655.0, ((0.0, -19.0), (0.2, -15.0), (0.8, -14.0), (1.0, -19.0)), sea - 1,
+                  shore.ROCK, heading=heading, rough=1.2, grain=4.0, seed=7.0),
+            *shore.ground((-420.0, 150.0, -10.0, 385.0), _QUAY, gravel, heading=heading),
+            *shore.ground((130.0, 190.0, 420.0, 450.0), _QUAY, gravel, heading=heading),
+            *shore.ground((-300.0, 15.0, 300.0, 205.0), _QUAY, concrete, heading=heading),
             *self._harbor(),
             *self._houses(),
         ]  # fmt: skip
 
-    def _harbor(self) -> list[Facet]:
+    def _harbor(self) -> list[shore.Facet]:
         """What stands on the quay."""
         heading, mark, dark = self.scene.heading_deg, (206.0, 204.0, 196.0), (72.0, 76.0, 80.0)
         found = [
-            *ground((-300.0, 203.0, 300.0, 204.2), _QUAY, mark, heading=heading),
-            *ground((-300.0, 15.0, 300.0, 64.0), _QUAY, (86.0, 104.0, 58.0), heading=heading, grain=0.7),
-            *ground((-300.0, 64.0, 300.0, 65.0), _QUAY, (176.0, 172.0, 162.0), heading=heading),
-            *ground((-300.0, 65.0, 300.0, 74.0), _QUAY, (84.0, 86.0, 90.0), heading=heading, grain=0.5),
+            *shore.ground((-300.0, 203.0, 300.0, 204.2), _QUAY, mark, heading=heading),
+            *shore.ground((-300.0, 15.0, 300.0, 64.0), _QUAY, (86.0, 104.0, 58.0), heading=heading, grain=0.7),
+            *shore.ground((-300.0, 64.0, 300.0, 65.0), _QUAY, (176.0, 172.0, 162.0), heading=heading),
+            *shore.ground((-300.0, 65.0, 300.0, 74.0), _QUAY, (84.0, 86.0, 90.0), heading=heading, grain=0.5),
         ]
         found += [
-            part for x in range(-90, 90, 9) for part in ground((x, 69.3, x + 3.0, 69.6), _QUAY, mark, heading=heading)
+            part
+            for x in range(-90, 90, 9)
+            for part in shore.ground((x, 69.3, x + 3.0, 69.6), _QUAY, mark, heading=heading)
         ]
         found += [
-            part for x in range(-60, 60, 6) for part in ground((x, 78.0, x + 0.2, 83.0), _QUAY, mark, heading=heading)
+            part
+            for x in range(-60, 60, 6)
+            for part in shore.ground((x, 78.0, x + 0.2, 83.0), _QUAY, mark, heading=heading)
         ]
         for bearing in (-35.0, -23.0, -15.2, -2.4, 14.6, 24.6, 33.5):
             lamp = self.at(76.0 / math.cos(math.radians(bearing)), bearing, -6.5)
             arm = np.array([[-0.08, -0.1], [1.6, 0.05], [1.6, 0.25], [-0.08, 0.1]])
-            found += [*pole(lamp, 0.16, _QUAY, dark), facing(lamp, arm, dark)]
-        for bearing, color in ((-31.0, RED), (-22.0, WHITE), (-19.5, (44.0, 62.0, 96.0)), (10.6, (60.0, 64.0, 70.0)),
-                               (28.5, WHITE), (1.2, (150.0, 132.0, 60.0))):  # fmt: skip
+            found += [*shore.pole(lamp, 0.16, _QUAY, dark), shore.facing(lamp, arm, dark)]
+        for bearing, color in ((-31.0, shore.RED), (-22.0, shore.WHITE), (-19.5, (44.0, 62.0, 96.0)),
+                               (10.6, (60.0, 64.0, 70.0)),
+                               (28.5, shore.WHITE), (1.2, (150.0, 132.0, 60.0))):  # fmt: skip
             found += _car(self.at(80.0 / math.cos(math.radians(bearing)), bearing, _QUAY), color)
         # A crane at the edge of the quay.
         steel = (198.0, 152.0, 44.0)
@@ -265,13 +244,13 @@ class PracticeSite:
             [(-1.6, 22.0), (2.4, 22.0), (2.4, 25.5), (-1.6, 25.5)],
             [(-1.0, 24.6), (-18.0, 37.6), (-18.4, 36.8), (-1.4, 23.2)],
         ):  # fmt: skip
-            found.append(facing(foot, np.array(shape), steel))
+            found.append(shore.facing(foot, np.array(shape), steel))
         return found
 
-    def _houses(self) -> list[Facet]:
+    def _houses(self) -> list[shore.Facet]:
         """Houses that are no landmarks: so that it looks like a place."""
         random = np.random.default_rng(20)
-        found: list[Facet] = []
+        found: list[shore.Facet] = []
         paints = ((206.0, 198.0, 184.0), (170.0, 84.0, 66.0), (196.0, 168.0, 110.0), (222.0, 222.0, 216.0))
         for bearing, distance, up in (
             (-33.0, 1480.0, 22.0), (-31.0, 1490.0, 16.0), (-29.5, 1470.0, 20.0), (-27.8, 1485.0, 10.0),
@@ -280,7 +259,7 @@ class PracticeSite:
         ):  # fmt: skip
             size = (float(random.uniform(16, 34)), float(random.uniform(10, 18)))
             paint_ = paints[int(random.integers(len(paints)))]
-            found += building(self.at(distance, bearing, up + size[1] / 2), size, paint_, windows=(4.0, 3.4))
+            found += shore.building(self.at(distance, bearing, up + size[1] / 2), size, paint_, windows=(4.0, 3.4))
         rust, green, blue = (158.0, 70.0, 48.0), (92.0, 110.0, 84.0), (58.0, 92.0, 124.0)
         for bearing, distance, color in (
             (-34.0, 150.0, rust), (-32.4, 150.0, green), (-36.5, 160.0, blue),
@@ -288,64 +267,65 @@ class PracticeSite:
             (-21.9, 300.0, rust),
             (-11.5, 280.0, green), (24.5, 250.0, rust), (26.0, 252.0, blue), (31.5, 330.0, (188.0, 184.0, 172.0)),
         ):  # fmt: skip
-            found += building(self.at(distance, bearing, _QUAY + 2.8), (9.0, 2.8), color)
+            found += shore.building(self.at(distance, bearing, _QUAY + 2.8), (9.0, 2.8), color)
         return found
 
-    def _landmarks(self, place: dict[str, Floats]) -> list[Facet]:
+    def _landmarks(self, place: dict[str, Floats]) -> list[shore.Facet]:
         return [
-            *panel(place["panel 1"], 2.4, _QUAY),
-            *panel(place["panel 2"], 3.0, _QUAY),
-            *panel(place["panel 3"], 3.2, _QUAY),
-            *building(place["hut"], (11.0, 6.0), (228.0, 222.0, 208.0), windows=(3.6, 4.4)),
-            *building(place["barn"], (18.0, 7.0), (196.0, 170.0, 120.0), windows=(4.5, 5.0)),
-            *pole(place["chimney"], 1.6, _QUAY, (128.0, 70.0, 56.0)),
-            *building(self.at(424.0, 28.6, -6.0), (24.0, 9.0), (170.0, 160.0, 146.0), windows=(4.0, 4.4)),
-            *building(place["depot"], (26.0, 22.0), (176.0, 88.0, 66.0), windows=(5.0, 5.4)),
-            *building(place["silo"], (30.0, 19.0), (226.0, 224.0, 218.0), side=0.5),
-            *pole(place["beacon"], 2.6, -18.0, BLACK),
-            *pole(place["antenna"], 3.0, 10.0, (110.0, 44.0, 40.0)),
-            *pole(place["hill mast"], 4.0, 90.0, (70.0, 66.0, 70.0)),
-            *pole(place["lighthouse"], 7.0, -16.0, RED),
+            *shore.panel(place["panel 1"], 2.4, _QUAY),
+            *shore.panel(place["panel 2"], 3.0, _QUAY),
+            *shore.panel(place["panel 3"], 3.2, _QUAY),
+            *shore.building(place["hut"], (11.0, 6.0), (228.0, 222.0, 208.0), windows=(3.6, 4.4)),
+            *shore.building(place["barn"], (18.0, 7.0), (196.0, 170.0, 120.0), windows=(4.5, 5.0)),
+            *shore.pole(place["chimney"], 1.6, _QUAY, (128.0, 70.0, 56.0)),
+            *shore.building(self.at(424.0, 28.6, -6.0), (24.0, 9.0), (170.0, 160.0, 146.0), windows=(4.0, 4.4)),
+            *shore.building(place["depot"], (26.0, 22.0), (176.0, 88.0, 66.0), windows=(5.0, 5.4)),
+            *shore.building(place["silo"], (30.0, 19.0), (226.0, 224.0, 218.0), side=0.5),
+            *shore.pole(place["beacon"], 2.6, -18.0, shore.BLACK),
+            *shore.pole(place["antenna"], 3.0, 10.0, (110.0, 44.0, 40.0)),
+            *shore.pole(place["hill mast"], 4.0, 90.0, (70.0, 66.0, 70.0)),
+            *shore.pole(place["lighthouse"], 7.0, -16.0, shore.RED),
         ]
 
-    def _targets(self, place: dict[str, Floats]) -> list[Facet]:
+    def _targets(self, place: dict[str, Floats]) -> list[shore.Facet]:
         hull = (44.0, 40.0, 46.0)
         ferry, freighter = place["ferry"], place["freighter"]
         turbine, yawl = place["turbine"], place["yawl"]
-        blade = box_outline((-2.6, -56.0, 2.6, 0.0))
+        blade = shore.box_outline((-2.6, -56.0, 2.6, 0.0))
         hub = turbine - np.array([0.0, 0.0, 58.0])
         white = (206.0, 208.0, 210.0)
         others = [
-            facing(hub, np.array([[0.0, -2.6], [s * 49.0, -30.9], [s * 47.0, -34.0], [0.0, 2.6]]), white)
+            shore.facing(hub, np.array([[0.0, -2.6], [s * 49.0, -30.9], [s * 47.0, -34.0], [0.0, 2.6]]), white)
             for s in (-1.0, 1.0)
         ]
+        outline = np.array([[-16.0, -30.4], [62.0, -30.4], [68.0, -20.0], [-18.0, -20.0]])
         return [
-            *pole(place["gate"], 0.36, _QUAY, WHITE),
-            *ship(self.sea_at(250.0, 14.5), 10.0, 3, 1.0)[:1],
-            facing(yawl, box_outline((-0.25, -8.0, 0.25, 0.0)), (214.0, 206.0, 190.0)),
-            *pole(place["buoy"], 1.3, -18.4, (226.0, 206.0, 70.0)),
-            facing(ferry, np.array([[-16.0, -30.4], [62.0, -30.4], [68.0, -20.0], [-18.0, -20.0]]), (36.0, 52.0, 88.0)),
-            facing(ferry, box_outline((0.0, -20.5, 52.0, 0.0)), (58.0, 84.0, 136.0)),
-            facing(ferry, box_outline((14.0, -19.0, 50.0, -9.0)), WHITE, windows=(5.0, 5.0)),
-            facing(ferry, box_outline((-12.0, -20.0, -1.0, -15.0)), WHITE),
-            facing(ferry, box_outline((34.0, 0.0, 41.0, 8.0)), RED),
-            *building(place["tower"], (16.0, 50.0), (72.0, 66.0, 62.0), side=0.4),
-            facing(turbine, box_outline((-3.0, -160.0, 3.0, -56.0)), (96.0, 98.0, 102.0)),
+            *shore.pole(place["gate"], 0.36, _QUAY, shore.WHITE),
+            *shore.ship(self.sea_at(250.0, 14.5), 10.0, 3, 1.0)[:1],
+            shore.facing(yawl, shore.box_outline((-0.25, -8.0, 0.25, 0.0)), (214.0, 206.0, 190.0)),
+            *shore.pole(place["buoy"], 1.3, -18.4, (226.0, 206.0, 70.0)),
+            shore.facing(ferry, outline, (36.0, 52.0, 88.0)),
+            shore.facing(ferry, shore.box_outline((0.0, -20.5, 52.0, 0.0)), (58.0, 84.0, 136.0)),
+            shore.facing(ferry, shore.box_outline((14.0, -19.0, 50.0, -9.0)), shore.WHITE, windows=(5.0, 5.0)),
+            shore.facing(ferry, shore.box_outline((-12.0, -20.0, -1.0, -15.0)), shore.WHITE),
+            shore.facing(ferry, shore.box_outline((34.0, 0.0, 41.0, 8.0)), shore.RED),
+            *shore.building(place["tower"], (16.0, 50.0), (72.0, 66.0, 62.0), side=0.4),
+            shore.facing(turbine, shore.box_outline((-3.0, -160.0, 3.0, -56.0)), (96.0, 98.0, 102.0)),
             *others,
-            facing(turbine, blade, (88.0, 90.0, 96.0)),
-            facing(freighter, np.array([[-60.0, -60.5], [220.0, -60.5], [236.0, -36.0], [-66.0, -36.0]]), hull),
-            facing(freighter, box_outline((0.0, -37.0, 48.0, 0.0)), BLACK),
-            facing(freighter, box_outline((70.0, -36.0, 150.0, -14.0)), (150.0, 66.0, 48.0)),
-            facing(freighter, box_outline((158.0, -36.0, 214.0, -18.0)), (60.0, 98.0, 128.0)),
+            shore.facing(turbine, blade, (88.0, 90.0, 96.0)),
+            shore.facing(freighter, np.array([[-60.0, -60.5], [220.0, -60.5], [236.0, -36.0], [-66.0, -36.0]]), hull),
+            shore.facing(freighter, shore.box_outline((0.0, -37.0, 48.0, 0.0)), shore.BLACK),
+            shore.facing(freighter, shore.box_outline((70.0, -36.0, 150.0, -14.0)), (150.0, 66.0, 48.0)),
+            shore.facing(freighter, shore.box_outline((158.0, -36.0, 214.0, -18.0)), (60.0, 98.0, 128.0)),
         ]  # fmt: skip
 
 
-def _car(foot: Floats, color: Color) -> list[Facet]:
+def _car(foot: Floats, color: shore.Color) -> list[shore.Facet]:
     cabin = np.array([[-1.2, 0.8], [1.5, 0.8], [1.0, 1.45], [-0.7, 1.45]])
-    tires = [facing(foot, box_outline((x - 0.32, 0.0, x + 0.32, 0.6)), BLACK) for x in (-1.35, 1.35)]
+    tires = [shore.facing(foot, shore.box_outline((x - 0.32, 0.0, x + 0.32, 0.6)), shore.BLACK) for x in (-1.35, 1.35)]
     return [
-        facing(foot, box_outline((-2.1, 0.28, 2.1, 0.85)), color),
-        facing(foot, cabin, (64.0, 76.0, 88.0)),
+        shore.facing(foot, shore.box_outline((-2.1, 0.28, 2.1, 0.85)), color),
+        shore.facing(foot, cabin, (64.0, 76.0, 88.0)),
         *tires,
     ]
 
@@ -444,7 +424,7 @@ class ShipAt(NamedTuple):
 
     passage: Passage
     middle: Floats
-    facets: list[Facet]
+    facets: list[shore.Facet]
 
 
 def ships_at(site: PracticeSite, share: float) -> list[ShipAt]:
@@ -461,7 +441,7 @@ def ships_at(site: PracticeSite, share: float) -> list[ShipAt]:
         distance, bearing = (a + share * (b - a) for a, b in zip(passage.start, passage.end, strict=True))
         distance += passage.bow * 4.0 * share * (1.0 - share)
         forward = math.copysign(1.0, passage.end[1] - passage.start[1])
-        facets = ship(site.sea_at(distance, bearing), passage.length, passage.style, forward)
+        facets = shore.ship(site.sea_at(distance, bearing), passage.length, passage.style, forward)
         corners = np.concatenate([facet.outline for facet in facets])
         across, up = 0.5 * (corners.min(0) + corners.max(0))
         angle = math.radians(site.scene.heading_deg + bearing)
@@ -481,13 +461,13 @@ def frames(site: PracticeSite, side: Side, count: int = RATE * SECONDS) -> Itera
     """
     camera, light = site.eyes[side], site.light(side)
     random = np.random.default_rng([site.scene.seed, SIDES.index(side), 2])
-    still = exposed(light @ _LUMA, BLUR, NOISE, random)
-    windows = facet_windows(camera, site.facets)
+    still = shore.exposed(light @ _LUMA, BLUR, NOISE, random)
+    windows = shore.facet_windows(camera, site.facets)
     fixed = [(facet, window) for facet, window in zip(site.facets, windows, strict=True) if window is not None]
     for first in range(0, count, _AT_ONCE):
         moments = [ships_at(site, n / max(count - 1, 1)) for n in range(first, min(first + _AT_ONCE, count))]
         pieces = [facet for ships in moments for each in ships for facet in each.facets]
-        places = iter(facet_windows(camera, pieces))
+        places = iter(shore.facet_windows(camera, pieces))
         for ships in moments:
             frame = still.copy()
             moving = [(facet, place) for each in ships for facet in each.facets if (place := next(places)) is not None]
@@ -496,13 +476,13 @@ def frames(site: PracticeSite, side: Side, count: int = RATE * SECONDS) -> Itera
                 if own:
                     window = _ship_window(own, frame.shape)
                     light = _with_ships(site, side, window, fixed, moving)
-                    seen = exposed(light @ _LUMA, BLUR, NOISE, random)
+                    seen = shore.exposed(light @ _LUMA, BLUR, NOISE, random)
                     inner = tuple(slice(_AROUND, size - _AROUND) for size in seen.shape)
                     frame[window][inner] = seen[inner]
             yield frame
 
 
-_Placed = tuple[Facet, tuple[slice, slice]]
+_Placed = tuple[shore.Facet, tuple[slice, slice]]
 
 
 def _with_ships(
@@ -513,16 +493,16 @@ def _with_ships(
     ships = [each for each in moving if _meet(each[1], window)]
     farthest = max(facet.distance for facet, _ in ships)
     nearer = [each for each in fixed if each[0].distance < farthest and _meet(each[1], window)]
-    cuts: dict[bytes, Cut] = {}
+    cuts: dict[bytes, shore.Cut] = {}
     for facet, place in sorted((*ships, *nearer), key=lambda each: -each[0].distance):
         # All pieces of a ship lie on one plane.
         plane = facet.origin.tobytes() + facet.along.tobytes() + facet.up.tobytes()
-        cuts[plane] = at = cuts.get(plane) or cut(camera, facet, window, small=facet.up[2] == 1)
+        cuts[plane] = at = cuts.get(plane) or shore.cut(camera, facet, window, small=facet.up[2] == 1)
         inner = tuple(
             slice(max(own.start - whole.start, 0), max(own.stop - whole.start, 0))
             for own, whole in zip(place, window, strict=True)
         )
-        paint(part[inner], facet, at.part(inner), site.coast.haze)
+        shore.paint(part[inner], facet, at.part(inner), site.coast.haze)
     return part
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 from torch import Tensor
 
+import kcal.skyline.fit as fits
 from kcal.calibrate.rig.sources import SkylineSource
 from kcal.checks import variance_factor
 from kcal.errors import DegenerateError, InputError
@@ -23,16 +24,6 @@ from kcal.locate.geodesy import ecef_from_enu_rotation, enu_to_geodetic, mean_ra
 from kcal.locate.mounting import attitude
 from kcal.locate.raster import Raster
 from kcal.skyline.border import Border, sky_border
-from kcal.skyline.fit import (
-    COMMON,
-    Candidate,
-    SkylineFit,
-    candidates,
-    fit_rotation,
-    lens_errors,
-    rotation_by,
-    terrain_covariances,
-)
 from kcal.skyline.horizon import (
     Columns,
     Comparison,
@@ -163,7 +154,7 @@ class SkylineAttitude:
     second_deg: float
     second_worse: float
     warnings: tuple[str, ...]
-    fit: SkylineFit
+    fit: fits.SkylineFit
 
 
 @in_one_thread
@@ -230,11 +221,11 @@ def attitude_against(
             "skyline must be in the image, by day, without fog, and without things close by in front of it"
         )
     around = horizon_there()
-    errors = SkylineErrors(error, np.array(place_sigma), lens_errors(camera), mean_radius(place.lat))
-    found = candidates(columns, around, camera, errors, heading)
+    errors = SkylineErrors(error, np.array(place_sigma), fits.lens_errors(camera), mean_radius(place.lat))
+    found = fits.candidates(columns, around, camera, errors, heading)
     horizon = terrain_horizon(raster, place, _azimuths(columns, found[0]), refraction=error.refraction)
     horizon = raised_horizon(horizon, raster, place, error)
-    fit = fit_rotation(columns, horizon, found[0].rotation, camera, errors)
+    fit = fits.fit_rotation(columns, horizon, found[0].rotation, camera, errors)
     open_share = 1.0 - float(around.known.mean())
     gap = "" if open_share < _OPEN else (
         f". The raster has no horizon in {100 * open_share:.0f} % of the directions around the camera: it ends before "
@@ -261,7 +252,7 @@ def _above_ground(raster: Raster, place: Origin) -> float:
     return place.height - float(raster(lat, lon)[0])
 
 
-def _azimuths(columns: Columns, found: Candidate) -> Floats:
+def _azimuths(columns: Columns, found: fits.Candidate) -> Floats:
     """Radians, increasing, two for each column of the image."""
     heading = columns.ray @ found.rotation
     middle = math.radians(found.heading)
@@ -272,8 +263,8 @@ def _azimuths(columns: Columns, found: Candidate) -> Floats:
 
 
 def _checked_attitude(
-    fit: SkylineFit, found: list[Candidate], columns: Columns, horizon: Horizon, border: Border, camera: Camera,
-    raster: Raster, place: Origin, gap: str,
+    fit: fits.SkylineFit, found: list[fits.Candidate], columns: Columns, horizon: Horizon, border: Border,
+    camera: Camera, raster: Raster, place: Origin, gap: str,
 ) -> SkylineAttitude:  # fmt: skip
     """The attitude, unless something speaks against it."""
     heading, pitch, roll = attitude(torch.from_numpy(fit.rotation.T.copy()))
@@ -347,14 +338,14 @@ def _angles_by_turn(rotation: Floats) -> Floats:
     for axis in range(3):
         ends = []
         for sign in (1.0, -1.0):
-            turned = rotation_by(sign * step * np.eye(3)[axis]) @ rotation
+            turned = fits.rotation_by(sign * step * np.eye(3)[axis]) @ rotation
             ends.append(np.array(attitude(torch.from_numpy(turned.T.copy()))))
         found[:, axis] = ((ends[0] - ends[1] + 180.0) % 360.0 - 180.0) / (2.0 * step)
     return found
 
 
 def _attitude_warnings(
-    fit: SkylineFit, columns: Columns, horizon: Horizon, raster: Raster, place: Origin, widened: float
+    fit: fits.SkylineFit, columns: Columns, horizon: Horizon, raster: Raster, place: Origin, widened: float
 ) -> list[str]:
     found = []
     above = _above_ground(raster, place)
@@ -498,14 +489,16 @@ def _joined(
         image_of += len(part) * [number]
         seen_of.append(dataclasses.replace(seen, point=seen.point @ turn.T + centers[c].numpy()))
     together, number_of, times = Comparison.together(seen_of), np.array(image_of), np.array(widened)
-    covariance = np.diag(np.square(together.sigma)) + COMMON**2 * (number_of[:, None] == number_of)
-    covariance += sum(terrain_covariances(together, error, mean_radius(origin.lat)).values())
+    covariance = np.diag(np.square(together.sigma)) + fits.COMMON**2 * (number_of[:, None] == number_of)
+    covariance += sum(fits.terrain_covariances(together, error, mean_radius(origin.lat)).values())
     root = np.linalg.cholesky(covariance * times[:, None] * times)
     white = np.linalg.solve(root, np.column_stack([np.concatenate(rows), np.concatenate(residual)]))
     # Only what moves by turns, and by what is not known of places and lenses, is kept: the rest says how well the
     # skylines fit, which each image has told.
     moves = [white[:, : 3 * count], white[:, 3 * count : 6 * count] * center_sigma.numpy().reshape(-1)]
-    moves += [white[:, a:b] @ lens_errors(camera) for camera, a, b in zip(cameras, begin[:-1], begin[1:], strict=True)]
+    moves += [
+        white[:, a:b] @ fits.lens_errors(camera) for camera, a, b in zip(cameras, begin[:-1], begin[1:], strict=True)
+    ]
     basis, size, _ = np.linalg.svd(np.column_stack(moves), full_matrices=False)
     compact = basis[:, size > _TELLS].T @ white
     return SkylineSource(

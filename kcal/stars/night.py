@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+import kcal.stars.sky as night_sky
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector, step_rows, vector_from_rotation
@@ -22,17 +23,6 @@ from kcal.lens.rig import Origin
 from kcal.locate.mounting import attitude
 from kcal.stars.detect import DetectedStars, detect_stars
 from kcal.stars.identification import identify, turn_between
-from kcal.stars.sky import (
-    EARTH_RATE,
-    LOWEST_ALTITUDE,
-    UNKNOWN_DUT1_SIGMA,
-    Air,
-    StarCatalog,
-    celestial_directions,
-    observed_directions,
-    pole_in_enu,
-    refraction_sigma,
-)
 from kcal.threads import in_one_thread
 
 # How a camera looks, from the named stars of one image: rotation, residuals of every star, and covariance.
@@ -256,7 +246,7 @@ class SkyView:
 
     time: datetime.datetime | None = None
     origin: Origin | None = None
-    air: Air | None = None
+    air: night_sky.Air | None = None
     dut1: float | None = None
     time_sigma: float = 0.1
 
@@ -274,21 +264,21 @@ class SkyView:
     @property
     def clock_sigma(self) -> float:
         """Seconds: of the camera's clock and of UT1 - UTC together."""
-        return math.hypot(self.time_sigma, UNKNOWN_DUT1_SIGMA if self.dut1 is None else 0.0)
+        return math.hypot(self.time_sigma, night_sky.UNKNOWN_DUT1_SIGMA if self.dut1 is None else 0.0)
 
-    def directions(self, catalog: StarCatalog, air: Air | None = None) -> NDArray[np.float64]:
+    def directions(self, catalog: night_sky.StarCatalog, air: night_sky.Air | None = None) -> NDArray[np.float64]:
         """(N, 3) in which the stars are seen: east, north, up if time and place are known."""
         if self.time is None or self.origin is None:
-            return celestial_directions(catalog, self.time)
-        return observed_directions(catalog, self.time, self.origin, air or self.known_air, self.dut1 or 0.0)
+            return night_sky.celestial_directions(catalog, self.time)
+        return night_sky.observed_directions(catalog, self.time, self.origin, air or self.known_air, self.dut1 or 0.0)
 
     @property
-    def known_air(self) -> Air:
+    def known_air(self) -> night_sky.Air:
         """The air, standard where nothing was said."""
         assert self.origin is not None
-        return self.air or Air.at_height(self.origin.height)
+        return self.air or night_sky.Air.at_height(self.origin.height)
 
-    def by_air(self, catalog: StarCatalog, index: NDArray[np.int64]) -> list[tuple[str, NDArray[np.float64]]]:
+    def by_air(self, catalog: night_sky.StarCatalog, index: NDArray[np.int64]) -> list[tuple[str, NDArray[np.float64]]]:
         """By how much stars (N, 3) shift for one sigma of the air's temperature and of its pressure."""
         some, known, air = _part(catalog, index), self.directions(_part(catalog, index)), self.known_air
         warmer = dataclasses.replace(air, celsius=min(air.celsius + air.celsius_sigma, 60.0))
@@ -343,7 +333,10 @@ class NamedStars:
 
 @in_one_thread
 def name_stars(
-    image: NDArray[Any] | DetectedStars, camera: Camera, view: SkyView | None = None, catalog: StarCatalog | None = None
+    image: NDArray[Any] | DetectedStars,
+    camera: Camera,
+    view: SkyView | None = None,
+    catalog: night_sky.StarCatalog | None = None,
 ) -> NamedStars:
     """Name the stars of a night image without knowing where the camera looks, and find its attitude.
 
@@ -363,7 +356,7 @@ def name_stars(
         Traceback (most recent call last):
         kcal.errors.InputError: no stars: the image is dark all over; is the lens cap on, or the exposure too short?
     """
-    view, catalog = view or SkyView(), catalog or StarCatalog.bundled()
+    view, catalog = view or SkyView(), catalog or night_sky.StarCatalog.bundled()
     if not isinstance(image, tuple) and image.shape != camera.size[::-1]:
         raise InputError(
             f"the image has {image.shape[1]}x{image.shape[0]} pixels, the camera {camera.size[0]}x{camera.size[1]}"
@@ -381,7 +374,7 @@ def name_stars(
             f"{len(found.pixels)} points of light, which no stars of the catalogue explain: too few of them are "
             "stars, the camera file is of another lens, or clouds cover most of the sky"
         )
-    celestial = celestial_directions(catalog, view.time)
+    celestial = night_sky.celestial_directions(catalog, view.time)
     sky = fit_attitude(found.pixels, found.sigma, celestial, catalog.magnitude, camera, named.rotation)
     if sky is None:
         raise InputError("fewer than three stars stand alone; the attitude cannot be fitted")
@@ -394,11 +387,11 @@ def name_stars(
 
 
 def _on_earth(
-    found: DetectedStars, view: SkyView, catalog: StarCatalog, camera: Camera, sky: Attitude, celestial: Any
+    found: DetectedStars, view: SkyView, catalog: night_sky.StarCatalog, camera: Camera, sky: Attitude, celestial: Any
 ) -> NamedStars:
     there = view.directions(catalog)
     index = sky.star[sky.star >= 0]
-    low = there[index, 2] < math.sin(LOWEST_ALTITUDE)
+    low = there[index, 2] < math.sin(night_sky.LOWEST_ALTITUDE)
     below = int((there[index, 2] < math.sin(math.radians(-1.0))).sum())
     if below > 0.2 * len(index):
         text = (
@@ -410,10 +403,10 @@ def _on_earth(
             warnings=(text,),
         )  # fmt: skip
     # Refraction near the horizon is not known well enough: lower stars are put where no camera sees a star.
-    usable = np.where(there[:, 2:] > math.sin(LOWEST_ALTITUDE), there, [0.0, 0.0, -1.0])
+    usable = np.where(there[:, 2:] > math.sin(night_sky.LOWEST_ALTITUDE), there, [0.0, 0.0, -1.0])
     start = sky.rotation.numpy() @ turn_between(there[index], celestial[index])
     scale = float(camera.params[0])
-    blurred = np.hypot(found.sigma, scale * float(refraction_sigma(np.arcsin(there[index, 2])).mean()))
+    blurred = np.hypot(found.sigma, scale * float(night_sky.refraction_sigma(np.arcsin(there[index, 2])).mean()))
     on_ground = fit_attitude(found.pixels, blurred, usable, catalog.magnitude, camera, start)
     if on_ground is None:
         raise InputError(
@@ -427,7 +420,7 @@ def _on_earth(
         f"the camera would be rolled by {roll:.0f}°: unless it lies on its side, place or time is wrong"
     ] * (abs(roll) > _ON_ITS_SIDE)  # fmt: skip
     part = _part(catalog, used)
-    vacuum = view.directions(part, Air(hectopascal=0.0))
+    vacuum = view.directions(part, night_sky.Air(hectopascal=0.0))
     sigma = blurred[on_ground.star >= 0]
     doubt = refraction_doubt(on_ground, sigma, torch.from_numpy(there[used]), torch.from_numpy(vacuum), camera)
     if doubt is not None:
@@ -440,11 +433,11 @@ def _on_earth(
 
 def _by_clock(view: SkyView) -> Tensor:
     assert view.origin is not None
-    turn = torch.from_numpy(pole_in_enu(view.origin.lat) * EARTH_RATE * view.clock_sigma)
+    turn = torch.from_numpy(night_sky.pole_in_enu(view.origin.lat) * night_sky.EARTH_RATE * view.clock_sigma)
     return torch.outer(turn, turn)
 
 
-def _by_air(view: SkyView, catalog: StarCatalog, index: NDArray[np.int64]) -> Tensor:
+def _by_air(view: SkyView, catalog: night_sky.StarCatalog, index: NDArray[np.int64]) -> Tensor:
     known, total = view.directions(_part(catalog, index)), torch.zeros(3, 3, dtype=torch.float64)
     for _, shift in view.by_air(catalog, index):
         turn = vector_from_rotation(torch.from_numpy(turn_between(known, known + shift)))
@@ -452,9 +445,9 @@ def _by_air(view: SkyView, catalog: StarCatalog, index: NDArray[np.int64]) -> Te
     return total
 
 
-def _part(catalog: StarCatalog, index: NDArray[np.int64]) -> StarCatalog:
+def _part(catalog: night_sky.StarCatalog, index: NDArray[np.int64]) -> night_sky.StarCatalog:
     columns = {field.name: getattr(catalog, field.name)[index] for field in dataclasses.fields(catalog)}
-    return StarCatalog(**columns)
+    return night_sky.StarCatalog(**columns)
 
 
 def _reach(camera: Camera) -> float:
@@ -506,14 +499,14 @@ def clock_doubts(images: Sequence[NamedStars]) -> list[tuple[int, str]]:
         first, other = images[on_earth[0]], images[number]
         assert first.view.origin is not None
         turn = vector_from_rotation(first.attitude.rotation.T @ other.attitude.rotation)
-        pole = torch.from_numpy(pole_in_enu(first.view.origin.lat))
+        pole = torch.from_numpy(night_sky.pole_in_enu(first.view.origin.lat))
         about = float(turn @ pole)
         beside = float((turn - about * pole).norm())
         spread = first.attitude.covariance + other.attitude.covariance
         aside = _SURE_TIMES * math.sqrt(float(spread.trace())) + math.radians(_BENDS)
         along = _SURE_TIMES * math.sqrt(float(pole @ spread @ pole)) + math.radians(_BENDS)
         if abs(about) > along and beside < aside:
-            seconds = about / EARTH_RATE
+            seconds = about / night_sky.EARTH_RATE
             found.append((
                 number,
                 f"the camera would have turned about the Earth's axis by {math.degrees(about):+.3f}° since the first "

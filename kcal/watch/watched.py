@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+import kcal.watch.state as estimate
 from kcal.calibrate.rig.drift import Drift, drift_of_turns
 from kcal.errors import InputError
 from kcal.lens.rig import RigCovariance, StereoRig
@@ -21,19 +22,6 @@ from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.monitor import relocked
 from kcal.watch.history import MOST_ROWS, HistoryRow, HistoryTail, read_history
-from kcal.watch.state import (
-    AngleSeries,
-    TurnModel,
-    Turns,
-    TurnState,
-    between_rows,
-    first_state,
-    learned,
-    passed,
-    smoothed,
-    taken,
-    turns_of,
-)
 
 # `Watched`: a rig and the history of its attitude; the rig of any moment, with the errors of that moment.
 
@@ -60,15 +48,17 @@ class Watched:
         10.0
     """
 
-    def __init__(self, rig: StereoRig, rows: Sequence[HistoryRow] = (), model: TurnModel | None = None) -> None:
+    def __init__(
+        self, rig: StereoRig, rows: Sequence[HistoryRow] = (), model: estimate.TurnModel | None = None
+    ) -> None:
         self.rig, self.model = rig, model or model_of(rows)
-        self.between = between_rows(rig)
+        self.between = estimate.between_rows(rig)
         # Of which moments the rows tell all that the history does.
         self.since, self.until = -math.inf, math.inf
         self.times: list[float] = []
-        self.states: list[TurnState] = []
+        self.states: list[estimate.TurnState] = []
         self.seen: list[bool] = []
-        self._smooth: list[TurnState] | None = None
+        self._smooth: list[estimate.TurnState] | None = None
         for row in rows:
             self.take(row)
 
@@ -92,11 +82,11 @@ class Watched:
         if self.times and not row.time > self.times[-1]:
             raise InputError(f"time {row.time:g}: not after that of the last look, {self.times[-1]:g}")
         if self.times:
-            state, _ = passed(self.states[-1], torch.tensor(row.time - self.times[-1]).double(), self.model)
+            state, _ = estimate.passed(self.states[-1], torch.tensor(row.time - self.times[-1]).double(), self.model)
         else:
-            state = first_state(self.model)
+            state = estimate.first_state(self.model)
         self.times.append(row.time)
-        self.states.append(taken(state, row.look, self.model, self.between))
+        self.states.append(estimate.taken(state, row.look, self.model, self.between))
         self.seen.append(bool(row.look.seen.all()))
         self._smooth = None
         if most is not None and len(self.times) > most:
@@ -108,7 +98,7 @@ class Watched:
         stands = self.rig.mounting
         return None if stands is None else enu_from_cam(stands.heading_deg, stands.pitch_deg, stands.roll_deg).T
 
-    def turns_at(self, time: float, *, gusts: bool = True) -> Turns:
+    def turns_at(self, time: float, *, gusts: bool = True) -> estimate.Turns:
         """The turn of both cameras at a moment, from the looks before and after it.
 
         Raises:
@@ -119,11 +109,11 @@ class Watched:
             begin = f"it begins at {self.times[0]:.0f}" if self.times else "it has no rows"
             raise InputError(f"time {time:.0f} s: the history of the rig tells nothing of that moment; {begin}")
         if self._smooth is None and k + 1 < len(self.times):
-            self._smooth = smoothed(self.states, self.times, self.model)
-        state, _ = passed(self.states[k], torch.tensor(time - self.times[k]).double(), self.model)
+            self._smooth = estimate.smoothed(self.states, self.times, self.model)
+        state, _ = estimate.passed(self.states[k], torch.tensor(time - self.times[k]).double(), self.model)
         if self._smooth is not None and k + 1 < len(self.times):
-            state = smoothed([state, self._smooth[k + 1]], [time, self.times[k + 1]], self.model)[0]
-        return turns_of(state, self.model, gusts=gusts)
+            state = estimate.smoothed([state, self._smooth[k + 1]], [time, self.times[k + 1]], self.model)[0]
+        return estimate.turns_of(state, self.model, gusts=gusts)
 
     def drift_at(self, time: float, *, gusts: bool = True) -> Drift:
         """How the cameras have turned since the reference; see `turns_at`."""
@@ -160,10 +150,10 @@ def _uncertain(rig: StereoRig) -> StereoRig:
     return same
 
 
-def model_of(rows: Sequence[HistoryRow]) -> TurnModel:
+def model_of(rows: Sequence[HistoryRow]) -> estimate.TurnModel:
     """How a rig turns, as its history tells."""
     if not rows:
-        return TurnModel.usual()
+        return estimate.TurnModel.usual()
     looks = [row.look for row in rows]
     seen = torch.stack([look.seen for look in looks]).repeat_interleave(3, -1)
     own = torch.stack([look.covariance.diagonal() for look in looks])
@@ -173,7 +163,7 @@ def model_of(rows: Sequence[HistoryRow]) -> TurnModel:
         found: NDArray[np.float64] = values.numpy()
         return found
 
-    return learned(AngleSeries(
+    return estimate.learned(estimate.AngleSeries(
         time=np.array([row.time for row in rows]),
         angle=array(torch.where(seen, torch.stack([look.turn for look in looks]), math.nan)),
         variance=array((1.0 - share) * own),

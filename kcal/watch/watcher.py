@@ -15,20 +15,12 @@ from urllib.parse import urlsplit
 import torch
 from torch import Tensor
 
+import kcal.watch.measure as measure
 from kcal.corners.images import Gray
 from kcal.errors import FileError, InputError
 from kcal.lens.rig import StereoRig
 from kcal.pipeline.stream_journal import Ledger
 from kcal.watch.history import HistoryRow, Temperatures, history_head, history_line, read_history, warmed
-from kcal.watch.measure import (
-    FixedFeatures,
-    TwoViews,
-    load_references,
-    measured,
-    new_reference,
-    renewed,
-    save_references,
-)
 from kcal.watch.watched import Watched, model_of
 
 # When to say that a rig has drifted: beyond a limit, so surely that chance says it less than once a month.
@@ -161,7 +153,7 @@ class Watcher:
         self.skipped, self.looks, self.alarms = 0, 0, 0
         self._temperatures, self._warmth = temperatures, math.nan
         self._rows: deque[HistoryRow] = deque(maxlen=_KEPT)
-        self._sides: tuple[FixedFeatures, FixedFeatures] | None = None
+        self._sides: tuple[measure.FixedFeatures, measure.FixedFeatures] | None = None
         self._matched, self._learned, self._alarm = -math.inf, -math.inf, False
         self._lost = [0, 0]
         self._notes = ""
@@ -177,7 +169,7 @@ class Watcher:
                 self._warmth = self._warmth if not first else first[0] - float(
                     next(row.look.kelvin for row in self._rows if not math.isnan(row.temperature)))  # fmt: skip
             if self.reference.exists():
-                self._sides = load_references(self.reference, rig)
+                self._sides = measure.load_references(self.reference, rig)
             elif self._rows:
                 raise FileError(f"{self.reference}: the reference of the history is missing; begin a new history")
             self.watched = self._relearned()
@@ -213,8 +205,8 @@ class Watcher:
         """
         if self._sides is not None:
             raise FileError(f"{self.reference}: there is a reference already; begin a new history for another")
-        sides = new_reference(left, "left"), new_reference(right, "right")
-        save_references(self.reference, self.rig, sides)
+        sides = measure.new_reference(left, "left"), measure.new_reference(right, "right")
+        measure.save_references(self.reference, self.rig, sides)
         self._sides = sides
 
     def look(self, time: float, left: Gray, right: Gray) -> Noticed:
@@ -229,7 +221,7 @@ class Watcher:
         assert self._sides is not None
         about = self.watched.turns_at(time).mean if self.watched.times else torch.zeros(6, dtype=torch.float64)
         between = time >= self._matched + _BETWEEN_S
-        found = measured(self.rig, self._sides, (left, right), about, between=between)
+        found = measure.measured(self.rig, self._sides, (left, right), about, between=between)
         self._matched = time if between else self._matched
         self._check_lost(found)
         warm = math.nan if self._temperatures is None else self._temperatures.at(time)
@@ -256,7 +248,7 @@ class Watcher:
         """Save the reference, and let others write the history."""
         try:
             if self._sides is not None:
-                save_references(self.reference, self.rig, self._sides)
+                measure.save_references(self.reference, self.rig, self._sides)
             self._ledger.checkpoint({"rig": self.rig.fingerprint})
         finally:
             self._ledger.close()
@@ -278,7 +270,7 @@ class Watcher:
         self.alarms += begins
         return Noticed(row, steady.relative, sigma, alarm, begins)
 
-    def _check_lost(self, found: TwoViews) -> None:
+    def _check_lost(self, found: measure.TwoViews) -> None:
         for k, (side, name) in enumerate(zip(found.sides, ("left", "right"), strict=True)):
             self._lost[k] = self._lost[k] + 1 if side.lost else 0
             if self._lost[k] == _LOST:
@@ -293,7 +285,7 @@ class Watcher:
         turns = self.watched.turns_at(self.last_time)
         seen = self._rows[-1].look.seen.tolist()
         sides = [
-            renewed(side, camera, image, turns.mean[part], turns.covariance[part, part]) if there else side
+            measure.renewed(side, camera, image, turns.mean[part], turns.covariance[part, part]) if there else side
             for side, camera, image, there, part in zip(
                 self._sides,
                 (self.rig.left, self.rig.right),
@@ -305,7 +297,7 @@ class Watcher:
         ]
         self._sides = sides[0], sides[1]
         # Before the journal: a reference that is ahead of the history does no harm.
-        save_references(self.reference, self.rig, self._sides)
+        measure.save_references(self.reference, self.rig, self._sides)
         self._ledger.checkpoint({"rig": self.rig.fingerprint})
 
     def _relearned(self) -> Watched:

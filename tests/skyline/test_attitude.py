@@ -150,7 +150,7 @@ def test_refusals(change: Any, kind: type[InputError], said: str) -> None:
 
 def test_a_second_heading_that_fits_as_well_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     few = [Candidate(as_it_is().rotation, 10.0), Candidate(_turned(as_it_is().rotation, 90.0), 12.0)]
-    monkeypatch.setattr(attitude, "candidates", lambda *_: few)
+    monkeypatch.setattr(attitude.fits, "candidates", lambda *_: few)
     with pytest.raises(DegenerateError, match=r"two headings .* equally well: 40\.\d and 130\.\d .* by 2\.0; 14 are"):
         found()
 

@@ -11,17 +11,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+import kcal.calibrate.rig.explanations as explanations
 from kcal.calibrate.rig.adjustment import Adjustment
 from kcal.calibrate.rig.blocks import FeatureBlock, LandmarkBlock, PerKind, RigState
-from kcal.calibrate.rig.explanations import (
-    AS_GOOD,
-    CERTAIN,
-    TRIAL,
-    contradictions,
-    decided_by_few,
-    refuse_exact,
-    swap_warnings,
-)
 from kcal.calibrate.rig.initial_poses import InitialPoses, distinct_poses
 from kcal.calibrate.rig.motion import moved_warnings
 from kcal.calibrate.rig.problem import RigProblem, held
@@ -280,11 +272,11 @@ def refuse_several(work: Adjustment, masks: PerKind) -> None:
         work: at its solution; it stays there.
         masks: what agrees.
     """
-    if not decided_by_few(work, masks):
+    if not explanations.decided_by_few(work, masks):
         return
     here = copy.copy(work)
     here.unknowns = held(work.data.cameras)
-    problem, _ = here.solve(masks, TRIAL)
+    problem, _ = here.solve(masks, explanations.TRIAL)
     own = goodness_of_fit(problem, here.part(masks))
     matrix, scale = problem.linearize(here.part(masks)).information()
     for state in _other_places(here, masks):
@@ -311,9 +303,9 @@ def refuse_several(work: Adjustment, masks: PerKind) -> None:
 
 def _as_good(work: Adjustment, masks: PerKind, chi2: float, variance: float) -> bool:
     """Whether the solution from here is as good; one that is far from it after a few steps is not followed."""
-    for effort, times in ((_GLANCE, _FAR), (TRIAL, 1.0)):
+    for effort, times in ((_GLANCE, _FAR), (explanations.TRIAL, 1.0)):
         problem, _ = work.solve(masks, effort)
-        if not 2.0 * float(problem.cost(work.part(masks))) < chi2 + times * AS_GOOD * variance:
+        if not 2.0 * float(problem.cost(work.part(masks))) < chi2 + times * explanations.AS_GOOD * variance:
             return False
     return True
 
@@ -425,10 +417,10 @@ def rig_result(
                 f"the data do not determine how {data.names[second]} stands from {data.names[0]}: {what} could be "
                 f"anything; {cure}"
             )
-    refuse_exact(problem, data.names, fit.freedom)
+    explanations.refuse_exact(problem, data.names, fit.freedom)
     refuse_several(work, masks)
-    against = contradictions(work, problem, state)
-    certain = [one for one in against if one.sigmas > CERTAIN]
+    against = explanations.contradictions(work, problem, state)
+    certain = [one for one in against if one.sigmas > explanations.CERTAIN]
     if refuse and certain and certain[0].stated:
         raise InputError(certain[0].text)
     widen, doubts = check_places(problem, state, covariance, data.names, refuse=refuse)
@@ -469,7 +461,7 @@ def rig_result(
             "the data do not determine all parameters of the cameras: the rig has no covariance, and intervals know "
             "errors of the marks alone"
         )
-    warnings += swap_warnings(data, problem, state, covariance)
+    warnings += explanations.swap_warnings(data, problem, state, covariance)
     items = item_records(work, masks, reasons)
     cameras = data.cameras
     if any(bool(part.any()) for part in problem.unknowns.cameras):

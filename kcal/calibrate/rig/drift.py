@@ -10,16 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.adjustment import (
-    FALSE_ALARM,
-    LOSS,
-    MOST_WRONG,
-    ROUGHLY,
-    WRONG_AS_A_WHOLE,
-    Adjustment,
-    typical_ratio,
-    without_wrong,
-)
+import kcal.calibrate.rig.adjustment as adjustment
 from kcal.calibrate.rig.blocks import KINDS, PerKind
 from kcal.calibrate.rig.initial_poses import Start
 from kcal.calibrate.rig.problem import held
@@ -90,7 +81,7 @@ def camera_turns(
             )
     matched, sigma = known.any(0), math.sqrt(2.0) * features.pixel_sigma
     found = [view.turn(matched, sigma, robust=True) for view in views]
-    if (times := max(math.sqrt(_typical(turn)) for turn in found)) > WRONG_AS_A_WHOLE:
+    if (times := max(math.sqrt(_typical(turn)) for turn in found)) > adjustment.WRONG_AS_A_WHOLE:
         raise InputError(
             f"drift: no turn explains the marks: typically they are {times:.0f} times as far off as their sigma says; "
             "check names, the sigma of the marks and that the images are of these cameras"
@@ -102,7 +93,7 @@ def camera_turns(
         if torch.equal(before, used):
             break
         gone, total = int((matched & ~used).sum()), int(matched.sum())
-        if gone > max(1, MOST_WRONG * total):
+        if gone > max(1, adjustment.MOST_WRONG * total):
             raise InputError(
                 f"{gone} of {total} features have moved against the rest: these are not a few; check names, the sigma "
                 "of the marks and that the images are of these cameras"
@@ -154,7 +145,7 @@ class _MarksTwice:
             pixels, rows = self._project(self.points @ turn.T)
             off = torch.where(self.known[:, None], self.moved - pixels, torch.nan)
             rows, scaled = rows / sigma, off / sigma
-            weight = used.double() * (LOSS.weight(0.5 * scaled.square().sum(-1)) if robust else 1.0)
+            weight = used.double() * (adjustment.LOSS.weight(0.5 * scaled.square().sum(-1)) if robust else 1.0)
             weight = torch.where(used, weight, 0.0)
             information = torch.einsum("n,nik,nil->kl", weight, rows, rows)
             values = torch.linalg.eigvalsh(information)
@@ -174,12 +165,12 @@ class _MarksTwice:
 
 def _typical(turn: CameraTurn) -> float:
     """How much larger χ² typically is than the sigma of the marks says."""
-    return typical_ratio(turn.squares, 2.0 * torch.isfinite(turn.off).all(-1))
+    return adjustment.typical_ratio(turn.squares, 2.0 * torch.isfinite(turn.off).all(-1))
 
 
 def _over_limit(turn: CameraTurn, known: Tensor) -> Tensor:
     """(F,) χ² of each mark over the largest that noise explains; what is typical of a camera counts as its noise."""
-    level = 1.0 - FALSE_ALARM / int(known.sum())
+    level = 1.0 - adjustment.FALSE_ALARM / int(known.sum())
     return turn.squares / (max(1.0, _typical(turn)) * chi2_quantile(2.0, level))
 
 
@@ -386,7 +377,7 @@ def _against(
     cameras = (rig.left, rig.right)
     data = RigData(cameras=cameras, names=_NAMES, features=features, landmarks=landmarks)
     unknowns = held(cameras).and_refraction(*refraction) if loose else held(cameras)
-    work = Adjustment(data, start, unknowns, 1.0, turning=[loose, True], moving=[False] * 2)
+    work = adjustment.Adjustment(data, start, unknowns, 1.0, turning=[loose, True], moving=[False] * 2)
     masks = _telling(data)
     few = "too few of the images have a mark of it"
     reasons = {
@@ -394,8 +385,8 @@ def _against(
     }
     if sum(int(mask.sum()) for mask in masks) < 2:
         raise DegenerateError("drift: two features or landmarks at least are needed; more let wrong ones be found")
-    work.solve(masks, ROUGHLY, LOSS)
-    masks = without_wrong(work, masks, _SOLVER)
+    work.solve(masks, adjustment.ROUGHLY, adjustment.LOSS)
+    masks = adjustment.without_wrong(work, masks, _SOLVER)
     problem, _ = work.solve(masks, _SOLVER)
     state = work.part(masks)
     fit = goodness_of_fit(problem, state)

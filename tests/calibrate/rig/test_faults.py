@@ -100,7 +100,7 @@ class TestSeveralSolutions:
 
     def test_other_places_that_fit_alike_are_refused(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Three landmarks in each camera fit in several places; that nothing checks them is taken out here."""
-        monkeypatch.setattr("kcal.calibrate.rig.assess.refuse_exact", lambda *_: None)
+        monkeypatch.setattr("kcal.calibrate.rig.explanations.refuse_exact", lambda *_: None)
         monkeypatch.setattr("kcal.calibrate.rig.assess.check_places", lambda *_, **__: (1.0, []))
         # On a circle around the cameras' axis, so that the other places are real ones.
         around = tensor([30.0, 0, 0], [-14, 24, 2], [-16, -25, -3])
