@@ -21,8 +21,7 @@ from kcal.files import dump_json, make_folder, read_bytes, write_atomic
 from kcal.io.camera_file import load_camera
 from kcal.io.images import write_png, write_video
 from kcal.io.rig_file import load_rig
-from kcal.lens.rig import Origin
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Origin, StereoRig
 from kcal.locate.geodesy import enu_to_geodetic
 from kcal.report.practice_score import score_lens, score_positions, score_rig, score_tracks
 from kcal.report.siting import save_site_sketch
