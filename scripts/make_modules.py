@@ -28,6 +28,7 @@ import kcal
 from kcal import Board, Camera, StereoRig
 from kcal.calibrate.camera.layer import CalibrationLayer
 from kcal.calibrate.camera.result import CalibrationOptions
+from kcal.corners.refine import RefineCorners
 from kcal.lens import rotation_from_vector
 from kcal.lens.baking import LookupCamera, bake
 from kcal.lens.camera_parameters import CameraDistortion, ExtendedDistortion
@@ -52,9 +53,7 @@ PAGE = Path(__file__).resolve().parents[1] / "docs" / "reference" / "modules.md"
 # What only others are made of.
 BASES = {
     "Float64Module", "StatedModule", "Movable", "LensParameters", "CameraParameters", "ConvertibleCamera", "Network",
-    "Operations", "_Method",
-    # Not probed yet; the page says so.
-    "AdaptedCamera", "RefineCorners",
+    "Operations", "_Method", "AdaptedCamera",
 }  # fmt: skip
 STEPS = (1e-3, 1e-4, 1e-5, 1e-6)
 # Meters by which heights on the ellipsoid are rounded.
@@ -230,6 +229,16 @@ def objects() -> dict[str, Any]:
     }  # fmt: skip
 
 
+def crossings() -> Values:
+    """A crossing in each of two images, with its rough place and the side of its squares."""
+    x, middle = torch.arange(40.0, dtype=torch.float64), torch.tensor([[20.6, 19.3], [18.9, 20.2]]).double()
+    edges = torch.erf((x - middle[..., None]) / 1.4)
+    light = 0.3 * edges[:, 1, :, None] * edges[:, 0, None, :] + 0.5 + 0.002 * noise(2, 40, 40)
+    return {
+        "image": light[:, None], "pixels": middle[:, None].round(), "side": torch.full((2, 1), 15.0).double(),
+    }  # fmt: skip
+
+
 def plain_rig(number: int) -> StereoRig:
     """Parallel pinholes with a small image."""
     one = Camera.build(focal=(90.0 + number, 90.0), center=(47.5, 35.5), size=(96, 72), model="pinhole")
@@ -331,6 +340,11 @@ CASES: dict[str, Case] = {
         inputs=lambda: {"start": torch.zeros(1, dtype=torch.float64), "data": torch.arange(3.0, dtype=torch.float64)},
         batched=("start", "data"), constant=("input start",), detached=("cost", "history"),
         otherwise=lambda: LevenbergMarquardt(Mean(0), backward="none"),
+    ),
+    "RefineCorners": Case(
+        make=lambda _: RefineCorners(), inputs=crossings, functional=False, native=("image", "pixels", "side"),
+        detached=("covariance", "blur"), constant=("input pixels", "input side"),
+        rtol=0.01,  # what corners of an image know together counts as constant
     ),
     "CalibrationLayer": Case(
         make=lambda n: CalibrationLayer((640, 480), CalibrationOptions(model="opencv5")), inputs=boards,

@@ -3,7 +3,8 @@
     KCAL_DATA=DATA python -m scripts.bench.network_field [--captures gavin_l st1_l] [--write]
 
 For each capture: RMS over held-out blocks of views (`kcal.calibrate.camera.compare`), and CPU seconds of one fit of all
-views. `--write` puts the table into docs/measured/network-field.md.
+views. Also the error at infinity on a simulated lens with a dent (`scripts/shared/dented_lens.py`). `--write` puts both
+tables into docs/measured/network-field.md.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ from kcal.calibrate.camera.result import CalibrationOptions
 from kcal.calibrate.hybrid.network_fit import FieldTraining
 from kcal.corners.observations import Observations
 from kcal.errors import KcalError
+from scripts.shared.dented_lens import capture, network, off
+from scripts.shared.page import table, write_row
 
 CAPTURES = ("gavin_l", "gavin_r", "st1_l", "lanhp_l", "luisa39", "carnd18", "fish_l", "kaidan", "ch1280", "sq1280")
 # Name -> lens model and training.
@@ -42,37 +45,51 @@ def measure(seen: Observations, name: str, parts: int) -> tuple[float, float]:
     return held, time.process_time() - begin
 
 
-def table(captures: list[str], parts: int, tell: Callable[[str], object]) -> str:
-    """One row for each capture: held-out RMS, and CPU seconds in brackets."""
-    lines = [f"| capture | views | {' | '.join(FITS)} |", f"|---|---|{'---|' * len(FITS)}"]
-    for capture in captures:
-        seen = Observations.load(Path(os.environ["KCAL_DATA"], "captures", f"{capture}.obs.json"))
-        cells = []
-        for name in FITS:
-            try:
-                held, seconds = measure(seen, name, parts)
-                cells.append(f"{held:.4f} ({seconds:.1f})")
-            except KcalError as error:
-                # A lens that does not fit is a result, too.
-                tell(f"{capture}, {name}: {error}")
-                cells.append("does not fit")
-            tell(f"{capture}, {name}: {cells[-1]}")
-        lines.append(f"| {capture} | {len(seen.views)} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+def cells(seen: Observations, parts: int, tell: Callable[[str], object]) -> list[str]:
+    """For each lens the held-out RMS, and CPU seconds in brackets."""
+    out = []
+    for name in FITS:
+        try:
+            held, seconds = measure(seen, name, parts)
+            out.append(f"{held:.4f} ({seconds:.1f})")
+        except KcalError as error:
+            # A lens that does not fit is a result, too.
+            tell(f"{name}: {error}")
+            out.append("does not fit")
+        tell(f"{name}: {out[-1]}")
+    return out
+
+
+def dent() -> list[str]:
+    """For each lens the error at infinity over the middle of the image of a lens with a dent, pixels."""
+    out, own = [], {"board": "exact", "motion": False}
+    for model, training in FITS.values():
+        lens = {"field": network(), "training": training} if model == "network" else {"model": model}
+        options = CalibrationOptions(**lens) if model == "ext20" else CalibrationOptions(**lens, **own)
+        begin = time.process_time()
+        camera = calibrate_camera(capture(), options).camera
+        out.append(f"{off(camera):.3f} ({time.process_time() - begin:.1f})")
+    return out
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--captures", nargs="*", default=list(CAPTURES))
-    parser.add_argument("--parts", type=int, default=4)
+    parser.add_argument("--parts", type=int, default=3)
     parser.add_argument("--write", action="store_true")
     given = parser.parse_args()
-    text = table(given.captures, given.parts, lambda line: print(line, flush=True))
-    print(text)
-    if given.write:
-        page = Path(__file__).parents[2] / "docs" / "measured" / "network-field.md"
-        head = page.read_text(encoding="utf-8").split("\n| capture")[0]
-        page.write_text(f"{head}\n{text}\n", encoding="utf-8")
+    keep(given.write, "dent", ["lens", *FITS], ["with a dent of 3 px", *dent()])
+    for name in given.captures:
+        seen = Observations.load(Path(os.environ["KCAL_DATA"], "captures", f"{name}.obs.json"))
+        found = cells(seen, given.parts, lambda line, name=name: print(f"{name}, {line}", flush=True))
+        keep(given.write, "captures", ["capture", "views", *FITS], [name, len(seen.views), *found])
+
+
+def keep(write: bool, section: str, heads: list[object], row: list[object]) -> None:
+    """Print a row, and put it into its table of the page."""
+    print("\n".join(table(heads, [row])), flush=True)
+    if write:
+        write_row("network-field.md", section, heads, row)
 
 
 if __name__ == "__main__":
