@@ -10,9 +10,10 @@ tables into docs/measured/network-field.md.
 from __future__ import annotations
 
 import argparse
+import functools
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from kcal.calibrate.camera.calibrate import calibrate_camera
@@ -62,10 +63,13 @@ def cells(seen: Observations, parts: int, tell: Callable[[str], object]) -> list
 
 def dent() -> list[str]:
     """For each lens the error at infinity over the middle of the image of a lens with a dent, pixels."""
-    out, own = [], {"board": "exact", "motion": False}
+    out = []
     for model, training in FITS.values():
-        lens = {"field": network(), "training": training} if model == "network" else {"model": model}
-        options = CalibrationOptions(**lens) if model == "ext20" else CalibrationOptions(**lens, **own)
+        options = CalibrationOptions(model=model)
+        if model == "hybrid":
+            options = CalibrationOptions(board="exact", motion=False)
+        elif model == "network":
+            options = CalibrationOptions(field=network(), training=training, board="exact", motion=False)
         begin = time.process_time()
         camera = calibrate_camera(capture(), options).camera
         out.append(f"{off(camera):.3f} ({time.process_time() - begin:.1f})")
@@ -81,11 +85,11 @@ def main() -> None:
     keep(given.write, "dent", ["lens", *FITS], ["with a dent of 3 px", *dent()])
     for name in given.captures:
         seen = Observations.load(Path(os.environ["KCAL_DATA"], "captures", f"{name}.obs.json"))
-        found = cells(seen, given.parts, lambda line, name=name: print(f"{name}, {line}", flush=True))
+        found = cells(seen, given.parts, functools.partial(print, name, flush=True))
         keep(given.write, "captures", ["capture", "views", *FITS], [name, len(seen.views), *found])
 
 
-def keep(write: bool, section: str, heads: list[object], row: list[object]) -> None:
+def keep(write: bool, section: str, heads: Sequence[object], row: Sequence[object]) -> None:
     """Print a row, and put it into its table of the page."""
     print("\n".join(table(heads, [row])), flush=True)
     if write:

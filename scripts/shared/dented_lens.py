@@ -42,8 +42,8 @@ def capture(count: int = 18, dent: float = 3.0) -> Observations:
         pixels, valid = truth(dent).project((BOARD.points - middle) @ turn.T + shift)
         if bool((valid & truth().inside(pixels)).all()):
             noise = NOISE * torch.randn(pixels.shape, generator=random, dtype=torch.float64)
-            views.append(View(name=str(len(views)), pixels=(pixels + noise).tolist()))
-    return Observations(board=BOARD, image_size=SIZE, views=views)
+            views.append(View(name=str(len(views)), pixels=tuple(map(tuple, (pixels + noise).tolist()))))
+    return Observations(board=BOARD, image_size=SIZE, views=tuple(views))
 
 
 def network() -> nn.Module:
