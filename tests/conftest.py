@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
+from typing import Any
 
 import hypothesis
 import numpy as np
@@ -25,11 +26,20 @@ def pytest_configure(config: pytest.Config) -> None:
         config.pluginmanager.register(Watch(float(os.environ.get("KCAL_WAIT", "60"))))
 
 
+# The states in which the generators of modules of tests began.
+_BEGINNINGS: dict[int, dict[str, Any]] = {}
+
+
 @pytest.hookimpl(tryfirst=True)
-def pytest_runtest_setup() -> None:
-    """What is drawn without a generator of its own does not depend on the tests that ran before in this process."""
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """What is drawn does not depend on the tests that ran before, in this process or in this file."""
     np.random.seed(0)  # noqa: NPY002
     torch.manual_seed(0)
+    for value in vars(getattr(item, "module", item)).values():
+        if isinstance(value, torch.Generator):
+            value.manual_seed(value.initial_seed())
+        elif isinstance(value, np.random.Generator):
+            value.bit_generator.state = _BEGINNINGS.setdefault(id(value), value.bit_generator.state)
 
 
 @pytest.fixture(scope="session")

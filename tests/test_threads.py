@@ -7,7 +7,7 @@ import os
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import cv2
 import pytest
@@ -17,6 +17,7 @@ from threadpoolctl import ThreadpoolController
 
 from kcal.__main__ import _THREADS, main
 from kcal.calibrate.camera.calibrate import calibrate_camera
+from kcal.corners.observations import Observations
 from kcal.threads import in_one_thread, one_thread
 
 LIBRARIES = ThreadpoolController().lib_controllers
@@ -102,9 +103,10 @@ def test_the_doors_bound(several: list[int], monkeypatch: pytest.MonkeyPatch) ->
         raise ArithmeticError
 
     monkeypatch.setattr("kcal.calibrate.camera.calibrate.unusable_views", fit)
-    views = SimpleNamespace(board=SimpleNamespace(points=None), pixels=lambda: None)
+    views = MagicMock()
+    views.__class__ = Observations  # type: ignore[assignment]
     with pytest.raises(ArithmeticError):
-        calibrate_camera(views)  # type: ignore[arg-type]
+        calibrate_camera(views)
     assert set(seen[0]) == {1}
     assert numbers() == several
 

@@ -92,7 +92,7 @@ def live_on(folder: Path) -> Iterator[subprocess.Popen[str]]:
     rig = tracked_site().rig
     rig.mounting = Mounting(origin=ORIGIN, heading_deg=0.0)
     save_rig(rig, folder / "rig.json")
-    words = ["live", "rig.json", "--detections", "-", "-o", "tracks.csv", "--map", "0"]
+    words = ["live", "rig.json", "--detections", "-", "-o", "tracks.csv", "--port", "0"]
     process = subprocess.Popen(
         [sys.executable, "-m", "kcal", *words], cwd=folder, text=True, stdin=subprocess.PIPE, stderr=subprocess.PIPE,
         env={**os.environ, "PYTHONUNBUFFERED": "1", "COLUMNS": "200"},

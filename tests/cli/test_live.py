@@ -107,9 +107,9 @@ def test_the_map_is_told_how_it_ended(folder: Path, how: str, monkeypatch: pytes
     monkeypatch.setattr(Stream, "_write", disturbed)
     if how.startswith("ended"):
         with pytest.raises(FileError, match="disk is full"):
-            live(folder, "--map", "0")
+            live(folder, "--port", "0")
     else:
-        live(folder, "--map", "0")
+        live(folder, "--port", "0")
     assert told == [how]
     assert shown == list(range(1, 21 if how == "finished" else 8))
 
