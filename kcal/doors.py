@@ -6,8 +6,8 @@ defined: one table for type checkers, the reference and the door. A door imports
 circle.
 
 What it gives out also names a slip: where a function or constructor fails and one of its arguments is no such thing as
-its annotation says, an `InputError` says which, and what makes one. Nothing is checked as long as nothing fails, and
-kcal itself, which does not import through doors, sees its own errors.
+its annotation says, an `InputError` says which, and what makes one. Nothing is checked as long as nothing fails. A
+function or class is the same object wherever it is imported from, so kcal's own calls name slips too.
 """
 
 from __future__ import annotations

@@ -160,17 +160,12 @@ _ROUND = 0.83  # 4 pi area / perimeter²: squares have 0.79, circles seen from 4
 _SIZES = (0.6, 1.6)  # of the median: sizes of circles of one grid, seen from aside
 
 
-def seen_instead(
-    image: npt.NDArray[np.uint8],
-    board: Board,
-    seen_size: Callable[[npt.NDArray[np.uint8]], tuple[int, int] | None],
-) -> str:
+def seen_instead(image: npt.NDArray[np.uint8], board: Board) -> str:
     """Which board an image shows that is not the one asked for; empty if it shows none.
 
     Args:
         image: (H, W).
         board: that was asked for.
-        seen_size: `seen_size`.
     """
     if markers := seen_markers(image, board):
         return markers
@@ -578,7 +573,7 @@ def _hint(files: list[Any], board: Board) -> str:
         except FileError:
             continue
         small = to_8bit(reduced(image, max(1.0, max(image.shape) / SEARCH_SIDES[0]), _size(image))[0])
-        if other := seen_instead(small, board, seen_size):
+        if other := seen_instead(small, board):
             return f"; {other}"
     return ""
 

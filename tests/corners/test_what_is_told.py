@@ -24,6 +24,13 @@ from kcal.errors import FileError
 BLANK = np.full((200, 240), 230, np.uint8)
 
 
+def instead(image: np.ndarray, board: Board, size: tuple[int, int] | None) -> str:
+    """What is told where the largest grid of the image has a size."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("kcal.corners.detect.seen_size", lambda _: size)
+        return seen_instead(image, board)
+
+
 def markers(dictionary: str, *numbers: int, border: int = 1) -> NDArray[np.uint8]:
     """A page with so many markers in rows of four."""
     page = np.full((60 + 90 * (1 + (len(numbers) - 1) // 4), 400), 255, np.uint8)
@@ -48,16 +55,16 @@ class TestOtherBoards:
         ((8, 6), "a board of 8x6 was found: give --board 8x6"),
     ])  # fmt: skip
     def test_another_checkerboard(self, found: tuple[int, int] | None, told: str) -> None:
-        assert seen_instead(BLANK, self.BOARD, lambda image: found) == told
+        assert instead(BLANK, self.BOARD, found) == told
         tall = Board(columns=6, rows=9, square=0.025)
-        assert seen_instead(BLANK, tall, lambda image: found) == told
+        assert instead(BLANK, tall, found) == told
 
     def test_a_checkerboard_in_place_of_markers(self) -> None:
         """Of the same size too: its markers are missing."""
         marked = Board.parse("charuco:9x6", "25mm")
-        assert seen_instead(BLANK, marked, lambda image: (9, 6)) == "a board of 9x6 was found: give --board 9x6"
+        assert instead(BLANK, marked, (9, 6)) == "a board of 9x6 was found: give --board 9x6"
         circles = Board.parse("circles:9x6", "25mm")
-        assert seen_instead(BLANK, circles, lambda image: (8, 5)) == "a board of 8x5 was found: give --board 8x5"
+        assert instead(BLANK, circles, (8, 5)) == "a board of 8x5 was found: give --board 8x5"
 
     def test_markers(self) -> None:
         told = "markers 3 to 9 of dictionary 4x4_50 were found: give --board charuco:COLUMNSxROWS:4x4_50"
@@ -68,7 +75,7 @@ class TestOtherBoards:
         own = Board.parse("charuco:9x6", "25mm")
         assert seen_markers(page, own) == ""
         assert has_own_markers(page, own)
-        assert seen_instead(page, own, lambda image: (8, 6)) == ""
+        assert instead(page, own, (8, 6)) == ""
         others = Board.parse("charuco:9x6:4x4_250:id20", "25mm")
         assert seen_markers(page, others) == told
         assert not has_own_markers(page, others)
@@ -94,7 +101,7 @@ class TestOtherBoards:
         assert seen_circles(eleven, self.BOARD) is None
         told = "some 12 circles were found: give --board circles:COLUMNSxROWS or asymmetric:COLUMNSxROWS"
         assert seen_circles(twelve, self.BOARD) == told
-        assert seen_instead(twelve, self.BOARD, lambda image: None) == told
+        assert instead(twelve, self.BOARD, None) == told
         assert seen_circles(twelve, Board.parse("circles:4x3", "25mm")) == ""
         other = seen_circles(twelve, Board.parse("asymmetric:4x4", "25mm"))
         assert other is not None
