@@ -1,8 +1,13 @@
 """The `kcal` command; also `python -m kcal`, for environments whose commands are not on the PATH."""
 
+from __future__ import annotations
+
+import _thread
 import gc
 import os
+import signal
 import sys
+import threading
 
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 
@@ -17,15 +22,33 @@ def main() -> None:
     # The garbage collector would search the imported libraries again and again while they load and once more at the
     # end: .55 of 2.1 CPU s of `kcal diff`. Cyclic garbage of ordinary work stays below 50,000 objects.
     gc.set_threshold(50_000, 20, 20)
+    sys.unraisablehook = _unraisable
+    code: int | str | None = None
     try:
         from kcal.cli.main import main as run
 
         run()
     except KeyboardInterrupt:
         print("interrupted; nothing was written", file=sys.stderr)
-        sys.exit(130)
+        code = 130
+    except SystemExit as ended:
+        code = ended.code
     finally:
         gc.freeze()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # it ends already
+    exec("")  # otherwise Python ends as if killed where an interruption came inside such a call
+    if any(thread.name == "unstoppable" for thread in threading.enumerate()):  # kcal.child_processes
+        sys.stdout.flush()
+        os._exit(code if isinstance(code, int) else bool(code))
+    sys.exit(code)
+
+
+def _unraisable(what: sys.UnraisableHookArgs) -> None:
+    """Interrupt again, a moment later, where Python drops an interruption: in callbacks of its import system."""
+    if issubclass(what.exc_type, KeyboardInterrupt):
+        threading.Timer(0.01, _thread.interrupt_main).start()
+    else:
+        sys.__unraisablehook__(what)
 
 
 if __name__ == "__main__":

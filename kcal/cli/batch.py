@@ -51,7 +51,7 @@ def batch_command(
         typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers see the same files: tcp://host:8786."),
     ] = None,
     time_limit: Annotated[
-        float, typer.Option(metavar="S", help="Seconds for one image or one calibration.", min=1)
+        float, typer.Option(metavar="S", help="Seconds of processor time for one image or one calibration.", min=1)
     ] = 300.0,
 ) -> None:
     """Calibrate many cameras: images in, observations, camera files and one table out.

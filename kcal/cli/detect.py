@@ -44,7 +44,10 @@ def detect_command(
         Path | None, typer.Option(help="PNG file to write: where in the image corners were seen.")
     ] = None,
     time_limit: Annotated[
-        float, typer.Option(metavar="S", help="Seconds after which the search in one image is given up.", min=0.1)
+        float,
+        typer.Option(
+            metavar="S", help="Seconds of processor time after which the search in one image is given up.", min=0.1
+        ),
     ] = 60.0,
     duration: Annotated[
         float, typer.Option(metavar="S", help="Seconds for which a stream is watched.", min=1.0)

@@ -1,14 +1,17 @@
-"""Limit the time of calls into C++ libraries that cannot be interrupted by a signal."""
+"""Limit the processor time of calls into C++ libraries that cannot be interrupted by a signal."""
 
 from __future__ import annotations
 
+import ctypes
 import multiprocessing
 import threading
+import time
 from collections.abc import Callable
+from contextlib import suppress
 from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
-from kcal.child_processes import deaf_to_interrupts
+from kcal.child_processes import OVER_LIMIT, UNSTOPPABLE, deaf_to_interrupts, work_limit
 from kcal.errors import InputError, KcalError
 
 T = TypeVar("T")
@@ -19,14 +22,14 @@ class TookTooLongError(KcalError):
 
 
 class Limited:
-    """Make calls one after the other, each with a time limit.
+    """Make calls one after the other, each with a limit of the time that processors work on it.
 
-    The first calls run in a thread of this process, at no cost. A thread that exceeds the limit cannot be stopped. It
-    is left behind, and all later calls run in a separate process, which can be killed. So at most one call goes on
-    until this process ends.
+    Other work on the machine does not count. The first calls run in a thread of this process, at no cost. A thread that
+    exceeds the limit, or whose caller is interrupted, ends when its C++ library returns. Later calls run in a separate
+    process, which can be killed.
 
     Args:
-        seconds: the limit of each call; None for no limit.
+        seconds: the limit of each call, in seconds of one processor; None for no limit.
 
     Raises:
         InputError: a limit that is not positive.
@@ -76,14 +79,26 @@ class Limited:
         self._process = self._pipe = None
 
     def _in_thread(self, function: Callable[..., T], arguments: tuple[Any, ...]) -> Any:
+        assert self.seconds is not None
         outcome: list[Any] = []
-        thread = threading.Thread(target=lambda: outcome.append(_result_or_error(function, arguments)), daemon=True)
+
+        def run() -> None:
+            with suppress(SystemExit):
+                outcome.append(_result_or_error(function, arguments))
+
+        # No daemon: Python aborts if it ends while such a thread is in a C++ library.
+        thread = threading.Thread(target=run, name=UNSTOPPABLE)
         thread.start()
-        thread.join(self.seconds)
-        if outcome:
-            return outcome[0]
-        self._processes = True
-        return self._too_long()
+        try:
+            end = time.process_time() + self.seconds
+            while thread.is_alive() and (left := end - time.process_time()) > 0:
+                thread.join(max(left, 0.01))
+        finally:
+            if thread.is_alive():
+                self._processes = True
+                identity = ctypes.c_ulong(thread.ident or 0)
+                ctypes.pythonapi.PyThreadState_SetAsyncExc(identity, ctypes.py_object(SystemExit))
+        return outcome[0] if outcome else self._too_long()
 
     def _in_process(self, function: Callable[..., T], arguments: tuple[Any, ...]) -> Any:
         if self._pipe is None:
@@ -94,33 +109,34 @@ class Limited:
             with deaf_to_interrupts():
                 self._process.start()
             theirs.close()
+        assert self._process is not None
         try:
-            self._pipe.send((function, arguments))
-            self._pipe.recv()  # the process is there and has imported what it needs
-            if self._pipe.poll(self.seconds):
-                return self._pipe.recv()
+            self._pipe.send((self.seconds, function, arguments))
+            return self._pipe.recv()
         except (EOFError, OSError):
+            self._process.join()
+            too_long = self._process.exitcode == OVER_LIMIT
             self.close()
-            return TookTooLongError(
-                "the process that searched this image died (out of memory, or a crash); leave it out"
-            )
-        self.close()
-        return self._too_long()
+        if too_long:
+            return self._too_long()
+        return TookTooLongError("the process that searched this image died (out of memory, or a crash); leave it out")
 
     def _too_long(self) -> TookTooLongError:
         return TookTooLongError(
-            f"stopped at the time limit of {self.seconds:g} s (--time-limit); leave the image out, or allow more time"
+            f"stopped at the time limit of {self.seconds:g} s of processor time (--time-limit); leave the image out, "
+            "or allow more time"
         )
 
 
 def _serve(pipe: Connection) -> None:
     while True:
         try:
-            function, arguments = pipe.recv()
+            seconds, function, arguments = pipe.recv()
         except EOFError:
             return
-        pipe.send(None)
-        pipe.send(_result_or_error(function, arguments))
+        with work_limit(seconds):
+            outcome = _result_or_error(function, arguments)
+        pipe.send(outcome)
 
 
 def _result_or_error(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:

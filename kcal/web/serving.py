@@ -197,7 +197,7 @@ class LocalServer:
         bound, token = self._listener.getsockname()[1], new_token()
         app = make_app(token, tuple(f"{name}:{bound}" for name in ("127.0.0.1", "localhost")))
         self.address = f"http://127.0.0.1:{bound}/#{token}"
-        self._server = uvicorn.Server(uvicorn.Config(app, log_level="warning", access_log=False))
+        self._server = uvicorn.Server(uvicorn.Config(app, log_level="warning", access_log=False, lifespan="off"))
 
     def run(self) -> None:
         """Answer until `stop` is called, or until Ctrl+C."""

@@ -47,6 +47,16 @@ def test_an_old_file_stays_until_the_new_one_is_whole(folder: Path) -> None:
     assert (folder / "left.yaml").read_text() == "old"
 
 
+def test_while_an_image_is_searched(folder: Path) -> None:
+    """OpenCV's search goes on in a thread, from which Python's end would abort the process."""
+    corners = np.array([[200, 150], [440, 160], [430, 330], [190, 320]], np.float32)
+    flat = np.array([[0, 0], [6, 0], [6, 5], [0, 5]], np.float32)
+    image, _ = render(BOARD, (640, 480), cv2.getPerspectiveTransform(flat, corners), supersample=3)
+    cv2.imwrite(str(folder / "a.png"), image)
+    line = "detect a.png --board 7x6 --square 50mm -o new.obs.json"
+    assert interrupt(folder, "search:1", line) == "interrupted; nothing was written"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("line", "moments"),

@@ -1,10 +1,13 @@
+import hashlib
 import os
+import threading
 import time
 
 import cv2
 import pytest
 from board_render import homography, render
 
+from kcal.child_processes import UNSTOPPABLE
 from kcal.corners import detect as module
 from kcal.corners.board import Board
 from kcal.corners.detect import detect
@@ -15,10 +18,18 @@ BOARD = Board(columns=6, rows=5, square=0.02)
 found_by_the_library = module.detect_board
 
 
+def busy(seconds):
+    """Work for so much processor time, as a C++ library that never asks Python."""
+    end = time.process_time() + seconds
+    data = bytes(20_000_000)
+    while time.process_time() < end:
+        hashlib.sha256(data)
+
+
 def slow_if_upright(image, board, refine):
     """A detector that loops for ever on one kind of image."""
     if image.shape[0] > image.shape[1] and image[0, 0] == 7:
-        time.sleep(3600)
+        busy(3600.0)
     return found_by_the_library(image, board, refine)
 
 
@@ -33,7 +44,7 @@ def test_calls_return_or_are_given_up():
         for _ in range(2):  # in a thread, then in a process
             limited.seconds = SCANT
             with pytest.raises(TookTooLongError, match=r"0\.3 s"):
-                limited(time.sleep, 3600)
+                limited(busy, 3600.0)
             limited.seconds = AMPLE
             assert limited(divmod, 7, 2) == (3, 1)
         with pytest.raises(ZeroDivisionError):
@@ -41,6 +52,19 @@ def test_calls_return_or_are_given_up():
         with pytest.raises(TookTooLongError, match="died"):
             limited(os._exit, 3)
         assert limited(divmod, 7, 2) == (3, 1)
+
+
+def test_only_work_counts():
+    """Waiting, as for processors that are busy, takes nothing of the limit, in a thread and in a process."""
+    with Limited(SCANT) as limited:
+        limited(time.sleep, 2 * SCANT)
+        with pytest.raises(TookTooLongError):
+            limited(busy, 3600.0)
+        limited(time.sleep, 2 * SCANT)
+    left = [thread for thread in threading.enumerate() if thread.name == UNSTOPPABLE]
+    for thread in left:
+        thread.join(60.0)
+    assert not any(thread.is_alive() for thread in left)
 
 
 def test_no_limit_and_bad_limit():

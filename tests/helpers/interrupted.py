@@ -3,6 +3,7 @@
 `python interrupted.py KIND:VALUE COMMAND...`, where the moment is
 
 * `import:NAME`: when that module is imported;
+* `search:N`: during the N-th search of an image by OpenCV;
 * `step:N`: at the N-th step of a progress bar;
 * `write:N`, `written:N`: right before and right after the N-th file comes into its place;
 * `killed:N`: right after that, but killed, as when the power fails.
@@ -61,6 +62,20 @@ def interrupt_at(moment: str) -> None:
             return load(name, *arguments, **options)
 
         builtins.__import__ = imported
+    elif kind == "search":
+        import cv2
+
+        search = cv2.findChessboardCorners
+
+        def searched(*arguments: Any, **options: Any) -> Any:
+            left[0] -= 1
+            if left[0] == 0:
+                os.killpg(0, sent)
+                for _ in range(100):
+                    search(*arguments, **options)
+            return search(*arguments, **options)
+
+        cv2.findChessboardCorners = searched
     elif kind == "step":
         rich.progress.Progress.update = struck(rich.progress.Progress.update)  # type: ignore[method-assign]
     else:

@@ -8,19 +8,18 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import faulthandler
 import hashlib
 import io
 import os
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar
 
 import kcal
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
 from kcal.calibrate.camera.result import HYBRID
+from kcal.child_processes import work_limit
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_board, view_of
 from kcal.corners.images import decode_gray, expand_images, unique_names
@@ -43,7 +42,7 @@ class BatchOptions:
         refine: how corners are refined, see `kcal.corners.refine.refine_corners`.
         board_warp: also estimate how each board bends.
         one_type: the cameras are of one type: each learns from the others what its lens is like.
-        time_limit: seconds for one image or one calibration, after which it is given up.
+        time_limit: seconds of processor time for one image or one calibration, after which it is given up.
     """
 
     refine: Refinement = "erf"
@@ -181,7 +180,7 @@ def detection_key(digest: str, board: Board, refine: str) -> str:
 
 def detect_image(path: str, board: Board, options: BatchOptions) -> Detected:
     """Find the board in one image."""
-    with _time_limit(options.time_limit):
+    with work_limit(options.time_limit):
         try:
             image = decode_gray(read_bytes(path), path)
         except FileError as error:
@@ -232,7 +231,7 @@ def calibration_options(model: str, options: BatchOptions) -> CalibrationOptions
 
 def calibrate_again(seen: Observations, options: BatchOptions) -> CameraCalibrationResult:
     """One camera with the hybrid lens, with all that its calibration tells."""
-    with _time_limit(options.time_limit):
+    with work_limit(options.time_limit):
         return calibrate_camera(seen, calibration_options(HYBRID, options))
 
 
@@ -243,23 +242,9 @@ def calibrated(result: CameraCalibrationResult, name: str) -> Calibrated:
 
 def calibrate_observations(seen: Observations, name: str, model: str, options: BatchOptions) -> Calibrated:
     """Calibrate one camera."""
-    with _time_limit(options.time_limit):
+    with work_limit(options.time_limit):
         try:
             result = calibrate_camera(seen, calibration_options(model, options))
         except KcalError as error:
             return Calibrated(error=str(error))
         return calibrated(result, name)
-
-
-@contextmanager
-def _time_limit(seconds: float) -> Iterator[None]:
-    """End this process if the work takes longer.
-
-    A Python signal cannot interrupt a C++ library, so the watchdog is a thread of its own.
-    """
-    with open(os.devnull, "w") as nowhere:
-        faulthandler.dump_traceback_later(seconds, exit=True, file=nowhere)
-        try:
-            yield
-        finally:
-            faulthandler.cancel_dump_traceback_later()
