@@ -206,9 +206,9 @@ def rectify_command(
     """Resample images: pinhole without distortion, part of a fisheye as a perspective image, cylinder, stereo pair.
 
     Writes NAME.png for each image (8 or 16 bits, gray or color as the source) and the pinhole camera of the new images.
-    Of a rig, rows of left/ and right/ are epipolar lines: depth is focal length · baseline / disparity, which
-    rectified.rig.json and Q.npy (cv2.reprojectImageTo3D) say, and the table shows with its sigma. EXIF orientation is
-    ignored: pixels are used as the sensor wrote them.
+    Of a rig, rows of left/ and right/ are epipolar lines (columns, where one camera stands above the other): depth is
+    focal length · baseline / disparity, which rectified.rig.json and Q.npy (cv2.reprojectImageTo3D) say, and the table
+    shows with its sigma. EXIF orientation is ignored: pixels are used as the sensor wrote them.
 
     Images that are done are not made again. A bad image does not stop the others: it is reported, and the exit code
     is 1.
@@ -311,7 +311,8 @@ def _rectify_rig(
     from kcal.corners.images import expand_images
 
     if len(images) not in ((0, 2) if maps else (2,)):
-        raise InputError(f"a rig needs LEFT and RIGHT: two files, folders or quoted wildcards, got {len(images)}")
+        got = f"got {len(images)}" if images else "or --maps for the maps alone"
+        raise InputError(f"a rig needs LEFT and RIGHT: two files, folders or quoted wildcards, {got}")
     names = ("left", "right")
     sides = {name: expand_images([given]) for name, given in zip(names, images, strict=False)}
     rig_path, matrix_path = folder / "rectified.rig.json", folder / "Q.npy"
@@ -337,8 +338,7 @@ def _rectify_rig(
                 before, failures = before + done, failures + wrong
     paths = [path for some in sides.values() for path in some]
     _refuse_none(paths, failures)
-    apart = torch.tensor([-float(rig.baseline), 0.0, 0.0], dtype=torch.float64)
-    save_rig(StereoRig(module.camera, module.camera, torch.eye(3), apart), rig_path)
+    save_rig(StereoRig(module.camera, module.camera, torch.eye(3), -module.right_center), rig_path)
     _save_array(matrix_path, module.depth_matrix)
     for name, side in zip(names, (module.left, module.right), strict=True):
         _write_extras(folder, name, side, maps, mask)
@@ -347,6 +347,7 @@ def _rectify_rig(
     out.print(f"both cameras: focal length {focal:.2f} px, cx {cx:.2f}, cy {cy:.2f}, baseline {rig.baseline:.6g} m")
     for name, side in zip(names, (module.left, module.right), strict=True):
         _tell_view(side.camera, side, f"{name}: ")
+    _tell_side(module)
     _tell_ranges(module)
     print_wrote(folder, *extras)
     _fail_at_end(paths, failures)
@@ -409,6 +410,29 @@ def _tell_view(camera: Camera, module: Undistort, label: str) -> None:
     tell(**{label.removesuffix(": ") or "view": told})
 
 
+def _tell_side(module: StereoRectification) -> None:
+    """Print what a disparity is; warn where a matcher must be told so."""
+    right, down = module.right_center.tolist()[:2]
+    line, sign = ("column" if abs(right) > abs(down) else "row"), ("positive" if right + down > 0 else "negative")
+    out.print(f"disparity is the {line} in left/ minus the {line} in right/, and {sign}")
+    if line == "row":
+        where = "below" if down > 0 else "above"
+        warn(
+            f"the right camera stands {where} the left one, so that the same thing is in the same column, and "
+            f"disparities are {sign}: transpose both images for a matcher that searches along rows"
+        )
+    elif sign == "negative":
+        warn(
+            "the right camera stands to the left of the left one, so that disparities are negative: exchange the "
+            "cameras and their images, or let the matcher search from -N to 0 (if it stands to the right in truth, the "
+            "rig's pose is left_from_right)"
+        )
+    if float(module.left.rotation[0, :2] @ module.right.rotation[0, :2]) < 0:
+        warn(
+            "the right camera is rolled by more than 90° against the left one: both images are upright as the left one"
+        )
+
+
 def _tell_ranges(module: StereoRectification) -> None:
     """Print what a disparity means in the middle of the image."""
     import torch
@@ -422,7 +446,8 @@ def _tell_ranges(module: StereoRectification) -> None:
     # Distances from the camera, of which the depth is a part.
     ahead = float(torch.hypot(torch.hypot(where[0, 0] - cx, where[0, 1] - cy), torch.tensor(focal))) / focal
     ranges = usual_ranges(module.rig)
-    disparity = focal * float(module.rig.baseline) * ahead / torch.tensor(ranges, dtype=torch.float64)
+    apart = float(module.right_center[:2].sum())
+    disparity = focal * apart * ahead / torch.tensor(ranges, dtype=torch.float64)
     found = DisparityRanges(module, disparity_sigma=_DISPARITY_SIGMA).at(where.expand(len(ranges), 2), disparity)
     rows = [["range, m", "disparity, px", f"sigma, m, of ± {_DISPARITY_SIGMA} px", "95 % from", "to"]]
     for i, at in enumerate(ranges):

@@ -307,17 +307,24 @@ def _source_positions(
 #
 # The new x axis lies along the baseline, the new z axis between both cameras' axes (A. Fusiello, E. Trucco and A.
 # Verri, "A compact algorithm for rectification of stereo pairs", 2000). Both pinholes have one focal length and one
-# principal point, so that far things have no disparity and depth is f b / disparity.
+# principal point, so that far things have no disparity and depth is f b / disparity. Images stay upright, as those of
+# cv2.stereoRectify: x or y lies along the baseline, in either direction, whichever turns the cameras least.
 
-# Between the baseline and a camera's axis, degrees: nearer, the rectified images are stretched beyond use.
-_LEAST_ANGLE = 20.0
+# Degrees between the baseline and a camera's axis below which the rectified images are stretched beyond use, and
+# between the rectified axis and a camera's above which a pinhole does not show the middle of its image.
+_LEAST_ANGLE, _MOST_TURNED = 20.0, 80.0
 
 
 class StereoRectification(Float64Module):
     """Resample both images of a rig so that the same thing is in the same row of both.
 
     Convention: the rectified frame has its origin in the left camera; points_left = rotation @ points_rectified, and
-    the right pinhole stands at (baseline, 0, 0). Disparity is the column in the left minus that in the right image.
+    the right pinhole stands at `right_center`, commonly (baseline, 0, 0). Disparity is the column in the left minus
+    that in the right image. Images stay upright, as with cv2.stereoRectify. So disparities are negative where the right
+    camera stands to the left of the left one. Where one camera stands above the other, the same thing is in the same
+    column, and disparity is the row in the left minus that in the right image. Where one camera is rolled against the
+    other by more than 90 degrees, both images are upright as the left one is.
+
     The frame and the new camera are chosen once, from the rig as it stands: they have no gradients by it. Images have
     gradients by images and by the cameras' parameters.
 
@@ -330,7 +337,8 @@ class StereoRectification(Float64Module):
 
     Raises:
         InputError: alpha, field of view or size that cannot be.
-        DegenerateError: the cameras look along their baseline, or in directions that have nothing in common.
+        DegenerateError: the cameras look along their baseline, or in directions that have nothing in common, or see
+            nothing of the field of view.
 
     Example:
         >>> camera = Camera.build(focal=(500, 500), center=(319.5, 239.5), size=(640, 480), coefficients=[-0.2])
@@ -366,6 +374,9 @@ class StereoRectification(Float64Module):
             self.camera = _common_pinhole((TurnedCamera(rig.left, left), TurnedCamera(rig.right, right)), alpha, size)
         self.left = Undistort(self.rig.left, self.camera, left, at=at)
         self.right = Undistort(self.rig.right, self.camera, right, at=at)
+        for name, side in (("left", self.left), ("right", self.right)):
+            if not bool(side.mask.any()):
+                raise DegenerateError(f"rectification: the {name} camera shows nothing of this field of view; widen it")
         self.register_buffer("rotation", turn)
 
     def forward(self, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -374,22 +385,30 @@ class StereoRectification(Float64Module):
         return new_left, new_right, mask_left, mask_right
 
     @property
-    def _baseline(self) -> Tensor:
-        return self.rig.baseline.detach()
+    def right_center(self) -> Tensor:
+        """(3,) meters in the rectified frame: where the right pinhole stands, along x, or along y if that is nearer."""
+        rig = still(self.rig)
+        return -(rig.right_from_left_rotation @ self.rotation).mT @ rig.right_from_left_translation
+
+    @property
+    def _apart(self) -> tuple[Tensor, Tensor]:
+        """Axis (2,) along which the cameras stand apart, 1 there, and how far, signed as `right_center`."""
+        place = self.right_center[:2]
+        return (place / torch.linalg.vector_norm(place)).round().abs(), place.sum()
 
     @property
     def depth_matrix(self) -> Tensor:
         """(4, 4) Q of OpenCV: (X, Y, Z, W) = Q (u, v, disparity, 1), the point being (X, Y, Z) / W, in meters."""
         focal, _, cx, cy, _ = self.camera.params.detach().unbind()
         Q = torch.zeros(4, 4, dtype=torch.float64, device=focal.device)
-        Q[0, 0], Q[1, 1], Q[0, 3], Q[1, 3], Q[2, 3], Q[3, 2] = 1.0, 1.0, -cx, -cy, focal, 1.0 / self._baseline
+        Q[0, 0], Q[1, 1], Q[0, 3], Q[1, 3], Q[2, 3], Q[3, 2] = 1.0, 1.0, -cx, -cy, focal, 1.0 / self._apart[1]
         return Q
 
     def depth(self, disparity: Tensor) -> Tensor:
-        """Depth Z along the rectified axis, meters, of disparities in pixels; infinite where these are not positive."""
+        """Depth Z along the rectified axis, meters, of disparities in pixels; infinite for 0 and the wrong sign."""
         disparity = torch.as_tensor(disparity, dtype=torch.float64)
-        ahead = disparity > 0
-        reach = self.camera.params.detach()[0] * self._baseline
+        reach = self.camera.params.detach()[0] * self._apart[1]
+        ahead = disparity * reach > 0
         return torch.where(ahead, reach / torch.where(ahead, disparity, 1.0), torch.inf)
 
     def points(self, pixels: Tensor, disparity: Tensor) -> Tensor:
@@ -414,7 +433,7 @@ class StereoRectification(Float64Module):
             left and right (..., N, 2), and valid (..., N).
         """
         pixels = as_points("pixels", pixels, 2)
-        moved = pixels - torch.stack([disparity, torch.zeros_like(disparity)], -1)
+        moved = pixels - disparity[..., None] * self._apart[0]
         found = []
         for module, where in ((self.left, pixels), (self.right, moved)):
             rays, _ = self.camera.unproject(where)
@@ -423,27 +442,36 @@ class StereoRectification(Float64Module):
 
 
 def _rectified_frame(rig: StereoRig) -> Tensor:
-    """(3, 3) left_from_rectified: x along the baseline, z as nearly as possible between both cameras' axes."""
+    """(3, 3) left_from_rectified: x or y along the baseline, z as nearly as possible between both cameras' axes."""
     rotation = rig.right_from_left_rotation
     center = -rotation.T @ rig.right_from_left_translation
     length = float(center.norm())
     if not length > 0:
         raise DegenerateError("rectification: the cameras stand in one place, so that there is no disparity")
     across = center / length
-    # In the left camera's frame, both cameras look along the third rows.
-    for name, axis in (("left", torch.eye(3).to(rotation)[2]), ("right", rotation[2])):
+    # In the left camera's frame, the cameras' axes are the rows.
+    axes = {"left": torch.eye(3).to(rotation), "right": rotation}
+    for name, (_, _, axis) in axes.items():
         angle = math.degrees(math.acos(min(1.0, abs(float(axis @ across)))))
         if angle < _LEAST_ANGLE:
             raise DegenerateError(
                 f"rectification: the {name} camera looks {angle:.0f} degrees from the baseline, at the other camera or "
                 f"away from it; at least {_LEAST_ANGLE:g} are needed"
             )
-    ahead = torch.eye(3).to(rotation)[2] + rotation[2]
-    ahead = ahead - (ahead @ across) * across
-    if float(ahead.norm()) < 0.1:
-        raise DegenerateError("rectification: the cameras look in opposite directions")
-    ahead = ahead / ahead.norm()
-    return torch.stack([across, torch.linalg.cross(ahead, across), ahead], -1)
+    ahead = axes["left"][2] + rotation[2]
+    ahead = torch.nn.functional.normalize(ahead - (ahead @ across) * across, dim=0)
+    for name, (_, _, axis) in axes.items():
+        angle = math.degrees(math.acos(max(-1.0, min(1.0, float(axis @ ahead)))))
+        if not angle <= _MOST_TURNED:
+            raise DegenerateError(
+                f"rectification: the {name} camera looks {angle:.0f} degrees away from what lies between both cameras' "
+                f"axes; at most {_MOST_TURNED:g} are possible: the cameras look in different directions"
+            )
+    down = torch.linalg.cross(ahead, across)
+    level = axes["left"][0] + (rotation[0] if float(axes["left"][0] @ rotation[0]) > 0 else 0.0)
+    quarter = round(math.atan2(float(level @ down), float(level @ across)) / (0.5 * math.pi)) % 4
+    right = (across, down, -across, -down)[quarter]
+    return torch.stack([right, torch.linalg.cross(ahead, right), ahead], -1)
 
 
 def _common_pinhole(cameras: tuple[TurnedCamera, TurnedCamera], alpha: float, size: tuple[int, int]) -> Camera:
@@ -461,7 +489,10 @@ def _common_pinhole(cameras: tuple[TurnedCamera, TurnedCamera], alpha: float, si
         lows, highs = (torch.stack([one[k] for one in each]) for k in (0, 1))
         low, high = (lows.amax(0), highs.amin(0)) if inner else (lows.amin(0), highs.amax(0))
         if not bool((high > low).all()):
-            raise DegenerateError("rectification: the cameras have no directions in common; give a field of view")
+            raise DegenerateError(
+                "rectification: far away the cameras have no directions in common; for near things give a field of "
+                "view (--fov)"
+            )
         scale = last / (high - low)
         focal = focal + share * (scale.max() if inner else scale.min())
         middle = middle + share * 0.5 * (low + high)

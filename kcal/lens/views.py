@@ -25,6 +25,8 @@ _SLACK = 1e-6
 _SIDE_SAMPLES = 129
 # Rays farther from the axis count for neither rectangle: on a pinhole's plane they lie too far out.
 _WIDEST = math.radians(89.0)
+# Which side of the image is at the left, right, top and bottom of a frame, by quarter turns of the image.
+_SIDES = (0, 1, 2, 3), (3, 2, 0, 1), (1, 0, 3, 2), (2, 3, 1, 0)
 
 
 class Sees(Protocol):
@@ -57,6 +59,12 @@ class TurnedCamera:
     def __init__(self, camera: Camera, rotation: Tensor, at: float = math.inf) -> None:
         self.camera, self.rotation, self.at = camera, rotation, at
         self.params, self.size = camera.params, camera.size
+
+    @property
+    def roll(self) -> float:
+        """Degrees from the frame's x axis to the camera's, towards the frame's y axis."""
+        x, y = self.rotation[..., 0, :2].reshape(-1, 2)[0].tolist()
+        return math.degrees(math.atan2(y, x))
 
     def unproject(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         """As `Camera.unproject`, in the turned frame."""
@@ -170,9 +178,10 @@ def _points_on_sides(low: Tensor, high: Tensor, along: Tensor) -> Tensor:
 def _side_extremes(camera: Sees, outermost: bool) -> Tensor:
     """Innermost (or outermost) x of the left and right side and y of the top and bottom side of the image, (..., 4).
 
-    Infinite for a side on which no pixel has a ray.
+    Infinite for a side on which no pixel has a ray. Left is the side that is at the left in the camera's frame.
     """
     vector = camera.params
+    sides = list(_SIDES[round(camera.roll / 90.0) % 4 if isinstance(camera, TurnedCamera) else 0])
     last = torch.tensor(camera.size, dtype=vector.dtype, device=vector.device) - 1
     step = torch.linspace(0, 1, _SIDE_SAMPLES, dtype=vector.dtype, device=vector.device)
     # Inward is +x on the left and -x on the right.
@@ -183,7 +192,7 @@ def _side_extremes(camera: Sees, outermost: bool) -> Tensor:
     # 129 samples per side, then twice the two steps around the best one: the remaining error is below 1e-9 px.
     for _ in range(3):
         along = start[..., None] + (end - start)[..., None] * step
-        pixels = _points_on_sides(torch.zeros_like(last), last, along)
+        pixels = _points_on_sides(torch.zeros_like(last), last, along)[..., sides, :, :]
         rays, valid = camera.unproject(pixels.flatten(-3, -2))
         rays, valid = rays.unflatten(-2, (4, _SIDE_SAMPLES)), valid.unflatten(-1, (4, _SIDE_SAMPLES))
         valid = valid & (rays[..., 2] > math.cos(_WIDEST))
@@ -210,7 +219,15 @@ def inner_rectangle(camera: Sees, size: tuple[int, int]) -> tuple[Tensor, Tensor
     rays, valid = camera.unproject(middle[None])
     ray, valid = rays[..., 0, :], valid[..., 0]
     center = ray[..., :2] / ray[..., 2:]
-    if not bool((valid & (ray[..., 2] > 0) & (center > low).all(-1) & (center < high).all(-1)).all()):
+    valid = valid & (ray[..., 2] > 0)
+    around = valid & (center > low).all(-1) & (center < high).all(-1)
+    boxes = [(low, high)] if bool(around.all()) else []
+    if isinstance(camera, TurnedCamera) and bool(valid):
+        # Of an image that is rolled, innermost points of its sides leave little, or nothing.
+        reach = (_side_extremes(camera, outermost=True) - center.repeat_interleave(2)).abs()
+        half = reach.where(reach.isfinite(), disc.repeat_interleave(2)).amax() * shape / shape.amin()
+        boxes.append((center - half, center + half))
+    if not boxes:
         raise DegenerateError(
             "new_pinhole: the image's center has no valid ray; check the camera, or make the new one by `Camera.build`"
         )
@@ -219,18 +236,21 @@ def inner_rectangle(camera: Sees, size: tuple[int, int]) -> tuple[Tensor, Tensor
     longest = max(size)
     along = torch.stack([torch.nn.functional.pad(t, (0, longest - t.numel())) for t in (rows, rows, columns, columns)])
 
-    def all_seen(scale: Tensor) -> Tensor:
+    def all_seen(box: tuple[Tensor, Tensor], scale: Tensor) -> Tensor:
         """Whether all pixels along the border have a source, after the rectangle is shrunk towards the center."""
-        border = _points_on_sides(*_shrunk(center, low, high, scale), along)
+        border = _points_on_sides(*_shrunk(center, *box, scale), along)
         return source_pixels(camera, _on_plane(border.flatten(-3, -2)))[1].all(-1)
 
-    good, bad = torch.zeros_like(center[..., 0]), torch.ones_like(center[..., 0])
-    good = torch.where(all_seen(bad), bad, good)
-    while bool((bad - good > 1e-9).any()):
-        trial = (good + bad) / 2
-        passed = all_seen(trial) | (good == bad)
-        good, bad = torch.where(passed, trial, good), torch.where(passed, bad, trial)
-    return _shrunk(center, low, high, good)
+    found = []
+    for box in boxes:
+        good, bad = torch.zeros_like(center[..., 0]), torch.ones_like(center[..., 0])
+        good = torch.where(all_seen(box, bad), bad, good)
+        while bool((bad - good > 1e-9).any()):
+            trial = (good + bad) / 2
+            passed = all_seen(box, trial) | (good == bad)
+            good, bad = torch.where(passed, trial, good), torch.where(passed, bad, trial)
+        found.append(_shrunk(center, *box, good))
+    return max(found, key=lambda box: float(((box[1] - box[0]) / shape).amin()))
 
 
 def _shrunk(center: Tensor, low: Tensor, high: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:

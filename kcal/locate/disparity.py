@@ -85,7 +85,7 @@ class DisparityRanges(Float64Module):
 
     @torch.no_grad()
     def forward(self, disparity: Tensor) -> RangeImage:
-        """Map disparities (..., H, W) in pixels of the left rectified image; NaN and what is not positive has no range.
+        """Map disparities (..., H, W) in pixels of the left rectified image; NaN and the wrong sign have no range.
 
         Raises:
             InputError: not floating point, or another size.
@@ -105,7 +105,7 @@ class DisparityRanges(Float64Module):
     @torch.no_grad()
     def at(self, pixels: Tensor, disparity: Tensor) -> RangeImage:
         """The same for single pixels (N, 2) of the left rectified image and their disparities (N,)."""
-        good = disparity.isfinite() & (disparity > 0)
+        good = self.rectification.depth(disparity).isfinite() & disparity.isfinite()
         safe = torch.where(good, disparity, 1.0)
         left, right, seen = self.rectification.source_pixels(pixels, safe)
         slopes = []

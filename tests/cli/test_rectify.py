@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import re
 import sys
+import warnings
 from pathlib import Path
 
 import cv2
@@ -17,7 +18,7 @@ from kcal.io.camera_file import load_camera, save_camera
 from kcal.io.images import encode_png
 from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.camera import Camera
-from kcal.lens.images import Undistort
+from kcal.lens.images import StereoRectification, Undistort
 from kcal.lens.rig import StereoRig
 from kcal.lens.views import new_pinhole
 
@@ -192,6 +193,39 @@ def test_rig(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
     assert abs(float(new.baseline) - 0.5001) < 1e-5
     assert np.load(folder / "out" / "Q.npy").shape == (4, 4)
     assert {path.name for path in (folder / "out" / "right").iterdir()} == {"1.png", "rectify.json"}
+
+
+@pytest.mark.parametrize(
+    ("place", "line", "warned"),
+    [
+        ((-0.5, 0.0, 0.0), "disparity is the column in left/ minus the column in right/, and positive", ""),
+        ((0.5, 0.0, 0.0), "and negative", "stands to the left of the left one, so that disparities are negative"),
+        ((0.0, -0.5, 0.0), "disparity is the row in left/ minus the row in right/, and positive", "stands below"),
+        ((0.0, 0.5, 0.0), "and negative", "stands above the left one"),
+    ],
+)
+def test_sides_of_a_rig(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    place: tuple[float, float, float], line: str, warned: str,
+) -> None:  # fmt: skip
+    """Maps without images; what a disparity is, is said; the rig that is written rectifies to itself."""
+    monkeypatch.setenv("COLUMNS", "300")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        save_rig(StereoRig(CAMERA, CAMERA, torch.eye(3), torch.tensor(place)), folder / "rig.json")
+    assert run(monkeypatch, "rig.json") == 1
+    assert "or --maps for the maps alone" in capsys.readouterr().err
+    assert run(monkeypatch, "rig.json", "--maps", "-o", "out") == 0
+    printed = capsys.readouterr()
+    assert line in printed.out
+    assert warned in printed.err
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        new = load_rig(folder / "out" / "rectified.rig.json")
+    assert torch.allclose(new.right_from_left_translation, torch.tensor(place).double(), atol=1e-12)
+    again = StereoRectification(new)
+    assert torch.allclose(again.rotation, torch.eye(3).double(), atol=1e-12)
+    assert np.allclose(np.load(folder / "out" / "Q.npy")[3, 2], 1.0 / -sum(place))
 
 
 def test_rays(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import cv2
 import numpy as np
@@ -111,15 +112,47 @@ class TestViews:
 
 
 class TestStereo:
-    def test_rows_and_disparity(self) -> None:
-        """A point is in the same row of both images, and its disparity gives it back."""
-        rectify, there = StereoRectification(RIG), points()
-        seen_left, seen_right, valid = RIG(there)
+    @pytest.mark.parametrize("options", [{}, {"alpha": 1.0}, {"field_of_view": 50.0}], ids=str)
+    @pytest.mark.parametrize("rolled", [0.0, 180.0])
+    @pytest.mark.parametrize(
+        ("place", "axis", "sign"),
+        [
+            ((2.0, 0.1, 0.05), 0, 1), ((-2.0, 0.1, 0.05), 0, -1), ((0.1, 2.0, 0.05), 1, 1), ((0.1, -2.0, 0.05), 1, -1),
+            ((2.0, -1.6, 0.0), 0, 1),
+        ],
+        ids=["right", "left", "below", "above", "diagonal"],
+    )  # fmt: skip
+    def test_rows_and_disparity(
+        self, place: tuple[float, float, float], axis: int, sign: int, rolled: float, options: dict[str, float]
+    ) -> None:
+        """A point is in one row, or column, of both upright images, as OpenCV's; its disparity gives it back."""
+        turn = rotation_from_vector(torch.tensor([0.0, 0.0, math.radians(rolled)], dtype=F64)) @ TURN
+        shift = -turn @ torch.tensor(place, dtype=F64)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            rig = StereoRig(LEFT, RIGHT, turn, shift)
+        rectify, there = StereoRectification(rig, **options), points()
+        if not rolled:
+            lens, more = np.array([-0.2, 0.03, 0, 0, 0]), np.array([-0.18, 0.02, 1e-3, 5e-4, 0])
+            first, _, _, second, Q, *_ = cv2.stereoRectify(
+                LEFT.matrix.numpy(), lens, RIGHT.matrix.numpy(), more, (640, 480), turn.numpy(), shift[:, None].numpy()
+            )
+            assert np.abs(second[axis, 3]) > np.abs(second[1 - axis, 3])
+            assert abs(float(rectify.depth_matrix[3, 2]) - Q[3, 2]) < 1e-9
+            assert np.abs(first.T - rectify.rotation.numpy()).max() < 0.02
+        # Upright: x of the left image lies in its half; all of what both show has a source.
+        assert float(rectify.rotation[0, 0]) > 0.7
+        if not options:
+            assert bool(rectify.left.mask.all() and rectify.right.mask.all())
+            assert rectify.camera.focal[0] < (2000 if place[1] == -1.6 else 900)
+        seen_left, seen_right, valid = rig(there)
         turned = there @ rectify.rotation
         left, _ = rectify.camera.project(turned)
-        right, _ = rectify.camera.project(turned - torch.tensor([float(RIG.baseline), 0, 0], dtype=F64))
-        disparity = left[:, 0] - right[:, 0]
-        assert float(disparity.min()) > 0
+        right, _ = rectify.camera.project(turned - rectify.right_center)
+        assert float((left - right)[:, 1 - axis].abs().max()) < 1e-9
+        disparity = (left - right)[:, axis]
+        assert float((sign * disparity).min()) > 0
+        assert not bool(rectify.depth(-disparity).isfinite().any())
         source_left, source_right, _ = rectify.source_pixels(left, disparity)
         assert float((source_left - seen_left)[valid].abs().max()) < 1e-9
         assert float((source_right - seen_right)[valid].abs().max()) < 1e-5
@@ -128,6 +161,8 @@ class TestStereo:
         homogeneous = torch.cat([left, disparity[:, None], torch.ones_like(disparity)[:, None]], -1)
         found = homogeneous @ rectify.depth_matrix.T
         assert float((found[:, :3] / found[:, 3:] - turned).abs().max()) < 1e-6
+        at = DisparityRanges(rectify).at(left[valid], disparity[valid])
+        assert float((at.range - there[valid].norm(dim=-1)).abs().max()) < 1e-4
 
     @pytest.mark.parametrize("alpha", [0.0, 1.0])
     def test_alpha(self, alpha: float) -> None:
@@ -173,6 +208,14 @@ class TestStereo:
             StereoRectification(ahead)
         with pytest.raises(InputError, match="alpha"):
             StereoRectification(RIG, alpha=2.0)
+        for degrees, options, text in (
+            (175.0, {}, "the left camera looks 88 degrees away"),
+            (120.0, {}, "no directions in common"),
+            (120.0, {"field_of_view": 30.0}, "the left camera shows nothing of this field of view"),
+        ):
+            turn = rotation_from_vector(torch.tensor([math.radians(degrees), 0.0, 0.0], dtype=F64))
+            with pytest.raises(DegenerateError, match=text):
+                StereoRectification(StereoRig(LEFT, RIGHT, turn, -turn[:, 0]), **options)
 
 
 class TestRays:
