@@ -39,6 +39,8 @@ _TOO_MUCH = 0.5 * LARGEST
 _AT_REST = 0.1
 # The same for a fit from which another begins.
 _NEAR_REST = 0.3
+# Nats by which the evidence may still change from one round to the next.
+_UNFELT = 0.02
 # With which motions begin: as a hand moves. From that of still views, field and board explain the motion first, and
 # the evidence has another maximum there (one of sixty simulated captures by hand).
 _MOVING = 3e-3
@@ -111,6 +113,7 @@ def run_rounds(
     """
     readout, converged, tempered, lost = capture.readout, False, False, math.nan
     top: Rounds | None = None
+    last = math.inf
     estimate = begin_motion(capture, estimate)
     if capture.readout is not None:
         # That of an earlier fit, which was found after its rounds.
@@ -135,7 +138,9 @@ def run_rounds(
                 data, estimate.families, best.h, best.variance, hyperprior, best.log_ratio, tempering, roughly
             )
             change = max(_moved_by(estimate, best), abs(math.log(tempering / former)))
-            resting = not first and (change < _NEAR_REST if rough else change < _AT_REST and steps <= most)
+            # The solver may try several steps where it finds nothing that the evidence feels.
+            still = steps <= most or abs(best.loss - last) < _UNFELT
+            resting = not first and (change < _NEAR_REST if rough else change < _AT_REST and still)
             # To the end where nothing will change any more.
             if not resting:
                 break
@@ -145,6 +150,7 @@ def run_rounds(
             variance=best.variance * tempering,
             tempering=tempering,
         )
+        last = best.loss
         progress(f"evidence, round {turn + 1}")
         if data.moving and turn < _ROUNDS - 1:
             # The first round tells it as the second does, within .05 nats for 16 simulated captures of 6 to 200 views.

@@ -25,6 +25,9 @@ BOARD = -4
 LEADING_UNKNOWNS, _PUPIL = 6, 4
 # Unequal and skewed axes, in units of R: pixels are square.
 SQUARE = 1e-4
+# Of a focal length about that of the base projection, as a share of it: views that leave it open still tell it to no
+# better than this, and where field and shape stand for it, it does not drift away (a mirror's image without a middle).
+_FOCAL = 0.2
 # Of the principal point about the middle, in diagonals.
 _CENTER = 0.05
 
@@ -113,8 +116,8 @@ def prior_families(
     """
     diagonal = math.hypot(*size)
     corner = math.atan(0.5 * diagonal / focal)
-    leading = [focal, _CENTER * diagonal, _CENTER * diagonal, 1.0 + 0.5 / corner**2, distance, distance]
-    rows = [] if aspect is None else [aspect * focal]
+    leading = [_FOCAL * focal, _CENTER * diagonal, _CENTER * diagonal, 1.0 + 0.5 / corner**2, distance, distance]
+    rows = [] if aspect is None else [_FOCAL * aspect * focal]
     mean = torch.zeros(len(leading) + len(form.modes) + len(rows) + len(board.unit), dtype=torch.float64)
     mean[:4] = torch.tensor([focal, (size[0] - 1) / 2, (size[1] - 1) / 2, 0.5 - form.shape])
     if aspect is not None:

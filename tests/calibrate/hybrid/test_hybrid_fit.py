@@ -407,3 +407,28 @@ def test_a_fit_begins_where_another_has_settled() -> None:
     assert start.iterations < found.iterations < 2 * start.iterations
     with pytest.raises(InputError, match="no start explains"):
         rough_start(BOARD.points, torch.full_like(pixels, torch.nan), SIZE, weights)
+
+
+def test_a_lens_seen_in_a_ring_alone_comes_to_rest() -> None:
+    """As through a mirror: focal length, shape and field stand for each other, and the rounds drifted to their end."""
+    generator = torch.Generator().manual_seed(2)
+    camera = Camera.build(
+        focal=(82, 82), center=(323, 248), size=(640, 480), coefficients=[0.02, -0.01, 0, 0], model="fisheye4"
+    )
+    points = Board(columns=11, rows=7, square=0.03).points
+    middle, seen = points.mean(0), []
+    while len(seen) < 12:
+        u = torch.rand(6, generator=generator, dtype=torch.float64)
+        around, away = 2.0 * math.pi * u[0], 0.7 + 1.05 * u[1]
+        face = rotation_from_vector(away * torch.stack([-around.sin(), around.cos(), 0.0 * around]))
+        rotation = face @ rotation_from_vector((u[2:5] - 0.5) * torch.tensor([1.2, 1.2, 0.8], dtype=torch.float64))
+        pixels, valid = camera.project((points - middle) @ rotation.T + (0.25 + 0.25 * u[5]) * face[:, 2])
+        off = (pixels - camera.center).norm(dim=-1)
+        valid &= (off > 60) & (off < 200)
+        if int(valid.sum()) >= 40:
+            noise = NOISE * torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
+            seen.append(torch.where(valid[:, None], pixels + noise, torch.nan))
+    fit = fit_hybrid(points, torch.stack(seen), (640, 480))
+    assert fit.converged
+    assert float(fit.state.parameters[0] / fit.families.mean[0]) < 1.5
+    assert fit.sigma == pytest.approx(NOISE, rel=0.1)

@@ -103,7 +103,7 @@ class TestFleets:
         families = prior_families(FORM, 800.0, board, SIZE, 0.6)
         unit = families.log_unit.exp()
         corner = math.atan(400.0 / 800.0)
-        assert unit[:6].tolist() == pytest.approx([800.0, 40.0, 40.0, 1.0 + 0.5 / corner**2, 0.6, 0.6])
+        assert unit[:6].tolist() == pytest.approx([160.0, 40.0, 40.0, 1.0 + 0.5 / corner**2, 0.6, 0.6])
         assert families.mean[:6].tolist() == pytest.approx([800.0, 319.5, 239.5, 0.5 - 0.4, 0.0, 0.0])
         assert not bool(families.mean[6:].any())
         torch.testing.assert_close(unit[-28:], board.unit)
