@@ -108,6 +108,8 @@ _ROUGH = LMOptions(max_iterations=10, tolerance=1e-4)
 # Most flipped poses are still this many times worse after four steps, and are dropped.
 _FIRST_STEPS = LMOptions(max_iterations=4, tolerance=1e-4)
 _HOPELESS = 30.0
+# Cosine of the angle from the middle of a view's rays, from which they have a place on its plane.
+_AHEAD = 0.05
 
 
 def poses_under(camera: Camera, views: Views, options: LMOptions) -> tuple[BoardState, Tensor]:
@@ -122,22 +124,35 @@ def poses_under(camera: Camera, views: Views, options: LMOptions) -> tuple[Board
         the state, and the cost of each view (V,) as in `refine_poses`. Both are NaN for a view whose corners with a ray
         do not determine a homography (`spread_out`).
     """
-    ideal, valid = camera.normalize(views.pixels)
-    ideal = torch.where(valid[..., None], ideal, torch.nan)
+    rays, valid = camera.unproject(views.pixels)
+    # The plane of each view's homography stands across its own rays: wide lenses also see boards beside the camera.
+    turn = _to_axis(torch.where(valid[..., None], rays, 0.0).sum(1))
+    ahead = rays @ turn.transpose(-1, -2)
+    shown = (valid & (ahead[..., 2] > _AHEAD))[..., None]
+    ideal = torch.where(shown, ahead[..., :2] / ahead[..., 2:], torch.nan)
     good = spread_out(views.board_points, ideal).nonzero()[:, 0]
     count = len(views.pixels)
     rotation, translation = ideal.new_full((count, 3, 3), torch.nan), ideal.new_full((count, 3), torch.nan)
     cost = ideal.new_full((count,), torch.nan)
     if len(good):
-        some, model = views.some(good), camera.model
+        some, model, back = views.some(good), camera.model, turn[good].transpose(-1, -2)
         pinhole = torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=torch.float64)
-        poses = poses_from_homographies(homographies(views.board_points, ideal[good]), pinhole)
+        turned, moved = poses_from_homographies(homographies(views.board_points, ideal[good]), pinhole)
+        poses = back @ turned, (back @ moved[..., None])[..., 0]
         state, cost[good] = refine_poses(some, model, BoardState.flat(camera.params.detach(), *poses), options)
         state, flipped = unflip(some, model, state)
         if flipped:
             state, cost[good] = refine_poses(some, model, state, options)
         rotation[good], translation[good] = state.rotation, state.translation
     return BoardState.flat(camera.params.detach(), rotation, translation), cost
+
+
+def _to_axis(directions: Tensor) -> Tensor:
+    """Rotations (V, 3, 3) that turn directions (V, 3) to the z axis."""
+    z = torch.nn.functional.normalize(directions, dim=-1)
+    least = torch.nn.functional.one_hot(z.abs().argmin(-1), 3).to(z.dtype)
+    x = torch.nn.functional.normalize(torch.linalg.cross(least, z), dim=-1)
+    return torch.stack([x, torch.linalg.cross(z, x), z], -2)
 
 
 def refine_poses(views: Views, model: LensModel, state: BoardState, options: LMOptions) -> tuple[BoardState, Tensor]:

@@ -20,6 +20,7 @@ from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.views import Views
 from kcal.corners.board import Board
 from kcal.lens.camera import Camera
+from kcal.lens.pose import rotation_from_vector
 from kcal.solve.lm import LMOptions
 
 CENTERED = Camera.build(focal=(500, 505), center=(319.5, 239.5), size=SIZE, model="pinhole")
@@ -200,3 +201,18 @@ class TestPosesUnder:
         torch.testing.assert_close(cost[good], least, rtol=1e-6, atol=0)
         torch.testing.assert_close(state.rotation[good], best.rotation, rtol=0, atol=1e-4)
         assert poses_under(truth, views.some([4]), LMOptions())[1].isnan().all()
+
+    def test_boards_beside_a_wide_camera_have_their_poses(self) -> None:
+        """At 70 to 110 degrees from the axis, where a plane in front of the camera has no place for them."""
+        truth = Camera.build(focal=(150, 150), center=(320, 320), size=(640, 640), model="fisheye4")
+        rotation, translation = motions(camera(), 5, 6, tilt=40.0)
+        angle = torch.linspace(70.0, 110.0, 5, dtype=torch.float64).deg2rad()
+        turn = rotation_from_vector(torch.stack([0 * angle, angle, 0 * angle], -1))
+        middle = rotation @ BOARD.points.mean(0) + translation
+        central = translation + middle.norm(dim=-1, keepdim=True) * torch.tensor([0.0, 0.0, 1.0]) - middle
+        poses = turn @ rotation, (turn @ central[..., None])[..., 0]
+        pixels, valid = truth.project(BOARD.points @ poses[0].transpose(1, 2) + poses[1][:, None])
+        assert bool(valid.all())
+        state, cost = poses_under(truth, Views(board_points=BOARD.points, pixels=pixels), LMOptions())
+        assert float(cost.max()) < 1e-12
+        torch.testing.assert_close(state.translation, poses[1], rtol=0, atol=1e-6)
