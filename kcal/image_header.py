@@ -44,8 +44,8 @@ ImageSize = Annotated[tuple[pydantic.PositiveInt, pydantic.PositiveInt], pydanti
 Size = tuple[int, int]
 
 
-def check_image_header(data: bytes, source: str | Path) -> None:
-    """Refuse bytes that are no image of a known format, or one with more than 500 megapixels.
+def check_image_header(data: bytes, source: str | Path) -> Size:
+    """(width, height) of an image of a known format with at most 500 megapixels; (0, 0) of WebP, which is smaller.
 
     The formats are JPEG, PNG, TIFF, BMP, WebP, PNM (PBM, PGM, PPM) and JPEG 2000. Whether the rest of the file is whole
     is found out by the decoder.
@@ -68,7 +68,7 @@ def check_image_header(data: bytes, source: str | Path) -> None:
     except (struct.error, IndexError, TypeError, ValueError):
         raise FileError(f"{source}: the image is truncated or corrupt; copy it again or leave it out") from None
     try:
-        check_pixel_count(size)
+        return check_pixel_count(size)
     except ValueError as error:
         raise FileError(f"{source}: {error}") from error
 

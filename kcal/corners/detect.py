@@ -23,13 +23,14 @@ from kcal.corners.grid import MIN_SHARPNESS, local_side, sharpness, without_fals
 from kcal.corners.images import VIDEO_SUFFIXES, Gray, decode_gray, expand_images, to_8bit, unique_names
 from kcal.corners.marker_boards import BORDERS, MIN_CORNERS, enough, find_aprilgrid, find_charuco, free_side
 from kcal.corners.markers import opencv_dictionary
-from kcal.corners.observations import Failure, Observations, View, common_size, rescaled, resized_alike
+from kcal.corners.observations import Failure, Observations, View, common_size, rescaled
 from kcal.corners.refine import Refinement, refine_corners
 from kcal.corners.saddle import CornerStatus, Refined
 from kcal.corners.search import SEARCH_SIDES, find_board, largest_grid, reduced, refine_through_sizes
 from kcal.corners.time_limit import Limited, TookTooLongError
 from kcal.errors import FileError, InputError
 from kcal.files import is_stream, read_bytes, source_name
+from kcal.image_header import check_image_header
 from kcal.texts import brief
 
 # What the search for a board in one image gives.
@@ -390,7 +391,7 @@ def detect(
 
     An image that cannot be read or shows no board becomes a `Failure` with its reason. The others become views, named
     by their file names (with folders where two files share one). Corners in images that were resized alike are scaled
-    to the size that most images have (`kcal.corners.observations`).
+    to the size that most images have, and images of other sizes left out (`kcal.corners.observations.common_size`).
 
     Args:
         paths: a folder, a wildcard or an image file, or several of them; or images themselves, as `detect_board`
@@ -405,7 +406,7 @@ def detect(
             draw why (`kcal.report.calibration.FailedImage`).
 
     Raises:
-        InputError: no images, images that were cropped or rotated, or no board in any image.
+        InputError: no images, no size that more than half of them have, or no board in any image.
         FileError: a folder without images, a wildcard without a match, or a single path that does not exist.
 
     Example:
@@ -425,21 +426,19 @@ def detect(
     sources = dict(zip(names, files, strict=True))
     views: list[View] = []
     failures: list[Failure] = []
-    sizes: list[tuple[int, int] | None] = []
     numberings: dict[bool | None, list[str]] = {}
+    common = common_size(names, [_size_of(file) for file in files])
+    for text in common.notes:
+        note(text)
     with Limited(time_limit) as limited:
-        for name, file in zip(names, files, strict=True):
+        for i, (name, file) in enumerate(zip(names, files, strict=True)):
             try:
+                if i in common.left_out:
+                    raise FileError(common.left_out[i])
                 image, digest = _image_and_hash(file)
             except FileError as error:
                 failures.append(Failure(name=name, reason=str(error).removeprefix(f"{file}: ")))
-                sizes.append(None)
             else:
-                sizes.append(_size(image))
-                first_size = next(size for size in sizes if size)
-                if _size(image) != first_size and not resized_alike(_size(image), first_size):
-                    # Named at once, not after the search of all images.
-                    common_size(names, [_size_of(file) for file in files])
                 try:
                     found = limited(detect_board, image, board, refine)
                 except TookTooLongError as error:
@@ -458,11 +457,8 @@ def detect(
         raise InputError(f"no board in any of {len(files)} images ({first}){_hint(files, board)}")
     if True in numberings:
         views = _renumbered(views, sources, numberings, board, refine)
-    common = common_size(names, sizes)
-    if common.note:
-        note(common.note)
-        scales = {names[i]: scale for i, scale in common.scales.items()}
-        views = [rescaled(view, scales[view.name]) if view.name in scales else view for view in views]
+    scales = {names[i]: scale for i, scale in common.scales.items()}
+    views = [rescaled(view, scales[view.name]) if view.name in scales else view for view in views]
     return Observations(
         board=board, image_size=common.size, refinement=refine, views=tuple(views), failures=tuple(failures)
     )
@@ -559,8 +555,12 @@ def _size(image: Any) -> tuple[int, int]:
 
 
 def _size_of(file: Any) -> tuple[int, int] | None:
+    """(width, height), from the first bytes where they tell it."""
+    if not isinstance(file, Path):
+        return _size(file)
     try:
-        return _size(_image_and_hash(file)[0])
+        width, height = check_image_header(read_bytes(file), file)
+        return (width, height) if width else _size(_image_and_hash(file)[0])
     except FileError:
         return None
 

@@ -154,17 +154,19 @@ class Observations(NativeFile):
         return self.model_copy(update={"views": tuple(by_name[name] for name in names)})
 
 
-# Images of one camera that were resized alike: corners of all of them in the pixels of most.
+# Images of one camera in several sizes: corners of all of them in the pixels of most.
 #
 # A messenger, a gallery or a video tool makes some images smaller. An image that was only resized shows the same lens:
-# its corners are scaled to the size that most images have, edges upon edges. An image that was cropped or rotated does
-# not tell where in the whole image it lies, and is refused.
+# its corners are scaled to the size that most images have, edges upon edges. A program that cuts or pads to an even
+# size, or to blocks, adds a pixel or two. An image that was cropped or rotated does not tell where in the whole image
+# it lies, and one of another camera is not of this lens: both are left out.
 
 Size = tuple[int, int]
 # A resized image has both sides rounded to whole pixels.
 _ROUNDED = 1.0
 # Sizes nearer to each other than this share are cropped by a few pixels more likely than resized.
 _NEAR = 0.05
+_SAME = 2  # pixels by which images of one camera may differ in width and height
 # Names in one message, at most.
 _SHOWN = 3
 
@@ -173,18 +175,20 @@ class CommonSize(NamedTuple):
     """The size that most images have.
 
     Attributes:
-        size: (width, height).
-        scales: (sx, sy) by which the others must be scaled, by their indices.
-        note: which images these are, in one sentence; empty if there are none.
+        size: (width, height); (0, 0) if no image has one.
+        scales: (sx, sy) by which others must be scaled, by their indices.
+        left_out: why others cannot be used, by their indices.
+        notes: what was done, a sentence each.
     """
 
     size: Size
     scales: dict[int, tuple[float, float]]
-    note: str
+    left_out: dict[int, str]
+    notes: tuple[str, ...]
 
 
 def common_size(names: Sequence[str], sizes: Sequence[Size | None]) -> CommonSize:
-    """Find the size of most images, and how the others must be scaled to have it.
+    """Find the size of most images, how others must be scaled to have it, and which ones cannot.
 
     Of sizes that equally many images have, the largest is taken.
 
@@ -193,34 +197,70 @@ def common_size(names: Sequence[str], sizes: Sequence[Size | None]) -> CommonSiz
         sizes: (width, height) of each; None for what is no image.
 
     Raises:
-        InputError: images that were cropped or rotated, or no image.
+        InputError: no size to which more than half of the images belong.
 
     Example:
-        >>> found = common_size(["a", "b", "c"], [(1920, 1080), (640, 360), (1920, 1080)])
-        >>> found.size, found.scales
-        ((1920, 1080), {1: (3.0, 3.0)})
+        >>> found = common_size(["a", "b", "c", "d"], [(1920, 1080), (640, 360), (1920, 1080), (640, 480)])
+        >>> found.size, found.scales, list(found.left_out)
+        ((1920, 1080), {1: (3.0, 3.0)}, [3])
     """
     groups: dict[Size, list[int]] = {}
     for i, size in enumerate(sizes):
         if size is not None:
             groups.setdefault(size, []).append(i)
     if not groups:
-        raise InputError("no image that can be read")
-    most = max(groups, key=lambda size: (len(groups[size]), size[0] * size[1]))
+        return CommonSize((0, 0), {}, {}, ())
+
+    def fitting(size: Size) -> int:
+        return sum(len(group) for other, group in groups.items() if _nearly(other, size) or resized_alike(other, size))
+
+    most = max(groups, key=lambda size: (fitting(size), len(groups[size]), size[0] * size[1]))
+    shown = f"{most[0]}x{most[1]} px of most images"
     others = sorted((size for size in groups if size != most), key=lambda size: (-len(groups[size]), size))
-    wrong = [size for size in others if not resized_alike(size, most)]
-    if wrong:
-        shown = "; ".join(f"{w}x{h} ({_named(names, groups[w, h])})" for w, h in (most, *others))
-        turned = any(resized_alike((h, w), most) or (h, w) == most for w, h in wrong)
-        which = "turned by 90 degrees: turn them back" if turned else "cropped: take the originals"
-        raise InputError(
-            f"images of different sizes: {shown}; some were {which}, or run kcal detect on those of each size apart, "
-            "as on a camera of its own"
+    near = [size for size in others if _nearly(size, most)]
+    alike = [size for size in others if resized_alike(size, most)]
+    wrong = [size for size in others if size not in (*near, *alike)]
+    turned = {size for size in wrong if (size[1], size[0]) == most or resized_alike((size[1], size[0]), most)}
+    if 2 * fitting(most) <= sum(map(len, groups.values())):
+        counts = "; ".join(
+            f"{len(groups[w, h])} of {w}x{h} px ({_named(names, groups[w, h])})" for w, h in (most, *others)
         )
-    texts = [f"{_named(names, groups[w, h])} from {w}x{h} px by {_factor(most[0] / w, most[1] / h)}" for w, h in others]
-    note = f"images of several sizes: corners were scaled to {most[0]}x{most[1]} px of most images: {'; '.join(texts)}"
-    scales = {i: (most[0] / w, most[1] / h) for w, h in others for i in groups[w, h]}
-    return CommonSize(most, scales, note if others else "")
+        cure = "turn back those that were turned by 90 degrees, or " if turned else ""
+        raise InputError(
+            f"images of different sizes, of which none has more than half: {counts}; {cure}run kcal detect on those of "
+            "each size apart, as on a camera of its own"
+        )
+    notes = [
+        f"images of {w}x{h} px were taken as they are among the {shown}; which edge has more pixels is not known: "
+        f"{_named(names, groups[w, h])}"
+        for w, h in near
+    ]
+    if alike:
+        texts = [
+            f"{_named(names, groups[w, h])} from {w}x{h} px by {_factor(most[0] / w, most[1] / h)}" for w, h in alike
+        ]
+        notes.append(f"images of several sizes: corners were scaled to {shown}: {'; '.join(texts)}")
+    reasons = {
+        (w, h): f"{w}x{h} px, not the {shown}: "
+        + (
+            "turned by 90 degrees, turn it back"
+            if (w, h) in turned
+            else "cropped or of another camera, take the original or leave it out"
+        )
+        for w, h in wrong
+    }
+    left_out = {i: reasons[size] for size in wrong for i in groups[size]}
+    if left_out:
+        notes.append(
+            f"{len(left_out)} of {len(sizes)} images were left out, because their size is not the {shown}: "
+            f"{_named(names, sorted(left_out))}"
+        )
+    scales = {i: (most[0] / w, most[1] / h) for w, h in alike for i in groups[w, h]}
+    return CommonSize(most, scales, left_out, tuple(notes))
+
+
+def _nearly(one: Size, other: Size) -> bool:
+    return max(abs(one[0] - other[0]), abs(one[1] - other[1])) <= _SAME
 
 
 def resized_alike(one: Size, other: Size) -> bool:

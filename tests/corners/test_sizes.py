@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from kcal.corners import detect as module
 from kcal.corners.board import Board
 from kcal.corners.detect import detect
 from kcal.corners.observations import View, common_size, rescaled, resized_alike
@@ -62,9 +63,9 @@ def test_most_images_decide_and_then_the_largest() -> None:
     found = common_size("abcd", sizes)
     assert found.size == (640, 360)
     assert found.scales == {1: (1 / 3, 1 / 3)}
-    assert found.note.endswith("b from 1920x1080 px by 0.3333")
+    assert found.notes[0].endswith("b from 1920x1080 px by 0.3333")
     assert common_size("ab", sizes[:2]).size == (1920, 1080)
-    assert common_size("ad", [(640, 360), (640, 360)]) == ((640, 360), {}, "")
+    assert common_size("ad", [(640, 360), (640, 360)]) == ((640, 360), {}, {}, ())
 
 
 @pytest.mark.parametrize(
@@ -99,14 +100,56 @@ def test_sides_that_were_rounded_have_scales_of_their_own() -> None:
 
 
 @pytest.mark.parametrize(
-    ("sizes", "message"),
+    ("sizes", "left_out"),
     [
-        ([(640, 480), (640, 480), (640, 360)], r"640x480 \(a, b\); 640x360 \(c\); some were cropped"),
-        ([(640, 480), (640, 480), (480, 640)], r"480x640 \(c\); some were turned by 90 degrees: turn them back"),
-        ([(640, 480), (320, 240), (240, 320)], "turned by 90 degrees"),
-        ([None, None, None], "no image that can be read"),
+        ([(640, 480), (640, 480), (640, 360)], "640x360 px, not the 640x480 px of most images: cropped or of another"),
+        ([(640, 480), (640, 480), (480, 640)], "480x640 px, not the 640x480 px of most images: turned by 90 degrees"),
+        ([(640, 480), (320, 240), (240, 320)], "240x320 px, not the 640x480 px of most images: turned by 90 degrees"),
+        ([(1281, 721), (1280, 720), (1280, 724)], "1280x724 px, not the 1281x721 px"),
     ],
 )
-def test_what_is_refused(sizes, message) -> None:
+def test_what_is_left_out(sizes, left_out) -> None:
+    found = common_size("abc", sizes)
+    assert found.size == sizes[0]
+    assert list(found.left_out) == [2]
+    assert found.left_out[2].startswith(left_out)
+    assert found.notes[-1].startswith("1 of 3 images were left out, because their size is not")
+
+
+@pytest.mark.parametrize(
+    ("sizes", "message"),
+    [
+        (
+            [(640, 480), (640, 360)],
+            r"1 of 640x480 px \(a\); 1 of 640x360 px \(b\); run kcal detect on those of each size",
+        ),
+        ([(640, 480), (480, 640), None], "turn back those that were turned by 90 degrees, or run"),
+        ([(640, 480), (640, 480), (640, 360), (480, 360)], "none has more than half: 2 of 640x480"),
+    ],
+)
+def test_no_size_of_most_is_refused_with_counts(sizes, message) -> None:
     with pytest.raises(InputError, match=message):
-        common_size("abc", sizes)
+        common_size("abcd"[: len(sizes)], sizes)
+    assert common_size("ab", [None, None]).size == (0, 0)
+
+
+def test_sizes_are_read_before_anything_is_searched(folder, monkeypatch) -> None:
+    """A pixel or two more is the same camera; an image of another size costs no search, and the rest is there."""
+    whole = checkerboard(60, 150, 90, (721, 541))
+    cv2.imwrite(str(folder / "d.png"), whole)
+    cv2.imwrite(str(folder / "foreign.jpg"), whole[:400])
+    searched, find, notes = [], module.detect_board, []
+    monkeypatch.setattr(module, "detect_board", lambda image, *rest: searched.append(image.shape) or find(image, *rest))
+    seen = detect([folder / name for name in ("foreign.jpg", "a.png", "b.png", "d.png")], BOARD, note=notes.append)
+    assert searched == [(540, 720), (540, 720), (541, 721)]
+    assert (seen.names, seen.image_size) == (("a.png", "b.png", "d.png"), (720, 540))
+    assert [failure.name for failure in seen.failures] == ["foreign.jpg"]
+    assert [text.split(";")[0] for text in notes] == [
+        "images of 721x541 px were taken as they are among the 720x540 px of most images",
+        "1 of 4 images were left out, because their size is not the 720x540 px of most images: foreign.jpg",
+    ]
+    first = torch.tensor([150.0 + 60.0 - 0.5, 90.0 + 60.0 - 0.5], dtype=torch.float64)
+    torch.testing.assert_close(seen.pixels()[2, 0], first, rtol=0, atol=0.05)
+    with pytest.raises(InputError, match="1 of 721x400 px"):
+        detect([folder / name for name in ("foreign.jpg", "a.png")], BOARD)
+    assert len(searched) == 3

@@ -199,20 +199,19 @@ def observations_of(
     """Put the pieces of one camera's images together; also what was done about images of several sizes.
 
     Raises:
-        InputError: images that were cropped or rotated, or no board in any.
+        InputError: no size that more than half of the images have, or no board in any.
     """
     assert job.board is not None
     names = unique_names(list(job.images))
     views, failures = [], []
-    common = common_size(names, [piece.size for piece in pieces]) if any(piece.size for piece in pieces) else None
+    common = common_size(names, [piece.size for piece in pieces])
     for i, (name, path, piece, digest) in enumerate(zip(names, job.images, pieces, digests, strict=True)):
-        if piece.pixels is None:
-            failures.append(Failure(name=name, reason=piece.reason))
+        if piece.pixels is None or i in common.left_out:
+            failures.append(Failure(name=name, reason=common.left_out.get(i, piece.reason)))
             continue
         view = View(name=name, pixels=piece.pixels, covariance=piece.covariance, image=str(path), sha256=digest)
-        assert common is not None
         views.append(rescaled(view, common.scales[i]) if i in common.scales else view)
-    if not views or common is None:
+    if not views:
         raise InputError(f"no board in any of {len(pieces)} images ({failures[0].name}: {failures[0].reason})")
     seen = Observations(
         board=job.board,
@@ -221,7 +220,7 @@ def observations_of(
         views=tuple(views),
         failures=tuple(failures),
     )
-    return seen, common.note
+    return seen, "; ".join(common.notes)
 
 
 def calibration_options(model: str, options: BatchOptions) -> CalibrationOptions:
