@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies, typical_hyperprior
-from kcal.calibrate.problem.state import AMPLITUDES, LARGEST, MEDIAN, MOTION, SMALLEST, SPREAD, stillness
+from kcal.calibrate.problem.state import AXES, LARGEST, MEDIAN, SMALLEST, SPREAD, stillness
 from kcal.calibrate.problem.views import LEAST_NOISE
 from kcal.solve.schur import Products, matrix_product, products_of
 
@@ -87,11 +87,11 @@ class ViewData(NamedTuple):
         """With motions integrated out, whose standard deviation over the noise has these logarithms by order."""
         if not self.moving:
             return Integrated(self.still, 0.0, self.own, self.cross)
-        ratio = np.repeat(np.exp(log_ratio), MOTION // AMPLITUDES)
+        ratio = np.repeat(np.exp(log_ratio), AXES)
         matrix = self.own * torch.from_numpy(ratio[:, None] * ratio)
         matrix.diagonal(dim1=-2, dim2=-1).add_(1.0)
         root = torch.linalg.cholesky(matrix)
-        _, ones, _ = torch.broadcast_tensors(root, torch.eye(MOTION, dtype=root.dtype), root)
+        _, ones, _ = torch.broadcast_tensors(root, torch.eye(len(ratio), dtype=root.dtype), root)
         inverse = torch.linalg.solve_triangular(root, ones, upper=False)
         half = matrix_product(inverse * torch.from_numpy(ratio), self.cross)
         data = self.still._replace(products=self.still.products - products_of(half.flatten(0, 1).T))
@@ -146,7 +146,7 @@ class Integrated(NamedTuple):
         reach = matrix_product(self.half.flatten(0, 1), direction).view(self.half.shape)
         E = matrix_product(self.inverse.transpose(1, 2) / math.sqrt(variance * tempering), reach)
         mean, others, kept = E[..., 0], E[..., 1:], own.diagonal(dim1=1, dim2=2)
-        by_order = (AMPLITUDES, MOTION // AMPLITUDES)
+        by_order = (kept.shape[1] // AXES, AXES)
         G = others @ others.transpose(1, 2)
         moment = mean.square() + G.diagonal(dim1=1, dim2=2)
         first = ((1.0 - kept) / tempering - moment).sum(0).view(by_order).sum(1)
@@ -155,7 +155,7 @@ class Integrated(NamedTuple):
         within.diagonal().add_((0.5 * kept / tempering + 0.5 * moment).sum(0))
         second = 4.0 * within.view(*by_order, *by_order).sum((1, 3))
         orders = others.unflatten(1, by_order).transpose(0, 1).flatten(1, 2)
-        along = (orders.transpose(1, 2) @ mean.unflatten(1, by_order).transpose(0, 1).reshape(AMPLITUDES, -1, 1))[
+        along = (orders.transpose(1, 2) @ mean.unflatten(1, by_order).transpose(0, 1).reshape(by_order[0], -1, 1))[
             ..., 0
         ]
         # Of E times the inverse, a row for each motion, only sums over motions are wanted.
@@ -163,7 +163,10 @@ class Integrated(NamedTuple):
         if orders.shape[1] < orders.shape[2]:
             # Few views have fewer rows than there are unknowns.
             pairs = (
-                products_of(orders.flatten(0, 1)).square().unflatten(0, (AMPLITUDES, -1)).unflatten(2, (AMPLITUDES, -1))
+                products_of(orders.flatten(0, 1))
+                .square()
+                .unflatten(0, (by_order[0], -1))
+                .unflatten(2, (by_order[0], -1))
             )
             across, squared = pairs.sum((1, 3)), matrix_product(orders, inverse).square().sum(1)
         else:

@@ -27,11 +27,14 @@ from torch import Tensor
 # Numbers of a motion: for each order three of the turn and three of the shift, of which each three have an amplitude.
 MOTION = 12
 ORDERS = 2
-AMPLITUDES = 4
+AXES = 3
+AMPLITUDES = MOTION // AXES
 # Median and standard deviation of the logarithm of a motion's standard deviation: radians, and distances of the board,
 # while an image is read. A hand that turns by 1 rad/s moves by 0.03 in 30 ms: beyond it is no motion. Below the
 # smallest no pixel feels it.
 MEDIAN, SPREAD, SMALLEST, LARGEST = 2e-4, 2.0, 1e-6, 0.03
+# Readouts between the exposures of two cameras that are not synchronized, typically.
+APART = 10.0
 # A motion is worth a stand if it moves corners by so many standard deviations of their noise.
 FELT = 5.0
 
@@ -95,25 +98,28 @@ class Readout:
         about = (points - self.center[:, None]).expand_as(turn)
         return MovedBoard(points + torch.linalg.cross(turn, about, dim=1), self.distance * shift, turn)
 
-    def columns_of(self, by_point: Tensor, rotation: Tensor, time: Tensor, points: Tensor) -> Tensor:
-        """(V, 12, 2, N) derivatives of pixels by motions.
+    def columns_of(
+        self, by_point: Tensor, rotation: Tensor, time: Tensor, points: Tensor, *, apart: bool = False
+    ) -> Tensor:
+        """(V, 12, 2, N) derivatives of pixels by motions; (V, 18, 2, N) with what happens before the image is read.
 
         Args:
             by_point: (V, 3, 2, N) of pixels by points in the camera's frame.
             rotation: (V, 3, 3) cam_from_board.
             time: (V, N).
             points: (3, N) the board, meters.
+            apart: last, a motion during `APART` readouts, which all corners share.
         """
         by_board = torch.einsum("vkun,vkl->vlun", by_point, rotation)
         about = (points - self.center[:, None])[None, :, None].expand_as(by_board)
         both = torch.cat([torch.linalg.cross(about, by_board, dim=1), self.distance * by_point], 1)
         g = time[:, None, None]
-        return torch.cat([g * both, g * g * both], 1)
+        return torch.cat([g * both, g * g * both, *([APART * both] if apart else [])], 1)
 
 
 def stillness(log_ratio: np.ndarray) -> Tensor:
     """(12,) weights of a motion's numbers, from the logarithms (4,) of their deviations over the noise; or none, ()."""
-    return torch.from_numpy(np.exp(-2.0 * log_ratio)).repeat_interleave(MOTION // AMPLITUDES)
+    return torch.from_numpy(np.exp(-2.0 * log_ratio)).repeat_interleave(AXES)
 
 
 class MotionSigma(NamedTuple):
