@@ -345,7 +345,8 @@ def _placements(
             for column in range(board.columns - wide + 1):
                 fits = (not top or row == 0) and (not bottom or row + high == board.rows)
                 fits = fits and (not left or column == 0) and (not right or column + wide == board.columns)
-                if fits and dark == ((row + column) % 2 == 0):
+                # Boards that are printed white on black have the other color there.
+                if fits and (all(ends) or dark == ((row + column) % 2 == 0)):
                     whole = torch.full((board.rows, board.columns, 2), torch.nan, dtype=torch.float64)
                     whole[row : row + high, column : column + wide] = grid
                     places.append(whole)

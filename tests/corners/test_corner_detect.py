@@ -262,3 +262,14 @@ def test_detection_does_not_depend_on_what_was_called_before(stereo):
     cv2.setRNGSeed(3)
     find_sector(images[0], part)
     assert cv2.randu(np.zeros(4), 0.0, 1.0).tolist() == before  # the caller's random numbers are left alone
+
+
+def test_a_board_near_a_fisheye(kcal_data):
+    """Its corners lie on a smooth surface: quadratics of their places on the board, and then a lens, leave less."""
+    board = Board(columns=8, rows=6, square=0.025)
+    pixels = detect_board(read_gray(kcal_data / "captures" / "single" / "fisheye_8x6.jpg"), board).pixels
+    assert bool(torch.isfinite(pixels).all())
+    x, y = (board.points[:, :2] / 0.1 - 1.0).unbind(-1)
+    surface = torch.stack([x**i * y**j for i in range(7) for j in range(7 - i)], -1)
+    left = pixels - surface @ torch.linalg.lstsq(surface, pixels).solution
+    assert float(left.square().sum(-1).mean().sqrt()) < 0.1
