@@ -49,7 +49,7 @@ PUBLIC = {
     "kcal.calibrate": """
         CalibratedViews CalibrationLayer CalibrationSummary ComparisonResult Examination HalvesDifference
         IntervalCheck Refit against_capture interval_check simulated_refits
-        MeasuredBoard OutlierRejection RejectedCorner RejectedView ResidualStructure SharedBoard
+        MeasuredBoard OutlierRejection PlainLens RejectedCorner RejectedView ResidualStructure SharedBoard
         calibrate_cameras calibrate_views compare_models examine load_measured_board measure_board
         save_measured_board summarize camera_at_setting InterpolatedCamera
     """,
@@ -146,6 +146,7 @@ RECORDS = {
     "Finding",
     "HalvesDifference",
     "RangeAnswer",
+    "PlainLens",
     "ResidualStructure",
     "Association",
     "BoxPairs",

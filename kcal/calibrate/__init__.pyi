@@ -22,6 +22,7 @@ from kcal.calibrate.camera.summary import CalibrationSummary as CalibrationSumma
 from kcal.calibrate.camera.trust import examine as examine
 from kcal.calibrate.camera.trust import Examination as Examination
 from kcal.calibrate.camera.trust import HalvesDifference as HalvesDifference
+from kcal.calibrate.camera.trust import PlainLens as PlainLens
 from kcal.calibrate.camera.trust import ResidualStructure as ResidualStructure
 from kcal.calibrate.camera.interval_check import interval_check as interval_check
 from kcal.calibrate.camera.interval_check import IntervalCheck as IntervalCheck

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -13,8 +13,16 @@ from kcal.calibrate.camera.advice import ROLL_SPAN, board_tilts, reached, roll_s
 from kcal.calibrate.camera.checks import mirrored_views
 from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult, Progress
 from kcal.calibrate.camera.summary import summarize
-from kcal.calibrate.camera.trust import Examination, HalvesDifference, examine, seen_pixels, unexplained
-from kcal.calibrate.camera.warnings import REPEATING
+from kcal.calibrate.camera.trust import (
+    PREDICTED,
+    Examination,
+    HalvesDifference,
+    PlainLens,
+    ResidualStructure,
+    examine,
+    seen_pixels,
+    unexplained,
+)
 from kcal.calibrate.rig.pairs import names_by_side
 from kcal.corners.observations import Observations
 from kcal.lens.calibration import CalibrationRecord
@@ -36,17 +44,18 @@ from kcal.threads import in_one_thread
 
 # Findings about the views of a calibration: order of corners, tilts, rolls, depth, coverage, blur, number.
 
-# Degrees beyond which a view tells the focal length, and how many views must.
-_TILTED, _FEWEST_TILTED = 15.0, 3
+# Degrees beyond which a view tells the focal length, and how many views must; and its error, as a share of it, from
+# which too little tilt is the reason.
+_TILTED, _FEWEST_TILTED, _OPEN = 25.0, 3, 0.02
 # Farthest over nearest board.
 _DEPTH = 1.3
 # Share of the image, and of its border ring, that no board reached.
 _UNREACHED, _BORDER = 0.25, 0.5
 # Pixels of noise: sharp images give 0.02 to 0.2; blurred corners are shifted by what lies beyond their squares as well.
+# Corners that themselves tell of more than the second are blurred.
 _SOFT, _BLURRED = 0.35, 0.7
 # Share of the views whose corners say that they are blurred.
 _MANY = 0.25
-_TEMPERING = 5.0
 _FEW_VIEWS = 12
 # Share of the views with a partner of another camera's name, beyond which these are of two cameras.
 _PARTNERS = 0.5
@@ -61,12 +70,14 @@ def view_findings(result: CameraCalibrationResult, noise: float | None = None) -
     """
     used = result.cam_from_board_rotation.isfinite().all(-1).all(-1)
     rotation, translation = result.cam_from_board_rotation[used], result.cam_from_board_translation[used]
-    found = [_order_finding(seen_pixels(result)[used], result.observations), *_pose_findings(rotation, translation)]
+    found = [
+        _order_finding(seen_pixels(result)[used], result.observations),
+        *_pose_findings(result.camera, rotation, translation),
+    ]
     found += [
         _coverage_finding(result.observations),
         _sides_finding(result.observations.names, "doubt"),
         _blur_finding(result.noise if noise is None else noise, _blurred_share(result.observations)),
-        _repetition_finding(1.0 if result.hybrid is None else result.hybrid.tempering),
     ]
     if len(rotation) < _FEW_VIEWS:
         found.append(_few_finding(len(rotation)))
@@ -75,12 +86,12 @@ def view_findings(result: CameraCalibrationResult, noise: float | None = None) -
 
 def record_findings(record: CalibrationRecord) -> list[Finding]:
     """What the record of a calibration tells of its views, where these themselves are not at hand."""
-    found = [_sides_finding(tuple(record.per_view_rms), "stop"), _repetition_finding(record.tempering or 1.0)]
+    found = [_sides_finding(tuple(record.per_view_rms), "stop")]
     if record.noise is not None:
         found.append(_blur_finding(record.noise, 0.0))
     if record.views < _FEW_VIEWS:
         found.append(_few_finding(record.views))
-    found += [Finding(name="calibration", severity="doubt", text=text, part="lenses") for text in record.warnings]
+    found += [Finding.of("calibration", "doubt", text) for text in record.warnings]
     return [finding for finding in found if finding is not None]
 
 
@@ -93,27 +104,21 @@ def _sides_finding(names: Sequence[str], severity: Severity) -> Finding | None:
     for (one, some), (other, others) in itertools.pairwise(sides):
         both = [key for key in some if key in others]
         if 2 * len(both) > _PARTNERS * len(names):
-            return Finding(
-                name="names",
-                severity=severity,
-                text=f"{2 * len(both)} of {len(names)} views are named like pairs of two cameras, {some[both[0]]} and "
-                f"{others[both[0]]}: images of both in one file",
-                action=f"calibrate each camera from its own images, {one} and {other}; if they are of one camera, its "
-                "observations tell (kcal report --observations)",
-                part="lenses",
+            text = (
+                f"{2 * len(both)} of {len(names)} views are named like pairs of two cameras, {some[both[0]]} and "
+                f"{others[both[0]]}: images of both in one file"
             )
+            action = (
+                f"calibrate each camera from its own images, {one} and {other}; if they are of one camera, its "
+                "observations tell (kcal report --observations)"
+            )
+            return Finding.of("names", severity, text, action)
     return None
 
 
 def _few_finding(views: int) -> Finding:
-    return Finding(
-        name="views",
-        severity="doubt",
-        text=f"{views} views are few: a wrong one among them could not be noticed",
-        action="take 20 to 40 views",
-        picture="views",
-        part="lenses",
-    )
+    text = f"{views} views are few: a wrong one among them could not be noticed"
+    return Finding.of("views", "doubt", text, "take 20 to 40 views")
 
 
 def _order_finding(pixels: Tensor, observations: Observations) -> Finding | None:
@@ -121,68 +126,46 @@ def _order_finding(pixels: Tensor, observations: Observations) -> Finding | None
     if not wrong:
         return None
     some = "all views show" if wrong == len(pixels) else f"{wrong} of {len(pixels)} views show"
-    return Finding(
-        name="mirrored",
-        severity="stop",
-        text=f"{some} the board mirrored: the images are flipped (a selfie view, a mirror), or the corners are in "
-        "another order than the board's",
-        action="switch the mirroring off, or correct the order of the corners, and detect again",
-        picture="coverage",
+    text = (
+        f"{some} the board mirrored: the images are flipped (a selfie view, a mirror), or the corners are in "
+        "another order than the board's"
     )
+    action = "switch the mirroring off, or correct the order of the corners, and detect again"
+    return Finding.of("mirrored", "stop", text, action)
 
 
-def _pose_findings(rotation: Tensor, translation: Tensor) -> list[Finding]:
+def _pose_findings(camera: Camera, rotation: Tensor, translation: Tensor) -> list[Finding]:
     tilts = board_tilts(rotation)
     found = []
+    known = None if camera.calibration is None else camera.calibration.sigma
+    # Not known; or held, and so not asked of tilts.
+    focal_error = math.inf if known is None else (known.get("fx") or 0.0) / float(camera.focal[0])
     tilted = int((tilts > _TILTED).sum())
-    if tilted < _FEWEST_TILTED:
-        found.append(
-            Finding(
-                name="tilt",
-                severity="stop",
-                text=f"the board faces the camera in {len(tilts) - tilted} of {len(tilts)} views: without tilted views "
-                "focal length and distance cannot be told apart",
-                action="tilt the board by 30 to 45 degrees in different directions",
-                picture="poses",
-                part="lenses",
-            )
+    if tilted < _FEWEST_TILTED and focal_error > _OPEN:
+        text = (
+            f"the board is tilted by more than {_TILTED:.0f}° in {tilted} of {len(tilts)} views, by "
+            f"{float(tilts.max()):.0f}° at most: the focal length is known only to "
+            + (f"±{100 * focal_error:.2g} %" if math.isfinite(focal_error) else "an error that nobody can tell")
         )
+        found.append(Finding.of("tilt", "stop", text, "tilt the board by 30 to 45 degrees in different directions"))
     if (span := roll_span(rotation)) < ROLL_SPAN:
-        found.append(
-            Finding(
-                name="roll",
-                severity="doubt",
-                text=f"the board was always held the same way up (rolls within {span:.0f}°): its print and the "
-                "principal point cannot be told apart",
-                action="turn the board by 90 degrees in some views",
-                picture="poses",
-                part="lenses",
-            )
+        text = (
+            f"the board was always held the same way up (rolls within {span:.0f}°): its print and the "
+            "principal point cannot be told apart"
         )
+        found.append(Finding.of("roll", "doubt", text, "turn the board by 90 degrees in some views"))
     distance = translation.norm(dim=-1)
     if float(distance.max()) < _DEPTH * float(distance.min()):
-        found.append(
-            Finding(
-                name="depth",
-                severity="doubt",
-                text=f"the board was always at the same distance ({float(distance.min()):.2g} to "
-                f"{float(distance.max()):.2g} m)",
-                action="show the board near and far",
-                picture="poses",
-                part="lenses",
-            )
+        text = (
+            f"the board was always at the same distance ({float(distance.min()):.2g} to {float(distance.max()):.2g} m)"
         )
+        found.append(Finding.of("depth", "doubt", text, "show the board near and far"))
     if not found:
-        found.append(
-            Finding(
-                name="poses",
-                severity="fine",
-                text=f"tilts up to {float(tilts.max()):.0f}°, rolls within {span:.0f}°, distances "
-                f"{float(distance.min()):.2g} to {float(distance.max()):.2g} m",
-                picture="poses",
-                part="lenses",
-            )
+        text = (
+            f"tilts up to {float(tilts.max()):.0f}°, rolls within {span:.0f}°, distances "
+            f"{float(distance.min()):.2g} to {float(distance.max()):.2g} m"
         )
+        found.append(Finding.of("poses", "fine", text))
     return found
 
 
@@ -194,14 +177,12 @@ def _coverage_finding(observations: Observations) -> Finding:
     border = 1.0 - float(seen[ring].double().mean())
     text = f"no board reached {100 * share:.0f} % of the image, and {100 * border:.0f} % of its border"
     if share <= _UNREACHED and border <= _BORDER:
-        return Finding(name="coverage", severity="fine", text=text, picture="coverage", part="lenses")
-    return Finding(
-        name="coverage",
-        severity="doubt",
-        text=f"{text}: there the camera rests on its lens model alone",
-        action="show the board at the borders and in the corners of the image, parts of it outside if need be",
-        picture="coverage",
-        part="lenses",
+        return Finding.of("coverage", "fine", text)
+    return Finding.of(
+        "coverage",
+        "doubt",
+        f"{text}: there the camera rests on its lens model alone",
+        "show the board at the borders and in the corners of the image, parts of it outside if need be",
     )
 
 
@@ -217,37 +198,21 @@ def _blurred_share(observations: Observations) -> float:
 def _blur_finding(noise: float, share: float) -> Finding | None:
     if noise <= _SOFT and share <= _MANY:
         return None
-    blurred = noise > _BLURRED or share > _MANY
     what = f"{100 * share:.0f} % of the views are blurred" if share > _MANY else f"corners scatter by {noise:.2g} px"
-    return Finding(
-        name="blur",
-        severity="stop" if blurred else "doubt",
-        text=f"{what}: blurred corners are shifted by what lies next to them, which no error bar knows",
-        action="hold board and camera still, focus, use more light or a shorter exposure, and take the views again",
-        picture="residuals",
-        part="lenses",
-    )
-
-
-def _repetition_finding(tempering: float) -> Finding | None:
-    if tempering <= _TEMPERING:
-        return None
-    return Finding(
-        name="unsteady",
-        severity="stop",
-        text=f"residuals repeat within views ({tempering:.1f} times as much as noise): the board flexes, "
-        "several boards were used, or the images are from a moving camera",
-        action="use one stiff board, held still, and take the views again",
-        picture="views",
-        part="lenses",
-    )
+    text = f"{what}: blurred corners are shifted by what lies next to them, which no error bar knows"
+    action = "hold board and camera still, focus, use more light or a shorter exposure, and take the views again"
+    return Finding.of("blur", "doubt", text, action)
 
 
 # Findings about lens model, board and error bars, from what a calibration says against itself.
 
-# Chance by which halves may differ. Error bars from half of the views are approximate: at 1e-3, one of 30 clean
-# captures was doubted (tuning seeds of scripts/check/verdict.py), where wrong models reach 1e-7 and less.
-_CHANCE = 1e-6
+# Chance by which halves may differ. Error bars from half of the views are approximate: at the higher level, one of 30
+# clean captures was doubted (tuning seeds of scripts/check/verdict.py), where wrong models reach 1e-7 and less. At that
+# level residuals must also have patterns, or halves predict each other worse than halves that are alike by this factor:
+# 1.1 and 1.2 for OpenCV's left and right images, 1.9 for both in one file.
+_CHANCE, _LIKELY, _APART = 1e-6, 1e-3, 1.5
+# Chance below which a difference is told with its figures, without a word of agreement.
+_AGREE = 0.01
 # Correlation of neighboring residuals: -0.06 to 0.02 in clean captures, 0.4 and more with a wrong lens or board.
 _NEIGHBORS = 0.12
 # Averages of residuals over parts of the image, mean squares over what noise leaves: below 1.2 in clean captures.
@@ -256,13 +221,8 @@ _IMAGE = 2.5
 _SURE = 5.0
 # RMS of halves over that of all views, below which these are not of one camera: 0.93 and more in captures of one.
 _OWN = 0.8
-# A lens with a measured board and motions fits two cameras that are nearly alike. Their halves differ by more than
-# chance explains at the lower level, and predict each other worse than halves that are alike by this factor: 1.1 and
-# 1.2 for OpenCV's left and right images, 1.9 for both in one file.
-_LIKELY, _APART = 1e-3, 1.5
-# RMS of corners that a half did not see over that of fitted ones: 1.01 to 1.19 in clean captures of 12 to 22 views, 1.5
-# to 2.1 with 5 coefficients on a wide lens (tuning seeds of scripts/check/verdict.py).
-_PREDICTED = 1.25
+# A half of few views may predict badly though its error bars say so. More than a plain lens is a fault.
+_PLAIN = 1.1
 # Mean squares of averages of residuals over parts of the image beyond which the lens is wrong, whatever else is: 11 and
 # more with wrong lenses, at most 2.5 with bent boards and moving pupils.
 _LENS = 5.0
@@ -271,81 +231,55 @@ _LENS = 5.0
 def model_findings(
     result: CameraCalibrationResult, options: CalibrationOptions, found: Examination
 ) -> tuple[list[Finding], float]:
-    """What speaks against lens model, board and error bars, and by how many px RMS the camera is wrong beyond these."""
-    structured = found.structure.neighbors > _NEIGHBORS or found.structure.image > _IMAGE
-    halves = {half.label: unexplained(half.difference, _CHANCE) for half in found.halves}
-    beyond = max(halves.values(), default=0.0)
-    against = None
-    if (changed := _changed(result, found.halves, halves)) is not None:
-        against, beyond = _changed_finding(changed), max(beyond, unexplained(changed.difference, _LIKELY))
+    """What speaks against lens model, board and error bars, and by how many px RMS the camera is wrong beyond these.
+
+    A fault is what was measured: halves of the views, or a reference, that differ by more than the error bars state, or
+    a plain lens that predicts other views better. Residuals that are not noise are a note: error bars allow for them.
+    """
+    structure = found.structure
+    patterns = structure.neighbors > _NEIGHBORS or structure.image > _IMAGE
+    apart = _far_halves(found.halves, patterns)
+    beyond = max((unexplained(half.difference, _LIKELY) for half in apart), default=0.0)
+    against = _apart_finding(result, found.halves, apart[0], patterns, structure) if apart else None
     if found.model is not None and found.reference is not None:
         named = _against_reference(result, options, found, found.model.rms)
         certain = named is not None and named.name in ("board", "pupil")
-        beyond = max(beyond, found.model.rms if certain or structured else unexplained(found.model))
+        beyond = max(beyond, found.model.rms if certain or patterns else unexplained(found.model))
         if named is None and beyond:
-            named = Finding(
-                name="model",
-                severity="doubt",
-                text=f"the lens model {result.camera.model} does not fit this lens: it differs by "
-                f"{found.model.rms:.2g} px from one that does",
-                action="calibrate with the default lens (--model hybrid)",
-                picture="model",
-                part=FAULTS,
+            text = (
+                f"the lens model {result.camera.model} does not fit this lens: it differs by "
+                f"{found.model.rms:.2g} px from one that does"
             )
-        against = against or named
-    elif structured and against is None:
-        # Real corners are never quite independent: with halves that agree, and the same in all views, they do little.
-        # OpenCV's stereo images have a correlation of 0.25 and predict held-out views to 0.1 px; their tempering is
-        # below that of which the calibration itself warns, that of two boards in one file above it.
-        tempered = result.hybrid is not None and result.hybrid.tempering <= REPEATING
-        slight = tempered and not beyond and found.structure.image <= _IMAGE
-        against = Finding(
-            name="model",
-            severity="doubt" if slight else "stop",
-            text="residuals are not noise: those of neighboring corners have a correlation of "
-            f"{found.structure.neighbors:.2f}. Lens model or board do not fit"
-            + (" everywhere" if slight else ", and error bars are too small"),
-            action="check that all views show one flat, stiff board, with the camera's focus and zoom unchanged",
-            picture="residuals",
-            part=FAULTS,
-        )
-    elif beyond and against is None:
-        worst = max(halves, key=lambda label: halves[label])
-        against = Finding(
-            name="model",
-            severity="doubt",
-            text=f"cameras from two halves of the views ({worst}) differ by {halves[worst]:.2g} px beyond their error "
-            "bars: lens model or board do not fit",
-            action="take more views, with one flat, stiff board",
-            picture="halves",
-            part=FAULTS,
-        )
+            named = Finding.of("model", "doubt", text, "calibrate with the default lens (--model hybrid)")
+        against = against if against is not None and against.name == "changed" else named or against
     findings = [] if against is None else [against]
+    if patterns and against is None:
+        findings.append(_patterns_finding(found))
     if alike := [half for half in found.halves if half.alike]:
-        findings.append(_prediction_finding(alike[0]))
+        findings.append(_prediction_finding(alike[0], found.plain))
     if found.failures or not found.halves:
-        findings.append(
-            Finding(
-                name="halves",
-                severity="doubt",
-                text=f"the error bars could not be checked by halves of the views: {'; '.join(found.failures)}",
-                action="take more views",
-                part="lenses",
-            )
-        )
+        text = f"the error bars could not be checked by halves of the views: {'; '.join(found.failures)}"
+        findings.append(Finding.of("halves", "doubt", text, "take more views"))
     elif against is None:
-        ratios = ", ".join(f"{half.difference.ratio or 0.0:.1f}" for half in found.halves)
-        findings.append(
-            Finding(
-                name="halves",
-                severity="fine",
-                text=f"cameras from halves of the views agree: their difference is {ratios} times what the error bars "
-                "predict",
-                picture="halves",
-                part="lenses",
-            )
+        agree = _halves_agree(found.halves)
+        text = (
+            f"cameras from halves of the views {'agree: they ' if agree else ''}differ by "
+            f"{_ratios(found.halves)} what the error bars predict{'' if agree else ': these may be too small'}"
         )
+        findings.append(Finding.of("halves", "fine" if agree else "doubt", text, "" if agree else "take more views"))
     return findings, beyond
+
+
+def _halves_agree(halves: Sequence[HalvesDifference]) -> bool:
+    return all((half.difference.probability or 0.0) >= _AGREE for half in halves)
+
+
+def _ratios(halves: Sequence[HalvesDifference]) -> str:
+    """Differences of halves over what their error bars predict, each with its chance."""
+    return ", ".join(
+        f"{half.difference.ratio or 0.0:.1f} times (p {half.difference.probability or 0.0:.1g}, {half.label})"
+        for half in halves
+    )
 
 
 def fault_of_views(
@@ -357,52 +291,103 @@ def fault_of_views(
     return faults[0] if faults and (beyond > 0.0 or faults[0].severity == "stop") else None
 
 
-def _prediction_finding(half: HalvesDifference) -> Finding:
-    """How well one half of the views predicts the other: held-out residuals beside those of fits."""
+def _patterns_finding(found: Examination) -> Finding:
+    """Residuals that are not noise, where no harm of it was measured."""
+    structure = found.structure
+    what = (
+        f"neighboring corners have a correlation of {structure.neighbors:.2f}"
+        if structure.neighbors > _NEIGHBORS
+        else f"averages over parts of the image are {math.sqrt(structure.image):.1f} times what noise leaves"
+    )
+    checked = (
+        "halves of the views agree within the error bars, which allow for it"
+        if found.halves and _halves_agree(found.halves)
+        else "halves of the views do not show that the error bars allow for it"
+    )
+    return Finding.of(
+        "patterns",
+        "note" if found.halves and _halves_agree(found.halves) else "doubt",
+        f"residuals are not only noise: {what}; {checked}",
+        "for smaller error bars use a flat, stiff board on a stand, with fixed focus and zoom",
+    )
+
+
+def _prediction_finding(half: HalvesDifference, plain: PlainLens | None) -> Finding:
+    """How well one half of the views predicts the other, beside fits and a plain lens."""
     ratio = half.held_out / half.own
     text = (
         f"the camera from one half of the views predicts the corners of the other half to {half.held_out:.2g} px RMS, "
         f"{ratio:.2f} times what is left where they are fitted"
     )
-    if ratio <= _PREDICTED:
-        return Finding(name="prediction", severity="fine", text=text, picture="halves", part="lenses")
-    return Finding(
-        name="prediction",
-        severity="doubt",
-        text=f"{text}: lens model or board do not carry over to other views",
-        action="take more views, all over the image and at several distances, with one flat, stiff board",
-        picture="halves",
-        part="lenses",
-    )
+    if ratio <= PREDICTED:
+        return Finding.of("prediction", "fine", text)
+    better = plain is not None and plain.own > _PLAIN * plain.held_out
+    if plain is not None:
+        text += (
+            f". With poses alone refitted, a plain lens ({plain.model}) predicts them "
+            f"{'better' if better else 'no better'}: {plain.held_out:.2g} px, this lens {plain.own:.2g} px"
+        )
+    if plain is None or not better:
+        action = "take more views, all over the image and at several distances, with one flat, stiff board"
+        return Finding.of("prediction", "doubt" if plain is None else "note", text, action)
+    action = f"use --model {plain.model}, or take more views all over the image and at several distances"
+    return Finding.of("prediction", "stop", text, action, part=FAULTS)
 
 
-def _changed(
-    result: CameraCalibrationResult, halves: Sequence[HalvesDifference], beyond: Mapping[str, float]
-) -> HalvesDifference | None:
-    """Halves in time, or by name, that are not of one camera: each fits alone, and both together, or one the other not.
+def _far_halves(halves: Sequence[HalvesDifference], patterns: bool) -> list[HalvesDifference]:
+    """Halves that differ by more than their error bars state, the farthest first.
 
-    Args:
-        result: the calibration.
-        halves: of its views.
-        beyond: label -> px by which they differ beyond their error bars.
+    Less is proof enough where something else says so too: `patterns` in the residuals, or that halves which are not
+    alike by construction predict each other worse than those that are.
     """
     alike = min((half.held_out for half in halves if half.alike), default=math.inf)
-    for half in halves:
-        likely = (half.difference.probability or 0.0) < _LIKELY and half.held_out > _APART * alike
-        likely = likely and result.hybrid is not None
-        if not half.alike and (likely or (beyond[half.label] and half.own < _OWN * result.rms)):
-            return half
-    return None
+
+    def far(half: HalvesDifference) -> float:
+        also = patterns or (not half.alike and half.held_out > _APART * alike)
+        return unexplained(half.difference, _LIKELY if also else _CHANCE)
+
+    return sorted((half for half in halves if far(half)), key=far, reverse=True)
 
 
-def _changed_finding(half: HalvesDifference) -> Finding:
-    return Finding(
-        name="changed",
-        severity="stop",
-        text=f"{half.label} show two different cameras, {half.difference.rms:.2g} px apart: images of two "
-        "cameras in one file, or focus, zoom or image stabilization changed in between",
-        action="calibrate from the images of one camera with fixed focus and zoom",
-        picture="halves",
+def _apart_finding(
+    result: CameraCalibrationResult,
+    halves: Sequence[HalvesDifference],
+    half: HalvesDifference,
+    patterns: bool,
+    structure: ResidualStructure,
+) -> Finding:
+    """Error bars that halves contradict, and what the tests say of the cause.
+
+    Halves in time or by name are of two cameras where each fits much better alone. Otherwise halves that are alike
+    tell whether something changed from the one half to the other, or the model does not fit.
+    """
+    difference = half.difference
+    how = (
+        f"{half.label}: two cameras that differ by {difference.rms:.2g} px, {difference.ratio:.1f} times what their "
+        f"error bars predict (p {difference.probability:.1g})"
+    )
+    alike = next((one for one in halves if one.alike and one is not half), None)
+    if not half.alike and half.own < _OWN * result.rms:
+        text = (
+            f"{how}, and each fits better alone (RMS {half.own:.2g} px, together {result.rms:.2g} px): images of "
+            "two cameras in one file, or focus, zoom or image stabilization changed in between"
+        )
+        return Finding.of("changed", "stop", text, "calibrate from the images of one camera with fixed focus and zoom")
+    if alike is not None and not half.alike and not unexplained(alike.difference, _CHANCE):
+        cause = (
+            f". With {alike.label} it is {alike.difference.ratio:.1f} times, and the halves fit hardly better alone "
+            f"(RMS {half.own:.2g} px, together {result.rms:.2g} px): it is one camera, and the board's shape, or how "
+            "it was held, changed from one half to the other"
+        )
+    elif patterns:
+        cause = f", and residuals are not noise (correlation {structure.neighbors:.2f}): lens model or board do not fit"
+    else:
+        cause = ": lens model or board do not fit"
+    return Finding.of(
+        "halves",
+        "doubt",
+        f"{how}{cause}. The error bars are too small",
+        "take the views again with one flat, stiff board on a stand, tilted and rolled in mixed order",
         part=FAULTS,
     )
 
@@ -413,24 +398,13 @@ def _against_reference(
     """What the reference finds that was left out: the board's shape, the pupil's movement, or another lens."""
     plain = found.structure.image < _LENS
     if plain and (bends := _board_fault(result, options, found.reference)):
-        return Finding(
-            name="board",
-            severity="doubt",
-            text=f"{bends}, but was taken as flat and exact: far directions are wrong by {far:.2g} px",
-            action="calibrate with the default lens and --board printed, which measures the board, or use a stiffer "
-            "board",
-            picture="board",
-            part=FAULTS,
-        )
+        text = f"{bends}, but was taken as flat and exact: far directions are wrong by {far:.2g} px"
+        action = "calibrate with the default lens and --board printed, which measures the board, or use a stiffer board"
+        return Finding.of("board", "doubt", text, action)
     if plain and (pupil := _pupil_fault(result, found.reference)):
-        return Finding(
-            name="pupil",
-            severity="doubt",
-            text=f"{pupil}, which {result.camera.model} does not have: far directions are off by {far:.2g} px",
-            action="calibrate with the default lens (--model hybrid), or show the board from farther away",
-            picture="model",
-            part=FAULTS,
-        )
+        text = f"{pupil}, which {result.camera.model} does not have: far directions are off by {far:.2g} px"
+        action = "calibrate with the default lens (--model hybrid), or show the board from farther away"
+        return Finding.of("pupil", "doubt", text, action)
     if (
         plain
         and result.hybrid is None
@@ -438,15 +412,12 @@ def _against_reference(
         and not unexplained(found.model)
         and far > _image_sigma_of(result)
     ):
-        return Finding(
-            name="model",
-            severity="doubt",
-            text=f"another lens model fits these views as well as {result.camera.model} and differs by {far:.2g} px, "
-            "most where no board was",
-            action="calibrate with the default lens (--model hybrid), and show the board at the borders of the image",
-            picture="model",
-            part=FAULTS,
+        text = (
+            f"another lens model fits these views as well as {result.camera.model} and differs by {far:.2g} px, "
+            "most where no board was"
         )
+        action = "calibrate with the default lens (--model hybrid), and show the board at the borders of the image"
+        return Finding.of("model", "doubt", text, action)
     return None
 
 
@@ -540,10 +511,9 @@ def camera_verdict(
     # Faults of the views come first: without tilts or with blur the model looks wrong too.
     reference = examination.reference or result
     found = [*view_findings(result, min(result.noise, reference.noise)), *against]
-    found += [
-        Finding(name="calibration", severity="doubt", text=text, picture="residuals", part="lenses")
-        for text in result.warnings
-    ]
+    found += [Finding.of("calibration", "doubt", text) for text in result.warnings]
+    if any("upright" in text for text in result.warnings):
+        found = [finding for finding in found if finding.name != "roll"]
     if stored is not None:
         other, apart = other_views(stored, result)
         found, beyond = [*other, *found], max(beyond, apart)
@@ -555,10 +525,11 @@ def camera_verdict(
         _camera_answer(result.camera, requirement, sigma, beyond, baseline, mark_sigma) for requirement in requirements
     )
     rotation = result.cam_from_board_rotation
+    contradicted = any(finding.name == "halves" and finding.part == FAULTS for finding in against)
     return Verdict(
         subject=subject,
         answers=answers,
-        findings=weighed_findings(found, answers),
+        findings=weighed_findings(found, answers, wrong=contradicted or beyond > _image_rms(result.camera)),
         advice=result.advice or what_to_photograph(result.observations, result.camera, rotation),
         basis=_BASIS.format(baseline, mark_sigma),
         unexplained=beyond,
@@ -591,14 +562,8 @@ def stored_verdict(
     found = stored_findings(camera)
     sigma = _image_rms(camera)
     if math.isinf(sigma):
-        found.append(
-            Finding(
-                name="error-bars",
-                severity="stop",
-                text="the camera has no error bars: nobody can say how wrong its directions are",
-                action="calibrate it with kcal calibrate",
-            )
-        )
+        text = "the camera has no error bars: nobody can say how wrong its directions are"
+        found.append(Finding.of("error-bars", "stop", text, "calibrate it with kcal calibrate"))
     return Verdict(
         subject=subject,
         answers=tuple(
@@ -612,13 +577,9 @@ def stored_verdict(
 def stored_findings(camera: Camera) -> list[Finding]:
     """What a camera's file tells of its calibration, and that its views were not looked at."""
     record = camera.calibration.record if camera.calibration else None
-    unseen = Finding(
-        name="halves",
-        severity="doubt",
-        text="the views were not looked at, and a camera file alone cannot show that its lens model or board is wrong",
-        action="give the observations too (--observations FILE, for a rig twice: left, then right)",
-        part="lenses",
-    )
+    text = "the views were not looked at, and a camera file alone cannot show that its lens model or board is wrong"
+    action = "give the observations too (--observations FILE, for a rig twice: left, then right)"
+    unseen = Finding.of("halves", "doubt", text, action)
     return [unseen, *([] if record is None else record_findings(record))]
 
 
@@ -637,12 +598,11 @@ def other_views(stored: Camera, result: CameraCalibrationResult) -> tuple[list[F
     text += f": they give one that differs by {found.rms:.2g} px (RMS)"
     if found.ratio is not None:
         text += f", {found.ratio:.1f} times what the error bars predict"
-    other = Finding(
-        name="other-views",
-        severity="doubt" if found.same else "stop",
-        text=text,
-        action="give the observations that it was calibrated from, or calibrate it again",
-        part=FAULTS,
+    other = Finding.of(
+        "other-views",
+        "doubt" if found.same else "stop",
+        text,
+        "give the observations that it was calibrated from, or calibrate it again",
     )
     told = record_findings(record) if record is not None and missing else []
     return [other, *told], unexplained(found)

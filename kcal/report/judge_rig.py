@@ -286,72 +286,48 @@ def _own_findings(rig: StereoRig | CameraRig, result: RigResult | None) -> list[
     record = rig.calibration
     if record is None and result is None:
         text = "the rig's file does not tell how it was solved: residuals and what was left out could not be checked"
-        found.append(Finding(name="record", severity="doubt", text=text, part="relative pose"))
+        found.append(Finding.of("record", "doubt", text))
     warnings = result.warnings if result is not None else record.warnings if record is not None else ()
-    found += [Finding(name="rig", severity="doubt", text=text, part="relative pose") for text in warnings]
+    found += [Finding.of("rig", "doubt", text) for text in warnings]
     return found
 
 
 def _doubts(rig: StereoRig | CameraRig, result: RigResult | None) -> list[Finding]:
     found = []
     if (rig.root if isinstance(rig, CameraRig) else rig.covariance) is None:
-        found.append(
-            Finding(
-                name="error-bars",
-                severity="stop",
-                text="the rig has no error bars: nobody can say how wrong its ranges are",
-                action="solve it with kcal rig from cameras that kcal calibrated",
-            )
-        )
+        text = "the rig has no error bars: nobody can say how wrong its ranges are"
+        found.append(Finding.of("error-bars", "stop", text, "solve it with kcal rig from cameras that kcal calibrated"))
     record = rig.calibration
     if record is not None:
         out = sum(source.left_out for source in record.sources)
         share = out / max(out + sum(source.used for source in record.sources), 1)
         if share > _MOST_LEFT_OUT:
-            found.append(
-                Finding(
-                    name="left-out",
-                    severity="stop",
-                    text=f"{100 * share:.0f} % of what was seen contradicts the rest and was left out: with so much "
-                    "of it nobody can tell which part is right",
-                    action="check that both images of each pair were taken at the same moment, and the survey",
-                    part="relative pose",
-                )
+            text = (
+                f"{100 * share:.0f} % of what was seen contradicts the rest and was left out: with so much "
+                "of it nobody can tell which part is right"
             )
+            action = "check that both images of each pair were taken at the same moment, and the survey"
+            found.append(Finding.of("left-out", "stop", text, action))
         found += [
-            Finding(
-                name="contradiction",
-                severity="stop",
-                text=text,
-                action="measure again what contradicts, correct it or its sigma, and solve the rig again",
-                picture="rig",
-                part="relative pose",
+            Finding.of(
+                "contradiction",
+                "stop",
+                text,
+                "measure again what contradicts, correct it or its sigma, and solve the rig again",
             )
             for text in record.contradictions
         ]
     if exact := _exact_lenses(rig, result):
-        found.append(
-            Finding(
-                name="exact-lenses",
-                severity="doubt",
-                text=f"the lenses of {' and '.join(exact)} were taken as exact: their errors are in no error bar",
-                action="solve the rig from cameras with error bars, with --intrinsics prior",
-                part="lenses",
-            )
-        )
+        text = f"the lenses of {' and '.join(exact)} were taken as exact: their errors are in no error bar"
+        action = "solve the rig from cameras with error bars, with --intrinsics prior"
+        found.append(Finding.of("exact-lenses", "doubt", text, action))
     variance = max(1.0 if result is None else result.variance, _largest_variance(record if result is None else result))
     if variance > _MOST_VARIANCE:
-        found.append(
-            Finding(
-                name="misfit",
-                severity="stop",
-                text=f"residuals are {math.sqrt(variance):.1f} times as large as their sigmas say: cameras, "
-                "survey and marks do not fit each other",
-                action="look at the residuals by item, and correct what stands out",
-                picture="rig",
-                part="relative pose",
-            )
+        text = (
+            f"residuals are {math.sqrt(variance):.1f} times as large as their sigmas say: cameras, "
+            "survey and marks do not fit each other"
         )
+        found.append(Finding.of("misfit", "stop", text, "look at the residuals by item, and correct what stands out"))
     return found
 
 
@@ -387,23 +363,18 @@ def _pairs_compared(rig: StereoRig, result: RigResult | None, pairs: tuple[Tenso
 
 
 def _unseen_finding(distance: float) -> Finding:
-    return Finding(
-        name="view",
-        severity="stop",
-        text=f"at {range_text(distance)} from a camera, along the middle rows of the images, no two cameras see one "
-        "thing: no range can be told",
-        action="turn the cameras so that their views overlap, or add one (kcal sites says where)",
+    text = (
+        f"at {range_text(distance)} from a camera, along the middle rows of the images, no two cameras see one "
+        "thing: no range can be told"
     )
+    action = "turn the cameras so that their views overlap, or add one (kcal sites says where)"
+    return Finding.of("view", "stop", text, action)
 
 
 def _unpaired_finding(why: str) -> Finding:
-    return Finding(
-        name="synchronization",
-        severity="doubt",
-        text=f"whether both cameras saw the board at the same moments could not be checked: {why}",
-        action="give the observations of the pairs (--observations twice: left, then right)",
-        part="relative pose",
-    )
+    text = f"whether both cameras saw the board at the same moments could not be checked: {why}"
+    action = "give the observations of the pairs (--observations twice: left, then right)"
+    return Finding.of("synchronization", "doubt", text, action)
 
 
 def _synchrony_finding(found: Synchrony) -> Finding:
@@ -413,13 +384,11 @@ def _synchrony_finding(found: Synchrony) -> Finding:
         and abs(found.delay) > max(_LATE_SIGMAS * found.delay_sigma, _LATE)
     )
     if found.ratio <= _APART and not late:
-        return Finding(
-            name="synchronization",
-            severity="fine",
-            text=f"both cameras saw the board in the same place in {found.pairs} pairs "
-            f"({found.ratio:.1f} times what noise explains)",
-            part="relative pose",
+        text = (
+            f"both cameras saw the board in the same place in {found.pairs} pairs "
+            f"({found.ratio:.1f} times what noise explains)"
         )
+        return Finding.of("synchronization", "fine", text)
     how = ""
     if late and found.delay is not None and found.delay_sigma is not None:
         which = "after" if found.delay > 0 else "before"
@@ -427,12 +396,9 @@ def _synchrony_finding(found: Synchrony) -> Finding:
             f"; the right camera took its pictures {abs(found.delay):.2f} ± {found.delay_sigma:.2f} steps {which} "
             "the left one"
         )
-    return Finding(
-        name="synchronization",
-        severity="stop" if found.ratio > _APART else "doubt",
-        text=f"the board moved between both exposures, or a camera did: it is {1e3 * found.shift:.2g} mm elsewhere for "
-        f"the right camera, {found.ratio:.1f} times what noise explains{how}",
-        action="trigger both cameras together, or hold the board still in each pose (a tripod), and take pairs again",
-        picture="rig",
-        part="relative pose",
+    text = (
+        f"the board moved between both exposures, or a camera did: it is {1e3 * found.shift:.2g} mm elsewhere for "
+        f"the right camera, {found.ratio:.1f} times what noise explains{how}"
     )
+    action = "trigger both cameras together, or hold the board still in each pose (a tripod), and take pairs again"
+    return Finding.of("synchronization", "stop" if found.ratio > _APART else "doubt", text, action)

@@ -12,7 +12,7 @@ from kcal.errors import InputError
 from kcal.locate.stereo import BEARING_SIGMAS
 from kcal.texts import range_text
 
-Severity = Literal["stop", "doubt", "fine"]
+Severity = Literal["stop", "doubt", "note", "fine"]
 # The source of what a camera is wrong by beyond its error bars.
 FAULTS = "faults of the calibration"
 # What lessens each source, where no finding tells more.
@@ -22,14 +22,22 @@ _NEXT = {
     "relative pose": "mark more far features or surveyed landmarks in both images: they determine the relative yaw",
     FAULTS: "look at the doubts below, and calibrate again without them",
 }
-# What findings are called where people read them, if not by their names.
-_TITLES = {
-    "halves": "check by halves of the views", "model": "lens model", "changed": "two cameras", "names": "two cameras",
-    "prediction": "prediction of other views", "pupil": "entrance pupil", "views": "number of views",
-    "mirrored": "mirrored board", "tilt": "tilts", "roll": "rolls", "depth": "distances", "record": "no record",
-    "calibration": "warning when it was calibrated", "rig": "warning when it was solved", "error-bars": "error bars",
-    "unsteady": "repeating residuals", "other-views": "other views", "left-out": "left out", "view": "common view",
-    "misfit": "residuals", "exact-lenses": "exact lenses", "synchronization": "same moment",
+# Of each finding: what people read as its name, the picture that shows it, and the part of errors that it enlarges.
+_KINDS = {
+    "views": ("number of views", "views", "lenses"), "mirrored": ("mirrored board", "coverage", ""),
+    "coverage": ("coverage", "coverage", "lenses"), "blur": ("blur", "residuals", "lenses"),
+    "patterns": ("patterns in residuals", "residuals", "lenses"), "poses": ("poses", "poses", "lenses"),
+    "prediction": ("prediction of other views", "halves", "lenses"), "tilt": ("tilts", "poses", "lenses"),
+    "halves": ("check by halves of the views", "halves", "lenses"), "roll": ("rolls", "poses", "lenses"),
+    "other-views": ("other views", "", FAULTS), "depth": ("distances", "poses", "lenses"),
+    "calibration": ("warning when it was calibrated", "residuals", "lenses"), "board": ("board", "board", FAULTS),
+    "changed": ("two cameras", "halves", FAULTS), "names": ("two cameras", "", "lenses"),
+    "pupil": ("entrance pupil", "model", FAULTS), "model": ("lens model", "model", FAULTS),
+    "error-bars": ("error bars", "", ""), "view": ("common view", "", ""),
+    "misfit": ("residuals", "rig", "relative pose"), "record": ("no record", "", "relative pose"),
+    "synchronization": ("same moment", "rig", "relative pose"), "exact-lenses": ("exact lenses", "", "lenses"),
+    "rig": ("warning when it was solved", "", "relative pose"),
+    "contradiction": ("contradiction", "rig", "relative pose"), "left-out": ("left out", "", "relative pose"),
 }  # fmt: skip
 
 
@@ -130,7 +138,8 @@ class Finding:
 
     Args:
         name: short and fixed, for programs: "model", "pupil", "board", "tilt", "coverage", ...
-        severity: "stop": the answer is no whatever the error bars say; "doubt": read it; "fine": nothing found.
+        severity: "stop": the answer is no whatever the error bars say; "doubt": read it; "note": it does no harm that
+            was measured; "fine": nothing found.
         text: what was found, and why it matters; one sentence.
         action: what to do; empty where nothing is needed.
         picture: name of the picture on the page that shows it.
@@ -148,7 +157,14 @@ class Finding:
     @property
     def title(self) -> str:
         """What it is about, in words."""
-        return _TITLES.get(self.name, self.name)
+        return _KINDS.get(self.name, (self.name,))[0]
+
+    @classmethod
+    def of(cls, name: str, severity: Severity, text: str, action: str = "", *, part: str | None = None) -> Finding:
+        """A finding of a known kind, with its picture, and its part unless another one is given."""
+        _, picture, own = _KINDS[name]
+        return cls(name=name, severity=severity, text=text, action=action, picture=picture,
+                   part=own if part is None else part)  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -264,12 +280,17 @@ class Verdict:
 
 def sorted_findings(findings: Sequence[Finding]) -> tuple[Finding, ...]:
     """The most severe first, otherwise in their order."""
-    return tuple(sorted(findings, key=lambda finding: ("stop", "doubt", "fine").index(finding.severity)))
+    return tuple(sorted(findings, key=lambda finding: ("stop", "doubt", "note", "fine").index(finding.severity)))
 
 
-def weighed_findings(findings: Sequence[Finding], answers: Sequence[RangeAnswer]) -> tuple[Finding, ...]:
-    """Sorted findings, where a fault that the requirements bear is a doubt, and one that breaks them is the reason."""
-    breaks = any(answer.fails_by(FAULTS) for answer in answers)
+def weighed_findings(
+    findings: Sequence[Finding], answers: Sequence[RangeAnswer], *, wrong: bool = False
+) -> tuple[Finding, ...]:
+    """Sorted findings, where a fault that the requirements bear is a doubt, and one that breaks them is the reason.
+
+    Without requirements, one that makes the camera `wrong` by more than its error bars is.
+    """
+    breaks = any(answer.fails_by(FAULTS) for answer in answers) or (wrong and not answers)
     return sorted_findings(
         [
             dataclasses.replace(finding, severity="stop")

@@ -63,4 +63,4 @@ def test_a_stereo_capture_from_observations_to_the_verdict_on_its_rig(kcal_data:
     assert code in (0, 3)
     assert ("YES" if code == 0 else "NO") in text
     # Each finding in words, none by its internal name.
-    assert not any(name in text for name in ("\n  halves:", "\n  unsteady:", "\n  other-views:", "\n  exact-lenses:"))
+    assert not any(name in text for name in ("\n  halves:", "\n  patterns:", "\n  other-views:", "\n  exact-lenses:"))

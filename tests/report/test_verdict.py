@@ -19,7 +19,7 @@ from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import StereoRig
-from kcal.report.judge_camera import camera_verdict, model_findings, stored_verdict, view_findings
+from kcal.report.judge_camera import camera_verdict, stored_verdict, view_findings
 from kcal.report.judge_rig import rig_verdict, synchrony
 from kcal.report.verdict import Finding, RangeAnswer, Requirement, Verdict
 from kcal.report.verdict_page import range_rows, verdict_page
@@ -133,7 +133,10 @@ def test_a_bent_board_that_was_taken_as_flat_is_named(poses: tuple[Tensor, Tenso
 
 def test_boards_parallel_to_the_image_are_named(clean: CameraCalibrationResult, examination: Examination) -> None:
     flat = torch.eye(3, dtype=torch.float64).expand(VIEWS, 3, 3)
-    verdict = camera_verdict(dataclasses.replace(clean, cam_from_board_rotation=flat), OPTIONS, examination=examination)
+    lens = clean.camera.with_parameters(clean.camera.params)
+    sigma = clean.sigma | {"fx": 0.03 * float(lens.focal[0])}
+    given = dataclasses.replace(clean, cam_from_board_rotation=flat, camera=lens, sigma=sigma)
+    verdict = camera_verdict(given, OPTIONS, examination=examination)
     assert {"tilt"} == names(verdict, "stop")
     assert "tilt the board" in verdict.next_step
 
@@ -165,9 +168,8 @@ def test_blur_is_named_by_noise_and_by_what_corners_say(poses: tuple[Tensor, Ten
     def blur(seen: Observations) -> list[str]:
         return [one.severity for one in view_findings(calibrate_camera(seen, OPTIONS)) if one.name == "blur"]
 
-    assert blur(observed(pixels + rough)) == ["stop"]
     assert blur(observed(pixels + 0.45 * rough)) == ["doubt"]
-    assert blur(observed(pixels, spread=0.9)) == ["stop"]
+    assert blur(observed(pixels, spread=0.9)) == ["doubt"]
     assert blur(observed(pixels, spread=0.1)) == []
 
 
@@ -207,52 +209,6 @@ def test_residuals_that_repeat_have_structure(clean: CameraCalibrationResult) ->
     assert residual_structure(noise + noise[:1], pixels, size, clean.observations).board > 5
     shifted = residual_structure(noise + 2 * noise[:, :1], pixels, size, clean.observations)
     assert shifted.neighbors > 0.5
-
-
-def test_real_corners_are_never_quite_independent(clean: CameraCalibrationResult, examination: Examination) -> None:
-    """A hybrid camera whose halves agree is doubted for neighbors that are alike, and stopped for more than that."""
-    result = calibrate_camera(clean.observations)
-    assert result.hybrid is not None
-    found = dataclasses.replace(examination, reference=None, model=None)
-    assert found.halves
-
-    def severity(tempering: float = 1.0, **changes: float) -> str:
-        assert result.hybrid is not None
-        fit = dataclasses.replace(result.hybrid, tempering=tempering)
-        structure = found.structure._replace(**{"neighbors": 0.25, "image": 1.0, **changes})
-        given = dataclasses.replace(found, structure=structure)
-        findings, beyond = model_findings(dataclasses.replace(result, hybrid=fit), CalibrationOptions(), given)
-        assert beyond == 0.0
-        return findings[0].severity
-
-    assert severity() == "doubt"
-    assert severity(neighbors=0.0) == "fine"
-    assert severity(image=3.0) == "stop"
-    assert severity(tempering=2.5) == "stop"
-
-
-def test_two_cameras_that_one_lens_can_fit_are_told_by_their_halves(
-    clean: CameraCalibrationResult, examination: Examination
-) -> None:
-    """Motions and a measured board fit images of two like cameras together; each half then predicts the other badly."""
-    result = calibrate_camera(clean.observations)
-    alike = next(half for half in examination.halves if half.alike)
-    other = dataclasses.replace(alike, label="images left… and right…", alike=False)
-
-    def found(held_out: float, probability: float, fit: CameraCalibrationResult = result) -> tuple[list[str], float]:
-        difference = dataclasses.replace(alike.difference, ratio=3.0, probability=probability)
-        halves = (alike, dataclasses.replace(other, difference=difference, held_out=held_out * alike.held_out))
-        given = dataclasses.replace(examination, halves=halves, reference=None, model=None)
-        findings, beyond = model_findings(fit, CalibrationOptions(), given)
-        return [one.name for one in findings if one.severity == "stop"], beyond
-
-    names, beyond = found(1.9, 1e-4)
-    assert names == ["changed"]
-    assert beyond > 0.0
-    assert found(1.2, 1e-4) == ([], 0.0)
-    assert found(1.9, 0.1) == ([], 0.0)
-    # A parametric model that does not fit its lens predicts badly too.
-    assert found(1.9, 1e-4, clean)[0] == []
 
 
 def test_a_camera_that_is_not_from_these_views_is_told(

@@ -98,9 +98,9 @@ def test_findings_are_called_by_words() -> None:
     names = {
         name
         for module in folder.glob("judge_*.py")
-        for name in re.findall(r'Finding\(\s*name="([\w-]+)"', module.read_text(encoding="utf-8"))
+        for name in re.findall(r'Finding.of\(\s*"([\w-]+)"', module.read_text(encoding="utf-8"))
     }
-    assert {"halves", "tilt", "unsteady", "coverage"} <= names
+    assert {"halves", "tilt", "patterns", "coverage"} <= names
     names |= {"other-views", "left-out", "exact-lenses", "error-bars", "misfit", "synchronization"}
     titles = {name: Finding(name=name, severity="fine", text="").title for name in names}
     assert not any("-" in title for title in titles.values())

@@ -137,7 +137,6 @@ def settle(
     board: Literal["printed", "exact"] | BoardPrior | MeasuredBoard,
     square: bool | None = None,
     motion: bool,
-    bending: bool = True,
     focal: float | None,
     start: FitStart | None = None,
     robust: bool = False,
@@ -173,7 +172,6 @@ def settle(
         square=start.square if start is not None else lens.square if lens is not None else square is True,
         robust=robust,
         exact=board == "exact",
-        heights=board_modes(ordered).heights if bending and start is None and board != "exact" else None,
     )
 
     def run(
@@ -237,7 +235,6 @@ def rough_start(
     weights: Tensor,
     board: Literal["printed", "exact"] | BoardPrior | MeasuredBoard = "printed",
     motion: bool = True,
-    bending: bool = True,
     focal: float | None = None,
     progress: Callable[[str], object] = lambda _: None,
     modes: FieldModes | None = None,
@@ -249,8 +246,8 @@ def rough_start(
         DegenerateError: likewise.
     """
     rounds, never, _, known = settle(
-        points, pixels, size, weights, modes=modes, board=board, motion=motion, bending=bending, focal=focal,
-        progress=progress, rough=True,
+        points, pixels, size, weights, modes=modes, board=board, motion=motion, focal=focal, progress=progress,
+        rough=True,
     )  # fmt: skip
     capture, estimate = rounds.capture, rounds.estimate
     errors = capture.problem(estimate, never).pixel_errors(estimate.state)
