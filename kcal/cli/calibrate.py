@@ -188,6 +188,10 @@ def calibrate_command(
             "board that `kcal board measure` wrote.",
         ),
     ] = "printed",
+    without: Annotated[
+        list[str] | None,
+        rarely("KIND", "motion: nothing moves while rows are read. bending: the board is stiff in all views."),
+    ] = None,
     one_type: Annotated[
         bool,
         typer.Option("--one-type", help="The cameras, four or more, are of one type: each learns from the others."),
@@ -330,8 +334,13 @@ def calibrate_command(
     from kcal.lens.calibration import LensSetting
     from kcal.solve.problem import RobustLoss
 
+    unknown = set(without or ()) - {"motion", "bending"}
+    if unknown:
+        raise InputError(f"--without {unknown.pop()}: write motion or bending")
     options = CalibrationOptions(
         model=model,
+        motion="motion" not in (without or ()),
+        bending="bending" not in (without or ()),
         # An unknown kind is refused by the options themselves, and that of a loss by the loss.
         board=load_measured_board(board) if Path(board).suffix else board,  # type: ignore[arg-type]
         board_warp=board_warp,

@@ -2,7 +2,8 @@
 
     python -m scripts.check.handheld --out FILE --seeds 0-99                    # 8 views
     python -m scripts.check.handheld --out FILE --seeds 0-199 --views 3 4 5 6   # few views
-    python -m scripts.check.handheld --out FILE --seeds 0-99 --still            # without the terms for motion
+    python -m scripts.check.handheld --out FILE --seeds 0-99 --fit still        # without the terms for motion
+    python -m scripts.check.handheld --out FILE --seeds 0-99 --kinds bent "few bent" "bent, hand"   # boards that flex
     python -m scripts.check.handheld --out FILE [OTHER ...] --write             # the tables in docs/measured
 
 Captures that FILE has are not made again, so that a run can be interrupted, and split over several files.
@@ -34,14 +35,24 @@ from scripts.shared.timing import show
 
 PAGE = "ordinary.md"
 SIGMA = 0.08
-KINDS = ("hand", "stand")
+TERMS = ("motion", "bending")
+# Whether the capture is by hand, and by how many meters the board bends in what share of the views.
+KINDS = {
+    "hand": (True, 0.0, 1.0),
+    "stand": (False, 0.0, 1.0),
+    "bent": (False, 1e-3, 1.0),
+    "few bent": (False, 3e-3, 0.2),
+    "bent, hand": (True, 1e-3, 1.0),
+}
+FITS = {"default": {}, "still": {"motion": False}, "stiff": {"bending": False}}
 
 
 def captured(kind: str, views: int, seed: int, fit: str) -> Record:
     """One capture and its calibration."""
-    case = simulated(seed, views, SIGMA, kind == "hand")
+    by_hand, bent, share = KINDS[kind]
+    case = simulated(seed, views, SIGMA, by_hand, bent=bent, share=share)
     start = time.process_time()
-    found = against_truth(case, default_options(fit == "still"))
+    found = against_truth(case, default_options(**FITS[fit]))
     spent = time.process_time() - start
     moved = {name: getattr(case.truth, name) for name in ("readout", "exposure", "turning", "speed")}
     return found | moved | {"cpu_s": spent, "blur": float(case.truth.blur.norm(dim=-1).square().nanmean().sqrt())}
@@ -53,7 +64,7 @@ def line(record: Record) -> str:
         return f"refused: {record['refused'][:90]}"
     return (
         f"error {record['rms']:.3f} px, stated {record['predicted']:.3f}, {100 * record['everywhere']:.0f} % in the "
-        f"ellipses, {record['cpu_s']:.1f} s"
+        f"ellipses, {record['terms']}, {record['cpu_s']:.1f} s"
     )
 
 
@@ -80,18 +91,19 @@ def lines(records: list[Record]) -> list[str]:
         known = [record for record in own if "refused" not in record]
         refused = f"{100 * (1 - len(known) / len(own)):.1f} %"
         if not known:
-            rows.append([views, kind, fit, len(own), refused, *["–"] * 4])
+            rows.append([views, kind, fit, len(own), refused, *["–"] * 6])
             continue
         true, stated = [r["rms"] for r in known], [r["predicted"] for r in known]
         rows.append(
             [
                 views, kind, fit, len(own), refused, share(known, "everywhere"),
                 f"{statistics.median(true):.3f}", f"{rms(true):.3f}", f"{rms(stated):.3f}",
+                *(f"{100 * statistics.fmean(term in r.get('terms', ()) for r in known):.0f} %" for term in TERMS),
             ]
         )  # fmt: skip
     head = [
         "views", "held by", "fit", "captures", "refused", "in 95 %, whole image", "median error, px",
-        "RMS error", "RMS stated",
+        "RMS error", "RMS stated", "motion found", "bending found",
     ]  # fmt: skip
     return table(head, rows)
 
@@ -101,15 +113,16 @@ def main() -> None:
     parser.add_argument("--out", nargs="+", type=Path, required=True, help="JSON lines; the first is written to")
     parser.add_argument("--seeds", type=seeds, help="for example 0-99")
     parser.add_argument("--views", nargs="+", type=int, default=[8])
-    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
-    parser.add_argument("--still", action="store_true", help="fit without the terms for motion")
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=["hand", "stand"])
+    parser.add_argument("--fit", choices=FITS, default="default", help="still: no motion; stiff: no bending")
     parser.add_argument("--write", action="store_true", help="write the tables into the page")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     if arguments.seeds is not None:
-        fit = "still" if arguments.still else "default"
-        default_options(arguments.still)
-        keys = [(k, n, s, fit) for s, n, k in itertools.product(arguments.seeds, arguments.views, arguments.kinds)]
+        default_options(**FITS[arguments.fit])
+        keys = [
+            (k, n, s, arguments.fit) for s, n, k in itertools.product(arguments.seeds, arguments.views, arguments.kinds)
+        ]
         finish(arguments.out[0], keys, captured, line)
     records = read(arguments.out)
     text = show(lines(records))

@@ -139,6 +139,7 @@ def moving_capture(
     seed: int,
     hands: Hands | None = None,
     board: BoardLike = PAPER_BOARD,
+    heights: Tensor | None = None,
 ) -> MovingCapture:
     """Simulate a capture by hand: rolling shutter, blur, and noise that is larger along the blur.
 
@@ -149,6 +150,7 @@ def moving_capture(
         seed: of noise and motion. On a stand, the noise is that of the same seed before blur.
         hands: how the hand moves; None: board and camera are on stands.
         board: its size, or a `PrintedBoard`.
+        heights: (V, N) meters by which its corners lie higher in each view; None: it is stiff.
 
     Raises:
         InputError: no poses, or a sigma that is negative.
@@ -166,7 +168,10 @@ def moving_capture(
             f"{len(poses)} poses, sigma {sigma}: at least one, and pixels that are not negative, are needed"
         )
     rotation, translation = (torch.stack(parts) for parts in zip(*poses, strict=True))
-    placed = true_corners(board) @ rotation.transpose(-1, -2) + translation[:, None]
+    points = true_corners(board)
+    if heights is not None:
+        points = points + torch.nn.functional.pad(heights[..., None], (2, 0))
+    placed = points @ rotation.transpose(-1, -2) + translation[:, None]
     noise = torch.randn((*placed.shape[:2], 2), dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
     if hands is None:
         true, valid = lens.project(placed)

@@ -12,6 +12,7 @@ from torch import Tensor
 from kcal.calibrate.camera.advice import reached
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.camera.result import CameraCalibrationResult
+from kcal.calibrate.hybrid.fit import HybridFit
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.errors import KcalError
@@ -48,6 +49,8 @@ def simulated(
     max_roll: float = math.radians(25.0),
     stretch: float = 1.0,
     take: int = 0,
+    bent: float = 0.0,
+    share: float = 1.0,
 ) -> Simulated:
     """Draw a lens, a printed board and views of it; lens and what is held follow from the seed in turn.
 
@@ -59,16 +62,34 @@ def simulated(
         max_roll: largest turn of the boards about their normals, radians.
         stretch: factor by which the images' rows were stretched; 1 leaves pixels square.
         take: another one has other poses, motions and noise, and the same lens and board.
+        bent: meters by which the board bends about an axis of its own in each view (standard deviation).
+        share: of the views in which it does; in the others it is stiff.
     """
     lens = drawn_lens(LENSES[seed % len(LENSES)], 1.0, seed, wander=1.0)
     hands = Hands(holds="camera" if seed // len(LENSES) % 2 else "board") if by_hand else None
     generator, options = torch.Generator().manual_seed(1000 + seed + 10**6 * take), PoseOptions(max_roll=max_roll)
     poses = sample_board_poses(quick(lens), BOARD, views, generator, fill=FILL, options=options)
     board = PrintedBoard(BOARD.columns, BOARD.rows, BOARD.square, seed)
-    truth = moving_capture(lens, poses, sigma=sigma, seed=1000 + seed + 10**6 * take, hands=hands, board=board)
+    heights = bends(views, bent, share, torch.Generator().manual_seed(9000 + seed)) if bent else None
+    truth = moving_capture(
+        lens, poses, sigma=sigma, seed=1000 + seed + 10**6 * take, hands=hands, board=board, heights=heights
+    )
     seen = truth.pixels.isfinite().all(-1) & lens.inside(truth.pixels.nan_to_num(nan=-9.0))
     pixels = torch.where(seen[..., None], truth.pixels, torch.nan)
     return Simulated(lens, stretched(pixels, truth.covariance, lens.size, stretch), truth)
+
+
+def bends(views: int, size: float, share: float, generator: torch.Generator) -> Tensor:
+    """(V, N) heights of `BOARD` that bends in some views: along one direction of its own, more on one side."""
+    low, high = BOARD.points[:, :2].amin(0), BOARD.points[:, :2].amax(0)
+    flat = (2.0 * BOARD.points[:, :2] - low - high) / (high - low).max()
+    angle, chosen = torch.rand(2, views, dtype=torch.float64, generator=generator)
+    height, skewed = torch.randn(2, views, 1, dtype=torch.float64, generator=generator)
+    across = torch.stack([torch.cos(math.pi * angle), torch.sin(math.pi * angle)], -1) @ flat.T
+    count = max(1, round(share * views))
+    return torch.where((chosen.argsort().argsort() < count)[:, None], size * height, 0.0) * (
+        (1.0 - across**2) * (1.0 + 0.3 * skewed * across)
+    )
 
 
 def quick(lens: TruthLens) -> Camera:
@@ -108,17 +129,15 @@ def view_of(name: str, pixels: Tensor, covariance: Tensor) -> View:
     )
 
 
-def default_options(still: bool) -> CalibrationOptions:
-    """No option set; or, if asked for, that the camera did not move.
+def default_options(**switched: bool) -> CalibrationOptions:
+    """No option set but those given.
 
     Raises:
-        SystemExit: this version of kcal cannot switch motion off.
+        SystemExit: this version of kcal has no such option.
     """
-    if not still:
-        return CalibrationOptions()
-    if "motion" not in {field.name for field in dataclasses.fields(CalibrationOptions)}:
-        raise SystemExit("--still: this version of kcal has no term for motion that could be switched off")
-    return CalibrationOptions(motion=False)  # type: ignore[call-arg, unused-ignore]
+    if not set(switched) <= {field.name for field in dataclasses.fields(CalibrationOptions)}:
+        raise SystemExit(f"this version of kcal has no term that could be switched off: {', '.join(switched)}")
+    return CalibrationOptions(**switched)  # type: ignore[arg-type, unused-ignore]
 
 
 def against_truth(case: Simulated, options: CalibrationOptions) -> Record:
@@ -137,7 +156,15 @@ def told(result: CameraCalibrationResult) -> Record:
         "noise": result.noise,
         "warnings": list(result.warnings),
         "tempering": None if result.hybrid is None else result.hybrid.tempering,
+        "terms": [] if result.hybrid is None else terms(result.hybrid),
     }
+
+
+def terms(fit: HybridFit) -> list[str]:
+    """What views were found to do."""
+    readout = fit.readout
+    bends = getattr(readout, "bends", None) is not None
+    return ["motion"] * (readout is not None and getattr(readout, "moves", True)) + ["bending"] * bends
 
 
 def figures(result: CameraCalibrationResult, case: Simulated, pixels: Tensor, errors: Tensor) -> Record:

@@ -103,7 +103,7 @@ def compare_models(
         parts: the groups are dealt into so many parts, each of which is held out once. As many parts as groups leave
             out one group at a time.
         options: for the parametric models; not given: with the board's warp. The hybrid takes
-            `board`, `motion`, `weighted`, `focal` and `field_of_view` of them.
+            `board`, `motion`, `bending`, `weighted`, `focal` and `field_of_view` of them.
         progress: called after each fit.
 
     Returns:
@@ -195,7 +195,7 @@ def _options(model: str | LensModel, options: CalibrationOptions) -> Calibration
     """The options for one model; the hybrid takes those that are its own."""
     if model not in (HYBRID, NETWORK):
         return dataclasses.replace(options, model=model, board="printed", field=None)
-    own = ["board", "motion", "weighted", "focal", "field_of_view"]
+    own = ["board", "motion", "bending", "weighted", "focal", "field_of_view"]
     own += ["field", "training"] if model == NETWORK else []
     return CalibrationOptions(model=str(model), **{name: getattr(options, name) for name in own})
 

@@ -19,6 +19,7 @@ from kcal.calibrate.camera.checks import MINIMUM_VIEWS, check_views
 from kcal.calibrate.camera.outliers import leave_out_outliers, noise_scale
 from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult, OutlierRejection, Progress
 from kcal.calibrate.camera.warnings import (
+    bending_warnings,
     general_warnings,
     hybrid_warnings,
     motion_warnings,
@@ -52,6 +53,7 @@ def calibrate_hybrid(
             weights,
             options.board,
             options.motion,
+            options.bending,
             options.start_focal(observations.image_size),
             progress,
             options.modes,
@@ -78,6 +80,7 @@ def _fit_views(
         options.modes,
         board=options.board,
         motion=options.motion,
+        bending=options.bending,
         focal=options.start_focal(observations.image_size),
         start=start,
         robust=robust,
@@ -169,6 +172,7 @@ def hybrid_result(observations: Observations, fit: HybridFit, options: Calibrati
             *general_warnings([names[i] for i in used], camera, fit.rms, per_view[used], (), status),
             *hybrid_warnings(fit),
             *motion_warnings(fit),
+            *bending_warnings(names, fit),
             *pixel_warnings(fit),
             *pupil_warnings(camera, covariance),
             *(roll_warnings(fit.state.rotation) if options.board == "printed" else ()),

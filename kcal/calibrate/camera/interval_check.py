@@ -153,7 +153,8 @@ class SimulatedCapture(NamedTuple):
         if self.fit is not None:
             fit = fit_hybrid(
                 self.seen.board.points, self.pixels, self.seen.image_size, self.fit.weights, options.modes,
-                board=options.board, motion=options.motion, start=self.fit if warm else None,
+                board=options.board, motion=options.motion, bending=options.bending,
+                start=self.fit if warm else None,
             )  # fmt: skip
             fit.camera.calibration = CameraCalibration(information=fit.information)
             return fit.camera
@@ -289,7 +290,7 @@ def _possible_fit(fit: HybridFit, random: torch.Generator) -> HybridFit:
     board = state.board + change[len(change) - len(state.board) :]
     motion = state.motion
     if fit.readout is not None:
-        spread = (fit.sigma**2 / fit.tempering / fit.stillness).sqrt()
+        spread = (fit.sigma**2 / fit.tempering / fit.own_stillness).sqrt()
         motion = spread * torch.randn(motion.shape, dtype=torch.float64, generator=random)
     moved = torch.einsum("b,bkn->nk", board - state.board, fit.board_shapes.shapes)
     return dataclasses.replace(

@@ -129,7 +129,8 @@ def hybrid_views(
     if start is None:
         fit = fit_hybrid(
             fixed[1], fixed[0], size, modes=options.modes, board=options.board, motion=options.motion,
-            focal=options.start_focal(size), training=None if options.modes is None else options.training,
+            bending=options.bending, focal=options.start_focal(size),
+            training=None if options.modes is None else options.training,
         )  # fmt: skip
         begin = fit.state
     else:

@@ -148,7 +148,14 @@ def two_camera_warnings(
         if _promising(_by_view(problem, state, result.noise**2), pixels, seen.image_size) is None:
             return ()
         try:
-            fit = fit_hybrid(seen.board.points, pixels, seen.image_size, board=options.board, motion=options.motion)
+            fit = fit_hybrid(
+                seen.board.points,
+                pixels,
+                seen.image_size,
+                board=options.board,
+                motion=options.motion,
+                bending=options.bending,
+            )
         except _UNCOMPARED:
             return ()
     found = two_cameras(fit, seen.board.points, pixels, options, progress)
@@ -221,7 +228,7 @@ def _evidence_at(fit: HybridFit, tempering: float) -> float:
 
 def _of_fit(fit: HybridFit, pixels: Tensor, held: float = 1.0) -> _ByView:
     """Of a fit's views, motions held back so many times as much as it found."""
-    still = None if fit.readout is None else held * fit.stillness
+    still = None if fit.readout is None else held * fit.own_stillness
     problem = BoardProblem(
         fit.board_points, pixels, fit.model, _INDICES, weights=fit.weights, readout=fit.readout, stillness=still
     )

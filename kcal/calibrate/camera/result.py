@@ -77,6 +77,8 @@ class CalibrationOptions:
             as known, with what is not known of it.
         motion: with the hybrid lens, views may move while their rows are read, as with a rolling shutter and a board or
             camera that is held by hand; the views tell how much. False: nothing moved, or all rows were read at once.
+        bending: with the hybrid lens, the board may bend by another amount in each view, where the evidence of the
+            views says so, as paper does that a hand holds. False: it has one shape in all of them.
         board_warp: with a parametric model, estimate how the board bends (two more parameters).
         weighted: weight corners by their covariances where all views have them (`kcal.calibrate.problem.views`);
             False minimizes the plain RMS, as OpenCV does.
@@ -112,6 +114,7 @@ class CalibrationOptions:
     training: FieldTraining | None = _TRAINING
     board: Literal["printed", "exact"] | MeasuredBoard = "printed"
     motion: bool = True
+    bending: bool = True
     board_warp: bool = False
     weighted: bool = True
     loss: RobustLoss | None = None

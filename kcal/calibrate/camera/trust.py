@@ -190,6 +190,7 @@ def _reference_options(result: CameraCalibrationResult, options: CalibrationOpti
         reject=options.reject,
         focal=float(paraxial_focal(result.camera).value[0]),
         motion=options.motion,
+        bending=options.bending,
     )
 
 

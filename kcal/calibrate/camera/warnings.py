@@ -21,6 +21,8 @@ from kcal.solve.problem import SolverStatus
 
 # Of fewer views that moved, 95 % ellipses contain the truth in 86 to 93 % (`scripts.check.handheld`).
 _FEW = 6
+# Views in which the board bends by so many times what is typical are named, if they are no more than this share.
+_BENT, _SOME, _NAMED = 2.0, 0.5, 5
 # A share of the largest motion, from which it is at its limit.
 _LIMIT = 0.9
 
@@ -32,8 +34,8 @@ def motion_warnings(fit: HybridFit) -> list[str]:
     if max(fit.motion_sigma) > _LIMIT * LARGEST:
         return [
             "while an image is read, views move by more than any hand does: these motions stand for something else "
-            "(wrong corners, a board that flexes, a cropped or stabilized video); look at the views that fit worst, "
-            "and photograph a stiff board on a stand"
+            "(wrong corners, a cropped or stabilized video); look at the views that fit worst, and photograph a board "
+            "on a stand"
         ]
     lines = "column" if fit.readout.columns else "row"
     moved = fit.motion_sigma.moved(float(fit.state.parameters[0]), fit.readout.reach(fit.board_points))
@@ -50,6 +52,30 @@ def motion_warnings(fit: HybridFit) -> list[str]:
         f"the camera or the board moved while {lines}s were read (rolling shutter), by some {moved:.1f} px from the "
         f"first {lines} to the last: this is taken out, and error bars allow for it; put both on a stand, or take the "
         "still moments of a video, for smaller error bars",
+    ]
+
+
+def bending_warnings(names: Sequence[str], fit: HybridFit) -> list[str]:
+    """A warning where the board bends from view to view, with how much, and in which views."""
+    if fit.bends is None or fit.relative is None:
+        return []
+    # RMS of the corners in each view, millimeters.
+    height = 1e3 * fit.bends.square().mean(-1).sqrt()
+    known = height.isfinite()
+    count, clear = int(known.sum()), (known & (fit.relative > _BENT)).nonzero()[:, 0].tolist()
+    size, rest = float(height[known].square().mean().sqrt()), "and error bars allow for it"
+    if not 0 < len(clear) <= _SOME * count:
+        return [
+            f"the board bends from view to view, by {size:.2g} mm (RMS of its corners): this is "
+            f"taken out, {rest}; mount it on a stiff plate for smaller error bars"
+        ]
+    clear.sort(key=lambda i: -float(height[i]))
+    some, others = height[clear].square().mean().sqrt(), height[known & ~(fit.relative > _BENT)].square().mean().sqrt()
+    named = ", ".join(names[i] for i in clear[:_NAMED]) + (", ..." if len(clear) > _NAMED else "")
+    return [
+        f"the board bends in {len(clear)} of {count} views ({named}), by {float(some):.2g} mm there and by "
+        f"{float(others):.2g} mm in the others (RMS of its corners): this is taken out, {rest}; take these views again "
+        "with the board on a stiff plate"
     ]
 
 
@@ -213,8 +239,9 @@ def hybrid_warnings(fit: HybridFit) -> list[str]:
     found = []
     if fit.tempering > REPEATING:
         found.append(
-            f"residuals repeat within views (tempering {fit.tempering:.1f}, where noise alone gives 1): blur, motion "
-            "or a board that flexes; error bars are widened for it; use a stiff board, a stand and a short exposure"
+            f"residuals repeat within views (tempering {fit.tempering:.1f}, where noise alone gives 1): blur, or what "
+            "neither motion nor bending of the board explains; error bars are widened for it; use a stand and a short "
+            "exposure"
         )
     off = (fit.state.parameters[2:4] - fit.families.mean[1:3]).norm() / fit.families.log_unit[1].exp()
     if float(off) > _FAR_CENTER:

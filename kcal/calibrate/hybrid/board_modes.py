@@ -39,6 +39,12 @@ class BoardModes(NamedTuple):
     unit: Tensor
     family: Tensor
 
+    @property
+    def heights(self) -> Tensor:
+        """(12, N) meters of the corners by which a board bends in a view: a quarter as much with each degree."""
+        factor = self.unit**2 / self.unit.max()
+        return (factor[:, None] * self.shapes[:, 2])[self.family == BENDING]
+
 
 def board_modes(points: Tensor) -> BoardModes:
     """The 28 modes of a board.

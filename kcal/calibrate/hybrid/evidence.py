@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +12,17 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies, typical_hyperprior
-from kcal.calibrate.problem.state import AXES, LARGEST, MEDIAN, SMALLEST, SPREAD, stillness
+from kcal.calibrate.problem.state import (
+    AMPLITUDES,
+    BENDS,
+    LARGEST,
+    MEDIAN,
+    MOTION,
+    SMALLEST,
+    SPREAD,
+    by_number,
+    stillness,
+)
 from kcal.calibrate.problem.views import LEAST_NOISE
 from kcal.solve.schur import Products, matrix_product, products_of
 
@@ -64,36 +74,53 @@ class Quadratic(NamedTuple):
 
 
 class ViewData(NamedTuple):
-    """Data near a solution, of views that moved by M = 12 numbers each while they were read, or stood still, M = 0.
+    """Data near a solution, of views with M numbers each: of motion, of bending, of both; or that stood still, M = 0.
 
     Attributes:
         still: as if they had stood still.
         own: (V, M, M) UᵀU of each view.
         cross: (V, M, S + 1) Uᵀ [A, r], A being the rows and r their residuals as if all views had stood still.
         score: (V, S) Aᵀ r of each view.
+        relative: (V,) how much the board bends in each view, relative to the others; None: alike.
     """
 
     still: Quadratic
     own: Tensor
     cross: Tensor
     score: Tensor
+    relative: Tensor | None = None
 
     @property
     def moving(self) -> bool:
-        """Whether views moved."""
+        """Whether views have such numbers."""
         return self.own.shape[-1] > 0
+
+    @property
+    def unequal(self) -> float:
+        """-ln of the prior density of the factors by which the board bends more in some views, over that at one."""
+        if self.relative is None:
+            return 0.0
+        precision = self.relative.double() ** -2
+        return 0.5 * _TAILS * float((precision - 1.0 - precision.log()).sum())
+
+    def only(self, amplitudes: Sequence[int]) -> ViewData:
+        """With some of the amplitudes of views, all other numbers being zero."""
+        bends = self.relative is not None
+        count = (AMPLITUDES if self.own.shape[-1] > BENDS * bends else 0) + bends
+        kept = np.isin(by_number(np.log(1.0 + np.arange(count))).round().numpy() - 1.0, amplitudes)
+        relative = self.relative if count - 1 in amplitudes else None
+        return self._replace(own=self.own[:, kept][..., kept], cross=self.cross[:, kept], relative=relative)
 
     def integrated(self, log_ratio: Array) -> Integrated:
         """With motions integrated out, whose standard deviation over the noise has these logarithms by order."""
         if not self.moving:
             return Integrated(self.still, 0.0, self.own, self.cross)
-        ratio = np.repeat(np.exp(log_ratio), AXES)
-        matrix = self.own * torch.from_numpy(ratio[:, None] * ratio)
+        ratio = by_number(log_ratio, self.relative)
+        matrix = self.own * (ratio[..., :, None] * ratio[..., None, :])
         matrix.diagonal(dim1=-2, dim2=-1).add_(1.0)
         root = torch.linalg.cholesky(matrix)
-        _, ones, _ = torch.broadcast_tensors(root, torch.eye(len(ratio), dtype=root.dtype), root)
-        inverse = torch.linalg.solve_triangular(root, ones, upper=False)
-        half = matrix_product(inverse * torch.from_numpy(ratio), self.cross)
+        inverse = torch.linalg.solve_triangular(root, torch.eye(len(root[0]), dtype=root.dtype), upper=False)
+        half = matrix_product(inverse * ratio[..., None, :], self.cross)
         data = self.still._replace(products=self.still.products - products_of(half.flatten(0, 1).T))
         log_determinant = 2.0 * float(root.diagonal(dim1=-2, dim2=-1).log().sum())
         return Integrated(data, log_determinant, inverse, half)
@@ -102,7 +129,7 @@ class ViewData(NamedTuple):
         """(V, S) derivatives of each view's -½ chi² by the shared unknowns, motions integrated out."""
         if not self.moving:
             return self.score
-        matrix = self.own + torch.diag(stillness(log_ratio))
+        matrix = self.own + torch.diag_embed(stillness(log_ratio, self.relative))
         best = torch.linalg.solve(matrix, self.cross[..., -1:])
         return self.score - (self.cross[..., :-1].transpose(1, 2) @ best)[..., 0]
 
@@ -113,8 +140,8 @@ class Integrated(NamedTuple):
     Attributes:
         data: the quadratic form of lens and board.
         log_determinant: ln det(R UᵀU R + I), over the views.
-        inverse: (V, 12, 12) of the Cholesky factor of that.
-        half: (V, 12, S + 1) inverse times R Uᵀ [A, r].
+        inverse: (V, M, M) of the Cholesky factor of that.
+        half: (V, M, S + 1) inverse times R Uᵀ [A, r].
     """
 
     data: Quadratic
@@ -123,8 +150,9 @@ class Integrated(NamedTuple):
     half: Tensor
 
     def slopes(
-        self, step: Array, inverse: Tensor, deviation: Array, y: Array, variance: float, tempering: float
-    ) -> Slopes:
+        self, step: Array, inverse: Tensor, deviation: Array, y: Array, variance: float, tempering: float,
+        amplitudes: int,
+    ) -> Slopes:  # fmt: skip
         """Derivatives of -ln p by the logarithms of the ratios.
 
         Each first one is the sum over motions of 1 less the posterior's second moment in units of the prior. The
@@ -137,6 +165,7 @@ class Integrated(NamedTuple):
             y: (S,) the best lens and board in the same units.
             variance: of the noise.
             tempering: by which the data count less.
+            amplitudes: number of the ratios.
         """
         own = self.inverse.transpose(1, 2) @ self.inverse  # of motions whose lens and board are known
         size = len(step)
@@ -146,7 +175,7 @@ class Integrated(NamedTuple):
         reach = matrix_product(self.half.flatten(0, 1), direction).view(self.half.shape)
         E = matrix_product(self.inverse.transpose(1, 2) / math.sqrt(variance * tempering), reach)
         mean, others, kept = E[..., 0], E[..., 1:], own.diagonal(dim1=1, dim2=2)
-        by_order = (kept.shape[1] // AXES, AXES)
+        by_order = (self.half.shape[1] * AMPLITUDES // MOTION, MOTION // AMPLITUDES)
         G = others @ others.transpose(1, 2)
         moment = mean.square() + G.diagonal(dim1=1, dim2=2)
         first = ((1.0 - kept) / tempering - moment).sum(0).view(by_order).sum(1)
@@ -155,9 +184,7 @@ class Integrated(NamedTuple):
         within.diagonal().add_((0.5 * kept / tempering + 0.5 * moment).sum(0))
         second = 4.0 * within.view(*by_order, *by_order).sum((1, 3))
         orders = others.unflatten(1, by_order).transpose(0, 1).flatten(1, 2)
-        along = (orders.transpose(1, 2) @ mean.unflatten(1, by_order).transpose(0, 1).reshape(by_order[0], -1, 1))[
-            ..., 0
-        ]
+        along = (orders.transpose(1, 2) @ mean.unflatten(1, by_order).transpose(0, 1).flatten(1)[..., None])[..., 0]
         # Of E times the inverse, a row for each motion, only sums over motions are wanted.
         mixed = along @ inverse
         if orders.shape[1] < orders.shape[2]:
@@ -165,8 +192,8 @@ class Integrated(NamedTuple):
             pairs = (
                 products_of(orders.flatten(0, 1))
                 .square()
-                .unflatten(0, (by_order[0], -1))
-                .unflatten(2, (by_order[0], -1))
+                .unflatten(0, (len(orders), -1))
+                .unflatten(2, (len(orders), -1))
             )
             across, squared = pairs.sum((1, 3)), matrix_product(orders, inverse).square().sum(1)
         else:
@@ -179,7 +206,12 @@ class Integrated(NamedTuple):
         Y = torch.from_numpy(y)
         by_variance = -(2.0 * mixed * Y + squared)
         by_noise = mean.square().sum(0).view(by_order).sum(1) + 2.0 * mixed @ Y + squared.sum(-1)
-        return Slopes(first.numpy(), second.numpy(), by_variance.numpy(), by_noise.numpy())
+        # The last amplitude may be that of several threes.
+        each, sums = np.arange(amplitudes), np.add.reduceat
+        return Slopes(
+            sums(first.numpy(), each), sums(sums(second.numpy(), each), each, 1), sums(by_variance.numpy(), each),
+            sums(by_noise.numpy(), each),
+        )  # fmt: skip
 
 
 class Slopes(NamedTuple):
@@ -471,8 +503,9 @@ class EvidenceLoss:
             best = found.best
             own = slice(count, count + motions)
             slopes = integrated.slopes(
-                best.step, found.inverse, best.deviation, best.y, math.exp(log_variance), self._tempering
-            )
+                best.step, found.inverse, best.deviation, best.y, math.exp(log_variance), self._tempering,
+                motions,
+            )  # fmt: skip
             slope[own], bend[own, own] = slopes.first, slopes.second
             bend[own, others] = np.concatenate([slopes.by_variance @ found.by_h, slopes.by_noise[:, None]], 1)
             bend[others, own] = bend[own, others].T
@@ -496,7 +529,7 @@ class EvidenceLoss:
 
     def _beside(self, v: np.ndarray, log_determinant: float) -> float:
         z, w = self._scaled(v)
-        return 0.5 * (float(z @ z) + log_determinant / self._tempering + float(w @ w))
+        return 0.5 * (float(z @ z) + log_determinant / self._tempering + float(w @ w)) + self._data.unequal
 
 
 def with_tempering(loss: float, data_freedom: float, variance: float, own: float, tempering: float) -> float:
@@ -515,15 +548,46 @@ def with_tempering(loss: float, data_freedom: float, variance: float, own: float
     return loss + 0.5 * data_freedom * (1.0 / tempering - 1.0 / own) * (math.log(variance) + 1.0)
 
 
-def evidence_of_motion(data: ViewData, best: Maximum, families: PriorFamilies, tempering: float) -> float:
-    """By how much motions raise the logarithm of the evidence (nats), all other amplitudes as they are."""
+def evidence_of_motion(
+    data: ViewData, best: Maximum, families: PriorFamilies, tempering: float, some: Sequence[int] | None = None
+) -> float:
+    """By how much motions raise the logarithm of the evidence (nats), all other amplitudes as they are.
+
+    Or some of the amplitudes of views, by their numbers, such as that of bending.
+    """
     log_variance = math.log(best.variance)
-    moving = data.integrated(best.log_ratio)
+    rest = [k for k in range(len(best.log_ratio)) if some is not None and k not in some]
     losses = []
-    for quadratic, determinant in ((data.still, 0.0), (moving.data, moving.log_determinant)):
-        found = _best(quadratic.tempered(tempering), families, best.h.numpy(), log_variance)
-        losses.append(float(found.value) + 0.5 * determinant / tempering)
+    for view, ratios in ((data.only(rest), best.log_ratio[rest]), (data, best.log_ratio)):
+        one = view.integrated(ratios)
+        found = _best(one.data.tempered(tempering), families, best.h.numpy(), log_variance)
+        losses.append(float(found.value) + 0.5 * one.log_determinant / tempering + view.unequal)
     return losses[0] - losses[1]
+
+
+# How much the board bends in each view, relative to the others.
+#
+# Most views may show a stiff board and a few one that a hand bends. With one amplitude the few would loosen all. So the
+# standard deviation s w of a view's bending has a factor w of its own, and 1/w² has a gamma prior of mean one: bending
+# by itself then has Student's t distribution. Its largest posterior density in ln w has a closed form, step by step.
+
+# Degrees of freedom of that distribution.
+_TAILS = 3.0
+_REPEATS = 30
+
+
+def relative_bends(data: ViewData, best: Maximum, families: PriorFamilies) -> Tensor:
+    """(V,) the factors w of each view, at the best lens and board."""
+    assert data.relative is not None
+    step = _best(data.integrated(best.log_ratio).data, families, best.h.numpy(), math.log(best.variance)).step
+    left = data.cross @ torch.cat([torch.from_numpy(step), torch.ones(1).double()])
+    relative, square = data.relative, best.variance * math.exp(2.0 * best.log_ratio[-1])
+    for _ in range(_REPEATS):
+        inverse = torch.linalg.inv(data.own + torch.diag_embed(stillness(best.log_ratio, relative)))
+        mean, spread = inverse @ left[..., None], inverse.diagonal(dim1=1, dim2=2)
+        moment = (mean[..., 0].square() + best.variance * spread)[:, -BENDS:].sum(1) / square
+        relative = ((_TAILS + moment) / (_TAILS + BENDS)).sqrt()
+    return relative
 
 
 # How large amplitudes are on the average, where views tell them only roughly.

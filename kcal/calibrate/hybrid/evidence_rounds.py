@@ -19,11 +19,19 @@ from kcal.calibrate.hybrid.evidence import (
     expected_maximum,
     maximize_evidence,
     overdispersion,
+    relative_bends,
     with_tempering,
 )
-from kcal.calibrate.hybrid.families import Hyperprior
+from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies
 from kcal.calibrate.hybrid.fitted_views import NO_MOTION, Estimate, FittedViews
-from kcal.calibrate.problem.state import AMPLITUDES, LARGEST, MOTION, Readout, motion_sigma
+from kcal.calibrate.problem.state import (
+    AMPLITUDES,
+    BENDS,
+    LARGEST,
+    MOTION,
+    Readout,
+    motion_sigma,
+)
 
 _ROUNDS = 12
 # Rounds after which the evidence of one compares with that of another: the first begins with typical amplitudes.
@@ -44,6 +52,8 @@ _UNFELT = 0.02
 # With which motions begin: as a hand moves. From that of still views, field and board explain the motion first, and
 # the evidence has another maximum there (one of sixty simulated captures by hand).
 _MOVING = 3e-3
+# Standard deviations of bending, in extents of the board, with which it is tried.
+_BENT = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2)
 
 
 class Rounds(NamedTuple):
@@ -78,14 +88,59 @@ class Rounds(NamedTuple):
 
 
 def begin_motion(capture: FittedViews, estimate: Estimate) -> Estimate:
-    """An estimate of still views as one of views that may move, as a hand does; or of views that may not."""
-    moving = capture.readout is not None
-    count = len(capture.pixels)
-    if (len(estimate.log_ratio) > 0) == moving and len(estimate.state.motion) == count:
+    """An estimate with the numbers of views that a capture has: those it had stay, others begin as a hand moves."""
+    readout, old, ratios = capture.readout, estimate.state.motion, estimate.log_ratio
+    has = (False, False) if readout is None else (readout.moves, readout.bends is not None)
+    had = (len(ratios) >= AMPLITUDES, len(ratios) % AMPLITUDES > 0)
+    count, again = len(capture.pixels), len(old) == len(capture.pixels)
+    if has == had and again:
         return estimate
-    state = estimate.state._replace(motion=estimate.state.rotation.new_zeros(count, MOTION if moving else 0))
-    ratio = np.full(AMPLITUDES, math.log(_MOVING) - 0.5 * math.log(estimate.variance / estimate.tempering))
-    return estimate._replace(state=state, log_ratio=ratio if moving else NO_MOTION)
+    begin = math.log(_MOVING) - 0.5 * math.log(estimate.variance / estimate.tempering)
+    motion, ratio = old.new_zeros(count, MOTION * has[0] + BENDS * has[1]), np.full(AMPLITUDES * has[0] + has[1], begin)
+    # Motion comes first, bending last.
+    numbers, parts = (slice(MOTION), slice(-BENDS, None)), (slice(AMPLITUDES), slice(-1, None))
+    for kept in (k for k in (0, 1) if again and has[k] and had[k]):
+        motion[:, numbers[kept]], ratio[parts[kept]] = old[:, numbers[kept]], ratios[parts[kept]]
+    relative = (estimate.relative if again and had[1] else old.new_ones(count)) if has[1] else None
+    return estimate._replace(
+        state=estimate.state._replace(motion=motion), log_ratio=ratio if any(has) else NO_MOTION, relative=relative
+    )
+
+
+def _least_gained(
+    readout: Readout, data: ViewData, best: Maximum, families: PriorFamilies, tempering: float
+) -> tuple[float, Readout | None]:
+    """By how many nats motion, or bending, raises the evidence beside the other: the lesser; and what is without it."""
+    both = readout.moves and readout.bends is not None
+    parts: list[tuple[list[int], Readout | None]] = []
+    if readout.moves:
+        parts.append((list(range(AMPLITUDES)), dataclasses.replace(readout, moves=False) if both else None))
+    if readout.bends is not None:
+        parts.append(([len(best.log_ratio) - 1], dataclasses.replace(readout, bends=None) if both else None))
+    gains = [evidence_of_motion(data, best, families, tempering, part) for part, _ in parts]
+    least = int(np.argmin(gains))
+    return gains[least], parts[least][1]
+
+
+def _with_bending(
+    capture: FittedViews, estimate: Estimate, best: Maximum, tempering: float, never: Tensor
+) -> tuple[FittedViews, Estimate] | None:
+    """The same of a board that bends by view; None where that explains the views no better.
+
+    It is told near the estimate, from one linearization: nothing is fitted.
+    """
+    readout = capture.readout or Readout(center=capture.points.mean(0), distance=1.0, size=capture.size, moves=False)
+    if capture.heights is None or readout.bends is not None:
+        return None
+    wider = dataclasses.replace(capture, readout=dataclasses.replace(readout, bends=capture.heights))
+    bent = begin_motion(wider, estimate)
+    data, trials = wider.data(wider.problem(bent, never), bent, never), []
+    for sigma in _BENT:
+        ratio = np.append(best.log_ratio, math.log(sigma) - 0.5 * math.log(best.variance))
+        trial, number = best._replace(log_ratio=ratio), [len(ratio) - 1]
+        trials.append((evidence_of_motion(data, trial, estimate.families, tempering, number), sigma, ratio))
+    gained, _, ratio = max(trials)
+    return (wider, bent._replace(log_ratio=ratio, variance=best.variance, tempering=1.0)) if gained >= WORTH else None
 
 
 def run_rounds(
@@ -144,19 +199,36 @@ def run_rounds(
             # To the end where nothing will change any more.
             if not resting:
                 break
+        if data.relative is not None:
+            relative = relative_bends(data, best, estimate.families)
+            moved = float((relative / data.relative).log().abs().max())
+            resting &= moved < (_NEAR_REST if rough else _AT_REST)
+            data = data._replace(relative=relative)
         estimate = estimate._replace(
             hyperparameters=best.h,
+            relative=data.relative,
             log_ratio=best.log_ratio,
             variance=best.variance * tempering,
             tempering=tempering,
         )
         last = best.loss
         progress(f"evidence, round {turn + 1}")
+        if (first or resting) and turn < _ROUNDS // 2:
+            bent = _with_bending(capture, estimate, best, tempering, never)
+            if bent is not None:
+                (capture, estimate), top = bent, None
+                continue
         if data.moving and turn < _ROUNDS - 1:
             # The first round tells it as the second does, within .05 nats for 16 simulated captures of 6 to 200 views.
-            gained = evidence_of_motion(data, best, estimate.families, tempering)
+            assert capture.readout is not None
+            gained, rest = _least_gained(capture.readout, data, best, estimate.families, tempering)
             if gained < WORTH:
-                lost, capture = gained, dataclasses.replace(capture, readout=None)
+                now, capture = capture.readout, dataclasses.replace(capture, readout=rest)
+                if now.moves and not (rest and rest.moves):
+                    lost = gained
+                else:
+                    # A stiff board is not tried again.
+                    capture = dataclasses.replace(capture, heights=None)
                 estimate = begin_motion(capture, estimate)
                 continue
         if resting:
@@ -210,6 +282,8 @@ def columns_may_be_read(rounds: Rounds, hyperprior: Hyperprior, never: Tensor) -
     """
     readout, estimate = rounds.capture.readout, rounds.estimate
     if readout is None:
+        return False
+    if not readout.moves:
         return False
     found = motion_sigma(estimate.log_ratio, estimate.variance / estimate.tempering)
     if not rounds.converged or max(found.turn, found.shift) > _TOO_MUCH:

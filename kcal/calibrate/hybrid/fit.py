@@ -23,7 +23,7 @@ from kcal.calibrate.hybrid.network_fit import FieldTraining, train_network
 from kcal.calibrate.hybrid.settled import FitStart, check_shown, settle
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.covariance import information_of
-from kcal.calibrate.problem.state import BoardState, MotionSigma, Readout, motion_sigma, stillness, widening
+from kcal.calibrate.problem.state import BENDS, BoardState, MotionSigma, Readout, motion_sigma, stillness, widening
 from kcal.calibrate.problem.views import among
 from kcal.lens.camera import Camera
 from kcal.lens.field_modes import FieldModes
@@ -56,8 +56,9 @@ class HybridFit:
         log_evidence: of the last round, of data that count less by the tempering where views stand still.
         effective: number of parameters that the data determine.
         square: whether pixels are square.
-        readout: how views move while they are read; None: they stand still.
-        log_ratio: (4,) logarithms of the motions' standard deviations over the noise, as in `MotionSigma`; ().
+        readout: how views move while they are read, and how the board bends in them; None: neither.
+        log_ratio: logarithms of standard deviations over the noise: of motions as in `MotionSigma`, and of bending.
+        relative: (V,) how much the board bends in each view, relative to the others; None: it is stiff.
         board_shapes: modes of the board.
         board_points: (N, 3) meters, the board as it was measured.
         residuals: (V, N, 2) projected minus observed, pixels, weights left out; NaN where a corner did not count.
@@ -96,6 +97,7 @@ class HybridFit:
     square: bool
     readout: Readout | None
     log_ratio: np.ndarray
+    relative: Tensor | None
     board_shapes: BoardModes
     board_points: Tensor
     residuals: Tensor
@@ -116,19 +118,32 @@ class HybridFit:
 
     @property
     def stillness(self) -> Tensor:
-        """(12,) the squared noise over the variance of each number of a motion; () where views stand still."""
+        """(M,) the squared noise over the variance of each number of any view; () where views stand still."""
         return stillness(self.log_ratio)
+
+    @property
+    def own_stillness(self) -> Tensor:
+        """The same of the views of this fit, (V, M) where the board bends more in some than in others."""
+        return stillness(self.log_ratio, self.relative)
 
     @property
     def motion_sigma(self) -> MotionSigma | None:
         """Standard deviations of motions; None where views stand still."""
-        return motion_sigma(self.log_ratio, self.sigma**2 / self.tempering) if self.readout else None
+        moves = self.readout is not None and self.readout.moves
+        return motion_sigma(self.log_ratio, self.sigma**2 / self.tempering) if moves else None
+
+    @property
+    def bends(self) -> Tensor | None:
+        """(V, N) meters by which the board bends in each view beside its shape in all of them; None: it is stiff."""
+        if self.readout is None or self.readout.bends is None:
+            return None
+        return self.state.motion[:, -BENDS:] @ self.readout.bends
 
     def problem(self, points: Tensor, pixels: Tensor, weights: Tensor, mean: Tensor, precision: Tensor) -> BoardProblem:
         """The least squares of this lens, board and motion with other data and priors; see `hybrid_problem`."""
         shapes = self.board_shapes.shapes
         return hybrid_problem(
-            points, shapes, pixels, weights, self.model, mean, precision, self.readout, self.stillness, self.square
+            points, shapes, pixels, weights, self.model, mean, precision, self.readout, self.own_stillness, self.square
         )
 
     def residuals_of(self, pixels: Tensor) -> Tensor:
@@ -145,7 +160,10 @@ class HybridFit:
         """This fit with some of its views; the others were left out of it."""
         at, state = list(views), self.state
         state = state._replace(rotation=state.rotation[at], translation=state.translation[at], motion=state.motion[at])
-        return dataclasses.replace(self, state=state, residuals=self.residuals[at], weights=self.weights[at])
+        relative = None if self.relative is None else self.relative[at]
+        return dataclasses.replace(
+            self, state=state, relative=relative, residuals=self.residuals[at], weights=self.weights[at]
+        )
 
     def among(self, views: Sequence[int], count: int) -> HybridFit:
         """This fit of some views as one of `count` views: NaN for the others."""
@@ -155,7 +173,8 @@ class HybridFit:
             for values in (own.rotation, own.translation, own.motion, self.residuals, self.weights)
         )
         state = own._replace(rotation=rotation, translation=translation, motion=motion)
-        return dataclasses.replace(self, state=state, residuals=residuals, weights=weights)
+        relative = None if self.relative is None else among(self.relative, views, count)
+        return dataclasses.replace(self, state=state, relative=relative, residuals=residuals, weights=weights)
 
     @property
     def as_start(self) -> FitStart:
@@ -168,6 +187,7 @@ class HybridFit:
             self.log_ratio,
             self.sigma**2,
             self.tempering,
+            self.relative,
         )
         return FitStart(estimate, self.readout, self.square, self.residuals, self.iterations)
 
@@ -187,6 +207,7 @@ def fit_hybrid(
     board: Literal["printed", "exact"] | BoardPrior | MeasuredBoard = "printed",
     square: bool | None = None,
     motion: bool = True,
+    bending: bool = True,
     focal: float | None = None,
     start: HybridFit | FitStart | None = None,
     robust: bool = False,
@@ -206,6 +227,7 @@ def fit_hybrid(
         board: how it differs from the one that was ordered: as printers err, not at all, or as was measured.
         square: whether pixels are square; None: the views tell.
         motion: views may move while they are read; False: they stand still.
+        bending: the board may bend by view, where the evidence says so; False: it is stiff.
         focal: roughly known, pixels, for the start.
         start: an earlier fit of the same views with other weights or another board, to begin with, or
             `kcal.calibrate.hybrid.settled.rough_start`.
@@ -223,8 +245,8 @@ def fit_hybrid(
     weights = torch.ones_like(pixels[..., 0]) if weights is None else weights
     begun = start.as_start if isinstance(start, HybridFit) else start
     rounds, never, hyperprior, board = settle(
-        points, pixels, size, weights, modes=modes, board=board, square=square, motion=motion, focal=focal,
-        start=begun, robust=robust, hyperprior=hyperprior, lens=lens, progress=progress,
+        points, pixels, size, weights, modes=modes, board=board, square=square, motion=motion, bending=bending,
+        focal=focal, start=begun, robust=robust, hyperprior=hyperprior, lens=lens, progress=progress,
     )  # fmt: skip
     ordered, own = points, board_modes(points)
     if training is not None:
@@ -232,7 +254,7 @@ def fit_hybrid(
     capture, likely = rounds.capture, rounds.estimate
     # Error bars are for amplitudes as they are to be expected (`kcal.calibrate.hybrid.evidence`).
     estimate = likely if robust else expected_estimate(rounds, hyperprior)
-    model, families, state, h, _, variance, tempering = estimate
+    model, families, state, h, _, variance, tempering, _ = estimate
     # Modes that the evidence holds so closely to zero that no pixel feels them are left out, error bars included.
     assert model.hybrid is not None
     peaks = torch.tensor(model.hybrid.modes.peaks, dtype=torch.float64)
@@ -277,6 +299,7 @@ def fit_hybrid(
         square=capture.square,
         readout=capture.readout,
         log_ratio=estimate.log_ratio,
+        relative=estimate.relative,
         effective=len(deviation) - float(inverse.square().sum()),
         board_shapes=own,
         board_points=ordered + torch.einsum("b,bkn->nk", state.board, own.shapes),

@@ -15,7 +15,7 @@ from kcal.calibrate.hybrid.evidence import ViewData, view_data
 from kcal.calibrate.hybrid.families import PriorFamilies
 from kcal.calibrate.problem.board_problem import POSE, BoardProblem
 from kcal.calibrate.problem.parameters import FreeParameters, GaussianPrior
-from kcal.calibrate.problem.state import MOTION, BoardState, Readout, stillness
+from kcal.calibrate.problem.state import BoardState, Readout, stillness
 from kcal.calibrate.problem.views import LEAST_NOISE
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
@@ -57,8 +57,8 @@ def hybrid_problem(
         model: of a hybrid lens.
         mean: (S,) of the prior on the unknowns of the camera and on the board.
         precision: (S,) its weight: the squared noise over the prior's variance. Infinite: held.
-        readout: how views move while they are read; None: they stand still.
-        stillness: (12,) the squared noise over the variance of each number of a motion.
+        readout: how views move while they are read, and how the board bends in them; None: neither.
+        stillness: (M,) or (V, M) the squared noise over the variance of each of these numbers.
         square: whether pixels are square; others have two focal lengths.
     """
     held = torch.isinf(precision)
@@ -91,7 +91,7 @@ NO_MOTION = np.zeros(0)
 
 
 class Estimate(NamedTuple):
-    """Where a fit stands."""
+    """Where a fit stands; last how much the board bends in each view (V,), relative to the others (None: alike)."""
 
     model: LensModel
     families: PriorFamilies
@@ -100,6 +100,12 @@ class Estimate(NamedTuple):
     log_ratio: np.ndarray
     variance: float
     tempering: float
+    relative: Tensor | None = None
+
+    @property
+    def stillness(self) -> Tensor:
+        """The squared noise over the variance of each number of a view."""
+        return stillness(self.log_ratio, self.relative)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -112,10 +118,11 @@ class FittedViews:
         pixels: (V, N, 2), NaN where not seen.
         size: (width, height) of the image.
         weights: (V, N) by which residuals are multiplied.
-        readout: how views move while they are read; None: they stand still.
+        readout: how views move while they are read, and how the board bends in them; None: neither.
         square: whether pixels are square.
         robust: bound the weight of corners that are far off.
         exact: the board does not differ.
+        heights: (12, N) of the corners by which the board may bend by view, meters, if the evidence says so, or None.
     """
 
     points: Tensor
@@ -127,6 +134,7 @@ class FittedViews:
     square: bool
     robust: bool
     exact: bool
+    heights: Tensor | None = None
 
     @functools.cached_property
     def _kept(self) -> list[tuple[LensModel, Tensor, BoardProblem]]:
@@ -151,7 +159,7 @@ class FittedViews:
         """The least squares at amplitudes of an estimate; unknowns of which `never` is true are held."""
         deviation = estimate.families.deviation(estimate.hyperparameters)
         precision = torch.where(never, torch.inf, estimate.variance / deviation.square())
-        held, still, kept = torch.isinf(precision), stillness(estimate.log_ratio), self._kept
+        held, still, kept = torch.isinf(precision), estimate.stillness, self._kept
         if kept and kept[0][0] is estimate.model and torch.equal(kept[0][1], held):
             # What corners say at the last state serves under other priors, too.
             prior = hybrid_prior(estimate.model, len(self.board.shapes), estimate.families.mean, precision, self.square)
@@ -203,7 +211,8 @@ class FittedViews:
                 for part in (products.right, products.score)
             )
             products = products._replace(right=right, score=score, total=total)
-        return view_data(products, problem.unknowns(state) - estimate.families.mean, state.motion, self.freedom)
+        found = view_data(products, problem.unknowns(state) - estimate.families.mean, state.motion, self.freedom)
+        return found._replace(relative=estimate.relative)
 
 
 def _cauchy_weights(problem: BoardProblem, state: BoardState, weights: Tensor) -> Tensor:
@@ -241,7 +250,7 @@ def moving_residuals(
         rotation: (V, 3, 3) cam_from_board, to begin with; a view without a pose is NaN and stays so.
         translation: (V, 3) meters.
         readout: how views are read.
-        stillness: (12,) the squared noise over the variance of each number of a motion.
+        stillness: (M,) the squared noise over the variance of each number of a view.
 
     Returns:
         (V, N, 2) projected minus seen, pixels; NaN where not seen.
@@ -259,7 +268,7 @@ def moving_residuals(
         readout=readout,
         stillness=stillness,
     )
-    motion = rotation.new_zeros(len(some), MOTION)
+    motion = rotation.new_zeros(len(some), readout.numbers)
     state = BoardState.flat(params, rotation[posed], translation[posed])._replace(motion=motion)
     out[posed] = problem.corner_residuals(minimize(problem, state, _EFFORT).state)
     return out

@@ -137,6 +137,7 @@ def settle(
     board: Literal["printed", "exact"] | BoardPrior | MeasuredBoard,
     square: bool | None = None,
     motion: bool,
+    bending: bool = True,
     focal: float | None,
     start: FitStart | None = None,
     robust: bool = False,
@@ -172,6 +173,7 @@ def settle(
         square=start.square if start is not None else lens.square if lens is not None else square is True,
         robust=robust,
         exact=board == "exact",
+        heights=board_modes(ordered).heights if bending and start is None and board != "exact" else None,
     )
 
     def run(
@@ -235,6 +237,7 @@ def rough_start(
     weights: Tensor,
     board: Literal["printed", "exact"] | BoardPrior | MeasuredBoard = "printed",
     motion: bool = True,
+    bending: bool = True,
     focal: float | None = None,
     progress: Callable[[str], object] = lambda _: None,
     modes: FieldModes | None = None,
@@ -246,8 +249,8 @@ def rough_start(
         DegenerateError: likewise.
     """
     rounds, never, _, known = settle(
-        points, pixels, size, weights, modes=modes, board=board, motion=motion, focal=focal, progress=progress,
-        rough=True,
+        points, pixels, size, weights, modes=modes, board=board, motion=motion, bending=bending, focal=focal,
+        progress=progress, rough=True,
     )  # fmt: skip
     capture, estimate = rounds.capture, rounds.estimate
     errors = capture.problem(estimate, never).pixel_errors(estimate.state)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.problem.parameters import FreeParameters, GaussianPrior, Term
-from kcal.calibrate.problem.state import MOTION, BoardState, Readout, warp_modes
+from kcal.calibrate.problem.state import BoardState, Readout, warp_modes
 from kcal.gaussian import triangular
 from kcal.lens.hybrid_terms import LEADING, fill_field_columns
 from kcal.lens.model import LensModel
@@ -108,7 +108,7 @@ class BoardImages:
         self._target = torch.where(self.seen[..., None], pixels, 0.0).transpose(-1, -2).contiguous()
         self._weigh(weights)
         self.readout = readout
-        self.local_size = POSE + (MOTION if readout else 0)
+        self.local_size = POSE + (readout.numbers if readout else 0)
         if readout is not None:
             self._time = readout.time(pixels)
         self.unknown_count = len(self.free) + len(self.shapes) * free_board
@@ -332,8 +332,8 @@ class BoardProblem(BoardImages, SchurProblem[BoardState]):
             all corners count alike.
         loss: of the length of each corner's residual (after weighting), or None for plain least squares.
         terms: priors and barriers on the camera's parameters and the board's amplitudes, as further residuals.
-        readout: how views move while they are read; None: they stand still.
-        stillness: (12,) the squared noise over the variance of each number of a motion.
+        readout: how views move while they are read, and how the board bends in them; None: neither.
+        stillness: (M,) or (V, M) the squared noise over the variance of each of these numbers.
         batch: leading shape of the states, () for one solve.
 
     Attributes:
@@ -377,7 +377,7 @@ class BoardProblem(BoardImages, SchurProblem[BoardState]):
         self.terms = tuple(terms)
         self.residual_count = 2 * int(self.seen.sum((-2, -1)).max())
         if readout is not None:
-            self._still = torch.zeros(MOTION, dtype=pixels.dtype) if stillness is None else stillness
+            self._still = torch.zeros(readout.numbers, dtype=pixels.dtype) if stillness is None else stillness
         self.moving = torch.arange(self.unknown_count) if held is None else (~held).nonzero()[:, 0]
         self.shared_size = len(self.moving)
         self._all_move = self.shared_size == self.unknown_count
@@ -458,9 +458,10 @@ class BoardProblem(BoardImages, SchurProblem[BoardState]):
             rows[..., self.local_size : -1, :].masked_fill_(held[:, None], 0.0)
         if self.readout is None:
             return rows
-        prior = rows.new_zeros(*rows.shape[:-1], MOTION)
-        prior[..., POSE : self.local_size, :] = torch.diag(self._still.sqrt())
-        prior[..., -1, :] = self._still.sqrt() * state.motion[views]
+        pull = self._still.sqrt().expand_as(state.motion)[views]
+        prior = rows.new_zeros(*rows.shape[:-1], pull.shape[-1])
+        prior[..., POSE : self.local_size, :] = torch.diag_embed(pull)
+        prior[..., -1, :] = pull * state.motion[views]
         return torch.cat([rows, prior], -1)
 
     def _chunks(self, state: BoardState) -> Iterator[slice]:

@@ -24,17 +24,20 @@ from torch import Tensor
 # first and of second order (hands turn by more than they shift). Rows that are read upward are the same with another
 # sign; where a picture was turned, columns stand for rows.
 
+# A board that flexes has another shape in each view: modes of bending h, as those of its shape in all views, whose
+# heights b·h in the board's frame stand beside that shape. These numbers follow those of the motion. They have one
+# amplitude, and a prior whose width differs by view (`kcal.calibrate.hybrid.evidence.relative_bends`).
+
 # Numbers of a motion: for each order three of the turn and three of the shift, of which each three have an amplitude.
 MOTION = 12
 ORDERS = 2
-AXES = 3
-AMPLITUDES = MOTION // AXES
+AMPLITUDES = 4
+# Numbers by which a board bends in a view.
+BENDS = 12
 # Median and standard deviation of the logarithm of a motion's standard deviation: radians, and distances of the board,
 # while an image is read. A hand that turns by 1 rad/s moves by 0.03 in 30 ms: beyond it is no motion. Below the
 # smallest no pixel feels it.
 MEDIAN, SPREAD, SMALLEST, LARGEST = 2e-4, 2.0, 1e-6, 0.03
-# Readouts between the exposures of two cameras that are not synchronized, typically.
-APART = 10.0
 # A motion is worth a stand if it moves corners by so many standard deviations of their noise.
 FELT = 5.0
 
@@ -57,13 +60,15 @@ def widening(views: int) -> float:
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Readout:
-    """The order in which an image is read, and the units of motions.
+    """What a view has beside its pose: motion in the order in which the image is read, and bending of its board.
 
     Args:
         center: (3,) of the board, about which it turns, meters.
         distance: of the board, typically, by which shifts are divided, meters.
         size: of the image.
         columns: whether columns are read one after the other instead of rows, as in a picture that was turned.
+        moves: whether views move.
+        bends: (12, N) heights of the corners by modes of bending (`BoardModes.heights`), meters; None: it is stiff.
 
     Example:
         >>> readout = Readout(center=torch.zeros(3), distance=1.0, size=(640, 480))
@@ -75,6 +80,13 @@ class Readout:
     distance: float
     size: tuple[int, int]
     columns: bool = False
+    moves: bool = True
+    bends: Tensor | None = None
+
+    @property
+    def numbers(self) -> int:
+        """How many numbers a view has beside its pose."""
+        return MOTION * self.moves + BENDS * (self.bends is not None)
 
     def time(self, pixels: Tensor) -> Tensor:
         """(...) when pixels (..., 2) were read: -½ at the first edge of the image, ½ at the last; 0 where NaN."""
@@ -89,37 +101,58 @@ class Readout:
         """Boards as they stand when their corners are read.
 
         Args:
-            motion: (V, 12) of each view: ω₁, s₁, ω₂, s₂.
+            motion: (V, M) of each view: ω₁, s₁, ω₂, s₂ where views move, and heights of bending where the board bends.
             time: (V, N) of each corner.
             points: (3, N) the board, meters.
         """
-        powers = torch.stack([time, time * time], -1)
-        turn, shift = torch.einsum("vno,vokj->kvjn", powers, motion.unflatten(1, (ORDERS, 2, 3)))
-        about = (points - self.center[:, None]).expand_as(turn)
-        return MovedBoard(points + torch.linalg.cross(turn, about, dim=1), self.distance * shift, turn)
+        points = points.expand(len(motion), *points.shape)
+        turn = shift = torch.zeros_like(points)
+        if self.moves:
+            powers = torch.stack([time, time * time], -1)
+            turn, shift = torch.einsum("vno,vokj->kvjn", powers, motion[:, :MOTION].unflatten(1, (ORDERS, 2, 3)))
+            points = points + torch.linalg.cross(turn, points - self.center[:, None], dim=1)
+        if self.bends is not None:
+            points = points + torch.nn.functional.pad((motion[:, -BENDS:] @ self.bends)[:, None], (0, 0, 2, 0))
+        return MovedBoard(points, self.distance * shift, turn)
 
-    def columns_of(
-        self, by_point: Tensor, rotation: Tensor, time: Tensor, points: Tensor, *, apart: bool = False
-    ) -> Tensor:
-        """(V, 12, 2, N) derivatives of pixels by motions; (V, 18, 2, N) with what happens before the image is read.
+    def columns_of(self, by_point: Tensor, rotation: Tensor, time: Tensor, points: Tensor) -> Tensor:
+        """(V, M, 2, N) derivatives of pixels by these numbers.
 
         Args:
             by_point: (V, 3, 2, N) of pixels by points in the camera's frame.
             rotation: (V, 3, 3) cam_from_board.
             time: (V, N).
             points: (3, N) the board, meters.
-            apart: last, a motion during `APART` readouts, which all corners share.
         """
         by_board = torch.einsum("vkun,vkl->vlun", by_point, rotation)
-        about = (points - self.center[:, None])[None, :, None].expand_as(by_board)
-        both = torch.cat([torch.linalg.cross(about, by_board, dim=1), self.distance * by_point], 1)
-        g = time[:, None, None]
-        return torch.cat([g * both, g * g * both, *([APART * both] if apart else [])], 1)
+        found = []
+        if self.moves:
+            about = (points - self.center[:, None])[None, :, None].expand_as(by_board)
+            both = torch.cat([torch.linalg.cross(about, by_board, dim=1), self.distance * by_point], 1)
+            g = time[:, None, None]
+            found = [g * both, g * g * both]
+        return torch.cat(found if self.bends is None else [*found, by_board[:, 2:] * self.bends[:, None]], 1)
 
 
-def stillness(log_ratio: np.ndarray) -> Tensor:
-    """(12,) weights of a motion's numbers, from the logarithms (4,) of their deviations over the noise; or none, ()."""
-    return torch.from_numpy(np.exp(-2.0 * log_ratio)).repeat_interleave(AXES)
+def by_number(log_ratio: np.ndarray, relative: Tensor | None = None) -> Tensor:
+    """Standard deviations (M,) of the numbers of a view over the noise, from the logarithms of those by amplitude.
+
+    Four amplitudes are those of motion, one is that of bending, five are both. With how much the board bends in each
+    view (V,), relative to the others, (V, M).
+    """
+    moves, bends = len(log_ratio) >= AMPLITUDES, len(log_ratio) % AMPLITUDES
+    counts = [MOTION // AMPLITUDES] * AMPLITUDES * moves + [BENDS] * bends
+    ratio = torch.from_numpy(np.repeat(np.exp(log_ratio), counts))
+    if relative is None:
+        return ratio
+    ratio = ratio.repeat(len(relative), 1)
+    ratio[:, -BENDS:] *= relative[:, None]
+    return ratio
+
+
+def stillness(log_ratio: np.ndarray, relative: Tensor | None = None) -> Tensor:
+    """Weights (M,) or (V, M) of the numbers of views, with arguments as of `by_number`."""
+    return by_number(log_ratio, relative) ** -2
 
 
 class MotionSigma(NamedTuple):
@@ -153,10 +186,10 @@ def motion_sigma(log_ratio: np.ndarray, variance: float) -> MotionSigma:
     """Standard deviations of motions.
 
     Args:
-        log_ratio: (4,) their logarithms over the noise.
+        log_ratio: their logarithms over the noise, the first four.
         variance: of the noise.
     """
-    return MotionSigma(*(np.exp(log_ratio) * np.sqrt(variance)).tolist())
+    return MotionSigma(*(np.exp(log_ratio[:AMPLITUDES]) * np.sqrt(variance)).tolist())
 
 
 class MovedBoard(NamedTuple):
@@ -184,8 +217,8 @@ class BoardState(NamedTuple):
         board: (..., B) amplitudes of the board's modes, meters.
         rotation: (..., V, 3, 3) cam_from_board.
         translation: (..., V, 3) cam_from_board, meters.
-        motion: (..., V, 12) of each view while it is read; (..., V, 0): they stand
-            still.
+        motion: (..., V, M) numbers of each view beside its pose (`Readout`): how it moves while it is read, and how its
+            board bends; (..., V, 0): neither.
 
     Example:
         >>> poses = torch.eye(3).expand(4, 3, 3), torch.zeros(4, 3)

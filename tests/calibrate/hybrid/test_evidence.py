@@ -16,6 +16,7 @@ from kcal.calibrate.hybrid.evidence import (
     evidence_of_motion,
     hyper_bounds,
     maximize_evidence,
+    relative_bends,
     view_data,
 )
 from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies
@@ -94,6 +95,45 @@ def check_derivatives(loss: EvidenceLoss, at: np.ndarray) -> None:
 @pytest.mark.parametrize("moving", [False, True])
 def test_derivatives(moving: bool, tempering: float) -> None:
     check_derivatives(EvidenceLoss(data(moving), FAMILIES, PRIOR, tempering), vector(moving))
+
+
+@pytest.mark.parametrize("amplitudes", [[4], [0, 1, 2, 3, 4]])
+def test_derivatives_where_the_board_bends(amplitudes: list[int]) -> None:
+    """By one amplitude of twelve numbers, whose deviations differ by view; of its own, and beside motion."""
+    U, A, residual, x, motion = (torch.from_numpy(part) for part in rows(True))
+    relative = torch.tensor([0.5, 3.0, 1.0], dtype=F64)
+    both, numbers = torch.cat([U, U.flip(-1)], 1), torch.cat([motion, -motion], 1)
+    products = Products.of_rows(torch.cat([both, A, residual[:, None]], 1), both.shape[1])
+    found = view_data(products, x, numbers, float(VIEWS * ROWS))._replace(relative=relative).only(amplitudes)
+    assert found.own.shape[-1] == 12 * (1 + (len(amplitudes) > 1))
+    at = np.concatenate([AT[:2], np.array([0.2, -0.4, 0.1, 0.5, 0.3])[amplitudes], AT[-1:]])
+    check_derivatives(EvidenceLoss(found, FAMILIES, PRIOR, 1.3), at)
+    # 1/w² has a gamma prior of three degrees of freedom and mean one.
+    precision = relative**-2
+    assert found.unequal == pytest.approx(1.5 * float((precision - 1.0 - precision.log()).sum()))
+
+
+def test_factors_of_views_are_the_most_likely() -> None:
+    """-ln p of residuals and factors, lens and board held, does not fall by a small change of any."""
+    U, A, residual, x, motion = (torch.from_numpy(part) for part in rows(True))
+    products = Products.of_rows(torch.cat([U, A, residual[:, None]], 1), MOTION)
+    begun = view_data(products, x, motion, float(VIEWS * ROWS))._replace(relative=torch.ones(VIEWS, dtype=F64))
+    # No prior lets lens and board move.
+    held = FAMILIES._replace(log_unit=torch.full((UNKNOWNS,), -30.0, dtype=F64))
+    best = Maximum(torch.from_numpy(AT[:2]), np.array([0.4]), 0.5, math.inf)
+    relative = relative_bends(begun, best, held)
+    assert float(relative.std()) > 0.05
+
+    def loss(factors: torch.Tensor) -> float:
+        whole = begun._replace(relative=factors)
+        return float(
+            EvidenceLoss(whole, held, PRIOR, 1.0).values(np.concatenate([AT[:2], [0.4], [math.log(0.5)]])[None])[0]
+        )
+
+    here = loss(relative)
+    for k in range(VIEWS):
+        for factor in (0.98, 1.02):
+            assert loss(torch.where(torch.arange(VIEWS) == k, factor * relative, relative)) > here
 
 
 def test_derivatives_of_a_single_view() -> None:

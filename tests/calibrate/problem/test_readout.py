@@ -28,6 +28,7 @@ from kcal.calibrate.problem.state import (
     SPREAD,
     BoardState,
     Readout,
+    by_number,
     motion_sigma,
     stillness,
     widening,
@@ -48,6 +49,8 @@ MODES = ZernikeModes(radial=9, decentered=4, astigmatic=3, other=2)
 NOISE = 0.05
 # Of turns and shifts of first and second order, as they are drawn.
 MOVES = (2e-3, 7e-4, 5e-4, 1e-3)
+# Logarithms of deviations over the noise: of motion, and of bending.
+RATIO = np.array([-3.0, -2.0, -4.0, -2.5, -1.5])
 
 
 def truth() -> Camera:
@@ -100,31 +103,33 @@ def test_time_runs_from_the_first_edge_to_the_last() -> None:
     assert columns.time(pixels[:, [0, 1]] * torch.tensor([1.0, 0.0])).tolist() == [-0.5, 0.5, 0.0, 0.0]
 
 
-def moving_problem(square: bool) -> tuple[BoardProblem, BoardState]:
-    """A problem at a state where views move and the board is bent."""
+def moving_problem(square: bool, bends: bool = False) -> tuple[BoardProblem, BoardState]:
+    """A problem at a state where views move and the board is bent; in each of them otherwise, if it `bends`."""
     generator = torch.Generator().manual_seed(2)
     pixels = capture(2e-3, 4)
     model = LensModel(hybrid=HybridForm(shape=0.6, radius=1.1, modes=MODES))
     shapes = board_modes(BOARD.points).shapes
     count = 3 + model.size + len(shapes) + (0 if square else 1)
-    readout = Readout(center=BOARD.points.mean(0), distance=0.6, size=SIZE)
+    heights = board_modes(BOARD.points).heights if bends else None
+    readout = Readout(center=BOARD.points.mean(0), distance=0.6, size=SIZE, bends=heights)
+    still = stillness(RATIO[: 5 if bends else 4], torch.tensor([0.5, 1.0, 2.0, 0.7], dtype=F64) if bends else None)
     problem = hybrid_problem(
         BOARD.points, shapes, pixels, torch.ones(4, BOARD.corners, dtype=F64), model, torch.zeros(count, dtype=F64),
-        torch.zeros(count, dtype=F64), readout, stillness(np.array([-3.0, -2.0, -4.0, -2.5])), square,
+        torch.zeros(count, dtype=F64), readout, still, square,
     )  # fmt: skip
     params = torch.zeros(5 + model.size, dtype=F64)
     params[:4] = torch.tensor([800.0, 800.0 if square else 830.0, 640.0, 480.0])
     params[8:] = 1e-3 * torch.randn(len(MODES), generator=generator, dtype=F64)
     base = fitted(2e-3).state
-    motion = 5e-3 * torch.randn(4, MOTION, generator=generator, dtype=F64)
+    motion = 5e-3 * torch.randn(4, readout.numbers, generator=generator, dtype=F64)
     board = 1e-3 * torch.randn(len(shapes), generator=generator, dtype=F64)
     return problem, BoardState(params, board, base.rotation[:4], base.translation[:4], motion)
 
 
-@pytest.mark.parametrize("square", [True, False])
-def test_rows_are_derivatives_of_residuals(square: bool) -> None:
-    """By pose, motion, lens, focal lengths and board, where views move and the board is bent."""
-    problem, state = moving_problem(square)
+@pytest.mark.parametrize(("square", "bends"), [(True, False), (False, False), (True, True)])
+def test_rows_are_derivatives_of_residuals(square: bool, bends: bool) -> None:
+    """By pose, motion, bending, lens, focal lengths and board, where views move and the board is bent."""
+    problem, state = moving_problem(square, bends)
     rows, local = problem.rows(state), problem.local_size
     shared = problem.shared_size
     for index in (0, 1, 3, 5, 6, 8, 10, 13, 16, 17, 18, 19, 21, 22, 30, local + shared - 29, local + shared - 1):
@@ -141,27 +146,29 @@ def test_rows_are_derivatives_of_residuals(square: bool) -> None:
         torch.testing.assert_close(rows[:, index], (both[0] - both[1]) / (2.0 * step), rtol=1e-5, atol=2e-4)
 
 
-def test_motions_are_eliminated_like_poses() -> None:
+@pytest.mark.parametrize("bends", [False, True])
+def test_motions_are_eliminated_like_poses(bends: bool) -> None:
     """By QR with the rows of their prior, by the Schur complement, and by integrating the Gaussian model."""
-    problem, state = moving_problem(True)
+    problem, state = moving_problem(True, bends)
+    M = problem.local_size - POSE
     x = problem.unknowns(state)
     off_all = problem.off_poses(state)
     flat = off_all.transpose(0, 1).flatten(1)
     matrix, scale = problem.linearize(state).information()
     reduced = matrix / scale[:, None] / scale
     torch.testing.assert_close(flat[:-1] @ flat[:-1].T, reduced, rtol=1e-6, atol=1e-6 * float(reduced.max()))
-    data = view_data(problem.products(state).off(POSE), x, state.motion, 100.0)
-    ratio = np.array([-3.0, -2.0, -4.0, -2.5])
+    data, ratio = view_data(problem.products(state).off(POSE), x, state.motion, 100.0), RATIO[: 5 if bends else 4]
+    data = data._replace(relative=torch.tensor([0.5, 1.0, 2.0, 0.7], dtype=F64) if bends else None)
     found = data.integrated(ratio)
     torch.testing.assert_close(found.data.K, reduced, rtol=1e-6, atol=1e-6 * float(reduced.max()))
     # Chi² at any x is that of residuals whose covariance contains the motions.
     each = without_local(problem.corner_rows(state), POSE)
     there = x + 1e-3 * torch.randn(len(x), generator=torch.Generator().manual_seed(3), dtype=F64) / scale
-    spread = torch.exp(torch.from_numpy(ratio)).repeat_interleave(3)
+    spreads = by_number(ratio, data.relative).expand(4, M)
     chi2 = logdet = 0.0
-    for rows, motion in zip(each, state.motion, strict=True):
-        still = rows[-1] - motion @ rows[:MOTION] + (there - x) @ rows[MOTION:-1]
-        mixed = (rows[:MOTION] * spread[:, None]).T
+    for rows, motion, spread in zip(each, state.motion, spreads, strict=True):
+        still = rows[-1] - motion @ rows[:M] + (there - x) @ rows[M:-1]
+        mixed = (rows[:M] * spread[:, None]).T
         covariance = torch.eye(len(still), dtype=F64) + mixed @ mixed.T
         chi2 += float(still @ torch.linalg.solve(covariance, still))
         logdet += float(torch.logdet(covariance))
@@ -172,13 +179,12 @@ def test_motions_are_eliminated_like_poses() -> None:
     assert found.log_determinant == pytest.approx(logdet, rel=1e-9)
     own = torch.stack(
         [
-            rows[MOTION:-1]
+            rows[M:-1]
             @ torch.linalg.solve(
-                torch.eye(rows.shape[1], dtype=F64)
-                + (rows[:MOTION] * spread[:, None]).T @ (rows[:MOTION] * spread[:, None]),
-                rows[-1] - motion @ rows[:MOTION],
+                torch.eye(rows.shape[1], dtype=F64) + (rows[:M] * spread[:, None]).T @ (rows[:M] * spread[:, None]),
+                rows[-1] - motion @ rows[:M],
             )
-            for rows, motion in zip(each, state.motion, strict=True)
+            for rows, motion, spread in zip(each, state.motion, spreads, strict=True)
         ]
     )
     torch.testing.assert_close(data.scores(ratio), own, rtol=1e-6, atol=1e-8 * float(data.score.abs().max()))
