@@ -88,6 +88,18 @@ def test_a_lost_corner_is_no_victory() -> None:
     assert ordinary.over_best({"held": {"opencv5": whole}}) == {}
 
 
+def test_the_table_of_captures_tells_answers_and_leaves_out_what_was_not_measured() -> None:
+    held = {model: {"still": 0.2, "moved": 0.1, "lost": 0} for model in ("kcal", "opencv5")}
+    whole = {"yes": False, "rms": 0.31, "worst": "two cameras"}
+    good = {"key": ["a.obs.json"], "views": [7, 8], "held": held, "refused": [], "ratio": 0.9, "p": 0.4, "whole": whole}
+    bad = {"key": ["b"], "views": [7, 8], "held": {}, "refused": ["few"], "whole": {"refused": "of two sizes"}}
+    text = "\n".join(ordinary.lines([good, bad]))
+    assert "| a | no, 0.3100 | 7+8 | 0.90 (0.4) | 0.2000 / 0.1000 | 0.2000 / 0.1000 | 1.00 / 1.00 |" in text
+    assert "| b | refused | 7+8 | refused | – | – | – |" in text
+    assert text.endswith("- `a`: two cameras\n- `b`: of two sizes\n- half of `b`, refused: few")
+    assert "mrcal" not in text
+
+
 def test_tables_count_what_was_refused_and_said() -> None:
     good = {"rms": 1.0, "predicted": 1.0, "inside": 0.9, "beyond": 1.0, "everywhere": 0.95}
     records = [

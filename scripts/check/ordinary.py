@@ -1,15 +1,16 @@
-"""The default camera on captures that people really have: halves against halves, beside OpenCV and mrcal.
+"""The default camera on captures that people really have: whole, and halves against halves, beside OpenCV and mrcal.
 
     KCAL_DATA=DATA python -m scripts.check.ordinary --out FILE          # all captures; those that FILE has are kept
     KCAL_DATA=DATA python -m scripts.check.ordinary --out FILE ch1280 other.obs.json
     KCAL_DATA=DATA python -m scripts.check.ordinary --out FILE --write  # the table of docs/measured/ordinary.md
     KCAL_MRCAL=/usr/bin/python3 ...                                     # mrcal's spline, too
 
-Each camera is fitted to every other view of a capture (in natural order of their names) and judged on the others, both
+Whole: refused or not, RMS, what `kcal report` answers where nothing is required, and the worst that is said. Each
+camera is then fitted to every other view of a capture (in natural order of their names) and judged on the others, both
 ways. Held out: RMS in pixels over both halves, `scripts.shared.held_out`: as seen, with poses and board refitted, and
 with each view's own motion during the readout refitted as well. *Lost* are seen corners that a camera has no image of;
-they are not in its RMS. Halves: `camera_difference` between both halves'
-cameras; a ratio of 1 is what their error bars state, p is the chance of more.
+they are not in its RMS. Halves: `camera_difference` between both halves' cameras; a ratio of 1 is what their error bars
+state, p is the chance of more. A model that was not measured has no column.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera
 from kcal.lens.difference import camera_difference
+from kcal.report.judge_camera import camera_verdict
 from scripts.shared.held_out import Projection, held_out
 from scripts.shared.mrcal_camera import splined_camera
 from scripts.shared.page import table, write_section
@@ -48,7 +50,7 @@ def judged(name: str, cache: Path) -> Record:
     """Both halves of one capture, by all models."""
     capture = load(name, data_folder(), cache)
     halves = capture.half(0), capture.half(1)
-    record: Record = {"views": [len(half.seen.views) for half in halves], "held": {}}
+    record: Record = {"whole": _whole(capture), "views": [len(half.seen.views) for half in halves], "held": {}}
     kcal = _defaults(halves, record)
     fitters: dict[str, Callable[[RealCapture], Projection]] = {
         "opencv5": lambda half: opencv(half.seen, 5),
@@ -67,6 +69,21 @@ def judged(name: str, cache: Path) -> Record:
         except (KcalError, cv2.error, subprocess.SubprocessError) as error:
             record["held"][model] = {"failed": str(error)[-300:]}
     return record
+
+
+def _whole(capture: RealCapture) -> Record:
+    """What a user gets of all views: RMS, the verdict, and its worst sentence; or why they are refused."""
+    start = time.process_time()
+    try:
+        result = calibrate_camera(capture.seen, CalibrationOptions())
+    except KcalError as error:
+        return {"refused": str(error)}
+    fitted = time.process_time()
+    verdict = camera_verdict(result)
+    doubts = [finding.text for finding in verdict.findings if finding.severity == "doubt"]
+    worst = next(iter([verdict.reason] if verdict.stops else [*result.warnings, *doubts]), "")
+    seconds = {"cpu_s": fitted - start, "report_cpu_s": time.process_time() - fitted}
+    return {"rms": result.rms, "yes": verdict.usable, "worst": worst, **seconds}
 
 
 def _defaults(halves: tuple[RealCapture, RealCapture], record: Record) -> list[Camera] | None:
@@ -122,16 +139,19 @@ def shown(held: Record | None) -> str:
 
 def lines(records: list[Record]) -> list[str]:
     """The page's table, and how the aims fare."""
+    models = [model for model in MODELS if any(model in record["held"] for record in records)]
     rows = []
     for record in records:
-        cells = [shown(record["held"].get(model)) for model in MODELS]
+        cells = [shown(record["held"].get(model)) for model in models]
         between = f"{record['ratio']:.2f} ({record['p']:.2g})" if "ratio" in record else "refused"
         over = " / ".join(f"{value:.2f}" for value in over_best(record).values()) or "–"
         views = "+".join(map(str, record["views"]))
-        rows.append([Path(record["key"][0]).name.removesuffix(".obs.json"), views, between, *cells, over])
+        whole = record.get("whole", {})
+        answer = f"{'yes' if whole['yes'] else 'no'}, {whole['rms']:.4f}" if "rms" in whole else "refused"
+        rows.append([_short(record), answer, views, between, *cells, over])
     known = [record for record in records if "ratio" in record]
-    worst = max((value for record in known for value in over_best(record).values() if value == value), default=math.nan)
-    head = ["capture", "views", "halves: ratio (p)", *MODELS, "kcal / best other"]
+    most = max((value for record in known for value in over_best(record).values() if value == value), default=math.nan)
+    head = ["capture", "usable, RMS", "views", "halves: ratio (p)", *models, "kcal / best other"]
     out = [*table(head, rows), ""]
     if known:
         out += [
@@ -139,11 +159,18 @@ def lines(records: list[Record]) -> list[str]:
             f"{sum(record['p'] >= LEAST_P for record in known)} have p ≥ {LEAST_P}; the smallest is "
             f"{min(record['p'] for record in known):.2g}. Mean ratio "
             f"{statistics.fmean(record['ratio'] for record in known):.2f} (aim: {RATIOS[0]} to {RATIOS[1]}). "
-            f"Held out, kcal errs by at most {worst:.2f} times the best other (aim: {WORST}).",
+            f"Held out, kcal errs by at most {most:.2f} times the best other (aim: {WORST}).",
             "",
         ]
-    refusals = [f"`{record['key'][0]}`: {reason}" for record in records for reason in record["refused"]]
-    return [*out, *(["Refused:", "", *(f"- {reason}" for reason in refusals)] if refusals else [])]
+    told = [(record, record.get("whole", {})) for record in records]
+    worst = [f"- `{_short(record)}`: {whole.get('refused') or whole['worst']}" for record, whole in told
+             if whole.get("refused") or whole.get("worst")]  # fmt: skip
+    halves = [f"- half of `{_short(record)}`, refused: {reason}" for record in records for reason in record["refused"]]
+    return [*out, *(["The worst that was said:", "", *worst, *halves] if worst or halves else [])]
+
+
+def _short(record: Record) -> str:
+    return Path(record["key"][0]).name.removesuffix(".obs.json")
 
 
 def line(record: Record) -> str:

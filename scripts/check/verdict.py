@@ -45,7 +45,7 @@ NAMES = {
     "blur": {"blur"},
     "unsynchronized": {"synchronization"},
     "pupil": {"pupil"},
-    "mirrored or mixed": {"mirrored", "unsteady"},
+    "mirrored or mixed": {"mirrored"},
 }
 # What the error says where kcal refuses the capture.
 REFUSALS = {"fronto-parallel": ("parallel to the image",), "unsynchronized": ("boards contradict the rest",)}
