@@ -286,12 +286,12 @@ def solve_command(
         left_out={item.label: item.reason for item in result.left_out},
         warnings=list(result.warnings),
     )
+    print_rig(result, [*lines, *notes])
     save_rig(rig, output)
     if picture is not None:
         from kcal.report.rig import save_rig_picture
 
         save_rig_picture(picture, result)
-    print_rig(result, [*lines, *notes])
     try:
         console.print_table(range_sigma_rows(range_sigmas(rig, pixel_sigma=noise), rig.covariance is not None))
         if note:

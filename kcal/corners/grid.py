@@ -256,6 +256,9 @@ def _curvature(lines: Tensor) -> Tensor:
 
 MAX_BEND = 0.25  # of a square: distance of a corner from its neighbors' homography; a wrong grid is off by 1
 MAX_RATIO = 1.7  # of one square's side to the next along a row; perspective reaches it only 3 squares from the board
+# The same where four squares meet at every corner: fisheyes reach 0.9 and 2.6 two squares from the board.
+_LENS_BEND, _LENS_RATIO = 1.0, 2.7
+_FOUR_MEET = 0.5  # of the median contrast, which is left 0.3 of a square beside a corner
 MIN_ALTERNATING = 0.9  # share of neighboring squares that must alternate; glare may spoil a few
 # Of the contrast on the inner side of an outer line: true lines have 0.55 to 1.1, false ones up to 0.1.
 MIN_OUTER = 0.35
@@ -270,6 +273,7 @@ def grid_trouble(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, r
     * Every square must have the same orientation.
     * Every block of up to 3 x 3 corners must fit a homography; a single one for the board would refuse wide lenses.
     * Sides must change slowly along rows and columns; a homography alone would accept a skipped row.
+    * Near a fisheye both change faster. That is accepted where four squares meet at every corner.
     * Dark and light squares must alternate, also outside the outer corners, must not go on farther, and no corners may
       lie between those of the grid.
     """
@@ -296,7 +300,10 @@ def uneven(image: npt.NDArray[np.generic], grid: Tensor) -> str | None:
     areas = _corner_areas(grid)
     if not (bool((areas > 0).all()) or bool((areas < 0).all())):
         return "the grid found is folded: not the board"
-    if float(_bend(grid)) > MAX_BEND or float(_ratio(grid)) > MAX_RATIO:
+    bend, ratio = float(_bend(grid)), float(_ratio(grid))
+    if (bend > MAX_BEND or ratio > MAX_RATIO) and not (
+        bend < _LENS_BEND and ratio < _LENS_RATIO and _four_meet(image, grid)
+    ):
         return "the grid found is uneven: not the board, or another number of corners"
     rows, columns = grid.shape[:2]
     if first_square_dark(image, grid.reshape(-1, 2), columns, rows)[1] < MIN_ALTERNATING:
@@ -386,6 +393,14 @@ def _contrast(image: npt.NDArray[np.generic], places: Tensor, along: Tensor, dow
     places, along, down = places[..., None, :], along[..., None, :], down[..., None, :]
     parts = [sign * levels_at(image, places + share * (a * along + b * down)).mean(-1) for a, b, sign in signs]
     return torch.stack(parts).sum(0)
+
+
+def _four_meet(image: npt.NDArray[np.generic], grid: Tensor) -> bool:
+    """Whether four squares meet at every corner of a grid (rows, columns, 2), in the order of a checkerboard."""
+    along, down = torch.gradient(grid, dim=1)[0], torch.gradient(grid, dim=0)[0]
+    i, j = torch.meshgrid(*map(torch.arange, grid.shape[:2]), indexing="ij")
+    contrast = _contrast(image, grid, along, down) * (1.0 - 2.0 * ((i + j) % 2))
+    return float((contrast / contrast.median()).min()) > _FOUR_MEET
 
 
 def _goes_on_above(image: npt.NDArray[np.generic], grid: Tensor) -> bool:

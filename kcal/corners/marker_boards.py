@@ -120,6 +120,8 @@ _FREE_SHARE = 0.85  # of the distance from a corner to what else is printed; the
 # of the image, markers of the other numbering are a square off.
 _TOLERANCE = 0.35
 _MOST = 0.7  # of the markers: if so many lie as on one board or the other, the image shows both
+# Of those that were read for certain; a board of another number of columns shows up to half of its markers in place.
+_MIN_FITTING = 0.75
 _MIN_MARKERS = 3  # that agree on one numbering; two of them fit any
 _MIN_UNSURE = 5  # the same where wrong bits had to be corrected
 FEW = 0.6  # of the markers: if fewer are read, more effort is made
@@ -158,6 +160,10 @@ def find_charuco(image: npt.NDArray[np.uint8], board: Board, legacy: bool | None
     if board.dictionary is None:
         raise InputError(f"{board}: not a ChArUco board")
     found, others = read_markers(image, board, board.dictionary)
+    if len(found) < _MIN_MARKERS:  # a board that is printed white on black
+        inverted = read_markers(255 - image, board, board.dictionary)
+        if len(inverted[0]) > len(found):
+            image, (found, others) = 255 - image, inverted
     own = _single(found)
     twice = sorted(found.keys() - own)
     if twice:
@@ -184,12 +190,13 @@ def find_charuco(image: npt.NDArray[np.uint8], board: Board, legacy: bool | None
     old = bool(legacy if told is None else told)
     markers = before if old else today
     sure = len(markers.keys() & own)
-    if 2 * sure >= len(own) and (sure >= _MIN_MARKERS or len(markers) >= _MIN_UNSURE):
+    if sure >= _MIN_FITTING * len(own) and (sure >= _MIN_MARKERS or len(markers) >= _MIN_UNSURE):
         pixels = _between(image, markers, board, old)
         if enough(pixels, board):
             return FoundCharuco(pixels, legacy=told)
     reason = f"fewer than {MIN_CORNERS} corners of the ChArUco board found, or all on one line"
-    if len(own) >= _MIN_MARKERS and 2 * max(len(fitting.keys() & own) for fitting in (today, before)) < len(own):
+    fitting = max(len(placed.keys() & own) for placed in (today, before))
+    if len(own) >= _MIN_MARKERS and fitting < _MIN_FITTING * len(own):
         reason = "the markers do not lie as on this board: check its columns, rows, dictionary and first number"
     elif others and not own:
         reason += f"; markers {min(others)} to {max(others)} of {board.dictionary} are another board's"
@@ -250,6 +257,7 @@ def _between(image: npt.NDArray[np.uint8], markers: Markers, board: Board, legac
     pixels = torch.full((board.corners, 2), torch.nan, dtype=torch.float64)
     options = cv2.aruco.CharucoParameters()
     options.minMarkers = 1
+    options.checkMarkers = False  # `in_place` has done so; OpenCV's own check refuses boards seen from 65 degrees on
     corners = [corners.astype(np.float32)[None] for corners in markers.values()]
     numbers = np.array(list(markers), np.int32)[:, None]
     detector = cv2.aruco.CharucoDetector(_opencv_board(board, legacy), options)

@@ -334,7 +334,8 @@ def _placements(
     image: npt.NDArray[np.generic], grid: Tensor, ends: tuple[bool, bool, bool, bool], board: Board
 ) -> list[Tensor]:
     """All boards (rows, columns, 2) of which the grid can be a part, NaN outside it."""
-    places = []
+    places: list[Tensor] = []
+    inverted: list[Tensor] = []
     top, bottom, left, right = ends
     for _ in range(4):
         high, wide = grid.shape[:2]
@@ -345,13 +346,14 @@ def _placements(
             for column in range(board.columns - wide + 1):
                 fits = (not top or row == 0) and (not bottom or row + high == board.rows)
                 fits = fits and (not left or column == 0) and (not right or column + wide == board.columns)
-                if fits and dark == ((row + column) % 2 == 0):
+                if fits:
                     whole = torch.full((board.rows, board.columns, 2), torch.nan, dtype=torch.float64)
                     whole[row : row + high, column : column + wide] = grid
-                    places.append(whole)
+                    (places if dark == ((row + column) % 2 == 0) else inverted).append(whole)
         grid = grid.transpose(0, 1).flip(1)
         top, bottom, left, right = left, right, bottom, top
-    return places
+    # A whole board that is printed white on black has the other colors.
+    return places or (inverted if all(ends) else [])
 
 
 def _symmetries(board: Board) -> int:

@@ -48,7 +48,7 @@ NAMES = {
     "mirrored or mixed": {"mirrored"},
 }
 # What the error says where kcal refuses the capture.
-REFUSALS = {"fronto-parallel": ("parallel to the image",), "unsynchronized": ("boards contradict the rest",)}
+REFUSALS = {"fronto-parallel": ("parallel to the image",), "unsynchronized": ("taken at the same moment",)}
 CLEAN = ("clean", "clean", "clean", "clean pair")
 
 

@@ -1,3 +1,4 @@
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -7,6 +8,7 @@ from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.cli.main import app
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_board, view_of
+from kcal.corners.images import read_gray
 from kcal.corners.marker_boards import free_side
 from kcal.corners.markers import marker_cells
 from kcal.corners.observations import Observations
@@ -55,6 +57,7 @@ def shoot(paper, camera, rotation, translation, seed=0):
     return image, camera.project(points)[0]
 
 
+FINE_CAMERA = Camera.build(focal=(1400, 1400), center=(600, 450), size=(1200, 900))
 CAMERA = Camera.build(focal=(560, 560), center=(241, 178), size=(480, 360), coefficients=[-0.1, 0.02])
 
 
@@ -117,6 +120,42 @@ class TestDetection:
     def test_upside_down(self, paper):
         image, truth = shoot(paper, CAMERA, *pose([0.1, 0.05, 3.1], [0.0, 0.0], 0.4))
         assert float((detect_board(image, BOARD).pixels - truth).abs().nan_to_num().max()) < 0.2
+
+    def test_a_board_printed_white_on_black(self, paper):
+        image, _ = shoot(paper, CAMERA, *pose([0.2, -0.15, 0.1], [0.0, 0.0], 0.4))
+        pixels, inverted = (detect_board(each, BOARD).pixels for each in (image, 255 - image))
+        assert float((inverted - pixels).abs().max()) < 0.05
+
+    @pytest.mark.parametrize("tilt", [[1.25, 0.0, 0.0], [0.75, 1.0, 0.0]])
+    def test_a_board_seen_at_seventy_degrees(self, tilt, paper):
+        image, truth = shoot(paper, FINE_CAMERA, *pose(tilt, [0.0, 0.0], 0.3))
+        found = detect_board(image, BOARD).pixels
+        seen = torch.isfinite(found).all(-1)
+        assert int(seen.sum()) >= 20
+        assert float((found - truth)[seen].square().mean().sqrt()) < 0.06
+
+    def test_another_number_of_columns_is_no_board(self, paper):
+        """Half of the markers lie as on a board of other columns: rows of markers are parallel on both."""
+        image, _ = shoot(paper, CAMERA, *pose([0.2, -0.15, 0.1], [0.0, 0.0], 0.4))
+        for size in ("charuco:6x9", "charuco:8x6", "charuco:10x6"):
+            assert detect_board(image, Board.parse(size, "25mm")).reason.startswith("the markers do not lie as on this")
+
+    @pytest.mark.parametrize(
+        ("name", "size", "square", "corners"),
+        [
+            ("captures/single/inverted_charuco.png", "charuco:3x4:4x4_1000:40.5mm", "54mm", 12),
+            ("field/charuco/v2.png", "charuco:16x10:5x5_100:4mm", "8mm", 120),
+        ],
+    )
+    def test_boards_of_strangers(self, name, size, square, corners, kcal_data):
+        board = Board.parse(size, square)
+        pixels = detect_board(read_gray(kcal_data / name), board).pixels
+        seen = torch.isfinite(pixels).all(-1).numpy()
+        assert seen.sum() >= corners
+        places, pixels = board.points[:, :2].numpy()[seen], pixels.numpy()[seen]
+        plane = cv2.perspectiveTransform(places[None], cv2.findHomography(places, pixels)[0])[0]
+        # A wide lens bends the first one by 2 px.
+        assert np.abs(plane - pixels).max() < (0.12 if corners > 12 else 2.5)
 
     def test_a_part_at_the_border_is_enough(self, paper):
         image, truth = shoot(paper, CAMERA, *pose([0.1, -0.2, 0.0], [0.12, 0.08], 0.4))

@@ -5,6 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import scipy.optimize
 import torch
 from board_render import homography, render
 
@@ -262,3 +263,19 @@ def test_detection_does_not_depend_on_what_was_called_before(stereo):
     cv2.setRNGSeed(3)
     find_sector(images[0], part)
     assert cv2.randu(np.zeros(4), 0.0, 1.0).tolist() == before  # the caller's random numbers are left alone
+
+
+def test_a_board_near_a_fisheye(kcal_data):
+    """Its corners are those of a flat board in OpenCV's fisheye."""
+    board = Board(columns=8, rows=6, square=1.0)
+    pixels = detect_board(read_gray(kcal_data / "captures" / "single" / "fisheye_8x6.jpg"), board).pixels.numpy()
+
+    def misses(at):
+        lens = np.array([[at[6], 0, at[7]], [0, at[6], at[8]], [0, 0, 1]])
+        return (
+            cv2.fisheye.projectPoints(board.points.numpy()[None], at[:3], at[3:6], lens, at[9:])[0][0] - pixels
+        ).ravel()
+
+    start = [0.25, -0.4, 0.0, -3.5, -2.0, 4.0, 340, 515.5, 388.5, 0, 0, 0, 0]
+    fitted = scipy.optimize.least_squares(misses, np.array(start), x_scale="jac")
+    assert np.sqrt(2 * np.square(fitted.fun).mean()) < 0.4

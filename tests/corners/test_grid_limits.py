@@ -97,26 +97,34 @@ class TestWholeBoards:
                 image, lines = np.ascontiguousarray(image.T), lines.transpose(0, 1).flip(-1)
             assert skips(image, lines.reshape(-1, 2), lines.shape[1], lines.shape[0]) is skipped
 
-    @pytest.mark.parametrize(("wide", "even"), [(33, True), (35, False)])
-    def test_sides_may_grow_by_seventy_percent(self, wide: int, even: bool) -> None:
-        """From one square to the next; three corners on a line have a homography whatever their distances are."""
+    @pytest.mark.parametrize(("wide", "meet", "even"), [(33, 0, True), (35, 0, False), (53, 1, True), (55, 1, False)])
+    def test_sides_may_grow_by_seventy_percent(self, wide: int, meet: int, even: bool) -> None:
+        """From one square to the next, and 2.7 times where four squares meet at each corner.
+
+        Three corners on a line have a homography whatever their distances are.
+        """
         image, grid = picture(alternating(4, 4))
         image = np.concatenate([image[:, :80], np.repeat(image[:, 80:81], wide - 20, 1), image[:, 80:]], 1)
         moved = grid.clone()
         moved[:, 2, 0] += wide - 20
+        if not meet:
+            image[50:70, 50:70] = 120  # at one corner
         assert (uneven(image, moved) is None) is even
         turned = moved.transpose(0, 1).flip(-1)
         assert (uneven(np.ascontiguousarray(image.T), turned) is None) is even
 
     @pytest.mark.parametrize("axis", [0, 1])
-    def test_a_corner_may_be_a_quarter_of_a_square_off(self, axis: int) -> None:
+    def test_a_corner_may_be_off_where_squares_meet(self, axis: int) -> None:
         """Off by d, it bends the homography of its block so that .8148 d are left; the smallest side is 1 - d."""
         image, grid = picture(alternating(4, 4), side=100)
-        for share, even in ((0.230, True), (0.240, False)):
-            assert (0.8148 * share / (1.0 - share) < 0.25) is even
+        plain = image.copy()
+        plain[190:290, 190:290] = 120  # at one corner
+        cases = (0.230, True, plain), (0.240, False, plain), (0.29, True, image), (0.31, False, image)
+        for share, even, seen in cases:
+            assert seen is image or (0.8148 * share / (1.0 - share) < 0.25) is even
             moved = grid.clone()
             moved[1, 1, axis] += 100.0 * share
-            assert (uneven(image, moved) is None) is even
+            assert (uneven(seen, moved) is None) is even
 
     def test_nine_of_ten_pairs_of_squares_alternate(self) -> None:
         for place, even in (((1, 1), True), ((1, 2), False)):

@@ -13,13 +13,13 @@ from torch import Tensor
 
 from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies, typical_hyperprior
 from kcal.calibrate.problem.state import (
-    AMPLITUDES,
+    AXES,
     BENDS,
     LARGEST,
     MEDIAN,
-    MOTION,
     SMALLEST,
     SPREAD,
+    amplitudes_of,
     by_number,
     stillness,
 )
@@ -106,8 +106,8 @@ class ViewData(NamedTuple):
     def only(self, amplitudes: Sequence[int]) -> ViewData:
         """With some of the amplitudes of views, all other numbers being zero."""
         bends = self.relative is not None
-        count = (AMPLITUDES if self.own.shape[-1] > BENDS * bends else 0) + bends
-        kept = np.isin(by_number(np.log(1.0 + np.arange(count))).round().numpy() - 1.0, amplitudes)
+        count = (self.own.shape[-1] - BENDS * bends) // AXES + bends
+        kept = np.isin(amplitudes_of(count), amplitudes)
         relative = self.relative if count - 1 in amplitudes else None
         return self._replace(own=self.own[:, kept][..., kept], cross=self.cross[:, kept], relative=relative)
 
@@ -175,7 +175,7 @@ class Integrated(NamedTuple):
         reach = matrix_product(self.half.flatten(0, 1), direction).view(self.half.shape)
         E = matrix_product(self.inverse.transpose(1, 2) / math.sqrt(variance * tempering), reach)
         mean, others, kept = E[..., 0], E[..., 1:], own.diagonal(dim1=1, dim2=2)
-        by_order = (self.half.shape[1] * AMPLITUDES // MOTION, MOTION // AMPLITUDES)
+        by_order = (kept.shape[1] // AXES, AXES)
         G = others @ others.transpose(1, 2)
         moment = mean.square() + G.diagonal(dim1=1, dim2=2)
         first = ((1.0 - kept) / tempering - moment).sum(0).view(by_order).sum(1)

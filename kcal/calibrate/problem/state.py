@@ -31,13 +31,16 @@ from torch import Tensor
 # Numbers of a motion: for each order three of the turn and three of the shift, of which each three have an amplitude.
 MOTION = 12
 ORDERS = 2
-AMPLITUDES = 4
+AXES = 3
+AMPLITUDES = MOTION // AXES
 # Numbers by which a board bends in a view.
 BENDS = 12
 # Median and standard deviation of the logarithm of a motion's standard deviation: radians, and distances of the board,
 # while an image is read. A hand that turns by 1 rad/s moves by 0.03 in 30 ms: beyond it is no motion. Below the
 # smallest no pixel feels it.
 MEDIAN, SPREAD, SMALLEST, LARGEST = 2e-4, 2.0, 1e-6, 0.03
+# Readouts between the exposures of two cameras that are not synchronized, typically.
+APART = 10.0
 # A motion is worth a stand if it moves corners by so many standard deviations of their noise.
 FELT = 5.0
 
@@ -115,14 +118,17 @@ class Readout:
             points = points + torch.nn.functional.pad((motion[:, -BENDS:] @ self.bends)[:, None], (0, 0, 2, 0))
         return MovedBoard(points, self.distance * shift, turn)
 
-    def columns_of(self, by_point: Tensor, rotation: Tensor, time: Tensor, points: Tensor) -> Tensor:
-        """(V, M, 2, N) derivatives of pixels by these numbers.
+    def columns_of(
+        self, by_point: Tensor, rotation: Tensor, time: Tensor, points: Tensor, *, apart: bool = False
+    ) -> Tensor:
+        """(V, M, 2, N) derivatives of pixels by these numbers; with what happens before the image is read.
 
         Args:
             by_point: (V, 3, 2, N) of pixels by points in the camera's frame.
             rotation: (V, 3, 3) cam_from_board.
             time: (V, N).
             points: (3, N) the board, meters.
+            apart: last, a motion during `APART` readouts, which all corners share.
         """
         by_board = torch.einsum("vkun,vkl->vlun", by_point, rotation)
         found = []
@@ -130,19 +136,25 @@ class Readout:
             about = (points - self.center[:, None])[None, :, None].expand_as(by_board)
             both = torch.cat([torch.linalg.cross(about, by_board, dim=1), self.distance * by_point], 1)
             g = time[:, None, None]
-            found = [g * both, g * g * both]
+            found = [g * both, g * g * both, *([APART * both] if apart else [])]
         return torch.cat(found if self.bends is None else [*found, by_board[:, 2:] * self.bends[:, None]], 1)
+
+
+def amplitudes_of(count: int) -> np.ndarray:
+    """(M,) which of a view's amplitudes each of its numbers has.
+
+    Three numbers of a motion have one; of an odd number of amplitudes the last is that of bending.
+    """
+    bends = count % 2
+    return np.repeat(np.arange(count), [AXES] * (count - bends) + [BENDS] * bends)
 
 
 def by_number(log_ratio: np.ndarray, relative: Tensor | None = None) -> Tensor:
     """Standard deviations (M,) of the numbers of a view over the noise, from the logarithms of those by amplitude.
 
-    Four amplitudes are those of motion, one is that of bending, five are both. With how much the board bends in each
-    view (V,), relative to the others, (V, M).
+    With how much the board bends in each view (V,), relative to the others, (V, M).
     """
-    moves, bends = len(log_ratio) >= AMPLITUDES, len(log_ratio) % AMPLITUDES
-    counts = [MOTION // AMPLITUDES] * AMPLITUDES * moves + [BENDS] * bends
-    ratio = torch.from_numpy(np.repeat(np.exp(log_ratio), counts))
+    ratio = torch.from_numpy(np.exp(log_ratio)[amplitudes_of(len(log_ratio))])
     if relative is None:
         return ratio
     ratio = ratio.repeat(len(relative), 1)

@@ -219,12 +219,11 @@ class Adjustment:
     def fit_motion(self, masks: PerKind) -> None:
         """Find how boards move while the cameras' rows are read, from residuals at the present state.
 
-        Not before cameras of parametric models: what their lenses cannot show would be taken for motion.
+        While rows are read, not before cameras of parametric models: what these cannot show would be taken for motion.
         """
         boards, state = self.data.boards, self.state
         self.motion = [None] * len(self.data.cameras)
-        trusted = [c for c, one in enumerate(self.data.cameras) if one.model.hybrid or one.calibration is None]
-        if boards is None or not trusted or not bool(masks.boards.any()):
+        if boards is None or not bool(masks.boards.any()):
             return
         everything = masks._replace(boards=torch.ones_like(masks.boards))
         # Boards that are off by far are wrong, not moved.
@@ -237,7 +236,7 @@ class Adjustment:
         # Rows of cameras whose motions are taken out, as they were before; what the others' motions were at that time.
         before: dict[int, Tensor] = {}
         others: dict[int, list[BoardMotion | None]] = {}
-        for c in trusted * _TURNS:
+        for c in [*range(len(posed))] * _TURNS:
             beside = [one for k, one in enumerate(self.motion) if k != c]
             if c in others and all(a is b for a, b in zip(beside, others[c], strict=True)):
                 continue
@@ -254,7 +253,9 @@ class Adjustment:
                 whitening=block.whitening[:, c],
                 size=posed[c].camera.size,
             )
-            found = self.motion[c] = board_motion(seen, rig, c)
+            camera = self.data.cameras[c]
+            trusted = camera.model.hybrid or camera.calibration is None
+            found = self.motion[c] = board_motion(seen, rig, c, reads=trusted)
             if found is not None:
                 before[c] = rig.parts[c].rows
                 rig.put(c, WithoutMotion(found.columns, block.whitening[:, c])(before[c]))
@@ -478,10 +479,9 @@ def without_wrong(work: Adjustment, masks: PerKind, solver: LMOptions) -> PerKin
     squares, freedom = work.squares(masks), work.freedom(masks)
     for kind, square, dof in zip(KINDS, squares, freedom, strict=True):
         if (times := math.sqrt(typical_ratio(square, dof))) > WRONG_AS_A_WHOLE:
-            more = ", and time, zone and place of the night images" if kind == "stars" else ""
             raise InputError(
                 f"the {kind} contradict each other or the rest: typically they are {times:.0f} times as far off as "
-                f"their sigmas say; check names, units, heights, sigmas and that the cameras are these{more}"
+                f"their sigmas say; {_to_check(kind)}"
             )
     over = over_limit(work, masks, squares)
     kept = PerKind(*(mask & ~(ratio > 1.0) for mask, ratio in zip(masks, over, strict=True)))
@@ -523,5 +523,13 @@ def _refuse_many(work: Adjustment, kept: PerKind, masks: PerKind) -> None:
             names: Sequence[str] = [work.names(kind)[i] for i in (before & ~after).nonzero()[:, 0].tolist()]
             raise InputError(
                 f"{gone} of {total} {kind} contradict the rest ({', '.join(names[:6])}{' ...' if gone > 6 else ''}): "
-                "these are not a few wrong ones; check names, units, heights, sigmas and that the cameras are these"
+                f"these are not a few wrong ones; {_to_check(kind)}"
             )
+
+
+def _to_check(kind: Kind) -> str:
+    """What may be wrong with a source as a whole."""
+    if kind == "boards":
+        return "were both views of each pair taken at the same moment, of one board, and by these cameras?"
+    more = ", and time, zone and place of the night images" if kind == "stars" else ""
+    return f"check names, units, heights, sigmas and that the cameras are these{more}"

@@ -15,7 +15,7 @@ import kcal.calibrate.rig.explanations as explanations
 from kcal.calibrate.rig.adjustment import Adjustment
 from kcal.calibrate.rig.blocks import FeatureBlock, LandmarkBlock, PerKind, RigState
 from kcal.calibrate.rig.initial_poses import InitialPoses, distinct_poses
-from kcal.calibrate.rig.motion import moved_warnings
+from kcal.calibrate.rig.motion import moved_warnings, scatter_warnings
 from kcal.calibrate.rig.problem import RigProblem, held
 from kcal.calibrate.rig.result import Reasons, RigResult, item_records, places, source_records
 from kcal.calibrate.rig.uncertainty import SharedCovariance, goodness_of_fit, parameter_rows, relative_rows
@@ -447,11 +447,13 @@ def rig_result(
     only_boards = len(problem.blocks) == 1 and problem.blocks[0].kind == "boards"
     if only_boards and (count := int(masks.boards.sum())) < _FEW_BOARDS:
         warnings.append(f"{count} pair(s) only: a wrong one could not be noticed; 5 or more are good")
-    if only_boards and rms > _HIGH_RMS:
+    focal = [float(camera.params[0]) for camera in data.cameras]
+    scattered = scatter_warnings(focal, work.motion, work.sigma_corner)
+    warnings = scattered + warnings
+    if only_boards and rms > _HIGH_RMS and not scattered:
         warnings.append(f"RMS {rms:.2f} px is high: were both views of each pair taken at the same moment?")
     if status not in (SolverStatus.CONVERGED, SolverStatus.EXACT):
         warnings.append(f"the solver {status.message}")
-    focal = [float(camera.params[0]) for camera in data.cameras]
     warnings += moved_warnings(data.names, focal, work.motion, work.sigma_corner)
     warnings += doubts
     warnings += [f"not determined by the data: {text}" for text in undetermined]

@@ -28,6 +28,11 @@ _CLEARLY = 0.9
 _FEW, _ROUGH = 4, LMOptions(max_iterations=10, tolerance=1e-4)
 # Pairs that propose a relative pose: half of them may be wrong.
 _PROPOSALS = 16
+# Share of the image's diagonal by which a typical pair's views differ only if they are not of one moment, and places by
+# which views may be late. Share of the error that is left if they are put right, or if the cameras moved once.
+_OTHER_MOMENT, _PLACES, _BETTER = 0.03, 3, 0.25
+# Pairs before and after cameras moved, and pixels by which boards are then elsewhere.
+_PART, _MOVED = 3, 1.0
 # A turned order of corners is believed only if it leaves less than this share of the error.
 _TURNED = 0.2
 
@@ -61,7 +66,7 @@ class Poses:
         back = self.rotation.transpose(-1, -2)
         return Poses(back, -(back @ self.translation[..., None])[..., 0])
 
-    def __getitem__(self, index: int) -> Poses:
+    def __getitem__(self, index: int | slice) -> Poses:
         return Poses(self.rotation[index], self.translation[index])
 
 
@@ -187,3 +192,67 @@ def consensus(
 def _distance(projected: Tensor, observed: Tensor) -> Tensor:
     """Root mean square distance (P,) over the corners that were seen."""
     return torch.sqrt(torch.nanmean(((projected - observed) ** 2).sum(-1), -1))
+
+
+def refuse_wrong_pairs(
+    boards: Boards, both: Tensor, cameras: tuple[Camera, Camera], names: Sequence[str], poses: tuple[Poses, Poses]
+) -> tuple[Poses, Tensor, Tensor]:
+    """`consensus` of two cameras; refuse views that are paired with those of other moments, and cameras that moved.
+
+    Args:
+        boards: all boards, (V, 2, N, 2) pixels of both cameras.
+        both: numbers of those that both see, in the order in which they were taken.
+        cameras: the two.
+        names: of them.
+        poses: of these boards before each camera.
+
+    Raises:
+        InputError: with what the pairs tell, and how many pixels they differ by.
+    """
+    points, pixels = boards.points, boards.pixels[both]
+    found = relative, turned, error = consensus(points, pixels, cameras, *poses)
+    typical, count = float(error.median()), len(both)
+    if typical > _OTHER_MOMENT * math.hypot(*cameras[1].size):
+        text = (
+            f"the pairs contradict each other: a typical {names[1]} view shows its board {typical:.0f} px away from "
+            f"where the {names[0]} view puts it"
+        )
+        for later in sorted(range(-_PLACES, _PLACES + 1), key=abs)[1:]:
+            first, second = (slice(max(0, shift), min(count, count + shift)) for shift in (-later, later))
+            if count - abs(later) < _PART:
+                continue
+            shifted = torch.stack([pixels[first, 0], pixels[second, 1]], 1)
+            better = float(consensus(points, shifted, cameras, poses[0][first], poses[1][second])[2].median())
+            if better < _BETTER * typical and better < _OTHER_MOMENT * math.hypot(*cameras[1].size):
+                views = boards.views or (boards.names, boards.names)
+                mates = [views[c][int(both[part.start])] for c, part in enumerate((first, second))]
+                raise InputError(
+                    f"{text}, and only {better:.1f} px if {mates[0]} belongs with {mates[1]}, and so on: views of "
+                    "different moments are paired; give the right pairs with kcal rig --match PAIRS.csv"
+                )
+        raise InputError(
+            f"{text}: were both views of each pair taken at the same moment, and of one board? Give the pairs that "
+            "belong together with kcal rig --match PAIRS.csv"
+        )
+    placed = points @ poses[0].rotation.mT + poses[0].translation[:, None]
+    seen = torch.where(turned[:, None, None], pixels[:, 1].flip(-2), pixels[:, 1])
+    projected, _ = cameras[1].project(placed @ relative.rotation.T + relative.translation)
+    off = torch.nanmean(seen - projected, 1)
+    splits = [(_scatter(off[:k])[0] + _scatter(off[k:])[0], k) for k in range(_PART, count - _PART + 1)]
+    if splits:
+        within, k = min(splits)
+        moved = float((_scatter(off[k:])[1] - _scatter(off[:k])[1]).norm())
+        if within < _BETTER * _scatter(off)[0] and moved > _MOVED:
+            raise InputError(
+                f"{names[0]} and {names[1]} moved against each other between pair {boards.names[int(both[k - 1])]} and "
+                f"pair {boards.names[int(both[k])]}: from there on, boards appear {moved:.1f} px elsewhere, and before "
+                f"and after pairs agree within {within / count:.1f} px. Give the pairs of one part with "
+                "kcal rig --match PAIRS.csv, or take all of them again"
+            )
+    return found
+
+
+def _scatter(values: Tensor) -> tuple[float, Tensor]:
+    """Sum of distances from the median, axis by axis, and the median."""
+    middle = values.median(0).values
+    return float((values - middle).abs().sum()), middle

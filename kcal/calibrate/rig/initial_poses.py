@@ -16,9 +16,9 @@ from kcal.calibrate.rig.board_consensus import (
     Poses,
     SeenAlone,
     check_cameras,
-    consensus,
     half_turn,
     pose_alone,
+    refuse_wrong_pairs,
 )
 from kcal.calibrate.rig.sources import Boards, RigData
 from kcal.errors import DegenerateError
@@ -487,8 +487,14 @@ class _BoardViews:
         both = (self._good[:, first] & self._good[:, second]).nonzero()[:, 0]
         cameras = self.data.cameras[first], self.data.cameras[second]
         one, two = (Poses(self._alone[c].rotation[both], self._alone[c].translation[both]) for c in (first, second))
-        pixels = boards.pixels[both][:, [first, second]]
-        relative, turned, error = consensus(boards.points, pixels, cameras, one, two)
+        seen = dataclasses.replace(
+            boards,
+            pixels=boards.pixels[:, [first, second]],
+            covariance=None,
+            views=boards.views and (boards.views[first], boards.views[second]),
+        )
+        names = self.data.names[first], self.data.names[second]
+        relative, turned, error = refuse_wrong_pairs(seen, both, cameras, names, (one, two))
         if bool(turned.any()):
             self._turn(boards, both[turned], second)
         limit = max(_FOREIGN_TIMES * float(error.median()), _FOREIGN_PX)

@@ -12,6 +12,8 @@ from torch import Tensor
 
 from kcal.calibrate.hybrid.evidence import (
     WORTH,
+    EvidenceLoss,
+    Maximum,
     Quadratic,
     ViewData,
     evidence_of_motion,
@@ -19,7 +21,7 @@ from kcal.calibrate.hybrid.evidence import (
     maximize_evidence,
 )
 from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies
-from kcal.calibrate.problem.state import AMPLITUDES, FELT, MEDIAN, MOTION, MotionSigma, Readout, motion_sigma
+from kcal.calibrate.problem.state import AMPLITUDES, APART, AXES, FELT, MEDIAN, MOTION, MotionSigma, Readout
 from kcal.lens.model import LensModel
 from kcal.lens.projection import project_components
 from kcal.solve.schur import Products, column_scale
@@ -79,6 +81,8 @@ _POSE = 6
 _WIDE = 1e3
 # Of fewer boards, one that is wrong cannot be told from motion.
 _FEWEST = 3
+# Numbers of motions while rows are read, between exposures, and of both.
+_READ, _APART, _ALL = slice(0, MOTION), slice(MOTION, MOTION + 2 * AXES), slice(0, MOTION + 2 * AXES)
 # One amplitude, which stands for none.
 _NONE = torch.zeros(1, dtype=torch.float64)
 _NO_PRIOR = Hyperprior(_NONE, torch.ones_like(_NONE))
@@ -109,26 +113,49 @@ class SeenBoards(NamedTuple):
 
 
 class BoardMotion(NamedTuple):
-    """How boards move while a camera reads its rows.
+    """How boards move while a camera reads its rows, and between the exposures of cameras that are not synchronized.
 
     Attributes:
-        columns: (V, 12, 2, N) derivatives of pixels by a motion, times its standard deviations.
-        sigma: standard deviations of motions.
+        columns: (V, M, 2, N) derivatives of pixels by a motion, times its standard deviations.
+        sigma: standard deviations of motions while rows are read.
+        apart: of turns and shifts between the exposures, in the same units.
         reach: of the board about its middle, distances of the board.
     """
 
     columns: Tensor
     sigma: MotionSigma
+    apart: tuple[float, float]
     reach: float
 
+    def between(self, focal: float) -> float:
+        """Pixels by which a corner moves between the exposures."""
+        return focal * math.hypot(self.apart[1], self.reach * self.apart[0])
 
-def board_motion(seen: SeenBoards, rig: RigRows, camera: int) -> BoardMotion | None:
-    """How boards move while this camera reads its rows; None where they stand still.
+
+class _Moving(NamedTuple):
+    """Motions of some kinds: their numbers, and their amplitudes where the evidence is largest."""
+
+    numbers: slice
+    best: Maximum
+
+    def of(self, data: ViewData) -> ViewData:
+        """What boards tell of these motions, the others being none."""
+        return data._replace(own=data.own[:, self.numbers, self.numbers], cross=data.cross[:, self.numbers])
+
+    def loss(self, data: ViewData, families: PriorFamilies) -> float:
+        """The negative logarithm of the evidence of these amplitudes."""
+        v = np.concatenate([self.best.h.numpy(), self.best.log_ratio, [math.log(self.best.variance)]])
+        return float(EvidenceLoss(self.of(data), families, _NO_PRIOR, 1.0).values(v[None])[0])
+
+
+def board_motion(seen: SeenBoards, rig: RigRows, camera: int, *, reads: bool) -> BoardMotion | None:
+    """How boards move while this camera reads its rows, and beforehand; None where they stand still.
 
     Args:
         seen: all boards.
         rig: rows of all cameras, other cameras' motions integrated out.
         camera: its number.
+        reads: whether they may move while rows are read.
     """
     good = rig.good
     if int(good.sum()) < _FEWEST or camera not in rig.parts:
@@ -137,26 +164,49 @@ def board_motion(seen: SeenBoards, rig: RigRows, camera: int) -> BoardMotion | N
     found = project_components(points_cam, seen.parameters, seen.model, [])
     distance = float(seen.translation[good].norm(dim=-1).median())
     readout = Readout(center=seen.points.mean(-1), distance=distance, size=seen.size)
-    columns = readout.columns_of(found.by_point, seen.rotation, readout.time(seen.pixels), seen.points).nan_to_num(0.0)
+    time = readout.time(seen.pixels)
+    columns = readout.columns_of(found.by_point, seen.rotation, time, seen.points, apart=True).nan_to_num(0.0)
     white = torch.einsum("vuwn,vpwn->vpun", seen.whitening, columns).flatten(-2)
-    variance = rig.variance
     # Nothing is left to explain of corners without noise.
-    if variance < _EXACT:
+    if rig.variance < _EXACT:
         return None
     data, families = rig.told(camera, white)
-    begin = np.full(AMPLITUDES, math.log(MEDIAN) - 0.5 * math.log(variance))
-    best = maximize_evidence(data, families, _NONE, variance, _NO_PRIOR, begin)
-    if evidence_of_motion(data, best, families, 1.0) < WORTH:
+
+    def worth(one: _Moving, than: _Moving | None, data: ViewData, families: PriorFamilies) -> float:
+        """By how much these motions raise the evidence, or are better than fewer ones."""
+        if than is None:
+            return evidence_of_motion(one.of(data), one.best, families, 1.0)
+        return than.loss(data, families) - one.loss(data, families)
+
+    chosen: _Moving | None = None
+    for numbers in (_APART, _READ, _ALL) if reads else (_APART,):
+        one = _Moving(numbers, Maximum(_NONE, np.zeros(0), rig.variance, 0.0))
+        begin = np.full(one.of(data).own.shape[-1] // AXES, math.log(MEDIAN) - 0.5 * math.log(rig.variance))
+        one = one._replace(best=maximize_evidence(one.of(data), families, _NONE, rig.variance, _NO_PRIOR, begin))
+        than = chosen if numbers is _ALL else None
+        if worth(one, than, data, families) < WORTH:
+            continue
+        # What a single board tells of is wrong with that board.
+        explained = one.of(data).integrated(one.best.log_ratio).half[..., -1].square().sum(-1)
+        others = rig.without(int(good.nonzero()[explained.argmax(), 0])).told(camera, white)
+        if worth(one, than, *others) < _WORTH_OF_OTHERS:
+            continue
+        if chosen is None or worth(one, chosen, data, families) > 0.0:
+            chosen = one
+    if chosen is None:
         return None
-    # What a single board tells of is wrong with that board.
-    explained = data.integrated(best.log_ratio).half[..., -1].square().sum(-1)
-    others = rig.without(int(good.nonzero()[explained.argmax(), 0]))
-    rest, their_families = others.told(camera, white)
-    if evidence_of_motion(rest, best, their_families, 1.0) < _WORTH_OF_OTHERS:
-        return None
-    sigma = motion_sigma(expected_maximum(data, families, best, _NO_PRIOR).log_ratio, best.variance)
-    each = torch.tensor(sigma, dtype=torch.float64).repeat_interleave(MOTION // AMPLITUDES)
-    return BoardMotion(columns * each[:, None, None], sigma, readout.reach(seen.points.T))
+    best = expected_maximum(chosen.of(data), families, chosen.best, _NO_PRIOR)
+    sigma = torch.zeros(columns.shape[1] // AXES, dtype=torch.float64)
+    sigma[chosen.numbers.start // AXES : chosen.numbers.stop // AXES] = torch.from_numpy(
+        np.exp(best.log_ratio) * math.sqrt(best.variance)
+    )
+    each, amounts = sigma.repeat_interleave(AXES)[chosen.numbers, None, None], sigma.tolist()
+    return BoardMotion(
+        columns[:, chosen.numbers] * each,
+        MotionSigma(*amounts[:AMPLITUDES]),
+        (APART * amounts[-2], APART * amounts[-1]),
+        readout.reach(seen.points.T),
+    )
 
 
 class RigRows:
@@ -330,3 +380,17 @@ def moved_warnings(
                 "smaller (if nothing moved, pairs are mixed up or a camera is wrong)"
             )
     return found
+
+
+def scatter_warnings(focal: Sequence[float], motions: Sequence[BoardMotion | None], noise: float) -> list[str]:
+    """A warning where the cameras' relative pose differs from pair to pair by much more than the noise, in pixels."""
+    each = [motion.between(length) for length, motion in zip(focal, motions, strict=True) if motion is not None]
+    off = math.hypot(*each)
+    if off <= FELT * noise:
+        return []
+    return [
+        f"the cameras' relative pose differs from pair to pair by some {off:.1f} px, {off / noise:.0f} times the noise "
+        "of a corner: were both views of each pair taken at the same moment, of a board at rest? Each pair counts with "
+        "such an error, and the covariance allows for it; trigger the cameras together, or put the board on a stand "
+        "(if nothing moved, a camera is wrong)"
+    ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,13 +12,16 @@ import torch
 from calibrate_scenes import observe
 from torch import Tensor
 
+from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.hybrid.evidence import EvidenceLoss, view_data
 from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies
 from kcal.calibrate.rig.motion import CameraRows, RigRows, WithoutMotion
+from kcal.calibrate.rig.pairs import pair_by_name
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, calibrate_rig
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations
+from kcal.errors import InputError
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
@@ -147,12 +151,87 @@ def test_nothing_moves_on_a_stand() -> None:
         assert torch.equal(found.relative_covariance(), still.relative_covariance())
 
 
-def test_not_before_a_lens_that_is_calibrated_with_few_coefficients() -> None:
-    """What it cannot show would be taken for motion."""
+def test_before_a_lens_that_is_calibrated_with_few_coefficients_only_pairs_scatter() -> None:
+    """What it cannot show would be taken for motion of rows; that pairs differ is known all the same."""
     camera = Camera(CAMERA.params, size=CAMERA.size, model=CAMERA.model)
     camera.calibration = CameraCalibration(covariance=1e-12 * torch.eye(len(CAMERA.params), dtype=F64))
     found = solve(True, 0, camera)
     assert not any("moved while rows were read" in text for text in found.warnings)
-    assert found.sigma_corner is not None
+    assert "taken at the same moment" in found.warnings[0]
+    assert surprise(found) < 4.0
     assert math.isfinite(found.rms)
-    assert found.sigma_corner > 0.2
+
+
+def taken_apart(seed: int, turn: float, *, later: int = 0, bump: float = 0.0) -> RigResult:
+    """A rig whose boards turn, and move by as much, in between; the second half of the pairs after a bump.
+
+    Views of the right camera are paired with those that the left one took `later`.
+    """
+    random = torch.Generator().manual_seed(seed)
+    poses = sample_board_poses(CAMERA, SIZE, 12, random, fill=(0.25, 0.4))
+    twist = turn * torch.randn(len(poses), 6, generator=random, dtype=F64)
+    bumped = rotation_from_vector(torch.tensor([0.0, bump, 0.0], dtype=F64))
+    right = []
+    for i, (pose, step) in enumerate(zip(poses, twist, strict=True)):
+        rotation = TURN @ pose.rotation @ rotation_from_vector(step[:3])
+        moved = BoardPose(rotation, TURN @ (pose.translation + step[3:]) + SHIFT)
+        right.append(moved if i < 6 else BoardPose(bumped @ moved.rotation, bumped @ moved.translation))
+    sides = [
+        moving_capture(CAMERA, own, sigma=0.1, seed=2 * seed + k, board=SIZE).pixels
+        for k, own in enumerate((poses, right))
+    ]
+    sides[1] = sides[1].roll(later, 0)
+    seen = [torch.where((CAMERA.inside(own) & own.isfinite().all(-1))[..., None], own, torch.nan) for own in sides]
+    kept = (torch.stack(seen).isfinite().all(-1).sum(-1) >= 12).all(0).nonzero()[:, 0].tolist()
+    names = [f"{i:02d}" for i in kept]
+    views = [observe(own[kept], board=BOARD, size=CAMERA.size, names=names) for own in seen]
+    return calibrate_rig(CAMERA, CAMERA, *views, [(name, name) for name in names])
+
+
+@pytest.mark.parametrize("turn", [0.001, 0.005])
+def test_pairs_that_were_not_taken_at_one_moment_scatter(turn: float) -> None:
+    found = [taken_apart(seed, turn) for seed in range(3)]
+    assert sum(map(surprise, found)) / 3 < 2.5
+    for result in found:
+        assert not result.left_out
+        # The boards are 1 m away: a turn of 1 mrad of a board of 0.45 m, and 1 mm, are some 1 px.
+        text = result.warnings[0]
+        assert "were both views of each pair taken at the same moment" in text
+        assert 0.4 < float(text.split("by some ")[1].split(" px")[0]) / (1000 * turn) < 2.5
+        assert not any("moved while rows were read" in one for one in result.warnings)
+        assert result.sigma_corner == pytest.approx(0.1, rel=0.3)
+        # Of a dozen pairs, each is off by as much.
+        assert 0.15 * turn < result.relative_covariance()[:3, :3].diagonal().max().sqrt() < turn
+
+
+def test_views_that_are_paired_with_those_of_other_moments_are_refused() -> None:
+    with pytest.raises(InputError, match=r"typical right view .* px if 01 belongs with 02, and so on: .*--match"):
+        taken_apart(0, 0.001, later=1)
+    with pytest.raises(InputError, match=r"the same moment, and of one board\?"):
+        taken_apart(0, 0.001, later=5)
+
+
+def test_a_rig_that_was_moved_in_between_is_refused() -> None:
+    with pytest.raises(InputError, match=r"left and right moved against each other between pair 05 and pair 06: .* px"):
+        taken_apart(0, 0.0, bump=0.005)
+    # 0.1 mrad are a tenth of a pixel.
+    assert not taken_apart(0, 0.0, bump=1e-4).left_out
+
+
+@pytest.mark.slow  # Two calibrations and two rigs
+def test_two_webcams_that_are_not_synchronized(kcal_data: Path) -> None:
+    """Both halves of a real capture agree within what they state; motions are those that each camera finds alone."""
+    seen = [Observations.load(kcal_data / "captures" / f"gavin_{side}.obs.json") for side in "lr"]
+    cameras = [calibrate_camera(one).camera for one in seen]
+    pairs = pair_by_name(seen[0].names, seen[1].names)
+    first, second = (calibrate_rig(*cameras, *seen, some) for some in (pairs[:9], pairs[9:]))
+    one, other = first.stereo(), second.stereo()
+    turn = vector_from_rotation(one.right_from_left_rotation @ other.right_from_left_rotation.T)
+    off = torch.cat([turn, one.right_from_left_translation - other.right_from_left_translation])
+    both = first.relative_covariance() + second.relative_covariance()
+    assert float(off @ torch.linalg.solve(both, off)) < 16.8  # Of six numbers, 1 %
+    for result in (first, second):
+        assert "taken at the same moment" in result.warnings[0]
+        moved = [float(text.split("by some ")[1].split()[0]) for text in result.warnings if "rolling" in text]
+        assert max(moved) < 1.0
+        assert result.sigma_corner == pytest.approx(0.06, abs=0.01)
