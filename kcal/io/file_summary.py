@@ -45,21 +45,26 @@ class CameraSummary(Record):
     @classmethod
     def made(cls, camera: Camera, content: dict[str, Any]) -> Self | None:
         """That of a camera; None where something cannot be derived."""
+        try:
+            return cls.derived(camera, content)
+        except (KcalError, ValueError):
+            return None
+
+    @classmethod
+    def derived(cls, camera: Camera, content: dict[str, Any]) -> Self:
+        """The same, with the error where something cannot be derived."""
         from kcal.lens.paraxial import paraxial_focal
 
         record = camera.calibration.record if camera.calibration else None
-        try:
-            return cls(
-                of=digest(content),
-                model=str(camera.model),
-                board=None if record is None else str(record.board),
-                focal_length=str(paraxial_focal(camera)),
-                covers_image=bool(camera.covers_image()),
-                sigma=sigma_of(camera),
-                sigma_px=sigma_over_image(camera),
-            )
-        except (KcalError, ValueError):
-            return None
+        return cls(
+            of=digest(content),
+            model=str(camera.model),
+            board=None if record is None else str(record.board),
+            focal_length=str(paraxial_focal(camera)),
+            covers_image=bool(camera.covers_image()),
+            sigma=sigma_of(camera),
+            sigma_px=sigma_over_image(camera),
+        )
 
 
 def sigma_of(camera: Camera) -> dict[str, float | None]:
