@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.camera.checks import MINIMUM_VIEWS, copied_views, copy_warnings, pose_warnings, unusable_views
-from kcal.calibrate.camera.hybrid import hybrid_result
+from kcal.calibrate.camera.hybrid import calibrate_hybrid, hybrid_result
 from kcal.calibrate.camera.leave_out import (
     calibrate_what_fits,
     lasting_warnings,
@@ -25,10 +25,13 @@ from kcal.calibrate.camera.result import (
     RejectedView,
     SharedBoard,
 )
+from kcal.calibrate.camera.warnings import spacing_warnings
+from kcal.calibrate.hybrid.base_fit import may_be_unequal
 from kcal.calibrate.hybrid.board_orders import turned_corners
 from kcal.calibrate.hybrid.cameras_fit import Run, fit_cameras
 from kcal.calibrate.hybrid.fit import HybridFit
 from kcal.calibrate.hybrid.fleet import LEAST_CAMERAS
+from kcal.calibrate.hybrid.measured_board import MeasuredBoard
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError, KcalError
 from kcal.threads import in_one_thread
@@ -189,6 +192,7 @@ def calibrate_camera(
             )
         return without_views(calibrate_camera(observations.subset(kept), options, progress), observations, unusable)
     pixels, copied = observations.pixels(), copied_views(observations.pixels(), 0.0)
+    _check_spacing(observations, options, progress)
     result = _calibrate(_without_copies(observations, copied), options, progress)
     if (nearly := copied_views(pixels, result.noise)) != copied:
         progress(f"{len(nearly)} views are copies of others; again without them")
@@ -197,6 +201,21 @@ def calibrate_camera(
     doubts = two_camera_warnings(result, options, progress)
     result = dataclasses.replace(result, warnings=(*result.warnings, *doubts))
     return _complete(result, observations, copied)
+
+
+def _check_spacing(observations: Observations, options: CalibrationOptions, progress: Progress) -> None:
+    """Raise `InputError` where the lens cannot allow for columns of the board that are not as far apart as its rows."""
+    if (options.hybrid and options.board != "exact") or isinstance(options.board, MeasuredBoard):
+        return
+    try:
+        if not may_be_unequal(observations.board.points, observations.pixels(), observations.image_size):
+            return
+        found = spacing_warnings(calibrate_hybrid(observations, CalibrationOptions(), progress), refused=True)
+    except (KcalError, ArithmeticError):
+        # What is wrong with the views is said when they are calibrated.
+        return
+    if found:
+        raise InputError(found[0])
 
 
 def _without_copies(observations: Observations, copied: Mapping[int, int]) -> Observations:

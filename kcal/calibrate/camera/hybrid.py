@@ -9,6 +9,7 @@ one.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import torch
@@ -26,6 +27,7 @@ from kcal.calibrate.camera.warnings import (
     outlier_warnings,
     pixel_warnings,
     pupil_warnings,
+    spacing_warnings,
 )
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.settled import FitStart, rough_start
@@ -151,7 +153,7 @@ def hybrid_result(observations: Observations, fit: HybridFit, options: Calibrati
     )
     status = SolverStatus.CONVERGED if fit.converged else SolverStatus.ITERATION_LIMIT
     used = [i for i, rms in enumerate(per_view.tolist()) if not math.isnan(rms)]
-    return CameraCalibrationResult(
+    result = CameraCalibrationResult(
         camera=camera,
         observations=observations,
         rms=fit.rms,
@@ -179,3 +181,6 @@ def hybrid_result(observations: Observations, fit: HybridFit, options: Calibrati
             *outlier_warnings(names, fit.residuals),
         ),
     )
+    unequal = spacing_warnings(result) if options.board == "printed" else ()
+    # It explains what else may be said.
+    return dataclasses.replace(result, warnings=(*unequal, *result.warnings)) if unequal else result

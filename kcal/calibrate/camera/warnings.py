@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.camera.outliers import corners_beyond
+from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.hybrid.fit import HybridFit
 from kcal.calibrate.problem.parameters import GaussianPrior, Term
 from kcal.calibrate.problem.state import FELT, LARGEST, BoardState
@@ -96,6 +97,33 @@ def pixel_warnings(fit: HybridFit) -> list[str]:
         f"pixels are not square: f_y / f_x = {aspect:.4f} ± {sigma:.4f}; was the image or video resized, or taken in "
         "an anamorphic mode? The camera is right for images of this size and shape only: photograph boards and targets "
         "in the same mode"
+    ]
+
+
+# Share beyond which columns of a board that are farther apart than its rows are no error of the print, and in standard
+# deviations.
+_NO_PRINT, _UNEQUAL = 0.02, 5.0
+
+
+def spacing_warnings(result: CameraCalibrationResult, refused: bool = False) -> list[str]:
+    """A warning where columns of the board are not as far apart as its rows; or why a lens is refused for it."""
+    board, measured = result.observations.board, result.measured_board
+    if measured is None:
+        return []
+    value, sigma = measured.stretch
+    if abs(value) < max(_NO_PRINT, _UNEQUAL * sigma):
+        return []
+    rows = 1e3 * board.square
+    what = "tags of the board are {} mm wide and {} mm high"
+    if board.pattern != "aprilgrid":
+        what = "columns of the board are {} mm apart, and its rows {} mm"
+    apart = what.format(f"{rows * (1.0 + value):.4g}", f"{rows:.4g}")
+    allows = "the camera allows for this, and all distances are as right as that of the rows"
+    if refused:
+        allows = "only the default lens with a printed board allows for this"
+    return [
+        f"{apart} ({100 * value:+.2f} ± {100 * sigma:.2g} %), but one length was given for both: {allows}; measure "
+        "both with a ruler, give the distance of the rows as --square, and print at 100 %, not fitted to the page"
     ]
 
 

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.calibrate.hybrid.board_modes import BoardModes
-from kcal.calibrate.hybrid.families import PriorFamilies, prior_families, typical_hyperprior
+from kcal.calibrate.hybrid.board_modes import KNOWN, STRETCH, BoardModes, board_modes
+from kcal.calibrate.hybrid.families import BOARD, PriorFamilies, prior_families, typical_hyperprior
 from kcal.calibrate.hybrid.fitted_views import NO_MOTION, Estimate, FittedViews, hybrid_unknowns
 from kcal.calibrate.hybrid.fleet import LensPrior
 from kcal.calibrate.problem.poses import homographies, poses_from_homographies
@@ -37,6 +37,9 @@ _PINHOLE = torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=torch.float64)
 _DOUBT = 2.0
 # Changes of focal length and shape after which these are constants of the lens: what is left is their square.
 _NEAR = 0.02
+# Columns of the board that are not as far apart as its rows: standard deviation of the difference, the least that is no
+# error of the print, and how many times larger the squared misfit must be without it; changes that are tried.
+_UNEQUAL, _NO_PRINT, _WITHOUT, _CHANGES = 0.15, 0.02, 1.5, (-0.2, 0.25)
 # A field that is held at zero, as small as there is one.
 _NO_FIELD = ZernikeModes(radial=0, decentered=0, astigmatic=1, other=0)
 
@@ -48,7 +51,7 @@ class Base(NamedTuple):
         focal: F, pixels.
         shape: s of the projection.
         aspect: f_y / f_x; None: pixels are square.
-        state: the camera's parameters, the board as it was, and poses.
+        state: the camera's parameters, the board's stretch where that was found, and poses.
         variance: of residuals along an axis, px².
         steps: trial steps.
     """
@@ -125,12 +128,17 @@ def _no_modes(points: Tensor) -> BoardModes:
     return BoardModes(points.new_zeros(0, 3, len(points)), points.new_zeros(0), torch.zeros(0, dtype=torch.long))
 
 
-def _base_of(capture: FittedViews, known_focal: float | None, exact_focal: bool = False) -> Base:
-    pixels, weights = capture.pixels, capture.weights
+def _base_of(
+    capture: FittedViews, known_focal: float | None, exact_focal: bool = False, stretch: BoardModes | None = None
+) -> Base:
+    pixels, weights, points = capture.pixels, capture.weights, capture.points
     # Of many views some tell which projection it is; the poses of all follow from it.
     some = slice(None, None, 1 + (len(pixels) - 1) // _VIEWS)
     few = dataclasses.replace(capture, pixels=pixels[some], weights=weights[some])
-    base = _fit_projection(few, known_focal, exact_focal)
+    start = _base_start(few, known_focal, None, exact_focal)
+    base = _settled_base(few, start, exact_focal)
+    if stretch is not None and (other := _unequal(few, start, base, known_focal, stretch)) is not None:
+        base, points = other, points + other.state.board * stretch.shapes[0].T
     if len(base.state.rotation) == len(pixels):
         return base
     params = base.state.parameters
@@ -139,20 +147,35 @@ def _base_of(capture: FittedViews, known_focal: float | None, exact_focal: bool 
         offset = offset / torch.tensor([1.0, base.aspect], dtype=torch.float64)
     ideal, usable = _through_base(offset, capture.seen, base.focal, base.shape)
     if bool((usable.sum(-1) < _FEWEST).any()):
-        return _fit_projection(capture, known_focal, exact_focal)
-    poses = poses_from_homographies(homographies(capture.points, ideal), _PINHOLE)
+        return _settled_base(capture, _base_start(capture, known_focal, None, exact_focal), exact_focal)
+    poses = poses_from_homographies(homographies(points, ideal), _PINHOLE)
     state = base.state._replace(rotation=poses[0], translation=poses[1], motion=pixels.new_zeros(len(pixels), 0))
     return base._replace(state=state)
 
 
-def _fit_projection(capture: FittedViews, known_focal: float | None, exact_focal: bool) -> Base:
-    focal, shape, rotation, translation = _base_start(capture, known_focal, None, exact_focal)
-    flat = capture.board
-    state = BoardState.still(flat.unit, flat.unit, rotation, translation)
-    base = Base(focal, shape, None if capture.square else 1.0, state, 0.0, 0)
+def _unequal(
+    capture: FittedViews, start: Base, plain: Base, known_focal: float | None, stretch: BoardModes
+) -> Base | None:
+    """The projection with a board whose columns are not as far apart as its rows, if that explains views far better."""
+    unit, begun, least = stretch.unit / _UNEQUAL, plain.state._replace(board=torch.zeros_like(stretch.unit)), start
+    for change in _CHANGES:
+        points = capture.points + change * unit * stretch.shapes[0].T
+        try:
+            other = _base_start(dataclasses.replace(capture, points=points), known_focal, None)
+        except InputError:
+            continue
+        if _DOUBT * other.variance < least.variance:
+            least, begun = other, other.state._replace(board=change * unit)
+    base = plain if least is start else least
+    found = _settled_base(dataclasses.replace(capture, board=stretch, exact=False), base._replace(state=begun), False)
+    large = bool(found.state.board.abs() > _NO_PRINT * unit)
+    return found if large and plain.variance > _WITHOUT * found.variance else None
+
+
+def _settled_base(capture: FittedViews, base: Base, exact_focal: bool) -> Base:
     h = typical_hyperprior(_NO_FIELD).mean
     for _ in range(6):
-        model, families = _with_constants(base, capture.size, _NO_FIELD, flat)
+        model, families = _with_constants(base, capture.size, _NO_FIELD, capture.board)
         state = base.state
         if not len(state.parameters):
             state = state._replace(parameters=_leading(model, base.focal, families))
@@ -176,6 +199,23 @@ def _fit_projection(capture: FittedViews, known_focal: float | None, exact_focal
     return base
 
 
+def may_be_unequal(points: Tensor, pixels: Tensor, size: tuple[int, int]) -> bool:
+    """Whether a board whose columns are not as far apart as its rows explains views far better; as `fit_projection`."""
+    capture = FittedViews(
+        points=points,
+        board=board_modes(points),
+        pixels=pixels,
+        size=size,
+        weights=torch.ones_like(pixels[..., 0]),
+        readout=None,
+        square=False,
+        robust=False,
+        exact=False,
+    )
+    estimate, _ = fit_base(capture, _NO_FIELD, None, typical_hyperprior(_NO_FIELD).mean, None)
+    return bool(estimate.state.board.any())
+
+
 def fit_base(
     capture: FittedViews, modes: FieldModes, known_focal: float | None, h: Tensor, lens: LensPrior | None
 ) -> tuple[Estimate, int]:
@@ -183,26 +223,38 @@ def fit_base(
     board = capture.board
     if lens is not None:
         return _fit_known(capture, h, lens)
-    base = _base_of(dataclasses.replace(capture, board=_no_modes(capture.points), readout=None), known_focal)
+    flat = dataclasses.replace(capture, board=_no_modes(capture.points), readout=None, exact=True)
+    first = (board.family == STRETCH).nonzero()[:1, 0]
+    # A board that was measured is known, in modes of its own.
+    mode = None
+    if len(first) and not capture.exact:
+        x = capture.points[:, 0]
+        mode = BoardModes(board.shapes[first], 0.5 * _UNEQUAL * (x.amax() - x.amin())[None], torch.tensor([KNOWN]))
+    base = _base_of(flat, known_focal, stretch=mode)
     model, families = _with_constants(base, capture.size, modes, board)
     params = torch.zeros(5 + model.size, dtype=torch.float64)
     params[:5] = base.state.parameters[:5]
-    state = base.state._replace(parameters=params, board=torch.zeros_like(board.unit))
+    amplitudes = torch.zeros_like(board.unit)
+    if len(base.state.board):
+        amplitudes[first] = base.state.board
+        h = h.clone()
+        h[BOARD + STRETCH] = (base.state.board.abs() / board.unit[first]).log()
+    state = base.state._replace(parameters=params, board=amplitudes)
     return Estimate(model, families, state, h, NO_MOTION, base.variance, 1.0), base.steps
 
 
 def _fit_known(capture: FittedViews, h: Tensor, lens: LensPrior) -> tuple[Estimate, int]:
     """Likewise for a camera of a known type, whose constants and typical field are given."""
-    _, _, rotation, translation = _base_start(capture, None, lens)
+    start = _base_start(capture, None, lens)
     aspect = None if capture.square else 1.0
-    distance = float(translation.norm(dim=-1).median())
-    families = lens.families(prior_families(lens.form, lens.focal, capture.board, capture.size, distance, aspect))
+    families = lens.families(prior_families(lens.form, lens.focal, capture.board, capture.size, start.distance, aspect))
     model = LensModel(hybrid=lens.form)
     params = _leading(model, lens.focal, families)
     unknowns = hybrid_unknowns(model, capture.square)
     params[list(unknowns.indices)] = unknowns.expand(lens.unknowns.mean)
-    state = BoardState.still(params, torch.zeros_like(capture.board.unit), rotation, translation)
-    state, variance, steps = _solve_base(dataclasses.replace(capture, readout=None), model, families, state, h, False)
+    state = start.state._replace(parameters=params, board=torch.zeros_like(capture.board.unit))
+    still = dataclasses.replace(capture, readout=None, exact=True)
+    state, variance, steps = _solve_base(still, model, families, state, h, False)
     return Estimate(model, families, state, h, NO_MOTION, variance, 1.0), steps
 
 
@@ -234,14 +286,14 @@ def _solve_base(
     held[int(exact_focal) : 4] = False
     if not capture.square:
         held[-1 - len(capture.board.unit)] = False
+    if not capture.exact:
+        held[len(held) - len(capture.board.unit) :] = False
     problem = capture.problem(Estimate(model, families, state, h, NO_MOTION, 1.0, 1.0), held)
     found = minimize(problem, state, LMOptions(max_iterations=15, tolerance=1e-4, initial_damping=1e-6))
     return found.state, max(2.0 * float(found.cost) / capture.freedom, LEAST_NOISE**2), int(found.iterations)
 
 
-def _base_start(
-    capture: FittedViews, known: float | None, lens: LensPrior | None, exact: bool = False
-) -> tuple[float, float, Tensor, Tensor]:
+def _base_start(capture: FittedViews, known: float | None, lens: LensPrior | None, exact: bool = False) -> Base:
     """Focal length, shape and poses: the base projection, among several, under which homographies fit best.
 
     A roughly known focal length is taken unless another one fits clearly better; an exact one is taken.
@@ -283,7 +335,9 @@ def _base_start(
     if not math.isfinite(float(values[best])):
         raise InputError("no start explains the corners: are all views of this board and from this camera?")
     poses = poses_from_homographies(homographies(points, whole[best]), _PINHOLE)
-    return float(focals[best]), float(shapes[best]), *poses
+    empty = points.new_zeros(0)
+    state, aspect = BoardState.still(empty, empty, *poses), None if capture.square else 1.0
+    return Base(float(focals[best]), float(shapes[best]), aspect, state, float(values[best]), 0)
 
 
 def _through_base(offset: Tensor, seen: Tensor, focal: Tensor | float, shape: Tensor | float) -> tuple[Tensor, Tensor]:

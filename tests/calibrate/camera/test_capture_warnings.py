@@ -1,12 +1,21 @@
-"""What is said of views that moved while their rows were read."""
+"""What is said of views that moved while their rows were read, and of boards that are not as ordered."""
 
 from __future__ import annotations
 
+import math
+from pathlib import Path
+
+import pytest
 import torch
 
+from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.camera.warnings import motion_warnings
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
+from kcal.corners.board import Board
+from kcal.corners.observations import Observations, View
+from kcal.errors import InputError
 from kcal.lens.camera import Camera
+from kcal.lens.pose import rotation_from_vector
 from kcal.lens.zernike import ZernikeModes
 from kcal.sim.board import BoardSize, board_points
 from kcal.sim.captures import sample_board_poses
@@ -37,3 +46,62 @@ def test_few_views_that_moved() -> None:
     """Their error bars are wide, and may still be too small, which no other warning says."""
     few = motion_warnings(fitted(5, HANDS))
     assert [text.startswith("5 views that moved are few") for text in few] == [True, False]
+
+
+def unequal(factor: float, board: Board, roll: float = math.pi, aspect: float = 1.0) -> Observations:
+    """Views of a board whose columns are farther apart than its rows by a factor, by pixels of an aspect ratio."""
+    camera = Camera.build(focal=(900, 900 * aspect), center=(644, 476), size=(1280, 960), coefficients=[-0.1, 0.02])
+    generator, views = torch.Generator().manual_seed(7), []
+    points = (board.points - board.points.mean(0)) * torch.tensor([factor, 1.0, 1.0])
+    for i in range(12):
+        u = 2.0 * torch.rand(6, generator=generator, dtype=torch.float64) - 1.0
+        tilt = rotation_from_vector(torch.stack([0.6 * u[0], 0.6 * u[1], 0.0 * u[0]]))
+        rotation = tilt @ rotation_from_vector(roll * u[2] * torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+        center = torch.stack([0.08 * u[3], 0.05 * u[4], 0.45 + 0.1 * u[5]])
+        pixels = camera.project(points @ rotation.T + center)[0]
+        noisy = pixels + 0.05 * torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
+        inside = camera.inside(noisy).tolist()
+        seen = [(u, v) if ok else None for (u, v), ok in zip(noisy.tolist(), inside, strict=True)]
+        views.append(View(name=f"{i}.png", pixels=seen))
+    return Observations(board=board, image_size=camera.size, views=tuple(views))
+
+
+ASYMMETRIC = Board(columns=4, rows=11, square=0.02, pattern="asymmetric")
+CHECKERBOARD = Board(columns=9, rows=6, square=0.025)
+
+
+class TestSpacing:
+    @pytest.mark.parametrize(
+        ("factor", "board"), [(1.25, ASYMMETRIC), (0.7, CHECKERBOARD), (0.95, CHECKERBOARD), (1.3, CHECKERBOARD)]
+    )
+    def test_columns_that_are_not_as_far_apart_as_rows(self, factor: float, board: Board) -> None:
+        """They are measured and said first, and the camera is right all the same."""
+        found = calibrate_camera(unequal(factor, board))
+        first, *others = found.warnings
+        rows = 1e3 * board.square
+        assert first.startswith(f"columns of the board are {rows * factor:.4g} mm apart, and its rows {rows:g} mm")
+        assert not any(part in text for text in others for part in ("square", "moved", "one camera", "repeat"))
+        assert found.rms < 0.08
+        assert found.camera.focal[0] == pytest.approx(900.0, abs=5.0 * (found.sigma["fx"] or 0.0))
+
+    @pytest.mark.parametrize("options", [CalibrationOptions(model="opencv5"), CalibrationOptions(board="exact")])
+    def test_a_lens_that_cannot_allow_for_it_is_refused(self, options: CalibrationOptions) -> None:
+        with pytest.raises(InputError, match="columns of the board are 30 mm apart, and its rows 25 mm"):
+            calibrate_camera(unequal(1.2, CHECKERBOARD), options)
+        assert calibrate_camera(unequal(1.0, CHECKERBOARD), options).warnings == ()
+
+    @pytest.mark.parametrize(("roll", "aspect"), [(math.pi, 1.0), (0.1, 1.0), (math.pi, 1.25)])
+    def test_a_board_as_ordered_is_not_blamed(self, roll: float, aspect: float) -> None:
+        said = calibrate_camera(unequal(1.0, CHECKERBOARD, roll, aspect)).warnings
+        assert not any("apart" in text for text in said)
+        assert any("pixels are not square" in text for text in said) == (aspect != 1.0)
+
+    def test_real_circles(self, kcal_data: Path) -> None:
+        rows = [line.split(",") for line in (kcal_data / "field/asym/rolled.csv").read_text().splitlines()[1:]]
+        views: dict[str, list[tuple[float, float]]] = {}
+        for name, u, v in rows:
+            views.setdefault(name, []).append((float(u), float(v)))
+        seen = [View(name=name, pixels=corners) for name, corners in views.items()]
+        found = calibrate_camera(Observations(board=ASYMMETRIC, image_size=(1280, 800), views=tuple(seen)))
+        assert found.camera.focal[0] == pytest.approx(954.0, abs=2.0)
+        assert found.warnings[0].startswith("columns of the board are 25 mm apart, and its rows 20 mm")
