@@ -59,7 +59,7 @@ def show_command(
     if content["kcal"] == "rig" and content.get("version") == CAMERA_RIG_VERSION:
         _show_stations(file)
         return
-    cameras, rig = _stored(content) or _derived(file, content["kcal"])
+    cameras, rig = _as_written(content) or _derived(file, content["kcal"])
     for camera in cameras:
         _show_camera(*camera)
     if rig is not None:
@@ -82,7 +82,7 @@ def _show_foreign(file: Path) -> None:
         _show_pose(*pose)
 
 
-def _stored(content: dict[str, Any]) -> tuple[list[_Camera], _Rig | None] | None:
+def _as_written(content: dict[str, Any]) -> tuple[list[_Camera], _Rig | None] | None:
     """Blocks of a file with their summaries; None where it has none, or was changed after they were written."""
     from kcal.io.file_summary import CameraSummary, RigSummary
 

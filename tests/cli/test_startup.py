@@ -84,7 +84,7 @@ def test_what_is_stored_is_what_is_computed(folder: Path, monkeypatch: pytest.Mo
     for name in ("left.json", "plain.json", str(SAMPLE)):
         stored = CliRunner().invoke(app, ["show", str(folder / name)]).output
         with monkeypatch.context() as patch:
-            patch.setattr("kcal.cli.show._stored", lambda content: None)
+            patch.setattr("kcal.cli.show._as_written", lambda content: None)
             assert CliRunner().invoke(app, ["show", str(folder / name)]).output == stored
 
 
