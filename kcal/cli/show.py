@@ -59,7 +59,7 @@ def show_command(
     if content["kcal"] == "rig" and content.get("version") == CAMERA_RIG_VERSION:
         _show_stations(file)
         return
-    cameras, rig = _as_written(content) or _derived(file, content["kcal"])
+    cameras, rig = _as_written(content) or _computed_anew(file, content["kcal"])
     for camera in cameras:
         _show_camera(*camera)
     if rig is not None:
@@ -88,14 +88,16 @@ def _as_written(content: dict[str, Any]) -> tuple[list[_Camera], _Rig | None] | 
 
     try:
         if content["kcal"] == "camera":
-            cameras = [(content, _read(CameraSummary, content["summary"]))]
+            cameras = [(content, _checked_summary(CameraSummary, content["summary"]))]
             rig = None
         else:
-            rig = content, _read(RigSummary, content["summary"])
+            rig = content, _checked_summary(RigSummary, content["summary"])
             if rig[1].of != digest({key: value for key, value in content.items() if key not in ("left", "right")}):
                 return None
             # The rig knows more of its cameras than each of them knew before it was solved.
-            cameras = [(content[side], _read(CameraSummary, content["summary"][side])) for side in ("left", "right")]
+            cameras = [
+                (content[side], _checked_summary(CameraSummary, content["summary"][side])) for side in ("left", "right")
+            ]
         fresh = all(
             known.of == digest(block) and (known.board is None) == (block["calibration"] is None)
             for block, known in cameras
@@ -106,11 +108,11 @@ def _as_written(content: dict[str, Any]) -> tuple[list[_Camera], _Rig | None] | 
         return None
 
 
-def _read(kind: type[_Summary], summary: Any) -> _Summary:
+def _checked_summary(kind: type[_Summary], summary: Any) -> _Summary:
     return kind.model_validate_json(json.dumps(summary), strict=True)
 
 
-def _derived(file: Path, kind: str) -> tuple[list[_Camera], _Rig | None]:
+def _computed_anew(file: Path, kind: str) -> tuple[list[_Camera], _Rig | None]:
     if kind == "camera":
         from kcal.io.camera_file import load_camera
 
