@@ -10,6 +10,7 @@ import os
 import re
 import secrets
 import stat
+import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -159,7 +160,7 @@ def _holder(handle: int) -> str:
 
 
 def read_bytes(path: str | Path, most: int = 2**30) -> bytes:
-    """The bytes of a regular file; a pipe or a device, which may never end, is refused.
+    """The bytes of a regular file, unpacked if it is a .gz; a pipe or a device, which may never end, is refused.
 
     Raises:
         FileError: missing, no regular file, larger than `most` bytes, or not readable.
@@ -168,7 +169,17 @@ def read_bytes(path: str | Path, most: int = 2**30) -> bytes:
         size = os.fstat(file.fileno()).st_size
         if size > most:
             raise FileError(f"{path}: {size / 2**20:.0f} MiB; at most {most / 2**20:.0f} MiB are read")
-        return file.read(most)
+        data = file.read(most)
+    if Path(path).suffix.lower() != ".gz":
+        return data
+    unpacker = zlib.decompressobj(31)
+    try:
+        data = unpacker.decompress(data, most)
+    except zlib.error as error:
+        raise FileError(f"{path}: not gzip that can be unpacked: {error}") from None
+    if not unpacker.eof:
+        raise FileError(f"{path}: cut short, or more than {most / 2**20:.0f} MiB unpacked")
+    return data
 
 
 def read_text(path: str | Path, most: int) -> str:

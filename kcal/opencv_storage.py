@@ -140,8 +140,10 @@ def _from_yaml(text: str) -> Any:
         # As many lines as before, so that messages name the right one.
         return f"!numbers {len(lists) - 1}" + "\n" * match[0].count("\n")
 
-    # The first line is no directive of YAML 1.1, and tabs are not its white space.
-    plain = _LONG_LIST.sub(put_away, re.sub(r"^%.*", "", text, flags=re.MULTILINE).expandtabs())
+    # The first line is no directive of YAML 1.1, tabs are not its white space, and its names end without a space.
+    spaced = re.sub(r"^%.*", "", text, flags=re.MULTILINE).expandtabs()
+    spaced = re.sub(r"^( *(?:- +)?[A-Za-z_][\w.]*):(?=[^\s:/])", r"\1: ", spaced, flags=re.MULTILINE)
+    plain = _LONG_LIST.sub(put_away, spaced)
     if len(plain) > MOST_YAML:
         raise ValueError(f"more than {MOST_YAML // 2**20} MiB besides lists of numbers")
     try:
@@ -160,6 +162,8 @@ class _Nodes(yaml.BaseLoader):
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         """Called for each node."""
+        if str(getattr(self.peek_event(), "tag", "")).startswith("tag:yaml.org,2002:python"):
+            raise ValueError("an object of Python; write arrays as lists (array.tolist())")
         if self.check_event(yaml.AliasEvent):
             raise ValueError("a reference to another part (*name); OpenCV writes none")
         self.depth += 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import yaml
@@ -27,7 +28,8 @@ def read_yaml(text: str, source: str) -> dict[str, Any]:
     if nesting(text.encode("utf-8", "replace")) > MOST_DEPTH:
         raise FileError(f"{source}: nested deeper than {MOST_DEPTH} levels; no file of a camera or a board is")
     try:
-        content = yaml.safe_load(text)
+        # OpenCV's first line is no directive of YAML, and `ros2 topic echo` ends with the start of another document.
+        content = yaml.safe_load(re.sub(r"\A\s*%YAML:.*|^---\s*\Z", "", text, flags=re.MULTILINE))
     except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
         raise FileError(f"{source}: no YAML file: {' '.join(str(error).split())[:300]}") from error
     if not isinstance(content, dict):

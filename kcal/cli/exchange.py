@@ -118,7 +118,7 @@ def import_command(
     ] = None,
     camera: Annotated[str | None, typer.Option(metavar="NAME", help="Take this camera of several.")] = None,
     size: Annotated[
-        str | None, typer.Option(metavar="WIDTHxHEIGHT", help="Image size, where the file has none.")
+        str | None, typer.Option(metavar="WIDTHxHEIGHT", help="Image size, where the file has none or a wrong one.")
     ] = None,
     fisheye: Annotated[
         bool | None, typer.Option("--fisheye/--no-fisheye", help="Whether four coefficients of OpenCV are a fisheye's.")
@@ -142,7 +142,7 @@ def import_command(
 ) -> None:
     """Read a camera or a rig from a file of another program.
 
-    The format is recognized. Two cameras with their relative pose become a rig file. With --board, corners become an
+    The format is recognized. Cameras with their relative poses become a rig file. With --board, corners become an
     observations file: mrcal's corners.vnl, CSV (image,u,v,weight), image_points of OpenCV's sample, and MATLAB's
     imagePoints. GeoJSON and GPX become a survey.csv for `kcal rig --landmarks`.
 
@@ -169,6 +169,7 @@ def import_command(
         raise InputError(f"--unit {unit}: write mm, cm, m or in")
 
     from kcal.io.camera_file import save_camera
+    from kcal.io.camera_rig_file import save_camera_rig
     from kcal.io.formats import import_cameras
     from kcal.io.rig_file import save_rig
 
@@ -177,7 +178,10 @@ def import_command(
     )
     for note in found.notes:
         warn(note)
-    if camera is None and found.is_rig():
+    if camera is None and len(found.poses) > 2 and not found.unread:
+        save_camera_rig(found.camera_rig(), output)
+        out.print(f"rig from {found.format}: {', '.join(found.names)}", markup=False)
+    elif camera is None and found.is_rig() and not found.unread:
         rig = found.rig()
         save_rig(rig, output)
         out.print(f"rig from {found.format}: baseline {float(rig.baseline):.6g} m", markup=False)

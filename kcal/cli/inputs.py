@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeAlias
 import typer
 from typer.models import ArgumentInfo, OptionInfo
 
-from kcal.cli.console import err
+from kcal.cli.console import err, warn
 from kcal.errors import FileError, InputError
 from kcal.file_kind import WORDS, file_kind
 from kcal.files import is_stream
@@ -44,13 +44,15 @@ def picked(found: ImportedCameras, name: str | None, source: str) -> Camera:
     Raises:
         InputError: several cameras and no name, or a name that none has.
     """
-    if name is None and len(found.cameras) == 1:
+    if name is None and len(found.cameras) == 1 and not found.unread:
         return found.cameras[0]
+    if name is not None and name in found.unread:
+        raise InputError(f"{source}: camera {name}: {found.unread[name]}")
     names = list(found.names)
     if len(names) == 2 and name in ("left", "right") and name not in names:
         return found.cameras[("left", "right").index(name)]
     if name is None or names.count(name) != 1:
-        wrong = f"no camera {name!r}" if name else f"{len(names)} cameras"
+        wrong = f"no camera {name!r}" if name else f"{len(names) + len(found.unread)} cameras"
         raise InputError(f"{source}: {wrong}; name one of {', '.join(map(repr, names))}")
     return found.cameras[names.index(name)]
 
@@ -60,7 +62,7 @@ def cameras_and_rig(path: Path) -> tuple[ImportedCameras, StereoRig | None]:
     from kcal.io.formats import import_cameras, recognized
     from kcal.io.rig_file import load_rig
 
-    found = import_cameras(path)
+    found = _notes_said(import_cameras(path))
     if len(found.cameras) == 1:
         return found, None
     if recognized(path) == "kcal":
@@ -76,7 +78,14 @@ def single_camera(source: str) -> Camera:
         return calibrated_camera(source)
     from kcal.io.formats import import_cameras
 
-    return picked(import_cameras(path), name, source)
+    return picked(_notes_said(import_cameras(path)), name, source)
+
+
+def _notes_said(found: ImportedCameras) -> ImportedCameras:
+    """The same, after its notes were said."""
+    for note in found.notes:
+        warn(note)
+    return found
 
 
 def calibrated_camera(source: str | Path) -> Camera:

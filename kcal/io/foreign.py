@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,7 +25,7 @@ from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.lens.pose import nearest_rotation
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import CameraRig, StereoRig
 from kcal.strict_yaml import MOST_BYTES as MOST_YAML
 from kcal.strict_yaml import read_yaml
 from kcal.texts import brief
@@ -62,12 +63,14 @@ class ImportedCameras:
         poses: rotation (3, 3) and translation (3,) of each camera from the reference frame of the file, meters; empty
             if the file contains none.
         notes: what the file left open and how it was read, and what of it kcal does not keep.
+        unread: cameras of the file that cannot be read, each with the reason.
     """
 
     format: str
     cameras: tuple[Camera, ...]
     poses: tuple[CameraPose, ...] = ()
     notes: tuple[str, ...] = ()
+    unread: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -96,6 +99,15 @@ class ImportedCameras:
         left, right = self.cameras
         return StereoRig(left, right, *_second_from_first(self.poses))
 
+    def camera_rig(self) -> CameraRig:
+        """All cameras as a rig, in the frame of the file.
+
+        Raises:
+            InputError: cameras without poses, or with equal names.
+        """
+        turns, shifts = (torch.stack([pose[i] for pose in self.poses]) for i in (0, 1))
+        return CameraRig(self.cameras, self.names, turns, -(turns.mT @ shifts[..., None])[..., 0])
+
     def __repr__(self) -> str:
         return brief(self)
 
@@ -112,6 +124,27 @@ def rig_poses(rig: StereoRig) -> tuple[CameraPose, CameraPose]:
     zero = torch.zeros(3, dtype=torch.float64)
     still = CameraPose(torch.eye(3, dtype=torch.float64), zero)
     return still, CameraPose(rig.right_from_left_rotation, rig.right_from_left_translation)
+
+
+def each_readable(
+    readers: Iterable[tuple[str, Callable[[], Camera]]],
+) -> tuple[tuple[Camera, ...], dict[str, str]]:
+    """The cameras that can be read, and why the others, by name, cannot.
+
+    Raises:
+        ValueError: none can; the reason is that of the first one.
+    """
+    cameras, unread = [], dict[str, str]()
+    for name, read in readers:
+        try:
+            cameras.append(read())
+        except KeyError as error:
+            unread[name] = f"{error.args[0]} is missing"
+        except (ValueError, TypeError) as error:
+            unread[name] = str(error)
+    if unread and not cameras:
+        raise ValueError(next(iter(unread.values())))
+    return tuple(cameras), unread
 
 
 def checked_pose(rotation: Any, translation: Any) -> CameraPose:
@@ -181,24 +214,15 @@ def numbers(value: Any, count: Sequence[int] | int, what: str) -> list[float]:
     Raises:
         ValueError: something else.
     """
-    flat: list[float] = []
-
-    def collect(part: Any) -> None:
-        if isinstance(part, (list, tuple)):
-            for inner in part:
-                collect(inner)
-        elif isinstance(part, bool) or not isinstance(part, (int, float, str)):
-            raise ValueError(f"{what} must be numbers")
-        else:
-            flat.append(float(part))
-
-    collect(value.tolist() if hasattr(value, "tolist") else value)
+    found = flat(value)
+    if found is None:
+        raise ValueError(f"{what} must be numbers")
     allowed = (count,) if isinstance(count, int) else tuple(count)
-    if len(flat) not in allowed:
-        raise ValueError(f"{what} has {len(flat)} numbers; {' or '.join(map(str, allowed))} are needed")
-    if not all(map(math.isfinite, flat)):
+    if len(found) not in allowed:
+        raise ValueError(f"{what} has {len(found)} numbers; {' or '.join(str(n) for n in allowed if n)} are needed")
+    if not all(map(math.isfinite, found)):
         raise ValueError(f"{what} has a number that is not finite")
-    return flat
+    return found
 
 
 def whole_size(width: Any, height: Any) -> tuple[int, int]:
@@ -207,6 +231,90 @@ def whole_size(width: Any, height: Any) -> tuple[int, int]:
     if not all(0 < value < math.inf and value == int(value) for value in sizes):
         raise ValueError(f"the image size is {width} x {height}; positive whole numbers are needed")
     return int(sizes[0]), int(sizes[1])
+
+
+# Keys of files. Names are compared without case and punctuation.
+
+BEFORE = re.compile(r"(left|right|(?:cam(?:era)?)?[0-9])(.+)")
+# Keys of other things than a lens, and keys of a lens.
+OTHER = re.compile(
+    "err|rms|resid|uncert|^std|std$|sigma|view|(?<!principal)point|corner|board|square|pattern|marker|target|grid|time"
+    "|date$|stamp|flag|extrin|pose|rotat|translat|rvec|tvec|quat|orient|posit|world|valid|^new|optimal|undist|rectif|^proj"
+    "|essential|fundamental|fps|rate|name|path|file|version|count|^num|comment|note|desc|serial|id$|header|frame|gain"
+    "|expos|aspect|bias|noise|gyro|acc|imu|body|base(?:line)?$|overlap|resolutions|transform|aabb|scene|bound|render|^(?:[rp][12]?|[qef]|om|h[12]|t[0-9a-z]{0,4})$"
+)
+_LENS = re.compile(
+    "distor|dist[kp]?[0-9]|^dist(?!ance)|coef|lens|^k[0-9]|^p[0-9]|^s[1-4]$|tau|xi$|alpha|beta|gamma|model|skew|binn|roi|tang|radial|fisheye|omni|mirror"
+    "|intrins|matrix|focal|princip|cent(?:er|re)|^[fc][xyuv]$|mapping|stretch|poly|affin|equi|^[dfk]$"
+)
+_MOST_NAMED = 12
+
+
+def bare(key: object) -> str:
+    """A name without case and punctuation."""
+    return re.sub("[^a-z0-9]", "", str(key).lower())
+
+
+def flat(value: Any) -> list[float] | None:
+    """All numbers of a scalar, of nested lists, of an array or of a block with `data`; None for anything else."""
+    if isinstance(value, Mapping):
+        return flat(value["data"]) if "data" in value else None
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        parts = [flat(part) for part in value]
+        return None if any(part is None for part in parts) else [n for part in parts for n in part or ()]
+    try:
+        return None if isinstance(value, bool) else [float(value)]
+    except (TypeError, ValueError):
+        return None
+
+
+class Keys(Mapping[str, Any]):
+    """A mapping that knows which of its keys were read."""
+
+    def __init__(self, content: Mapping[str, Any]) -> None:
+        self.content, self.read = content, set[str]()
+
+    def __getitem__(self, key: str) -> Any:
+        value = self.content[key]
+        self.read.add(key)
+        return value
+
+    def __contains__(self, key: object) -> bool:
+        return key in self.content
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.content)
+
+    def __len__(self) -> int:
+        return len(self.content)
+
+    def rest(self, where: str = "") -> list[str]:
+        """A note on the keys that were not read.
+
+        Raises:
+            ValueError: one of them may describe the lens.
+        """
+        unknown = []
+        for key in set(self.content) - self.read:
+            value, name = self.content[key], bare(key)
+            name = (BEFORE.fullmatch(name) or ("", "", name))[2]
+            found = flat(value)
+            if isinstance(value, Mapping) and found is None and not OTHER.search(name):
+                unknown += Keys(value).rest(f"{where}{key}.")
+            if not found or not any(found):
+                continue
+            if OTHER.search(name) and not (len(found) == 1 and name in ("p1", "p2", "f")):
+                continue
+            if _LENS.search(name) or 4 <= len(found) <= 14:
+                shape = f"{len(found)} numbers" if len(found) > 1 else f"{found[0]:g}"
+                raise ValueError(
+                    f"{where}{key} ({shape}) may describe the lens, and kcal does not know this name; rename it as the "
+                    "format has it (camera_matrix, distortion_coefficients, ...), or delete it if it is no lens's"
+                )
+            unknown.append(f"{where}{key}")
+        return [f"not read: {', '.join(sorted(unknown)[:_MOST_NAMED])}"] if unknown else []
 
 
 @contextmanager
@@ -247,7 +355,8 @@ def core_of(matrix: Any, what: str) -> tuple[list[float], float]:
     """
     fx, skew, cx, below, fy, cy, *last = numbers(matrix, 9, what)
     if below or last != [0.0, 0.0, 1.0]:
-        raise ValueError(f"{what} is no camera matrix")
+        turned = "; exchange its rows and columns" if not (skew or cx or cy) and last[2] == 1.0 else ""
+        raise ValueError(f"{what} is no camera matrix{turned}")
     return [fx, fy, cx, cy], skew
 
 

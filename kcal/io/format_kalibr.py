@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -79,35 +80,67 @@ def fit_omni(rays: Array, pixels: Array, focal: float) -> Array:
     return np.asarray(best.x, dtype=np.float64)
 
 
-def omni_camera(name: str, values: Sequence[float], size: tuple[int, int]) -> tuple[Camera, str]:
-    """The hybrid camera that comes nearest to such a lens over the image, and a note on how near.
+def _central_rays(kind: str, values: Sequence[float], plane: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Rays (N, 3) of places (N, 2) on the plane of a kind of lens, and where (N,) it has one.
+
+    Sources: Mei and Rives 2007 (omni), Usenko et al. 2018 (ds, eucm), Devernay and Faugeras 2001 (fov), Fitzgibbon 2001
+    (division). The places of `theta` are directions times the angle from the axis.
+    """
+    square, first = plane.square().sum(-1), values[0] if values else 0.0
+    radius = square.sqrt()
+    if kind == "omni":
+        root = 1.0 + (1.0 - first**2) * square
+        along = (first + root.clamp_min(0.0).sqrt()) / (square + 1.0)
+        return torch.cat([plane * along[:, None], (along - first)[:, None]], -1), root > 0
+    if kind in ("ds", "eucm"):
+        alpha, beta, behind = (values[1], 1.0, first) if kind == "ds" else (first, values[1], 0.0)
+        root = 1.0 - (2.0 * alpha - 1.0) * beta * square
+        depth = (1.0 - alpha**2 * beta * square) / (alpha * root.clamp_min(0.0).sqrt() + 1.0 - alpha)
+        length = depth**2 + (1.0 - behind**2) * square
+        along = (
+            (depth * behind + length.clamp_min(0.0).sqrt()) / (depth**2 + square) if behind else torch.ones_like(depth)
+        )
+        rays = torch.cat([plane * along[:, None], (along * depth - behind)[:, None]], -1)
+        return rays, (root > 0) & (length > 0)
+    if kind == "division":
+        return torch.cat([plane, 1.0 + first * square[:, None]], -1), square >= 0
+    angle, good = radius, radius < math.pi
+    if kind == "fov":
+        # Tangents of angles near 90° are no rays of a camera.
+        turned = (radius * first).clamp_max(1.55)
+        angle, good = (turned.tan() / (2.0 * math.tan(0.5 * first))).atan(), radius * first < 1.55
+    scale = torch.where(radius > 0, angle.sin() / radius.clamp_min(1e-30), 1.0)
+    return torch.cat([plane * scale[:, None], angle.cos()[:, None]], -1), good
+
+
+def central_camera(kind: str, inner: Camera, values: Sequence[float] = ()) -> tuple[Camera, str]:
+    """The hybrid camera that comes nearest to another program's lens over the image, and a note on how near.
 
     Args:
-        name: of the camera.
-        values: xi, fu, fv, pu, pv, k1, k2, p1, p2.
-        size: (width, height).
+        kind: omni, ds, eucm, fov, division or theta.
+        inner: from the plane of the lens to pixels.
+        values: xi of omni; xi and alpha of ds; alpha and beta of eucm; omega of fov; k of division.
 
     Raises:
         ValueError: a lens that no hybrid lens follows.
     """
-    xi, fu, fv, pu, pv, *lens = map(float, values)
-    if not -1.0 < xi < _MOST_XI:
-        raise ValueError(f"{name}: xi is {xi:g}; from -1 to {_MOST_XI:g} is possible")
-    inner = foreign.named_camera(name, (fu, fv, pu, pv), size, "opencv4", lens)
+    size, name = inner.size, foreign.camera_name(inner, "camera")
+    limits: dict[str, list[tuple[float, float]]]
+    limits = {"omni": [(-1, _MOST_XI)], "ds": [(-1, 1), (0, 1)], "eucm": [(0, 1), (0, 1e3)], "fov": [(0, 3)]}
+    for value, (low, high) in zip(values, limits.get(kind, []), strict=False):
+        if not low < value < high:
+            raise ValueError(f"{name}: {kind} with a parameter of {value:g}; from {low} to {high:g} is possible")
 
     def lines(grid: tuple[int, int]) -> tuple[torch.Tensor, torch.Tensor]:
         pixels = inner.grid(*grid).reshape(-1, 2)
         plane, seen = inner.normalize(pixels)
-        square = plane.square().sum(-1)
-        root = 1.0 + (1.0 - xi * xi) * square
-        along = (xi + root.clamp_min(0.0).sqrt()) / (square + 1.0)
-        rays = torch.cat([plane * along[:, None], (along - xi)[:, None]], -1)
-        good = seen & (root > 0)
+        rays, has = _central_rays(kind, values, plane)
+        good = seen & has
         return rays[good], pixels[good]
 
     rays, pixels = lines(_GRID)
     if len(rays) < _GRID[0] * _GRID[1] // 4:
-        raise ValueError(f"{name}: this omni lens has no ray for most of the image")
+        raise ValueError(f"{name}: this {kind} lens has no ray for most of the image")
     camera, _ = hybrid_through(rays, pixels, size)
     camera.calibration = CameraCalibration(name=name)
     rays, pixels = lines(_BETWEEN)
@@ -115,10 +148,11 @@ def omni_camera(name: str, values: Sequence[float], size: tuple[int, int]) -> tu
     error = (seen - pixels)[shown].norm(dim=-1)
     rms, most = float(error.square().mean().sqrt()), float(error.max())
     if not most < _FAR:
-        raise ValueError(f"{name}: no lens of kcal follows this omni lens: the nearest is {most:.2g} px off")
+        raise ValueError(f"{name}: no lens of kcal follows this {kind} lens: the nearest is {most:.2g} px off")
     covered = float(len(rays) / (_BETWEEN[0] * _BETWEEN[1]))
     rest = "" if covered == 1.0 else f"; {1.0 - covered:.1%} of the image has no ray"
-    return camera, f"{name}: {NAME} became kcal's hybrid lens, RMS {rms:.2g} px, at most {most:.2g} px{rest}"
+    title = NAME if kind == "omni" else f"its {kind} lens"
+    return camera, f"{name}: {title} became kcal's hybrid lens, RMS {rms:.2g} px, at most {most:.2g} px{rest}"
 
 
 # Kalibr's camchain YAML: `cam0`, `cam1`, ... with `T_cn_cnm1` from each camera to the next.
@@ -135,46 +169,66 @@ def read_kalibr(path: Path, hints: foreign.Hints) -> foreign.ImportedCameras:
     if _RESULTS.search(text):
         return _read_results(text, hints)
     content = read_yaml(text, str(path))
-    cameras: list[Camera] = []
-    poses: list[foreign.CameraPose] = []
-    lost: set[str] = set()
-    whole = np.eye(4)
-    while (name := f"cam{len(cameras)}") in content:
-        part = content[name]
-        kind, lens = str(part["camera_model"]), str(part["distortion_model"])
-        if kind == "omni" and lens in ("radtan", "none"):
-            core = foreign.numbers(part["intrinsics"], 5, f"{name} intrinsics")
-            terms = foreign.numbers(part.get("distortion_coeffs", []), (0, 4), f"{name} distortion_coeffs") or [0.0] * 4
-            camera, note = omni_camera(name, [*core, *terms], foreign.whole_size(*part["resolution"]))
-            cameras.append(camera)
-            lost.add(note)
-        elif kind != "pinhole" or lens not in _LENSES:
-            raise ValueError(f"{name}: camera_model {kind} with distortion_model {lens}: kcal reads pinhole with "
-                             f"{', '.join(_LENSES)}, and omni with radtan or none")  # fmt: skip
-        else:
-            coefficients = foreign.numbers(
-                part.get("distortion_coeffs", []), 0 if lens == "none" else 4, f"{name} distortion_coeffs"
-            )
-            intrinsics = foreign.numbers(part["intrinsics"], 4, f"{name} intrinsics")
-            size = foreign.whole_size(*part["resolution"])
-            cameras.append(foreign.named_camera(name, intrinsics, size, _LENSES[lens], coefficients))
-        if "T_cn_cnm1" in part:
-            step = np.array(foreign.numbers(part["T_cn_cnm1"], 16, f"{name} T_cn_cnm1")).reshape(4, 4)
-            whole = step @ whole
-        elif len(cameras) > 1:
-            poses = []
-            lost.add(f"{name} has no T_cn_cnm1")
-            continue
-        poses.append(foreign.checked_pose(whole[:3, :3].tolist(), whole[:3, 3].tolist()))
-        lost |= {f"{key} is not kept" for key in ("T_cam_imu", "timeshift_cam_imu") if key in part}
-    if not cameras:
+    names = [name for name in content if re.fullmatch(r"cam\d+", str(name))]
+    parts = {name: foreign.Keys(content[name]) for name in names}
+    notes: list[str] = []
+    cameras, unread = foreign.each_readable((name, partial(_chain_camera, name, parts[name], notes)) for name in names)
+    if not names:
         raise ValueError("no cam0")
+    whole, poses = np.eye(4), dict[str, foreign.CameraPose]()
+    first: np.ndarray | None = None
+    for i, (name, part) in enumerate(parts.items()):
+        imu = next((_transform(part, key, name) for key in ("T_cam_imu", "T_imu_cam") if key in part), None)
+        if imu is not None:
+            imu = imu if "T_cam_imu" in part else np.linalg.inv(imu)
+            first = imu if not i else first
+        if "T_cn_cnm1" in part:
+            whole = _transform(part, "T_cn_cnm1", name) @ whole
+        elif i and imu is not None and first is not None:
+            whole = imu @ np.linalg.inv(first)
+        elif i:
+            poses = {}
+            notes.append(f"{name} has neither T_cn_cnm1 nor T_cam_imu: no pose is read")
+            break
+        poses[name] = foreign.checked_pose(whole[:3, :3].tolist(), whole[:3, 3].tolist())
+    if first is not None:
+        notes.append("where the IMU is (T_cam_imu) is not kept")
+    for name in parts:
+        notes += parts[name].rest(f"{name}.") if name not in unread else []
     return foreign.ImportedCameras(
         format="kalibr",
-        cameras=tuple(cameras),
-        poses=tuple(poses) if len(poses) == len(cameras) > 1 else (),
-        notes=tuple(sorted(lost)),
+        cameras=cameras,
+        poses=tuple(pose for name, pose in poses.items() if name not in unread) if len(poses) > 1 else (),
+        notes=tuple(dict.fromkeys(notes)),
+        unread=unread,
     )
+
+
+def _transform(part: Mapping[str, Any], key: str, name: str) -> np.ndarray:
+    return np.array(foreign.numbers(part[key], 16, f"{name} {key}")).reshape(4, 4)
+
+
+def _chain_camera(name: str, part: Mapping[str, Any], notes: list[str]) -> Camera:
+    kind, lens = str(part["camera_model"]), str(part.get("distortion_model", "none"))
+    size, before = foreign.whole_size(*part["resolution"]), {"omni": 1, "ds": 2, "eucm": 2}.get(kind, 0)
+    allowed = {"pinhole": (*_LENSES, "fov"), "omni": ("radtan", "none"), "ds": ("none",), "eucm": ("none",)}
+    if lens not in allowed.get(kind, ()):
+        raise ValueError(
+            f"camera_model {kind} with distortion_model {lens}: kcal reads "
+            + ", ".join(f"{model} with {' or '.join(lenses)}" for model, lenses in allowed.items())
+        )
+    *values, fu, fv, pu, pv = foreign.numbers(part["intrinsics"], before + 4, f"{name} intrinsics")
+    count = {"none": (0, 4) if before else 0, "fov": 1}.get(lens, 4)
+    terms = foreign.numbers(part.get("distortion_coeffs", []), count, f"{name} distortion_coeffs")
+    if lens == "none" and any(terms):
+        raise ValueError("distortion_model none with coefficients")
+    model = "pinhole" if lens in ("none", "fov") else _LENSES[lens]
+    inner = foreign.named_camera(name, (fu, fv, pu, pv), size, model, [] if model == "pinhole" else terms)
+    if kind == "pinhole" and lens != "fov":
+        return inner
+    camera, note = central_camera("fov" if lens == "fov" else kind, inner, terms if lens == "fov" else values)
+    notes.append(note)
+    return camera
 
 
 def _read_results(text: str, hints: foreign.Hints) -> foreign.ImportedCameras:

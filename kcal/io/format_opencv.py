@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import configparser
 import dataclasses
 import io
 import json
+import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,7 +14,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import torch
 
 from kcal.errors import InputError
 from kcal.files import read_bytes, read_text, write_atomic
@@ -34,12 +35,13 @@ from kcal.io.foreign import (
     whole_size,
     with_sigmas,
 )
-from kcal.io.format_kalibr import omni_camera
+from kcal.io.keyed import flat, read_keyed
 from kcal.lens.camera import Camera
-from kcal.lens.camera_conversions import OPENCV_MODELS
-from kcal.lens.pose import rotation_from_vector, vector_from_rotation
+from kcal.lens.pose import vector_from_rotation
 from kcal.mat_file import read_mat
 from kcal.opencv_storage import read_storage
+from kcal.strict_json import read_json
+from kcal.strict_npz import read_npz
 
 # OpenCV's YAML, XML and JSON files of one camera or a stereo pair, as its samples write and read them.
 #
@@ -47,86 +49,14 @@ from kcal.opencv_storage import read_storage
 # s3 s4 τx τy), `fisheye_model`; `xi` of an omnidir camera; `stdDeviationsIntrinsics` of `calibrateCamera`. A pair:
 # `M1`, `D1`, `M2`, `D2` and `R`, `T`, in one file or in two.
 
-_MATRICES = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "mtx")
-_SIGMAS = ("stdDeviationsIntrinsics", "std_deviations_intrinsics", "stdDeviations", "std_deviations")
-_COEFFICIENTS = ("distortion_coefficients", "distCoeffs", "Distortion_Coefficients", "D", "dist")
-
 
 def read_opencv(path: Path, hints: Hints) -> ImportedCameras:
     """Read one camera, a pair, or the R and T of a pair whose cameras are in another file."""
-    stored = read_storage(read_bytes(path, MOST_BYTES), str(path))
-    notes: list[str] = []
-    size = hints.size or _stored_size(stored)
-    pairs = [("M1", "D1", "left"), ("M2", "D2", "right")]
-    if "M1" not in stored and "cameraMatrix1" in stored:
-        pairs = [("cameraMatrix1", "distCoeffs1", "left"), ("cameraMatrix2", "distCoeffs2", "right")]
-    poses: tuple[CameraPose, ...] = ()
-    if "R" in stored and "T" in stored:
-        meters = hints.meters or 1.0
-        rotation, translation = numbers(stored["R"], 9, "R"), [meters * t for t in numbers(stored["T"], 3, "T")]
-        poses = (checked_pose(np.eye(3).tolist(), [0.0, 0.0, 0.0]), checked_pose(rotation, translation))
-        if hints.meters is None:
-            notes.append("the unit of T is not in the file: taken as meters (--unit mm for millimeters)")
-    if pairs[0][0] not in stored:
-        matrix, coefficients = _present(stored, _MATRICES), _present(stored, _COEFFICIENTS)
-        pairs = [(matrix, coefficients, path.stem)] if matrix else []
-        if not pairs and not poses:
-            raise ValueError(f"no camera; {_MATRICES[0]}, M1 or R and T are needed")
-    cameras = tuple(
-        _opencv_camera(stored, matrix, coefficients, name, size, hints.fisheye, notes)
-        for matrix, coefficients, name in pairs
-    )
-    return ImportedCameras(format="opencv", cameras=cameras, poses=poses, notes=tuple(dict.fromkeys(notes)))
-
-
-def _present(stored: Mapping[str, Any], names: Sequence[str]) -> str:
-    return next((name for name in names if name in stored), "")
-
-
-def _stored_size(stored: Mapping[str, Any]) -> tuple[int, int] | None:
-    width, height = (
-        _present(stored, [f"image_{side}", f"image_{side.capitalize()}", side]) for side in ("width", "height")
-    )
-    if width and height:
-        return whole_size(*numbers([stored[width], stored[height]], 2, "the image size"))
-    name = _present(stored, ("image_size", "imageSize", "size"))
-    return whole_size(*numbers(stored[name], 2, name)) if name else None
-
-
-def _opencv_camera(
-    stored: Mapping[str, Any],
-    matrix: str,
-    coefficients: str,
-    name: str,
-    size: Any,
-    fisheye: bool | None,
-    notes: list[str],
-) -> Camera:
-    size = known_size(size)
-    core, skew = core_of(stored[matrix], matrix)
-    if skew:
-        notes.append(f"{matrix} has a skew of {skew:g}, which OpenCV does not use and kcal does not take over")
-    lens = numbers(stored.get(coefficients, []), tuple(OPENCV_MODELS), coefficients)
-    if "xi" in stored:
-        if len(lens) != 4 or skew:
-            raise ValueError("an omnidir camera has 4 coefficients and, here, no skew")
-        camera, note = omni_camera(name, [*numbers(stored["xi"], 1, "xi"), *core, *lens], size)
-        notes.append(note)
-        return camera
-    known = fisheye
-    if known is None and "fisheye_model" in stored:
-        known = bool(numbers([stored["fisheye_model"]], 1, "fisheye_model")[0])
-    if known and len(lens) != 4:
-        raise ValueError(f"a fisheye has 4 coefficients, {coefficients} has {len(lens)}")
-    if known is None and len(lens) == 4:
-        notes.append("4 coefficients read as k1 k2 p1 p2; if they are a fisheye's, use --fisheye")
-    model = "fisheye4" if known else OPENCV_MODELS[len(lens)]
-    camera = named_camera(name, core, size, model, lens)
-    if (sigmas := _present(stored, _SIGMAS)) and matrix in _MATRICES:
-        # OpenCV always states those of 14 coefficients.
-        given = numbers(stored[sigmas], (4 + len(lens), 18), sigmas)
-        notes.append(with_sigmas(camera, given[: 4 + len(lens)]))
-    return camera
+    data = read_bytes(path, MOST_BYTES)
+    # `np.savez` of the tutorials.
+    packed = data[:2] == b"PK"
+    stored = read_npz(data, str(path), MOST_BYTES, "camera") if packed else read_storage(data, str(path))
+    return read_keyed(stored, path.stem, hints, "opencv")
 
 
 def write_opencv(cameras: Sequence[Camera], poses: Sequence[CameraPose], path: Path) -> list[Path]:
@@ -161,35 +91,48 @@ def write_opencv(cameras: Sequence[Camera], poses: Sequence[CameraPose], path: P
 # A pair has the rectification of both cameras: a point of the rectified frame of the left camera is at R^T (p + (Tx /
 # fx, 0, 0)) of the right one, with Tx the fourth column of its projection matrix.
 
-_ROS_LENSES = {
-    "plumb_bob": ("opencv5", (4, 5)),
-    "rational_polynomial": ("opencv8", (8,)),
-    "equidistant": ("fisheye4", (4,)),
-}
-
 
 def read_ros(path: Path, hints: Hints) -> ImportedCameras:
-    """Read one camera, and how it is rectified."""
-    content = load_yaml(path)
-    name = str(content.get("camera_name") or path.stem)
-    kind = str(content.get("distortion_model") or "plumb_bob")
-    if kind not in _ROS_LENSES:
-        raise ValueError(f"distortion_model {kind!r}: kcal reads {', '.join(_ROS_LENSES)}")
-    model, counts = _ROS_LENSES[kind]
-    core, skew = core_of(content["camera_matrix"]["data"], "camera_matrix")
-    lens = numbers(content["distortion_coefficients"]["data"], (*counts, 0), "distortion_coefficients")
-    notes = [f"camera_matrix has a skew of {skew:g}, which kcal does not take over"] if skew else []
-    size = whole_size(content["image_width"], content["image_height"])
-    camera = named_camera(name, core, size, model if lens else "pinhole", lens)
-    poses: tuple[CameraPose, ...] = ()
-    if "rectification_matrix" in content and "projection_matrix" in content:
-        rotation = np.array(numbers(content["rectification_matrix"]["data"], 9, "rectification_matrix")).reshape(3, 3)
-        projection = np.array(numbers(content["projection_matrix"]["data"], 12, "projection_matrix")).reshape(3, 4)
-        if not projection[0, 0] > 0 or not projection[1, 1] > 0:
-            raise ValueError("projection_matrix has no focal length")
-        beside = np.array([projection[0, 3] / projection[0, 0], projection[1, 3] / projection[1, 1], 0.0])
-        poses = (checked_pose(rotation.T.tolist(), (rotation.T @ beside).tolist()),)
-    return ImportedCameras(format="ros", cameras=(camera,), poses=poses, notes=tuple(notes))
+    """Read one camera, and how it is rectified; YAML, or the text that the calibrator calls `ost.txt`."""
+    text = read_text(path, MOST_BYTES)
+    content = _sections(text) if ROS_TEXT.search(text) else load_yaml(path)
+    found = read_keyed(content, str(content.get("camera_name") or path.stem), hints, "ros")
+    turn, projected = (
+        flat(content.get(long, content.get(short, content.get(short.lower()))))
+        for long, short in (("rectification_matrix", "R"), ("projection_matrix", "P"))
+    )
+    if not turn or not projected or len(found.cameras) != 1:
+        return found
+    rotation = np.array(numbers(turn, 9, "rectification_matrix")).reshape(3, 3)
+    projection = np.array(numbers(projected, 12, "projection_matrix")).reshape(3, 4)
+    if not projection[0, 0] > 0 or not projection[1, 1] > 0:
+        raise ValueError("projection_matrix has no focal length")
+    beside = np.array([projection[0, 3] / projection[0, 0], projection[1, 3] / projection[1, 1], 0.0])
+    pose = checked_pose(rotation.T.tolist(), (rotation.T @ beside).tolist())
+    return dataclasses.replace(found, poses=(pose,))
+
+
+# The calibrator's `ost.txt`: names of values, each above its numbers.
+ROS_TEXT = re.compile(r"^\s*camera matrix\s*$", re.MULTILINE)
+
+
+def _sections(text: str) -> dict[str, Any]:
+    """Its values by their names; the name of the last section is the camera's."""
+    found: dict[str, Any] = {}
+    name = ""
+    for line in map(str.strip, text.splitlines()):
+        if line.startswith("["):
+            found["camera_name"] = line.strip("[]")
+        elif re.match("[A-Za-z]", line):
+            name = {"width": "image_width", "height": "image_height", "distortion": "distortion_coefficients"}.get(
+                line, f"{line}_matrix" if line in ("rectification", "projection") else line.replace(" ", "_")
+            )
+            if name in found:
+                raise ValueError(f"{line} is there twice: two cameras in one file; split it")
+            found[name] = []
+        elif line and not line.startswith("#"):
+            found[name] += [float(word) for word in line.split()]
+    return found
 
 
 def write_ros(cameras: Sequence[Camera], poses: Sequence[CameraPose], path: Path) -> list[Path]:
@@ -252,43 +195,16 @@ _MOST_BYTES = 2**20
 
 def read_toml(path: Path, hints: Hints) -> ImportedCameras:
     """Read all cameras of a file; poses are from the frame of the world, if every camera has one."""
-    content = tomllib.loads(read_text(path, _MOST_BYTES))
-    inside = content.get("cameras")
-    tables = {**content, **inside} if isinstance(inside, Mapping) else content
-    parts = {key: part for key, part in tables.items() if isinstance(part, Mapping) and "matrix" in part}
-    if not parts:
-        raise ValueError("no camera: a table with matrix, distortions and size is needed")
-    cameras = tuple(_toml_camera(key, part, hints) for key, part in parts.items())
-    poses = tuple(_toml_pose(part, hints.meters or 1.0) for part in parts.values() if part.get("rotation") is not None)
-    complete = len(poses) == len(cameras)
-    unsaid = complete and hints.meters is None and any(bool(pose.translation.any()) for pose in poses)
-    notes = (
-        ["the unit of translation is not in the file: taken as meters (--unit mm for millimeters)"] if unsaid else []
-    )
-    if poses and not complete:
-        notes.append("some cameras have no rotation: no pose is read")
-    return ImportedCameras(format="toml", cameras=cameras, poses=poses if complete else (), notes=tuple(notes))
-
-
-def _toml_camera(key: str, part: Mapping[str, Any], hints: Hints) -> Camera:
-    name = str(part.get("name", key))
-    size = known_size(whole_size(*numbers(part["size"], 2, f"{name} size")) if "size" in part else hints.size)
-    core, skew = core_of(part["matrix"], f"{name} matrix")
-    if skew:
-        raise ValueError(f"{name}: matrix has a skew of {skew:g}, which aniposelib does not know")
-    lens = numbers(part.get("distortions", []), tuple(OPENCV_MODELS), f"{name} distortions")
-    fisheye = bool(part.get("fisheye", False))
-    if (fisheye and len(lens) < 4) or (fisheye and any(lens[4:])):
-        raise ValueError(f"{name}: a fisheye has 4 coefficients, distortions has {len(lens)}")
-    return named_camera(
-        name, core, size, "fisheye4" if fisheye else OPENCV_MODELS[len(lens)], lens[:4] if fisheye else lens
-    )
-
-
-def _toml_pose(part: Mapping[str, Any], meters: float) -> CameraPose:
-    turn = numbers(part["rotation"], (3, 9), "rotation")
-    rotation = plain(rotation_from_vector(torch.tensor(turn, dtype=torch.float64))) if len(turn) == 3 else turn
-    return checked_pose(rotation, [meters * value for value in numbers(part["translation"], 3, "translation")])
+    text = read_text(path, _MOST_BYTES)
+    try:
+        content: Mapping[str, Any] = tomllib.loads(text)
+    except tomllib.TOMLDecodeError:
+        if path.suffix.lower() == ".toml":
+            raise
+        sections = configparser.RawConfigParser(strict=True)
+        sections.read_string(text)
+        content = {name: dict(sections[name]) for name in sections.sections()}
+    return read_keyed(content, path.stem, hints, "toml")
 
 
 def write_toml(cameras: Sequence[Camera], poses: Sequence[CameraPose], path: Path) -> list[Path]:
@@ -328,7 +244,10 @@ _METERS = {"mm": 1e-3, "millimeters": 1e-3, "cm": 1e-2, "centimeters": 1e-2, "m"
 
 def read_matlab(path: Path, hints: Hints) -> ImportedCameras:
     """Read a struct of `cameraParameters`, `cameraIntrinsics` or `stereoParameters`; objects must be made structs."""
-    structs = read_mat(read_bytes(path, MOST_BYTES), str(path))
+    data = read_bytes(path, MOST_BYTES)
+    structs = read_json(data, str(path)) if data[:1] == b"{" else read_mat(data, str(path))
+    if {"fc", "cc"} <= set(structs) or {"fc_left", "fc_right"} <= set(structs):
+        return _bouguet(structs, path.stem, hints)
     # A file may hold one struct, or its fields.
     candidates = [*structs.items(), (path.stem, structs)]
     errors = next((value for _, value in candidates if isinstance(value, Mapping) and _ERRORS & set(value)), {})
@@ -340,6 +259,30 @@ def read_matlab(path: Path, hints: Hints) -> ImportedCameras:
             found = ImportedCameras(format="matlab", cameras=(_matlab_camera(value, name, hints),))
             return _with_errors(found, [errors.get("IntrinsicsErrors")])
     raise ValueError("no struct of camera parameters; save one with s = toStruct(params); save('file.mat', 's')")
+
+
+def _bouguet(value: Mapping[str, Any], name: str, hints: Hints) -> ImportedCameras:
+    """What Bouguet's toolbox saves: pixels from 0, the skew as a fraction of fx, and errors of three deviations.
+
+    Source: Camera Calibration Toolbox for Matlab, "Description of the calibration parameters".
+    """
+    content = {
+        new: value[old] for new, old in (("width", "nx"), ("height", "ny"), ("R", "R"), ("T", "T")) if old in value
+    }
+    for side in ("", "_left", "_right"):
+        if f"fc{side}" in value:
+            fx, fy, cx, cy = (*numbers(value[f"fc{side}"], 2, "fc"), *numbers(value[f"cc{side}"], 2, "cc"))
+            alpha = numbers(value.get(f"alpha_c{side}", 0.0), 1, "alpha_c")[0]
+            own = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "skew": alpha * fx, "kc": value.get(f"kc{side}", [])}
+            content |= {f"{key}{side}": number for key, number in own.items()}
+    if {"fc_error", "cc_error", "kc_error"} <= set(value):
+        errors = (numbers(value[key], range(6), key) for key in ("fc_error", "cc_error", "kc_error"))
+        content["std_dev"] = [error / 3.0 for part in errors for error in part]
+    found = read_keyed(content, name, hints._replace(meters=hints.meters or 1e-3), "matlab")
+    unsaid = (
+        ("the unit of T is not in the file: taken as millimeters (--unit)",) if found.poses and not hints.meters else ()
+    )
+    return dataclasses.replace(found, notes=(*found.notes, *unsaid))
 
 
 def _with_errors(found: ImportedCameras, errors: Sequence[Any]) -> ImportedCameras:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import math
+import re
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree.ElementTree import Element
@@ -15,6 +18,7 @@ import torch
 import kcal.io.foreign as foreign
 from kcal.errors import InputError
 from kcal.files import dump_json, read_bytes, read_text, write_atomic
+from kcal.io.format_kalibr import central_camera
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
@@ -39,9 +43,12 @@ def read_agisoft(path: Path, hints: foreign.Hints) -> foreign.ImportedCameras:
     """Read the adjusted calibration of every sensor; poses are in a frame of the chunk and not read."""
     root = read_xml(read_bytes(path, foreign.MOST_BYTES), str(path))
     sensors = [part for part in root.iter("sensor") if part.find("calibration") is not None] or [root]
-    cameras = tuple(_agisoft_camera(part, number) for number, part in enumerate(sensors))
+    cameras, unread = foreign.each_readable(
+        (part.get("label") or f"sensor {number}", partial(_agisoft_camera, part, number))
+        for number, part in enumerate(sensors)
+    )
     notes = ("the poses of images are not read",) if root.find(".//camera/transform") is not None else ()
-    return foreign.ImportedCameras(format="agisoft", cameras=cameras, notes=notes)
+    return foreign.ImportedCameras(format="agisoft", cameras=cameras, notes=notes, unread=unread)
 
 
 def _agisoft_camera(sensor: Element, number: int) -> Camera:
@@ -125,6 +132,20 @@ COLMAP_MODELS = {
     "FULL_OPENCV": ColmapModel(6, (*_TWO, "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), "opencv8"),
     "SIMPLE_RADIAL_FISHEYE": ColmapModel(8, ("f", *_CENTER, "k1"), "fisheye4"),
     "RADIAL_FISHEYE": ColmapModel(9, ("f", *_CENTER, "k1", "k2"), "fisheye4"),
+    "SIMPLE_FISHEYE": ColmapModel(14, ("f", *_CENTER), "fisheye4"),
+    "FISHEYE": ColmapModel(15, _TWO, "fisheye4"),
+    # Those that become hybrid lenses.
+    "FOV": ColmapModel(7, (*_TWO, "omega"), "fov"),
+    "THIN_PRISM_FISHEYE": ColmapModel(
+        10,
+        (*_TWO, "k1", "k2", "p1", "p2", "k3", "k7", "s1", "s3"),
+        "theta",  # kcal's names: k4 is a denominator's
+    ),
+    "SIMPLE_DIVISION": ColmapModel(12, ("f", *_CENTER, "k"), "division"),
+    "DIVISION": ColmapModel(13, (*_TWO, "k"), "division"),
+    "EUCM": ColmapModel(-1, (*_TWO, "alpha", "beta"), "eucm"),
+    # Known, so that other cameras of a binary file can be read, and held by no lens of kcal.
+    "RAD_TAN_THIN_PRISM_FISHEYE": ColmapModel(11, (*_TWO, *(f"c{i}" for i in range(12))), ""),
 }
 WRITTEN = {"pinhole": "PINHOLE", "opencv4": "OPENCV", "opencv8": "FULL_OPENCV", "fisheye4": "OPENCV_FISHEYE"}
 
@@ -134,24 +155,37 @@ def read_colmap(path: Path, hints: foreign.Hints) -> foreign.ImportedCameras:
     entries = _from_binary(read_bytes(path, foreign.MOST_BYTES)) if path.suffix.lower() == ".bin" else _from_text(path)
     if not entries:
         raise ValueError("no cameras")
-    cameras = tuple(_colmap_camera(*entry) for entry in entries)
-    return foreign.ImportedCameras(format="colmap", cameras=cameras)
+    notes: list[str] = []
+    cameras, unread = foreign.each_readable(
+        (str(entry[0]), partial(_colmap_camera, *entry, notes)) for entry in entries
+    )
+    return foreign.ImportedCameras(format="colmap", cameras=cameras, notes=tuple(notes), unread=unread)
 
 
-def _colmap_camera(number: int, name: str, size: tuple[int, int], values: Sequence[float]) -> Camera:
-    known = COLMAP_MODELS[name]
+def _colmap_camera(number: int, name: str, size: tuple[int, int], values: Sequence[float], notes: list[str]) -> Camera:
+    known = _known(name)
     given = dict(zip(known.parameters, values, strict=True))
     fx = given.pop("fx", None) or given["f"]
     fy = given.pop("fy", None) or given.pop("f")
     cx, cy = given.pop("cx") - _HALF, given.pop("cy") - _HALF
+    if known.model in ("fov", "theta", "division", "eucm"):
+        lens = (
+            LensModel(numerator=4, tangential=True, prism=1) if known.model == "theta" else LensModel.named("pinhole")
+        )
+        inner = foreign.named_camera(str(number), (fx, fy, cx, cy), size, lens, [given[name] for name in lens.names])
+        camera, note = central_camera(known.model, inner, [given[name] for name in given if name not in lens.names])
+        notes.append(note)
+        return camera
     # What is left are coefficients, and kcal has the same names in the same order.
     return foreign.named_camera(str(number), (fx, fy, cx, cy), size, known.model, list(given.values()))
 
 
 def _known(name: str) -> ColmapModel:
-    if name not in COLMAP_MODELS:
-        raise ValueError(f"camera model {name}: kcal reads {', '.join(COLMAP_MODELS)}")
-    return COLMAP_MODELS[name]
+    known = COLMAP_MODELS.get(name)
+    if known is None or not known.model:
+        readable = ", ".join(name for name, model in COLMAP_MODELS.items() if model.model)
+        raise ValueError(f"camera model {name}: kcal reads {readable}")
+    return known
 
 
 def _from_text(path: Path) -> list[tuple[int, str, tuple[int, int], list[float]]]:
@@ -160,7 +194,12 @@ def _from_text(path: Path) -> list[tuple[int, str, tuple[int, int], list[float]]
         fields = line.split()
         if not fields or fields[0].startswith("#"):
             continue
-        if len(fields) < 5 or len(fields) != 4 + len(_known(fields[1]).parameters):
+        known = COLMAP_MODELS.get(fields[1]) if len(fields) > 4 else None
+        if (
+            len(fields) < 5
+            or not re.fullmatch(r"\d+ [A-Z0-9_]+", " ".join(fields[:2]))
+            or (known and len(fields) != 4 + len(known.parameters))
+        ):
             raise ValueError(f"line {number}: ID MODEL WIDTH HEIGHT and the model's parameters are needed")
         values = [float(field) for field in fields[4:]]
         entries.append((int(fields[0]), fields[1], foreign.whole_size(fields[2], fields[3]), values))
@@ -206,42 +245,79 @@ def write_colmap(cameras: Sequence[Camera], poses: Sequence[foreign.CameraPose],
 
 
 # nerfstudio's `transforms.json`: intrinsics of one camera, or of each frame. Pixel (0.5, 0.5) is the first center.
+#
+# `camera_model` names a lens of COLMAP, but the program has two: k1 to k4 of r², r⁴, r⁶, r⁸ with p1 and p2, and
+# OpenCV's fisheye. instant-ngp says `is_fisheye`. Both may have a field of view in place of the focal length.
 
-_FIELDS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_model", "k1", "k2", "k3", "k4", "p1", "p2")
+_PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
+_FIELDS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_model", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2",
+           "distortion_params", "is_fisheye", "camera_angle_x", "camera_angle_y")  # fmt: skip
 
 
 def read_nerfstudio(path: Path, hints: foreign.Hints) -> foreign.ImportedCameras:
     """Read the cameras; frames with intrinsics of their own that are equal are one camera."""
-    content = read_json(read_bytes(path, foreign.MOST_BYTES), str(path))
+    content = foreign.Keys(read_json(read_bytes(path, foreign.MOST_BYTES), str(path)))
     frames = content.get("frames", [])
     shared = {key: content[key] for key in _FIELDS if key in content}
     found: dict[str, dict[str, Any]] = {}
-    for i, frame in enumerate(frames or [{}]):
+    notes = content.rest()
+    for i, frame in enumerate(foreign.Keys(frame) for frame in frames or [{}]):
         values = shared | {key: frame[key] for key in _FIELDS if key in frame}
+        notes += frame.rest()
         found.setdefault(json.dumps(values, sort_keys=True), values | {"name": str(frame.get("file_path", i))})
     single = len(found) == 1
-    cameras = tuple(_nerfstudio_camera(values, path.stem if single else values["name"]) for values in found.values())
-    notes = ("the poses of the frames are not kept",) if any("transform_matrix" in frame for frame in frames) else ()
-    return foreign.ImportedCameras(format="nerfstudio", cameras=cameras, notes=notes)
+    named = {path.stem if single else values.pop("name"): values for values in found.values()}
+    cameras, unread = foreign.each_readable(
+        (name, partial(_nerfstudio_camera, values, name, hints)) for name, values in named.items()
+    )
+    if any("transform_matrix" in frame for frame in frames):
+        notes.append("the poses of the frames are not kept")
+    return foreign.ImportedCameras(
+        format="nerfstudio", cameras=cameras, notes=tuple(dict.fromkeys(notes)), unread=unread
+    )
 
 
-def _nerfstudio_camera(values: dict[str, Any], name: str) -> Camera:
+def _nerfstudio_camera(values: dict[str, Any], name: str, hints: foreign.Hints) -> Camera:
     kind = str(values.get("camera_model", "OPENCV"))
-    if kind not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FISHEYE"):
-        raise ValueError(f"camera_model {kind}: kcal reads OPENCV, PINHOLE and OPENCV_FISHEYE")
-    size = foreign.whole_size(values["w"], values["h"])
-    fx, cx, cy = foreign.numbers([values["fl_x"], values["cx"], values["cy"]], 3, "fl_x, cx, cy")
-    fy = float(values.get("fl_y", fx))
-    k1, k2, k3, k4, p1, p2 = (float(values.get(key, 0.0)) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    intrinsics = (fx, fy, cx - _HALF, cy - _HALF)
-    if kind == "OPENCV_FISHEYE":
-        return foreign.named_camera(name, intrinsics, size, "fisheye4", [k1, k2, k3, k4])
-    if k4:
-        raise ValueError("k4 is a fourth radial coefficient here, which kcal's models with OpenCV's names do not have")
-    lens = [k1, k2, p1, p2, k3] if kind == "OPENCV" else []
-    while lens and lens[-1] == 0.0 and len(lens) > 4:
-        lens.pop()
-    return foreign.named_camera(name, intrinsics, size, {0: "pinhole", 4: "opencv4", 5: "opencv5"}[len(lens)], lens)
+    fisheye = kind in ("OPENCV_FISHEYE", "fisheye") or values.get("is_fisheye") in (True, 1)
+    if kind not in (*_PERSPECTIVE, "OPENCV_FISHEYE", "fisheye"):
+        raise ValueError(f"camera_model {kind}: kcal reads {', '.join(_PERSPECTIVE)} and OPENCV_FISHEYE")
+    if "w" in values and "h" in values:
+        size = foreign.whole_size(values["w"], values["h"])
+    else:
+        size = foreign.known_size(hints.size)
+    given = {key: foreign.numbers(value, 1, key)[0] for key, value in values.items() if key in _NUMBERS}
+    if "distortion_params" in values:
+        stated = foreign.numbers(values["distortion_params"], 6, "distortion_params")
+        given |= dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), stated, strict=True))
+    # In place of the focal length there may be the angle of view.
+    fx, fy = (
+        given.get(f"fl_{axis}") or (0.5 * side / math.tan(0.5 * angle) if angle else 0.0)
+        for axis, side in zip("xy", size, strict=True)
+        for angle in (given.get(f"camera_angle_{axis}"),)
+    )
+    if not fx and not fy:
+        raise ValueError("neither fl_x nor camera_angle_x is there")
+    center = [given.get(key, 0.5 * side) - _HALF for key, side in zip(("cx", "cy"), size, strict=True)]
+    stray = [key for key in (("p1", "p2", "k5", "k6") if fisheye else ("k5", "k6")) if given.get(key)]
+    if stray:
+        raise ValueError(f"{', '.join(stray)}: {'a fisheye' if fisheye else 'a lens of nerfstudio'} has no such term")
+    # kcal's name for a fourth radial coefficient; k4 is a denominator's.
+    lens = given | {"k7": given.get("k4", 0.0)}
+    if fisheye:
+        model = LensModel.named("fisheye4")
+    elif lens["k7"]:
+        model = LensModel(numerator=4, tangential=True)
+    elif lens.get("k3"):
+        model = LensModel.named("opencv5")
+    else:
+        bent = any(lens.get(key) for key in ("k1", "k2", "p1", "p2")) or kind not in ("PINHOLE", "SIMPLE_PINHOLE")
+        model = LensModel.named("opencv4" if bent else "pinhole")
+    terms = [lens.get(key, 0.0) for key in model.names]
+    return foreign.named_camera(name, (fx or fy, fy or fx, *center), size, model, terms)
+
+
+_NUMBERS = {*_FIELDS} - {"camera_model", "distortion_params", "is_fisheye"}
 
 
 def write_nerfstudio(cameras: Sequence[Camera], poses: Sequence[foreign.CameraPose], path: Path) -> list[Path]:
@@ -284,13 +360,15 @@ def read_opensfm(path: Path, hints: foreign.Hints) -> foreign.ImportedCameras:
     if isinstance(content, list):
         content = content[0]
     content = content.get("cameras", content)
-    cameras = tuple(_opensfm_camera(name, value) for name, value in content.items())
-    if not cameras:
+    if not content:
         raise ValueError("no cameras")
-    return foreign.ImportedCameras(format="opensfm", cameras=cameras)
+    cameras, unread = foreign.each_readable(
+        (name, partial(_opensfm_camera, name, foreign.Keys(value))) for name, value in content.items()
+    )
+    return foreign.ImportedCameras(format="opensfm", cameras=cameras, unread=unread)
 
 
-def _opensfm_camera(name: str, value: Mapping[str, Any]) -> Camera:
+def _opensfm_camera(name: str, value: foreign.Keys) -> Camera:
     kind = str(value["projection_type"])
     if kind not in _OPENSFM_LENSES:
         raise ValueError(f"{name}: projection_type {kind}: kcal reads {', '.join(_OPENSFM_LENSES)}")
@@ -302,7 +380,9 @@ def _opensfm_camera(name: str, value: Mapping[str, Any]) -> Camera:
     cx, cy = (
         longer * float(value.get(key, 0.0)) + 0.5 * (side - 1) for key, side in zip(("c_x", "c_y"), size, strict=True)
     )
-    return foreign.named_camera(name, (fx, fy, cx, cy), size, model, [float(value.get(key, 0.0)) for key in names])
+    lens = [float(value.get(key, 0.0)) for key in names]
+    value.rest()
+    return foreign.named_camera(name, (fx, fy, cx, cy), size, model, lens)
 
 
 def write_opensfm(cameras: Sequence[Camera], poses: Sequence[foreign.CameraPose], path: Path) -> list[Path]:

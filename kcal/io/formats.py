@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import json
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -11,7 +12,7 @@ from pathlib import Path
 import torch
 
 from kcal.errors import FileError, InputError
-from kcal.files import read_head, read_text
+from kcal.files import read_bytes, read_head, read_text
 from kcal.io import (
     format_kalibr,
     format_mrcal,
@@ -20,10 +21,19 @@ from kcal.io import (
     format_prior,
 )
 from kcal.io.camera_file import load_camera
-from kcal.io.foreign import MOST_BYTES, CameraPose, Hints, ImportedCameras, reading, rig_poses
+from kcal.io.foreign import (
+    MOST_BYTES,
+    CameraPose,
+    Hints,
+    ImportedCameras,
+    camera_name,
+    reading,
+    rig_poses,
+)
+from kcal.io.keyed import speaks_of_camera
 from kcal.io.rig_file import load_rig
 from kcal.lens.camera import Camera
-from kcal.lens.camera_conversions import OPENCV_MODELS
+from kcal.lens.camera_conversions import OPENCV_MODELS, size_doubt
 from kcal.lens.model import LensModel
 from kcal.strict_json import MOST_BYTES as MOST_JSON
 from kcal.strict_json import read_json
@@ -127,7 +137,7 @@ FORMATS = {
         pose=False,
     ),
     "toml": CameraFormat(
-        title="TOML of aniposelib, pose2sim and Caliscope",
+        title="TOML of aniposelib, pose2sim and Caliscope; INI",
         suffixes=(".toml",),
         models=(*OPENCV_MODELS.values(), "fisheye4"),
         read=format_opencv.read_toml,
@@ -187,26 +197,33 @@ def recognized(path: Path) -> str:
     Raises:
         FileError: it cannot be read, or is of no known format.
     """
-    suffix = path.suffix.lower()
+    suffix = (path.with_suffix("") if path.suffix.lower() == ".gz" else path).suffix.lower()
     read_head(path, 0)
-    if suffix in (".mat", ".cameramodel", ".bin", ".npz"):
-        return {".mat": "matlab", ".cameramodel": "mrcal", ".bin": "colmap", ".npz": "numpy"}[suffix]
+    if suffix in (".mat", ".cameramodel", ".bin"):
+        return {".mat": "matlab", ".cameramodel": "mrcal", ".bin": "colmap"}[suffix]
+    if suffix == ".npz":
+        # Names of arrays are in clear in an archive.
+        return "numpy" if b"kcal_prior" in read_bytes(path, MOST_BYTES) else "opencv"
     text = read_text(path, MOST_BYTES)
-    if suffix == ".toml":
+    if format_opencv.ROS_TEXT.search(text):
+        return "ros"
+    if suffix == ".toml" or re.match(r"\s*([#;].*\s+)*\[\w[\w .-]*\]\s*\n", text):
         return "toml"
     # mrcal's files begin with comments.
     if suffix == ".json" or re.sub(r"^\s*#.*$", "", text, flags=re.MULTILINE).lstrip()[:1] in ("{", "["):
         return _json_format(path, text)
     if (found := _XML.search(text)) is not None:
         return "qualisys" if found[0] == "<cameras" else "agisoft"
+    if re.search(r"^cam\d+\s*:|^cam0 \(.*\):", text, re.MULTILINE):
+        return "kalibr"
     if suffix == ".xml" or "opencv-matrix" in text or text.startswith("%YAML"):
         return "opencv"
-    if re.search(r"^cam0\s*:|^cam0 \(.*\):", text, re.MULTILINE):
-        return "kalibr"
-    if re.search(r"^camera_matrix\s*:", text, re.MULTILINE):
-        return "ros"
-    if suffix == ".txt" or re.search(r"^\d+ [A-Z_]+ \d+ \d+ ", text, re.MULTILINE):
+    if re.search(r"^\d+ [A-Z][A-Z0-9_]+ \d+ \d+ ", text, re.MULTILINE):
         return "colmap"
+    if speaks_of_camera(text):
+        return (
+            "ros" if re.search(r"^(distortion_model|(rectif|project)\w+_matrix)\s*:", text, re.MULTILINE) else "opencv"
+        )
     raise FileError(f"{path}: not a camera file that kcal knows; name its format (--format {', '.join(FORMATS)})")
 
 
@@ -218,17 +235,26 @@ def _json_format(path: Path, text: str) -> str:
         if "lensmodel" in text or "distortion_model" in text:
             return "mrcal"
         raise FileError(f"{path}: neither a camera file that kcal knows nor JSON that can be read ({error})") from None
-    if isinstance(content, dict) and "kcal" in content:
-        return "kcal"
-    if isinstance(content, dict) and "kcal_prior" in content:
-        return "ceres"
-    if isinstance(content, dict) and ("fl_x" in content or "frames" in content):
-        return "nerfstudio"
     if "projection_type" in text:
         return "opensfm"
-    if isinstance(content, dict) and ("camera_matrix" in content or "M1" in content):
-        return "opencv"
+    if isinstance(content, dict):
+        for name, marks in _JSON.items():
+            if marks & set(content):
+                return name
+        other = next((program for key, program in _UNREAD.items() if key in content), "")
+        if other:
+            raise FileError(f"{path}: a file of {other}, which kcal does not read; copy its numbers into one of Kalibr")
+        if speaks_of_camera(json.dumps(content, indent=1)):
+            return "opencv"
     raise FileError(f"{path}: a JSON file, but no camera that kcal knows")
+
+
+# Keys that JSON files of a format have, and of programs whose files are not read.
+_UNREAD = {"value0": "Basalt or cereal", "cameraData": "DepthAI", "views": "Meshroom", "sfm_data_version": "OpenMVG"}
+_JSON = {
+    "kcal": {"kcal"}, "ceres": {"kcal_prior"}, "nerfstudio": {"fl_x", "frames", "camera_angle_x"},
+    "matlab": {"RadialDistortion", "IntrinsicMatrix", "CameraParameters1"},
+}  # fmt: skip
 
 
 def import_cameras(
@@ -271,16 +297,36 @@ def import_cameras(
         format_named(format)
     parts = [_imported(Path(path), format, Hints(size, fisheye, meters)) for path in paths]
     cameras = tuple(itertools.chain.from_iterable(part.cameras for part in parts))
+    unread = {name: reason for part in parts for name, reason in part.unread.items()}
     poses = tuple(itertools.chain.from_iterable(part.poses for part in parts))
     if not cameras:
         raise InputError(f"{paths[0]}: the pose of a pair without its cameras; name the file of the cameras too")
-    notes = tuple(dict.fromkeys(itertools.chain.from_iterable(part.notes for part in parts)))
+    notes = [*itertools.chain.from_iterable(part.notes for part in parts)]
+    notes += [f"camera {name} cannot be read: {reason}" for name, reason in unread.items()]
+    foreign = [camera for part in parts if part.format != "kcal" for camera in part.cameras]
+    notes += [f"{camera_name(camera, 'camera')}: {text}" for camera in foreign if (text := _doubt(camera, paths[0]))]
     return ImportedCameras(
         format=parts[0].format,
         cameras=cameras,
         poses=poses if len(poses) == len(cameras) else (),
-        notes=notes,
+        notes=tuple(dict.fromkeys(notes)),
+        unread=unread,
     )
+
+
+def _doubt(camera: Camera, path: str | Path) -> str:
+    """Why a camera does not seem to be of images of its size.
+
+    Raises:
+        FileError: its principal point is a fraction of the image.
+    """
+    fx, fy, cx, cy = camera.params[:4].tolist()
+    if 0 < max(abs(cx), abs(cy)) < 1 <= min(camera.size) / 16:
+        raise FileError(
+            f"{path}: the principal point ({cx:.3g}, {cy:.3g}) is a fraction of the image and not in pixels; multiply "
+            f"the lengths by the image's sides, {camera.size[0]} and {camera.size[1]} px"
+        )
+    return size_doubt(fx, fy, cx, cy, camera.size, most=0.09)
 
 
 def _imported(path: Path, name: str | None, hints: Hints) -> ImportedCameras:

@@ -307,7 +307,7 @@ class ConvertibleCamera(CameraParameters):
         if fisheye:
             values = torch.nn.functional.pad(values, (0, 9 - len(values)))
         camera = cls(values, size=size, model=PRESETS["fisheye4" if fisheye else OPENCV_MODELS[lens.numel()]])
-        if doubt := _size_doubt(fx, fy, cx, cy, size):
+        if doubt := size_doubt(fx, fy, cx, cy, size):
             warn_user(doubt)
         return camera
 
@@ -346,8 +346,11 @@ class ConvertibleCamera(CameraParameters):
         return cls(parameters, size=size, model=model)
 
 
-def _size_doubt(fx: float, fy: float, cx: float, cy: float, size: tuple[int, int]) -> str:
-    """Why a camera matrix does not seem to belong to an image of this size; empty if it may."""
+def size_doubt(fx: float, fy: float, cx: float, cy: float, size: tuple[int, int], most: float = 0.24) -> str:
+    """Why a camera matrix does not seem to belong to an image of this size; empty if it may.
+
+    `most` is how far from the middle the principal point may be, in sides of the image.
+    """
 
     def off(width: int, height: int) -> float:
         return max(abs((cx + 0.5) / width - 0.5), abs((cy + 0.5) / height - 0.5))
@@ -363,9 +366,10 @@ def _size_doubt(fx: float, fy: float, cx: float, cy: float, size: tuple[int, int
             "size is (width, height)"
         )
     # Where K is of half the image's size, it is off by a quarter; more is left to crops.
-    if off(width, height) > 0.24:
+    if off(width, height) > most:
+        where = "far from the middle of" if -0.5 <= cx < width and -0.5 <= cy < height else "outside"
         return (
-            f"the principal point ({cx:g}, {cy:g}) is far from the middle of {image}: if K is of another size, give "
-            "that one, and use camera.resized(...)"
+            f"the principal point ({cx:g}, {cy:g}) is {where} {image}: if these are numbers "
+            "of another size, give that size and resize the camera"
         )
     return ""

@@ -1,0 +1,372 @@
+"""Cameras whose numbers have names: what keys mean in files of OpenCV, ROS, SLAM programs and tutorials.
+
+Names are compared without case and punctuation. A key that nobody read and that may describe the lens, by its name or
+its shape, refuses the file: a lens must not become another one because a key is spelled unlike others.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import torch
+
+from kcal.io.foreign import (
+    BEFORE,
+    CameraPose,
+    Hints,
+    ImportedCameras,
+    Keys,
+    bare,
+    camera_name,
+    checked_pose,
+    core_of,
+    each_readable,
+    flat,
+    known_size,
+    named_camera,
+    numbers,
+    plain,
+    whole_size,
+    with_sigmas,
+)
+from kcal.io.format_kalibr import central_camera
+from kcal.lens.camera import Camera
+from kcal.lens.camera_conversions import OPENCV_MODELS, ImageTransform
+from kcal.lens.pose import rotation_from_vector
+
+_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_COEFS = "(?:coef+s?|coef+icients?|param(?:eter)?s?|vec(?:tor)?)"
+_IMAGE = "(?:image|img|frame|gray)?"
+# Names and how many numbers belong to them; -1 for a text or a switch.
+_ROLES: dict[str, tuple[str, Sequence[int]]] = {
+    "matrix": ("(?:intrinsics?)?(?:matrix|mtx|mat)|intrinsics?(?:param(?:eter)?s?)?|kk?|m|cm|a", (4, 9)),
+    "lens": (f"(?:lens)?dist(?:ort|ortion)?s?{_COEFS}?|coef+(?:icient)?s?|d|kc", range(15)),
+    "width": (f"{_IMAGE}(?:width|w)|imagecols", (1,)),
+    "height": (f"{_IMAGE}(?:height|h)|imagerows", (1,)),
+    "size": (f"{_IMAGE}(?:size|resolution|dims?|dimensions?)", (2,)),
+    "kind": ("(?:lens|distortion|dist|projection)?(?:model|type|modeltype|modelname)", (-1,)),
+    "fisheye": ("(?:is|use)?fisheye(?:model)?", (-1, 1)),
+    "sigmas": ("std(?:ard)?dev(?:iation)?s?(?:intrinsics)?", range(4, 19)),
+    "rotation": ("(?:stereo)?(?:r|rot(?:ation)?(?:matrix|mat|vector|vec)?|rmat)", (3, 9)),
+    "translation": ("(?:stereo)?(?:t|trans(?:lation)?(?:vector|vec)?|tvec)", (3,)),
+    "binning_x": ("binningx?", (1,)),
+    "binning_y": ("binningy", (1,)),
+    "roi": ("roi|regionofinterest", (-1,)),
+    "fx": ("fx|flx|fu|focal(?:length)?x|gamma1|mu", (1,)),
+    "fy": ("fy|fly|fv|focal(?:length)?y|gamma2|mv", (1,)),
+    "f": ("f|focal(?:length)?", (1,)),
+    "cx": ("cx|cu|u0|ppx|(?:principal(?:point)?|center)x", (1,)),
+    "cy": ("cy|cv|v0|ppy|(?:principal(?:point)?|center)y", (1,)),
+    **{name: (name, (1,)) for name in ("xi", "skew", *_COEFFICIENTS)},
+}
+_PATTERNS = {role: re.compile(f"(?:cam(?:era)?)?(?:{names})") for role, (names, _) in _ROLES.items()}
+_AFTER = re.compile(r"(.+?)(left|right|l|r|(?:cam(?:era)?)?[0-9])")
+# Lenses of OpenCV, its fisheye, what both may be called, and lenses that are neither.
+_PLAIN = re.compile(
+    "plumbbob|rational(?:polynomial)?|radtan8?|radialtangential|brown(?:conrady)?|opencv[0-9]*|standard|normal"
+)
+_FISHEYE = re.compile("fisheye|equi(?:distant)?|kannalabrandt[48]?|kb[48]?|opencvfisheye|fisheyeopencv")
+_EITHER = re.compile("|none|null|pinhole|perspective|camera|mono|monocular|stereo|central|rectified")
+# What is no name of a lens may be that of a product.
+_FOREIGN = re.compile(
+    ".*(fish|omni|spher|ucm|mei|fov|divis|scara|ocam|poly|radial|prism|cahv|pano|equi|ortho|unified|brown)|ds|kb"
+)
+_OMNI = re.compile("omni(?:dir|directional)?|mei")
+# Of RealSense; they are no lens of kcal unless all coefficients are zero.
+_ZERO = re.compile(".*(?:inverse|modified)brownconrady")
+
+
+def _role(key: str, value: Any) -> tuple[str, str] | None:
+    """What a key of a camera means, and which side of a rig it says that it is of."""
+    name, found = bare(key), flat(value)
+    count = len(found) if found is not None else -1
+    before, after = BEFORE.fullmatch(name), _AFTER.fullmatch(name)
+    ways = [(name, ""), (before and before[2], before and before[1]), (after and after[1], after and after[2])]
+    for base, side in ways:
+        for role, pattern in _PATTERNS.items():
+            # A distance is one number; no list of coefficients is.
+            if base and count in _ROLES[role][1] and pattern.fullmatch(base) and (role != "lens" or _many(value)):
+                return role, re.sub("cam(?:era)?", "", side or "")[:1]
+    return None
+
+
+def _many(value: Any) -> bool:
+    return isinstance(value, list | tuple | Mapping) or hasattr(value, "tolist")
+
+
+class _Named:
+    """What is known of cameras: (role, side) to the key that says it."""
+
+    def __init__(self, content: Mapping[str, Any]) -> None:
+        self.keys, self.at = Keys(content), dict[tuple[str, str], str]()
+        for key, value in content.items():
+            role = _role(key, value)
+            if role is None or (role[0] == "kind" and not isinstance(value, str)):
+                continue
+            if (other := self.at.get(role)) is not None and role[0] not in ("kind", "rotation", "translation"):
+                if flat(content[other]) != flat(value):
+                    raise ValueError(f"{other} and {key} are both there and differ; delete the one that is not meant")
+                self.keys[key]
+            self.at.setdefault((f"kind {key}", role[1]) if role[0] == "kind" else role, key)
+
+    def sides(self) -> list[str]:
+        """Those of which there is a camera."""
+        return sorted({side for role, side in self.at if role in ("matrix", "fx", "f")})
+
+    def get(self, role: str, side: str = "") -> Any:
+        """What is said of a side, or of all; None if nothing is."""
+        key = self.at.get((role, side)) or self.at.get((role, ""))
+        return None if key is None else self.keys[key]
+
+    def key(self, role: str, side: str) -> str:
+        """What that is called in the file."""
+        return self.at.get((role, side)) or self.at.get((role, ""), role)
+
+    def number(self, role: str, side: str, otherwise: float = 0.0) -> float:
+        """The same for a number."""
+        found = self.get(role, side)
+        return otherwise if found is None else numbers(found, 1, self.key(role, side))[0]
+
+    def size(self, side: str) -> tuple[int, int] | None:
+        """(width, height) as stated."""
+        both = [self.get("width", side), self.get("height", side)]
+        if None in both:
+            both = self.get("size", side)
+        return None if both is None else whole_size(*numbers(both, 2, "the image size"))
+
+    def core(self, side: str) -> tuple[list[float], float]:
+        """fx, fy, cx, cy, and the skew in the matrix."""
+        if (matrix := self.get("matrix", side)) is not None:
+            found, key = flat(matrix) or [], self.key("matrix", side)
+            # Four numbers that are called intrinsics are fx, fy, cx, cy.
+            return (found, 0.0) if len(found) == 4 and "intrin" in bare(key) else core_of(found, key)
+        fx = self.number("fx", side) or self.number("f", side)
+        if missing := [name for name in ("cx", "cy") if self.get(name, side) is None]:
+            raise ValueError(f"{' and '.join(missing)} of the principal point are missing")
+        return [fx, self.number("fy", side, fx), self.number("cx", side), self.number("cy", side)], 0.0
+
+    def kind(self, side: str, fisheye: bool | None, notes: list[str]) -> bool | None:
+        """Whether the lens is a fisheye's; None if the file does not say.
+
+        Raises:
+            ValueError: a lens that is neither, or keys that contradict each other.
+        """
+        said: dict[bool, str] = {}
+        bent = any(flat(self.get("lens", side)) or [])
+        for (role, where), key in self.at.items():
+            if where not in ("", side) or role.split()[0] not in ("kind", "fisheye"):
+                continue
+            value = self.keys[key]
+            text = bare(value)
+            if role == "fisheye":
+                said[value not in (0, "0", "no", "No") and text not in ("false", "00")] = key
+            elif _FISHEYE.fullmatch(text) or _PLAIN.fullmatch(text) or (_ZERO.fullmatch(text) and not bent):
+                said[bool(_FISHEYE.fullmatch(text))] = f"{key} {value}"
+            elif text in ("none", "null") and bent:
+                raise ValueError(f"{key} {value}, but there are coefficients that are not zero; delete one of them")
+            elif _EITHER.fullmatch(text) or (_OMNI.fullmatch(text) and ("xi", side) in self.at) or fisheye is not None:
+                continue
+            elif bare(key) in ("type", "model", "cameratype", "cameramodel") and not _FOREIGN.match(text):
+                notes.append(f"{key} {value}: no name of a lens model; not read")
+            else:
+                raise ValueError(
+                    f"{key} {value}: kcal reads plumb_bob, rational_polynomial, radtan, equidistant, fisheye and none; "
+                    "if this is no name of a lens model, say --fisheye or --no-fisheye"
+                )
+        if len(said) == 2 and fisheye is None:
+            raise ValueError(f"{' and '.join(said.values())} contradict each other: say --fisheye or --no-fisheye")
+        return fisheye if fisheye is not None else next(iter(said), None)
+
+
+def has_camera(content: Mapping[str, Any]) -> bool:
+    """Whether keys of a mapping name a camera's matrix or focal length."""
+    return any(role is not None and role[0] in ("matrix", "fx", "f") for role in map(_role, content, content.values()))
+
+
+def speaks_of_camera(text: str) -> bool:
+    """Whether a text has such keys at the beginning of its lines."""
+    names = map(bare, re.findall(r"^[\s\"'{-]*([A-Za-z][\w. -]{0,40}?)[\"']?\s*[:=]", text, re.MULTILINE))
+    return any(
+        pattern.fullmatch(base)
+        for name in names
+        for base in (name, (BEFORE.fullmatch(name) or ("", "", ""))[2], (_AFTER.fullmatch(name) or ("", ""))[1])
+        for pattern in (_PATTERNS["matrix"], _PATTERNS["fx"])
+    )
+
+
+def read_keyed(content: Mapping[str, Any], name: str, hints: Hints, title: str) -> ImportedCameras:
+    """The cameras of a mapping: one, several whose keys name a side, or those of mappings inside it.
+
+    Poses are those of each camera, or R and T of the second one of two.
+
+    Raises:
+        ValueError: no camera, a lens that kcal does not have, or keys that it does not know.
+    """
+    notes: list[str] = []
+    inside = _cameras_inside(content)
+    if inside:
+        outer = {key: value for key, value in content.items() if key not in inside and bare(key) != "cameras"}
+        named = _Named(outer)
+        shared = {key: named.keys[key] for (role, _), key in named.at.items() if role in ("width", "height", "size")}
+        parts = {
+            str(part.get("name") or part.get("camera_name") or (key if len(inside) > 1 else name)): (
+                _Named(shared | _flattened(part)), "",
+            )
+            for key, part in inside.items()
+        }  # fmt: skip
+    else:
+        named = _Named(_flattened(content))
+        sides = named.sides()
+        labels = ["left", "right"] if len(sides) == 2 else [f"camera{side}" for side in sides]
+        parts = {label if len(sides) > 1 else name: (named, side) for label, side in zip(labels, sides, strict=True)}
+    cameras, refused = each_readable(
+        (label, partial(_camera, *part, label, hints, notes)) for label, part in parts.items()
+    )
+    poses = _poses(named, list(parts.values()), hints, notes)
+    if not parts and not poses:
+        named.keys.rest()
+        raise ValueError("no camera: a matrix (camera_matrix, K, M1, ...), or fx, fy, cx and cy, is needed")
+    if cameras and len(poses) == len(parts):
+        poses = tuple(pose for pose, label in zip(poses, parts, strict=True) if label not in refused)
+    for whole in {id(part): part for part, _ in [*parts.values(), (named, "")]}.values():
+        notes += whole.keys.rest()
+    return ImportedCameras(
+        format=title, cameras=cameras, poses=poses, notes=tuple(dict.fromkeys(notes)), unread=refused
+    )
+
+
+def _cameras_inside(content: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """Mappings in it, or in its `cameras`, that have a camera each."""
+    if has_camera(content):
+        return {}
+    tables = dict(content)
+    inside: Any = next((tables.pop(key) for key in list(tables) if bare(key) == "cameras"), {})
+    if isinstance(inside, list):
+        inside = {str(i): part for i, part in enumerate(inside)}
+    tables |= inside if isinstance(inside, Mapping) else {}
+    # Blocks such as `projection_parameters` are parts of one camera.
+    return {
+        str(key): part for key, part in tables.items()
+        if isinstance(part, Mapping) and "data" not in part and has_camera(_flattened(part))
+        and not re.search("param|intrin|proj", bare(key))
+    }  # fmt: skip
+
+
+def _flattened(content: Mapping[str, Any]) -> dict[str, Any]:
+    """With the keys of the mappings inside it, such as `projection_parameters` of camodocal."""
+    found: dict[str, Any] = {}
+    for key, value in content.items():
+        block = isinstance(value, Mapping) and "data" not in value and _role(key, value) is None
+        if block and any(map(_role, value, value.values())):
+            if twice := set(found) & set(value):
+                raise ValueError(
+                    f"{min(twice)} is there twice, in {key} and elsewhere; kcal cannot tell which is meant"
+                )
+            found |= value
+        else:
+            found[key] = value
+    if "mu" in found and "k5" in found:
+        # camodocal counts the coefficients of its fisheye from k2.
+        found = {f"k{int(key[1]) - 1}" if re.fullmatch("k[2-5]", key) else key: value for key, value in found.items()}
+    return found
+
+
+def _camera(named: _Named, side: str, name: str, hints: Hints, notes: list[str]) -> Camera:
+    stated_size = named.size(side)
+    size = known_size(hints.size or stated_size)
+    core, skew = named.core(side)
+    matrix = named.key("matrix", side)
+    fisheye = named.kind(side, hints.fisheye, notes)
+    stated = named.get("lens", side)
+    lens = _coefficients(named, side, bool(fisheye)) if stated is None else (flat(stated) or [])
+    key = named.key("lens", side) if stated is not None else "the coefficients k1, k2, p1, p2"
+    if fisheye and len(lens) > 4 and not any(lens[4:]):
+        lens = lens[:4]
+    if named.get("xi", side) is not None:
+        if len(lens) != 4 or skew:
+            raise ValueError("an omnidir camera has 4 coefficients and, here, no skew")
+        inner = named_camera(name, core, size, "opencv4", lens)
+        camera, note = central_camera("omni", inner, [named.number("xi", side)])
+        notes.append(note)
+        return camera
+    if fisheye and lens and len(lens) != 4:
+        raise ValueError(f"a fisheye has 4 coefficients, {key} has {len(lens)}")
+    lens = numbers(lens, (4,) if fisheye and lens else tuple(OPENCV_MODELS), key)
+    if fisheye is None and len(lens) == 4 and stated is not None:
+        notes.append("4 coefficients read as k1 k2 p1 p2; if they are a fisheye's, use --fisheye")
+    if not lens:
+        notes.append(f"{name}: no coefficients of a lens in the file; read as one without distortion")
+    if skew and not fisheye:
+        notes.append(f"{matrix} has a skew of {skew:g}, which OpenCV does not use and kcal does not take over")
+        skew = 0.0
+    skew = skew or named.number("skew", side)
+    model = "fisheye4" if fisheye else OPENCV_MODELS[len(lens)]
+    camera = named_camera(name, core, size, model, lens or [0.0] * 4 * bool(fisheye), skew)
+    if (sigmas := named.get("sigmas")) is not None and not side:
+        # OpenCV always states those of 14 coefficients.
+        given = numbers(sigmas, (4 + len(lens), 18), named.key("sigmas", side))
+        notes.append(with_sigmas(camera, given[: 4 + len(lens)]))
+    return camera if hints.size else _delivered(named, side, camera, notes)
+
+
+def _coefficients(named: _Named, side: str, fisheye: bool) -> list[float]:
+    """Those that have a name each: OpenCV's first 0, 4, 5 or 8, or the four of a fisheye."""
+    order = ("k1", "k2", "k3", "k4") if fisheye else _COEFFICIENTS
+    stated = [named.number(name, side) for name in order]
+    last = max((i + 1 for i, name in enumerate(order) if named.get(name, side) is not None), default=0)
+    return stated[: next(count for count in (0, 4, 5, 8) if count >= last)]
+
+
+def _delivered(named: _Named, side: str, camera: Camera, notes: list[str]) -> Camera:
+    """The camera of the images that are delivered, of which ROS states the window of the sensor and the binning."""
+    width, height = camera.size
+    bins = [int(max(1.0, named.number(f"binning_{axis}", side, 1.0))) for axis in "xy"]
+    roi = named.get("roi", side)
+    roi = roi if isinstance(roi, Mapping) else {}
+    left, top, wide, high = (int(roi.get(key, 0)) for key in ("x_offset", "y_offset", "width", "height"))
+    wide, high = (wide or width - left) // bins[0], (high or height - top) // bins[1]
+    if (wide, high) == (width, height):
+        return camera
+    images = f"the delivered images of {wide}x{high} px, part of {width}x{height} px in bins of {bins[0]}x{bins[1]}"
+    fx, fy, cx, cy, skew, *lens = camera.params.tolist()
+    if abs(cx / wide - 0.5) + abs(cy / high - 0.5) < 0.1 < abs(cx / width - 0.5) + abs(cy / height - 0.5):
+        notes.append(
+            f"the principal point ({cx:g}, {cy:g}) is in the middle of {images}: taken as that of these images"
+        )
+        return named_camera(camera_name(camera, ""), (fx, fy, cx, cy), (wide, high), camera.model, lens, skew)
+    notes.append(f"the camera is that of {images}")
+    cut = camera.cropped(left, top, (wide * bins[0], high * bins[1]))
+    return cut.transformed(ImageTransform.resize(cut.size, (wide, high)))
+
+
+def _poses(
+    named: _Named, parts: Sequence[tuple[_Named, str]], hints: Hints, notes: list[str]
+) -> tuple[CameraPose, ...]:
+    """Of each camera, or of the second one of two from the first."""
+    meters = hints.meters or 1.0
+    each = [part.get("rotation", side) is not None and part.get("translation", side) is not None and part is not named
+            for part, side in parts]  # fmt: skip
+    if each and all(each):
+        poses = [_pose_of_keys(part, side, meters) for part, side in parts]
+    elif len(parts) in (0, 2) and named.get("rotation") is not None and named.get("translation") is not None:
+        still = torch.zeros(3, dtype=torch.float64)
+        poses = [CameraPose(torch.eye(3, dtype=torch.float64), still), _pose_of_keys(named, "", meters)]
+    else:
+        if any(each):
+            notes.append("some cameras have no rotation: no pose is read")
+        return ()
+    longest = max(float(pose.translation.norm()) for pose in poses)
+    if hints.meters is None and longest > 0:
+        notes.append(f"the unit of the translation is not in the file: taken as meters, {longest:.4g} m "
+                     "(--unit mm for millimeters, --unit cm for centimeters)")  # fmt: skip
+    return tuple(poses)
+
+
+def _pose_of_keys(named: _Named, side: str, meters: float) -> CameraPose:
+    turn = numbers(named.get("rotation", side), (3, 9), named.key("rotation", side))
+    rotation = plain(rotation_from_vector(torch.tensor(turn, dtype=torch.float64))) if len(turn) == 3 else turn
+    shift = numbers(named.get("translation", side), 3, named.key("translation", side))
+    return checked_pose(rotation, [meters * value for value in shift])
