@@ -20,12 +20,14 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+from kcal.calibrate.camera.trust import examine
 from kcal.calibrate.rig.pairs import pair_by_name, paired_boards
 from kcal.calibrate.rig.solve import solve_rig
 from kcal.calibrate.rig.sources import RigData
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import nearest_rotation
+from kcal.lens.uncertainty import image_sigma
 from kcal.report.judge_camera import camera_verdict
 from kcal.report.judge_rig import rig_verdict
 from kcal.report.verdict import Requirement, Verdict
@@ -37,6 +39,8 @@ from scripts.shared.timing import show
 FIRST = 200
 # What is required of a camera, in a rig with 10 m of baseline; of a rig, from boards alone.
 CAMERA, RIG, MARK = "2km:10%", "500m:5%", 0.1
+# Where nothing is required, a camera whose true error is more than so many times its error bars is wrong.
+SIGMAS = 2.0
 # Which finding names which fault.
 NAMES = {
     "model": {"model"},
@@ -48,7 +52,10 @@ NAMES = {
     "mirrored or mixed": {"mirrored"},
 }
 # What the error says where kcal refuses the capture.
-REFUSALS = {"fronto-parallel": ("parallel to the image",), "unsynchronized": ("taken at the same moment",)}
+REFUSALS = {
+    "fronto-parallel": ("parallel to the image", "determine the focal length only"),
+    "unsynchronized": ("taken at the same moment",),
+}
 CLEAN = ("clean", "clean", "clean", "clean pair")
 
 
@@ -63,17 +70,20 @@ def true_error(lens: TruthLens, camera: Camera) -> float:
     return float((seen - grid)[good].square().sum(-1).mean().sqrt())
 
 
-def judge_camera(planted: Planted) -> tuple[Verdict, float, float]:
-    """Verdict, true RMS error over the image in px, and that of the range over what is required."""
+def judge_camera(planted: Planted) -> tuple[Verdict, float, float, dict[str, Any]]:
+    """Verdict, true RMS error over the image in px, that of the range over what is required; the verdict without."""
     result = calibrate_camera(planted.observations, planted.options)
-    need = Requirement.parse(CAMERA)
-    verdict = camera_verdict(result, planted.options, need, mark_sigma=MARK)
-    off = true_error(planted.lens, result.camera)
+    need, found = Requirement.parse(CAMERA), examine(result, planted.options)
+    verdict = camera_verdict(result, planted.options, need, mark_sigma=MARK, examination=found)
+    bare = camera_verdict(result, planted.options, examination=found)
+    off, sigma = true_error(planted.lens, result.camera), image_sigma(result.camera)
+    stated = float(sigma[sigma.isfinite()].square().mean().sqrt())
     slope = math.sqrt(2.0) * need[0].distance ** 2 / (float(result.camera.focal[0]) * 10.0)
-    return verdict, off, slope * math.hypot(off, MARK) / need[0].meters
+    more = {"bare": bare.usable, "sigmas": round(off / stated, 2)}
+    return verdict, off, slope * math.hypot(off, MARK) / need[0].meters, more
 
 
-def judge_pair(planted: PlantedPair) -> tuple[Verdict, float, float]:
+def judge_pair(planted: PlantedPair) -> tuple[Verdict, float, float, dict[str, Any]]:
     """Verdict, true RMS error of ranges in meters, and over what is required."""
     cameras = []
     for seen in planted.alone:
@@ -95,7 +105,7 @@ def judge_pair(planted: PlantedPair) -> tuple[Verdict, float, float]:
     lines = sight_lines(rig, left, right)
     off = (lines.points.norm(dim=-1) - need.distance)[seen_by_both]
     error = float(off.square().mean().sqrt())
-    return verdict, error, error / need.meters
+    return verdict, error, error / need.meters, {}
 
 
 def judge(kind: str, seed: int) -> dict[str, Any]:
@@ -104,8 +114,8 @@ def judge(kind: str, seed: int) -> dict[str, Any]:
     planted = drawn(kind, seed)
     line: dict[str, Any] = {"kind": kind, "seed": seed, "detail": planted.detail}
     try:
-        verdict, off, over = judge_pair(planted) if isinstance(planted, PlantedPair) else judge_camera(planted)
-        line |= {
+        verdict, off, over, more = judge_pair(planted) if isinstance(planted, PlantedPair) else judge_camera(planted)
+        line |= more | {
             "yes": verdict.usable,
             "off": round(off, 4),
             "over": round(over, 3),
@@ -138,14 +148,18 @@ def table_of(lines: list[dict[str, Any]]) -> list[str]:
         here = clean if kind == "clean" else [line for line in planted if kind in ("all planted", line["kind"])]
         if not here:
             continue
-        yes = [line for line in here if line["yes"]]
+        yes, alone = [line for line in here if line["yes"]], [line for line in here if "bare" in line]
         rows.append([
             kind, len(here), len(yes), sum(broken(line, 1.0) for line in yes), sum(broken(line, 2.0) for line in yes),
             sum(broken(line, 1.0) for line in here), "" if kind == "clean" else sum(map(named, here)),
+            *([sum(line["bare"] for line in alone),
+               sum(line["bare"] and line["sigmas"] > SIGMAS for line in alone),
+               sum(not line["bare"] and line["sigmas"] <= SIGMAS for line in alone)] if alone else [""] * 3),
         ])  # fmt: skip
     head = [
         "captures", "number", "yes", "yes, but off by more than required", "by twice that", "all that are off by more",
-        "fault named",
+        "fault named", "nothing required: yes", f"of these, off by more than {SIGMAS:g} σ",
+        f"no, though within {SIGMAS:g} σ",
     ]  # fmt: skip
     good = [line for line in clean if not broken(line, 1.0)]
     return [

@@ -165,7 +165,7 @@ def examine(
                 if options.hybrid and alike and halves[-1].held_out > PREDICTED * halves[-1].own:
                     plain = _plain_lens(result.camera, seen, parts, options, halves[-1].still)
             except KcalError as error:
-                failures.append(f"{label}: {error}")
+                failures.append(f"{label}: {str(error).split(' (')[0]}")  # without the names of views
     reference, model = None, None
     if not (options.hybrid and options.board == "printed"):
         try:
