@@ -98,7 +98,7 @@ def assess(observations: Observations, solution: Solution, options: CalibrationO
             *doubts,
             *rival_warnings(camera, sigma, solution.rivals, solution.plain_cost, problem.residual_count),
             *prior_warnings(solution.terms, solved.state, solution.views.prior_noise),
-            *outlier_warnings(observations.names, weighted),
+            *outlier_warnings(observations.names, weighted, "; this lens may need a richer model"),
         ),
     )
 

@@ -281,10 +281,10 @@ def hybrid_warnings(fit: HybridFit) -> list[str]:
     return found
 
 
-def outlier_warnings(names: Sequence[str], residuals: Tensor) -> list[str]:
+def outlier_warnings(names: Sequence[str], residuals: Tensor, more: str = "") -> list[str]:
     """A warning where a corner is off by twice what noise explains; residuals (V, N, 2), NaN where not seen.
 
-    Smaller deviations are as often the lens model's fault.
+    Smaller deviations are as often the lens model's fault. `more` is said where the lens may be to blame.
     """
     beyond = corners_beyond(residuals)
     if not bool(corners_beyond(residuals, _GROSS).any()):
@@ -295,7 +295,7 @@ def outlier_warnings(names: Sequence[str], residuals: Tensor) -> list[str]:
     return [
         f"{count} of {int(residuals.isfinite().all(-1).sum())} corners are farther off than noise explains, corner "
         f"{corner} of view {names[view]} by {float(length.max()):.2f} px: look at them, and leave wrong ones out "
-        "(--reject); a parametric lens may need a richer model"
+        f"(--reject){more}"
     ]
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from kcal.calibrate.camera.advice import reached, roll_warnings, what_to_photograph
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.calibrate.camera.warnings import corner_pupil, general_warnings, pupil_warnings
+from kcal.calibrate.camera.warnings import corner_pupil, general_warnings, outlier_warnings, pupil_warnings
 from kcal.corners.board import Board
 from kcal.corners.detect import detect
 from kcal.corners.observations import Observations, View
@@ -133,6 +133,16 @@ class TestGeneral:
 
     def test_a_high_rms(self) -> None:
         assert "check the board's size, and look at the views" in self.warned(camera("pinhole"), rms=1.5)[0]
+
+
+def test_a_far_corner_blames_the_lens_only_where_it_may_be_too_simple() -> None:
+    residuals = 0.1 * torch.randn(4, 40, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    assert outlier_warnings("abcd", residuals) == []
+    residuals[1, 3] = 5.0
+    (plain,), (model,) = outlier_warnings("abcd", residuals), outlier_warnings("abcd", residuals, "; a richer model")
+    assert plain.startswith("1 of 160 corners are farther off than noise explains, corner 3 of view b by 7.07 px")
+    assert plain.endswith("(--reject)")
+    assert model == plain + "; a richer model"
 
 
 def test_advice_names_three_parts_of_the_image_or_all_of_them() -> None:
