@@ -30,6 +30,8 @@ _SHAPES = (1.0, 0.25, 0.0)
 _CORNERS = (12.0, 20.0, 30.0, 42.0, 55.0, 68.0, 80.0)
 # Views by which the start is chosen: its projection among several, and that fitted.
 _SOME, _VIEWS = 15, 60
+# Boards of more corners are shown by some of them: so many of each view.
+_LARGE, _BY_VIEW = 1000, 100
 # Corners that a view needs at least, and how far off the axis they are at most, radians.
 _FEWEST, _STEEPEST = 6, math.radians(80.0)
 _PINHOLE = torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=torch.float64)
@@ -135,9 +137,14 @@ def _base_of(
     # Of many views some tell which projection it is; the poses of all follow from it.
     some = slice(None, None, 1 + (len(pixels) - 1) // _VIEWS)
     few = dataclasses.replace(capture, pixels=pixels[some], weights=weights[some])
+    mode = stretch
+    if len(points) > _LARGE:
+        each = [view.nonzero()[:, 0] for view in few.seen]
+        spread = torch.cat([own[:: 1 + (len(own) - 1) // _BY_VIEW] for own in each]).unique()
+        few, mode = few.of_corners(spread), stretch and stretch._replace(shapes=stretch.shapes[..., spread])
     start = _base_start(few, known_focal, None, exact_focal)
     base = _settled_base(few, start, exact_focal)
-    if stretch is not None and (other := _unequal(few, start, base, known_focal, stretch)) is not None:
+    if stretch and mode and (other := _unequal(few, start, base, known_focal, mode)) is not None:
         base, points = other, points + other.state.board * stretch.shapes[0].T
     if len(base.state.rotation) == len(pixels):
         return base
@@ -228,8 +235,8 @@ def fit_base(
     # A board that was measured is known, in modes of its own.
     mode = None
     if len(first) and not capture.exact:
-        x = capture.points[:, 0]
-        mode = BoardModes(board.shapes[first], 0.5 * _UNEQUAL * (x.amax() - x.amin())[None], torch.tensor([KNOWN]))
+        across, own = (x.amax() - x.amin() for x in (capture.points[:, 0], board.shapes[first][0, 0]))
+        mode = BoardModes(board.shapes[first], (_UNEQUAL * across / own)[None], torch.tensor([KNOWN]))
     base = _base_of(flat, known_focal, stretch=mode)
     model, families = _with_constants(base, capture.size, modes, board)
     params = torch.zeros(5 + model.size, dtype=torch.float64)

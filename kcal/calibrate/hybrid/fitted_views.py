@@ -150,6 +150,18 @@ class FittedViews:
         """(V, N, 2) errors (V, 2, N) of pixels; NaN where a corner does not count."""
         return torch.where(self.seen[..., None], errors.transpose(-1, -2), torch.nan)
 
+    def of_corners(self, kept: Tensor) -> FittedViews:
+        """These views, standing still, with some corners of the board alone, by their numbers."""
+        return dataclasses.replace(
+            self,
+            points=self.points[kept],
+            board=self.board._replace(shapes=self.board.shapes[..., kept]),
+            pixels=self.pixels[:, kept],
+            weights=self.weights[:, kept],
+            readout=None,
+            heights=None,
+        )
+
     @property
     def freedom(self) -> int:
         """Residuals without those that poses take up."""

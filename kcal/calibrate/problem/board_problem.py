@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -470,13 +471,37 @@ class BoardProblem(BoardImages, SchurProblem[BoardState]):
         size = max(1, _CHUNK // (row * (self.local_size + self.unknown_count + 1)))
         yield from (slice(start, start + size) for start in range(0, count, size)) if size < count else (ALL,)
 
+    def _parts(self, state: BoardState) -> Iterator[tuple[BoardProblem, BoardState, slice]]:
+        """A few views at a time, of a large board without corners that none of these shows."""
+        for views in self._chunks(state):
+            shown = self.seen[views].any(0) if self.seen.ndim == 2 and not self.batch else self.seen
+            if shown.ndim > 1 or 2 * int(shown.sum()) > len(shown):
+                yield self, state, views
+                continue
+            part = copy.copy(self)
+            part._kept, part._shown = [], []
+            part.seen, part._target, part._counts = (
+                each[views][..., shown] for each in (self.seen, self._target, self._counts)
+            )
+            part._all_count = bool(part._counts.all())
+            part.weights = None if self.weights is None else self.weights[views][..., shown]
+            if self.readout is not None:
+                bends = None if self.readout.bends is None else self.readout.bends[:, shown]
+                part.readout, part._time = dataclasses.replace(self.readout, bends=bends), self._time[views][:, shown]
+                part._still = self._still.expand_as(state.motion)[views]
+            part._board, part.shapes = self._board[:, shown], self.shapes[..., shown]
+            yield part, state.views(views), ALL
+
     def products(self, state: BoardState) -> Products:
         """What the corners alone say near a state, by the unknowns that are not held; the last ones are kept."""
         if self._kept and self._kept[0][0] is state:
             return self._kept[0][1]
         memory: list[Tensor] = []
         found = Products.together(
-            [Products.of_rows(self.corner_rows(state, views, memory), self.local_size) for views in self._chunks(state)]
+            [
+                Products.of_rows(part.corner_rows(own, at, memory), self.local_size)
+                for part, own, at in self._parts(state)
+            ]
         )
         if not self._all_move:
             found = found.of_shared(self.moving)
@@ -507,8 +532,8 @@ class BoardProblem(BoardImages, SchurProblem[BoardState]):
     def reduced_rows(self, state: BoardState) -> Tensor:
         """(S + 1, S + 1) triangle with the same products as the rows of `off_poses`, some views at a time."""
         parts = [
-            triangular(without_local(self.rows(state, views), self.local_size).transpose(0, 1).flatten(1).T)
-            for views in self._chunks(state)
+            triangular(without_local(part.rows(own, at), self.local_size).transpose(0, 1).flatten(1).T)
+            for part, own, at in self._parts(state)
         ]
         return parts[0] if len(parts) == 1 else triangular(torch.cat(parts))
 
