@@ -188,7 +188,8 @@ def with_command(text: str, cure: str) -> str:
         >>> with_command("left.obs.json: too few views", "To add views: kcal capture camera:0")
         'left.obs.json: too few views. To add views: kcal capture camera:0'
     """
-    return f"{text.rstrip('.')}. {cure}" if cure and "kcal " not in text else text
+    stop = "" if text.endswith("?") else "."
+    return f"{text.rstrip('.')}{stop} {cure}" if cure and "kcal " not in text else text
 
 
 def board_words(board: Board) -> str:

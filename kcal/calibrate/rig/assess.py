@@ -448,9 +448,8 @@ def rig_result(
     if only_boards and (count := int(masks.boards.sum())) < _FEW_BOARDS:
         warnings.append(f"{count} pair(s) only: a wrong one could not be noticed; 5 or more are good")
     focal = [float(camera.params[0]) for camera in data.cameras]
-    scattered = scatter_warnings(focal, work.motion, work.sigma_corner)
-    warnings = scattered + warnings
-    if only_boards and rms > _HIGH_RMS and not scattered:
+    warnings = scatter_warnings(focal, work.motion, work.sigma_corner) + warnings
+    if only_boards and rms > _HIGH_RMS and not any(work.motion):
         warnings.append(f"RMS {rms:.2f} px is high: were both views of each pair taken at the same moment?")
     if status not in (SolverStatus.CONVERGED, SolverStatus.EXACT):
         warnings.append(f"the solver {status.message}")

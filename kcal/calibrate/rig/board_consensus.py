@@ -20,8 +20,9 @@ from kcal.lens.camera import Camera
 from kcal.solve.lm import LMOptions
 
 MINIMUM_CORNERS = 6
-# A camera that leaves its own boards this far off (pixels) is not the camera that took them.
-_FOREIGN_RMS = 5.0
+# A camera that leaves its own boards this far off (pixels) is not the camera that took them; one that is calibrated
+# leaves them less far off, though more than then if they move: by no more than these times, and hardly ever by less px.
+_FOREIGN_RMS, _MISFIT_TIMES, _HARDLY = 5.0, 20.0, 2.0
 # Cameras are swapped only if each fits the other's boards with less than this share of its own RMS.
 _CLEARLY = 0.9
 # Views, and steps of the solver, that tell whether another camera may fit them at all: of C cameras there are C² pairs.
@@ -110,11 +111,14 @@ def check_cameras(data: RigData, good: Tensor, alone: Sequence[SeenAlone], solve
     boards = data.boards
     assert boards is not None
     rms = [_median_rms(one.rms[good[:, c]]) for c, one in enumerate(alone)]
-    for name, own in zip(data.names, rms, strict=True):
-        if not own <= _FOREIGN_RMS:
+    for name, camera, own in zip(data.names, data.cameras, rms, strict=True):
+        record = None if camera.calibration is None else camera.calibration.record
+        limit = _FOREIGN_RMS if record is None else min(_FOREIGN_RMS, max(_HARDLY, _MISFIT_TIMES * record.rms))
+        if not own <= limit:
+            then = "" if record is None else f"; {record.rms:.2g} px when it was calibrated"
             raise InputError(
-                f"the {name} observations do not fit the {name} camera (RMS {own:.1f} px): are cameras or "
-                "observations swapped?"
+                f"the {name} observations do not fit the {name} camera (RMS {own:.1f} px{then}): are cameras or "
+                "observations swapped, or were zoom or focus changed?"
             )
     for pair in itertools.combinations(range(len(data.cameras)), 2):
         one, other = pair

@@ -12,8 +12,6 @@ from torch import Tensor
 
 from kcal.calibrate.hybrid.evidence import (
     WORTH,
-    EvidenceLoss,
-    Maximum,
     Quadratic,
     ViewData,
     evidence_of_motion,
@@ -79,10 +77,10 @@ _EXACT = 0.01
 _POSE = 6
 # How far what boards share may move their corners, in standard deviations of the noise: nothing is known beforehand.
 _WIDE = 1e3
+# Readouts by which exposures must be apart to be called apart.
+_OTHER_MOMENT = 0.4
 # Of fewer boards, one that is wrong cannot be told from motion.
 _FEWEST = 3
-# Numbers of motions while rows are read, between exposures, and of both.
-_READ, _APART, _ALL = slice(0, MOTION), slice(MOTION, MOTION + 2 * AXES), slice(0, MOTION + 2 * AXES)
 # One amplitude, which stands for none.
 _NONE = torch.zeros(1, dtype=torch.float64)
 _NO_PRIOR = Hyperprior(_NONE, torch.ones_like(_NONE))
@@ -127,26 +125,6 @@ class BoardMotion(NamedTuple):
     apart: tuple[float, float]
     reach: float
 
-    def between(self, focal: float) -> float:
-        """Pixels by which a corner moves between the exposures."""
-        return focal * math.hypot(self.apart[1], self.reach * self.apart[0])
-
-
-class _Moving(NamedTuple):
-    """Motions of some kinds: their numbers, and their amplitudes where the evidence is largest."""
-
-    numbers: slice
-    best: Maximum
-
-    def of(self, data: ViewData) -> ViewData:
-        """What boards tell of these motions, the others being none."""
-        return data._replace(own=data.own[:, self.numbers, self.numbers], cross=data.cross[:, self.numbers])
-
-    def loss(self, data: ViewData, families: PriorFamilies) -> float:
-        """The negative logarithm of the evidence of these amplitudes."""
-        v = np.concatenate([self.best.h.numpy(), self.best.log_ratio, [math.log(self.best.variance)]])
-        return float(EvidenceLoss(self.of(data), families, _NO_PRIOR, 1.0).values(v[None])[0])
-
 
 def board_motion(seen: SeenBoards, rig: RigRows, camera: int, *, reads: bool) -> BoardMotion | None:
     """How boards move while this camera reads its rows, and beforehand; None where they stand still.
@@ -166,45 +144,30 @@ def board_motion(seen: SeenBoards, rig: RigRows, camera: int, *, reads: bool) ->
     readout = Readout(center=seen.points.mean(-1), distance=distance, size=seen.size)
     time = readout.time(seen.pixels)
     columns = readout.columns_of(found.by_point, seen.rotation, time, seen.points, apart=True).nan_to_num(0.0)
+    columns = columns if reads else columns[:, MOTION:]
     white = torch.einsum("vuwn,vpwn->vpun", seen.whitening, columns).flatten(-2)
+    variance = rig.variance
     # Nothing is left to explain of corners without noise.
-    if rig.variance < _EXACT:
+    if variance < _EXACT:
         return None
     data, families = rig.told(camera, white)
-
-    def worth(one: _Moving, than: _Moving | None, data: ViewData, families: PriorFamilies) -> float:
-        """By how much these motions raise the evidence, or are better than fewer ones."""
-        if than is None:
-            return evidence_of_motion(one.of(data), one.best, families, 1.0)
-        return than.loss(data, families) - one.loss(data, families)
-
-    chosen: _Moving | None = None
-    for numbers in (_APART, _READ, _ALL) if reads else (_APART,):
-        one = _Moving(numbers, Maximum(_NONE, np.zeros(0), rig.variance, 0.0))
-        begin = np.full(one.of(data).own.shape[-1] // AXES, math.log(MEDIAN) - 0.5 * math.log(rig.variance))
-        one = one._replace(best=maximize_evidence(one.of(data), families, _NONE, rig.variance, _NO_PRIOR, begin))
-        than = chosen if numbers is _ALL else None
-        if worth(one, than, data, families) < WORTH:
-            continue
-        # What a single board tells of is wrong with that board.
-        explained = one.of(data).integrated(one.best.log_ratio).half[..., -1].square().sum(-1)
-        others = rig.without(int(good.nonzero()[explained.argmax(), 0])).told(camera, white)
-        if worth(one, than, *others) < _WORTH_OF_OTHERS:
-            continue
-        if chosen is None or worth(one, chosen, data, families) > 0.0:
-            chosen = one
-    if chosen is None:
+    begin = np.full(columns.shape[1] // AXES, math.log(MEDIAN) - 0.5 * math.log(variance))
+    best = maximize_evidence(data, families, _NONE, variance, _NO_PRIOR, begin)
+    if evidence_of_motion(data, best, families, 1.0) < WORTH:
         return None
-    best = expected_maximum(chosen.of(data), families, chosen.best, _NO_PRIOR)
-    sigma = torch.zeros(columns.shape[1] // AXES, dtype=torch.float64)
-    sigma[chosen.numbers.start // AXES : chosen.numbers.stop // AXES] = torch.from_numpy(
-        np.exp(best.log_ratio) * math.sqrt(best.variance)
-    )
-    each, amounts = sigma.repeat_interleave(AXES)[chosen.numbers, None, None], sigma.tolist()
+    # What a single board tells of is wrong with that board.
+    explained = data.integrated(best.log_ratio).half[..., -1].square().sum(-1)
+    others = rig.without(int(good.nonzero()[explained.argmax(), 0]))
+    rest, their_families = others.told(camera, white)
+    if evidence_of_motion(rest, best, their_families, 1.0) < _WORTH_OF_OTHERS:
+        return None
+    best = expected_maximum(data, families, best, _NO_PRIOR)
+    *sigma, turn, shift = (np.exp(best.log_ratio) * math.sqrt(best.variance)).tolist()
+    each = torch.tensor([*sigma, turn, shift], dtype=torch.float64).repeat_interleave(AXES)
     return BoardMotion(
-        columns[:, chosen.numbers] * each,
-        MotionSigma(*amounts[:AMPLITUDES]),
-        (APART * amounts[-2], APART * amounts[-1]),
+        columns * each[:, None, None],
+        MotionSigma(*sigma or (0.0,) * AMPLITUDES),
+        (APART * turn, APART * shift),
         readout.reach(seen.points.T),
     )
 
@@ -384,9 +347,12 @@ def moved_warnings(
 
 def scatter_warnings(focal: Sequence[float], motions: Sequence[BoardMotion | None], noise: float) -> list[str]:
     """A warning where the cameras' relative pose differs from pair to pair by much more than the noise, in pixels."""
-    each = [motion.between(length) for length, motion in zip(focal, motions, strict=True) if motion is not None]
-    off = math.hypot(*each)
-    if off <= FELT * noise:
+    moving = [(length, motion) for length, motion in zip(focal, motions, strict=True) if motion is not None]
+    off = math.hypot(*(length * math.hypot(one.apart[1], one.reach * one.apart[0]) for length, one in moving))
+    # What rolling shutters leave open of boards that move during one exposure is no matter of another moment.
+    if off <= max(
+        FELT * noise, _OTHER_MOMENT * math.hypot(*(one.sigma.moved(length, one.reach) for length, one in moving))
+    ):
         return []
     return [
         f"the cameras' relative pose differs from pair to pair by some {off:.1f} px, {off / noise:.0f} times the noise "

@@ -140,6 +140,8 @@ def test_motion_is_found_and_taken_out() -> None:
     assert all(result.sigma_corner == pytest.approx(0.1, rel=0.35) for result in moving)
     told = [text for result in moving for text in result.warnings if "moved while rows were read" in text]
     assert len(told) >= 8
+    # Exposures are together; only rows are apart.
+    assert not any("same moment" in text for result in moving for text in result.warnings)
 
 
 def test_nothing_moves_on_a_stand() -> None:
@@ -235,3 +237,9 @@ def test_two_webcams_that_are_not_synchronized(kcal_data: Path) -> None:
         moved = [float(text.split("by some ")[1].split()[0]) for text in result.warnings if "rolling" in text]
         assert max(moved) < 1.0
         assert result.sigma_corner == pytest.approx(0.06, abs=0.01)
+    zoomed = cameras[1].params.detach().clone()
+    zoomed[:2] *= 2.0
+    other = cameras[1].with_parameters(zoomed)
+    other.calibration = CameraCalibration(record=cameras[1].calibration.record)
+    with pytest.raises(InputError, match=r"do not fit the right camera \(RMS .* px; 0\.08 px when it was calibrated\)"):
+        calibrate_rig(cameras[0], other, *seen, pairs)
