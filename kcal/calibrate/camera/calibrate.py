@@ -14,9 +14,9 @@ from kcal.calibrate.camera.leave_out import (
     calibrate_what_fits,
     lasting_warnings,
     listed_views,
-    two_camera_warnings,
     without_views,
 )
+from kcal.calibrate.camera.one_camera import lenses_by_view
 from kcal.calibrate.camera.parametric import calibrate_parametric
 from kcal.calibrate.camera.result import (
     CalibrationOptions,
@@ -67,7 +67,12 @@ def sharing(
         KcalError: the cameras cannot be fitted together.
     """
     found = list(outcomes)
-    known = {i: outcome for i, outcome in enumerate(outcomes) if isinstance(outcome, CameraCalibrationResult)}
+    # A lens that moves by view stays as it was found.
+    known = {
+        i: outcome
+        for i, outcome in enumerate(outcomes)
+        if isinstance(outcome, CameraCalibrationResult) and outcome.by_view is None
+    }
     boards = [result.observations.board for result in known.values()]
     together = options.board == "printed" and len(set(boards)) < len(boards)
     if not options.hybrid or not (together or (one_type and len(known) >= LEAST_CAMERAS)):
@@ -198,9 +203,15 @@ def calibrate_camera(
         progress(f"{len(nearly)} views are copies of others; again without them")
         copied = nearly
         result = _calibrate(_without_copies(observations, copied), options, progress)
-    doubts = two_camera_warnings(result, options, progress)
-    result = dataclasses.replace(result, warnings=(*result.warnings, *doubts))
-    return _complete(result, observations, copied)
+    checked = lenses_by_view(result, options, progress)
+    if not isinstance(checked, CameraCalibrationResult):
+        left = [view.name for view in result.observations.views]
+        wrong = {observations.names.index(left[i]): why for i, why in checked.items()}
+        wrong |= {i: wrong[first] for i, first in copied.items() if first in wrong}
+        progress(f"again without {len(wrong)} views of another camera")
+        kept = [name for i, name in enumerate(observations.names) if i not in wrong]
+        return without_views(calibrate_camera(observations.subset(kept), options, progress), observations, wrong)
+    return _complete(checked, observations, copied)
 
 
 def _check_spacing(observations: Observations, options: CalibrationOptions, progress: Progress) -> None:

@@ -61,19 +61,20 @@ def calibrate_hybrid(
             options.modes,
         )
         weights = corner_weights(observations, start.residuals)
-    fit = _fit_views(observations, pixels, weights, start, options, progress)
+    fit = fit_by_options(observations, pixels, weights, start, options, progress)
     return hybrid_result(observations, fit, options)
 
 
-def _fit_views(
+def fit_by_options(
     observations: Observations,
     pixels: Tensor,
-    weights: Tensor,
-    start: FitStart | None,
+    weights: Tensor | None,
+    start: HybridFit | FitStart | None,
     options: CalibrationOptions,
     progress: Progress,
     robust: bool = False,
 ) -> HybridFit:
+    """Fit a hybrid lens as the options say; arguments as of `kcal.calibrate.hybrid.fit.fit_hybrid`."""
     return fit_hybrid(
         observations.board.points,
         pixels,
@@ -113,14 +114,14 @@ def _hybrid_without_outliers(
     pixels, names = observations.pixels(), observations.names
     own = torch.isfinite(pixels).all(-1).double()
     # A few wrong corners bend a plain fit towards them; bounded weights let them stand out.
-    robust = _fit_views(observations, pixels, own, None, options, progress, robust=True)
+    robust = fit_by_options(observations, pixels, own, None, options, progress, robust=True)
     if options.weighted:
         own = corner_weights(observations, robust.residuals)
 
     def fit(left: list[int], rejected: Tensor) -> tuple[HybridFit, Tensor]:
         some, weights = pixels[left], own[left]
         used = observations.subset([names[i] for i in left])
-        found = _fit_views(used, some, torch.where(rejected, 0.0, weights), None, options, progress)
+        found = fit_by_options(used, some, torch.where(rejected, 0.0, weights), None, options, progress)
         return found, found.residuals_of(some) * weights[..., None]
 
     kept = leave_out_outliers(observations, reject, robust.residuals_of(pixels) * own[..., None], fit, progress)

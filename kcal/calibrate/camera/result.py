@@ -301,6 +301,8 @@ class CameraCalibrationResult:
             be more than 1.4 times as large.
         rejected_corners: corners of the views that were used, left out by `CalibrationOptions.reject`.
         rejected_views: views left out likewise, and copies of other views.
+        by_view: (V, 3) logarithm of the scale, and principal point (pixels), of each view off those of the camera, if
+            a stabilizer or an autofocus moves the lens; None: all views have the same.
         shared_board: which cameras helped to measure the board, where several were calibrated together. Errors of such
             cameras are not quite independent of each other; a rig of them knows that.
     """
@@ -328,6 +330,7 @@ class CameraCalibrationResult:
     led_by_prior: tuple[str, ...] = ()
     rejected_corners: tuple[RejectedCorner, ...] = ()
     rejected_views: tuple[RejectedView, ...] = ()
+    by_view: Tensor | None = None
     shared_board: SharedBoard | None = None
 
     def __post_init__(self) -> None:
@@ -347,6 +350,7 @@ class CameraCalibrationResult:
             cam_from_board_rotation=among(self.cam_from_board_rotation, views, count),
             cam_from_board_translation=among(self.cam_from_board_translation, views, count),
             hybrid=None if self.hybrid is None else self.hybrid.among(views, count),
+            by_view=None if self.by_view is None else among(self.by_view, views, count),
         )
 
     def _record(self) -> CalibrationRecord:

@@ -1,0 +1,571 @@
+"""Tell whether one camera took all views: groups at another zoom or crop, and lenses that move from view to view."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kcal.calibrate.camera.hybrid import fit_by_options, hybrid_result
+from kcal.calibrate.camera.leave_out import few_views, lasting_warnings
+from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult, Progress
+from kcal.calibrate.hybrid.evidence import WORTH, with_tempering
+from kcal.calibrate.hybrid.fit import HybridFit
+from kcal.calibrate.hybrid.fitted_views import hybrid_unknowns
+from kcal.calibrate.problem.board_problem import POSE, BoardProblem
+from kcal.calibrate.problem.state import BoardState, by_number
+from kcal.calibrate.problem.views import LEAST_NOISE, among
+from kcal.corners.observations import Observations
+from kcal.errors import DegenerateError, InputError
+from kcal.gaussian import triangular
+from kcal.solve.schur import without_local
+from kcal.texts import number_text
+
+# A view's own scale and principal point, θ = (ln scale, cx, cy) off those of all views: of another camera or crop, of a
+# lens that focuses anew, or of one that a stabilizer moves.
+#
+# Poses, and motions during the readout, hide most of that: the RMS of one camera for all is hardly larger. So it is
+# told by the evidence. Near the solution each view is a quadratic form in θ, its pose and motion eliminated. θ is given
+# a normal prior, whose amplitudes have the largest evidence; views of one camera stay below zero nats. Where they do
+# not, corners are moved by what was found, the camera is fitted again to these, and so on. In the end two values of θ,
+# one for each of two groups of views, compete with the normal prior.
+
+# fx, fy, cx, cy among the parameters.
+_INDICES = (0, 1, 2, 3)
+_SIZE = 3
+# Which numbers share an amplitude, of θ and of three ways in which a board bends; -1: zero. A board that bends by view
+# is the rival: what it explains better is no matter of the lens.
+_NONE, _BENT = (-1,) * 6, (-1, -1, -1, 0, 0, 0)
+_LENS = ((-1, 0, 0, -1, -1, -1), (0, -1, -1, -1, -1, -1), (0, 1, 1, -1, -1, -1))
+# Of amplitudes of motions, of others than these.
+_OTHER = 10
+# Share of the variances of motions with which the search for amplitudes begins: a lens that moves was taken for motion.
+_LESS = 0.01
+# Share of its price that must be in sight before a camera is fitted again for two groups alone.
+_PROMISED = 0.4
+# Widths of the prior of the difference between two groups: ln scale, and shares of the image's diagonal.
+_APART, _APART_CENTER = 0.1, 0.02
+# Rounds of refits; share of θ, and standard deviations of the camera, by which the last one changes it; the largest
+# share of a step of groups that the next one is taken to be; and steps of the search for amplitudes.
+_ROUNDS, _REST, _MOVED, _AHEAD, _STEPS = 12, 0.05, 0.2, 0.6, 60
+# What to do about a lens that moves.
+_STILL = "lock focus and zoom, switch the image stabilizer off (also in the camera's app), and photograph again"
+# Fewer views tell nothing; one view alone may be wrong otherwise, and a scale and principal point suits it.
+_FEWEST, _FEWEST_OTHERS = 6, 2
+# Shares of the image's diagonal that corners of two groups must be apart, beyond which they are of two cameras; a lens
+# that focuses by itself scales images by one to three percent.
+_CERTAIN = 0.008
+# Nats by which a view belongs to its group; standard deviations from which a difference is told, and χ² of two
+# numbers that agree.
+_CLEAR, _TOLD, _AGREE = 3.0, 3.0, 9.2
+
+
+class _ByView(NamedTuple):
+    """χ² of each view by x: its motion and bending over their deviations, θ, and how its board bends: 2 gᵀx + xᵀNx.
+
+    Attributes:
+        N: (V, X, X).
+        g: (V, X).
+        ties: which numbers of the motion and bending share an amplitude.
+        begin: (6,) standard deviations of the rest, larger than any, with which the search for amplitudes begins.
+    """
+
+    N: Tensor
+    g: Tensor
+    ties: tuple[int, ...]
+    begin: Tensor
+
+    def lens(self, held: float = 1.0) -> _ByView:
+        """By θ alone, motions integrated out, with this share of their variances; the board as it is."""
+        count = len(self.ties)
+        inner = self.N[:, :count, :count] + torch.eye(count, dtype=torch.float64) / held
+        rest = torch.cat([self.N[:, :count, count : count + _SIZE], self.g[:, :count, None]], 2)
+        gone = torch.linalg.solve(inner, rest)
+        across = self.N[:, count : count + _SIZE, :count]
+        N = self.N[:, count : count + _SIZE, count : count + _SIZE] - across @ gone[..., :-1]
+        g = self.g[:, count : count + _SIZE] - (across @ gone[..., -1:])[..., 0]
+        return _ByView(N, g, (), self.begin[:_SIZE])
+
+    def change(self, theta: Tensor) -> Tensor:
+        """(..., V) of χ² by θ (..., V, 3), or by one for all (..., 1, 3)."""
+        each = theta.expand(*theta.shape[:-2], *self.g.shape)
+        return (each * (2.0 * self.g + (self.N @ each[..., None])[..., 0])).sum(-1)
+
+    def best(self, second: Tensor) -> Tensor:
+        """(..., 2, 3) the best θ of both groups; `second` (..., V) tells which views are in the second one."""
+        groups = torch.stack([~second, second], -2).to(self.g.dtype)
+        N, g = (groups @ self.N.flatten(1)).unflatten(-1, self.N.shape[1:]), groups @ self.g
+        return -torch.linalg.lstsq(N, g[..., None]).solution[..., 0]
+
+    def fall(self, second: Tensor) -> Tensor:
+        """(...) half of that by which χ² falls with the best of both groups: nats."""
+        theta = self.best(second)
+        return -0.5 * torch.where(second, self.change(theta[..., 1:, :]), self.change(theta[..., :1, :])).sum(-1)
+
+    def spread(self, tied: Sequence[int]) -> _Spread:
+        """Normal motions and others, whose amplitudes have the largest evidence (by EM); `tied` tells which are one."""
+        count, tied = len(self.ties), tied[: len(self.begin)]
+        ties = torch.tensor([*self.ties, *tied])
+        index = (ties >= 0).nonzero()[:, 0]
+        if not len(index):
+            zeros = self.g.new_zeros(len(self.g), len(tied))
+            return _Spread(0.0, zeros[:, 0], zeros[0], zeros)
+        N, g, one = self.N[:, index[:, None], index], self.g[:, index], torch.eye(len(index), dtype=torch.float64)
+        share = (ties[index] == ties[index, None]).double()
+        share = share / share.sum(1)
+        variance = share @ torch.cat([self.g.new_full((count,), _LESS), self.begin.square()])[index]
+        for _ in range(_STEPS):
+            root = variance.sqrt()
+            inner = one + root[:, None] * N * root
+            P = root[:, None] * torch.linalg.inv(inner) * root
+            mean = -(P @ g[..., None])[..., 0]
+            variance = share @ (P.diagonal(dim1=1, dim2=2) + mean.square()).mean(0)
+        nats = -0.5 * ((mean * g).sum(-1) + torch.linalg.slogdet(inner).logabsdet)
+        sigma, each = N.new_zeros(len(ties)), N.new_zeros(len(N), len(ties))
+        sigma[index], each[:, index] = root, mean
+        # A second amplitude must be worth it.
+        paid = 0.5 * len(ties[index].unique()) * math.log(len(N)) + WORTH * max(0, *tied)
+        return _Spread(float(nats.sum()) - paid, nats, sigma[count:][: len(tied)], each[:, count:])
+
+
+class _Spread(NamedTuple):
+    """Numbers of all views that are normal about zero.
+
+    Attributes:
+        nats: by which they are likelier than zeros, the choice of amplitudes paid for.
+        by_view: (V,) nats of each view.
+        sigma: (X,) standard deviations.
+        mean: (V, X) of each view.
+    """
+
+    nats: float
+    by_view: Tensor
+    sigma: Tensor
+    mean: Tensor
+
+    def beyond(self, other: _Spread) -> float:
+        """Nats by which this is likelier than another one, without the view that tells most: it may be a wrong one."""
+        return self.nats - other.nats - float((self.by_view - other.by_view).max().clamp_min(0.0))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class OwnLenses:
+    """Scale and principal point of each view, off the camera's.
+
+    Args:
+        fit: of corners from which they were taken away; its error bars allow for them, and for those of the next view.
+        sigma: (3,) standard deviations of ln scale, cx and cy, pixels.
+        theta: (V, 3) of each view.
+        nats: by which this is likelier than one camera for all views.
+        groups: of two cameras, if these are likelier.
+    """
+
+    fit: HybridFit
+    sigma: Tensor
+    theta: Tensor
+    nats: float
+    groups: TwoCameras | None = None
+
+    @property
+    def what(self) -> str:
+        """What moves."""
+        scale, center = 100.0 * float(self.sigma[0]), float(self.sigma[1])
+        words = [f"its focal length by some {number_text(scale, digits=2)} % (autofocus or zoom)"] * (scale > 0)
+        words += [f"its principal point by some {number_text(center, digits=2)} px (image stabilizer or crop)"] * (
+            center > 0
+        )
+        return f"the lens moves from view to view, {' and '.join(words)}"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class TwoCameras:
+    """Views that are not of one camera.
+
+    Args:
+        second: (V,) which views are in the smaller group.
+        clear: (V,) nats by which each view belongs to its own group.
+        change: (3,) ln scale and principal point (px) of the second group less those of the first.
+        sigma: (3,) standard deviations of these.
+        turned: how images of the second group may have been turned or mirrored; empty if they were not.
+    """
+
+    second: Tensor
+    clear: Tensor
+    change: Tensor
+    sigma: Tensor
+    turned: str
+
+    @property
+    def why(self) -> str:
+        """What is different about the smaller group."""
+        scale, right, down = self.change.tolist()
+        told = (self.change.abs() > _TOLD * self.sigma).tolist()
+        percent = 100.0 * math.expm1(scale)
+        words = [f"everything is {abs(percent):.1f} % {'larger' if percent > 0 else 'smaller'}"] * told[0]
+        sides = [f"{abs(right):.0f} px to the {'right' if right > 0 else 'left'}"] * told[1]
+        sides += [f"{abs(down):.0f} px {'down' if down > 0 else 'up'}"] * told[2]
+        words += [
+            f"the principal point is {' and '.join(sides)}{self.turned and ', as where images are '}{self.turned}"
+        ] * bool(sides)
+        return f"another camera, zoom or crop: {', and '.join(words) or 'the lens is another one'}"
+
+    @property
+    def cure(self) -> str:
+        """What to do."""
+        back = "turn or mirror images back if they were; otherwise " if self.turned else ""
+        return f"{back}calibrate each group for itself, from images as the camera gives them, or take all at one zoom"
+
+    def distance(self, size: tuple[int, int]) -> float:
+        """How far apart corners of both groups typically are, in shares of the image's diagonal."""
+        # Half of the diagonal's half is a typical distance from the middle.
+        return math.hypot(0.25 * float(self.change[0]), float(self.change[1:].norm()) / math.hypot(*size))
+
+    def text(self, names: Sequence[str]) -> str:
+        """One sentence that names the views of the smaller group."""
+        own = [names[i] for i in self.second.nonzero()[:, 0].tolist()]
+        unclear = [names[i] for i in (self.clear < _CLEAR).nonzero()[:, 0].tolist()]
+        return (
+            f"the views are not of one camera: {len(own)} of {len(names)} ({', '.join(own)}), {self.why}"
+            + f" (not clear for {', '.join(unclear)})" * bool(unclear)
+        )
+
+
+def lenses_by_view(
+    result: CameraCalibrationResult, options: CalibrationOptions, progress: Progress
+) -> CameraCalibrationResult | dict[int, str]:
+    """A result that allows for a lens that moves from view to view; or the few views of another camera, and why.
+
+    Raises:
+        InputError: the views are of two cameras; or the lens moves, and is a parametric one.
+    """
+    used = result.per_view_rms.isfinite().nonzero()[:, 0].tolist()
+    if len(used) < _FEWEST:
+        return result
+    pixels = torch.where(result.residuals.isfinite(), result.observations.pixels(), torch.nan)[used]
+    seen = result.observations.subset([result.observations.names[i] for i in used])
+    try:
+        if result.hybrid is not None:
+            fit, own = result.hybrid.only(used), options
+        else:
+            # Views of a parametric lens have no motion: the reference lens tells whether it is that.
+            poses = result.cam_from_board_rotation[used], result.cam_from_board_translation[used]
+            state, none = BoardState.flat(result.camera.params.detach(), *poses), pixels.new_zeros(len(used), _SIZE)
+            problem = BoardProblem(result.board_points, pixels, result.camera.model, _INDICES)
+            begin = _widths(seen.image_size)
+            views = _by_view(problem, state, max(result.noise, LEAST_NOISE), none, begin)
+            if _likeliest(views, _LENS).nats < WORTH:
+                return result
+            own = CalibrationOptions(board=options.board, motion=options.motion, bending=options.bending)
+            fit = fit_by_options(seen, pixels, None, None, own, progress)
+        found = own_lenses(fit, seen, pixels, own, progress)
+    except (InputError, DegenerateError, ArithmeticError, torch.linalg.LinAlgError):
+        return result
+    if found is None:
+        return result
+    text, groups = f"{found.what} ({found.nats:.0f} nats)", found.groups
+    if groups is not None:
+        second = groups.second.nonzero()[:, 0].tolist()
+        if few_views(len(second), len(used)):
+            return {used[i]: groups.why for i in second}
+        if groups.distance(fit.size) > _CERTAIN:
+            raise InputError(f"{groups.text(seen.names)}; {groups.cure}")
+        text += f"; {groups.text(seen.names)}"
+    if result.hybrid is None:
+        raise InputError(f"{text}. A parametric lens does not allow for that: leave the model out, or {_STILL}")
+    try:
+        after = hybrid_result(result.observations, found.fit.among(used, len(result.observations.views)), options)
+    except DegenerateError as error:
+        raise DegenerateError(f"{text}, which leaves no focal length for all of them: {_STILL}") from error
+    text += f": the camera is their mean, and its error bars contain the movement; for smaller ones {_STILL}"
+    return dataclasses.replace(
+        after,
+        by_view=among(found.theta, used, len(result.observations.views)),
+        warnings=(*lasting_warnings(result), text, *after.warnings),
+        rejected_corners=result.rejected_corners,
+        rejected_views=result.rejected_views,
+    )
+
+
+def own_lenses(
+    fit: HybridFit, seen: Observations, pixels: Tensor, options: CalibrationOptions, progress: Progress = lambda _: None
+) -> OwnLenses | None:
+    """Scale and principal point of each view; None if all views have the same, or where nothing tells.
+
+    Args:
+        fit: of all of them as one camera.
+        seen: the views.
+        pixels: (V, N, 2), NaN where not seen.
+        options: with which they were fitted.
+        progress: called after each further fit.
+    """
+    views = _of_fit(fit, pixels, torch.zeros_like(pixels[:, 0, :1]).expand(-1, _SIZE))
+    if not bool(views.N.isfinite().all() and views.g.isfinite().all()):
+        return None
+    found, none = _likeliest(views, _LENS), views.spread(_NONE)
+    if views.spread(_BENT).nats > max(found.nats, none.nats):
+        return None
+    refits, about, normal, nats = _Refits(fit, seen, pixels, options, progress), views.lens(), None, 0.0
+    if found.beyond(none) < 0.0:
+        # Two values may be likelier where no spread is: motions that are held back do not hide the groups.
+        held = views.lens(_LESS)
+        second = _grouped(held, held.spread(_LENS[-1]).mean, fit.size)
+        if not _FEWEST_OTHERS <= int(second.sum()) <= len(second) - _FEWEST_OTHERS:
+            return None
+        if about.fall(second) < _PROMISED * _Parted.of(about, second, fit.size).price:
+            return None
+    else:
+        for _ in range(_ROUNDS):
+            views = refits.with_own(found.mean[:, :_SIZE])
+            found = _likeliest(views, _LENS)
+            if refits.rest:
+                break
+        about = views.lens()
+        found = _likeliest(about, _LENS)
+        nats = found.nats + refits.nats(about)
+        second = _grouped(about, found.mean, fit.size)
+        if nats >= WORTH:
+            normal = OwnLenses(fit=refits.widened(found.sigma), sigma=found.sigma, theta=refits.theta, nats=nats)
+    return _two_cameras(refits, about, second, max(nats, 0.0)) or normal
+
+
+def _likeliest(views: _ByView, ways: Sequence[Sequence[int]]) -> _Spread:
+    return max((views.spread(tied) for tied in ways), key=lambda spread: spread.nats)
+
+
+class _Refits:
+    """Fits of pixels from which a θ of each view was taken away, each begun where the last one ended."""
+
+    def __init__(
+        self, first: HybridFit, seen: Observations, pixels: Tensor, options: CalibrationOptions, progress: Progress
+    ) -> None:
+        self.first = self.fit = first
+        self.seen, self.pixels, self.options, self.progress = seen, pixels, options, progress
+        self.theta, self.step, self.rest = pixels.new_zeros(len(pixels), _SIZE), math.inf, False
+
+    @property
+    def undone(self) -> Tensor:
+        """(V, N, 2) pixels as one camera shows them."""
+        center, theta = self.first.state.parameters[2:4], self.theta[:, None]
+        return (self.pixels - center - theta[..., 1:]) * torch.exp(-theta[..., :1]) + center
+
+    def with_own(self, theta: Tensor, ahead: float = 0.0) -> _ByView:
+        """Fit with θ (V, 3) taken away; or with more of it, ahead of motions, which make way slowly."""
+        theta, before = theta - theta.mean(0), self.fit
+        step = (theta - self.theta) / _widths(before.size)
+        share = min(float(step.norm()) / self.step, ahead)
+        self.step = float(step.norm())
+        still = self.step <= _REST * float((theta / _widths(before.size)).norm())
+        self.theta = theta + share / (1.0 - share) * (theta - self.theta)
+        self.fit = fit_by_options(self.seen, self.undone, before.weights, before, self.options, self.progress)
+        self.progress("views with a lens of their own")
+        moved = (self.fit.state.parameters - before.state.parameters)[:4]
+        self.rest = still and bool((moved.abs() <= _MOVED * self.fit.covariance.diagonal()[:4].sqrt()).all())
+        return _of_fit(self.fit, self.undone, self.theta)
+
+    def widened(self, sigma: Tensor) -> HybridFit:
+        """The last fit with error bars that allow for θ, and for that of the next view."""
+        return _widened(self.fit, self.undone, self.theta, sigma)
+
+    def nats(self, views: _ByView) -> float:
+        """By which the last fit is likelier than the first one, were θ zero in it."""
+        fit, first = self.fit, self.first
+        # Evidence of views that move is found before they are tempered.
+        tempering = fit.tempering if fit.readout is None and first.readout is None else 1.0
+        gained = _evidence_at(fit, tempering) - _evidence_at(first, tempering)
+        # Pixels were moved, and scaled.
+        counts = self.pixels[..., 0].isfinite().sum(1)
+        return gained + 0.5 * float(views.change(self.theta).sum()) - 2.0 * float((counts * self.theta[:, 0]).sum())
+
+
+class _Parted(NamedTuple):
+    """What parts two groups of views.
+
+    Attributes:
+        both: (2, 3) the best θ of each.
+        covariance: (3, 3) of their difference.
+        price: nats of the choice of these numbers, and of a group for each view.
+    """
+
+    both: Tensor
+    covariance: Tensor
+    price: float
+
+    @classmethod
+    def of(cls, views: _ByView, second: Tensor, size: tuple[int, int]) -> _Parted:
+        """Of groups of which `second` (V,) is one."""
+        covariance = torch.linalg.pinv(torch.stack([views.N[~second].sum(0), views.N[second].sum(0)])).sum(0)
+        unit, share = _widths(size), float(second.double().mean())
+        known = torch.eye(_SIZE, dtype=torch.float64) + torch.linalg.pinv(covariance) * unit * unit[:, None]
+        mixed = -sum(part * math.log(part) for part in (share, 1.0 - share) if part > 0)
+        price = 0.5 * float(torch.logdet(known)) + 0.5 * math.log(len(second)) + len(second) * mixed
+        return cls(views.best(second), covariance, price)
+
+
+def _grouped(views: _ByView, mean: Tensor, size: tuple[int, int]) -> Tensor:
+    """(V,) the second of the two groups with which χ² falls most, from several starts; `mean` (V, 3) of single θ."""
+    mean = mean / _widths(size)
+    _, axes = torch.linalg.eigh(torch.cov(mean.T))
+    order = torch.arange(len(mean), dtype=torch.float64)
+    lines = torch.cat([order[None], order[None] % 2, mean.T, (mean @ axes).T])
+    low, high = lines.aminmax(dim=1, keepdim=True)
+    second = torch.cat([lines > lines.median(1, keepdim=True).values, lines > 0.5 * (low + high)])
+    for _ in range(_STEPS):
+        theta = views.best(second)
+        moved = views.change(theta[:, 1:]) < views.change(theta[:, :1])
+        if torch.equal(moved, second):
+            break
+        second = moved
+    return second[views.fall(second).argmax()]
+
+
+def _two_cameras(refits: _Refits, views: _ByView, second: Tensor, nats: float) -> OwnLenses | None:
+    """Two groups of views, if two values of θ are likelier than normal ones, which are by so many nats."""
+    refits.step = math.inf
+    for _ in range(_ROUNDS):
+        if not _FEWEST_OTHERS <= int(second.sum()) <= len(second) - _FEWEST_OTHERS:
+            return None
+        views = refits.with_own(views.best(second)[second.long()], _AHEAD).lens()
+        changes = views.change(views.best(second)[:, None])
+        moved = changes[1] < changes[0]
+        if refits.rest and torch.equal(moved, second):
+            break
+        second = moved
+    second = second if 2 * int(second.sum()) <= len(second) else ~second
+    parted, fit = _Parted.of(views, second, refits.fit.size), refits.fit
+    unlikely = (parted.both[1] - parted.both[0]) / _widths(fit.size)
+    likelier = refits.nats(views) + float(views.fall(second) - 0.5 * unlikely.square().sum()) - parted.price
+    if likelier < nats + WORTH:
+        return None
+    change, changes = parted.both[1] - parted.both[0], views.change(parted.both[:, None])
+    groups = TwoCameras(
+        second=second,
+        clear=0.5 * torch.where(second, changes[0] - changes[1], changes[1] - changes[0]),
+        change=change,
+        sigma=parted.covariance.diagonal().sqrt(),
+        turned=_mirrored(change, parted.covariance, fit.state.parameters[2:4] + parted.both[0, 1:], fit),
+    )
+    sigma = refits.theta.square().mean(0).sqrt()
+    return OwnLenses(fit=refits.widened(sigma), sigma=sigma, theta=refits.theta, nats=likelier, groups=groups)
+
+
+def _mirrored(change: Tensor, covariance: Tensor, place: Tensor, fit: HybridFit) -> str:
+    """How images are turned or mirrored that move the principal point from `place` by the change; or nothing."""
+    width, height = fit.size
+    (x, y), last = place.tolist(), (width - 1.0, height - 1.0)
+    images = {
+        "turned by 180°": (last[0] - x, last[1] - y),
+        "mirrored left to right": (last[0] - x, y),
+        "mirrored top to bottom": (x, last[1] - y),
+    }
+    if width == height:
+        images |= {"turned by 90°": (last[1] - y, x), "turned by -90°": (y, last[0] - x)}
+    # Of the difference: the image of the principal point moves against it.
+    known = covariance[1:, 1:] + 4.0 * fit.covariance[2:4, 2:4]
+    if abs(float(change[0])) > _TOLD * float(covariance[0, 0].sqrt()):
+        return ""
+    for how, there in images.items():
+        wanted = torch.tensor(there, dtype=torch.float64) - place
+        off = change[1:] - wanted
+        if float(off @ torch.linalg.solve(known, off)) < _AGREE < float(wanted @ torch.linalg.solve(known, wanted)):
+            return how
+    return ""
+
+
+def _widened(fit: HybridFit, pixels: Tensor, theta: Tensor, sigma: Tensor) -> HybridFit:
+    """A fit of pixels from which θ was taken away, with error bars that allow for it, and for that of the next view."""
+    known = fit.information
+    unknowns = hybrid_unknowns(fit.model, fit.square)
+    problem = BoardProblem(
+        fit.board_points,
+        pixels,
+        fit.model,
+        unknowns,
+        shapes=fit.board_shapes.shapes,
+        free_board=True,
+        weights=fit.weights,
+        readout=fit.readout,
+        stillness=None if fit.readout is None else fit.stillness,
+    )
+    rows, local = problem.rows(fit.state._replace(board=torch.zeros_like(fit.state.board))), problem.local_size
+    moves = sigma > 0
+    fx, fy = fit.state.parameters[:2]
+    by_parameter = [rows[:, local + slot] for slot in unknowns.slots[:4]]
+    zoom = fx * by_parameter[0] + (fy * by_parameter[1] if not fit.square else 0.0)
+    own = torch.stack([zoom, *by_parameter[2:]], 1)[:, moves]
+    prior = rows.new_zeros(len(rows), own.shape[1] + rows.shape[1], own.shape[1])
+    weight = fit.sigma / sigma[moves]
+    prior[:, local : local + len(weight)] = torch.diag(weight)
+    prior[:, -1] = weight * theta[:, moves]
+    rows = torch.cat([rows[:, :local], own, rows[:, local:]], 1)
+    off = without_local(torch.cat([rows, prior], 2), local + len(weight)).transpose(0, 1).flatten(1).T
+    # Those of the information, and the camera's own movement, which is that of the next view, in front.
+    columns = [0] * known.lens_size
+    for index, slot in zip(unknowns.indices, unknowns.slots, strict=True):
+        if known.slots[index] >= 0:
+            columns[known.slots[index]] = slot
+    columns += range(len(unknowns), len(unknowns) + known.board_size)
+    data = triangular(off[:, [*columns, -1]]) / (fit.sigma * math.sqrt(fit.wider))
+    change = data.new_zeros(len(columns), _SIZE)
+    change[[known.slots[0], known.slots[1]], 0] = torch.stack([fx, fy])
+    change[known.slots[2], 1] = change[known.slots[3], 2] = 1.0
+    moved = data[:, :-1] @ change[:, moves]
+    rows = torch.cat(
+        [torch.cat([-moved, data], 1), torch.nn.functional.pad(torch.diag(1.0 / sigma[moves]), (0, data.shape[1]))]
+    )
+    rows = triangular(rows)[len(weight) : -1, len(weight) :]
+    known = dataclasses.replace(known, rows=rows[:, :-1], residuals=rows[:, -1])
+    half = torch.zeros_like(fit.half)
+    half[: len(columns), columns] = known.half()
+    return dataclasses.replace(fit, information=known, half=half)
+
+
+def _evidence_at(fit: HybridFit, tempering: float) -> float:
+    """Logarithm of a fit's evidence were its data to count as this tempering says."""
+    own = fit.tempering if fit.readout is None else 1.0
+    freedom = 2.0 * float(fit.residuals[..., 0].isfinite().sum()) - POSE * len(fit.residuals)
+    return -with_tempering(-fit.log_evidence, freedom, fit.sigma**2 / fit.tempering, own, tempering)
+
+
+def _of_fit(fit: HybridFit, pixels: Tensor, theta: Tensor) -> _ByView:
+    """Of a fit's views, about no motion and no θ; `theta` (V, 3) was taken away from the pixels."""
+    shapes, noise = fit.board_shapes.shapes[:_SIZE], max(fit.sigma / math.sqrt(fit.tempering), LEAST_NOISE)
+    problem = BoardProblem(
+        fit.board_points, pixels, fit.model, _INDICES, shapes=shapes, free_board=True, weights=fit.weights,
+        readout=fit.readout, stillness=None if fit.readout is None else fit.stillness,
+    )  # fmt: skip
+    begin, state = torch.cat([_widths(fit.size), _APART * fit.board_shapes.unit[:_SIZE]]), fit.state
+    # Numbers of one amplitude have the same logarithm.
+    ties = _OTHER + by_number(np.arange(float(len(fit.log_ratio)))).unique(return_inverse=True)[1]
+    spread = (noise / fit.stillness.sqrt()).expand_as(state.motion)
+    return _by_view(problem, state._replace(board=theta.new_zeros(len(shapes))), noise, theta, begin, ties, spread)
+
+
+def _by_view(
+    problem: BoardProblem,
+    state: BoardState,
+    noise: float,
+    theta: Tensor,
+    begin: Tensor,
+    ties: Tensor | None = None,
+    spread: Tensor | None = None,
+) -> _ByView:
+    rows, local, motion = problem.corner_rows(state), problem.local_size, state.motion
+    scale = state.parameters[0] * rows[:, local] + state.parameters[1] * rows[:, local + 1]
+    own = rows[:, POSE:local]
+    if spread is not None:
+        own, motion = own * spread[..., None], motion / spread.clamp_min(1e-30)
+    rows = torch.cat([rows[:, :POSE], own, scale[:, None], rows[:, local + 2 :]], 1)
+    off, x = without_local(rows, POSE) / noise, torch.cat([motion, theta], 1)
+    gram = off @ off.mT
+    g = gram[:, :-1, -1] - (gram[:, :-1, : x.shape[1]] @ x[..., None])[..., 0]
+    return _ByView(gram[:, :-1, :-1], g, () if ties is None else tuple(ties.tolist()), begin)
+
+
+def _widths(size: tuple[int, int]) -> Tensor:
+    """(3,) of the prior of what parts two cameras."""
+    return torch.tensor([_APART, *[_APART_CENTER * math.hypot(*size)] * 2], dtype=torch.float64)
