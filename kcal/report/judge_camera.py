@@ -69,10 +69,11 @@ def view_findings(result: CameraCalibrationResult, noise: float | None = None) -
         noise: of a corner along an axis, px, under a lens that fits; that of the calibration if left out.
     """
     used = result.cam_from_board_rotation.isfinite().all(-1).all(-1)
-    rotation, translation = result.cam_from_board_rotation[used], result.cam_from_board_translation[used]
+    rotation = result.cam_from_board_rotation[used]
+    middle = rotation @ result.board_points.mean(0) + result.cam_from_board_translation[used]
     found = [
         _order_finding(seen_pixels(result)[used], result.observations),
-        *_pose_findings(result.camera, rotation, translation),
+        *_pose_findings(result.camera, rotation, middle),
     ]
     found += [
         _coverage_finding(result.observations),
@@ -134,7 +135,8 @@ def _order_finding(pixels: Tensor, observations: Observations) -> Finding | None
     return Finding.of("mirrored", "stop", text, action)
 
 
-def _pose_findings(camera: Camera, rotation: Tensor, translation: Tensor) -> list[Finding]:
+def _pose_findings(camera: Camera, rotation: Tensor, middle: Tensor) -> list[Finding]:
+    """Tilts, rolls and distances of boards, from their rotations and middles (V, 3)."""
     tilts = board_tilts(rotation)
     found = []
     known = None if camera.calibration is None else camera.calibration.sigma
@@ -154,7 +156,7 @@ def _pose_findings(camera: Camera, rotation: Tensor, translation: Tensor) -> lis
             "principal point cannot be told apart"
         )
         found.append(Finding.of("roll", "doubt", text, "turn the board by 90 degrees in some views"))
-    distance = translation.norm(dim=-1)
+    distance = middle.norm(dim=-1)
     if float(distance.max()) < _DEPTH * float(distance.min()):
         text = (
             f"the board was always at the same distance ({float(distance.min()):.2g} to {float(distance.max()):.2g} m)"

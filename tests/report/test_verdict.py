@@ -141,6 +141,14 @@ def test_boards_parallel_to_the_image_are_named(clean: CameraCalibrationResult, 
     assert "tilt the board" in verdict.next_step
 
 
+def test_distances_are_those_of_the_middle_of_the_board(clean: CameraCalibrationResult) -> None:
+    lens, far = clean.camera.with_parameters(clean.camera.params), torch.linspace(0.5, 0.6, VIEWS).double()
+    flat = torch.eye(3, dtype=torch.float64).expand(VIEWS, 3, 3)
+    place = far[:, None] * torch.tensor([0.0, 0.0, 1.0]).double() - BOARD.points.mean(0)
+    given = dataclasses.replace(clean, camera=lens, cam_from_board_rotation=flat, cam_from_board_translation=place)
+    assert "(0.5 to 0.6 m)" in next(one.text for one in view_findings(given) if one.name == "depth")
+
+
 @pytest.mark.parametrize("some", [slice(None), slice(0, VIEWS - 3)], ids=["all", "most"])
 def test_mirrored_views_are_named(clean: CameraCalibrationResult, examination: Examination, some: slice) -> None:
     pixels = clean.observations.pixels().unflatten(1, (BOARD.rows, BOARD.columns))
