@@ -5,9 +5,11 @@ from __future__ import annotations
 import glob
 import hashlib
 import os
+import re
 import warnings
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
@@ -172,17 +174,71 @@ def seen_instead(image: npt.NDArray[np.uint8], board: Board) -> str:
         return markers
     if has_own_markers(image, board):
         return ""
-    circles = seen_circles(image, board)
-    if circles is not None:
+    plain = board.pattern == "checkerboard" and board.dictionary is None
+    found = seen_size(image) if plain else None  # corners between squares pass for circles more easily than vice versa
+    if found is None and (circles := seen_circles(image, board)) is not None:
         return circles
-    found = seen_size(image)
+    found = found or seen_size(image)
     own = (max(board.columns, board.rows), min(board.columns, board.rows))
-    plain = board.pattern == "checkerboard"
-    if found is None or (found == own and plain and board.dictionary is None):
-        return ""
-    squares = found == (own[0] - 1, own[1] - 1) and plain
+    return "" if found is None or (found == own and plain) else _other_size(found, board)
+
+
+def _other_size(found: tuple[int, int], board: Board) -> str:
+    own = (max(board.columns, board.rows), min(board.columns, board.rows))
+    squares = found == (own[0] - 1, own[1] - 1) and board.pattern == "checkerboard"
     advice = "count inner corners, not squares" if squares else f"give --board {found[0]}x{found[1]}"
     return f"a board of {found[0]}x{found[1]} was found: {advice}"
+
+
+# What a detection says that has found all corners of another board, or more than this one has.
+_OTHER = re.compile(r"a (?:board|grid) of (\d+)x(\d+) inner corners was found")
+_LOOKS = 3  # images without the board in which another one is sought
+_STOPS = 3, 8  # images without the board, and none with it, after which the search may end
+_FEW = 0.2  # views, as a share of the images that show one other board: the board was named wrongly
+
+
+def seen_by_most(failed: Sequence[tuple[Any, str]], board: Board) -> tuple[str, int]:
+    """What most of the images show that show another board, and how many do; empty if none does.
+
+    Args:
+        failed: images without the board, and why.
+        board: that was asked for.
+    """
+    votes: dict[str, list[str]] = {}
+    for number, (file, reason) in enumerate(failed):
+        said = _OTHER.search(reason)
+        text = _other_size((int(said[1]), int(said[2])), board) if said else ""
+        if not said and number < _LOOKS:
+            with suppress(FileError):
+                image = to_8bit(_image_and_hash(file)[0])
+                small = reduced(image, max(1.0, max(image.shape) / SEARCH_SIDES[0]), _size(image))[0]
+                text = seen_instead(to_8bit(small), board)
+        if text:
+            votes.setdefault(text.rpartition(": ")[2], []).append(text)
+    most = max(votes.values(), key=len, default=[""])
+    return most[0], len(most) if votes else 0
+
+
+def refuse_other_board(views: int, failed: Sequence[tuple[Any, str]], count: int, board: Board) -> None:
+    """Refuse images of which none shows the board, or hardly any while most show one other board.
+
+    Args:
+        views: in which the board was found.
+        failed: images without it, and why.
+        count: of all images; fewer than that may have been searched.
+        board: that was asked for.
+
+    Raises:
+        InputError: so it is; with what most images show.
+    """
+    where = f"any of {count} images" if len(failed) == count else f"the first {len(failed)} of {count} images"
+    if not views:
+        text, shown = seen_by_most(failed, board)
+        raise InputError(f"no board in {where} ({f'{shown} of them: {text}' if text else failed[0][1]})")
+    if views <= _FEW * sum(bool(_OTHER.search(reason)) for _, reason in failed):
+        text, shown = seen_by_most(failed, board)
+        if views <= _FEW * shown:
+            raise InputError(f"the board is in {views} of {count} images only; in {shown} of them {text}")
 
 
 def seen_markers(image: npt.NDArray[np.uint8], board: Board) -> str:
@@ -426,6 +482,7 @@ def detect(
     sources = dict(zip(names, files, strict=True))
     views: list[View] = []
     failures: list[Failure] = []
+    failed: list[tuple[Any, str]] = []
     numberings: dict[bool | None, list[str]] = {}
     common = common_size(names, [_size_of(file) for file in files])
     for text in common.notes:
@@ -438,6 +495,8 @@ def detect(
                 image, digest = _image_and_hash(file)
             except FileError as error:
                 failures.append(Failure(name=name, reason=str(error).removeprefix(f"{file}: ")))
+                if i not in common.left_out:
+                    failed.append((file, f"{name}: {failures[-1].reason}"))
             else:
                 try:
                     found = limited(detect_board, image, board, refine)
@@ -445,6 +504,9 @@ def detect(
                     found = Detection(None, str(error))
                 if found.pixels is None:
                     failures.append(Failure(name=name, reason=found.reason))
+                    failed.append((file, f"{name}: {found.reason}"))
+                    if not views and len(failed) in _STOPS and 2 * seen_by_most(failed, board)[1] > len(failed) + 1:
+                        refuse_other_board(0, failed, len(files), board)
                     if on_failure is not None and isinstance(file, Path):
                         on_failure(name, file, found)
                 else:
@@ -452,9 +514,7 @@ def detect(
                     views.append(view_of(found, name, image=str(file) if digest else None, sha256=digest))
             if progress is not None:
                 progress(name)
-    if not views:
-        first = f"{failures[0].name}: {failures[0].reason}"
-        raise InputError(f"no board in any of {len(files)} images ({first}){_hint(files, board)}")
+    refuse_other_board(len(views), failed, len(files) - len(common.left_out), board)
     if True in numberings:
         views = _renumbered(views, sources, numberings, board, refine)
     scales = {names[i]: scale for i, scale in common.scales.items()}
@@ -563,19 +623,6 @@ def _size_of(file: Any) -> tuple[int, int] | None:
         return (width, height) if width else _size(_image_and_hash(file)[0])
     except FileError:
         return None
-
-
-def _hint(files: list[Any], board: Board) -> str:
-    """Which board the first images show, if they show another one."""
-    for file in files[:3]:
-        try:
-            image = to_8bit(_image_and_hash(file)[0])
-        except FileError:
-            continue
-        small = to_8bit(reduced(image, max(1.0, max(image.shape) / SEARCH_SIDES[0]), _size(image))[0])
-        if other := seen_instead(small, board):
-            return f"; {other}"
-    return ""
 
 
 def seen_size(image: Gray) -> tuple[int, int] | None:

@@ -408,13 +408,18 @@ def _goes_on_above(image: npt.NDArray[np.generic], grid: Tensor) -> bool:
     # Extrapolated quadratically, because perspective would shift a linear step by a good part of a square.
     beyond = 3 * grid[0] - 3 * grid[1] + grid[2]
     out = beyond - grid[0]
-    inside = in_image(image, beyond + 0.5 * out)
-    if int(inside.sum()) * 2 < len(inside):
+    inside = in_image(image, beyond + 0.5 * out) & torch.isfinite(beyond + along).all(-1)
+    if 2 * int(inside.sum()) < max(len(inside), 6):
         return False
-    there = _contrast(image, beyond, along, out)
-    own = _contrast(image, grid[0], along, (grid[0] - grid[1] + out) / 2)
+    own = _contrast(image, grid[0], along, (grid[0] - grid[1] + out) / 2)[inside]
     own = torch.where(own.abs() < 1e-9, 1e-9, own)
-    return float((-there / own)[inside].median()) > GOES_ON
+    beyond, along, out = (each[inside, None] for each in (beyond, along, out))
+    # Near a fisheye the next corners are up to a quarter of a square from there. No place on an outer edge has more
+    # than half of a corner's contrast.
+    step = torch.tensor([-0.24, -0.12, 0.0, 0.12, 0.24], dtype=torch.float64)
+    a, b = (each[:, None] for each in torch.cartesian_prod(step, step).unbind(-1))
+    there = -_contrast(image, beyond + a * along + b * out, along, out) / own[:, None]
+    return float(there.amax(1).nanmedian()) > GOES_ON
 
 
 def _corner_areas(grid: Tensor) -> Tensor:

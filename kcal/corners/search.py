@@ -18,6 +18,7 @@ from kcal.corners.grid import (
     MIN_SQUARE,
     as_grid,
     first_square_dark,
+    goes_on,
     grid_trouble,
     in_image,
     levels_beside,
@@ -279,6 +280,8 @@ def _grown(image: npt.NDArray[np.uint8], seed: Tensor, board: Board) -> BoardPar
         )
     if max(high, wide) > longer or min(high, wide) > shorter:
         return BoardPart(None, f"a grid of {size} inner corners was found, larger than {asked}", seen, other=True)
+    if goes_on(image, grid.reshape(-1, 2), wide, high):
+        return BoardPart(None, f"the squares go on beyond the {size} inner corners that were found", seen)
     places = _placements(image, grid, ends, board)
     if not places:
         return BoardPart(None, f"a grid of {size} inner corners was found, which is no part of {asked}", seen)

@@ -77,6 +77,16 @@ class TestWholeBoards:
         assert goes_on(image, grid[1:].reshape(-1, 2), 5, 5)
 
     @pytest.mark.parametrize("turn", range(4))
+    def test_squares_go_on_a_quarter_of_a_square_beside_where_a_lens_bends_them(self, turn: int) -> None:
+        """Squares of the row beyond are lower than those before: 8x6 was found on a 9x6 before a fisheye."""
+        image, grid = picture(alternating(7, 6))
+        low = np.delete(image, slice(62, 67), 0)
+        low = np.concatenate([low, low[-5:]])  # the same size
+        whole, grid = seen_from(turn, low, grid - torch.tensor([0.0, 5.0]))
+        part = (grid[1:], grid[:-1], grid[:, 1:], grid[:, :-1])[turn]
+        assert goes_on(whole, part.reshape(-1, 2), part.shape[1], part.shape[0])
+
+    @pytest.mark.parametrize("turn", range(4))
     def test_an_outer_line_needs_a_third_of_the_contrast_outside(self, turn: int) -> None:
         for share, false in ((0.3, True), (0.4, False)):
             signs = alternating(7, 6)

@@ -13,13 +13,23 @@ from PIL import ExifTags, Image
 
 from kcal.corners.board import Board
 from kcal.corners.circles import find_circles
-from kcal.corners.detect import has_own_markers, seen_circles, seen_instead, seen_markers, seen_size, too_few
+from kcal.corners.detect import (
+    detect,
+    has_own_markers,
+    refuse_other_board,
+    seen_by_most,
+    seen_circles,
+    seen_instead,
+    seen_markers,
+    seen_size,
+    too_few,
+)
 from kcal.corners.image_tags import image_time
 from kcal.corners.markers import opencv_dictionary
 from kcal.corners.refine import refine_corners
 from kcal.corners.saddle import CornerStatus, Refined
 from kcal.corners.video import VideoFrames
-from kcal.errors import FileError
+from kcal.errors import FileError, InputError
 
 BLANK = np.full((200, 240), 230, np.uint8)
 
@@ -183,3 +193,28 @@ def test_single_frames_of_a_video(tmp_path: Path) -> None:
     for name, message in (("none.avi", "not a video"), ("missing.avi", "no such file")):
         with pytest.raises(FileError, match=message):
             VideoFrames(tmp_path / name)
+
+
+def test_most_images_tell_which_board_they_show() -> None:
+    """Not one image each: a grid that is seen in one of them is no other board."""
+    board = Board(columns=8, rows=6, square=0.025)
+    whole = "a board of 9x6 inner corners was found, not 8x6: give --board 9x6"
+    failed = [(None, whole), (None, whole.replace("9x6", "11x7"))]
+    failed += 4 * [(None, "a grid of 9x6 inner corners was found, larger than 8x6"), (None, "too blurred")]
+    assert seen_by_most(failed, board) == ("a board of 9x6 was found: give --board 9x6", 5)
+    with pytest.raises(InputError) as caught:
+        refuse_other_board(0, failed, 26, board)
+    said = "(5 of them: a board of 9x6 was found: give --board 9x6)"
+    assert str(caught.value) == f"no board in the first 10 of 26 images {said}"
+    with pytest.raises(InputError, match="is in 1 of 11 images only; in 5 of them a board of 9x6"):
+        refuse_other_board(1, failed, 11, board)
+    refuse_other_board(2, failed, 12, board)
+
+
+def test_a_wrong_size_ends_the_search_early(kcal_data: Path) -> None:
+    """It took 291 s, gave two false views and said "give --board 11x7 … give --board 3x3"."""
+    searched: list[str] = []
+    images = sorted((kcal_data / "opencv_stereo").glob("left*.jpg"))
+    with pytest.raises(InputError, match=r"no board in the first 3 of 13 images .*: give --board 9x6\)$"):
+        detect(images, Board(columns=8, rows=6, square=0.025), progress=searched.append)
+    assert len(searched) == 2

@@ -21,7 +21,7 @@ from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibratio
 from kcal.calibrate.camera.result import HYBRID
 from kcal.child_processes import work_limit
 from kcal.corners.board import Board
-from kcal.corners.detect import detect_board, view_of
+from kcal.corners.detect import detect_board, refuse_other_board, view_of
 from kcal.corners.images import decode_gray, expand_images, unique_names
 from kcal.corners.observations import Failure, Observations, PackedCovariance, Pixel, View, common_size, rescaled
 from kcal.corners.refine import Refinement
@@ -211,8 +211,10 @@ def observations_of(
             continue
         view = View(name=name, pixels=piece.pixels, covariance=piece.covariance, image=str(path), sha256=digest)
         views.append(rescaled(view, common.scales[i]) if i in common.scales else view)
-    if not views:
-        raise InputError(f"no board in any of {len(pieces)} images ({failures[0].name}: {failures[0].reason})")
+    paths = dict(zip(names, job.images, strict=True))
+    refuse_other_board(
+        len(views), [(paths[one.name], f"{one.name}: {one.reason}") for one in failures], len(pieces), job.board
+    )
     seen = Observations(
         board=job.board,
         image_size=common.size,
