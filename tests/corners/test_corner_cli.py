@@ -92,8 +92,10 @@ def test_what_cannot_be_done_leaves_no_file(shots, tmp_path):
     refused(InputError, "no board in any of 2 images", "detect", shots, *larger)
     refused(InputError, "with its unit", "detect", shots, "--board", "6x5", "--square", "20", "-o", output)
     refused(InputError, "COLUMNSxROWS", "detect", shots, "--board", "6", "--square", "20mm", "-o", output)
-    cv2.imwrite(f"{shots}/wide.png", np.random.default_rng(0).integers(0, 255, (100, 300), dtype=np.uint8))
-    refused(InputError, "240x200 (shot0.png, shot1.png); 300x100 (wide.png)", "detect", shots, *OPTIONS, output)
+    for name in ("wide", "wider"):
+        cv2.imwrite(f"{shots}/{name}.png", np.random.default_rng(0).integers(0, 255, (100, 300), dtype=np.uint8))
+    counts = "2 of 240x200 px (shot0.png, shot1.png); 2 of 300x100 px (wide.png, wider.png)"
+    refused(InputError, counts, "detect", shots, *OPTIONS, output)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["empty", "shots"]
 
 
