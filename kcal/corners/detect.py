@@ -180,10 +180,10 @@ def seen_instead(image: npt.NDArray[np.uint8], board: Board) -> str:
         return circles
     found = found or seen_size(image)
     own = (max(board.columns, board.rows), min(board.columns, board.rows))
-    return "" if found is None or (found == own and plain) else _other_size(found, board)
+    return "" if found is None or (found == own and plain) else _size_advice(found, board)
 
 
-def _other_size(found: tuple[int, int], board: Board) -> str:
+def _size_advice(found: tuple[int, int], board: Board) -> str:
     own = (max(board.columns, board.rows), min(board.columns, board.rows))
     squares = found == (own[0] - 1, own[1] - 1) and board.pattern == "checkerboard"
     advice = "count inner corners, not squares" if squares else f"give --board {found[0]}x{found[1]}"
@@ -207,7 +207,7 @@ def seen_by_most(failed: Sequence[tuple[Any, str]], board: Board) -> tuple[str, 
     votes: dict[str, list[str]] = {}
     for number, (file, reason) in enumerate(failed):
         said = _OTHER.search(reason)
-        text = _other_size((int(said[1]), int(said[2])), board) if said else ""
+        text = _size_advice((int(said[1]), int(said[2])), board) if said else ""
         if not said and number < _LOOKS:
             with suppress(FileError):
                 image = to_8bit(_image_and_hash(file)[0])
