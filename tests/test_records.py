@@ -109,7 +109,7 @@ def test_tables_count_what_was_refused_and_said() -> None:
         {"key": ["stand", 8, 2, "default"], "refused": "too few"},
     ]
     rows = handheld.lines(records)[2:]
-    assert rows[0] == "| 8 | hand | default | 3 | 33.3 % | 90.0 ± 5.0 | 2.000 | 2.236 | 1.000 |"
+    assert rows[0] == "| 8 | hand | default | 3 | 33.3 % | 90.0 ± 5.0 | 2.000 | 2.236 | 1.000 | 0 % | 0 % |"
     assert "100.0 %" in rows[1]
     said = [
         {"key": [1.01, k], "factor": 1.01, "aspect": 1.012, "hand": k == 0, "said": text}
