@@ -160,7 +160,7 @@ def central_camera(kind: str, inner: Camera, values: Sequence[float] = ()) -> tu
 _LENSES = {"radtan": "opencv4", "equidistant": "fisheye4", "none": "pinhole"}
 # Of a text of results: names of lenses, and lines with numbers and their standard deviations.
 _GEOMETRIES = {"DistortedPinholeCamera": "opencv4", "EquidistantDistortedPinholeCamera": "fisheye4"}
-_RESULTS = re.compile(r"^\s*(distortion|projection): \[([^\]\n]*)\] \+- \[([^\]\n]*)\]", re.MULTILINE)
+_RESULTS = re.compile(r"^[ \t]*(distortion|projection): \[([^\]\n]*)\] \+- \[([^\]\n]*)\]", re.MULTILINE)
 
 
 def read_kalibr(path: Path, hints: foreign.Hints) -> foreign.ImportedCameras:

@@ -113,7 +113,7 @@ def read_ros(path: Path, hints: Hints) -> ImportedCameras:
 
 
 # The calibrator's `ost.txt`: names of values, each above its numbers.
-ROS_TEXT = re.compile(r"^\s*camera matrix\s*$", re.MULTILINE)
+ROS_TEXT = re.compile(r"^[ \t]*camera matrix[ \t]*$", re.MULTILINE)
 
 
 def _sections(text: str) -> dict[str, Any]:

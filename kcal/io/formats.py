@@ -64,6 +64,8 @@ class CameraFormat:
     prior: bool = False
 
 
+# The first section of an INI file or of TOML.
+_SECTION = re.compile(r"(?:[ \t]*(?:[#;].*)?\n)*+[ \t]*\[\w[\w .-]*\][ \t]*\n")
 # What begins the cameras of Qualisys, and the sensors or the calibration of Metashape.
 _XML = re.compile(r"<cameras(?=>\s*<camera[^>]*serial)|<sensors(?=[ >])|<calibration(?=>\s*<(projection|width|type))")
 
@@ -207,10 +209,10 @@ def recognized(path: Path) -> str:
     text = read_text(path, MOST_BYTES)
     if format_opencv.ROS_TEXT.search(text):
         return "ros"
-    if suffix == ".toml" or re.match(r"\s*([#;].*\s+)*\[\w[\w .-]*\]\s*\n", text):
+    if suffix == ".toml" or _SECTION.match(text):
         return "toml"
     # mrcal's files begin with comments.
-    if suffix == ".json" or re.sub(r"^\s*#.*$", "", text, flags=re.MULTILINE).lstrip()[:1] in ("{", "["):
+    if suffix == ".json" or re.sub(r"^[ \t]*#.*$", "", text, flags=re.MULTILINE).lstrip()[:1] in ("{", "["):
         return _json_format(path, text)
     if (found := _XML.search(text)) is not None:
         return "qualisys" if found[0] == "<cameras" else "agisoft"

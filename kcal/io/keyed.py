@@ -188,7 +188,7 @@ def has_camera(content: Mapping[str, Any]) -> bool:
 
 def speaks_of_camera(text: str) -> bool:
     """Whether a text has such keys at the beginning of its lines."""
-    names = map(bare, re.findall(r"^[\s\"'{-]*([A-Za-z][\w. -]{0,40}?)[\"']?\s*[:=]", text, re.MULTILINE))
+    names = map(bare, re.findall(r"^[ \t\"'{-]*+([A-Za-z][\w. -]{0,40}?)[\"']?[ \t]*[:=]", text, re.MULTILINE))
     return any(
         pattern.fullmatch(base)
         for name in names

@@ -431,6 +431,14 @@ def test_refused_with_its_reason(tmp_path: Path, case: str) -> None:
         import_cameras(written(tmp_path, name, content))
 
 
+@pytest.mark.parametrize("text", ["\n" * 1_000_000, "# " * 100_000, "# a\n" * 100_000])
+@pytest.mark.parametrize("form", [None, "kalibr", "ros"])
+def test_blank_lines_and_comments_take_no_time(tmp_path: Path, text: str, form: str | None) -> None:
+    """Patterns that look back at each line would take minutes."""
+    with pytest.raises(FileError):
+        import_cameras(written(tmp_path, "a.txt", text), format=form)
+
+
 @pytest.mark.parametrize(
     "more",
     [
