@@ -125,9 +125,11 @@ def main() -> None:
         ]
         finish(arguments.out[0], keys, captured, line)
     records = read(arguments.out)
-    text = show(lines(records))
-    if arguments.write:
-        write_section(PAGE, "handheld", "\n".join(text))
+    for section, bent in (("handheld", False), ("bent", True)):
+        own = [record for record in records if (KINDS[record["key"][0]][1] > 0.0) is bent]
+        text = show(lines(own)) if own else []
+        if arguments.write and own:
+            write_section(PAGE, section, "\n".join(text))
 
 
 if __name__ == "__main__":

@@ -49,17 +49,9 @@ def calibrate_hybrid(
     weights, start = torch.ones_like(pixels[..., 0]), None
     if options.weighted and observations.covariances() is not None:
         start = rough_start(
-            board,
-            pixels,
-            observations.image_size,
-            weights,
-            options.board,
-            options.motion,
-            options.bending,
-            options.start_focal(observations.image_size),
-            progress,
-            options.modes,
-        )
+            board, pixels, observations.image_size, weights, options.board, options.motion, options.bending,
+            options.start_focal(observations.image_size), progress, options.modes,
+        )  # fmt: skip
         weights = corner_weights(observations, start.residuals)
     fit = fit_by_options(observations, pixels, weights, start, options, progress)
     return hybrid_result(observations, fit, options)
@@ -76,20 +68,10 @@ def fit_by_options(
 ) -> HybridFit:
     """Fit a hybrid lens as the options say; arguments as of `kcal.calibrate.hybrid.fit.fit_hybrid`."""
     return fit_hybrid(
-        observations.board.points,
-        pixels,
-        observations.image_size,
-        weights,
-        options.modes,
-        board=options.board,
-        motion=options.motion,
-        bending=options.bending,
-        focal=options.start_focal(observations.image_size),
-        start=start,
-        robust=robust,
-        training=None if robust or options.modes is None else options.training,
-        progress=progress,
-    )
+        observations.board.points, pixels, observations.image_size, weights, options.modes, board=options.board,
+        motion=options.motion, bending=options.bending, focal=options.start_focal(observations.image_size), start=start,
+        robust=robust, training=None if robust or options.modes is None else options.training, progress=progress,
+    )  # fmt: skip
 
 
 def corner_weights(observations: Observations, residuals: Tensor) -> Tensor:

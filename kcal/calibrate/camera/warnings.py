@@ -57,26 +57,18 @@ def motion_warnings(fit: HybridFit) -> list[str]:
 
 
 def bending_warnings(names: Sequence[str], fit: HybridFit) -> list[str]:
-    """A warning where the board bends from view to view, with how much, and in which views."""
+    """A warning where the board bends from view to view, with how much, and in which views most."""
     if fit.bends is None or fit.relative is None:
         return []
-    # RMS of the corners in each view, millimeters.
-    height = 1e3 * fit.bends.square().mean(-1).sqrt()
-    known = height.isfinite()
-    count, clear = int(known.sum()), (known & (fit.relative > _BENT)).nonzero()[:, 0].tolist()
-    size, rest = float(height[known].square().mean().sqrt()), "and error bars allow for it"
-    if not 0 < len(clear) <= _SOME * count:
-        return [
-            f"the board bends from view to view, by {size:.2g} mm (RMS of its corners): this is "
-            f"taken out, {rest}; mount it on a stiff plate for smaller error bars"
-        ]
-    clear.sort(key=lambda i: -float(height[i]))
-    some, others = height[clear].square().mean().sqrt(), height[known & ~(fit.relative > _BENT)].square().mean().sqrt()
+    # RMS of the corners in each view, millimeters; NaN where a view was left out.
+    height, count = 1e3 * fit.bends.square().mean(-1).sqrt(), int(fit.relative.isfinite().sum())
+    clear = [i for i in height.nan_to_num(0.0).argsort(descending=True).tolist() if float(fit.relative[i]) > _BENT]
     named = ", ".join(names[i] for i in clear[:_NAMED]) + (", ..." if len(clear) > _NAMED else "")
+    where = f", most in {len(clear)} of {count} views ({named})" if 0 < len(clear) <= _SOME * count else ""
     return [
-        f"the board bends in {len(clear)} of {count} views ({named}), by {float(some):.2g} mm there and by "
-        f"{float(others):.2g} mm in the others (RMS of its corners): this is taken out, {rest}; take these views again "
-        "with the board on a stiff plate"
+        f"the board bends from view to view, by {float(height.nanmedian()):.2g} mm (RMS of its corners) in a typical "
+        f"view and by up to {float(height.nan_to_num(0.0).max()):.2g} mm{where}: this is taken out, and error bars "
+        "allow for it; mount the board on a stiff plate for smaller error bars"
     ]
 
 

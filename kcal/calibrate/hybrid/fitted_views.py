@@ -63,18 +63,10 @@ def hybrid_problem(
     """
     held = torch.isinf(precision)
     return BoardProblem(
-        points,
-        pixels,
-        model,
-        hybrid_unknowns(model, square),
-        shapes=shapes,
-        free_board=True,
-        held=held,
-        weights=weights,
-        terms=[hybrid_prior(model, len(shapes), mean, precision, square)],
-        readout=readout,
+        points, pixels, model, hybrid_unknowns(model, square), shapes=shapes, free_board=True, held=held,
+        weights=weights, terms=[hybrid_prior(model, len(shapes), mean, precision, square)], readout=readout,
         stillness=stillness,
-    )
+    )  # fmt: skip
 
 
 def hybrid_prior(model: LensModel, shapes: int, mean: Tensor, precision: Tensor, square: bool = True) -> GaussianPrior:
@@ -178,17 +170,9 @@ class FittedViews:
             problem = kept[0][2].with_priors([prior], still)
         else:
             problem = hybrid_problem(
-                self.points,
-                self.board.shapes,
-                self.pixels,
-                self.weights,
-                estimate.model,
-                estimate.families.mean,
-                precision,
-                self.readout,
-                still,
-                self.square,
-            )
+                self.points, self.board.shapes, self.pixels, self.weights, estimate.model, estimate.families.mean,
+                precision, self.readout, still, self.square,
+            )  # fmt: skip
             kept[:] = [(estimate.model, held, problem)]
         if self.robust:
             return problem.with_weights(_cauchy_weights(problem, estimate.state, self.weights))
