@@ -382,9 +382,9 @@ def _hidden_sides(image: npt.NDArray[np.generic], grid: Tensor, ends: tuple[bool
         (cut if 2 * int(outside.sum()) >= int(known.sum()) else unclear).append(name)
     texts = []
     if cut:
-        texts.append(f"the board is cut by the image's edge at the {' and '.join(cut)}")
+        texts.append(f"the board is cut by the image's edge at the {' and '.join(dict.fromkeys(cut))}")
     if unclear:
-        texts.append(f"its end at the {' and '.join(unclear)} is covered, glaring or unclear")
+        texts.append(f"its end at the {' and '.join(dict.fromkeys(unclear))} is covered, glaring or unclear")
     return ", ".join(texts)
 
 
