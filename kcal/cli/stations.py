@@ -193,28 +193,35 @@ def _print_stations(result: RigResult, rig: CameraRig, notes: Sequence[str]) -> 
 
 
 def station_rows(rig: CameraRig) -> list[list[str]]:
-    """A table of how each camera stands, heads first: on the Earth with error bars, or in the rig's own frame."""
-    from kcal.locate.stations import station_mounting
+    """A table of how each camera stands, heads first, with error bars: on the Earth, or in the rig's own frame."""
+    import torch
 
-    rows = [["camera", "RMS px", "lat", "lon", "height m", "± level", "± up", "heading °", "pitch °", "roll °"]]
-    if rig.origin is None:
-        rows = [["camera", "RMS px", "east m", "north m", "up m"]]
+    from kcal.locate.stations import station_stands
+
+    where = ["lat", "lon", "height m"] if rig.origin else ["east m", "north m", "up m"]
+    rows = [["camera", "RMS px", *where, "± level", "± up", "heading °", "pitch °", "roll °"]]
+    # The frame of the first camera has no north.
+    own = not rig.origin and torch.equal(rig.rotation[0], torch.eye(3).to(rig.rotation))
+    if own:
+        rows = [["camera", "RMS px", "x m", "y m", "z m"]]
     residuals = rig.calibration.rms_px if rig.calibration else (None,) * len(rig)
     for c, (name, residual) in enumerate(zip(rig.names, residuals, strict=True)):
         rms = "" if residual is None else f"{residual:.3f}"
-        if rig.origin is None:
-            rows.append([name, rms, *(f"{value:.3f}" for value in rig.center[c].tolist())])
+        place, angles, covariance = station_stands(rig, c)
+        digits = (7, 7, 2) if rig.origin else (3, 3, 3)
+        told = [f"{value:.{many}f}" for value, many in zip(place, digits, strict=True)]
+        if own:
+            rows.append([name, rms, *told])
             continue
-        stands = station_mounting(rig, c)
-        place = [f"{stands.origin.lat:.7f}", f"{stands.origin.lon:.7f}"]
-        angles = (stands.heading_deg, stands.pitch_deg, stands.roll_deg)
-        if rig.root is None or stands.covariance is None:
-            rows.append([name, rms, *place, f"{stands.origin.height:.2f}", "", "", *(f"{a:.4f}" for a in angles)])
+        if rig.root is None or covariance is None:
+            rows.append([name, rms, *told, "", "", *(f"{angle:.4f}" for angle in angles)])
             continue
-        sigma = stands.covariance.diagonal().sqrt().tolist()
+        sigma = covariance.diagonal().sqrt().tolist()
+        if not rig.origin:
+            told[:2] = (number_text(value, one) for value, one in zip(place[:2], sigma[:2], strict=True))
         level = math.degrees(max(sigma[3:5]))
         rows.append(
-            [name, rms, *place, number_text(stands.origin.height, sigma[2]), length_text(max(sigma[:2]), digits=2),
+            [name, rms, *told[:2], number_text(place[2], sigma[2]), length_text(max(sigma[:2]), digits=2),
              length_text(sigma[2], digits=2), measured_text(angles[0], math.degrees(sigma[5])),
              measured_text(angles[1], level), number_text(angles[2], level)]
         )  # fmt: skip
@@ -223,18 +230,14 @@ def station_rows(rig: CameraRig) -> list[list[str]]:
 
 def _stands(rig: CameraRig) -> dict[str, dict[str, float]]:
     """How each camera stands, for --json."""
-    from kcal.locate.stations import station_mounting
+    from kcal.locate.stations import station_stands
 
-    if rig.origin is None:
-        return {}
-    told = {}
+    told, where = {}, ("lat", "lon", "height") if rig.origin else ("east_m", "north_m", "up_m")
     for c, name in enumerate(rig.names):
-        stands = station_mounting(rig, c)
-        told[name] = dataclasses.asdict(stands.origin) | {
-            "heading_deg": stands.heading_deg, "pitch_deg": stands.pitch_deg, "roll_deg": stands.roll_deg,
-        }  # fmt: skip
-        if rig.root is not None and stands.covariance is not None:
-            sigma = stands.covariance.diagonal().sqrt().tolist()
+        place, angles, covariance = station_stands(rig, c)
+        told[name] = dict(zip((*where, "heading_deg", "pitch_deg", "roll_deg"), (*place, *angles), strict=True))
+        if rig.root is not None and covariance is not None:
+            sigma = covariance.diagonal().sqrt().tolist()
             told[name] |= {"sigma_m": max(sigma[:3]), "sigma_deg": math.degrees(max(sigma[3:6]))}
     return told
 

@@ -14,7 +14,7 @@ from kcal.io.rig_file import RigFile
 from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, CameraRig, Mounting, Origin, StereoRig, half_of_covariance
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.localizer import StereoLocalizer
-from kcal.locate.mounting import mounting_of
+from kcal.locate.mounting import attitude, mounting_of
 from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.strict_json import MOST_BYTES, read_json
 
@@ -194,3 +194,18 @@ def station_mounting(rig: CameraRig, camera: int) -> Mounting:
     return mounting_of(
         rig.rotation[camera], rig.center[camera], covariance, rig.origin, refraction=float(rig.refraction)
     )
+
+
+def station_stands(rig: CameraRig, camera: int) -> tuple[tuple[float, ...], tuple[float, ...], Tensor | None]:
+    """Place, then heading, pitch and roll (degrees), and their covariance, of a camera.
+
+    The place is latitude, longitude, height where the rig has an origin, otherwise meters of its frame, whose axes are
+    taken as east, north and up.
+    """
+    if rig.origin is not None:
+        stands = station_mounting(rig, camera)
+        place = (stands.origin.lat, stands.origin.lon, stands.origin.height)
+        return place, (stands.heading_deg, stands.pitch_deg, stands.roll_deg), stands.covariance
+    half = None if rig.root is None else rig.root[:, rig.pose_columns(camera)]
+    covariance = None if half is None else half.T @ half
+    return tuple(rig.center[camera].tolist()), attitude(rig.rotation[camera].T), covariance

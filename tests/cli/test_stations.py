@@ -20,7 +20,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import CameraRig
 from kcal.locate.budget import station_sigmas
-from kcal.locate.geodesy import enu_to_geodetic
+from kcal.locate.geodesy import enu_to_geodetic, geodetic_to_enu
 from kcal.locate.stations import load_camera_rig
 from scripts.shared.station_scenes import ORIGIN, marks, ring, targets
 
@@ -106,6 +106,27 @@ def test_one_station_alone(folder: Path) -> None:
     text = run(folder, "station", "mill.camera.json", "survey.csv", "--marks", "marks.csv", "-o", "mill.json")
     assert "mill" in text
     assert load_camera_rig(folder / "mill.json").names == ("mill",)
+
+
+def test_one_station_in_local_meters(folder: Path, tmp_path: Path) -> None:
+    """Places and angles have their error bars there, too: those that an origin gives."""
+    table = (folder / "survey.csv").read_text().splitlines()
+    names, numbers = zip(
+        *((line.split(",")[0], [float(x) for x in line.split(",")[1:4]]) for line in table[1:]), strict=True
+    )
+    local = geodetic_to_enu(torch.tensor(numbers, dtype=torch.float64), ORIGIN).tolist()
+    lines = [f"{name},{','.join(f'{x:.4f}' for x in place)},0.05" for name, place in zip(names, local, strict=True)]
+    (tmp_path / "local.csv").write_text("\n".join(["name,east,north,up,sigma", *lines]) + "\n")
+    rows = []
+    for more in ([], ["--origin", f"{ORIGIN.lat},{ORIGIN.lon},{ORIGIN.height}"]):
+        given = [str(folder / "mill.camera.json"), str(tmp_path / "local.csv"), "--marks", str(folder / "marks.csv")]
+        result = CliRunner().invoke(app, ["station", *given, "-o", str(tmp_path / "mill.rig.json"), *more, "--json"])
+        assert result.exit_code == 0, result.output
+        rows.append(json.loads(result.stdout)["cameras"]["mill"])
+    assert rows[0].keys() >= {"east_m", "heading_deg", "sigma_m"}
+    assert abs(rows[0]["sigma_m"] / rows[1]["sigma_m"] - 1.0) < 0.2
+    # The camera's own vertical is a little different from the origin's.
+    assert abs(rows[0]["heading_deg"] - rows[1]["heading_deg"]) < 0.1
 
 
 def test_messages(folder: Path) -> None:

@@ -18,7 +18,13 @@ from kcal.calibrate.rig.initial_poses import InitialPoses, distinct_poses
 from kcal.calibrate.rig.motion import moved_warnings, scatter_warnings
 from kcal.calibrate.rig.problem import RigProblem, held
 from kcal.calibrate.rig.result import Reasons, RigResult, item_records, places, source_records
-from kcal.calibrate.rig.uncertainty import SharedCovariance, goodness_of_fit, parameter_rows, relative_rows
+from kcal.calibrate.rig.uncertainty import (
+    SharedCovariance,
+    goodness_of_fit,
+    mounting_rows,
+    parameter_rows,
+    relative_rows,
+)
 from kcal.errors import DegenerateError, InputError
 from kcal.io.camera_file import provenance
 from kcal.lens.calibration import CameraCalibration
@@ -26,6 +32,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.pose import vector_from_rotation
 from kcal.solve.lm import LMOptions
 from kcal.solve.problem import Result, SolverStatus
+from kcal.texts import length_text
 
 # Refuse rigs whose baseline is so open that intervals of ranges are wrong; widen intervals where that helps.
 #
@@ -46,6 +53,7 @@ _LINE, _PLANE, _CLUSTER = 0.15, 0.1, 0.1
 _MARK, _DISTANCES = 0.1, (25.0, 100.0, 500.0)
 _COLUMNS, _ROWS = 5, 3
 _SIGMAS = 2.0
+_UNDAMPED = torch.tensor(1e-12, dtype=torch.float64)
 # From the middle of a cube to its corners, edges and faces.
 _DIRECTIONS = torch.nn.functional.normalize(
     torch.tensor([way for way in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(way)], dtype=torch.float64)
@@ -89,30 +97,88 @@ def check_places(
     return widen, warnings
 
 
+# What landmarks tell of a camera is linear in its pose only nearby. So the pose is moved by two standard deviations in
+# the directions in which it is most open, and one step of the solver leads back: were all linear, to where it was. What
+# is missing, in standard deviations, grows with the square of an error. Its second moment is added to the covariance,
+# and above the limit the covariance says nothing (measured on simulated landmarks, scripts/check/weak_geometry.py).
+_MOST_BENT, _DIRECTIONS_TRIED = 1.0, 2
+
+
+def check_poses(
+    problem: RigProblem, state: RigState, covariance: SharedCovariance, names: Sequence[str], *, refuse: bool = True
+) -> list[str]:
+    """Widen the covariance where landmarks leave a camera's pose so open that it is not linear; return warnings.
+
+    Args:
+        problem: the problem.
+        state: its solution.
+        covariance: of the solution; its root grows.
+        names: of the cameras.
+        refuse: raise an error where the pose could be anything; otherwise a warning tells.
+
+    Raises:
+        DegenerateError: a camera whose pose is so open; what to add is told.
+    """
+    warnings, missing = list[str](), list[Tensor]()
+    if not any(isinstance(block, LandmarkBlock) for block in problem.blocks) or not covariance.complete:
+        return warnings
+    still, at_rest = problem.linearize(state).step(_UNDAMPED)[0]
+    for c, name in enumerate(names):
+        pose = mounting_rows(problem, state, c)[:6]
+        half = covariance.half_of(pose)
+        if half is None or not bool(half.any()):
+            continue
+        distance = float((state.points - state.center[c]).norm(dim=-1).median())
+        ways = torch.linalg.svd(half / half.new_tensor([distance] * 3 + [1.0] * 3), full_matrices=False).U
+        sigma, bent = half.square().sum(0).sqrt(), 0.0
+        for way in ways.T[:_DIRECTIONS_TRIED]:
+            step = _SIGMAS * covariance.root @ way
+            ends = []
+            for moved in (step, -step):
+                there = problem.retract(state, (moved, torch.zeros_like(at_rest)))
+                back = problem.linearize(there).step(_UNDAMPED)[0][0]
+                off = (moved + back - still).nan_to_num(math.inf)
+                ends.append(off)
+                bent = max(bent, float(((pose @ off).abs() / sigma).nan_to_num(math.inf).max()))
+            missing.append(math.sqrt(3.0) / _SIGMAS**2 * 0.5 * (ends[0] + ends[1]))
+        if bent > _MOST_BENT:
+            place, turn = length_text(float(sigma[:3].max()), digits=2), min(float(sigma[3:].max()), math.pi)
+            text = f"the landmarks do not determine where {name} stands: ± {place}, ± {math.degrees(turn):.0f}° turned"
+            text = f"{text}. {_advice(problem, state)}"
+            if refuse:
+                raise DegenerateError(text)
+            warnings.append(text)
+    if missing and not warnings:
+        covariance.root = torch.cat([covariance.root, torch.stack(missing, 1)], 1)
+    return warnings
+
+
 def _advice(problem: RigProblem, state: RigState) -> str:
     """What the landmarks have in common, and what to add."""
-    measure = "or measure the positions of the cameras"
+    several = len(problem.cameras) > 1
+    measure = f"or measure the position{'s of the cameras' if several else ' of the camera'}"
+    rig = "the rig" if several else "the camera"
     if not any(isinstance(block, LandmarkBlock) for block in problem.blocks):
         return f"Add surveyed landmarks, {measure}"
     middle = state.points.mean(0)
     extent = torch.linalg.svdvals(state.points - middle) / math.sqrt(len(state.points))
     long, wide, thick = (*extent.tolist(), 0.0, 0.0)[:3]
-    if long < _CLUSTER * float((state.center[0] - middle).norm()):
-        return (
-            "The landmarks are close together as the cameras see them: turning the rig about that place is not "
-            f"determined; add landmarks far to the side of it and nearer ones, {measure}"
-        )
     if wide < _LINE * long:
         return (
-            "The landmarks lie nearly in one line: turning the rig about that line is not determined; add a landmark "
+            f"The landmarks lie nearly in one line: turning {rig} about that line is not determined; add a landmark "
             f"well off the line, {measure}"
+        )
+    if long < _CLUSTER * float((state.center[0] - middle).norm()):
+        return (
+            f"The landmarks are close together as the cameras see them: turning {rig} about that place is not "
+            f"determined; add landmarks far to the side of it and nearer ones, {measure}"
         )
     if thick < _PLANE * wide:
         return (
             "The landmarks lie nearly in one plane: their common distance stands for a turn of the cameras; add "
             f"landmarks well before or behind that plane, {measure}"
         )
-    return f"Add landmarks that are nearer and spread over the image, mark them more precisely, {measure}"
+    return f"Add surveyed landmarks that are nearer and spread over the image, mark them more precisely, {measure}"
 
 
 class OpenPlace(NamedTuple):
@@ -251,12 +317,13 @@ def _targets(
     return _Targets(rays, near, half.T.unflatten(0, (3, -1)), own)
 
 
-# Where few landmarks tie a rig: look for other places of its cameras that fit as well, and refuse to choose.
+# Where landmarks tie a rig: look for other places of its cameras that fit as well, and refuse to choose.
 #
-# Three landmarks put a camera in up to four places, and with noise a fourth or fifth does not always tell which.
+# Three landmarks put a camera in up to four places, and with noise a fourth or fifth does not always tell which. Any
+# number of them in a plane looks nearly the same with the plane's tilt reversed, as a cube that is drawn does.
 
-# Marks of one camera up to which other places are tried, how many of each camera's, and of all together.
-_FEW_MARKS, _PLACES, _MOST = 6, 4, 64
+# How many other places are tried of each camera, and of all together.
+_PLACES, _MOST = 4, 64
 # Times the noise that a ray may be off where three others place a camera: an adjustment spreads that over all.
 _AWRY = 50.0
 # Squared distance of two solutions, in standard deviations, beyond which they are not the same.
@@ -266,39 +333,44 @@ _GLANCE, _FAR = LMOptions(max_iterations=10, tolerance=1e-4, residual_floor=1e-8
 
 
 def refuse_several(work: Adjustment, masks: PerKind) -> None:
-    """Raise `DegenerateError` if the cameras could as well stand elsewhere, with few landmarks.
+    """Raise `DegenerateError` if the cameras could as well stand elsewhere, as far as landmarks tell.
 
     Args:
         work: at its solution; it stays there.
         masks: what agrees.
     """
-    if not explanations.decided_by_few(work, masks):
+    if not explanations.decided_by_landmarks(work, masks):
         return
     here = copy.copy(work)
     here.unknowns = held(work.data.cameras)
     problem, _ = here.solve(masks, explanations.TRIAL)
     own = goodness_of_fit(problem, here.part(masks))
     matrix, scale = problem.linearize(here.part(masks)).information()
+    found = [here.state]
     for state in _other_places(here, masks):
         there = copy.copy(here)
         there.state = state
         if not _as_good(there, masks, own.chi2, own.variance):
             continue
-        away = _step(problem, here.state, there.state) / scale
-        if float(away @ matrix @ away) < _OTHER:
-            continue
-        names = work.data.names
-        moved = (there.state.center - here.state.center).norm(dim=-1)
-        which = int(moved.argmax())
-        if len(names) == 2:
-            apart = [float((one.state.center[1] - one.state.center[0]).norm()) for one in (here, there)]
-            what = f"{names[1]} may be {apart[0]:.3g} m or {apart[1]:.3g} m from {names[0]}"
-        else:
-            what = f"{names[which]} may stand in two places {float(moved[which]):.3g} m apart"
-        raise DegenerateError(
-            f"the landmarks do not tell where the cameras stand: {what}, which fit alike ({own.freedom} degrees of "
-            "freedom). Mark more surveyed landmarks in the images, or add a measured baseline or measured positions"
-        )
+        steps = [_step(problem, other, there.state) / scale for other in found]
+        if min(float(step @ matrix @ step) for step in steps) >= _OTHER:
+            found.append(there.state)
+        if len(found) > _PLACES:
+            break
+    if len(found) == 1:
+        return
+    names = work.data.names
+    moved = torch.stack([(other.center - found[0].center).norm(dim=-1) for other in found])
+    which = int(moved.amax(0).argmax())
+    if len(names) == 2:
+        apart = " or ".join(f"{float((other.center[1] - other.center[0]).norm()):.3g} m" for other in found)
+        what = f"{names[1]} may be {apart} from {names[0]}"
+    else:
+        what = f"{names[which]} may stand in {len(found)} places up to {float(moved[:, which].max()):.3g} m apart"
+    raise DegenerateError(
+        f"the landmarks do not tell where the cameras stand: {what}, which fit alike ({own.freedom} degrees of "
+        f"freedom). {_advice(problem, here.part(masks))}"
+    )
 
 
 def _as_good(work: Adjustment, masks: PerKind, chi2: float, variance: float) -> bool:
@@ -331,6 +403,17 @@ def _one_at_a_time(choices: list[list[tuple[Tensor, Tensor]]]) -> Iterator[tuple
             yield (*first[:c], other, *first[c + 1 :])
 
 
+def _reversed(rotation: Tensor, center: Tensor, points: Tensor) -> list[tuple[Tensor, Tensor]]:
+    """Poses from which points in a plane look nearly the same: the tilt of the plane is reversed, not its middle."""
+    middle = points.mean(0)
+    sight = torch.nn.functional.normalize(rotation @ (middle - center), dim=0)
+    still, found = torch.eye(3, dtype=torch.float64), []
+    for normal in torch.linalg.svd(points - middle).Vh[1:].flip(0):
+        turned = (still - 2.0 * torch.outer(sight, sight)) @ rotation @ (still - 2.0 * torch.outer(normal, normal))
+        found.append((turned, middle - turned.T @ (rotation @ (middle - center))))
+    return found
+
+
 def _other_places(work: Adjustment, masks: PerKind) -> Iterator[RigState]:
     """States in which one camera, or all of them, stand where three of the landmarks would put them as well."""
     marks, state = work.data.landmarks, work.state
@@ -339,14 +422,15 @@ def _other_places(work: Adjustment, masks: PerKind) -> Iterator[RigState]:
     for c, camera in enumerate(work.data.cameras):
         rays, valid = camera.unproject(marks.pixels[:, c])
         use = valid & masks.landmarks
-        few = 3 <= int(use.sum()) <= _FEW_MARKS
-        distance = (marks.points[use] - state.center[c]).norm(dim=-1).min() if few else torch.ones(())
+        if int(use.sum()) < 3:
+            places.append([])
+            continue
+        distance = (marks.points[use] - state.center[c]).norm(dim=-1).min()
         mark = torch.as_tensor(marks.pixel_sigma).expand(marks.pixels.shape[:2])[use, c]
-        pixel = float(mark.max()) / float(camera.focal[0].detach()) if few else 0.0
-        noise = pixel + float(marks.sigma.max()) / float(distance)
+        noise = float(mark.max()) / float(camera.focal[0].detach()) + float(marks.sigma.max()) / float(distance)
         most = noise * _AWRY if int(use.sum()) > 3 else math.inf
-        own = distinct_poses(rays[use], marks.points[use], state.center[c], _PLACES, most) if few else []
-        places.append(own)
+        own = distinct_poses(rays[use], marks.points[use], state.center[c], _PLACES, most)
+        places.append(own + _reversed(state.rotation[c], state.center[c], marks.points[use]))
     here = [[(state.rotation[c], state.center[c]), *own] for c, own in enumerate(places)]
     # The first choice is the present one. Without measurements, cameras do not depend on each other.
     together = itertools.product(*here) if work.terms else _one_at_a_time(here)
@@ -418,14 +502,16 @@ def rig_result(
                 f"anything; {cure}"
             )
     explanations.refuse_exact(problem, data.names, fit.freedom)
+    widen, doubts = check_places(problem, state, covariance, data.names, refuse=refuse)
+    if widen > 1.0:
+        covariance = SharedCovariance(problem, state, widen**2 * fit.variance)
+    more = check_poses(problem, state, covariance, data.names, refuse=refuse)
+    doubts += [] if doubts else more
     refuse_several(work, masks)
     against = explanations.contradictions(work, problem, state)
     certain = [one for one in against if one.sigmas > explanations.CERTAIN]
     if refuse and certain and certain[0].stated:
         raise InputError(certain[0].text)
-    widen, doubts = check_places(problem, state, covariance, data.names, refuse=refuse)
-    if widen > 1.0:
-        covariance = SharedCovariance(problem, state, widen**2 * fit.variance)
     squared, counts = torch.zeros(len(data.cameras)).double(), torch.zeros(len(data.cameras)).double()
     for block in problem.blocks:
         squared += block.errors(problem.posed(state), state).square().sum((0, 2, 3))

@@ -515,8 +515,12 @@ def _worst_names(work: Adjustment, masks: PerKind, kept: PerKind) -> str:
 
 def decided_by_few(work: Adjustment, masks: PerKind) -> bool:
     """Whether a camera depends on landmarks, and these are few."""
-    count = int(masks.landmarks.sum())
-    if not 0 < count <= _FEW:
+    return int(masks.landmarks.sum()) <= _FEW and decided_by_landmarks(work, masks)
+
+
+def decided_by_landmarks(work: Adjustment, masks: PerKind) -> bool:
+    """Whether a camera depends on landmarks."""
+    if not bool(masks.landmarks.any()):
         return False
     rest = work.problem(masks._replace(landmarks=torch.zeros_like(masks.landmarks)))
     return not rest.blocks or least_redundancy(rest) <= 0

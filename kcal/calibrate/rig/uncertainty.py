@@ -53,27 +53,35 @@ class SharedCovariance:
         problem: the problem.
         state: its solution.
         variance: by which the covariance is multiplied: 1 where the stated sigmas are right.
+
+    Attributes:
+        root: (S, K) with root rootᵀ the covariance.
     """
 
     def __init__(self, problem: RigProblem, state: RigState, variance: float = 1.0) -> None:
         self._problem, self._state = problem, state
         information, self._scale = problem.linearize(state).information()
         root, self._open = inverse_root(information, self._scale, _RANK_TOLERANCE)
-        self._root = root * math.sqrt(variance)
+        self.root = root * math.sqrt(variance)
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing is open."""
+        return not self._open.shape[1]
 
     def of(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         """Covariance (K, K) of K linear functions (K, S) of a step, and which of them are determined.
 
         What is not determined has infinite variance, and no covariance with anything.
         """
-        factor, lost = rows @ self._root, self._lost(rows)
+        factor, lost = rows @ self.root, self._lost(rows)
         matrix = factor @ factor.T
         matrix = torch.where(lost[:, None] | lost[None, :], 0.0, 0.5 * (matrix + matrix.T))
         return matrix + torch.diag(torch.where(lost, torch.inf, 0.0)), ~lost
 
     def variances(self, rows: Tensor) -> Tensor:
         """(K,) variances of K linear functions (K, S) of a step; infinite for what is not determined."""
-        return torch.where(self._lost(rows), torch.inf, (rows @ self._root).square().sum(-1))
+        return torch.where(self._lost(rows), torch.inf, (rows @ self.root).square().sum(-1))
 
     def _lost(self, rows: Tensor) -> Tensor:
         """(K,) which functions are not determined."""
@@ -84,7 +92,7 @@ class SharedCovariance:
     def half_of(self, rows: Tensor) -> Tensor | None:
         """(S, K) root of the covariance of K linear functions (K, S) of a step; None where one is not determined."""
         _, determined = self.of(rows)
-        return (rows @ self._root).T if bool(determined.all()) else None
+        return (rows @ self.root).T if bool(determined.all()) else None
 
     def open_directions(self, names: Sequence[str], *, absolute: bool) -> tuple[str, ...]:
         """Names of what the data leave open, plainest first."""

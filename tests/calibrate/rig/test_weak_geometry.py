@@ -19,6 +19,7 @@ from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.lens.rig import Origin, RigCovariance
+from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.localizer import StereoLocalizer
 
 HELD = RigOptions(intrinsics="fixed")
@@ -171,3 +172,47 @@ def test_first_order_is_the_slope() -> None:
     step = 1e-5
     slope = (seen_from(step * moved) - seen_from(-step * moved)) / (2 * step)
     torch.testing.assert_close(_first_order(rays, true, center, moved), slope, rtol=1e-6, atol=1e-12)
+
+
+def station(extent: tuple[float, float, float], seed: int, count: int = 6) -> tuple[RigData, Tensor]:
+    """One camera that looks north from 3 m above the ground at landmarks 40 m away, and where it stands."""
+    camera = Camera.build(focal=(1400, 1400), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
+    center = tensor(0.0, 0.0, 3.0)
+    # Walls are turned by 35 degrees, so that they have another pose with the turn reversed.
+    turn = enu_from_cam(35.0 if extent[1] == 0.0 else 0.0) @ enu_from_cam(0.0).T
+    points = box(extent, (0.0, 0.0, 1.0), seed, count) @ turn.T + tensor(0.0, 40.0, 0.0)
+    pixels, _ = camera.project((points - center) @ enu_from_cam(0.0))
+    noise = normal(pixels.shape, 100 + seed), normal(points.shape, 200 + seed)
+    marks = Landmarks(
+        names=tuple(f"post {i}" for i in range(count)), points=points + 0.02 * noise[1], pixel_sigma=0.3,
+        sigma=torch.full_like(points, 0.02), pixels=(pixels + 0.3 * noise[0])[:, None],
+    )  # fmt: skip
+    return RigData(cameras=(camera,), names=("cam",), landmarks=marks), center
+
+
+class TestOneCamera:
+    @pytest.mark.parametrize(
+        ("extent", "count", "text"),
+        [
+            ((14.0, 0.0, 0.0), 6, r"where cam stands: ± .* nearly in one line: turning the camera about that line"),
+            ((2.5, 0.0, 1.75), 14, r"cam may stand in 2 places up to 4[0-9.]+ m apart, which fit alike"),
+        ],
+        ids=["line", "small wall"],
+    )
+    @pytest.mark.parametrize("seed", [0, 1])
+    def test_refused(self, extent: tuple[float, float, float], count: int, text: str, seed: int) -> None:
+        """Landmarks in a line determine no turn about it; a plane that is small looks alike from two places."""
+        with pytest.raises(DegenerateError, match=text):
+            solve_rig(station(extent, seed, count)[0], HELD)
+
+    def test_others_are_not(self) -> None:
+        """Spread landmarks, also flat ground, give a place within its error bars, however open it is."""
+        shares = []
+        for seed in range(4):
+            for extent in ((12.0, 15.0, 3.0), (12.0, 15.0, 0.0), (14.0, 1.5, 1.0)):
+                data, center = station(extent, seed, 8)
+                result = solve_rig(data, HELD)
+                assert not any("determine" in text for text in result.warnings)
+                sigma = result.mounting_covariance()[:3, :3].diagonal().sqrt()
+                shares.append(((result.center[0] - center).abs() < 1.96 * sigma).double().mean())
+        assert float(torch.stack(shares).mean()) > 0.8
