@@ -212,11 +212,12 @@ def solve_command(
 
     `kcal rig mill.camera.json mast.camera.json church.camera.json --landmarks survey.csv --marks marks.csv -o rig.json`
     """
-    from kcal.calibrate.rig.solve import RigOptions, solve_rig
+    from kcal.calibrate.rig.solve import RigOptions
     from kcal.corners.observations import Observations
     from kcal.io.camera_file import load_camera
     from kcal.io.rig_file import save_rig
     from kcal.locate.budget import range_sigmas
+    from kcal.locate.mirrored import solve_surveyed
     from kcal.locate.mounting import placed_rig
     from kcal.report.tables import range_sigma_rows
 
@@ -269,7 +270,7 @@ def solve_command(
     with console.ending_with(cure):
         data, frame, unpaired, notes, stated, told = rig_sources.read_sources(calibrated, sources)
         with console.steps("solving the rig", None) as advance:
-            result = solve_rig(data, options, advance)
+            result = solve_surveyed(data, frame, options, advance)
         notes = (*notes, *told(result))
     rig = result.stereo() if frame is None else placed_rig(result, frame)
     known = stated if pixel_sigma is None else pixel_sigma

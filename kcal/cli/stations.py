@@ -139,9 +139,9 @@ def solve_stations(
     needs: tuple[Requirement, ...] = (), report: Path | None = None, picture: Path | None = None,
 ) -> None:  # fmt: skip
     """Solve one camera, or three and more, write the rig, print how each stands and whether it may be used."""
-    from kcal.calibrate.rig.solve import solve_rig
     from kcal.io.camera_file import load_camera
     from kcal.io.camera_rig_file import save_camera_rig
+    from kcal.locate.mirrored import solve_surveyed
 
     names = camera_names(paths)
     for given, option, instead in (
@@ -155,7 +155,7 @@ def solve_stations(
     sources = dataclasses.replace(sources, names=names)
     data, origin, _, notes, _, told = rig_sources.read_sources(tuple(map(load_camera, paths)), sources)
     with steps("solving the stations", None) as advance:
-        result = solve_rig(data, options, advance)
+        result = solve_surveyed(data, origin, options, advance)
     rig = result.stations(origin)
     assert rig.calibration is not None
     rig.calibration = dataclasses.replace(rig.calibration, pixel_sigma=sources.mark_sigma)

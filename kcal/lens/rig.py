@@ -49,6 +49,15 @@ class Origin:
     def __post_init__(self) -> None:
         if not all(math.isfinite(value) for value in (self.lat, self.lon, self.height)):
             raise InputError(f"origin: latitude, longitude and height must be finite, got {self}")
+        for word, value, most in (("latitude", self.lat, 90), ("longitude", self.lon, 180)):
+            # 4319.2162 of receivers is 43 degrees and 19.2162 minutes.
+            degrees, minutes = divmod(abs(value), 100)
+            if most < degrees * 100 and degrees <= most and minutes < 60 and value % 1:
+                decimal = math.copysign(degrees + minutes / 60, value)
+                raise InputError(
+                    f"origin: {word} {value:.10g} is outside -{most} to {most}; write decimal degrees: as degrees and "
+                    f"minutes it is {decimal:.8f}"
+                )
         if abs(self.lat) > 90:
             hint = "; longitude came first? write LAT,LON,HEIGHT" if abs(self.lon) <= 90 else ""
             raise InputError(f"origin: latitude {self.lat:g} is outside -90 to 90{hint}")

@@ -31,6 +31,8 @@ from kcal.texts import brief, csv_line
 EARTH, LOCAL = ("lat", "lon", "height"), ("east", "north", "up")
 FEATURE_COLUMNS = ("name", *PIXELS, "range", "range_sigma", "beyond", "note")
 PLACE_COLUMNS = ("name", *EARTH, *LOCAL, "sigma", "sigma_up", "note")
+# Degrees: places of one table that lie together, and one that does not.
+_TOGETHER, _APART = 0.5, 1.0
 # 1/m: how well the inverse range of a star is known.
 _INFINITY_SIGMA = 1e-12
 
@@ -96,17 +98,37 @@ def places_of(rows: Sequence[TableRow], path: str | Path, origin: Origin | None)
         FileError: neither latitudes nor local meters, or both; a number that is none, a latitude out of range.
     """
     columns = _coordinates(rows[0], path)
-    values = torch.tensor([[row.number(column) for column in columns] for row in rows], dtype=torch.float64)
+    whats = ["a number in meters" if column in (*LOCAL, "height") else "decimal degrees" for column in columns]
+    values = torch.tensor([[*map(row.number, columns, whats)] for row in rows], dtype=torch.float64)
     if columns == LOCAL:
         return values, origin
+    _refuse_exchanged(rows, values)
     for row, (lat, lon, height) in zip(rows, values.tolist(), strict=True):
         try:
             place = Origin(lat=lat, lon=lon, height=height)
         except InputError as error:
-            raise FileError(f"{row.where}: {str(error).removeprefix('origin: ')}") from error
+            height_there = ", unless lon and height are exchanged" if abs(lon) > 180 >= abs(height) else ""
+            raise FileError(f"{row.where}: {str(error).removeprefix('origin: ')}{height_there}") from error
         origin = origin or place
     assert origin is not None
     return geodetic_to_enu(values, origin), origin
+
+
+def _refuse_exchanged(rows: Sequence[TableRow], values: Tensor) -> None:
+    """Raise `FileError` for lines that lie among the others once latitude and longitude are exchanged."""
+    places = values[:, :2]
+    middle = places.median(0).values
+    # With as many lines of each kind, that of the first line counts as right.
+    for center in (middle, places[0]):
+        direct, exchanged = ((values - center).abs().amax(1) for values in (places, places.flip(1)))
+        wrong = (direct > _APART) & (exchanged < _TOGETHER)
+        if bool(wrong.any()) and bool((direct[~wrong] < _TOGETHER).all()) and 2 * int(wrong.sum()) <= len(rows):
+            lines = [rows[i] for i in wrong.nonzero()[:, 0].tolist()]
+            named = ", ".join(row.name for row in lines[:6]) + (" ..." if len(lines) > 6 else "")
+            raise FileError(
+                f"{lines[0].where}: latitude and longitude are exchanged ({named}): only then does it lie near the "
+                f"other {len(rows) - len(lines)} places"
+            )
 
 
 def _coordinates(row: TableRow, path: str | Path) -> tuple[str, str, str]:

@@ -262,7 +262,8 @@ class TableRow(NamedTuple):
             raise FileError(f"{self.where}: {column} is empty; write {what} or delete the line")
         value = _float(cell)
         if not math.isfinite(value):
-            raise FileError(f"{self.where}: {column} is {cell!r}; {what} is needed, for example 960.5")
+            verb, example = ("are", 43.32027) if what.endswith("degrees") else ("is", 960.5)
+            raise FileError(f"{self.where}: {column} is {cell!r}; {what} {verb} needed, for example {example}")
         return value
 
     def positive(self, column: str, *, infinite: bool = False) -> float | None:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.rig.result import ItemResidual
-from kcal.calibrate.rig.solve import RigOptions, solve_rig
+from kcal.calibrate.rig.solve import RigOptions
 from kcal.calibrate.rig.sources import RigData
 from kcal.errors import InputError, KcalError
 from kcal.lens.camera import Camera
@@ -18,6 +18,7 @@ from kcal.lens.rig import Origin, StereoRig
 from kcal.locate.budget import range_sigmas
 from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic
 from kcal.locate.marks import Marks
+from kcal.locate.mirrored import solve_surveyed
 from kcal.locate.mounting import placed_rig
 from kcal.locate.positions import Located, Position, locate_points, near, region_rings
 from kcal.locate.stereo import PositionStatus
@@ -95,7 +96,8 @@ def solve_live(cameras: tuple[Camera, Camera], survey: Survey | None, marks: Mar
         return nothing._replace(text=f"{missing} more landmark{'s' if missing > 1 else ''} in both images for a rig")
     try:
         landmarks = match_landmarks(survey, marks, marks.sigmas(hand_sigma)).landmarks
-        result = solve_rig(RigData(cameras=cameras, names=("left", "right"), landmarks=landmarks), RigOptions())
+        data = RigData(cameras=cameras, names=("left", "right"), landmarks=landmarks)
+        result = solve_surveyed(data, survey.origin, RigOptions())
         rig = placed_rig(result, survey.origin or NOWHERE)
     except KcalError as error:
         return nothing._replace(text=f"no rig from these landmarks: {error}")

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
+from click.testing import Result
 from typer.testing import CliRunner
 
 from kcal.cli.main import app
@@ -18,9 +20,9 @@ from kcal.io.camera_file import save_camera
 from kcal.io.camera_rig_file import save_camera_rig
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import CameraRig
+from kcal.lens.rig import CameraRig, Origin
 from kcal.locate.budget import station_sigmas
-from kcal.locate.geodesy import enu_to_geodetic, geodetic_to_enu
+from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic, geodetic_to_enu
 from kcal.locate.stations import load_camera_rig
 from scripts.shared.station_scenes import ORIGIN, marks, ring, targets
 
@@ -127,6 +129,53 @@ def test_one_station_in_local_meters(folder: Path, tmp_path: Path) -> None:
     assert abs(rows[0]["sigma_m"] / rows[1]["sigma_m"] - 1.0) < 0.2
     # The camera's own vertical is a little different from the origin's.
     assert abs(rows[0]["heading_deg"] - rows[1]["heading_deg"]) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("columns", "text"),
+    [
+        (lambda i, lat, lon, h: (lon, lat, h), "as in a mirror: latitude and longitude are exchanged; as given, "),
+        (lambda i, lat, lon, h: (lat, -lon, h), "as in a mirror: latitudes or longitudes have the wrong sign"),
+        (lambda i, lat, lon, h: (lat, lon, -h), "as in a mirror: heights count downward; as given, "),
+        (
+            lambda i, lat, lon, h: (lon, lat, h) if i % 3 == 1 else (lat, lon, h),
+            "line 3: latitude and longitude are ex",
+        ),
+        (lambda i, lat, lon, h: (f"{100 * int(lat) + 60 * (lat - int(lat)):.7f}", lon, h), "write decimal degrees: as"),
+        (lambda i, lat, lon, h: (f"{int(lat)}°{60 * (lat - int(lat)):.7f}'", lon, h), "decimal degrees are needed"),
+        (lambda i, lat, lon, h: (lat, 200.0, lon), "unless lon and height are exchanged"),
+    ],
+    ids=["exchanged", "sign", "depths", "some", "ddmm", "dms", "height"],
+)
+def test_exchanged_columns_of_a_survey(
+    tmp_path: Path,
+    columns: Callable[[int, float, float, float], tuple[object, ...]],
+    text: str,
+) -> None:
+    """What is wrong with the table is said, whether landmarks contradict each other or put the camera upside down."""
+    origin = Origin(lat=43.32, lon=21.9, height=200.0)
+    camera = Camera.build(focal=(1400, 1400), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
+    # Level ground has no other side, so that depths are told by landmarks at several heights.
+    flat = "downward" not in text
+    draw = torch.rand(6, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) - 0.5
+    points = draw * torch.tensor([30.0, 60.0, 0.0 if flat else 8.0]) + torch.tensor([0.0, 60.0, 0.0])
+    pixels, _ = camera.project((points - torch.tensor([0.0, 0.0, 6.0])) @ enu_from_cam(0.0, -8.0, 0.5))
+    save_camera(camera, tmp_path / "cctv.camera.json")
+    marked = [f"p{i},cctv,{u:.3f},{v:.3f}" for i, (u, v) in enumerate(pixels.tolist())]
+    (tmp_path / "marks.csv").write_text("\n".join(["name,camera,u,v", *marked]) + "\n")
+
+    def solved(change: Callable[[int, float, float, float], tuple[object, ...]]) -> Result:
+        places = enumerate(enu_to_geodetic(points, origin).tolist())
+        lines = [",".join(map(str, (f"p{i}", *change(i, *place), 0.05))) for i, place in places]
+        (tmp_path / "survey.csv").write_text("\n".join(["name,lat,lon,height,sigma", *lines]) + "\n")
+        given = [str(tmp_path / name) for name in ("cctv.camera.json", "survey.csv")]
+        more = ["--marks", str(tmp_path / "marks.csv"), "-o", str(tmp_path / "rig.json")]
+        return CliRunner().invoke(app, ["station", *given, *more])
+
+    assert solved(lambda i, *place: place).exit_code == 0
+    wrong = solved(columns)
+    assert isinstance(wrong.exception, InputError | FileError), wrong.output
+    assert text in str(wrong.exception)
 
 
 def test_messages(folder: Path) -> None:
