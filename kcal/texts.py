@@ -309,6 +309,18 @@ def measured_length(meters: float, sigma: float | None) -> str:
     return measured_text(meters / unit.meters, None if sigma is None else sigma / unit.meters, unit.name)
 
 
+def percent_text(share: float) -> str:
+    """A share in percent, without a sign; what is not zero is not written as zero.
+
+    Example:
+        >>> percent_text(0.274), percent_text(0.0004), percent_text(0.0), percent_text(0.9996)
+        ('27 %', 'less than 1 %', '0 %', 'more than 99 %')
+    """
+    if 0.0 < share < 0.01 or 0.99 < share < 1.0:
+        return "less than 1 %" if share < 0.5 else "more than 99 %"
+    return f"{100.0 * share:.0f} %"
+
+
 def range_text(meters: float) -> str:
     """A length that is exact, such as a requirement or a ring of a map, with its unit: 250 m, 5 km.
 

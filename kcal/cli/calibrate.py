@@ -16,7 +16,7 @@ from kcal.cli.settings import rarely
 from kcal.cli.stars import TIME_HELP, by_night, joined_by_stars
 from kcal.errors import DegenerateError, InputError, KcalError
 from kcal.files import check_picture, check_writable, make_folder
-from kcal.texts import measured_text, number_text
+from kcal.texts import measured_text, number_text, percent_text
 
 if TYPE_CHECKING:
     from kcal.calibrate.camera.result import CameraCalibrationResult
@@ -77,7 +77,7 @@ def print_calibration(result: CameraCalibrationResult, *, reject: bool, verbose:
         center, border, worst = (number_text(one, digits=2) for one in (brief.center, brief.border, brief.worst))
         out.print(
             f"far directions: ± {center} px in the middle of the image, "
-            f"{border} px at its border, {worst} px at worst; no board reached {100 * brief.unreached:.0f} % of it"
+            f"{border} px at its border, {worst} px at worst; no board reached {percent_text(brief.unreached)} of it"
         )
     if result.hybrid is not None:
         (cx, cy), (sx, sy) = result.camera.center.tolist(), (result.sigma[name] for name in ("cx", "cy"))

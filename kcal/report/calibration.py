@@ -27,7 +27,7 @@ from kcal.corners.images import read_gray, to_8bit
 from kcal.corners.observations import Observations, View
 from kcal.errors import FileError
 from kcal.lens.uncertainty import image_sigma
-from kcal.texts import measured_text
+from kcal.texts import measured_text, percent_text
 from kcal.threads import in_one_thread
 
 # Draw a calibration: where the board was seen, the residuals, and the RMS of each view.
@@ -432,7 +432,8 @@ def coverage_figure(observations: Observations) -> Figure:
     figures.frame_image(axes, observations.image_size)
     share = 100.0 * (1.0 - unreached_share(observations))
     axes.set_title(
-        f"{len(pixels)} views, {int(seen.sum())} corners; boards reached {share:.0f} % of the image, hatched: not",
+        f"{len(pixels)} views, {int(seen.sum())} corners; boards reached {percent_text(share / 100.0)} of "
+        "the image, hatched: not",
         fontsize=11,
         loc="left",
     )

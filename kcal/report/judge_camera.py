@@ -40,6 +40,7 @@ from kcal.report.verdict import (
     sorted_findings,
     weighed_findings,
 )
+from kcal.texts import percent_text
 from kcal.threads import in_one_thread
 
 # Findings about the views of a calibration: order of corners, tilts, rolls, depth, coverage, blur, number.
@@ -177,7 +178,7 @@ def _coverage_finding(observations: Observations) -> Finding:
     ring = torch.ones_like(seen)
     ring[6:-6, 9:-9] = False
     border = 1.0 - float(seen[ring].double().mean())
-    text = f"no board reached {100 * share:.0f} % of the image, and {100 * border:.0f} % of its border"
+    text = f"no board reached {percent_text(share)} of the image, and {percent_text(border)} of its border"
     if share <= _UNREACHED and border <= _BORDER:
         return Finding.of("coverage", "fine", text)
     return Finding.of(

@@ -192,7 +192,8 @@ def calibrate_camera(
         kept = [name for i, name in enumerate(observations.names) if i not in unusable]
         if len(kept) < MINIMUM_VIEWS:
             raise DegenerateError(
-                f"{len(kept)} view(s) of the board can be used, and at least {MINIMUM_VIEWS} at different tilts are "
+                f"{len(kept)} of {len(observations.views)} views of the board can be used, and at "
+                f"least {MINIMUM_VIEWS} at different tilts are "
                 f"needed, 10 to 40 are good; of no use: {listed_views(observations, unusable)}"
             )
         return without_views(calibrate_camera(observations.subset(kept), options, progress), observations, unusable)

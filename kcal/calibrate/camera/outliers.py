@@ -21,6 +21,7 @@ from kcal.calibrate.problem.poses import spread_out
 from kcal.calibrate.problem.views import LEAST_NOISE
 from kcal.corners.observations import Observations
 from kcal.errors import InputError
+from kcal.texts import percent_text
 
 # Expected number of good corners beyond the limit in a whole calibration, for normal noise.
 _FALSE_CORNERS = 0.01
@@ -215,7 +216,7 @@ def check_share(gone: int, total: int, views: Sequence[RejectedView], limit: flo
         return
     names = ", ".join(view.view for view in views[:5]) + (" ..." if len(views) > 5 else "")
     raise InputError(
-        f"{gone} of {total} corners ({100 * gone / total:.0f} %)"
+        f"{gone} of {total} corners ({percent_text(gone / total)})"
         + (f", with the whole views {names}," if views else "")
         + f" do not agree with the rest, more than the {100 * limit:.0f} % that may be left out (--reject-limit). "
         "Check the board, its size, the corners' order, the lens model, and these images"

@@ -17,6 +17,7 @@ from kcal.calibrate.problem.state import FELT, LARGEST, BoardState
 from kcal.lens.camera import Camera
 from kcal.lens.projection import pupil_depth
 from kcal.solve.problem import SolverStatus
+from kcal.texts import percent_text
 
 # Warnings about how views were taken: motion while rows were read, and images that were stretched.
 
@@ -321,15 +322,15 @@ def general_warnings(
         found.append(f"the views do not determine {', '.join(lost)}: choose a smaller model or add views")
     if not bool(camera.covers_image()):
         _, valid = camera.unproject(camera.grid(33, 25))
-        share = 100.0 * float((~valid).double().mean())
+        share = percent_text(float((~valid).double().mean()))
         if hybrid:
             found.append(
-                f"{share:.0f} % of the image has no ray: no board was there, and the lens found from the rest ends "
+                f"{share} of the image has no ray: no board was there, and the lens found from the rest ends "
                 "before; if the lens shows anything there, add views with the board in these parts"
             )
         else:
             found.append(
-                f"the lens model folds inside the image: {share:.0f} % of it has no ray; choose a smaller model, or "
+                f"the lens model folds inside the image: {share} of it has no ray; choose a smaller model, or "
                 "add views with corners there"
             )
     return found

@@ -11,11 +11,13 @@ from lenses import hybrid_camera
 
 from kcal.calibrate.camera.advice import check_directions, direction_share
 from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.corners.observations import Observations
+from kcal.corners.board import Board
+from kcal.corners.observations import Observations, View
 from kcal.errors import DegenerateError
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.lens.paraxial import paraxial_focal
+from kcal.lens.pose import rotation_from_vector
 from kcal.lens.projection import FAR, project_components
 
 
@@ -109,3 +111,23 @@ def test_the_focal_length_of_a_simulated_capture() -> None:
         pulls.append((focal - wanted) / sigma)
     # χ² of six: below 22.5 but once in a thousand.
     assert 0.3 < sum(pull * pull for pull in pulls) < 22.5
+
+
+@pytest.mark.parametrize(("spread", "refused"), [(2.0, True), (20.0, False)])
+def test_the_spread_of_tilts_counts_not_the_tilt(spread: float, refused: bool) -> None:
+    """All boards by 25 degrees, and by little or much more or less."""
+    draw = torch.Generator().manual_seed(1)
+    truth = Camera.build(focal=(800, 800), center=(322, 238), size=(640, 480), model="pinhole")
+    board, count = Board(columns=9, rows=6, square=0.03), 14
+    tilt = torch.tensor([25.0, 0.0, 0.0]) + spread * (2.0 * torch.rand(count, 3, generator=draw) - 1.0)
+    points = (board.points - board.points.mean(0)) @ rotation_from_vector(torch.deg2rad(tilt.double())).mT
+    place = (2.0 * torch.rand(count, 3, generator=draw).double() - 1.0) * torch.tensor([0.05, 0.04, 0.04])
+    pixels = truth.project(points + (place + torch.tensor([0.0, 0.0, 0.65]))[:, None])[0]
+    pixels = pixels + 0.02 * torch.randn(pixels.shape, generator=draw, dtype=torch.float64)
+    views = tuple(View(name=str(i), pixels=tuple(map(tuple, one))) for i, one in enumerate(pixels.tolist()))
+    seen = Observations(board=board, image_size=(640, 480), views=views)
+    if refused:
+        with pytest.raises(DegenerateError, match="tilted alike"):
+            calibrate_camera(seen)
+    else:
+        assert float(calibrate_camera(seen).camera.focal[0]) == pytest.approx(800.0, rel=0.02)
