@@ -21,6 +21,7 @@ from kcal.calibrate.camera.outliers import leave_out_outliers, noise_scale
 from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult, OutlierRejection, Progress
 from kcal.calibrate.camera.warnings import (
     bending_warnings,
+    check_end,
     general_warnings,
     hybrid_warnings,
     motion_warnings,
@@ -117,7 +118,9 @@ def hybrid_result(observations: Observations, fit: HybridFit, options: Calibrati
 
     Raises:
         DegenerateError: the views hardly determine where the camera sees what they show.
+        InputError: the fit did not reach its solution.
     """
+    check_end(fit)
     camera, covariance, names = fit.camera, fit.covariance, observations.names
     per_view = fit.residuals.square().sum(-1).nanmean(-1).sqrt()
     spread = covariance.diagonal().sqrt()

@@ -12,8 +12,10 @@ from torch import Tensor
 from kcal.calibrate.camera.outliers import corners_beyond
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.hybrid.fit import HybridFit
+from kcal.calibrate.hybrid.settled import pixels_are_square
 from kcal.calibrate.problem.parameters import GaussianPrior, Term
 from kcal.calibrate.problem.state import FELT, LARGEST, BoardState
+from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.projection import pupil_depth
 from kcal.solve.problem import SolverStatus
@@ -86,6 +88,9 @@ def pixel_warnings(fit: HybridFit) -> list[str]:
     if fit.square:
         return []
     aspect, sigma = measured_aspect(fit)
+    if pixels_are_square((aspect - 1.0) / sigma):
+        # The rounds said so, and error bars with amplitudes as they are to be expected do not.
+        return []
     return [
         f"pixels are not square: f_y / f_x = {aspect:.4f} ± {sigma:.4f}; was the image or video resized, or taken in "
         "an anamorphic mode? The camera is right for images of this size and shape only: photograph boards and targets "
@@ -131,7 +136,8 @@ def spacing_warnings(result: CameraCalibrationResult, refused: bool = False) -> 
 _GLASS = 10 * 3e-3
 # Meters. At small angles long lenses move by more than that rule says, and by less than this.
 _LEAST = 10e-3
-_SURE = 3.0
+# Of chance, in standard deviations: what glass does not have needs less proof than what it may have.
+_SURE = 2.0
 
 
 class CornerPupil(NamedTuple):
@@ -182,10 +188,11 @@ def pupil_warnings(camera: Camera, covariance: Tensor) -> list[str]:
     if not abs(pupil.depth) > max(most, _SURE * pupil.sigma):
         return []
     return [
-        f"the fitted entrance pupil moves by {1e3 * abs(pupil.depth):.0f} mm, which no lens does ({1e3 * most:.0f} mm "
-        f"at most, {math.degrees(pupil.angle):.0f}° off the axis): it stands for an error that changes with the "
-        "board's distance, most likely a wrong size of the squares, a board that flexes, or motion; measure the "
-        "squares, and photograph a stiff board with camera and board at rest"
+        f"the fitted entrance pupil moves by {1e3 * abs(pupil.depth):.0f} ± {1e3 * pupil.sigma:.0f} mm, which no lens "
+        f"does ({1e3 * most:.0f} mm at most, {math.degrees(pupil.angle):.0f}° off the axis): it stands for an error "
+        "that changes with the board's distance: a wrong size of the squares, a board that flexes, motion, or a focal "
+        "length that too few tilts tell; measure the squares, and photograph a stiff board at rest, tilted by 30 to 45 "
+        "degrees in all directions"
     ]
 
 
@@ -199,6 +206,8 @@ _CONTRADICTION = 3.0
 _GROSS = 2.0
 # Tempering that chance and rounding do not explain: it is 1 on simulated captures, 2.2 on the wide lens's.
 REPEATING = 2.0
+# Times the noise of its corners beyond which the RMS of a fit shows that it did not end: it is 0.93 to 1.0 on captures.
+_ENDED = 2.0
 # Of the principal point, in standard deviations of its prior.
 _FAR_CENTER = 3.0
 NO_ERROR_BARS = (
@@ -253,6 +262,17 @@ def rival_warnings(
                 "parameters; choose a smaller model or add views"
             ]
     return []
+
+
+def check_end(fit: HybridFit) -> None:
+    """Raise `InputError` where residuals are far larger than the noise that error bars are made of."""
+    noise = math.sqrt(2.0) * fit.sigma / math.sqrt(fit.tempering)
+    if not fit.weighted_rms < _ENDED * noise:
+        raise InputError(
+            f"the fit ended before it reached its solution: RMS {fit.weighted_rms:.3g} px, where its error bars assume "
+            f"{noise:.3g} px; look at the views that fit worst, leave them out (--reject), or give the focal length "
+            "roughly (--focal, --fov)"
+        )
 
 
 def hybrid_warnings(fit: HybridFit) -> list[str]:

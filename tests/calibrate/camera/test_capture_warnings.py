@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 import torch
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.calibrate.camera.warnings import motion_warnings
+from kcal.calibrate.camera.warnings import check_end, measured_aspect, motion_warnings, pixel_warnings
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
@@ -106,3 +107,25 @@ class TestSpacing:
         found = calibrate_camera(Observations(board=ASYMMETRIC, image_size=(1280, 800), views=tuple(seen)))
         assert float(paraxial_focal(found.camera).value[0]) == pytest.approx(954.0, abs=2.0)
         assert found.warnings[0].startswith("columns of the board are 25 mm apart, and its rows 20 mm")
+
+
+def test_a_fit_that_did_not_reach_its_solution_is_refused() -> None:
+    """Its RMS is far above the noise that its error bars are made of; with tempering these are wider than the noise."""
+    fit = fitted(12, None)
+    for end in (fit, dataclasses.replace(fit, sigma=3.0 * fit.sigma, tempering=9.0)):
+        check_end(end)
+        with pytest.raises(InputError, match=r"ended before it reached its solution: RMS 79\.6 px"):
+            check_end(dataclasses.replace(end, weighted_rms=79.6))
+
+
+def test_a_sentence_about_pixels_needs_its_evidence() -> None:
+    """That of the finished fit: 2.6 standard deviations are none."""
+    seen = unequal(1.0, CHECKERBOARD, aspect=1.01)
+    fit = calibrate_camera(seen).hybrid
+    assert fit is not None
+    assert not fit.square
+    aspect, sigma = measured_aspect(fit)
+    assert aspect == pytest.approx(1.01, abs=5.0 * sigma)
+    assert "f_y / f_x = 1.01" in pixel_warnings(fit)[0]
+    wider = dataclasses.replace(fit, half=(aspect - 1.0) / sigma / 2.6 * fit.half)
+    assert pixel_warnings(wider) == []
