@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kcal.calibrate.camera.advice import roll_warnings
 from kcal.calibrate.camera.outliers import corners_beyond
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.hybrid.fit import HybridFit
@@ -119,9 +120,18 @@ def spacing_warnings(result: CameraCalibrationResult, refused: bool = False) -> 
     allows = "the camera allows for this, and all distances are as right as that of the rows"
     if refused:
         allows = "only the default lens with a printed board allows for this"
+    unsure = (
+        ""
+        if not roll_warnings(result.cam_from_board_rotation)
+        else (
+            "; or else pixels are not square, which views that show the board upright hardly tell: turn it by 90° "
+            "for a third of the views"
+        )
+    )
     return [
         f"{apart} ({100 * value:+.2f} ± {100 * sigma:.2g} %), but one length was given for both: {allows}; measure "
         "both with a ruler, give the distance of the rows as --square, and print at 100 %, not fitted to the page"
+        + unsure
     ]
 
 

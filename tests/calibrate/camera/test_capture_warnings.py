@@ -98,6 +98,12 @@ class TestSpacing:
         assert not any("apart" in text for text in said)
         assert any("pixels are not square" in text for text in said) == (aspect != 1.0)
 
+    def test_upright_views_hardly_tell_the_board_from_the_pixels(self) -> None:
+        (upright,) = (t for t in calibrate_camera(unequal(1.2, CHECKERBOARD, 0.1)).warnings if "apart" in t)
+        (turned,) = (t for t in calibrate_camera(unequal(1.2, CHECKERBOARD)).warnings if "apart" in t)
+        assert "or else pixels are not square" in upright
+        assert "or else" not in turned
+
     def test_real_circles(self, kcal_data: Path) -> None:
         rows = [line.split(",") for line in (kcal_data / "field/asym/rolled.csv").read_text().splitlines()[1:]]
         views: dict[str, list[tuple[float, float]]] = {}
