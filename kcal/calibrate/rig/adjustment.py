@@ -22,7 +22,7 @@ from kcal.calibrate.rig.blocks import (
     StarBlock,
 )
 from kcal.calibrate.rig.initial_poses import Start
-from kcal.calibrate.rig.motion import BoardMotion, RigRows, SeenBoards, WithoutMotion, board_motion
+from kcal.calibrate.rig.motion import BoardMotion, RigRows, WithoutMotion, board_motion
 from kcal.calibrate.rig.problem import (
     DistanceTerm,
     PlaceTerm,
@@ -243,19 +243,10 @@ class Adjustment:
             others[c] = beside
             if c in before:
                 rig.put(c, before.pop(c))
-            seen = SeenBoards(
-                model=posed[c].camera.model,
-                parameters=posed[c].parameters,
-                rotation=posed[c].rotation @ state.board_rotation,
-                translation=(state.board_translation - posed[c].center) @ posed[c].rotation.T,
-                points=block.shaped(state),
-                pixels=boards.pixels[:, c],
-                whitening=block.whitening[:, c],
-                size=posed[c].camera.size,
-            )
             camera = self.data.cameras[c]
-            trusted = camera.model.hybrid or camera.calibration is None
-            found = self.motion[c] = board_motion(seen, rig, c, reads=trusted)
+            reads = camera.model.hybrid or camera.calibration is None
+            columns, reach = block.motion_columns(posed[c], state, c, reads=reads)
+            found = self.motion[c] = board_motion(columns, block.whitening[:, c], reach, rig, c)
             if found is not None:
                 before[c] = rig.parts[c].rows
                 rig.put(c, WithoutMotion(found.columns, block.whitening[:, c])(before[c]))

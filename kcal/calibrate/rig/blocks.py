@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.problem.board_problem import apply_twist
+from kcal.calibrate.problem.state import MOTION, Readout
 from kcal.calibrate.rig.motion import CameraRows, WithoutMotion
 from kcal.lens.camera import Camera
 from kcal.lens.pose import side_axes, step_rows
@@ -315,6 +316,24 @@ class BoardBlock(Block):
         if self._shapes is None or not len(self._shapes):
             return self._board
         return self._board + torch.einsum("b,bkn->kn", state.board, self._shapes)
+
+    def motion_columns(self, posed: PosedCamera, state: RigState, camera: int, *, reads: bool) -> tuple[Tensor, float]:
+        """(V, M, 2, N) derivatives of a camera's pixels by motions, and how far a board reaches, in distances of it.
+
+        Args:
+            posed: the camera.
+            state: where.
+            camera: its number.
+            reads: whether boards may move while its rows are read, too.
+        """
+        points, rotation = self.shaped(state), posed.rotation @ state.board_rotation
+        translation = (state.board_translation - posed.center) @ posed.rotation.T
+        found = project_components(rotation @ points + translation[..., None], posed.parameters, posed.camera.model, [])
+        distance = float(translation.norm(dim=-1).median())
+        readout = Readout(center=points.mean(-1), distance=distance, size=posed.camera.size)
+        time = readout.time(self.target[:, camera].mT)
+        columns = readout.columns_of(found.by_point, rotation, time, points, apart=True).nan_to_num(0.0)
+        return columns if reads else columns[:, MOTION:], readout.reach(points.T)
 
     def _place(self, state: RigState) -> tuple[Tensor, Tensor]:
         points = state.board_rotation @ self.shaped(state) + state.board_translation[..., None]

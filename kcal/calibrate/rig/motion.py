@@ -19,9 +19,7 @@ from kcal.calibrate.hybrid.evidence import (
     maximize_evidence,
 )
 from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies
-from kcal.calibrate.problem.state import AMPLITUDES, APART, AXES, FELT, MEDIAN, MOTION, MotionSigma, Readout
-from kcal.lens.model import LensModel
-from kcal.lens.projection import project_components
+from kcal.calibrate.problem.state import AMPLITUDES, APART, AXES, FELT, MEDIAN, MotionSigma
 from kcal.solve.schur import Products, column_scale
 
 # Rows of each camera of a rig, and their products, without the many columns that are zero for it.
@@ -86,30 +84,6 @@ _NONE = torch.zeros(1, dtype=torch.float64)
 _NO_PRIOR = Hyperprior(_NONE, torch.ones_like(_NONE))
 
 
-class SeenBoards(NamedTuple):
-    """Boards as one camera sees them.
-
-    Attributes:
-        model: of the camera.
-        parameters: of the camera.
-        rotation: (V, 3, 3) cam_from_board.
-        translation: (V, 3) meters.
-        points: (3, N) the board, meters.
-        pixels: (V, N, 2), NaN where not seen.
-        whitening: (V, 2, 2, N) by which residuals are multiplied; zero where not seen.
-        size: of the image.
-    """
-
-    model: LensModel
-    parameters: Tensor
-    rotation: Tensor
-    translation: Tensor
-    points: Tensor
-    pixels: Tensor
-    whitening: Tensor
-    size: tuple[int, int]
-
-
 class BoardMotion(NamedTuple):
     """How boards move while a camera reads its rows, and between the exposures of cameras that are not synchronized.
 
@@ -126,26 +100,21 @@ class BoardMotion(NamedTuple):
     reach: float
 
 
-def board_motion(seen: SeenBoards, rig: RigRows, camera: int, *, reads: bool) -> BoardMotion | None:
-    """How boards move while this camera reads its rows, and beforehand; None where they stand still.
+def board_motion(columns: Tensor, whitening: Tensor, reach: float, rig: RigRows, camera: int) -> BoardMotion | None:
+    """How boards move while a camera reads its rows, and beforehand; None where they stand still.
 
     Args:
-        seen: all boards.
+        columns: (V, 18, 2, N) derivatives of its pixels by motions; (V, 6, 2, N) if they do not move while rows are
+            read.
+        whitening: (V, 2, 2, N) by which residuals are multiplied; zero where not seen.
+        reach: of the board about its middle, distances of the board.
         rig: rows of all cameras, other cameras' motions integrated out.
         camera: its number.
-        reads: whether they may move while rows are read.
     """
     good = rig.good
     if int(good.sum()) < _FEWEST or camera not in rig.parts:
         return None
-    points_cam = seen.rotation @ seen.points + seen.translation[..., None]
-    found = project_components(points_cam, seen.parameters, seen.model, [])
-    distance = float(seen.translation[good].norm(dim=-1).median())
-    readout = Readout(center=seen.points.mean(-1), distance=distance, size=seen.size)
-    time = readout.time(seen.pixels)
-    columns = readout.columns_of(found.by_point, seen.rotation, time, seen.points, apart=True).nan_to_num(0.0)
-    columns = columns if reads else columns[:, MOTION:]
-    white = torch.einsum("vuwn,vpwn->vpun", seen.whitening, columns).flatten(-2)
+    white = torch.einsum("vuwn,vpwn->vpun", whitening, columns).flatten(-2)
     variance = rig.variance
     # Nothing is left to explain of corners without noise.
     if variance < _EXACT:
@@ -168,7 +137,7 @@ def board_motion(seen: SeenBoards, rig: RigRows, camera: int, *, reads: bool) ->
         columns * each[:, None, None],
         MotionSigma(*sigma or (0.0,) * AMPLITUDES),
         (APART * turn, APART * shift),
-        readout.reach(seen.points.T),
+        reach,
     )
 
 
