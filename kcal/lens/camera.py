@@ -18,7 +18,7 @@ from kcal.lens.camera_parameters import CameraDistortion, ExtendedDistortion
 from kcal.lens.distortion import distort_components
 from kcal.lens.hybrid_points import FittedPolynomials, map_points, worth_fitting
 from kcal.lens.inverse import InverseStart, PreparedInverse, undistort_components
-from kcal.lens.model import LensModel
+from kcal.lens.model import LensModel, larger_model
 from kcal.lens.projection import (
     FAR,
     angle_over_distance,
@@ -94,7 +94,7 @@ class Camera(ConvertibleCamera):
         model = LensModel.named(model)
         lens = [float(value) for value in coefficients]
         if len(lens) > model.size:
-            raise InputError(f"{len(lens)} coefficients given, {model} has {model.size}; choose a model with more")
+            raise InputError(f"{len(lens)} coefficients given, {model} has {model.size}; {larger_model(len(lens))}")
         lens += [0.0] * (model.size - len(lens))
         values = [*map(float, focal), *map(float, center), float(skew), *lens]
         return cls(torch.tensor(values, dtype=torch.float64), size=size, model=model)

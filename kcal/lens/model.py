@@ -177,3 +177,14 @@ PRESETS: dict[str, LensModel] = {
     "ext24": LensModel(numerator=7, denominator=7, tangential=True, prism=3, tilt=True),
     "fisheye4": LensModel(numerator=4, fisheye=True),
 }
+
+
+def larger_model(count: int) -> str:
+    """Which model to choose for that many coefficients of OpenCV, in words.
+
+    Example:
+        >>> larger_model(8)
+        'choose model="opencv8"'
+    """
+    fit = [name for name, model in PRESETS.items() if name.startswith("opencv") and model.size >= count]
+    return f'choose model="{fit[0]}"' if fit else "choose a model with more"

@@ -370,7 +370,8 @@ def _first_lens(
             break
     if focal is None or not named:
         raise InputError(
-            f"in none of {len(images)} images stars have names: too few are seen, or this is not the night sky"
+            f"in none of {len(images)} images stars have names: too few are seen, this is not the night sky, or its "
+            f"diagonal field of view is not {_NARROWEST:g} to {_WIDEST:g} degrees: start from a camera file (--camera)"
         )
     first = next(iter(named))
     return _from_middle_outward(images, views, size, focal, {first: named[first].rotation}, catalog)
