@@ -12,8 +12,9 @@ import torch
 from calibrate_scenes import BOARD, camera, motions
 from torch import Tensor
 
+from kcal.calibrate.camera import trust
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
-from kcal.calibrate.camera.trust import Examination, examine, residual_structure
+from kcal.calibrate.camera.trust import Examination, HalvesDifference, examine, residual_structure
 from kcal.corners.observations import Observations, View
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
@@ -91,6 +92,33 @@ def test_halves_that_do_not_predict_each_other_are_doubted(
     verdict = camera_verdict(clean, OPTIONS, Requirement.parse("100m:10%"), mark_sigma=0.1, examination=given)
     assert "prediction" in names(verdict, "doubt")
     assert any("1.50 times" in finding.text for finding in verdict.findings)
+
+
+def test_halves_that_predict_badly_are_set_beside_a_plain_lens(
+    clean: CameraCalibrationResult, examination: Examination, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of this camera's kind, with poses alone solved again for both; only where the default lens predicts badly."""
+    seen, asked = clean.observations, []
+    parts = list(seen.names[::2]), list(seen.names[1::2])
+    found = trust._plain_lens(clean.camera, seen, parts, CalibrationOptions(), 0.3)
+    assert found is not None
+    assert (found.model, found.own) == ("opencv5", 0.3)
+    assert found.held_out == pytest.approx(math.sqrt(2) * NOISE, rel=0.2)
+
+    def compared(_: object, __: object, options: CalibrationOptions, label: str, alike: bool) -> HalvesDifference:
+        asked.append(str(options.model))
+        given = dataclasses.replace(examination.halves[0], label=label, alike=alike, own=0.1, still=0.2)
+        return dataclasses.replace(given, held_out=ratio * 0.1)
+
+    monkeypatch.setattr(trust, "_compare", compared)
+    ratio = 1.3
+    assert examine(clean, CalibrationOptions()).plain == ("opencv5", pytest.approx(0.13), 0.2)
+    ratio = 1.2
+    assert examine(clean, CalibrationOptions()).plain is None
+    assert asked.count("opencv5") == 1
+    wide = Camera.build(focal=(200, 200), center=(320, 240), size=(640, 480), model="fisheye4")
+    assert (plain := trust._plain_lens(wide, seen, parts, CalibrationOptions(), 0.1)) is not None
+    assert plain.model == "fisheye4"
 
 
 def test_the_range_asked_for_decides(clean: CameraCalibrationResult, examination: Examination) -> None:
