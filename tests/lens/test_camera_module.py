@@ -209,7 +209,7 @@ class TestRefusals:
             Camera(torch.ones(10), size=(0, 3))
         with pytest.raises(InputError, match="unknown lens model 'opencv6'"):
             Camera(torch.ones(10), size=(4, 3), model="opencv6")
-        with pytest.raises(InputError, match="6 coefficients given, opencv5 has 5; choose model=.opencv8."):
+        with pytest.raises(InputError, match=r"6 coefficients given, opencv5 has 5; choose model=.opencv8."):
             Camera.build(focal=(1, 1), center=(0, 0), size=(4, 3), coefficients=[0.0] * 6)
 
     @pytest.mark.parametrize(
