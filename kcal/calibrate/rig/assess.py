@@ -100,7 +100,7 @@ def check_places(
 # What landmarks tell of a camera is linear in its pose only nearby. So the pose is moved by two standard deviations in
 # the directions in which it is most open, and one step of the solver leads back: were all linear, to where it was. What
 # is missing, in standard deviations, grows with the square of an error. Its second moment is added to the covariance,
-# and above the limit the covariance says nothing (measured on simulated landmarks, scripts/check/weak_geometry.py).
+# and above the limit, one standard deviation of any part of the pose, the pose is refused.
 _MOST_BENT, _DIRECTIONS_TRIED = 1.0, 2
 
 
