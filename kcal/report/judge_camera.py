@@ -247,8 +247,9 @@ def model_findings(
     if found.model is not None and found.reference is not None:
         named = _against_reference(result, options, found, found.model.rms)
         certain = named is not None and named.name in ("board", "pupil")
-        beyond = max(beyond, found.model.rms if certain or patterns else unexplained(found.model))
-        if named is None and beyond:
+        wrong = found.model.rms if certain or patterns else unexplained(found.model)
+        beyond = max(beyond, wrong)
+        if named is None and wrong:
             text = (
                 f"the lens model {result.camera.model} does not fit this lens: it differs by "
                 f"{found.model.rms:.2g} px from one that does"

@@ -20,6 +20,7 @@ from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import StereoRig
+from kcal.lens.uncertainty import image_sigma
 from kcal.report.judge_camera import camera_verdict, stored_verdict, view_findings
 from kcal.report.judge_rig import rig_verdict, synchrony
 from kcal.report.verdict import Finding, RangeAnswer, Requirement, Verdict
@@ -160,6 +161,24 @@ def test_a_bent_board_that_was_taken_as_flat_is_named(poses: tuple[Tensor, Tenso
         verdict = camera_verdict(result, OPTIONS, need, mark_sigma=0.1, examination=found)
         assert verdict.stops[0].name == "board"
         assert "bends" in verdict.reason
+
+
+@pytest.mark.parametrize("alone", [True, False], ids=["no reference", "a reference that agrees"])
+def test_halves_that_contradict_error_bars_are_a_no_however_wide_these_are(
+    clean: CameraCalibrationResult, examination: Examination, alone: bool
+) -> None:
+    half = next(half for half in examination.halves if half.alike)
+    sigma = image_sigma(clean.camera)
+    stated = float(sigma[sigma.isfinite()].square().mean().sqrt())
+    shift = half.difference.shift * (0.5 * stated / half.difference.rms)
+    apart = dataclasses.replace(half.difference, shift=shift, ratio=3.0, probability=1e-7)
+    given = dataclasses.replace(examination, halves=(dataclasses.replace(half, difference=apart),))
+    given = dataclasses.replace(given, reference=None, model=None) if alone else given
+    verdict = camera_verdict(clean, OPTIONS, examination=given)
+    assert 0.0 < verdict.unexplained < stated
+    assert not verdict.usable
+    assert verdict.stops[0].name == "halves"
+    assert "3.0 times what their error bars predict" in verdict.reason
 
 
 def test_boards_parallel_to_the_image_are_named(clean: CameraCalibrationResult, examination: Examination) -> None:
