@@ -47,8 +47,9 @@ _TOO_MUCH = 0.5 * LARGEST
 _AT_REST = 0.1
 # The same for a fit from which another begins.
 _NEAR_REST = 0.3
-# Nats by which the evidence may still change from one round to the next.
-_UNFELT = 0.02
+# Nats by which the evidence may still change from one round to the next; and where a board bends by view: its amplitude
+# and the factors of views pass a common scale to each other for many rounds, which the camera does not feel.
+_UNFELT, _SCALE = 0.02, 0.5
 # With which motions begin: as a hand moves. From that of still views, field and board explain the motion first, and
 # the evidence has another maximum there (one of sixty simulated captures by hand).
 _MOVING = 3e-3
@@ -162,14 +163,14 @@ def run_rounds(
     """
     readout, converged, tempered, lost = capture.readout, False, False, math.nan
     top: Rounds | None = None
-    last = math.inf
+    last, effort = math.inf, _LATER
     estimate = begin_motion(capture, estimate)
     if capture.readout is not None:
         # That of an earlier fit, which was found after its rounds.
         estimate = estimate._replace(variance=estimate.variance / estimate.tempering, tempering=1.0)
     for turn in range(_ROUNDS):
         first = turn == 0 and cold
-        problem, estimate, steps = capture.solved(estimate, never, _FIRST if first else _LATER)
+        problem, estimate, steps = capture.solved(estimate, never, _FIRST if first else effort)
         spent += steps
         data = capture.data(problem, estimate, never)
         former = tempering = estimate.tempering
@@ -188,7 +189,8 @@ def run_rounds(
             )
             change = max(_moved_by(estimate, best), abs(math.log(tempering / former)))
             # The solver may try several steps where it finds nothing that the evidence feels.
-            still = steps <= most or abs(best.loss - last) < _UNFELT
+            ended, unfelt = steps < effort[0], _UNFELT if data.relative is None else _SCALE
+            still = steps <= most or (ended and abs(best.loss - last) < unfelt)
             resting = not first and (change < _NEAR_REST if rough else change < _AT_REST and still)
             # To the end where nothing will change any more.
             if not resting:
@@ -206,6 +208,8 @@ def run_rounds(
             tempering=tempering,
         )
         last = best.loss
+        # Where amplitudes rest and the solver does not, more rounds of a few steps would end as those before.
+        effort = LAST if change < _AT_REST and not ended else _LATER
         progress(f"evidence, round {turn + 1}")
         if (first or resting) and turn < _ROUNDS // 2:
             bent = _with_bending(capture, estimate, best, tempering, never)
@@ -226,7 +230,7 @@ def run_rounds(
         if resting:
             converged = True
             break
-        if data.moving and turn >= _SETTLED and steps < _LATER[0]:
+        if data.moving and turn >= _SETTLED and ended:
             # Few views that move much leave a direction along which the best camera drifts while the evidence falls:
             # the round of largest evidence counts, among those whose solver came to its end.
             if top is None or best.loss < top.loss:
