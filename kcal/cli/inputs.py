@@ -143,11 +143,12 @@ class Wanted:
     instead: tuple[tuple[str, str], ...] = ()
     part: bool = False
 
-    def cure(self, given: Path, kind: str) -> str:
-        """The command that makes what is needed, from what was given if that is possible."""
-        text = dict(self.instead).get(kind, self.make)
+    def cure(self, given: Path, kind: str, marks: Path | None = None) -> str:
+        """The command that makes what is needed, from what was given if that is possible; marks name their cameras."""
+        text = _STATION if marks and kind == "camera" else dict(self.instead).get(kind, self.make)
         name = given.name.split(".")[0] or "left"
-        return text.format(given=shlex.quote(str(given)), name=shlex.quote(str(given.with_name(name))))
+        quoted = {"given": given, "name": given.with_name(name), "marks": marks}
+        return text.format(**{key: shlex.quote(str(path)) for key, path in quoted.items()})
 
 
 _DETECT = "kcal detect {given} --board 9x6 --square 25mm -o {name}.obs.json"
@@ -179,6 +180,11 @@ RIG = Wanted(
      ("observations", "kcal calibrate left.obs.json right.obs.json -o cameras"),
      ("foreign", "kcal import {given} -o rig.json"), ("json", "kcal import {given} -o rig.json")),
 )  # fmt: skip
+# Where marks are of any number of cameras, `name,camera,u,v`.
+_STATION = (
+    "kcal station {given} survey.csv --marks marks.csv -o {name}.rig.json (several cameras: kcal rig), then kcal locate "
+    "{name}.rig.json {marks}, with --height 12±3 or --terrain dem.tif for positions"
+)
 CAMERA_OR_RIG = dataclasses.replace(
     ANY_CAMERA, words="a camera or rig file", kinds=frozenset({"camera", "rig", "foreign", "json", "unknown"})
 )
@@ -311,7 +317,11 @@ def check_kinds(found: Sequence[_Given]) -> None:
     inside = next(_candidates(wrong, kind), None)
     if inside is not None and typed:
         raise FileError(f"{text}. Perhaps: {typed_with({wrong.text: inside})}")
-    raise FileError(f"{text}. To make one: {wrong.wanted.cure(wrong.path, kind)}")
+    from kcal.locate.survey import is_long
+
+    tables = [one.path for one in found if wrong.wanted is RIG and one.wanted is MARKS and one.fits(one.text)]
+    marks = next(filter(is_long, tables), None)
+    raise FileError(f"{text}. To make one: {wrong.wanted.cure(wrong.path, kind, marks)}")
 
 
 def typed_with(exchange: dict[str, str], *more: str) -> str:

@@ -50,9 +50,9 @@ class Origin:
         if not all(math.isfinite(value) for value in (self.lat, self.lon, self.height)):
             raise InputError(f"origin: latitude, longitude and height must be finite, got {self}")
         for word, value, most in (("latitude", self.lat, 90), ("longitude", self.lon, 180)):
-            # 4319.2162 of receivers is 43 degrees and 19.2162 minutes.
+            # 4319.2162 of receivers is 43 degrees and 19.2162 minutes; up to 360 it may be another angle in degrees.
             degrees, minutes = divmod(abs(value), 100)
-            if most < degrees * 100 and degrees <= most and minutes < 60 and value % 1:
+            if abs(value) > 360 and degrees <= most and minutes < 60 and value % 1:
                 decimal = math.copysign(degrees + minutes / 60, value)
                 raise InputError(
                     f"origin: {word} {value:.10g} is outside -{most} to {most}; write decimal degrees: as degrees and "

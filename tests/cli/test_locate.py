@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from kcal.cli.main import main
-from kcal.io.camera_file import provenance
+from kcal.io.camera_file import provenance, save_camera
 from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.calibration import RigCalibration
 from kcal.lens.camera import Camera
@@ -24,6 +24,8 @@ ORIGIN = "-33.9,151.2,10"
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     camera = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
     save_rig(StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0])), tmp_path / "rig.json")
+    save_camera(camera, tmp_path / "mast.camera.json")
+    (tmp_path / "long.csv").write_text("name,camera,u,v\ncorner,mast,113,360\n")
     (tmp_path / "points.csv").write_text(HEADER + "[b]mast,975.5,539.5,959.5,539.5\nlost,-40,5,1,5\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "60")
@@ -125,6 +127,8 @@ def test_nothing_located_is_a_failure_with_its_reasons(
             ["points.csv", "points.csv", "--origin", ORIGIN, "--heading", "0"],
             "points.csv: this is a table of marks; a kcal rig file is needed",
         ),
+        (["mast.camera.json", "long.csv"], "To make one: kcal station mast.camera.json survey.csv --marks marks.csv"),
+        (["mast.camera.json", "points.csv"], "To make one: kcal rig mast.camera.json right.camera.json"),
         (["rig.json", "points.csv", "--origin", ORIGIN, "--heading", "0", "-o", "a.shp"], "a.shp: unknown format"),
         (["rig.json", "points.csv", "--origin", ORIGIN, "--heading", "0", "-o", "no/a.csv"], "does not exist"),
         (["rig.json", "points.csv", "--origin", ORIGIN, "--heading", "0", "--picture", "a.pdf"], "end with .png"),

@@ -212,6 +212,8 @@ def test_shapes_and_bad_points() -> None:
         ("151.2,-33.9,10", "longitude came first"),
         ("95,120,10", "latitude 95 is outside"),
         ("10,190,0", "write -170"),
+        ("10,190.5,0", "write -169.5"),
+        ("4319.2162,20,0", "degrees and minutes it is 43.32027"),
         ("10,400,0", "longitude 400 is outside"),
         ("nan,0,0", "finite"),
         ("10,20,inf", "finite"),
