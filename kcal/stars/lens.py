@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -237,12 +236,14 @@ def _agreement_with(stars: Tensor, change: Tensor, lens: CameraInformation, coun
 # A camera from night images alone: stars named by their pattern, the field of view unknown, then the lens fitted.
 
 # Degrees between opposite corners: the widest and narrowest lens that is looked for, and steps between.
-_WIDEST, _NARROWEST, _STEP = 115.0, 6.0, 1.02
+_WIDEST, _NARROWEST, _STEP = 320.0, 6.0, 1.02
 _SCALE_ERROR = 0.012
-# Of the half diagonal: stars nearer the middle, where all lenses are alike, are named first.
-_MIDDLE = 0.5
+# Wider lenses are taken to be fisheyes.
+_PINHOLES = 115.0
+# Of the half diagonal: stars nearer the middle, where all lenses are alike, are named first; and of fisheyes.
+_MIDDLE, _WIDE_MIDDLE = 0.5, 0.3
 # How many of the brightest stars make triangles in each pass over all fields of view, most of which are wrong.
-_CORNERS, _SEARCHED = (4, 6), 24
+_FEW_CORNERS, _MORE_CORNERS, _SEARCHED = 4, 6, 24
 _ROUGH_PX = 3.0
 # Images in which the field of view is looked for.
 _TRIES = 3
@@ -361,63 +362,71 @@ def _first_lens(
     progress: Callable[[str], object],
 ) -> tuple[Camera, dict[int, np.ndarray]]:
     """A rough camera from the first image whose stars have names, and its rotation."""
-    named: dict[int, Identification] = {}
-    for number in order[:_TRIES]:
-        found = _search(images[number], size, focal, catalog)
-        progress(f"field of view of image {number + 1}")
+    # More triangles take five times as long: of one image, where few have failed in all.
+    tries = [(_FEW_CORNERS, number) for number in order[:_TRIES]] + [(_MORE_CORNERS, number) for number in order[:1]]
+    for count, (corners, number) in enumerate(tries, 1):
+        of = f"search {count} of {len(tries)}"
+        found = _search(images[number], size, focal, corners, catalog, lambda text, of=of: progress(f"{of}, {text}"))
         if found is not None:
-            named[number], focal = found
-            break
-    if focal is None or not named:
-        raise InputError(
-            f"in none of {len(images)} images stars have names: too few are seen, this is not the night sky, or its "
-            f"diagonal field of view is not {_NARROWEST:g} to {_WIDEST:g} degrees: start from a camera file (--camera)"
-        )
-    first = next(iter(named))
-    return _from_middle_outward(images, views, size, focal, {first: named[first].rotation}, catalog)
+            named, camera = found
+            return _from_middle_outward(images, views, camera, {number: named.rotation}, catalog)
+    raise InputError(
+        f"in none of {len(images)} images stars have names: too few are seen, this is not the night sky, or its "
+        f"diagonal field of view is not {_NARROWEST:g} to {_WIDEST:g} degrees: start from a camera file (--camera)"
+    )
 
 
-def _pinhole(focal: float, size: tuple[int, int]) -> Camera:
+def _plain_camera(focal: float, size: tuple[int, int], model: str) -> Camera:
     center = ((size[0] - 1) / 2, (size[1] - 1) / 2)
-    return Camera.build(focal=(focal, focal), center=center, size=size, model="pinhole")
+    return Camera.build(focal=(focal, focal), center=center, size=size, model=model)
 
 
-def _rays(pixels: np.ndarray, size: tuple[int, int], focal: float) -> np.ndarray:
-    plane = (pixels - [(size[0] - 1) / 2, (size[1] - 1) / 2]) / focal
-    rays = np.c_[plane, np.ones(len(plane))]
-    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+def _camera_of(degrees: float, size: tuple[int, int]) -> Camera:
+    """A pinhole, or an equidistant fisheye if it is wide, with an angle between opposite corners."""
+    half, angle = 0.5 * math.hypot(*size), math.radians(degrees) / 2
+    wide = degrees > _PINHOLES
+    return _plain_camera(half / (angle if wide else math.tan(angle)), size, "fisheye4" if wide else "pinhole")
 
 
 def _search(
-    found: DetectedStars, size: tuple[int, int], focal: float | None, catalog: StarCatalog
-) -> tuple[Identification, float] | None:
-    """Names of the stars in the middle of an image, and the focal length, tried from wide to narrow."""
-    half = 0.5 * math.hypot(*size)
-    away = np.linalg.norm(found.pixels - [(size[0] - 1) / 2, (size[1] - 1) / 2], axis=1)
-    inside = np.flatnonzero(away < _MIDDLE * half)[:_SEARCHED]
-    if len(inside) < 5:
-        return None
-    steps = round(math.log(_WIDEST / _NARROWEST) / math.log(_STEP))
-    angles = [math.radians(_WIDEST * _STEP**-k) for k in range(steps + 1)]
+    found: DetectedStars,
+    size: tuple[int, int],
+    focal: float | None,
+    corners: int,
+    catalog: StarCatalog,
+    progress: Callable[[str], object],
+) -> tuple[Identification, Camera] | None:
+    """Names of the stars in the middle of an image, and a plain camera, tried from wide to narrow."""
+    count = round(math.log(_WIDEST / _NARROWEST) / math.log(_STEP))
     tried = (
-        [half / math.tan(angle / 2) for angle in angles]
+        [_camera_of(_WIDEST * _STEP**-k, size) for k in range(count + 1)]
         if focal is None
-        else [focal * _STEP**k for k in (0, 1, -1, 2, -2)]
+        else [
+            _plain_camera(focal * _STEP**k, size, model) for model in ("pinhole", "fisheye4") for k in (0, 1, -1, 2, -2)
+        ]
     )
-    for corners, guess in itertools.product(_CORNERS, tried):
-        rays = _rays(found.pixels[inside], size, guess)
-        field = 2 * math.atan(_MIDDLE * half / guess)
+    center = np.array([(size[0] - 1) / 2, (size[1] - 1) / 2])
+    away = np.linalg.norm(found.pixels - center, axis=1)
+    for camera in tried:
+        guess, middle = float(camera.params[0]), 0.5 * math.hypot(*size)
+        middle *= _WIDE_MIDDLE if camera.model.fisheye else _MIDDLE
+        inside = np.flatnonzero(away < middle)[:_SEARCHED]
+        progress(f"focal length {guess:.0f} px")
+        if len(inside) < 5:
+            continue
+        rays, _ = camera.unproject(torch.from_numpy(found.pixels[inside]))
+        rays = torch.nn.functional.normalize(rays, dim=-1).numpy()
+        field = 2 * (middle / guess if camera.model.fisheye else math.atan(middle / guess))
         here = identify(rays, 1.5 / guess, catalog=catalog, scale_error=_SCALE_ERROR, field=field, corners=corners)
         if here is None:
             continue
         known = np.flatnonzero(here.star >= 0)
-        seen = catalog.directions()[here.star[known]] @ here.rotation.T
-        plane = seen[:, :2] / seen[:, 2:]
-        centered = found.pixels[inside[known]] - [(size[0] - 1) / 2, (size[1] - 1) / 2]
+        seen = torch.from_numpy(catalog.directions()[here.star[known]] @ here.rotation.T)
+        plane = (camera.project(seen)[0].numpy() - center) / guess
         star = np.full(len(found.pixels), -1)
         star[inside[: len(here.star)]] = here.star
-        scale = float((plane * centered).sum() / (plane**2).sum())
-        return here._replace(star=star), scale
+        scale = float((plane * (found.pixels[inside[known]] - center)).sum() / (plane**2).sum())
+        return here._replace(star=star), _plain_camera(scale, size, "fisheye4" if camera.model.fisheye else "pinhole")
     return None
 
 
@@ -431,14 +440,14 @@ def _by_camera(found: DetectedStars, camera: Camera, catalog: StarCatalog) -> Id
 def _from_middle_outward(
     images: Sequence[DetectedStars],
     views: Sequence[SkyView],
-    size: tuple[int, int],
-    focal: float,
+    camera: Camera,
     rotations: dict[int, np.ndarray],
     catalog: StarCatalog,
 ) -> tuple[Camera, dict[int, np.ndarray]]:
     """A camera from one image, whose stars get names from the middle outward while the lens becomes better known."""
-    camera = _pinhole(focal, size)
-    for share in (0.6, 0.8, 1.0, 1.2):
+    assert camera.size is not None
+    size = camera.size
+    for share in (0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.2) if camera.model.fisheye else (0.6, 0.8, 1.0, 1.2):
         near = {n: _near_middle(images[n], size, share) for n in rotations}
         fields, _, _, kept = _star_fields(near, views, camera, rotations, catalog)
         lens = fit_star_lens(fields, [rotation for _, rotation in kept], size, float(camera.params[0]))

@@ -14,10 +14,12 @@ from typer.testing import CliRunner
 from kcal.cli.main import app
 from kcal.errors import InputError
 from kcal.io.camera_file import load_camera
+from kcal.lens.camera import Camera
 from kcal.stars.budget import NightPlan, planned_stars
 from kcal.stars.detect import DetectedStars
 from kcal.stars.lens import calibrate_by_stars
 from kcal.stars.lens_fit import StarField, fit_star_lens
+from scripts.shared.infinity import error_at_infinity
 from scripts.shared.star_lenses import SIZE, lens_difference, star_images, true_lens
 
 REAL = Path(os.environ.get("KCAL_DATA", ""), "stars")
@@ -42,6 +44,19 @@ def test_a_lens_from_stars(focal: float | None) -> None:
     focal_sigma = known.sigma["fx"]
     assert focal_sigma is not None
     assert abs(float(found.lens.camera.params[0] - true_lens().params[0])) < 5 * focal_sigma
+
+
+def test_a_fisheye_of_which_nothing_is_known() -> None:
+    """140 degrees between the corners, which no pinhole has."""
+    lens = Camera.build(focal=(618, 618), center=(642, 396), size=SIZE, model="fisheye4")
+    lens = lens.with_parameters(lens.params.detach() + torch.tensor([0, 0, 0, 0, 0, -1 / 24, 0, 0, 0]).double())
+    images, views = star_images(50.0, 1, seed=1, lens=lens, faintest=4.4)
+    told: list[str] = []
+    found = calibrate_by_stars(images, views, SIZE, progress=told.append)
+    assert found.images == (0,)
+    assert found.lens.rms_px < 0.13
+    assert error_at_infinity(found.lens.camera, lens, columns=17, rows=11).rms < 0.2
+    assert "search 1 of 2, focal length" in told[0]
 
 
 def test_too_few_stars() -> None:
