@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 import torch
@@ -39,23 +40,27 @@ _LOCAL = {
 def solve_surveyed(
     data: RigData, origin: Origin | None, options: RigOptions, progress: Callable[[str], None] = lambda _: None
 ) -> RigResult:
-    """`solve_rig`, and where landmarks are surveyed as in a mirror, an error that says so.
+    """`solve_rig`, and where landmarks may be surveyed as in a mirror, an error or a warning that says so.
 
     Raises:
-        InputError: see `refuse_mirrored`, and `solve_rig`.
+        InputError: landmarks fit only as in a mirror; or see `solve_rig`.
         DegenerateError: see `solve_rig`.
     """
     try:
         found = solve_rig(data, options, progress)
     except KcalError:
-        refuse_mirrored(data, origin, None)
+        _, text = _like_mirrored(data, origin, None)
+        if text:
+            raise InputError(text) from None
         raise
-    refuse_mirrored(data, origin, found)
-    return found
+    told, text = _like_mirrored(data, origin, found)
+    if told:
+        raise InputError(text)
+    return dataclasses.replace(found, warnings=(*found.warnings, text)) if text else found
 
 
-def refuse_mirrored(data: RigData, origin: Origin | None, found: RigResult | None) -> None:
-    """Raise `InputError` if landmarks fit, or put a camera upright, only as in a mirror; what is exchanged is named.
+def _like_mirrored(data: RigData, origin: Origin | None, found: RigResult | None) -> tuple[bool, str]:
+    """Whether landmarks fit better as in a mirror, and what is then exchanged; no text where nothing speaks for it.
 
     A camera cannot tell flat ground from its mirror image: that is seen alike from below by a camera that hangs upside
     down. Landmarks at several heights contradict each other.
@@ -67,16 +72,16 @@ def refuse_mirrored(data: RigData, origin: Origin | None, found: RigResult | Non
     """
     marks = data.landmarks
     if marks is None or marks.effects or data.positions or data.skyline or data.stars:
-        return
+        return False, ""
     seen = torch.isfinite(marks.pixels).all(-1)
     camera = int(seen.sum(0).argmax())
     if int(seen[:, camera].sum()) < _LEAST:
-        return
+        return False, ""
     if found is not None and _upright(found, camera) and not found.left_out and found.variance == 1.0:
-        return
+        return False, ""
     given = _one_camera(data, marks.points, camera)
     if given is not None and _upright(given, 0):
-        return
+        return False, ""
     ways = {}
     for text, (order, signs) in (_LOCAL if origin is None else _EARTH).items():
         points = _changed(marks.points, origin, list(order), signs)
@@ -84,16 +89,20 @@ def refuse_mirrored(data: RigData, origin: Origin | None, found: RigResult | Non
         if mirrored is not None and _upright(mirrored, 0) and (given is None or mirrored.chi2 < given.chi2 + AS_GOOD):
             ways[text] = mirrored
     if not ways:
-        return
+        return False, ""
     least = min(way.chi2 for way in ways.values())
     text = min((text for text in ways if ways[text].chi2 < least + AS_GOOD), key=lambda text: _tilt(ways[text], 0))
     below = "as given, they contradict each other"
     if given is not None:
         _, _, roll = attitude(given.rotation[0].T)
         below = f"as given, {data.names[camera]} hangs upside down (roll {roll:.0f}°) {_height(given)} them"
-    raise InputError(
-        f"the landmarks are surveyed as in a mirror: {text}; {below}, otherwise they fit and it stands upright "
-        f"{_height(ways[text])} them (RMS {ways[text].rms:.2g} px). Correct the columns of the survey"
+    told = given is None or least < given.chi2 - AS_GOOD
+    first, last = ("are", "Correct the columns of the survey") if told or found is None else (
+        "may be", "Correct the columns of the survey, unless it hangs so: level landmarks do not tell"
+    )  # fmt: skip
+    return told, (
+        f"the landmarks {first} surveyed as in a mirror: {text}; {below}, otherwise they fit and it stands upright "
+        f"{_height(ways[text])} them (RMS {ways[text].rms:.2g} px). {last}"
     )
 
 

@@ -365,8 +365,8 @@ def _first_lens(
     # More triangles take five times as long: of one image, where few have failed in all.
     tries = [(_FEW_CORNERS, number) for number in order[:_TRIES]] + [(_MORE_CORNERS, number) for number in order[:1]]
     for count, (corners, number) in enumerate(tries, 1):
-        of = f"search {count} of {len(tries)}"
-        found = _search(images[number], size, focal, corners, catalog, lambda text, of=of: progress(f"{of}, {text}"))
+        what = f"search {count} of {len(tries)}"
+        found = _search(images[number], size, focal, corners, catalog, progress, what)
         if found is not None:
             named, camera = found
             return _from_middle_outward(images, views, camera, {number: named.rotation}, catalog)
@@ -381,7 +381,7 @@ def _plain_camera(focal: float, size: tuple[int, int], model: str) -> Camera:
     return Camera.build(focal=(focal, focal), center=center, size=size, model=model)
 
 
-def _camera_of(degrees: float, size: tuple[int, int]) -> Camera:
+def _plain_of(degrees: float, size: tuple[int, int]) -> Camera:
     """A pinhole, or an equidistant fisheye if it is wide, with an angle between opposite corners."""
     half, angle = 0.5 * math.hypot(*size), math.radians(degrees) / 2
     wide = degrees > _PINHOLES
@@ -395,11 +395,12 @@ def _search(
     corners: int,
     catalog: StarCatalog,
     progress: Callable[[str], object],
+    what: str,
 ) -> tuple[Identification, Camera] | None:
     """Names of the stars in the middle of an image, and a plain camera, tried from wide to narrow."""
     count = round(math.log(_WIDEST / _NARROWEST) / math.log(_STEP))
     tried = (
-        [_camera_of(_WIDEST * _STEP**-k, size) for k in range(count + 1)]
+        [_plain_of(_WIDEST * _STEP**-k, size) for k in range(count + 1)]
         if focal is None
         else [
             _plain_camera(focal * _STEP**k, size, model) for model in ("pinhole", "fisheye4") for k in (0, 1, -1, 2, -2)
@@ -411,13 +412,14 @@ def _search(
         guess, middle = float(camera.params[0]), 0.5 * math.hypot(*size)
         middle *= _WIDE_MIDDLE if camera.model.fisheye else _MIDDLE
         inside = np.flatnonzero(away < middle)[:_SEARCHED]
-        progress(f"focal length {guess:.0f} px")
+        progress(f"{what}, focal length {guess:.0f} px")
         if len(inside) < 5:
             continue
-        rays, _ = camera.unproject(torch.from_numpy(found.pixels[inside]))
-        rays = torch.nn.functional.normalize(rays, dim=-1).numpy()
+        rays = torch.nn.functional.normalize(camera.unproject(torch.from_numpy(found.pixels[inside]))[0], dim=-1)
         field = 2 * (middle / guess if camera.model.fisheye else math.atan(middle / guess))
-        here = identify(rays, 1.5 / guess, catalog=catalog, scale_error=_SCALE_ERROR, field=field, corners=corners)
+        here = identify(
+            rays.numpy(), 1.5 / guess, catalog=catalog, scale_error=_SCALE_ERROR, field=field, corners=corners
+        )
         if here is None:
             continue
         known = np.flatnonzero(here.star >= 0)

@@ -258,3 +258,18 @@ class TestRays:
             CameraRays([LEFT, with_pupil()])
         with pytest.raises(InputError, match="no rotation"):
             CameraRays(LEFT)(2.0 * torch.eye(4)[None])
+
+
+@pytest.mark.parametrize("place", [(-0.12, 0, 0), (0.12, 0, 0), (0, -0.12, 0), (0, 0.12, 0), (-0.12, -0.1, 0)])
+def test_rectified_pairs_stay_upright_wherever_the_second_camera_is(place: tuple[float, float, float]) -> None:
+    """A dot near the top of the image stays there, but where the baseline is vertical, and nothing is refused."""
+    camera = Camera.build(focal=(450, 450), center=(319.5, 179.5), size=(640, 360), model="pinhole")
+    rig = StereoRig(camera, camera, torch.eye(3, dtype=F64), torch.tensor(place, dtype=F64))
+    image = torch.zeros(1, 1, 360, 640, dtype=F64)
+    image[..., 50, 320] = 1
+    seen = StereoRectification(rig, field_of_view=60.0)(image, image)[0][0, 0]
+    row, column = divmod(int(seen.argmax()), seen.shape[1])
+    assert seen.max() > 0
+    assert row < seen.shape[0] / 2
+    # What is straight ahead of an upright pair stays above the middle column.
+    assert abs(column - seen.shape[1] / 2) < 0.2 * seen.shape[1]
