@@ -9,8 +9,8 @@ import torch
 from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.pipeline.association import AssociationOptions
 from kcal.pipeline.detections import Detections
-from kcal.pipeline.epipolar_pencil import StationSights, meetings
-from kcal.pipeline.grouping import group_objects, separate_pairs
+from kcal.pipeline.epipolar_pencil import StationSights, meetings, separate_pairs
+from kcal.pipeline.grouping import group_objects
 from scripts.shared.station_scenes import drawn_errors, marks, ring
 
 SIZE = (1920, 1080)

@@ -8,8 +8,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kcal.pipeline.epipolar_pencil import FARTHEST_BEND_M, StationSights, meetings, near_in_angle
-from kcal.pipeline.grouping import Confirming, _Edges, _FittedGroups, _with_one_range
+from kcal.pipeline.epipolar_pencil import (
+    FARTHEST_BEND_M,
+    Confirming,
+    StationSights,
+    _FittedGroups,
+    meetings,
+    near_in_angle,
+)
+from kcal.pipeline.grouping import _Edges, _with_one_range
 
 SIGMA, PLACE, AIR = 1e-4, 0.2, 2e-10
 UP = np.array([[0.0, 0.0, 1.0], [0.02, 0.0, 1.0], [0.0, 0.02, 1.0], [-0.02, 0.0, 1.0], [0.0, -0.02, 1.0]])
