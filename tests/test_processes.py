@@ -40,8 +40,8 @@ def test_work_of_a_child():
 # A user's program: videos are open, threads have worked, and the workers of torch are forked.
 LOADER = """
 import gc, sys, threading, torch, cv2, numpy as np, scipy.linalg
-from kcal.pipeline.handover import Handover
-from kcal.pipeline.paired_frames import file_frames
+from kcal.threads import Handover
+from kcal.pipeline.video_source import file_frames
 from kcal.threads import one_thread
 from pathlib import Path
 
@@ -154,7 +154,7 @@ def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="threads are counted in /proc")
 def test_an_open_video_has_no_threads(video: Path) -> None:
-    from kcal.pipeline.paired_frames import file_frames
+    from kcal.pipeline.video_source import file_frames
 
     before = len(os.listdir("/proc/self/task"))
     frames = file_frames(video, (320, 240))

@@ -29,7 +29,7 @@ from kcal.errors import FileError, InputError, KcalError
 from kcal.files import is_stream, make_folder, read_bytes, source_name, write_atomic
 from kcal.io.images import encode_png
 from kcal.lens.camera import Camera
-from kcal.pipeline.handover import Handover
+from kcal.threads import Handover
 
 # Frames for a capture: a camera or stream, a video, or a folder into which images come.
 

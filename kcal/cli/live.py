@@ -28,8 +28,7 @@ if TYPE_CHECKING:
     from kcal.pipeline.association import AssociationOptions
     from kcal.pipeline.senders import LiveMap
     from kcal.pipeline.stream import StreamCounts
-    from kcal.pipeline.track_options import Tracks
-    from kcal.pipeline.tracks import Tracker
+    from kcal.pipeline.tracks import Tracker, Tracks
     from kcal.pipeline.video_source import Videos
 
 
@@ -139,12 +138,11 @@ def live_command(
     from kcal.locate.multi_localizer import MultiViewLocalizer
     from kcal.locate.stations import names_of_rig
     from kcal.pipeline.association import AssociationOptions
-    from kcal.pipeline.lines import read_moment
+    from kcal.pipeline.grouping import read_moment
+    from kcal.pipeline.measurements import ClockPrior
     from kcal.pipeline.senders import sender_to
-    from kcal.pipeline.shared_errors import ClockPrior
     from kcal.pipeline.stream import Stream, lines_of
-    from kcal.pipeline.track_options import TrackOptions
-    from kcal.pipeline.tracks import Tracker
+    from kcal.pipeline.tracks import Tracker, TrackOptions
 
     if (origin is None) != (heading is None):
         raise typer.BadParameter("--origin and --heading belong together")
@@ -227,7 +225,7 @@ def _moments(
 ) -> tuple[Callable[[float], StereoLocalizer], int]:
     """The rig as it stands at each second, by a history that grows; and how many errors more that has."""
     from kcal.locate.localizer import StereoLocalizer
-    from kcal.watch.watched import MORE_ERRORS, Followed
+    from kcal.watch.watcher import MORE_ERRORS, Followed
 
     assert isinstance(localize, StereoLocalizer)
     return Followed(history, localize), MORE_ERRORS

@@ -45,7 +45,7 @@ def located_at(history: Path, rig: StereoRig, locator: Callable[[StereoRig], Loc
     """
     from kcal.locate.tables import PositionColumns
     from kcal.watch.history import seconds_of
-    from kcal.watch.watched import Watched
+    from kcal.watch.watcher import Watched
 
     watched: Watched | None = None
 

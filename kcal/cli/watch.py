@@ -20,9 +20,8 @@ from kcal.texts import measured_text
 if TYPE_CHECKING:
     from kcal.corners.images import Gray
     from kcal.lens.rig import StereoRig
-    from kcal.pipeline.paired_frames import FramesTogether
-    from kcal.watch.watched import Watched
-    from kcal.watch.watcher import Noticed, Watcher, Webhook
+    from kcal.pipeline.video_source import FramesTogether
+    from kcal.watch.watcher import Noticed, Watched, Watcher, Webhook
 
 _EXIT = "exit"
 # Points of a picture.
@@ -86,9 +85,8 @@ def watch_command(
     from kcal.corners.images import read_gray
     from kcal.io.rig_file import load_rig, save_rig
     from kcal.watch.history import Temperatures
-    from kcal.watch.watched import Watched
-    from kcal.watch.watched import relock as relocked_by
-    from kcal.watch.watcher import Watcher, Webhook
+    from kcal.watch.watcher import Watched, Watcher, Webhook
+    from kcal.watch.watcher import relock as relocked_by
 
     if images and len(images) != 2:
         raise typer.BadParameter("two folders, videos or addresses, of the left and the right camera, are needed")
@@ -166,7 +164,7 @@ def _follow(watcher: Watcher, rig: StereoRig, sources: tuple[str, str], hooks: l
 
 def _frame_pairs(rig: StereoRig, sources: tuple[str, str]) -> FramesTogether:
     with with_extra("video", "videos need"):
-        from kcal.pipeline.paired_frames import FramesTogether
+        from kcal.pipeline.video_source import FramesTogether
 
     sizes = {"left": rig.left.size, "right": rig.right.size}
     return FramesTogether(sources, sizes, pairs=True, tell=lambda text: err.print(text, markup=False))

@@ -21,8 +21,8 @@ from kcal.lens.uncertainty import pixel_slopes
 from kcal.locate.multi_localizer import MultiViewLocalizer, common_errors, posed_cameras
 from kcal.locate.stations import stations_of
 from kcal.locate.views import CommonErrors, PosedCameras, ViewsFit, fit_views
+from kcal.pipeline.assignment import assign_groups
 from kcal.pipeline.detections import Anchor, Detections, box_anchors
-from kcal.pipeline.one_to_one import assign_groups
 from kcal.texts import brief
 
 # `AssociationOptions`: which detections may be of one object.
@@ -332,7 +332,7 @@ def size_cost(magnified: Tensor, boxes: Tensor, box_sigma: float, parallax: Tens
 #
 # Pairs near one epipolar line get their most likely point, at once on tensors. What no
 # point explains is the epipolar error; it is judged by the noise of the boxes and by what is not known of the rig. The
-# assignment with the least sum of costs is exact (`kcal.pipeline.one_to_one`); a detection may stay alone.
+# assignment with the least sum of costs is exact (`kcal.pipeline.assignment`); a detection may stay alone.
 
 # Spread of 1 - correlation between two views of one object; of two objects it is 0.5 to 1.
 _LOOKS_SPREAD = 0.25

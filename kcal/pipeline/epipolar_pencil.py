@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from kcal.pipeline.one_to_one import assign_groups
+from kcal.pipeline.assignment import assign_groups
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -13,7 +13,7 @@ from kcal.locate.geodesy import place_enu
 from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.locate.stereo import BEARING_SIGMAS, PositionStatus, flag_positions, range_interval, status_counts
 from kcal.pipeline.imm_filter import Summary
-from kcal.pipeline.small_matrices import product, rooted, squared
+from kcal.pipeline.measurements import product, rooted, squared
 from kcal.texts import brief
 
 # From what is believed of tracks in the rig frame to places and velocities on the Earth, with all their errors.

@@ -10,8 +10,17 @@ import torch
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.pipeline.measurements import Anchored
-from kcal.pipeline.small_matrices import congruent, eliminate, mahalanobis, outer, product, rooted, solved, squared
+from kcal.pipeline.measurements import (
+    Anchored,
+    congruent,
+    eliminate,
+    mahalanobis,
+    outer,
+    product,
+    rooted,
+    solved,
+    squared,
+)
 
 # Motion of targets: hovering, straight and turning models, and a state in which they stay linear at any range.
 #
@@ -227,7 +236,7 @@ class Summary(NamedTuple):
 
 
 class Beliefs(NamedTuple):
-    """T tracks under J models; see `kcal.pipeline.imm_filter` for the state and `kcal.pipeline.shared_errors` for b.
+    """T tracks under J models; see `kcal.pipeline.imm_filter` for the state and `kcal.pipeline.measurements` for b.
 
     Attributes:
         mean: (6, J, T) as if b were zero.

@@ -1,21 +1,115 @@
-"""Turn pixels of one moment into what a filter measures: rows of unit noise, with every error's effect on them.
-
-Where the lines of sight of the cameras that saw an object meet (`kcal.locate.views`) is told by three numbers: two
-across the line of sight of the first of them, and the inverse range from it. The pixels are nearly linear in them at
-any range. They are rows, whitened, so that those of cameras that saw nothing are zeros beside a noise of one and change
-nothing. One camera alone gives two rows: its inverse range is then that of the track.
-"""
+"""What a filter measures, and what all tracks share, in small matrices, many at once."""
 
 from __future__ import annotations
 
+import dataclasses
+import math
+from collections.abc import Sequence
 from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
 
+from kcal.errors import InputError
 from kcal.locate.multi_localizer import MultiViewLocalizer, common_errors, posed_cameras
 from kcal.locate.views import ALONE_M, KnownViews, known_views, view_rows
-from kcal.pipeline.small_matrices import outer, product
+
+# Small matrices, many at once: rows and columns are the first axes, and the last ones count the matrices.
+#
+# One operation then runs along many matrices, where `@` takes them one by one; a compiler makes loops over consecutive
+# numbers of it.
+
+
+def product(first: Tensor, second: Tensor) -> Tensor:
+    """Of matrices (R, M, ...) and (M, C, ...).
+
+    Example:
+        >>> first, second = torch.rand(2, 3, 10), torch.rand(3, 4, 10)
+        >>> torch.allclose(product(first, second).movedim(-1, 0), first.movedim(-1, 0) @ second.movedim(-1, 0))
+        True
+    """
+    return (first[:, :, None] * second).sum(1)
+
+
+def outer(first: Tensor, second: Tensor) -> Tensor:
+    """(R, C, ...) from vectors (R, ...) and (C, ...)."""
+    return first[:, None] * second
+
+
+def congruent(slope: Tensor, covariance: Tensor) -> Tensor:
+    """Slope covariance slopeᵀ: (R, R, ...) from (R, M, ...) and (M, M, ...)."""
+    return product(product(slope, covariance), slope.transpose(0, 1))
+
+
+def squared(root: Tensor) -> Tensor:
+    """Root rootᵀ: (R, R, ...) from (R, M, ...)."""
+    return product(root, root.transpose(0, 1))
+
+
+def rooted(effect: Tensor, root: Tensor | None) -> Tensor:
+    """Effect root: (R, M, ...) from (R, K, ...) and one root (K, M) for all; None: the identity."""
+    return effect if root is None else torch.tensordot(effect, root, ([1], [0])).movedim(-1, 1)
+
+
+class Eliminated(NamedTuple):
+    """Gauss's elimination of symmetric positive S (R, R, ...) beside columns B (R, C, ...): S = L D Lᵀ.
+
+    No rows are exchanged, which positive matrices do not need, whatever the units of their rows.
+
+    Attributes:
+        pivots: (R, ...) of D; positive, also where rounding left none.
+        rows: (R, R, ...) of D Lᵀ, upper triangular.
+        columns: (R, C, ...) L⁻¹ B.
+    """
+
+    pivots: Tensor
+    rows: Tensor
+    columns: Tensor
+
+
+def eliminate(matrix: Tensor, columns: Tensor) -> Eliminated:
+    """See `Eliminated`.
+
+    Example:
+        >>> done = eliminate(torch.tensor([[4.0, 2.0], [2.0, 3.0]])[..., None], torch.tensor([[2.0], [5.0]])[..., None])
+        >>> done.pivots[:, 0].tolist(), done.columns[:, 0, 0].tolist()
+        ([4.0, 2.0], [2.0, 4.0])
+    """
+    size = len(matrix)
+    rest, upper, pivots = torch.cat([matrix, columns], 1), [], []
+    for step in range(size):
+        row = rest[0]
+        pivots.append(row[step].clamp_min(1e-300))
+        upper.append(row)
+        if step < size - 1:
+            below = rest[1:]
+            rest = torch.addcmul(below, (below[:, step] / pivots[-1])[:, None], row, value=-1.0)
+    whole = torch.stack(upper)
+    return Eliminated(torch.stack(pivots), whole[:, :size], whole[:, size:])
+
+
+def solved(done: Eliminated) -> Tensor:
+    """(R, C, ...) S⁻¹ B."""
+    size = len(done.rows)
+    found = [done.columns[-1] / done.pivots[-1]]
+    for step in range(size - 2, -1, -1):
+        known = (done.rows[step, step + 1 :, None] * torch.stack(found)).sum(0)
+        found.insert(0, (done.columns[step] - known) / done.pivots[step])
+    return torch.stack(found)
+
+
+def mahalanobis(covariance: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
+    """valueᵀ covariance⁻¹ value and the logarithm of the determinant, (...) each, from (R, R, ...) and (R, ...)."""
+    done = eliminate(covariance, value[:, None])
+    return (done.columns[:, 0].square() / done.pivots).sum(0), done.pivots.log().sum(0)
+
+
+# Turn pixels of one moment into what a filter measures: rows of unit noise, with every error's effect on them.
+#
+# Where the lines of sight of the cameras that saw an object meet (`kcal.locate.views`) is told by three numbers: two
+# across the line of sight of the first of them, and the inverse range from it. The pixels are nearly linear in them at
+# any range. They are rows, whitened, so that those of cameras that saw nothing are zeros beside a noise of one and
+# change nothing. One camera alone gives two rows: its inverse range is then that of the track.
 
 
 class Sightings(NamedTuple):
@@ -183,3 +277,143 @@ def anchored(
     turn = depth * (by_ray + last)
     late = (seen.late[:, :, :, None] * turn).sum(2)
     return Anchored(torch.cat([ray[:2], inverse[None]]) / depth, value, late, shared, ahead)
+
+
+# What all tracks share: errors of calibration, mounting and clocks, which more frames do not average away.
+#
+# A state's error is noise plus `shared @ b`, with the same unknown b for every track and frame: K independent errors of
+# the calibration, and three of each clock but the first's. The filter's gain follows the noise alone, and the effect of
+# b is carried along exactly. Two things follow: the covariance, noise + shared cov(b) sharedᵀ, never falls below the
+# systematic part; and innovations tell what they know of b, the calibration included, which `SharedErrors` collects to
+# estimate the clock.
+#
+# Source: Friedland, "Treatment of bias in recursive filtering" (1969); Schmidt (1966) for considered states.
+
+# Offset, drift, slope over the rows.
+CLOCK_TERMS = 3
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ClockPrior:
+    """What is known of a camera's clock before any target moved, beside the clock of the first camera (the left one).
+
+    Args:
+        offset_s: seconds by which its images are later than their times say.
+        offset_sigma_s: its standard deviation.
+        drift_sigma: of the change of the offset, seconds per second.
+        slope_sigma_s: of the difference between the bottom and the top row: two rolling shutters that are unlike.
+
+    Raises:
+        InputError: a value that is not finite, or a negative sigma.
+    """
+
+    offset_s: float = 0.0
+    offset_sigma_s: float = 0.0
+    drift_sigma: float = 0.0
+    slope_sigma_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not math.isfinite(self.offset_s) or not all(0 <= value < math.inf for value in self.sigmas):
+            raise InputError("clock: a finite offset and finite sigmas, not negative, are needed")
+
+    @property
+    def sigmas(self) -> tuple[float, float, float]:
+        """Of offset, drift and slope."""
+        return self.offset_sigma_s, self.drift_sigma, self.slope_sigma_s
+
+
+class ClockEstimate(NamedTuple):
+    """What the tracks say of a camera's clock beside the first one's.
+
+    Attributes:
+        values: (3,) offset (s) at the time of the first frame, drift (s/s), slope (s from top to bottom).
+        covariance: (3, 3); calibration errors are included.
+        start: seconds, the time at which the drift counts from.
+    """
+
+    values: Tensor
+    covariance: Tensor
+    start: float
+
+    def offset(self, time: float) -> tuple[float, float]:
+        """The offset at a time, with its standard deviation: seconds."""
+        row = self.values.new_tensor([1.0, time - self.start, 0.0])
+        return float(row @ self.values), float((row @ self.covariance @ row).clamp_min(0).sqrt())
+
+
+class SharedErrors:
+    """What is known of b: the calibration's errors stay as they are, the clock's are estimated.
+
+    b counts from `values` for the clock: after each `settle`, the best estimate of b is zero.
+
+    Args:
+        calibration: K, how many independent unit errors are not estimated: those of the calibration, and what lasts of
+            errors in the marks.
+        clocks: what is known of the clock of each camera but the first.
+        device: of the tensors.
+    """
+
+    def __init__(self, calibration: int, clocks: Sequence[ClockPrior], device: torch.device | None = None) -> None:
+        self.calibration = calibration
+        # With clocks that are exact, there is nothing to estimate.
+        self.estimated = any(any(clock.sigmas) for clock in clocks)
+        sigmas = torch.tensor([clock.sigmas for clock in clocks], dtype=torch.float64, device=device)
+        known = sigmas.flatten() if self.estimated else sigmas.new_zeros(0)
+        self.scale = torch.cat([sigmas.new_ones(calibration), known])
+        # Offset, drift and slope of each clock in turn.
+        self.values = sigmas.new_tensor([[clock.offset_s, 0.0, 0.0] for clock in clocks]).flatten()
+        size = len(self.scale)
+        # In units of the prior's sigmas: a sigma of zero is no exception.
+        self.information = torch.eye(size, dtype=torch.float64, device=device)
+        self.score = torch.zeros(size, dtype=torch.float64, device=device)
+        self.start: float | None = None
+        self.root = torch.diag(self.scale)
+
+    def add(self, effect: Tensor, innovation: Tensor, covariance: Tensor) -> None:
+        """Collect independent innovations (M, N) = effect (M, K + Q, N) b + noise of the covariance (M, M, N)."""
+        if not self.estimated:
+            return
+        scaled = effect * self.scale[:, None]
+        white = solved(eliminate(covariance, torch.cat([scaled, innovation[:, None]], 1)))
+        both = (scaled[:, :, None] * white[:, None]).sum((0, -1))
+        self.information = self.information + both[:, :-1]
+        self.score = self.score + both[:, -1]
+
+    def settle(self) -> Tensor:
+        """Move `values` to what was collected, and return the move (Q,); `root` is then that of what remains of b.
+
+        The clock's error and the calibration's are correlated as in the joint posterior; the calibration keeps its
+        prior, because its errors must not average away where the model of its errors is not exact.
+        """
+        k = self.calibration
+        if not self.estimated:
+            return self.values[:0]
+        joint = torch.linalg.inv(self.information)
+        move = joint @ self.score
+        move[:k] = 0.0
+        self.score = self.score - self.information @ move
+        joint[:k, :k] = torch.eye(k).to(joint)
+        values, vectors = torch.linalg.eigh(0.5 * (joint + joint.T))
+        self.root = self.scale[:, None] * vectors * values.clamp_min(0.0).sqrt()
+        change = (self.scale * move)[k:]
+        self.values = self.values + change
+        return change
+
+    @property
+    def mixing(self) -> Tensor | None:
+        """`root`; None where it is the identity."""
+        return self.root if self.estimated else None
+
+    @property
+    def corrected(self) -> Tensor:
+        """(Q,) values of the clocks' errors that are estimated."""
+        return self.values if self.estimated else self.values[:0]
+
+    def clock_estimate(self, camera: int = 1) -> ClockEstimate:
+        """The clock of a camera, from 1, as now known."""
+        mine = slice(CLOCK_TERMS * (camera - 1), CLOCK_TERMS * camera)
+        covariance = self.values.new_zeros(CLOCK_TERMS, CLOCK_TERMS)
+        if self.estimated:
+            part = self.root[self.calibration :][mine]
+            covariance = part @ part.T
+        return ClockEstimate(self.values[mine].clone(), covariance, self.start or 0.0)

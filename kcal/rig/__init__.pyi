@@ -62,7 +62,7 @@ from kcal.locate.stations import station_mounting as station_mounting
 from kcal.locate.stations import stations_of as stations_of
 
 # Drift
-from kcal.watch.watched import Watched as Watched
+from kcal.watch.watcher import Watched as Watched
 from kcal.locate.monitor import check_rig as check_rig
 from kcal.calibrate.rig.drift import measure_drift as measure_drift
 from kcal.calibrate.rig.drift import Drift as Drift

@@ -23,8 +23,8 @@ from kcal.lens.rig import Origin
 from kcal.locate.geodesy import ecef_from_enu_rotation, enu_to_geodetic, mean_radius
 from kcal.locate.mounting import attitude
 from kcal.locate.raster import Raster
-from kcal.skyline.border import Border, sky_border
 from kcal.skyline.horizon import (
+    Border,
     Columns,
     Comparison,
     Horizon,
@@ -34,6 +34,7 @@ from kcal.skyline.horizon import (
     columns_of,
     compare,
     sample_distances,
+    sky_border,
     terrain_horizon,
 )
 from kcal.threads import in_one_thread

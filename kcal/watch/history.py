@@ -1,21 +1,355 @@
-"""Tables that grow while they are read: the history of a watched rig, and temperatures."""
+"""How the cameras of a rig turn over time: model, filter, smoother, and tables that grow while they are read."""
 
 from __future__ import annotations
 
 import bisect
 import csv
+import dataclasses
 import math
 from collections import deque
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from kcal.checks import chi2_quantile
 from kcal.errors import FileError, InputError
+from kcal.lens.rig import StereoRig
 from kcal.texts import csv_line, unix_seconds
-from kcal.watch.state import Look
+
+# How the cameras of a rig turn over time: model, Kalman filter and smoother.
+
+# How the cameras of a rig turn over time, and how that is learned from what was measured (maximum likelihood).
+#
+# Each camera turns by three angles, left before right: pitch, yaw, roll, in radians about its own axes, counted from
+# the moment of the reference. Each angle is a random walk that returns to its mean (an Ornstein-Uhlenbeck process:
+# masts bend with the sun and go back), plus a turn for each kelvin where temperatures are known, plus a part that has
+# another value at every look (wind). Beyond the noise of a look, patches change with light and shade: that error lasts
+# for hours.
+
+# Seconds that light and shade last.
+LASTING_S = 7200.0
+# Radians per kelvin of an angle: 1 K across a steel beam of 10 m bends it by 0.6 mrad; brackets do a hundredth of that.
+HEAT_SIGMA = 1e-5
+# What is assumed of swing (radians), return (seconds) and wind (radians), and by which factors it may differ.
+_USUAL = (math.radians(0.003), 6 * 3600.0, math.radians(0.0005))
+_FACTOR = math.log(5.0)
+_LEAST, _MOST = (1e-7, 300.0, 1e-8), (0.05, 3e7, 0.01)
+# Rows that are enough to learn from, and the most that are read.
+FEWEST, MOST_LEARNT = 60, 1500
+# Standard deviations beyond which a look is left out of the likelihood.
+_OUTLIER = 5.0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class TurnModel:
+    """What is known of the motion of the six angles before anything is measured.
+
+    Args:
+        swing: (..., 6) radians, standard deviation of the part that changes slowly.
+        return_s: (..., 6) seconds in which it goes back by 1 - 1/e; a random walk where that is long.
+        gust: (..., 6) radians, standard deviation of what has another value at every look.
+    """
+
+    swing: Tensor
+    return_s: Tensor
+    gust: Tensor
+
+    @classmethod
+    def usual(cls) -> TurnModel:
+        """What is assumed before enough was measured."""
+        swing, back, gust = torch.tensor(_USUAL, dtype=torch.float64)[:, None].expand(3, 6)
+        return cls(swing=swing, return_s=back, gust=gust)
+
+
+class AngleSeries(NamedTuple):
+    """One angle at T looks, for K angles: what `learned` reads.
+
+    Attributes:
+        time: (T,) seconds.
+        angle: (T, K) radians, NaN where it was not measured.
+        variance: (T, K) of its noise that is new at each look.
+        lasting: (T, K) variance of what lasts.
+        kelvin: (T, K) of warming since the reference; zeros where nobody measured it.
+    """
+
+    time: NDArray[np.float64]
+    angle: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    lasting: NDArray[np.float64]
+    kelvin: NDArray[np.float64]
+
+
+def learned(series: AngleSeries) -> TurnModel:
+    """The most likely model of K angles; what is usual counts where the looks tell little.
+
+    Looks are thinned to some thousand, evenly; a compass search goes over the logarithms of the three numbers.
+    """
+    known = np.isfinite(series.angle).any(1)
+    rows = np.flatnonzero(known)
+    if len(rows) < FEWEST:
+        return TurnModel.usual()
+    rows = rows[-MOST_LEARNT:] if len(rows) <= 2 * MOST_LEARNT else rows[:: len(rows) // MOST_LEARNT]
+    part = AngleSeries(*(values[rows] for values in series))
+    usual, count = np.log(_USUAL), part.angle.shape[1]
+    low, high = np.log(_LEAST), np.log(_MOST)
+    best = np.repeat(usual[:, None], count, 1)
+    step = np.full(count, 1.5)
+    moves = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+    for _ in range(24):
+        tried = np.clip(best[None] + moves[:, :, None] * step, low[:, None], high[:, None])
+        prior = -0.5 * (((tried - usual[:, None]) / _FACTOR) ** 2).sum(1)
+        value = _log_likelihood(part, np.exp(tried)) + prior
+        first = value.argmax(0)
+        best = tried[first, :, np.arange(count)].T
+        step = np.where(first == 0, 0.5 * step, step)
+        if step.max() < 0.1:
+            break
+    swing, back, gust = torch.from_numpy(np.exp(best))
+    # The sun moves masts smoothly, which looks say is slow; how far they go is what was seen: 95 % of it, as of a sine.
+    far = np.nanquantile(np.abs(part.angle), 0.95, axis=0) / math.sqrt(2.0)
+    swing = torch.maximum(swing, torch.from_numpy(far))
+    return TurnModel(swing=swing, return_s=back, gust=gust)
+
+
+def _log_likelihood(series: AngleSeries, tried: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(C, K) of C candidates (C, 3, K), by a Kalman filter of slow part, lasting error and turn per kelvin."""
+    swing, back, gust = tried.swapaxes(0, 1)
+    shape = swing.shape
+    mean, spread = np.zeros((3, *shape)), np.zeros((3, 3, *shape))
+    spread[0, 0], spread[1, 1], spread[2, 2] = swing**2, series.lasting[0], HEAT_SIGMA**2
+    total = np.zeros(shape)
+    for k in range(len(series.time)):
+        if k:
+            passed = series.time[k] - series.time[k - 1]
+            keep = np.ones((3, *shape))
+            keep[0], keep[1] = np.exp(-passed / back), math.exp(-passed / LASTING_S)
+            mean = keep * mean
+            spread = keep[:, None] * spread * keep
+            spread[0, 0] += (1.0 - keep[0] ** 2) * swing**2
+            spread[1, 1] += (1.0 - keep[1] ** 2) * series.lasting[k]
+        toward = spread[0] + spread[1] + series.kelvin[k] * spread[2]
+        variance = toward[0] + toward[1] + series.kelvin[k] * toward[2] + gust**2 + series.variance[k]
+        off = series.angle[k] - mean[0] - mean[1] - series.kelvin[k] * mean[2]
+        square = off**2 / variance
+        used = square < _OUTLIER**2
+        log = -0.5 * (np.minimum(square, _OUTLIER**2) + np.log(variance))
+        total += np.where(np.isfinite(off), log, 0.0)
+        gain = np.where(used, toward / variance, 0.0)
+        mean = mean + gain * np.where(used, off, 0.0)
+        spread = spread - gain[:, None] * toward
+    return total
+
+
+# Kalman filter and smoother of the attitude of both cameras: from looks at the scene to the turn of any moment.
+
+# Of the state: slow turns, lasting errors of the looks, errors of the lenses between the cameras, turns per kelvin.
+_SLOW, _LASTING, _BIAS, _HEAT = slice(0, 6), slice(6, 12), slice(12, 17), slice(17, 23)
+SIZE = 23
+# Radians by which lenses may be wrong between the cameras: some tenths of a pixel.
+_LENS_SIGMA = 3e-4
+# A look that chance makes so unlikely once in a million is doubted, until so many in a row say the same.
+_CHANCE, _AGREE = 1.0 - 1e-6, 3
+_GATES = torch.cat([torch.ones(1, dtype=torch.float64),
+                    chi2_quantile(torch.arange(1.0, 12.0, dtype=torch.float64), _CHANCE)])  # fmt: skip
+
+
+class Look(NamedTuple):
+    """What the images of one moment tell; leading dimensions (...) are separate rigs.
+
+    Attributes:
+        turn: (..., 6) radians of the left and right camera since the reference; what is not seen is not read.
+        covariance: (..., 6, 6) of it, as one look tells.
+        lasting: (...) share of that covariance that lasts (light and shade).
+        seen: (..., 2) whether there is a turn of each camera.
+        between: (..., 5) of `between_rows`, from matches between the cameras.
+        between_covariance: (..., 5, 5).
+        matched: (...) whether there are such.
+        kelvin: (...) of warming since the reference; zeros where nobody measures.
+    """
+
+    turn: Tensor
+    covariance: Tensor
+    lasting: Tensor
+    seen: Tensor
+    between: Tensor
+    between_covariance: Tensor
+    matched: Tensor
+    kelvin: Tensor
+
+
+class TurnState(NamedTuple):
+    """What is known at a moment.
+
+    Attributes:
+        mean: (..., 23).
+        covariance: (..., 23, 23).
+        doubt: (..., 6) radians by which the last looks contradict the state, if they do.
+        strikes: (...) how many in a row did.
+        kelvin: (...) of the last look.
+        lasting: (..., 6) variance of lasting errors, of the last look.
+    """
+
+    mean: Tensor
+    covariance: Tensor
+    doubt: Tensor
+    strikes: Tensor
+    kelvin: Tensor
+    lasting: Tensor
+
+
+class Turns(NamedTuple):
+    """Turn of both cameras at a moment: (..., 6) radians, and (..., 6, 6)."""
+
+    mean: Tensor
+    covariance: Tensor
+
+
+def between_rows(rig: StereoRig) -> Tensor:
+    """(5, 6): what matches between the cameras can tell of turns of both.
+
+    These are the turn of the right camera against the left one (3, about the right one's axes), and of the baseline's
+    direction in the left camera's frame (2). A turn of both about the baseline shows in no match.
+    """
+    rotation = rig.right_from_left_rotation
+    axis = -(rotation.T @ rig.right_from_left_translation)
+    beside = torch.linalg.svd(axis[None])[2][1:]
+    across = torch.linalg.cross((axis / axis.norm()).expand(2, 3), beside)
+    zero = torch.zeros(2, 3, dtype=torch.float64)
+    return torch.cat([torch.cat([-rotation, torch.eye(3, dtype=torch.float64)], 1), torch.cat([across, zero], 1)])
+
+
+def first_state(model: TurnModel, lead: tuple[int, ...] = ()) -> TurnState:
+    """Before the first look."""
+    variance = torch.zeros(*lead, SIZE, dtype=torch.float64)
+    variance[..., _SLOW], variance[..., _BIAS], variance[..., _HEAT] = model.swing**2, _LENS_SIGMA**2, HEAT_SIGMA**2
+    zero = torch.zeros(*lead, 6, dtype=torch.float64)
+    return TurnState(
+        mean=torch.zeros(*lead, SIZE, dtype=torch.float64),
+        covariance=torch.diag_embed(variance),
+        doubt=zero, strikes=zero[..., 0], kelvin=zero[..., 0], lasting=zero,
+    )  # fmt: skip
+
+
+def passed(state: TurnState, seconds: Tensor, model: TurnModel) -> tuple[TurnState, Tensor]:
+    """The state after a time (...), and (..., 23) what each part keeps."""
+    keep = torch.ones_like(state.mean)
+    keep[..., _SLOW] = torch.exp(-seconds[..., None] / model.return_s)
+    keep[..., _LASTING] = torch.exp(-seconds / LASTING_S)[..., None]
+    more = torch.zeros_like(state.mean)
+    more[..., _SLOW] = model.swing**2
+    more[..., _LASTING] = state.lasting
+    covariance = keep[..., None] * state.covariance * keep[..., None, :]
+    covariance = covariance + torch.diag_embed((1.0 - keep**2) * more)
+    return state._replace(mean=keep * state.mean, covariance=covariance), keep
+
+
+def taken(state: TurnState, look: Look, model: TurnModel, rows: Tensor) -> TurnState:
+    """The state after a look of the same moment; `rows` are those of `between_rows`.
+
+    A look that contradicts the state is doubted and widens what is told of that moment. Three in a row that do are
+    believed: somebody has hit the mast.
+    """
+    share = look.lasting[..., None]
+    own = look.covariance.diagonal(dim1=-2, dim2=-1)
+    first = (state.lasting == 0).all(-1, keepdim=True)
+    variance = state.covariance.diagonal(dim1=-2, dim2=-1).clone()
+    # The first look tells how much may last.
+    variance[..., _LASTING] = torch.where(first, share * own, variance[..., _LASTING])
+    spread = (
+        state.covariance - torch.diag_embed(state.covariance.diagonal(dim1=-2, dim2=-1)) + torch.diag_embed(variance)
+    )
+    design, noise, wanted, there = _rows_of(look, model, rows)
+    off = torch.where(there, wanted - (design @ state.mean[..., None])[..., 0], 0.0)
+
+    def innovation(prior: Tensor) -> Tensor:
+        return design @ prior @ design.mT + noise
+
+    square = (off * torch.linalg.solve(innovation(spread), off[..., None])[..., 0]).sum(-1)
+    strange = square > _GATES[there.sum(-1)]
+    strikes = torch.where(strange, state.strikes + 1.0, 0.0)
+    believed = strange & (strikes >= _AGREE)
+    jump = torch.where(there[..., :6], off[..., :6], 0.0)
+    wider = torch.zeros_like(variance)
+    wider[..., _SLOW] = torch.where(believed[..., None], jump**2, 0.0)
+    spread = spread + torch.diag_embed(wider)
+    gain = torch.linalg.solve(innovation(spread), design @ spread).mT
+    used = (~strange | believed)[..., None]
+    rest = torch.eye(SIZE, dtype=torch.float64) - gain @ design
+    after = rest @ spread @ rest.mT + gain @ noise @ gain.mT
+    return TurnState(
+        mean=torch.where(used, state.mean + (gain @ off[..., None])[..., 0], state.mean),
+        covariance=torch.where(used[..., None], after, spread),
+        doubt=torch.where(used, 0.0, torch.maximum(state.doubt, jump.abs())),
+        strikes=torch.where(believed, 0.0, strikes),
+        kelvin=look.kelvin,
+        lasting=torch.where(look.seen.repeat_interleave(3, -1), share * own, state.lasting),
+    )
+
+
+def _rows_of(look: Look, model: TurnModel, rows: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Design (..., 11, 23), covariance (..., 11, 11), what was measured (..., 11) and which of it there is."""
+    there = torch.cat([look.seen.repeat_interleave(3, -1), look.matched[..., None].expand(*look.matched.shape, 5)], -1)
+    by_turn = torch.cat([torch.eye(6, dtype=torch.float64), rows])
+    design = torch.zeros(*there.shape, SIZE, dtype=torch.float64)
+    design[..., _SLOW] = by_turn
+    design[..., :6, _LASTING] = torch.eye(6, dtype=torch.float64)
+    design[..., 6:, _BIAS] = torch.eye(5, dtype=torch.float64)
+    design[..., _HEAT] = look.kelvin[..., None, None] * by_turn
+    # Wind turns both measurements of a moment alike.
+    noise = (by_turn * model.gust[..., None, :] ** 2) @ by_turn.mT
+    noise = noise.expand(*there.shape, 11).clone()
+    noise[..., :6, :6] += (1.0 - look.lasting)[..., None, None] * look.covariance
+    noise[..., 6:, 6:] += look.between_covariance
+    both = there[..., None] & there[..., None, :]
+    noise = torch.where(both, noise, 0.0) + torch.diag_embed((~there).double())
+    wanted = torch.cat([look.turn, look.between], -1)
+    return torch.where(there[..., None], design, 0.0), noise, torch.where(there, wanted, 0.0), there
+
+
+def turns_of(state: TurnState, model: TurnModel, *, gusts: bool = True) -> Turns:
+    """The turn of both cameras; with the wind of the moment, or only what lasts beyond it (for alarms)."""
+    whole = torch.zeros(*state.mean.shape[:-1], 6, SIZE, dtype=torch.float64)
+    whole[..., _SLOW] = torch.eye(6, dtype=torch.float64)
+    whole[..., _HEAT] = state.kelvin[..., None, None] * torch.eye(6, dtype=torch.float64)
+    covariance = whole @ state.covariance @ whole.mT
+    more = state.doubt**2 + (model.gust**2 if gusts else 0.0)
+    return Turns((whole @ state.mean[..., None])[..., 0], covariance + torch.diag_embed(more))
+
+
+def smoothed(states: list[TurnState], times: list[float], model: TurnModel) -> list[TurnState]:
+    """What is known of each moment from all looks, those after it too (H. Rauch, F. Tung and C. Striebel 1965).
+
+    Args:
+        states: after each look, in turn.
+        times: seconds of these.
+        model: of the turns.
+    """
+    found = list(states)
+    for k in range(len(states) - 2, -1, -1):
+        later, here = found[k + 1], states[k]
+        prior, keep = passed(here, torch.tensor(times[k + 1] - times[k], dtype=torch.float64), model)
+        if bool(states[k + 1].strikes == 0) and bool(here.strikes > 0) and _jumped(states[k + 1], prior):
+            # Believed after doubts: what came after the jump tells nothing of before.
+            continue
+        gain = torch.linalg.solve(prior.covariance + 1e-24 * torch.eye(SIZE, dtype=torch.float64),
+                                  keep[:, None] * here.covariance).mT  # fmt: skip
+        mean = here.mean + gain @ (later.mean - prior.mean)
+        covariance = here.covariance + gain @ (later.covariance - prior.covariance) @ gain.mT
+        found[k] = here._replace(mean=mean, covariance=0.5 * (covariance + covariance.mT))
+    return found
+
+
+def _jumped(after: TurnState, prior: TurnState) -> bool:
+    move = (after.mean - prior.mean)[_SLOW]
+    return bool((move.abs() > 4.0 * prior.covariance.diagonal()[_SLOW].sqrt()).any())
+
+
+# Tables that grow while they are read: the history of a watched rig, and temperatures.
 
 # Lines of a text file that another process writes, as they become whole.
 

@@ -24,7 +24,7 @@ from kcal.io.rig_file import save_rig
 from kcal.lens.rig import Mounting, Origin, RigCovariance, StereoRig
 from kcal.locate.budget import planned_rig
 from kcal.locate.localizer import StereoLocalizer
-from kcal.pipeline.pairs import ObjectPairs
+from kcal.pipeline.pairing import ObjectPairs
 from kcal.pipeline.tracks import Tracker
 from scripts.shared.page import table, write_section
 

@@ -25,7 +25,7 @@ from torch import Tensor
 from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
 from kcal.pipeline.association import AssociationOptions
-from kcal.pipeline.pairs import ObjectPairs
+from kcal.pipeline.pairing import ObjectPairs
 from kcal.pipeline.video_source import Videos
 from scripts.shared.object_scene import Floats, exposed, paint_plate, plate, true_box
 from scripts.shared.page import table, write_section

@@ -20,7 +20,7 @@ from stonesoup.updater.kalman import KalmanUpdater, UnscentedKalmanUpdater
 from torch import Tensor
 
 from kcal.locate.localizer import StereoLocalizer
-from kcal.pipeline.pairs import ObjectPairs
+from kcal.pipeline.pairing import ObjectPairs
 
 START = datetime.datetime(2026, 1, 1)
 

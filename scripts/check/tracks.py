@@ -22,10 +22,9 @@ from kcal.lens.rig import Origin, RigCovariance, StereoRig
 from kcal.locate.budget import planned_rig
 from kcal.locate.localizer import StereoLocalizer
 from kcal.pipeline.imm_filter import Motion
-from kcal.pipeline.pairs import ObjectPairs
-from kcal.pipeline.shared_errors import ClockPrior
-from kcal.pipeline.track_options import TrackOptions, Tracks
-from kcal.pipeline.tracks import Tracker
+from kcal.pipeline.measurements import ClockPrior
+from kcal.pipeline.pairing import ObjectPairs
+from kcal.pipeline.tracks import Tracker, TrackOptions, Tracks
 from scripts.check.track_rivals import CartesianFilters, OfPixels, OfPositions
 from scripts.shared.page import table, write_section
 

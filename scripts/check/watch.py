@@ -28,7 +28,7 @@ from kcal.lens.rig import Mounting, Origin, RigCovariance, StereoRig
 from kcal.locate.budget import planned_rig
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.monitor import relocked
-from kcal.watch.state import AngleSeries, Look, TurnModel, between_rows, first_state, learned, passed, taken, turns_of
+from kcal.watch.history import AngleSeries, Look, TurnModel, between_rows, first_state, learned, passed, taken, turns_of
 from kcal.watch.watcher import LIMIT, exceeded
 from scripts.shared.page import table, write_section
 

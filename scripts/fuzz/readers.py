@@ -39,8 +39,8 @@ from kcal.locate.survey import import_survey, read_features, read_survey, read_v
 from kcal.mark.session import Journal
 from kcal.pipeline.association import AssociationOptions
 from kcal.pipeline.detections import Detections
-from kcal.pipeline.lines import read_moment
-from kcal.pipeline.stream_journal import Ledger
+from kcal.pipeline.grouping import read_moment
+from kcal.pipeline.stream import Ledger
 from kcal.report.map_page import local_image
 from kcal.report.practice_score import located_rows
 from kcal.stars.detect import read_night

@@ -19,7 +19,7 @@ from kcal.io.camera_rig_file import save_camera_rig
 from kcal.io.rig_file import save_rig
 from kcal.lens.rig import Mounting
 from kcal.pipeline.stream import Stream
-from kcal.pipeline.track_options import TrackOptions
+from kcal.pipeline.tracks import TrackOptions
 from scripts.shared.station_scenes import marks, ring
 
 

@@ -26,8 +26,8 @@ from kcal.errors import FileError, InputError
 from kcal.io.camera_rig_file import save_camera_rig
 from kcal.io.rig_file import save_rig
 from kcal.lens.rig import CameraRig, Origin, StereoRig
-from kcal.pipeline.handover import Handover
 from kcal.pipeline.stream import Stream
+from kcal.threads import Handover
 
 FRAMES, LATE = 14, 0.03
 
@@ -277,7 +277,7 @@ def test_two_rtsp_streams_whose_newest_frames_are_taken(folder: Path, monkeypatc
             os.kill(os.getpid(), signal.SIGTERM)
 
     monkeypatch.setattr(Stream, "_write", terminated)
-    monkeypatch.setattr("kcal.pipeline.paired_frames.Handover", Pairs)
+    monkeypatch.setattr("kcal.pipeline.video_source.Handover", Pairs)
     began = time.time()
     cameras = [RtspCamera(lambda when, side=side: table[side][round(10 * when) % 7], 10.0) for side in (0, 1)]
     with cameras[0], cameras[1]:

@@ -34,8 +34,7 @@ from kcal.mark.server import marking_app
 from kcal.mark.session import Session
 from kcal.pipeline.senders import LiveMap
 from kcal.pipeline.stream import track_columns
-from kcal.pipeline.track_options import TrackOptions
-from kcal.pipeline.tracks import Tracker
+from kcal.pipeline.tracks import Tracker, TrackOptions
 from kcal.report.map_page import save_map
 from kcal.report.tables import Part, save_summary
 from kcal.web.serving import LocalServer

@@ -12,7 +12,7 @@ from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import Origin, RigCovariance, StereoRig
 from kcal.locate.budget import planned_rig
 from kcal.locate.localizer import StereoLocalizer
-from kcal.pipeline.pairs import ObjectPairs
+from kcal.pipeline.pairing import ObjectPairs
 
 ORIGIN = Origin(lat=19.07, lon=72.87, height=14.0)
 

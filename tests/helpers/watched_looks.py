@@ -7,8 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from kcal.watch.history import HistoryRow, no_look
-from kcal.watch.state import LASTING_S, Look, TurnModel
+from kcal.watch.history import LASTING_S, HistoryRow, Look, TurnModel, no_look
 
 SIGMA, SHARE = 4e-6, 0.3
 START = 1_777_636_800.0

@@ -14,9 +14,9 @@ from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.views import PosedCameras, fit_views
+from kcal.pipeline.assignment import assign_groups, best_assignment
 from kcal.pipeline.association import Association, AssociationOptions, associate, association_costs, near_epipolar_lines
 from kcal.pipeline.detections import Detections
-from kcal.pipeline.one_to_one import assign_groups, best_assignment
 
 SIZE = (1920, 1080)
 
@@ -191,7 +191,7 @@ def test_a_crowd_takes_bounded_time_and_memory(monkeypatch: pytest.MonkeyPatch) 
         return fit_views(posed, pixels, *rest, **options)
 
     monkeypatch.setattr("kcal.pipeline.association.fit_views", counted)
-    monkeypatch.setattr("kcal.pipeline.one_to_one.linear_sum_assignment", assigned)
+    monkeypatch.setattr("kcal.pipeline.assignment.linear_sum_assignment", assigned)
     found = associate(rig_of(), left, right)
     assert len(solved) == 1
     assert len(found.left) > 300

@@ -10,9 +10,8 @@ from track_scenes import pairs_of, seen_by, tracked_site
 
 from kcal.errors import InputError
 from kcal.pipeline.imm_filter import Motion
-from kcal.pipeline.shared_errors import ClockPrior
-from kcal.pipeline.track_options import TrackOptions
-from kcal.pipeline.tracks import Tracker
+from kcal.pipeline.measurements import ClockPrior
+from kcal.pipeline.tracks import Tracker, TrackOptions
 
 OPTIONS = TrackOptions(motions=(Motion(acceleration=0.02),), speed_mps=8.0)
 

@@ -10,7 +10,7 @@ from kcal.errors import InputError
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.stations import stations_at
 from kcal.pipeline.imm_filter import no_beliefs
-from kcal.pipeline.shared_errors import ClockPrior
+from kcal.pipeline.measurements import ClockPrior
 from kcal.pipeline.tracks import Tracker, compiled_steps, track_steps
 
 

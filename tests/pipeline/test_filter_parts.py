@@ -13,8 +13,7 @@ from torch import Tensor
 from kcal.pipeline.assignment import SeenFrom, looks_of, nearby
 from kcal.pipeline.association import appearance, size_cost
 from kcal.pipeline.imm_filter import Beliefs, Timing, by_rates, fit_of, innovations, rates, updated
-from kcal.pipeline.measurements import Anchored
-from kcal.pipeline.shared_errors import ClockEstimate, ClockPrior, SharedErrors
+from kcal.pipeline.measurements import Anchored, ClockEstimate, ClockPrior, SharedErrors
 from kcal.pipeline.stream import MomentOrder
 
 

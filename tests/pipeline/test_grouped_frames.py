@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import pytest
 
 from kcal.errors import FileError, InputError
-from kcal.pipeline import paired_frames
-from kcal.pipeline.paired_frames import FramesTogether, VideoCounts, frames_together
+from kcal.pipeline import video_source
+from kcal.pipeline.video_source import FramesTogether, VideoCounts, frames_together
 
 
 class Frame(NamedTuple):
@@ -29,7 +29,7 @@ def videos(monkeypatch: pytest.MonkeyPatch, *times: list[float]) -> list[tuple[A
         undecoded()
         return (Frame(time) for time in times[int(path.name)] if time >= since)
 
-    monkeypatch.setattr(paired_frames, "file_frames", frames)
+    monkeypatch.setattr(video_source, "file_frames", frames)
     return asked
 
 
@@ -119,10 +119,10 @@ def test_live_streams_without_partners_are_told(monkeypatch: pytest.MonkeyPatch)
     sizes = {"left": (6, 4), "right": (6, 4)}
     for late, told in ((500.0, 1), (0.1, 0)):
         ticks = [float(k) for k in range(150)]
-        monkeypatch.setattr(paired_frames, "live_frames", frames({"a": ticks, "b": [late + t for t in ticks]}))
+        monkeypatch.setattr(video_source, "live_frames", frames({"a": ticks, "b": [late + t for t in ticks]}))
         words: list[str] = []
         live = FramesTogether(["rtsp://one/a", "rtsp://one/b"], sizes, pairs=False, tell=words.append)
-        monkeypatch.setattr(paired_frames, "_FRAMES", 1000)
+        monkeypatch.setattr(video_source, "_FRAMES", 1000)
         found = list(live(0))
         live.close()
         assert len([word for word in words if "100 frames of the left camera" in word]) == told

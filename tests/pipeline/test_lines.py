@@ -10,7 +10,7 @@ from kcal.errors import InputError
 from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.locate.stations import stations_of
 from kcal.pipeline.association import AssociationOptions
-from kcal.pipeline.lines import Moment, read_moment
+from kcal.pipeline.grouping import Moment, read_moment
 
 RIG = tracked_site().rig
 

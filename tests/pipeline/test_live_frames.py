@@ -18,8 +18,8 @@ from rtsp_server import RtspCamera
 from video_scenes import SIZE, Image
 
 from kcal.errors import FileError
-from kcal.pipeline import paired_frames as module
-from kcal.pipeline.paired_frames import TimedFrame, live_frames
+from kcal.pipeline import video_source as module
+from kcal.pipeline.video_source import TimedFrame, live_frames
 
 PERIOD = 8.0
 

@@ -28,8 +28,7 @@ from kcal.locate.tables import PositionColumns
 from kcal.locate.tabulate import Locator
 from kcal.pipeline.senders import LiveMap
 from kcal.pipeline.stream import track_columns
-from kcal.pipeline.track_options import TrackOptions
-from kcal.pipeline.tracks import Tracker
+from kcal.pipeline.tracks import Tracker, TrackOptions
 from scripts.shared.children import children
 
 SITE = tracked_site()

@@ -8,7 +8,7 @@ from kornia.feature import DescriptorMatcher, LocalFeatureMatcher, SIFTFeature, 
 from kornia.filters import gaussian_blur2d
 
 from kcal.errors import InputError
-from kcal.pipeline.pairs import ObjectPairs, matched_pixels
+from kcal.pipeline.pairing import ObjectPairs, matched_pixels
 
 
 def pairs(**changes: object) -> ObjectPairs:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from kcal.pipeline.small_matrices import congruent, eliminate, outer, product, solved, squared
+from kcal.pipeline.measurements import congruent, eliminate, outer, product, solved, squared
 
 
 def lanes(*shape: int, seed: int = 0) -> torch.Tensor:

@@ -8,9 +8,8 @@ import torch
 from track_scenes import pairs_of, seen_by, tracked_site, yawed_rig
 
 from kcal.pipeline.imm_filter import Motion
-from kcal.pipeline.shared_errors import ClockPrior
-from kcal.pipeline.track_options import TrackOptions
-from kcal.pipeline.tracks import Tracker
+from kcal.pipeline.measurements import ClockPrior
+from kcal.pipeline.tracks import Tracker, TrackOptions
 
 
 def test_smoothed_states_are_consistent_and_sharper() -> None:

@@ -18,10 +18,9 @@ from kcal.pipeline.association import AssociationOptions, associate
 from kcal.pipeline.detections import Detections
 from kcal.pipeline.grouping import group_objects
 from kcal.pipeline.imm_filter import Motion
-from kcal.pipeline.pairs import ObjectViews
-from kcal.pipeline.shared_errors import ClockPrior
-from kcal.pipeline.track_options import TrackOptions
-from kcal.pipeline.tracks import Tracker
+from kcal.pipeline.measurements import ClockPrior
+from kcal.pipeline.pairing import ObjectViews
+from kcal.pipeline.tracks import Tracker, TrackOptions
 from scripts.shared.station_scenes import ORIGIN, drawn_errors, marks, ring
 
 SIZE = (1920, 1080)

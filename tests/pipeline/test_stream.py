@@ -29,11 +29,10 @@ from kcal.errors import FileError, InputError
 from kcal.locate.positions import located_by
 from kcal.locate.tabulate import Locator
 from kcal.pipeline.association import AssociationOptions
-from kcal.pipeline.lines import Moment, read_moment
+from kcal.pipeline.grouping import Moment, read_moment
+from kcal.pipeline.measurements import ClockPrior
 from kcal.pipeline.senders import CotSender, sender_to
-from kcal.pipeline.shared_errors import ClockPrior
-from kcal.pipeline.stream import SourceItem, Stream, lines_of
-from kcal.pipeline.stream_journal import Ledger
+from kcal.pipeline.stream import Ledger, SourceItem, Stream, lines_of
 from kcal.pipeline.tracks import Tracker
 from scripts.shared.children import children
 
@@ -118,7 +117,7 @@ def kill_after(lines: int) -> None:
 
     def count(frame: FrameType, event: str, argument: object) -> Any:
         nonlocal left
-        if Path(frame.f_code.co_filename).name not in ("stream.py", "stream_journal.py"):
+        if Path(frame.f_code.co_filename).name != "stream.py":
             return None
         left -= event == "line"
         if not left:

@@ -21,7 +21,7 @@ from kcal.errors import FileError, InputError
 from kcal.locate.positions import located_by
 from kcal.locate.tabulate import Locator
 from kcal.pipeline.association import AssociationOptions
-from kcal.pipeline.lines import Moment, read_moment
+from kcal.pipeline.grouping import Moment, read_moment
 from kcal.pipeline.stream import MomentOrder, SourceItem, Stream, StreamCounts, lines_of
 from kcal.pipeline.tracks import Tracker
 
@@ -147,7 +147,7 @@ def test_sparse_and_slow_times_are_taken_as_they_come() -> None:
 SECOND = """
 import sys
 from pathlib import Path
-from kcal.pipeline.stream_journal import Ledger
+from kcal.pipeline.stream import Ledger
 ledger = Ledger(Path(sys.argv[2]), [Path(sys.argv[1])])
 ledger.checkpoint({})
 ledger.append([b"row\\n"], 1.0, 5)

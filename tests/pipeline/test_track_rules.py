@@ -17,9 +17,8 @@ from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import StereoRig
 from kcal.pipeline.association import _patches, appearance, near_epipolar_lines
 from kcal.pipeline.imm_filter import Motion
-from kcal.pipeline.pairs import ObjectPairs
-from kcal.pipeline.track_options import TrackOptions, TrackRecord
-from kcal.pipeline.tracks import Tracker, _toward
+from kcal.pipeline.pairing import ObjectPairs
+from kcal.pipeline.tracks import Tracker, TrackOptions, TrackRecord, _toward
 
 SLOW = TrackOptions(motions=(Motion(acceleration=0.05),), confirm_hits=3, lose_after_s=1.0, forget_after_s=4.0)
 HERE = (0.0, 0.0, 400.0)

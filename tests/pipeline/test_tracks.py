@@ -17,8 +17,7 @@ from kcal.locate.stations import stations_at
 from kcal.pipeline.estimates import track_states
 from kcal.pipeline.imm_filter import Motion, Timing, born
 from kcal.pipeline.measurements import anchored, known_sightings, sightings
-from kcal.pipeline.track_options import TrackOptions, Tracks
-from kcal.pipeline.tracks import Tracker
+from kcal.pipeline.tracks import Tracker, TrackOptions, Tracks
 
 STEADY = TrackOptions(motions=(Motion(acceleration=1e-4),), speed_mps=10.0, confirm_hits=2)
 

@@ -10,8 +10,7 @@ import torch
 from track_scenes import pairs_of, seen_by, tracked_site
 
 from kcal.pipeline.imm_filter import Motion
-from kcal.pipeline.track_options import TrackOptions
-from kcal.pipeline.tracks import Tracker
+from kcal.pipeline.tracks import Tracker, TrackOptions
 
 pytest.importorskip("stonesoup", reason="an oracle of the tests only")
 from stonesoup.models.measurement.linear import LinearGaussian

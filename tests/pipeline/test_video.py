@@ -15,8 +15,8 @@ import av
 from video_scenes import SIZE, drawn_image, small_rig, write_video
 
 from kcal.errors import FileError
-from kcal.pipeline.handover import Handover
-from kcal.pipeline.paired_frames import file_frames, paired_by_time
+from kcal.pipeline.video_source import file_frames, paired_by_time
+from kcal.threads import Handover
 
 Frame = namedtuple("Frame", "time")
 TIMES = [0.0, 0.04, 0.1, 0.101, 0.3, 0.34, 1.5, 1.54, 1.6, 2.9, 3.0, 3.04, 3.08, 3.2]

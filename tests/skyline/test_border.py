@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from kcal.errors import InputError
-from kcal.skyline.border import sky_border
+from kcal.skyline.horizon import sky_border
 
 COLUMNS, ROWS = 320, 200
 

@@ -14,8 +14,7 @@ from kcal.corners.image_tags import image_time
 from kcal.errors import FileError, InputError
 from kcal.locate.budget import planned_rig
 from kcal.watch.history import HistoryRow, HistoryTail, Temperatures, history_head, history_line, read_history
-from kcal.watch.watched import Watched, relock
-from kcal.watch.watcher import Watcher, alarm_sigmas, exceeded
+from kcal.watch.watcher import Watched, Watcher, alarm_sigmas, exceeded, relock
 from tests.helpers.scene_pairs import pair, small_rig
 from tests.helpers.watched_looks import row_of, steady_model, yaw_turn
 

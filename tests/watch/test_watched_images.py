@@ -9,6 +9,7 @@ import torch
 
 from kcal.errors import FileError, InputError
 from kcal.scene.match import ImagePair, match_scene
+from kcal.watch.history import between_rows
 from kcal.watch.measure import (
     MEMORY,
     AnotherCameraError,
@@ -22,7 +23,6 @@ from kcal.watch.measure import (
     seen_by,
     with_look,
 )
-from kcal.watch.state import between_rows
 from tests.helpers.scene_pairs import pair, small_rig
 
 RIG = small_rig()

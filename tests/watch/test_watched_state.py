@@ -8,8 +8,8 @@ import torch
 from kcal.errors import InputError
 from kcal.lens.rig import Mounting, Origin
 from kcal.locate.budget import planned_rig
-from kcal.watch.state import AngleSeries, between_rows, first_state, learned, passed, taken, turns_of
-from kcal.watch.watched import MORE_ERRORS, Watched
+from kcal.watch.history import AngleSeries, between_rows, first_state, learned, passed, taken, turns_of
+from kcal.watch.watcher import MORE_ERRORS, Watched
 from tests.helpers.watched_looks import SHARE, SIGMA, row_of, simulated, steady_model, yaw_turn
 
 RIG = planned_rig()
