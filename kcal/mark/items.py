@@ -16,6 +16,9 @@ from kcal.errors import InputError
 
 Kind = Literal["landmark", "feature", "target"]
 Side = Literal["left", "right"]
+# What pages ask for: a pixel of a frame, and numbers of frames and tiles.
+Coordinate = Annotated[float, pydantic.Field(allow_inf_nan=False, ge=-1e6, le=1e6)]
+Number = Annotated[int, pydantic.Field(ge=0, le=10_000_000)]
 _Finite = Annotated[float, pydantic.Field(allow_inf_nan=False)]
 _Name = Annotated[str, pydantic.StringConstraints(strip_whitespace=True, min_length=1, max_length=60)]
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import threading
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
+import pydantic
 import torch
 from torch import Tensor
 
@@ -24,7 +25,7 @@ from kcal.locate.positions import Located, Position, locate_points, near, region
 from kcal.locate.stereo import PositionStatus
 from kcal.locate.survey import Survey, match_landmarks, read_survey
 from kcal.mark.guide import Pictures, Proposal, Reference, RigBand, at_shape, propose, top_level
-from kcal.mark.items import SIDES, Change, Item, Mark, MarkingState, Put, Side, Step, other_side
+from kcal.mark.items import SIDES, Change, Coordinate, Item, Mark, MarkingState, Number, Put, Side, Step, other_side
 from kcal.mark.session import Session, marks_of, pair_covariance
 from kcal.mark.shapes import snap
 from kcal.texts import range_text
@@ -218,6 +219,8 @@ def map_content(rig: StereoRig, located: Located | None, survey: Survey | None, 
 # What the page asks for, as plain values: state, shapes at clicks, matches, positions. Knows nothing of HTTP.
 
 Json = dict[str, Any]
+How = Annotated[str, pydantic.Field(max_length=20)]
+Reach = Annotated[int, pydantic.Field(ge=5, le=200)]
 
 
 class Desk:
@@ -363,7 +366,7 @@ class Desk:
         local = self._live.rig is not None and self._live.origin is None
         return rig is not None and rig.mounting is not None and not local
 
-    def snapped(self, side: Side, frame: int, u: float, v: float) -> Json:
+    def snapped(self, side: Side, frame: Number, u: Coordinate, v: Coordinate) -> Json:
         """The shape near a click, or why there is none."""
         try:
             found = snap(self.pictures.image(side, frame), u, v)
@@ -382,7 +385,7 @@ class Desk:
             return {"refusal": str(error)}
         return {"refusal": "", "pixels": found.pixels.tolist(), "band": (2 * found.sigma).tolist()}
 
-    def proposal(self, side: Side, frame: int, u: float, v: float, how: str = "hand") -> Json:
+    def proposal(self, side: Side, frame: Number, u: Coordinate, v: Coordinate, how: How = "hand") -> Json:
         """The match of a pixel in the other image, at the shape that is there if the mark is at such a shape."""
         rig, band = self.rig, self._band
         if rig is None or band is None:
@@ -395,13 +398,13 @@ class Desk:
         found = propose(rig, images, side, u, v, sigma)
         return _proposal(at_shape(found, images[SIDES.index(other_side(side))], how))
 
-    def again(self, name: str, side: Side, frame: int, reach: int) -> Json:
+    def again(self, name: str, side: Side, frame: Number, reach: Reach = 40) -> Json:
         """Where a thing of the reference is now."""
         if self.reference is None:
             raise InputError("start with --reference and --reference-images to find points again")
         return _proposal(self.reference.find(name, side, self.pictures.image(side, frame), reach))
 
-    def position(self, left: Mark, right: Mark, matched: Side | None) -> Json:
+    def position(self, left: Mark, right: Mark, matched: Side | None = None) -> Json:
         """Where a pair of marks lies that is being dragged."""
         rig = self.rig
         if rig is None:

@@ -12,21 +12,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+import kcal.corners.patches as patches
 from kcal.checks import StatedModule, as_points, as_tensor, exportable, require_finite
 from kcal.corners.match import MatchStatus
-from kcal.corners.patches import (
-    fit_shifts,
-    grid_of,
-    has_samples,
-    highest_peak,
-    image_windows,
-    is_textured,
-    object_planes,
-    plane_pixels,
-    plane_places,
-    sample,
-    weighted_correlation,
-)
 from kcal.dispatch import still
 from kcal.errors import InputError
 from kcal.lens.rig import StereoRig
@@ -492,31 +480,31 @@ class ObjectDisparity(StatedModule):
         device = objects.boxes.device
         rotation = rig.right_from_left_rotation
         with torch.no_grad():
-            planes = object_planes(rig, objects.left, objects.right, torch.full_like(objects.left[:, 0], level))
+            planes = patches.object_planes(rig, objects.left, objects.right, torch.full_like(objects.left[:, 0], level))
             step = planes.step[:, None, None, None]
-            grid = grid_of((objects.half,) * 2, device)
-            here, seen = plane_pixels(rig.left, planes, planes.left[:, None, None] + step * grid)
+            grid = patches.grid_of((objects.half,) * 2, device)
+            here, seen = patches.plane_pixels(rig.left, planes, planes.left[:, None, None] + step * grid)
             here = torch.where(seen[..., None], here, objects.left[:, None, None])
             search = math.ceil(options.search / 2**level) + 1, math.ceil(options.max_off_line / 2**level) + 1
-            wide = grid_of((objects.half + search[0], objects.half + search[1]), device)
+            wide = patches.grid_of((objects.half + search[0], objects.half + search[1]), device)
             # On the epipolar line: the row of the left anchor.
             aim = torch.stack([planes.right[:, 0], torch.zeros_like(planes.step)], -1)
-            there, shown = plane_pixels(rig.right, planes, aim[:, None, None] + step * wide, rotation)
+            there, shown = patches.plane_pixels(rig.right, planes, aim[:, None, None] + step * wide, rotation)
             there = torch.where(shown[..., None], there, objects.right[:, None, None])
-        first = image_windows(left, here, level, _brightest(left, options))
-        second = image_windows(right, there, level, _brightest(right, options))
-        template = sample(first, here)
+        first = patches.image_windows(left, here, level, _brightest(left, options))
+        second = patches.image_windows(right, there, level, _brightest(right, options))
+        template = patches.sample(first, here)
         with torch.no_grad():
-            base = objects.weight(here) * (seen & has_samples(first, here))
+            base = objects.weight(here) * (seen & patches.has_samples(first, here))
             outside = planes.valid & (base.sum((1, 2)) < options.min_share * objects.weight(here).sum((1, 2)))
-            saturated = (sample(first, here, saturated=True) > 0.02) & (base > 0)
+            saturated = (patches.sample(first, here, saturated=True) > 0.02) & (base > 0)
             clear = torch.where(saturated, 0.0, base)
-            usable = shown & has_samples(second, there)
-            scores = weighted_correlation(template, clear, sample(second, there), usable)
-            _, best, score, rival, edge = highest_peak(scores, grid_of(search, device))
+            usable = shown & patches.has_samples(second, there)
+            scores = patches.weighted_correlation(template, clear, patches.sample(second, there), usable)
+            _, best, score, rival, edge = patches.highest_peak(scores, patches.grid_of(search, device))
             start = aim + planes.step[:, None] * best
-            beyond = grid_of((objects.half + 1,) * 2, device)
-            places, _ = plane_pixels(rig.right, planes, start[:, None, None] + step * beyond, rotation)
+            beyond = patches.grid_of((objects.half + 1,) * 2, device)
+            places, _ = patches.plane_pixels(rig.right, planes, start[:, None, None] + step * beyond, rotation)
             moved = places[:, 1:-1, 1:-1]
             slopes = torch.stack(
                 [
@@ -525,12 +513,12 @@ class ObjectDisparity(StatedModule):
                 ],
                 -1,
             )
-            saturated |= (sample(second, moved, saturated=True) > 0.02) & (base > 0)
-            weight = torch.where(saturated | ~has_samples(second, moved), 0.0, base)
-            wanted, named = plane_places(rig.left, planes, objects.anchors)
+            saturated |= (patches.sample(second, moved, saturated=True) > 0.02) & (base > 0)
+            weight = torch.where(saturated | ~patches.has_samples(second, moved), 0.0, base)
+            wanted, named = patches.plane_places(rig.left, planes, objects.anchors)
             bright = (base * saturated).sum((1, 2)) / base.sum((1, 2)).clamp_min(1e-12)
             searched = (scores > -1.0).flatten(1).any(1)
-            textured = is_textured(template, weight)
+            textured = patches.is_textured(template, weight)
             # What is named last counts first.
             status = _flagged(torch.full_like(score, int(MatchStatus.GOOD), dtype=torch.int64), (
                 (rival > options.max_rival * score, MatchStatus.AMBIGUOUS),
@@ -541,9 +529,9 @@ class ObjectDisparity(StatedModule):
                 (~(planes.valid & named), MatchStatus.NO_RAY),
             ))  # fmt: skip
             found = status == int(MatchStatus.GOOD)
-        fit = fit_shifts(template, second, moved, slopes, weight, found)
+        fit = patches.fit_shifts(template, second, moved, slopes, weight, found)
         column = start + planes.step[:, None] * fit.shift
-        pixels, _ = plane_pixels(rig.right, planes, (wanted + column - planes.left)[:, None], rotation)
+        pixels, _ = patches.plane_pixels(rig.right, planes, (wanted + column - planes.left)[:, None], rotation)
         with torch.no_grad():
             at = objects.half
             middle = slopes[:, at, at]

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+import kcal.pipeline.imm_filter as imm
 from kcal.dispatch import known_true
 from kcal.errors import InputError
 from kcal.lens.pose import side_axes
@@ -21,21 +22,6 @@ from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.locate.stations import MOUNTING_ERRORS, stations_at
 from kcal.pipeline.assignment import Candidates, Looks, Scores, SeenFrom, assigned, looks_of, nearby, within
 from kcal.pipeline.estimates import History, SmoothedTrack, TrackStates, track_states
-from kcal.pipeline.imm_filter import (
-    MOTIONS,
-    Beliefs,
-    Motion,
-    Timing,
-    born,
-    cross_covariance,
-    fit_of,
-    innovations,
-    no_beliefs,
-    predicted,
-    step_numbers,
-    transition,
-    updated,
-)
 from kcal.pipeline.measurements import (
     Anchored,
     ClockEstimate,
@@ -77,7 +63,7 @@ class TrackOptions:
         InputError: a value that is not positive (`lasting_px` may be zero), or a forgetting before the losing.
     """
 
-    motions: tuple[Motion, ...] = MOTIONS
+    motions: tuple[imm.Motion, ...] = imm.MOTIONS
     switch_s: float = 20.0
     speed_mps: float = 15.0
     confirm_hits: int = 4
@@ -174,23 +160,23 @@ class TrackSteps(NamedTuple):
     """
 
     measure: Callable[[Tensor, Tensor, Tensor, Tensor], Sightings]
-    move: Callable[[Beliefs, Tensor, Tensor, Tensor], Beliefs]
-    look: Callable[[Beliefs, Tensor, Tensor, Tensor | None], tuple[Beliefs, Looks]]
-    near: Callable[[Looks, Sightings, Timing, Tensor], Tensor]
-    score: Callable[[Beliefs, Tensor, Tensor, Sightings, Timing, Tensor | None, Tensor, Tensor], Scores]
-    take: Callable[[Beliefs, Anchored, Timing, Tensor | None], Beliefs]
-    place: Callable[[Beliefs, Tensor, Tensor, Tensor | None, Tensor], TrackStates]
+    move: Callable[[imm.Beliefs, Tensor, Tensor, Tensor], imm.Beliefs]
+    look: Callable[[imm.Beliefs, Tensor, Tensor, Tensor | None], tuple[imm.Beliefs, Looks]]
+    near: Callable[[Looks, Sightings, imm.Timing, Tensor], Tensor]
+    score: Callable[[imm.Beliefs, Tensor, Tensor, Sightings, imm.Timing, Tensor | None, Tensor, Tensor], Scores]
+    take: Callable[[imm.Beliefs, Anchored, imm.Timing, Tensor | None], imm.Beliefs]
+    place: Callable[[imm.Beliefs, Tensor, Tensor, Tensor | None, Tensor], TrackStates]
 
 
-def moved_on(beliefs: Beliefs, up: Tensor, numbers: Tensor, stay: Tensor) -> Beliefs:
+def moved_on(beliefs: imm.Beliefs, up: Tensor, numbers: Tensor, stay: Tensor) -> imm.Beliefs:
     """Beliefs after a step: `up` and `numbers` as in `transition`, `stay` as in `Beliefs.mixed`."""
-    return predicted(beliefs.mixed(stay), transition(numbers, up))
+    return imm.predicted(beliefs.mixed(stay), imm.transition(numbers, up))
 
 
-def taken_in(beliefs: Beliefs, seen: Anchored, timing: Timing, root: Tensor | None) -> Beliefs:
+def taken_in(beliefs: imm.Beliefs, seen: Anchored, timing: imm.Timing, root: Tensor | None) -> imm.Beliefs:
     """Beliefs with sightings, one for each track."""
-    found = innovations(beliefs, seen, timing)
-    return updated(beliefs, found, root)
+    found = imm.innovations(beliefs, seen, timing)
+    return imm.updated(beliefs, found, root)
 
 
 def track_steps(localize: MultiViewLocalizer, lasting_px: float) -> TrackSteps:
@@ -203,12 +189,12 @@ def track_steps(localize: MultiViewLocalizer, lasting_px: float) -> TrackSteps:
     def measure(pixels: Tensor, seen: Tensor, covariance: Tensor, time: Tensor) -> Sightings:
         return sightings(known, pixels, seen, covariance, time, lasting_px)
 
-    def looked_at(beliefs: Beliefs, frame: Tensor, home: Tensor, root: Tensor | None) -> tuple[Beliefs, Looks]:
+    def looked_at(beliefs: imm.Beliefs, frame: Tensor, home: Tensor, root: Tensor | None) -> tuple[imm.Beliefs, Looks]:
         merged = beliefs.merged()
         return merged, looks_of(merged, frame, centers.T.index_select(1, home), cameras, root)
 
     def scored(
-        merged: Beliefs, frame: Tensor, home: Tensor, seen: Sightings, timing: Timing, root: Tensor | None,
+        merged: imm.Beliefs, frame: Tensor, home: Tensor, seen: Sightings, timing: imm.Timing, root: Tensor | None,
         track: Tensor, which: Tensor,
     ) -> Scores:  # fmt: skip
         """Sightings (L,) against tracks (L,), whose beliefs are merged."""
@@ -216,14 +202,14 @@ def track_steps(localize: MultiViewLocalizer, lasting_px: float) -> TrackSteps:
         origin = centers.T.index_select(1, home[track])
         where = None if known_true(~local.alone) else beliefs.mean[:3, 0]
         there = anchored(local, frame.index_select(-1, track), origin, where, bending, k)
-        found = innovations(beliefs, there, timing.at(which))
-        fit = fit_of(found, root)
+        found = imm.innovations(beliefs, there, timing.at(which))
+        fit = imm.fit_of(found, root)
         density = fit.log_density[0] + _EXPLAINED * local.seen.sum(0)
         return Scores(
             there, found.effect[..., 0, :], found.value[:, 0], found.noise[..., 0, :], fit.squared[0], density
         )
 
-    def place(beliefs: Beliefs, frame: Tensor, home: Tensor, root: Tensor | None, which: Tensor) -> TrackStates:
+    def place(beliefs: imm.Beliefs, frame: Tensor, home: Tensor, root: Tensor | None, which: Tensor) -> TrackStates:
         summary = beliefs.at(which).summary()
         return track_states(localize, frame.index_select(-1, which).movedim(-1, 0), home[which], summary, root)
 
@@ -231,7 +217,7 @@ def track_steps(localize: MultiViewLocalizer, lasting_px: float) -> TrackSteps:
 
 
 @torch.no_grad()
-def compiled_steps(steps: TrackSteps, cameras: int, nothing: Beliefs, root: Tensor | None) -> TrackSteps:
+def compiled_steps(steps: TrackSteps, cameras: int, nothing: imm.Beliefs, root: Tensor | None) -> TrackSteps:
     """The steps in C++ for any numbers of tracks and sightings: this takes three minutes, less where torch remembers.
 
     Args:
@@ -255,15 +241,15 @@ def compiled_steps(steps: TrackSteps, cameras: int, nothing: Beliefs, root: Tens
     return made
 
 
-def _compile_all(made: TrackSteps, cameras: int, nothing: Beliefs, root: Tensor | None) -> None:
+def _compile_all(made: TrackSteps, cameras: int, nothing: imm.Beliefs, root: Tensor | None) -> None:
     """Call each step with stand-ins."""
     new, models = nothing.mean.new_zeros, nothing.mean.shape[1]
     unit = torch.eye(2 * cameras).to(nothing.mean).expand(_PAIRS, 2 * cameras, 2 * cameras)
     there = torch.ones(_PAIRS, cameras, dtype=torch.bool, device=unit.device)
     seen = made.measure(new(_PAIRS, cameras, 2), there, unit, new(_PAIRS, cameras))
     clocks = nothing.late.shape[1] // 3
-    timing = Timing(new(cameras, _PAIRS), new(clocks, 3, _PAIRS), new(clocks, _PAIRS))
-    beliefs = Beliefs(*(torch.nn.functional.pad(value, (0, _TRACKS), value=1.0) for value in nothing))
+    timing = imm.Timing(new(cameras, _PAIRS), new(clocks, 3, _PAIRS), new(clocks, _PAIRS))
+    beliefs = imm.Beliefs(*(torch.nn.functional.pad(value, (0, _TRACKS), value=1.0) for value in nothing))
     frame = torch.eye(3).to(unit)[..., None].expand(3, 3, _TRACKS)
     home = torch.zeros(_TRACKS, dtype=torch.long, device=unit.device)
     beliefs = made.move(beliefs, frame[2], new(9, models), new(()))
@@ -494,10 +480,10 @@ class Tracker:
             raise InputError("nothing was recorded; make the tracker with record=True")
         return self.history.smoothed(self.localize, self.shared.corrected, self.shared.mixing)
 
-    def _nothing(self) -> Beliefs:
+    def _nothing(self) -> imm.Beliefs:
         """Beliefs of no tracks."""
         clocks = len(self.shared.corrected)
-        return no_beliefs(self.calibration, clocks, len(self.options.motions), self.frame.device)
+        return imm.no_beliefs(self.calibration, clocks, len(self.options.motions), self.frame.device)
 
     def _is_told(self, track: TrackRecord) -> bool:
         return track.number > 0 and self.time - track.last <= self.options.lose_after_s
@@ -506,7 +492,7 @@ class Tracker:
         dt, self.time = time - self.time, time
         if not self.records:
             return
-        numbers = self.frame.new_tensor(step_numbers(self.options.motions, dt))
+        numbers = self.frame.new_tensor(imm.step_numbers(self.options.motions, dt))
         stay = self.frame.new_tensor(math.exp(-dt / self.options.switch_s))
         up = self.frame[:, 2]
         aim, turn = self.beliefs.middle[:2, 0], None
@@ -516,11 +502,11 @@ class Tracker:
         elif self.history is None:
             self.beliefs = self.steps.move(self.beliefs, up, numbers, stay)
             return
-        beliefs, step = self.beliefs.mixed(stay), transition(numbers, up)
-        self.beliefs = predicted(beliefs, step, turn)
+        beliefs, step = self.beliefs.mixed(stay), imm.transition(numbers, up)
+        self.beliefs = imm.predicted(beliefs, step, turn)
         if self.history is not None:
             keys = [track.key for track in self.records]
-            cross = cross_covariance(beliefs, self.beliefs, step, turn)
+            cross = imm.cross_covariance(beliefs, self.beliefs, step, turn)
             self.history.predicted(keys, self.beliefs.summary(), cross, self.shared.corrected)
 
     def _take(self, views: ObjectViews, seen: Sightings) -> None:
@@ -545,7 +531,7 @@ class Tracker:
             self.beliefs = self.beliefs._replace(mean=self.beliefs.mean + shift)
 
     def _match(
-        self, views: ObjectViews, seen: Sightings, timing: Timing, ends: list[_Ends], rows: Tensor, camera: int
+        self, views: ObjectViews, seen: Sightings, timing: imm.Timing, ends: list[_Ends], rows: Tensor, camera: int
     ) -> _Ends:
         """Give tracks the sightings of some rows; those of one `camera` (not -1) go to tracks that it has not seen yet.
 
@@ -570,16 +556,16 @@ class Tracker:
             self.seen_now |= {(self.records[t].key, c): i for c, _ in ends[i]}
         return {mark for i in taken for mark in ends[i]}
 
-    def _delays(self, seen: Sightings) -> Timing:
+    def _delays(self, seen: Sightings) -> imm.Timing:
         since = seen.time[1:] - (self.shared.start or 0.0)
         clock = torch.stack([torch.ones_like(since), since, seen.row[1:]], 1)  # (V - 1, 3, N)
         values = self.shared.values.unflatten(0, clock.shape[:2])
         delay = seen.time - self.time + torch.nn.functional.pad((values[..., None] * clock).sum(1), (0, 0, 1, 0))
         if not self.shared.estimated:
-            return Timing(delay, clock[:0], since[:0])
+            return imm.Timing(delay, clock[:0], since[:0])
         root = self.shared.root[self.calibration :].unflatten(0, clock.shape[:2])
         unsure = (root[..., None] * clock[:, :, None]).sum(1).square().sum(1).sqrt()
-        return Timing(delay, clock, unsure)
+        return imm.Timing(delay, clock, unsure)
 
     def _tier(self, track: TrackRecord) -> int:
         if track.number == 0:
@@ -587,7 +573,13 @@ class Tracker:
         return 0 if self.time - track.last <= self.options.lose_after_s else -1
 
     def _update(
-        self, possible: Candidates, rows: Tensor, seen: Sightings, timing: Timing, categories: list[str], score: Tensor
+        self,
+        possible: Candidates,
+        rows: Tensor,
+        seen: Sightings,
+        timing: imm.Timing,
+        categories: list[str],
+        score: Tensor,
     ) -> None:
         track, which, scores = possible.track[rows], possible.pair[rows], possible.scores
         count = seen.seen.sum(0)[which]
@@ -601,7 +593,7 @@ class Tracker:
         local = scores.seen if len(rows) == len(possible.track) else scores.seen.at(rows)
         new = self.steps.take(old, local, timing.at(which), self.shared.mixing)
         both = zip(self.beliefs, new, strict=True)
-        self.beliefs = new if every else Beliefs(*(value.index_copy(-1, track, part) for value, part in both))
+        self.beliefs = new if every else imm.Beliefs(*(value.index_copy(-1, track, part) for value, part in both))
         columns = track.tolist(), scores.log_density[rows].tolist(), categories, score.tolist(), count.tolist()
         for t, density, name, weight, cameras in zip(*columns, strict=True):
             record = self.records[t]
@@ -612,13 +604,13 @@ class Tracker:
             record.evidence += density
             record.categories[name] = record.categories.get(name, 0.0) + weight
 
-    def _begin(self, which: Tensor, views: ObjectViews, seen: Sightings, timing: Timing) -> None:
+    def _begin(self, which: Tensor, views: ObjectViews, seen: Sightings, timing: imm.Timing) -> None:
         seen = seen.at(which)
         ray = torch.nn.functional.normalize(seen.direction.T, dim=-1)
         frame = torch.stack([*side_axes(ray), ray]).movedim(-1, 1)
         local = anchored(seen, frame, seen.place)
-        new = born(local, timing.at(which), self.options.speed_mps, len(self.options.motions))
-        self.beliefs = Beliefs(*(torch.cat(both, -1) for both in zip(self.beliefs, new, strict=True)))
+        new = imm.born(local, timing.at(which), self.options.speed_mps, len(self.options.motions))
+        self.beliefs = imm.Beliefs(*(torch.cat(both, -1) for both in zip(self.beliefs, new, strict=True)))
         self.frame, self.home = torch.cat([self.frame, frame], -1), torch.cat([self.home, seen.anchor])
         for i in which.tolist():
             needed = self.options.confirm_hits * (2 if bool(views.ambiguous[i]) else 1)
@@ -659,11 +651,11 @@ class Tracker:
         which = torch.tensor(lost, device=self.frame.device)
         old, here = self.beliefs.at(which).merged(), self.beliefs.at(torch.tensor([new])).merged()
         frame, to = self.frame[..., which], self.frame[..., new, None]
-        still = transition(frame.new_tensor(step_numbers((Motion(acceleration=0.0),), 0.0)), frame[:, 2])
+        still = imm.transition(frame.new_tensor(imm.step_numbers((imm.Motion(acceleration=0.0),), 0.0)), frame[:, 2])
         centers = self.localize.rig.center
         apart = centers[self.home[which]] - centers[self.home[new]]
         shift = None if not bool(apart.any()) else product(to, apart.T[:, None])[:, 0]
-        old = predicted(old, still, product(to, frame.transpose(0, 1)), shift)
+        old = imm.predicted(old, still, product(to, frame.transpose(0, 1)), shift)
         spread = rooted(here.effect - old.effect, self.shared.mixing)
         distance = mahalanobis(here.noise + old.noise + squared(spread), here.mean - old.mean)[0][0]
         near = [i for i, value in zip(lost, distance.tolist(), strict=True) if value <= self.options.recognize]

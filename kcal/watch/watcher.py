@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-import kcal.watch.history as estimate
+import kcal.watch.history as past
 import kcal.watch.measure as measure
 from kcal.calibrate.rig.drift import Drift, drift_of_turns
 from kcal.corners.images import Gray
@@ -29,16 +29,6 @@ from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.monitor import relocked
 from kcal.pipeline.stream import Ledger
-from kcal.watch.history import (
-    MOST_ROWS,
-    HistoryRow,
-    HistoryTail,
-    Temperatures,
-    history_head,
-    history_line,
-    read_history,
-    warmed,
-)
 
 # A rig and the history of its attitude: the rig of any moment, a stream that follows it, and a new rig file.
 
@@ -60,7 +50,7 @@ class Watched:
 
     Example:
         >>> from kcal.locate.budget import planned_rig
-        >>> from kcal.watch.history import no_look
+        >>> from kcal.watch.history import HistoryRow, no_look
         >>> rig = planned_rig()
         >>> watched = Watched(rig, [HistoryRow(0.0, no_look())])
         >>> float(watched.rig_at(60.0).baseline)  # nothing was seen: the same rig, less well known
@@ -68,16 +58,16 @@ class Watched:
     """
 
     def __init__(
-        self, rig: StereoRig, rows: Sequence[HistoryRow] = (), model: estimate.TurnModel | None = None
+        self, rig: StereoRig, rows: Sequence[past.HistoryRow] = (), model: past.TurnModel | None = None
     ) -> None:
         self.rig, self.model = rig, model or model_of(rows)
-        self.between = estimate.between_rows(rig)
+        self.between = past.between_rows(rig)
         # Of which moments the rows tell all that the history does.
         self.since, self.until = -math.inf, math.inf
         self.times: list[float] = []
-        self.states: list[estimate.TurnState] = []
+        self.states: list[past.TurnState] = []
         self.seen: list[bool] = []
-        self._smooth: list[estimate.TurnState] | None = None
+        self._smooth: list[past.TurnState] | None = None
         for row in rows:
             self.take(row)
 
@@ -88,11 +78,11 @@ class Watched:
         Raises:
             FileError: no history, or one of another rig.
         """
-        found = cls(rig, read_history(path, rig.fingerprint, since=since - _BEFORE, until=until + _AFTER))
+        found = cls(rig, past.read_history(path, rig.fingerprint, since=since - _BEFORE, until=until + _AFTER))
         found.since, found.until = since, until
         return found
 
-    def take(self, row: HistoryRow, most: int | None = None) -> None:
+    def take(self, row: past.HistoryRow, most: int | None = None) -> None:
         """Take in a further look; of more than `most` the oldest are forgotten.
 
         Raises:
@@ -101,11 +91,11 @@ class Watched:
         if self.times and not row.time > self.times[-1]:
             raise InputError(f"time {row.time:g}: not after that of the last look, {self.times[-1]:g}")
         if self.times:
-            state, _ = estimate.passed(self.states[-1], torch.tensor(row.time - self.times[-1]).double(), self.model)
+            state, _ = past.passed(self.states[-1], torch.tensor(row.time - self.times[-1]).double(), self.model)
         else:
-            state = estimate.first_state(self.model)
+            state = past.first_state(self.model)
         self.times.append(row.time)
-        self.states.append(estimate.taken(state, row.look, self.model, self.between))
+        self.states.append(past.taken(state, row.look, self.model, self.between))
         self.seen.append(bool(row.look.seen.all()))
         self._smooth = None
         if most is not None and len(self.times) > most:
@@ -117,7 +107,7 @@ class Watched:
         stands = self.rig.mounting
         return None if stands is None else enu_from_cam(stands.heading_deg, stands.pitch_deg, stands.roll_deg).T
 
-    def turns_at(self, time: float, *, gusts: bool = True) -> estimate.Turns:
+    def turns_at(self, time: float, *, gusts: bool = True) -> past.Turns:
         """The turn of both cameras at a moment, from the looks before and after it.
 
         Raises:
@@ -128,11 +118,11 @@ class Watched:
             begin = f"it begins at {self.times[0]:.0f}" if self.times else "it has no rows"
             raise InputError(f"time {time:.0f} s: the history of the rig tells nothing of that moment; {begin}")
         if self._smooth is None and k + 1 < len(self.times):
-            self._smooth = estimate.smoothed(self.states, self.times, self.model)
-        state, _ = estimate.passed(self.states[k], torch.tensor(time - self.times[k]).double(), self.model)
+            self._smooth = past.smoothed(self.states, self.times, self.model)
+        state, _ = past.passed(self.states[k], torch.tensor(time - self.times[k]).double(), self.model)
         if self._smooth is not None and k + 1 < len(self.times):
-            state = estimate.smoothed([state, self._smooth[k + 1]], [time, self.times[k + 1]], self.model)[0]
-        return estimate.turns_of(state, self.model, gusts=gusts)
+            state = past.smoothed([state, self._smooth[k + 1]], [time, self.times[k + 1]], self.model)[0]
+        return past.turns_of(state, self.model, gusts=gusts)
 
     def drift_at(self, time: float, *, gusts: bool = True) -> Drift:
         """How the cameras have turned since the reference; see `turns_at`."""
@@ -169,10 +159,10 @@ def _uncertain(rig: StereoRig) -> StereoRig:
     return same
 
 
-def model_of(rows: Sequence[HistoryRow]) -> estimate.TurnModel:
+def model_of(rows: Sequence[past.HistoryRow]) -> past.TurnModel:
     """How a rig turns, as its history tells."""
     if not rows:
-        return estimate.TurnModel.usual()
+        return past.TurnModel.usual()
     looks = [row.look for row in rows]
     seen = torch.stack([look.seen for look in looks]).repeat_interleave(3, -1)
     own = torch.stack([look.covariance.diagonal() for look in looks])
@@ -182,7 +172,7 @@ def model_of(rows: Sequence[HistoryRow]) -> estimate.TurnModel:
         found: NDArray[np.float64] = values.numpy()
         return found
 
-    return estimate.learned(estimate.AngleSeries(
+    return past.learned(past.AngleSeries(
         time=np.array([row.time for row in rows]),
         angle=array(torch.where(seen, torch.stack([look.turn for look in looks]), math.nan)),
         variance=array((1.0 - share) * own),
@@ -239,7 +229,7 @@ def relock(watched: Watched) -> Relock:
 # A watched rig in a stream: the localizer of each moment, from a history that another process writes.
 
 # Seconds for which an attitude counts, and rows that are kept.
-_STEP_S, _KEPT = 10.0, MOST_ROWS // 4
+_STEP_S, _KEPT = 10.0, past.MOST_ROWS // 4
 
 
 class Followed:
@@ -254,7 +244,7 @@ class Followed:
     """
 
     def __init__(self, history: Path, localize: StereoLocalizer) -> None:
-        self._tail, self._solved = HistoryTail(history, localize.rig.fingerprint), localize
+        self._tail, self._solved = past.HistoryTail(history, localize.rig.fingerprint), localize
         self._watched = Watched(localize.rig, self._tail.rows())
         self._now, self._until = localize, -math.inf
 
@@ -383,7 +373,7 @@ class Noticed(NamedTuple):
         begins: whether it was not at the look before.
     """
 
-    row: HistoryRow
+    row: past.HistoryRow
     turn: Tensor
     sigma: Tensor
     alarm: bool
@@ -415,14 +405,14 @@ class Watcher:
         *,
         every_s: float = 60.0,
         limit_deg: float = LIMIT,
-        temperatures: Temperatures | None = None,
+        temperatures: past.Temperatures | None = None,
         tell: Callable[[str], None] = lambda _: None,
     ) -> None:
         self.rig, self.every_s, self.limit_deg, self.tell = rig, every_s, limit_deg, tell
         self.history, self.reference = history, history.with_suffix(".reference.npz")
         self.skipped, self.looks, self.alarms = 0, 0, 0
         self._temperatures, self._warmth = temperatures, math.nan
-        self._rows: deque[HistoryRow] = deque(maxlen=_KEPT_ROWS)
+        self._rows: deque[past.HistoryRow] = deque(maxlen=_KEPT_ROWS)
         self._sides: tuple[measure.FixedFeatures, measure.FixedFeatures] | None = None
         self._matched, self._learned, self._alarm = -math.inf, -math.inf, False
         self._lost = [0, 0]
@@ -434,7 +424,7 @@ class Watcher:
         self._ledger = Ledger(history.with_name(history.name + ".journal"), [history], "watch")
         try:
             if self._ledger.place.sequence:
-                self._rows.extend(read_history(history, rig.fingerprint))
+                self._rows.extend(past.read_history(history, rig.fingerprint))
                 first = [row.temperature for row in self._rows if not math.isnan(row.temperature)]
                 self._warmth = self._warmth if not first else first[0] - float(
                     next(row.look.kelvin for row in self._rows if not math.isnan(row.temperature)))  # fmt: skip
@@ -497,8 +487,8 @@ class Watcher:
         warm = math.nan if self._temperatures is None else self._temperatures.at(time)
         self._warmth = warm if math.isnan(self._warmth) else self._warmth
         counts = found.sides[0].found, found.sides[1].found
-        row = warmed(
-            HistoryRow(time, found.look, counts, found.matches, warm, found.note), self._warmth,
+        row = past.warmed(
+            past.HistoryRow(time, found.look, counts, found.matches, warm, found.note), self._warmth,
             self._rows[-1].look.kelvin if self._rows else None,
         )  # fmt: skip
         self._sides = found.sides[0].reference, found.sides[1].reference
@@ -523,14 +513,14 @@ class Watcher:
         finally:
             self._ledger.close()
 
-    def _write(self, row: HistoryRow) -> Noticed:
+    def _write(self, row: past.HistoryRow) -> Noticed:
         whole = self.watched.drift_at(row.time)
         steady = self.watched.drift_at(row.time, gusts=False)
         sigma = steady.relative_covariance.diagonal().sqrt()
         told = whole.relative, whole.relative_covariance.diagonal().sqrt()
-        text = history_line(row, self.rig.fingerprint, told)
+        text = past.history_line(row, self.rig.fingerprint, told)
         if not self._ledger.place.sequence:
-            text = history_head() + text
+            text = past.history_head() + text
         self._ledger.append([text.encode()], row.time, round(1e6 * row.time) + 1)
         self.looks += 1
         alarm = bool(exceeded(steady.relative, sigma, self.limit_deg, self.every_s).any)
