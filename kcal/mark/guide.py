@@ -25,7 +25,7 @@ from kcal.lens.projection import FAR, project_components
 from kcal.lens.rig import StereoRig
 from kcal.locate.marks import Marks, read_marks
 from kcal.mark.items import Side
-from kcal.mark.shapes import snap
+from kcal.mark.shapes import snap, three_of
 
 # Help with the second mark: the epipolar curve with its band, and the match on it with covariance or a refusal.
 
@@ -186,10 +186,8 @@ def propose(
         again = match_points(return_way, second, first, found.pixels, options)
     except InputError as error:
         return Proposal(str(error))
-    covariance = found.covariance[0]
-    at_u, at_v = found.pixels[0].tolist()
-    cov = (float(covariance[0, 0]), float(covariance[0, 1]), float(covariance[1, 1]))
-    proposal = Proposal("", at_u, at_v, cov, float(found.score[0]), float(found.off_line[0]))
+    covariance, (at_u, at_v) = found.covariance[0], found.pixels[0].tolist()
+    proposal = Proposal("", at_u, at_v, three_of(covariance), float(found.score[0]), float(found.off_line[0]))
     if int(again.status[0]) != MatchStatus.GOOD:
         status = MatchStatus(int(again.status[0]))
         return proposal._replace(refusal=f"{_REFUSALS[status]} (on the way back)")
@@ -419,7 +417,5 @@ class Reference:
         score = float(found.score[0])
         if status != MatchStatus.GOOD:
             return Proposal(_NOT_FOUND[status], score=score)
-        covariance = found.covariance[0]
-        cov = (float(covariance[0, 0]), float(covariance[0, 1]), float(covariance[1, 1]))
         u, v = found.pixels[0].tolist()
-        return Proposal("", u, v, cov, score, math.nan)
+        return Proposal("", u, v, three_of(found.covariance[0]), score)

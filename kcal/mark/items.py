@@ -196,35 +196,29 @@ def applied(state: MarkingState, action: Change) -> MarkingState:
         items = {name: item for name, item in items.items() if item.kind not in action.kinds}
         for name, (kind, left, right) in action.items.items():
             items[name] = Item(kind=kind, left=left, right=right)
-        return MarkingState(items=items, survey=survey)
-    if isinstance(action, Places):
-        for name, place in action.places.items():
-            survey[name] = place
+    elif isinstance(action, Places | SurveyPlace):
+        places = action.places if isinstance(action, Places) else {action.name: action.place}
+        survey |= places
+        for name in places:
             items.setdefault(name, Item(kind="landmark"))
-        return MarkingState(items=items, survey=survey)
-    if isinstance(action, SurveyPlace):
-        survey[action.name] = action.place
-        items.setdefault(action.name, Item(kind="landmark"))
-        return MarkingState(items=items, survey=survey)
-    if isinstance(action, Add):
+    elif isinstance(action, Add):
         if action.name in items:
             raise InputError(f"the name {action.name!r} is used already; names must differ")
         if not action.name.isprintable():
             raise InputError("a name is one line of printable characters")
-        return MarkingState(items={**items, action.name: Item(kind=action.kind)}, survey=survey)
-    if action.name not in items:
+        items[action.name] = Item(kind=action.kind)
+    elif action.name not in items:
         raise InputError(f"nothing is named {action.name!r}")
-    item = items[action.name]
-    if isinstance(action, Put):
-        items[action.name] = _with_mark(action, item)
+    elif isinstance(action, Put):
+        items[action.name] = _with_mark(action, items[action.name])
     elif isinstance(action, Take):
-        items[action.name] = _item_with(_unmatched(item), action.side, None)
+        items[action.name] = _item_with(_unmatched(items[action.name]), action.side, None)
     elif isinstance(action, Drop):
         del items[action.name]
     else:
         if action.to != action.name and action.to in items:
             raise InputError(f"the name {action.to!r} is used already; names must differ")
-        renamed = dataclasses.replace(item, kind=action.kind)
+        renamed = dataclasses.replace(items[action.name], kind=action.kind)
         items = {action.to if name == action.name else name: value for name, value in items.items()}
         items[action.to] = renamed
         if action.name in survey:

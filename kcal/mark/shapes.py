@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cholesky, solve_triangular
 from scipy.spatial.distance import cdist
 from scipy.special import ndtr
+from torch import Tensor
 
 from kcal.corners.images import Gray
 from kcal.corners.point import refine_point
@@ -50,14 +51,12 @@ class ShapeModel(NamedTuple):
 
 def _across(where: Floats, point: Floats, angle: float) -> Floats:
     """Signed distance (N,) from the line through a point whose normal has an angle."""
-    result: Floats = (where - point) @ np.array([math.cos(angle), math.sin(angle)])
-    return result
+    return (where - point) @ np.array([math.cos(angle), math.sin(angle)])
 
 
 def _bar(distance: Floats, width: float, blur: float) -> Floats:
     """Profile of a blurred bar, 1 in its middle if it is wide."""
-    result: Floats = ndtr((distance + width / 2) / blur) - ndtr((distance - width / 2) / blur)
-    return result
+    return ndtr((distance + width / 2) / blur) - ndtr((distance - width / 2) / blur)
 
 
 def _both_positive(h: Floats, k: Floats, correlation: float) -> Floats:
@@ -212,8 +211,7 @@ def _whitened_residual(
         design, target = columns[:, :-1], columns[:, -1]
         normal = design.T @ design
         normal[np.diag_indices_from(normal)] *= 1 + 1e-10  # patterns may be equal far from the point
-        result: Floats = target - design @ np.linalg.solve(normal + 1e-12 * np.eye(len(normal)), design.T @ target)
-        return result
+        return target - design @ np.linalg.solve(normal + 1e-12 * np.eye(len(normal)), design.T @ target)
 
     return residual
 
@@ -333,8 +331,7 @@ def fit_before_texture(shape: ShapeModel, fit: ShapeFit, where: Floats, levels: 
     strengths = np.linalg.lstsq(design, levels, rcond=None)[0]
 
     def modeled(p: Floats) -> Floats:
-        result: Floats = design_of(shape, where, p) @ strengths
-        return result
+        return design_of(shape, where, p) @ strengths
 
     left_over = levels - design @ strengths
     unknowns = np.concatenate([design, slopes(modeled, fit.parameters, modeled(fit.parameters))], 1)
@@ -342,8 +339,7 @@ def fit_before_texture(shape: ShapeModel, fit: ShapeFit, where: Floats, levels: 
     half = cholesky(found.strength * np.exp(-cdist(where, where) / found.length) + np.eye(len(where)), lower=True)
 
     def whiten(columns: Floats) -> Floats:
-        result: Floats = solve_triangular(half, columns, lower=True, check_finite=False)
-        return result
+        return solve_triangular(half, columns, lower=True, check_finite=False)
 
     again = improve(shape, fit.parameters, where, levels, np.ones(len(where)), whiten)
     return (
@@ -462,7 +458,7 @@ def snap(image: Gray, u: float, v: float) -> Snapped:
     best = _best_shape(levels, np.array([u - column, v - row]))
     if best is not None:
         cov = best.covariance + _MODEL_SIGMA**2 * np.eye(2)
-        return Snapped(column + float(best.point[0]), row + float(best.point[1]), _three(cov), best.shape)
+        return Snapped(column + float(best.point[0]), row + float(best.point[1]), three_of(cov), best.shape)
     return _by_edges(image, u, v)
 
 
@@ -518,8 +514,9 @@ def _by_edges(image: Gray, u: float, v: float) -> Snapped:
     covariance = found.covariance.numpy() + _MODEL_SIGMA**2 * np.eye(2)
     if math.sqrt(float(np.linalg.eigvalsh(covariance)[-1])) > _LARGEST_SIGMA:
         raise InputError("nothing here determines a point: no corner, cross, blob or end; mark it by hand")
-    return Snapped(left + float(found.pixel[0]), top + float(found.pixel[1]), _three(covariance), "edges")
+    return Snapped(left + float(found.pixel[0]), top + float(found.pixel[1]), three_of(covariance), "edges")
 
 
-def _three(covariance: Floats) -> tuple[float, float, float]:
+def three_of(covariance: Floats | Tensor) -> tuple[float, float, float]:
+    """Variance of u, covariance and variance of v, of a covariance (2, 2)."""
     return float(covariance[0, 0]), float(covariance[0, 1]), float(covariance[1, 1])

@@ -8,6 +8,8 @@ the ranges where they do.
 
 from __future__ import annotations
 
+import functools
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -224,6 +226,7 @@ class _FittedGroups(NamedTuple):
         return _FittedGroups(self.marks[which], self.point[which], self.normal[which], self.squared[which])
 
 
+@dataclass(frozen=True, eq=False)
 class Confirming:
     """Lines of sight in trees, one for each camera.
 
@@ -238,21 +241,19 @@ class Confirming:
         nearest: see `meetings`.
     """
 
-    def __init__(
-        self,
-        lines: StationSights,
-        kind: Ints,
-        axis: Floats,
-        inner: Floats,
-        there: list[int],
-        gate: float,
-        near: float,
-        nearest: float,
-    ) -> None:
-        self.lines, self.axis, self.inner, self.there = lines, axis, inner, there
-        self.kind, self.gate, self.near, self.nearest = kind, gate, near, nearest
-        # A fourth axis keeps kinds apart.
-        self.place = np.column_stack([lines.ray, _ELSEWHERE * kind])
+    lines: StationSights
+    kind: Ints
+    axis: Floats
+    inner: Floats
+    there: list[int]
+    gate: float
+    near: float
+    nearest: float
+
+    @functools.cached_property
+    def place(self) -> Floats:
+        """(N, 4) where lines of sight are in the trees: a fourth axis keeps kinds apart."""
+        return np.column_stack([self.lines.ray, _ELSEWHERE * self.kind])
 
     def found(self, pair: tuple[int, int], misses: int, free: NDArray[np.bool_]) -> Ints:
         """(K, V) marks of groups that two cameras see, and all others but so many that have them in their images.
@@ -447,8 +448,7 @@ class Confirming:
 
 def _sideways(ray: Floats) -> Floats:
     """(..., 3, 3) what of a vector lies across unit vectors (..., 3)."""
-    result: Floats = np.eye(3) - ray[..., :, None] * ray[..., None, :]
-    return result
+    return np.eye(3) - ray[..., :, None] * ray[..., None, :]
 
 
 def separate_pairs(center: Floats, axis: Floats, there: list[int]) -> list[tuple[int, int]]:

@@ -48,10 +48,11 @@ class _Edges(NamedTuple):
 
 
 class _Group(NamedTuple):
-    """Numbers of detections, -1 for cameras that have none, and what the group saves beside staying alone."""
+    """Numbers of detections, -1 for cameras that have none, what the group saves beside staying alone, and doubts."""
 
     marks: tuple[int, ...]
     saved: float
+    doubt: bool = False
 
 
 def group_objects(
@@ -103,11 +104,14 @@ def group_objects(
     with torch.no_grad():
         here = localize if rig.center.device.type == "cpu" else copy.deepcopy(localize).cpu()
         scene = _Scene(here, [None if each is None else each.to("cpu") for each in seen], options)
-        groups, ambiguous = scene.chosen()
-    taken = {mark for group, doubt in zip(groups, ambiguous, strict=True) if not doubt for mark in group}
+        found = scene.chosen()
+    taken = {mark for one in found if not one.doubt for mark in one.marks}
     alone = [mark for mark in range(len(scene.camera)) if mark not in taken]
     count = len(rig)
-    rows = [*groups, *(tuple(mark if c == scene.camera[mark] else -1 for c in range(count)) for mark in alone)]
+    rows = [
+        *(one.marks for one in found),
+        *(tuple(mark if c == scene.camera[mark] else -1 for c in range(count)) for mark in alone),
+    ]
     marks = [each.anchors(options.anchor) for each in seen if each is not None]
     every = torch.cat(marks) if marks else scene.pixels
     place = every.device
@@ -127,7 +131,7 @@ def group_objects(
         time=time.expand(len(rows), count),
         score=torch.where(there, score[numbers.clamp_min(0)], torch.inf).amin(-1) if rows else score[:0],
         category=tuple(scene.category[mark] for mark in firsts),
-        ambiguous=torch.tensor([*ambiguous, *[False] * len(alone)], dtype=torch.bool, device=place),
+        ambiguous=torch.tensor([*(one.doubt for one in found), *[False] * len(alone)], dtype=torch.bool, device=place),
     )
 
 
@@ -151,22 +155,20 @@ class _Scene:
         self.own = [np.flatnonzero(self.camera == c) for c in range(len(localize.rig))]
         self.lines = self._lines()
 
-    def chosen(self) -> tuple[list[tuple[int, ...]], list[bool]]:
-        """Groups of two views and more, each detection once, and which are ambiguous."""
-        groups, doubts, free = self._clear()
+    def chosen(self) -> list[_Group]:
+        """Groups of two views and more, each detection once."""
+        groups, free = self._clear()
         self.own = [own[free[own]] for own in self.own]
-        more, more_doubts = self._remaining()
-        return groups + more, doubts + more_doubts
+        return groups + self._remaining()
 
-    def _clear(self) -> tuple[list[tuple[int, ...]], list[bool], NDArray[np.bool_]]:
-        """Groups that most cameras see, which are ambiguous, and which marks are of none of these things."""
+    def _clear(self) -> tuple[list[_Group], NDArray[np.bool_]]:
+        """Groups that most cameras see, and which marks are of none of these things."""
         posed, options = self.posed, self.options
         there = [c for c, own in enumerate(self.own) if len(own)]
-        groups: list[tuple[int, ...]] = []
-        doubts: list[bool] = []
+        groups: list[_Group] = []
         free = np.ones(len(self.camera), dtype=bool)
         if len(there) < FEWEST_VIEWS:
-            return groups, doubts, free
+            return groups, free
         cameras = range(len(self.own))
         axis, inner = (np.stack(value) for value in zip(*(self._middle(c) for c in cameras), strict=True))
         near = 2.0 * math.log(options.odds)
@@ -183,7 +185,7 @@ class _Scene:
                 left[found[-1][found[-1] >= 0]] = False
         all_found = np.concatenate(found)
         if not len(all_found):
-            return groups, doubts, free
+            return groups, free
         settled = confirming.settled(all_found, every)
         # Without the marks that could as well be of another thing, if views enough are left.
         sure = np.where(settled.rival, -1, settled.marks)
@@ -192,10 +194,9 @@ class _Scene:
         number = {mark: i for i, row in enumerate(rows.tolist()) for mark in row}
         for group in self._fitted([tuple(row) for row in rows.tolist()]):
             which = number[max(group.marks)]
-            groups.append(group.marks)
-            doubts.append(bool(doubtful[which]))
+            groups.append(group._replace(doubt=bool(doubtful[which])))
             free[settled.marks[which][settled.marks[which] >= 0]] = False
-        return groups, doubts, free
+        return groups, free
 
     def _middle(self, c: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Where a camera looks, and the cosine of the widest cone about it that is inside its image."""
@@ -240,7 +241,7 @@ class _Scene:
             float(posed.bending),
         )
 
-    def _remaining(self) -> tuple[list[tuple[int, ...]], list[bool]]:
+    def _remaining(self) -> list[_Group]:
         """Groups of what no clear group has."""
         cameras, edges = range(len(self.own)), self._edges()
         candidates = self._fitted(_with_one_range(edges, self.camera, len(self.own), self.options.gate))
@@ -249,8 +250,7 @@ class _Scene:
         for group in candidates:
             for mark in group.marks:
                 by_mark.setdefault(mark, []).append(group)
-        groups: list[tuple[int, ...]] = []
-        doubts: list[bool] = []
+        groups: list[_Group] = []
         used: set[int] = set()
         for group in sorted(candidates, key=lambda group: -group.saved):
             marks = {mark for mark in group.marks if mark >= 0}
@@ -258,8 +258,7 @@ class _Scene:
                 continue
             used |= marks
             rivals = (other for mark in marks for other in by_mark[mark] if not {*other.marks} <= {*group.marks, -1})
-            groups.append(group.marks)
-            doubts.append(any(group.saved - other.saved < near for other in rivals))
+            groups.append(group._replace(doubt=any(group.saved - other.saved < near for other in rivals)))
         alone = self.options.gate**2
         left = np.ones(len(self.camera), dtype=bool)
         left[list(used)] = False
@@ -273,10 +272,10 @@ class _Scene:
             best, rival = assign_groups(cost, alone, near)
             for one in np.flatnonzero(best >= 0):
                 pair = {i: int(rows[one]), j: int(columns[best[one]])}
-                groups.append(tuple(pair.get(c, -1) for c in cameras))
-                doubts.append(bool(rival[one]))
+                saved = alone - float(cost[one, best[one]])
+                groups.append(_Group(tuple(pair.get(c, -1) for c in cameras), saved, bool(rival[one])))
                 left[list(pair.values())] = False
-        return groups, doubts
+        return groups
 
     def _edges(self) -> _Edges:
         """Possible pairs of all cameras."""

@@ -347,7 +347,6 @@ def track_columns(tracks: Tracks, sequence: int, stations: CameraRig | None = No
         state = state._replace(bearing=(own_axes(stations).cpu()[state.anchor] @ state.bearing[..., None])[..., 0])
     shared = {name: value for name, value in state._asdict().items() if name in Localization._fields}
     numbers = number_table(Localization(**shared, reprojection=torch.zeros(count, 2)))
-    velocity = [_texts(state.velocity[:, i], ok) for i in range(3)]
     sigma = state.velocity_covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
     extras = {
         "sequence": [str(sequence)] * count,
@@ -355,13 +354,10 @@ def track_columns(tracks: Tracks, sequence: int, stations: CameraRig | None = No
         "category": list(tracks.category),
         "hits": [str(hits) for hits in tracks.hits.tolist()],
         "unseen_s": [f"{seconds:.3f}" for seconds in tracks.unseen_s.tolist()],
-        "velocity_east_mps": velocity[0],
-        "velocity_north_mps": velocity[1],
-        "velocity_up_mps": velocity[2],
-        "velocity_east_sigma_mps": _texts(sigma[:, 0], ok),
-        "velocity_north_sigma_mps": _texts(sigma[:, 1], ok),
-        "velocity_up_sigma_mps": _texts(sigma[:, 2], ok),
     }
+    for part, values in (("", state.velocity), ("_sigma", sigma)):
+        for axis, along in zip(("east", "north", "up"), values.T, strict=True):
+            extras[f"velocity_{axis}{part}_mps"] = _texts(along, ok)
     if stations is not None:
         extras["told_from"] = [stations.names[camera] for camera in state.anchor.tolist()]
         extras["cameras"] = [

@@ -45,8 +45,7 @@ def rough_rig(cameras: tuple[Camera, Camera], points: tuple[Keypoints, Keypoints
     Raises:
         InputError: the images have too little in common.
     """
-    everything = torch.ones(len(points[0].pixels), dtype=torch.bool)
-    pairs = _both_ways(points, [everything], [torch.ones(len(points[1].pixels), dtype=torch.bool)], None, _FREE_RATIO)
+    pairs = _both_ways(points, None, _FREE_RATIO)
     sides = zip(cameras, points, strict=True)
     rays = [camera.unproject(own.pixels[pairs[:, k]]) for k, (camera, own) in enumerate(sides)]
     good = rays[0][1] & rays[1][1] & (rays[0][0][:, 2] > 0.1) & (rays[1][0][:, 2] > 0.1)
@@ -91,47 +90,45 @@ class _Epipolar:
 
 def guided_matches(rig: StereoRig, points: tuple[Keypoints, Keypoints]) -> Tensor:
     """(M, 2) indices of keypoints that are each other's best along the epipolar line, at a positive distance."""
-    sides = [_Epipolar(rig, side, own.pixels) for side, own in enumerate(points)]
-    band = BAND / float(rig.left.focal[0].detach())
-    return _both_ways(points, [sides[0].turn, sides[0].along, sides[0].valid],
-                      [sides[1].turn, sides[1].along, sides[1].valid], band, _GUIDED_RATIO)  # fmt: skip
+    left, right = (_Epipolar(rig, side, own.pixels) for side, own in enumerate(points))
+    return _both_ways(points, (left, right, BAND / float(rig.left.focal[0].detach())), _GUIDED_RATIO)
 
 
 def _both_ways(
-    points: tuple[Keypoints, Keypoints], left: list[Tensor], right: list[Tensor], band: float | None, ratio: float
+    points: tuple[Keypoints, Keypoints], near: tuple[_Epipolar, _Epipolar, float] | None, ratio: float
 ) -> Tensor:
     """(M, 2) mutual best matches that are clearly better than the second best.
 
     Args:
         points: keypoints of both images.
-        left: turn, along and valid of the left ones (see `_Epipolar`); anything without a band.
-        right: of the right ones.
-        band: radians that turns may differ by; None: every keypoint is compared with every other.
+        near: the left and the right ones, and radians that turns may differ by; None: every keypoint is compared with
+            every other.
         ratio: the second best must be farther than the best over this.
     """
     first, second = (own.descriptors for own in points)
-    orders = [torch.arange(len(own)) if band is None else side[0].argsort() for own, side in
-              zip((first, second), (left, right), strict=True)]  # fmt: skip
+    orders = [torch.arange(len(own)) for own in (first, second)] if near is None else [
+        side.turn.argsort() for side in near[:2]
+    ]  # fmt: skip
     best = [torch.full((len(own),), -1, dtype=torch.long) for own in (first, second)]
     column_score = torch.full((len(second),), -math.inf)
     clear = torch.zeros(len(first), dtype=torch.bool)
     if not len(first) or not len(second):
         return torch.zeros(0, 2, dtype=torch.long)
-    turns = None if band is None else right[0][orders[1]].contiguous()
     for rows in orders[0].split(_AT_ONCE):
         columns = orders[1]
-        if band is not None and turns is not None:
-            ends = torch.stack([left[0][rows[0]] - band, left[0][rows[-1]] + band])
-            low, high = torch.searchsorted(turns, ends).tolist()
-            columns = orders[1][low:high]
+        if near is not None:
+            left, right, band = near
+            ends = torch.stack([left.turn[rows[0]] - band, left.turn[rows[-1]] + band])
+            low, high = torch.searchsorted(right.turn[columns].contiguous(), ends).tolist()
+            columns = columns[low:high]
         if not len(columns):
             continue
         score = first[rows] @ second[columns].T
-        if band is not None:
-            apart = (left[0][rows, None] - right[0][columns]).abs()
-            parallax = right[1][columns] - left[1][rows, None]
-            near = (apart < band) & (parallax > -band) & (parallax < 1.0 / _NEAREST)
-            score = torch.where(near & left[2][rows, None] & right[2][columns], score, -1.0)
+        if near is not None:
+            apart = (left.turn[rows, None] - right.turn[columns]).abs()
+            parallax = right.along[columns] - left.along[rows, None]
+            close = (apart < band) & (parallax > -band) & (parallax < 1.0 / _NEAREST)
+            score = torch.where(close & left.valid[rows, None] & right.valid[columns], score, -1.0)
         top = score.topk(min(2, score.shape[1]), dim=1)
         distance = (2.0 - 2.0 * top.values).clamp_min(0.0).sqrt()
         other = distance[:, 1] if distance.shape[1] > 1 else torch.full_like(distance[:, 0], _NO_SECOND)

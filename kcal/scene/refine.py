@@ -122,8 +122,7 @@ def _warps(left: Tensor, right: Tensor, shear: Tensor) -> Tensor:
     """(N, 2, 2) pixels of the right image by those of the left, from both by steps of a patch and its shear (N, 2)."""
     stretched = torch.eye(2, dtype=torch.float64).repeat(len(shear), 1, 1)
     stretched[:, 0] += shear
-    warp: Tensor = right @ stretched @ torch.linalg.inv(left)
-    return warp
+    return right @ stretched @ torch.linalg.inv(left)
 
 
 def _patch(

@@ -54,8 +54,7 @@ def _one_octave(x: Floats, y: Floats) -> NDArray[np.float32]:
     upper += u * (lattice[top + right] - upper)
     lower = lattice[bottom + left]
     lower += u * (lattice[bottom + right] - lower)
-    mixed: NDArray[np.float32] = upper + v * (lower - upper)
-    return mixed
+    return upper + v * (lower - upper)
 
 
 # Paint flat convex pieces of a scene through a true lens: walls, roofs, poles, hulls, the ground.
@@ -110,8 +109,7 @@ class Facet:
         if self.top is not None:
             along = np.linspace(outline[:, 0].min(), outline[:, 0].max(), 33)
             outline = np.concatenate([outline, np.stack([along, self.top(along)], -1)])
-        at: Floats = self.origin + outline[:, :1] * self.along + outline[:, 1:] * self.up
-        return at
+        return self.origin + outline[:, :1] * self.along + outline[:, 1:] * self.up
 
     @functools.cached_property
     def distance(self) -> float:
@@ -140,8 +138,7 @@ class Eye(NamedTuple):
 
     def to_camera(self, points: Floats) -> Floats:
         """Points (..., 3) of the scene in the camera's frame."""
-        moved: Floats = (points - self.center) @ self.rotation.T
-        return moved
+        return (points - self.center) @ self.rotation.T
 
     def project(self, points: Floats) -> tuple[Floats, NDArray[np.bool_]]:
         """Pixels (N, 2) of points (N, 3) of the scene, and whether the lens sees them."""
@@ -210,8 +207,7 @@ class Haze(NamedTuple):
     def seen(self, color: Floats, distance: Floats) -> Floats:
         """Colors (..., 3) of things at distances (...,) in meters."""
         clear = np.exp(-np.maximum(distance, 0.0) / self.length)[..., None]
-        air: Floats = np.array(self.color) + clear * (color - np.array(self.color))
-        return air
+        return np.array(self.color) + clear * (color - np.array(self.color))
 
 
 class Cut(NamedTuple):
@@ -325,8 +321,7 @@ def _windows(facet: Facet, at: Cut) -> Floats:
 def _glass_before(t: Floats) -> Floats:
     """Length of glass up to a position in periods: the middle half of each."""
     whole = np.floor(t)
-    before: Floats = 0.5 * whole + np.clip(t - whole - 0.25, 0.0, 0.5)
-    return before
+    return 0.5 * whole + np.clip(t - whole - 0.25, 0.0, 0.5)
 
 
 # Things on a coast, made of flat pieces: panels, poles, buildings, ridges, ships.
@@ -431,8 +426,7 @@ def ridge(
     def top(along: Floats) -> Floats:
         share = 0.5 + 0.5 * along / half
         detail = smooth_noise(along / (6.0 * grain) + seed, np.full_like(along, seed), 4)
-        edge: Floats = np.interp(share, shares, levels) + rough * detail
-        return edge
+        return np.interp(share, shares, levels) + rough * detail
 
     high = max(levels) + 2 * rough + 1.0
     return facing(place, box_outline((-half, foot, half, high)), color, texture=texture, grain=grain, top=top)
@@ -577,8 +571,7 @@ def _sky(heading: Floats, coast: Coast) -> Floats:
     few = heading[::_FEW, ::_FEW] / steep[::_FEW, ::_FEW, None]
     cloud = _joined_values(smooth_noise(0.55 * few[..., 0], 0.8 * few[..., 1], 5), up.shape)
     cover = np.clip(1.6 * cloud + 0.1, 0.0, 1.0) * np.clip((heading[..., 2] - 0.03) / 0.1, 0.0, 1.0)
-    mixed: Floats = color + 0.75 * cover[..., None] * (np.array([238.0, 240.0, 242.0]) - color)
-    return mixed
+    return color + 0.75 * cover[..., None] * (np.array([238.0, 240.0, 242.0]) - color)
 
 
 def _joined_values(values: Floats, shape: tuple[int, ...]) -> Floats:
@@ -616,11 +609,9 @@ def exposed(light: Floats, blur: float, noise: float, random: np.random.Generato
     seen = gaussian_filter(light, sigma) if blur else light
     if noise:
         seen = seen + noise * random.standard_normal(light.shape, dtype=np.float32)
-    levels: NDArray[np.uint8] = np.clip(np.rint(seen), 0, 255).astype(np.uint8)
-    return levels
+    return np.clip(np.rint(seen), 0, 255).astype(np.uint8)
 
 
 def rotation_of(matrix: torch.Tensor) -> Floats:
     """A rotation as NumPy's floats."""
-    found: Floats = matrix.detach().numpy().astype(np.float64)
-    return found
+    return matrix.detach().numpy().astype(np.float64)

@@ -519,11 +519,9 @@ def _joined(
 def _world_from_eye(origin: Origin, eye: Origin) -> Floats:
     """(3, 3) from east, north, up of an eye to those of the rig's origin."""
     world, own = (ecef_from_enu_rotation(place.lat, place.lon).numpy() for place in (origin, eye))
-    found: Floats = world.T @ own
-    return found
+    return world.T @ own
 
 
 def _vector(rotation: Floats) -> Floats:
     """Rotation vector of a small rotation."""
-    found: Floats = vector_from_rotation(torch.from_numpy(np.ascontiguousarray(rotation))).numpy()
-    return found
+    return vector_from_rotation(torch.from_numpy(np.ascontiguousarray(rotation))).numpy()

@@ -167,8 +167,7 @@ def column_sigma(seen: Comparison, errors: SkylineErrors) -> Floats:
     """(N,) px, of each column alone: noise of the image, errors of the raster and of the camera's place."""
     height = seen.by_height() * np.hypot(errors.raster.sigma, errors.raster.offset)
     place = np.linalg.norm(seen.by_shift * errors.place, axis=1)
-    found: Floats = np.sqrt(np.square(seen.sigma) + np.square(height) + np.square(place))
-    return found
+    return np.sqrt(np.square(seen.sigma) + np.square(height) + np.square(place))
 
 
 def column_cost(seen: Comparison, errors: SkylineErrors, columns: Columns) -> float:
@@ -183,8 +182,7 @@ def column_cost(seen: Comparison, errors: SkylineErrors, columns: Columns) -> fl
 
 def rotation_by(vector: Floats) -> Floats:
     """(3, 3) by a rotation vector (3,)."""
-    found: Floats = rotation_from_vector(torch.from_numpy(vector)).numpy()
-    return found
+    return rotation_from_vector(torch.from_numpy(vector)).numpy()
 
 
 # Fit a camera's rotation to a skyline by generalized least squares, and say where its variance comes from.
@@ -236,8 +234,7 @@ def lens_errors(camera: Camera) -> Floats:
     if known is None:
         return np.zeros((camera.params.shape[-1], 0))
     unknowns, _ = joint_unknowns((camera,), gathered((camera,), (known,), None)[0], None)
-    found: Floats = unknowns.cameras[0][:, unknowns.known].numpy()
-    return found
+    return unknowns.cameras[0][:, unknowns.known].numpy()
 
 
 def terrain_covariances(seen: Comparison, raster: RasterError, radius: float) -> dict[str, Floats]:
@@ -334,8 +331,7 @@ def _columns_that_agree(seen: Comparison, errors: SkylineErrors, most_below: flo
     ratio = seen.residual / column_sigma(seen, errors)
     wrong = ~seen.known | (ratio > _ABOVE) | (ratio < -most_below)
     near = np.convolve(wrong, np.ones(2 * _BESIDE + 1), mode="same") > 0
-    found: Bools = ~near
-    return found
+    return ~near
 
 
 def _in_bins(columns: Columns, seen: Comparison, used: Bools, width: int) -> Comparison:
@@ -348,8 +344,7 @@ def _in_bins(columns: Columns, seen: Comparison, used: Bools, width: int) -> Com
         some = values[used].astype(np.float64)
         total = np.zeros((len(names), *some.shape[1:]))
         np.add.at(total, index, some)
-        found: Floats = total / count.reshape(-1, *[1] * (some.ndim - 1))
-        return found
+        return total / count.reshape(-1, *[1] * (some.ndim - 1))
 
     parts = {field.name: mean(getattr(seen, field.name)) for field in dataclasses.fields(seen)}
     square = mean(np.square(seen.sigma)) * np.minimum(_ALIKE / count, 1.0)

@@ -119,8 +119,7 @@ def _noise(light: Floats) -> Floats:
 def _row_steps(light: Floats) -> Floats:
     """(H, W) gray levels by which the rows above a row differ from those from there on."""
     smooth = uniform_filter1d(light, _ACROSS, axis=1, mode="nearest")
-    found: Floats = convolve1d(smooth, np.repeat([1.0, -1.0], _BOX) / _BOX, axis=0, mode="nearest")
-    return found
+    return convolve1d(smooth, np.repeat([1.0, -1.0], _BOX) / _BOX, axis=0, mode="nearest")
 
 
 def _strength(step: Floats, noise: Floats, least: float) -> Floats:
@@ -294,8 +293,7 @@ class RasterError:
         level = points[:, :2]
         apart = np.hypot(*(level[:, None] - level).transpose(2, 0, 1))
         own = np.hypot(np.broadcast_to(self.sigma, len(points)), blunted)
-        found: Floats = own[:, None] * own * np.exp(-apart / self.correlation) + self.offset**2
-        return found
+        return own[:, None] * own * np.exp(-apart / self.correlation) + self.offset**2
 
     def alike(self, distance: Floats, spacing: Floats) -> Floats:
         """(M,) how many columns share one error of the raster: columns `spacing` radians apart that see `distance`."""
@@ -486,8 +484,7 @@ def _chebyshev_weights(nodes: Floats, at: Floats) -> Floats:
     factor = (-1.0) ** np.arange(count) * np.sin(math.pi * (np.arange(count) + 0.5) / count)
     off = at[..., None, :] - nodes[:, None]
     part = factor[:, None] / np.where(off == 0.0, 1e-9, off)
-    found: Floats = part / part.sum(-2, keepdims=True)
-    return found
+    return part / part.sum(-2, keepdims=True)
 
 
 def _highest(rays: TerrainRays, azimuth: Floats, distance: Floats) -> tuple[Floats, Floats, Floats, Bools, Floats]:
@@ -576,13 +573,11 @@ class Comparison:
 
     def by_height(self) -> Floats:
         """(N,) by the raster's height there, px/m."""
-        found: Floats = self.by_elevation * np.square(np.cos(self.elevation)) / self.distance
-        return found
+        return self.by_elevation * np.square(np.cos(self.elevation)) / self.distance
 
     def by_refraction(self, radius: float) -> Floats:
         """(N,) by the coefficient of refraction, px, over the Earth's radius in meters."""
-        found: Floats = self.by_elevation * self.distance / (2.0 * radius)
-        return found
+        return self.by_elevation * self.distance / (2.0 * radius)
 
 
 def compare(columns: Columns, horizon: Horizon, rotation: Floats, camera: Camera, *, lens: bool = False) -> Comparison:
@@ -623,8 +618,7 @@ def compare(columns: Columns, horizon: Horizon, rotation: Floats, camera: Camera
     by_toward = np.einsum("jk,jun->kun", _FAR * rotation, seen.by_point.numpy())
 
     def moved(direction: Floats) -> Floats:
-        found: Floats = np.einsum("kun,kn->un", by_toward, direction)
-        return found
+        return np.einsum("kun,kn->un", by_toward, direction)
 
     # Across the skyline as the camera sees it, and upwards.
     along, higher = moved(by_azimuth + slope * by_elevation), moved(by_elevation)
@@ -632,8 +626,7 @@ def compare(columns: Columns, horizon: Horizon, rotation: Floats, camera: Camera
     across = across * np.where((across * higher).sum(0) < 0.0, -1.0, 1.0)
 
     def of(motion: Floats) -> Floats:
-        found: Floats = -np.einsum("...un,un->n...", motion, across)
-        return found
+        return -np.einsum("...un,un->n...", motion, across)
 
     # A column's border has its error along the column.
     distance = np.where(known, horizon.distance[near], 1.0)

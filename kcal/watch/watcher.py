@@ -16,7 +16,6 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 import kcal.watch.history as past
@@ -168,16 +167,12 @@ def model_of(rows: Sequence[past.HistoryRow]) -> past.TurnModel:
     own = torch.stack([look.covariance.diagonal() for look in looks])
     share = torch.stack([look.lasting for look in looks])[:, None]
 
-    def array(values: Tensor) -> NDArray[np.float64]:
-        found: NDArray[np.float64] = values.numpy()
-        return found
-
     return past.learned(past.AngleSeries(
         time=np.array([row.time for row in rows]),
-        angle=array(torch.where(seen, torch.stack([look.turn for look in looks]), math.nan)),
-        variance=array((1.0 - share) * own),
-        lasting=array(share * own),
-        kelvin=array(torch.stack([look.kelvin for look in looks])[:, None].expand(-1, 6)),
+        angle=torch.where(seen, torch.stack([look.turn for look in looks]), math.nan).numpy(),
+        variance=((1.0 - share) * own).numpy(),
+        lasting=(share * own).numpy(),
+        kelvin=torch.stack([look.kelvin for look in looks])[:, None].expand(-1, 6).numpy(),
     ))  # fmt: skip
 
 
