@@ -113,7 +113,7 @@ def test_the_focal_length_of_a_simulated_capture() -> None:
     assert 0.3 < sum(pull * pull for pull in pulls) < 22.5
 
 
-@pytest.mark.parametrize(("spread", "refused"), [(2.0, True), (20.0, False)])
+@pytest.mark.parametrize(("spread", "refused"), [(2.0, True), (5.5, False), (20.0, False)])
 def test_the_spread_of_tilts_counts_not_the_tilt(spread: float, refused: bool) -> None:
     """All boards by 25 degrees, and by little or much more or less."""
     draw = torch.Generator().manual_seed(1)
