@@ -182,8 +182,8 @@ def _emptiest(seen: Tensor) -> str:
 
 # Directions less certain than this are no calibration: 5 % of range at every distance.
 _MOST = 0.05
-# Degrees of one direction within which all boards are alike: halves of 49 views within 5.1 gave 999 ± 31 and 589 ± 14 px,
-# and halves of 25 views within 7.2 agree within their error bars.
+# Degrees of one direction within which all boards are alike: halves of 49 views within 5.1 gave 999 ± 31 and
+# 589 ± 14 px; those of 25 views within 7.2 agree within their error bars.
 _ALIKE = 6.0
 # Corners that stand for all: more change nothing.
 _CORNERS = 400
