@@ -139,11 +139,12 @@ def hybrid_result(observations: Observations, fit: HybridFit, options: Calibrati
     )
     status = SolverStatus.CONVERGED if fit.converged else SolverStatus.ITERATION_LIMIT
     used = [i for i, rms in enumerate(per_view.tolist()) if not math.isnan(rms)]
+    stated = observations.covariances()
     result = CameraCalibrationResult(
         camera=camera,
         observations=observations,
         rms=fit.rms,
-        weighted_rms=fit.weighted_rms if options.weighted and observations.covariances() is not None else None,
+        weighted_rms=fit.weighted_rms if options.weighted and stated is not None else None,
         per_view_rms=per_view,
         residuals=fit.residuals,
         cam_from_board_rotation=fit.state.rotation,
@@ -157,7 +158,7 @@ def hybrid_result(observations: Observations, fit: HybridFit, options: Calibrati
         hybrid=fit,
         advice=what_to_photograph(observations, camera, fit.state.rotation),
         warnings=(
-            *general_warnings([names[i] for i in used], camera, fit.rms, per_view[used], (), status),
+            *general_warnings([names[i] for i in used], camera, fit.rms, per_view[used], (), status, stated),
             *hybrid_warnings(fit),
             *motion_warnings(fit),
             *bending_warnings(names, fit),

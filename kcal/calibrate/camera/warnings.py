@@ -218,6 +218,9 @@ _GROSS = 2.0
 REPEATING = 2.0
 # Times the noise of its corners beyond which the RMS of a fit shows that it did not end: it is 0.93 to 1.0 on captures.
 _ENDED = 2.0
+# Times what corners state of themselves from which the RMS is not of their noise: 1.3 to 8 on most captures that
+# strangers made, 14 and 20 on the worst two.
+_NOT_OF_CORNERS = 30.0
 # Of the principal point, in standard deviations of its prior.
 _FAR_CENTER = 3.0
 NO_ERROR_BARS = (
@@ -323,7 +326,13 @@ def outlier_warnings(names: Sequence[str], residuals: Tensor, more: str = "") ->
 
 
 def general_warnings(
-    names: Sequence[str], camera: Camera, rms: float, per_view: Tensor, lost: Sequence[str], status: SolverStatus
+    names: Sequence[str],
+    camera: Camera,
+    rms: float,
+    per_view: Tensor,
+    lost: Sequence[str],
+    status: SolverStatus,
+    stated: Tensor | None = None,
 ) -> list[str]:
     """Warnings about the solver, the RMS, parameters that are not determined, and folds of the lens.
 
@@ -334,8 +343,10 @@ def general_warnings(
         per_view: (V,) likewise.
         lost: names of parameters that the views do not determine.
         status: of the solver.
+        stated: (..., 2, 2) covariances of the corners, as they came with them, in views that were used.
     """
     found = []
+    noise = math.nan if stated is None else float(stated.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt().nanmedian())
     hybrid = camera.model.hybrid is not None
     if status not in (SolverStatus.CONVERGED, SolverStatus.EXACT):
         rest = ": the camera may be farther off than its error bars say; add views, and see which of them fit worst"
@@ -344,6 +355,13 @@ def general_warnings(
         found.append(
             f"RMS {rms:.2f} px is high: corners, board and lens model do not fit each other; check the board's size, "
             "and look at the views that fit worst"
+        )
+    elif rms > _NOT_OF_CORNERS * noise:
+        found.append(
+            f"RMS {rms:.2g} px is {rms / noise:.0f} times what the corners' own covariances say ({noise:.2g} px): "
+            "either these are far too small, or most of it is no noise; look whether the board is as ordered (numbers "
+            "of squares, print), whether all images are of one camera at one zoom and focus, and whether they were "
+            "resized or stabilized"
         )
     typical = float(per_view.median())
     for i in (per_view > max(3.0 * typical, 0.1)).nonzero()[:, 0].tolist():

@@ -137,6 +137,23 @@ class TestGeneral:
     def test_a_high_rms(self) -> None:
         assert "check the board's size, and look at the views" in self.warned(camera("pinhole"), rms=1.5)[0]
 
+    @pytest.mark.parametrize(("stated", "misprint", "said"), [(0.015, 0.6, True), (0.02, 0.0, False)])
+    def test_noise_far_above_that_of_corners(self, stated: float, misprint: float, said: bool) -> None:
+        """A board of which each corner is elsewhere than was ordered: it is small in each view, and no noise."""
+        truth, generator = camera("pinhole"), torch.Generator().manual_seed(4)
+        pixels = pixels_of(truth, motions(truth, 10, 2), noise=0.08)
+        seen = observe(pixels + misprint * torch.randn(BOARD.corners, 2, dtype=torch.float64, generator=generator))
+        spread = ((stated**2, 0.0, stated**2),) * BOARD.corners
+        views = tuple(view.model_copy(update={"covariance": spread}) for view in seen.views)
+        found = calibrate_camera(seen.model_copy(update={"views": views}))
+        assert 0.08 < found.rms < 1.0
+        warned = [text for text in found.warnings if "corners' own covariances" in text]
+        assert len(warned) == said
+        if said:
+            ratio = found.rms / (2**0.5 * stated)
+            assert warned[0].startswith(f"RMS {found.rms:.2g} px is {ratio:.0f} times what")
+            assert f"({2**0.5 * stated:.2g} px)" in warned[0]
+
 
 def test_a_far_corner_blames_the_lens_only_where_it_may_be_too_simple() -> None:
     residuals = 0.1 * torch.randn(4, 40, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
