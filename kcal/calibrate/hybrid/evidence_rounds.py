@@ -189,8 +189,8 @@ def run_rounds(
             )
             change = max(_moved_by(estimate, best), abs(math.log(tempering / former)))
             # The solver may try several steps where it finds nothing that the evidence feels.
-            ended, unfelt = steps < effort[0], _UNFELT if data.relative is None else _SCALE
-            still = steps <= most or (ended and abs(best.loss - last) < unfelt)
+            ended, bends = steps < effort[0], data.relative is not None
+            still = steps <= most or abs(best.loss - last) < (_SCALE if ended and bends else _UNFELT)
             resting = not first and (change < _NEAR_REST if rough else change < _AT_REST and still)
             # To the end where nothing will change any more.
             if not resting:
@@ -208,8 +208,8 @@ def run_rounds(
             tempering=tempering,
         )
         last = best.loss
-        # Where amplitudes rest and the solver does not, more rounds of a few steps would end as those before.
-        effort = LAST if change < _AT_REST and not ended else _LATER
+        # Where its amplitudes rest and the solver does not, more rounds of a few steps would end as those before.
+        effort = LAST if bends and change < _AT_REST and not ended else _LATER
         progress(f"evidence, round {turn + 1}")
         if (first or resting) and turn < _ROUNDS // 2:
             bent = _with_bending(capture, estimate, best, tempering, never)
