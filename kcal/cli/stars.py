@@ -180,8 +180,6 @@ def by_night(
     found = _by_stars(images, time, place, output)
     camera = found.lens.camera
     if camera.calibration is not None and name:
-        import dataclasses
-
         camera.calibration = dataclasses.replace(camera.calibration, name=name)
     save_camera(camera, output)
     out.print("at infinity, without an entrance pupil: for what is farther than some hundred pupil movements")
