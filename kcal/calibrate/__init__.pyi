@@ -4,8 +4,8 @@
 # Several cameras, several models
 from kcal.calibrate.camera.calibrate import calibrate_cameras as calibrate_cameras
 from kcal.calibrate.camera.result import SharedBoard as SharedBoard
-from kcal.calibrate.camera.compare import compare_models as compare_models
-from kcal.calibrate.camera.compare import ComparisonResult as ComparisonResult
+from kcal.calibrate.camera.at_setting import compare_models as compare_models
+from kcal.calibrate.camera.at_setting import ComparisonResult as ComparisonResult
 
 # Zoom and focus
 from kcal.calibrate.camera.at_setting import camera_at_setting as camera_at_setting
@@ -17,8 +17,8 @@ from kcal.calibrate.camera.result import RejectedCorner as RejectedCorner
 from kcal.calibrate.camera.result import RejectedView as RejectedView
 
 # Judge a calibration
-from kcal.calibrate.camera.summary import summarize as summarize
-from kcal.calibrate.camera.summary import CalibrationSummary as CalibrationSummary
+from kcal.calibrate.camera.trust import summarize as summarize
+from kcal.calibrate.camera.trust import CalibrationSummary as CalibrationSummary
 from kcal.calibrate.camera.trust import examine as examine
 from kcal.calibrate.camera.trust import Examination as Examination
 from kcal.calibrate.camera.trust import HalvesDifference as HalvesDifference

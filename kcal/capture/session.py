@@ -16,9 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.camera.advice import board_rolls
+from kcal.calibrate.camera.advice import NextView, board_rolls, far_sigma, next_view, possible_views
 from kcal.calibrate.camera.calibrate import CameraCalibrationResult, calibrate_camera
-from kcal.calibrate.camera.next_view import NextView, far_sigma, next_view, possible_views
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_board, view_of
 from kcal.corners.images import IMAGE_SUFFIXES, Gray, decode_gray

@@ -60,7 +60,7 @@ def stated_settings(texts: list[str] | None, count: int) -> list[dict[str, float
 
 def print_calibration(result: CameraCalibrationResult, *, reject: bool, verbose: bool) -> None:
     """Print what a person reads: noise, uncertainty, parameters, board, warnings, what to photograph next."""
-    from kcal.calibrate.camera.summary import distances_text, summarize
+    from kcal.calibrate.camera.trust import distances_text, summarize
 
     assert result.camera.calibration is not None
     record = result.camera.calibration.record
@@ -112,7 +112,7 @@ def print_calibration(result: CameraCalibrationResult, *, reject: bool, verbose:
 
 def calibration_numbers(result: CameraCalibrationResult) -> dict[str, Any]:
     """What programs want to know of a calibration."""
-    from kcal.calibrate.camera.summary import summarize
+    from kcal.calibrate.camera.trust import summarize
 
     brief = summarize(result)
     return dict(
@@ -328,7 +328,7 @@ def calibrate_command(
         known = calibrated_camera(camera)
 
     from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera, calibrate_cameras
-    from kcal.calibrate.camera.outliers import OutlierRejection
+    from kcal.calibrate.camera.checks import OutlierRejection
     from kcal.calibrate.hybrid.measured_board import load_measured_board
     from kcal.corners.observations import Observations
     from kcal.lens.calibration import LensSetting

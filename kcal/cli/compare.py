@@ -48,7 +48,7 @@ def compare_command(
     if not names:
         raise InputError("name the models to compare, for example --model hybrid opencv5 opencv14")
 
-    from kcal.calibrate.camera.compare import compare_models
+    from kcal.calibrate.camera.at_setting import compare_models
     from kcal.corners.observations import Observations
 
     seen = Observations.load(observations)
@@ -102,7 +102,7 @@ def diff_command(
     import torch
 
     from kcal.lens.difference import camera_difference
-    from kcal.report.difference_text import difference_text
+    from kcal.report.tables import difference_text
 
     if picture is not None:
         check_picture(picture)
@@ -126,7 +126,7 @@ def diff_command(
     for line in difference_text(found):
         out.print(line, markup=False)
     if picture is not None:
-        from kcal.report.difference import save_difference_picture
+        from kcal.report.calibration import save_difference_picture
 
         print_wrote(save_difference_picture(picture, found, title=f"{first} and {second}"))
 

@@ -23,8 +23,8 @@ from kcal.io.images import write_png, write_video
 from kcal.io.rig_file import load_rig
 from kcal.lens.rig import Origin, StereoRig
 from kcal.locate.geodesy import enu_to_geodetic
+from kcal.report.positions import save_site_sketch
 from kcal.report.practice_score import score_lens, score_positions, score_rig, score_tracks
-from kcal.report.siting import save_site_sketch
 from kcal.sim.render import render_board
 from kcal.sim.scene import DemoScene, scene_views
 from kcal.stars.night import SkyView

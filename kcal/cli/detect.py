@@ -81,8 +81,7 @@ def detect_command(
     board = Board.parse(size, square)
 
     from kcal.corners.detect import Detection, detect
-    from kcal.corners.image_tags import turned_images
-    from kcal.corners.images import VIDEO_SUFFIXES, expand_images
+    from kcal.corners.images import VIDEO_SUFFIXES, expand_images, turned_images
     from kcal.corners.video import detect_video
 
     failed: list[tuple[str, Path, Detection]] = []

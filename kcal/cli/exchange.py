@@ -94,7 +94,7 @@ def export_command(
         out.print(f"not in the file: {', '.join(done.lost)}")
     fitted = [(camera, misfit) for camera, misfit in zip(names, done.misfits, strict=True) if misfit is not None]
     if picture is not None and fitted:
-        from kcal.report.difference import save_difference_picture
+        from kcal.report.calibration import save_difference_picture
 
         camera, misfit = max(fitted, key=lambda each: each[1].largest)
         title = f"{source}: {camera}" if len(names) > 1 else source

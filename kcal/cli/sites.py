@@ -125,7 +125,7 @@ def sites_command(
     if output is not None:
         write_atomic(output, _map_text(field, now, later))
     if picture is not None:
-        from kcal.report.siting import save_siting_picture
+        from kcal.report.positions import save_siting_picture
 
         save_siting_picture(picture, field, standing, ranked)
     print_wrote(output, picture)

@@ -12,7 +12,7 @@ import typer
 
 from kcal.cli.console import err, on_signals, out, print_table, print_wrote, warn
 from kcal.cli.inputs import RIG
-from kcal.cli.rig_check import DRIFTED
+from kcal.cli.rig import DRIFTED
 from kcal.errors import InputError, with_extra
 from kcal.files import check_picture, check_writable
 from kcal.texts import measured_text
@@ -179,8 +179,7 @@ def _of_frames(watcher: Watcher, frames: FramesTogether) -> Iterator[tuple[float
 
 def _folder_pairs(watcher: Watcher, folders: tuple[str, str]) -> Iterator[tuple[float, Gray, Gray]]:
     from kcal.calibrate.rig.pairs import pair_by_name
-    from kcal.corners.image_tags import image_time
-    from kcal.corners.images import expand_images, read_gray
+    from kcal.corners.images import expand_images, image_time, read_gray
 
     files = [{path.name: path for path in expand_images([folder])} for folder in folders]
     pairs = pair_by_name(*(list(own) for own in files))

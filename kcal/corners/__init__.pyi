@@ -15,8 +15,8 @@ from kcal.corners.print_board import save_board as save_board
 from kcal.corners.refine import RefineCorners as RefineCorners
 from kcal.corners.saddle import Refined as Refined
 from kcal.corners.saddle import CornerStatus as CornerStatus
-from kcal.corners.point import refine_point as refine_point
-from kcal.corners.point import RefinedPoint as RefinedPoint
+from kcal.corners.match import refine_point as refine_point
+from kcal.corners.match import RefinedPoint as RefinedPoint
 from kcal.corners.match import match_points as match_points
 from kcal.corners.match import MatchOptions as MatchOptions
 from kcal.corners.match import Matches as Matches

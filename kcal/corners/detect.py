@@ -23,8 +23,15 @@ from kcal.corners.board import DICTIONARIES, TAGS, Board
 from kcal.corners.circles import find_circles, refine_circles, round_blobs, wrong_size
 from kcal.corners.grid import MIN_SHARPNESS, local_side, sharpness, without_false_sides
 from kcal.corners.images import VIDEO_SUFFIXES, Gray, decode_gray, expand_images, to_8bit, unique_names
-from kcal.corners.marker_boards import BORDERS, MIN_CORNERS, enough, find_aprilgrid, find_charuco, free_side
-from kcal.corners.markers import opencv_dictionary
+from kcal.corners.marker_boards import (
+    BORDERS,
+    MIN_CORNERS,
+    enough,
+    find_aprilgrid,
+    find_charuco,
+    free_side,
+    opencv_dictionary,
+)
 from kcal.corners.observations import Failure, Observations, View, common_size, rescaled
 from kcal.corners.refine import Refinement, refine_corners
 from kcal.corners.saddle import CornerStatus, Refined

@@ -443,7 +443,7 @@ def erf_saddle(
 ) -> Refined:
     """Fit two blurred edges that cross at each corner.
 
-    Starts must be good to about half a pixel, such as those of `kcal.corners.saddle.saddle`. The corners are
+    Starts must be good to about half a pixel, such as those of `kcal.corners.refine.saddle`. The corners are
     differentiable with respect to `image` by the implicit function theorem; covariance and blur carry no gradient.
 
     Args:

@@ -49,7 +49,7 @@ from kcal.io.foreign import ImportedCameras as ImportedCameras
 from kcal.io.foreign import CameraPose as CameraPose
 from kcal.calibrate.camera.export import export_cameras as export_cameras
 from kcal.calibrate.camera.export import ExportedCameras as ExportedCameras
-from kcal.calibrate.camera.misfit import Misfit as Misfit
+from kcal.calibrate.camera.export import Misfit as Misfit
 from kcal.io.onnx_file import save_onnx as save_onnx
 
 # Cameras of other makes, tables and learned starts

@@ -12,7 +12,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
-from kcal.corners.point import enlarge
+from kcal.corners.match import enlarge
 from kcal.mark.items import ACTION, Coordinate, Number, Side
 from kcal.mark.marking_service import Desk, Json
 from kcal.web.serving import json_body, local_app, page_files

@@ -15,7 +15,7 @@ from scipy.special import ndtr
 from torch import Tensor
 
 from kcal.corners.images import Gray
-from kcal.corners.point import refine_point
+from kcal.corners.match import refine_point
 from kcal.errors import InputError
 
 # Models of what an operator marks: two edges that meet, a cross, a blob, the end of a pole; each blurred.
@@ -430,7 +430,7 @@ def snap(image: Gray, u: float, v: float) -> Snapped:
     """Find what a click means.
 
     Four shapes are fitted around it and the one that explains the pixels best is taken. Where
-    none explains them, edges that meet decide alone (`kcal.corners.point.refine_point`).
+    none explains them, edges that meet decide alone (`kcal.corners.match.refine_point`).
 
     Args:
         image: (H, W) gray levels.

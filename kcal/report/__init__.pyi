@@ -23,8 +23,8 @@ from kcal.report.calibration import save_gallery as save_gallery
 from kcal.report.calibration import FailedImage as FailedImage
 from kcal.report.calibration import save_coverage as save_coverage
 from kcal.report.calibration import save_board_picture as save_board_picture
-from kcal.report.difference import save_difference_picture as save_difference_picture
+from kcal.report.calibration import save_difference_picture as save_difference_picture
 from kcal.report.calibration import save_interval_picture as save_interval_picture
 from kcal.report.positions import save_budget_picture as save_budget_picture
-from kcal.report.siting import siting_figure as siting_figure
-from kcal.report.siting import save_siting_picture as save_siting_picture
+from kcal.report.positions import siting_figure as siting_figure
+from kcal.report.positions import save_siting_picture as save_siting_picture

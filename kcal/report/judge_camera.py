@@ -12,7 +12,6 @@ from torch import Tensor
 from kcal.calibrate.camera.advice import ROLL_SPAN, board_tilts, reached, roll_span, unreached_share, what_to_photograph
 from kcal.calibrate.camera.checks import mirrored_views
 from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult, Progress
-from kcal.calibrate.camera.summary import summarize
 from kcal.calibrate.camera.trust import (
     PREDICTED,
     Examination,
@@ -21,6 +20,7 @@ from kcal.calibrate.camera.trust import (
     ResidualStructure,
     examine,
     seen_pixels,
+    summarize,
     unexplained,
 )
 from kcal.calibrate.rig.pairs import names_by_side

@@ -17,7 +17,7 @@ from kcal.calibrate.rig.initial_poses import Start
 from kcal.calibrate.rig.problem import held
 from kcal.calibrate.rig.sources import Baseline, Features, RigData
 from kcal.corners.images import Gray
-from kcal.corners.keypoints import Keypoints, keypoints, pose_between
+from kcal.corners.match import Keypoints, keypoints, pose_between
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import side_axes

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from kcal.calibrate.rig.prior_information import gathered, joint_unknowns
+from kcal.calibrate.rig.uncertainty import gathered, joint_unknowns
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector

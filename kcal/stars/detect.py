@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from kcal.corners.image_tags import DATE_IN_NAME
-from kcal.corners.images import VIDEO_SUFFIXES, expand_images, read_gray
+from kcal.corners.images import DATE_IN_NAME, VIDEO_SUFFIXES, expand_images, read_gray
 from kcal.corners.video import read_frames
 from kcal.errors import FileError, InputError
 from kcal.files import read_bytes

@@ -15,7 +15,7 @@ from torch import Tensor
 from kcal.calibrate.rig.drift import camera_turns
 from kcal.calibrate.rig.sources import Features
 from kcal.corners.images import Gray, to_8bit
-from kcal.corners.keypoints import keypoints
+from kcal.corners.match import keypoints
 from kcal.corners.patches import fit_shifts, grid_of, has_samples, image_windows, sample
 from kcal.errors import DegenerateError, FileError, InputError
 from kcal.files import read_bytes, write_atomic

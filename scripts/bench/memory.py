@@ -106,7 +106,7 @@ _FLEET = """
 import dataclasses
 from kcal.calibrate.batch.jobs import BatchOptions, Calibrated, CameraJob, Detected
 from kcal.calibrate.batch.results import Results
-from kcal.calibrate.batch.workers import Task
+from kcal.calibrate.batch.results import Task
 from kcal.corners.board import Board
 from kcal.io.camera_file import CameraFile
 board = Board(columns=9, rows=6, square=0.03)

@@ -2,9 +2,9 @@
 
     KCAL_DATA=DATA python -m scripts.bench.network_field [--captures gavin_l st1_l] [--write]
 
-For each capture: RMS over held-out blocks of views (`kcal.calibrate.camera.compare`), and CPU seconds of one fit of all
-views. Also the error at infinity on a simulated lens with a dent (`scripts/shared/dented_lens.py`). `--write` puts both
-tables into docs/measured/network-field.md.
+For each capture: RMS over held-out blocks of views (`kcal.calibrate.camera.at_setting`), and CPU seconds of one fit of
+all views. Also the error at infinity on a simulated lens with a dent (`scripts/shared/dented_lens.py`). `--write` puts
+both tables into docs/measured/network-field.md.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from kcal.calibrate.camera.at_setting import compare_models
 from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.calibrate.camera.compare import compare_models
 from kcal.calibrate.camera.result import CalibrationOptions
 from kcal.calibrate.hybrid.network_fit import FieldTraining
 from kcal.corners.observations import Observations

@@ -72,7 +72,7 @@ def _hilltop(ground: Tensor, name: str, lat: float, lon: float) -> Site:
 
 def sites() -> list[str]:
     """Time of a map and of the order of candidates, and the picture of the how-to page."""
-    from kcal.report.siting import save_siting_picture
+    from kcal.report.positions import save_siting_picture
 
     raster = hills(460)
     head = (

@@ -27,8 +27,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kcal.calibrate.camera.advice import NextView, far_sigma
 from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.calibrate.camera.next_view import NextView, far_sigma
 from kcal.capture.session import CaptureOptions, CaptureSession
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_board, view_of

@@ -34,7 +34,7 @@ from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.sources import Baseline, Features, Landmarks, RigData
-from kcal.corners.keypoints import keypoints
+from kcal.corners.match import keypoints
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import vector_from_rotation

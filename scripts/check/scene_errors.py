@@ -18,7 +18,7 @@ import torch
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 from torch import Tensor
 
-from kcal.corners.keypoints import keypoints
+from kcal.corners.match import keypoints
 from kcal.lens.rig import StereoRig
 from kcal.scene.common_errors import line_errors
 from kcal.scene.match import guided_matches

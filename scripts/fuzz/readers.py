@@ -18,8 +18,7 @@ from kcal.calibrate.batch.jobs import read_jobs
 from kcal.calibrate.hybrid.measured_board import load_measured_board, save_measured_board
 from kcal.calibrate.rig.pairs import read_pairs
 from kcal.cli.settings import read_settings, toml_text
-from kcal.corners.image_tags import turned_images
-from kcal.corners.images import read_gray
+from kcal.corners.images import read_gray, turned_images
 from kcal.corners.observations import Observations, View
 from kcal.corners.video import VideoFrames, read_frames
 from kcal.file_kind import file_kind

@@ -12,8 +12,8 @@ from typing import Any
 
 import cv2
 
+from kcal.calibrate.camera.at_setting import compare_models
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.calibrate.camera.compare import compare_models
 from kcal.corners.observations import Observations
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera

@@ -14,7 +14,7 @@ import pytest
 import torch
 from capture_frames import BOARD
 
-from kcal.calibrate.camera.next_view import NextView
+from kcal.calibrate.camera.advice import NextView
 from kcal.capture import session as module
 from kcal.capture.session import FIRST_VIEWS, CaptureOptions, CaptureSession, follow
 from kcal.corners.detect import Detection

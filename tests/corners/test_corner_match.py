@@ -5,9 +5,8 @@ import pytest
 import torch
 from skimage.registration import phase_cross_correlation
 
-from kcal.corners.match import MatchOptions, MatchStatus, match_points
+from kcal.corners.match import MatchOptions, MatchStatus, enlarge, match_points, refine_point
 from kcal.corners.patches import filtered, gaussian_kernel, has_samples, image_windows, sample
-from kcal.corners.point import enlarge, refine_point
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector

@@ -20,7 +20,7 @@ from torch import Tensor
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_board
 from kcal.corners.grid import local_side
-from kcal.corners.point import refine_point
+from kcal.corners.match import refine_point
 from kcal.corners.refine import refine_corners
 from kcal.corners.saddle import CornerStatus
 from kcal.errors import InputError

@@ -10,8 +10,7 @@ import torch
 from locate_rigs import real_rig, spread_points, tensor
 from torch import Tensor
 
-from kcal.corners.keypoints import Keypoints, keypoints, pose_between
-from kcal.corners.match import MatchOptions, MatchStatus, find_again
+from kcal.corners.match import Keypoints, MatchOptions, MatchStatus, find_again, keypoints, pose_between
 from kcal.corners.patches import (
     ShiftFit,
     fit_shifts,

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from kcal.cli.main import app
 from kcal.corners.board import Board
-from kcal.corners.image_tags import exif_orientation, turned_images
+from kcal.corners.images import exif_orientation, turned_images
 from kcal.corners.observations import Observations
 from kcal.corners.video import detect_video, read_frames
 from kcal.errors import FileError, InputError

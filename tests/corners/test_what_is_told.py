@@ -24,8 +24,8 @@ from kcal.corners.detect import (
     seen_size,
     too_few,
 )
-from kcal.corners.image_tags import image_time
-from kcal.corners.markers import opencv_dictionary
+from kcal.corners.images import image_time
+from kcal.corners.marker_boards import opencv_dictionary
 from kcal.corners.refine import refine_corners
 from kcal.corners.saddle import CornerStatus, Refined
 from kcal.corners.video import VideoFrames

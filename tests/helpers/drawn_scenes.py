@@ -33,12 +33,17 @@ from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.ground import level_ground
 from kcal.locate.positions import Located, locate_points
 from kcal.locate.siting import Area, RankedSite, Site, area_of, rank_sites
-from kcal.report.calibration import board_figure, calibration_figure, coverage_figure, gallery_figure, interval_figure
-from kcal.report.difference import difference_figure
-from kcal.report.difference_text import difference_text
-from kcal.report.positions import budget_figure, positions_figure, stations_figure
+from kcal.report.calibration import (
+    board_figure,
+    calibration_figure,
+    coverage_figure,
+    difference_figure,
+    gallery_figure,
+    interval_figure,
+)
+from kcal.report.positions import budget_figure, positions_figure, siting_figure, stations_figure
 from kcal.report.rig import attitude_figure, rig_figure, stars_figure
-from kcal.report.siting import siting_figure
+from kcal.report.tables import difference_text
 
 PLACES = tensor([20.0, 0.0, 100.0], [-300.0, 5.0, 1000.0], [900.0, 0.0, 5000.0], [0.0, 0.0, 60_000.0])
 PLACE = Origin(lat=10.0, lon=20.0, height=0.0)

@@ -33,12 +33,18 @@ from kcal.lens.difference import camera_difference
 from kcal.lens.rig import Origin
 from kcal.locate.geodesy import geodetic_to_enu
 from kcal.locate.siting import Site, siting_map
-from kcal.report import siting as siting_module
-from kcal.report.difference import difference_figure
+from kcal.report import positions as siting_module
+from kcal.report.calibration import difference_figure
 from kcal.report.figures import WARN
-from kcal.report.positions import budget_figure, positions_figure, stations_figure
+from kcal.report.positions import (
+    _siting_footer,
+    _siting_marks,
+    budget_figure,
+    positions_figure,
+    siting_figure,
+    stations_figure,
+)
 from kcal.report.rig import _above_sky, _edges, _places, attitude_figure, rig_figure, stars_figure
-from kcal.report.siting import _siting_footer, _siting_marks, siting_figure
 from kcal.report.verdict import RangeAnswer, Requirement
 from kcal.report.verdict_pictures import _difference_figure, camera_pictures, range_picture
 

@@ -21,7 +21,7 @@ from kcal.io.images import write_png
 from kcal.lens.rig import Origin
 from kcal.locate.geodesy import enu_to_geodetic
 from kcal.locate.positions import locate_points
-from kcal.report import siting
+from kcal.report import positions
 from kcal.report.calibration import FailedImage, _predicted_sigma, _thumbnail, coverage_figure, gallery_figure
 from kcal.report.figures import ACCENT, WARN, round_levels
 from kcal.report.practice_score import _place_at, located_rows, score_positions, score_tracks
@@ -109,10 +109,10 @@ class TestGallery:
 
 def test_a_sketch_names_what_to_mark(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     kept: list[Any] = []
-    monkeypatch.setattr(siting, "save_picture", lambda path, figure: kept.append(figure) or path)
+    monkeypatch.setattr(positions, "save_picture", lambda path, figure: kept.append(figure) or path)
     image = np.zeros((320, 640, 3), np.uint8)
     marks = ["post", "roof"], np.array([[100.0, 50.0], [300.0, 80.0]])
-    siting.save_site_sketch(tmp_path / "a.png", image, marks, (["ship"], np.array([[500.0, 200.0]])))
+    positions.save_site_sketch(tmp_path / "a.png", image, marks, (["ship"], np.array([[500.0, 200.0]])))
     (figure,) = kept
     assert tuple(figure.get_size_inches()) == (4.0, 2.0)
     axes = figure.axes[0]

@@ -12,12 +12,17 @@ from matplotlib.quiver import Quiver
 
 from kcal.calibrate.camera.advice import unreached_share
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.calibrate.camera.misfit import Misfit
+from kcal.calibrate.camera.export import Misfit
 from kcal.corners.observations import Observations, View
 from kcal.lens.camera import Camera
 from kcal.lens.difference import camera_difference
-from kcal.report.calibration import calibration_figure, coverage_figure, gallery_figure
-from kcal.report.difference import difference_figure, difference_text
+from kcal.report.calibration import (
+    calibration_figure,
+    coverage_figure,
+    difference_figure,
+    difference_text,
+    gallery_figure,
+)
 
 LONG = "/home/somebody/a long folder of a site/with the date 2026-11-24/and more of it/rig.json: the left camera"
 

@@ -10,8 +10,8 @@ from matplotlib.quiver import Quiver
 
 from kcal.locate.siting import siting_map
 from kcal.report.calibration import draw_coverage
+from kcal.report.positions import _sigma_levels
 from kcal.report.rig import rig_figure
-from kcal.report.siting import _sigma_levels
 
 
 def test_north_is_up() -> None:

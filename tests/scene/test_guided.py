@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal.corners.keypoints import Keypoints
+from kcal.corners.match import Keypoints
 from kcal.errors import InputError
 from kcal.scene.match import BAND, guided_matches, rough_rig
 from kcal.scene.refine import refine_matches

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal.corners.keypoints import Keypoints
+from kcal.corners.match import Keypoints
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from kcal.corners.image_tags import image_time
+from kcal.corners.images import image_time
 from kcal.errors import FileError, InputError
 from kcal.locate.budget import planned_rig
 from kcal.watch.history import HistoryRow, HistoryTail, Temperatures, history_head, history_line, read_history

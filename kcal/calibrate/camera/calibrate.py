@@ -9,15 +9,15 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.camera.checks import MINIMUM_VIEWS, copied_views, copy_warnings, pose_warnings, unusable_views
-from kcal.calibrate.camera.hybrid import calibrate_hybrid, hybrid_result
-from kcal.calibrate.camera.leave_out import (
+from kcal.calibrate.camera.hybrid import (
+    calibrate_hybrid,
     calibrate_what_fits,
+    hybrid_result,
     lasting_warnings,
     listed_views,
     without_views,
 )
 from kcal.calibrate.camera.one_camera import lenses_by_view
-from kcal.calibrate.camera.parametric import calibrate_parametric
 from kcal.calibrate.camera.result import (
     CalibrationOptions,
     CameraCalibrationResult,
@@ -25,6 +25,7 @@ from kcal.calibrate.camera.result import (
     RejectedView,
     SharedBoard,
 )
+from kcal.calibrate.camera.solve import calibrate_parametric
 from kcal.calibrate.camera.warnings import spacing_warnings
 from kcal.calibrate.hybrid.base_fit import may_be_unequal
 from kcal.calibrate.hybrid.board_orders import turned_corners

@@ -11,14 +11,28 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
 
 from kcal.calibrate.camera.advice import check_directions, roll_warnings, what_to_photograph
-from kcal.calibrate.camera.checks import MINIMUM_VIEWS, check_views
-from kcal.calibrate.camera.outliers import leave_out_outliers, noise_scale
-from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult, OutlierRejection, Progress
+from kcal.calibrate.camera.checks import (
+    MINIMUM_VIEWS,
+    check_views,
+    corners_beyond,
+    least_planar,
+    leave_out_outliers,
+    noise_scale,
+    views_beyond,
+)
+from kcal.calibrate.camera.result import (
+    CalibrationOptions,
+    CameraCalibrationResult,
+    OutlierRejection,
+    Progress,
+    RejectedView,
+)
 from kcal.calibrate.camera.warnings import (
     bending_warnings,
     check_end,
@@ -33,6 +47,7 @@ from kcal.calibrate.camera.warnings import (
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.settled import FitStart, rough_start
 from kcal.corners.observations import Observations
+from kcal.errors import DegenerateError, InputError
 from kcal.solve.problem import SolverStatus
 
 # The unknowns that the views alone must determine: focal length, principal point, shape of the base projection.
@@ -171,3 +186,177 @@ def hybrid_result(observations: Observations, fit: HybridFit, options: Calibrati
     unequal = spacing_warnings(result) if options.board == "printed" else ()
     # It explains what else may be said.
     return dataclasses.replace(result, warnings=(*unequal, *result.warnings)) if unequal else result
+
+
+# Calibrate without a few views that no lens fits, and name them.
+
+# Calibrate without views that no lens fits, before refusing all of them; and name them.
+#
+# One image of another board, of another camera, or with corners in a wrong order can leave no lens that shows all
+# corners. A fit with bounded weights tells which views these are. A few are left out, with a warning; if they are many,
+# nobody knows which ones are wrong.
+
+# Views that contradict each other wholly leave a fit without a number to go on with.
+_FAILED = (InputError, ArithmeticError, torch.linalg.LinAlgError)
+# Largest share of the views that is left out without being asked.
+_FEW = 0.2
+# How many times larger or smaller a focal length is that was given wrongly.
+_FAR = 1.5
+# In warnings about what was not used: they concern the views, not the fit, and stay with another fit of the same views.
+_LEFT_OUT, _START = "views were left out:", "was given for the start"
+# Names and reasons in one message, at most.
+_SHOWN = 5
+
+
+def calibrate_what_fits(
+    observations: Observations, options: CalibrationOptions, progress: Progress
+) -> CameraCalibrationResult:
+    """As `kcal.calibrate.camera.hybrid.calibrate_hybrid`, but a few views that no lens fits are left out.
+
+    Raises:
+        DegenerateError: as `calibrate_hybrid`, with the names of the views.
+        InputError: more than a fifth of the views do not fit; the message names them.
+    """
+    # What these refuse, leaving out views does not mend.
+    check_views(observations.board.points, observations.pixels(), observations.names, _UNKNOWNS, fewest=MINIMUM_VIEWS)
+    given = options.start_focal(observations.image_size)
+    try:
+        return _with_start(calibrate_hybrid(observations, options, progress), given)
+    except _FAILED as error:
+        if options.reject is not None:
+            raise
+        failure = error
+    except DegenerateError as error:
+        # Wrong views can leave the others open, too.
+        if options.reject is None and given is None:
+            wrong = _wrong_views(observations, options)
+            if wrong and few_views(len(wrong), len(observations.views)):
+                return _without(observations, options, wrong, error, progress)
+        if any(name in str(error) for name in observations.names):
+            raise
+        raise DegenerateError(f"{error}; the views are {_few_names(observations.names)}") from error
+    if given is not None:
+        return _without_start(observations, options, given, failure, progress)
+    wrong = _wrong_views(observations, options)
+    listed = listed_views(observations, wrong)
+    if not wrong or not few_views(len(wrong), len(observations.views)):
+        which = (
+            f"{len(wrong)} of {len(observations.views)} views do not fit the others: {listed}"
+            if wrong
+            else f"Look first at {least_planar(observations.board.points, observations.pixels(), observations.names)}"
+        )
+        raise InputError(
+            f"no lens shows all corners where they are. {which}. Do all images show this board, not mirrored, and are "
+            "all from this camera at this zoom? Remove those that do not, and detect again"
+        ) from failure
+    return _without(observations, options, wrong, failure, progress)
+
+
+def few_views(wrong: int, count: int) -> bool:
+    """Whether so many of `count` views are few enough to go on without them."""
+    return wrong <= max(1.0, _FEW * count) and count - wrong >= MINIMUM_VIEWS
+
+
+def _without(
+    observations: Observations,
+    options: CalibrationOptions,
+    wrong: Mapping[int, str],
+    failure: Exception,
+    progress: Progress,
+) -> CameraCalibrationResult:
+    """Without views that do not fit."""
+    progress(f"without {len(wrong)} views that no lens fits")
+    kept = [i for i in range(len(observations.views)) if i not in wrong]
+    used = observations.subset([observations.names[i] for i in kept])
+    try:
+        result = calibrate_hybrid(used, options, progress)
+    except _FAILED as error:
+        listed = listed_views(observations, wrong)
+        raise InputError(f"without {len(wrong)} views that no lens fits ({listed}): {error}") from failure
+    return without_views(result, observations, wrong)
+
+
+def _with_start(result: CameraCalibrationResult, given: float | None) -> CameraCalibrationResult:
+    """A result, and what is to say of a focal length that was given."""
+    found = float(result.camera.focal[0])
+    if given is None or 1.0 / _FAR < found / given < _FAR:
+        return result
+    note = (
+        f"the focal length that {_START} ({given:.4g} px) is far from the camera's ({found:.4g} px): it was not used; "
+        "leave it out, or correct it"
+    )
+    return dataclasses.replace(result, warnings=(note, *result.warnings))
+
+
+def _without_start(
+    observations: Observations, options: CalibrationOptions, given: float, failure: Exception, progress: Progress
+) -> CameraCalibrationResult:
+    """Again, as if no focal length had been given."""
+    progress("again without the focal length that was given")
+    try:
+        result = calibrate_what_fits(
+            observations, dataclasses.replace(options, focal=None, field_of_view=None), progress
+        )
+    except InputError:
+        raise failure from None
+    note = (
+        f"no lens with the focal length that {_START} ({given:.4g} px) shows the corners: it was not "
+        "used; leave it out, or correct it"
+    )
+    return dataclasses.replace(result, warnings=(note, *result.warnings))
+
+
+def _wrong_views(observations: Observations, options: CalibrationOptions) -> dict[int, str]:
+    """Views that do not fit, by a fit in which few wrong corners count little: index -> why."""
+    pixels, board = observations.pixels(), observations.board.points
+    try:
+        fit = fit_hybrid(board, pixels, observations.image_size, board=options.board, robust=True)
+    except (*_FAILED, DegenerateError):
+        return {}
+    residuals = fit.residuals_of(pixels)
+    seen = torch.isfinite(pixels).all(-1)
+    missing = (seen & ~torch.isfinite(residuals).all(-1)).sum(-1)
+    found = views_beyond(board, residuals, pixels, corners_beyond(residuals))
+    for i in missing.nonzero()[:, 0].tolist():
+        found[i] = f"the lens that fits the others cannot show {int(missing[i])} of its {int(seen[i].sum())} corners"
+    return dict(sorted(found.items()))
+
+
+def lasting_warnings(result: CameraCalibrationResult) -> tuple[str, ...]:
+    """Those of a result's warnings that hold for another fit of the same views, too: of these, or what was not used."""
+    return tuple(text for text in result.warnings if any(part in text for part in (_LEFT_OUT, _START)))
+
+
+def _few_names(names: Sequence[str]) -> str:
+    more = len(names) - _SHOWN
+    return ", ".join(names[:_SHOWN]) + (f" and {more} more" if more > 0 else "")
+
+
+def listed_views(observations: Observations, wrong: Mapping[int, str]) -> str:
+    """Names of views with their reasons, a few of them."""
+    shown = [f"{observations.names[i]} ({why})" for i, why in list(wrong.items())[:_SHOWN]]
+    more = len(wrong) - len(shown)
+    return ", ".join(shown) + (f" and {more} more" if more > 0 else "")
+
+
+def without_views(
+    result: CameraCalibrationResult, observations: Observations, wrong: Mapping[int, str]
+) -> CameraCalibrationResult:
+    """A result without some views as one for all `observations`, with a warning that names them."""
+    if not wrong:
+        return result
+    kept = [i for i in range(len(observations.views)) if i not in wrong]
+    counts = torch.isfinite(observations.pixels()).all(-1).sum(-1).tolist()
+    left_out = tuple(
+        RejectedView(view=observations.names[i], corners=counts[i], residual=float("nan"), reason=why)
+        for i, why in wrong.items()
+    )
+    note = (
+        f"{len(wrong)} of {len(observations.views)} {_LEFT_OUT} {listed_views(observations, wrong)}; look at "
+        "these images, and remove or retake them"
+    )
+    return dataclasses.replace(
+        result.among(kept, observations),
+        warnings=(note, *result.warnings),
+        rejected_views=(*result.rejected_views, *left_out),
+    )

@@ -23,8 +23,8 @@ from torch import Tensor
 
 from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.camera.hybrid import corner_weights
-from kcal.calibrate.camera.parametric import calibrate_parametric
 from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult
+from kcal.calibrate.camera.solve import calibrate_parametric
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.fitted_views import hybrid_unknowns
 from kcal.corners.observations import Observations

@@ -11,8 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.camera.hybrid import fit_by_options, hybrid_result
-from kcal.calibrate.camera.leave_out import few_views, lasting_warnings
+from kcal.calibrate.camera.hybrid import few_views, fit_by_options, hybrid_result, lasting_warnings
 from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult, Progress
 from kcal.calibrate.hybrid.evidence import WORTH, with_tempering
 from kcal.calibrate.hybrid.fit import HybridFit

@@ -84,7 +84,7 @@ class CalibrationOptions:
             False minimizes the plain RMS, as OpenCV does.
         loss: a robust loss of each corner's residual in pixels, for data with wrong corners, or None. It is used after
             a plain solution has been found; choose a scale of about three times the noise.
-        reject: leave out corners, then views, that noise cannot explain (`kcal.calibrate.camera.outliers`), and list
+        reject: leave out corners, then views, that noise cannot explain (`kcal.calibrate.camera.checks`), and list
             them. None, the default: every corner counts, and a warning reports outliers. A calibration that quietly
             selects its data has an RMS that cannot be compared with others, and outliers are often the model's fault.
         focal: roughly known focal length in pixels (from EXIF or the field of view), tried first as a start, or None.

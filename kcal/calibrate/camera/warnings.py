@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.camera.advice import roll_warnings
-from kcal.calibrate.camera.outliers import corners_beyond
+from kcal.calibrate.camera.checks import corners_beyond
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.hybrid.fit import HybridFit
 from kcal.calibrate.hybrid.settled import pixels_are_square

@@ -23,7 +23,7 @@ from kcal.solve.lm import LMOptions
 
 # Recognize cameras that were mixed up: the same one given twice, or left and right swapped throughout.
 #
-# A swap of cameras against their data contradicts itself (`kcal.calibrate.rig.board_consensus.check_cameras`). A swap
+# A swap of cameras against their data contradicts itself (`kcal.calibrate.rig.pairs.check_cameras`). A swap
 # of everything does not: the rig is solved as well as any, with the right camera on the left side. Only the names tell.
 
 # The right camera is on the wrong side if it is to the left by more than this share of the baseline: cameras above each

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.problem.poses import spread_out
-from kcal.calibrate.rig.board_consensus import (
+from kcal.calibrate.rig.pairs import (
     MINIMUM_CORNERS,
     Poses,
     SeenAlone,

@@ -20,14 +20,13 @@ from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.rig.adjustment import LOSS, ROUGHLY, Adjustment, possible
 from kcal.calibrate.rig.assess import rig_result
 from kcal.calibrate.rig.blocks import KINDS, PerKind
-from kcal.calibrate.rig.board_consensus import MINIMUM_CORNERS, evenly, pose_alone
 from kcal.calibrate.rig.explanations import cost_of_features_behind, explained, refuse_same_camera
 from kcal.calibrate.rig.initial_poses import InitialPoses, first_poses
-from kcal.calibrate.rig.pairs import Pair, paired_boards
-from kcal.calibrate.rig.prior_information import gathered, joint_unknowns, less
+from kcal.calibrate.rig.pairs import MINIMUM_CORNERS, Pair, evenly, paired_boards, pose_alone
 from kcal.calibrate.rig.problem import SharedUnknowns, free, held
 from kcal.calibrate.rig.result import Reasons, RigResult, item_records
 from kcal.calibrate.rig.sources import Boards, RigData
+from kcal.calibrate.rig.uncertainty import gathered, joint_unknowns, less
 from kcal.corners.observations import Observations
 from kcal.errors import InputError
 from kcal.gaussian import triangular

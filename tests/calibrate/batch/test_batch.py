@@ -17,8 +17,16 @@ from typer.testing import CliRunner
 from waiting import wait_for
 
 from kcal.calibrate.batch.jobs import BatchOptions, detect_image, pieces, read_jobs, sharing_jobs
-from kcal.calibrate.batch.results import Results, SummaryRow, write_summary
-from kcal.calibrate.batch.workers import Pool, Task, WorkerDiedError, pool, run_tasks
+from kcal.calibrate.batch.results import (
+    Pool,
+    Results,
+    SummaryRow,
+    Task,
+    WorkerDiedError,
+    pool,
+    run_tasks,
+    write_summary,
+)
 from kcal.calibrate.camera.calibrate import calibrate_cameras
 from kcal.cli.main import app
 from kcal.corners.board import Board
@@ -421,8 +429,8 @@ def dask_processes(tmp_path):
 @pytest.mark.parametrize("killed", ["scheduler", "worker"])
 def test_a_scheduler_or_its_last_worker_that_dies_is_an_error(dask_processes, monkeypatch, killed):
     address, scheduler, worker = dask_processes
-    monkeypatch.setattr("kcal.calibrate.batch.workers._LOOK", 0.5)
-    monkeypatch.setattr("kcal.calibrate.batch.workers.WORKERS_BACK", 3.0)
+    monkeypatch.setattr("kcal.calibrate.batch.results._LOOK", 0.5)
+    monkeypatch.setattr("kcal.calibrate.batch.results.WORKERS_BACK", 3.0)
     with pool(1, address) as workers:
         wait_for(lambda: bool(workers._client.nthreads()))
         threading.Timer(1.0, (scheduler if killed == "scheduler" else worker).kill).start()

@@ -25,8 +25,7 @@ from kcal.calibrate.batch.jobs import (
     read_jobs,
     sharing_jobs,
 )
-from kcal.calibrate.batch.results import Results, calibrate_batch
-from kcal.calibrate.batch.workers import Task, run_tasks
+from kcal.calibrate.batch.results import Results, Task, calibrate_batch, run_tasks
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations

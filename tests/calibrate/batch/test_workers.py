@@ -9,8 +9,8 @@ import cv2
 import pytest
 import torch
 
-from kcal.calibrate.batch import workers as module
-from kcal.calibrate.batch.workers import WORKERS_BACK, Pool, Task, WorkerDiedError, pool, run_tasks
+from kcal.calibrate.batch import results as module
+from kcal.calibrate.batch.results import WORKERS_BACK, Pool, Task, WorkerDiedError, pool, run_tasks
 from kcal.errors import FileError
 
 

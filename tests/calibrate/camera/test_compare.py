@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal.calibrate.camera.compare import ComparisonResult, compare_models
+from kcal.calibrate.camera.at_setting import ComparisonResult, compare_models
 from kcal.calibrate.camera.result import CalibrationOptions
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View

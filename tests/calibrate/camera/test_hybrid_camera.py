@@ -11,8 +11,8 @@ from calibrate_scenes import BOARD, SIZE, camera, motions, observe, pixels_of
 from torch import Tensor
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
-from kcal.calibrate.camera.outliers import OutlierRejection
-from kcal.calibrate.camera.summary import summarize
+from kcal.calibrate.camera.checks import OutlierRejection
+from kcal.calibrate.camera.trust import summarize
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError
 from kcal.io.camera_file import load_camera

@@ -9,8 +9,8 @@ import torch
 from calibrate_scenes import BOARD, SIZE, camera, motions, pixels_of
 from torch import Tensor, nn
 
+from kcal.calibrate.camera.checks import OutlierRejection
 from kcal.calibrate.camera.layer import CalibratedViews, CalibrationLayer, calibrate_views
-from kcal.calibrate.camera.outliers import OutlierRejection
 from kcal.calibrate.camera.result import CalibrationOptions
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.errors import DegenerateError, InputError

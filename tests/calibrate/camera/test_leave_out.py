@@ -9,7 +9,7 @@ import torch
 from calibrate_scenes import BOARD, SIZE, camera, motions, observe, pixels_of
 from torch import Tensor
 
-from kcal.calibrate.camera import leave_out
+from kcal.calibrate.camera import hybrid
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.camera.checks import least_planar
 from kcal.calibrate.camera.result import CameraCalibrationResult
@@ -98,7 +98,7 @@ def test_an_arithmetic_failure_is_an_error_of_the_views(monkeypatch: pytest.Monk
     def divided(*_: object) -> None:
         raise ZeroDivisionError
 
-    monkeypatch.setattr(leave_out, "calibrate_hybrid", divided)
+    monkeypatch.setattr(hybrid, "calibrate_hybrid", divided)
     with pytest.raises(InputError, match=r"no lens shows all corners where they are\. Look first at v0\d \("):
         calibrate_camera(observe(corners()[:6]))
 
@@ -107,7 +107,7 @@ def test_views_are_named_where_the_fit_names_none(monkeypatch: pytest.MonkeyPatc
     def refuse(*_: object) -> None:
         raise DegenerateError("the views do not determine the focal length")
 
-    monkeypatch.setattr(leave_out, "calibrate_hybrid", refuse)
+    monkeypatch.setattr(hybrid, "calibrate_hybrid", refuse)
     with pytest.raises(DegenerateError, match=r"focal length; the views are v00, v01, v02, v03, v04 and 7 more"):
         calibrate_camera(observe(corners()))
 

@@ -10,9 +10,9 @@ import torch
 from calibrate_scenes import observe
 from printed_boards import printed_views
 
-from kcal.calibrate.camera import next_view as module
+from kcal.calibrate.camera import advice as module
+from kcal.calibrate.camera.advice import far_sigma, next_view, possible_views
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.calibrate.camera.next_view import far_sigma, next_view, possible_views
 from kcal.corners.board import Board
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera

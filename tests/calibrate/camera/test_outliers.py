@@ -8,7 +8,7 @@ from calibrate_scenes import BOARD, SIZE, camera, motions, observe, pixels_of
 from torch import Tensor
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
-from kcal.calibrate.camera.outliers import OutlierRejection, corners_beyond
+from kcal.calibrate.camera.checks import OutlierRejection, corners_beyond
 from kcal.errors import InputError
 
 REJECT = CalibrationOptions(model="opencv5", reject=OutlierRejection())

@@ -9,7 +9,7 @@ import torch
 from calibrate_scenes import camera, motions, observe, pixels_of
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.calibrate.camera.outliers import OutlierRejection
+from kcal.calibrate.camera.checks import OutlierRejection
 from kcal.io.camera_file import CameraFile, load_camera, save_camera
 
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from kcal.calibrate.camera.next_view import possible_views
+from kcal.calibrate.camera.advice import possible_views
 from kcal.cli.main import app
 from kcal.corners.board import Board
 from kcal.corners.marker_boards import _opencv_board

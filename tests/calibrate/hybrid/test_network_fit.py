@@ -10,8 +10,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from kcal.calibrate.camera.at_setting import compare_models
 from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.calibrate.camera.compare import compare_models
 from kcal.calibrate.camera.layer import calibrate_views
 from kcal.calibrate.camera.result import CalibrationOptions
 from kcal.calibrate.hybrid.families import typical_hyperprior

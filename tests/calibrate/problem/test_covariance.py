@@ -9,7 +9,7 @@ import torch
 from calibrate_scenes import BOARD, SIZE, camera, motions, observe, pixels_of
 from torch import Tensor
 
-from kcal.calibrate.camera import parametric
+from kcal.calibrate.camera import solve
 from kcal.calibrate.camera.advice import check_directions
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.problem.board_problem import BoardProblem
@@ -180,8 +180,8 @@ class TestWhatCannotBeComputed:
             return _uncertainty(*given, **named)  # type: ignore[arg-type]
 
         # Only after the solution was found.
-        _uncertainty = parametric._uncertainty
-        monkeypatch.setattr(parametric, "_uncertainty", count)
+        _uncertainty = solve._uncertainty
+        monkeypatch.setattr(solve, "_uncertainty", count)
         monkeypatch.setattr(BoardProblem, "linearize", folded)
         result = calibrate_camera(seen, CalibrationOptions(weak_prior=None, model="opencv14"))
         assert calls

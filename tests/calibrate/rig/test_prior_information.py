@@ -12,9 +12,9 @@ from printed_boards import printed_points, seen_whole, shown
 from torch import Tensor
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.calibrate.rig.prior_information import gathered, joint_unknowns, less
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, calibrate_rig
+from kcal.calibrate.rig.uncertainty import gathered, joint_unknowns, less
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations
 from kcal.lens.camera import Camera

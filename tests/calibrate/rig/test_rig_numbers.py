@@ -30,10 +30,9 @@ from kcal.calibrate.rig.drift import drift_of_turns
 from kcal.calibrate.rig.explanations import _Part, _test, least_redundancy, redundancy, refuse_exact
 from kcal.calibrate.rig.initial_poses import Start
 from kcal.calibrate.rig.motion import CameraRows, summed_products
-from kcal.calibrate.rig.prior_information import _moving
 from kcal.calibrate.rig.problem import DistanceTerm, PlaceTerm, RigProblem, _of_item, held, least
 from kcal.calibrate.rig.sources import RigData
-from kcal.calibrate.rig.uncertainty import SharedCovariance, mounting_rows, relative_rows
+from kcal.calibrate.rig.uncertainty import SharedCovariance, _moving, mounting_rows, relative_rows
 from kcal.checks import chi2_quantile
 from kcal.errors import DegenerateError
 from kcal.lens.pose import vector_from_rotation

@@ -22,7 +22,6 @@ from rig_scenes import (
 )
 from torch import Tensor
 
-from kcal.calibrate.rig.board_consensus import Poses, _median_rms, _view_rms, consensus, evenly, half_turn
 from kcal.calibrate.rig.initial_poses import (
     Start,
     _baseline,
@@ -39,6 +38,7 @@ from kcal.calibrate.rig.initial_poses import (
     poses_from_three,
     rotation_between,
 )
+from kcal.calibrate.rig.pairs import Poses, _median_rms, _view_rms, consensus, evenly, half_turn
 from kcal.calibrate.rig.sources import Baseline, MeasuredPosition, RigData
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector

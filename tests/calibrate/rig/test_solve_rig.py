@@ -29,11 +29,11 @@ from torch import Tensor
 from kcal.calibrate.rig import adjustment, initial_poses, solve
 from kcal.calibrate.rig.blocks import BoardBlock, FeatureBlock, LandmarkBlock, PosedCamera, RigState
 from kcal.calibrate.rig.initial_poses import Start, consensus_pose, poses_from_three
-from kcal.calibrate.rig.prior_information import joint_unknowns
 from kcal.calibrate.rig.problem import DistanceTerm, PlaceTerm, RigProblem, SharedUnknowns
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.sources import Baseline, MeasuredPosition, RigData, inverse_range_beyond
+from kcal.calibrate.rig.uncertainty import joint_unknowns
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
