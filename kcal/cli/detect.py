@@ -86,9 +86,6 @@ def detect_command(
 
     failed: list[tuple[str, Path, Detection]] = []
 
-    def note_failure(name: str, path: Path, found: Detection) -> None:
-        failed.append((name, path, found))
-
     turned: list[Path] = []
     notes: list[str] = []
     streams = [source_name(image) for image in images if is_stream(image)]
@@ -122,7 +119,7 @@ def detect_command(
                 progress=advance,
                 time_limit=time_limit,
                 note=notes.append,
-                on_failure=note_failure,
+                on_failure=lambda name, path, found: failed.append((name, path, found)),
             )
         turned = turned_images([path for path in paths if os.path.isfile(path)])
         source = f"of {len(paths)} images"

@@ -47,6 +47,14 @@ class View(Record):
     image: str | None = None
     sha256: str | None = None
 
+    def keeping(self, kept: Sequence[bool]) -> View:
+        """The same view without the corners that are not kept."""
+        pixels = tuple(value if own else None for value, own in zip(self.pixels, kept, strict=True))
+        spread = self.covariance
+        if spread is not None:
+            spread = tuple(value if own else None for value, own in zip(spread, kept, strict=True))
+        return self.model_copy(update={"pixels": pixels, "covariance": spread})
+
 
 class Failure(Record):
     """An image that gave no view, and why."""

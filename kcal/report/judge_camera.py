@@ -414,7 +414,7 @@ def _against_reference(
         and result.hybrid is None
         and found.model is not None
         and not unexplained(found.model)
-        and far > _image_sigma_of(result)
+        and far > _image_rms(result.camera)
     ):
         text = (
             f"another lens model fits these views as well as {result.camera.model} and differs by {far:.2g} px, "
@@ -423,12 +423,6 @@ def _against_reference(
         action = "calibrate with the default lens (--model hybrid), and show the board at the borders of the image"
         return Finding.of("model", "doubt", text, action)
     return None
-
-
-def _image_sigma_of(result: CameraCalibrationResult) -> float:
-    """RMS over the image of the error bars, px."""
-    sigma = image_sigma(result.camera)
-    return float(sigma[sigma.isfinite()].square().mean().sqrt())
 
 
 def _board_fault(

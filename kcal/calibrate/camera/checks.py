@@ -424,20 +424,8 @@ def view_rms(residuals: Tensor, rejected: Tensor) -> Tensor:
 
 def without(observations: Observations, views: Sequence[int], rejected: Tensor) -> Observations:
     """The observations of some views only, without the corners (V, N) of these views that are rejected."""
-    kept = []
-    for i, gone in zip(views, rejected.tolist(), strict=True):
-        view = observations.views[i]
-        if any(gone):
-            update: dict[str, object] = {
-                "pixels": tuple(None if out else value for value, out in zip(view.pixels, gone, strict=True))
-            }
-            if view.covariance is not None:
-                update["covariance"] = tuple(
-                    None if out else value for value, out in zip(view.covariance, gone, strict=True)
-                )
-            view = view.model_copy(update=update)
-        kept.append(view)
-    return observations.model_copy(update={"views": tuple(kept)})
+    kept = tuple(observations.views[i].keeping(good) for i, good in zip(views, (~rejected).tolist(), strict=True))
+    return observations.model_copy(update={"views": kept})
 
 
 def check_share(gone: int, total: int, views: Sequence[RejectedView], limit: float) -> None:

@@ -334,9 +334,7 @@ def _few_names(names: Sequence[str]) -> str:
 
 def listed_views(observations: Observations, wrong: Mapping[int, str]) -> str:
     """Names of views with their reasons, a few of them."""
-    shown = [f"{observations.names[i]} ({why})" for i, why in list(wrong.items())[:_SHOWN]]
-    more = len(wrong) - len(shown)
-    return ", ".join(shown) + (f" and {more} more" if more > 0 else "")
+    return _few_names([f"{observations.names[i]} ({why})" for i, why in wrong.items()])
 
 
 def without_views(

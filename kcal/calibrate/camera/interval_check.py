@@ -160,11 +160,8 @@ class SimulatedCapture(NamedTuple):
             return fit.camera
         views = []
         for view, corners in zip(self.seen.views, self.pixels.tolist(), strict=True):
-            kept = [None if math.isnan(u) else (u, v) for u, v in corners]
-            spread = None
-            if view.covariance is not None:
-                spread = tuple(None if gone is None else own for own, gone in zip(view.covariance, kept, strict=True))
-            views.append(view.model_copy(update={"pixels": tuple(kept), "covariance": spread}))
+            moved = view.model_copy(update={"pixels": tuple((u, v) for u, v in corners)})
+            views.append(moved.keeping([not math.isnan(u) for u, _ in corners]))
         drawn = self.seen.model_copy(update={"views": tuple(views)})
         return calibrate_parametric(drawn, dataclasses.replace(options, reject=None), lambda _: None).camera
 

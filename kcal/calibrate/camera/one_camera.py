@@ -17,6 +17,7 @@ from kcal.calibrate.hybrid.evidence import WORTH, with_tempering
 from kcal.calibrate.hybrid.fit import HybridFit
 from kcal.calibrate.hybrid.fitted_views import hybrid_unknowns
 from kcal.calibrate.problem.board_problem import POSE, BoardProblem
+from kcal.calibrate.problem.parameters import FreeParameters
 from kcal.calibrate.problem.state import BoardState, by_number
 from kcal.calibrate.problem.views import LEAST_NOISE, among
 from kcal.corners.observations import Observations
@@ -479,17 +480,7 @@ def _widened(fit: HybridFit, pixels: Tensor, theta: Tensor, sigma: Tensor) -> Hy
     """A fit of pixels from which θ was taken away, with error bars that allow for it, and for that of the next view."""
     known = fit.information
     unknowns = hybrid_unknowns(fit.model, fit.square)
-    problem = BoardProblem(
-        fit.board_points,
-        pixels,
-        fit.model,
-        unknowns,
-        shapes=fit.board_shapes.shapes,
-        free_board=True,
-        weights=fit.weights,
-        readout=fit.readout,
-        stillness=None if fit.readout is None else fit.stillness,
-    )
+    problem = _problem(fit, pixels, unknowns, fit.board_shapes.shapes)
     rows, local = problem.rows(fit.state._replace(board=torch.zeros_like(fit.state.board))), problem.local_size
     moves = sigma > 0
     fx, fy = fit.state.parameters[:2]
@@ -523,6 +514,14 @@ def _widened(fit: HybridFit, pixels: Tensor, theta: Tensor, sigma: Tensor) -> Hy
     return dataclasses.replace(fit, information=known, half=half)
 
 
+def _problem(fit: HybridFit, pixels: Tensor, free: FreeParameters | Sequence[int], shapes: Tensor) -> BoardProblem:
+    """Of a fit's views, with these pixels, and with the board free in these shapes."""
+    return BoardProblem(
+        fit.board_points, pixels, fit.model, free, shapes=shapes, free_board=True, weights=fit.weights,
+        readout=fit.readout, stillness=None if fit.readout is None else fit.stillness,
+    )  # fmt: skip
+
+
 def _evidence_at(fit: HybridFit, tempering: float) -> float:
     """Logarithm of a fit's evidence were its data to count as this tempering says."""
     own = fit.tempering if fit.readout is None else 1.0
@@ -533,10 +532,7 @@ def _evidence_at(fit: HybridFit, tempering: float) -> float:
 def _of_fit(fit: HybridFit, pixels: Tensor, theta: Tensor) -> _ByView:
     """Of a fit's views, about no motion and no θ; `theta` (V, 3) was taken away from the pixels."""
     shapes, noise = fit.board_shapes.shapes[:_SIZE], max(fit.sigma / math.sqrt(fit.tempering), LEAST_NOISE)
-    problem = BoardProblem(
-        fit.board_points, pixels, fit.model, _INDICES, shapes=shapes, free_board=True, weights=fit.weights,
-        readout=fit.readout, stillness=None if fit.readout is None else fit.stillness,
-    )  # fmt: skip
+    problem = _problem(fit, pixels, _INDICES, shapes)
     begin, state = torch.cat([_widths(fit.size), _APART * fit.board_shapes.unit[:_SIZE]]), fit.state
     # Numbers of one amplitude have the same logarithm.
     ties = _OTHER + by_number(np.arange(float(len(fit.log_ratio)))).unique(return_inverse=True)[1]

@@ -90,7 +90,7 @@ def test_a_start_that_shows_nothing_is_not_used() -> None:
 def test_what_is_left_must_be_enough() -> None:
     pixels = corners()[:4]
     pixels[:2, 4:] = torch.nan
-    with pytest.raises(DegenerateError, match=r"^2 view\(s\) .* of no use: v00 \(it has 4 corners.*, v01 \(it has 4"):
+    with pytest.raises(DegenerateError, match=r"^2 of 4 views .* of no use: v00 \(it has 4 corners.*, v01 \(it has 4"):
         calibrate_camera(observe(pixels))
 
 
