@@ -156,13 +156,11 @@ def test_an_entrance_pupil_that_no_lens_has() -> None:
         assert found.depth == pytest.approx(slope * corner**2, rel=1e-6)
         assert found.sigma == pytest.approx(0.01 * corner**2, rel=1e-6)
         (text,) = pupil_warnings(*hybrid(slope))
-        assert (
-            f"moves by {100 * corner**2:.0f} ± {found.sigma * 1e3:.0f} mm, which no lens does (11 mm at most, 35° off the axis)"
-            in text
-        )
-    # Ten times what glass does, and three sigmas.
+        told = f"moves by {100 * corner**2:.0f} ± {found.sigma * 1e3:.0f} mm, which no lens does"
+        assert f"{told} (11 mm at most, 35° off the axis)" in text
+    # Ten times what glass does, and two sigmas.
     assert pupil_warnings(*hybrid(0.029)) == []
     assert len(pupil_warnings(*hybrid(0.031))) == 1
     lens, covariance = hybrid(0.1)
-    assert pupil_warnings(lens, 12 * covariance) == []
-    assert len(pupil_warnings(lens, 10 * covariance)) == 1
+    assert pupil_warnings(lens, 26 * covariance) == []
+    assert len(pupil_warnings(lens, 24 * covariance)) == 1
