@@ -144,7 +144,7 @@ def lines(records: list[Record]) -> list[str]:
     for record in records:
         cells = [shown(record["held"].get(model)) for model in models]
         between = f"{record['ratio']:.2f} ({record['p']:.2g})" if "ratio" in record else "refused"
-        over = " / ".join(f"{value:.2f}" for value in over_best(record).values()) or "–"
+        over = " / ".join(f"{value:.2f}" for value in over_best(record).values() if value == value) or "–"
         views = "+".join(map(str, record["views"]))
         whole = record.get("whole", {})
         answer = f"{'yes' if whole['yes'] else 'no'}, {whole['rms']:.4f}" if "rms" in whole else "refused"
