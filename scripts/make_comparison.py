@@ -34,6 +34,7 @@ from kcal.corners.observations import Observations, View
 from kcal.report.figures import ACCENT, FAINT, GRAY, INK, WARN, new_figure, save_picture
 from kcal.sim.board import PrintedBoard
 from kcal.sim.captures import drawn_rig
+from kcal.sim.raytrace import SURVEILLANCE
 from kcal.sim.scene import FOCAL_MM, DemoScene, NamedPoints
 from scripts.check.chain import FLAGS as CHAIN_FLAGS
 from scripts.check.chain_rig import localizer
@@ -56,7 +57,7 @@ def scene_of(draw: int) -> DemoScene:
     places = tuple((f"{far:g} {at:g}", far, at, 0.0) for far in RANGES for at in BEARINGS[:: 2 if far < 5000 else 1])
     return DemoScene(
         seed=draw,
-        rig=drawn_rig("surveillance", 1.0, draw, focal_mm=FOCAL_MM, wander=1.0),
+        rig=drawn_rig(SURVEILLANCE, 1.0, draw, focal_mm=FOCAL_MM, wander=1.0),
         near_board=PrintedBoard(9, 6, 0.06, seed=draw),
         targets_at=places,
     )

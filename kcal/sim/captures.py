@@ -11,7 +11,7 @@ from torch import Tensor
 from kcal.errors import InputError
 from kcal.lens.pose import rotation_from_vector
 from kcal.sim.board import BoardLike, BoardPose, LensLike, board_points
-from kcal.sim.raytrace import PRESCRIPTIONS, Misalignment
+from kcal.sim.raytrace import Misalignment, Prescription
 from kcal.sim.truth import TruthLens
 
 # Choose poses of a board that are completely visible, tilted in all directions, and spread over image and depth.
@@ -216,7 +216,7 @@ _SENSOR_TILT, _AXIS = math.radians(0.2), 8.0
 
 
 def drawn_lens(
-    name: str,
+    prescription: Prescription,
     strength: float,
     seed: int,
     *,
@@ -232,7 +232,7 @@ def drawn_lens(
     it 8 px from its middle.
 
     Args:
-        name: of a prescription: "surveillance", "machine-vision" or "webcam".
+        prescription: of the lens.
         strength: of the misalignment.
         seed: of its draw.
         focal: in pixels; the prescription's own if left out.
@@ -241,19 +241,18 @@ def drawn_lens(
         scale: of the image of 1920 x 1080 px, with the same lens and field of view; smaller for quick tests.
 
     Example:
-        >>> lens = drawn_lens("machine-vision", 1.0, 7)
+        >>> from kcal.sim.raytrace import SURVEILLANCE
+        >>> lens = drawn_lens(SURVEILLANCE, 1.0, 7)
         >>> lens.size, round(float(lens.focal[0]))
         ((1920, 1080), 1600)
     """
-    if name not in PRESCRIPTIONS:
-        raise InputError(f"prescription {name!r}: there are {', '.join(PRESCRIPTIONS)}")
     generator = torch.Generator().manual_seed(seed)
-    misalignment = Misalignment.draw(PRESCRIPTIONS[name], strength, generator)
+    misalignment = Misalignment.draw(prescription, strength, generator)
     tilt, shift = (strength * torch.randn((2, 2), dtype=torch.float64, generator=generator)).tolist()
     size = round(1920 * scale), round(1080 * scale)
     return TruthLens(
-        name,
-        focal=scale * (PRESCRIPTIONS[name].focal if focal is None else focal),
+        prescription,
+        focal=scale * (prescription.focal if focal is None else focal),
         size=size,
         focal_mm=focal_mm,
         center=(0.5 * (size[0] - 1) + scale * _AXIS * shift[0], 0.5 * (size[1] - 1) + scale * _AXIS * shift[1]),
@@ -299,14 +298,14 @@ class TrueRig:
 
 
 def drawn_rig(
-    lens: str, strength: float, seed: int, *, focal_mm: float = 2.8, wander: float = 0.1, scale: float = 1.0
+    lens: Prescription, strength: float, seed: int, *, focal_mm: float = 2.8, wander: float = 0.1, scale: float = 1.0
 ) -> TrueRig:
     """Draw two cameras 10 m apart whose lenses have one design and separate errors of assembly.
 
     The right camera is toed in by 0.34 degrees, and turned by 0.17 degrees in pitch and 0.46 in roll.
 
     Args:
-        lens: name of a prescription.
+        lens: prescription of both.
         strength: of the misalignment, see `drawn_lens`.
         seed: of both draws.
         focal_mm: see `TruthLens`.
@@ -314,7 +313,8 @@ def drawn_rig(
         scale: of the image, see `drawn_lens`.
 
     Example:
-        >>> rig = drawn_rig("surveillance", 1.0, 3)
+        >>> from kcal.sim.raytrace import SURVEILLANCE
+        >>> rig = drawn_rig(SURVEILLANCE, 1.0, 3)
         >>> round(float(rig.baseline), 3), rig.left.size
         (10.0, (1920, 1080))
     """

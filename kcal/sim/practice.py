@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 import kcal.sim.coast as shore
 from kcal.sim.board import PrintedBoard
 from kcal.sim.captures import drawn_rig
+from kcal.sim.raytrace import SURVEILLANCE
 from kcal.sim.scene import FOCAL_MM, DemoScene
 from kcal.sim.truth import TruthLens
 
@@ -113,7 +114,7 @@ def practice_scene(seed: int = 1, views: int = 12, scale: float = 1.0) -> DemoSc
     """
     return DemoScene(
         seed=seed,
-        rig=drawn_rig("surveillance", 1.0, 10 + seed, focal_mm=FOCAL_MM, wander=1.0, scale=scale),
+        rig=drawn_rig(SURVEILLANCE, 1.0, 10 + seed, focal_mm=FOCAL_MM, wander=1.0, scale=scale),
         lat=58.094, lon=6.571, height=61.0, heading_deg=236.0, pitch_deg=2.2, roll_deg=0.3,
         near_board=PrintedBoard(9, 6, 0.06, seed=10 + seed), near_views=views,
         targets_at=tuple(thing[:4] for thing in TARGETS), landmarks_at=tuple(thing[:4] for thing in LANDMARKS),

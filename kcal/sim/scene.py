@@ -20,6 +20,7 @@ from kcal.checks import as_points, require_finite
 from kcal.errors import InputError
 from kcal.sim.board import BoardLike, BoardPose, PrintedBoard, project_board
 from kcal.sim.captures import TrueRig, drawn_rig, sample_board_poses
+from kcal.sim.raytrace import SURVEILLANCE
 from kcal.sim.render import RenderOptions, render_board
 
 # Name, horizontal distance in meters, degrees to the right of the heading, meters above the rig.
@@ -97,7 +98,7 @@ def demo_rig() -> TrueRig:
         >>> round(float(demo_rig().baseline), 3)
         10.0
     """
-    return drawn_rig("surveillance", 1.0, 1, focal_mm=FOCAL_MM, wander=1.0)
+    return drawn_rig(SURVEILLANCE, 1.0, 1, focal_mm=FOCAL_MM, wander=1.0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -13,7 +13,7 @@ from torch import Tensor
 from kcal.checks import as_points
 from kcal.errors import InputError
 from kcal.lens.pose import rotation_from_vector
-from kcal.sim.raytrace import PRESCRIPTIONS, Misalignment, Placed, Prescription, focal_length, place, trace
+from kcal.sim.raytrace import Misalignment, Placed, Prescription, focal_length, place, trace
 
 # Rectangles of pixels.
 
@@ -281,7 +281,7 @@ class TruthLens:
     first pixel. All tensors are float64; nothing here is differentiable.
 
     Args:
-        prescription: a lens, or its name.
+        prescription: of the lens.
         focal: paraxial focal length in pixels; that of the prescription if left out.
         size: (width, height) in pixels.
         center: pixel in which the barrel's axis meets the sensor; the image's center if left out.
@@ -300,10 +300,11 @@ class TruthLens:
         table_error: largest difference between the table and tracing, pixels, at 256 places between the nodes.
 
     Raises:
-        InputError: an unknown name, a value out of range, or a lens that does not reach the image's corners.
+        InputError: a value out of range, or a lens that does not reach the image's corners.
 
     Example:
-        >>> lens = TruthLens("machine-vision")
+        >>> from kcal.sim.raytrace import SURVEILLANCE
+        >>> lens = TruthLens(SURVEILLANCE)
         >>> pixels, valid = lens.project(torch.tensor([[0.5, 0.0, 1.0], [0.0, 0.0, -1.0]]).double())
         >>> [round(value, 2) for value in pixels[0].tolist()], valid.tolist()
         ([1743.36, 539.5], [True, False])
@@ -313,7 +314,7 @@ class TruthLens:
 
     def __init__(
         self,
-        prescription: Prescription | str,
+        prescription: Prescription,
         *,
         focal: float | None = None,
         size: tuple[int, int] = (1920, 1080),
@@ -323,10 +324,6 @@ class TruthLens:
         focal_mm: float = 2.8,
         wander: float = 0.1,
     ) -> None:
-        if isinstance(prescription, str):
-            if prescription not in PRESCRIPTIONS:
-                raise InputError(f"prescription {prescription!r}: there are {', '.join(PRESCRIPTIONS)}")
-            prescription = PRESCRIPTIONS[prescription]
         focal = prescription.focal if focal is None else focal
         for name, value in (("focal", focal), ("focal_mm", focal_mm)):
             if not 0 < value < math.inf:

@@ -39,6 +39,7 @@ from kcal.sim.captures import drawn_lens
 from kcal.sim.truth import TruthLens
 from scripts.shared.infinity import error_at_infinity
 from scripts.shared.page import table, write_section
+from scripts.shared.prescriptions import PRESCRIPTIONS
 from scripts.shared.timing import show
 from scripts.shared.traced import BOARD, captures, printed
 
@@ -62,7 +63,7 @@ def cells(
     name: str, board: str, views: int, sigmas: list[float], seed: int, models: list[str]
 ) -> Iterator[dict[str, Any]]:
     """Models on captures that differ in their noise alone."""
-    lens = drawn_lens(name, 1.0, seed, wander=1.0)
+    lens = drawn_lens(PRESCRIPTIONS[name], 1.0, seed, wander=1.0)
     points = BOARD.points if board == "exact" else printed(BOARD.points, seed)
     for sigma, seen in zip(sigmas, captures(lens, views, sigmas, 1000 + seed, points), strict=True):
         for model in models:

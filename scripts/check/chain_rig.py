@@ -19,6 +19,7 @@ from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.mounting import placed_rig
 from kcal.sim.captures import TrueRig, drawn_rig
+from kcal.sim.raytrace import SURVEILLANCE
 from scripts.shared.long_range import ORIGIN, RANGES, range_sigma
 
 How = Literal["held", "prior"]
@@ -56,7 +57,7 @@ def true_rig(draw: int, pupil: float) -> TrueRig:
         draw: seed of the lenses.
         pupil: movement of the entrance pupil, mm/rad².
     """
-    return drawn_rig("surveillance", 1.0, draw, focal_mm=FOCAL_MM, wander=pupil / FULL_PUPIL)
+    return drawn_rig(SURVEILLANCE, 1.0, draw, focal_mm=FOCAL_MM, wander=pupil / FULL_PUPIL)
 
 
 def targets(rig: TrueRig) -> Targets:

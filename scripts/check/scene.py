@@ -44,6 +44,7 @@ from kcal.scene.common_errors import line_errors, with_common_errors
 from kcal.scene.match import ImagePair, MatchedPair, counted, match_scene, scene_of, still_matches
 from kcal.scene.match import _posed as posed
 from kcal.sim.captures import TrueRig, drawn_rig
+from kcal.sim.raytrace import SURVEILLANCE
 from kcal.sim.scene import FOCAL_MM
 from scripts.shared.long_range import ORIGIN
 from scripts.shared.page import DOCS, table, write_row, write_section
@@ -72,7 +73,7 @@ CONDITIONS: dict[str, tuple[Weather, ...]] = {
 
 @functools.cache
 def rig_of(scale: float) -> TrueRig:
-    return drawn_rig("surveillance", 1.0, 1, focal_mm=FOCAL_MM, wander=1.0, scale=scale)
+    return drawn_rig(SURVEILLANCE, 1.0, 1, focal_mm=FOCAL_MM, wander=1.0, scale=scale)
 
 
 @functools.cache

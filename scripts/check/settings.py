@@ -34,13 +34,14 @@ from kcal.corners.observations import Observations
 from kcal.lens.calibration import LensSetting
 from kcal.lens.camera import Camera
 from kcal.lens.uncertainty import pixel_covariance, pixel_errors
-from kcal.sim.raytrace import PRESCRIPTIONS, Misalignment, focal_length, system_matrix
+from kcal.sim.raytrace import Misalignment, focal_length, system_matrix
 from kcal.sim.truth import TruthLens
 from scripts.shared.page import table, write_section
+from scripts.shared.prescriptions import MACHINE_VISION
 from scripts.shared.records import Record, finish
 from scripts.shared.traced import BOARD, captures, printed
 
-LENS = PRESCRIPTIONS["machine-vision"]
+LENS = MACHINE_VISION
 SETTINGS = (0.0, 0.25, 0.5, 0.75, 1.0)
 VIEWS, NOISE = 8, 0.1
 # The surface behind which the gap changes with zoom, and by how much of the prescription's unit at each end.

@@ -18,6 +18,7 @@ from kcal.sim.board import BoardPose
 from kcal.sim.captures import PoseOptions, TrueRig, drawn_lens, drawn_rig, sample_board_poses
 from kcal.sim.truth import TruthLens
 from scripts.shared.pair_poses import sample_pair_poses
+from scripts.shared.prescriptions import PRESCRIPTIONS
 from scripts.shared.traced import printed
 
 FAULTS = ("model", "fronto-parallel", "warp", "blur", "unsynchronized", "pupil", "mirrored or mixed")
@@ -112,10 +113,10 @@ def drawn(kind: str, seed: int) -> Planted | PlantedPair:
         design, wander, fill = "surveillance", 1.0, (0.4, 1.0)
         options = CalibrationOptions(model=draw.choice(["opencv8", "opencv14"]))
         detail = f"{options.model}"
-    lens = drawn_lens(design, strength, seed, wander=wander)
+    lens = drawn_lens(PRESCRIPTIONS[design], strength, seed, wander=wander)
     if kind == "pupil":
         # Lenses of large cameras: the pupil moves by millimeters, and the board is near.
-        lens = drawn_lens(design, strength, seed, wander=wander, focal_mm=draw.uniform(4.0, 12.0))
+        lens = drawn_lens(PRESCRIPTIONS[design], strength, seed, wander=wander, focal_mm=draw.uniform(4.0, 12.0))
     held = sample_board_poses(lens, BOARD, views, generator, fill=fill, options=_ROLLS)
     if kind == "fronto-parallel":
         held = [_parallel(pose, math.radians(tilt), generator) for pose in held]
@@ -168,7 +169,7 @@ def _bent(points: Tensor, height: float, angle: float) -> Tensor:
 
 def _pair(kind: str, draw: random.Random, seed: int, generator: torch.Generator) -> PlantedPair:
     """Both cameras calibrated alone; then pairs of a larger board, with or without motion between both exposures."""
-    rig = drawn_rig("machine-vision", 1.0, seed)
+    rig = drawn_rig(PRESCRIPTIONS["machine-vision"], 1.0, seed)
     sigma = draw.uniform(0.05, 0.15)
     alone = []
     for lens in (rig.left, rig.right):

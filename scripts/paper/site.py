@@ -24,6 +24,7 @@ from kcal.sim.captures import drawn_rig, sample_board_poses
 from kcal.sim.render import RenderOptions, render_board
 from kcal.sim.scene import FOCAL_MM, DemoScene, NamedPoints, Places, SceneMarks
 from scripts.shared.captures import PAPER_BOARD
+from scripts.shared.prescriptions import PRESCRIPTIONS
 
 BOARD = Board(columns=PAPER_BOARD.columns, rows=PAPER_BOARD.rows, square=PAPER_BOARD.square)
 QUALITY = 90  # of JPEG
@@ -95,7 +96,7 @@ def paper_scene(kind: Kind, seed: int) -> PaperScene:
     return dataclasses.replace(
         plain,
         seed=seed,
-        rig=drawn_rig(kind.lens, kind.strength, 100 + seed, focal_mm=kind.focal_mm, wander=1.0),
+        rig=drawn_rig(PRESCRIPTIONS[kind.lens], kind.strength, 100 + seed, focal_mm=kind.focal_mm, wander=1.0),
         near_board=PrintedBoard(*PAPER_BOARD, seed),
         render=LOOKS[kind.look],
         mark_sigma=MARK_SIGMA,

@@ -23,6 +23,7 @@ from kcal.sim.captures import PoseOptions, drawn_lens, sample_board_poses
 from kcal.sim.truth import TruthLens
 from scripts.shared.infinity import error_at_infinity
 from scripts.shared.moving_captures import Hands, MovingCapture, moving_capture
+from scripts.shared.prescriptions import PRESCRIPTIONS
 from scripts.shared.records import Record
 
 BOARD = Board(columns=7, rows=6, square=0.05)
@@ -65,7 +66,7 @@ def simulated(
         bent: meters by which the board bends about an axis of its own in each view (standard deviation).
         share: of the views in which it does; in the others it is stiff.
     """
-    lens = drawn_lens(LENSES[seed % len(LENSES)], 1.0, seed, wander=1.0)
+    lens = drawn_lens(PRESCRIPTIONS[LENSES[seed % len(LENSES)]], 1.0, seed, wander=1.0)
     hands = Hands(holds="camera" if seed // len(LENSES) % 2 else "board") if by_hand else None
     generator, options = torch.Generator().manual_seed(1000 + seed + 10**6 * take), PoseOptions(max_roll=max_roll)
     poses = sample_board_poses(quick(lens), BOARD, views, generator, fill=FILL, options=options)

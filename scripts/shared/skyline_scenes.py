@@ -142,7 +142,8 @@ def skyline_image(
     Example:
         >>> from kcal.sim.captures import drawn_lens
         >>> look = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]).double()  # to the north
-        >>> lens = drawn_lens("surveillance", 1.0, 1, focal_mm=4.64, scale=0.25)
+        >>> from kcal.sim.raytrace import SURVEILLANCE
+        >>> lens = drawn_lens(SURVEILLANCE, 1.0, 1, focal_mm=4.64, scale=0.25)
         >>> seen = skyline_image(Hills(seed=1), lens, look, np.array([0.0, 0, 220]), HillWeather(), farthest=5e3)
         >>> seen.image.shape, bool(seen.elevation.max() > 0.02)
         ((270, 480), True)

@@ -17,6 +17,7 @@ from kcal.lens.rig import Origin
 from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic
 from kcal.locate.raster import Raster
 from kcal.sim.captures import drawn_lens
+from kcal.sim.raytrace import SURVEILLANCE
 from kcal.sim.truth import TruthLens
 from kcal.skyline.horizon import RasterError
 from scripts.shared.skyline_scenes import Hills, HillWeather, Skyline, skyline_image
@@ -69,7 +70,7 @@ class Site(NamedTuple):
 @functools.lru_cache(8)
 def lens_of(number: int) -> TruthLens:
     """A traced surveillance lens, f 800 px, 960 x 540."""
-    return drawn_lens("surveillance", 1.0, number, focal_mm=4.64, scale=0.5)
+    return drawn_lens(SURVEILLANCE, 1.0, number, focal_mm=4.64, scale=0.5)
 
 
 @functools.lru_cache(8)

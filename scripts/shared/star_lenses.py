@@ -22,6 +22,7 @@ from kcal.stars.night import FAR, SkyView
 from kcal.stars.sky import StarCatalog, observed_directions
 from scripts.shared.infinity import error_at_infinity
 from scripts.shared.night_scenes import PLACE, TIME
+from scripts.shared.prescriptions import PRESCRIPTIONS
 from scripts.shared.simulated import CHI2, LENSES
 from scripts.shared.traced import BOARD, capture, printed
 
@@ -121,7 +122,7 @@ def compared(camera: Camera, lens: TruthLens, agreement: Agreement | None = None
 
 def lens_trials(seed: int, boards: int = 20, images: int = 20) -> dict[str, LensTrial]:
     """One traced lens calibrated by boards, by stars, and by both, level and tilted up by 30°."""
-    lens = drawn_lens(LENSES[seed % len(LENSES)], 1.0, seed, wander=1.0)
+    lens = drawn_lens(PRESCRIPTIONS[LENSES[seed % len(LENSES)]], 1.0, seed, wander=1.0)
     seen = capture(lens, boards, 0.1, seed, printed(BOARD.points, seed), FILL)
     known = calibrate_camera(seen)
     out = {"boards": compared(known.camera, lens)}

@@ -110,7 +110,8 @@ class Terrain:
 
     Example:
         >>> from kcal.sim.captures import drawn_rig
-        >>> rig = drawn_rig("surveillance", 1.0, 1, focal_mm=4.64, wander=1.0, scale=0.125)
+        >>> from kcal.sim.raytrace import SURVEILLANCE
+        >>> rig = drawn_rig(SURVEILLANCE, 1.0, 1, focal_mm=4.64, wander=1.0, scale=0.125)
         >>> left, right = Terrain(rig, 1).images(1, Weather(hour=9.0, haze=8000.0))
         >>> left.shape, left.dtype
         ((135, 240), dtype('uint8'))

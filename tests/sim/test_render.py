@@ -8,6 +8,7 @@ from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.sim.board import BoardPose, BoardSize, PrintedBoard, board_points, project_board
+from kcal.sim.raytrace import SURVEILLANCE
 from kcal.sim.render import RenderOptions, invert_window, render_board, render_light
 from kcal.sim.truth import PixelRectangle, TruthLens, pixel_axes
 
@@ -86,12 +87,12 @@ def test_corners_are_where_the_camera_projects_them(name, coefficients):
 @pytest.mark.parametrize("gamma", [1.0, 2.2])
 def test_corners_are_where_the_true_lens_sees_them(gamma):
     # All of the pupil's wander, at 45 cm: lines of sight from one point would be wrong by a pixel.
-    lens = TruthLens("surveillance", size=(960, 600), focal=700.0, wander=1.0, focal_mm=8.0)
+    lens = TruthLens(SURVEILLANCE, size=(960, 600), focal=700.0, wander=1.0, focal_mm=8.0)
     pose = pose_of((0.3, -0.2, 0.1), (-0.02, 0.01, 0.45))
     image = render_light(lens, pose, BOARD, RenderOptions(noise=0, vignetting=0, blur=1.0, gamma=gamma))
     pixels, visible = project_board(lens, pose, BOARD)
     assert visible.all()
-    central = TruthLens("surveillance", size=(960, 600), focal=700.0, wander=0.0, focal_mm=8.0)
+    central = TruthLens(SURVEILLANCE, size=(960, 600), focal=700.0, wander=0.0, focal_mm=8.0)
     assert float((project_board(central, pose, BOARD)[0] - pixels).abs().max()) > 0.3
     some = pixels[::7]
     error = torch.stack([cubic_saddle((image / 255) ** gamma, pixel) for pixel in some]) - some
@@ -99,7 +100,7 @@ def test_corners_are_where_the_true_lens_sees_them(gamma):
 
 
 def test_corners_of_a_print_are_where_its_errors_put_them():
-    lens = TruthLens("surveillance", size=(960, 600), focal=700.0, wander=1.0, focal_mm=8.0)
+    lens = TruthLens(SURVEILLANCE, size=(960, 600), focal=700.0, wander=1.0, focal_mm=8.0)
     pose, board = pose_of((0.3, -0.2, 0.1), (-0.02, 0.01, 0.45)), PrintedBoard(9, 6, 0.06, seed=3)
     image = render_light(lens, pose, board, RenderOptions(noise=0, vignetting=0, blur=1.0))
     pixels, visible = project_board(lens, pose, board)

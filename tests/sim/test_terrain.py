@@ -10,13 +10,14 @@ import torch
 from scipy.ndimage import map_coordinates
 
 from kcal.sim.captures import drawn_rig
+from kcal.sim.raytrace import SURVEILLANCE
 from kcal.sim.scene import FOCAL_MM
 from scripts.shared.terrain import Terrain, Weather
 
 
 @functools.cache
 def terrain() -> Terrain:
-    return Terrain(drawn_rig("surveillance", 1.0, 1, focal_mm=FOCAL_MM, wander=1.0, scale=0.25), 1)
+    return Terrain(drawn_rig(SURVEILLANCE, 1.0, 1, focal_mm=FOCAL_MM, wander=1.0, scale=0.25), 1)
 
 
 def shift_between(weather: Weather, *, ground: bool) -> np.ndarray:

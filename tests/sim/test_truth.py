@@ -7,16 +7,17 @@ import torch
 
 from kcal.errors import InputError
 from kcal.sim.captures import drawn_lens
-from kcal.sim.raytrace import PRESCRIPTIONS, Misalignment
+from kcal.sim.raytrace import SURVEILLANCE, Misalignment
 from kcal.sim.truth import TruthLens
 from scripts.shared.captures import PAPER_BOARD, capture_corners
+from scripts.shared.prescriptions import MACHINE_VISION, PRESCRIPTIONS, WEBCAM
 
 NAMES = sorted(PRESCRIPTIONS)
 
 
 @pytest.fixture(scope="module", params=NAMES)
 def lens(request: pytest.FixtureRequest) -> TruthLens:
-    return drawn_lens(request.param, 1.0, 4)
+    return drawn_lens(PRESCRIPTIONS[request.param], 1.0, 4)
 
 
 def some_pixels(lens: TruthLens, count: int = 200) -> torch.Tensor:
@@ -72,7 +73,7 @@ def test_the_image_ends_half_a_pixel_beyond_its_outer_centers(lens: TruthLens) -
 
 
 def test_a_perfect_lens_is_round() -> None:
-    lens = TruthLens("surveillance", size=(800, 800), focal=700.0)
+    lens = TruthLens(SURVEILLANCE, size=(800, 800), focal=700.0)
     around = torch.linspace(0, 6.2, 30, dtype=torch.float64)
     ring = torch.stack([torch.cos(around), torch.sin(around), torch.full_like(around, 2.0)], -1)
     radius = (lens.project(ring)[0] - 399.5).norm(dim=-1)
@@ -82,12 +83,12 @@ def test_a_perfect_lens_is_round() -> None:
 
 
 def test_turning_the_misplaced_glass_turns_the_picture() -> None:
-    drawn = Misalignment.draw(PRESCRIPTIONS["surveillance"], 2.0, torch.Generator().manual_seed(2))
+    drawn = Misalignment.draw(SURVEILLANCE, 2.0, torch.Generator().manual_seed(2))
     turned = Misalignment(
         decenter=tuple((-y, x) for x, y in drawn.decenter), tilt=tuple((-y, x) for x, y in drawn.tilt)
     )
     straight, quarter = (
-        TruthLens("surveillance", size=(600, 600), focal=500.0, misalignment=each, sensor_tilt=tilt)
+        TruthLens(SURVEILLANCE, size=(600, 600), focal=500.0, misalignment=each, sensor_tilt=tilt)
         for each, tilt in ((drawn, (0.004, -0.002)), (turned, (0.002, 0.004)))
     )
     points = torch.tensor([[0.4, 0.1, 1.0], [-0.2, 0.45, 1.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
@@ -108,7 +109,7 @@ def pupil_wander(lens: TruthLens) -> float:
 
 
 def test_the_pupil_wanders_by_its_share() -> None:
-    whole, tenth, none = (TruthLens("surveillance", wander=share) for share in (1.0, 0.1, 0.0))
+    whole, tenth, none = (TruthLens(SURVEILLANCE, wander=share) for share in (1.0, 0.1, 0.0))
     assert 1e-4 < pupil_wander(whole) < 5e-4
     assert pupil_wander(tenth) == pytest.approx(0.1 * pupil_wander(whole), rel=1e-6)
     assert pupil_wander(none) < 1e-12
@@ -117,27 +118,26 @@ def test_the_pupil_wanders_by_its_share() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"prescription": "pinhole"}, "there are"),
-        ({"prescription": "webcam", "focal": 0.0}, "positive"),
-        ({"prescription": "webcam", "wander": 2.0}, "from 0 to 1"),
-        ({"prescription": "webcam", "focal": 800.0}, "no chief ray"),
-        ({"prescription": "webcam", "size": (0, 3)}, "positive"),
+        ({"focal": 0.0}, "positive"),
+        ({"wander": 2.0}, "from 0 to 1"),
+        ({"focal": 800.0}, "no chief ray"),
+        ({"size": (0, 3)}, "positive"),
     ],
 )
 def test_bad_arguments(arguments: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        TruthLens(**arguments)
+        TruthLens(WEBCAM, **arguments)
 
 
 def test_a_larger_lens_has_the_same_image_and_moves_its_pupil_farther() -> None:
-    small, large = (drawn_lens("surveillance", 1.0, 4, focal_mm=focal_mm, wander=1.0) for focal_mm in (2.8, 5.6))
+    small, large = (drawn_lens(SURVEILLANCE, 1.0, 4, focal_mm=focal_mm, wander=1.0) for focal_mm in (2.8, 5.6))
     assert pupil_wander(large) == pytest.approx(2 * pupil_wander(small), rel=1e-6)
     pixels = torch.tensor([[0.0, 0.0], [1700.0, 300.0]], dtype=torch.float64)
     torch.testing.assert_close(large.unproject(pixels)[0], small.unproject(pixels)[0], atol=1e-11, rtol=0)
 
 
 def test_captures_are_seeded_and_their_noise_scales() -> None:
-    lens = drawn_lens("machine-vision", 1.0, 4)
+    lens = drawn_lens(MACHINE_VISION, 1.0, 4)
     one, two = (capture_corners(lens, 6, sigma=sigma, seed=9) for sigma in (0.1, 0.2))
     torch.testing.assert_close(one.true_pixels, two.true_pixels, atol=0, rtol=0)
     torch.testing.assert_close(2 * (one.pixels - one.true_pixels), two.pixels - two.true_pixels, atol=1e-9, rtol=0)

@@ -28,6 +28,7 @@ from kcal.lens.zernike import ZernikeModes
 from kcal.sim.captures import drawn_lens
 from kcal.solve.lm import LMOptions, minimize
 from scripts.shared.captures import capture_corners
+from scripts.shared.prescriptions import MACHINE_VISION
 
 BOARD = Board(columns=9, rows=7, square=0.04)
 SIZE = (1280, 960)
@@ -364,7 +365,7 @@ def test_normal_equations_without_poses() -> None:
 @pytest.mark.parametrize("seed", [60, 63])
 def test_the_start_of_a_narrow_lens(seed: int) -> None:
     """Five views of 60 degrees: projections of 160 degrees, whose angles hardly differ, must not win the start."""
-    lens = drawn_lens("machine-vision", 1.0, seed)
+    lens = drawn_lens(MACHINE_VISION, 1.0, seed)
     capture = capture_corners(lens, 5, sigma=0.1, seed=seed)
     modes = ZernikeModes(radial=7, decentered=4, astigmatic=3, other=3)
     found = fit_hybrid(capture.points, capture.pixels, lens.size, modes=modes)
