@@ -12,9 +12,9 @@ from torch._dynamo.testing import CompileCounterWithBackend
 from whole_graphs import traced_whole
 
 from kcal.lens.camera import Camera
+from kcal.lens.field_modes import NetworkModes
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.model import LensModel
-from kcal.lens.network_modes import NetworkModes
 from kcal.lens.rays import Unproject
 from kcal.lens.rig import Origin, RigCovariance, StereoRig
 from kcal.lens.zernike import ZernikeModes

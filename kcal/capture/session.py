@@ -14,6 +14,11 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import Route
 from torch import Tensor
 
 from kcal.calibrate.camera.advice import NextView, board_rolls, far_sigma, next_view, possible_views
@@ -29,6 +34,7 @@ from kcal.files import is_stream, make_folder, read_bytes, source_name, write_at
 from kcal.io.images import encode_png
 from kcal.lens.camera import Camera
 from kcal.threads import Handover
+from kcal.web.serving import local_app, page_files
 
 # Frames for a capture: a camera or stream, a video, or a folder into which images come.
 
@@ -339,3 +345,35 @@ def _holds(rotation: Tensor) -> list[list[float]]:
     rotation = rotation[rotation.isfinite().all(-1).all(-1)]
     leaning: list[list[float]] = torch.cat([rotation[:, :2, 2], board_rolls(rotation)[:, None]], 1).tolist()
     return leaning
+
+
+# The capture page's routes.
+
+
+def capture_app(session: CaptureSession, stop: threading.Event, token: str, hosts: tuple[str, ...]) -> Starlette:
+    """The application.
+
+    Args:
+        session: that is shown.
+        stop: set when the page asks to end.
+        token: that requests for data must carry.
+        hosts: that are answered.
+    """
+
+    async def state(_: Request) -> Response:
+        return JSONResponse({**await run_in_threadpool(session.state), "stopped": stop.is_set()})
+
+    async def picture(_: Request) -> Response:
+        found = await run_in_threadpool(session.picture)
+        return Response(status_code=204) if found is None else Response(found, media_type="image/png")
+
+    async def end(_: Request) -> Response:
+        stop.set()
+        return JSONResponse({})
+
+    routes = [
+        Route("/api/state", state, methods=["GET"]),
+        Route("/api/picture", picture, methods=["GET"]),
+        Route("/api/stop", end, methods=["POST"]),
+    ]
+    return local_app(routes, page_files(("kcal.capture", "page")), token, hosts)

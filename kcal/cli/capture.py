@@ -83,7 +83,7 @@ def capture_command(
     server = None
     if page:
         with with_extra("mark", "the page needs", ", or give --no-page"):
-            from kcal.capture.server import capture_app
+            from kcal.capture.session import capture_app
             from kcal.web.serving import LocalServer
         server = LocalServer(
             lambda token, hosts: capture_app(session, stop, token, hosts), port, fallback=port == _PORT

@@ -169,9 +169,8 @@ def import_command(
         raise InputError(f"--unit {unit}: write mm, cm, m or in")
 
     from kcal.io.camera_file import save_camera
-    from kcal.io.camera_rig_file import save_camera_rig
     from kcal.io.formats import import_cameras
-    from kcal.io.rig_file import save_rig
+    from kcal.io.rig_file import save_camera_rig, save_rig
 
     found = import_cameras(
         *sources, format=format, size=parse_size(size), fisheye=fisheye, meters=_UNITS[unit] if unit else None

@@ -15,7 +15,7 @@ from kcal.errors import InputError
 FILES = {
     "camera": ("kcal.io.camera_file", "CameraFile", "kcal calibrate"),
     "rig": ("kcal.io.rig_file", "RigFile", "kcal rig"),
-    "camera-rig": ("kcal.io.camera_rig_file", "CameraRigFile", "kcal rig of three cameras and more, kcal station"),
+    "camera-rig": ("kcal.io.rig_file", "CameraRigFile", "kcal rig of three cameras and more, kcal station"),
     "observations": ("kcal.corners.observations", "Observations", "kcal detect"),
     "board": ("kcal.calibrate.hybrid.measured_board", "BoardFile", "kcal board measure"),
 }

@@ -204,7 +204,7 @@ def _show_pose(content: Mapping[str, Any], known: RigSummary) -> None:
 
 
 def _show_stations(file: Path) -> None:
-    from kcal.io.camera_rig_file import CameraRigFile
+    from kcal.io.rig_file import CameraRigFile
 
     rig = CameraRigFile.load(file).rig()
     for camera in rig.each:

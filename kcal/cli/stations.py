@@ -140,7 +140,7 @@ def solve_stations(
 ) -> None:  # fmt: skip
     """Solve one camera, or three and more, write the rig, print how each stands and whether it may be used."""
     from kcal.io.camera_file import load_camera
-    from kcal.io.camera_rig_file import save_camera_rig
+    from kcal.io.rig_file import save_camera_rig
     from kcal.locate.mirrored import solve_surveyed
 
     names = camera_names(paths)

@@ -20,9 +20,7 @@ from kcal.checks import MOST_FOCAL
 from kcal.errors import InputError
 from kcal.image_header import ImageSize
 from kcal.io.file_summary import CameraSummary
-from kcal.io.information_record import InformationRecord
-from kcal.io.lens_record import LensOrders
-from kcal.io.record import CovarianceRecord
+from kcal.io.record import CovarianceRecord, InformationRecord, LensOrders
 from kcal.lens.calibration import CalibrationRecord, CameraCalibration, LensSetting
 from kcal.lens.camera import Camera
 from kcal.lens.projection import INTRINSICS

@@ -1,8 +1,8 @@
-"""kcal's own rig file: two whole cameras, where the second stands, and how that was found.
+"""kcal's own rig files: whole cameras, where they stand, and how that was found.
 
-JSON, `"kcal": "rig"`, version 2. The cameras are embedded, not
-referred to: relative yaw of 0.01° is 436 m at 5 km, so a rig must never be combined with cameras that were solved again
-after it.
+JSON, `"kcal": "rig"`. Two cameras are version 2, which maps of pairs read too; any other number is version 3. The
+cameras are embedded, not referred to: relative yaw of 0.01° is 436 m at 5 km, so a rig must never be combined with
+cameras that were solved again after it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from kcal.io.file_summary import RigSummary
 from kcal.io.record import Packed
 from kcal.lens.calibration import RigCalibration
 from kcal.lens.projection import INTRINSICS
-from kcal.lens.rig import Mounting, Origin, RigCovariance, StereoRig
+from kcal.lens.rig import CameraRig, CameraRigCalibration, Mounting, Origin, RigCovariance, StereoRig
 from kcal.native_file import NativeFile, Record, storing
 
 Triple = tuple[float, float, float]
@@ -60,15 +60,15 @@ def _tensor(value: Matrix, rows: int, columns: int, what: str) -> Tensor:
     return torch.tensor(value, dtype=torch.float64)
 
 
-def _stored(matrix: Tensor | None) -> Matrix | None:
-    return None if matrix is None else tuple(map(tuple, matrix.tolist()))
+class FrameOrigin(Record):
+    """Where the frame is anchored: degrees, meters above the WGS84 ellipsoid."""
+
+    lat: float = pydantic.Field(ge=-90, le=90)
+    lon: float = pydantic.Field(ge=-180, le=180)
+    height: float
 
 
-def _loaded(matrix: Matrix | None) -> Tensor | None:
-    return None if matrix is None else torch.tensor(matrix, dtype=torch.float64)
-
-
-class RigMounting(Record):
+class RigMounting(FrameOrigin):
     """Where the left camera stands on the Earth and where it looks.
 
     Args:
@@ -84,9 +84,6 @@ class RigMounting(Record):
         refraction: the coefficient, if anything was found of it.
     """
 
-    lat: float = pydantic.Field(ge=-90, le=90)
-    lon: float = pydantic.Field(ge=-180, le=180)
-    height: float
     heading_deg: float
     pitch_deg: float = pydantic.Field(ge=-90, le=90)
     roll_deg: float
@@ -108,28 +105,17 @@ class RigMounting(Record):
     @classmethod
     def of(cls, mounting: Mounting) -> RigMounting:
         """In the form in which it is stored."""
-        return cls(
-            **dataclasses.asdict(mounting.origin),
-            heading_deg=mounting.heading_deg,
-            pitch_deg=mounting.pitch_deg,
-            roll_deg=mounting.roll_deg,
-            covariance=_stored(mounting.covariance),
-            link=_stored(mounting.link),
-            refraction=mounting.refraction,
-        )
+        own = {name: getattr(mounting, name) for name in cls.model_fields if hasattr(mounting, name)}
+        return cls(**dataclasses.asdict(mounting.origin), **own)
 
     def mounting(self) -> Mounting:
         """As `StereoRig.mounting`."""
-        covariance, link = map(_loaded, (self.covariance, self.link))
-        return Mounting(
-            origin=Origin(lat=self.lat, lon=self.lon, height=self.height),
-            heading_deg=self.heading_deg,
-            pitch_deg=self.pitch_deg,
-            roll_deg=self.roll_deg,
-            covariance=covariance,
-            link=link,
-            refraction=self.refraction,
-        )
+        content: dict[str, Any] = dict(self)
+        origin = Origin(**{name: content.pop(name) for name in FrameOrigin.model_fields})
+        for name in ("covariance", "link"):
+            if content[name] is not None:
+                content[name] = torch.tensor(content[name], dtype=torch.float64)
+        return Mounting(origin=origin, **content)
 
 
 class RigFile(NativeFile):
@@ -230,16 +216,12 @@ def rig_to_file(rig: StereoRig) -> RigFile:
     """
     rig = still(rig)
     covariance, mounting = rig.covariance, rig.mounting
+    pose: Any = {"rotation": rig.right_from_left_rotation, "translation": rig.right_from_left_translation}
     with storing("rig"):
         file = RigFile(
             left=named_camera_file(rig.left, "left"),
             right=named_camera_file(rig.right, "right"),
-            right_from_left=RigPose.model_validate(
-                {
-                    "rotation": rig.right_from_left_rotation.tolist(),
-                    "translation": rig.right_from_left_translation.tolist(),
-                }
-            ),
+            right_from_left=RigPose(**pose),
             half=None if covariance is None else Packed.of(covariance.half),
             mounting=None if mounting is None else RigMounting.of(mounting),
             calibration=rig.calibration,
@@ -280,3 +262,108 @@ def load_rig(path: str | Path, *, field: nn.Module | None = None) -> StereoRig:
         kcal.errors.FileError: no-such-file.json: cannot read: No such file or directory
     """
     return RigFile.load(path).rig(field)
+
+
+# Any number of cameras.
+
+
+class StationPose(Record):
+    """`points_cam = rotation @ (points - center)`, meters, in the rig's frame."""
+
+    rotation: tuple[Triple, Triple, Triple]
+    center: Triple
+
+
+class CameraRigFile(NativeFile):
+    """A rig of any number of cameras (file kind `rig`, version 3).
+
+    Args:
+        names: of the cameras.
+        cameras: whole.
+        poses: where they stand.
+        origin: of the frame, east, north, up; None: the first camera's frame.
+        refraction: coefficient.
+        root: (K, P) as `CameraRig.root`.
+        calibration: how the rig was solved, if it was.
+
+    Example:
+        >>> from kcal import Camera
+        >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
+        >>> rig = CameraRig([camera] * 3, ["a", "b", "c"], torch.eye(3).repeat(3, 1, 1), torch.eye(3))
+        >>> camera_rig_to_file(rig).rig().names
+        ('a', 'b', 'c')
+    """
+
+    KIND: ClassVar[str] = "rig"
+    VERSION: ClassVar[int] = CAMERA_RIG_VERSION
+
+    names: tuple[str, ...]
+    cameras: tuple[CameraFile, ...]
+    poses: tuple[StationPose, ...]
+    origin: FrameOrigin | None = None
+    refraction: float = pydantic.Field(default=0.0, ge=-2, le=2)
+    root: Packed | None = None
+    calibration: CameraRigCalibration | None = None
+
+    @pydantic.model_validator(mode="after")
+    def _fitting(self) -> CameraRigFile:
+        if not len(self.names) == len(self.cameras) == len(self.poses):
+            raise ValueError(f"{len(self.names)} names, {len(self.cameras)} cameras and {len(self.poses)} poses")
+        if all(file.model.complete for file in self.cameras):
+            self.rig()
+        return self
+
+    def rig(self, field: nn.Module | None = None) -> CameraRig:
+        """The rig, equal to the stored one to the last bit; `field` as for `kcal.load_rig`."""
+        rig = CameraRig(
+            [file.camera(field) for file in self.cameras],
+            self.names,
+            torch.tensor([pose.rotation for pose in self.poses], dtype=torch.float64).reshape(-1, 3, 3),
+            torch.tensor([pose.center for pose in self.poses], dtype=torch.float64).reshape(-1, 3),
+            origin=None if self.origin is None else Origin(**dict(self.origin)),
+            refraction=self.refraction,
+        )
+        rig.root = None if self.root is None else self.root.tensor()
+        rig.calibration = self.calibration
+        return rig
+
+
+def camera_rig_to_file(rig: CameraRig) -> CameraRigFile:
+    """Put a rig, with all that is known of it and of its cameras, in the form in which it is stored.
+
+    Raises:
+        InputError: values that do not fit together.
+    """
+    rig = still(rig)
+    root, origin = rig.root, rig.origin
+    with storing("rig"):
+        return CameraRigFile(
+            names=rig.names,
+            cameras=tuple(named_camera_file(camera, name) for camera, name in zip(rig.each, rig.names, strict=True)),
+            poses=tuple(
+                StationPose(rotation=turn, center=at) for turn, at in zip(rig.rotation, rig.center, strict=True)
+            ),
+            origin=None if origin is None else FrameOrigin(**dataclasses.asdict(origin)),
+            refraction=float(rig.refraction),
+            root=None if root is None else Packed.of(root),
+            calibration=rig.calibration,
+        )
+
+
+def save_camera_rig(rig: CameraRig, path: str | Path) -> Path:
+    """Write a rig of any number of cameras with all that is known of it.
+
+    Raises:
+        InputError: see `camera_rig_to_file`.
+        FileError: the file cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> from kcal import Camera
+        >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
+        >>> rig = CameraRig([camera], ["tower"], torch.eye(3)[None], torch.zeros(1, 3))
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     CameraRigFile.load(save_camera_rig(rig, Path(folder, "rig.json"))).names
+        ('tower',)
+    """
+    return camera_rig_to_file(rig).save(path)

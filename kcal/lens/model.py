@@ -7,8 +7,8 @@ import dataclasses
 from torch import Tensor, nn
 
 from kcal.errors import InputError
+from kcal.lens.field_modes import NetworkModes
 from kcal.lens.hybrid_terms import HybridForm
-from kcal.lens.network_modes import NetworkModes
 
 # The term and the order of every coefficient, in storage order: OpenCV's 14 first, so that its models are prefixes,
 # then the higher orders of Eq. 10 of the paper and their continuation. A name means the same in every model.
@@ -137,7 +137,7 @@ class LensModel:
 
     @property
     def network(self) -> nn.Module | None:
-        """The module inside the field of a hybrid lens, if that is a network (`kcal.lens.network_modes`)."""
+        """The module inside the field of a hybrid lens, if that is a network (`kcal.lens.field_modes`)."""
         modes = self.hybrid and self.hybrid.modes
         return modes.trunk if isinstance(modes, NetworkModes) else None
 

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from kcal.errors import InputError
 from kcal.files import read_bytes
-from kcal.io.camera_rig_file import CameraRigFile
-from kcal.io.rig_file import RigFile
+from kcal.io.rig_file import CameraRigFile, RigFile
 from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, CameraRig, Mounting, Origin, StereoRig, half_of_covariance
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.localizer import StereoLocalizer

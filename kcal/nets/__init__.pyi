@@ -5,7 +5,7 @@
 from kcal.nets.joint import ResidualNet as ResidualNet
 
 # Residual field of a camera
-from kcal.lens.network_modes import NetworkModes as NetworkModes
+from kcal.lens.field_modes import NetworkModes as NetworkModes
 from kcal.calibrate.hybrid.network_fit import FieldTraining as FieldTraining
 
 # Inverse

@@ -14,8 +14,16 @@ from kcal.checks import as_points
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.projection import INTRINSICS, from_pixels, plane_from_points, project_components
-from kcal.nets.inverse import InverseFit, InverseNet, judged_inverse, set_scales
-from kcal.nets.mlp import Network, evaluate, evaluate_with_slopes, initial_weights
+from kcal.nets.inverse import (
+    InverseFit,
+    InverseNet,
+    Network,
+    evaluate,
+    evaluate_with_slopes,
+    initial_weights,
+    judged_inverse,
+    set_scales,
+)
 from kcal.solve.lm import LMOptions, minimize
 from kcal.solve.problem import SolverStatus, State
 from kcal.solve.schur import SchurProblem
@@ -27,7 +35,7 @@ from kcal.solve.schur import SchurProblem
 # For one camera K* is a constant, and so is the network's value. The corrected camera has the same lens model, and the
 # weights are only another way to write its parameters: this net can fit nothing that the parameters cannot (a test
 # proves it). docs/measured/paper.md has figures. The correction that depends on the position, as Fig. 8 draws it, is
-# `kcal.lens.network_modes.NetworkModes`.
+# `kcal.lens.field_modes.NetworkModes`.
 
 _SKEW = INTRINSICS.index("skew")
 

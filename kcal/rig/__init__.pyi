@@ -57,7 +57,7 @@ from kcal.locate.budget import planned_rig as planned_rig
 from kcal.lens.rig import CameraRig as CameraRig
 from kcal.lens.rig import CameraRigCalibration as CameraRigCalibration
 from kcal.locate.stations import load_camera_rig as load_camera_rig
-from kcal.io.camera_rig_file import save_camera_rig as save_camera_rig
+from kcal.io.rig_file import save_camera_rig as save_camera_rig
 from kcal.locate.stations import station_mounting as station_mounting
 from kcal.locate.stations import stations_of as stations_of
 

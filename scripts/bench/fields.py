@@ -26,8 +26,7 @@ from kcal.corners.board import Board
 from kcal.corners.detect import detect
 from kcal.corners.images import expand_images
 from kcal.corners.observations import Observations
-from kcal.lens.field_modes import FieldModes, GaussianModes
-from kcal.lens.network_modes import NetworkModes
+from kcal.lens.field_modes import FieldModes, GaussianModes, NetworkModes
 from kcal.lens.zernike import ZernikeModes
 from scripts.shared.page import table, write_section
 from scripts.shared.timing import show

@@ -37,7 +37,7 @@ from kcal.calibrate.rig.solve import solve_rig
 from kcal.calibrate.rig.sources import RigData
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
-from kcal.io.camera_rig_file import save_camera_rig
+from kcal.io.rig_file import save_camera_rig
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import CameraRig, Mounting, Origin, RigCovariance

@@ -24,9 +24,8 @@ from kcal.corners.video import VideoFrames, read_frames
 from kcal.file_kind import file_kind
 from kcal.files import read_bytes
 from kcal.io.camera_file import load_camera, save_camera
-from kcal.io.camera_rig_file import save_camera_rig
 from kcal.io.lookup_file import load_lookup, save_lookup
-from kcal.io.rig_file import load_rig, save_rig
+from kcal.io.rig_file import load_rig, save_camera_rig, save_rig
 from kcal.lens.baking import bake
 from kcal.lens.rig import Mounting, Origin, StereoRig
 from kcal.locate.export import write_positions

@@ -24,8 +24,7 @@ import numpy as np
 from hypothesis import strategies
 from starlette.applications import Starlette
 
-from kcal.capture.server import capture_app
-from kcal.capture.session import CaptureOptions, CaptureSession
+from kcal.capture.session import CaptureOptions, CaptureSession, capture_app
 from kcal.io.images import write_png
 from kcal.locate.marks import read_marks
 from kcal.locate.positions import located_by

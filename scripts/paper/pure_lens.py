@@ -18,7 +18,15 @@ from kcal.calibrate.problem.board_problem import apply_twist
 from kcal.checks import as_points
 from kcal.errors import InputError
 from kcal.lens.pose import step_rows
-from kcal.nets.mlp import Network, Widths, evaluate, evaluate_with_slopes, fit_weights, initial_weights, weight_count
+from kcal.nets.inverse import (
+    Network,
+    Widths,
+    evaluate,
+    evaluate_with_slopes,
+    fit_weights,
+    initial_weights,
+    weight_count,
+)
 from kcal.solve.lm import LMOptions
 from kcal.solve.problem import Result, State
 from kcal.solve.schur import SchurProblem

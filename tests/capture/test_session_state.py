@@ -199,7 +199,7 @@ def test_routes(session: CaptureSession) -> None:
     pytest.importorskip("httpx", reason="starlette's test client needs httpx")
     from starlette.testclient import TestClient
 
-    from kcal.capture.server import capture_app
+    from kcal.capture.session import capture_app
 
     stop = threading.Event()
     app = capture_app(session, stop, "token", ("here",))

@@ -15,8 +15,7 @@ from typer.testing import CliRunner
 
 from kcal.cli.main import app
 from kcal.errors import FileError, InputError
-from kcal.io.camera_rig_file import save_camera_rig
-from kcal.io.rig_file import save_rig
+from kcal.io.rig_file import save_camera_rig, save_rig
 from kcal.lens.rig import Mounting
 from kcal.pipeline.stream import Stream
 from kcal.pipeline.tracks import TrackOptions

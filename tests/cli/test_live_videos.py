@@ -23,8 +23,7 @@ from waiting import wait_for
 
 from kcal.cli.main import app
 from kcal.errors import FileError, InputError
-from kcal.io.camera_rig_file import save_camera_rig
-from kcal.io.rig_file import save_rig
+from kcal.io.rig_file import save_camera_rig, save_rig
 from kcal.lens.rig import CameraRig, Origin, StereoRig
 from kcal.pipeline.stream import Stream
 from kcal.threads import Handover

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from kcal.cli.main import app
 from kcal.errors import InputError
-from kcal.io.camera_rig_file import save_camera_rig
+from kcal.io.rig_file import save_camera_rig
 from scripts.shared.station_scenes import ring
 
 AREA = "44.98,5.97,45.02,6.03"

@@ -17,7 +17,7 @@ from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.errors import DegenerateError, FileError, InputError
 from kcal.io.camera_file import save_camera
-from kcal.io.camera_rig_file import save_camera_rig
+from kcal.io.rig_file import save_camera_rig
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import CameraRig, Origin

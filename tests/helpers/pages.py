@@ -19,8 +19,7 @@ from starlette.applications import Starlette
 from track_scenes import pairs_of, tracked_site
 from typer.testing import CliRunner
 
-from kcal.capture.server import capture_app
-from kcal.capture.session import CaptureSession
+from kcal.capture.session import CaptureSession, capture_app
 from kcal.cli.main import app
 from kcal.corners.observations import Observations, View
 from kcal.io.images import write_png

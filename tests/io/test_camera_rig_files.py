@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from kcal.errors import FileError
-from kcal.io.camera_rig_file import CameraRigFile, camera_rig_to_file, save_camera_rig
+from kcal.io.rig_file import CameraRigFile, camera_rig_to_file, save_camera_rig
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector

@@ -22,8 +22,8 @@ from typer.testing import CliRunner
 
 from kcal.cli.main import app
 from kcal.errors import FileError, KcalError
-from kcal.io.camera_rig_file import CameraRigFile
 from kcal.io.formats import import_cameras
+from kcal.io.rig_file import CameraRigFile
 
 K = np.array([[500.0, 0, 330], [0, 505, 236], [0, 0, 1]])
 D = [-0.2, 0.05, 0.001, -0.002, 0.01]

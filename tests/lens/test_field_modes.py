@@ -14,10 +14,9 @@ from wrong_files import assert_refused
 from kcal.errors import InputError
 from kcal.io.camera_file import camera_to_file, load_camera, save_camera
 from kcal.lens.camera import Camera
-from kcal.lens.field_modes import FieldModes, GaussianModes
+from kcal.lens.field_modes import FieldModes, GaussianModes, NetworkModes
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.model import LensModel
-from kcal.lens.network_modes import NetworkModes
 from kcal.lens.projection import project_components
 from kcal.lens.zernike import RADIAL, ZernikeModes
 

@@ -15,14 +15,13 @@ from torch.func import functional_call, stack_module_state, vmap
 
 from kcal.errors import InputError
 from kcal.io.camera_file import load_camera, save_camera
-from kcal.io.camera_rig_file import CameraRigFile, save_camera_rig
-from kcal.io.rig_file import load_rig, save_rig
+from kcal.io.rig_file import CameraRigFile, load_rig, save_camera_rig, save_rig
 from kcal.lens.baking import bake
 from kcal.lens.camera import Camera
+from kcal.lens.field_modes import NetworkModes
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.images import Undistort
 from kcal.lens.model import LensModel
-from kcal.lens.network_modes import NetworkModes
 from kcal.lens.rays import CameraRays
 from kcal.lens.rig import CameraRig, Origin, StereoRig
 from kcal.locate.localizer import StereoLocalizer

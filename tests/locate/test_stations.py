@@ -12,8 +12,7 @@ from torch import Tensor
 from kcal.calibrate.rig.solve import solve_rig
 from kcal.calibrate.rig.sources import Landmarks, MeasuredPosition, RigData
 from kcal.errors import DegenerateError, FileError
-from kcal.io.camera_rig_file import save_camera_rig
-from kcal.io.rig_file import load_rig, save_rig
+from kcal.io.rig_file import load_rig, save_camera_rig, save_rig
 from kcal.lens.rig import CameraRig, Mounting, RigCovariance
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.mounting import placed_rig

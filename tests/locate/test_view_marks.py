@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from kcal.cli.main import app
 from kcal.cli.stars import images_of_nights
 from kcal.errors import FileError, InputError
-from kcal.io.camera_rig_file import save_camera_rig
+from kcal.io.rig_file import save_camera_rig
 from kcal.locate import survey
 from kcal.locate.budget import range_sigmas, station_sigmas
 from kcal.locate.geodesy import enu_to_geodetic, geodetic_to_enu

@@ -18,8 +18,15 @@ from kcal.errors import DegenerateError, InputError
 from kcal.io.onnx_file import save_onnx
 from kcal.lens.camera import Camera
 from kcal.lens.rays import Unproject
-from kcal.nets.inverse import InverseFit, InverseNet, InverseNetOptions, train_inverse
-from kcal.nets.mlp import RegressionProblem, evaluate, initial_weights
+from kcal.nets.inverse import (
+    InverseFit,
+    InverseNet,
+    InverseNetOptions,
+    RegressionProblem,
+    evaluate,
+    initial_weights,
+    train_inverse,
+)
 
 _BARREL = [-0.28, 0.1, 5e-4, -3e-4, 0.02, 0.05, 0.02, 0.01, 4e-4, -2e-4, -3e-4, 1e-4, 0.004, -0.006]
 _WIDE = [0.4749, 0.02579, 3e-5, -9e-6, 8.2e-5, 0.7623, 0.09433, 1.329e-3, 3.1e-5, -2e-7, -2.6e-5, 3e-8, 1.1e-3, 1e-3]

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from kcal.errors import InputError
-from kcal.nets.mlp import evaluate, evaluate_with_slopes, initial_weights, layers, weight_count
+from kcal.nets.inverse import evaluate, evaluate_with_slopes, initial_weights, layers, weight_count
 
 WIDTHS = [(2, 3), (2, 5, 4, 2), (3, 4, 6, 4, 1)]
 

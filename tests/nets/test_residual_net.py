@@ -9,8 +9,8 @@ from torch import Tensor
 
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
+from kcal.nets.inverse import initial_weights
 from kcal.nets.joint import ResidualNet
-from kcal.nets.mlp import initial_weights
 
 
 def start_of(model: str = "opencv5") -> Camera:

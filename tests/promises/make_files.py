@@ -23,9 +23,8 @@ from kcal.calibrate.hybrid.measured_board import load_measured_board, save_measu
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.io.camera_file import load_camera, save_camera
-from kcal.io.camera_rig_file import save_camera_rig
 from kcal.io.lookup_file import load_lookup, save_lookup
-from kcal.io.rig_file import load_rig, save_rig
+from kcal.io.rig_file import load_rig, save_camera_rig, save_rig
 from kcal.lens.baking import bake
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector

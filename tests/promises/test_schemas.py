@@ -14,8 +14,7 @@ from kcal.cli.main import app
 from kcal.cli.schema import FILES, file_schema
 from kcal.corners.observations import Observations
 from kcal.io.camera_file import load_camera, save_camera
-from kcal.io.camera_rig_file import save_camera_rig
-from kcal.io.rig_file import load_rig, save_rig
+from kcal.io.rig_file import load_rig, save_camera_rig, save_rig
 from kcal.locate.stations import load_camera_rig
 
 STORED = Path(__file__).parent / "files"

@@ -22,10 +22,9 @@ from kcal.errors import InputError
 from kcal.io.camera_file import CameraFile, camera_to_file, provenance
 from kcal.lens.calibration import CalibrationRecord, CameraCalibration, Exclusion, LensSetting
 from kcal.lens.camera import Camera
-from kcal.lens.field_modes import FieldModes
+from kcal.lens.field_modes import FieldModes, NetworkModes
 from kcal.lens.information import CameraInformation
 from kcal.lens.model import LensModel
-from kcal.lens.network_modes import NetworkModes
 from kcal.solve.lm import LMOptions
 from kcal.solve.problem import RobustLoss, SolverStatus
 from kcal.texts import brief

@@ -1,6 +1,6 @@
 """Train the network of a field together with camera, poses, motions and board.
 
-Of all unknowns, those inside the network (`kcal.lens.network_modes`) are the only ones that the solver does not know.
+Of all unknowns, those inside the network (`kcal.lens.field_modes`) are the only ones that the solver does not know.
 Where everything else is at its optimum, the derivative of the least cost by them is the partial one (variable
 projection, Golub and Pereyra 1973). So both take turns: a few steps of the network's weights, then rounds of solver and
 evidence. What counts in the end is the evidence, so that a step which only follows the noise is taken back.
@@ -23,9 +23,9 @@ from kcal.calibrate.hybrid.families import LEADING_UNKNOWNS, Hyperprior
 from kcal.calibrate.hybrid.fitted_views import Estimate, FittedViews
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.errors import InputError
+from kcal.lens.field_modes import NetworkModes
 from kcal.lens.hybrid_terms import LEADING
 from kcal.lens.model import LensModel
-from kcal.lens.network_modes import NetworkModes
 from kcal.lens.projection import INTRINSICS, project_components
 from kcal.solve.schur import products_of, without_local
 

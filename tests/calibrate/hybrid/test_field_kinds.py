@@ -14,9 +14,8 @@ from kcal.calibrate.hybrid.families import SQUARE, prior_families, typical_hyper
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
 from kcal.corners.board import Board
 from kcal.lens.camera import Camera
-from kcal.lens.field_modes import FieldModes, GaussianModes
+from kcal.lens.field_modes import FieldModes, GaussianModes, NetworkModes
 from kcal.lens.hybrid_terms import HybridForm
-from kcal.lens.network_modes import NetworkModes
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.zernike import ZernikeModes
 

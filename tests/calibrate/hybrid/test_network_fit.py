@@ -29,7 +29,7 @@ from kcal.calibrate.hybrid.network_fit import (
 )
 from kcal.calibrate.hybrid.settled import settle
 from kcal.errors import InputError
-from kcal.lens.network_modes import NetworkModes
+from kcal.lens.field_modes import NetworkModes
 from scripts.shared.dented_lens import BOARD, NOISE, SIZE, capture, network, off
 
 
