@@ -32,8 +32,7 @@ from kcal.calibrate.rig.sources import Landmarks
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.report.figures import ACCENT, FAINT, GRAY, INK, WARN, new_figure, save_picture
-from kcal.sim.board import PrintedBoard
-from kcal.sim.captures import drawn_rig
+from kcal.sim.captures import PrintedBoard, drawn_rig
 from kcal.sim.raytrace import SURVEILLANCE
 from kcal.sim.scene import FOCAL_MM, DemoScene, NamedPoints
 from scripts.check.chain import FLAGS as CHAIN_FLAGS

@@ -138,7 +138,7 @@ def _temperature(camera: Camera) -> float | None:
 
 def _history(camera: Camera) -> str:
     """Model, focal length and, if the file tells, when the camera was calibrated."""
-    from kcal.lens.paraxial import paraxial_focal
+    from kcal.lens.uncertainty import paraxial_focal
 
     record = camera.calibration.record if camera.calibration else None
     when = ""

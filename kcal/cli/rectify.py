@@ -500,8 +500,8 @@ def rays_command(
     import numpy as np
     import torch
 
-    from kcal.lens.paraxial import paraxial_focal
     from kcal.lens.rays import CameraRays, ray_error
+    from kcal.lens.uncertainty import paraxial_focal
 
     rig = rig_of(sources[0]) if len(sources) == 1 else None
     cameras = [single_camera(source) for source in sources] if rig is None else [rig.left, rig.right]

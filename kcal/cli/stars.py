@@ -110,7 +110,7 @@ def print_star_budget(
         altitude: of the middle of the image, degrees.
         clock: sigma of the offset between the cameras' clocks, seconds.
     """
-    from kcal.stars.budget import NightPlan, planned_stars
+    from kcal.stars.detect import NightPlan, planned_stars
 
     out.print(
         f"stars: f {focal:g} px, {size[0]}x{size[1]}, aperture {aperture:g} mm, middle of the image {altitude:g}° up, "

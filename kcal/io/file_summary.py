@@ -53,7 +53,7 @@ class CameraSummary(Record):
     @classmethod
     def derived(cls, camera: Camera, content: dict[str, Any]) -> Self:
         """The same, with the error where something cannot be derived."""
-        from kcal.lens.paraxial import paraxial_focal
+        from kcal.lens.uncertainty import paraxial_focal
 
         record = camera.calibration.record if camera.calibration else None
         return cls(

@@ -10,7 +10,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from kcal.checks import Float64Module, as_tensor
+from kcal.checks import Float64Module, as_tensor, require_finite
 from kcal.dispatch import is_differentiated
 from kcal.errors import InputError
 
@@ -59,6 +59,20 @@ def nearest_rotation(matrix: Tensor) -> Tensor:
     sign = torch.linalg.det(u @ vh)
     u = torch.cat([u[..., :2], u[..., 2:] * sign[..., None, None]], -1)
     return u @ vh
+
+
+def check_motion(name: str, rotation: Tensor, translation: Tensor) -> None:
+    """Raise `InputError` unless these are a rotation (3, 3) and a translation (3,), all finite; `name` says of what."""
+    if rotation.shape != (3, 3) or translation.shape != (3,):
+        raise InputError(
+            f"{name} pose: shapes (3, 3) and (3,) are needed, got {tuple(rotation.shape)} and "
+            f"{tuple(translation.shape)}"
+        )
+    require_finite(f"{name} rotation", rotation)
+    require_finite(f"{name} translation", translation)
+    identity = torch.eye(3, dtype=torch.float64, device=rotation.device)
+    if not torch.allclose(rotation @ rotation.T, identity, atol=1e-6) or torch.linalg.det(rotation) < 0:
+        raise InputError(f"{name} rotation: not a rotation matrix (R Rᵀ must be 1 and det R = +1)")
 
 
 def step_rows(by_point: Tensor, rotated: Tensor) -> Tensor:

@@ -33,7 +33,7 @@ class Unproject(nn.Module):
     steps for every point. The few pixels next to a fold that have not converged by then are not valid there, although
     an eager call may find their rays.
 
-    `kcal.io.onnx_file.save_onnx` writes the module as ONNX.
+    `kcal.io.lookup_file.save_onnx` writes the module as ONNX.
 
     Args:
         camera: the camera, kept as a submodule.

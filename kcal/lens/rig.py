@@ -19,7 +19,7 @@ from kcal.errors import InputError, warn_user
 from kcal.lens.calibration import Exclusion, RigCalibration, RigSource, UntilChanged
 from kcal.lens.camera import Camera
 from kcal.lens.camera_like import CameraLike, as_camera
-from kcal.lens.pose import Movable, rotation_from_vector
+from kcal.lens.pose import Movable, check_motion, rotation_from_vector
 from kcal.texts import brief, length_text
 
 # `Origin` and `Mounting`: where a camera stands on the Earth and where it looks, as plain numbers.
@@ -194,16 +194,7 @@ class StereoRig(Movable):
         # OpenCV's T is (3, 1).
         translation = translation[:, 0] if translation.shape == (3, 1) else translation
         translation = as_points("right_from_left_translation", translation, 3, like)
-        if rotation.shape != (3, 3) or translation.shape != (3,):
-            raise InputError(
-                f"rig pose: shapes (3, 3) and (3,) are needed, got {tuple(rotation.shape)} and "
-                f"{tuple(translation.shape)}"
-            )
-        require_finite("rig rotation", rotation)
-        require_finite("rig translation", translation)
-        identity = torch.eye(3, dtype=torch.float64, device=rotation.device)
-        if not torch.allclose(rotation @ rotation.T, identity, atol=1e-6) or torch.linalg.det(rotation) < 0:
-            raise InputError("rig rotation: not a rotation matrix (R Rᵀ must be 1 and det R = +1)")
+        check_motion("rig", rotation, translation)
         self.left: Camera = as_camera(left)
         self.right: Camera = as_camera(right)
         if isinstance(right_from_left_translation, nn.Parameter) and translation is not right_from_left_translation:

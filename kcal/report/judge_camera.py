@@ -28,8 +28,7 @@ from kcal.corners.observations import Observations
 from kcal.lens.calibration import CalibrationRecord
 from kcal.lens.camera import Camera
 from kcal.lens.difference import camera_difference
-from kcal.lens.paraxial import paraxial_focal
-from kcal.lens.uncertainty import image_sigma
+from kcal.lens.uncertainty import image_sigma, paraxial_focal
 from kcal.report.verdict import (
     FAULTS,
     Finding,

@@ -13,8 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 import kcal.sim.coast as shore
-from kcal.sim.board import PrintedBoard
-from kcal.sim.captures import drawn_rig
+from kcal.sim.captures import PrintedBoard, drawn_rig
 from kcal.sim.raytrace import SURVEILLANCE
 from kcal.sim.scene import FOCAL_MM, DemoScene
 from kcal.sim.truth import TruthLens

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.sim.board import (
+from kcal.sim.captures import (
     BoardLike,
     BoardPose,
     PrintedBoard,
@@ -183,7 +183,7 @@ def render_board(
             or pose, or noise without a generator.
 
     Example:
-        >>> from kcal.sim.board import BoardSize
+        >>> from kcal.sim.captures import BoardSize
         >>> camera = Camera.build(focal=(400, 400), center=(159.5, 119.5), size=(320, 240))
         >>> pose = BoardPose(torch.eye(3), torch.tensor([-0.2, -0.125, 1.0]))
         >>> image = render_board(camera, pose, BoardSize(9, 6, 0.05), RenderOptions(noise=0, vignetting=0))
@@ -211,7 +211,7 @@ def render_light(
     Arguments and errors are those of `render_board`.
 
     Example:
-        >>> from kcal.sim.board import BoardSize
+        >>> from kcal.sim.captures import BoardSize
         >>> camera = Camera.build(focal=(400, 400), center=(159.5, 119.5), size=(320, 240))
         >>> pose = BoardPose(torch.eye(3), torch.tensor([-0.2, -0.125, 1.0]))
         >>> light = render_light(camera, pose, BoardSize(9, 6, 0.05), RenderOptions(vignetting=0))

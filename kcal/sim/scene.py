@@ -18,8 +18,7 @@ from torch import Tensor
 
 from kcal.checks import as_points, require_finite
 from kcal.errors import InputError
-from kcal.sim.board import BoardLike, BoardPose, PrintedBoard, project_board
-from kcal.sim.captures import TrueRig, drawn_rig, sample_board_poses
+from kcal.sim.captures import BoardLike, BoardPose, PrintedBoard, TrueRig, drawn_rig, project_board, sample_board_poses
 from kcal.sim.raytrace import SURVEILLANCE
 from kcal.sim.render import RenderOptions, render_board
 

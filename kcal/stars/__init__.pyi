@@ -30,6 +30,6 @@ from kcal.stars.lens import calibrate_by_stars as calibrate_by_stars
 from kcal.stars.lens import StarCamera as StarCamera
 from kcal.stars.lens_fit import StarLens as StarLens
 from kcal.stars.lens import Agreement as Agreement
-from kcal.stars.budget import planned_stars as planned_stars
-from kcal.stars.budget import NightPlan as NightPlan
-from kcal.stars.budget import PlannedStars as PlannedStars
+from kcal.stars.detect import planned_stars as planned_stars
+from kcal.stars.detect import NightPlan as NightPlan
+from kcal.stars.detect import PlannedStars as PlannedStars

@@ -35,7 +35,7 @@ from kcal.corners.refine import Refinement, refine_corners
 from kcal.corners.saddle import saddle
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
-from kcal.sim.board import BoardSize, project_board
+from kcal.sim.captures import BoardSize, project_board
 from kcal.sim.render import RenderOptions, render_light
 from scripts.shared.page import table, write_section
 

@@ -34,8 +34,7 @@ from kcal.corners.grid import local_side
 from kcal.corners.images import expand_images, read_gray
 from kcal.corners.refine import refine_corners
 from kcal.lens.camera import Camera
-from kcal.sim.board import BoardSize
-from kcal.sim.captures import sample_board_poses
+from kcal.sim.captures import BoardSize, sample_board_poses
 from kcal.sim.render import render_board
 from scripts.shared.page import table, write_section
 

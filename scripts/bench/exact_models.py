@@ -20,7 +20,7 @@ from torch import Tensor
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.lens.camera import Camera
-from kcal.sim.board import board_points
+from kcal.sim.captures import board_points
 from scripts.shared.captures import PAPER_BOARD, capture_corners
 from scripts.shared.infinity import error_at_infinity
 from scripts.shared.page import table, write_section

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcal.corners.board import Board
-from kcal.sim.board import BoardPose
+from kcal.sim.captures import BoardPose
 from scripts.bench.hard_scenes import SIZE, Light, Scene
 
 BOARD = Board(columns=9, rows=6, square=0.025)

@@ -13,8 +13,7 @@ from torch import Tensor
 from kcal.corners.board import Board
 from kcal.corners.print_board import pattern_shapes
 from kcal.lens.camera import Camera
-from kcal.sim.board import BoardPose, BoardSize
-from kcal.sim.captures import PoseOptions, sample_board_poses
+from kcal.sim.captures import BoardPose, BoardSize, PoseOptions, sample_board_poses
 from kcal.sim.render import RenderOptions, render_light
 from scripts.shared.printed_board import Paper, light_of, points_of, through_lens
 

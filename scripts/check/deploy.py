@@ -20,7 +20,7 @@ import onnxruntime
 import torch
 from torch import Tensor
 
-from kcal.io.onnx_file import save_onnx
+from kcal.io.lookup_file import save_onnx
 from kcal.lens.camera import Camera
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.model import LensModel

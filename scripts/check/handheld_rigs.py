@@ -25,8 +25,7 @@ from kcal.corners.observations import Observations
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
-from kcal.sim.board import BoardPose, BoardSize
-from kcal.sim.captures import sample_board_poses
+from kcal.sim.captures import BoardPose, BoardSize, sample_board_poses
 from scripts.shared.moving_captures import Hands, MovingCapture, moving_capture
 from scripts.shared.page import table, write_section
 from scripts.shared.records import Record, finish, read, seeds

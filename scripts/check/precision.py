@@ -26,7 +26,7 @@ from torch import Tensor
 
 from kcal.errors import InputError
 from kcal.io.camera_file import load_camera, save_camera
-from kcal.io.onnx_file import save_onnx
+from kcal.io.lookup_file import save_onnx
 from kcal.io.rig_file import load_rig
 from kcal.lens.baking import bake
 from kcal.lens.camera import Camera

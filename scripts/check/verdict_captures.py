@@ -14,8 +14,7 @@ from kcal.calibrate.camera.result import CalibrationOptions
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.lens.pose import rotation_from_vector
-from kcal.sim.board import BoardPose
-from kcal.sim.captures import PoseOptions, TrueRig, drawn_lens, drawn_rig, sample_board_poses
+from kcal.sim.captures import BoardPose, PoseOptions, TrueRig, drawn_lens, drawn_rig, sample_board_poses
 from kcal.sim.truth import TruthLens
 from scripts.shared.pair_poses import sample_pair_poses
 from scripts.shared.prescriptions import PRESCRIPTIONS

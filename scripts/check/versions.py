@@ -41,7 +41,7 @@ import torch
 import kcal
 assert "site-packages" in kcal.__file__, kcal.__file__
 from kcal import Board, Camera, Observations, View
-from kcal.sim.board import BoardSize, board_points
+from kcal.sim.captures import BoardSize, board_points
 from kcal.sim.captures import sample_board_poses
 
 true = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080), coefficients=[-0.2, 0.05])

@@ -9,8 +9,15 @@ import torch
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.sim.board import BoardLike, BoardSize, LensLike, board_points, project_board
-from kcal.sim.captures import PoseOptions, sample_board_poses
+from kcal.sim.captures import (
+    BoardLike,
+    BoardSize,
+    LensLike,
+    PoseOptions,
+    board_points,
+    project_board,
+    sample_board_poses,
+)
 
 # The board of the paper: 6 x 7 corners, squares of 5 cm.
 PAPER_BOARD = BoardSize(7, 6, 0.05)

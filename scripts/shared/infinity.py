@@ -9,7 +9,7 @@ from torch import Tensor
 
 from kcal.errors import InputError
 from kcal.lens.pose import rotation_from_vector
-from kcal.sim.board import LensLike
+from kcal.sim.captures import LensLike
 
 _TURN_STEPS = 4
 _TURN_NUDGE = 1e-6  # radians, for central differences

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from kcal.errors import InputError
 from kcal.lens.pose import rotation_from_vector
-from kcal.sim.board import BoardLike, BoardPose, LensLike, true_corners
+from kcal.sim.captures import BoardLike, BoardPose, LensLike, true_corners
 from scripts.shared.captures import PAPER_BOARD
 
 # Width of an edge in a sharp image, pixels (standard deviation). Where motion of length L widens it to s, an edge is

@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 from kcal.lens.rig import StereoRig
-from kcal.sim.board import BoardLike, BoardPose
-from kcal.sim.captures import PoseOptions, TrueRig, check_draws, choose_poses, draw_poses
+from kcal.sim.captures import BoardLike, BoardPose, PoseOptions, TrueRig, check_draws, choose_poses, draw_poses
 
 
 def sample_pair_poses(
@@ -39,7 +38,7 @@ def sample_pair_poses(
         >>> from kcal import Camera
         >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480))
         >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
-        >>> from kcal.sim.board import BoardSize, project_board
+        >>> from kcal.sim.captures import BoardSize, project_board
         >>> board = BoardSize(9, 6, 0.1)
         >>> poses = sample_pair_poses(rig, board, 4, torch.Generator().manual_seed(1), distance=(4.0, 6.0))
         >>> bool(project_board(rig.right, rig_pose(rig, poses[0]), board)[1].all())

@@ -18,8 +18,7 @@ from kcal.corners.observations import Observations, View
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera
 from kcal.lens.uncertainty import pixel_covariance
-from kcal.sim.board import PrintedBoard
-from kcal.sim.captures import PoseOptions, drawn_lens, sample_board_poses
+from kcal.sim.captures import PoseOptions, PrintedBoard, drawn_lens, sample_board_poses
 from kcal.sim.truth import TruthLens
 from scripts.shared.infinity import error_at_infinity
 from scripts.shared.moving_captures import Hands, MovingCapture, moving_capture

@@ -13,8 +13,7 @@ from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.lens.camera import Camera
 from kcal.lens.uncertainty import pixel_covariance
 from kcal.locate.geodesy import enu_from_cam
-from kcal.sim.board import LensLike
-from kcal.sim.captures import drawn_lens
+from kcal.sim.captures import LensLike, drawn_lens
 from kcal.sim.truth import TruthLens
 from kcal.stars.detect import DetectedStars
 from kcal.stars.lens import Agreement, StarCamera, calibrate_by_stars

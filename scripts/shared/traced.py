@@ -15,7 +15,7 @@ from kcal.lens.hybrid_terms import HybridForm, radius_over_angle
 from kcal.lens.model import LensModel
 from kcal.lens.projection import project_components
 from kcal.lens.zernike import ZernikeModes
-from kcal.sim.board import LensLike, PrintedBoard
+from kcal.sim.captures import LensLike, PrintedBoard
 from kcal.sim.truth import TruthLens
 from scripts.shared.captures import capture_corners
 

@@ -18,7 +18,7 @@ from kcal.cli.main import app
 from kcal.corners.board import Board
 from kcal.errors import DegenerateError
 from kcal.io.camera_file import load_camera
-from kcal.lens.paraxial import paraxial_focal
+from kcal.lens.uncertainty import paraxial_focal
 
 RUNNER = CliRunner()
 

@@ -10,8 +10,7 @@ import torch
 
 from kcal.corners.board import Board
 from kcal.lens.camera import Camera
-from kcal.sim.board import BoardSize
-from kcal.sim.captures import sample_board_poses
+from kcal.sim.captures import BoardSize, sample_board_poses
 from kcal.sim.render import RenderOptions, render_board
 
 BOARD = Board(columns=6, rows=5, square=0.02)

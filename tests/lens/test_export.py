@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from whole_graphs import traced_whole
 
 from kcal.errors import FileError, InputError
-from kcal.io.onnx_file import save_onnx
+from kcal.io.lookup_file import save_onnx
 from kcal.lens.camera import Camera
 from kcal.lens.model import PRESETS
 from kcal.lens.rays import Unproject

@@ -13,10 +13,9 @@ from torch import Tensor
 
 from kcal.lens.camera import Camera
 from kcal.lens.distortion import distort
-from kcal.lens.fold_proof import Jet, Span
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.model import LensModel
-from kcal.lens.region import direction_limits, in_region, valid_region
+from kcal.lens.region import Jet, Span, direction_limits, in_region, valid_region
 from scripts.check import folds
 from scripts.check.uncertainty import LENS
 from tests.helpers.lenses import MODELS, strong

@@ -16,8 +16,7 @@ from lenses import hybrid_camera
 from torch import Tensor
 
 from kcal.errors import DegenerateError, FileError, InputError
-from kcal.io.lookup_file import load_lookup, save_lookup
-from kcal.io.onnx_file import save_onnx
+from kcal.io.lookup_file import load_lookup, save_lookup, save_onnx
 from kcal.lens.baking import (
     RINGS,
     LookupCamera,

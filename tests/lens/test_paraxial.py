@@ -14,8 +14,8 @@ from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
 from kcal.lens.model import PRESETS
-from kcal.lens.paraxial import ParaxialFocal, paraxial_focal
 from kcal.lens.projection import FAR, project_components
+from kcal.lens.uncertainty import ParaxialFocal, paraxial_focal
 
 PLAIN = [name for name, model in PRESETS.items() if not model.tilt]
 

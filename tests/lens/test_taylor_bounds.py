@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal.lens.fold_proof import Jet, Span
+from kcal.lens.region import Jet, Span
 
 HALF = 0.5
 

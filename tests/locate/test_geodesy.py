@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from locate_rigs import tensor
 
 from kcal.errors import InputError
-from kcal.io.onnx_file import save_onnx
+from kcal.io.lookup_file import save_onnx
 from kcal.lens.rig import Origin
 from kcal.locate.geodesy import (
     anchor,

@@ -15,7 +15,7 @@ from torch import Tensor
 
 import kcal.lens.inverse
 from kcal.errors import DegenerateError, InputError
-from kcal.io.onnx_file import save_onnx
+from kcal.io.lookup_file import save_onnx
 from kcal.lens.camera import Camera
 from kcal.lens.rays import Unproject
 from kcal.nets.inverse import (

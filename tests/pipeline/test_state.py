@@ -12,7 +12,7 @@ from lenses import HYBRID, strong
 from torch import Tensor, nn
 
 from kcal.errors import InputError
-from kcal.io.onnx_file import save_onnx
+from kcal.io.lookup_file import save_onnx
 from kcal.lens.camera import Camera
 from kcal.lens.model import PRESETS
 from kcal.lens.rig import Origin, RigCovariance, StereoRig

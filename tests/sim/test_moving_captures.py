@@ -9,8 +9,7 @@ import torch
 
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.sim.board import BoardPose, project_board
-from kcal.sim.captures import sample_board_poses
+from kcal.sim.captures import BoardPose, project_board, sample_board_poses
 from scripts.shared.captures import PAPER_BOARD
 from scripts.shared.moving_captures import HandMotion, Hands, draw_motion, moving_capture, noise_root, rolling_corners
 

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
-from kcal.sim.board import BoardSize, board_points, project_board
-from kcal.sim.captures import PoseOptions, sample_board_poses
+from kcal.sim.captures import BoardSize, PoseOptions, board_points, project_board, sample_board_poses
 from kcal.sim.scene import demo_rig
 from scripts.shared.pair_poses import rig_pose, sample_pair_poses
 

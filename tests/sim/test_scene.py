@@ -6,7 +6,7 @@ import torch
 
 from kcal.errors import InputError
 from kcal.locate.geodesy import enu_from_cam
-from kcal.sim.board import project_board
+from kcal.sim.captures import project_board
 from kcal.sim.scene import DemoScene, demo_rig, mark_points, render_demo, scene_views
 
 

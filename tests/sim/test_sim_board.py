@@ -4,7 +4,7 @@ import torch
 from kcal.corners.board import Board
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.sim.board import BoardPose, BoardSize, area_colors, board_points, check_pose, project_board
+from kcal.sim.captures import BoardPose, BoardSize, area_colors, board_points, check_pose, project_board
 
 
 def test_points_are_those_of_the_library_board():

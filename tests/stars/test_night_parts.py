@@ -14,8 +14,17 @@ import torch
 from kcal.errors import InputError
 from kcal.io.images import write_png, write_video
 from kcal.lens.camera import Camera
-from kcal.stars.budget import NightPlan, PlannedStars, planned_stars
-from kcal.stars.detect import _night_sky, _uncrowded, detect_stars, expand_nights, read_night, time_of
+from kcal.stars.detect import (
+    NightPlan,
+    PlannedStars,
+    _night_sky,
+    _uncrowded,
+    detect_stars,
+    expand_nights,
+    planned_stars,
+    read_night,
+    time_of,
+)
 from kcal.stars.identification import Identification
 from kcal.stars.night import _names_at, field_angle
 from kcal.stars.rig_stars import moments_of

@@ -17,8 +17,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
 from kcal.lens.pose import rotation_from_vector
 from kcal.locate.geodesy import enu_from_cam
-from kcal.stars.budget import NightPlan, _signal
-from kcal.stars.detect import DetectedStars
+from kcal.stars.detect import DetectedStars, NightPlan, _signal
 from kcal.stars.identification import _triangles, pair_table, turn_between
 from kcal.stars.lens import (
     Agreement,

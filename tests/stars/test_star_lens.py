@@ -15,8 +15,7 @@ from kcal.cli.main import app
 from kcal.errors import InputError
 from kcal.io.camera_file import load_camera
 from kcal.lens.camera import Camera
-from kcal.stars.budget import NightPlan, planned_stars
-from kcal.stars.detect import DetectedStars
+from kcal.stars.detect import DetectedStars, NightPlan, planned_stars
 from kcal.stars.lens import calibrate_by_stars
 from kcal.stars.lens_fit import StarField, fit_star_lens
 from scripts.shared.infinity import error_at_infinity

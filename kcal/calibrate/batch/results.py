@@ -46,7 +46,7 @@ from kcal.child_processes import deaf_to_interrupts
 from kcal.corners.observations import Observations
 from kcal.errors import FileError, InputError, KcalError
 from kcal.files import dump_json, make_folder, read_bytes, write_atomic
-from kcal.lens.paraxial import paraxial_focal
+from kcal.lens.uncertainty import paraxial_focal
 from kcal.native_file import NativeFile
 from kcal.strict_json import MOST_BYTES, read_json
 from kcal.texts import csv_line

@@ -397,7 +397,7 @@ def measure_board(
 
     Example:
         >>> from kcal import Board, Camera, View
-        >>> from kcal.sim.board import BoardSize, project_board
+        >>> from kcal.sim.captures import BoardSize, project_board
         >>> from kcal.sim.captures import sample_board_poses
         >>> camera = Camera.build(focal=(500, 500), center=(320, 240), size=(640, 480), coefficients=[-0.1])
         >>> size, generator = BoardSize(7, 6, 0.05), torch.Generator().manual_seed(3)

@@ -34,8 +34,7 @@ from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, FileError, InputError, KcalError
 from kcal.io.camera_file import CameraFile, load_camera
 from kcal.lens.camera import Camera
-from kcal.sim.board import BoardSize
-from kcal.sim.captures import sample_board_poses
+from kcal.sim.captures import BoardSize, sample_board_poses
 from kcal.sim.render import RenderOptions, render_board
 
 BOARD = Board(columns=6, rows=5, square=0.02)

@@ -16,11 +16,10 @@ from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.lens.paraxial import paraxial_focal
 from kcal.lens.pose import rotation_from_vector
+from kcal.lens.uncertainty import paraxial_focal
 from kcal.lens.zernike import ZernikeModes
-from kcal.sim.board import BoardSize, board_points
-from kcal.sim.captures import sample_board_poses
+from kcal.sim.captures import BoardSize, board_points, sample_board_poses
 from scripts.shared.moving_captures import Hands, moving_capture
 
 BOARD = BoardSize(9, 6, 0.05)

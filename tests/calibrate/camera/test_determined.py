@@ -16,9 +16,9 @@ from kcal.corners.observations import Observations, View
 from kcal.errors import DegenerateError
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
-from kcal.lens.paraxial import paraxial_focal
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.projection import FAR, project_components
+from kcal.lens.uncertainty import paraxial_focal
 
 
 def rays_of(lens: Camera) -> torch.Tensor:

@@ -13,7 +13,7 @@ from kcal.corners.observations import Observations
 from kcal.io.camera_file import load_camera
 from kcal.lens.camera import Camera
 from kcal.lens.difference import camera_difference
-from kcal.lens.paraxial import paraxial_focal
+from kcal.lens.uncertainty import paraxial_focal
 from scripts.shared.printed_board import Paper, pose
 
 CAMERA = Camera.build(focal=(430, 430), center=(243, 177), size=(480, 360), coefficients=[-0.1, 0.02])

@@ -20,8 +20,7 @@ from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.difference import camera_difference
 from kcal.lens.pose import rotation_from_vector
-from kcal.sim.board import PrintedBoard, true_corners
-from kcal.sim.captures import sample_board_poses
+from kcal.sim.captures import PrintedBoard, sample_board_poses, true_corners
 
 BOARD, VIEWS, SIZE = Board(columns=9, rows=6, square=0.03), 12, (1280, 960)
 LENS = Camera.build(focal=(1100, 1100), center=(652, 470), size=SIZE, coefficients=[-0.2, 0.05, 2e-4, -3e-4])

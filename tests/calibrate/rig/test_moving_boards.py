@@ -25,8 +25,7 @@ from kcal.errors import InputError
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
-from kcal.sim.board import BoardPose, BoardSize
-from kcal.sim.captures import sample_board_poses
+from kcal.sim.captures import BoardPose, BoardSize, sample_board_poses
 from kcal.solve.schur import Products, without_local
 from scripts.shared.moving_captures import Hands, moving_capture
 
