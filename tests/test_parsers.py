@@ -11,8 +11,7 @@ import pytest
 from scipy.io import savemat
 
 from kcal.errors import FileError
-from kcal.mat_file import read_mat
-from kcal.opencv_storage import read_storage
+from kcal.strict_formats import read_mat, read_storage
 
 
 def stored(kind: str) -> tuple[bytes, dict[str, Any]]:

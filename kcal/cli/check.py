@@ -195,7 +195,7 @@ def _kept_refits(path: Path, key: str) -> list[Refit]:
     import torch
 
     from kcal.calibrate.camera.interval_check import Refit
-    from kcal.strict_npz import read_npz
+    from kcal.strict_formats import read_npz
 
     if not path.exists():
         return []

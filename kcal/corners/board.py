@@ -13,7 +13,7 @@ from kcal.errors import FileError, InputError
 from kcal.files import read_text
 from kcal.lens.calibration import BoardRecord
 from kcal.native_file import Record
-from kcal.strict_yaml import MOST_BYTES, read_yaml
+from kcal.strict_formats import MOST_YAML, read_yaml
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -167,7 +167,7 @@ def target_fields(path: str | Path) -> dict[str, Any]:
         ...     target_fields(path)
         {'pattern': 'aprilgrid', 'columns': 12, 'rows': 8, 'square': 0.08, 'gap': 0.02}
     """
-    content = read_yaml(read_text(path, MOST_BYTES), str(path))
+    content = read_yaml(read_text(path, MOST_YAML), str(path))
     if "target_type" not in content:
         raise FileError(f"{path}: not a target file of Kalibr: target_type is missing")
     kind = content["target_type"]

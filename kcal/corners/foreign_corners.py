@@ -19,8 +19,7 @@ from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.errors import FileError, InputError
 from kcal.files import read_bytes, read_text
-from kcal.mat_file import read_mat
-from kcal.opencv_storage import read_storage
+from kcal.strict_formats import read_mat, read_storage
 from kcal.strict_json import MOST_BYTES
 
 # (u, v, weight) of a corner, or None where it was not seen.

@@ -26,8 +26,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.lens.pose import nearest_rotation
 from kcal.lens.rig import CameraRig, StereoRig
-from kcal.strict_yaml import MOST_BYTES as MOST_YAML
-from kcal.strict_yaml import read_yaml
+from kcal.strict_formats import MOST_YAML, read_yaml
 from kcal.texts import brief
 
 # Rotations of files with six digits; beyond it they are no rotation but a mistake.

@@ -23,8 +23,7 @@ from kcal.lens.hybrid_terms import HybridForm, radius_over_angle
 from kcal.lens.model import LensModel
 from kcal.lens.projection import project_components
 from kcal.lens.zernike import ZernikeModes
-from kcal.strict_yaml import MOST_BYTES as MOST_YAML
-from kcal.strict_yaml import read_yaml
+from kcal.strict_formats import MOST_YAML, read_yaml
 
 # Kalibr's omni-radtan lens: a ray on the unit sphere, seen from a point xi behind its center, then radial terms.
 #

@@ -22,7 +22,7 @@ from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector, step_rows, vector_from_rotation
 from kcal.lens.projection import project_components
-from kcal.strict_npz import read_npz
+from kcal.strict_formats import read_npz
 
 # What mrcal's `optimization_inputs` say of a camera: its covariance from the corners that are stored in its file.
 #

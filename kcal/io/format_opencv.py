@@ -38,10 +38,8 @@ from kcal.io.foreign import (
 from kcal.io.keyed import flat, read_keyed
 from kcal.lens.camera import Camera
 from kcal.lens.pose import vector_from_rotation
-from kcal.mat_file import read_mat
-from kcal.opencv_storage import read_storage
+from kcal.strict_formats import read_mat, read_npz, read_storage
 from kcal.strict_json import read_json
-from kcal.strict_npz import read_npz
 
 # OpenCV's YAML, XML and JSON files of one camera or a stereo pair, as its samples write and read them.
 #

@@ -25,8 +25,8 @@ from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.lens.projection import parameter_names
 from kcal.lens.uncertainty import square_root_information
+from kcal.strict_formats import read_npz
 from kcal.strict_json import read_json
-from kcal.strict_npz import read_npz
 
 # More parameters than any lens of another program has.
 _MOST_PARAMETERS, _MOST_CAMERAS = 64, 10_000

@@ -45,9 +45,9 @@ class CameraFormat:
 
     Args:
         title: what the files are.
-        suffixes: of file names that mean this format where nothing else is said.
         models: kcal's lens models that it can hold.
         read: one file.
+        suffixes: of file names that mean this format where nothing else is said.
         write: cameras and their poses, all of one of the models; None for formats that kcal only reads.
         skew: whether it can hold a skew.
         pose: whether it can hold the relative pose of two cameras.
@@ -55,9 +55,9 @@ class CameraFormat:
     """
 
     title: str
-    suffixes: tuple[str, ...]
     models: tuple[str, ...]
     read: Callable[[Path, Hints], ImportedCameras]
+    suffixes: tuple[str, ...] = ()
     write: Callable[[Sequence[Camera], Sequence[CameraPose], Path], list[Path]] | None = None
     skew: bool = False
     pose: bool = True
@@ -72,7 +72,7 @@ _XML = re.compile(r"<cameras(?=>\s*<camera[^>]*serial)|<sensors(?=[ >])|<calibra
 
 def _prior_format(program: str, title: str, models: tuple[str, ...]) -> CameraFormat:
     return CameraFormat(
-        title=title, suffixes=(), models=models, read=format_prior.read_prior,
+        title=title, models=models, read=format_prior.read_prior,
         write=format_prior.prior_writer(program), skew=program == "gtsam", pose=False, prior=True,
     )  # fmt: skip
 
@@ -87,14 +87,12 @@ FORMATS = {
     ),
     "ros": CameraFormat(
         title="ROS camera_info, a file per camera",
-        suffixes=(),
         models=("pinhole", "opencv4", "opencv5", "opencv8", "fisheye4"),
         read=format_opencv.read_ros,
         write=format_opencv.write_ros,
     ),
     "kalibr": CameraFormat(
         title="Kalibr camchain",
-        suffixes=(),
         models=("pinhole", "opencv4", "fisheye4"),
         read=format_kalibr.read_kalibr,
         write=format_kalibr.write_kalibr,
@@ -132,7 +130,6 @@ FORMATS = {
     ),
     "opensfm": CameraFormat(
         title="OpenSfM camera_models.json",
-        suffixes=(),
         models=("pinhole", "opencv4", "opencv5", "fisheye4"),
         read=format_photos.read_opensfm,
         write=format_photos.write_opensfm,
@@ -145,12 +142,8 @@ FORMATS = {
         read=format_opencv.read_toml,
         write=format_opencv.write_toml,
     ),
-    "qualisys": CameraFormat(
-        title="Qualisys .qca.txt", suffixes=(), models=(), read=format_photos.read_qualisys, pose=False
-    ),
-    "agisoft": CameraFormat(
-        title="Agisoft Metashape XML", suffixes=(), models=(), read=format_photos.read_agisoft, pose=False
-    ),
+    "qualisys": CameraFormat(title="Qualisys .qca.txt", models=(), read=format_photos.read_qualisys, pose=False),
+    "agisoft": CameraFormat(title="Agisoft Metashape XML", models=(), read=format_photos.read_agisoft, pose=False),
     "gtsam": _prior_format("gtsam", "Values and noise model for GTSAM, JSON", format_prior.GTSAM_MODELS),
     "ceres": _prior_format("ceres", "A and b of Ceres's NormalPrior, JSON", format_prior.PLAIN_MODELS),
     "numpy": _prior_format("numpy", "Parameters and their square-root information, .npz", format_prior.PLAIN_MODELS),

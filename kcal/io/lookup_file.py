@@ -48,7 +48,7 @@ from kcal.errors import FileError, InputError
 from kcal.files import check_writable, read_bytes, write_atomic
 from kcal.image_header import check_pixel_count
 from kcal.lens.baking import LookupCamera, Spline
-from kcal.strict_npz import read_npz
+from kcal.strict_formats import read_npz
 
 KIND, VERSION = "lookup", 1
 # Tables of 700 cells each way take 16 MB.

@@ -334,7 +334,7 @@ def square_root_information(camera: Camera, order: Sequence[int]) -> tuple[Tenso
 # parameters, so that its sigma follows from their covariance.
 
 # Standard deviations beyond which both focal lengths are told apart, and relative rounding.
-_UNEQUAL, _ROUNDING = 3.0, 1e-9
+_UNEQUAL, _SAME = 3.0, 1e-9
 
 
 class ParaxialFocal(NamedTuple):
@@ -374,7 +374,7 @@ class ParaxialFocal(NamedTuple):
             return measured_text(value, sigma) if sigma == sigma else f"{value:.3f}"
 
         (aspect, error), (u, v), (s, t) = self.aspect, self.value.tolist(), self.sigma.tolist()
-        if abs(aspect - 1.0) > _UNEQUAL * (error if error == error else 0.0) + _ROUNDING:
+        if abs(aspect - 1.0) > _UNEQUAL * (error if error == error else 0.0) + _SAME:
             return f"{shown(u, s)} px along rows, {shown(v, t)} px along columns"
         return f"{shown(*self.mean)} px"
 

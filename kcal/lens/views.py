@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -27,24 +27,6 @@ _SIDE_SAMPLES = 129
 _WIDEST = math.radians(89.0)
 # Which side of the image is at the left, right, top and bottom of a frame, by quarter turns of the image.
 _SIDES = (0, 1, 2, 3), (3, 2, 0, 1), (1, 0, 3, 2), (2, 3, 1, 0)
-
-
-class Sees(Protocol):
-    """What choosing a pinhole asks of a camera; `TurnedCamera` is one, too."""
-
-    @property
-    def params(self) -> Tensor:
-        """(..., 5 + P), for their batch shape, dtype and device."""
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """(width, height) of the image."""
-
-    def unproject(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """As `Camera.unproject`."""
-
-    def project_rays(self, rays: Tensor) -> tuple[Tensor, Tensor]:
-        """As `Camera.project_rays`."""
 
 
 class TurnedCamera:
@@ -79,7 +61,7 @@ class TurnedCamera:
         return self.camera.project(self.at * rays / rays.norm(dim=-1, keepdim=True))
 
 
-def source_pixels(camera: Sees, rays: Tensor) -> tuple[Tensor, Tensor]:
+def source_pixels(camera: Camera | TurnedCamera, rays: Tensor) -> tuple[Tensor, Tensor]:
     """Project directions to pixels, and say whether the image has a value there.
 
     Args:
@@ -175,7 +157,7 @@ def _points_on_sides(low: Tensor, high: Tensor, along: Tensor) -> Tensor:
     )
 
 
-def _side_extremes(camera: Sees, outermost: bool) -> Tensor:
+def _side_extremes(camera: Camera | TurnedCamera, outermost: bool) -> Tensor:
     """Innermost (or outermost) x of the left and right side and y of the top and bottom side of the image, (..., 4).
 
     Infinite for a side on which no pixel has a ray. Left is the side that is at the left in the camera's frame.
@@ -205,7 +187,7 @@ def _side_extremes(camera: Sees, outermost: bool) -> Tensor:
     return value
 
 
-def inner_rectangle(camera: Sees, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+def inner_rectangle(camera: Camera | TurnedCamera, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """The rectangle in which every pixel of a new image of this size has a source."""
     vector = camera.params
     shape = torch.tensor(size, dtype=vector.dtype, device=vector.device) - 1
@@ -259,7 +241,7 @@ def _shrunk(center: Tensor, low: Tensor, high: Tensor, scale: Tensor) -> tuple[T
     return center + scale * (low - center), center + scale * (high - center)
 
 
-def outer_rectangle(camera: Sees) -> tuple[Tensor, Tensor]:
+def outer_rectangle(camera: Camera | TurnedCamera) -> tuple[Tensor, Tensor]:
     """The rectangle around every source pixel that has a ray."""
     sides = _side_extremes(camera, outermost=True)
     low, high = sides[..., 0::2], sides[..., 1::2]
@@ -271,7 +253,7 @@ def outer_rectangle(camera: Sees) -> tuple[Tensor, Tensor]:
     return low, high
 
 
-def _valid_rim(camera: Sees) -> Tensor:
+def _valid_rim(camera: Camera | TurnedCamera) -> Tensor:
     """Last valid points (..., 1440, 2) of the plane z = 1 along as many directions from the axis."""
     vector = camera.params
     turn = torch.arange(1440, dtype=vector.dtype, device=vector.device) * (2 * math.pi / 1440)

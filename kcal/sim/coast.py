@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from kcal.sim.render import invert_window
+from kcal.sim.scene import invert_window
 from kcal.sim.truth import PixelRectangle, TruthLens
 
 # Smooth random fields that have a value everywhere: clouds, waves, rock, grass.

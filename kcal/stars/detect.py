@@ -287,7 +287,7 @@ def time_of(text: str | None, path: Path) -> datetime.datetime | None:
 # Electrons a second and cm² of a star of magnitude 0: silicon, 400 to 900 nm, behind color filters and glass.
 _ELECTRONS = 1.0e6
 _READ, _DARK = 2.0, 1.0  # electrons, and electrons a second, of a pixel
-_PSF, _LEAST_SIGMA = 1.0, 0.05  # px
+_PSF, _PLANNED_SIGMA = 1.0, 0.05  # px
 _LEAST_SIGNAL = 7.0
 _EXTINCTION = 0.25  # magnitudes for each thickness of the atmosphere
 _ARCSECONDS = 206265.0
@@ -398,4 +398,4 @@ def _signal(
     signal = star / np.sqrt(star + pixels * (sky + _DARK * plan.seconds + _READ**2))
     # Image motion in a small aperture.
     seeing = 2.0 * air**0.6 / math.sqrt(1 + plan.seconds / 0.1) / pixel
-    return signal, np.sqrt(_LEAST_SIGMA**2 + (1.2 * along / signal) ** 2 + seeing**2)
+    return signal, np.sqrt(_PLANNED_SIGMA**2 + (1.2 * along / signal) ** 2 + seeing**2)

@@ -24,7 +24,7 @@ from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import StereoRig
 from kcal.scene.match import ImagePair, MatchedPair, match_scene
 from kcal.scene.refine import SAME, SWAY, whole_shifts
-from kcal.strict_npz import read_npz
+from kcal.strict_formats import read_npz
 from kcal.watch.history import Look, between_rows, no_look
 
 # What is looked for in each image of a watched rig: patches of fixed things, and where they were.

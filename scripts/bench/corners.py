@@ -36,7 +36,7 @@ from kcal.corners.saddle import saddle
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.sim.captures import BoardSize, project_board
-from kcal.sim.render import RenderOptions, render_light
+from kcal.sim.scene import RenderOptions, render_light
 from scripts.shared.page import table, write_section
 
 BOARD = Board(columns=9, rows=6, square=0.025)

@@ -35,7 +35,7 @@ from kcal.corners.images import expand_images, read_gray
 from kcal.corners.refine import refine_corners
 from kcal.lens.camera import Camera
 from kcal.sim.captures import BoardSize, sample_board_poses
-from kcal.sim.render import render_board
+from kcal.sim.scene import render_board
 from scripts.shared.page import table, write_section
 
 BOARD = Board(columns=9, rows=6, square=0.025)

@@ -14,7 +14,7 @@ from kcal.corners.board import Board
 from kcal.corners.print_board import pattern_shapes
 from kcal.lens.camera import Camera
 from kcal.sim.captures import BoardPose, BoardSize, PoseOptions, sample_board_poses
-from kcal.sim.render import RenderOptions, render_light
+from kcal.sim.scene import RenderOptions, render_light
 from scripts.shared.printed_board import Paper, light_of, points_of, through_lens
 
 SIZE = 640, 480

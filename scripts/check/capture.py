@@ -36,7 +36,7 @@ from kcal.corners.observations import Observations, View
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.sim.captures import BoardPose, BoardSize, sample_board_poses
-from kcal.sim.render import RenderOptions, render_board
+from kcal.sim.scene import RenderOptions, render_board
 from scripts.shared.page import table, write_section
 from scripts.shared.timing import show
 

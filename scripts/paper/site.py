@@ -20,8 +20,7 @@ from kcal.corners.board import Board
 from kcal.corners.detect import detect_board, view_of
 from kcal.corners.observations import Failure, Observations, View
 from kcal.sim.captures import PrintedBoard, drawn_rig, sample_board_poses
-from kcal.sim.render import RenderOptions, render_board
-from kcal.sim.scene import FOCAL_MM, DemoScene, NamedPoints, Places, SceneMarks
+from kcal.sim.scene import FOCAL_MM, DemoScene, NamedPoints, Places, RenderOptions, SceneMarks, render_board
 from scripts.shared.captures import PAPER_BOARD
 from scripts.shared.prescriptions import PRESCRIPTIONS
 

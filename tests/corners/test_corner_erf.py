@@ -21,7 +21,7 @@ from kcal.corners.saddle import CornerStatus
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.sim.captures import BoardSize, project_board
-from kcal.sim.render import RenderOptions, render_light
+from kcal.sim.scene import RenderOptions, render_light
 
 BOARD = Board(columns=5, rows=4, square=0.02)
 

@@ -11,7 +11,7 @@ import torch
 from kcal.corners.board import Board
 from kcal.lens.camera import Camera
 from kcal.sim.captures import BoardSize, sample_board_poses
-from kcal.sim.render import RenderOptions, render_board
+from kcal.sim.scene import RenderOptions, render_board
 
 BOARD = Board(columns=6, rows=5, square=0.02)
 Image = npt.NDArray[np.uint8]

@@ -9,7 +9,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.sim.captures import BoardPose, BoardSize, PrintedBoard, board_points, project_board
 from kcal.sim.raytrace import SURVEILLANCE
-from kcal.sim.render import RenderOptions, invert_window, render_board, render_light
+from kcal.sim.scene import RenderOptions, invert_window, render_board, render_light
 from kcal.sim.truth import PixelRectangle, TruthLens, pixel_axes
 
 BOARD = BoardSize(9, 6, 0.06)

@@ -35,7 +35,7 @@ from kcal.errors import DegenerateError, FileError, InputError, KcalError
 from kcal.io.camera_file import CameraFile, load_camera
 from kcal.lens.camera import Camera
 from kcal.sim.captures import BoardSize, sample_board_poses
-from kcal.sim.render import RenderOptions, render_board
+from kcal.sim.scene import RenderOptions, render_board
 
 BOARD = Board(columns=6, rows=5, square=0.02)
 WHAT = ("--board", "6x5", "--square", "20mm")
