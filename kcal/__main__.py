@@ -37,7 +37,7 @@ def main() -> None:
         gc.freeze()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # it ends already
     exec("")  # otherwise Python ends as if killed where an interruption came inside such a call
-    if any(thread.name == "unstoppable" for thread in threading.enumerate()):  # kcal.child_processes
+    if any(thread.name == "unstoppable" for thread in threading.enumerate()):  # kcal.threads
         sys.stdout.flush()
         os._exit(code if isinstance(code, int) else bool(code))
     sys.exit(code)

@@ -31,9 +31,9 @@ from kcal.calibrate.camera.result import CalibrationOptions
 from kcal.corners.refine import RefineCorners
 from kcal.lens import rotation_from_vector
 from kcal.lens.baking import LookupCamera, bake
+from kcal.lens.camera_like import CameraRays, Unproject
 from kcal.lens.camera_parameters import CameraDistortion, ExtendedDistortion
 from kcal.lens.images import StereoRectification, Undistort, UndistortImage
-from kcal.lens.rays import CameraRays, Unproject
 from kcal.lens.rig import CameraRig, Origin, RigCovariance
 from kcal.lens.views import Cylinder
 from kcal.locate.disparity import DisparityRanges

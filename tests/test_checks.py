@@ -11,8 +11,8 @@ from torch import Tensor
 
 from kcal.checks import Float64Module, as_covariance, as_points, as_size, require_finite
 from kcal.errors import InputError
+from kcal.file_kind import check_pixel_count
 from kcal.files import is_stream, source_name
-from kcal.image_header import check_pixel_count
 
 F64 = torch.float64
 

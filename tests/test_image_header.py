@@ -16,7 +16,7 @@ from PIL import Image
 
 from kcal.corners.images import decode_image, read_gray
 from kcal.errors import FileError
-from kcal.image_header import _FORMATS, check_image_header
+from kcal.file_kind import _FORMATS, check_image_header
 
 LEVELS = np.random.default_rng(0).integers(0, 255, (37, 53), np.uint8)
 

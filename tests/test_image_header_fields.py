@@ -7,7 +7,7 @@ import struct
 import pytest
 
 from kcal.errors import FileError
-from kcal.image_header import _FORMATS, check_image_header, is_image
+from kcal.file_kind import _FORMATS, check_image_header, is_image
 
 
 def tiff(order: str, big: bool, entries: list[tuple[int, int, int]], pad: int = 4) -> bytes:

@@ -201,7 +201,7 @@ def test_a_planted_circle_is_seen() -> None:
         ("kcal.lens.camera", "import kcal.io.camera_file as c", "imports kcal.io.camera_file"),
         ("kcal.lens.camera", "from kcal import calibrate", "imports kcal.calibrate"),
         ("kcal.lens.camera", "from ..calibrate import rig", "imports kcal.calibrate.rig"),
-        ("kcal.lens.rays", "from kcal.nets.inverse import InverseNet", "imports kcal.nets.inverse"),
+        ("kcal.lens.camera_like", "from kcal.nets.inverse import InverseNet", "imports kcal.nets.inverse"),
         ("kcal.solve.lm", "from kcal.lens.camera import Camera", "imports kcal.lens.camera"),
         ("kcal.corners.detect", "from kcal.io.camera_file import load_camera", "imports kcal.io.camera_file"),
         ("kcal.io.camera_file", "from kcal.corners.board import Board", "imports kcal.corners.board"),

@@ -12,10 +12,10 @@ from torch._dynamo.testing import CompileCounterWithBackend
 from whole_graphs import traced_whole
 
 from kcal.lens.camera import Camera
+from kcal.lens.camera_like import Unproject
 from kcal.lens.field_modes import NetworkModes
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.model import LensModel
-from kcal.lens.rays import Unproject
 from kcal.lens.rig import Origin, RigCovariance, StereoRig
 from kcal.lens.zernike import ZernikeModes
 from kcal.locate.localizer import StereoLocalizer

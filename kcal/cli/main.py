@@ -16,7 +16,6 @@ import kcal
 from kcal.cli import inputs
 from kcal.cli.batch import batch_command
 from kcal.cli.board import app as board
-from kcal.cli.budget import budget_command
 from kcal.cli.calibrate import calibrate_command
 from kcal.cli.capture import capture_command
 from kcal.cli.check import check_command
@@ -24,7 +23,7 @@ from kcal.cli.compare import bake_command, compare_command, diff_command, interp
 from kcal.cli.console import err, option_for_each, with_json
 from kcal.cli.demo import demo_command
 from kcal.cli.detect import detect_command
-from kcal.cli.exchange import export_command, import_command
+from kcal.cli.exchange import export_command, import_command, schema_command
 from kcal.cli.inputs import with_inputs
 from kcal.cli.live import live_command
 from kcal.cli.locate import locate_command
@@ -32,10 +31,9 @@ from kcal.cli.mark import mark_command
 from kcal.cli.rectify import rays_command, rectify_command
 from kcal.cli.report import report_command
 from kcal.cli.rig import app as rig
-from kcal.cli.schema import schema_command
 from kcal.cli.settings import Command, defaults_of, init_command, read_settings
 from kcal.cli.show import show_command
-from kcal.cli.sites import sites_command
+from kcal.cli.sites import budget_command, sites_command
 from kcal.cli.stars import stars_command
 from kcal.cli.stations import station_command
 from kcal.cli.watch import watch_command

@@ -500,7 +500,7 @@ def rays_command(
     import numpy as np
     import torch
 
-    from kcal.lens.rays import CameraRays, ray_error
+    from kcal.lens.camera_like import CameraRays, ray_error
     from kcal.lens.uncertainty import paraxial_focal
 
     rig = rig_of(sources[0]) if len(sources) == 1 else None

@@ -38,8 +38,8 @@ from kcal.corners.saddle import CornerStatus, Refined
 from kcal.corners.search import SEARCH_SIDES, find_board, largest_grid, reduced, refine_through_sizes
 from kcal.corners.time_limit import Limited, TookTooLongError
 from kcal.errors import FileError, InputError
+from kcal.file_kind import check_image_header
 from kcal.files import is_stream, read_bytes, source_name
-from kcal.image_header import check_image_header
 from kcal.texts import brief
 
 # What the search for a board in one image gives.

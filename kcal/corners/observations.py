@@ -10,7 +10,7 @@ import pydantic
 
 from kcal.corners.board import Board
 from kcal.errors import InputError
-from kcal.image_header import ImageSize
+from kcal.file_kind import ImageSize
 from kcal.native_file import NativeFile, Record
 
 if TYPE_CHECKING:

@@ -11,8 +11,8 @@ from contextlib import suppress
 from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
-from kcal.child_processes import OVER_LIMIT, UNSTOPPABLE, deaf_to_interrupts, work_limit
 from kcal.errors import InputError, KcalError
+from kcal.threads import OVER_LIMIT, UNSTOPPABLE, deaf_to_interrupts, work_limit
 
 T = TypeVar("T")
 

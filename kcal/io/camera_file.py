@@ -7,6 +7,7 @@ the last bit. Parameters are stored by name, so that a value cannot slip into an
 from __future__ import annotations
 
 import datetime
+import itertools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
@@ -18,7 +19,7 @@ from torch import nn
 import kcal
 from kcal.checks import MOST_FOCAL
 from kcal.errors import InputError
-from kcal.image_header import ImageSize
+from kcal.file_kind import ImageSize
 from kcal.io.record import CameraSummary, CovarianceRecord, InformationRecord, LensOrders
 from kcal.lens.calibration import CalibrationRecord, CameraCalibration, LensSetting
 from kcal.lens.camera import Camera
@@ -115,25 +116,15 @@ class CameraFile(NativeFile):
             raise ValueError(f"{what}; the lens model needs exactly {_listed(names) or 'nothing'}")
         return {name: value[name] for name in names}
 
-    @pydantic.field_validator("covariance")
+    @pydantic.field_validator("covariance", "information")
     @classmethod
-    def _of_model(cls, value: CovarianceRecord | None, info: pydantic.ValidationInfo) -> CovarianceRecord | None:
-        if value is None or "model" not in info.data:
-            return value
-        names = (*INTRINSICS, *info.data["model"].names)
-        unknown = [name for name in value.names if name not in names]
-        if unknown:
-            raise ValueError(f"covariance: {unknown[0]} is unknown; the lens model has {_listed(names)}")
-        return value
-
-    @pydantic.field_validator("information")
-    @classmethod
-    def _on_model(cls, value: InformationRecord | None, info: pydantic.ValidationInfo) -> InformationRecord | None:
+    def _of_model(cls, value: Any, info: pydantic.ValidationInfo) -> Any:
         if value is not None and "model" in info.data:
             names = (*INTRINSICS, *info.data["model"].names)
-            unknown = [name for group in value.unknowns for name in group if name not in names]
+            own = value.names if isinstance(value, CovarianceRecord) else itertools.chain(*value.unknowns)
+            unknown = [name for name in own if name not in names]
             if unknown:
-                raise ValueError(f"information: {unknown[0]} is unknown; the lens model has {_listed(names)}")
+                raise ValueError(f"{info.field_name}: {unknown[0]} is unknown; the lens model has {_listed(names)}")
         return value
 
     @pydantic.field_serializer("calibration", mode="wrap")

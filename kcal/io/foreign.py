@@ -19,8 +19,8 @@ from torch import Tensor
 
 from kcal.checks import MOST_FOCAL
 from kcal.errors import FileError, InputError, KcalError
+from kcal.file_kind import check_pixel_count
 from kcal.files import read_text
-from kcal.image_header import check_pixel_count
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel

@@ -45,8 +45,8 @@ from torch import Tensor, nn
 
 from kcal.checks import as_points
 from kcal.errors import FileError, InputError
+from kcal.file_kind import check_pixel_count
 from kcal.files import check_writable, read_bytes, write_atomic
-from kcal.image_header import check_pixel_count
 from kcal.lens.baking import LookupCamera, Spline
 from kcal.strict_formats import read_npz
 

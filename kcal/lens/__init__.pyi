@@ -25,8 +25,8 @@ from kcal.lens.views import pinhole_view as pinhole_view
 from kcal.lens.views import looking as looking
 from kcal.lens.views import pupil_shift as pupil_shift
 from kcal.lens.images import StereoRectification as StereoRectification
-from kcal.lens.rays import CameraRays as CameraRays
-from kcal.lens.rays import ray_error as ray_error
+from kcal.lens.camera_like import CameraRays as CameraRays
+from kcal.lens.camera_like import ray_error as ray_error
 from kcal.lens.camera_conversions import ImageTransform as ImageTransform
 
 # Error bars
@@ -58,8 +58,8 @@ from kcal.lens.baking import bake as bake
 from kcal.lens.baking import LookupCamera as LookupCamera
 from kcal.io.lookup_file import load_lookup as load_lookup
 from kcal.io.lookup_file import save_lookup as save_lookup
-from kcal.lens.rays import Unproject as Unproject
-from kcal.lens.rays import LearnedStart as LearnedStart
+from kcal.lens.camera_like import Unproject as Unproject
+from kcal.lens.camera_like import LearnedStart as LearnedStart
 
 # Rotations
 from kcal.lens.pose import rotation_from_vector as rotation_from_vector

@@ -23,8 +23,8 @@ from pyproj.exceptions import ProjError
 from torch import Tensor
 
 from kcal.errors import FileError, InputError
+from kcal.file_kind import check_pixel_count
 from kcal.files import read_bytes, write_atomic
-from kcal.image_header import check_pixel_count
 from kcal.locate.positions import (
     Located,
     Position,

@@ -11,9 +11,13 @@ from torch import Tensor
 
 from kcal.checks import as_points
 from kcal.errors import InputError
+from kcal.lens.camera import Camera
 from kcal.lens.pose import check_motion, rotation_from_vector
 from kcal.sim.raytrace import Misalignment, Prescription
 from kcal.sim.truth import TruthLens
+
+# What projects: a camera of kcal, or a true lens.
+LensLike = Camera | TruthLens
 
 # Choose poses of a board that are completely visible, tilted in all directions, and spread over image and depth.
 #
@@ -333,25 +337,6 @@ def drawn_rig(
 
 
 # The simulator's checkerboard: size, errors of its print, pose, true corners, and colors averaged over small areas.
-
-
-class LensLike(Protocol):
-    """Anything that projects: a `Camera` or a `TruthLens`."""
-
-    size: tuple[int, int]
-
-    @property
-    def focal(self) -> Tensor:
-        """(2,) focal lengths in pixels, at least roughly."""
-
-    def project(self, points_cam: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels (..., N, 2) of points (..., N, 3), and valid (..., N)."""
-
-    def unproject(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """Rays (..., N, 3) of pixels (..., N, 2), at infinity, and valid (..., N)."""
-
-    def inside(self, pixels: Tensor) -> Tensor:
-        """Whether pixels lie on the image."""
 
 
 class BoardLike(Protocol):

@@ -18,6 +18,7 @@ from kcal.lens.camera import Camera
 from kcal.sim.captures import (
     BoardLike,
     BoardPose,
+    LensLike,
     PrintedBoard,
     TrueRig,
     area_colors,
@@ -33,8 +34,6 @@ from kcal.sim.truth import PixelRectangle, TruthLens, grow, pixel_axes
 
 # Invert a lens at every pixel of a rectangle: exactly on a grid, interpolated in between, never past a fold.
 
-AnyLens = Camera | TruthLens
-
 _NODE_SPACING = 8  # pixels at most between the places where the lens is inverted; cubic interpolation between them
 _NODES_PER_FOCAL = 50  # at least so many of them in a focal length
 _FOLD = 6  # steps around a place without inverse that are inverted pixel by pixel
@@ -42,7 +41,7 @@ _PIXELS_AT_ONCE = 1 << 15  # pixels inverted at a time; more would leave the pro
 
 
 @torch.no_grad()
-def invert_window(lens: AnyLens, window: PixelRectangle) -> tuple[Tensor, Tensor]:
+def invert_window(lens: LensLike, window: PixelRectangle) -> tuple[Tensor, Tensor]:
     """Find where every pixel of a window looks.
 
     The lens is inverted at every eighth pixel (more densely if the focal length is below 400 px) and interpolated by
@@ -78,7 +77,7 @@ def invert_window(lens: AnyLens, window: PixelRectangle) -> tuple[Tensor, Tensor
     return looks, valid
 
 
-def _look(lens: AnyLens, pixels: Tensor) -> tuple[Tensor, Tensor]:
+def _look(lens: LensLike, pixels: Tensor) -> tuple[Tensor, Tensor]:
     if isinstance(lens, TruthLens):
         valid = lens.covers(pixels)
         lines = lens.lines(pixels.clamp(lens.low, lens.high))
@@ -161,7 +160,7 @@ class RenderOptions:
 
 
 def render_board(
-    camera: AnyLens,
+    camera: LensLike,
     cam_from_board: tuple[Tensor, Tensor],
     board: BoardLike,
     options: RenderOptions | None = None,
@@ -210,7 +209,7 @@ def render_board(
 
 @torch.no_grad()
 def render_light(
-    camera: AnyLens,
+    camera: LensLike,
     cam_from_board: tuple[Tensor, Tensor],
     board: BoardLike,
     options: RenderOptions | None = None,
@@ -254,7 +253,7 @@ def _in_light(options: RenderOptions) -> RenderOptions:
 
 
 def _light(
-    camera: AnyLens, pose: BoardPose, board: BoardLike, window: PixelRectangle, options: RenderOptions
+    camera: LensLike, pose: BoardPose, board: BoardLike, window: PixelRectangle, options: RenderOptions
 ) -> Tensor:
     """The scene in gray levels, before the optics: (2 height, 2 width), four samples in each pixel of a window.
 
@@ -304,7 +303,7 @@ def _paint(
 
 
 def _board_coordinates(
-    camera: AnyLens, pose: BoardPose, board: BoardLike, window: PixelRectangle, margin: int
+    camera: LensLike, pose: BoardPose, board: BoardLike, window: PixelRectangle, margin: int
 ) -> tuple[Tensor, Tensor]:
     """Find where each pixel's ray meets the board, x and y in squares; far away where it does not."""
     looks, valid = invert_window(camera, window)
@@ -357,7 +356,7 @@ def _linear(count: int, step: int) -> tuple[Tensor, Tensor]:
     return weights, nodes
 
 
-def _paper_window(camera: AnyLens, pose: BoardPose, board: BoardLike, margin: int, radius: int) -> PixelRectangle:
+def _paper_window(camera: LensLike, pose: BoardPose, board: BoardLike, margin: int, radius: int) -> PixelRectangle:
     """Bound the part of the image that the paper and its blur reach; the whole image where that is uncertain."""
     outline = _outline(board, 1 + margin) @ pose.rotation.T + pose.translation
     if bool((outline[:, 2] <= 0).any()):

@@ -307,7 +307,7 @@ class TruthLens:
         >>> lens = TruthLens(SURVEILLANCE)
         >>> pixels, valid = lens.project(torch.tensor([[0.5, 0.0, 1.0], [0.0, 0.0, -1.0]]).double())
         >>> [round(value, 2) for value in pixels[0].tolist()], valid.tolist()
-        ([1743.36, 539.5], [True, False])
+        ([1682.81, 539.5], [True, False])
         >>> lens.table_error < 1e-6
         True
     """

@@ -24,8 +24,8 @@ from torch import Tensor
 
 from kcal.calibrate.hybrid.fit import fit_hybrid
 from kcal.lens.camera import Camera
+from kcal.lens.camera_like import Unproject
 from kcal.lens.distortion import distort
-from kcal.lens.rays import Unproject
 from scripts.bench import undistort
 from scripts.shared import wide_lens
 from scripts.shared.page import write_section

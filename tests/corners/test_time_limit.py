@@ -7,12 +7,12 @@ import cv2
 import pytest
 from board_render import homography, render
 
-from kcal.child_processes import UNSTOPPABLE
 from kcal.corners import detect as module
 from kcal.corners.board import Board
 from kcal.corners.detect import detect
 from kcal.corners.time_limit import Limited, TookTooLongError
 from kcal.errors import InputError
+from kcal.threads import UNSTOPPABLE
 
 BOARD = Board(columns=6, rows=5, square=0.02)
 found_by_the_library = module.detect_board

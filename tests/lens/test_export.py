@@ -15,8 +15,8 @@ from whole_graphs import traced_whole
 from kcal.errors import FileError, InputError
 from kcal.io.lookup_file import save_onnx
 from kcal.lens.camera import Camera
+from kcal.lens.camera_like import Unproject
 from kcal.lens.model import PRESETS
-from kcal.lens.rays import Unproject
 from kcal.lens.rig import StereoRig
 
 # In front, beside the axis, off the image but in the lens, behind, and not a number.

@@ -18,11 +18,11 @@ from kcal.io.camera_file import load_camera, save_camera
 from kcal.io.rig_file import CameraRigFile, load_rig, save_camera_rig, save_rig
 from kcal.lens.baking import bake
 from kcal.lens.camera import Camera
+from kcal.lens.camera_like import CameraRays
 from kcal.lens.field_modes import NetworkModes
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.images import Undistort
 from kcal.lens.model import LensModel
-from kcal.lens.rays import CameraRays
 from kcal.lens.rig import CameraRig, Origin, StereoRig
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.stereo import Triangulate

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
+from kcal.lens.camera_like import CameraRays, ray_error
 from kcal.lens.images import StereoRectification, Undistort, undistort_maps
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rays import CameraRays, ray_error
 from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.lens.views import Cylinder, cylinder_view, looking, pinhole_view, pupil_shift, shown_by
 from kcal.locate.disparity import DisparityRanges

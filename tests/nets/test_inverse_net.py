@@ -17,7 +17,7 @@ import kcal.lens.inverse
 from kcal.errors import DegenerateError, InputError
 from kcal.io.lookup_file import save_onnx
 from kcal.lens.camera import Camera
-from kcal.lens.rays import Unproject
+from kcal.lens.camera_like import Unproject
 from kcal.nets.inverse import (
     InverseFit,
     InverseNet,

@@ -10,8 +10,8 @@ import jsonschema
 import pytest
 from typer.testing import CliRunner
 
+from kcal.cli.exchange import FILES, file_schema
 from kcal.cli.main import app
-from kcal.cli.schema import FILES, file_schema
 from kcal.corners.observations import Observations
 from kcal.io.camera_file import load_camera, save_camera
 from kcal.io.rig_file import load_rig, save_camera_rig, save_rig

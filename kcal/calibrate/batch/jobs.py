@@ -19,17 +19,17 @@ from typing import ClassVar
 import kcal
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
 from kcal.calibrate.camera.result import HYBRID
-from kcal.child_processes import work_limit
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_board, refuse_other_board, view_of
 from kcal.corners.images import decode_gray, expand_images, unique_names
 from kcal.corners.observations import Failure, Observations, PackedCovariance, Pixel, View, common_size, rescaled
 from kcal.corners.refine import Refinement
 from kcal.errors import FileError, InputError, KcalError
+from kcal.file_kind import ImageSize
 from kcal.files import read_bytes
-from kcal.image_header import ImageSize
 from kcal.io.camera_file import CameraFile
 from kcal.native_file import NativeFile
+from kcal.threads import work_limit
 
 _COLUMNS = ("camera", "images", "board", "square", "model")
 
