@@ -260,7 +260,7 @@ def test_limits_of_mat(monkeypatch: pytest.MonkeyPatch) -> None:
         read_mat(head() + array(1, (1, 1), body), "x")
     with pytest.raises(FileError, match=r"not a \.mat file of version 5"):
         read_mat(head()[:126] + b"XY" + body, "x")
-    monkeypatch.setattr("kcal.strict_formats.MOST_BYTES", 2**20)
+    monkeypatch.setattr("kcal.strict_formats._MOST_UNPACKED", 2**20)
     zeros = array(6, (1, 2**18), element(9, bytes(2**21)))
     for part in (zeros, struct.pack("<II", 15, len(zlib.compress(zeros))) + zlib.compress(zeros)):
         with pytest.raises(FileError, match="it unpacks to more than 1 MiB"):

@@ -52,6 +52,10 @@ class CameraPose(NamedTuple):
     translation: Tensor
 
 
+# Of the camera whose frame is the reference.
+STILL = CameraPose(torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class ImportedCameras:
     """Cameras and poses from a file of another program.
@@ -120,9 +124,7 @@ def _second_from_first(poses: Sequence[CameraPose]) -> CameraPose:
 
 def rig_poses(rig: StereoRig) -> tuple[CameraPose, CameraPose]:
     """Both cameras from the left one's frame."""
-    zero = torch.zeros(3, dtype=torch.float64)
-    still = CameraPose(torch.eye(3, dtype=torch.float64), zero)
-    return still, CameraPose(rig.right_from_left_rotation, rig.right_from_left_translation)
+    return STILL, CameraPose(rig.right_from_left_rotation, rig.right_from_left_translation)
 
 
 def each_readable(

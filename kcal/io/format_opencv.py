@@ -19,6 +19,7 @@ from kcal.errors import InputError
 from kcal.files import read_bytes, read_text, write_atomic
 from kcal.io.foreign import (
     MOST_BYTES,
+    STILL,
     CameraPose,
     Hints,
     ImportedCameras,
@@ -335,9 +336,8 @@ def _pair(value: Mapping[str, Any], hints: Hints) -> ImportedCameras:
     # MATLAB's own apps work in millimeters.
     unsaid = hints.meters is None and not stated
     notes = ("WorldUnits is not in the file: the translation is taken as millimeters (--unit)",) if unsaid else ()
-    still = checked_pose(np.eye(3).tolist(), [0.0] * 3)
     pose = checked_pose(rotation.tolist(), (meters * translation).tolist())
-    return ImportedCameras(format="matlab", cameras=cameras, poses=(still, pose), notes=notes)
+    return ImportedCameras(format="matlab", cameras=cameras, poses=(STILL, pose), notes=notes)
 
 
 def write_matlab(cameras: Sequence[Camera], poses: Sequence[CameraPose], path: Path) -> list[Path]:

@@ -15,6 +15,7 @@ import torch
 
 from kcal.io.foreign import (
     BEFORE,
+    STILL,
     CameraPose,
     Hints,
     ImportedCameras,
@@ -83,18 +84,15 @@ def _role(key: str, value: Any) -> tuple[str, str] | None:
     """What a key of a camera means, and which side of a rig it says that it is of."""
     name, found = bare(key), flat(value)
     count = len(found) if found is not None else -1
+    many = isinstance(value, list | tuple | Mapping) or hasattr(value, "tolist")
     before, after = BEFORE.fullmatch(name), _AFTER.fullmatch(name)
     ways = [(name, ""), (before and before[2], before and before[1]), (after and after[1], after and after[2])]
     for base, side in ways:
         for role, pattern in _PATTERNS.items():
             # A distance is one number; no list of coefficients is.
-            if base and count in _ROLES[role][1] and pattern.fullmatch(base) and (role != "lens" or _many(value)):
+            if base and count in _ROLES[role][1] and pattern.fullmatch(base) and (role != "lens" or many):
                 return role, re.sub("cam(?:era)?", "", side or "")[:1]
     return None
-
-
-def _many(value: Any) -> bool:
-    return isinstance(value, list | tuple | Mapping) or hasattr(value, "tolist")
 
 
 class _Named:
@@ -352,8 +350,7 @@ def _poses(
     if each and all(each):
         poses = [_pose_of_keys(part, side, meters) for part, side in parts]
     elif len(parts) in (0, 2) and named.get("rotation") is not None and named.get("translation") is not None:
-        still = torch.zeros(3, dtype=torch.float64)
-        poses = [CameraPose(torch.eye(3, dtype=torch.float64), still), _pose_of_keys(named, "", meters)]
+        poses = [STILL, _pose_of_keys(named, "", meters)]
     else:
         if any(each):
             notes.append("some cameras have no rotation: no pose is read")

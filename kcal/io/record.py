@@ -341,9 +341,8 @@ class HybridRecord(Record):
     def of(cls, form: HybridForm) -> HybridRecord:
         """The constants of a lens."""
         modes, own = form.modes, next(key for key, kind in _KINDS.items() if isinstance(form.modes, kind))
-        if isinstance(modes, NetworkModes):
-            return cls(shape=form.shape, radius=form.radius, network=NetworkRecord.of(modes))
-        return cls.model_validate({"shape": form.shape, "radius": form.radius, own: modes}, from_attributes=True)
+        stored = NetworkRecord.of(modes) if isinstance(modes, NetworkModes) else modes
+        return cls.model_validate({"shape": form.shape, "radius": form.radius, own: stored}, from_attributes=True)
 
     @pydantic.model_validator(mode="after")
     def _one_kind(self) -> HybridRecord:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
 
@@ -115,16 +115,15 @@ class Prescription:
     @property
     def elements(self) -> tuple[tuple[int, int], ...]:
         """First and last surface of each piece of glass; cemented lenses are one piece."""
-        return tuple(self._pieces())
-
-    def _pieces(self) -> Iterator[tuple[int, int]]:
+        pieces: list[tuple[int, int]] = []
         first = None
         for i, surface in enumerate(self.surfaces):
             if first is None and surface.index != 1.0:
                 first = i
             elif first is not None and surface.index == 1.0:
-                yield first, i
+                pieces.append((first, i))
                 first = None
+        return tuple(pieces)
 
 
 def system_matrix(prescription: Prescription) -> tuple[float, float, float, float]:

@@ -4,8 +4,8 @@
 # Find and name stars
 from kcal.stars.detect import detect_stars as detect_stars
 from kcal.stars.detect import DetectedStars as DetectedStars
-from kcal.stars.identification import identify as identify
-from kcal.stars.identification import Identification as Identification
+from kcal.stars.sky import identify as identify
+from kcal.stars.sky import Identification as Identification
 from kcal.stars.night import name_stars as name_stars
 from kcal.stars.night import NamedStars as NamedStars
 from kcal.stars.night import Attitude as Attitude

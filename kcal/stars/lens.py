@@ -23,10 +23,9 @@ from kcal.gaussian import Gaussian, numbered
 from kcal.lens.camera import Camera
 from kcal.lens.information import LENS_SLOT, CameraInformation
 from kcal.stars.detect import DetectedStars
-from kcal.stars.identification import Identification, identify, turn_between
 from kcal.stars.lens_fit import CUT, StarField, StarLens, StarProblem, fit_star_lens, require_stars, star_lens
 from kcal.stars.night import SkyView, fit_attitude
-from kcal.stars.sky import StarCatalog, celestial_directions
+from kcal.stars.sky import Identification, StarCatalog, celestial_directions, identify, turn_between
 from kcal.threads import in_one_thread
 
 # One lens from boards and stars: boards tell the lens and its pupil where they were, stars the field at infinity.

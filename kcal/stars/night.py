@@ -22,7 +22,7 @@ from kcal.lens.projection import project_components
 from kcal.lens.rig import Origin
 from kcal.locate.mounting import attitude
 from kcal.stars.detect import DetectedStars, detect_stars
-from kcal.stars.identification import identify, turn_between
+from kcal.stars.sky import identify, turn_between
 from kcal.threads import in_one_thread
 
 # How a camera looks, from the named stars of one image: rotation, residuals of every star, and covariance.

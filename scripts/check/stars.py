@@ -25,10 +25,9 @@ import torch
 
 from kcal.lens.rig import Origin
 from kcal.stars.detect import detect_stars, read_night, time_of
-from kcal.stars.identification import identify
 from kcal.stars.lens import StarCamera, calibrate_by_stars
 from kcal.stars.night import SkyView, fit_attitude, name_stars
-from kcal.stars.sky import StarCatalog
+from kcal.stars.sky import StarCatalog, identify
 from scripts.shared.page import write_section
 
 # Trials that are done already, one a line; a run continues where another one ended.

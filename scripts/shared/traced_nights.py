@@ -146,7 +146,7 @@ def night(rig: TrueRig, cameras: tuple[Camera, Camera], case: Case, draw: np.ran
 
 
 def _turn(seen: np.ndarray, known: np.ndarray) -> Tensor:
-    from kcal.stars.identification import turn_between
+    from kcal.stars.sky import turn_between
 
     return torch.from_numpy(turn_between(known, seen))
 

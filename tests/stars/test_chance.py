@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kcal.stars.identification import _by_chance
+from kcal.stars.sky import _by_chance
 
 
 def test_three_matches_are_those_of_the_triangle() -> None:

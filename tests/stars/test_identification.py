@@ -16,9 +16,8 @@ from kcal.lens.camera import Camera
 from kcal.lens.rig import Origin
 from kcal.locate.geodesy import enu_from_cam
 from kcal.stars.detect import detect_stars, read_night
-from kcal.stars.identification import _table_of, cache_folder, identify, pair_table
 from kcal.stars.night import SkyView, clock_doubts, field_angle, name_stars
-from kcal.stars.sky import StarCatalog, observed_directions
+from kcal.stars.sky import StarCatalog, _table_of, cache_folder, identify, observed_directions, pair_table
 from scripts.shared.night_scenes import PLACE, TIME, night_camera, rendered, star_pixels
 
 CATALOG = StarCatalog.bundled()

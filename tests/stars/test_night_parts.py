@@ -25,10 +25,9 @@ from kcal.stars.detect import (
     read_night,
     time_of,
 )
-from kcal.stars.identification import Identification
 from kcal.stars.night import _names_at, field_angle
 from kcal.stars.rig_stars import moments_of
-from kcal.stars.sky import StarCatalog
+from kcal.stars.sky import Identification, StarCatalog
 
 CAMERA = Camera.build(focal=(1000, 1000), center=(319.5, 239.5), size=(640, 480), model="pinhole")
 ROWS, COLUMNS = np.mgrid[0:240, 0:320].astype(float)

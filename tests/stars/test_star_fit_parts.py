@@ -18,7 +18,6 @@ from kcal.lens.information import CameraInformation
 from kcal.lens.pose import rotation_from_vector
 from kcal.locate.geodesy import enu_from_cam
 from kcal.stars.detect import DetectedStars, NightPlan, _signal
-from kcal.stars.identification import _triangles, pair_table, turn_between
 from kcal.stars.lens import (
     Agreement,
     _agreement_with,
@@ -45,7 +44,17 @@ from kcal.stars.night import (
     refraction_doubt,
     star_rows,
 )
-from kcal.stars.sky import EARTH_RATE, StarCatalog, celestial_directions, observed_directions, pole_in_enu, unit_vectors
+from kcal.stars.sky import (
+    EARTH_RATE,
+    StarCatalog,
+    _triangles,
+    celestial_directions,
+    observed_directions,
+    pair_table,
+    pole_in_enu,
+    turn_between,
+    unit_vectors,
+)
 from scripts.shared.night_scenes import PLACE, TIME, night_camera, star_pixels
 
 CATALOG = StarCatalog.bundled()

@@ -18,28 +18,26 @@ from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import Origin
 from kcal.stars.detect import _reasons, _windowed, detect_stars
-from kcal.stars.identification import (
-    _angle,
-    _best_turn,
-    _kabsch_turns,
-    _met,
-    _middle,
-    _table_on_disk,
-    identify,
-    pair_table,
-    turn_between,
-)
 from kcal.stars.lens import _near_middle
 from kcal.stars.night import SkyView, _names_at, fit_attitude
 from kcal.stars.sky import (
     EARTH_RATE,
     Air,
     StarCatalog,
+    _angle,
+    _best_turn,
     _julian,
+    _kabsch_turns,
+    _met,
+    _middle,
+    _table_on_disk,
+    identify,
+    pair_table,
     parse_time,
     pole_in_enu,
     refraction_sigma,
     require_erfa,
+    turn_between,
     unit_vectors,
     year_of,
 )

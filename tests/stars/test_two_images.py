@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kcal.stars.identification import cache_folder, pair_table
 from kcal.stars.lens import StarCamera, calibrate_by_stars
-from kcal.stars.sky import StarCatalog
+from kcal.stars.sky import StarCatalog, cache_folder, pair_table
 from scripts.shared.star_lenses import SIZE, lens_difference, star_images, true_lens
 
 
