@@ -25,8 +25,7 @@ from kcal.lens.rig import Origin, StereoRig
 from kcal.locate.geodesy import enu_to_geodetic
 from kcal.report.positions import save_site_sketch
 from kcal.report.practice_score import score_lens, score_positions, score_rig, score_tracks
-from kcal.sim.render import render_board
-from kcal.sim.scene import DemoScene, scene_views
+from kcal.sim.scene import DemoScene, render_board, scene_views
 from kcal.stars.night import SkyView
 from kcal.stars.sky import StarCatalog
 from kcal.strict_json import MOST_BYTES, read_json

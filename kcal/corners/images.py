@@ -25,8 +25,8 @@ from PIL import ExifTags, Image, UnidentifiedImageError
 from PIL.JpegImagePlugin import JpegImageFile
 
 from kcal.errors import FileError, InputError
+from kcal.file_kind import check_image_header
 from kcal.files import read_bytes, read_head
-from kcal.image_header import check_image_header
 
 Gray = npt.NDArray[np.uint8 | np.uint16]
 

@@ -6,8 +6,8 @@ from kcal.lens.model import LensModel as LensModel
 from kcal.lens.camera_parameters import ExtendedDistortion as ExtendedDistortion
 from kcal.lens.hybrid_terms import HybridForm as HybridForm
 from kcal.lens.zernike import ZernikeModes as ZernikeModes
-from kcal.lens.paraxial import paraxial_focal as paraxial_focal
-from kcal.lens.paraxial import ParaxialFocal as ParaxialFocal
+from kcal.lens.uncertainty import paraxial_focal as paraxial_focal
+from kcal.lens.uncertainty import ParaxialFocal as ParaxialFocal
 from kcal.lens.views import new_pinhole as new_pinhole
 from kcal.calibrate.camera.export import refit_camera as refit_camera
 from kcal.calibrate.camera.export import RefittedCamera as RefittedCamera
@@ -50,7 +50,7 @@ from kcal.io.foreign import CameraPose as CameraPose
 from kcal.calibrate.camera.export import export_cameras as export_cameras
 from kcal.calibrate.camera.export import ExportedCameras as ExportedCameras
 from kcal.calibrate.camera.export import Misfit as Misfit
-from kcal.io.onnx_file import save_onnx as save_onnx
+from kcal.io.lookup_file import save_onnx as save_onnx
 
 # Cameras of other makes, tables and learned starts
 from kcal.lens.camera_like import CameraLike as CameraLike

@@ -42,7 +42,6 @@ from kcal.calibrate.batch.jobs import (
 )
 from kcal.calibrate.camera.calibrate import ALONE, sharing
 from kcal.calibrate.camera.result import HYBRID, CameraCalibrationResult
-from kcal.child_processes import deaf_to_interrupts
 from kcal.corners.observations import Observations
 from kcal.errors import FileError, InputError, KcalError
 from kcal.files import dump_json, make_folder, read_bytes, write_atomic
@@ -50,6 +49,7 @@ from kcal.lens.uncertainty import paraxial_focal
 from kcal.native_file import NativeFile
 from kcal.strict_json import MOST_BYTES, read_json
 from kcal.texts import csv_line
+from kcal.threads import deaf_to_interrupts
 
 Piece = TypeVar("Piece", bound=NativeFile)
 

@@ -20,10 +20,9 @@ from kcal.errors import DegenerateError
 from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
 from kcal.lens.model import LensModel
-from kcal.lens.paraxial import paraxial_focal
 from kcal.lens.pose import rotation_from_vector, step_rows
 from kcal.lens.projection import FAR, project_components
-from kcal.lens.uncertainty import pixel_covariance, pixel_slopes
+from kcal.lens.uncertainty import paraxial_focal, pixel_covariance, pixel_slopes
 from kcal.solve.lm import LMOptions
 
 # Tell what the next pictures of the board should show, from what the present ones leave open.

@@ -26,8 +26,7 @@ from kcal.corners.observations import Observations
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera
 from kcal.lens.difference import CameraDifference, camera_difference
-from kcal.lens.paraxial import ParaxialFocal, paraxial_focal
-from kcal.lens.uncertainty import image_sigma
+from kcal.lens.uncertainty import ParaxialFocal, image_sigma, paraxial_focal
 from kcal.solve.lm import LMOptions
 from kcal.threads import in_one_thread
 
