@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import functools
 import importlib
+import importlib.resources
 import json
 import math
 from collections.abc import Callable, Iterator
@@ -82,35 +83,12 @@ def readme_text(scene: DemoScene) -> str:
         for number, step in enumerate(STEPS, 1)
     )
     place = f"--lat {scene.lat:g} --lon {scene.lon:g} --height {scene.height:g}"
-    return f"""A site to practise on
-=====================
+    return _template("README.txt").format(commands=commands, night=night_name("left"), place=place)
 
-Two cameras stand 10 m apart on masts above a harbor. Everything is rendered, so the truth is known.
 
-boards/left, boards/right   photographs of a printed board: 9x6 inner corners, squares of 60 mm
-site/left.png, right.png    the site as both cameras see it, to be marked
-site/sketch.png             the surveyor's sketch: which landmark is which, and the targets
-night/                      the stars over both cameras; times in the names are UTC
-survey.csv                  surveyed places of the landmarks, with their sigma
-targets.csv                 what to locate, and which point of it is meant; use these names
-video/left.mp4, right.mp4   two minutes with ships that move
-video/detections.jsonl      the same ships as a detector would report them, if you cannot read videos
-find_ships.py               a detector for the videos
-
-Run the commands in this folder:
-
-{commands}
-
-   Without the extra `video`:
-   kcal live rig.json --detections video/detections.jsonl -o tracks.csv
-
-   How do the cameras look, by the stars?
-   kcal stars night/{night_name("left")} --camera left.camera.json --time name:Z {place}
-
-How well did you do? This may be asked after each step:
-   kcal demo --score .
-The truth is in the hidden folder .truth; look there afterwards.
-"""
+def _template(name: str) -> str:
+    """A text of the folder `practice` beside this module."""
+    return importlib.resources.files("kcal.cli").joinpath("practice", name).read_text(encoding="utf-8")
 
 
 def survey_text(scene: DemoScene) -> str:
@@ -137,35 +115,6 @@ _BOARD_STEPS, _PICTURE_STEPS = 15, 100
 _DETECTION_SIGMA = 0.2  # px
 # What parts of a site need beyond kcal itself, and the extra that brings it along.
 _EXTRAS = {"av": "video", "erfa": "stars"}
-
-_DETECTOR = '''"""A detector for `kcal live`: what differs from the picture of the site without ships.
-
-With your own cameras take a detector that knows ships: any callable from an image to boxes will do.
-"""
-
-from pathlib import Path
-
-import numpy as np
-from PIL import Image
-from scipy import ndimage
-
-HERE = Path(__file__).parent
-EMPTY = [np.asarray(Image.open(HERE / "site" / f"{side}.png").convert("L"), np.float32) for side in ("left", "right")]
-
-
-def find_ships(image):
-    """Boxes (N, 4) x1, y1, x2, y2 in pixels of what is not there on a day without ships."""
-    gray = image[..., 0].astype(np.float32)
-    change = min((gray - empty for empty in EMPTY), key=lambda change: np.abs(change[::16, ::16]).mean())
-    height, width = (size // 2 for size in change.shape)
-    blocks = change[: 2 * height, : 2 * width].reshape(height, 2, width, 2).mean((1, 3))
-    moved = np.abs(ndimage.uniform_filter(blocks, 2)) > 3.5
-    # Parts of a ship that look like what is behind it do not part it.
-    labels, _ = ndimage.label(ndimage.binary_dilation(moved, np.ones((3, 9))))
-    labels[~moved] = 0
-    boxes = [(2 * x.start, 2 * y.start, 2 * x.stop, 2 * y.stop) for y, x in ndimage.find_objects(labels)]
-    return np.array([box for box in boxes if box[2] - box[0] > 7 and box[3] - box[1] > 5], float).reshape(-1, 4)
-'''
 
 
 def practice_site(folder: Path, seed: int, *, views: int = 12, frames: int = 600, scale: float = 1.0) -> None:
@@ -254,7 +203,7 @@ def _practice_parts(site: practice.PracticeSite, frames: int) -> Iterator[tuple[
     yield Path("README.txt"), 1, text(lambda: readme_text(site.scene))
     yield Path("survey.csv"), 1, text(lambda: survey_text(site.scene))
     yield Path("targets.csv"), 1, text(targets_text)
-    yield Path("find_ships.py"), 1, text(lambda: _DETECTOR)
+    yield Path("find_ships.py"), 1, text(lambda: _template("find_ships.txt"))
     yield from _board_parts(site)
     for side in practice.SIDES:
         yield Path("site", f"{side}.png"), _PICTURE_STEPS, functools.partial(_picture, site, side)
