@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
+import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -118,8 +120,11 @@ def test_the_command_and_its_processes_have_one_thread(monkeypatch: pytest.Monke
     monkeypatch.setattr("kcal.cli.main.main", lambda: seen.update(os.environ))
     for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
         monkeypatch.setenv(name, "8")
-    thresholds = gc.get_threshold()
-    main()
+    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
+    thresholds, interrupted = gc.get_threshold(), signal.getsignal(signal.SIGINT)
+    with pytest.raises(SystemExit):
+        main()
+    signal.signal(signal.SIGINT, interrupted)
     gc.unfreeze()
     gc.set_threshold(*thresholds)
     assert {seen[name] for name in _THREADS} == {"1"}

@@ -25,7 +25,7 @@ from kcal.stars.lens import (
     _by_camera,
     _directions,
     _near_middle,
-    _rays,
+    _plain_of,
     _search,
     _star_noise,
     _with_star_rows,
@@ -389,11 +389,12 @@ class TestRoughLens:
         celestial = pixels, np.full(len(pixels), 0.1), 10 ** (-0.4 * CATALOG.magnitude[index])
         return DetectedStars(*celestial, 0.02, {}), index
 
-    def test_rays_of_a_pinhole(self) -> None:
-        pixels = np.array([[0.0, 0.0], [479.5, 299.5], [959.0, 10.0]])
-        rays, _ = CAMERA.unproject(torch.from_numpy(pixels))
-        by_camera = torch.nn.functional.normalize(rays, dim=-1).numpy()
-        np.testing.assert_allclose(_rays(pixels, self.SIZE, 900.0), by_camera, atol=1e-12)
+    @pytest.mark.parametrize(("degrees", "model"), [(60.0, "pinhole"), (180.0, "fisheye4")])
+    def test_a_lens_of_a_stated_field(self, degrees: float, model: str) -> None:
+        made = _plain_of(degrees, self.SIZE)
+        rays = torch.nn.functional.normalize(made.unproject(torch.tensor([[-0.5, -0.5], [959.5, 599.5]]))[0], dim=-1)
+        assert str(made.model) == model
+        assert float(torch.rad2deg(torch.acos(rays[0] @ rays[1]))) == pytest.approx(degrees, abs=1e-6)
 
     def test_names_and_scale_from_the_middle(self) -> None:
         """Of a focal length that is stated 2 % too short."""
