@@ -301,9 +301,9 @@ def calibrate_by_stars(
         InputError: no image whose stars have names, or too few of them.
 
     Example:
-        >>> calibrate_by_stars([], [], (1920, 1080))
+        >>> calibrate_by_stars([], [], (1920, 1080))  # doctest: +ELLIPSIS
         Traceback (most recent call last):
-        kcal.errors.InputError: in none of 0 images stars have names: too few are seen, or this is not the night sky
+        kcal.errors.InputError: in none of 0 images stars have names: too few are seen, this is not the night sky, ...
     """
     catalog = catalog or StarCatalog.bundled()
     order = sorted(range(len(images)), key=lambda number: -len(images[number].pixels))
