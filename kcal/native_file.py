@@ -26,7 +26,7 @@ def digest(content: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()[:16]
 
 
-# Derived from the rest when a file is written, see `kcal.io.record`: a wrong one counts as missing.
+# Derived from the rest when a file is written, see `kcal.io.file_summary`: a wrong one counts as missing.
 _DERIVED = "summary"
 
 

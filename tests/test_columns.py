@@ -43,7 +43,9 @@ def test_places() -> None:
 def test_positions_and_tracks() -> None:
     positions, tracks = tables("Positions")
     assert positions == [*TEXTS, *NUMBERS]
-    assert tracks == re.findall(r'^        (?:extras\[)?"(\w+)"(?:: |\] = )', SOURCE, re.MULTILINE)
+    plain = re.findall(r'^        (?:extras\[)?"(\w+)"(?:: |\] = )', SOURCE, re.MULTILINE)
+    velocity = [f"velocity_{axis}{part}_mps" for part in ("", "_sigma") for axis in ("east", "north", "up")]
+    assert tracks == [*plain[:5], *velocity, *plain[5:]]
 
 
 def test_batches() -> None:

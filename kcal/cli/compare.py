@@ -101,8 +101,7 @@ def diff_command(
     """
     import torch
 
-    from kcal.lens.difference import camera_difference
-    from kcal.report.tables import difference_text
+    from kcal.lens.difference import camera_difference, difference_text
 
     if picture is not None:
         check_picture(picture)

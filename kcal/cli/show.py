@@ -25,7 +25,7 @@ from kcal.strict_json import MOST_BYTES, read_json
 from kcal.texts import number_text, setting_text
 
 if TYPE_CHECKING:
-    from kcal.io.record import CameraSummary, RigSummary
+    from kcal.io.file_summary import CameraSummary, RigSummary
     from kcal.lens.camera import Camera
     from kcal.lens.rig import StereoRig
 
@@ -84,7 +84,7 @@ def _show_foreign(file: Path) -> None:
 
 def _as_written(content: dict[str, Any]) -> tuple[list[_Camera], _Rig | None] | None:
     """Blocks of a file with their summaries; None where it has none, or was changed after they were written."""
-    from kcal.io.record import CameraSummary, RigSummary
+    from kcal.io.file_summary import CameraSummary, RigSummary
 
     try:
         if content["kcal"] == "camera":
@@ -124,14 +124,14 @@ def _computed_anew(file: Path, kind: str) -> tuple[list[_Camera], _Rig | None]:
 
 def _derived_camera(camera: Camera) -> _Camera:
     from kcal.io.camera_file import camera_to_file
-    from kcal.io.record import CameraSummary
+    from kcal.io.file_summary import CameraSummary
 
     content = camera_to_file(camera).dump()
     return content, CameraSummary.derived(camera, content)
 
 
 def _derived_rig(rig: StereoRig) -> tuple[list[_Camera], _Rig]:
-    from kcal.io.record import RigSummary, take_joint_errors
+    from kcal.io.file_summary import RigSummary, take_joint_errors
     from kcal.io.rig_file import rig_to_file
 
     pose = rig_to_file(rig).dump(), RigSummary.made(rig, {})

@@ -30,8 +30,8 @@ from kcal.corners.marker_boards import (
     find_aprilgrid,
     find_charuco,
     free_side,
-    opencv_dictionary,
 )
+from kcal.corners.markers import opencv_dictionary
 from kcal.corners.observations import Failure, Observations, View, common_size, rescaled
 from kcal.corners.refine import Refinement, refine_corners
 from kcal.corners.saddle import CornerStatus, Refined
@@ -167,6 +167,7 @@ _ENOUGH = 8  # markers of one dictionary, after which no other is searched
 _MIN_MARKERS = 4  # fewer are found in pictures without any: markers of 16 cells have few errors to correct
 _MIN_CIRCLES = 12
 _ROUND = 0.83  # 4 pi area / perimeter²: squares have 0.79, circles seen from 45 degrees 0.94
+_ROUNDER = 0.88  # 58 % and more of the spots in blurred checkerboards are less round
 _SIZES = (0.6, 1.6)  # of the median: sizes of circles of one grid, seen from aside
 
 
@@ -182,12 +183,17 @@ def seen_instead(image: npt.NDArray[np.uint8], board: Board) -> str:
     if has_own_markers(image, board):
         return ""
     plain = board.pattern == "checkerboard" and board.dictionary is None
-    found = seen_size(image) if plain else None  # corners between squares pass for circles more easily than vice versa
-    if found is None and (circles := seen_circles(image, board)) is not None:
+    found = seen_size(image) if plain else None
+    if (circles := _clear_circles(image, board) if found else seen_circles(image, board)) is not None:
         return circles
     found = found or seen_size(image)
     own = (max(board.columns, board.rows), min(board.columns, board.rows))
     return "" if found is None or (found == own and plain) else _size_advice(found, board)
+
+
+def _clear_circles(image: npt.NDArray[np.uint8], board: Board) -> str | None:
+    """As `seen_circles`, where blurred squares do not pass for circles: most of the spots are rounder."""
+    return seen_circles(image, board) if _like_sized(image, _ROUNDER) > 0.6 * _like_sized(image) else None
 
 
 def _size_advice(found: tuple[int, int], board: Board) -> str:
@@ -215,11 +221,12 @@ def seen_by_most(failed: Sequence[tuple[Any, str]], board: Board) -> tuple[str, 
     for number, (file, reason) in enumerate(failed):
         said = _OTHER.search(reason)
         text = _size_advice((int(said[1]), int(said[2])), board) if said else ""
-        if not said and number < _LOOKS:
+        if number < _LOOKS:
             with suppress(FileError):
                 image = to_8bit(_image_and_hash(file)[0])
-                small = reduced(image, max(1.0, max(image.shape) / SEARCH_SIDES[0]), _size(image))[0]
-                text = seen_instead(to_8bit(small), board)
+                small = to_8bit(reduced(image, max(1.0, max(image.shape) / SEARCH_SIDES[0]), _size(image))[0])
+                # Corners may also be seen between circles.
+                text = (_clear_circles(small, board) or text) if said else seen_instead(small, board)
         if text:
             votes.setdefault(text.rpartition(": ")[2], []).append(text)
     most = max(votes.values(), key=len, default=[""])
@@ -321,11 +328,11 @@ def _smallest(family: str, highest: int) -> str:
     return min((name for name in sizes if DICTIONARIES[name] > highest), key=DICTIONARIES.__getitem__, default=family)
 
 
-def _like_sized(image: npt.NDArray[np.uint8]) -> int:
+def _like_sized(image: npt.NDArray[np.uint8], least: float = _ROUND) -> int:
     """How many round spots of like size are seen, dark or light; a checkerboard has as many of both."""
     counts = []
     for picture in (image, 255 - image):
-        sizes = np.array([blob.size for blob in round_blobs(picture, _ROUND)])
+        sizes = np.array([blob.size for blob in round_blobs(picture, least)])
         middle = float(np.median(sizes)) if len(sizes) else 0.0
         counts.append(int(((sizes > _SIZES[0] * middle) & (sizes < _SIZES[1] * middle)).sum()))
     return max(counts) if min(counts) < max(counts) / 3 else 0

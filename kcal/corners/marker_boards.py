@@ -11,9 +11,10 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from kcal.corners.board import DICTIONARIES, TAGS, Board
+from kcal.corners.board import TAGS, Board
 from kcal.corners.erf import SHARE
 from kcal.corners.grid import as_grid, local_side
+from kcal.corners.markers import opencv_dictionary
 from kcal.corners.saddle import CornerStatus, inside_image, saddle
 from kcal.corners.search import filled_grid
 from kcal.errors import InputError
@@ -511,32 +512,3 @@ def _with_unread(image: npt.NDArray[np.uint8], placed: Markers, board: Board, tu
         if not new:
             return tags
         tags |= new
-
-
-# The markers and tags that a board is printed with: apart from their detection, because torch takes long to load.
-
-
-def marker_cells(board: Board) -> list[npt.NDArray[np.bool_]]:
-    """Which cells of each marker are black, border included, in the order of the light squares.
-
-    Raises:
-        InputError: the board has no markers.
-    """
-    if board.dictionary is None:
-        raise InputError(f"{board}: not a ChArUco board")
-    dictionary = opencv_dictionary(board.dictionary)
-    cells = dictionary.markerSize + 2
-    numbers = range(board.first, board.first + board.markers)
-    return [dictionary.generateImageMarker(number, cells, borderBits=1) == 0 for number in numbers]
-
-
-def opencv_dictionary(name: str) -> cv2.aruco.Dictionary:
-    """OpenCV's dictionary of a name in `DICTIONARIES`.
-
-    Raises:
-        InputError: an unknown name.
-    """
-    if name not in DICTIONARIES:
-        raise InputError(f"dictionary {name!r}: choose one of {', '.join(DICTIONARIES)}")
-    dictionary: cv2.aruco.Dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name.upper()}"))
-    return dictionary

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kcal.corners.board import TAGS, Board
-from kcal.corners.marker_boards import marker_cells, opencv_dictionary
+from kcal.corners.markers import marker_cells, opencv_dictionary
 from kcal.errors import InputError
 from kcal.files import write_atomic
 

@@ -20,7 +20,8 @@ import kcal
 from kcal.checks import MOST_FOCAL
 from kcal.errors import InputError
 from kcal.file_kind import ImageSize
-from kcal.io.record import CameraSummary, CovarianceRecord, InformationRecord, LensOrders
+from kcal.io.file_summary import CameraSummary
+from kcal.io.record import CovarianceRecord, InformationRecord, LensOrders
 from kcal.lens.calibration import CalibrationRecord, CameraCalibration, LensSetting
 from kcal.lens.camera import Camera
 from kcal.lens.projection import INTRINSICS

@@ -21,7 +21,8 @@ from kcal.dispatch import still
 from kcal.errors import FileError
 from kcal.file_kind import CAMERA_RIG_VERSION
 from kcal.io.camera_file import CameraFile, named_camera_file
-from kcal.io.record import Packed, RigSummary
+from kcal.io.file_summary import RigSummary
+from kcal.io.record import Packed
 from kcal.lens.calibration import RigCalibration
 from kcal.lens.projection import INTRINSICS
 from kcal.lens.rig import CameraRig, CameraRigCalibration, Mounting, Origin, RigCovariance, StereoRig

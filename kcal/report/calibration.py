@@ -28,10 +28,9 @@ from kcal.calibrate.hybrid.measured_board import Measured, MeasuredBoard
 from kcal.corners.images import read_gray, to_8bit
 from kcal.corners.observations import Observations, View
 from kcal.errors import FileError
-from kcal.lens.difference import CameraDifference
+from kcal.lens.difference import CameraDifference, difference_text
 from kcal.lens.uncertainty import image_sigma
 from kcal.report.figures import INK, draw_arrows, frame_image, new_figure, save_picture, wrapped
-from kcal.report.tables import difference_text
 from kcal.texts import measured_text, percent_text
 from kcal.threads import in_one_thread
 

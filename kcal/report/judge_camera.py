@@ -242,7 +242,9 @@ def model_findings(
     patterns = structure.neighbors > _NEIGHBORS or structure.image > _IMAGE
     apart = _far_halves(found.halves, patterns)
     beyond = max((unexplained(half.difference, _LIKELY) for half in apart), default=0.0)
-    against = _apart_finding(result, found.halves, apart[0], patterns, structure) if apart else None
+    # Names may tell two cameras apart of which every other view is the one: they are the better reason then.
+    worst = next((half for half in apart if not half.alike and half.own < _OWN * result.rms), next(iter(apart), None))
+    against = None if worst is None else _apart_finding(result, found.halves, worst, patterns, structure)
     if found.model is not None and found.reference is not None:
         named = _against_reference(result, options, found, found.model.rms)
         certain = named is not None and named.name in ("board", "pupil")
@@ -500,7 +502,7 @@ def camera_verdict(
         >>> result = calibrate_camera(Observations(board=board, image_size=(640, 480), views=views))
         >>> verdict = camera_verdict(result, requirements=Requirement.parse("50m:10%"))
         >>> verdict.usable, [finding.name for finding in verdict.findings if finding.severity == "doubt"]
-        (True, ['roll', 'depth', 'coverage', 'views', 'halves', 'calibration'])
+        (True, ['depth', 'coverage', 'views', 'halves', 'calibration'])
     """
     options = options or CalibrationOptions()
     examination = examination or examine(result, options, progress)

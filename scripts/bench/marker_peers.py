@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcal.corners.board import TAGS, Board
-from kcal.corners.marker_boards import opencv_dictionary
+from kcal.corners.markers import opencv_dictionary
 from kcal.corners.print_board import TAG_BORDER
 
 HAS_APRILTAG = importlib.util.find_spec("pupil_apriltags") is not None

@@ -5,7 +5,8 @@ import torch
 
 from kcal.corners.board import Board
 from kcal.corners.detect import detect, detect_board
-from kcal.corners.marker_boards import find_aprilgrid, opencv_dictionary
+from kcal.corners.marker_boards import find_aprilgrid
+from kcal.corners.markers import opencv_dictionary
 from kcal.corners.print_board import pattern_shapes
 from kcal.errors import InputError
 from kcal.lens.camera import Camera

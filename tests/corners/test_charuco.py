@@ -9,7 +9,8 @@ from kcal.cli.main import app
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_board, view_of
 from kcal.corners.images import read_gray
-from kcal.corners.marker_boards import free_side, marker_cells
+from kcal.corners.marker_boards import free_side
+from kcal.corners.markers import marker_cells
 from kcal.corners.observations import Observations
 from kcal.corners.print_board import board_sheet
 from kcal.errors import InputError

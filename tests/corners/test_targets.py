@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from kcal.corners.board import DICTIONARIES, Board
-from kcal.corners.marker_boards import opencv_dictionary
+from kcal.corners.markers import opencv_dictionary
 from kcal.corners.observations import Observations, View
 from kcal.corners.print_board import Circle, Drawing, board_sheet, pattern_shapes, tag_cells, to_pdf, to_svg
 from kcal.errors import FileError, InputError

@@ -25,7 +25,7 @@ from kcal.corners.detect import (
     too_few,
 )
 from kcal.corners.images import image_time
-from kcal.corners.marker_boards import opencv_dictionary
+from kcal.corners.markers import opencv_dictionary
 from kcal.corners.refine import refine_corners
 from kcal.corners.saddle import CornerStatus, Refined
 from kcal.corners.video import VideoFrames

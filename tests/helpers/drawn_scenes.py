@@ -26,7 +26,7 @@ from kcal.calibrate.rig.sources import Landmarks, RigData
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.lens.camera import Camera
-from kcal.lens.difference import camera_difference
+from kcal.lens.difference import camera_difference, difference_text
 from kcal.lens.rig import Origin
 from kcal.locate.budget import RangeError
 from kcal.locate.geodesy import enu_from_cam
@@ -43,7 +43,6 @@ from kcal.report.calibration import (
 )
 from kcal.report.positions import budget_figure, positions_figure, siting_figure, stations_figure
 from kcal.report.rig import attitude_figure, rig_figure, stars_figure
-from kcal.report.tables import difference_text
 
 PLACES = tensor([20.0, 0.0, 100.0], [-300.0, 5.0, 1000.0], [900.0, 0.0, 5000.0], [0.0, 0.0, 60_000.0])
 PLACE = Origin(lat=10.0, lon=20.0, height=0.0)

@@ -8,7 +8,7 @@ import math
 import pytest
 import torch
 
-from kcal.io.record import CameraSummary, RigSummary, sigma_of, sigma_over_image, take_joint_errors
+from kcal.io.file_summary import CameraSummary, RigSummary, sigma_of, sigma_over_image, take_joint_errors
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector

@@ -11,8 +11,8 @@ import torch
 from kcal.calibrate.hybrid.measured_board import load_measured_board, save_measured_board
 from kcal.corners.observations import Observations
 from kcal.io.camera_file import CameraFile, load_camera, save_camera
+from kcal.io.file_summary import sigma_of
 from kcal.io.lookup_file import load_lookup
-from kcal.io.record import sigma_of
 from kcal.io.rig_file import CameraRigFile, RigFile, load_rig, save_camera_rig, save_rig
 from kcal.lens.camera import Camera
 from kcal.locate.stations import load_camera_rig

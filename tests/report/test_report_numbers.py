@@ -12,14 +12,14 @@ import torch
 from kcal.errors import InputError
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
-from kcal.lens.difference import camera_difference
+from kcal.lens.difference import camera_difference, difference_text
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import Origin, StereoRig
 from kcal.locate.positions import locate_points
 from kcal.report.calibration import difference_figure
 from kcal.report.positions import plotted_ranges
 from kcal.report.practice_score import score_lens, score_rig
-from kcal.report.tables import chance_text, difference_text
+from kcal.report.tables import chance_text
 from kcal.report.verdict import RangeAnswer, Requirement, Verdict
 from kcal.report.verdict_page import _correlations, _percent, _sentence, range_rows
 
