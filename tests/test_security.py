@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from kcal import image_header, strict_json
+from kcal import file_kind, strict_json
 from kcal.io import lookup_file
 from kcal.web import serving
 from scripts.check import container
@@ -25,7 +25,7 @@ def test_what_it_names_exists() -> None:
 def test_its_limits_are_those_of_the_code() -> None:
     rows = dict(re.findall(r"^\| ([^|]+) \| ([^|]+) \|$", TEXT, re.MULTILINE))
     assert rows["JSON files of kcal"].startswith(f"{strict_json.MOST_BYTES >> 20} MiB, {strict_json.MOST_DEPTH} levels")
-    assert rows["images"].startswith(f"{image_header.MOST_PIXELS // 10**6} megapixels")
+    assert rows["images"].startswith(f"{file_kind.MOST_PIXELS // 10**6} megapixels")
     assert rows["lookup tables (.npz)"].startswith(f"{lookup_file._MOST_BYTES >> 20} MiB")
     assert rows["requests to a local page"].startswith(f"{serving._LARGEST_BODY >> 20} MiB, {serving._DEEPEST} levels")
 

@@ -364,7 +364,7 @@ def _first_lens(
     # More triangles take five times as long: of one image, where few have failed in all.
     tries = [(_FEW_CORNERS, number) for number in order[:_TRIES]] + [(_MORE_CORNERS, number) for number in order[:1]]
     for count, (corners, number) in enumerate(tries, 1):
-        what = f"search {count} of {len(tries)}"
+        what = f"search {count} of {len(tries)}: image {number + 1}"
         found = _search(images[number], size, focal, corners, catalog, progress, what)
         if found is not None:
             named, camera = found

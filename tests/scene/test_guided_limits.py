@@ -76,8 +76,7 @@ def test_everything_with_everything_without_a_band() -> None:
     other = kinds[order].clone()
     other[:3] = other[3:6]
     nowhere = torch.zeros(60, 2).double()
-    everything = torch.ones(60, dtype=torch.bool)
-    pairs = _both_ways((Keypoints(nowhere, kinds), Keypoints(nowhere, other)), [everything], [everything], None, 0.75)
+    pairs = _both_ways((Keypoints(nowhere, kinds), Keypoints(nowhere, other)), None, 0.75)
     assert {(int(i), int(j)) for i, j in pairs} == {(int(order[j]), j) for j in range(6, 60)}
 
 

@@ -88,10 +88,10 @@ def test_the_message_names_the_view_that_is_tilted_most() -> None:
 
 @pytest.mark.slow
 def test_a_fisheye_whose_parameter_is_open_calibrates(kcal_data) -> None:
-    """Its fx is known to 29 %, its directions to a thousandth, its focal length on the axis to a quarter pixel."""
+    """Its focal length on the axis is known to a quarter pixel, its fx far less."""
     found = calibrate_camera(Observations.load(kcal_data / "captures" / "fish_l.obs.json"))
     focal, sigma = paraxial_focal(found.camera).mean
-    assert (found.sigma["fx"] or 0.0) > 20 * sigma
+    assert (found.sigma["fx"] or 0.0) > 15 * sigma
     assert sigma < 0.25
     assert 226.0 < focal < 230.0
 
