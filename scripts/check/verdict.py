@@ -53,7 +53,7 @@ NAMES = {
 }
 # What the error says where kcal refuses the capture.
 REFUSALS = {
-    "fronto-parallel": ("parallel to the image", "determine the focal length only"),
+    "fronto-parallel": ("parallel to the image", "determine the focal length only", "tilted alike"),
     "unsynchronized": ("taken at the same moment",),
 }
 CLEAN = ("clean", "clean", "clean", "clean pair")
