@@ -199,8 +199,9 @@ def test_most_images_tell_which_board_they_show() -> None:
     """Not one image each: a grid that is seen in one of them is no other board."""
     board = Board(columns=8, rows=6, square=0.025)
     whole = "a board of 9x6 inner corners was found, not 8x6: give --board 9x6"
-    failed = [(None, whole), (None, whole.replace("9x6", "11x7"))]
-    failed += 4 * [(None, "a grid of 9x6 inner corners was found, larger than 8x6"), (None, "too blurred")]
+    gray = np.full((60, 80), 128, np.uint8)
+    failed = [(gray, whole), (gray, whole.replace("9x6", "11x7"))]
+    failed += 4 * [(gray, "a grid of 9x6 inner corners was found, larger than 8x6"), (gray, "too blurred")]
     assert seen_by_most(failed, board) == ("a board of 9x6 was found: give --board 9x6", 5)
     with pytest.raises(InputError) as caught:
         refuse_other_board(0, failed, 26, board)
