@@ -55,7 +55,7 @@ def test_a_fisheye_of_which_nothing_is_known() -> None:
     assert found.images == (0,)
     assert found.lens.rms_px < 0.13
     assert error_at_infinity(found.lens.camera, lens, columns=17, rows=11).rms < 0.2
-    assert "search 1 of 2, focal length" in told[0]
+    assert "search 1 of 2: image 1, focal length" in told[0]
 
 
 def test_too_few_stars() -> None:
