@@ -109,8 +109,6 @@ def _json_kind(path: Path, text: str, size: int) -> str:
     return "geojson" if '"FeatureCollection"' in text or '"Feature"' in text else "json"
 
 
-# The size of an image: as files have it, and from an image file's header alone.
-
 # The size of an image, as kcal's files have it; apart from other checks, because torch takes long to load.
 
 # Of one image. The largest sensors of 2025 have about 410 megapixels.

@@ -23,14 +23,7 @@ from kcal.corners.board import DICTIONARIES, TAGS, Board
 from kcal.corners.circles import find_circles, refine_circles, round_blobs, wrong_size
 from kcal.corners.grid import MIN_SHARPNESS, local_side, sharpness, without_false_sides
 from kcal.corners.images import VIDEO_SUFFIXES, Gray, decode_gray, expand_images, to_8bit, unique_names
-from kcal.corners.marker_boards import (
-    BORDERS,
-    MIN_CORNERS,
-    enough,
-    find_aprilgrid,
-    find_charuco,
-    free_side,
-)
+from kcal.corners.marker_boards import BORDERS, MIN_CORNERS, enough, find_aprilgrid, find_charuco, free_side
 from kcal.corners.markers import opencv_dictionary
 from kcal.corners.observations import Failure, Observations, View, common_size, rescaled
 from kcal.corners.refine import Refinement, refine_corners
@@ -233,7 +226,7 @@ def seen_by_most(failed: Sequence[tuple[Any, str]], board: Board) -> tuple[str, 
     return most[0], len(most) if votes else 0
 
 
-def refuse_other_board(views: int, failed: Sequence[tuple[Any, str]], count: int, board: Board) -> None:
+def refuse_other_board(views: int, failed: Sequence[tuple[Any, str]], count: int, board: Board, least: int = 0) -> None:
     """Refuse images of which none shows the board, or hardly any while most show one other board.
 
     Args:
@@ -241,6 +234,7 @@ def refuse_other_board(views: int, failed: Sequence[tuple[Any, str]], count: int
         failed: images without it, and why.
         count: of all images; fewer than that may have been searched.
         board: that was asked for.
+        least: images that must show one other board where none shows this one.
 
     Raises:
         InputError: so it is; with what most images show.
@@ -248,6 +242,8 @@ def refuse_other_board(views: int, failed: Sequence[tuple[Any, str]], count: int
     where = f"any of {count} images" if len(failed) == count else f"the first {len(failed)} of {count} images"
     if not views:
         text, shown = seen_by_most(failed, board)
+        if shown < least:
+            return
         raise InputError(f"no board in {where} ({f'{shown} of them: {text}' if text else failed[0][1]})")
     if views <= _FEW * sum(bool(_OTHER.search(reason)) for _, reason in failed):
         text, shown = seen_by_most(failed, board)
@@ -519,8 +515,8 @@ def detect(
                 if found.pixels is None:
                     failures.append(Failure(name=name, reason=found.reason))
                     failed.append((file, f"{name}: {found.reason}"))
-                    if not views and len(failed) in _STOPS and 2 * seen_by_most(failed, board)[1] > len(failed) + 1:
-                        refuse_other_board(0, failed, len(files), board)
+                    if not views and len(failed) in _STOPS:
+                        refuse_other_board(0, failed, len(files), board, least=(len(failed) + 1) // 2 + 1)
                     if on_failure is not None and isinstance(file, Path):
                         on_failure(name, file, found)
                 else:
@@ -629,7 +625,7 @@ def _size(image: Any) -> tuple[int, int]:
 
 
 def _size_of(file: Any) -> tuple[int, int] | None:
-    """(width, height), from the first bytes where they tell it."""
+    """(width, height), without decoding the image where its header tells it."""
     if not isinstance(file, Path):
         return _size(file)
     try:

@@ -24,8 +24,6 @@ from kcal.lens.projection import from_pixels, plane_from_points, rays_from_plane
 from kcal.solve.lm import DenseLinearization, DenseProblem, LMOptions, minimize
 from kcal.solve.problem import Problem, Result, SolverStatus, State
 
-# Small fully connected networks as functions of one vector of weights, and the fit that all of them share.
-
 # Small fully connected networks as functions of one vector of weights, with closed-form Jacobians.
 #
 # Convention: features come first and points last, (..., F, N). Hidden layers are tanh, the last layer is linear.

@@ -24,8 +24,6 @@ from kcal.pipeline.epipolar_pencil import FEWEST_VIEWS, Confirming, StationSight
 from kcal.pipeline.pairing import ObjectPairs, ObjectViews, pair_objects
 
 # `group_objects`: which detections of any number of cameras are of one thing, by where their lines of sight meet.
-
-# `group_objects`: which detections of any number of cameras are of one thing, by where their lines of sight meet.
 #
 # Two lines of sight that come close are a possible pair, with an inverse range from the first of them. Pairs of one
 # detection with others whose inverse ranges agree are a possible group; all its views are then fitted together, with

@@ -134,8 +134,6 @@ class Tracks(NamedTuple):
     seen: Tensor
 
 
-# `Tracker`: objects of one moment after another become tracks with places, velocities and honest errors.
-
 # What a tracker computes at each moment, as functions of tensors alone: as they are, or compiled.
 #
 # Sizes are T tracks under J models, N pairs, L possible matches.

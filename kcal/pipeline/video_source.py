@@ -32,8 +32,6 @@ from kcal.pipeline.pairing import ObjectDisparity, ObjectPairs, ObjectViews, pai
 from kcal.pipeline.stream import CALENDAR, SourceItem
 from kcal.threads import Handover
 
-# Frames of video files and live streams with their times, and those of several cameras that belong together.
-
 # Frames of video files with their own times, decoded by PyAV (the extra `video`).
 
 # A file whose frames end this much before it says, in seconds or as a share of its length, is damaged or cut off.

@@ -304,14 +304,15 @@ def _patterns_finding(found: Examination) -> Finding:
         if structure.neighbors > _NEIGHBORS
         else f"averages over parts of the image are {math.sqrt(structure.image):.1f} times what noise leaves"
     )
+    agree = bool(found.halves) and _halves_agree(found.halves)
     checked = (
         "halves of the views agree within the error bars, which allow for it"
-        if found.halves and _halves_agree(found.halves)
+        if agree
         else "halves of the views do not show that the error bars allow for it"
     )
     return Finding.of(
         "patterns",
-        "note" if found.halves and _halves_agree(found.halves) else "doubt",
+        "note" if agree else "doubt",
         f"residuals are not only noise: {what}; {checked}",
         "for smaller error bars use a flat, stiff board on a stand, with fixed focus and zoom",
     )

@@ -464,8 +464,6 @@ def save_budget_picture(
     return figures.save_picture(path, budget_figure(distances, found, labels))
 
 
-# Pictures of sites: how well an area is seen and located, and a sketch of what to mark.
-
 # A picture of sites: how well an area is seen and located today, and with the candidates that are worth most.
 
 # From good to poor; blind and single are told apart by the blind eye too.

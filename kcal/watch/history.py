@@ -21,8 +21,6 @@ from kcal.errors import FileError, InputError
 from kcal.lens.rig import StereoRig
 from kcal.texts import csv_line, unix_seconds
 
-# How the cameras of a rig turn over time: model, Kalman filter and smoother.
-
 # How the cameras of a rig turn over time, and how that is learned from what was measured (maximum likelihood).
 #
 # Each camera turns by three angles, left before right: pitch, yaw, roll, in radians about its own axes, counted from

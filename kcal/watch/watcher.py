@@ -29,8 +29,6 @@ from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.monitor import relocked
 from kcal.pipeline.stream import Ledger
 
-# A rig and the history of its attitude: the rig of any moment, a stream that follows it, and a new rig file.
-
 # `Watched`: a rig and the history of its attitude; the rig of any moment, with the errors of that moment.
 
 # Shared errors that a moment has beside those of the rig file.

@@ -188,8 +188,6 @@ def hybrid_result(observations: Observations, fit: HybridFit, options: Calibrati
     return dataclasses.replace(result, warnings=(*unequal, *result.warnings)) if unequal else result
 
 
-# Calibrate without a few views that no lens fits, and name them.
-
 # Calibrate without views that no lens fits, before refusing all of them; and name them.
 #
 # One image of another board, of another camera, or with corners in a wrong order can leave no lens that shows all

@@ -437,11 +437,12 @@ def _two_cameras(refits: _Refits, views: _ByView, second: Tensor, nats: float) -
         second = moved
     second = second if 2 * int(second.sum()) <= len(second) else ~second
     parted, fit = _Parted.of(views, second, refits.fit.size), refits.fit
-    unlikely = (parted.both[1] - parted.both[0]) / _widths(fit.size)
+    change = parted.both[1] - parted.both[0]
+    unlikely = change / _widths(fit.size)
     likelier = refits.nats(views) + float(views.fall(second) - 0.5 * unlikely.square().sum()) - parted.price
     if likelier < nats + WORTH:
         return None
-    change, changes = parted.both[1] - parted.both[0], views.change(parted.both[:, None])
+    changes = views.change(parted.both[:, None])
     groups = TwoCameras(
         second=second,
         clear=0.5 * torch.where(second, changes[0] - changes[1], changes[1] - changes[0]),

@@ -389,8 +389,6 @@ def _reweight_priors(
     return views, result, spent
 
 
-# Calibrate one camera with a parametric lens model, for exchange with other programs, and assess its solution.
-
 # Assess a camera's solution: σ, covariance, residuals and warnings, as the result of its calibration.
 
 

@@ -277,9 +277,7 @@ def columns_may_be_read(rounds: Rounds, hyperprior: Hyperprior, never: Tensor) -
     They do near this solution; or there is none, because motions came to their limit.
     """
     readout, estimate = rounds.capture.readout, rounds.estimate
-    if readout is None:
-        return False
-    if not readout.moves:
+    if readout is None or not readout.moves:
         return False
     found = motion_sigma(estimate.log_ratio, estimate.variance / estimate.tempering)
     if not rounds.converged or max(found.turn, found.shift) > _TOO_MUCH:
