@@ -155,7 +155,7 @@ def lines(records: list[Record]) -> list[str]:
     out = [*table(head, rows), ""]
     if known:
         out += [
-            f"Of {len(records)} captures, {len(records) - len(known)} have a half that kcal refuses. Of the others, "
+            f"kcal refuses a half of {len(records) - len(known)} of {len(records)} captures. Of the others, "
             f"{sum(record['p'] >= LEAST_P for record in known)} have p ≥ {LEAST_P}; the smallest is "
             f"{min(record['p'] for record in known):.2g}. Mean ratio "
             f"{statistics.fmean(record['ratio'] for record in known):.2f} (aim: {RATIOS[0]} to {RATIOS[1]}). "

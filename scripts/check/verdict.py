@@ -165,7 +165,7 @@ def table_of(lines: list[dict[str, Any]]) -> list[str]:
     return [
         *table(head, rows), "",
         f"Of the {len(good)} clean captures that are not off by more than required, "
-        f"{sum(not line['yes'] for line in good)} are answered with no.",
+        f"{sum(not line['yes'] for line in good)} got a no.",
     ]  # fmt: skip
 
 
