@@ -55,11 +55,11 @@ PUBLIC = {
     """,
     "kcal.rig": """
         RasterError SkylineAttitude SkylineImage SkylineSource skyline_attitude skyline_source
-        FeatureEffect Identity LandmarkEffect MovingControl MovingOptions MovingTrack Sighting match_moving
+        Effect Identity MovingControl MovingOptions MovingTrack Sighting match_moving
         read_sightings
         read_tracks CameraRig CameraRigCalibration load_camera_rig save_camera_rig station_mounting stations_of
         Drift DriftEffect ImagePair ItemResidual MarkedLandmarks Mounting PairCounts RigCalibration RigCovariance
-        RigSource SceneMatches Sides SourceResidual Survey TurnedBoard Watched camera_positions check_rig drift_effect
+        RigSource SceneMatches Sides Survey TurnedBoard Watched camera_positions check_rig drift_effect
         import_survey match_landmarks measure_drift mounting_covariance pair_by_name paired_boards placed_rig
         planned_rig read_features read_pairs read_survey relocked scene_features triangulated_sides
     """,
@@ -88,7 +88,7 @@ PUBLIC = {
     "kcal.stars": """
         NightPlan PlannedStars StarCamera StarLens calibrate_by_stars planned_stars
         Agreement Air Attitude DetectedStars Identification NamedStars SkyView StarCatalog celestial_directions
-        clock_doubts detect_stars identify moments_of name_stars observed_directions parse_time star_source StarEffect
+        clock_doubts detect_stars identify moments_of name_stars observed_directions parse_time star_source
         StarSource
     """,
     "kcal.solve": """
@@ -136,7 +136,6 @@ RECORDS = {
     "DetectedStars",
     "Identification",
     "NamedStars",
-    "StarEffect",
     "StarCamera",
     "StarLens",
     "PlannedStars",
@@ -211,7 +210,6 @@ RECORDS = {
     "SceneMatches",
     "SharedBoard",
     "Sides",
-    "SourceResidual",
     "SolverStatus",
     "Survey",
     "Triangulation",

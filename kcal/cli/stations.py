@@ -39,8 +39,8 @@ def source_lines(result: RigResult) -> list[str]:
             "" if source.rms_px is None else f"{source.rms_px:.4f}",
             "" if source.rms_m is None else length_text(source.rms_m),
         ]
-        sigmas = "" if math.isnan(source.sigmas) else f"{source.sigmas:.2f}"
-        rows.append([source.source, f"{source.used}", f"{source.left_out}", *cells, sigmas])
+        sigmas = "" if source.sigmas is None else f"{source.sigmas:.2f}"
+        rows.append([source.name, f"{source.used}", f"{source.left_out}", *cells, sigmas])
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip() for row in rows]
 

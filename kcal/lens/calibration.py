@@ -218,7 +218,17 @@ class CameraCalibration:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RigSource:
-    """One kind of data that a rig was solved from; see `kcal.rig.SourceResidual`."""
+    """All items of one source that a rig was solved from: boards, landmarks, and so on.
+
+    Args:
+        name: which source.
+        used: how many items are part of the solution.
+        left_out: how many are not.
+        rms_px: sqrt(mean ‖r‖²) over its pixels; None where it has none.
+        rms_m: root of the mean squared meters of the items that have them.
+        sigmas: root of χ² over the degrees of freedom, by the stated sigmas; 1 where these are right; None without any
+            degree of freedom.
+    """
 
     name: str
     used: int

@@ -16,7 +16,7 @@ from scipy.interpolate import Akima1DInterpolator, BSpline, make_smoothing_splin
 from torch import Tensor
 
 from kcal.calibrate.rig.initial_poses import consensus_pose, consensus_rotation
-from kcal.calibrate.rig.sources import LandmarkEffect, Landmarks, MeasuredPosition
+from kcal.calibrate.rig.sources import Effect, Landmarks, MeasuredPosition
 from kcal.errors import FileError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.rig import Origin
@@ -650,27 +650,27 @@ def _shared_shifts(
     pixels: Tensor,
     names: Sequence[str],
     options: MovingOptions,
-) -> tuple[LandmarkEffect, ...]:
+) -> tuple[Effect, ...]:
     """Clocks, latencies and constant offsets, as far as there are any."""
     count = pixels.shape[1]
     everywhere = velocity[:, None].expand(-1, count, -1)
     found = []
     if options.clock_sigma:
-        found.append(LandmarkEffect(name=CLOCK, shift=options.clock_sigma * everywhere))
+        found.append(Effect(name=CLOCK, shift=options.clock_sigma * everywhere))
     seeing = torch.isfinite(pixels).all(-1).any(0).nonzero()[:, 0].tolist()
     for camera in seeing[1:] if options.between_sigma else ():
         shift = torch.zeros(len(of), count, 3, dtype=torch.float64)
         shift[:, camera] = options.between_sigma * velocity
-        found.append(LandmarkEffect(name=f"the clock of {names[camera]} against {names[seeing[0]]}", shift=shift))
+        found.append(Effect(name=f"the clock of {names[camera]} against {names[seeing[0]]}", shift=shift))
     for k, track in enumerate(tracks):
         own = (of == k).double()[:, None, None]
         if not bool(own.any()):
             continue
         if track.latency:
-            found.append(LandmarkEffect(name=f"how late {track.name} is", shift=track.latency * own * everywhere))
+            found.append(Effect(name=f"how late {track.name} is", shift=track.latency * own * everywhere))
         for axis, (way, constant) in enumerate(zip(("east", "north", "up"), track.constant, strict=True)):
             if constant:
                 unit = constant * torch.eye(3, dtype=torch.float64)[axis]
                 shift = own * unit.expand(len(of), count, 3)
-                found.append(LandmarkEffect(name=f"where on {track.name} its antenna is, {way}", shift=shift))
+                found.append(Effect(name=f"where on {track.name} its antenna is, {way}", shift=shift))
     return tuple(found)

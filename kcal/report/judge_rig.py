@@ -347,7 +347,7 @@ def _exact_lenses(rig: StereoRig | CameraRig, result: RigResult | None) -> tuple
 def _largest_variance(solved: RigResult | RigCalibration | CameraRigCalibration | None) -> float:
     """Largest mean square of a source's residuals in their sigmas."""
     sources = () if solved is None else solved.sources
-    known = [source.sigmas for source in sources if source.sigmas is not None and not math.isnan(source.sigmas)]
+    known = [source.sigmas for source in sources if source.sigmas is not None]
     return max((sigmas**2 for sigmas in known), default=0.0)
 
 

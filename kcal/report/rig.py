@@ -245,7 +245,8 @@ def _footer(result: RigResult) -> str:
         values = [f"{source.used} used"] + ([f"{source.left_out} left out"] if source.left_out else [])
         values += [] if source.rms_px is None else [f"{source.rms_px:.3f} px"]
         values += [] if source.rms_m is None else [length_text(source.rms_m)]
-        parts.append(f"{source.source}: {', '.join(values)}, {source.sigmas:.2f} sigma")
+        values += [] if source.sigmas is None else [f"{source.sigmas:.2f} sigma"]
+        parts.append(f"{source.name}: {', '.join(values)}")
     texts = ["   ".join(parts), *(f"{item.label}: {item.reason}" for item in result.left_out[:2])]
     return "\n".join(line for text in texts for line in wrapped(text, 12.6, 9.0))
 

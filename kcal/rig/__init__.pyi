@@ -16,8 +16,7 @@ from kcal.scene.match import ImagePair as ImagePair
 from kcal.scene.match import scene_features as scene_features
 from kcal.scene.match import SceneMatches as SceneMatches
 from kcal.scene.match import PairCounts as PairCounts
-from kcal.calibrate.rig.sources import FeatureEffect as FeatureEffect
-from kcal.calibrate.rig.sources import LandmarkEffect as LandmarkEffect
+from kcal.calibrate.rig.sources import Effect as Effect
 
 # Skylines
 from kcal.skyline.attitude import skyline_source as skyline_source
@@ -39,7 +38,6 @@ from kcal.locate.moving import Identity as Identity
 
 # Results
 from kcal.calibrate.rig.result import ItemResidual as ItemResidual
-from kcal.calibrate.rig.result import SourceResidual as SourceResidual
 from kcal.calibrate.rig.initial_poses import TurnedBoard as TurnedBoard
 from kcal.lens.calibration import RigCalibration as RigCalibration
 from kcal.lens.calibration import RigSource as RigSource

@@ -11,7 +11,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from kcal.calibrate.rig.sources import FeatureEffect
+from kcal.calibrate.rig.sources import Effect
 from kcal.lens.pose import side_axes
 from kcal.lens.rig import StereoRig
 from kcal.scene.refine import HALF
@@ -225,7 +225,7 @@ _SMOOTH_PX = 0.0035
 _NAMES = tuple(f"errors that matches share, {part}" for part in ("everywhere", "by columns", "by rows"))
 
 
-def smooth_effects(pixels: Tensor, across: Tensor, size: tuple[int, int]) -> tuple[FeatureEffect, ...]:
+def smooth_effects(pixels: Tensor, across: Tensor, size: tuple[int, int]) -> tuple[Effect, ...]:
     """Three errors: one everywhere, and one each that grows linearly from the middle of the left image to its borders.
 
     Args:
@@ -238,7 +238,7 @@ def smooth_effects(pixels: Tensor, across: Tensor, size: tuple[int, int]) -> tup
     # Half of it in each image: matches tell the difference alone.
     sides = torch.tensor([-0.5, 0.5], dtype=torch.float64)[:, None] * across[:, None]
     shifts = _SMOOTH_PX * amounts[..., None, None] * sides
-    return tuple(FeatureEffect(name=name, shift=shift) for name, shift in zip(_NAMES, shifts, strict=True))
+    return tuple(Effect(name=name, shift=shift) for name, shift in zip(_NAMES, shifts, strict=True))
 
 
 # What errors of matches have in common farther than a patch: those of neighbors are a little alike.

@@ -23,7 +23,6 @@ from kcal.stars.sky import parse_time as parse_time
 from kcal.stars.rig_stars import star_source as star_source
 from kcal.stars.rig_stars import moments_of as moments_of
 from kcal.calibrate.rig.sources import StarSource as StarSource
-from kcal.calibrate.rig.sources import StarEffect as StarEffect
 
 # Lenses, and what to expect
 from kcal.stars.lens import calibrate_by_stars as calibrate_by_stars

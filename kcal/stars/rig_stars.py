@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from kcal.calibrate.rig.sources import StarEffect, StarSource
+from kcal.calibrate.rig.sources import Effect, StarSource
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.rig import Origin
@@ -226,7 +226,7 @@ def _effects(
     catalog: StarCatalog,
     *,
     on_earth: bool,
-) -> list[StarEffect]:
+) -> list[Effect]:
     """Clocks against each other, the clock against UT1, and the air."""
     some = next(iter(moments[0].values()))
     if origin is not None:
@@ -245,13 +245,13 @@ def _effects(
         turn, whose = torch.zeros(cameras, 3, dtype=torch.float64), f"the clock of camera {camera + 1}"
         turn[camera] = second
         if clock_sigma > 0:
-            found.append(StarEffect(name=f"{whose} against that of the first", turn=clock_sigma * turn))
+            found.append(Effect(name=f"{whose} against that of the first", turn=clock_sigma * turn))
         for number, hours in nights.items():
-            found.append(StarEffect(name=f"drift of {whose}, night {number}", turn=drift_sigma * turn, factor=hours))
+            found.append(Effect(name=f"drift of {whose}, night {number}", turn=drift_sigma * turn, factor=hours))
     if not on_earth:
         return found
     turn = (some.view.clock_sigma * second).expand(cameras, 3)
-    found.append(StarEffect(name="the clocks against UT1", turn=turn))
+    found.append(Effect(name="the clocks against UT1", turn=turn))
     shifts: dict[str, Tensor] = {}
     for number, moment in enumerate(moments):
         at = [k for k, (m, star) in enumerate(zip(rows.moment, rows.star, strict=True)) if m == number and star >= 0]
@@ -259,6 +259,6 @@ def _effects(
             continue
         view = next(iter(moment.values())).view
         for name, shift in view.by_air(catalog, np.array([rows.star[k] for k in at])):
-            whole = shifts.setdefault(name, torch.zeros(len(rows.names), 3, dtype=torch.float64))
-            whole[at] = torch.from_numpy(shift)
-    return found + [StarEffect(name=name, shift=shift) for name, shift in shifts.items()]
+            whole = shifts.setdefault(name, torch.zeros(len(rows.names), cameras, 3, dtype=torch.float64))
+            whole[at] = torch.from_numpy(shift)[:, None]
+    return found + [Effect(name=name, shift=shift) for name, shift in shifts.items()]

@@ -82,7 +82,7 @@ def judged(times: float, tape: float, draws: int) -> list[str]:
             continue
         blamed += any("the baseline" in text and "contradicts" in text for text in found.warnings)
         off.append(errors(found))
-        told.append(next(one.sigmas for one in found.sources if one.source == "landmarks"))
+        told.append(next(one.sigmas or math.nan for one in found.sources if one.name == "landmarks"))
     what = [f"{times:g}", "right" if tape == 1.0 else f"wrong by {100 * (tape - 1.0):.0f} %"]
     if not off:
         return [*what, str(draws), str(refused), str(blamed), "–", "–", "–"]

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.sources import Baseline, Features, MeasuredPosition, RigData, StarEffect, StarSource
+from kcal.calibrate.rig.sources import Baseline, Effect, Features, MeasuredPosition, RigData, StarSource
 from kcal.lens.camera import Camera
 from kcal.locate.geodesy import enu_from_cam
 from kcal.stars.night import FAR
@@ -70,12 +70,12 @@ def star_rig(
         names += [f"HR {catalog.number[i]} at {moment}" for i in index[good.numpy()]]
     clean, known = torch.cat(pixels), torch.cat(direction)
     turn = -EARTH_RATE * clock_sigma * torch.from_numpy(pole_in_enu(PLACE.lat))
-    effects = [StarEffect(name="the clock of the second camera", turn=torch.stack([torch.zeros_like(turn), turn]))]
+    effects = [Effect(name="the clock of the second camera", turn=torch.stack([torch.zeros_like(turn), turn]))]
     if drift_sigma:
         hours = torch.tensor([int(name.split()[-1]) * 25 / 60 for name in names]).double()
         each = effects[0].turn
         assert each is not None
-        effects.append(StarEffect(name="its drift", turn=each * drift_sigma / clock_sigma, factor=hours))
+        effects.append(Effect(name="its drift", turn=each * drift_sigma / clock_sigma, factor=hours))
     stars = StarSource(
         names=tuple(names),
         pixels=clean + torch.from_numpy(draw.normal(0, sigma, clean.shape)),

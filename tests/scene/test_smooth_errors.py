@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.calibrate.rig.sources import Baseline, FeatureEffect, Features, RigData
+from kcal.calibrate.rig.sources import Baseline, Effect, Features, RigData
 from kcal.lens.pose import rotation_from_vector, side_axes
 from kcal.lens.rig import StereoRig
 from kcal.scene import common_errors
@@ -23,11 +23,11 @@ def some_pixels(count: int) -> Tensor:
     return drawn_pixels(torch.Generator().manual_seed(7), count)
 
 
-def effects_of(pixels: Tensor) -> tuple[FeatureEffect, ...]:
+def effects_of(pixels: Tensor) -> tuple[Effect, ...]:
     return smooth_effects(pixels, line_errors(RIG, pixels).across, SIZE)
 
 
-def turn_covariance(pixels: Tensor, effects: tuple[FeatureEffect, ...]) -> Tensor:
+def turn_covariance(pixels: Tensor, effects: tuple[Effect, ...]) -> Tensor:
     """(3, 3) of the relative rotation that an adjustment states."""
     nothing = torch.zeros(len(pixels), dtype=torch.float64)
     each = (0.5 * SIGMA**2 * torch.eye(2, dtype=torch.float64)).expand(len(pixels), 2, 2, 2)

@@ -69,10 +69,10 @@ def test_a_rig_from_skylines_and_positions_alone() -> None:
         assert abs(off[0]) < 3 * float(sigma[2])
         assert np.abs(off[1:]).max() < 3 * float(sigma[:2].max())
     (skyline, positions) = result.sources
-    assert (skyline.source, skyline.used) == ("skyline", 2)
+    assert (skyline.name, skyline.used) == ("skyline", 2)
     assert skyline.rms_px is not None
     assert skyline.rms_px < 0.4
-    assert positions.source == "positions"
+    assert positions.name == "positions"
     assert result.rms == pytest.approx(skyline.rms_px)
     assert result.warnings == ()
 

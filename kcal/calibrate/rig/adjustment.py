@@ -34,7 +34,7 @@ from kcal.calibrate.rig.problem import (
     own_fits,
 )
 from kcal.calibrate.rig.problem import held as nothing
-from kcal.calibrate.rig.sources import Features, Landmarks, RigData, StarSource, with_effects
+from kcal.calibrate.rig.sources import Features, Landmarks, RigData, StarSource, shifts_of, star_turns, with_effects
 from kcal.checks import beyond_chance, chi2_quantile
 from kcal.errors import InputError
 from kcal.solve.lm import LMOptions, minimize
@@ -122,12 +122,13 @@ class Adjustment:
             surveyed = data.landmarks.points[masks.landmarks], times * data.landmarks.sigma[masks.landmarks]
             marks = _weighted(data.landmarks, masks.landmarks, times)
             effects = self._effects(data.landmarks, unknowns)
-            shifts = data.landmarks.shifts()[:, masks.landmarks]
+            shifts = shifts_of(data.landmarks.effects, (*data.landmarks.pixels.shape[:2], 3))[:, masks.landmarks]
             found.append(LandmarkBlock(*marks, *surveyed, unknowns.by_refraction, effects, shifts))
         if data.features and masks.features.any():
             times, some = self.widened["features"], masks.features
             known = data.features.inverse_range[some], times * data.features.inverse_range_sigma[some]
-            shared = self._effects(data.features, unknowns), data.features.shifts()[:, some]
+            shifts = shifts_of(data.features.effects, data.features.pixels.shape)[:, some]
+            shared = self._effects(data.features, unknowns), shifts
             found.append(FeatureBlock(*_weighted(data.features, some, times), *known, self.anchor, *shared))
         if data.stars and masks.stars.any():
             found.append(self._star_block(masks.stars, unknowns))
@@ -139,7 +140,9 @@ class Adjustment:
         times = self.widened["stars"]
         white = torch.eye(2, dtype=torch.float64) / (times * stars.pixel_sigma[mask][..., None, None])
         known = stars.direction[mask], times * stars.direction_sigma[mask]
-        moves = stars.by_effects(), stars.factors()[:, mask], stars.shifts()[:, mask]
+        count, cameras = stars.pixels.shape[:2]
+        turns = star_turns(stars.effects, count, cameras)[:, :, mask]
+        moves = turns, shifts_of(stars.effects, (count, cameras, 3))[:, mask]
         effects = self._effects(stars, unknowns)
         return StarBlock(stars.pixels[mask], white, *known, *moves, effects)
 

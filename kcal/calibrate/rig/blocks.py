@@ -363,7 +363,7 @@ class FeatureBlock(Block):
     Args:
         pixels: (V, C, 2), see `Block`, as `whitening` (V, C, 2, 2) and `effects`.
         inverse_range: (V,) as known beforehand, with `sigma`.
-        shifts: (E, V, C, 2) see `FeatureEffect`; needed with effects.
+        shifts: (E, V, C, 2) see `Effect`; needed with effects.
     """
 
     kind: Kind = "features"
@@ -439,7 +439,7 @@ class LandmarkBlock(Block):
         sigma: (V, 3) meters.
         by_refraction: (K,) of the coefficient of refraction by the unknowns; None: it is held.
         effects: see `Block`.
-        shifts: (E, V, C, 3) see `LandmarkEffect`; needed with effects.
+        shifts: (E, V, C, 3) see `Effect`; needed with effects.
     """
 
     kind: Kind = "landmarks"
@@ -501,7 +501,7 @@ class LandmarkBlock(Block):
 class StarBlock(Block):
     """Stars, each with a direction of its own that the catalogue knows, if the star has a name.
 
-    Camera c sees star i in the direction d_i + Σ_e u_e (t_ec × d_i + s_ei) with the unknowns u_e of clocks and air,
+    Camera c sees star i in the direction d_i + Σ_e u_e (t_eci × d_i + s_eic) with the unknowns u_e of clocks and air,
     which are standard normal beforehand.
 
     Args:
@@ -509,9 +509,8 @@ class StarBlock(Block):
         whitening: (V, C, 2, 2), see `Block`.
         direction: (V, 3) of the catalogue; anything for stars without a name.
         sigma: (V,) radians; infinite for these.
-        turns: (E, C, 3), see `StarSource.by_effects`.
-        factors: (E, V), see `StarSource.factors`.
-        shifts: (E, V, 3), see `StarSource.shifts`.
+        turns: (E, C, V, 3) radians, see `kcal.calibrate.rig.sources.star_turns`.
+        shifts: (E, V, C, 3), see `kcal.calibrate.rig.sources.shifts_of`.
         effects: see `Block`; its amounts are the u_e.
     """
 
@@ -525,7 +524,6 @@ class StarBlock(Block):
         direction: Tensor,
         sigma: Tensor,
         turns: Tensor,
-        factors: Tensor,
         shifts: Tensor,
         effects: Effects | None = None,
     ) -> None:
@@ -533,9 +531,7 @@ class StarBlock(Block):
         named = torch.isfinite(sigma)
         self._weight = torch.where(named, 1.0 / sigma, 0.0)
         self._known = torch.where(named[:, None], direction, 0.0)
-        # (E, C, V, 3).
-        self._turns = turns[:, :, None] * factors[:, None, :, None]
-        self._shifts = shifts
+        self._turns, self._shifts = turns, shifts
 
     def _prior_count(self) -> Tensor:
         return 2 * (self._weight > 0).long()
@@ -545,7 +541,7 @@ class StarBlock(Block):
 
     def _moves(self, state: RigState, camera: int) -> Tensor:
         turned = torch.linalg.cross(self._turns[:, camera], state.star.expand(len(self._turns), -1, -1))
-        return turned + self._shifts
+        return turned + self._shifts[:, :, camera]
 
     def _by_local(self, state: RigState, by_q: Tensor, center: Tensor, by_w: Tensor | None) -> Tensor:
         return torch.einsum("vjun,vlj->vlun", by_q, torch.stack(side_axes(state.star), 1))

@@ -39,8 +39,8 @@ class SharedUnknowns:
         labels: (K,) names of those that have one.
         refraction: coefficient of refraction of light for the unknowns as they begin.
         by_refraction: (K,) of it by each unknown; None: it is held.
-        by_effects: (E, K) of what shifts stars (`StarEffect`), then landmarks (`LandmarkEffect`), and then features
-            (`FeatureEffect`) together, by each unknown; None: there is nothing.
+        by_effects: (E, K) amount of each `Effect` of stars, then landmarks, and then features, by each unknown; None:
+            there are none.
     """
 
     cameras: tuple[Tensor, ...]

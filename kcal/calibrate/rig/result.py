@@ -63,27 +63,6 @@ class ItemResidual:
         return f"{self.source.removesuffix('s')} {self.name}"
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class SourceResidual:
-    """All items of one source together.
-
-    Args:
-        source: which.
-        used: how many are part of the solution.
-        left_out: how many are not.
-        rms_px: sqrt(mean ‖r‖²) over its pixels; None where it has none.
-        rms_m: root of the mean squared meters of the items that have them.
-        sigmas: root of χ² over the degrees of freedom, by the stated sigmas; 1 where these are right.
-    """
-
-    source: Source
-    used: int
-    left_out: int
-    rms_px: float | None
-    rms_m: float | None
-    sigmas: float
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class RigResult:
     """What `solve_rig` and `calibrate_rig` found.
@@ -124,7 +103,7 @@ class RigResult:
     rotation: Tensor
     center: Tensor
     board_warp: Tensor | None
-    sources: tuple[SourceResidual, ...]
+    sources: tuple[RigSource, ...]
     items: tuple[ItemResidual, ...]
     flipped: tuple[TurnedBoard, ...]
     rms: float
@@ -259,17 +238,7 @@ class RigResult:
             "excluded": tuple(
                 Exclusion(f"{item.source} {item.name}".removeprefix("boards "), item.reason) for item in self.left_out
             ),
-            "sources": tuple(
-                RigSource(
-                    name=source.source,
-                    used=source.used,
-                    left_out=source.left_out,
-                    rms_px=source.rms_px,
-                    rms_m=source.rms_m,
-                    sigmas=None if math.isnan(source.sigmas) else source.sigmas,
-                )
-                for source in self.sources
-            ),
+            "sources": self.sources,
             "warnings": self.warnings,
             "contradictions": self.contradictions,
             **self._provenance,
@@ -381,9 +350,9 @@ def item_records(work: Adjustment, masks: PerKind, reasons: Reasons) -> tuple[It
     return tuple(sorted(items, key=lambda item: (order.index(item.source), not item.used)))
 
 
-def source_records(work: Adjustment, masks: PerKind, items: Sequence[ItemResidual]) -> tuple[SourceResidual, ...]:
+def source_records(work: Adjustment, masks: PerKind, items: Sequence[ItemResidual]) -> tuple[RigSource, ...]:
     """Each source that there is."""
-    squares, freedom, found = work.squares(masks), work.freedom(masks), list[SourceResidual]()
+    squares, freedom, found = work.squares(masks), work.freedom(masks), list[RigSource]()
     problem, state = work.problem(masks), work.part(masks)
     rms_px: dict[Source, float] = {
         block.kind: math.sqrt(float(block.errors(problem.posed(state), state).square().sum()) / int(block.seen.sum()))
@@ -397,15 +366,15 @@ def source_records(work: Adjustment, masks: PerKind, items: Sequence[ItemResidua
         own = [item for item in items if item.source == source]
         if not own:
             continue
-        sigmas = _root_mean_square([item.sigmas for item in own])
+        sigmas: float | None = _root_mean_square([item.sigmas for item in own])
         if source in KINDS:
             k = KINDS.index(source)
             total, dof = float(squares[k].nansum()), int(freedom[k].sum())
-            sigmas = work.widened[KINDS[k]] * math.sqrt(total / dof) if dof > 0 else math.nan
+            sigmas = work.widened[KINDS[k]] * math.sqrt(total / dof) if dof > 0 else None
         meters = [item.meters for item in own if item.used and item.meters is not None]
         found.append(
-            SourceResidual(
-                source=source,
+            RigSource(
+                name=source,
                 used=sum(item.used for item in own),
                 left_out=sum(not item.used for item in own),
                 rms_px=rms_px.get(source),

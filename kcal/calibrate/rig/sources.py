@@ -6,7 +6,6 @@ import dataclasses
 import math
 from collections import Counter
 from collections.abc import Sequence
-from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -74,24 +73,71 @@ class SkylineSource:
         require_finite("skyline: rotation", self.rotation[sorted(set(self.cameras))])
 
 
-# Stars that several cameras of a rig saw at the same moments: at infinity, known to a few millionths of a radian.
+# Errors that many items of a source share: of a clock, of the air, of an antenna's place, of matching.
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class StarEffect:
-    """Something that shifts all stars together and is known only roughly: a clock, the air.
+class Effect:
+    """An error that many items of a source share and of which only the size is known: of a clock, the air, matching.
 
     Args:
         name: what it is, for messages.
-        turn: (C, 3) radians about the frame's axes by which each camera sees the sky turned at one sigma of it.
-        factor: (S,) by which the turn is larger for some stars, as that of a clock that drifts; 1 if left out.
-        shift: (S, 3) by which each star is seen elsewhere at one sigma of it, in all cameras.
+        shift: what one sigma of it does to each item, as each camera sees it: (L, C, 3) meters by which landmarks are
+            elsewhere, (F, C, 2) px by which marks of features are off, (S, C, 3) by which stars are seen elsewhere.
+            Zero if left out.
+        turn: (C, 3) radians about the frame's axes by which each camera sees the sky turned at one sigma; of stars
+            only.
+        factor: (S,) by which this turn is larger for some stars, as that of a clock that drifts; 1 if left out.
+
+    Example:
+        >>> velocity = torch.tensor([[5.0, 0.0, 0.0]], dtype=torch.float64)  # of one landmark, seen by two cameras
+        >>> Effect(name="the clock, 0.1 s", shift=0.1 * velocity[:, None].expand(1, 2, 3)).shift[0, 0].tolist()
+        [0.5, 0.0, 0.0]
     """
 
     name: str
+    shift: Tensor | None = None
     turn: Tensor | None = None
     factor: Tensor | None = None
-    shift: Tensor | None = None
+
+
+def shifts_of(effects: Sequence[Effect], shape: Sequence[int]) -> Tensor:
+    """(E, *shape) the shifts of all effects, each of this shape."""
+    zero = torch.zeros(*shape, dtype=torch.float64)
+    return torch.stack([zero, *(zero if effect.shift is None else effect.shift for effect in effects)])[1:]
+
+
+def star_turns(effects: Sequence[Effect], stars: int, cameras: int) -> Tensor:
+    """(E, C, S, 3) radians by which each camera sees each star turned at one sigma of each effect."""
+    found = torch.zeros(len(effects), cameras, stars, 3, dtype=torch.float64)
+    for own, effect in zip(found, effects, strict=True):
+        if effect.turn is not None:
+            own += effect.turn[:, None] * (1.0 if effect.factor is None else effect.factor[:, None])
+    return found
+
+
+def _check_effects(kind: str, effects: Sequence[Effect], shape: tuple[int, ...], axes: str) -> None:
+    for effect in effects:
+        shift, turn, factor = effect.shift, effect.turn, effect.factor
+        good = shift is None or (shift.shape == shape and bool(torch.isfinite(shift).all()))
+        if not good or (kind != "stars" and (turn is not None or shift is None)):
+            raise InputError(f"{kind}: the effect of {effect.name} needs finite shifts {axes}")
+        fits = (turn is None or turn.shape == (shape[1], 3)) and (factor is None or factor.shape == shape[:1])
+        if not fits:
+            raise InputError(f"{kind}: the effect of {effect.name} has another shape than stars and cameras")
+
+
+def _effects_of_both(one: Sequence[Effect], count: int, other: Sequence[Effect], more: int) -> tuple[Effect, ...]:
+    """Effects of `count` items and of `more` others, for all of them: each shifts its own alone."""
+    around = [(effect, 0, more) for effect in one] + [(effect, count, 0) for effect in other]
+    return tuple(
+        dataclasses.replace(effect, shift=torch.nn.functional.pad(effect.shift, (0, 0, 0, 0, before, after)))
+        for effect, before, after in around
+        if effect.shift is not None
+    )
+
+
+# Stars that several cameras of a rig saw at the same moments: at infinity, known to a few millionths of a radian.
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -119,7 +165,7 @@ class StarSource:
     pixel_sigma: Tensor
     direction: Tensor
     direction_sigma: Tensor
-    effects: tuple[StarEffect, ...] = ()
+    effects: tuple[Effect, ...] = ()
 
     def __post_init__(self) -> None:
         count, shape = len(self.names), self.pixels.shape
@@ -135,35 +181,12 @@ class StarSource:
         if not bool((self.direction_sigma > 0).all()):
             raise InputError("stars: every direction_sigma must be positive; it is infinite without a name")
         require_finite("stars: directions", self.direction[self.named])
-        for effect in self.effects:
-            turn, shift = effect.turn, effect.shift
-            fits = effect.factor is None or effect.factor.shape == (count,)
-            fits &= (turn is None or turn.shape == (shape[1], 3)) and (shift is None or shift.shape == (count, 3))
-            if not fits:
-                raise InputError(f"stars: the effect of {effect.name} has another shape than stars and cameras")
+        _check_effects("stars", self.effects, (count, shape[1], 3), "(S, C, 3)")
 
     @property
     def named(self) -> Tensor:
         """(S,) whether a star's direction is known."""
         return torch.isfinite(self.direction_sigma)
-
-    def by_effects(self) -> Tensor:
-        """(E, C, 3) turns of the sky at one sigma of each effect."""
-        zero = torch.zeros(self.pixels.shape[1], 3, dtype=torch.float64)
-        turns = [zero if effect.turn is None else effect.turn for effect in self.effects]
-        return torch.stack(turns) if turns else zero.new_zeros(0, *zero.shape)
-
-    def factors(self) -> Tensor:
-        """(E, S) by which these turns are larger for each star."""
-        one = torch.ones(len(self.names), dtype=torch.float64)
-        factors = [one if effect.factor is None else effect.factor for effect in self.effects]
-        return torch.stack(factors) if factors else one.new_zeros(0, len(one))
-
-    def shifts(self) -> Tensor:
-        """(E, S, 3) shifts of the stars at one sigma of each effect."""
-        zero = torch.zeros(len(self.names), 3, dtype=torch.float64)
-        shifts = [zero if effect.shift is None else effect.shift for effect in self.effects]
-        return torch.stack(shifts) if shifts else zero.new_zeros(0, *zero.shape)
 
 
 # Hold what a rig is solved from: boards, surveyed landmarks, far features, measured baselines and positions.
@@ -252,24 +275,6 @@ class Boards:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class LandmarkEffect:
-    """Something that shifts many landmarks together and is known only roughly: a clock, an antenna's place.
-
-    Args:
-        name: what it is, for messages.
-        shift: (L, C, 3) meters by which each camera sees each landmark elsewhere at one sigma of it.
-
-    Example:
-        >>> velocity = torch.tensor([[5.0, 0.0, 0.0]], dtype=torch.float64)  # of one landmark, seen by two cameras
-        >>> LandmarkEffect(name="the clock, 0.1 s", shift=0.1 * velocity[:, None].expand(1, 2, 3)).shift[0, 0].tolist()
-        [0.5, 0.0, 0.0]
-    """
-
-    name: str
-    shift: Tensor
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Landmarks:
     """Surveyed points, marked in the images.
 
@@ -289,7 +294,7 @@ class Landmarks:
     sigma: Tensor
     pixels: Tensor
     pixel_sigma: float | Tensor = 0.3
-    effects: tuple[LandmarkEffect, ...] = ()
+    effects: tuple[Effect, ...] = ()
 
     def __post_init__(self) -> None:
         count = len(self.names)
@@ -312,11 +317,6 @@ class Landmarks:
         if not bool((torch.isfinite(sigma) & (sigma > 0)).all()):
             raise InputError("landmarks: pixel_sigma must be a positive number of pixels wherever there is a mark")
 
-    def shifts(self) -> Tensor:
-        """(E, L, C, 3) of all effects."""
-        nothing = self.pixels.new_zeros(0, *self.pixels.shape[:2], 3)
-        return torch.cat([nothing, *(effect.shift[None] for effect in self.effects)])
-
     def __add__(self, other: Landmarks) -> Landmarks:
         """Both, with a sigma for each mark; effects shift only those whose they are."""
         return Landmarks(
@@ -330,42 +330,6 @@ class Landmarks:
 
     def _each(self) -> Tensor:
         return torch.as_tensor(self.pixel_sigma, dtype=torch.float64).expand(self.pixels.shape[:2])
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class FeatureEffect:
-    """An error that the marks of many features share and of which only the size is known, such as of matching.
-
-    Args:
-        name: what it is, for messages.
-        shift: (F, C, 2) px by which each mark is off at one sigma of it.
-
-    Example:
-        >>> lower = torch.tensor([[[0.0, 0.0], [0.0, 0.01]]], dtype=torch.float64)  # of one feature in two images
-        >>> FeatureEffect(name="matches are too low", shift=lower).shift.shape
-        torch.Size([1, 2, 2])
-    """
-
-    name: str
-    shift: Tensor
-
-
-_Effect = TypeVar("_Effect", LandmarkEffect, FeatureEffect)
-
-
-def _check_effects(kind: str, effects: Sequence[_Effect], shape: tuple[int, ...], axes: str) -> None:
-    for effect in effects:
-        if effect.shift.shape != shape or not bool(torch.isfinite(effect.shift).all()):
-            raise InputError(f"{kind}: the effect of {effect.name} needs finite shifts {axes}")
-
-
-def _effects_of_both(one: Sequence[_Effect], count: int, other: Sequence[_Effect], more: int) -> tuple[_Effect, ...]:
-    """Effects of `count` items and of `more` others, for all of them: each shifts its own alone."""
-    around = [(effect, 0, more) for effect in one] + [(effect, count, 0) for effect in other]
-    return tuple(
-        dataclasses.replace(effect, shift=torch.nn.functional.pad(effect.shift, (0, 0, 0, 0, before, after)))
-        for effect, before, after in around
-    )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -394,7 +358,7 @@ class Features:
     inverse_range_sigma: Tensor
     pixel_sigma: float = 0.3
     covariance: Tensor | None = None
-    effects: tuple[FeatureEffect, ...] = ()
+    effects: tuple[Effect, ...] = ()
 
     def __post_init__(self) -> None:
         count = len(self.names)
@@ -409,12 +373,6 @@ class Features:
                 f"features: a covariance {(*self.pixels.shape, 2)} is needed, got {tuple(self.covariance.shape)}"
             )
         _check_effects("features", self.effects, self.pixels.shape, "(F, C, 2)")
-
-    def shifts(self) -> Tensor:
-        """(E, F, C, 2) of all effects."""
-        return torch.cat(
-            [self.pixels.new_zeros(0, *self.pixels.shape), *(effect.shift[None] for effect in self.effects)]
-        )
 
     def __add__(self, other: Features) -> Features:
         """Both, with a covariance for each mark; effects shift only those whose they are."""

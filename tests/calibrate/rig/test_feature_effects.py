@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.calibrate.rig.sources import Baseline, FeatureEffect, Features, LandmarkEffect, Landmarks, RigData
+from kcal.calibrate.rig.sources import Baseline, Effect, Features, Landmarks, RigData, shifts_of
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import vector_from_rotation
@@ -38,7 +38,7 @@ def features(shift: Tensor, amount: float, seed: int = 0, name: str = "shared") 
     return Features(
         names=tuple(f"{name} {i}" for i in range(COUNT)), pixels=pixels + amount * shift + noise, inverse_range=nothing,
         inverse_range_sigma=torch.full_like(nothing, torch.inf), pixel_sigma=NOISE,
-        effects=(FeatureEffect(name=name, shift=shift),),
+        effects=(Effect(name=name, shift=shift),),
     )  # fmt: skip
 
 
@@ -82,7 +82,7 @@ def test_pose_is_as_uncertain_as_the_shared_error_makes_it() -> None:
     shift = torch.stack([torch.zeros_like(lean), lean], -1) * torch.tensor([[0.0], [1.0]])
     with_it, without = (
         solved(dataclasses.replace(features(shift, 0.0), effects=effects)).relative_covariance(0, 1)
-        for effects in ((FeatureEffect(name="lean", shift=shift),), ())
+        for effects in ((Effect(name="lean", shift=shift),), ())
     )
     more = (with_it - without).diagonal()[:3].clamp_min(0.0).sqrt()
     assert float(more[2]) == pytest.approx(0.1 / 480.0, rel=0.05)
@@ -105,13 +105,14 @@ def test_each_source_keeps_its_own_effects() -> None:
     landmarks = Landmarks(
         names=tuple(f"l{i}" for i in range(COUNT)), points=points @ turn.T,
         sigma=torch.full((COUNT, 3), 0.02, dtype=torch.float64), pixels=pixels, pixel_sigma=NOISE,
-        effects=(LandmarkEffect(name="clock", shift=way),),
+        effects=(Effect(name="clock", shift=way),),
     )  # fmt: skip
     first, second = features(scattered(0.5), 1.0, 1, "first"), features(scattered(0.5), -1.0, 2, "second")
     both = first + second
-    assert both.shifts().shape == (2, 2 * COUNT, 2, 2)
-    assert not both.shifts()[0, COUNT:].any()
-    assert not both.shifts()[1, :COUNT].any()
+    shifts = shifts_of(both.effects, both.pixels.shape)
+    assert shifts.shape == (2, 2 * COUNT, 2, 2)
+    assert not shifts[0, COUNT:].any()
+    assert not shifts[1, :COUNT].any()
     data = RigData(cameras=(CAMERA, CAMERA), names=("left", "right"), landmarks=landmarks, features=both)
     assert data.effects == ("clock", "first", "second")
     found = solve_rig(data, RigOptions(refraction=0.0, refraction_sigma=0.0)).effects()
@@ -123,4 +124,4 @@ def test_each_source_keeps_its_own_effects() -> None:
 @pytest.mark.parametrize("shift", [torch.zeros(COUNT, 2).double(), torch.full((COUNT, 2, 2), torch.nan).double()])
 def test_shifts_of_another_shape_or_not_finite_are_refused(shift: Tensor) -> None:
     with pytest.raises(InputError, match=r"the effect of odd needs finite shifts \(F, C, 2\)"):
-        dataclasses.replace(features(scattered(0.5), 0.0), effects=(FeatureEffect(name="odd", shift=shift),))
+        dataclasses.replace(features(scattered(0.5), 0.0), effects=(Effect(name="odd", shift=shift),))

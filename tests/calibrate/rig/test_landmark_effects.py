@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.calibrate.rig.sources import LandmarkEffect, Landmarks, RigData
+from kcal.calibrate.rig.sources import Effect, Landmarks, RigData, shifts_of
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 
@@ -35,7 +35,7 @@ def landmarks(amount: float, seed: int = 0, noise: float = 0.1) -> Landmarks:
         sigma=torch.full((COUNT, 3), 0.05, dtype=torch.float64),
         pixels=pixels,
         pixel_sigma=noise,
-        effects=(LandmarkEffect(name="their clock", shift=shift),),
+        effects=(Effect(name="their clock", shift=shift),),
     )
 
 
@@ -77,16 +77,14 @@ def test_sum_keeps_effects_with_their_landmarks() -> None:
     first, second = landmarks(0.5), landmarks(-0.5, seed=1)
     second = dataclasses.replace(second, names=tuple(f"q{i}" for i in range(COUNT)))
     both = first + second
-    shifts = both.shifts()
-    assert torch.equal(shifts[0, :COUNT], first.shifts()[0])
+    shifts = shifts_of(both.effects, (*both.pixels.shape[:2], 3))
+    assert torch.equal(shifts[0, :COUNT], first.effects[0].shift)
     assert not shifts[0, COUNT:].any()
-    assert torch.equal(shifts[1, COUNT:], second.shifts()[0])
+    assert torch.equal(shifts[1, COUNT:], second.effects[0].shift)
     assert not shifts[1, :COUNT].any()
     assert both.pixel_sigma.shape == (2 * COUNT, 2)
 
 
 def test_effects_of_another_shape_are_refused() -> None:
     with pytest.raises(InputError, match="their clock"):
-        dataclasses.replace(
-            landmarks(0.0), effects=(LandmarkEffect(name="their clock", shift=torch.zeros(COUNT, 3).double()),)
-        )
+        dataclasses.replace(landmarks(0.0), effects=(Effect(name="their clock", shift=torch.zeros(COUNT, 3).double()),))

@@ -47,7 +47,7 @@ def over_sigma(found: RigResult) -> Tensor:
 
 
 def of(found: RigResult, source: str) -> float:
-    return next(one.sigmas for one in found.sources if one.source == source)
+    return next(one.sigmas for one in found.sources if one.name == source)
 
 
 def test_good_sources_count_as_stated() -> None:

@@ -256,7 +256,7 @@ class TestRecovery:
 
     def test_each_source_has_its_residuals(self) -> None:
         found = solve_rig(data(**SOURCES["all"](2)))
-        assert [source.source for source in found.sources] == [
+        assert [source.name for source in found.sources] == [
             "boards", "landmarks", "features", "baselines", "positions",
         ]  # fmt: skip
         assert [source.used for source in found.sources] == [6, 12, 20, 1, 1]
@@ -458,7 +458,7 @@ class TestCovariance:
         marks = landmarks(count=16, noise=0.1, error=0.02)
         honest = solve_rig(data(landmarks=marks))
         boast = solve_rig(data(landmarks=dataclasses.replace(marks, pixel_sigma=0.02, sigma=marks.sigma / 5)))
-        assert next(one.sigmas for one in boast.sources if one.source == "landmarks") > 3
+        assert next(one.sigmas for one in boast.sources if one.name == "landmarks") > 3
         assert any("the landmarks differ from each other by" in text for text in boast.warnings)
         ratio = boast.relative_covariance().diagonal() / honest.relative_covariance().diagonal()
         assert bool(((ratio > 0.3) & (ratio < 3)).all())
