@@ -56,7 +56,9 @@ def camera_numbers(file: Path) -> Numbers:
         for name, value in {**content["intrinsics"], **content["coefficients"]}.items()
     }
     return (
-        found | {f"sigma {name}": [value] for name, value in sigma.items()} | {"rms": [content["calibration"]["rms"]]}
+        found
+        | {f"sigma {name}": [value] for name, value in sigma.items() if value}
+        | {"rms": [content["calibration"]["rms"]]}
     )
 
 
