@@ -17,13 +17,26 @@ from kcal.calibrate.hybrid.evidence import maximize_evidence, still_data
 from kcal.calibrate.hybrid.families import PriorFamilies, typical_hyperprior
 from kcal.calibrate.hybrid.fit import HybridFit
 from kcal.calibrate.hybrid.fitted_views import hybrid_unknowns
-from kcal.calibrate.problem.parameters import FreeParameters
+from kcal.calibrate.problem.board_problem import BoardProblem
+from kcal.calibrate.problem.parameters import FreeParameters, GaussianTerm
+from kcal.calibrate.problem.state import BoardState
 from kcal.errors import InputError
 from kcal.gaussian import Gaussian, numbered
 from kcal.lens.camera import Camera
 from kcal.lens.information import LENS_SLOT, CameraInformation
+from kcal.solve.lm import LMOptions, minimize
 from kcal.stars.detect import DetectedStars
-from kcal.stars.lens_fit import CUT, StarField, StarLens, StarProblem, fit_star_lens, require_stars, star_lens
+from kcal.stars.lens_fit import (
+    CUT,
+    StarField,
+    StarLens,
+    StarViews,
+    fit_star_lens,
+    lens_rows,
+    require_stars,
+    star_lens,
+    star_state,
+)
 from kcal.stars.night import SkyView, fit_attitude
 from kcal.stars.sky import Identification, StarCatalog, celestial_directions, identify, turn_between
 from kcal.threads import in_one_thread
@@ -37,8 +50,7 @@ _FIRST_CUT = 8.0
 _TOLD = 1.0
 # Less probable by chance: boards and stars contradict each other.
 _CONTRADICTION = 1e-4
-# Residuals by which the noise is taken to be known while amplitudes are set.
-_SURE = 1e4
+_EFFORT = LMOptions(max_iterations=15, tolerance=1e-10, initial_damping=1e-10)
 
 
 class Agreement(NamedTuple):
@@ -97,26 +109,31 @@ def refine_by_stars(
     lens = whole.without_board()
     free = [(index, slot) for index, slot in enumerate(lens.slots) if slot >= 0]
     unknowns = FreeParameters(*zip(*free, strict=True))
-    leading = list(unknowns.leading)
-    fit, model, parameters = StarProblem(fields, rotations), boards.camera.model, boards.camera.params.detach()
-    fit.leave_out(parameters, model, _FIRST_CUT)
-    sigma = lens.sigma
+    index = torch.tensor(unknowns.leading)
+    stars, model = StarViews.of(fields), boards.camera.model
+    state = star_state(boards.camera.params.detach(), rotations)
+    stars, sigma = stars.near(model, state, _FIRST_CUT), lens.sigma
+
+    def solved(state: BoardState) -> tuple[BoardProblem, BoardState]:
+        known = GaussianTerm(index, _known_lens(lens, sigma), stars.noise)
+        problem = stars.problem(model, unknowns, [known])
+        return problem, minimize(problem, state, _EFFORT).state
+
     for _ in range(_ROUNDS):
-        parameters = fit.minimize(parameters, model, unknowns, _known_lens(lens, sigma), 10)
-        fit.leave_out(parameters, model, CUT)
-        # As `whitened` counts them.
-        fit.variance = max(fit.variance, 1.0)
-        told = fit.whitened(parameters, model, unknowns)
+        _, state = solved(state)
+        stars = stars.near(model, state, CUT)
         if boards.hybrid is not None:
-            sigma = _by_evidence(boards.hybrid, unknowns, lens, told, parameters[leading])
-    known = _known_lens(lens, sigma)
-    parameters = fit.minimize(parameters, model, unknowns, known, 10)
-    told = fit.whitened(parameters, model, unknowns)
-    change = parameters[leading] - lens.estimate
-    refined = Camera(parameters, size=boards.camera.size, model=model)
+            told = lens_rows(stars.problem(model, unknowns), state, stars.noise)
+            sigma = _by_evidence(boards.hybrid, unknowns, lens, told, state.parameters[index])
+    problem, state = solved(state)
+    told = lens_rows(problem, state, stars.noise)
+    change = state.parameters[index] - lens.estimate
+    refined = Camera(state.parameters, size=boards.camera.size, model=model)
     wide = dataclasses.replace(whole, sigma=torch.cat([sigma, whole.sigma[len(sigma) :]]))
-    found = star_lens(fit, refined, known, told, _with_star_rows(wide, told, change))
-    return found, _agreement_with(told, change, lens, *_star_noise(fit))
+    # As they count.
+    stars = stars._replace(variance=stars.noise**2)
+    found = star_lens(stars, state, refined, told[:, :-1], _with_star_rows(wide, told, change))
+    return found, _agreement_with(told, change, lens, *_star_noise(stars))
 
 
 def joint_calibration(
@@ -167,13 +184,10 @@ def _by_evidence(
     kept = torch.tensor([number[index] for index in unknowns.leading])
     families = PriorFamilies(*(column[kept] for column in hybrid.families))
     boards = torch.cat([lens.rows, (lens.rows @ (x - lens.estimate) + lens.residuals)[:, None]], 1)
-    # The noise is known already, which the last row says.
-    noise = torch.nn.functional.pad(x.new_tensor([[math.sqrt(_SURE)]]), (len(x), 0))
-    rows = torch.cat([boards, stars, noise]).T[None]
-    data = still_data(rows, x - families.mean, _SURE)
+    data = still_data(torch.cat([boards, stars]).T[None], x - families.mean, 0.0)
     assert hybrid.model.hybrid is not None
     hyperprior = typical_hyperprior(hybrid.model.hybrid.modes)
-    best = maximize_evidence(data, families, hybrid.hyperparameters, 1.0, hyperprior)
+    best = maximize_evidence(data, families, hybrid.hyperparameters, 1.0, hyperprior, known_noise=True)
     return families.deviation(best.h)
 
 
@@ -202,11 +216,10 @@ def _with_star_rows(known: CameraInformation, stars: Tensor, change: Tensor) -> 
     )
 
 
-def _star_noise(fit: StarProblem) -> tuple[int, float]:
+def _star_noise(stars: StarViews) -> tuple[int, float]:
     """How many residuals of stars there are, and their sigma in px, as it counts."""
-    weights = torch.cat([w / f.sigma for w, f in zip(fit.weights, fit.fields, strict=True)])
-    count = int((weights > 0).sum())
-    return 2 * count, math.sqrt(max(fit.variance, 1.0) * count / float(weights.square().sum()))
+    count = int((stars.weights > 0).sum())
+    return 2 * count, stars.noise * math.sqrt(count / float(stars.weights.square().sum()))
 
 
 def _agreement_with(stars: Tensor, change: Tensor, lens: CameraInformation, count: int, sigma: float) -> Agreement:

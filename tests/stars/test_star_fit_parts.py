@@ -12,11 +12,14 @@ import pytest
 import torch
 from scipy import stats
 
-from kcal.gaussian import triangular
+from kcal.calibrate.problem.parameters import FreeParameters, GaussianPrior, GaussianTerm
+from kcal.calibrate.problem.state import BoardState
+from kcal.gaussian import Gaussian, triangular
 from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
 from kcal.lens.pose import rotation_from_vector
 from kcal.locate.geodesy import enu_from_cam
+from kcal.solve.lm import LMOptions, minimize
 from kcal.stars.detect import DetectedStars, NightPlan, _signal
 from kcal.stars.lens import (
     Agreement,
@@ -30,7 +33,7 @@ from kcal.stars.lens import (
     _star_noise,
     _with_star_rows,
 )
-from kcal.stars.lens_fit import StarField, StarProblem, free_unknowns, independent_lens
+from kcal.stars.lens_fit import StarField, StarViews, lens_rows, star_state
 from kcal.stars.night import (
     Attitude,
     NamedStars,
@@ -306,79 +309,84 @@ class TestPosterior:
 
     def test_noise_of_stars_is_that_of_those_used(self) -> None:
         fields = [StarField(torch.zeros(3, 3), torch.zeros(3, 2), tensor(0.1, 0.1, 7.0))]
-        fit = StarProblem(fields, [torch.eye(3).double()])
-        fit.weights, fit.variance = [tensor(1.0, 1.0, 0.0)], 4.0
-        count, sigma = _star_noise(fit)
+        stars = StarViews.of(fields)
+        stars = stars._replace(weights=stars.weights * tensor(1.0, 1.0, 0.0), variance=4.0)
+        count, sigma = _star_noise(stars)
         assert count == 4
         assert sigma == pytest.approx(0.2)
-        fit.variance = 0.25
-        assert _star_noise(fit)[1] == pytest.approx(0.1)
+        assert _star_noise(stars._replace(variance=0.25))[1] == pytest.approx(0.1)
 
 
 class TestProblem:
-    def problem(self) -> tuple[StarProblem, Camera]:
+    def problem(self) -> tuple[StarViews, BoardState, Camera]:
         first, pixels = scattered(12)
         field = StarField(first, pixels, torch.full((12,), 0.2).double())
         other = StarField(first[:8] @ TURN.T, pixels[:8] + 0.5, torch.full((8,), 0.1).double())
-        return StarProblem([field, other], [TURN, torch.eye(3).double()]), CAMERA
+        state = star_state(CAMERA.params.detach(), [TURN, torch.eye(3).double()])
+        return StarViews.of([field, other]), state, CAMERA
 
     def test_cost_is_the_sum_of_squares_in_sigmas(self) -> None:
-        fit, camera = self.problem()
+        stars, state, camera = self.problem()
         # Half a pixel along both axes of eight stars.
-        cost = fit.cost(camera.params.detach(), camera.model, fit.rotations)
+        cost = 2.0 * float(stars.problem(camera.model).cost(state))
         assert cost == pytest.approx(8 * 2 * (0.5 / 0.1) ** 2, rel=1e-6)
-        fit.weights[1][:3] = 0.0
-        assert fit.cost(camera.params.detach(), camera.model, fit.rotations) == pytest.approx(250.0, rel=1e-6)
-        errors = fit.errors(camera.params.detach(), camera.model)
-        torch.testing.assert_close(errors[1], torch.full((2, 8), -0.5).double(), rtol=0, atol=1e-6)
+        stars.weights[1][:3] = 0.0
+        assert 2.0 * float(stars.problem(camera.model).cost(state)) == pytest.approx(250.0, rel=1e-6)
+        stars, state, camera = self.problem()
+        errors = stars.errors(camera.model, state)
+        torch.testing.assert_close(errors[1, :8], torch.full((8, 2), -0.5).double(), rtol=0, atol=1e-6)
+        assert not bool(torch.isfinite(errors[1, 8:]).any())
 
     def test_what_is_far_off_is_left_out_by_what_is_typical(self) -> None:
-        fit, camera = self.problem()
-        pixels = fit.fields[0].pixels.clone()
-        pixels[2] += 40.0
-        pixels[:, 0] += 0.3
-        fit.fields[0] = fit.fields[0]._replace(pixels=pixels)
-        fit.leave_out(camera.params.detach(), camera.model, 5.0)
-        assert fit.weights[0].tolist() == [1.0, 1.0, 0.0] + 9 * [1.0]
+        stars, state, camera = self.problem()
+        stars.pixels[0, 2] += 40.0
+        stars.pixels[0, :, 0] += 0.3
+        found = stars.near(camera.model, state, 5.0)
+        assert (0.2 * found.weights[0]).tolist() == pytest.approx([1.0, 1.0, 0.0] + 9 * [1.0])
         # Lengths of errors in sigmas: eleven of 1.5, one far off, eight of 7.07: the tenth of twenty.
-        assert fit.variance == pytest.approx((1.5 / 1.18) ** 2, rel=1e-3)
+        assert found.variance == pytest.approx((1.5 / 1.18) ** 2, rel=1e-3)
 
     def test_a_wrong_focal_length_is_found_and_a_prior_holds_it(self) -> None:
-        from kcal.calibrate.problem.parameters import FreeParameters
-
-        unknowns = FreeParameters((0, 1, 2, 3), (0, 0, 1, 2))
+        # The principal point's height is no unknown: it is held where it was.
+        unknowns = FreeParameters((0, 1, 2), (0, 0, 1))
         truth = CAMERA.params.detach()
+        index = torch.tensor(unknowns.leading)
         for sigma in (1e6, 1e-4):
-            fit, camera = self.problem()
-            fit.fields[1] = fit.fields[1]._replace(pixels=fit.fields[1].pixels - 0.5)
+            stars, state, camera = self.problem()
+            stars.pixels[1] -= 0.5
             begin = truth.clone()
             begin[:2] += 5.0
-            known = independent_lens(begin[[0, 2, 3]], tensor(sigma, 1e3, 0.0))
-            assert free_unknowns(known, 3) == [0, 1]
-            found = fit.minimize(begin, camera.model, unknowns, known, 20)
-            # What has no deviation is held where it was.
-            assert float(found[3]) == float(begin[3])
-            if sigma > 1.0:
-                torch.testing.assert_close(found[:4], truth[:4], rtol=0, atol=1e-4)
-            else:
-                assert float(found[0]) == pytest.approx(float(begin[0]), abs=1e-3)
+            spread = tensor(sigma, 1e3)
+            prior = GaussianPrior(index, begin[index], 1.0 / spread)
+            known = GaussianTerm(index, Gaussian.independent(("f", "x"), begin[index], spread), 1.0)
+            for term in (prior, known):
+                problem = stars.problem(camera.model, unknowns, [term])
+                result = minimize(problem, state._replace(parameters=begin), LMOptions(max_iterations=20))
+                found = result.state.parameters
+                assert float(found[3]) == float(begin[3])
+                # Images at infinity turn and do not move.
+                assert not bool(result.state.translation.any())
+                if sigma > 1.0:
+                    torch.testing.assert_close(found[:4], truth[:4], rtol=0, atol=1e-4)
+                else:
+                    assert float(found[0]) == pytest.approx(float(begin[0]), abs=1e-3)
 
     def test_rows_without_rotations_are_a_projection(self) -> None:
-        """`whitened` has the products of all rows less what the rotations explain, in typical sigmas."""
-        from kcal.calibrate.problem.parameters import FreeParameters
-
-        fit, camera = self.problem()
-        unknowns = FreeParameters((0, 1, 2, 3), (0, 0, 1, 2))
-        fit.variance = 9.0
-        rows = fit.whitened(camera.params.detach(), camera.model, unknowns)
-        out, back = fit.reduced(camera.params.detach(), camera.model, unknowns)
-        torch.testing.assert_close(rows.T @ rows, (triangular(out.T)[:-1].T @ triangular(out.T)[:-1]) / 9.0)
-        flat = back[0][2]
-        turns = flat[:3]
-        left = flat[3:] - flat[3:] @ turns.T @ torch.linalg.inv(turns @ turns.T) @ turns
-        torch.testing.assert_close(out[:, :24], left, rtol=1e-9, atol=1e-9)
-        # Half of a pixel over its sigma is in the last row.
-        torch.testing.assert_close(back[1][2][-1], torch.full((16,), -5.0).double(), rtol=0, atol=1e-5)
+        """`lens_rows` has the products of all rows less what the rotations explain, in typical sigmas."""
+        stars, state, camera = self.problem()
+        problem = stars.problem(camera.model, FreeParameters((0, 1, 2, 3), (0, 0, 1, 2)))
+        rows = lens_rows(problem, state, 3.0)
+        out, whole = problem.off_poses(state), problem.rows(state)
+        joined = out.transpose(0, 1).flatten(1)
+        triangle = triangular(joined.T)[:-1]
+        torch.testing.assert_close(rows.T @ rows, triangle.T @ triangle / 9.0)
+        turns, flat = whole[0, :3], whole[0, 3:]
+        left = flat - flat @ turns.T @ torch.linalg.inv(turns @ turns.T) @ turns
+        torch.testing.assert_close(out[0], left, rtol=1e-9, atol=1e-9)
+        # Half of a pixel over its sigma is in the last row, and nothing where there is no star.
+        last = whole[1, -1].unflatten(0, (2, 12))
+        torch.testing.assert_close(last[:, :8], torch.full((2, 8), -5.0).double(), rtol=0, atol=1e-5)
+        assert not bool(whole[1].unflatten(1, (2, 12))[..., 8:].any())
 
 
 class TestRoughLens:

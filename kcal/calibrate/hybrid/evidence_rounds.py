@@ -39,6 +39,8 @@ _SETTLED = 1
 # Steps of the solver, and squared standard deviations by which one must lower chi² to be worth the next: in the first
 # round, in the others, and at the end.
 _FIRST, _LATER, LAST = (8, 0.1), (12, 0.02), (60, 0.01)
+# First rounds after which corners are weighed anew, where that is asked for.
+_REWEIGHED = 3
 # Nats by which the evidence may fall from one round to another, because the problem is not linear.
 _DRIFT = 5.0
 # Motions beyond this stand for something else.
@@ -148,6 +150,7 @@ def run_rounds(
     spent: int,
     rough: bool,
     progress: Callable[[str], object],
+    reweigh: Callable[[FittedViews, Estimate], FittedViews] | None = None,
 ) -> Rounds:
     """Solve and set amplitudes in turn.
 
@@ -160,6 +163,7 @@ def run_rounds(
         spent: trial steps before.
         rough: another fit will begin where this one ends, so that it need not come to rest entirely.
         progress: called after each round.
+        reweigh: called after each of the first rounds: the same views with other weights, such as without outliers.
     """
     readout, converged, tempered, lost = capture.readout, False, False, math.nan
     top: Rounds | None = None
@@ -174,7 +178,7 @@ def run_rounds(
         spent += steps
         data = capture.data(problem, estimate, never)
         former = tempering = estimate.tempering
-        if not first and problem.readout is None:
+        if not first and problem.readout is None and not capture.turning:
             found = _overdispersion(data, estimate, never)
             # More tempering leaves fewer parameters, over which the scores scatter less, and so on: the mean of both
             # ends this where the new value alone swings forever (OpenCV's left camera, between 1 and 2).
@@ -211,6 +215,10 @@ def run_rounds(
         # Where its amplitudes rest and the solver does not, more rounds of a few steps would end as those before.
         effort = LAST if bends and change < _AT_REST and not ended else _LATER
         progress(f"evidence, round {turn + 1}")
+        if reweigh is not None and turn < _REWEIGHED:
+            weighed = reweigh(capture, estimate)
+            resting &= torch.equal(weighed.weights, capture.weights)
+            capture = weighed
         if (first or resting) and turn < _ROUNDS // 2:
             bent = _with_bending(capture, estimate, best, tempering, never)
             if bent is not None:

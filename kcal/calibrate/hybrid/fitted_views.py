@@ -13,7 +13,7 @@ from torch import Tensor
 from kcal.calibrate.hybrid.board_modes import BoardModes
 from kcal.calibrate.hybrid.evidence import ViewData, view_data
 from kcal.calibrate.hybrid.families import PriorFamilies
-from kcal.calibrate.problem.board_problem import POSE, BoardProblem
+from kcal.calibrate.problem.board_problem import POSE, TURN, BoardProblem
 from kcal.calibrate.problem.parameters import FreeParameters, GaussianPrior
 from kcal.calibrate.problem.state import BoardState, Readout, stillness
 from kcal.calibrate.problem.views import LEAST_NOISE
@@ -46,6 +46,7 @@ def hybrid_problem(
     readout: Readout | None = None,
     stillness: Tensor | None = None,
     square: bool = True,
+    turning: bool = False,
 ) -> BoardProblem:
     """Residuals of boards under a hybrid lens, with a normal prior on each unknown of lens and board.
 
@@ -60,12 +61,13 @@ def hybrid_problem(
         readout: how views move while they are read, and how the board bends in them; None: neither.
         stillness: (M,) or (V, M) the squared noise over the variance of each of these numbers.
         square: whether pixels are square; others have two focal lengths.
+        turning: points are (V, N, 3) and infinitely far, so that poses are rotations.
     """
     held = torch.isinf(precision)
     return BoardProblem(
         points, pixels, model, hybrid_unknowns(model, square), shapes=shapes, free_board=True, held=held,
         weights=weights, terms=[hybrid_prior(model, len(shapes), mean, precision, square)], readout=readout,
-        stillness=stillness,
+        stillness=stillness, turning=turning,
     )  # fmt: skip
 
 
@@ -115,6 +117,8 @@ class FittedViews:
         robust: bound the weight of corners that are far off.
         exact: the board does not differ.
         heights: (12, N) of the corners by which the board may bend by view, meters, if the evidence says so, or None.
+        turning: views show points (V, N, 3) that are infinitely far, such as stars: poses are rotations, and errors do
+            not repeat within a view.
     """
 
     points: Tensor
@@ -127,6 +131,7 @@ class FittedViews:
     robust: bool
     exact: bool
     heights: Tensor | None = None
+    turning: bool = False
 
     @functools.cached_property
     def _kept(self) -> list[tuple[LensModel, Tensor, BoardProblem]]:
@@ -157,7 +162,7 @@ class FittedViews:
     @property
     def freedom(self) -> int:
         """Residuals without those that poses take up."""
-        return 2 * int(self.seen.sum()) - 6 * len(self.pixels)
+        return 2 * int(self.seen.sum()) - (TURN if self.turning else POSE) * len(self.pixels)
 
     def problem(self, estimate: Estimate, never: Tensor) -> BoardProblem:
         """The least squares at amplitudes of an estimate; unknowns of which `never` is true are held."""
@@ -171,7 +176,7 @@ class FittedViews:
         else:
             problem = hybrid_problem(
                 self.points, self.board.shapes, self.pixels, self.weights, estimate.model, estimate.families.mean,
-                precision, self.readout, still, self.square,
+                precision, self.readout, still, self.square, self.turning,
             )  # fmt: skip
             kept[:] = [(estimate.model, held, problem)]
         if self.robust:
@@ -196,7 +201,7 @@ class FittedViews:
 
     def data(self, problem: BoardProblem, estimate: Estimate, never: Tensor) -> ViewData:
         """What the views say near an estimate."""
-        state, products = estimate.state, problem.products(estimate.state).off(POSE)
+        state, products = estimate.state, problem.products(estimate.state).off(problem.pose)
         if bool(never.any()):
             # Unknowns that are held are among the others, of which nothing is said.
             place, size = torch.cat([problem.moving, torch.tensor([len(never)])]), len(never) + 1

@@ -71,8 +71,8 @@ def apply_twist(rotation: Tensor, translation: Tensor, step: Tensor) -> tuple[Te
 
 # All views.
 ALL = slice(None)
-# Numbers of a pose's step.
-POSE = 6
+# Numbers of a pose's step, and of its turn alone.
+POSE, TURN = 6, 3
 
 
 class BoardImages:
@@ -81,6 +81,7 @@ class BoardImages:
     Attributes:
         seen: (..., V, N) corners that count.
         weights: (..., V, N) or (..., V, 2, 2, N).
+        pose: unknowns of each view's pose, the first of its local ones.
         local_size: unknowns of each view: of its pose, and of its motion.
         unknown_count: of camera and board, those that are held among them.
         joint: whether a linearization costs little more than the cost alone: with hundreds of columns it costs more.
@@ -98,10 +99,11 @@ class BoardImages:
         loss: RobustLoss | None,
         readout: Readout | None,
         batch: tuple[int, ...],
+        turning: bool,
     ) -> None:
         self.model, self.loss, self.batch = model, loss, batch
         self.free, self.free_board = FreeParameters.of(free), free_board
-        self.board_points, self._board = board_points, board_points.T.contiguous()
+        self.board_points, self._board = board_points, board_points.mT.contiguous()
         self.shapes = warp_modes(board_points) if shapes is None else shapes
         self.seen = torch.isfinite(pixels).all(-1)
         if weights is not None and weights.ndim == self.seen.ndim:
@@ -109,7 +111,8 @@ class BoardImages:
         self._target = torch.where(self.seen[..., None], pixels, 0.0).transpose(-1, -2).contiguous()
         self._weigh(weights)
         self.readout = readout
-        self.local_size = POSE + (readout.numbers if readout else 0)
+        self.pose = TURN if turning else POSE
+        self.local_size = self.pose + (readout.numbers if readout else 0)
         if readout is not None:
             self._time = readout.time(pixels)
         self.unknown_count = len(self.free) + len(self.shapes) * free_board
@@ -145,8 +148,12 @@ class BoardImages:
         """(..., V, N, 2) observed corners; NaN where not seen."""
         return torch.where(self.seen[..., None], self._target.transpose(-1, -2), torch.nan)
 
+    def _points_of(self, views: slice) -> Tensor:
+        """(..., 3, N) the points of some views, of one board or of each view its own."""
+        return self._board if self._board.ndim == 2 else self._board[views]
+
     def _placed(self, state: BoardState, views: slice = ALL) -> _Placed:
-        flat = self._board
+        flat = self._points_of(views)
         if len(self.shapes) and (self.free_board or bool(state.board.any())):
             flat = flat + torch.einsum("...b,bkn->...kn", state.board, self.shapes)[..., None, :, :]
         if self.readout is None:
@@ -234,9 +241,9 @@ class BoardImages:
         )
         L, count = self.local_size, len(self.free)
         rows = self._memory(by_point, L + self.unknown_count + 1, memory)
-        rows[..., :POSE, :, :] = step_rows(by_point, placed.rotated)
+        rows[..., : self.pose, :, :] = step_rows(by_point, placed.rotated)[..., : self.pose, :, :]
         if self.readout is not None:
-            rows[..., POSE:L, :, :] = self.readout.columns_of(by_point, rotation, self._time[views], placed.flat)
+            rows[..., self.pose : L, :, :] = self.readout.columns_of(by_point, rotation, self._time[views], placed.flat)
         shared = rows[..., L:-1, :, :]
         slots = self._slots[: by_camera.shape[-3]]
         shared.index_fill_(-3, slots, 0.0).index_add_(-3, slots, by_camera)
@@ -322,7 +329,7 @@ class BoardProblem(BoardImages, SchurProblem[BoardState]):
     """Reprojection residuals (pixels) of one camera's views of a board, for `kcal.solve.lm.minimize`.
 
     Args:
-        board_points: (N, 3) meters.
+        board_points: (N, 3) meters, or (V, N, 3) where each view shows points of its own.
         pixels: (..., V, N, 2) observed corners; NaN where not seen. Leading dimensions broadcast with `batch`.
         model: the lens model.
         free: indices of the camera's free parameters, or which of them are tied.
@@ -336,6 +343,7 @@ class BoardProblem(BoardImages, SchurProblem[BoardState]):
         readout: how views move while they are read, and how the board bends in them; None: neither.
         stillness: (M,) or (V, M) the squared noise over the variance of each of these numbers.
         batch: leading shape of the states, () for one solve.
+        turning: the points are so far away that views differ by their rotations alone; translations are held.
 
     Attributes:
         moving: (M,) numbers of the unknowns that are not held.
@@ -373,8 +381,9 @@ class BoardProblem(BoardImages, SchurProblem[BoardState]):
         readout: Readout | None = None,
         stillness: Tensor | None = None,
         batch: tuple[int, ...] = (),
+        turning: bool = False,
     ) -> None:
-        super().__init__(board_points, pixels, model, free, shapes, free_board, weights, loss, readout, batch)
+        super().__init__(board_points, pixels, model, free, shapes, free_board, weights, loss, readout, batch, turning)
         self.terms = tuple(terms)
         self.residual_count = 2 * int(self.seen.sum((-2, -1)).max())
         if readout is not None:
@@ -461,7 +470,7 @@ class BoardProblem(BoardImages, SchurProblem[BoardState]):
             return rows
         pull = self._still.sqrt().expand_as(state.motion)[views]
         prior = rows.new_zeros(*rows.shape[:-1], pull.shape[-1])
-        prior[..., POSE : self.local_size, :] = torch.diag_embed(pull)
+        prior[..., self.pose : self.local_size, :] = torch.diag_embed(pull)
         prior[..., -1, :] = pull * state.motion[views]
         return torch.cat([rows, prior], -1)
 
@@ -489,7 +498,7 @@ class BoardProblem(BoardImages, SchurProblem[BoardState]):
                 bends = None if self.readout.bends is None else self.readout.bends[:, shown]
                 part.readout, part._time = dataclasses.replace(self.readout, bends=bends), self._time[views][:, shown]
                 part._still = self._still.expand_as(state.motion)[views]
-            part._board, part.shapes = self._board[:, shown], self.shapes[..., shown]
+            part._board, part.shapes = self._points_of(views)[..., shown], self.shapes[..., shown]
             yield part, state.views(views), ALL
 
     def products(self, state: BoardState) -> Products:
@@ -517,8 +526,8 @@ class BoardProblem(BoardImages, SchurProblem[BoardState]):
             # The prior of motions.
             pull = self._still * state.motion
             by_pose, by_both = by_pose.clone(), by_both.clone()
-            by_pose.diagonal(dim1=-2, dim2=-1)[..., POSE:] += self._still
-            by_both[..., POSE:, -1] += pull
+            by_pose.diagonal(dim1=-2, dim2=-1)[..., self.pose :] += self._still
+            by_both[..., self.pose :, -1] += pull
             total[..., -1, -1] += (pull * state.motion).sum((-2, -1))
         linear = SchurLinearization(by_pose, by_both, total)
         if self.loss is not None:
@@ -559,8 +568,9 @@ class BoardProblem(BoardImages, SchurProblem[BoardState]):
         parameters = state.parameters.clone()
         parameters[..., list(self.free)] += self.free.expand(shared[..., :count])
         board = state.board + shared[..., count:] if self.free_board else state.board
-        rotation, translation = apply_twist(state.rotation, state.translation, local[..., :POSE])
-        motion = state.motion if self.readout is None else state.motion + local[..., POSE:]
+        twist = torch.nn.functional.pad(local[..., : self.pose], (0, POSE - self.pose))
+        rotation, translation = apply_twist(state.rotation, state.translation, twist)
+        motion = state.motion if self.readout is None else state.motion + local[..., self.pose :]
         return BoardState(parameters, board, rotation, translation, motion)
 
     def tidy(self, state: BoardState) -> BoardState:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from kcal.errors import InputError
+from kcal.gaussian import Gaussian
 from kcal.lens.model import PRESETS, LensModel
 from kcal.lens.projection import INTRINSICS, parameter_names
 
@@ -110,6 +111,28 @@ class GaussianPrior(Term):
         total[..., -1].index_add_(-1, place, gradient)
         total[..., -1, :].index_add_(-1, place, gradient)
         total[..., -1, -1] += residual.square().sum(-1)
+
+
+@dataclasses.dataclass(frozen=True)
+class GaussianTerm(Term):
+    """What other data say of some values, whose errors go together; of one problem, not of a batch.
+
+    Args:
+        index: which values, (Q,).
+        known: a Gaussian of these, in that order.
+        noise: of a corner, pixels.
+    """
+
+    index: Tensor
+    known: Gaussian
+    noise: float
+
+    def rows(self, values: Tensor) -> Tensor:
+        """See `Term.rows`."""
+        own = self.noise * self.known.placed(self.known.slots, values[self.index]).rows
+        out = values.new_zeros(len(values) + 1, len(own))
+        out[self.index], out[-1] = own[:, :-1].T, own[:, -1]
+        return out
 
 
 class FoldBarrier(Term):
