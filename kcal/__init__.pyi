@@ -18,13 +18,11 @@ from kcal.corners.detect import detect as detect
 # Calibrate a camera
 from kcal.calibrate.camera.calibrate import calibrate_camera as calibrate_camera
 from kcal.calibrate.camera.result import CalibrationOptions as CalibrationOptions
-from kcal.calibrate.camera.result import CameraCalibrationResult as CameraCalibrationResult
 
 # Solve a rig
 from kcal.calibrate.rig.solve import calibrate_rig as calibrate_rig
 from kcal.calibrate.rig.solve import solve_rig as solve_rig
 from kcal.calibrate.rig.solve import RigOptions as RigOptions
-from kcal.calibrate.rig.result import RigResult as RigResult
 from kcal.calibrate.rig.sources import RigData as RigData
 from kcal.calibrate.rig.sources import Boards as Boards
 from kcal.calibrate.rig.sources import Landmarks as Landmarks
@@ -35,7 +33,6 @@ from kcal.calibrate.rig.sources import MeasuredPosition as MeasuredPosition
 # Locate
 from kcal.locate.localizer import StereoLocalizer as StereoLocalizer
 from kcal.locate.positions import locate_points as locate_points
-from kcal.locate.positions import Located as Located
 from kcal.locate.stereo import PositionStatus as PositionStatus
 from kcal.lens.rig import Origin as Origin
 

@@ -149,7 +149,7 @@ def brief(record: Any, **said: str) -> str:
 
     Example:
         >>> import numpy as np
-        >>> from kcal.corners import Detection
+        >>> from kcal.corners.detect import Detection
         >>> brief(Detection(np.zeros((54, 2)), reason="blurred"))
         "Detection(reason='blurred', pixels=(54, 2))"
     """

@@ -75,7 +75,7 @@ def with_descriptions(door: str, markdown: str) -> str:
     lines = []
     for title, names in groups(door).items():
         for name, module in names:
-            markdown = markdown.replace(f"| `{name}` |", f"| [`{name}`][{module}.{name}] |")
+            markdown = markdown.replace(f"| `{name}` ", f"| [`{name}`][{module}.{name}] ")
         lines += [f"## {title}: descriptions", "", *(f"::: {module}.{name}\n" for name, module in names)]
     return "\n".join([markdown, *lines])
 

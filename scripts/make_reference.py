@@ -9,6 +9,7 @@ and so on), what each is from the first line of its docstring. Nothing of kcal i
 from __future__ import annotations
 
 import ast
+import functools
 import re
 from pathlib import Path
 
@@ -21,8 +22,23 @@ DOORS = (
 )  # fmt: skip
 
 
+RETURNED = "Results and parts of them"
+
+
 def groups(door: str) -> dict[str, list[tuple[str, str]]]:
-    """Title of each group of names -> (name, the module that defines it); a comment of the stub begins a group."""
+    """Title of each group of names -> (name, the module that defines it); a comment of the stub begins a group.
+
+    The last group is what the others return, and parts of it: users read these and do not make them, so they are not
+    in the namespace but in the modules that define them.
+    """
+    found = public(door)
+    if returned := returned_by().get(door):
+        found[RETURNED] = returned
+    return found
+
+
+def public(door: str) -> dict[str, list[tuple[str, str]]]:
+    """The groups of the names that a door has."""
     stub = ROOT / door.replace(".", "/") / "__init__.pyi"
     found: dict[str, list[tuple[str, str]]] = {}
     for block in stub.read_text(encoding="utf-8").split("\n\n")[1:]:
@@ -31,6 +47,59 @@ def groups(door: str) -> dict[str, list[tuple[str, str]]]:
             title = block.splitlines()[0].removeprefix("# ")
             found[title] = [(alias.name, str(line.module)) for line in names for alias in line.names]
     return found
+
+
+@functools.cache
+def returned_by() -> dict[str, list[tuple[str, str]]]:
+    """Namespace -> types that its names, or fields of these types, give away and that are not public."""
+    named = {door: [home for homes in public(door).values() for home in homes] for door in DOORS}
+    seen = {home for homes in named.values() for home in homes}
+    found: dict[str, list[tuple[str, str]]] = {}
+    for door, homes in named.items():
+        for _ in range(2):
+            homes = sorted({home for name, module in homes for home in _returns(module, name)} - seen)
+            seen.update(homes)
+            found.setdefault(door, []).extend(homes)
+    return found
+
+
+def _returns(module: str, name: str) -> set[tuple[str, str]]:
+    """Classes of kcal (name, module) that a function, or a class in its methods and fields, gives away."""
+    tree = _tree(module)
+    imported = {
+        alias.asname or alias.name: (alias.name, str(node.module))
+        for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) for alias in node.names
+    }  # fmt: skip
+    imported |= {node.name: (node.name, module) for node in tree.body if isinstance(node, ast.ClassDef)}
+    (found,) = (node for node in tree.body if getattr(node, "name", None) == name)
+    members = found.body if isinstance(found, ast.ClassDef) else [found]
+    given = [
+        part
+        for node in members
+        if isinstance(node, ast.AnnAssign | ast.FunctionDef)
+        if (kind := node.annotation if isinstance(node, ast.AnnAssign) else node.returns)
+        if not _own(node).startswith("_") or _own(node) == "__call__"
+        for part in ast.walk(kind)
+    ]
+    homes = {imported[part.id] for part in given if isinstance(part, ast.Name) and part.id in imported}
+    return {
+        (kind, home)
+        for kind, home in homes
+        # How a problem is solved is no result.
+        if home.startswith("kcal.") and not home.startswith("kcal.calibrate.problem.") and not kind.startswith("_")
+        if any(isinstance(node, ast.ClassDef) and node.name == kind for node in _tree(home).body)
+    }
+
+
+def _own(node: ast.AnnAssign | ast.FunctionDef) -> str:
+    return ast.unparse(node.target) if isinstance(node, ast.AnnAssign) else node.name
+
+
+@functools.cache
+def _tree(module: str) -> ast.Module:
+    path = ROOT / module.replace(".", "/")
+    source = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+    return ast.parse(source.read_text(encoding="utf-8"))
 
 
 def page_of(door: str) -> Path:
@@ -44,9 +113,7 @@ def first_line(module: str, name: str | None = None) -> str:
     Raises:
         ValueError: the module does not define it, or it has no docstring.
     """
-    path = ROOT / module.replace(".", "/")
-    source = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
-    tree = ast.parse(source.read_text(encoding="utf-8"))
+    tree = _tree(module)
     for node in [tree] if name is None else tree.body:
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and getattr(node, "name", None) == name:
             text = ast.get_docstring(node)
@@ -68,8 +135,13 @@ def page(door: str) -> str:
         f"`help({door}.{example})` explains arguments, units and errors, and so does the site that `make docs` builds."
     ]
     for title, names in named.items():
-        lines += ["", f"## {title}", "", "| Name | What it is |", "|---|---|"]
-        lines += [f"| `{name}` | {first_line(module, name).replace('|', chr(92) + '|')} |" for name, module in names]
+        lines += ["", f"## {title}", ""]
+        if title == RETURNED:
+            lines += ["What the names above return and contain. To annotate with one, import it from its module.", ""]
+        lines += ["| Name | What it is |", "|---|---|"]
+        for name, module in names:
+            where = f" of `{module}`" if title == RETURNED else ""
+            lines += [f"| `{name}`{where} | {first_line(module, name).replace('|', chr(92) + '|')} |"]
     return "\n".join(lines) + "\n"
 
 

@@ -78,7 +78,7 @@ def test_a_program_runs_in_another_process(tmp_path: Path) -> None:
     count = torch.export.Dim("count", min=2)
     torch.export.save(torch.export.export(module, (left, right), dynamic_shapes=({0: count}, {0: count})), path)
     lines = (
-        "import sys, torch; from kcal.locate import Localization",
+        "import sys, torch; from kcal.locate.localizer import Localization",
         "run = torch.export.load(sys.argv[1]).module()",
         "left = torch.tensor([[980.0, 540.0], [960.0, 540.0]], dtype=torch.float64)",
         "found = run(left, left - torch.tensor([9.0, 0.1], dtype=torch.float64))",

@@ -11,7 +11,7 @@ import torch
 
 import kcal
 from kcal import Board, Camera, Observations, Origin, StereoLocalizer, StereoRig, View
-from kcal.corners import Detection
+from kcal.corners.detect import Detection
 from kcal.lens import rotation_from_vector
 from kcal.locate import Triangulate
 from kcal.rig import CameraRig, RigCovariance

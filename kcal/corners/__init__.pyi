@@ -3,21 +3,14 @@
 
 # Find boards
 from kcal.corners.detect import detect_board as detect_board
-from kcal.corners.detect import Detection as Detection
 from kcal.corners.video import detect_video as detect_video
-from kcal.corners.observations import Failure as Failure
-from kcal.corners.images import expand_images as expand_images
-from kcal.corners.images import read_gray as read_gray
 from kcal.corners.foreign_corners import import_corners as import_corners
 from kcal.corners.print_board import save_board as save_board
 
 # Refine and match points
 from kcal.corners.refine import RefineCorners as RefineCorners
-from kcal.corners.saddle import Refined as Refined
 from kcal.corners.saddle import CornerStatus as CornerStatus
 from kcal.corners.match import refine_point as refine_point
-from kcal.corners.match import RefinedPoint as RefinedPoint
 from kcal.corners.match import match_points as match_points
 from kcal.corners.match import MatchOptions as MatchOptions
-from kcal.corners.match import Matches as Matches
 from kcal.corners.match import MatchStatus as MatchStatus

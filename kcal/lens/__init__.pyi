@@ -4,62 +4,39 @@
 # Lens models
 from kcal.lens.model import LensModel as LensModel
 from kcal.lens.camera_parameters import ExtendedDistortion as ExtendedDistortion
-from kcal.lens.hybrid_terms import HybridForm as HybridForm
-from kcal.lens.zernike import ZernikeModes as ZernikeModes
-from kcal.lens.uncertainty import paraxial_focal as paraxial_focal
-from kcal.lens.uncertainty import ParaxialFocal as ParaxialFocal
 from kcal.lens.views import new_pinhole as new_pinhole
 from kcal.calibrate.camera.export import refit_camera as refit_camera
-from kcal.calibrate.camera.export import RefittedCamera as RefittedCamera
 from kcal.lens.difference import camera_difference as camera_difference
-from kcal.lens.difference import CameraDifference as CameraDifference
 
 # Images
 from kcal.lens.images import Undistort as Undistort
 from kcal.lens.images import UndistortImage as UndistortImage
 from kcal.lens.images import undistort_maps as undistort_maps
-from kcal.lens.images import UndistortMaps as UndistortMaps
-from kcal.lens.views import Cylinder as Cylinder
 from kcal.lens.views import cylinder_view as cylinder_view
 from kcal.lens.views import pinhole_view as pinhole_view
 from kcal.lens.views import looking as looking
-from kcal.lens.views import pupil_shift as pupil_shift
 from kcal.lens.images import StereoRectification as StereoRectification
 from kcal.lens.camera_like import CameraRays as CameraRays
-from kcal.lens.camera_like import ray_error as ray_error
 from kcal.lens.camera_conversions import ImageTransform as ImageTransform
 
 # Error bars
 from kcal.lens.uncertainty import projection_sigma as projection_sigma
-from kcal.lens.uncertainty import image_sigma as image_sigma
 from kcal.lens.uncertainty import pixel_covariance as pixel_covariance
-from kcal.lens.uncertainty import pixel_errors as pixel_errors
-from kcal.lens.information import CameraInformation as CameraInformation
 
 # Calibration records
 from kcal.lens.calibration import CameraCalibration as CameraCalibration
 from kcal.lens.calibration import LensSetting as LensSetting
-from kcal.lens.calibration import CalibrationRecord as CalibrationRecord
-from kcal.lens.calibration import BoardRecord as BoardRecord
-from kcal.lens.calibration import Exclusion as Exclusion
 
 # Other programs
 from kcal.io.formats import import_cameras as import_cameras
-from kcal.io.foreign import ImportedCameras as ImportedCameras
-from kcal.io.foreign import CameraPose as CameraPose
 from kcal.calibrate.camera.export import export_cameras as export_cameras
-from kcal.calibrate.camera.export import ExportedCameras as ExportedCameras
-from kcal.calibrate.camera.export import Misfit as Misfit
 from kcal.io.lookup_file import save_onnx as save_onnx
 
 # Cameras of other makes, tables and learned starts
 from kcal.lens.camera_like import CameraLike as CameraLike
 from kcal.lens.baking import bake as bake
-from kcal.lens.baking import LookupCamera as LookupCamera
 from kcal.io.lookup_file import load_lookup as load_lookup
 from kcal.io.lookup_file import save_lookup as save_lookup
-from kcal.lens.camera_like import Unproject as Unproject
-from kcal.lens.camera_like import LearnedStart as LearnedStart
 
 # Rotations
 from kcal.lens.pose import rotation_from_vector as rotation_from_vector

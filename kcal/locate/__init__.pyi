@@ -2,61 +2,38 @@
 # Where each name is defined, for type checkers and for `door`; a comment begins a group of the reference page.
 
 # Positions
-from kcal.locate.localizer import Localization as Localization
-from kcal.locate.localizer import Sensitivity as Sensitivity
-from kcal.locate.positions import Position as Position
-from kcal.locate.tables import PositionColumns as PositionColumns
-from kcal.locate.tabulate import Viewpoint as Viewpoint
 from kcal.locate.marks import read_marks as read_marks
 from kcal.locate.marks import Marks as Marks
 from kcal.locate.export import write_positions as write_positions
-from kcal.locate.tabulate import circular_error as circular_error
-from kcal.locate.positions import read_truth as read_truth
-from kcal.locate.positions import position_errors as position_errors
 
 # Triangulate
 from kcal.locate.stereo import Triangulate as Triangulate
-from kcal.locate.stereo import Triangulation as Triangulation
 from kcal.locate.multiview import TriangulateViews as TriangulateViews
-from kcal.locate.multiview import ViewsResult as ViewsResult
 from kcal.locate.disparity import DisparityRanges as DisparityRanges
-from kcal.locate.disparity import RangeImage as RangeImage
 
 # Any number of cameras
 from kcal.locate.multi_localizer import MultiViewLocalizer as MultiViewLocalizer
-from kcal.locate.multi_localizer import ViewsLocalization as ViewsLocalization
 from kcal.locate.station_positions import locate_views as locate_views
 from kcal.locate.survey import read_views as read_views
 from kcal.locate.survey import ViewMarks as ViewMarks
 
 # Points on the ground
 from kcal.locate.ground import locate_on_ground as locate_on_ground
-from kcal.locate.ground import GroundPlaces as GroundPlaces
 from kcal.locate.ground import level_ground as level_ground
 from kcal.locate.raster import terrain as terrain
-from kcal.locate.raster import Raster as Raster
 
 # Where to put the next camera
 from kcal.locate.siting import area_of as area_of
-from kcal.locate.siting import Area as Area
 from kcal.locate.siting import Site as Site
-from kcal.locate.siting import read_sites as read_sites
-from kcal.locate.siting import sites_of as sites_of
 from kcal.locate.siting import siting_map as siting_map
-from kcal.locate.siting import SitingMap as SitingMap
 from kcal.locate.siting import rank_sites as rank_sites
-from kcal.locate.siting import RankedSite as RankedSite
 
 # Geodesy
 from kcal.locate.geodesy import enu_from_cam as enu_from_cam
 from kcal.locate.geodesy import enu_to_geodetic as enu_to_geodetic
 from kcal.locate.geodesy import geodetic_to_enu as geodetic_to_enu
 from kcal.locate.tabulate import find_geoid as find_geoid
-from kcal.locate.tabulate import Geoid as Geoid
-from kcal.locate.tabulate import true_from_grid as true_from_grid
 
 # Range errors of a rig
 from kcal.locate.budget import range_errors as range_errors
-from kcal.locate.budget import RangeError as RangeError
 from kcal.locate.budget import BudgetErrors as BudgetErrors
-from kcal.locate.monitor import forgotten_yaw as forgotten_yaw

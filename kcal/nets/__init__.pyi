@@ -12,9 +12,7 @@ from kcal.calibrate.hybrid.network_fit import FieldTraining as FieldTraining
 from kcal.nets.inverse import InverseNet as InverseNet
 from kcal.nets.inverse import train_inverse as train_inverse
 from kcal.nets.inverse import InverseNetOptions as InverseNetOptions
-from kcal.nets.inverse import InverseFit as InverseFit
 
 # Residual and inverse together
 from kcal.nets.joint import train_jointly as train_jointly
 from kcal.nets.joint import JointOptions as JointOptions
-from kcal.nets.joint import JointFit as JointFit

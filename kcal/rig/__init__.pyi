@@ -5,65 +5,38 @@
 from kcal.calibrate.rig.pairs import pair_by_name as pair_by_name
 from kcal.calibrate.rig.pairs import read_pairs as read_pairs
 from kcal.calibrate.rig.pairs import paired_boards as paired_boards
-from kcal.locate.survey import read_survey as read_survey
 from kcal.locate.survey import import_survey as import_survey
 from kcal.locate.survey import Survey as Survey
 from kcal.locate.survey import match_landmarks as match_landmarks
-from kcal.locate.survey import MarkedLandmarks as MarkedLandmarks
 from kcal.locate.survey import read_features as read_features
-from kcal.locate.survey import camera_positions as camera_positions
 from kcal.scene.match import ImagePair as ImagePair
 from kcal.scene.match import scene_features as scene_features
-from kcal.scene.match import SceneMatches as SceneMatches
-from kcal.scene.match import PairCounts as PairCounts
 from kcal.calibrate.rig.sources import Effect as Effect
 
 # Skylines
 from kcal.skyline.attitude import skyline_source as skyline_source
 from kcal.skyline.attitude import SkylineImage as SkylineImage
-from kcal.calibrate.rig.sources import SkylineSource as SkylineSource
-from kcal.skyline.attitude import skyline_attitude as skyline_attitude
-from kcal.skyline.attitude import SkylineAttitude as SkylineAttitude
 from kcal.skyline.horizon import RasterError as RasterError
 
 # Things that move
-from kcal.locate.moving import MovingTrack as MovingTrack
 from kcal.locate.moving import read_tracks as read_tracks
-from kcal.locate.moving import Sighting as Sighting
 from kcal.locate.moving import read_sightings as read_sightings
 from kcal.locate.moving import MovingOptions as MovingOptions
 from kcal.locate.moving import match_moving as match_moving
-from kcal.locate.moving import MovingControl as MovingControl
-from kcal.locate.moving import Identity as Identity
-
-# Results
-from kcal.calibrate.rig.result import ItemResidual as ItemResidual
-from kcal.calibrate.rig.initial_poses import TurnedBoard as TurnedBoard
-from kcal.lens.calibration import RigCalibration as RigCalibration
-from kcal.lens.calibration import RigSource as RigSource
-from kcal.lens.rig import RigCovariance as RigCovariance
-from kcal.locate.monitor import triangulated_sides as triangulated_sides
-from kcal.locate.monitor import Sides as Sides
 
 # Place and plan rigs
 from kcal.lens.rig import Mounting as Mounting
+from kcal.lens.rig import RigCovariance as RigCovariance
 from kcal.locate.mounting import placed_rig as placed_rig
 from kcal.locate.mounting import mounting_covariance as mounting_covariance
 from kcal.locate.budget import planned_rig as planned_rig
 
 # Any number of cameras
 from kcal.lens.rig import CameraRig as CameraRig
-from kcal.lens.rig import CameraRigCalibration as CameraRigCalibration
 from kcal.locate.stations import load_camera_rig as load_camera_rig
 from kcal.io.rig_file import save_camera_rig as save_camera_rig
-from kcal.locate.stations import station_mounting as station_mounting
-from kcal.locate.stations import stations_of as stations_of
 
 # Drift
 from kcal.watch.watcher import Watched as Watched
 from kcal.locate.monitor import check_rig as check_rig
-from kcal.calibrate.rig.drift import measure_drift as measure_drift
-from kcal.calibrate.rig.drift import Drift as Drift
 from kcal.locate.monitor import relocked as relocked
-from kcal.locate.monitor import drift_effect as drift_effect
-from kcal.locate.monitor import DriftEffect as DriftEffect

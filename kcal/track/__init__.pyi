@@ -4,26 +4,15 @@
 # From a detector's boxes to pairs
 from kcal.pipeline.detections import Detections as Detections
 from kcal.pipeline.pairing import pair_objects as pair_objects
-from kcal.pipeline.pairing import ObjectPairs as ObjectPairs
-from kcal.pipeline.pairing import PixelPairs as PixelPairs
 from kcal.pipeline.pairing import matched_pixels as matched_pixels
 from kcal.pipeline.grouping import group_objects as group_objects
-from kcal.pipeline.pairing import ObjectViews as ObjectViews
-from kcal.pipeline.association import associate as associate
 from kcal.pipeline.association import AssociationOptions as AssociationOptions
-from kcal.pipeline.association import Association as Association
 from kcal.pipeline.association import PairBoxes as PairBoxes
-from kcal.pipeline.association import BoxPairs as BoxPairs
 from kcal.pipeline.pairing import ObjectDisparity as ObjectDisparity
-from kcal.pipeline.pairing import ObjectDisparities as ObjectDisparities
 from kcal.pipeline.pairing import DisparityOptions as DisparityOptions
 
 # Tracks
 from kcal.pipeline.tracks import Tracker as Tracker
 from kcal.pipeline.tracks import TrackOptions as TrackOptions
 from kcal.pipeline.imm_filter import Motion as Motion
-from kcal.pipeline.tracks import Tracks as Tracks
-from kcal.pipeline.estimates import TrackStates as TrackStates
-from kcal.pipeline.estimates import SmoothedTrack as SmoothedTrack
 from kcal.pipeline.measurements import ClockPrior as ClockPrior
-from kcal.pipeline.measurements import ClockEstimate as ClockEstimate
