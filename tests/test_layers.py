@@ -205,7 +205,7 @@ def test_a_planted_circle_is_seen() -> None:
         ("kcal.solve.lm", "from kcal.lens.camera import Camera", "imports kcal.lens.camera"),
         ("kcal.corners.detect", "from kcal.io.camera_file import load_camera", "imports kcal.io.camera_file"),
         ("kcal.io.camera_file", "from kcal.corners.board import Board", "imports kcal.corners.board"),
-        ("kcal.calibrate.problem.views", "from kcal.calibrate.hybrid import fleet", "imports kcal.calibrate.hybrid"),
+        ("kcal.calibrate.problem.views", "from kcal.calibrate.hybrid import fit", "imports kcal.calibrate.hybrid"),
         ("kcal.calibrate.rig.solve", "from kcal.calibrate.camera.solve import solve", "imports kcal.calibrate.camera"),
         ("kcal.calibrate.camera.solve", "from ..rig import pairs", "imports kcal.calibrate.rig"),
         ("kcal.calibrate.camera.solve", "from kcal.sim.scene import demo_rig", "imports kcal.sim.scene"),

@@ -28,10 +28,9 @@ from kcal.calibrate.camera.result import (
 from kcal.calibrate.camera.solve import calibrate_parametric
 from kcal.calibrate.camera.warnings import spacing_warnings
 from kcal.calibrate.hybrid.base_fit import may_be_unequal
-from kcal.calibrate.hybrid.board_orders import turned_corners
-from kcal.calibrate.hybrid.cameras_fit import Run, fit_cameras
+from kcal.calibrate.hybrid.board_modes import turned_corners
+from kcal.calibrate.hybrid.cameras_fit import LEAST_CAMERAS, Run, fit_cameras
 from kcal.calibrate.hybrid.fit import HybridFit
-from kcal.calibrate.hybrid.fleet import LEAST_CAMERAS
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError, KcalError

@@ -44,8 +44,7 @@ from kcal.calibrate.camera.warnings import (
     pupil_warnings,
     spacing_warnings,
 )
-from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
-from kcal.calibrate.hybrid.settled import FitStart, rough_start
+from kcal.calibrate.hybrid.fit import FitStart, HybridFit, fit_hybrid, rough_start
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError
 from kcal.solve.problem import SolverStatus

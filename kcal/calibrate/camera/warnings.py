@@ -12,8 +12,7 @@ from torch import Tensor
 from kcal.calibrate.camera.advice import roll_warnings
 from kcal.calibrate.camera.checks import corners_beyond
 from kcal.calibrate.camera.result import CameraCalibrationResult
-from kcal.calibrate.hybrid.fit import HybridFit
-from kcal.calibrate.hybrid.settled import pixels_are_square
+from kcal.calibrate.hybrid.fit import HybridFit, pixels_are_square
 from kcal.calibrate.problem.parameters import GaussianPrior, Term
 from kcal.calibrate.problem.state import FELT, LARGEST, BoardState
 from kcal.errors import InputError

@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.hybrid.board_modes import KNOWN, STRETCH, BoardModes, board_modes
-from kcal.calibrate.hybrid.families import BOARD, PriorFamilies, prior_families, typical_hyperprior
+from kcal.calibrate.hybrid.families import BOARD, LensPrior, PriorFamilies, prior_families, typical_hyperprior
 from kcal.calibrate.hybrid.fitted_views import NO_MOTION, Estimate, FittedViews, hybrid_unknowns
-from kcal.calibrate.hybrid.fleet import LensPrior
 from kcal.calibrate.problem.poses import homographies, poses_from_homographies
 from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.views import LEAST_NOISE

@@ -96,6 +96,34 @@ class PriorFamilies(NamedTuple):
         return (first + second)[:, :-1].numpy(), second[:, :-1].numpy()
 
 
+class LensPrior(NamedTuple):
+    """What is known of a camera's lens before it is calibrated.
+
+    Attributes:
+        form: constants of the lens.
+        focal: F₀, pixels.
+        unknowns: (L,) focal length, principal point, coefficients; the focal length of the rows too where pixels are
+            not square.
+    """
+
+    form: HybridForm
+    focal: float
+    unknowns: Hyperprior
+
+    @property
+    def square(self) -> bool:
+        """Whether pixels are square."""
+        return len(self.unknowns.mean) == LEADING_UNKNOWNS + len(self.form.modes)
+
+    def families(self, usual: PriorFamilies) -> PriorFamilies:
+        """Priors with this lens, and the board of others."""
+        own = torch.arange(len(usual.mean)) < len(self.unknowns.mean)
+        mean, log_unit = usual.mean.clone(), usual.log_unit.clone()
+        mean[own], log_unit[own] = self.unknowns.mean, self.unknowns.sd.log()
+        amplitude, decay = (torch.where(own, -1, index) for index in (usual.amplitude, usual.decay))
+        return PriorFamilies(mean, log_unit, amplitude, decay, usual.degree)
+
+
 def prior_families(
     form: HybridForm,
     focal: float,

@@ -10,8 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.calibrate.hybrid.board_modes import BoardModes, board_modes
-from kcal.calibrate.hybrid.board_orders import CLEAR, mode_turn, quarter_turns, turned
+from kcal.calibrate.hybrid.board_modes import CLEAR, BoardModes, board_modes, mode_turn, turned
 from kcal.calibrate.hybrid.families import BOARD, typical_hyperprior
 from kcal.calibrate.hybrid.measured_board import printed_board, printed_prior
 from kcal.calibrate.rig.blocks import RigState
@@ -285,7 +284,7 @@ def _agreeing(first: CameraInformation, other: CameraInformation, board: Board) 
     modes = board_modes(board.points)
     one, two = first.board_message, other.board_message
     apart = printed_board(modes, [one])[1] + printed_board(modes, [two])[1]
-    together = {turns: printed_board(modes, [one, turned(two, turns)])[1] - apart for turns in quarter_turns(board)}
+    together = {turns: printed_board(modes, [one, turned(two, turns)])[1] - apart for turns in board.quarter_turns}
     best = max(together, key=lambda turns: together[turns])
     return _board_turned(other, best) if together[best] > -CLEAR else None
 

@@ -8,8 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal.calibrate.hybrid.board_modes import board_modes
-from kcal.calibrate.hybrid.board_orders import find_turns, mode_turn, quarter_turns, turned, turned_corners
+from kcal.calibrate.hybrid.board_modes import board_modes, find_turns, mode_turn, turned, turned_corners
 from kcal.calibrate.hybrid.families import BOARD, typical_hyperprior
 from kcal.calibrate.hybrid.measured_board import BoardPrior, evidence, printed_board, printed_prior
 from kcal.corners.board import Board
@@ -94,7 +93,7 @@ def test_a_change_of_variables_is_the_same_board() -> None:
 )
 def test_a_turned_board_has_turned_amplitudes(board: Board, turns: tuple[int, ...]) -> None:
     """Corners in another order are those of the turned modes, after the best turn, shift and scale."""
-    assert quarter_turns(board) == turns
+    assert board.quarter_turns == turns
     modes = board_modes(board.points)
     a = 1e-5 * modes.unit / modes.unit.max() * normal(28, seed=8)
     for turn in turns:

@@ -12,7 +12,7 @@ from calibrate_scenes import observe
 from printed_boards import printed_points, printed_views
 from torch import Tensor
 
-from kcal.calibrate.hybrid.board_orders import turned_corners
+from kcal.calibrate.hybrid.board_modes import turned_corners
 from kcal.calibrate.hybrid.cameras_fit import CamerasFit, fit_cameras, measure_board
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard

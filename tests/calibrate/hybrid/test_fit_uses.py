@@ -13,18 +13,22 @@ import torch
 from printed_boards import shown
 from torch import Tensor
 
-from kcal.calibrate.hybrid import settled
+from kcal.calibrate.hybrid import fit as room
 from kcal.calibrate.hybrid.base_fit import fit_projection
-from kcal.calibrate.hybrid.board_modes import board_modes
-from kcal.calibrate.hybrid.board_orders import turned
-from kcal.calibrate.hybrid.cameras_fit import CameraFit, _begun_fleet, _learned_fleet, compared
+from kcal.calibrate.hybrid.board_modes import board_modes, turned
+from kcal.calibrate.hybrid.cameras_fit import (
+    CameraFit,
+    _begun_fleet,
+    _learned_fleet,
+    compared,
+    fleet_priors,
+    typical_lens,
+)
 from kcal.calibrate.hybrid.evidence import WORTH
-from kcal.calibrate.hybrid.families import Hyperprior, prior_families, typical_hyperprior
-from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
+from kcal.calibrate.hybrid.families import Hyperprior, LensPrior, prior_families, typical_hyperprior
+from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid, rough_start
 from kcal.calibrate.hybrid.fitted_views import _cauchy_weights, moving_residuals
-from kcal.calibrate.hybrid.fleet import LensPrior, fleet_priors, typical_lens
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard, evidence, printed_board
-from kcal.calibrate.hybrid.settled import rough_start
 from kcal.calibrate.problem.state import Readout
 from kcal.corners.board import Board
 from kcal.gaussian import Gaussian, numbered
@@ -274,14 +278,14 @@ def test_pixels_that_amplitudes_to_be_expected_leave_square(monkeypatch: pytest.
         assert (rounds.estimate, hyperprior) == ("likely", beforehand)
         return "expected"
 
-    monkeypatch.setattr(settled, "expected_estimate", expected)
-    monkeypatch.setattr(settled, "_standing", lambda rounds, never: scores[rounds.estimate])
+    monkeypatch.setattr(room, "expected_estimate", expected)
+    monkeypatch.setattr(room, "_standing", lambda rounds, never: scores[rounds.estimate])
     begin = cast(Any, Rounds("likely"))
-    assert settled.aspect_score(begin, beforehand, torch.zeros(0)) == 2.5
+    assert room.aspect_score(begin, beforehand, torch.zeros(0)) == 2.5
     scores["expected"] = -4.0
-    assert settled.aspect_score(begin, beforehand, torch.zeros(0)) == -4.0
+    assert room.aspect_score(begin, beforehand, torch.zeros(0)) == -4.0
     scores["likely"] = -3.0
-    assert settled.aspect_score(begin, beforehand, torch.zeros(0)) == -3.0
+    assert room.aspect_score(begin, beforehand, torch.zeros(0)) == -3.0
 
 
 def test_motion_is_looked_for_again_where_the_aspect_may_have_hidden_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -297,8 +301,8 @@ def test_motion_is_looked_for_again_where_the_aspect_may_have_hidden_it(monkeypa
             assert rounds.gained < WORTH
             return score
 
-        monkeypatch.setattr(settled, "motion_is_worth", motion_is_worth)
-        monkeypatch.setattr(settled, "aspect_score", of_pixels)
+        monkeypatch.setattr(room, "motion_is_worth", motion_is_worth)
+        monkeypatch.setattr(room, "aspect_score", of_pixels)
         fit_hybrid(BOARD.points, shots(8), SIZE, modes=MODES)
     assert asked == [3.5]
 

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from standing_views import quadratic, standing
 
+from kcal.calibrate.hybrid.cameras_fit import fleet_priors, hyper_likelihood
 from kcal.calibrate.hybrid.evidence import maximize_evidence, negative_log_evidence
 from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies
-from kcal.calibrate.hybrid.fleet import fleet_priors, hyper_likelihood
 from kcal.gaussian import Gaussian
 
 F64 = torch.float64

@@ -14,9 +14,8 @@ from torch import Tensor
 from kcal.calibrate.hybrid.board_modes import BENDING, PRINT, STRETCH, TRAPEZOID, board_modes
 from kcal.calibrate.hybrid.evidence import Quadratic, maximize_evidence, negative_log_evidence, with_tempering
 from kcal.calibrate.hybrid.families import PriorFamilies, prior_families, typical_hyperprior
-from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
+from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid, rough_start
 from kcal.calibrate.hybrid.fitted_views import hybrid_problem
-from kcal.calibrate.hybrid.settled import rough_start
 from kcal.calibrate.problem.state import BoardState
 from kcal.corners.board import Board
 from kcal.errors import InputError

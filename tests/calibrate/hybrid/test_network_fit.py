@@ -15,7 +15,7 @@ from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.camera.layer import calibrate_views
 from kcal.calibrate.camera.result import CalibrationOptions
 from kcal.calibrate.hybrid.families import typical_hyperprior
-from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
+from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid, settle
 from kcal.calibrate.hybrid.fitted_views import Estimate
 from kcal.calibrate.hybrid.network_fit import (
     FieldTraining,
@@ -27,7 +27,6 @@ from kcal.calibrate.hybrid.network_fit import (
     _with_weights,
     weights_of,
 )
-from kcal.calibrate.hybrid.settled import settle
 from kcal.errors import InputError
 from kcal.lens.field_modes import NetworkModes
 from scripts.shared.dented_lens import BOARD, NOISE, SIZE, capture, network, off

@@ -11,12 +11,11 @@ from torch import Tensor
 
 from kcal.calibrate.hybrid.base_fit import Base, _through_base, _with_constants
 from kcal.calibrate.hybrid.board_modes import KNOWN, board_modes, undetermined_modes
-from kcal.calibrate.hybrid.cameras_fit import _but_one
+from kcal.calibrate.hybrid.cameras_fit import _but_one, fleet_priors, typical_lens
 from kcal.calibrate.hybrid.evidence import Quadratic, overdispersion, posterior_root, still_data, view_data
-from kcal.calibrate.hybrid.families import PriorFamilies, prior_families, typical_hyperprior
+from kcal.calibrate.hybrid.families import LensPrior, PriorFamilies, prior_families, typical_hyperprior
+from kcal.calibrate.hybrid.fit import pixels_are_square, with_square_pixels
 from kcal.calibrate.hybrid.fitted_views import NO_MOTION, Estimate
-from kcal.calibrate.hybrid.fleet import LensPrior, fleet_priors, typical_lens
-from kcal.calibrate.hybrid.settled import pixels_are_square, with_square_pixels
 from kcal.calibrate.problem.state import BoardState
 from kcal.corners.board import Board
 from kcal.gaussian import Gaussian
