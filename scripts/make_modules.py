@@ -41,8 +41,7 @@ from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.mounting import mounting_covariance
 from kcal.locate.multi_localizer import MultiViewLocalizer
-from kcal.locate.multiview import TriangulateViews
-from kcal.locate.stereo import Triangulate
+from kcal.locate.triangulate import Triangulate
 from kcal.nets.inverse import InverseNet
 from kcal.nets.joint import ResidualNet
 from kcal.pipeline.association import PairBoxes
@@ -165,12 +164,6 @@ def several(number: int) -> MultiViewLocalizer:
     own = stations(number)
     root = torch.cat([own.with_errors(position_m=0.1, attitude_deg=0.01, refraction=0.1), 1e-4 * noise(3, 49, seed=5)])
     return MultiViewLocalizer(own, root=root, clock_sigma=0.01 + 0.01 * number, pixel_sigma=0.3 + 0.1 * number)
-
-
-def matrices(number: int) -> Tensor:
-    """(3, 3, 4) poses of the stations."""
-    own = stations(number)
-    return torch.cat([own.rotation, -(own.rotation @ own.center[..., None])], -1).detach()
 
 
 SMALL = (32, 24)
@@ -303,16 +296,12 @@ CASES: dict[str, Case] = {
         batched=("points",),
     ),
     "Triangulate": Case(
-        make=lambda n: Triangulate(rig(n), 0.3 + 0.1 * n), inputs=pairs, batched=("pixels_left", "pixels_right"),
+        make=lambda n: Triangulate(rig(n), 0.3 + 0.1 * n),
+        inputs=lambda: dict(zip(("pixels", "other"), pairs().values(), strict=True)),
+        batched=("pixels", "other"), otherwise=lambda: Triangulate(rig(0), method="linear"),
     ),
     "StereoLocalizer": Case(
         make=stereo, inputs=lambda: {**pairs(), "cov": pair_cov()}, batched=("pixels_left", "pixels_right", "cov"),
-    ),
-    "TriangulateViews": Case(
-        make=lambda n: TriangulateViews(stations().each, matrices(n), pixel_sigma=0.3 + 0.1 * n).free(),
-        inputs=lambda: {"pixels": seen_by_stations()}, batched=("pixels",),
-        steps=(1e-6, 1e-7, 1e-8),  # distances between mark and point are nearly zero, where they bend
-        otherwise=lambda: TriangulateViews(stations().each, matrices(0), method="linear").free(),
     ),
     "MultiViewLocalizer": Case(
         make=several, inputs=lambda: {"pixels": seen_by_stations(), "velocity": noise(2, 3, 2, seed=9)},

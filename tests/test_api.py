@@ -53,7 +53,7 @@ PUBLIC = {
         read_tracks relocked save_camera_rig scene_features skyline_source
     """,
     "kcal.locate": """
-        BudgetErrors DisparityRanges Marks MultiViewLocalizer Site Triangulate TriangulateViews ViewMarks
+        BudgetErrors DisparityRanges Marks MultiViewLocalizer Site Triangulate ViewMarks
         area_of enu_from_cam enu_to_geodetic find_geoid geodetic_to_enu level_ground locate_on_ground
         locate_views range_errors rank_sites read_marks read_views siting_map terrain write_positions
     """,

@@ -19,7 +19,7 @@ from kcal.lens.model import LensModel
 from kcal.lens.rig import Origin, RigCovariance, StereoRig
 from kcal.lens.zernike import ZernikeModes
 from kcal.locate.localizer import StereoLocalizer
-from kcal.locate.stereo import Triangulate
+from kcal.locate.triangulate import Triangulate
 
 pytestmark = traced_whole
 

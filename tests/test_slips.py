@@ -18,7 +18,7 @@ from kcal import Board, Camera, InputError, KcalWarning, Observations, Origin, S
 from kcal.corners import refine_point
 from kcal.doors import _is_kind, _naming_slips
 from kcal.lens import camera_difference, pixel_covariance, rotation_from_vector, vector_from_rotation
-from kcal.locate import MultiViewLocalizer, Triangulate, TriangulateViews, enu_to_geodetic
+from kcal.locate import MultiViewLocalizer, Triangulate, enu_to_geodetic
 from kcal.rig import CameraRig
 
 CAMERA = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480))
@@ -168,7 +168,7 @@ DOORS: dict[str, tuple[Callable[[Any], Any], int]] = {
     "localize cov": (lambda bad: LOCALIZE(PIXELS, PIXELS, bad), 4),
     "sensitivity": (lambda bad: LOCALIZE.sensitivity(PIXELS, bad), 2),
     "locate_points": (lambda bad: kcal.locate_points(RIG, PIXELS, bad, origin=LOCALIZE.origin, heading_deg=0.0), 2),
-    "views": (TriangulateViews([CAMERA] * 2, torch.stack([torch.eye(3, 4), torch.eye(3, 4) + NEXT])), 2),
+    "views": (Triangulate(STATIONS), 2),
     "multi": (MultiViewLocalizer(STATIONS), 2),
     "geodetic": (lambda bad: enu_to_geodetic(bad, LOCALIZE.origin), 3),
     "camera": (lambda bad: Camera(bad, size=(640, 480)), 10),

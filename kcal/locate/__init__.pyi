@@ -7,8 +7,7 @@ from kcal.locate.marks import Marks as Marks
 from kcal.locate.export import write_positions as write_positions
 
 # Triangulate
-from kcal.locate.stereo import Triangulate as Triangulate
-from kcal.locate.multiview import TriangulateViews as TriangulateViews
+from kcal.locate.triangulate import Triangulate as Triangulate
 from kcal.locate.disparity import DisparityRanges as DisparityRanges
 
 # Any number of cameras

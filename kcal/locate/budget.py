@@ -19,7 +19,8 @@ from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.max_likelihood import calibration_effect
 from kcal.locate.mounting import by_mounting
 from kcal.locate.multi_localizer import MultiViewLocalizer, ViewsLocalization
-from kcal.locate.stereo import BEARING_SIGMAS, PositionStatus, checked_rig, fit_pairs, sight_lines
+from kcal.locate.stereo import BEARING_SIGMAS, PositionStatus, checked_rig, sight_lines
+from kcal.locate.views import fit_pairs
 from kcal.threads import in_one_thread
 
 # What a stereo rig will do before it is built: range errors against distance, exactly and not to first order.

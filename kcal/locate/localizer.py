@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Self
 import torch
 from torch import Tensor
 
-from kcal.checks import as_covariance, as_points, expanded, exportable, scalar
+from kcal.checks import as_covariance, expanded, exportable, scalar
 from kcal.dispatch import is_differentiated
 from kcal.errors import InputError
 from kcal.io.rig_file import load_rig
@@ -19,17 +19,16 @@ from kcal.locate.geodesy import anchor, enu_from_cam, mean_radius, place_enu
 from kcal.locate.max_likelihood import by_pose, calibration_effect, inverse_variance, position_slope, symmetric
 from kcal.locate.mounting import attitude, by_mounting
 from kcal.locate.stereo import (
-    PairFit,
     PositionStatus,
+    checked_pair_covariance,
     checked_pairs,
     checked_rig,
-    fit_pairs,
-    inverse_range,
     piece_by_piece,
     range_where_ok,
     reprojection_errors,
     status_counts,
 )
+from kcal.locate.views import ViewsFit, fit_pairs, reach_of
 from kcal.operation import Operations, shapes_of
 from kcal.texts import brief
 
@@ -288,11 +287,7 @@ class StereoLocalizer(Operations, Movable):
             InputError: not floating point, or shapes that are wrong or unlike.
         """
         left, right = checked_pairs(pixels_left, pixels_right, self.rig)
-        if cov is not None:
-            cov = as_points("cov", cov, 4, left)
-            if cov.ndim < 2 or cov.shape[-2] != 4:
-                raise InputError(f"cov: shape (..., N, 4, 4) is needed, got {tuple(cov.shape)}")
-            cov = expanded("cov", cov, (*left.shape[:-1], 4, 4))
+        cov = checked_pair_covariance(cov, left)
         if mask is not None:
             mask = torch.as_tensor(mask, device=left.device)
             if mask.dtype != torch.bool:
@@ -304,22 +299,26 @@ class StereoLocalizer(Operations, Movable):
 
         def locate(left: Tensor, right: Tensor, cov: Tensor | None, mask: Tensor | None) -> Localization:
             by_camera = self.calibration_factor is not None
-            found = fit_pairs(self.rig, left, right, cov, mask, by_camera=by_camera, differentiated=differentiated)
-            return self._on_earth(found, self.pixel_sigma**2 if cov is None else 1.0)
+            return self._on_earth(
+                fit_pairs(
+                    self.rig, left, right, cov, mask, noise=self.pixel_sigma, by_camera=by_camera,
+                    differentiated=differentiated,
+                )
+            )  # fmt: skip
 
         return piece_by_piece(locate, left, right, cov, mask, differentiated=differentiated)
 
-    def _on_earth(self, found: PairFit, variance: Tensor | float) -> Localization:
-        """Positions and all their errors; `variance` is that of the pixels if it is the same for all, or else one."""
-        fit, scale, _, usable = found
-        spread = [variance * entry for entry in fit.covariance]
+    def _on_earth(self, found: ViewsFit) -> Localization:
+        """Positions and all their errors."""
+        fit, scale, usable = found.fit, found.scale, found.fitted
+        spread = [found.variance * entry for entry in fit.covariance]
         if self.calibration_factor is not None:
             factors = [self.calibration_factor, *([] if self.link is None else [self.link])]
             effect = calibration_effect(fit, scale, torch.cat(factors, 1))  # (..., 3, K, N)
             moved, by_link = effect.tensor_split([self.calibration_factor.shape[1]], -2)
             for number, (i, j) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))):
                 spread[number] = spread[number] + (moved[..., i, :, :] * moved[..., j, :, :]).sum(-2)
-        reach = inverse_range(found, inverse_variance(fit, spread), PositionStatus.BEARING_ONLY)
+        reach = reach_of(found, inverse_variance(fit, spread), PositionStatus.BEARING_ONLY)
         ok = reach.status == int(PositionStatus.OK)
         there = usable | (reach.status == int(PositionStatus.PARALLEL))
         bearing = (fit.direction / found.length[..., None, :]).mT @ self.enu_from_rig.mT
@@ -378,12 +377,13 @@ class StereoLocalizer(Operations, Movable):
             pixels_right: (..., N, 2).
         """
         by_camera = self.calibration_factor is not None
-        found = fit_pairs(self.rig, *checked_pairs(pixels_left, pixels_right, self.rig), by_camera=by_camera)
-        return self._on_earth(found, self.pixel_sigma**2), _sensitivity(found)
+        pairs = checked_pairs(pixels_left, pixels_right, self.rig)
+        found = fit_pairs(self.rig, *pairs, noise=self.pixel_sigma, by_camera=by_camera)
+        return self._on_earth(found), _sensitivity(found)
 
 
-def _sensitivity(found: PairFit) -> Sensitivity:
-    fit, scale, _, usable = found
+def _sensitivity(found: ViewsFit) -> Sensitivity:
+    fit, scale, usable = found.fit, found.scale, found.fitted
     known = usable & (fit.inverse > 0)
     inverse = torch.where(known, fit.inverse, 1.0)
     # d range = -range dρ / ρ

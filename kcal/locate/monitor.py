@@ -21,7 +21,8 @@ from kcal.locate.budget import usual_ranges
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.marks import Marks
 from kcal.locate.mounting import attitude
-from kcal.locate.stereo import PositionStatus, Triangulate, sight_lines
+from kcal.locate.stereo import PositionStatus, sight_lines
+from kcal.locate.triangulate import Triangulate
 from kcal.threads import in_one_thread
 
 # What a rig that was right once still knows of its relative yaw: masts bend with the sun, and creep with time.

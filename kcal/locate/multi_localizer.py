@@ -16,18 +16,17 @@ from kcal.lens.rig import CameraRig
 from kcal.locate.geodesy import anchor, ecef_from_enu_rotation, enu_to_geodetic, mean_radius, place_enu
 from kcal.locate.ground import EarthFrame, Ground, stated_ahead
 from kcal.locate.max_likelihood import inverse_variance
-from kcal.locate.multiview import checked_views_covariance
 from kcal.locate.stereo import (
-    BEARING_SIGMAS,
     PositionStatus,
+    checked_views,
+    checked_views_covariance,
     flag_positions,
     piece_by_piece,
-    range_interval,
     range_where_ok,
     reprojection_errors,
     status_counts,
 )
-from kcal.locate.views import CommonErrors, PosedCameras, ViewsFit, fit_views
+from kcal.locate.views import CommonErrors, PosedCameras, ViewsFit, fit_views, reach_of
 from kcal.texts import brief
 
 # How seldom good views are taken for bad ones.
@@ -210,17 +209,11 @@ class MultiViewLocalizer(StatedModule):
         Raises:
             InputError: not floating point, wrong shapes, a height where the rig has no place on the Earth.
         """
-        pixels, count = as_points("pixels", pixels, 2, self.rig.center), len(self.rig)
-        if pixels.ndim < 2 or pixels.shape[-2] != count:
-            raise InputError(f"pixels: shape (..., {count}, 2) is needed, got {tuple(pixels.shape)}")
-        lead = pixels.shape[:-2]
-        if seen is None:
-            seen = torch.ones(pixels.shape[:-1], dtype=torch.bool, device=pixels.device)
-        seen = torch.as_tensor(seen, device=pixels.device)
-        if seen.dtype != torch.bool:
-            raise InputError(f"seen: bool is needed, got {seen.dtype}")
-        seen = expanded("seen", seen, pixels.shape[:-1]).reshape(-1, count)
+        count = len(self.rig)
+        pixels, seen = checked_views(pixels, seen, count, self.rig.center)
+        lead, seen = pixels.shape[:-2], seen.reshape(-1, count)
         cov = checked_views_covariance(cov, pixels)
+        cov = None if cov is None else cov.reshape(-1, count, 2, 2)
         if velocity is not None:
             moved = expanded("velocity", as_points("velocity", velocity, 2, pixels), pixels.shape)
             moved = self.clock_sigma * moved.reshape(-1, count, 2)
@@ -298,44 +291,28 @@ class MultiViewLocalizer(StatedModule):
         return self._on_earth(posed, views, falls), bad, torn
 
     def _on_earth(self, posed: PosedCameras, views: ViewsFit, falls: Tensor) -> ViewsLocalization:
-        fit, scale, code = views.fit, views.scale, views.status
-        length = fit.direction.square().sum(-2).sqrt()
-        value = torch.where(views.fitted, fit.inverse / (scale * length), 0.0)
-        variance = views.variance * inverse_variance(fit, fit.covariance)
-        with torch.no_grad():
-            known = torch.isfinite(variance) & (variance > 0) & views.fitted
-        sigma = torch.where(known, torch.sqrt(torch.where(known, variance, 1.0)) / (scale * length), 0.0)
-        sigma = views.steady(sigma)
-        with torch.no_grad():
-            lost = views.fitted & ~(value > 0)
-            weak = views.fitted & (~known | (value < BEARING_SIGMAS * sigma))
-            for condition, status in (
-                (weak, PositionStatus.BEARING_ONLY),
-                (views.behind(posed.center), PositionStatus.BEHIND),
-                (lost, PositionStatus.PARALLEL),
-            ):
-                code = flag_positions(code, condition, status)
-        ok = code == int(PositionStatus.OK)
-        interval = range_interval(value, sigma, known)
+        fit, variance = views.fit, views.variance * inverse_variance(views.fit, views.fit.covariance)
+        reach = reach_of(views, variance, PositionStatus.BEARING_ONLY, views.behind(posed.center))
+        ok = reach.status == int(PositionStatus.OK)
         enu = torch.where(ok[..., None], views.points(ok), 0.0)
         geodetic = self.geodetic_of_origin.expand(enu.shape)
         if self.ecef_from_enu is not None:
             there = place_enu(enu, self.ecef_from_enu, self.ecef_of_origin)
             geodetic = torch.where(ok[..., None], there, geodetic)
         aimed = views.used.any(-1)
-        own = (fit.direction / length[..., None, :]).mT
+        own = (fit.direction / views.length[..., None, :]).mT
         sight = torch.where(views.fitted[..., None], own, (views.anchor[..., None] * views.rays).sum(-2))
         return ViewsLocalization(
             enu=enu,
             covariance=views.covariance(ok),
             geodetic=geodetic,
-            status=code,
+            status=reach.status,
             anchor=views.anchor.to(torch.int64).argmax(-1),
             bearing=torch.where(aimed[..., None], sight, 0.0),
-            inverse_range=value,
-            inverse_range_sigma=sigma,
-            range_low=views.steady(interval.low),
-            range_high=views.steady(interval.high),
+            inverse_range=reach.value,
+            inverse_range_sigma=reach.sigma,
+            range_low=reach.interval.low,
+            range_high=reach.interval.high,
             used=views.used,
             bad=torch.zeros_like(views.used),
             misfit=(0.5 * falls.clamp_min(0.0)).sqrt(),

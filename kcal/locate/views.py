@@ -1,4 +1,4 @@
-"""Pixels of any subset of cameras to points with errors, each on its own, and as rows that are linear near them."""
+"""Pixels of any subset of cameras to the most likely points, each on its own, and to the ranges of these."""
 
 from __future__ import annotations
 
@@ -8,20 +8,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kcal.dispatch import known_true
 from kcal.lens.camera import Camera
-from kcal.lens.camera_like import CameraStack, camera_stack, project_each, project_stack, unproject_each
+from kcal.lens.camera_like import project_each, unproject_each
 from kcal.lens.pose import side_axes, step_rows
-from kcal.locate.angular import (
-    LIGHT_HORIZON,
-    Found,
-    Surroundings,
-    baseline_axes,
-    first_seen,
-    length_of_one,
-    lifted,
-    meeting_points,
-    triangulate_angular,
-)
+from kcal.lens.rig import StereoRig
+from kcal.locate.angular import Found, Surroundings, first_seen, length_of_one, lifted, triangulate_angular
 from kcal.locate.max_likelihood import (
     PointFit,
     RelativeCamera,
@@ -30,11 +22,19 @@ from kcal.locate.max_likelihood import (
     position_slope,
     symmetric,
 )
-from kcal.locate.stereo import PositionStatus, flag_positions
+from kcal.locate.stereo import (
+    BEARING_SIGMAS,
+    PositionStatus,
+    RangeInterval,
+    flag_positions,
+    joint_covariance,
+    range_interval,
+    sight_lines,
+)
 
 # Pixels of any subset of cameras to points with errors, each point on its own.
 #
-# `TriangulateViews` and `MultiViewLocalizer` share what is here. A point is sought from the first camera that saw it,
+# `Triangulate` and the localizers share what is here. A point is sought from the first camera that saw it,
 # its anchor, as a direction and an inverse distance in the frame of all cameras. Errors that a camera's marks share
 # (lens, center, attitude, refraction) are to first order correlated noise of the pixels: a point is weighed by the
 # inverse covariance of all of them together, so that a camera whose attitude is poor counts less.
@@ -165,6 +165,12 @@ class ViewsFit(NamedTuple):
             self.place[..., None, :] - center
         )
         return (((offset * self.rays).sum(-1) < 0) & self.used).any(-1) & self.fitted
+
+    @property
+    def length(self) -> Tensor:
+        """(N,) of `fit.direction`."""
+        # `vector_norm` takes twenty times as long along this axis.
+        return self.fit.direction.square().sum(-2).sqrt()
 
     @property
     def _weight(self) -> Tensor:
@@ -352,9 +358,7 @@ def _weight(cov: Tensor | None, noise: Tensor | float, used: Tensor, moved: Tens
     """(2 C, 2 C, N) inverse covariance of the pixels of used views; the identity for the others."""
     still = torch.eye(2, dtype=torch.float64, device=used.device)
     own = noise**2 * still if cov is None else cov
-    own = torch.where(used[..., None, None], own, still)  # (N, C, 2, 2)
-    among = torch.eye(used.shape[-1], dtype=torch.float64, device=used.device)
-    whole = (own[..., :, :, None, :] * among[:, None, :, None]).flatten(-2).flatten(-3, -2)
+    whole = joint_covariance(torch.where(used[..., None, None], own, still))
     if moved is not None:
         each = moved.movedim(-1, 0)  # (N, K, 2 C)
         whole = whole + each.mT @ each
@@ -363,193 +367,115 @@ def _weight(cov: Tensor | None, noise: Tensor | float, used: Tensor, moved: Tens
     return weight
 
 
-# Pixels of any subset of cameras as rows that are linear around where their lines of sight meet.
-#
-# A filter takes these in as they are: it needs no optimum, and neither a status nor a covariance of each point. A point
-# is told from its anchor, the first camera that saw it, by a direction and an inverse distance, as in
-# `kcal.locate.views`. What does not change from one moment to the next is prepared once (`known_views`).
+def fit_pairs(
+    rig: StereoRig,
+    left: Tensor,
+    right: Tensor,
+    cov: Tensor | None = None,
+    mask: Tensor | None = None,
+    *,
+    noise: Tensor | float = 1.0,
+    by_camera: bool = False,
+    differentiated: bool = False,
+) -> ViewsFit:
+    """The most likely point of each pixel pair, in the left camera's frame: weighed by the marks' noise alone.
 
-# Meters at which a bearing of one camera is taken; what light bends elsewhere follows from it.
-ALONE_M = 20_000.0
-
-
-class KnownViews(NamedTuple):
-    """C cameras and K errors that their marks have in common.
-
-    Attributes:
-        posed: as they stand.
-        stack: of the cameras.
-        middle: (C, 2) principal points, px.
-        size: (C, 2) of the images, px.
-        wide: (C, 1) bool: sees also beside and behind itself.
-        up: (C, 3, 1) the vertical in each camera's axes; zeros where lines of sight are straight.
-        matrices: (C, 3, 4) of `PosedCameras`.
-        axes: (3, 3) of two cameras: the line between them and across; None for more.
-        baseline: meters between the first camera and the last.
-        moves: (C, 3 (K + 1), 5) what each error, and a larger k / 2R, makes of a point in a camera's axes, over its
-            distance: by this point, by one over its distance, and by how much one of `up` it is lifted by bending.
-        lens: for each camera the parameters that are not exact.
-        by_lens: (C, K + 1, Q) their change by each error.
-    """
-
-    posed: PosedCameras
-    stack: CameraStack
-    middle: Tensor
-    size: Tensor
-    wide: Tensor
-    up: Tensor
-    matrices: Tensor
-    axes: Tensor | None
-    baseline: Tensor
-    moves: Tensor
-    lens: tuple[tuple[int, ...], ...]
-    by_lens: Tensor
-
-
-class ViewRows(NamedTuple):
-    """N points of M = 2 C pixel coordinates; the last axis counts points.
-
-    Attributes:
-        anchor: (N,) number of the camera from which a point is told; the first one where nobody saw it.
-        place: (3, N) its center.
-        direction: (3, N) unit vectors in the frame.
-        sides: two (3, N) across it.
-        inverse: (N,) one over meters; zero where lines of sight do not meet ahead.
-        jacobian: (M, 3, N) pixels by steps along the sides and by the inverse distance; zeros of views that do not
-            count.
-        residual: (M, N) predicted minus measured.
-        shared: (M, K + 1, N) pixels by each common error, and by k / 2R.
-        white: (M, M, N) U⁻¹ of the covariance U Uᵀ of the pixels, U upper triangular; that of views that do not count
-            is the identity.
-        used: (C, N) which views count.
-        alone: (N,) one view counts.
-        fitted: (N,) the lines of sight exist.
-    """
-
-    anchor: Tensor
-    place: Tensor
-    direction: Tensor
-    sides: tuple[Tensor, Tensor]
-    inverse: Tensor
-    jacobian: Tensor
-    residual: Tensor
-    shared: Tensor
-    white: Tensor
-    used: Tensor
-    alone: Tensor
-    fitted: Tensor
-
-
-@torch.no_grad()
-def known_views(posed: PosedCameras, common: CommonErrors | None) -> KnownViews:
-    """Prepare cameras, and what is not known of them."""
-    cameras, center = posed.cameras, posed.center
-    count = len(cameras)
-    exact = CommonErrors(tuple(() for _ in cameras), center.new_zeros(0, count, 6), center.new_zeros(0))
-    lens, half, bending = exact if common is None else common
-    half = torch.nn.functional.pad(half, (0, 0, 0, 0, 0, 1))
-    bending = torch.cat([bending, bending.new_ones(1)])
-    up = torch.zeros_like(center) if posed.up is None else (posed.rotation @ posed.up[..., None])[..., 0]
-    by_center, turn = ((posed.rotation @ part[..., None])[..., 0] for part in (half[..., :3], half[..., 3:6]))
-    still = torch.eye(3, dtype=center.dtype, device=center.device).expand(*turn.shape, 3)
-    crossed = torch.linalg.cross(turn[..., None, :].expand_as(still), still).mT
-    lifts = bending[:, None, None] * up
-    moves = torch.cat([-crossed, -by_center[..., None], lifts[..., None]], -1).movedim(0, 1).flatten(1, 2)
-    middle = torch.stack([camera.center.detach() for camera in cameras])
-    size = center.new_tensor([camera.size for camera in cameras])
-    wide = torch.tensor([[camera.model.wide] for camera in cameras], device=center.device)
-    axes = baseline_axes(center[1] - center[0]) if count == 2 else None
-    return KnownViews(
-        posed, camera_stack(cameras), middle, size, wide, up[..., None], posed.matrices, axes,
-        torch.linalg.vector_norm(center[-1] - center[0]), moves, lens, half[..., 6:].movedim(0, 1),
-    )  # fmt: skip
-
-
-@torch.no_grad()
-def view_rows(known: KnownViews, pixels: Tensor, seen: Tensor, covariance: Tensor) -> ViewRows:
-    """Linear rows of objects.
+    A pair counts as a whole: `sight_lines` says which have a point.
 
     Args:
-        known: the cameras.
-        pixels: (N, C, 2) float64, finite where seen.
-        seen: (N, C) bool; what is False is not read.
-        covariance: (N, 2 C, 2 C) of the pixels of a row, px².
+        rig: two cameras and their relative pose.
+        left: (..., N, 2) float64 pixels.
+        right: (..., N, 2).
+        cov: (..., N, 4, 4) covariance of each pair's four coordinates; `noise` squared times the identity if left out.
+        mask: (..., N) bool; what is False is neither read nor differentiated.
+        noise: standard deviation of a pixel along each axis where there is no covariance, px.
+        by_camera: see `most_likely`.
+        differentiated: see `most_likely`.
     """
-    posed, cameras = known.posed, len(known.middle)
-    pixels = torch.where(seen[..., None], pixels, known.middle)
-    blocks = covariance.unflatten(-1, (cameras, 2)).unflatten(-3, (cameras, 2)).diagonal(dim1=-4, dim2=-2)
-    sound = sound_covariances(blocks.movedim(-1, 1))
-    marks = pixels.movedim(0, 1)  # (C, N, 2)
-    rays, valid = unproject_each(known.stack, marks)
-    shifted = pixels + 0.5
-    inside = ((shifted >= 0.0) & (shifted <= known.size)).all(-1)
-    used = seen & valid.T & inside & sound
-    count = used.sum(-1)
-    alone = count == 1
-    fitted = alone | ((count > 1) & ~(seen & ~sound).any(-1))
-    anchor = first_seen(used).to(torch.int64).argmax(-1)
-    in_frame = rays @ posed.rotation
-    place = posed.center.T.index_select(1, anchor)
-    ray = in_frame[anchor, torch.arange(len(anchor), device=anchor.device)].T
-    if known.axes is not None:
-        both = in_frame @ known.axes
-        found = meeting_points(both[0], both[1], known.axes, known.baseline)
-    elif cameras > 1:
-        found = triangulate_angular(known.matrices, rays.movedim(0, 1), used)
-    else:
-        found = Found(torch.zeros_like(ray.T), torch.zeros_like(alone))
-    away = torch.where(alone, ALONE_M * ray, found.points.T + (posed.center[0, :, None] - place))
-    met = alone | (found.valid & (count > 1))
-    away = torch.where(met, away, ray)
-    nearness = away.square().sum(0).rsqrt()
-    ahead, inverse = away * nearness, nearness * met
-    first, second = (side.T for side in side_axes(ahead.T))
-
-    # Axes of each camera: (C, 3, 3 columns, N), and what a larger inverse distance adds.
-    turned = (posed.rotation @ torch.stack([first, second, ahead], 1).flatten(1)).unflatten(-1, (3, -1))
-    shift = posed.rotation @ (place - posed.center[..., None])
-    at = turned[:, :, 2] + inverse * shift
-    along = (at * known.up).sum(1, keepdim=True)
-    lift = (at.square().sum(1, keepdim=True) - along * along) / inverse.clamp_min(1.0 / LIGHT_HORIZON)
-    at = at + (posed.bending * lift) * known.up
-    counts = used.T & fitted
-    good = counts & ((at[:, 2] > 1e-6) | known.wide)
-    # The axis is a harmless stand-in.
-    at = torch.where(good[:, None], at, at.new_tensor([[0.0], [0.0], [1.0]]))
-    projected = project_stack(known.stack, at, known.lens, inverse)
-    by_point, share = projected.by_point, counts.to(at.dtype)[:, None]
-    columns = torch.cat([turned[:, :, :2], shift[:, :, None]], 2)
-    jacobian = (columns[:, :, :, None] * by_point[:, :, None]).sum(1)  # (C, 3 columns, 2, N)
-    if projected.by_meter is not None:
-        jacobian = jacobian + torch.nn.functional.pad(projected.by_meter[:, None], (0, 0, 0, 0, 2, 0))
-    point = torch.cat([at, inverse.expand_as(lift), lift], 1)
-    moved = (known.moves @ point).unflatten(1, (-1, 3))  # (C, K + 1, 3, N)
-    shared = (moved[:, :, :, None] * by_point[:, None]).sum(2)
-    if known.by_lens.shape[-1]:
-        shared = shared + (known.by_lens @ projected.by_camera.flatten(2)).unflatten(-1, (2, -1))
-    return ViewRows(
-        anchor,
-        place,
-        ahead,
-        (first, second),
-        inverse,
-        (share[:, :, None] * jacobian).transpose(1, 2).flatten(0, 1),
-        (share * (projected.pixels - marks.mT)).flatten(0, 1),
-        (share[:, :, None] * shared).transpose(1, 2).flatten(0, 1),
-        _whitening(covariance, used),
-        used.T,
-        alone,
-        fitted,
+    finite = torch.isfinite(left + right).all(-1)
+    wanted = finite if mask is None else finite & mask
+    if not known_true(wanted):
+        left = torch.where(wanted[..., None], left, rig.left.center.detach())
+        right = torch.where(wanted[..., None], right, rig.right.center.detach())
+    with torch.no_grad():
+        lines = sight_lines(rig, left, right)
+        weight, sound = inverse_covariances(cov)
+        code = flag_positions(lines.status, ~sound, PositionStatus.BAD_COVARIANCE)
+        code = flag_positions(code, ~finite, PositionStatus.NOT_FINITE)
+        if mask is not None:
+            code = flag_positions(code, ~mask, PositionStatus.MASKED)
+        met = code == int(PositionStatus.OK)
+        usable = met | ((code == int(PositionStatus.PARALLEL)) & ~lines.along_baseline)
+        scale = rig.baseline.detach()
+        distance = torch.where(met, torch.linalg.vector_norm(lines.points, dim=-1), 1.0)
+        ahead = torch.where(met[..., None], lines.points / distance[..., None], lines.rays[..., 0, :])
+        start = torch.where(met, scale / distance, 0.0)
+    if differentiated and cov is not None:
+        weight, _ = inverse_covariances(cov)
+    rotation, translation = rig.right_from_left_rotation, rig.right_from_left_translation
+    still = torch.eye(3, dtype=torch.float64, device=rotation.device)
+    cameras = (
+        RelativeCamera(rig.left, still, torch.zeros_like(translation)),
+        RelativeCamera(rig.right, rotation, translation),
+    )
+    pixels = torch.cat([left, right], -1).mT
+    fit = most_likely(
+        cameras, scale, (ahead, start), pixels, usable, weight, by_camera=by_camera, differentiated=differentiated
+    )
+    used = usable[..., None].expand(*usable.shape, 2)
+    first = torch.tensor([True, False], device=used.device).expand(used.shape)
+    variance = noise**2 if cov is None else 1.0
+    return ViewsFit(
+        fit, scale, first, torch.zeros_like(translation), lines.rays, used, code, usable, weight, variance, None
     )
 
 
-def _whitening(covariance: Tensor, used: Tensor) -> Tensor:
-    """`ViewRows.white`; the identity where the covariance of all pixels of a row is none."""
-    still = torch.eye(covariance.shape[-1], dtype=covariance.dtype, device=covariance.device)
-    both = used[..., None].expand(-1, -1, 2).flatten(1)
-    whole = torch.where(both[:, :, None] & both[:, None], covariance, still)
-    mirrored = (whole - whole.mT).abs().amax((-2, -1)) <= 1e-6 * whole.abs().amax((-2, -1))
-    lower, info = torch.linalg.cholesky_ex((0.5 * (whole + whole.mT)).flip(-2, -1))
-    lower = torch.where((mirrored & (info == 0))[:, None, None], lower, still)
-    inverse = torch.linalg.solve_triangular(lower, still, upper=False)
-    return inverse.flip(-2, -1).movedim(0, -1)
+class Reach(NamedTuple):
+    """One over the range, whose errors are Gaussian at any distance, and what follows from it; each (..., N).
+
+    Attributes:
+        value: one over meters from the anchor; zero unless there is an optimum.
+        sigma: its standard deviation; zero where nothing is known.
+        interval: the 95 % interval of the range, meters.
+        weak: where the parallax is below three of its sigmas.
+        status: int8: PARALLEL where the value is not positive.
+    """
+
+    value: Tensor
+    sigma: Tensor
+    interval: RangeInterval
+    weak: Tensor
+    status: Tensor
+
+
+def reach_of(found: ViewsFit, variance: Tensor, weak_status: PositionStatus, behind: Tensor | None = None) -> Reach:
+    """Range and status of fitted points, given the variance (..., N) of `fit.inverse`.
+
+    What is `OK` and weak gets `weak_status`; what is `behind` (..., N) a camera that saw it, BEHIND.
+    """
+    fit, usable, code, unit = found.fit, found.fitted, found.status, found.scale * found.length
+    value = torch.where(usable, fit.inverse / unit, 0.0)
+    with torch.no_grad():
+        known = torch.isfinite(variance) & (variance > 0) & usable
+    sigma = torch.sqrt(torch.where(known, variance, 1.0)) / unit
+    sigma = found.steady(torch.where(known, sigma, 0.0))
+    with torch.no_grad():
+        weak = usable & (~known | (value < BEARING_SIGMAS * sigma))
+        lost = usable & ~(value > 0)
+        code = flag_positions(code, weak & (code == int(PositionStatus.OK)), weak_status)
+        if behind is not None:
+            code = flag_positions(code, behind, PositionStatus.BEHIND)
+        code = flag_positions(code, lost, PositionStatus.PARALLEL)
+        # What the closed form put at infinity may have come back in front of the rig.
+        back = usable & ~lost & ~weak
+        code = flag_positions(code, back if behind is None else back & ~behind, PositionStatus.OK)
+    interval = RangeInterval(*map(found.steady, range_interval(value, sigma, known)))
+    return Reach(value, sigma, interval, weak, code)
+
+
+def posed_pair(rig: StereoRig) -> PosedCameras:
+    """Both cameras in the left one's frame."""
+    rotation, shift = rig.right_from_left_rotation, rig.right_from_left_translation
+    still = torch.eye(3, dtype=torch.float64, device=rotation.device)
+    centers = torch.stack([torch.zeros_like(shift), -shift @ rotation])
+    return PosedCameras([rig.left, rig.right], torch.stack([still, rotation]), centers)

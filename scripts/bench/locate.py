@@ -22,10 +22,9 @@ from torch import Tensor
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.projection import project_components
 from kcal.lens.rig import Origin, RigCovariance, StereoRig
-from kcal.locate.angular import triangulate_pairs
+from kcal.locate.angular import triangulate_linear, triangulate_pairs
 from kcal.locate.geodesy import enu_to_geodetic
 from kcal.locate.localizer import StereoLocalizer
-from kcal.locate.multiview import triangulate_linear
 from kcal.locate.tabulate import circular_error
 from scripts.shared.long_range import ORIGIN, RANGES, rig
 from scripts.shared.page import write_section

@@ -28,7 +28,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.rig import Origin, RigCovariance, StereoRig
 from kcal.locate.budget import planned_rig
 from kcal.locate.localizer import StereoLocalizer
-from kcal.locate.stereo import Triangulate
+from kcal.locate.triangulate import Triangulate
 from kcal.pipeline.association import associate
 from kcal.pipeline.detections import Detections
 from kcal.pipeline.pairing import ObjectDisparity

@@ -35,7 +35,8 @@ from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import Origin, StereoRig
 from kcal.lens.views import new_pinhole
 from kcal.locate.geodesy import enu_to_geodetic, geodetic_to_enu
-from kcal.locate.stereo import PositionStatus, Triangulate
+from kcal.locate.stereo import PositionStatus
+from kcal.locate.triangulate import Triangulate
 from kcal.stars.sky import Air, StarCatalog, observed_directions
 from scripts.shared.page import table, write_section
 from scripts.shared.timing import show

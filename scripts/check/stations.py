@@ -40,8 +40,8 @@ from torch import Tensor
 from kcal.lens.camera import Camera
 from kcal.lens.rig import CameraRig
 from kcal.locate.multi_localizer import MultiViewLocalizer, ViewsLocalization
-from kcal.locate.multiview import TriangulateViews
 from kcal.locate.stereo import PositionStatus
+from kcal.locate.triangulate import Triangulate
 from scripts.shared.page import table, write_section
 from scripts.shared.station_scenes import drawn_errors, marks, ring, targets
 from scripts.shared.timing import show
@@ -91,7 +91,7 @@ def peers_of(rig: CameraRig) -> dict[str, tuple[Solve, int]]:
     """Functions from pixels (N, C, 2) to points (N, 3), and by how much fewer points they are timed on."""
     matrices, found = projections(rig), dict[str, tuple[Solve, int]]()
     shift = -(rig.rotation @ rig.center[..., None])
-    plain = TriangulateViews(rig.each, torch.cat([rig.rotation, shift], -1), pixel_sigma=1.0)
+    plain = Triangulate(rig, pixel_sigma=1.0)
     checked = MultiViewLocalizer(rig, pixel_sigma=1.0)
 
     def ours(pixels: np.ndarray) -> np.ndarray:
@@ -102,7 +102,7 @@ def peers_of(rig: CameraRig) -> dict[str, tuple[Solve, int]]:
         result = plain(torch.from_numpy(pixels))
         return np.where((result.status == OK).numpy()[:, None], result.points.numpy(), np.nan)
 
-    found["kcal `MultiViewLocalizer`"], found["kcal `TriangulateViews`"] = (ours, 1), (views, 1)
+    found["kcal `MultiViewLocalizer`"], found["kcal `Triangulate`"] = (ours, 1), (views, 1)
     try:
         import cv2
         from aniposelib.cameras import Camera as OtherCamera  # type: ignore[import-not-found]
@@ -310,7 +310,7 @@ def real() -> list[str]:
     pixels, sure = keypoints[..., :2].reshape(-1, 4, 2), keypoints[..., 2].reshape(-1, 4)
     seen = (sure > 0.3) & torch.isfinite(pixels).all(-1)
     # The noise by which half of the joints that all four see have less than the median of χ² with 5 degrees.
-    free = TriangulateViews(cameras, torch.cat([turn, shift[..., None]], -1), pixel_sigma=1.0)
+    free = Triangulate(rig, pixel_sigma=1.0)
     first = free(torch.where(seen[..., None], pixels, math.nan))
     four = (first.status == OK) & seen.all(-1)
     sigma = float((first.reprojection[four].square().sum(-1).median() / 4.351).sqrt())

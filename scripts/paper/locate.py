@@ -20,7 +20,7 @@ from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.sources import Landmarks, RigData
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera
-from kcal.locate.stereo import Triangulate
+from kcal.locate.triangulate import Triangulate
 from kcal.sim.scene import DemoScene
 from scripts.paper.site import MARK_SIGMA, SURVEY_SIGMA, PaperScene
 from scripts.shared.long_range import range_sigma

@@ -18,7 +18,7 @@ from kcal.lens.images import Undistort, undistort_maps
 from kcal.lens.rig import CameraRig, Origin, StereoRig
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.multi_localizer import MultiViewLocalizer
-from kcal.locate.stereo import Triangulate
+from kcal.locate.triangulate import Triangulate
 
 MODEL = Camera.build(focal=(900, 900), center=(322, 238), size=(640, 480), coefficients=[-0.1, 0.02, 1e-3, -5e-4, 0.0])
 

@@ -25,7 +25,7 @@ from kcal.lens.images import Undistort
 from kcal.lens.model import LensModel
 from kcal.lens.rig import CameraRig, Origin, StereoRig
 from kcal.locate.localizer import StereoLocalizer
-from kcal.locate.stereo import Triangulate
+from kcal.locate.triangulate import Triangulate
 
 
 class Waves(nn.Module):

@@ -7,8 +7,7 @@ import torch
 from locate_rigs import tensor, turned
 
 from kcal.lens.pose import side_axes
-from kcal.locate.angular import triangulate_angular, triangulate_pairs
-from kcal.locate.multiview import triangulate_linear
+from kcal.locate.angular import triangulate_angular, triangulate_linear, triangulate_pairs
 
 GENERATOR = torch.Generator().manual_seed(7)
 

@@ -17,7 +17,8 @@ from kcal.locate.disparity import DisparityRanges
 from kcal.locate.export import APPENDED, appended
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.positions import interval_coverage, locate_points, position_errors
-from kcal.locate.stereo import PositionStatus, fit_pairs
+from kcal.locate.stereo import PositionStatus
+from kcal.locate.views import fit_pairs
 
 ORIGIN = Origin(lat=19.0, lon=72.0, height=10.0)
 STRAIGHT = {"refraction": 0.0, "refraction_sigma": 0.0}

@@ -5,7 +5,7 @@ import torch
 from locate_rigs import tensor, turned
 
 from kcal.errors import InputError
-from kcal.locate.multiview import triangulate_linear
+from kcal.locate.angular import triangulate_linear
 
 GENERATOR = torch.Generator().manual_seed(5)
 

@@ -16,7 +16,8 @@ from kcal.lens.rig import Origin, RigCovariance, StereoRig
 from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic
 from kcal.locate.localizer import Localization, StereoLocalizer
 from kcal.locate.mounting import mounting_covariance
-from kcal.locate.stereo import PositionStatus, Triangulate
+from kcal.locate.stereo import PositionStatus
+from kcal.locate.triangulate import Triangulate
 
 ORIGIN = Origin(lat=-33.9, lon=151.2, height=40.0)
 RIG = real_rig()

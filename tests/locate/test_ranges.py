@@ -6,7 +6,8 @@ import pytest
 import torch
 from locate_rigs import pinhole_rig, real_rig, tensor
 
-from kcal.locate.stereo import PositionStatus, Triangulate, range_interval
+from kcal.locate.stereo import PositionStatus, range_interval
+from kcal.locate.triangulate import Triangulate
 
 N = 20_000
 

@@ -13,7 +13,9 @@ from whole_graphs import traced_whole
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
-from kcal.locate.stereo import PositionStatus, Triangulate, fit_pairs
+from kcal.locate.stereo import PositionStatus
+from kcal.locate.triangulate import Triangulate
+from kcal.locate.views import fit_pairs
 
 RIG = real_rig()
 

@@ -8,7 +8,8 @@ from kcal.lens.camera import Camera
 from kcal.lens.rig import CameraRig, Origin
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.multi_localizer import MultiViewLocalizer, common_errors, posed_cameras
-from kcal.locate.views import ALONE_M, known_views, shared_pixels, view_rows
+from kcal.locate.views import shared_pixels
+from kcal.pipeline.measurements import ALONE_M, known_views, view_rows
 
 
 def mixed_stations() -> CameraRig:

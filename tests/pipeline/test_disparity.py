@@ -11,7 +11,7 @@ from torch import Tensor
 from kcal.corners import patches
 from kcal.corners.match import MatchStatus
 from kcal.errors import InputError
-from kcal.locate.stereo import Triangulate
+from kcal.locate.triangulate import Triangulate
 from kcal.pipeline.pairing import DisparityOptions, ObjectDisparities, ObjectDisparity
 
 
