@@ -1,6 +1,7 @@
 # make demo   the whole chain on a simulated site; results in demo-output/
 # make test   linters, type check and all tests but the slow ones
 # make test-all  the same with the slow ones, as CI does
+# make fuzz   damaged files and messages with a fresh seed, for an hour; MINUTES=5 make fuzz: shorter
 # make test-cpus  the tests as other makes of CPU round: six times as long
 # make check  linters and type check only
 # make wheel  a wheel in dist/, the same to the last byte from the same commit, and its checksum
@@ -13,11 +14,12 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 OUT := demo-output
+MINUTES ?= 60
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := demo
-.PHONY: demo test test-all test-cpus check wheel docs clean
+.PHONY: demo test test-all fuzz test-cpus check wheel docs clean
 
 demo: $(VENV)/.installed
 	$(BIN)/kcal demo --output $(OUT)
@@ -36,11 +38,11 @@ test: check
 	$(BIN)/python -m pytest -n 2 -m "not slow" kcal tests
 	@echo "left out: $$(grep -rh '^ *@pytest.mark.slow' tests | wc -l) slow tests; make test-all runs them, too"
 
-# Seeds of fuzzing are fresh; KCAL_FUZZ_SEED=... repeats those that were printed.
-test-all: export KCAL_FUZZ_SEED := $(or $(KCAL_FUZZ_SEED),$(shell date +%s))
 test-all: check
-	@echo "fuzzing: KCAL_FUZZ_SEED=$(KCAL_FUZZ_SEED)"
 	$(BIN)/python -m pytest -n 2 kcal tests
+
+fuzz: $(VENV)/.installed-dev
+	$(BIN)/python -m scripts.fuzz --minutes $(MINUTES)
 
 test-cpus: $(VENV)/.installed-dev
 	$(BIN)/python -m scripts.check.cpus

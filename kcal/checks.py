@@ -147,6 +147,15 @@ def require_finite(name: str, value: Tensor) -> None:
         raise InputError(f"{name}: {int(bad.sum())} of {value.numel()} values are not finite, first at {where}")
 
 
+def require_root(name: str, root: Tensor, size: int) -> None:
+    """Raise `InputError` unless `root` is (K, size), and rootᵀ root is finite."""
+    if root.ndim != 2 or root.shape[1] != size:
+        raise InputError(f"{name}: a root (K, {size}) is needed, got {tuple(root.shape)}")
+    require_finite(name, root)
+    if not bool(root.detach().square().sum().isfinite()):
+        raise InputError(f"{name}: the covariance overflows; the largest element of its root is {root.abs().max():.1e}")
+
+
 def keep_float64(fn: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
     """Let `.to`, `.half`, `.float` move float64 tensors between devices without rounding them."""
 
@@ -178,7 +187,7 @@ def as_covariance(name: str, matrix: Tensor | ArrayLike | None, size: int) -> Te
     # Rounding stays below 1e-9 per row.
     if not torch.allclose(unit, unit.T, atol=1e-9) or (size and float(torch.linalg.eigvalsh(unit)[0]) < -1e-9 * size):
         raise InputError(f"{name}: not a covariance; it must be symmetric and have no negative eigenvalue")
-    return 0.5 * (matrix + matrix.T)
+    return 0.5 * matrix + 0.5 * matrix.T  # the sum itself may overflow
 
 
 class Float64Module(nn.Module):

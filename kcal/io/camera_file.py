@@ -128,6 +128,13 @@ class CameraFile(NativeFile):
                 raise ValueError(f"{info.field_name}: {unknown[0]} is unknown; the lens model has {_listed(names)}")
         return value
 
+    @pydantic.model_validator(mode="after")
+    def _usable(self) -> CameraFile:
+        # Checked here so that the error names the file.
+        if self.information is not None:
+            self.information.information(self._values())
+        return self
+
     @pydantic.field_serializer("calibration", mode="wrap")
     def _board_as_before(self, value: CalibrationRecord | None, plain: pydantic.SerializerFunctionWrapHandler):  # type: ignore[no-untyped-def]
         """Leave out what checkerboards do not need, so that files of them stay as they were."""

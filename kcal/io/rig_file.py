@@ -16,7 +16,7 @@ import pydantic
 import torch
 from torch import Tensor, nn
 
-from kcal.checks import as_covariance
+from kcal.checks import as_covariance, require_root
 from kcal.dispatch import still
 from kcal.errors import FileError
 from kcal.file_kind import CAMERA_RIG_VERSION
@@ -156,8 +156,8 @@ class RigFile(NativeFile):
     def _measured(self) -> RigFile:
         link = None if self.mounting is None else self.mounting.link
         size = len(self.left.coefficients) + len(self.right.coefficients) + 2 * len(INTRINSICS) + 6
-        if self.half is not None and (len(self.half.shape) != 2 or self.half.shape[1] != size):
-            raise ValueError(f"half: a root (K, {size}) is needed, got the shape {list(self.half.shape)}")
+        if self.half is not None:
+            require_root("half", self.half.tensor(), size)
         known = self.known()
         if link is not None:
             if known is None:

@@ -16,6 +16,8 @@ from kcal.texts import brief
 
 # Names of the unknowns: (LENS_SLOT, 0), ... of the camera, (BOARD_SLOT, 0), ... of its board.
 LENS_SLOT, BOARD_SLOT = "lens", "board"
+# Products of larger numbers, and of inverses of smaller ones, may overflow on the way to a covariance.
+_MOST = 1e100
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -37,7 +39,7 @@ class CameraInformation:
             the residuals at the estimate. None: nothing. A rig with such a camera and these others uses their own rows.
 
     Raises:
-        InputError: shapes that do not fit each other, or values that are not finite.
+        InputError: shapes that do not fit each other, or values that are not finite or whose squares would not be.
 
     Example:
         >>> focal = CameraInformation.from_covariance(torch.tensor([800.0, 800, 320, 240, 0]).double(),
@@ -72,6 +74,13 @@ class CameraInformation:
             raise InputError("information: values that are not finite")
         if not bool((self.sigma > 0).all()):
             raise InputError("information: sigmas of the prior must be positive")
+        weights = 1.0 / self.sigma
+        numbers = (self.estimate, self.mean, self.residuals, (self.estimate - self.mean) * weights, *others)
+        rows = torch.cat([self.rows, weights[None]]).abs()
+        if any(not bool((number.abs() <= _MOST).all()) for number in (*numbers, rows)):
+            raise InputError(f"information: numbers beyond {_MOST:.0e}, or sigmas of the prior below {1 / _MOST:.0e}")
+        if bool(((rows > 0).any(0) & (rows < 1.0 / _MOST).all(0)).any()):
+            raise InputError(f"information: the data and the prior say less than {1 / _MOST:.0e} of an unknown")
 
     @classmethod
     def from_covariance(cls, params: Tensor, covariance: Tensor) -> CameraInformation:

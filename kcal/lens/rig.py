@@ -13,7 +13,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
-from kcal.checks import StatedModule, as_covariance, as_points, as_tensor, require_finite, scalar
+from kcal.checks import StatedModule, as_covariance, as_points, as_tensor, require_finite, require_root, scalar
 from kcal.dispatch import is_differentiated
 from kcal.errors import InputError, warn_user
 from kcal.lens.calibration import Exclusion, RigCalibration, RigSource, UntilChanged
@@ -377,9 +377,7 @@ class RigCovariance:
     def check(self, rig: StereoRig) -> None:
         """Raise `InputError` unless it has the size of this rig's quantities, and is finite."""
         size = rig.left.values.shape[-1] + rig.right.values.shape[-1] + 6
-        if self.half.ndim != 2 or self.half.shape[1] != size:
-            raise InputError(f"joint covariance: a root (K, {size}) is needed, got {tuple(self.half.shape)}")
-        require_finite("joint covariance", self.half)
+        require_root("joint covariance", self.half, size)
 
     def with_pose(self, covariance: Tensor) -> RigCovariance:
         """This, and an independent error (6, 6) of the relative pose."""
@@ -606,9 +604,7 @@ class CameraRig(Movable, StatedModule):
 
     def check_root(self, root: Tensor) -> None:
         """Raise `InputError` unless `root` has the size of this rig's quantities, and is finite."""
-        if root.ndim != 2 or root.shape[1] != self.quantities:
-            raise InputError(f"root: a root (K, {self.quantities}) is needed, got {tuple(root.shape)}")
-        require_finite("root", root)
+        require_root("root", root, self.quantities)
 
     def with_errors(
         self,

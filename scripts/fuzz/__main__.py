@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import functools
+import math
 import re
 import sys
 import tempfile
@@ -32,6 +33,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("harness", nargs="*", metavar="HARNESS", help="all if none is named")
     parser.add_argument("--minutes", type=float, default=5.0, help="for all harnesses together")
+    parser.add_argument("--cases", type=int, help="so many of each harness, however long they take")
     parser.add_argument("--seed", type=int, default=int(time.time()), help="a new one if left out")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="for the smallest case of each finding")
     parser.add_argument("--replay", type=Path, metavar="FOLDER", help="run the cases that are kept there, once")
@@ -57,7 +59,8 @@ def main(arguments: list[str] | None = None) -> None:
             if kept is not None:
                 found, count = replay(harness, Path(folder), kept[name]), len(kept[name])
             else:
-                found, count = hunt(harness, Path(folder), chosen.seed, 60.0 * chosen.minutes / len(names))
+                seconds = math.inf if chosen.cases else 60.0 * chosen.minutes / len(names)
+                found, count = hunt(harness, Path(folder), chosen.seed, seconds, cases=chosen.cases)
         total += len(found)
         print(f"{name}: {count} cases, {len(found)} findings", flush=True)
         for number, finding in enumerate(found):

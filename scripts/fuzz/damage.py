@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import random
 import re
+from collections.abc import Iterator
 from typing import Any
 
 # None of these is a number of JSON in the range of float64: a file with one in a number's place must be refused.
@@ -17,23 +18,25 @@ ODD_TEXTS = ("<!--<script>", "=1+1", "\x1b[2J", "\ufffe", "$\\frac{", "\ud800", 
 SLOT = "\ue000"
 
 
-def _places(value: Any, found: list[tuple[Any, Any]]) -> list[tuple[Any, Any]]:
+def _places(value: Any, read: bool = True) -> Iterator[tuple[Any, Any, bool]]:
+    """Each place of a JSON value as its holder and key, and whether kcal reads what stands there."""
     pairs = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     for key, inside in pairs:
-        found.append((value, key))
-        _places(inside, found)
-    return found
+        # A summary is derived from the rest of its file: a wrong one counts as missing.
+        here = read and key != "summary"
+        yield value, key, here
+        yield from _places(inside, here)
 
 
 def damage_json(data: bytes, rng: random.Random) -> tuple[bytes, str, bool]:
     """Change one place of a JSON text; also what was done, and whether the text must now be refused."""
     content = json.loads(data)
-    places = _places(content, [])
+    places = list(_places(content))
     if not places:
         raise ValueError("nothing to damage")
-    holder, key = rng.choice(places)
+    holder, key, read = rng.choice(places)
     old = holder[key]
-    number = isinstance(old, int | float) and not isinstance(old, bool)
+    number = read and isinstance(old, int | float) and not isinstance(old, bool)
     raw, refused = rng.choice(NO_NUMBERS if rng.random() < 0.5 else ODD_NUMBERS), False
     way = rng.choice(["value", "value", "value", "text", "drop", "repeat", "nest", "twice"])
     if way == "value":

@@ -1,4 +1,4 @@
-"""Run one harness in a child process with limits, on damage that Hypothesis draws, until the time is over.
+"""Run one harness in a child process with limits, on damage that Hypothesis draws, for a time or a number of cases.
 
 A harness makes its whole files and servers in a folder, and returns the strategy of its cases (bytes) and the check
 that raises if a case breaks an invariant. It can be pickled: a function of a module, or `functools.partial` of one.
@@ -80,16 +80,19 @@ def within(seconds: float) -> Iterator[None]:
 
 
 def hunt(
-    harness: Harness, folder: Path, seed: int, seconds: float, *, most: int | None = None
+    harness: Harness, folder: Path, seed: int, seconds: float, *, cases: int | None = None, most: int | None = None
 ) -> tuple[list[Finding], int]:
-    """Findings of a harness, and how many cases were run; the search ends early once there are `most` findings."""
+    """Findings of a harness, and how many cases were run.
+
+    The search ends after `seconds`, after so many `cases` if they are stated, or once there are `most` findings.
+    """
     found: dict[str, Finding] = {}
     total, until = 0, time.monotonic() + seconds
     for start in range(_RESTARTS):
         left = until - time.monotonic()
         if start and left < 1:
             break
-        work = functools.partial(_search, harness, folder, seed + start, left, set(found), most)
+        work = functools.partial(_search, harness, folder, seed + start, left, cases, set(found), most)
         more, count = _child(work, folder, left)
         total += count
         found.update(more)
@@ -115,16 +118,26 @@ def _repeat(harness: Harness, folder: Path, cases: list[bytes], write: Write) ->
 
 
 def _search(
-    harness: Harness, folder: Path, seed: int, seconds: float, known: set[str], most: int | None, write: Write
+    harness: Harness,
+    folder: Path,
+    seed: int,
+    seconds: float,
+    cases: int | None,
+    known: set[str],
+    most: int | None,
+    write: Write,
 ) -> int:
     now, prepared = folder / "now", harness(folder)
     # One case at least, however long it took to make the files.
     until, count = time.monotonic() + seconds, 0
     smallest: dict[str, Finding] = {}
 
+    def over() -> bool:
+        return count == cases or bool(count and time.monotonic() > until)
+
     def body(case: bytes) -> None:
         nonlocal count
-        if count and time.monotonic() > until:
+        if over():
             return
         now.write_bytes(case)
         count += 1
@@ -140,7 +153,7 @@ def _search(
         phases=[hypothesis.Phase.generate, hypothesis.Phase.shrink],
     )  # fmt: skip
     for batch in itertools.count():
-        if (count and time.monotonic() > until) or (most and len(known) >= most):
+        if over() or (most and len(known) >= most):
             break
         run = hypothesis.seed(seed * 100_003 + batch)(quiet(hypothesis.given(prepared.cases)(body)))
         # Beside the finding: that it came only once, when the time ended while it was made smaller.

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from kcal.errors import FileError
+from kcal.io.record import Packed
 from kcal.io.rig_file import CameraRigFile, camera_rig_to_file, save_camera_rig
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
@@ -74,13 +75,17 @@ def spoil(content: dict[str, Any], which: str) -> None:
         content["origin"]["lat"] = 91.0
     elif which == "longitude":
         content["origin"]["lon"] = -181.0
+    elif which == "root":
+        content["root"] = Packed.of(1e200 * torch.ones(2, rig().quantities).double()).model_dump()
     elif which == "refraction":
         content["refraction"] = 2.5
     else:
         content["poses"][1]["rotation"][0][0] = 0.5
 
 
-@pytest.mark.parametrize("which", ["names", "cameras", "poses", "latitude", "longitude", "refraction", "rotation"])
+@pytest.mark.parametrize(
+    "which", ["names", "cameras", "poses", "latitude", "longitude", "root", "refraction", "rotation"]
+)
 def test_what_does_not_fit_is_refused(which: str, tmp_path: Path) -> None:
     path = save_camera_rig(rig(), tmp_path / "rig.json")
     content = json.loads(path.read_text())

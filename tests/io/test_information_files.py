@@ -66,6 +66,10 @@ def test_read_back(camera: Camera, tmp_path: Path) -> None:
         ({"triangle": {"shape": [1], "float64": "AAAA"}}, "whole doubles"),
         ({"triangle": {"shape": [54], "float64": "!"}}, "base64"),
         ({"unknowns": [[name] for name in ("fx", "cx", "cy", "k1", "k2", "p1", "k9")]}, "k9"),
+        # Their squares overflow, or those of their inverses.
+        ({"sigma": [5e-324, *[None] * 8]}, r"camera\.json.*below 1e-100"),
+        ({"triangle": Packed.of(1e200 * torch.ones(54).double()).model_dump()}, r"camera\.json.*beyond 1e\+100"),
+        ({"triangle": Packed.of(1e-200 * torch.ones(54).double()).model_dump()}, r"camera\.json.*less than 1e-100"),
     ],
 )
 def test_damaged(camera: Camera, tmp_path: Path, change: dict[str, object], message: str) -> None:

@@ -14,6 +14,7 @@ import torch
 
 from kcal.errors import FileError, InputError
 from kcal.io.camera_file import CameraFile, load_camera, save_camera
+from kcal.io.record import Packed
 from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
@@ -142,6 +143,9 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
         path.write_text(json.dumps(content | {"mounting": content["mounting"] | change}))
         with pytest.raises(FileError, match=complaint):
             load_rig(path)
+    path.write_text(json.dumps(content | {"half": Packed.of(1e200 * torch.ones(1, 26).double()).model_dump()}))
+    with pytest.raises(FileError, match=r"rig\.json.*overflows"):
+        load_rig(path)
     for change, complaint in (({"rms": -1.0}, "rms"), ({"color": "red"}, "Unexpected|Extra"), ({"pairs": 3}, "pairs")):
         path.write_text(json.dumps(content | {"calibration": content["calibration"] | change}))
         with pytest.raises(FileError, match=complaint):
