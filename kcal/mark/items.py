@@ -197,7 +197,7 @@ def applied(state: MarkingState, action: Change) -> MarkingState:
         for name, (kind, left, right) in action.items.items():
             items[name] = Item(kind=kind, left=left, right=right)
     elif isinstance(action, Places | SurveyPlace):
-        places = action.places if isinstance(action, Places) else {action.name: action.place}
+        places = typed_places(action)
         survey |= places
         for name in places:
             items.setdefault(name, Item(kind="landmark"))
@@ -224,6 +224,13 @@ def applied(state: MarkingState, action: Change) -> MarkingState:
         if action.name in survey:
             survey = {action.to if name == action.name else name: value for name, value in survey.items()}
     return MarkingState(items=items, survey=survey)
+
+
+def typed_places(action: Change | Step) -> dict[str, Place]:
+    """The surveyed places that an action states; empty for all other actions."""
+    if isinstance(action, SurveyPlace):
+        return {action.name: action.place}
+    return action.places if isinstance(action, Places) else {}
 
 
 def _with_mark(action: Put, item: Item) -> Item:

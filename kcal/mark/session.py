@@ -9,7 +9,7 @@ import json
 import math
 import os
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, NamedTuple
 
@@ -19,9 +19,10 @@ from torch import Tensor
 import kcal.mark.items as marking
 from kcal.errors import FileError, InputError
 from kcal.files import check_writable, try_lock, write_atomic
+from kcal.lens.rig import Origin
 from kcal.locate.marks import Marks, marks_text, read_marks
 from kcal.locate.survey import EARTH, LOCAL, PLACE_COLUMNS, places_csv, read_survey
-from kcal.locate.tables import read_rows
+from kcal.locate.tables import TableRow, read_rows
 
 # The undo log: every action is one line of a file, written through to the disk before it is answered.
 #
@@ -230,8 +231,7 @@ def read_places(path: Path) -> SurveyedPlaces:
         FileError: see `read_survey`; local meters in an earlier session and latitudes now.
     """
     read_survey(path)  # its checks name the line
-    rows = read_rows(path, "name,lat,lon,height,sigma", PLACE_COLUMNS, ("sigma",))
-    columns = EARTH if EARTH[0] in rows[0].cells else LOCAL
+    rows, columns = _place_rows(path)
     if any(not row.name.isprintable() or len(row.name) > 60 for row in rows):
         raise FileError(f"{path}: a name has more than 60 characters; give it a shorter one")
     places = {}
@@ -241,6 +241,11 @@ def read_places(path: Path) -> SurveyedPlaces:
             at=(first, second, third), sigma=row.number("sigma"), sigma_up=row.positive("sigma_up")
         )
     return SurveyedPlaces(columns, places)
+
+
+def _place_rows(path: Path) -> tuple[Sequence[TableRow], tuple[str, str, str]]:
+    rows = read_rows(path, "name,lat,lon,height,sigma", PLACE_COLUMNS, ("sigma",))
+    return rows, EARTH if EARTH[0] in rows[0].cells else LOCAL
 
 
 def places_text(survey: SurveyedPlaces) -> str:
@@ -334,8 +339,15 @@ class Session:
 
         What is in the log is done. Files that cannot be written then are written after a later action, or at the next
         start, and `trouble` says so.
+
+        Raises:
+            InputError: see `Journal.do`; a place out of range.
+            FileError: see `Journal.do`.
         """
         with self._lock:
+            if self.columns == EARTH:
+                for place in marking.typed_places(action).values():
+                    Origin(lat=place.at[0], lon=place.at[1], height=place.at[2])
             self._journal.do(action, key)
             self._write()
             return self.state
@@ -374,7 +386,8 @@ class Session:
         """Log the places that are new or have changed, and return the columns of coordinates."""
         columns = places.columns
         if not places.places and self.files.landmarks.exists():
-            columns = read_places(self.files.landmarks).columns
+            # Its places are in the log, too: one that cannot be right is mended on the page.
+            columns = _place_rows(self.files.landmarks)[1]
         new = {name: place for name, place in places.places.items() if self.state.survey.get(name) != place}
         if new:
             self._journal.do(marking.Places(do="places", places=new), f"{_LOADED} {self.version}")

@@ -102,6 +102,24 @@ def test_an_action_that_is_sent_twice_is_done_once(tmp_path: Path) -> None:
         again.do(Add(do="add", name="a", kind="target"), "key-0002")
 
 
+def test_a_place_that_no_survey_has_is_refused(tmp_path: Path, survey: Path) -> None:
+    session = Session(tmp_path / "marks.csv", survey)
+    for at, complaint in (((400.0, 2.0, 3.0), "latitude"), ((1.0, 2.0, -1e308), "height")):
+        with pytest.raises(InputError, match=complaint):
+            session.do(SurveyPlace(do="survey", name="post", place=Place(at=at, sigma=1.0)), "key-0001")
+    # Exchanged latitude and longitude: kcal rig refuses the file. The session begins again, so that they can be mended.
+    places = {"post": (20.0, 50.0, 1.0), "roof": (20.1, 50.0, 1.0), "hill": (50.0, 20.0, 1.0)}
+    for name, at in places.items():
+        session.do(SurveyPlace(do="survey", name=name, place=Place(at=at, sigma=1.0)), f"key-of-{name}")
+    with pytest.raises(FileError, match="exchanged"):
+        read_survey(session.files.landmarks)
+    state = session.state
+    session.close()
+    again = Session(tmp_path / "marks.csv")
+    assert again.state == state
+    again.close()
+
+
 def test_undo_to_the_beginning(tmp_path: Path, survey: Path) -> None:
     session = Session(tmp_path / "marks.csv", survey)
     work(session)
