@@ -10,8 +10,8 @@ from torch import Tensor
 
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
-from kcal.lens.pose import nearest_rotation, rotation_from_vector, step_rows
-from kcal.lens.projection import FAR, project_components
+from kcal.lens.projection import FAR
+from kcal.lens.turning import fit_turn, rotation_between, seen_turned
 from kcal.lens.uncertainty import pixel_covariance, pixel_slopes
 from kcal.texts import brief, length_text, number_text, range_text
 
@@ -55,7 +55,7 @@ class PixelShift:
 _LEVEL = 0.05
 # Share of the median variance that every pixel has at least in the weights, so that none counts alone.
 _LEAST_SHARE = 0.01
-_MOST_STEPS, _SETTLED = 50, 1e-13
+_SETTLED = 1e-13
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -155,7 +155,7 @@ def camera_difference(
     weight = _inverse_variances(first, second, flat, good)
     points = FAR * rays if math.isinf(at) else first.ray_origins(rays) + at * rays
     freedom = 0 if rotation is not None else 3 if math.isinf(at) else 6
-    start = nearest_rotation((rays_second * weight[:, None]).T @ rays) if rotation is None else rotation.double()
+    start = rotation_between(rays, rays_second * weight[:, None]) if rotation is None else rotation.double()
     turn, shift = _fit(second, points[good], flat[good], weight[good], start, freedom)
     moved = points @ turn.T + shift
     seen, visible = second.project(moved)
@@ -197,23 +197,19 @@ def _inverse_variances(first: Camera, second: Camera, pixels: Tensor, good: Tens
 def _fit(
     camera: Camera, points: Tensor, pixels: Tensor, weight: Tensor, rotation: Tensor, freedom: int
 ) -> tuple[Tensor, Tensor]:
-    """Gauss-Newton for the motion after which the camera sees points (N, 3) at pixels (N, 2)."""
-    translation = torch.zeros(3, dtype=torch.float64)
+    """The motion after which the camera sees points (N, 3) at pixels (N, 2): nothing, a turn, or a turn and a shift."""
     root = weight.sqrt()
-    for _ in range(_MOST_STEPS if freedom else 0):
-        turned = points @ rotation.T
-        seen = project_components((turned + translation).T, camera.params.detach(), camera.model, ())
-        rows = step_rows(seen.by_point, turned.T)[:freedom] * (root * seen.regular)
-        wrong = (seen.pixels - pixels.T) * (root * seen.regular)
-        scale = rows.flatten(1).norm(dim=1)
-        step = (
-            -torch.linalg.lstsq((rows.flatten(1) / scale[:, None]).T, wrong.flatten()[:, None]).solution[:, 0] / scale
-        )
-        rotation = rotation_from_vector(step[:3]) @ rotation
-        translation = translation + step[3:] if freedom == 6 else translation
-        if float(step[:3].norm()) < _SETTLED:
-            break
-    return rotation, translation
+    # So that a unit of the shift counts about as much as a radian.
+    unit = torch.cat([torch.ones(3).double(), points.norm(dim=-1).median().expand(3)])[:, None, None]
+
+    def look(rotation: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
+        seen, rows = seen_turned(camera, points, rotation, unit[3:, 0, 0] * shift if freedom == 6 else None)
+        return (unit * rows * root)[:freedom].flatten(1).T, ((seen - pixels.T) * root).flatten()
+
+    if not freedom:
+        return rotation, torch.zeros(3, dtype=torch.float64)
+    found = fit_turn(rotation, look, more=freedom - 3, settled=_SETTLED)
+    return found.rotation, unit[3:, 0, 0] * found.more if freedom == 6 else torch.zeros(3, dtype=torch.float64)
 
 
 def _judged(

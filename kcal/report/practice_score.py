@@ -19,8 +19,8 @@ from torch import Tensor
 from kcal.errors import FileError, InputError
 from kcal.files import read_bytes
 from kcal.lens.camera import Camera
-from kcal.lens.pose import nearest_rotation
 from kcal.lens.rig import Origin, StereoRig
+from kcal.lens.turning import rotation_between
 from kcal.locate.budget import range_sigmas
 from kcal.locate.geodesy import geodetic_to_enu
 from kcal.locate.localizer import StereoLocalizer
@@ -68,7 +68,7 @@ def score_lens(camera: Camera, truth: dict[str, Any], baseline: float) -> LensSc
     pixels, true = (torch.tensor(truth[name], dtype=torch.float64) for name in ("pixels", "rays"))
     with torch.no_grad():
         rays, valid = camera.unproject(pixels)
-        turn = nearest_rotation(rays[valid].T @ true[valid])
+        turn = rotation_between(true[valid], rays[valid])
         focal = float(camera.focal.detach().mean())
         seen, there = camera.project(1e9 * (true @ turn.T))
     off = torch.linalg.vector_norm(seen - pixels, dim=-1)

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from kcal.calibrate.rig.uncertainty import gathered, joint_unknowns
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
+from kcal.lens.turning import fit_turn
 from kcal.skyline.horizon import Columns, Comparison, Horizon, RasterError, SkylineErrors, compare
 
 # All headings in which a border of sky and ground could fit the horizon of a terrain, without any rough pose.
@@ -144,23 +147,28 @@ def _minima(cost: Floats, azimuth: Floats) -> list[int]:
 
 def _adjusted(columns: Columns, horizon: Horizon, rotation: Floats, camera: Camera, errors: SkylineErrors) -> Candidate:
     """An attitude after some robust steps, all columns counting by what they tell alone."""
-    for _ in range(_HEADING_STEPS):
-        seen = compare(columns, horizon, rotation, camera)
-        sigma = column_sigma(seen, errors)
-        rough = sigma + np.abs(seen.by_elevation) * _ROUGH * 0.25
-        weight = seen.known / np.square(rough) / np.square(1.0 + np.square(seen.residual / (3.0 * rough)))
-        rotation, size = turned_to(seen, weight, rotation, 0.05)
-        if size < 1e-8:
-            break
+
+    def weight(seen: Comparison) -> Floats:
+        rough = column_sigma(seen, errors) + np.abs(seen.by_elevation) * _ROUGH * 0.25
+        return seen.known / np.square(rough) / np.square(1.0 + np.square(seen.residual / (3.0 * rough)))
+
+    rotation = _turned(columns, horizon, rotation, camera, weight, _HEADING_STEPS, 0.05)
     return Candidate(rotation, column_cost(compare(columns, horizon, rotation, camera), errors, columns))
 
 
-def turned_to(seen: Comparison, weight: Floats, rotation: Floats, most: float) -> tuple[Floats, float]:
-    """A rotation after one step of weighted least squares, no longer than `most` radians, and how far it would go."""
-    normal = np.einsum("n,ni,nj->ij", weight, seen.by_turn, seen.by_turn)
-    turn = -np.linalg.lstsq(normal, np.einsum("n,ni,n->i", weight, seen.by_turn, seen.residual), rcond=None)[0]
-    size = float(np.linalg.norm(turn))
-    return rotation_by(turn * min(1.0, most / max(size, 1e-12))) @ rotation, size
+def _turned(
+    columns: Columns, horizon: Horizon, rotation: Floats, camera: Camera, weight: Callable[[Comparison], Floats],
+    steps: int, longest: float,
+) -> Floats:  # fmt: skip
+    """A rotation after some steps of weighted least squares, none longer than so many radians."""
+
+    def look(rotation: Tensor, _: Tensor) -> tuple[Tensor, Tensor]:
+        seen = compare(columns, horizon, rotation.numpy(), camera)
+        root = np.sqrt(weight(seen))
+        return torch.from_numpy(root[:, None] * seen.by_turn), torch.from_numpy(root * seen.residual)
+
+    # A flat horizon leaves the heading open: steps are short.
+    return fit_turn(torch.from_numpy(rotation), look, steps=steps, settled=1e-8, longest=longest).rotation.numpy()
 
 
 def column_sigma(seen: Comparison, errors: SkylineErrors) -> Floats:
@@ -284,19 +292,24 @@ def fit_rotation(
     below, used = float((used & ~close).mean()), close
     if used.sum() < _LEAST:
         return None
-    for _ in range(_STEPS):
-        binned = _in_bins(columns, compare(columns, horizon, rotation, camera, lens=True), used, camera.size[0])
-        parts = covariances(binned, errors)
+
+    def whitened(rotation: Floats) -> tuple[Comparison, dict[str, Floats], NDArray[np.floating], NDArray[np.floating]]:
+        """The columns in bins, their covariance by its parts and its root, and rows with residuals over the root."""
+        seen = _in_bins(columns, compare(columns, horizon, rotation, camera, lens=True), used, camera.size[0])
+        parts = covariances(seen, errors)
         # What correlates all columns, a lens and a place, is integrated out with the rest.
-        root = np.linalg.cholesky(sum(parts.values(), 1e-12 * np.eye(len(binned.residual))))
-        rows = np.linalg.solve(root, np.column_stack([binned.by_turn, binned.residual]))
-        gain = np.linalg.lstsq(rows[:, :3], np.linalg.inv(root), rcond=None)[0]
-        turn = -gain @ binned.residual
-        rotation = rotation_by(turn) @ rotation
-        if float(np.linalg.norm(turn)) < 1e-9:
-            break
+        root = np.linalg.cholesky(sum(parts.values(), 1e-12 * np.eye(len(seen.residual))))
+        return seen, parts, root, np.linalg.solve(root, np.column_stack([seen.by_turn, seen.residual]))
+
+    def look(rotation: Tensor, _: Tensor) -> tuple[Tensor, Tensor]:
+        rows = torch.from_numpy(whitened(rotation.numpy())[3])
+        return rows[:, :3], rows[:, 3]
+
+    rotation = fit_turn(torch.from_numpy(rotation), look, steps=_STEPS, settled=1e-9).rotation.numpy()
+    binned, parts, root, rows = whitened(rotation)
+    gain = np.linalg.lstsq(rows[:, :3], np.linalg.inv(root), rcond=None)[0]
     by_part = {name: gain @ part @ gain.T for name, part in parts.items()}
-    left = rows[:, 3] + rows[:, :3] @ turn
+    left = rows[:, 3]
     return SkylineFit(
         rotation,
         used,
@@ -313,18 +326,15 @@ def _robust_rotation(
     columns: Columns, horizon: Horizon, rotation: Floats, camera: Camera, errors: SkylineErrors, used: Bools | None
 ) -> Floats:
     """A rotation after some steps: columns count by what they tell alone, and less the worse they fit."""
-    for _ in range(_STEPS):
-        seen = compare(columns, horizon, rotation, camera)
+
+    def weight(seen: Comparison) -> Floats:
         sigma = column_sigma(seen, errors)
         ratio = seen.residual / sigma
         limit = np.where(ratio > 0, _ABOVE, _FAR_BELOW)
         soft = 1.0 / (1.0 + np.square(ratio / limit)) if used is None else used.astype(np.float64)
-        weight = seen.known * soft / np.square(sigma)
-        # A flat horizon leaves the heading open; no step is longer than a degree.
-        rotation, size = turned_to(seen, weight, rotation, math.radians(1.0))
-        if size < 1e-8:
-            break
-    return rotation
+        return seen.known * soft / np.square(sigma)
+
+    return _turned(columns, horizon, rotation, camera, weight, _STEPS, math.radians(1.0))
 
 
 def _columns_that_agree(seen: Comparison, errors: SkylineErrors, most_below: float) -> Bools:

@@ -16,7 +16,7 @@ from scipy.special import erf
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import step_rows
-from kcal.lens.projection import project_components
+from kcal.lens.projection import FAR, project_components
 from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Origin, check_refraction
 from kcal.locate.geodesy import anchor, geodetic_to_ecef, mean_radius, place_enu
 from kcal.locate.raster import Raster
@@ -510,9 +510,6 @@ def _highest(rays: TerrainRays, azimuth: Floats, distance: Floats) -> tuple[Floa
 
 # Compare the border of an image with the horizon of a terrain: residuals in pixels and how they change.
 
-# Meters: so far away a camera sees a horizon; entrance pupils do not matter there.
-_FAR = 1e9
-
 
 class Columns(NamedTuple):
     """Clear columns of a border with their rays.
@@ -609,13 +606,13 @@ def compare(columns: Columns, horizon: Horizon, rotation: Floats, camera: Camera
     toward = np.stack([sine * low, cosine * low, up])
     by_azimuth = np.stack([cosine * low, -sine * low, 0.0 * low])
     by_elevation = np.stack([-sine * up, -cosine * up, low])
-    turned = torch.from_numpy(_FAR * rotation @ toward)
+    turned = torch.from_numpy(FAR * rotation @ toward)
     wanted = range(camera.params.shape[-1]) if lens else ()
     seen = project_components(turned, camera.params.detach(), camera.model, wanted)
     known &= seen.regular.numpy()
     off = columns.pixel.T - seen.pixels.numpy()
     # (3, 2, N) of pixels by a direction in east, north, up.
-    by_toward = np.einsum("jk,jun->kun", _FAR * rotation, seen.by_point.numpy())
+    by_toward = np.einsum("jk,jun->kun", FAR * rotation, seen.by_point.numpy())
 
     def moved(direction: Floats) -> Floats:
         return np.einsum("kun,kn->un", by_toward, direction)

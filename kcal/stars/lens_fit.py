@@ -26,8 +26,8 @@ from kcal.lens.camera import Camera
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.information import CameraInformation
 from kcal.lens.model import LensModel
+from kcal.lens.projection import FAR
 from kcal.lens.zernike import ZernikeModes
-from kcal.stars.night import FAR
 
 # Night images of one camera as views of `BoardProblem`: each shows points of its own, infinitely far.
 

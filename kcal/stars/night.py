@@ -17,9 +17,10 @@ from torch import Tensor
 import kcal.stars.sky as night_sky
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector, step_rows, vector_from_rotation
-from kcal.lens.projection import project_components
+from kcal.lens.pose import vector_from_rotation
+from kcal.lens.projection import FAR
 from kcal.lens.rig import Origin
+from kcal.lens.turning import fit_turn, seen_turned
 from kcal.locate.mounting import attitude
 from kcal.stars.detect import DetectedStars, detect_stars
 from kcal.stars.sky import identify, turn_between
@@ -29,8 +30,6 @@ from kcal.threads import in_one_thread
 
 Floats = NDArray[np.float64]
 
-# m: so far away a camera sees stars; entrance pupils do not matter there.
-FAR = 1e9
 # A star is left out if its residual is more than so many times its sigma, which is widened where all are.
 _CUT = 5.0
 # px: stars are named within this distance first, while attitude and lens are rough.
@@ -69,17 +68,6 @@ class Attitude:
         return int((self.star >= 0).sum())
 
 
-def star_rows(directions: Tensor, rotation: Tensor, camera: Camera, parameters: Tensor) -> tuple[Tensor, Tensor]:
-    """Pixels (2, N) of directions (N, 3), NaN where there are none, and (3, 2, N) their derivatives by a turn.
-
-    The turn is about the camera's axes and comes after the rotation.
-    """
-    points = FAR * (rotation @ directions.T)
-    seen = project_components(points, parameters, camera.model, ())
-    rows = step_rows(seen.by_point, points)[:3]
-    return torch.where(seen.regular, seen.pixels, torch.nan), rows
-
-
 def fit_attitude(
     pixels: Floats, sigma: Floats, directions: Floats, magnitude: Floats, camera: Camera, rotation: Floats
 ) -> Attitude | None:
@@ -97,7 +85,6 @@ def fit_attitude(
         None if fewer than three stars have a name.
     """
     turn = torch.from_numpy(np.ascontiguousarray(rotation))
-    parameters = camera.params.detach()
     everywhere = torch.from_numpy(directions)
     star, reach = np.full(len(pixels), -1), np.full(len(pixels), _ROUGH)
     least = math.cos(min(_half_field(camera) + 0.01, math.pi))
@@ -108,27 +95,27 @@ def fit_attitude(
         known = torch.from_numpy(star >= 0)
         if int(known.sum()) < 3:
             return None
-        for _ in range(3):
-            seen, rows = star_rows(everywhere[star[star >= 0]], turn, camera, parameters)
-            error = seen - target[:, known]
-            white = (rows * weights[known]).flatten(1)
-            step = -torch.linalg.lstsq(white.T, (error * weights[known]).flatten()[:, None]).solution[:, 0]
-            turn = rotation_from_vector(step) @ turn
-            if float(step.norm()) < 1e-10:
-                break
-        scale = max(float((error.norm(dim=0) * weights[known]).median()) / 1.18, 1.0)
+        there, weight, seen = FAR * everywhere[star[star >= 0]], weights[known], target[:, known]
+
+        def look(
+            rotation: Tensor, _: Tensor, there: Tensor = there, weight: Tensor = weight, seen: Tensor = seen
+        ) -> tuple[Tensor, Tensor]:
+            pixels, rows = seen_turned(camera, there, rotation)
+            return (rows[:3] * weight).flatten(1).T, ((pixels - seen) * weight).flatten()
+
+        turn = fit_turn(turn, look, steps=3).rotation
+        white, error = look(turn, turn[0])
+        scale = max(float(error.reshape(2, -1).norm(dim=0).median()) / 1.18, 1.0)
         reach = np.maximum(_CUT * scale * sigma, min(_LEAST_REACH, _CUT * scale * float(np.median(sigma))))
         if attempt > 1 and np.array_equal(before, star):
             break
-    seen, rows = star_rows(everywhere[star[star >= 0]], turn, camera, parameters)
-    off = (seen - target[:, known]).T.numpy()
+    off = (error.reshape(2, -1) / weight).T.numpy()
     residual = np.full(pixels.shape, np.nan)
     residual[star >= 0] = off
     freedom = max(2 * len(off) - 3, 1)
     chi2 = float(((off / sigma[star >= 0, None]) ** 2).sum())
     widened = max(math.sqrt(chi2 / freedom), 1.0)
-    white = (rows * weights[known]).flatten(1)
-    own = torch.linalg.inv(white @ white.T) * widened**2
+    own = torch.linalg.inv(white.T @ white) * widened**2
     return Attitude(
         rotation=turn,
         covariance=turn.T @ own @ turn,
@@ -149,11 +136,11 @@ def refraction_doubt(seen: Attitude, sigma: Floats, refracted: Tensor, straight:
         straight: (N, 3) likewise without air.
         camera: which lens.
     """
-    at, rows = star_rows(refracted, seen.rotation, camera, camera.params.detach())
-    without, _ = star_rows(straight, seen.rotation, camera, camera.params.detach())
+    at, rows = seen_turned(camera, FAR * refracted, seen.rotation)
+    without, _ = seen_turned(camera, FAR * straight, seen.rotation)
     weight = torch.from_numpy(1.0 / sigma) / seen.widened
     pattern = (at - without) * weight
-    turns = (rows * weight).flatten(1)
+    turns = (rows[:3] * weight).flatten(1)
     own = pattern.flatten() - turns.T @ torch.linalg.lstsq(turns.T, pattern.flatten()[:, None]).solution[:, 0]
     residual = torch.from_numpy(seen.residual[seen.star >= 0]).T * weight
     length = float(own.norm())

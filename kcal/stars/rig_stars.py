@@ -15,8 +15,9 @@ from torch import Tensor
 from kcal.calibrate.rig.sources import Effect, StarSource
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
+from kcal.lens.projection import FAR
 from kcal.lens.rig import Origin
-from kcal.stars.night import FAR, NamedStars
+from kcal.stars.night import NamedStars
 from kcal.stars.sky import EARTH_RATE, StarCatalog, pole_in_enu, refraction_sigma
 from kcal.threads import in_one_thread
 

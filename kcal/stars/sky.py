@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy import stats
 from scipy.spatial import cKDTree
@@ -23,6 +24,7 @@ from scipy.spatial import cKDTree
 from kcal.errors import FileError, InputError
 from kcal.files import make_folder, read_bytes, write_atomic
 from kcal.lens.rig import Origin
+from kcal.lens.turning import rotation_between
 from kcal.texts import brief
 
 # The bright stars: positions, proper motions and magnitudes, and names for the brightest.
@@ -517,9 +519,7 @@ def identify(
         if not len(stars):
             continue
         proposals += len(stars)
-        found = _best_turn(
-            _kabsch_turns(table.directions[stars], rays[at]), rays, tree, reach + scale_error * field / 2
-        )
+        found = _best_turn(turn_between(table.directions[stars], rays[at]), rays, tree, reach + scale_error * field / 2)
         if best is None or found[1] > best[1]:
             best = found
             tested = _tested(best[0], rays, tree, table, reach + scale_error * field / 2, area, proposals, pool)
@@ -531,15 +531,8 @@ def identify(
 
 
 def turn_between(first: Floats, second: Floats) -> Floats:
-    """(3, 3) rotation R of smallest |second - R first|² for unit vectors (N, 3) (Kabsch 1976)."""
-    return _kabsch_turns(first[None], second)[0]
-
-
-def _kabsch_turns(first: Floats, second: Floats) -> Floats:
-    """(C, 3, 3) rotations of each of first (C, N, 3) to second (N, 3)."""
-    u, _, vt = np.linalg.svd(np.einsum("ni,cnj->cij", second, first))
-    u[..., 2] *= np.linalg.det(u @ vt)[:, None]
-    return u @ vt
+    """(..., 3, 3) rotations R of smallest |second - R first|² for unit vectors (..., N, 3)."""
+    return rotation_between(torch.from_numpy(first), torch.from_numpy(second)).numpy()
 
 
 def _middle(rays: Floats) -> Floats:

@@ -20,8 +20,9 @@ from kcal.corners.patches import fit_shifts, grid_of, has_samples, image_windows
 from kcal.errors import DegenerateError, FileError, InputError
 from kcal.files import read_bytes, write_atomic
 from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
+from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.lens.rig import StereoRig
+from kcal.lens.turning import fit_turn
 from kcal.scene.match import ImagePair, MatchedPair, match_scene
 from kcal.scene.refine import SAME, SWAY, whole_shifts
 from kcal.strict_formats import read_npz
@@ -386,31 +387,33 @@ def between_turn(rig: StereoRig, matched: MatchedPair) -> tuple[Tensor, Tensor]:
     sides = [rig.right.unproject(matched.pixels[:, 1] + step)[0] for step in 0.5 * torch.eye(2).double()]
     others = [rig.right.unproject(matched.pixels[:, 1] - step)[0] for step in 0.5 * torch.eye(2).double()]
     slope = torch.stack([a - b for a, b in zip(sides, others, strict=True)], -1)
-    back = torch.linalg.pinv(between_rows(rig))
-    shift = rig.right_from_left_translation / rig.baseline
+    relative, across = rig.right_from_left_rotation, between_rows(rig)[3:, :3]
+    baseline = -relative.T @ rig.right_from_left_translation / rig.baseline
+    # Aside from the baseline, in the left camera's frame: `across` are these cross the baseline.
+    aside = torch.linalg.cross(across, baseline.expand(2, 3))
 
-    def off_plane(values: Tensor) -> tuple[Tensor, Tensor]:
-        turns = back @ values
-        turn = rotation_from_vector(turns[3:])
-        rotation = turn @ rig.right_from_left_rotation @ rotation_from_vector(-turns[:3])
-        normal = torch.linalg.cross((turn @ shift).expand_as(left), left @ rotation.T)
+    def scaled(turn: Tensor, moved: Tensor) -> tuple[Tensor, Tensor]:
+        """By how many sigmas each match is off the plane of the baseline and its left ray, and the derivatives."""
+        turned, moved = left @ (turn @ relative).T, turn @ relative @ (baseline + moved @ aside)
+        normal = torch.linalg.cross(turned, moved.expand_as(left))
         by_pixel = torch.einsum("nk,nkp->np", normal, slope)
-        return (normal * right).sum(-1), torch.einsum("np,npq,nq->n", by_pixel, matched.covariance, by_pixel).sqrt()
+        sigma = torch.einsum("np,npq,nq->n", by_pixel, matched.covariance, by_pixel).sqrt()
+        # Both turn: as if the right ray turned back.
+        by_turn = torch.linalg.cross(normal, right)
+        by_moved = torch.linalg.cross(right, turned) @ (turn @ relative @ aside.T)
+        return torch.cat([by_turn, by_moved], 1) / sigma[:, None], (normal * right).sum(-1) / sigma
 
-    values = torch.zeros(5, dtype=torch.float64)
-    for _ in range(15):
-        off, sigma = off_plane(values)
-        steps = 1e-6 * torch.eye(5, dtype=torch.float64)
-        rows = torch.stack([(off_plane(values + s)[0] - off_plane(values - s)[0]) / 2e-6 for s in steps], -1)
-        rows, scaled = rows / sigma[:, None], off / sigma
-        weight = 1.0 / (1.0 + scaled.square() / 9.0).square()
-        normal = (weight[:, None] * rows).T @ rows
-        move = torch.linalg.solve(normal, (weight[:, None] * rows).T @ scaled)
-        values = values - move
-        if float(move.norm()) < 1e-10:
-            break
-    variance = float((weight * scaled.square()).sum() / weight.sum())
-    return values, max(1.0, variance) * torch.linalg.inv(normal)
+    def look(turn: Tensor, moved: Tensor) -> tuple[Tensor, Tensor]:
+        rows, off = scaled(turn, moved)
+        root = 1.0 / (1.0 + off.square() / 9.0)
+        return root[:, None] * rows, root * off
+
+    found = fit_turn(torch.eye(3, dtype=torch.float64), look, more=2, steps=15)
+    rows, off = scaled(found.rotation, found.more)
+    weight = 1.0 / (1.0 + off.square() / 9.0).square()
+    variance = float((weight * off.square()).sum() / weight.sum())
+    values = torch.cat([vector_from_rotation(found.rotation), found.more])
+    return values, max(1.0, variance) * torch.linalg.inv((weight[:, None] * rows).T @ rows)
 
 
 class TwoViews(NamedTuple):

@@ -26,7 +26,7 @@ from kcal.calibrate.rig.solve import solve_rig
 from kcal.calibrate.rig.sources import RigData
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera
-from kcal.lens.pose import nearest_rotation
+from kcal.lens.turning import rotation_between
 from kcal.lens.uncertainty import image_sigma
 from kcal.report.judge_camera import camera_verdict
 from kcal.report.judge_rig import rig_verdict
@@ -64,7 +64,7 @@ def true_error(lens: TruthLens, camera: Camera) -> float:
     grid = camera.grid(33, 25).reshape(-1, 2)
     rays, _ = lens.unproject(grid)
     own, valid = camera.unproject(grid)
-    turn = nearest_rotation(own[valid].T @ rays[valid])
+    turn = rotation_between(rays[valid], own[valid])
     seen, shown = camera.project(1e9 * rays @ turn.T)
     good = valid & shown
     return float((seen - grid)[good].square().sum(-1).mean().sqrt())

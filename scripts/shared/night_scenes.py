@@ -9,9 +9,9 @@ import torch
 from numpy.typing import NDArray
 
 from kcal.lens.camera import Camera
+from kcal.lens.projection import FAR
 from kcal.lens.rig import Origin
 from kcal.locate.geodesy import enu_from_cam
-from kcal.stars.night import FAR
 from kcal.stars.sky import StarCatalog, observed_directions
 
 TIME = datetime.datetime(2026, 11, 24, 4, 0, tzinfo=datetime.UTC)

@@ -11,13 +11,14 @@ import torch
 
 from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.lens.camera import Camera
+from kcal.lens.projection import FAR
 from kcal.lens.uncertainty import pixel_covariance
 from kcal.locate.geodesy import enu_from_cam
 from kcal.sim.captures import LensLike, drawn_lens
 from kcal.sim.truth import TruthLens
 from kcal.stars.detect import DetectedStars
 from kcal.stars.lens import Agreement, StarCamera, calibrate_by_stars
-from kcal.stars.night import FAR, SkyView
+from kcal.stars.night import SkyView
 from kcal.stars.sky import StarCatalog, observed_directions
 from scripts.shared.infinity import error_at_infinity
 from scripts.shared.night_scenes import PLACE, TIME

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from kcal.calibrate.rig.sources import Baseline, Effect, Features, MeasuredPosition, RigData, StarSource
 from kcal.lens.camera import Camera
+from kcal.lens.projection import FAR
 from kcal.locate.geodesy import enu_from_cam
-from kcal.stars.night import FAR
 from kcal.stars.sky import EARTH_RATE, StarCatalog, observed_directions, pole_in_enu
 from scripts.shared.night_scenes import PLACE, TIME
 

@@ -17,11 +17,12 @@ from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.sources import Baseline, Features, MeasuredPosition, RigData, StarSource
 from kcal.lens.camera import Camera
+from kcal.lens.projection import FAR
 from kcal.locate.localizer import StereoLocalizer
 from kcal.sim.captures import TrueRig
 from kcal.stars.detect import DetectedStars
 from kcal.stars.lens import calibrate_by_stars
-from kcal.stars.night import FAR, Attitude, NamedStars, SkyView
+from kcal.stars.night import Attitude, NamedStars, SkyView
 from kcal.stars.rig_stars import star_source
 from kcal.stars.sky import Air, StarCatalog, celestial_directions, observed_directions
 from scripts.check.chain_rig import ENU_FROM_RIG, Targets, landmarks, targets, true_rig

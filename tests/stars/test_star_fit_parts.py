@@ -18,6 +18,8 @@ from kcal.gaussian import Gaussian, triangular
 from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
 from kcal.lens.pose import rotation_from_vector
+from kcal.lens.projection import FAR
+from kcal.lens.turning import seen_turned
 from kcal.locate.geodesy import enu_from_cam
 from kcal.solve.lm import LMOptions, minimize
 from kcal.stars.detect import DetectedStars, NightPlan, _signal
@@ -45,7 +47,6 @@ from kcal.stars.night import (
     clock_doubts,
     fit_attitude,
     refraction_doubt,
-    star_rows,
 )
 from kcal.stars.sky import (
     EARTH_RATE,
@@ -80,12 +81,12 @@ def scattered(count: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
 class TestTurns:
     def test_derivatives_by_a_turn(self) -> None:
         directions, pixels = scattered(7)
-        seen, rows = star_rows(directions, TURN, CAMERA, CAMERA.params.detach())
+        seen, rows = seen_turned(CAMERA, FAR * directions, TURN)
         torch.testing.assert_close(seen, pixels.T, rtol=0, atol=1e-9)
         for axis in range(3):
             step = torch.zeros(3).double()
             step[axis] = 1e-6
-            ends = [star_rows(directions, rotation_from_vector(s * step) @ TURN, CAMERA, CAMERA.params.detach())[0]
+            ends = [seen_turned(CAMERA, FAR * directions, rotation_from_vector(s * step) @ TURN)[0]
                     for s in (1, -1)]  # fmt: skip
             torch.testing.assert_close(rows[axis], (ends[0] - ends[1]) / 2e-6, rtol=1e-6, atol=1e-4)
 
@@ -113,8 +114,12 @@ class TestTurns:
         for axis in range(3):
             step = torch.zeros(3).double()
             step[axis] = 1e-6
-            ends = [star_rows(directions[found.star[named]], found.rotation @ rotation_from_vector(s * step), CAMERA,
-                              CAMERA.params.detach())[0] for s in (1, -1)]  # fmt: skip
+            ends = [
+                seen_turned(
+                    CAMERA, FAR * directions[found.star[named]], found.rotation @ rotation_from_vector(s * step)
+                )[0]
+                for s in (1, -1)
+            ]
             rows.append(((ends[0] - ends[1]) / 2e-6 / 0.1).flatten())
         by_hand = torch.linalg.inv(torch.stack(rows) @ torch.stack(rows).T) * widened**2
         torch.testing.assert_close(found.covariance, by_hand, rtol=1e-5, atol=0)
@@ -143,8 +148,7 @@ class TestRefraction:
         lifted = straight + 2e-3 * torch.stack([0 * straight[:, 0], 0 * straight[:, 0], 1 - straight[:, 2] ** 2], -1)
         refracted = torch.nn.functional.normalize(lifted, dim=-1)
         true = torch.nn.functional.normalize(straight + share * (refracted - straight), dim=-1)
-        parameters = CAMERA.params.detach()
-        at, seen = (star_rows(one, TURN, CAMERA, parameters)[0].T.numpy() for one in (refracted, true))
+        at, seen = (seen_turned(CAMERA, FAR * one, TURN)[0].T.numpy() for one in (refracted, true))
         star = np.arange(40)
         star[3] = -1
         residual = np.where(star[:, None] >= 0, at - seen, np.nan)
@@ -168,10 +172,8 @@ class TestRefraction:
         lifted = straight + 2e-3 * torch.stack([0 * straight[:, 0], 0 * straight[:, 0], 1 - straight[:, 2] ** 2], -1)
         refracted = torch.nn.functional.normalize(lifted, dim=-1)
         used = torch.arange(40) != 3
-        (at, rows), (without, _) = (
-            star_rows(one[used], TURN, CAMERA, CAMERA.params.detach()) for one in (refracted, straight)
-        )
-        pattern, turns = (at - without).flatten().numpy(), rows.flatten(1).T.numpy()
+        (at, rows), (without, _) = (seen_turned(CAMERA, FAR * one[used], TURN) for one in (refracted, straight))
+        pattern, turns = (at - without).flatten().numpy(), rows[:3].flatten(1).T.numpy()
         own = pattern - turns @ np.linalg.lstsq(turns, pattern, rcond=None)[0]
         size = float(np.sqrt((own**2).mean()))
         for excess, told in ((0.036, False), (-0.036, False), (0.044, True), (-0.044, True)):

@@ -27,7 +27,6 @@ from kcal.stars.sky import (
     _angle,
     _best_turn,
     _julian,
-    _kabsch_turns,
     _met,
     _middle,
     _table_on_disk,
@@ -141,7 +140,7 @@ class TestTurns:
     def test_rotations_and_no_mirror_images(self) -> None:
         turn = rotation_from_vector(torch.tensor([0.3, -0.4, 0.2]).double()).numpy()
         np.testing.assert_allclose(turn_between(self.RAYS, self.RAYS @ turn.T), turn, atol=1e-12)
-        several = _kabsch_turns(np.stack([self.RAYS, self.RAYS @ turn.T]), self.RAYS)
+        several = turn_between(np.stack([self.RAYS, self.RAYS @ turn.T]), self.RAYS)
         np.testing.assert_allclose(several, [np.eye(3), turn.T], atol=1e-12)
         mirrored = turn_between(self.RAYS, self.RAYS * [-1.0, 1.0, 1.0])
         assert float(np.linalg.det(mirrored)) == pytest.approx(1.0)

@@ -20,9 +20,10 @@ from kcal.calibrate.rig.uncertainty import SharedCovariance, goodness_of_fit, re
 from kcal.checks import as_points, beyond_chance, chi2_quantile, variance_factor
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector, step_rows, vector_from_rotation
-from kcal.lens.projection import FAR, project_components
+from kcal.lens.pose import rotation_from_vector, vector_from_rotation
+from kcal.lens.projection import FAR
 from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, StereoRig
+from kcal.lens.turning import fit_turn, seen_turned
 from kcal.solve.lm import LMOptions
 from kcal.texts import brief
 from kcal.threads import in_one_thread
@@ -33,7 +34,7 @@ from kcal.threads import in_one_thread
 # each camera is solved alone, from the differences between its marks now and then. What is the same in both cancels:
 # errors of the lens and of the rig. Equal marks give exactly no turn.
 
-_STEPS, _ROUNDS = 50, 30
+_ROUNDS = 30
 
 
 class CameraTurn(NamedTuple):
@@ -131,36 +132,40 @@ class _MarksTwice:
         self.known = valid & torch.isfinite(now).all(-1)
         self.points = FAR * rays
         # The marks of then as they come back from their rays: equal marks leave no rounding.
-        self.moved = now - then + self._project(self.points)[0]
+        self.moved = now - then + self._project(torch.eye(3, dtype=torch.float64))[0]
 
-    def _project(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels (F, 2) of points, and their derivatives (F, 2, 3) by a turn."""
-        seen = project_components(points.T, self.camera.params.detach(), self.camera.model, ())
-        return seen.pixels.T, step_rows(seen.by_point, points.T)[:3].permute(2, 1, 0)
+    def _project(self, rotation: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels (F, 2) of the points after a turn, and their derivatives (F, 2, 3) by a further one."""
+        pixels, rows = seen_turned(self.camera, self.points, rotation)
+        return pixels.T, rows[:3].permute(2, 1, 0)
 
     def turn(self, used: Tensor, sigma: Tensor | float, *, robust: bool = False) -> CameraTurn:
         """The turn that takes the marks of then to those of now; `sigma` of their difference along an axis."""
-        used, turn = used & self.known, torch.eye(3, dtype=torch.float64)
-        for _ in range(_STEPS):
-            pixels, rows = self._project(self.points @ turn.T)
-            off = torch.where(self.known[:, None], self.moved - pixels, torch.nan)
-            rows, scaled = rows / sigma, off / sigma
-            weight = used.double() * (adjustment.LOSS.weight(0.5 * scaled.square().sum(-1)) if robust else 1.0)
-            weight = torch.where(used, weight, 0.0)
-            information = torch.einsum("n,nik,nil->kl", weight, rows, rows)
-            values = torch.linalg.eigvalsh(information)
-            if not bool(values[0] > 1e-12 * values[2]):
-                raise DegenerateError("drift: marks in one place do not determine how a camera has turned; add others")
-            step = torch.linalg.solve(information, torch.einsum("n,nik,ni->k", weight, rows, scaled.nan_to_num()))
-            turn = rotation_from_vector(step) @ turn
-            if float(step.norm()) < 1e-12:
-                break
+        used = used & self.known
+
+        def weighted(rotation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            pixels, rows = self._project(rotation)
+            scaled = torch.where(self.known[:, None], self.moved - pixels, torch.nan) / sigma
+            loss = adjustment.LOSS.weight(0.5 * scaled.square().sum(-1)) if robust else torch.ones_like(scaled[:, 0])
+            return torch.where(used, loss.sqrt(), 0.0), rows / sigma, scaled
+
+        def look(rotation: Tensor, _: Tensor) -> tuple[Tensor, Tensor]:
+            root, rows, scaled = weighted(rotation)
+            return (root[:, None, None] * rows).flatten(0, 1), -(root[:, None] * scaled).flatten()
+
+        turn = fit_turn(torch.eye(3, dtype=torch.float64), look, settled=1e-12).rotation
+        root, rows, scaled = weighted(turn)
+        seen = root[:, None, None] * rows
+        information = torch.einsum("nik,nil->kl", seen, seen)
+        values = torch.linalg.eigvalsh(information)
+        if not bool(values[0] > 1e-12 * values[2]):
+            raise DegenerateError("drift: marks in one place do not determine how a camera has turned; add others")
         covariance = torch.linalg.inv(information)
         # What a mark takes from the fit makes its residual smaller; one that was left out has the fit's error on top.
         share = torch.zeros_like(covariance[:2, :2]) if robust else rows @ covariance @ rows.mT
         spread = torch.eye(2, dtype=torch.float64) + torch.where(used[:, None, None], -share, share)
         squares = torch.einsum("ni,nij,nj->n", scaled, torch.linalg.pinv(spread, rtol=1e-6, hermitian=True), scaled)
-        return CameraTurn(vector_from_rotation(turn), covariance, off, squares.nan_to_num())
+        return CameraTurn(vector_from_rotation(turn), covariance, sigma * scaled, squares.nan_to_num())
 
 
 def _typical(turn: CameraTurn) -> float:

@@ -22,7 +22,7 @@ from kcal.calibrate.rig.pairs import (
 )
 from kcal.calibrate.rig.sources import Boards, RigData
 from kcal.errors import DegenerateError
-from kcal.lens.pose import nearest_rotation
+from kcal.lens.turning import rotation_between
 from kcal.solve.lm import LMOptions
 
 # Find a camera's pose from rays and known points alone, as a start for an adjustment.
@@ -36,19 +36,6 @@ _SAMPLES = 400
 _GROSS = 5e-3
 # Centers that are farther apart, in distances of the points, are other places.
 _ELSEWHERE = 0.01
-
-
-def rotation_between(rays: Tensor, directions: Tensor) -> Tensor:
-    """The rotation (..., 3, 3) with rays ≈ R directions, both (..., M, 3), in the least-squares sense.
-
-    Source: Kabsch (1976); Wahba's problem.
-
-    Example:
-        >>> e = torch.eye(3, dtype=torch.float64)
-        >>> rotation_between(e[[1, 2, 0]], e).tolist()
-        [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
-    """
-    return nearest_rotation(rays.transpose(-1, -2) @ directions) + 0.0
 
 
 def poses_from_three(rays: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -94,7 +81,7 @@ def poses_from_three(rays: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
     safe = torch.where(good[..., None], lengths, 1.0)
     in_camera = safe[..., None] * rays[..., None, :, :]
     middle, known = in_camera.mean(-2, keepdim=True), points.mean(-2, keepdim=True)
-    rotation = rotation_between(in_camera - middle, (points - known)[..., None, :, :])
+    rotation = rotation_between((points - known)[..., None, :, :], in_camera - middle)
     center = known - (rotation.transpose(-1, -2) @ middle.transpose(-1, -2))[..., 0]
     return torch.where(good[..., None, None], rotation, torch.nan), torch.where(good[..., None], center, torch.nan)
 
@@ -129,7 +116,7 @@ def _score(rays: Tensor, rotation: Tensor, directions: Tensor) -> Tensor:
 def consensus_rotation(rays: Tensor, directions: Tensor) -> tuple[Tensor, float]:
     """The rotation that most of the rays (M, 3) and directions (M, 3), M at least 2, agree on, and its score."""
     chosen = _samples(len(rays), 2)
-    rotation = rotation_between(rays[chosen], directions[chosen])
+    rotation = rotation_between(directions[chosen], rays[chosen])
     score = _score(rays, rotation, directions.expand(len(chosen), -1, -1))
     best = int(score.argmin())
     return rotation[best], float(score[best])
@@ -428,7 +415,7 @@ def _into_frame(data: RigData, start: Start) -> None:
     up = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
     moved = there - there.mean(0), here - here.mean(0)
     scale = max(float(torch.linalg.vector_norm(moved[1])), 1.0)
-    turn = rotation_between(torch.cat([moved[0] / scale, _LEVEL * up]), torch.cat([moved[1] / scale, _LEVEL * level]))
+    turn = rotation_between(torch.cat([moved[1] / scale, _LEVEL * level]), torch.cat([moved[0] / scale, _LEVEL * up]))
     start.center = (start.center - here.mean(0)) @ turn.T + there.mean(0)
     start.rotation = start.rotation @ turn.T
 

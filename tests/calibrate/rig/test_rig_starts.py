@@ -36,13 +36,13 @@ from kcal.calibrate.rig.initial_poses import (
     consensus_rotation,
     distinct_poses,
     poses_from_three,
-    rotation_between,
 )
 from kcal.calibrate.rig.pairs import Poses, _median_rms, _view_rms, consensus, evenly, half_turn
 from kcal.calibrate.rig.sources import Baseline, MeasuredPosition, RigData
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import StereoRig
+from kcal.lens.turning import rotation_between
 from kcal.report.judge_rig import synchrony
 
 
@@ -94,7 +94,7 @@ class TestFewPoints:
     def test_rotations_of_least_squares(self) -> None:
         turn = rotation_from_vector(tensor(0.3, -0.2, 0.1))
         directions = torch.nn.functional.normalize(normal((6, 3), 1), dim=-1)
-        torch.testing.assert_close(rotation_between(directions @ turn.T, directions), turn)
+        torch.testing.assert_close(rotation_between(directions, directions @ turn.T), turn)
         wrong = directions @ turn.T
         wrong[4] = -wrong[4]
         found, score = consensus_rotation(wrong, directions)
