@@ -50,7 +50,7 @@ PUBLIC = {
         CameraRig Effect ImagePair Mounting MovingOptions RasterError RigCovariance SkylineImage Survey Watched
         check_rig import_survey load_camera_rig match_landmarks match_moving mounting_covariance
         pair_by_name paired_boards placed_rig planned_rig read_features read_pairs read_sightings
-        read_tracks relocked save_camera_rig scene_features skyline_source
+        read_tracks save_camera_rig scene_features skyline_source
     """,
     "kcal.locate": """
         BudgetErrors DisparityRanges Marks MultiViewLocalizer Site Triangulate ViewMarks

@@ -274,10 +274,10 @@ def _of_pairs(rig: Path, points: Path, options: LocateOptions) -> LocateRun:
     from kcal.io.rig_file import load_rig
     from kcal.lens.rig import RigCovariance
     from kcal.locate.marks import filled, read_mark_chunks
-    from kcal.locate.monitor import parse_aging
     from kcal.locate.mounting import run_errors
     from kcal.locate.positions import located_by
     from kcal.locate.tabulate import Locator, find_geoid, true_from_grid
+    from kcal.watch.turned import parse_aging
 
     own = options
     if own.aged and own.watch:

@@ -21,10 +21,10 @@ from kcal.errors import InputError
 from kcal.files import check_picture, check_writable, write_atomic
 
 if TYPE_CHECKING:
-    from kcal.calibrate.rig.drift import Drift
     from kcal.calibrate.rig.sources import Landmarks
     from kcal.lens.rig import StereoRig
     from kcal.locate.marks import Marks
+    from kcal.watch.turned import Drift
 
 
 app = typer.Typer(cls=group_with_default("solve"), rich_markup_mode="markdown", help="Solve a rig, and check it later.")
@@ -385,7 +385,7 @@ def check(
     """
     from kcal.io.rig_file import load_rig
     from kcal.locate.marks import read_marks
-    from kcal.locate.monitor import check_rig, seen_again
+    from kcal.watch.turned import check_rig, seen_again
 
     if reference is None and landmarks is None:
         raise InputError("give --reference (marks of the same things in old images) or --landmarks (a survey)")
@@ -399,7 +399,8 @@ def check(
     features = None if reference is None else seen_again(read_marks(reference, single=True), now, noise)
     surveyed = None if landmarks is None else _landmarks(old, landmarks, now, noise)
     drift = check_rig(old, features=features, landmarks=surveyed)
-    _print_turns(old, drift)
+    print_turns(drift, f"{sum(item.used for item in drift.items)} of {len(drift.items)}")
+    _print_effect(drift)
     for item in drift.left_out:
         err.print("[yellow]left out:[/]", f"{item.name}: {item.reason}")
     if drift.variance > 1:
@@ -416,7 +417,7 @@ def check(
             out.print("nothing was written")
         return
     if relock:
-        kept = _relock(rig, old, drift, marks)
+        kept = _relock(rig, drift, marks)
         out.print(f"kept the old rig as {kept}", markup=False)
         print_wrote(rig)
     raise typer.Exit(DRIFTED)
@@ -430,40 +431,31 @@ def _landmarks(rig: StereoRig, path: Path, now: Marks, sigma: float) -> Landmark
     return match_landmarks(read_survey(path, rig.mounting.origin), now, now.sigmas(sigma)).landmarks
 
 
-def _print_turns(rig: StereoRig, drift: Drift) -> None:
+def print_turns(drift: Drift, used: str = "") -> None:
+    """Print what has turned by how much, and of how many things that was found, if that is known."""
     import math
 
-    from kcal.locate.monitor import drift_effect
-
-    rows = [["turn of", "pitch °", "yaw °", "roll °", "used"]]
-    used = f"{sum(item.used for item in drift.items)} of {len(drift.items)}"
-    parts = [
-        ("left camera", drift.left, drift.left_covariance),
-        ("right camera", drift.right, drift.right_covariance),
-        ("right from left", drift.relative, drift.relative_covariance),
-    ]
-    for name, turn, covariance in parts:
-        if turn is None or covariance is None:
-            continue
-        sigma = covariance.diagonal().sqrt()
-        cells = [
-            f"{math.degrees(value):+z.5f} ± {math.degrees(spread):.5f}"
-            for value, spread in zip(turn.tolist(), sigma.tolist(), strict=True)
-        ]
-        rows.append([name, *cells, used])
+    rows = [["turn of", "pitch °", "yaw °", "roll °", *(["used"] if used else [])]]
+    for name, turn, covariance in drift.turns:
+        both = zip(turn.tolist(), covariance.diagonal().sqrt().tolist(), strict=True)
+        cells = [f"{math.degrees(value):+z.5f} ± {math.degrees(sigma):.5f}" for value, sigma in both]
+        rows.append([name, *cells, *([used] if used else [])])
     print_table(rows, left=range(len(rows[0])))
-    effect = drift_effect(rig, drift.rig, drift.relative_covariance)
-    for distance, found, sigma in zip(*(value.tolist() for value in effect), strict=True):
+
+
+def _print_effect(drift: Drift) -> None:
+    import math
+
+    for distance, found, sigma in zip(*(value.tolist() for value in drift.effect()), strict=True):
         shift = "infinity" if math.isinf(found) else f"{found:.1f} m ({found - distance:+z.1f} ± {sigma:.1f} m)"
         out.print(f"with the old rig a target at {distance:g} m is found at {shift}")
 
 
-def _relock(path: Path, old: StereoRig, drift: Drift, marks: Path) -> Path:
+def _relock(path: Path, drift: Drift, marks: Path) -> Path:
     """Replace the rig file; returns where the old one is kept."""
     import datetime
 
     from kcal.io.rig_file import save_rig
-    from kcal.locate.monitor import relocked
 
     stamp = datetime.datetime.now(datetime.UTC).strftime("%Y%m%dT%H%M%SZ")
     kept = path.with_name(f"{path.stem}.before-{stamp}{path.suffix}")
@@ -471,7 +463,7 @@ def _relock(path: Path, old: StereoRig, drift: Drift, marks: Path) -> Path:
     while kept.exists():
         number += 1
         kept = path.with_name(f"{path.stem}.before-{stamp}-{number}{path.suffix}")
-    new = relocked(old, drift, f"{stamp}, from {marks.name}")
+    new = drift.relocked(f"{stamp}, from {marks.name}")
     # The old one first: whatever happens in between, there is a good rig.
     write_atomic(kept, path.read_bytes())
     save_rig(new, path)

@@ -47,7 +47,7 @@ def source_lines(result: RigResult) -> list[str]:
 
 def rig_lines(result: RigResult, rig: StereoRig, unpaired: int) -> list[str]:
     """What a result says: residuals by source, the relative pose with its sigmas, the board's squares, the mounting."""
-    from kcal.locate.monitor import triangulated_sides
+    from kcal.report.judge_rig import triangulated_sides
 
     lines = source_lines(result)
     boards, mounting = result.data.boards, rig.mounting

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kcal.cli.console import err, on_signals, out, print_table, print_wrote, warn
+from kcal.cli.console import err, on_signals, out, print_wrote, warn
 from kcal.cli.inputs import RIG
-from kcal.cli.rig import DRIFTED
+from kcal.cli.rig import DRIFTED, print_turns
 from kcal.errors import InputError, with_extra
 from kcal.files import check_picture, check_writable
 from kcal.texts import measured_text
@@ -222,16 +222,7 @@ def _tell_turns(watched: Watched, limit: float) -> None:
     """The attitude now, and how the rig turns."""
     drift = watched.drift_at(watched.times[-1])
     model, degrees = watched.model, math.degrees(1.0)
-    rows = [["turn of", "pitch °", "yaw °", "roll °"]]
-    for name, turn, covariance in (
-        ("left camera", drift.left, drift.left_covariance), ("right camera", drift.right, drift.right_covariance),
-        ("right from left", drift.relative, drift.relative_covariance),
-    ):  # fmt: skip
-        assert turn is not None
-        assert covariance is not None
-        both = zip((degrees * turn).tolist(), (degrees * covariance.diagonal().sqrt()).tolist(), strict=True)
-        rows.append([name, *(f"{value:+z.5f} ± {sigma:.5f}" for value, sigma in both)])
-    print_table(rows, left=range(4))
+    print_turns(drift)
     # What the yaw of both cameras does in an hour without a look.
     hour = [float(model.swing[k]) ** 2 * (1.0 - math.exp(-7200.0 / float(model.return_s[k]))) for k in (1, 4)]
     swing = degrees * math.hypot(float(model.swing[1]), float(model.swing[4]))

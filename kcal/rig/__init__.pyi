@@ -38,5 +38,4 @@ from kcal.io.rig_file import save_camera_rig as save_camera_rig
 
 # Drift
 from kcal.watch.watcher import Watched as Watched
-from kcal.locate.monitor import check_rig as check_rig
-from kcal.locate.monitor import relocked as relocked
+from kcal.watch.turned import check_rig as check_rig

@@ -152,11 +152,11 @@ def _adjusted(columns: Columns, horizon: Horizon, rotation: Floats, camera: Came
         rough = column_sigma(seen, errors) + np.abs(seen.by_elevation) * _ROUGH * 0.25
         return seen.known / np.square(rough) / np.square(1.0 + np.square(seen.residual / (3.0 * rough)))
 
-    rotation = _turned(columns, horizon, rotation, camera, weight, _HEADING_STEPS, 0.05)
+    rotation = _reweighted(columns, horizon, rotation, camera, weight, _HEADING_STEPS, 0.05)
     return Candidate(rotation, column_cost(compare(columns, horizon, rotation, camera), errors, columns))
 
 
-def _turned(
+def _reweighted(
     columns: Columns, horizon: Horizon, rotation: Floats, camera: Camera, weight: Callable[[Comparison], Floats],
     steps: int, longest: float,
 ) -> Floats:  # fmt: skip
@@ -334,7 +334,7 @@ def _robust_rotation(
         soft = 1.0 / (1.0 + np.square(ratio / limit)) if used is None else used.astype(np.float64)
         return seen.known * soft / np.square(sigma)
 
-    return _turned(columns, horizon, rotation, camera, weight, _STEPS, math.radians(1.0))
+    return _reweighted(columns, horizon, rotation, camera, weight, _STEPS, math.radians(1.0))
 
 
 def _columns_that_agree(seen: Comparison, errors: SkylineErrors, most_below: float) -> Bools:

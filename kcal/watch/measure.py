@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.drift import camera_turns
 from kcal.calibrate.rig.sources import Features
 from kcal.corners.images import Gray, to_8bit
 from kcal.corners.match import keypoints
@@ -21,12 +20,14 @@ from kcal.errors import DegenerateError, FileError, InputError
 from kcal.files import read_bytes, write_atomic
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
+from kcal.lens.projection import FAR
 from kcal.lens.rig import StereoRig
-from kcal.lens.turning import fit_turn
+from kcal.lens.turning import fit_turn, seen_turned
 from kcal.scene.match import ImagePair, MatchedPair, match_scene
 from kcal.scene.refine import SAME, SWAY, whole_shifts
 from kcal.strict_formats import read_npz
 from kcal.watch.history import Look, between_rows, no_look
+from kcal.watch.turned import camera_turns
 
 # What is looked for in each image of a watched rig: patches of fixed things, and where they were.
 #
@@ -351,21 +352,22 @@ def _patches_again(
 
 def _check_lens(camera: Camera, then: Tensor, now: Tensor, name: str) -> None:
     """Raise `AnotherCameraError` if images are larger or smaller than they were."""
-    middle = torch.tensor(camera.size, dtype=torch.float64) / 2.0
-    along = then - middle
-    zero, one = torch.zeros_like(along[:, 0]), torch.ones_like(along[:, 0])
-    # Shift, scale and turn in the image.
-    rows = torch.stack([torch.stack([one, zero, along[:, 0], -along[:, 1]], -1),
-                        torch.stack([zero, one, along[:, 1], along[:, 0]], -1)], 1)  # fmt: skip
-    off, weight = now - then, torch.ones_like(one)
-    for _ in range(10):
-        normal = torch.einsum("n,nik,nil->kl", weight, rows, rows)
-        found = torch.linalg.solve(normal, torch.einsum("n,nik,ni->k", weight, rows, off))
-        rest = (off - rows @ found).square().sum(-1)
-        scale = rest.median().clamp_min(1e-6)
-        weight = 1.0 / (1.0 + rest / (3.0 * scale))
-    sigma = math.sqrt(float(scale) * float(torch.linalg.inv(normal)[2, 2]))
-    larger = float(found[2])
+    rays, middle = camera.unproject(then)[0], torch.tensor(camera.size, dtype=torch.float64) / 2.0
+
+    def weighted(turn: Tensor, larger: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        seen, rows = seen_turned(camera, FAR * rays, turn)
+        away = seen.T - middle
+        off = away * (1.0 + larger) + middle - now
+        square = off.square().sum(-1)
+        scale = square.nanmedian().clamp_min(1e-6)
+        root = (1.0 / (1.0 + square / (3.0 * scale))).sqrt()[:, None]
+        by_all = torch.cat([rows[:3].permute(2, 1, 0), away[..., None]], -1)
+        return (root[..., None] * by_all).flatten(0, 1), (root * off).flatten(), scale
+
+    found = fit_turn(torch.eye(3, dtype=torch.float64), lambda *at: weighted(*at)[:2], more=1, steps=10)
+    rows, _, scale = weighted(found.rotation, found.more)
+    sigma = math.sqrt(float(scale) * float(torch.linalg.inv(rows.T @ rows)[3, 3]))
+    larger = float(found.more)
     if abs(larger) > max(_OTHER_LENS, _SURELY * sigma):
         word = "larger" if larger > 0 else "smaller"
         raise AnotherCameraError(

@@ -20,14 +20,13 @@ from torch import Tensor
 
 import kcal.watch.history as past
 import kcal.watch.measure as measure
-from kcal.calibrate.rig.drift import Drift, drift_of_turns
 from kcal.corners.images import Gray
 from kcal.errors import FileError, InputError
 from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.localizer import StereoLocalizer
-from kcal.locate.monitor import relocked
 from kcal.pipeline.stream import Ledger
+from kcal.watch.turned import Drift, drift_of_turns
 
 # `Watched`: a rig and the history of its attitude; the rig of any moment, with the errors of that moment.
 
@@ -134,9 +133,8 @@ class Watched:
         Raises:
             InputError: before the first look.
         """
-        rig = relocked(
-            _uncertain(self.rig), self.drift_at(time), f"at {time:.3f} s, from the history of the watched rig"
-        )
+        drift = dataclasses.replace(self.drift_at(time), old=_uncertain(self.rig))
+        rig = drift.relocked(f"at {time:.3f} s, from the history of the watched rig")
         # The same number of shared errors at every moment, for filters.
         known = rig.covariance
         if known is not None:
@@ -215,7 +213,7 @@ def relock(watched: Watched) -> Relock:
         new += float(off @ weight @ off)
     if new >= old:
         return Relock(None, f"the last {_HELD_OUT} looks fit the old rig file better")
-    better = relocked(watched.rig, drift, f"mean of the day before {end:.0f} s")
+    better = drift.relocked(f"mean of the day before {end:.0f} s")
     return Relock(better, f"χ² {drift.chi2:.0f} of the turn; the last looks: {old:.0f} before, {new:.0f} after")
 
 

@@ -30,7 +30,7 @@ from kcal.corners.board import Board
 from kcal.corners.detect import detect
 from kcal.corners.observations import Observations
 from kcal.lens.camera import Camera
-from kcal.locate.monitor import triangulated_sides
+from kcal.report.judge_rig import triangulated_sides
 from scripts.shared.page import write_section
 
 BOARD = Board(columns=9, rows=6, square=0.025)

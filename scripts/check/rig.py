@@ -18,7 +18,6 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.drift import measure_drift
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.sources import Baseline, Features, Landmarks, MeasuredPosition, RigData
@@ -26,8 +25,8 @@ from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.localizer import StereoLocalizer
-from kcal.locate.monitor import drift_effect
 from kcal.report.rig import save_rig_picture
+from kcal.watch.turned import drift_of_turns, measure_drift
 from scripts.shared.long_range import ORIGIN, RANGES, rig
 from scripts.shared.page import DOCS, write_section
 from scripts.shared.timing import row, show
@@ -212,6 +211,12 @@ def wrong(draws: int) -> list[str]:
 
 
 @torch.no_grad()
+def found_at_5_km(old: StereoRig, new: StereoRig) -> float:
+    """The range, in meters, that the old rig finds of a target at 5 km from the new one."""
+    still = drift_of_turns(old, torch.zeros(6, dtype=torch.float64), torch.eye(6, dtype=torch.float64))
+    return float(dataclasses.replace(still, rig=new).effect((5000.0,)).found[0])
+
+
 def drift(draws: int) -> list[str]:
     """The right camera turns by 0.01°; static things then and now, or landmarks."""
     lines = show(
@@ -228,8 +233,7 @@ def drift(draws: int) -> list[str]:
     later = StereoRig(
         TRUTH.left, TRUTH.right, now @ TRUTH.right_from_left_rotation, now @ TRUTH.right_from_left_translation
     )
-    nothing = torch.zeros(3, 3, dtype=torch.float64)
-    before = float(drift_effect(TRUTH, later, nothing, (5000.0,)).found[0]) - 5000.0
+    before = found_at_5_km(TRUTH, later) - 5000.0
 
     def check(count: int, turns: Tensor, seed: int, images: int) -> tuple[Tensor, Tensor, bool, StereoRig]:
         draw = generator(90_000 + seed)
@@ -266,7 +270,7 @@ def drift(draws: int) -> list[str]:
             errors.append(math.degrees(float(relative[1]) - yaw))
             sigmas.append(math.degrees(float(covariance[1, 1].sqrt())))
             significant += told
-            after.append(float(drift_effect(corrected, later, nothing, (5000.0,)).found[0]) - 5000.0)
+            after.append(found_at_5_km(corrected, later) - 5000.0)
             false += check(count, still, seed + draws, images)[2]
         rms = math.sqrt(sum(e * e for e in errors) / draws)
         within = sum(abs(e) < 0.001 for e in errors) / draws

@@ -22,13 +22,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.drift import drift_of_turns
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import Mounting, Origin, RigCovariance, StereoRig
 from kcal.locate.budget import planned_rig
 from kcal.locate.localizer import StereoLocalizer
-from kcal.locate.monitor import relocked
 from kcal.watch.history import AngleSeries, Look, TurnModel, between_rows, first_state, learned, passed, taken, turns_of
+from kcal.watch.turned import drift_of_turns
 from kcal.watch.watcher import LIMIT, exceeded
 from scripts.shared.page import table, write_section
 
@@ -214,7 +213,7 @@ def coverage(true: Truth, told: Told, number: int) -> dict[str, Tensor]:
             file.left, file.right, then @ file.right_from_left_rotation, file.right_from_left_translation
         )
         standing = drift_of_turns(solved, bent, torch.eye(6, dtype=torch.float64)).rig
-        watched = relocked(file, drift_of_turns(file, told.later[k, c], told.covariance[k, c]), "")
+        watched = drift_of_turns(file, told.later[k, c], told.covariance[k, c]).relocked("")
         inside["watch"].append(in_interval(watched, standing, n))
         inside["file"].append(in_interval(file, standing, n))
         inside["night"].append(bool(true.seen[k, c] < FEATURES))

@@ -387,7 +387,7 @@ class TestRig:
         def fails(*_: object) -> None:
             raise DegenerateError("no side of a square could be triangulated")
 
-        monkeypatch.setattr("kcal.locate.monitor.triangulated_sides", fails)
+        monkeypatch.setattr("kcal.report.judge_rig.triangulated_sides", fails)
         arguments = ["rig", "left.camera.json", "right.camera.json", *PAIRS, "-o", "rig.json"]
         assert "no side of a square" in refuse(cameras, monkeypatch, capsys, *arguments)
 

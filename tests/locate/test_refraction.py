@@ -18,8 +18,8 @@ from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.rig import Mounting, Origin
 from kcal.locate.geodesy import enu_to_geodetic
 from kcal.locate.localizer import StereoLocalizer
-from kcal.locate.monitor import check_rig
 from kcal.locate.mounting import placed_rig
+from kcal.watch.turned import check_rig
 
 ORIGIN = Origin(lat=19.07, lon=72.87, height=14.0)
 EARTH = 6_371_008.8  # meters, mean radius

@@ -13,10 +13,10 @@ from kcal.errors import FileError, InputError
 from kcal.lens.rig import CameraRig
 from kcal.locate.geodesy import enu_to_geodetic
 from kcal.locate.marks import Marks
-from kcal.locate.monitor import seen_again
 from kcal.locate.station_positions import locate_views
 from kcal.locate.stereo import PositionStatus
 from kcal.locate.survey import Survey, ViewMarks, is_long, match_views, read_feature_views, read_views
+from kcal.watch.turned import seen_again
 from scripts.shared.station_scenes import ORIGIN, marks, ring, targets
 
 NAMES = ("a", "b", "c")

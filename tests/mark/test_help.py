@@ -17,7 +17,6 @@ from kcal.io.images import write_png
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import Origin, RigCovariance, StereoRig
 from kcal.locate.marks import Marks, write_marks
-from kcal.locate.monitor import check_rig, seen_again
 from kcal.locate.positions import locate_points
 from kcal.locate.survey import Survey
 from kcal.mark.guide import Reference, RigBand, at_shape, open_pictures, propose
@@ -25,6 +24,7 @@ from kcal.mark.items import Add, Mark, MarkingState, Place, Put, Side, SurveyPla
 from kcal.mark.marking_service import Desk, Promise, map_content, solve_live, verdict
 from kcal.mark.session import Session
 from kcal.mark.shapes import snap
+from kcal.watch.turned import check_rig, seen_again
 from scripts.shared.marking_scene import (
     LANDMARKS,
     MarkingSite,

@@ -17,7 +17,7 @@ from kcal.corners.board import Board
 from kcal.corners.detect import detect
 from kcal.corners.observations import Observations
 from kcal.lens.camera import Camera
-from kcal.locate.monitor import triangulated_sides
+from kcal.report.judge_rig import triangulated_sides
 
 cv2 = pytest.importorskip("cv2")
 

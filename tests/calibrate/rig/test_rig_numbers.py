@@ -26,7 +26,6 @@ from torch import Tensor
 from kcal.calibrate.rig.adjustment import _first_rays, typical_ratio
 from kcal.calibrate.rig.assess import _advice, _Targets
 from kcal.calibrate.rig.blocks import Block, BoardBlock, FeatureBlock, LandmarkBlock, RigState
-from kcal.calibrate.rig.drift import drift_of_turns
 from kcal.calibrate.rig.explanations import _Part, _test, least_redundancy, redundancy, refuse_exact
 from kcal.calibrate.rig.initial_poses import Start
 from kcal.calibrate.rig.motion import CameraRows, summed_products
@@ -37,6 +36,7 @@ from kcal.checks import chi2_quantile
 from kcal.errors import DegenerateError
 from kcal.lens.pose import vector_from_rotation
 from kcal.locate.budget import planned_rig
+from kcal.watch.turned import drift_of_turns
 
 
 def white(pixels: Tensor) -> Tensor:

@@ -5,7 +5,7 @@ from kcal.corners.board import Board
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
-from kcal.locate.monitor import triangulated_sides
+from kcal.report.judge_rig import triangulated_sides
 
 
 @pytest.mark.parametrize("text", ["aprilgrid:3x2:0.3", "asymmetric:4x5", "5x4"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import pytest
@@ -9,7 +10,6 @@ import torch
 from locate_rigs import pinhole_rig, real_rig, tensor
 from torch import Tensor
 
-from kcal.calibrate.rig.drift import measure_drift
 from kcal.calibrate.rig.sources import Landmarks
 from kcal.errors import InputError
 from kcal.io.camera_file import provenance
@@ -17,7 +17,7 @@ from kcal.lens.calibration import RigCalibration
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import Mounting, Origin, RigCovariance, StereoRig
 from kcal.locate.geodesy import enu_from_cam
-from kcal.locate.monitor import check_rig, drift_effect, relocked
+from kcal.watch.turned import DriftEffect, check_rig, drift_of_turns, measure_drift
 
 # Sigmas of the origin (east, north, up) and of turns about these axes, all unlike; simulated light goes straight.
 STANDING = torch.diag(tensor(0.1, 0.2, 0.3, 1e-5, 2e-5, 3e-5, 0.0) ** 2)
@@ -70,7 +70,7 @@ def test_a_relocked_rig_stands_as_it_was_found() -> None:
     found = check_rig(rig, landmarks=eastward(rig, tensor(math.radians(-0.01), math.radians(-0.02), 0.0)))
     assert found.left_significant
     assert not found.significant
-    new = relocked(rig, found, "Monday")
+    new = found.relocked("Monday")
     assert new.mounting is not None
     assert rig.mounting is not None
     angles = new.mounting.heading_deg, new.mounting.pitch_deg, new.mounting.roll_deg
@@ -93,7 +93,7 @@ def test_a_relocked_rig_stands_as_it_was_found() -> None:
 def test_an_exact_mounting_stays_exact_and_none_is_refused() -> None:
     rig = standing_rig(covariance=None)
     marks = eastward(rig, tensor(0.0, math.radians(0.02), 0.0))
-    new = relocked(rig, check_rig(rig, landmarks=marks), "Monday")
+    new = check_rig(rig, landmarks=marks).relocked("Monday")
     assert new.mounting is not None
     assert new.mounting.covariance is None
     assert new.mounting.heading_deg == pytest.approx(89.98, abs=1e-5)
@@ -102,11 +102,16 @@ def test_an_exact_mounting_stays_exact_and_none_is_refused() -> None:
         check_rig(rig, landmarks=marks)
 
 
+def effect_of(old: StereoRig, new: StereoRig, covariance: Tensor, distances: tuple[float, ...]) -> DriftEffect:
+    still = drift_of_turns(old, torch.zeros(6).double(), torch.eye(6).double())
+    return dataclasses.replace(still, rig=new, relative_covariance=covariance).effect(distances)
+
+
 def test_sigma_of_a_drift_is_what_each_of_its_turns_does() -> None:
     """Turning by a thousandth of each column of a root of the covariance, and locating with the old rig."""
     rig = real_rig()
     root = 1e-5 * tensor([1.0, 0.0, 0.0], [0.5, 2.0, 0.0], [-3.0, 1.0, 2.0])
-    effect = drift_effect(rig, rig, root @ root.T, (250.0, 1000.0))
+    effect = effect_of(rig, rig, root @ root.T, (250.0, 1000.0))
     torch.testing.assert_close(effect.found, effect.distance, rtol=1e-9, atol=0)
     squares = torch.zeros(2).double()
     for column in root.T:
@@ -114,7 +119,7 @@ def test_sigma_of_a_drift_is_what_each_of_its_turns_does() -> None:
         new = StereoRig(
             rig.left, rig.right, turn @ rig.right_from_left_rotation, turn @ rig.right_from_left_translation
         )
-        shift = drift_effect(rig, new, root @ root.T, (250.0, 1000.0)).found - effect.distance
+        shift = effect_of(rig, new, root @ root.T, (250.0, 1000.0)).found - effect.distance
         squares += (1e3 * shift) ** 2
     torch.testing.assert_close(effect.sigma, squares.sqrt(), rtol=1e-3, atol=0)
 
@@ -123,11 +128,11 @@ def test_sigma_of_a_drift_by_the_disparity() -> None:
     """A yaw of ω shifts a range Z by Z² ω / b."""
     rig = pinhole_rig(1600.0, 10.0)
     yaw = torch.diag(tensor(0.0, 1e-5, 0.0) ** 2)
-    assert drift_effect(rig, rig, yaw, (1000.0,)).sigma.item() == pytest.approx(1.0, rel=2e-3)
+    assert effect_of(rig, rig, yaw, (1000.0,)).sigma.item() == pytest.approx(1.0, rel=2e-3)
 
 
 @pytest.mark.parametrize("distance", [0.0, -100.0, math.inf, math.nan])
 def test_effect_of_a_drift_at_impossible_distances(distance: float) -> None:
     rig = pinhole_rig(1600.0, 10.0)
     with pytest.raises(InputError, match="positive numbers of meters"):
-        drift_effect(rig, rig, torch.zeros(3, 3).double(), (250.0, distance))
+        effect_of(rig, rig, torch.zeros(3, 3).double(), (250.0, distance))

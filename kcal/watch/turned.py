@@ -1,9 +1,10 @@
-"""Measure how the cameras of a rig have turned since it was solved."""
+"""A rig has turned since it was solved: measure it, tell what it does to ranges, and correct the rig."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -22,8 +23,13 @@ from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.lens.projection import FAR
-from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, StereoRig
+from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, RigCovariance, StereoRig
 from kcal.lens.turning import fit_turn, seen_turned
+from kcal.locate.budget import usual_ranges
+from kcal.locate.geodesy import enu_from_cam
+from kcal.locate.marks import Marks
+from kcal.locate.mounting import attitude
+from kcal.locate.stereo import PositionStatus, sight_lines
 from kcal.solve.lm import LMOptions
 from kcal.texts import brief
 from kcal.threads import in_one_thread
@@ -202,6 +208,7 @@ class Drift:
         right_covariance: (3, 3), None as above.
         relative_covariance: (3, 3).
         chi2: of the relative turn: with three degrees of freedom, if there was none.
+        old: the rig as it was solved.
         rig: the rig as it stands now: the same cameras in the same places, turned.
         pose_covariance: (6, 6) what the measurement adds to the covariance of the rig's relative pose.
         cam_from_local: (3, 3) of the left camera now, where a pose was given.
@@ -218,6 +225,7 @@ class Drift:
     right_covariance: Tensor | None
     relative_covariance: Tensor
     chi2: float
+    old: StereoRig
     rig: StereoRig
     pose_covariance: Tensor
     cam_from_local: Tensor | None
@@ -240,6 +248,109 @@ class Drift:
     def left_out(self) -> tuple[ItemResidual, ...]:
         """What is not part of the answer."""
         return tuple(item for item in self.items if not item.used)
+
+    @property
+    def turns(self) -> tuple[tuple[str, Tensor, Tensor], ...]:
+        """What has turned, by how much (3,) and with which covariance (3, 3); without what cannot be told."""
+        every = (
+            ("left camera", self.left, self.left_covariance),
+            ("right camera", self.right, self.right_covariance),
+            ("right from left", self.relative, self.relative_covariance),
+        )
+        return tuple((name, turn, cov) for name, turn, cov in every if turn is not None and cov is not None)
+
+    def effect(self, distances: Sequence[float] | None = None) -> DriftEffect:
+        """Ranges that the old rig finds, in the direction in which both cameras look.
+
+        Args:
+            distances: D true ones, meters; `usual_ranges` if left out.
+
+        Raises:
+            InputError: a distance that is not positive, or cameras that do not look the same way.
+
+        Example:
+            >>> from kcal.rig import planned_rig
+            >>> turns = torch.tensor([0.0, 0.0, 0.0, 0.0, 1.745329e-4, 0.0], dtype=torch.float64)  # 0.01°
+            >>> found = drift_of_turns(planned_rig(), turns, 1e-12 * torch.eye(6).double()).effect().found
+            >>> [round(value) for value in found.tolist()]
+            [251, 1018, 5478]
+        """
+        old, new = self.old, self.rig
+        far = torch.tensor(usual_ranges(old) if distances is None else list(distances), dtype=torch.float64)
+        if not bool(((far > 0) & torch.isfinite(far)).all()):
+            raise InputError("distances: positive numbers of meters are needed")
+        with torch.no_grad():
+            axis = new.right_from_left_rotation[2] + new.right_from_left_rotation.new_tensor([0.0, 0.0, 1.0])
+            points = far[:, None] * axis / torch.linalg.vector_norm(axis)
+            left, right, seen = new(points)
+            if not bool(seen.all()):
+                raise InputError("the cameras do not look the same way: the effect of a drift cannot be computed")
+            lines = sight_lines(old, left, right)
+            found = torch.linalg.vector_norm(lines.points, dim=-1)
+            # Turning the right camera by ω about its x, y, z moves a point's image; the range follows the disparity.
+            rows = torch.stack([_range_slope(new, points, axis) for axis in torch.eye(3, dtype=torch.float64)], -1)
+        sigma = (rows @ self.relative_covariance * rows).sum(-1).clamp_min(0.0).sqrt()
+        return DriftEffect(far, torch.where(lines.status == int(PositionStatus.OK), found, math.inf), sigma)
+
+    @in_one_thread
+    def relocked(self, note: str) -> StereoRig:
+        """The old rig with the present attitudes; cameras and their places stay.
+
+        The covariance of the drift is added to that of the rig: the errors of the first solution are still in it, and
+        those of the check come on top. A rig that counted as exact has the latter alone.
+
+        Args:
+            note: when and from what, for the record.
+
+        Example:
+            >>> from kcal.rig import planned_rig
+            >>> turned = drift_of_turns(planned_rig(), 1e-4 * torch.ones(6).double(), 1e-10 * torch.eye(6).double())
+            >>> float(turned.relocked("Monday").baseline)
+            10.0
+        """
+        rig = self.old
+        new = StereoRig(rig.left, rig.right, self.rig.right_from_left_rotation, self.rig.right_from_left_translation)
+        new.covariance = (rig.covariance or RigCovariance.of(rig)).with_pose(self.pose_covariance)
+        new.mounting = rig.mounting
+        if rig.mounting is not None and self.cam_from_local is not None and self.left_covariance is not None:
+            rotation, covariance = self.cam_from_local, rig.mounting.covariance
+            heading, pitch, roll = attitude(rotation.T)
+            if covariance is not None:
+                covariance = covariance.clone()
+                covariance[3:6, 3:6] += rotation.T @ self.left_covariance @ rotation
+            new.mounting = dataclasses.replace(
+                rig.mounting, heading_deg=heading, pitch_deg=pitch, roll_deg=roll, covariance=covariance
+            )
+        if rig.calibration is not None:
+            new.calibration = dataclasses.replace(rig.calibration, relocked=note, baseline_m=float(new.baseline))
+        return new
+
+
+class DriftEffect(NamedTuple):
+    """What an old rig makes of things that a turned one sees, (D,) meters for D distances.
+
+    Attributes:
+        distance: true range from the left camera.
+        found: range by the old rig; infinite where its rays no longer meet.
+        sigma: one sigma of the shift, from the covariance of the turn, to first order.
+    """
+
+    distance: Tensor
+    found: Tensor
+    sigma: Tensor
+
+
+def _range_slope(rig: StereoRig, points: Tensor, axis: Tensor) -> Tensor:
+    """Meters of range by a radian of the right camera about one of its axes (3,)."""
+    ends = []
+    for step in (-1e-8, 1e-8):
+        turn = rotation_from_vector(step * axis)
+        turned = StereoRig(
+            rig.left, rig.right, turn @ rig.right_from_left_rotation, turn @ rig.right_from_left_translation
+        )
+        left, right, _ = turned(points)
+        ends.append(torch.linalg.vector_norm(sight_lines(rig, left, right).points, dim=-1))
+    return (ends[1] - ends[0]) / 2e-8
 
 
 @in_one_thread
@@ -351,6 +462,7 @@ def drift_of_turns(
         right_covariance=covariance[3:, 3:],
         relative_covariance=pose[:3, :3],
         chi2=float(drift @ torch.linalg.solve(pose[:3, :3], drift)),
+        old=rig,
         rig=StereoRig(rig.left, rig.right, change @ relative, turn @ shift),
         pose_covariance=pose,
         cam_from_local=None if cam_from_local is None else rotation_from_vector(left) @ cam_from_local,
@@ -416,6 +528,7 @@ def _against(
         right_covariance=alone[1] if loose else None,
         relative_covariance=compared,
         chi2=float(drift @ torch.linalg.solve(compared, drift)),
+        old=rig,
         rig=StereoRig(rig.left, rig.right, relative, state.rotation[1] @ (state.center[0] - state.center[1])),
         pose_covariance=covariance,
         cam_from_local=state.rotation[0] if pose is not None else None,
@@ -433,3 +546,123 @@ def _telling(data: RigData) -> PerKind:
         seen = torch.isfinite(data.features.pixels).all(-1).all(-1)
         ranged = seen & torch.isfinite(data.features.inverse_range_sigma)
     return PerKind(nothing, marked, ranged)
+
+
+def check_rig(rig: StereoRig, *, features: Features | None = None, landmarks: Landmarks | None = None) -> Drift:
+    """Measure how the cameras have turned (`measure_drift`) with what the rig knows of itself.
+
+    Its mounting gives the left camera's pose for landmarks, and its covariance says how well the attitudes were known.
+
+    Args:
+        rig: as it was solved, with its `covariance` and, for landmarks, its `mounting`.
+        features: see `measure_drift`.
+        landmarks: see `measure_drift`; in the frame of `rig.mounting.origin`.
+
+    Raises:
+        InputError: nothing to measure with, or landmarks for a rig without mounting.
+        DegenerateError: too little to tell the turn.
+
+    Example:
+        >>> from kcal.rig import planned_rig
+        >>> rig, rows = planned_rig(), torch.tensor([[-90.0, 2, 300], [80, -9, 250], [4, 6, 400], [30, 20, 200]])
+        >>> pixels = torch.cat([torch.stack(rig(rows.double())[:2], 1)] * 2, 1)  # the same then and now
+        >>> unknown = torch.zeros(4).double(), torch.full((4,), torch.inf).double()
+        >>> static = Features(names=tuple("abcd"), pixels=pixels, inverse_range=unknown[0],
+        ...                   inverse_range_sigma=unknown[1])
+        >>> check_rig(rig, features=static).significant
+        False
+    """
+    pose: tuple[Tensor, Tensor] | None = None
+    left = torch.zeros(3, 3, dtype=torch.float64)
+    refraction = REFRACTION, REFRACTION_SIGMA
+    if rig.mounting is not None:
+        stands = rig.mounting
+        rotation = enu_from_cam(stands.heading_deg, stands.pitch_deg, stands.roll_deg).T
+        pose = rotation, torch.zeros(3, dtype=torch.float64)
+        if stands.covariance is not None:
+            left = rotation @ stands.covariance[3:6, 3:6] @ rotation.T
+            # Light that was held straight stays so; otherwise another day has another coefficient.
+            straight = len(stands.covariance) == 7 and not bool(stands.covariance[6, 6])
+            refraction = (
+                REFRACTION if stands.refraction is None else stands.refraction,
+                0.0 if straight else REFRACTION_SIGMA,
+            )
+    before = None if rig.covariance is None else (rig.covariance.matrix[-6:-3, -6:-3], left)
+    return measure_drift(rig, features=features, landmarks=landmarks, pose=pose, before=before, refraction=refraction)
+
+
+def seen_again(then: Marks, now: Marks, sigma: float) -> Features:
+    """Things of unknown range that are marked in old and new images, for `check_rig`; `sigma` of a mark, pixels.
+
+    Raises:
+        InputError: no name is in both.
+
+    Example:
+        >>> pixels = torch.tensor([[10.0, 20.0], [30.0, 40.0]], dtype=torch.float64)
+        >>> found = seen_again(Marks(("a", "b"), pixels, pixels), Marks(("b", "c"), pixels, pixels), 0.3)
+        >>> found.names, found.pixels[0].tolist()
+        (('b',), [[30.0, 40.0], [30.0, 40.0], [10.0, 20.0], [10.0, 20.0]])
+    """
+    common = tuple(name for name in then.names if name in now.names)
+    if not common:
+        raise InputError("no name is in both files of marks; give the same things the same names")
+    pixels = [marks.pixels[[marks.names.index(name) for name in common]] for marks in (then, now)]
+    unknown = torch.zeros(len(common), dtype=torch.float64)
+    return Features(
+        names=common,
+        pixels=torch.cat(pixels, 1),
+        inverse_range=unknown,
+        inverse_range_sigma=torch.full_like(unknown, torch.inf),
+        pixel_sigma=sigma,
+    )
+
+
+# What a rig that was right once still knows of its relative yaw: masts bend with the sun, and creep with time.
+
+_PART = re.compile(r"([0-9.]+)\s*([hK])\s*:\s*([0-9.eE+-]+)")
+
+
+def forgotten_yaw(*, hours: float = 0.0, per_hour: float = 0.0, kelvin: float = 0.0, per_kelvin: float = 0.0) -> float:
+    """Standard deviation in degrees of the relative yaw that a rig has lost since it was solved.
+
+    A random walk of `per_hour` degrees after an hour, which grows with the root of time, and a turn of `per_kelvin`
+    degrees for each kelvin by which it is warmer or colder. Both must be known of the mast: from nights that were
+    solved one after the other, or from `kcal rig check`.
+
+    Raises:
+        InputError: a negative number.
+
+    Example:
+        >>> forgotten_yaw(hours=9, per_hour=0.0004, kelvin=8, per_kelvin=0.0002)  # 0.0012 and 0.0016 degrees
+        0.002
+    """
+    if min(hours, per_hour, kelvin, per_kelvin) < 0 or not math.isfinite(hours + per_hour + kelvin + per_kelvin):
+        raise InputError("what a rig forgets: hours, kelvin and degrees from 0 on are needed")
+    return math.hypot(per_hour * math.sqrt(hours), per_kelvin * kelvin)
+
+
+def parse_aging(text: str | None) -> float:
+    """`forgotten_yaw` of a text like 9h:0.0004,8K:0.0002; 0 for none.
+
+    Raises:
+        InputError: another text.
+
+    Example:
+        >>> parse_aging("9h:0.0004,8K:0.0002"), parse_aging("4h:0.001")
+        (0.002, 0.002)
+    """
+    if text is None:
+        return 0.0
+    known: dict[str, tuple[float, float]] = {}
+    for part in text.split(","):
+        found = _PART.fullmatch(part.strip())
+        try:
+            count, unit, degrees = found.groups()  # type: ignore[union-attr]
+            known[unit] = float(count), float(degrees)
+        except (AttributeError, ValueError):
+            raise InputError(
+                f"--aged {text}: write hours and degrees in an hour, kelvin and degrees per kelvin, like "
+                "9h:0.0004,8K:0.0002"
+            ) from None
+    (hours, per_hour), (kelvin, per_kelvin) = known.get("h", (0.0, 0.0)), known.get("K", (0.0, 0.0))
+    return forgotten_yaw(hours=hours, per_hour=per_hour, kelvin=kelvin, per_kelvin=per_kelvin)

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from kcal.errors import InputError
-from kcal.locate.monitor import forgotten_yaw, parse_aging
+from kcal.watch.turned import forgotten_yaw, parse_aging
 
 
 def test_time_is_a_random_walk_and_temperature_is_not() -> None:

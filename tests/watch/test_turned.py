@@ -10,11 +10,11 @@ import torch
 from rig_scenes import CAMERAS, CENTER, ROTATION, landmarks, normal, see, spread_points, tensor
 from torch import Tensor
 
-from kcal.calibrate.rig.drift import measure_drift
 from kcal.calibrate.rig.sources import Features, Landmarks
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.lens.rig import StereoRig
+from kcal.watch.turned import measure_drift
 
 RELATIVE = ROTATION[1] @ ROTATION[0].T
 RIG = StereoRig(CAMERAS[0], CAMERAS[1], RELATIVE, ROTATION[1] @ (CENTER[0] - CENTER[1]))
