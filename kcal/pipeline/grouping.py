@@ -21,7 +21,7 @@ from kcal.pipeline.assignment import assign_groups
 from kcal.pipeline.association import MOST_BOXES, AssociationOptions, fit_some, pair_costs
 from kcal.pipeline.detections import Detections
 from kcal.pipeline.epipolar_pencil import FEWEST_VIEWS, Confirming, StationSights, near_in_angle, separate_pairs
-from kcal.pipeline.pairing import ObjectPairs, ObjectViews, pair_objects
+from kcal.pipeline.pairing import ObjectViews, pair_objects
 
 # `group_objects`: which detections of any number of cameras are of one thing, by where their lines of sight meet.
 #
@@ -372,7 +372,7 @@ class Moment(NamedTuple):
     """What cameras saw at one moment: seconds of the first camera's image, and pairs or views, possibly none."""
 
     time: float
-    pairs: ObjectPairs | ObjectViews
+    pairs: ObjectViews
 
 
 def read_moment(
@@ -455,14 +455,13 @@ def _pairs_of_line(content: dict[str, Any], pixel_sigma: float) -> Moment:
     scores = content.get("scores", [1.0] * count)
     if not isinstance(scores, list) or len(scores) != count:
         raise InputError(f"scores: a list of {count} is needed")
-    pairs = ObjectPairs(
-        left=left,
-        right=right,
+    pairs = ObjectViews.of_pairs(
+        left,
+        right,
         covariance=covariance,
         time=time.expand(count, 2),
         score=_table([[score] for score in scores], "scores", 1)[:, 0],
         category=tuple(categories),
-        track=(None,) * count,
         ambiguous=torch.tensor(ambiguous, dtype=torch.bool),
     )
     return Moment(float(time[0, 0]), pairs)

@@ -1,4 +1,4 @@
-"""Objects that several cameras see at one moment, and how detections and all their pixels become pairs."""
+"""Objects that cameras see at one moment, and how detections and all their pixels become pairs."""
 
 from __future__ import annotations
 
@@ -21,8 +21,6 @@ from kcal.lens.rig import StereoRig
 from kcal.pipeline.association import AssociationOptions, associate
 from kcal.pipeline.detections import Detections
 from kcal.texts import brief
-
-# Objects that several cameras see at one moment: `ObjectPairs`, and views of any number of cameras.
 
 # `ObjectViews`: objects of one moment, each with its pixels in those of a rig's cameras that saw it.
 
@@ -96,96 +94,63 @@ class ObjectViews:
         """V."""
         return int(self.seen.shape[-1])
 
-
-def mark_numbers(pixels: Tensor, seen: Tensor) -> NDArray[np.int64]:
-    """(N, V) numbers of the marks of pixels (N, V, 2), -1 where nothing was seen: rows that share one share a mark.
-
-    Example:
-        >>> pixels = torch.tensor([[[1.0, 2.0], [1.0, 0.0]], [[1.0, 2.0], [2.0, 0.0]]])
-        >>> mark_numbers(pixels, torch.ones(2, 2, dtype=torch.bool)).tolist()
-        [[0, 0], [0, 1]]
-    """
-    numbers = []
-    for marks, there in zip(pixels.unbind(1), seen.T.tolist(), strict=True):
-        known: dict[tuple[float, ...], int] = {}
-        rows = zip(marks.tolist(), there, strict=True)
-        numbers.append([known.setdefault(tuple(mark), len(known)) if one else -1 for mark, one in rows])
-    return np.array(numbers, dtype=np.int64).reshape(len(numbers), len(pixels)).T
-
-
-# `ObjectPairs`: objects that both cameras of a rig see at one moment.
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ObjectPairs:
-    """Objects of one moment, each with its pixels in both images: from association and matching to tracks.
-
-    Args:
-        left: (N, 2) pixels of the left camera's full image.
-        right: (N, 2) pixels of the right camera's full image.
-        covariance: (N, 4, 4) of (u_left, v_left, u_right, v_right), px².
-        time: (N, 2) seconds at which the left and the right image were exposed, float64.
-        score: (N,) of the detections.
-        category: N names.
-        track: N names that the detector's own tracker gave, or None.
-        ambiguous: (N,) bool: another pairing is about as likely.
-
-    Raises:
-        InputError: shapes or lengths that do not fit each other, values that are not finite, or a matrix that is not
-            a covariance.
-
-    Example:
-        >>> pair = ObjectPairs(left=torch.tensor([[960.0, 540.0]]), right=torch.tensor([[944.0, 540.0]]),
-        ...                    covariance=0.01 * torch.eye(4)[None], time=torch.zeros(1, 2).double(),
-        ...                    score=torch.ones(1), category=("ship",), track=(None,),
-        ...                    ambiguous=torch.zeros(1, dtype=torch.bool))
-        >>> len(pair), pair.left.dtype
-        (1, torch.float64)
-    """
-
-    __repr__ = brief
-
-    left: Tensor
-    right: Tensor
-    covariance: Tensor
-    time: Tensor
-    score: Tensor
-    category: tuple[str, ...]
-    track: tuple[str | None, ...]
-    ambiguous: Tensor
-
-    def __post_init__(self) -> None:
-        for name, last in (("left", (2,)), ("right", (2,)), ("covariance", (4, 4)), ("time", (2,)), ("score", ())):
-            value = getattr(self, name)
-            if name == "time" and isinstance(value, Tensor) and value.dtype != torch.float64:
-                raise InputError(f"time: float64 is needed, got {value.dtype}; seconds lose milliseconds in float32")
-            value = as_points(name, value, last[-1] if last else len(self.category))
-            if value.shape != (len(self.category), *last):
-                wanted = (len(self.category), *last)
-                raise InputError(f"{name}: shape {wanted} is needed for its objects, got {tuple(value.shape)}")
-            require_finite(name, value)
-            object.__setattr__(self, name, value)
-        if len(self.track) != len(self):
-            raise InputError(f"track: {len(self)} names or None are needed, got {len(self.track)}")
-        if self.ambiguous.dtype != torch.bool or self.ambiguous.shape != (len(self),):
-            raise InputError(f"ambiguous: bool of shape ({len(self)},) is needed, got {tuple(self.ambiguous.shape)}")
-        _require_covariances(self.covariance.detach())
-
-    def __len__(self) -> int:
-        return len(self.category)
+    @property
+    def left(self) -> Tensor:
+        """(N, 2) pixels of the first camera."""
+        return self.pixels[:, 0]
 
     @property
-    def views(self) -> ObjectViews:
-        """The same as objects of a rig of two cameras."""
-        return ObjectViews(
-            pixels=torch.stack([self.left, self.right], 1),
-            seen=torch.ones(len(self), 2, dtype=torch.bool, device=self.left.device),
-            covariance=self.covariance,
-            time=self.time,
-            score=self.score,
-            category=self.category,
-            ambiguous=self.ambiguous,
-        )
+    def right(self) -> Tensor:
+        """(N, 2) pixels of the last camera."""
+        return self.pixels[:, -1]
+
+    @classmethod
+    def of_pairs(
+        cls,
+        left: Tensor,
+        right: Tensor,
+        *,
+        covariance: Tensor,
+        time: Tensor,
+        score: Tensor,
+        category: tuple[str, ...],
+        ambiguous: Tensor | None = None,
+    ) -> ObjectViews:
+        """Objects that both cameras of a rig see.
+
+        Args:
+            left: (N, 2) pixels of the left camera's full image.
+            right: (N, 2) pixels of the right camera's full image.
+            covariance: (N, 4, 4) of (u_left, v_left, u_right, v_right), px².
+            time: (N, 2) seconds at which the left and the right image were exposed, float64.
+            score: (N,) of the detections.
+            category: N names.
+            ambiguous: (N,) bool: another pairing is about as likely; none if left out.
+
+        Raises:
+            InputError: shapes that do not fit each other, values that are not finite, or a matrix that is not a
+                covariance.
+
+        Example:
+            >>> ship = ObjectViews.of_pairs(
+            ...     torch.tensor([[960.0, 540.0]]), torch.tensor([[944.0, 540.0]]), covariance=torch.eye(4)[None],
+            ...     time=torch.zeros(1, 2).double(), score=torch.ones(1), category=("ship",))
+            >>> len(ship), ship.seen.tolist()
+            (1, [[True, True]])
+        """
+        count, own = len(category), dict(left=left, right=right, covariance=covariance, time=time, score=score)
+        for (name, value), last in zip(own.items(), ((2,), (2,), (4, 4), (2,), ()), strict=True):
+            if name == "time" and isinstance(value, Tensor) and value.dtype != torch.float64:
+                raise InputError(f"time: float64 is needed, got {value.dtype}; seconds lose milliseconds in float32")
+            own[name] = as_points(name, value, last[-1] if last else count)
+            if own[name].shape != (count, *last):
+                raise InputError(f"{name}: shape {(count, *last)} is needed for its objects, got {tuple(value.shape)}")
+            require_finite(name, own[name])
+        _require_covariances(own["covariance"].detach())
+        pixels = torch.stack([own.pop("left"), own.pop("right")], 1)
+        seen = torch.ones_like(pixels[..., 0], dtype=torch.bool)
+        ambiguous = ~seen[:, 0] if ambiguous is None else ambiguous
+        return cls(pixels=pixels, seen=seen, category=category, ambiguous=ambiguous, **own)
 
     @classmethod
     def from_matches(
@@ -195,7 +160,7 @@ class ObjectPairs:
         pixel_sigma: float = 1.0,
         time: tuple[float, float] = (0.0, 0.0),
         category: str = "point",
-    ) -> ObjectPairs:
+    ) -> ObjectViews:
         """Points that a matcher of kornia found in both full images, for example LoFTR or `LocalFeatureMatcher`.
 
         Args:
@@ -211,27 +176,45 @@ class ObjectPairs:
         Example:
             >>> found = {"keypoints0": torch.tensor([[960.0, 540.0]]), "keypoints1": torch.tensor([[944.0, 540.0]]),
             ...          "confidence": torch.tensor([0.9])}
-            >>> ObjectPairs.from_matches(found).right.tolist()
+            >>> ObjectViews.from_matches(found).right.tolist()
             [[944.0, 540.0]]
         """
-        missing = [key for key in ("keypoints0", "keypoints1", "confidence") if key not in matches]
-        if missing:
-            raise InputError(f"matches: {missing[0]} is missing; the dictionary of a matcher of kornia is needed")
+        _require_keys(matches, "keypoints0", "keypoints1", "confidence")
         if not 0 < pixel_sigma < math.inf:
             raise InputError(f"pixel_sigma: a positive number of pixels is needed, got {pixel_sigma}")
         if bool((matches.get("batch_indexes", torch.zeros(1)) != 0).any()):
             raise InputError("matches: one pair of images at a time is needed; `matched_pixels` takes a batch")
         count, place = len(matches["keypoints0"]), matches["keypoints0"].device
-        return cls(
-            left=matches["keypoints0"],
-            right=matches["keypoints1"],
+        return cls.of_pairs(
+            matches["keypoints0"],
+            matches["keypoints1"],
             covariance=(pixel_sigma**2 * torch.eye(4, dtype=torch.float64, device=place)).expand(count, 4, 4),
             time=torch.tensor(time, dtype=torch.float64, device=place).expand(count, 2),
             score=matches["confidence"],
             category=(category,) * count,
-            track=(None,) * count,
-            ambiguous=torch.zeros(count, dtype=torch.bool, device=place),
         )
+
+
+def _require_keys(matches: Mapping[str, Tensor], *keys: str) -> None:
+    missing = [key for key in keys if key not in matches]
+    if missing:
+        raise InputError(f"matches: {missing[0]} is missing; the dictionary of a matcher of kornia is needed")
+
+
+def mark_numbers(pixels: Tensor, seen: Tensor) -> NDArray[np.int64]:
+    """(N, V) numbers of the marks of pixels (N, V, 2), -1 where nothing was seen: rows that share one share a mark.
+
+    Example:
+        >>> pixels = torch.tensor([[[1.0, 2.0], [1.0, 0.0]], [[1.0, 2.0], [2.0, 0.0]]])
+        >>> mark_numbers(pixels, torch.ones(2, 2, dtype=torch.bool)).tolist()
+        [[0, 0], [0, 1]]
+    """
+    numbers = []
+    for marks, there in zip(pixels.unbind(1), seen.T.tolist(), strict=True):
+        known: dict[tuple[float, ...], int] = {}
+        rows = zip(marks.tolist(), there, strict=True)
+        numbers.append([known.setdefault(tuple(mark), len(known)) if one else -1 for mark, one in rows])
+    return np.array(numbers, dtype=np.int64).reshape(len(numbers), len(pixels)).T
 
 
 class PixelPairs(NamedTuple):
@@ -279,9 +262,7 @@ def matched_pixels(matches: Mapping[str, Tensor], batch: int) -> PixelPairs:
         left, right = (center[numbers[:, side]] for side, center in enumerate(centers))
         own = {"confidence": torch.ones_like(left[:, 0]), **matches, "keypoints0": left, "keypoints1": right}
         matches = {**own, "batch_indexes": torch.zeros_like(numbers[:, 0])}
-    missing = [key for key in ("keypoints0", "keypoints1", "confidence", "batch_indexes") if key not in matches]
-    if missing:
-        raise InputError(f"matches: {missing[0]} is missing; the dictionary of a matcher of kornia is needed")
+    _require_keys(matches, "keypoints0", "keypoints1", "confidence", "batch_indexes")
     image = matches["batch_indexes"].long()
     if bool(((image < 0) | (image >= batch)).any()):
         raise InputError(f"matches: batch_indexes reach {int(image.max())}; the batch has {batch} pairs of images")
@@ -612,7 +593,7 @@ def pair_objects(
     *,
     options: AssociationOptions | None = None,
     disparity: ObjectDisparity | None = None,
-) -> ObjectPairs:
+) -> ObjectViews:
     """Pair the detections of both images, and match the image inside the boxes where there are images.
 
     Where matching succeeds, both pixels share the error of the anchor, `options.box_sigma`, and the right one has the
@@ -658,13 +639,12 @@ def pair_objects(
              torch.cat([slope @ own, slope @ own @ slope.mT + done.covariance], -1)], -2,
         )  # fmt: skip
         covariance = torch.where(good[:, None, None], 0.5 * (shared + shared.mT), covariance)
-    return ObjectPairs(
-        left=anchors,
-        right=pixels,
+    return ObjectViews.of_pairs(
+        anchors,
+        pixels,
         covariance=covariance,
         time=anchors.new_tensor([left.time or 0.0, right.time or 0.0]).expand(len(first), 2),
         score=torch.minimum(first.score, second.score),
         category=first.category,
-        track=tuple(one or other for one, other in zip(first.track, second.track, strict=True)),
         ambiguous=found.ambiguous,
     )

@@ -36,7 +36,7 @@ from kcal.pipeline.measurements import (
     sightings,
     squared,
 )
-from kcal.pipeline.pairing import ObjectPairs, ObjectViews, mark_numbers
+from kcal.pipeline.pairing import ObjectViews, mark_numbers
 
 # When tracks begin and end, and what is told of them.
 
@@ -331,9 +331,8 @@ class Tracker:
         >>> tracker = Tracker(StereoLocalizer(rig, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0))
         >>> for time in torch.arange(10).double() / 10:
         ...     left, right, _ = rig(torch.tensor([[0.0, 0.0, 500.0]]) + time * torch.tensor([8.0, 0.0, 0.0]))
-        ...     pairs = ObjectPairs(left=left, right=right, covariance=0.04 * torch.eye(4)[None],
-        ...                         time=time.expand(1, 2), score=torch.ones(1), category=("car",), track=(None,),
-        ...                         ambiguous=torch.zeros(1, dtype=torch.bool))
+        ...     pairs = ObjectViews.of_pairs(left, right, covariance=0.04 * torch.eye(4)[None],
+        ...                                  time=time.expand(1, 2), score=torch.ones(1), category=("car",))
         ...     tracks = tracker(pairs)
         >>> tracks.number, round(tracks.state.enu[0, 1].item()), round(tracks.state.velocity[0, 0].item())
         ((1,), 500, 8)
@@ -390,18 +389,17 @@ class Tracker:
             self.steps = compiled_steps(self.steps, len(rig), self.beliefs, self.shared.mixing)
 
     @torch.no_grad()
-    def __call__(self, objects: ObjectViews | ObjectPairs, time: float | None = None) -> Tracks:
+    def __call__(self, views: ObjectViews, time: float | None = None) -> Tracks:
         """Take in the objects of one moment; moments must not go back in time.
 
         Args:
-            objects: may be empty if `time` is given.
+            views: may be empty if `time` is given.
             time: seconds to which tracks are moved; if left out, the latest exposure of the first camera (of any, where
                 that saw nothing).
 
         Raises:
             InputError: a time before that of the last call, or none.
         """
-        views = objects.views if isinstance(objects, ObjectPairs) else objects
         if views.cameras != len(self.localize.rig):
             raise InputError(f"objects of {views.cameras} cameras, and the rig has {len(self.localize.rig)}")
         if time is None:

@@ -28,7 +28,7 @@ from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.pipeline.association import AssociationOptions
 from kcal.pipeline.detections import Detections, Detector, detect_in
 from kcal.pipeline.grouping import Moment, group_objects
-from kcal.pipeline.pairing import ObjectDisparity, ObjectPairs, ObjectViews, pair_objects
+from kcal.pipeline.pairing import ObjectDisparity, ObjectViews, pair_objects
 from kcal.pipeline.stream import CALENDAR, SourceItem
 from kcal.threads import Handover
 
@@ -603,7 +603,7 @@ class Videos:
         self.counts.paired += 1
         return Moment(time, found)
 
-    def _objects(self, seen: list[Detections | None], group: list[TimedFrame | None]) -> ObjectPairs | ObjectViews:
+    def _objects(self, seen: list[Detections | None], group: list[TimedFrame | None]) -> ObjectViews:
         if not isinstance(self._rig, StereoRig):
             return group_objects(self._rig, seen, self._options)
         (left, right), (one, other) = seen, group

@@ -24,7 +24,7 @@ from kcal.io.rig_file import save_rig
 from kcal.lens.rig import Mounting, Origin, RigCovariance, StereoRig
 from kcal.locate.budget import planned_rig
 from kcal.locate.localizer import StereoLocalizer
-from kcal.pipeline.pairing import ObjectPairs
+from kcal.pipeline.pairing import ObjectViews
 from kcal.pipeline.tracks import Tracker
 from scripts.shared.page import table, write_section
 
@@ -56,10 +56,10 @@ def cost_of_tracks(targets: int = 50, moments: int = 60, compiled: bool = False)
     spent = 0.0
     for moment in range(moments):
         left, right = marks(rig, targets, moment / 30.0, generator)
-        pairs = ObjectPairs(
-            left=left, right=right, covariance=0.04 * torch.eye(4, dtype=torch.float64).expand(targets, 4, 4),
+        pairs = ObjectViews.of_pairs(
+            left, right, covariance=0.04 * torch.eye(4, dtype=torch.float64).expand(targets, 4, 4),
             time=torch.full((targets, 2), moment / 30.0, dtype=torch.float64), score=torch.ones(targets),
-            category=("car",) * targets, track=(None,) * targets, ambiguous=torch.zeros(targets, dtype=torch.bool),
+            category=("car",) * targets,
         )  # fmt: skip
         before = time.process_time()
         tracker(pairs)

@@ -25,7 +25,6 @@ from torch import Tensor
 from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
 from kcal.pipeline.association import AssociationOptions
-from kcal.pipeline.pairing import ObjectPairs
 from kcal.pipeline.video_source import Videos
 from scripts.shared.object_scene import Floats, exposed, paint_plate, plate, true_box
 from scripts.shared.page import table, write_section
@@ -95,7 +94,6 @@ def errors_of(rig: StereoRig, films: list[list[Tensor]], boxes: list[list[Floats
         for frame, item in enumerate(source(0)):
             assert not isinstance(item.moment, Exception)
             pairs = item.moment.pairs
-            assert isinstance(pairs, ObjectPairs)
             left, right, _ = rig(places(item.moment.time, pace))
             which = torch.cdist(pairs.left, left).argmin(-1)
             c = pairs.covariance

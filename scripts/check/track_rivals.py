@@ -20,7 +20,7 @@ from stonesoup.updater.kalman import KalmanUpdater, UnscentedKalmanUpdater
 from torch import Tensor
 
 from kcal.locate.localizer import StereoLocalizer
-from kcal.pipeline.pairing import ObjectPairs
+from kcal.pipeline.pairing import ObjectViews
 
 START = datetime.datetime(2026, 1, 1)
 
@@ -145,7 +145,7 @@ class OfPixels(CartesianFilters):
     """Takes in the pairs themselves, unscented: the same information as kcal's tracker, in other coordinates."""
 
     def take(
-        self, targets: Tensor, pairs: ObjectPairs, places: Tensor, localize: StereoLocalizer, offset: float
+        self, targets: Tensor, pairs: ObjectViews, places: Tensor, localize: StereoLocalizer, offset: float
     ) -> None:
         """Take in the pairs of a moment.
 

@@ -23,7 +23,7 @@ from kcal.locate.budget import planned_rig
 from kcal.locate.localizer import StereoLocalizer
 from kcal.pipeline.imm_filter import Motion
 from kcal.pipeline.measurements import ClockPrior
-from kcal.pipeline.pairing import ObjectPairs
+from kcal.pipeline.pairing import ObjectViews
 from kcal.pipeline.tracks import Tracker, TrackOptions, Tracks
 from scripts.check.track_rivals import CartesianFilters, OfPixels, OfPositions
 from scripts.shared.page import table, write_section
@@ -74,7 +74,7 @@ def drawn_site(seed: int, frames: int) -> Site:
     return Site(localize, true, path, pace, generator)
 
 
-def seen_pairs(site: Site, frame: int, drift: float = 0.0, slope: float = 0.0) -> tuple[ObjectPairs, Tensor, Tensor]:
+def seen_pairs(site: Site, frame: int, drift: float = 0.0, slope: float = 0.0) -> tuple[ObjectViews, Tensor, Tensor]:
     """Pairs of a moment, the targets that they are of, and the true places when the left camera looked."""
     g, time = site.generator, frame / 10.0
     # The right camera runs at 25 frames a second; the nearest frame is taken, and its clock is late.
@@ -93,15 +93,13 @@ def seen_pairs(site: Site, frame: int, drift: float = 0.0, slope: float = 0.0) -
     still = torch.eye(2, dtype=torch.float64)
     shared = BEARING_PX**2 * torch.ones(2, 2, dtype=torch.float64)
     shared[1, 1] += MATCH_PX**2
-    pairs = ObjectPairs(
-        left=(left + box)[which],
-        right=(right + box + match)[which],
+    pairs = ObjectViews.of_pairs(
+        (left + box)[which],
+        (right + box + match)[which],
         covariance=torch.kron(shared, still).expand(len(which), 4, 4),
         time=torch.tensor([time, stamp], dtype=torch.float64).expand(len(which), 2),
         score=torch.ones(len(which)),
         category=("object",) * len(which),
-        track=(None,) * len(which),
-        ambiguous=torch.zeros(len(which), dtype=torch.bool),
     )
     return pairs, which, places
 

@@ -12,7 +12,7 @@ from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import Origin, RigCovariance, StereoRig
 from kcal.locate.budget import planned_rig
 from kcal.locate.localizer import StereoLocalizer
-from kcal.pipeline.pairing import ObjectPairs
+from kcal.pipeline.pairing import ObjectViews
 
 ORIGIN = Origin(lat=19.07, lon=72.87, height=14.0)
 
@@ -34,17 +34,16 @@ def tracked_site(yaw_deg: float = 0.0, **options: object) -> StereoLocalizer:
 
 def pairs_of(
     left: Tensor, right: Tensor, time: float | Tensor, sigma: float = 0.3, ambiguous: Sequence[bool] | None = None
-) -> ObjectPairs:
+) -> ObjectViews:
     """Pairs of one category; `time` is that of both, or (2,)."""
     count = len(left)
-    return ObjectPairs(
-        left=left,
-        right=right,
+    return ObjectViews.of_pairs(
+        left,
+        right,
         covariance=sigma**2 * torch.eye(4, dtype=torch.float64).expand(count, 4, 4),
         time=torch.as_tensor(time, dtype=torch.float64).expand(count, 2).clone(),
         score=torch.ones(count),
         category=("car",) * count,
-        track=(None,) * count,
         ambiguous=torch.tensor(ambiguous or [False] * count, dtype=torch.bool),
     )
 

@@ -8,10 +8,10 @@ from kornia.feature import DescriptorMatcher, LocalFeatureMatcher, SIFTFeature, 
 from kornia.filters import gaussian_blur2d
 
 from kcal.errors import InputError
-from kcal.pipeline.pairing import ObjectPairs, matched_pixels
+from kcal.pipeline.pairing import ObjectViews, matched_pixels
 
 
-def pairs(**changes: object) -> ObjectPairs:
+def pairs(**changes: object) -> ObjectViews:
     given = {
         "left": torch.rand(3, 2),
         "right": torch.rand(3, 2),
@@ -19,10 +19,9 @@ def pairs(**changes: object) -> ObjectPairs:
         "time": torch.zeros(3, 2, dtype=torch.float64),
         "score": torch.ones(3),
         "category": ("ship", "buoy", "ship"),
-        "track": (None, "7", None),
         "ambiguous": torch.zeros(3, dtype=torch.bool),
     }
-    return ObjectPairs(**(given | changes))  # type: ignore[arg-type]
+    return ObjectViews.of_pairs(**(given | changes))  # type: ignore[arg-type]
 
 
 def test_everything_becomes_float64() -> None:
@@ -33,10 +32,9 @@ def test_everything_becomes_float64() -> None:
 
 def test_no_objects() -> None:
     none = torch.zeros(0, 2, dtype=torch.float64)
-    empty = ObjectPairs(
-        left=none, right=none, covariance=none.new_zeros(0, 4, 4), time=none, score=none[:, 0], category=(), track=(),
-        ambiguous=torch.zeros(0, dtype=torch.bool),
-    )  # fmt: skip
+    empty = ObjectViews.of_pairs(
+        none, none, covariance=none.new_zeros(0, 4, 4), time=none, score=none[:, 0], category=()
+    )
     assert len(empty) == 0
     assert dataclasses.replace(empty).left.shape == (0, 2)
 
@@ -49,7 +47,6 @@ def test_no_objects() -> None:
         ({"right": torch.full((3, 2), torch.nan)}, "right: 6 of 6 values are not finite"),
         ({"time": torch.zeros(3, 2)}, "time: float64 is needed"),
         ({"score": torch.ones(2)}, "score"),
-        ({"track": (None,)}, "track: 3 names"),
         ({"ambiguous": torch.zeros(3)}, "ambiguous: bool"),
         ({"covariance": -torch.eye(4).expand(3, 4, 4)}, "3 of 3 are not symmetric or have a negative"),
         ({"covariance": torch.eye(4).index_put((torch.tensor(0), torch.tensor(1)), torch.tensor(0.5)).expand(3, 4, 4)},
@@ -68,7 +65,7 @@ def test_what_kornia_matched() -> None:
     image = gaussian_blur2d(noise.repeat_interleave(2, 2).repeat_interleave(2, 3), 7, (2.0, 2.0))
     matcher = LocalFeatureMatcher(SIFTFeature(60), DescriptorMatcher("smnn", 0.9))
     found = matcher({"image0": image, "image1": image.roll(-12, 3)})
-    points = ObjectPairs.from_matches(found, pixel_sigma=0.5, time=(1.0, 1.1))
+    points = ObjectViews.from_matches(found, pixel_sigma=0.5, time=(1.0, 1.1))
     assert len(points) > 10
     shift = (points.left - points.right).median(0).values
     assert torch.allclose(shift, torch.tensor([12.0, 0.0], dtype=torch.float64), atol=0.2)
@@ -87,7 +84,7 @@ def test_what_kornia_matched() -> None:
 def test_what_is_no_match_is_refused(change: dict, message: str) -> None:
     given = {"keypoints0": torch.ones(2, 2), "keypoints1": torch.ones(2, 2), "confidence": torch.ones(2)} | change
     with pytest.raises(InputError, match=message):
-        ObjectPairs.from_matches({key: value for key, value in given.items() if value is not None})
+        ObjectViews.from_matches({key: value for key, value in given.items() if value is not None})
 
 
 def test_batched_matches_of_kornia_reach_the_localizer() -> None:

@@ -17,7 +17,7 @@ from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import StereoRig
 from kcal.pipeline.association import _patches, appearance, near_epipolar_lines
 from kcal.pipeline.imm_filter import Motion
-from kcal.pipeline.pairing import ObjectPairs
+from kcal.pipeline.pairing import ObjectViews
 from kcal.pipeline.tracks import Tracker, TrackOptions, TrackRecord, _toward
 
 SLOW = TrackOptions(motions=(Motion(acceleration=0.05),), confirm_hits=3, lose_after_s=1.0, forget_after_s=4.0)
@@ -31,7 +31,7 @@ class Scene:
         localize = tracked_site()
         self.tracker, self.rig = Tracker(localize, options), localize.rig
 
-    def pairs(self, time: float, *places: tuple[float, float, float], doubt: bool = False) -> ObjectPairs:
+    def pairs(self, time: float, *places: tuple[float, float, float], doubt: bool = False) -> ObjectViews:
         left, right, _ = self.rig(torch.tensor(places).double().reshape(-1, 3))
         return pairs_of(left, right, time, 0.2, [doubt] * len(places))
 
@@ -113,7 +113,7 @@ class TestRules:
         pairs = scene.pairs(0.0, HERE, (30.0, 0.0, 500.0))
         times = torch.tensor([[7.0, 7.4], [7.1, 7.6]]).double()
         assert scene.tracker(dataclasses.replace(pairs, time=times)).time == pytest.approx(7.1)
-        views = dataclasses.replace(pairs, time=times + 1.0).views
+        views = dataclasses.replace(pairs, time=times + 1.0)
         right = dataclasses.replace(views, seen=torch.tensor([[False, True]] * 2))
         assert scene.tracker(right).time == pytest.approx(8.6)
 

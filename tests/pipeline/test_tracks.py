@@ -37,8 +37,7 @@ def test_one_sighting_is_what_the_localizer_says() -> None:
     pairs = pairs_of(left, right + tensor([0.0, 0.4]), 7.0)
     expected = localize(pairs.left, pairs.right, pairs.covariance)
     stations = stations_at(localize)
-    views = pairs.views
-    seen = sightings(known_sightings(stations), views.pixels, views.seen, views.covariance, views.time)
+    seen = sightings(known_sightings(stations), pairs.pixels, pairs.seen, pairs.covariance, pairs.time)
     turned = torch.linalg.qr(torch.eye(3).double() + 0.2 * mix[:3, :3])[0]
     frame = ((turned * torch.sign(turned.diagonal())).T @ localize.enu_from_rig.T).expand(4, 3, 3)
     timing = Timing(torch.zeros(2, 4).double(), torch.zeros(0, 3, 4).double(), torch.zeros(0, 4).double())
