@@ -17,6 +17,8 @@ from typing import Any
 
 import typer
 
+from scripts.make_reference import returned_by
+
 DOORS = ("kcal", *(f"kcal.{name}" for name in
          ["lens", "corners", "calibrate", "rig", "locate", "track", "report", "stars", "solve", "nets"]))  # fmt: skip
 FOLDER = Path(__file__).parents[1] / "tests" / "promises"
@@ -54,7 +56,7 @@ def _members(value: type) -> Iterator[tuple[str, str]]:
 
 
 def python_lines() -> list[str]:
-    """One line for each public name, and one for each public member of a public class."""
+    """One line for each public name, and one for each public member of a public class and of a result."""
     lines = []
     for door in DOORS:
         for name in importlib.import_module(door).__all__:
@@ -64,6 +66,9 @@ def python_lines() -> list[str]:
             lines.append(f"{door}.{name}{_arguments(value)}")
             if inspect.isclass(value):
                 lines += [f"{door}.{name}.{member}{arguments}" for member, arguments in _members(value)]
+    for name, module in (home for homes in returned_by().values() for home in homes):
+        value = getattr(importlib.import_module(module), name)
+        lines += [f"{name}.{member}{arguments}" for member, arguments in _members(value)]
     return lines
 
 

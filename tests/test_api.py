@@ -34,7 +34,7 @@ PUBLIC = {
     """,
     "kcal.lens": """
         CameraCalibration CameraLike CameraRays ExtendedDistortion ImageTransform LensModel LensSetting
-        StereoRectification Undistort UndistortImage bake camera_difference cylinder_view export_cameras
+        StereoRectification Undistort UndistortImage Unproject bake camera_difference cylinder_view export_cameras
         import_cameras load_lookup looking new_pinhole pinhole_view pixel_covariance projection_sigma
         refit_camera rotation_from_vector save_lookup save_onnx undistort_maps vector_from_rotation
     """,
@@ -50,7 +50,7 @@ PUBLIC = {
         CameraRig Effect ImagePair Mounting MovingOptions RasterError RigCovariance SkylineImage Survey Watched
         check_rig import_survey load_camera_rig match_landmarks match_moving mounting_covariance
         pair_by_name paired_boards placed_rig planned_rig read_features read_pairs read_sightings
-        read_tracks save_camera_rig scene_features skyline_source
+        read_tracks save_camera_rig scene_features skyline_attitude skyline_source
     """,
     "kcal.locate": """
         BudgetErrors DisparityRanges Marks MultiViewLocalizer Site Triangulate ViewMarks
@@ -80,7 +80,7 @@ PUBLIC = {
 NAMES = [(door, name) for door, names in PUBLIC.items() for name in names.split()]
 NAMESPACES = {door.removeprefix("kcal.") for door in PUBLIC} - {"kcal"}
 # Types of attributes in which only those look who work on kcal.
-INSIDE = {"HistoryRow", "TurnModel"}
+INSIDE = {"HistoryRow", "LearnedStart", "TurnModel"}
 # What functions return, and blocks of files: examples are those of the functions.
 RECORDS = {
     "ViewMarks",

@@ -37,6 +37,7 @@ from kcal.lens.camera_like import CameraLike as CameraLike
 from kcal.lens.baking import bake as bake
 from kcal.io.lookup_file import load_lookup as load_lookup
 from kcal.io.lookup_file import save_lookup as save_lookup
+from kcal.lens.camera_like import Unproject as Unproject
 
 # Rotations
 from kcal.lens.pose import rotation_from_vector as rotation_from_vector

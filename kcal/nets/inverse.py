@@ -60,16 +60,6 @@ class Network(StatedModule):
         return self.widths
 
 
-def weight_count(widths: Widths) -> int:
-    """Return the number of weights of a network.
-
-    Example:
-        >>> weight_count((2, 8, 8, 2))
-        114
-    """
-    return sum(out * (inside + 1) for inside, out in itertools.pairwise(widths))
-
-
 def initial_weights(widths: Widths, seed: int = 0) -> Tensor:
     """Draw random hidden layers and a last layer of zeros, so that the network's value is zero everywhere.
 

@@ -15,6 +15,7 @@ from kcal.calibrate.rig.sources import Effect as Effect
 
 # Skylines
 from kcal.skyline.attitude import skyline_source as skyline_source
+from kcal.skyline.attitude import skyline_attitude as skyline_attitude
 from kcal.skyline.attitude import SkylineImage as SkylineImage
 from kcal.skyline.horizon import RasterError as RasterError
 

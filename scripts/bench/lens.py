@@ -25,9 +25,9 @@ from torch import Tensor
 from kcal.calibrate.hybrid.fit import fit_hybrid
 from kcal.lens.camera import Camera
 from kcal.lens.camera_like import Unproject
-from kcal.lens.distortion import distort
 from scripts.bench import undistort
 from scripts.shared import wide_lens
+from scripts.shared.distorted import distort
 from scripts.shared.page import write_section
 from scripts.shared.timing import median, ratio, row, show, times
 

@@ -25,7 +25,6 @@ from kcal.nets.inverse import (
     evaluate_with_slopes,
     fit_weights,
     initial_weights,
-    weight_count,
 )
 from kcal.solve.lm import LMOptions
 from kcal.solve.problem import Result, State
@@ -78,7 +77,7 @@ class PureLensNet(Network):
         weights = initial_weights(widths, seed)
         if not skip:
             generator = torch.Generator().manual_seed(seed + 1)
-            last = weight_count(widths[-2:])
+            last = widths[-1] * (widths[-2] + 1)
             weights[-last:] = hidden**-0.5 * torch.randn(last, generator=generator, dtype=torch.float64)
         super().__init__(widths, weights.to(intrinsics.device))
         self.skip = skip

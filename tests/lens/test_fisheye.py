@@ -12,9 +12,9 @@ from torch import Tensor
 from torch.func import jacfwd
 
 from kcal.lens.camera import Camera
-from kcal.lens.distortion import distort
 from kcal.lens.model import PRESETS, LensModel
 from kcal.lens.projection import angle_over_distance, project_components
+from scripts.shared.distorted import distort
 
 FISHEYE = PRESETS["fisheye4"]
 COEFFICIENTS = [0.03, -0.012, 0.004, -0.0007]

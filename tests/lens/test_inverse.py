@@ -13,11 +13,11 @@ from torch import Tensor
 
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.lens.distortion import distort
 from kcal.lens.inverse import undistort
 from kcal.lens.model import LensModel
 from kcal.lens.projection import largest_radius
 from kcal.lens.region import valid_region
+from scripts.shared.distorted import distort
 
 # Newton stops at 1e-13 in normalized coordinates, which is 2e-10 px at 2000 px of focal length.
 PIXEL_TOLERANCE = 1e-9

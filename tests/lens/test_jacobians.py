@@ -15,9 +15,9 @@ from lenses import HYBRID, MODELS, distort_with_jacobian, parameters, strong
 from torch import Tensor
 from torch.func import jacfwd
 
-from kcal.lens.distortion import distort
 from kcal.lens.model import LensModel
 from kcal.lens.projection import project_components
+from scripts.shared.distorted import distort
 
 STATES = ("zero", "strong")
 # (3, N): about the axis, on both coordinate axes, in all four quadrants, near and far.

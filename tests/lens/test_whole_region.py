@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from kcal.lens.distortion import distort
 from kcal.lens.inverse import undistort
 from scripts.check import inverse
+from scripts.shared.distorted import distort
 
 
 @pytest.mark.slow

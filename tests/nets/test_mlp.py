@@ -6,14 +6,14 @@ import pytest
 import torch
 
 from kcal.errors import InputError
-from kcal.nets.inverse import evaluate, evaluate_with_slopes, initial_weights, layers, weight_count
+from kcal.nets.inverse import evaluate, evaluate_with_slopes, initial_weights, layers
 
 WIDTHS = [(2, 3), (2, 5, 4, 2), (3, 4, 6, 4, 1)]
 
 
 def random_net(widths: tuple[int, ...], *lead: int) -> tuple[torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(1)
-    weights = torch.randn(weight_count(widths), generator=generator, dtype=torch.float64)
+    weights = torch.randn(len(initial_weights(widths)), generator=generator, dtype=torch.float64)
     return torch.randn(*lead, widths[0], 7, generator=generator, dtype=torch.float64), weights
 
 
@@ -21,7 +21,7 @@ def random_net(widths: tuple[int, ...], *lead: int) -> tuple[torch.Tensor, torch
 def test_slopes_are_those_of_autograd(widths: tuple[int, ...]) -> None:
     inputs, weights = random_net(widths)
     net = evaluate_with_slopes(inputs, weights, widths)
-    assert net.by_weights.shape == (weight_count(widths), widths[-1], 7)
+    assert net.by_weights.shape == (len(weights), widths[-1], 7)
     torch.testing.assert_close(net.values, evaluate(inputs, weights, widths))
     by_weights = torch.func.jacfwd(evaluate, argnums=1)(inputs, weights, widths)
     torch.testing.assert_close(net.by_weights, by_weights.movedim(-1, 0))

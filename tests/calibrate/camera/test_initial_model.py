@@ -16,9 +16,9 @@ from kcal.calibrate.problem.views import CameraViews
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.lens.camera import Camera
-from kcal.lens.distortion import distort
 from kcal.lens.hybrid_terms import radius_over_angle
 from kcal.lens.model import LensModel
+from scripts.shared.distorted import distort
 
 TRUTH = camera("opencv14")
 # Of a standard deviation: the noise that priors count against is settled to 1e-4.
