@@ -13,7 +13,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from kcal.calibrate.hybrid.board_modes import BoardModes
 from kcal.calibrate.hybrid.evidence_rounds import LAST, run_rounds
-from kcal.calibrate.hybrid.families import prior_families, typical_hyperprior
+from kcal.calibrate.hybrid.families import PUPIL, prior_families, typical_hyperprior
 from kcal.calibrate.hybrid.fitted_views import NO_MOTION, Estimate, FittedViews
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.covariance import information_of
@@ -110,8 +110,6 @@ def lens_rows(problem: BoardProblem, state: BoardState, noise: float) -> Tensor:
 
 # Of the field's disc over the image's half diagonal.
 _REACH = 1.08
-# The pupil's two places among the unknowns, after focal length, principal point and shape.
-_PUPIL = slice(4, 6)
 _SHAPES = (1.0, 0.5, 0.25, 0.0, -0.3)
 # Stars farther off than so many typical sigmas are left out, first and later.
 _FIRST_CUT, CUT = 7.0, 5.0
@@ -165,8 +163,6 @@ def fit_star_lens(
     """
     require_stars(fields)
     modes, stars = ZernikeModes(), StarViews.of(fields)
-    hyperprior = typical_hyperprior(modes)
-    h = hyperprior.mean
     radius = _REACH * 0.5 * math.hypot(*size)
 
     def model_of(shape: float) -> LensModel:
@@ -179,31 +175,29 @@ def fit_star_lens(
     shape = min((cost, shape) for shape, cost in costs.items() if math.isfinite(cost))[1]
     for _ in range(4):  # the constants of the form follow what is found
         model = model_of(shape)
-        estimate = _typical_estimate(model, focal, stars, size, state, h)
-        never = torch.arange(len(estimate.families.mean)) >= _PUPIL.start
-        _, estimate, _ = _fitted(stars, size).solved(estimate, never, _BASE_EFFORT, last_step=True)
+        estimate = _typical_estimate(model, focal, stars, size, state)
+        held = torch.arange(len(estimate.families.mean)) >= PUPIL.start
+        _, estimate, _ = _fitted(stars, size).solved(estimate, _BASE_EFFORT, last_step=True, held=held)
         state, parameters = estimate.state, estimate.state.parameters.clone()
         stars = stars.near(model, state, _FIRST_CUT)
         focal, shape = float(parameters[0]), shape + min(max(float(parameters[5]), -1.0), 1.0)
         parameters[5] = 0.0
         state = state._replace(parameters=parameters)
     model = model_of(shape)
-    estimate = _typical_estimate(model, focal, stars, size, state, h)
-    never = torch.zeros_like(estimate.families.mean, dtype=torch.bool)
-    never[_PUPIL] = True
+    estimate = _typical_estimate(model, focal, stars, size, state)
 
     def without_far(capture: FittedViews, estimate: Estimate) -> FittedViews:
         weights = stars.near(model, estimate.state, CUT).weights
         return dataclasses.replace(capture, weights=weights)
 
+    capture = _fitted(stars, size)
     rounds = run_rounds(
-        _fitted(stars, size), estimate, hyperprior, never,
-        cold=False, spent=0, rough=False, progress=lambda _: None, reweigh=without_far,
-    )  # fmt: skip
+        capture, estimate, cold=False, spent=0, rough=False, progress=lambda _: None, reweigh=without_far
+    )
     stars = stars._replace(weights=rounds.capture.weights, variance=rounds.estimate.variance)
-    _, estimate, _ = rounds.capture.solved(rounds.estimate, never, LAST, last_step=True)
+    _, estimate, _ = rounds.capture.solved(rounds.estimate, LAST, last_step=True)
     state = estimate.state
-    stated = rounds.capture.problem(estimate._replace(variance=stars.noise**2), never)
+    stated = rounds.capture.problem(estimate._replace(variance=stars.noise**2))
     information = information_of(stated, state, stars.noise)
     camera = Camera(state.parameters, size=size, model=model)
     return star_lens(stars, state, camera, information.rows, information)
@@ -218,22 +212,20 @@ def _fitted(stars: StarViews, size: tuple[int, int]) -> FittedViews:
         pixels=stars.pixels,
         size=size,
         weights=stars.weights,
-        readout=None,
-        square=True,
-        robust=False,
+        hyperprior=typical_hyperprior(),
         exact=True,
         turning=True,
     )
 
 
 def _typical_estimate(
-    model: LensModel, focal: float, stars: StarViews, size: tuple[int, int], state: BoardState, h: Tensor
+    model: LensModel, focal: float, stars: StarViews, size: tuple[int, int], state: BoardState
 ) -> Estimate:
     """With typical amplitudes, and noise as residuals tell it."""
     form = model.hybrid
     assert form is not None
     families = prior_families(form, focal, _fitted(stars, size).board, size, 1.0)
-    return Estimate(model, families, state, h, NO_MOTION, stars.variance, 1.0)
+    return Estimate(model, families, state, typical_hyperprior().mean, NO_MOTION, stars.variance, 1.0)
 
 
 def require_stars(fields: Sequence[StarField]) -> None:

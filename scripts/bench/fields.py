@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
+from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.network_fit import FieldTraining
 from kcal.corners.board import Board
 from kcal.corners.detect import detect
@@ -47,7 +47,9 @@ class Case(NamedTuple):
 
 def with_modes(modes: FieldModes, training: FieldTraining | None = None) -> Fitter:
     def fit(seen: Observations, weight: Tensor) -> HybridFit:
-        return fit_hybrid(seen.board.points, seen.pixels(), seen.image_size, weight, modes=modes, training=training)
+        return fit_hybrid(
+            seen.board.points, seen.pixels(), seen.image_size, weight, FitOptions(modes=modes, training=training)
+        )
 
     return fit
 

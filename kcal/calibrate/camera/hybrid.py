@@ -44,7 +44,7 @@ from kcal.calibrate.camera.warnings import (
     pupil_warnings,
     spacing_warnings,
 )
-from kcal.calibrate.hybrid.fit import FitStart, HybridFit, fit_hybrid, rough_start
+from kcal.calibrate.hybrid.fit import FitOptions, FitStart, HybridFit, fit_hybrid, rough_start
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError
 from kcal.solve.problem import SolverStatus
@@ -64,9 +64,8 @@ def calibrate_hybrid(
     weights, start = torch.ones_like(pixels[..., 0]), None
     if options.weighted and observations.covariances() is not None:
         start = rough_start(
-            board, pixels, observations.image_size, weights, options.board, options.motion, options.bending,
-            options.start_focal(observations.image_size), progress, options.modes,
-        )  # fmt: skip
+            board, pixels, observations.image_size, weights, options.of_fit(observations.image_size), progress
+        )
         weights = corner_weights(observations, start.residuals)
     fit = fit_by_options(observations, pixels, weights, start, options, progress)
     return hybrid_result(observations, fit, options)
@@ -82,11 +81,11 @@ def fit_by_options(
     robust: bool = False,
 ) -> HybridFit:
     """Fit a hybrid lens as the options say; arguments as of `kcal.calibrate.hybrid.fit.fit_hybrid`."""
-    return fit_hybrid(
-        observations.board.points, pixels, observations.image_size, weights, options.modes, board=options.board,
-        motion=options.motion, bending=options.bending, focal=options.start_focal(observations.image_size), start=start,
-        robust=robust, training=None if robust or options.modes is None else options.training, progress=progress,
-    )  # fmt: skip
+    own = options.of_fit(observations.image_size)
+    if robust:
+        own = dataclasses.replace(own, robust=True, training=None)
+    size = observations.image_size
+    return fit_hybrid(observations.board.points, pixels, size, weights, own, start=start, progress=progress)
 
 
 def corner_weights(observations: Observations, residuals: Tensor) -> Tensor:
@@ -307,7 +306,8 @@ def _wrong_views(observations: Observations, options: CalibrationOptions) -> dic
     """Views that do not fit, by a fit in which few wrong corners count little: index -> why."""
     pixels, board = observations.pixels(), observations.board.points
     try:
-        fit = fit_hybrid(board, pixels, observations.image_size, board=options.board, robust=True)
+        own = FitOptions(board=options.board, robust=True)
+        fit = fit_hybrid(board, pixels, observations.image_size, options=own)
     except (*_FAILED, DegenerateError):
         return {}
     residuals = fit.residuals_of(pixels)

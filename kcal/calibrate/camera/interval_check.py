@@ -151,9 +151,9 @@ class SimulatedCapture(NamedTuple):
     def calibrated(self, options: CalibrationOptions, *, warm: bool = True) -> Camera:
         """The camera that this capture gives, with its error bars; `warm`: the fit begins at that of the real one."""
         if self.fit is not None:
+            own = dataclasses.replace(options.of_fit(self.seen.image_size), focal=None, training=None)
             fit = fit_hybrid(
-                self.seen.board.points, self.pixels, self.seen.image_size, self.fit.weights, options.modes,
-                board=options.board, motion=options.motion, bending=options.bending,
+                self.seen.board.points, self.pixels, self.seen.image_size, self.fit.weights, own,
                 start=self.fit if warm else None,
             )  # fmt: skip
             fit.camera.calibration = CameraCalibration(information=fit.information)

@@ -127,11 +127,7 @@ def hybrid_views(
     data = (pixels, board_points)
     fixed = tuple(tensor.detach() for tensor in data)
     if start is None:
-        fit = fit_hybrid(
-            fixed[1], fixed[0], size, modes=options.modes, board=options.board, motion=options.motion,
-            bending=options.bending, focal=options.start_focal(size),
-            training=None if options.modes is None else options.training,
-        )  # fmt: skip
+        fit = fit_hybrid(fixed[1], fixed[0], size, options=options.of_fit(size))
         begin = fit.state
     else:
         fit, begin = start[0], BoardState(*(part.detach() for part in start[1]))

@@ -11,7 +11,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from kcal.calibrate.hybrid.fit import HybridFit
+from kcal.calibrate.hybrid.fit import FitOptions, HybridFit
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard
 from kcal.calibrate.hybrid.network_fit import FieldTraining
 from kcal.calibrate.problem.parameters import ParameterConstraints, natural_value
@@ -172,6 +172,18 @@ class CalibrationOptions:
         if self.field is not None:
             return NetworkModes.of(self.field)[0]
         return NetworkModes.random(_UNITS) if self.model == NETWORK else None
+
+    def of_fit(self, size: tuple[int, int]) -> FitOptions:
+        """Those of the fit of a hybrid lens to images of (width, height)."""
+        modes = self.modes
+        return FitOptions(
+            modes=modes,
+            board=self.board,
+            motion=self.motion,
+            bending=self.bending,
+            focal=self.start_focal(size),
+            training=None if modes is None else self.training,
+        )
 
     def _refuse_parametric(self) -> None:
         names = ("board_warp", "loss", "fixed", "tied", "free", "priors")

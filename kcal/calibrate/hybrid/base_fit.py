@@ -116,9 +116,8 @@ def fit_projection(
         pixels=pixels,
         size=size,
         weights=weights,
-        readout=None,
+        hyperprior=typical_hyperprior(_NO_FIELD),
         square=square,
-        robust=False,
         exact=True,
     )
     return _base_of(capture, known_focal, exact_focal)
@@ -213,22 +212,20 @@ def may_be_unequal(points: Tensor, pixels: Tensor, size: tuple[int, int]) -> boo
         pixels=pixels,
         size=size,
         weights=torch.ones_like(pixels[..., 0]),
-        readout=None,
+        hyperprior=typical_hyperprior(_NO_FIELD),
         square=False,
-        robust=False,
-        exact=False,
     )
-    estimate, _ = fit_base(capture, _NO_FIELD, None, typical_hyperprior(_NO_FIELD).mean, None)
+    estimate, _ = fit_base(capture, _NO_FIELD)
     return bool(estimate.state.board.any())
 
 
 def fit_base(
-    capture: FittedViews, modes: FieldModes, known_focal: float | None, h: Tensor, lens: LensPrior | None
+    capture: FittedViews, modes: FieldModes, known_focal: float | None = None, lens: LensPrior | None = None
 ) -> tuple[Estimate, int]:
     """Fit the base projection alone: its focal length and shape become constants of the lens. Also the trial steps."""
-    board = capture.board
+    board, h = capture.board, capture.hyperprior.mean
     if lens is not None:
-        return _fit_known(capture, h, lens)
+        return _fit_known(capture, lens)
     flat = dataclasses.replace(capture, board=_no_modes(capture.points), readout=None, exact=True)
     first = (board.family == STRETCH).nonzero()[:1, 0]
     # A board that was measured is known, in modes of its own.
@@ -249,7 +246,7 @@ def fit_base(
     return Estimate(model, families, state, h, NO_MOTION, base.variance, 1.0), base.steps
 
 
-def _fit_known(capture: FittedViews, h: Tensor, lens: LensPrior) -> tuple[Estimate, int]:
+def _fit_known(capture: FittedViews, lens: LensPrior) -> tuple[Estimate, int]:
     """Likewise for a camera of a known type, whose constants and typical field are given."""
     start = _base_start(capture, None, lens)
     aspect = None if capture.square else 1.0
@@ -260,6 +257,7 @@ def _fit_known(capture: FittedViews, h: Tensor, lens: LensPrior) -> tuple[Estima
     params[list(unknowns.indices)] = unknowns.expand(lens.unknowns.mean)
     state = start.state._replace(parameters=params, board=torch.zeros_like(capture.board.unit))
     still = dataclasses.replace(capture, readout=None, exact=True)
+    h = capture.hyperprior.mean
     state, variance, steps = _solve_base(still, model, families, state, h, False)
     return Estimate(model, families, state, h, NO_MOTION, variance, 1.0), steps
 

@@ -21,7 +21,7 @@ from kcal.calibrate.hybrid.families import (
     PriorFamilies,
     typical_hyperprior,
 )
-from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
+from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.measured_board import BoardPrior, MeasuredBoard, evidence, printed_board, printed_prior
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations
@@ -181,7 +181,8 @@ def fit_turned(
         if first is not None and attempt == 0:
             fit = first
         else:
-            fit = fit_hybrid(board.points, ordered, seen.image_size, weighted, modes, shape, lens=lens, start=start)
+            options = FitOptions(modes=modes, board=shape, lens=lens)
+            fit = fit_hybrid(board.points, ordered, seen.image_size, weighted, options, start=start)
         if shape == "exact" or len(board.quarter_turns) == 1 or attempt == _MOST_FITS - 1:
             break
         prior = printed_prior(fit.board_shapes, fit.expected[BOARD:]) if shape == "printed" else shape.whole

@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from kcal.calibrate.hybrid.evidence import (
     WORTH,
@@ -22,7 +21,7 @@ from kcal.calibrate.hybrid.evidence import (
     relative_bends,
     with_tempering,
 )
-from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies
+from kcal.calibrate.hybrid.families import PriorFamilies
 from kcal.calibrate.hybrid.fitted_views import NO_MOTION, Estimate, FittedViews
 from kcal.calibrate.problem.state import (
     AMPLITUDES,
@@ -120,7 +119,7 @@ def _least_gained(
 
 
 def _with_bending(
-    capture: FittedViews, estimate: Estimate, best: Maximum, tempering: float, never: Tensor
+    capture: FittedViews, estimate: Estimate, best: Maximum, tempering: float
 ) -> tuple[FittedViews, Estimate] | None:
     """The same of a board that bends by view; None where that explains the views no better.
 
@@ -131,7 +130,7 @@ def _with_bending(
         return None
     wider = dataclasses.replace(capture, readout=dataclasses.replace(readout, bends=capture.heights))
     bent = begin_motion(wider, estimate)
-    data, trials = wider.data(wider.problem(bent, never), bent, never), []
+    data, trials = wider.data(wider.problem(bent), bent), []
     for sigma in _BENT:
         ratio = np.append(best.log_ratio, math.log(sigma) - 0.5 * math.log(best.variance))
         trial, number = best._replace(log_ratio=ratio), [len(ratio) - 1]
@@ -143,8 +142,6 @@ def _with_bending(
 def run_rounds(
     capture: FittedViews,
     estimate: Estimate,
-    hyperprior: Hyperprior,
-    never: Tensor,
     *,
     cold: bool,
     spent: int,
@@ -157,8 +154,6 @@ def run_rounds(
     Args:
         capture: what is fitted.
         estimate: to begin with.
-        hyperprior: of the amplitudes.
-        never: (S,) unknowns that are held.
         cold: the estimate is that of the base projection, so that its amplitudes mean nothing yet.
         spent: trial steps before.
         rough: another fit will begin where this one ends, so that it need not come to rest entirely.
@@ -174,12 +169,12 @@ def run_rounds(
         estimate = estimate._replace(variance=estimate.variance / estimate.tempering, tempering=1.0)
     for turn in range(_ROUNDS):
         first = turn == 0 and cold
-        problem, estimate, steps = capture.solved(estimate, never, _FIRST if first else effort)
+        problem, estimate, steps = capture.solved(estimate, _FIRST if first else effort)
         spent += steps
-        data = capture.data(problem, estimate, never)
+        data = capture.data(problem, estimate)
         former = tempering = estimate.tempering
         if not first and problem.readout is None and not capture.turning:
-            found = _overdispersion(data, estimate, never)
+            found = _overdispersion(data, estimate, capture)
             # More tempering leaves fewer parameters, over which the scores scatter less, and so on: the mean of both
             # ends this where the new value alone swings forever (OpenCV's left camera, between 1 and 2).
             tempering = math.sqrt(tempering * found) if tempered else found
@@ -189,7 +184,7 @@ def run_rounds(
         most = 3 if turn == 0 and problem.readout is None else 2
         for roughly in (True,) if rough else (True, False):
             best = maximize_evidence(
-                data, estimate.families, best.h, best.variance, hyperprior, best.log_ratio, tempering, roughly
+                data, estimate.families, best.h, best.variance, capture.hyperprior, best.log_ratio, tempering, roughly
             )
             change = max(_moved_by(estimate, best), abs(math.log(tempering / former)))
             # The solver may try several steps where it finds nothing that the evidence feels.
@@ -220,7 +215,7 @@ def run_rounds(
             resting &= torch.equal(weighed.weights, capture.weights)
             capture = weighed
         if (first or resting) and turn < _ROUNDS // 2:
-            bent = _with_bending(capture, estimate, best, tempering, never)
+            bent = _with_bending(capture, estimate, best, tempering)
             if bent is not None:
                 (capture, estimate), top = bent, None
                 continue
@@ -250,36 +245,36 @@ def run_rounds(
     if data.moving:
         # Once, at the end: amplitudes of motions that were set with it again would grow without bound where views are
         # few, as both explain the same residuals (measured on a webcam's seven views).
-        tempering = _overdispersion(data, estimate, never)
+        tempering = _overdispersion(data, estimate, capture)
         estimate = estimate._replace(variance=estimate.variance * tempering, tempering=tempering)
     return Rounds(capture, readout, estimate, data, best.loss, spent, converged, lost)
 
 
-def expected_estimate(rounds: Rounds, hyperprior: Hyperprior) -> Estimate:
+def expected_estimate(rounds: Rounds) -> Estimate:
     """The estimate with the amplitudes that are to be expected in place of the most likely ones."""
     estimate, data = rounds.estimate, rounds.data
     variance = estimate.variance / estimate.tempering
     best = Maximum(estimate.hyperparameters, estimate.log_ratio, variance, rounds.loss)
     # Views that move were tempered after their amplitudes were found.
     tempering = 1.0 if data.moving else estimate.tempering
-    found = expected_maximum(data, estimate.families, best, hyperprior, tempering)
+    found = expected_maximum(data, estimate.families, best, rounds.capture.hyperprior, tempering)
     return estimate._replace(hyperparameters=found.h, log_ratio=found.log_ratio)
 
 
-def motion_is_worth(rounds: Rounds, readout: Readout, hyperprior: Hyperprior, never: Tensor) -> bool:
+def motion_is_worth(rounds: Rounds, readout: Readout) -> bool:
     """Whether motion would explain views better that were fitted as standing still; to first order, near the fit."""
     capture = dataclasses.replace(rounds.capture, readout=readout)
     estimate = rounds.estimate
     moving = begin_motion(capture, estimate)
-    data = capture.data(capture.problem(moving, never), moving, never)
+    data = capture.data(capture.problem(moving), moving)
     variance, families = estimate.variance / estimate.tempering, estimate.families
     best = maximize_evidence(
-        data, families, estimate.hyperparameters, variance, hyperprior, moving.log_ratio, rough=True
+        data, families, estimate.hyperparameters, variance, capture.hyperprior, moving.log_ratio, rough=True
     )
     return bool(evidence_of_motion(data, best, families, 1.0) >= WORTH)
 
 
-def columns_may_be_read(rounds: Rounds, hyperprior: Hyperprior, never: Tensor) -> bool:
+def columns_may_be_read(rounds: Rounds) -> bool:
     """Whether columns, read one after the other, may explain the motion of views better than rows.
 
     They do near this solution; or there is none, because motions came to their limit.
@@ -294,13 +289,13 @@ def columns_may_be_read(rounds: Rounds, hyperprior: Hyperprior, never: Tensor) -
     still = estimate._replace(state=estimate.state._replace(motion=torch.zeros_like(estimate.state.motion)))
     for columns in (False, True):
         capture = dataclasses.replace(rounds.capture, readout=dataclasses.replace(readout, columns=columns))
-        data = capture.data(capture.problem(estimate, never), still, never)
+        data = capture.data(capture.problem(estimate), still)
         best = maximize_evidence(
             data,
             estimate.families,
             estimate.hyperparameters,
             estimate.variance / estimate.tempering,
-            hyperprior,
+            capture.hyperprior,
             estimate.log_ratio,
             rough=True,
         )
@@ -316,7 +311,7 @@ def _moved_by(estimate: Estimate, best: Maximum) -> float:
     return change
 
 
-def _overdispersion(data: ViewData, estimate: Estimate, never: Tensor) -> float:
-    deviation = torch.where(never, 0.0, estimate.families.deviation(estimate.hyperparameters))
+def _overdispersion(data: ViewData, estimate: Estimate, capture: FittedViews) -> float:
+    deviation = torch.where(capture.held(estimate), 0.0, estimate.families.deviation(estimate.hyperparameters))
     K = data.integrated(estimate.log_ratio).data.K
     return overdispersion(data.scores(estimate.log_ratio), K, deviation, estimate.variance)

@@ -22,7 +22,7 @@ _SD = np.array([2.0, 1.5, 1.5, 1.5, 1.5])
 # Where the amplitudes of the board stand among the hyperparameters: the last four.
 BOARD = -4
 # Unknowns before the field's weights: focal length, principal point, shape, pupil; where the pupil stands among them.
-LEADING_UNKNOWNS, _PUPIL = 6, 4
+LEADING_UNKNOWNS, PUPIL = 6, slice(4, 6)
 # Unequal and skewed axes, in units of R: pixels are square.
 SQUARE = 1e-4
 # Of a focal length about that of the base projection, as a share of it: views that leave it open still tell it to no
@@ -73,7 +73,7 @@ class PriorFamilies(NamedTuple):
     def with_board(self, board: BoardModes) -> PriorFamilies:
         """The same camera, and another board, or the same in other variables."""
         lens = len(self.mean) - len(board.unit)
-        family = torch.where(board.family == KNOWN, -1, self.amplitude[_PUPIL] + 1 + board.family)
+        family = torch.where(board.family == KNOWN, -1, self.amplitude[PUPIL.start] + 1 + board.family)
         return self._replace(
             log_unit=torch.cat([self.log_unit[:lens], board.unit.log()]),
             amplitude=torch.cat([self.amplitude[:lens], family]),

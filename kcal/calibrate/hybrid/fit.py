@@ -26,7 +26,6 @@ from kcal.calibrate.hybrid.evidence_rounds import (
 from kcal.calibrate.hybrid.families import (
     BOARD,
     LEADING_UNKNOWNS,
-    Hyperprior,
     LensPrior,
     PriorFamilies,
     typical_hyperprior,
@@ -59,27 +58,21 @@ _CLEAR = 3.75
 _NEARLY = 0.03
 
 
-def aspect_score(rounds: Rounds, hyperprior: Hyperprior, never: Tensor) -> float:
-    """Standard deviations by which the aspect ratio that a fit with two focal lengths found is off one.
-
-    Args:
-        rounds: of the fit.
-        hyperprior: of its amplitudes.
-        never: (S,) unknowns that were held.
-    """
-    score = _standing(rounds, never)
+def aspect_score(rounds: Rounds) -> float:
+    """Standard deviations by which the aspect ratio that a fit with two focal lengths found is off one."""
+    score = _standing(rounds)
     if pixels_are_square(score):
         return score
     # Amplitudes as they are to be expected: those of largest evidence may state the ratio too surely.
-    return _standing(rounds._replace(estimate=expected_estimate(rounds, hyperprior)), never)
+    return _standing(rounds._replace(estimate=expected_estimate(rounds)))
 
 
-def _standing(rounds: Rounds, never: Tensor) -> float:
+def _standing(rounds: Rounds) -> float:
     """The same at the amplitudes of the rounds, the board's stretch being hardly known."""
     estimate, data = rounds.estimate, rounds.data
     families, h = estimate.families, estimate.hyperparameters.clone()
     h[BOARD + STRETCH] = h[BOARD + STRETCH].clamp_min(math.log(_PRINTED))
-    deviation = torch.where(never, 0.0, families.deviation(h))
+    deviation = torch.where(rounds.capture.held(estimate), 0.0, families.deviation(h))
     still = data.integrated(estimate.log_ratio).data
     half = posterior_root(still.K, deviation, estimate.variance) * deviation
     x = half.T @ (half @ (still.g + still.K @ still.at)) / estimate.variance + families.mean
@@ -130,20 +123,38 @@ class FitStart(NamedTuple):
     iterations: int
 
 
-class Settled(NamedTuple):
-    """Where a fit settled.
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class FitOptions:
+    """What is known of a camera and its board before a fit, and what the views are asked.
 
-    Attributes:
-        rounds: the last ones.
-        never: (S,) unknowns that were held.
-        hyperprior: of the amplitudes.
-        board: how it differs from the one that was ordered.
+    Args:
+        modes: of the field; None: those of the start or of the lens, or else of the default lens.
+        board: how it differs from the one that was ordered: as printers err, not at all, or as was measured.
+        square: whether pixels are square; None: the views tell.
+        motion: views may move while they are read; False: they stand still.
+        bending: the board may bend by view, where the evidence says so; False: it is stiff.
+        focal: roughly known, pixels, for the start.
+        robust: bound the weight of corners that are far off, so that a few wrong ones change nothing. Error bars of
+            such a fit mean nothing; it tells which corners to leave out.
+        lens: what is known of it from cameras of its type; its modes are used.
+        training: of the network that the field is; None: it is not trained.
     """
 
-    rounds: Rounds
-    never: Tensor
-    hyperprior: Hyperprior
-    board: Literal["printed", "exact"] | BoardPrior
+    modes: FieldModes | None = None
+    board: Literal["printed", "exact"] | BoardPrior | MeasuredBoard = "printed"
+    square: bool | None = None
+    motion: bool = True
+    bending: bool = True
+    focal: float | None = None
+    robust: bool = False
+    lens: LensPrior | None = None
+    training: FieldTraining | None = None
+
+    def known_board(self, points: Tensor) -> BoardPrior | None:
+        """What is known of a board (N, 3) that differs from the ordered one by more than printers err."""
+        if isinstance(self.board, MeasuredBoard):
+            return self.board.prior_for(points)
+        return self.board if isinstance(self.board, BoardPrior) else None
 
 
 def settle(
@@ -151,24 +162,17 @@ def settle(
     pixels: Tensor,
     size: tuple[int, int],
     weights: Tensor,
+    options: FitOptions,
     *,
-    modes: FieldModes | None = None,
-    board: Literal["printed", "exact"] | BoardPrior | MeasuredBoard,
-    square: bool | None = None,
-    motion: bool,
-    bending: bool = True,
-    focal: float | None,
     start: FitStart | None = None,
-    robust: bool = False,
-    hyperprior: Hyperprior | None = None,
-    lens: LensPrior | None = None,
-    progress: Callable[[str], object],
+    progress: Callable[[str], object] = lambda _: None,
     rough: bool = False,
-) -> Settled:
-    """Settle amplitudes, camera, board, poses and motions, with arguments as of `kcal.calibrate.hybrid.fit.fit_hybrid`.
+) -> Rounds:
+    """Settle amplitudes, camera, board, poses and motions, with arguments as of `fit_hybrid`.
 
     If `rough`, another fit will begin where this one ends, so that it need not come to rest entirely.
     """
+    lens, square, modes, known = options.lens, options.square, options.modes, options.known_board(points)
     if start is not None:
         form = start.estimate.model.hybrid
         assert form is not None
@@ -176,36 +180,29 @@ def settle(
     elif lens is not None:
         modes = lens.form.modes
     modes = modes or ZernikeModes()
-    hyperprior = hyperprior or typical_hyperprior(modes)
-    if isinstance(board, MeasuredBoard):
-        board = board.prior_for(points)
+    hyperprior, exact = typical_hyperprior(modes), options.board == "exact"
     ordered, shown = points, board_modes(points)
-    if isinstance(board, BoardPrior):
-        points, shown = board.applied(points, shown)
+    if known is not None:
+        points, shown = known.applied(points, shown)
     capture = FittedViews(
         points=points,
         board=shown,
         pixels=pixels,
         size=size,
         weights=weights,
-        readout=_readout(ordered, size) if start is None and motion else start.readout if start else None,
+        hyperprior=hyperprior,
+        readout=_readout(ordered, size) if start is None and options.motion else start.readout if start else None,
         square=start.square if start is not None else lens.square if lens is not None else square is True,
-        robust=robust,
-        exact=board == "exact",
-        heights=board_modes(ordered).heights if bending and start is None and board != "exact" else None,
+        robust=options.robust,
+        exact=exact,
+        heights=board_modes(ordered).heights if options.bending and start is None and not exact else None,
     )
 
-    def run(
-        capture: FittedViews, estimate: Estimate, spent: int, *, cold: bool = False, rough: bool = rough
-    ) -> tuple[Rounds, Tensor]:
-        held = torch.zeros_like(estimate.families.mean, dtype=torch.bool)
-        if capture.exact:
-            held[-len(shown.unit) :] = True
-        rounds = run_rounds(capture, estimate, hyperprior, held, cold=cold, spent=spent, rough=rough, progress=progress)
-        return rounds, held
+    def run(capture: FittedViews, estimate: Estimate, spent: int, *, cold: bool = False, rough: bool = rough) -> Rounds:
+        return run_rounds(capture, estimate, cold=cold, spent=spent, rough=rough, progress=progress)
 
-    def begin(capture: FittedViews, rough: bool = rough) -> tuple[Rounds, Tensor]:
-        estimate, steps = fit_base(capture, modes, focal, hyperprior.mean, lens)
+    def begin(capture: FittedViews, rough: bool = rough) -> Rounds:
+        estimate, steps = fit_base(capture, modes, options.focal, lens)
         progress("base projection")
         if capture.readout is not None:
             distance = float(estimate.state.translation.norm(dim=-1).median())
@@ -216,37 +213,36 @@ def settle(
     if start is not None:
         estimate = start.estimate
         state, h = estimate.state, estimate.hyperparameters
-        if isinstance(board, BoardPrior):
-            state, h = state._replace(board=board.in_units(state.board)), h.clone()
+        if known is not None:
+            state, h = state._replace(board=known.in_units(state.board)), h.clone()
             # Nothing depends on them any more, so that they are no reason for another round.
             h[BOARD:] = hyperprior.mean[BOARD:]
         families = estimate.families.with_board(shown)
         estimate = estimate._replace(families=families, state=state, hyperparameters=h)
-        rounds, never = run(capture, estimate, start.iterations)
-    else:
-        undecided = square is None and lens is None
-        # Whether pixels are square is told well enough before amplitudes are entirely at rest.
-        rounds, never = begin(capture, rough or undecided)
-        if undecided:
-            score = aspect_score(rounds, hyperprior, never)
-            one = dataclasses.replace(rounds.capture, square=pixels_are_square(score))
-            near = with_square_pixels(rounds.estimate, shown) if one.square else rounds.estimate
-            readout, most = rounds.readout, rounds.gained + 0.5 * score**2
-            if near is None:
-                rounds, never = begin(dataclasses.replace(one, readout=readout))
-            elif one.square or not rough:
-                rounds, never = run(one, near, rounds.steps)
-                # Motion along columns and the aspect of pixels look alike: with square pixels it may explain what the
-                # aspect did, and that is no more than the nats that the aspect was worth.
-                hidden = one.square and one.readout is None and not most < WORTH
-                if hidden and readout is not None and motion_is_worth(rounds, readout, hyperprior, never):
-                    rounds, never = run(dataclasses.replace(one, readout=readout), near, rounds.steps)
-        if capture.readout is not None and columns_may_be_read(rounds, hyperprior, never):
-            by_columns = dataclasses.replace(capture.readout, columns=True)
-            other = begin(dataclasses.replace(capture, square=rounds.capture.square, readout=by_columns))
-            if other[0].untempered_loss < rounds.untempered_loss:
-                rounds, never = other
-    return Settled(rounds, never, hyperprior, board)
+        return run(capture, estimate, start.iterations)
+    undecided = square is None and lens is None
+    # Whether pixels are square is told well enough before amplitudes are entirely at rest.
+    rounds = begin(capture, rough or undecided)
+    if undecided:
+        score = aspect_score(rounds)
+        one = dataclasses.replace(rounds.capture, square=pixels_are_square(score))
+        near = with_square_pixels(rounds.estimate, shown) if one.square else rounds.estimate
+        readout, most = rounds.readout, rounds.gained + 0.5 * score**2
+        if near is None:
+            rounds = begin(dataclasses.replace(one, readout=readout))
+        elif one.square or not rough:
+            rounds = run(one, near, rounds.steps)
+            # Motion along columns and the aspect of pixels look alike: with square pixels it may explain what the
+            # aspect did, and that is no more than the nats that the aspect was worth.
+            hidden = one.square and one.readout is None and not most < WORTH
+            if hidden and readout is not None and motion_is_worth(rounds, readout):
+                rounds = run(dataclasses.replace(one, readout=readout), near, rounds.steps)
+    if capture.readout is not None and columns_may_be_read(rounds):
+        by_columns = dataclasses.replace(capture.readout, columns=True)
+        other = begin(dataclasses.replace(capture, square=rounds.capture.square, readout=by_columns))
+        if other.untempered_loss < rounds.untempered_loss:
+            rounds = other
+    return rounds
 
 
 def rough_start(
@@ -254,27 +250,22 @@ def rough_start(
     pixels: Tensor,
     size: tuple[int, int],
     weights: Tensor,
-    board: Literal["printed", "exact"] | BoardPrior | MeasuredBoard = "printed",
-    motion: bool = True,
-    bending: bool = True,
-    focal: float | None = None,
+    options: FitOptions | None = None,
     progress: Callable[[str], object] = lambda _: None,
-    modes: FieldModes | None = None,
 ) -> FitStart:
     """With what a fit of these views under other weights begins: no error bars, and not entirely at rest.
 
     Raises:
-        InputError: as `kcal.calibrate.hybrid.fit.fit_hybrid`.
+        InputError: as `fit_hybrid`.
         DegenerateError: likewise.
     """
-    rounds, never, _, known = settle(
-        points, pixels, size, weights, modes=modes, board=board, motion=motion, bending=bending, focal=focal,
-        progress=progress, rough=True,
-    )  # fmt: skip
+    options = options or FitOptions()
+    rounds = settle(points, pixels, size, weights, options, progress=progress, rough=True)
     capture, estimate = rounds.capture, rounds.estimate
-    errors = capture.problem(estimate, never).pixel_errors(estimate.state)
+    errors = capture.problem(estimate).pixel_errors(estimate.state)
     check_shown(errors)
-    if isinstance(known, BoardPrior):
+    known = options.known_board(points)
+    if known is not None:
         state = estimate.state
         estimate = estimate._replace(state=state._replace(board=known.in_amplitudes(state.board)))
     return FitStart(estimate, capture.readout, capture.square, capture.by_corner(errors), rounds.steps)
@@ -463,17 +454,9 @@ def fit_hybrid(
     pixels: Tensor,
     size: tuple[int, int],
     weights: Tensor | None = None,
-    modes: FieldModes | None = None,
-    board: Literal["printed", "exact"] | BoardPrior | MeasuredBoard = "printed",
-    square: bool | None = None,
-    motion: bool = True,
-    bending: bool = True,
-    focal: float | None = None,
+    options: FitOptions | None = None,
+    *,
     start: HybridFit | FitStart | None = None,
-    robust: bool = False,
-    hyperprior: Hyperprior | None = None,
-    lens: LensPrior | None = None,
-    training: FieldTraining | None = None,
     progress: Callable[[str], object] = lambda _: None,
 ) -> HybridFit:
     """Fit one camera.
@@ -483,19 +466,8 @@ def fit_hybrid(
         pixels: (V, N, 2), NaN where not seen.
         size: (width, height) of the image.
         weights: (V, N) by which residuals are multiplied; 0 leaves a corner out. None: all count alike.
-        modes: of the field.
-        board: how it differs from the one that was ordered: as printers err, not at all, or as was measured.
-        square: whether pixels are square; None: the views tell.
-        motion: views may move while they are read; False: they stand still.
-        bending: the board may bend by view, where the evidence says so; False: it is stiff.
-        focal: roughly known, pixels, for the start.
-        start: an earlier fit of the same views with other weights or another board, to begin with, or
-            `kcal.calibrate.hybrid.fit.rough_start`.
-        robust: bound the weight of corners that are far off, so that a few wrong ones change nothing. Error bars of
-            such a fit mean nothing; it tells which corners to leave out.
-        hyperprior: of the amplitudes; the typical one if not given.
-        lens: what is known of it from cameras of its type; its modes are used.
-        training: of the network that the field is; None: it is not trained.
+        options: what is known beforehand; by default nothing.
+        start: an earlier fit of the same views with other weights or another board, to begin with, or `rough_start`.
         progress: called after each step.
 
     Raises:
@@ -503,33 +475,32 @@ def fit_hybrid(
         DegenerateError: the board is seen from one side only, or from too few, so that no projection is found.
     """
     weights = torch.ones_like(pixels[..., 0]) if weights is None else weights
-    begun = start.as_start if isinstance(start, HybridFit) else start
-    rounds, never, hyperprior, board = settle(
-        points, pixels, size, weights, modes=modes, board=board, square=square, motion=motion, bending=bending,
-        focal=focal, start=begun, robust=robust, hyperprior=hyperprior, lens=lens, progress=progress,
-    )  # fmt: skip
-    ordered, own = points, board_modes(points)
-    if training is not None:
-        rounds = train_network(rounds, never, hyperprior, training, progress)
+    options = options or FitOptions()
+    begun, robust = start.as_start if isinstance(start, HybridFit) else start, options.robust
+    rounds = settle(points, pixels, size, weights, options, start=begun, progress=progress)
+    ordered, own, known = points, board_modes(points), options.known_board(points)
+    if options.training is not None:
+        rounds = train_network(rounds, options.training, progress)
     capture, likely = rounds.capture, rounds.estimate
     # Error bars are for amplitudes as they are to be expected (`kcal.calibrate.hybrid.evidence`).
-    estimate = likely if robust else expected_estimate(rounds, hyperprior)
+    estimate = likely if robust else expected_estimate(rounds)
     model, families, state, h, _, variance, tempering, _ = estimate
     # Modes that the evidence holds so closely to zero that no pixel feels them are left out, error bars included.
     assert model.hybrid is not None
     peaks = torch.tensor(model.hybrid.modes.peaks, dtype=torch.float64)
     field = slice(LEADING_UNKNOWNS, LEADING_UNKNOWNS + len(peaks))
     unfelt = families.deviation(h)[field] * float(state.parameters[0]) * peaks < _UNFELT
-    never[field] |= unfelt
+    held = capture.held(estimate)
+    held[field] |= unfelt
     if bool(unfelt.any()):
         parameters = state.parameters.clone()
         parameters[5 + len(LEADING) :][unfelt] = families.mean[field][unfelt]
         estimate = estimate._replace(state=state._replace(parameters=parameters))
-    problem, estimate, steps = capture.solved(estimate, never, LAST, last_step=True)
+    problem, estimate, steps = capture.solved(estimate, LAST, last_step=True, held=held)
     state = estimate.state
     reduced = problem.reduced_rows(state)
     K = products_of(reduced[:, :-1].T)
-    deviation = torch.where(never, 0.0, families.deviation(h))
+    deviation = torch.where(held, 0.0, families.deviation(h))
     inverse = posterior_root(K, deviation, variance)
     errors = problem.pixel_errors(state)
     if not robust:
@@ -538,10 +509,10 @@ def fit_hybrid(
     wider = widening(len(pixels)) if capture.readout is not None else 1.0
     half = math.sqrt(wider) * inverse * deviation
     information = information_of(problem, state, math.sqrt(wider * variance), reduced)
-    if isinstance(board, BoardPrior):
-        mean, root = board.whole.mean_and_half()
+    if known is not None:
+        mean, root = known.whole.mean_and_half()
         state = state._replace(board=mean + state.board @ root)
-        information = board.in_modes(information, state.board)
+        information = known.in_modes(information, state.board)
         half = torch.cat([half[:, : -len(mean)], half[:, -len(mean) :] @ root], 1)
     return HybridFit(
         model=model,

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from kcal.calibrate.hybrid.board_modes import BoardModes
 from kcal.calibrate.hybrid.evidence import ViewData, view_data
-from kcal.calibrate.hybrid.families import PriorFamilies
+from kcal.calibrate.hybrid.families import PUPIL, Hyperprior, PriorFamilies
 from kcal.calibrate.problem.board_problem import POSE, TURN, BoardProblem
 from kcal.calibrate.problem.parameters import FreeParameters, GaussianPrior
 from kcal.calibrate.problem.state import BoardState, Readout, stillness
@@ -112,13 +112,14 @@ class FittedViews:
         pixels: (V, N, 2), NaN where not seen.
         size: (width, height) of the image.
         weights: (V, N) by which residuals are multiplied.
+        hyperprior: of the amplitudes.
         readout: how views move while they are read, and how the board bends in them; None: neither.
         square: whether pixels are square.
         robust: bound the weight of corners that are far off.
         exact: the board does not differ.
         heights: (12, N) of the corners by which the board may bend by view, meters, if the evidence says so, or None.
-        turning: views show points (V, N, 3) that are infinitely far, such as stars: poses are rotations, and errors do
-            not repeat within a view.
+        turning: views show points (V, N, 3) that are infinitely far, such as stars: poses are rotations, nothing
+            depends on the pupil, and errors do not repeat within a view.
     """
 
     points: Tensor
@@ -126,10 +127,11 @@ class FittedViews:
     pixels: Tensor
     size: tuple[int, int]
     weights: Tensor
-    readout: Readout | None
-    square: bool
-    robust: bool
-    exact: bool
+    hyperprior: Hyperprior
+    readout: Readout | None = None
+    square: bool = True
+    robust: bool = False
+    exact: bool = False
     heights: Tensor | None = None
     turning: bool = False
 
@@ -164,12 +166,20 @@ class FittedViews:
         """Residuals without those that poses take up."""
         return 2 * int(self.seen.sum()) - (TURN if self.turning else POSE) * len(self.pixels)
 
-    def problem(self, estimate: Estimate, never: Tensor) -> BoardProblem:
-        """The least squares at amplitudes of an estimate; unknowns of which `never` is true are held."""
+    def held(self, estimate: Estimate) -> Tensor:
+        """(S,) whether an unknown keeps its value, whatever the views show: of an exact board, of a pupil of stars."""
+        held = torch.zeros_like(estimate.families.mean, dtype=torch.bool)
+        held[PUPIL] = self.turning
+        held[len(held) - len(self.board.unit) :] = self.exact
+        return held
+
+    def problem(self, estimate: Estimate, held: Tensor | None = None) -> BoardProblem:
+        """The least squares at amplitudes of an estimate, unknowns (S,) being held: those of `held` if not given."""
+        never = self.held(estimate) if held is None else held
         deviation = estimate.families.deviation(estimate.hyperparameters)
         precision = torch.where(never, torch.inf, estimate.variance / deviation.square())
-        held, still, kept = torch.isinf(precision), estimate.stillness, self._kept
-        if kept and kept[0][0] is estimate.model and torch.equal(kept[0][1], held):
+        fixed, still, kept = torch.isinf(precision), estimate.stillness, self._kept
+        if kept and kept[0][0] is estimate.model and torch.equal(kept[0][1], fixed):
             # What corners say at the last state serves under other priors, too.
             prior = hybrid_prior(estimate.model, len(self.board.shapes), estimate.families.mean, precision, self.square)
             problem = kept[0][2].with_priors([prior], still)
@@ -178,20 +188,20 @@ class FittedViews:
                 self.points, self.board.shapes, self.pixels, self.weights, estimate.model, estimate.families.mean,
                 precision, self.readout, still, self.square, self.turning,
             )  # fmt: skip
-            kept[:] = [(estimate.model, held, problem)]
+            kept[:] = [(estimate.model, fixed, problem)]
         if self.robust:
             return problem.with_weights(_cauchy_weights(problem, estimate.state, self.weights))
         return problem
 
     def solved(
-        self, estimate: Estimate, never: Tensor, effort: tuple[int, float], last_step: bool = False
+        self, estimate: Estimate, effort: tuple[int, float], last_step: bool = False, held: Tensor | None = None
     ) -> tuple[BoardProblem, Estimate, int]:
         """The problem, the estimate with its solution, and the trial steps.
 
         Without a last step the solution is where the problem was linearized: what is linear in lens and board, as the
         evidence is, follows from there.
         """
-        problem = self.problem(estimate, never)
+        problem = self.problem(estimate, held)
         steps, gain = effort
         options = LMOptions(
             max_iterations=steps, tolerance=gain / self.freedom, initial_damping=1e-10, last_step=last_step
@@ -199,12 +209,13 @@ class FittedViews:
         result = minimize(problem, estimate.state, options)
         return problem, estimate._replace(state=result.state), int(result.iterations)
 
-    def data(self, problem: BoardProblem, estimate: Estimate, never: Tensor) -> ViewData:
+    def data(self, problem: BoardProblem, estimate: Estimate) -> ViewData:
         """What the views say near an estimate."""
         state, products = estimate.state, problem.products(estimate.state).off(problem.pose)
-        if bool(never.any()):
+        count = problem.unknown_count
+        if len(problem.moving) < count:
             # Unknowns that are held are among the others, of which nothing is said.
-            place, size = torch.cat([problem.moving, torch.tensor([len(never)])]), len(never) + 1
+            place, size = torch.cat([problem.moving, torch.tensor([count])]), count + 1
             total = products.total.new_zeros(size, size)
             total[place[:, None], place] = products.total
             right, score = (

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.func import functional_call, jacrev, vmap
 
 from kcal.calibrate.hybrid.evidence_rounds import Rounds, run_rounds
-from kcal.calibrate.hybrid.families import LEADING_UNKNOWNS, Hyperprior
+from kcal.calibrate.hybrid.families import LEADING_UNKNOWNS
 from kcal.calibrate.hybrid.fitted_views import Estimate, FittedViews
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.errors import InputError
@@ -71,10 +71,9 @@ class FieldTraining:
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class _Turn:
-    """Views, what is held of a fit, and what is known of the network's weights."""
+    """Views, and what is known of the network's weights."""
 
     capture: FittedViews
-    never: Tensor
     initial: Tensor
     spread: float
 
@@ -89,8 +88,6 @@ class _Turn:
 
 def train_network(
     rounds: Rounds,
-    never: Tensor,
-    hyperprior: Hyperprior,
     options: FieldTraining,
     progress: Callable[[str], object] = lambda _: None,
 ) -> Rounds:
@@ -98,8 +95,6 @@ def train_network(
 
     Args:
         rounds: where it did.
-        never: (S,) unknowns that are held.
-        hyperprior: of the amplitudes.
         options: see there.
         progress: called after each turn.
 
@@ -111,14 +106,13 @@ def train_network(
         return rounds
     best, loss = rounds, rounds.untempered_loss
     for number in range(options.turns):
-        turn = _Turn(capture=best.capture, never=never, initial=initial, spread=options.spread)
+        turn = _Turn(capture=best.capture, initial=initial, spread=options.spread)
         step = _gauss_newton if options.optimizer == "gauss-newton" else _adam
         estimate, spent = step(turn, best.estimate)
         if estimate is best.estimate:
             break
         found = run_rounds(
-            best.capture, estimate, hyperprior, never,
-            cold=False, spent=best.steps + spent, rough=False, progress=lambda _: None,
+            best.capture, estimate, cold=False, spent=best.steps + spent, rough=False, progress=lambda _: None,
         )  # fmt: skip
         value = found.untempered_loss + float(turn.pull(weights_of(_trunk(found.estimate))))
         progress(f"network, turn {number + 1}")
@@ -209,7 +203,7 @@ class _Moved:
 def _gauss_newton(turn: _Turn, estimate: Estimate) -> tuple[Estimate, int]:
     """A few steps by all unknowns together, of which the solver then finds its own again; also its trial steps."""
     spent, damping = 0, _DAMPING
-    problem = turn.capture.problem(estimate, turn.never)
+    problem = turn.capture.problem(estimate)
     cost = turn.cost(problem, estimate)
     for _ in range(_STEPS):
         weights = weights_of(_trunk(estimate))
@@ -222,7 +216,7 @@ def _gauss_newton(turn: _Turn, estimate: Estimate) -> tuple[Estimate, int]:
             unit.diagonal().masked_fill_(H.diagonal() <= 0, 1.0)
             step = -scale * torch.linalg.solve(unit, g * scale)
             trial = _with_weights(estimate, weights + step[-len(weights) :])
-            problem, trial, steps = turn.capture.solved(trial, turn.never, _FOLLOW)
+            problem, trial, steps = turn.capture.solved(trial, _FOLLOW)
             spent += steps
             value = turn.cost(problem, trial)
             if value < cost:
@@ -261,7 +255,7 @@ def _joint_products(turn: _Turn, problem: BoardProblem, estimate: Estimate) -> T
 def _adam(turn: _Turn, estimate: Estimate) -> tuple[Estimate, int]:
     """Steps down the partial derivative of the cost, and after each few of them the solver's; also its trial steps."""
     spent = 0
-    problem = turn.capture.problem(estimate, turn.never)
+    problem = turn.capture.problem(estimate)
     cost = turn.cost(problem, estimate)
     for _ in range(_STEPS):
         moved, weights = _Moved(turn, problem, estimate), weights_of(_trunk(estimate)).requires_grad_()
@@ -275,7 +269,7 @@ def _adam(turn: _Turn, estimate: Estimate) -> tuple[Estimate, int]:
             (0.5 * residuals.square().sum() + estimate.variance * turn.pull(weights)).backward()
             optimizer.step()
         trial = _with_weights(estimate, weights.detach())
-        problem, trial, steps = turn.capture.solved(trial, turn.never, _FOLLOW)
+        problem, trial, steps = turn.capture.solved(trial, _FOLLOW)
         spent += steps
         value = turn.cost(problem, trial)
         if not value < cost:

@@ -11,7 +11,7 @@ import torch
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.camera.warnings import check_end, measured_aspect, motion_warnings, pixel_warnings
-from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
+from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.errors import InputError
@@ -33,7 +33,7 @@ def fitted(views: int, hands: Hands | None) -> HybridFit:
     seen = moving_capture(CAMERA, poses, sigma=0.05, seed=5, hands=hands, board=BOARD).pixels
     inside = CAMERA.inside(seen.nan_to_num(nan=-9.0))
     pixels = torch.where(inside[..., None], seen, torch.nan)
-    return fit_hybrid(board_points(BOARD), pixels, CAMERA.size, modes=MODES, square=True)
+    return fit_hybrid(board_points(BOARD), pixels, CAMERA.size, options=FitOptions(modes=MODES, square=True))
 
 
 def test_motion_is_told_in_pixels() -> None:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from kcal.calibrate.hybrid.board_modes import turned_corners
 from kcal.calibrate.hybrid.cameras_fit import CamerasFit, fit_cameras, measure_board
-from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
+from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations
@@ -134,7 +134,9 @@ def test_a_measured_board_helps_the_next_camera() -> None:
     for seed in (21, 22, 23):
         seen = seen_by(camera(seed), PRINT, 5, seed)
         kinds: tuple[MeasuredBoard | str, ...] = (board, "printed")
-        fits = [fit_hybrid(BOARD.points, seen.pixels(), SIZE, modes=MODES, board=kind) for kind in kinds]
+        fits = [
+            fit_hybrid(BOARD.points, seen.pixels(), SIZE, options=FitOptions(modes=MODES, board=kind)) for kind in kinds
+        ]
         errors.append([far_error(fit.camera, camera(seed)) for fit in fits])
     known, alone = torch.tensor(errors).square().mean(0).sqrt().tolist()
     assert known < 0.7 * alone
@@ -152,7 +154,7 @@ def test_sigma_of_the_board() -> None:
     for seed in range(20):
         points = printed_points(BOARD, seed)
         pixels = printed_views(camera(seed), BOARD, points, 13, seed, noise=NOISE, pupil=2e-3)
-        fit = fit_hybrid(BOARD.points, pixels, SIZE, modes=MODES)
+        fit = fit_hybrid(BOARD.points, pixels, SIZE, options=FitOptions(modes=MODES))
         shapes = fit.board_shapes.shapes.flatten(1).T
         true = torch.linalg.lstsq(shapes, (points - BOARD.points).T.flatten()).solution
         error = fit.state.board - true
@@ -177,7 +179,10 @@ def test_a_fleet_knows_its_lens() -> None:
     errors = []
     for seed in (31, 32, 33, 34):
         pixels = seen_by(camera(seed), flat, 5, seed).pixels()
-        fits = [fit_hybrid(flat, pixels, SIZE, modes=MODES, board="exact", lens=lens) for lens in (fleet.lens, None)]
+        fits = [
+            fit_hybrid(flat, pixels, SIZE, options=FitOptions(modes=MODES, board="exact", lens=lens))
+            for lens in (fleet.lens, None)
+        ]
         errors.append([far_error(fit.camera, camera(seed)) for fit in fits])
     known, alone = torch.tensor(errors).square().mean(0).sqrt().tolist()
     assert known < 0.85 * alone

@@ -11,7 +11,7 @@ from torch import Tensor
 from kcal.calibrate.hybrid import evidence_rounds
 from kcal.calibrate.hybrid.board_modes import board_modes
 from kcal.calibrate.hybrid.families import SQUARE, prior_families, typical_hyperprior
-from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
+from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid
 from kcal.corners.board import Board
 from kcal.lens.camera import Camera
 from kcal.lens.field_modes import FieldModes, GaussianModes, NetworkModes
@@ -46,7 +46,7 @@ def capture(count: int = 20) -> Tensor:
 
 
 def fitted(modes: FieldModes) -> HybridFit:
-    return fit_hybrid(BOARD.points, capture(), SIZE, modes=modes, board="exact")
+    return fit_hybrid(BOARD.points, capture(), SIZE, options=FitOptions(modes=modes, board="exact"))
 
 
 def off(camera: Camera) -> float:
@@ -121,5 +121,5 @@ def test_rounds_that_run_out_are_said(rounds: int, monkeypatch: pytest.MonkeyPat
 def test_pixels_are_square_where_that_is_said() -> None:
     """Although these are not: rows are 1 % higher than columns are wide."""
     pixels = capture(5) * torch.tensor([1.0, 1.01])
-    found = fit_hybrid(BOARD.points, pixels, SIZE, square=True).camera.params
+    found = fit_hybrid(BOARD.points, pixels, SIZE, options=FitOptions(square=True)).camera.params
     assert float(found[0]) == float(found[1])

@@ -25,8 +25,8 @@ from kcal.calibrate.hybrid.cameras_fit import (
     typical_lens,
 )
 from kcal.calibrate.hybrid.evidence import WORTH
-from kcal.calibrate.hybrid.families import Hyperprior, LensPrior, prior_families, typical_hyperprior
-from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid, rough_start
+from kcal.calibrate.hybrid.families import LensPrior, prior_families, typical_hyperprior
+from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid, rough_start
 from kcal.calibrate.hybrid.fitted_views import _cauchy_weights, moving_residuals
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard, evidence, printed_board
 from kcal.calibrate.problem.state import Readout
@@ -63,7 +63,7 @@ def shots(count: int = 9, noise: float = 0.1) -> Tensor:
 
 @functools.cache
 def fitted() -> HybridFit:
-    return fit_hybrid(BOARD.points, shots(), SIZE, modes=MODES, board="exact", motion=False)
+    return fit_hybrid(BOARD.points, shots(), SIZE, options=FitOptions(modes=MODES, board="exact", motion=False))
 
 
 class TestFits:
@@ -108,8 +108,10 @@ class TestFits:
     def test_a_wrong_corner_changes_little_where_that_is_asked_for(self) -> None:
         wrong = shots()
         wrong[3, 7] += 40.0
-        robust = fit_hybrid(BOARD.points, wrong, SIZE, modes=MODES, board="exact", motion=False, robust=True)
-        plain = fit_hybrid(BOARD.points, wrong, SIZE, modes=MODES, board="exact", motion=False)
+        robust = fit_hybrid(
+            BOARD.points, wrong, SIZE, options=FitOptions(modes=MODES, board="exact", motion=False, robust=True)
+        )
+        plain = fit_hybrid(BOARD.points, wrong, SIZE, options=FitOptions(modes=MODES, board="exact", motion=False))
         good = fitted().state.parameters
         assert float(robust.residuals[3, 7].norm()) == pytest.approx(math.hypot(40.0, 40.0), rel=0.05)
         off = [float((fit.state.parameters - good)[[0, 2, 3]].norm()) for fit in (robust, plain)]
@@ -133,7 +135,9 @@ class TestFits:
         assert found == pytest.approx(wanted)
 
     def test_starts_for_fits_under_other_weights(self) -> None:
-        start = rough_start(BOARD.points, shots(), SIZE, torch.ones(9, 48).double(), "exact", False)
+        start = rough_start(
+            BOARD.points, shots(), SIZE, torch.ones(9, 48).double(), FitOptions(board="exact", motion=False)
+        )
         assert start.readout is None
         assert start.square
         assert start.iterations > 0
@@ -176,7 +180,7 @@ class TestStarts:
         assert form is not None
         usual = typical_lens(form, fit.families, fit.expected, True)
         lens = LensPrior(form, float(fit.families.mean[0]), usual)
-        again = fit_hybrid(BOARD.points, shots(), SIZE, board="exact", motion=False, lens=lens)
+        again = fit_hybrid(BOARD.points, shots(), SIZE, options=FitOptions(board="exact", motion=False, lens=lens))
         assert again.model.hybrid == form
         sigma = fit.half.square().sum(0).sqrt()[:3]
         off = (again.state.parameters - fit.state.parameters)[[0, 2, 3]] / sigma
@@ -272,20 +276,19 @@ def test_pixels_that_amplitudes_to_be_expected_leave_square(monkeypatch: pytest.
             return Rounds(estimate)
 
     scores = {"likely": 5.0, "expected": 2.5}
-    beforehand = typical_hyperprior()
 
-    def expected(rounds: Rounds, hyperprior: Hyperprior) -> str:
-        assert (rounds.estimate, hyperprior) == ("likely", beforehand)
+    def expected(rounds: Rounds) -> str:
+        assert rounds.estimate == "likely"
         return "expected"
 
     monkeypatch.setattr(room, "expected_estimate", expected)
-    monkeypatch.setattr(room, "_standing", lambda rounds, never: scores[rounds.estimate])
+    monkeypatch.setattr(room, "_standing", lambda rounds: scores[rounds.estimate])
     begin = cast(Any, Rounds("likely"))
-    assert room.aspect_score(begin, beforehand, torch.zeros(0)) == 2.5
+    assert room.aspect_score(begin) == 2.5
     scores["expected"] = -4.0
-    assert room.aspect_score(begin, beforehand, torch.zeros(0)) == -4.0
+    assert room.aspect_score(begin) == -4.0
     scores["likely"] = -3.0
-    assert room.aspect_score(begin, beforehand, torch.zeros(0)) == -3.0
+    assert room.aspect_score(begin) == -3.0
 
 
 def test_motion_is_looked_for_again_where_the_aspect_may_have_hidden_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -303,7 +306,7 @@ def test_motion_is_looked_for_again_where_the_aspect_may_have_hidden_it(monkeypa
 
         monkeypatch.setattr(room, "motion_is_worth", motion_is_worth)
         monkeypatch.setattr(room, "aspect_score", of_pixels)
-        fit_hybrid(BOARD.points, shots(8), SIZE, modes=MODES)
+        fit_hybrid(BOARD.points, shots(8), SIZE, options=FitOptions(modes=MODES))
     assert asked == [3.5]
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from kcal.calibrate.hybrid.board_modes import BENDING, PRINT, STRETCH, TRAPEZOID, board_modes
 from kcal.calibrate.hybrid.evidence import Quadratic, maximize_evidence, negative_log_evidence, with_tempering
 from kcal.calibrate.hybrid.families import PriorFamilies, prior_families, typical_hyperprior
-from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid, rough_start
+from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid, rough_start
 from kcal.calibrate.hybrid.fitted_views import hybrid_problem
 from kcal.calibrate.problem.state import BoardState
 from kcal.corners.board import Board
@@ -148,7 +148,9 @@ def test_errors_are_as_large_as_predicted() -> None:
 
 def test_an_exact_board_and_few_views() -> None:
     pixels = views(truth(), 6, 3)
-    free, exact = (fit_hybrid(BOARD.points, pixels, SIZE, board=kind) for kind in ("printed", "exact"))
+    free, exact = (
+        fit_hybrid(BOARD.points, pixels, SIZE, options=FitOptions(board=kind)) for kind in ("printed", "exact")
+    )
     torch.testing.assert_close(exact.board_points, BOARD.points, rtol=0, atol=0)
     assert error_at_infinity(exact.camera, truth()) < 1.0
     assert error_at_infinity(free.camera, truth()) < 2.0
@@ -367,7 +369,7 @@ def test_the_start_of_a_narrow_lens(seed: int) -> None:
     lens = drawn_lens(MACHINE_VISION, 1.0, seed)
     capture = capture_corners(lens, 5, sigma=0.1, seed=seed)
     modes = ZernikeModes(radial=7, decentered=4, astigmatic=3, other=3)
-    found = fit_hybrid(capture.points, capture.pixels, lens.size, modes=modes)
+    found = fit_hybrid(capture.points, capture.pixels, lens.size, options=FitOptions(modes=modes))
     assert float(found.camera.focal[0]) == pytest.approx(1600.0, rel=0.03)
     assert found.sigma == pytest.approx(0.1, rel=0.15)
 

@@ -14,8 +14,7 @@ from kcal.calibrate.camera.at_setting import compare_models
 from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.camera.layer import calibrate_views
 from kcal.calibrate.camera.result import CalibrationOptions
-from kcal.calibrate.hybrid.families import typical_hyperprior
-from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid, settle
+from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid, settle
 from kcal.calibrate.hybrid.fitted_views import Estimate
 from kcal.calibrate.hybrid.network_fit import (
     FieldTraining,
@@ -50,7 +49,10 @@ class Rings(nn.Module):
 def fitted(training: FieldTraining | None) -> HybridFit:
     modes = NetworkModes.of(network())[0]
     return fit_hybrid(
-        BOARD.points, capture().pixels(), SIZE, modes=modes, board="exact", motion=False, square=True, training=training
+        BOARD.points,
+        capture().pixels(),
+        SIZE,
+        options=FitOptions(modes=modes, board="exact", motion=False, square=True, training=training),
     )
 
 
@@ -92,21 +94,17 @@ def test_the_users_network_stays_and_the_camera_has_a_trained_copy() -> None:
 
 def turn() -> tuple[_Turn, Estimate]:
     pixels = capture(6).pixels()
-    modes = NetworkModes.of(Rings())[0]
-    found = settle(
-        BOARD.points, pixels, SIZE, torch.ones_like(pixels[..., 0]), modes=modes, board="exact", motion=False,
-        focal=None, hyperprior=typical_hyperprior(modes), progress=lambda _: None,
-    )  # fmt: skip
-    capture_, estimate = found.rounds.capture, found.rounds.estimate
-    flat = weights_of(_trunk(estimate))
-    return _Turn(capture=capture_, never=found.never, initial=flat, spread=0.5), estimate
+    options = FitOptions(modes=NetworkModes.of(Rings())[0], board="exact", motion=False)
+    found = settle(BOARD.points, pixels, SIZE, torch.ones_like(pixels[..., 0]), options)
+    flat = weights_of(_trunk(found.estimate))
+    return _Turn(capture=found.capture, initial=flat, spread=0.5), found.estimate
 
 
 def test_derivatives_by_the_networks_weights() -> None:
     """Rows of Gauss-Newton against differences of the solver's own residuals."""
     torch.manual_seed(4)
     own, estimate = turn()
-    problem = own.capture.problem(estimate, own.never)
+    problem = own.capture.problem(estimate)
     weights = weights_of(_trunk(estimate))
     rows = _Moved(own, problem, estimate).rows(weights, slice(1, 3))
     for k in (0, 7, 25):
@@ -115,7 +113,7 @@ def test_derivatives_by_the_networks_weights() -> None:
             other = weights.clone()
             other[k] += sign * 1e-5
             changed = _with_weights(estimate, other)
-            sides.append(own.capture.problem(changed, own.never).pixel_errors(changed.state)[1:3].flatten(-2))
+            sides.append(own.capture.problem(changed).pixel_errors(changed.state)[1:3].flatten(-2))
         torch.testing.assert_close(rows[:, k], (sides[0] - sides[1]) / 2e-5, rtol=1e-4, atol=1e-7)
 
     # The prior of the weights, about their initial values, is part of the step.
@@ -131,10 +129,10 @@ def test_derivatives_by_the_networks_weights() -> None:
 def test_a_turn_lowers_the_cost_and_a_narrow_prior_holds_the_weights() -> None:
     torch.manual_seed(4)
     own, estimate = turn()
-    before = own.cost(own.capture.problem(estimate, own.never), estimate)
+    before = own.cost(own.capture.problem(estimate), estimate)
     after, steps = _gauss_newton(own, estimate)
     assert steps > 0
-    assert own.cost(own.capture.problem(after, own.never), after) < before
+    assert own.cost(own.capture.problem(after), after) < before
     narrow, _ = _gauss_newton(dataclasses.replace(own, spread=1e-5), estimate)
     moved = [weights_of(_trunk(each)) - own.initial for each in (after, narrow)]
     assert float(moved[1].abs().max()) < 1e-4 < 1e-2 < float(moved[0].abs().max())

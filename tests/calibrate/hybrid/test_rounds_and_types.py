@@ -19,7 +19,7 @@ from kcal.calibrate.hybrid import cameras_fit, evidence_rounds, fitted_views
 from kcal.calibrate.hybrid.board_modes import board_modes
 from kcal.calibrate.hybrid.cameras_fit import CameraFit, _measured, fit_turned
 from kcal.calibrate.hybrid.evidence_rounds import Rounds, columns_may_be_read
-from kcal.calibrate.hybrid.families import typical_hyperprior
+from kcal.calibrate.hybrid.families import Hyperprior, typical_hyperprior
 from kcal.calibrate.hybrid.measured_board import printed_board
 from kcal.calibrate.problem.state import Readout, motion_sigma
 from kcal.corners.board import Board
@@ -38,6 +38,7 @@ class Views:
     """Stand-ins for views whose data say only whether columns were read."""
 
     readout: Readout | None
+    hyperprior: Hyperprior | None = None
 
     def problem(self, *_: object) -> None: ...
 
@@ -56,7 +57,7 @@ class TestColumns:
             hyperparameters=None, _replace=lambda **_: None,
         )  # fmt: skip
         rounds = cast(Rounds, SimpleNamespace(capture=Views(readout), estimate=estimate, converged=converged))
-        return columns_may_be_read(rounds, typical_hyperprior(), torch.zeros(0))
+        return columns_may_be_read(rounds)
 
     @pytest.mark.parametrize("better", [True, False])
     def test_by_the_evidence_of_columns_against_rows(self, better: bool, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -92,14 +93,14 @@ def test_a_solution_without_a_last_step(monkeypatch: pytest.MonkeyPatch) -> None
     weights = torch.ones(2, 48).double()
     weights[1, :4] = 0.0
     views = fitted_views.FittedViews(
-        points=BOARD.points, board=board_modes(BOARD.points), pixels=pixels, size=SIZE, weights=weights, readout=None,
-        square=True, robust=False, exact=False,
+        points=BOARD.points, board=board_modes(BOARD.points), pixels=pixels, size=SIZE, weights=weights,
+        hyperprior=typical_hyperprior(),
     )  # fmt: skip
     freedom = 2 * (96 - 5) - 12
     assert views.freedom == freedom
     estimate = cast(Any, SimpleNamespace(state="here", _replace=lambda state: state))
-    assert views.solved(estimate, torch.zeros(0), (7, 0.1)) == ("problem", "there", 3)
-    views.solved(estimate, torch.zeros(0), (9, 0.2), True)
+    assert views.solved(estimate, (7, 0.1)) == ("problem", "there", 3)
+    views.solved(estimate, (9, 0.2), True)
     assert seen == [(False, 7, pytest.approx(0.1 / freedom)), (True, 9, pytest.approx(0.2 / freedom))]
 
 

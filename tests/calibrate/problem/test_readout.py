@@ -15,7 +15,7 @@ from kcal.calibrate.hybrid.board_modes import board_modes
 from kcal.calibrate.hybrid.evidence import Quadratic, ViewData, maximize_evidence, view_data
 from kcal.calibrate.hybrid.evidence_rounds import motion_is_worth, run_rounds
 from kcal.calibrate.hybrid.families import prior_families, typical_hyperprior
-from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
+from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.fitted_views import FittedViews, hybrid_problem
 from kcal.calibrate.problem import board_problem
 from kcal.calibrate.problem.board_problem import POSE, BoardProblem
@@ -81,7 +81,7 @@ def capture(amplitude: float, count: int = 12, seed: int = 1, noise: float = NOI
 
 @functools.cache
 def fitted(amplitude: float, motion: bool = True) -> HybridFit:
-    return fit_hybrid(BOARD.points, capture(amplitude), SIZE, modes=MODES, motion=motion)
+    return fit_hybrid(BOARD.points, capture(amplitude), SIZE, options=FitOptions(modes=MODES, motion=motion))
 
 
 def off(camera: Camera) -> float:
@@ -332,7 +332,7 @@ def test_few_views_that_moved_are_less_sure(monkeypatch: pytest.MonkeyPatch) -> 
     """All variances alike, in the covariance and in what other fits take of the camera."""
     found = fitted(2e-3)
     monkeypatch.setattr("kcal.calibrate.hybrid.fit.widening", lambda _: 1.0)
-    plain = fit_hybrid(BOARD.points, capture(2e-3), SIZE, modes=MODES)
+    plain = fit_hybrid(BOARD.points, capture(2e-3), SIZE, options=FitOptions(modes=MODES))
     wider = widening(12)
     assert 1.05 < wider < 1.2
     torch.testing.assert_close(found.covariance, wider * plain.covariance, rtol=1e-9, atol=0)
@@ -359,7 +359,7 @@ def test_nothing_moves_on_a_stand() -> None:
 def test_a_picture_that_was_turned_is_read_by_columns() -> None:
     pixels = capture(2e-3)
     turned = torch.stack([SIZE[1] - 1.0 - pixels[..., 1], pixels[..., 0]], -1)
-    found = fit_hybrid(BOARD.points, turned, SIZE[::-1], modes=MODES)
+    found = fit_hybrid(BOARD.points, turned, SIZE[::-1], options=FitOptions(modes=MODES))
     assert found.readout is not None
     assert found.readout.columns
     assert not fitted(2e-3).readout.columns  # type: ignore[union-attr]
@@ -371,7 +371,7 @@ def test_a_stretched_picture(aspect: float) -> None:
     """Rows of an image that was resized."""
     pixels = capture(0.0).clone()
     pixels[..., 1] = (pixels[..., 1] + 0.5) * aspect - 0.5
-    found = fit_hybrid(BOARD.points, pixels, (SIZE[0], round(SIZE[1] * aspect)), modes=MODES)
+    found = fit_hybrid(BOARD.points, pixels, (SIZE[0], round(SIZE[1] * aspect)), options=FitOptions(modes=MODES))
     fx, fy, _, cy = found.camera.params[:4].tolist()
     assert not found.square
     covariance = found.covariance[:2, :2]
@@ -430,21 +430,17 @@ def test_limits_of_motions() -> None:
 @pytest.mark.parametrize(("rate", "worth"), [(2e-3, True), (0.0, False)])
 def test_motion_is_looked_for_beside_a_fit_of_views_that_stand_still(rate: float, worth: bool) -> None:
     pixels, points = capture(rate, 8), BOARD.points
-    weights, board, hyperprior = torch.ones_like(pixels[..., 0]), board_modes(BOARD.points), typical_hyperprior(MODES)
+    weights, board = torch.ones_like(pixels[..., 0]), board_modes(BOARD.points)
     views = FittedViews(
         points=points,
         board=board,
         pixels=pixels,
         size=SIZE,
         weights=weights,
-        readout=None,
-        square=True,
-        robust=False,
-        exact=False,
+        hyperprior=typical_hyperprior(MODES),
     )
-    estimate, _ = fit_base(views, MODES, None, hyperprior.mean, None)
-    never = torch.zeros_like(estimate.families.mean, dtype=torch.bool)
-    rounds = run_rounds(views, estimate, hyperprior, never, cold=True, spent=0, rough=True, progress=lambda _: None)
+    estimate, _ = fit_base(views, MODES)
+    rounds = run_rounds(views, estimate, cold=True, spent=0, rough=True, progress=lambda _: None)
     distance = float(estimate.state.translation.norm(dim=-1).median())
     readout = Readout(center=points.mean(0), distance=distance, size=SIZE)
-    assert motion_is_worth(rounds, readout, hyperprior, never) is worth
+    assert motion_is_worth(rounds, readout) is worth
