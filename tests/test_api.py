@@ -53,9 +53,9 @@ PUBLIC = {
         read_tracks save_camera_rig scene_features skyline_attitude skyline_source
     """,
     "kcal.locate": """
-        BudgetErrors DisparityRanges Marks MultiViewLocalizer Site Triangulate ViewMarks
+        BudgetErrors DisparityRanges Marks MultiViewLocalizer Site Triangulate
         area_of enu_from_cam enu_to_geodetic find_geoid geodetic_to_enu level_ground locate_on_ground
-        locate_views range_errors rank_sites read_marks read_views siting_map terrain write_positions
+        locate_views range_errors rank_sites read_marks siting_map terrain write_positions
     """,
     "kcal.track": """
         AssociationOptions ClockPrior Detections DisparityOptions Motion ObjectDisparity PairBoxes
@@ -83,7 +83,6 @@ NAMESPACES = {door.removeprefix("kcal.") for door in PUBLIC} - {"kcal"}
 INSIDE = {"HistoryRow", "LearnedStart", "TurnModel"}
 # What functions return, and blocks of files: examples are those of the functions.
 RECORDS = {
-    "ViewMarks",
     "cylinder_view",
     "CornerStatus",
     "Baseline",

@@ -280,7 +280,7 @@ def _board_ends(output: Path, board: Board) -> Marks:
     names = [f"{Path(pair[0]).stem} {word}" for pair in pairs for word in ("first", "last")]
     both = torch.isfinite(torch.cat(marks, 1)).all(-1)
     chosen = tuple(name for name, seen in zip(names, both.tolist(), strict=True) if seen)
-    return Marks(chosen, marks[0][both], marks[1][both])
+    return Marks.of_pair(chosen, marks[0][both], marks[1][both])
 
 
 # `kcal demo` without images: a simulated site from rendered boards to positions, and a page that explains it.
@@ -308,7 +308,7 @@ def simulated_site(output: Path, seed: int) -> None:
     clock.lap("calibration")
     _write_places(output / "survey.csv", scene.surveyed(scene.landmarks), sigma=scene.survey_sigma)
     marks = scene.landmark_marks
-    write_marks(output / "landmarks.csv", Marks(scene.landmarks.names, marks.left, marks.right))
+    write_marks(output / "landmarks.csv", Marks.of_pair(scene.landmarks.names, marks.left, marks.right))
     run(
         "rig", *(output / f"{side}.camera.json" for side in SIDES),
         "--landmarks", output / "survey.csv", "--marks", output / "landmarks.csv", "--pixel-sigma", scene.mark_sigma,
@@ -319,7 +319,7 @@ def simulated_site(output: Path, seed: int) -> None:
     clock.lap("rig")
 
     marks, targets = scene.target_marks, scene.targets
-    write_marks(output / "points.csv", Marks(targets.names, marks.left, marks.right))
+    write_marks(output / "points.csv", Marks.of_pair(targets.names, marks.left, marks.right))
     _write_places(output / "truth.csv", targets)
     command = locate_again(output, "--pixel-sigma", scene.mark_sigma, "--truth", output / "truth.csv")
     rig = load_rig(output / "rig.json")

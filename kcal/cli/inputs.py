@@ -317,7 +317,7 @@ def check_kinds(found: Sequence[_Given]) -> None:
     inside = next(_candidates(wrong, kind), None)
     if inside is not None and typed:
         raise FileError(f"{text}. Perhaps: {typed_with({wrong.text: inside})}")
-    from kcal.locate.survey import is_long
+    from kcal.locate.marks import is_long
 
     tables = [one.path for one in found if wrong.wanted is RIG and one.wanted is MARKS and one.fits(one.text)]
     marks = next(filter(is_long, tables), None)

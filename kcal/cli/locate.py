@@ -226,8 +226,8 @@ class LocateRun(NamedTuple):
 
 def locate_run(rig: Path, points: Path, options: LocateOptions) -> LocateRun:
     """Read a rig and begin a table: marks of several cameras, or of one with a height or a terrain, or pairs."""
+    from kcal.locate.marks import is_long
     from kcal.locate.stations import names_of_rig
-    from kcal.locate.survey import is_long
 
     alone = options.height is not None or options.terrain is not None
     if alone or is_long(points) or len(names_of_rig(rig)) != 2:
@@ -236,10 +236,10 @@ def locate_run(rig: Path, points: Path, options: LocateOptions) -> LocateRun:
 
 
 def _of_stations(rig: Path, points: Path, options: LocateOptions) -> LocateRun:
+    from kcal.locate.marks import read_mark_chunks
     from kcal.locate.raster import terrain
     from kcal.locate.station_positions import ViewsLocator
     from kcal.locate.stations import load_camera_rig
-    from kcal.locate.survey import read_view_chunks
     from kcal.locate.tabulate import find_geoid
 
     own = options
@@ -263,8 +263,8 @@ def _of_stations(rig: Path, points: Path, options: LocateOptions) -> LocateRun:
     locate = ViewsLocator(stations, pixel_sigma=noise, height=height, ground=ground, geoid=find_geoid(own.geoid))
 
     def parts() -> Iterator[LocatedPart]:
-        for views, read in read_view_chunks(points, stations.names):
-            yield LocatedPart(*locate(views), bool(views.sigma.isfinite().any()), read)
+        for marks, read in read_mark_chunks(points, stations.names, single=True):
+            yield LocatedPart(*locate(marks), marks.covariance_or(noise) is not None, read)
 
     doubts = _warned(rig, stations.calibration.warnings if stations.calibration else ())
     return LocateRun(locate, locate.located(), parts(), doubts, note)
@@ -273,7 +273,7 @@ def _of_stations(rig: Path, points: Path, options: LocateOptions) -> LocateRun:
 def _of_pairs(rig: Path, points: Path, options: LocateOptions) -> LocateRun:
     from kcal.io.rig_file import load_rig
     from kcal.lens.rig import RigCovariance
-    from kcal.locate.marks import filled, read_mark_chunks
+    from kcal.locate.marks import read_mark_chunks
     from kcal.locate.mounting import run_errors
     from kcal.locate.positions import located_by
     from kcal.locate.tabulate import Locator, find_geoid, true_from_grid
@@ -318,10 +318,10 @@ def _of_pairs(rig: Path, points: Path, options: LocateOptions) -> LocateRun:
     by_moments = None if own.watch is None else located_at(own.watch, solved, locator)
 
     def parts() -> Iterator[LocatedPart]:
-        for chunk in read_mark_chunks(points):
-            cov = filled(chunk.covariance, noise)
-            columns = (by_moments or locate)(chunk.names, chunk.pixels, cov, chunk.extras)
-            yield LocatedPart(columns, None, cov is not None, chunk.bytes_read)
+        for marks, read in read_mark_chunks(points):
+            cov = marks.covariance_or(noise)
+            columns = (by_moments or locate)(marks.names, marks.pixels, cov, dict(marks.extras))
+            yield LocatedPart(columns, None, cov is not None, read)
 
     return LocateRun(locate, located_by(locate), parts(), doubts, note)
 

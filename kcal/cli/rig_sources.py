@@ -470,16 +470,7 @@ def read_sources(cameras: Sequence[Camera], sources: Sources) -> RigInput:
     from kcal.calibrate.rig.sources import RigData
     from kcal.lens.rig import Origin
     from kcal.locate.marks import read_marks
-    from kcal.locate.survey import (
-        camera_positions,
-        import_survey,
-        is_long,
-        match_landmarks,
-        match_views,
-        read_feature_views,
-        read_features,
-        read_views,
-    )
+    from kcal.locate.survey import camera_positions, import_survey, match_landmarks, read_features
 
     if (sources.landmarks is None) != (sources.marks is None):
         raise InputError("--landmarks and --marks belong together: places by name, and where they are in the images")
@@ -501,14 +492,10 @@ def read_sources(cameras: Sequence[Camera], sources: Sources) -> RigInput:
         if sources.positions is not None and survey.origin != origin:
             raise InputError("landmarks and positions: one has latitudes, the other local meters; give an --origin")
         origin = survey.origin
-        if not pair or is_long(sources.marks):
-            views = read_views(sources.marks, sources.names, others=len(cameras) == 1)
-            found = match_views(survey, views, sources.mark_sigma)
-        else:
-            marks = read_marks(sources.marks, single=True)
-            found = match_landmarks(survey, marks, marks.sigmas(sources.mark_sigma))
-            if marks.covariance is not None:
-                pixel_sigma = marks.typical_sigma(sources.mark_sigma)
+        marks = read_marks(sources.marks, sources.names, single=True, others=len(cameras) == 1)
+        found = match_landmarks(survey, marks, marks.sigmas(sources.mark_sigma))
+        if marks.covariance is not None:
+            pixel_sigma = marks.typical_sigma(sources.mark_sigma)
         landmarks = found.landmarks
         for some, text in ((found.unmarked, "surveyed, but not marked"), (found.unsurveyed, "marked, not surveyed")):
             if some:
@@ -524,10 +511,8 @@ def read_sources(cameras: Sequence[Camera], sources: Sources) -> RigInput:
         skyline, more = read_skyline(dict(zip(names, cameras, strict=True)), sources.skyline, origin, positions)
         notes = [*notes, *more]
     features = None
-    if sources.features is not None and (not pair or is_long(sources.features)):
-        features = read_feature_views(sources.features, sources.names, sources.mark_sigma)
-    elif sources.features is not None:
-        features = read_features(sources.features, sources.mark_sigma)
+    if sources.features is not None:
+        features = read_features(sources.features, sources.mark_sigma, sources.names)
     if sources.scene is not None:
         # One position alone tells no length; GNSS of both does.
         scaled = any((boards, landmarks, sources.baseline, len(positions) > 1))

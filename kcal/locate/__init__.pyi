@@ -13,8 +13,6 @@ from kcal.locate.disparity import DisparityRanges as DisparityRanges
 # Any number of cameras
 from kcal.locate.multi_localizer import MultiViewLocalizer as MultiViewLocalizer
 from kcal.locate.station_positions import locate_views as locate_views
-from kcal.locate.survey import read_views as read_views
-from kcal.locate.survey import ViewMarks as ViewMarks
 
 # Points on the ground
 from kcal.locate.ground import locate_on_ground as locate_on_ground

@@ -16,11 +16,11 @@ from kcal.lens.rig import CameraRig
 from kcal.locate.geodesy import anchor, ecef_from_enu_rotation, enu_to_geodetic
 from kcal.locate.ground import Ground
 from kcal.locate.localizer import Localization
+from kcal.locate.marks import Marks
 from kcal.locate.multi_localizer import MultiViewLocalizer, ViewsLocalization
 from kcal.locate.positions import Located, located_by
 from kcal.locate.stations import station_mounting
 from kcal.locate.stereo import PositionStatus
-from kcal.locate.survey import ViewMarks
 from kcal.locate.tables import NUMBERS, PositionColumns
 from kcal.locate.tabulate import Geoid, Locator, geoid_column, number_table, viewpoint
 
@@ -40,7 +40,7 @@ _TEXTS = {
 @torch.no_grad()
 def locate_views(
     rig: CameraRig,
-    views: ViewMarks,
+    views: Marks,
     *,
     pixel_sigma: float = 0.3,
     height: tuple[float, float] | None = None,
@@ -73,7 +73,7 @@ def locate_views(
         >>> rig = CameraRig([camera] * 2, ["mill", "mast"], look, torch.tensor([[0.0, 0, 30], [5000, 0, 30]]),
         ...                 origin=Origin(lat=45.0, lon=6.0, height=0.0), refraction=0.0)
         >>> pixels, _ = rig(torch.tensor([[100.0, 5000, 60]]))
-        >>> views = ViewMarks(("smoke",), pixels, torch.full((1, 2), 2.0), {})
+        >>> views = Marks(("smoke",), pixels, sigma=torch.full((1, 2), 2.0))
         >>> located = locate_views(rig, views).positions[0]
         >>> [round(value) for value in located.enu], located.status.name
         ([100, 5000, 60], 'OK')
@@ -103,16 +103,18 @@ class ViewsLocator:
         self.height, self.ground, self.to_own = height, ground, own_axes(rig)
 
     @torch.no_grad()
-    def __call__(self, views: ViewMarks) -> tuple[PositionColumns, Tensor]:
+    def __call__(self, views: Marks) -> tuple[PositionColumns, Tensor]:
         """The columns of some rows, and (N, 3) where their bearings and ranges count from."""
-        rig, sigma = self.rig, views.sigmas(float(self.localize.pixel_sigma))
-        cov = sigma.square()[..., None, None] * torch.eye(2, dtype=torch.float64)
+        rig, cov = self.rig, None
+        if views.sigma is not None or views.covariance is not None:
+            sigma = views.sigmas(float(self.localize.pixel_sigma))
+            cov = sigma.square()[..., None, None] * torch.eye(2, dtype=torch.float64)
         stated: Tensor | Ground | None = self.ground
         if self.ground is None and self.height is not None:
             stated = torch.full((len(views.names),), self.height[0], dtype=torch.float64)
         found = self.localize(
             views.pixels,
-            cov=cov if bool(views.sigma.isfinite().any()) else None,
+            cov=cov,
             height=stated,
             height_sigma=1.0 if self.height is None else self.height[1],
         )
@@ -127,7 +129,7 @@ class ViewsLocator:
         if self.geoid is not None:
             heights[ok] = geoid_column(self.geoid, found.geodetic[ok, 0].numpy(), found.geodetic[ok, 1].numpy())
         numbers = number_table(as_pairs, (("geoid_height_m", ok, heights[None]),))
-        extras = views.extras | {
+        extras = dict(views.extras) | {
             "cameras": [_camera_list(rig, row) for row in found.used.tolist()],
             "left_out": [_camera_list(rig, row) for row in found.bad.tolist()],
             "misfit_sigmas": [_misfits(rig, row) for row in found.misfit.tolist()],

@@ -411,7 +411,7 @@ class Desk:
             return {"refusal": "no rig yet"}
         item = Item(kind="target", left=left, right=right, cross=matched)
         pixels = torch.tensor([[left.u, left.v], [right.u, right.v]], dtype=torch.float64)
-        marks = Marks(("",), pixels[:1], pixels[1:], pair_covariance(item)[None])
+        marks = Marks(("",), pixels[None], pair_covariance(item)[None])
         try:
             return position_text(located(rig, marks, self.session.hand_sigma).positions[0], self._anchored)
         except KcalError as error:

@@ -450,7 +450,7 @@ def marks_of(state: marking.MarkingState, kinds: tuple[marking.Kind, ...], *, si
         return torch.tensor(rows, dtype=torch.float64).reshape(-1, 2)
 
     covariance = torch.stack([pair_covariance(item) for item in chosen.values()]) if chosen else None
-    return Marks(tuple(chosen), pixels("left"), pixels("right"), covariance)
+    return Marks.of_pair(tuple(chosen), pixels("left"), pixels("right"), covariance)
 
 
 def pair_covariance(item: marking.Item) -> Tensor:

@@ -599,7 +599,8 @@ def seen_again(then: Marks, now: Marks, sigma: float) -> Features:
 
     Example:
         >>> pixels = torch.tensor([[10.0, 20.0], [30.0, 40.0]], dtype=torch.float64)
-        >>> found = seen_again(Marks(("a", "b"), pixels, pixels), Marks(("b", "c"), pixels, pixels), 0.3)
+        >>> both = torch.stack([pixels, pixels], 1)
+        >>> found = seen_again(Marks(("a", "b"), both), Marks(("b", "c"), both), 0.3)
         >>> found.names, found.pixels[0].tolist()
         (('b',), [[30.0, 40.0], [30.0, 40.0], [10.0, 20.0], [10.0, 20.0]])
     """

@@ -70,7 +70,7 @@ def make_site(folder: Path, count: int) -> Marks:
     names = tuple(f"post {i + 1}" for i in range(count))
     lines = [f"{name},{e},{n},{u},{_SURVEY}" for name, (e, n, u) in zip(names, points.tolist(), strict=True)]
     (folder / "survey.csv").write_text("\n".join(["name,east,north,up,sigma", *lines]) + "\n")
-    marks = Marks(names, pixels[:, 0], pixels[:, 1], _SIGMA**2 * torch.eye(4).double().expand(count, 4, 4))
+    marks = Marks(names, pixels, _SIGMA**2 * torch.eye(4).double().expand(count, 4, 4))
     survey = Survey(names, points, torch.full_like(points, _SURVEY), None)
     solved = solve_live((rig.left, rig.right), survey, marks, 0.3)
     assert solved.rig is not None, solved.text

@@ -337,8 +337,8 @@ def real() -> list[str]:
 
 def picture() -> None:
     """Towers and smoke, for the how-to page."""
+    from kcal.locate.marks import Marks
     from kcal.locate.station_positions import locate_views
-    from kcal.locate.survey import ViewMarks
     from kcal.report.positions import save_stations_picture
 
     rig, generator = ring(3, 12_000.0), torch.Generator().manual_seed(5)
@@ -355,7 +355,7 @@ def picture() -> None:
     seen = marks(rig, points, drawn_errors(rig.root, 1, generator).expand(4, -1))
     seen = seen + 10.0 * torch.randn(seen.shape, generator=generator, dtype=torch.float64)
     seen[2, 1], seen[3, :2] = math.nan, math.nan
-    views = ViewMarks(("smoke 1", "smoke 2", "smoke 3", "smoke 4"), seen, torch.full((4, 3), 10.0).double(), {})
+    views = Marks(("smoke 1", "smoke 2", "smoke 3", "smoke 4"), seen, sigma=torch.full((4, 3), 10.0).double())
     located = locate_views(rig, views)
     show([str(save_stations_picture(Path(__file__).parents[2] / "docs" / "howto" / "stations.png", located, points))])
 

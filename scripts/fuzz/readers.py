@@ -33,7 +33,7 @@ from kcal.locate.marks import COVARIANCE, read_marks, write_marks
 from kcal.locate.positions import locate_points
 from kcal.locate.raster import terrain
 from kcal.locate.stations import load_camera_rig
-from kcal.locate.survey import import_survey, read_features, read_survey, read_views
+from kcal.locate.survey import import_survey, read_features, read_survey
 from kcal.mark.session import Journal
 from kcal.pipeline.association import AssociationOptions
 from kcal.pipeline.detections import Detections
@@ -203,7 +203,7 @@ READERS: dict[str, Reader] = {
         lambda found, path: write_marks(path, found), unknown=("covariance",),
         # Control characters in names are written in words.
         kept=lambda found: (len(found.names), found.left, found.right, found.covariance)),
-    "view marks": Reader(lambda path: read_views(path, ["a", "b"]), ".csv", whole_text(
+    "view marks": Reader(lambda path: read_marks(path, ["a", "b"]), ".csv", whole_text(
         "name,camera,u,v,time,sigma\np,a,1,2,0.5,0.1\np,b,3,4,0.5,\nq,b,5,6,1.5,0.3\n"), unknown=("pixels", "sigma")),
     "features": Reader(lambda path: read_features(path, 0.3), ".csv", infinite=("inverse_range_sigma",),
                        write=whole_text(

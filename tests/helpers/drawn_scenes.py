@@ -99,8 +99,8 @@ def calibrated() -> CameraCalibrationResult:
 def stations() -> Located:
     """Things seen by three towers, one of them by one tower alone."""
     from kcal.lens.rig import CameraRig
+    from kcal.locate.marks import Marks
     from kcal.locate.station_positions import locate_views
-    from kcal.locate.survey import ViewMarks
 
     lens = Camera.build(focal=(900, 900), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
     centers = tensor([0.0, 0.0, 30.0], [3000.0, 200.0, 40.0], [1500.0, -900.0, 35.0])
@@ -109,8 +109,7 @@ def stations() -> Located:
     things = tensor([1200.0, 4000.0, 10.0], [2000.0, 3000.0, 10.0], [-800.0, 2500.0, 10.0])
     pixels = torch.stack([lens.project((things - c) @ turn.T)[0] for c, turn in zip(centers, turns, strict=True)], 1)
     pixels[2, 1:] = math.nan
-    unknown = torch.full(pixels.shape[:2], math.nan).double()
-    return locate_views(rig, ViewMarks(("fire", "smoke", "light"), pixels, unknown, {}))
+    return locate_views(rig, Marks(("fire", "smoke", "light"), pixels))
 
 
 @functools.cache

@@ -14,8 +14,8 @@ from typer.testing import CliRunner
 from kcal.cli.main import app
 from kcal.errors import FileError
 from kcal.io.rig_file import save_rig
-from kcal.locate import survey, tables
-from kcal.locate.survey import read_view_chunks
+from kcal.locate import marks, tables
+from kcal.locate.marks import read_mark_chunks
 from kcal.locate.tables import DistinctKeys, Doubled, read_chunks
 
 
@@ -64,18 +64,18 @@ def test_a_table_that_is_longer_than_memory(tmp_path: Path) -> None:
 
 
 def test_a_long_table_of_views(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(survey, "_WHOLE", 0)
-    monkeypatch.setattr(survey, "read_chunks", lambda *given, **more: read_chunks(*given, **more, at_once=8))
+    monkeypatch.setattr(marks, "_WHOLE", 0)
+    monkeypatch.setattr(marks, "read_chunks", lambda *given, **more: read_chunks(*given, **more, at_once=8))
     path = tmp_path / "views.csv"
     lines = ["name,camera,u,v,time", *(f"a{i // 2 % 50},{'lr'[i % 2]},{i},1,{i // 100}" for i in range(300))]
     path.write_text("\n".join(lines) + "\n")
-    parts = [views for views, _ in read_view_chunks(path, ("l", "r"))]
+    parts = [views for views, _ in read_mark_chunks(path, ("l", "r"))]
     assert len({name for views in parts for name in views.names}) == 150
     path.write_text("\n".join([*lines, "a3,l,1,2,0"]) + "\n")
     with pytest.raises(
         FileError, match=r"line 302: lines of 'a3' stand at several places; .* sort it by name and time"
     ):
-        list(read_view_chunks(path, ("l", "r")))
+        list(read_mark_chunks(path, ("l", "r")))
 
 
 def test_nothing_is_written_of_a_refused_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

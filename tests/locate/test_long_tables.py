@@ -67,7 +67,7 @@ def written(suffix: str, path: Path, at_once: int, piece: int = 10_000) -> bytes
     writer = PositionWriter(file, suffix, located_by(locate))
     # The moment of Cursor-on-Target.
     writer._time = writer._time.replace(year=2026, month=5, day=4, hour=12, minute=0, second=0, microsecond=0)
-    for chunk in read_mark_chunks(path, at_once=at_once):
+    for chunk, _ in read_mark_chunks(path, at_once=at_once):
         for columns in locate(chunk.names, chunk.pixels, extras=chunk.extras).pieces(piece):
             writer.add(columns)
     writer.close()
@@ -204,7 +204,7 @@ def test_names_that_would_act_are_texts_and_come_back(tmp_path: Path) -> None:
         out = csv.writer(file)
         out.writerow(["name", "left_u", "left_v", "right_u", "right_v"])
         out.writerows([name, 960, 540, 950, 540] for name in names)
-    assert [name for chunk in read_mark_chunks(path) for name in chunk.names] == names
+    assert [name for chunk, _ in read_mark_chunks(path) for name in chunk.names] == names
     text = written(".csv", path, 10).decode()
     column = [row["name"] for row in csv.DictReader(io.StringIO(text))]
     assert column[:4] == ["'=1+1", "'@a", "-5", "'-5 m"]
@@ -214,7 +214,7 @@ def test_names_that_would_act_are_texts_and_come_back(tmp_path: Path) -> None:
         out = csv.writer(file)
         out.writerow(["name", "left_u", "left_v", "right_u", "right_v"])
         out.writerows([name, 960, 540, 950, 540] for name in column)
-    assert [name for chunk in read_mark_chunks(again) for name in chunk.names] == names
+    assert [name for chunk, _ in read_mark_chunks(again) for name in chunk.names] == names
     # A name that begins as if it had been guarded is guarded once more.
     located = locate_points(real_rig(), *pixels()[:1].unbind(1), names=["'=1"], origin=ORIGIN, heading_deg=0.0)
     text = write_positions(tmp_path / "guarded.csv", located).read_text(encoding="utf-8")
@@ -270,16 +270,16 @@ def test_blank_and_folded_lines_keep_their_numbers(tmp_path: Path) -> None:
             list(read_mark_chunks(path, at_once=at_once))
     path.write_bytes(path.read_bytes().replace(b"x", b"5."))
     for at_once in (1, 2, 3, 100):
-        chunks = list(read_mark_chunks(path, at_once=at_once))
+        chunks = [chunk for chunk, _ in read_mark_chunks(path, at_once=at_once)]
         assert [name for chunk in chunks for name in chunk.names] == ["two\nlines", "b", "c"]
         assert torch.cat([chunk.pixels for chunk in chunks]).flatten(1).tolist() == [[1, 2, 3, 4]] * 2 + [[1, 2, 5, 4]]
 
 
 def test_plain_lines_are_read_like_any(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = table(tmp_path / "points.csv", extra=True)
-    quick = list(read_mark_chunks(path, at_once=100))
+    quick = [chunk for chunk, _ in read_mark_chunks(path, at_once=100)]
     monkeypatch.setattr(tables, "_split_plain", lambda texts, names: None)
-    for one, other in zip(quick, read_mark_chunks(path, at_once=100), strict=True):
+    for one, (other, _) in zip(quick, read_mark_chunks(path, at_once=100), strict=True):
         assert (list(one.names), one.extras) == (list(other.names), other.extras)
         assert torch.equal(one.pixels, other.pixels)
 
@@ -287,7 +287,7 @@ def test_plain_lines_are_read_like_any(tmp_path: Path, monkeypatch: pytest.Monke
 def test_equal_hashes_of_unlike_names_are_no_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tables, "hash", lambda name: 1, raising=False)
     path = table(tmp_path / "points.csv")
-    assert sum(len(chunk.names) for chunk in read_mark_chunks(path, at_once=64)) == ROWS
+    assert sum(len(chunk.names) for chunk, _ in read_mark_chunks(path, at_once=64)) == ROWS
 
 
 def test_number_lines_keep_every_digit() -> None:

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from kcal.locate.marks import Marks, filled
+from kcal.locate.marks import Marks
 
 NONE = [math.nan, math.nan]
 
@@ -15,7 +15,7 @@ NONE = [math.nan, math.nan]
 def marks(covariance: torch.Tensor | None) -> Marks:
     left = torch.tensor([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]], dtype=torch.float64)
     right = torch.tensor([[1.0, 2.0], NONE, [5.0, 6.0]], dtype=torch.float64)
-    return Marks(("a", "b", "c"), left, right, covariance)
+    return Marks.of_pair(("a", "b", "c"), left, right, covariance)
 
 
 def stated() -> torch.Tensor:
@@ -35,18 +35,18 @@ def test_a_mark_has_the_mean_variance_of_its_axes() -> None:
 
 def test_the_typical_sigma_is_of_the_marks_that_are_there() -> None:
     assert marks(stated()).typical_sigma(0.3) == pytest.approx(math.sqrt((0.08 + 0.05**2 + 3 * 0.09) / 5))
-    nothing = Marks(("a",), torch.tensor([NONE]), torch.tensor([NONE]), None)
+    nothing = Marks.of_pair(("a",), torch.tensor([NONE]), torch.tensor([NONE]), None)
     assert nothing.typical_sigma(0.3) == 0.3
 
 
 def test_covariances_are_filled_pair_by_pair() -> None:
-    assert filled(None, 0.3) is None
-    found = filled(stated(), 0.3)
+    assert marks(None).covariance_or(0.3) is None
+    found = marks(stated()).covariance_or(0.3)
     assert found is not None
     assert torch.equal(found[0], stated()[0])
     torch.testing.assert_close(found[1], 0.09 * torch.eye(4, dtype=torch.float64))
     half = stated()
     half[0, 0, 1] = torch.nan
-    found = filled(half, 0.3)
+    found = marks(half).covariance_or(0.3)
     assert found is not None
     torch.testing.assert_close(found[0], 0.09 * torch.eye(4, dtype=torch.float64))

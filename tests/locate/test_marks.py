@@ -88,7 +88,7 @@ class TestCovariance:
         covariance = root @ root.mT + 0.1 * torch.eye(4).double()
         covariance[1] = torch.nan
         pixels = torch.rand(2, 2).double()
-        marks = Marks(("hill, west", "b"), pixels, pixels + 1.0, covariance)
+        marks = Marks.of_pair(("hill, west", "b"), pixels, pixels + 1.0, covariance)
         again = read_marks(write_marks(tmp_path / "marks.csv", marks))
         assert again.names == marks.names
         assert again.covariance is not None

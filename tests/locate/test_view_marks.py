@@ -15,12 +15,13 @@ from kcal.cli.main import app
 from kcal.cli.stars import images_of_nights
 from kcal.errors import FileError, InputError
 from kcal.io.rig_file import save_camera_rig
-from kcal.locate import survey
+from kcal.locate import marks as tables
 from kcal.locate.budget import range_sigmas, station_sigmas
 from kcal.locate.geodesy import enu_to_geodetic, geodetic_to_enu
+from kcal.locate.marks import Marks, read_mark_chunks, read_marks
 from kcal.locate.station_positions import PositionSample, ViewsLocator
 from kcal.locate.stations import stations_of
-from kcal.locate.survey import ViewMarks, read_feature_views, read_view_chunks, read_views
+from kcal.locate.survey import read_features
 from kcal.locate.tables import read_chunks
 from kcal.rig import RigCovariance, planned_rig
 from scripts.shared.station_scenes import ORIGIN, marks, ring, targets
@@ -41,17 +42,17 @@ def table(path: Path, things: int, times: int = 1) -> list[str]:
     return lines
 
 
-def joined(path: Path) -> ViewMarks:
-    parts = [views for views, _ in read_view_chunks(path, CAMERAS)]
+def joined(path: Path) -> Marks:
+    parts = [views for views, _ in read_mark_chunks(path, CAMERAS)]
     assert len(parts) > 3
     extras = {name: [cell for part in parts for cell in part.extras[name]] for name in parts[0].extras}
     names = tuple(name for part in parts for name in part.names)
-    return ViewMarks(names, torch.cat([p.pixels for p in parts]), torch.cat([p.sigma for p in parts]), extras)
+    return Marks(names, torch.cat([p.pixels for p in parts]), extras=extras)
 
 
 def small_parts(monkeypatch: pytest.MonkeyPatch, rows: int) -> None:
-    monkeypatch.setattr(survey, "_WHOLE", 0)
-    monkeypatch.setattr(survey, "read_chunks", lambda *given, **more: read_chunks(*given, **more, at_once=rows))
+    monkeypatch.setattr(tables, "_WHOLE", 0)
+    monkeypatch.setattr(tables, "read_chunks", lambda *given, **more: read_chunks(*given, **more, at_once=rows))
 
 
 @pytest.mark.parametrize("times", [1, 3])
@@ -59,7 +60,7 @@ def small_parts(monkeypatch: pytest.MonkeyPatch, rows: int) -> None:
 def test_parts_are_the_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rows: int, times: int) -> None:
     path = tmp_path / "long.csv"
     table(path, 80, times)
-    whole = read_views(path, CAMERAS)
+    whole = read_marks(path, CAMERAS)
     small_parts(monkeypatch, rows)
     parts = joined(path)
     assert parts.names == whole.names
@@ -75,14 +76,14 @@ def test_a_long_table_must_be_in_order(tmp_path: Path, monkeypatch: pytest.Monke
     lines.remove(own[-1])
     other = own[-1].split(",")[1]
     path.write_text("\n".join([head, *lines, f"thing 0,{other},1,2,0"]) + "\n")
-    found = read_views(path, CAMERAS)  # in any order, if it is short
+    found = read_marks(path, CAMERAS)  # in any order, if it is short
     assert bool(found.pixels[0, CAMERAS.index(other)].isfinite().all())
     small_parts(monkeypatch, 7)
     with pytest.raises(FileError, match="lines of 'thing 0' stand at several places"):
-        list(read_view_chunks(path, CAMERAS))
+        list(read_mark_chunks(path, CAMERAS))
     path.write_text("\n".join([head, *lines[:2], lines[-1], f"thing 0,{other},1,2,0", *lines[2:]]) + "\n")
     with pytest.raises(FileError, match="lines of 'thing 0' stand at several places"):
-        list(read_view_chunks(path, CAMERAS))
+        list(read_mark_chunks(path, CAMERAS))
 
 
 def test_times_keep_things_apart(tmp_path: Path) -> None:
@@ -90,20 +91,20 @@ def test_times_keep_things_apart(tmp_path: Path) -> None:
     path.write_text(
         "name,camera,u,v,time\nboat,a,1,2,10.0\nboat,b,3,4,10.0\nboat,a,5,6,11.0\nbuoy,c,7,8,10.0\n", encoding="utf-8"
     )
-    views = read_views(path, CAMERAS)
+    views = read_marks(path, CAMERAS)
     assert views.names == ("boat 10.0", "boat 11.0", "buoy")
     assert views.extras["time"] == ["10.0", "11.0", "10.0"]
     assert views.pixels[0].nan_to_num(nan=-1).tolist() == [[1, 2], [3, 4], [-1, -1]]
     path.write_text("name,camera,u,v,time\nboat,a,1,2,10.0\nboat,a,3,4,10.0\n")
     with pytest.raises(FileError, match="line 3: 'boat' was marked in a before"):
-        read_views(path, CAMERAS)
+        read_marks(path, CAMERAS)
 
 
 def test_features_of_any_two_cameras(tmp_path: Path) -> None:
     path = tmp_path / "far.csv"
     rows = ["summit,a,1,2,20000,2000,", "summit,c,3,4,20000,2000,", "cloud,b,5,6,,,5000", "cloud,c,7,8,,,5000"]
     path.write_text("\n".join(["name,camera,u,v,range,range_sigma,beyond", *rows, "rock,a,9,9,,,", "rock,b,9,9,,,"]))
-    found = read_feature_views(path, CAMERAS, 0.4)
+    found = read_features(path, 0.4, CAMERAS)
     assert found.names == ("summit", "cloud", "rock")
     assert found.pixels[:, :, 0].isnan().tolist() == [[False, True, False], [True, False, False], [False, False, True]]
     assert found.inverse_range.tolist() == pytest.approx([1 / 20_000, 0.5 / 5000, 0.0], rel=0.02)
@@ -133,7 +134,7 @@ def test_a_long_table_is_located_as_a_short_one(tmp_path: Path, monkeypatch: pyt
         assert result.exit_code == 0, result.output
         outputs.append([cell for row in csv.reader(out[0].read_text().splitlines()) for cell in row])
         locate, sample = ViewsLocator(rig), PositionSample(most=20)
-        for views, _ in read_view_chunks(tmp_path / "marks.csv", rig.names):
+        for views, _ in read_mark_chunks(tmp_path / "marks.csv", rig.names):
             sample.add(*locate(views))
         samples.append(sample.located(locate))
     for whole, part in zip(*outputs, strict=True):

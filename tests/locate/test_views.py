@@ -12,10 +12,10 @@ from locate_rigs import tensor
 from kcal.errors import FileError, InputError
 from kcal.lens.rig import CameraRig
 from kcal.locate.geodesy import enu_to_geodetic
-from kcal.locate.marks import Marks
+from kcal.locate.marks import Marks, is_long, read_marks
 from kcal.locate.station_positions import locate_views
 from kcal.locate.stereo import PositionStatus
-from kcal.locate.survey import Survey, ViewMarks, is_long, match_views, read_feature_views, read_views
+from kcal.locate.survey import Survey, match_landmarks, read_features
 from kcal.watch.turned import seen_again
 from scripts.shared.station_scenes import ORIGIN, marks, ring, targets
 
@@ -34,7 +34,7 @@ class TestTables:
                 "mill,b,5,6,1,2,x\n")  # fmt: skip
         path = table(tmp_path, text)
         assert is_long(path)
-        views = read_views(path, NAMES)
+        views = read_marks(path, NAMES)
         # A name that is seen at two moments needs its time, another does not.
         assert views.names == ("mast 0", "mast 1", "mill")
         nan = math.nan
@@ -45,11 +45,11 @@ class TestTables:
         sigma = tensor([0.5, nan, nan], [nan, 0.25, nan], [nan, 2.0, nan])
         torch.testing.assert_close(views.sigma, sigma, equal_nan=True, rtol=0, atol=0)
         stated = views.sigmas(0.3)
-        assert stated[0].tolist() == [0.5, 0.3, 0.3]
+        assert stated[0].nan_to_num(nan=-1.0).tolist() == [0.5, -1.0, 0.3]
         assert views.extras == {"time": ["0", "1", "1"], "kind": ["steel", "", "x"]}
 
     def test_a_name_twice_without_times_is_one_thing(self, tmp_path: Path) -> None:
-        views = read_views(table(tmp_path, "name,camera,u,v\nmast,a,10,20\nmast,b,1,2\n"), NAMES)
+        views = read_marks(table(tmp_path, "name,camera,u,v\nmast,a,10,20\nmast,b,1,2\n"), NAMES)
         assert views.names == ("mast",)
         assert views.extras == {}
         assert views.pixels[0, :2].tolist() == [[10.0, 20.0], [1.0, 2.0]]
@@ -66,25 +66,25 @@ class TestTables:
     )
     def test_refused(self, text: str, message: str, tmp_path: Path) -> None:
         with pytest.raises(FileError, match=message):
-            read_views(table(tmp_path, text), NAMES)
+            read_marks(table(tmp_path, text), NAMES)
 
     def test_marks_of_other_cameras_are_skipped_on_request(self, tmp_path: Path) -> None:
         path = table(tmp_path, "name,camera,u,v\nmast,d,1,2\nmast,a,3,4\n")
-        assert read_views(path, NAMES, others=True).pixels[0, 0].tolist() == [3.0, 4.0]
+        assert read_marks(path, NAMES, others=True).pixels[0, 0].tolist() == [3.0, 4.0]
         with pytest.raises(FileError, match="no mark of b"):
-            read_views(path, ("b",), others=True)
+            read_marks(path, ("b",), others=True)
 
     def test_a_table_of_pairs(self, tmp_path: Path) -> None:
         path = table(tmp_path, "name,left_u,left_v,right_u,right_v\nmast,1,2,3,4\nmill,5,6,7,8\n")
         assert not is_long(path)
-        views = read_views(path, ("left", "right"))
+        views = read_marks(path, ("left", "right"))
         assert views.names == ("mast", "mill")
         assert views.pixels.tolist() == [[[1, 2], [3, 4]], [[5, 6], [7, 8]]]
 
     def test_features_have_ranges(self, tmp_path: Path) -> None:
         text = ("name,camera,u,v,range,range_sigma,beyond\nmast,a,1,2,500,10,\nmast,b,3,4,,,\nmill,a,5,6,,,\n"
                 "hill,a,5,6,,,inf\n")  # fmt: skip
-        found = read_feature_views(table(tmp_path, text), NAMES, 0.4)
+        found = read_features(table(tmp_path, text), 0.4, NAMES)
         assert found.names == ("mast", "mill", "hill")
         assert found.pixel_sigma == 0.4
         assert found.inverse_range.tolist() == [1 / 500, 0.0, 0.0]
@@ -94,11 +94,11 @@ class TestTables:
     def test_places_are_matched_by_name(self) -> None:
         pixels = torch.arange(12.0).double().reshape(3, 2, 2)
         sigma = tensor([0.5, math.nan], [math.nan, math.nan], [1.0, 2.0])
-        views = ViewMarks(("mast", "mill", "post"), pixels, sigma, {})
+        views = Marks(("mast", "mill", "post"), pixels, sigma=sigma)
         survey = Survey(
             ("post", "lone", "mast"), torch.arange(9.0).double().reshape(3, 3), torch.ones(3, 3).double(), None
         )
-        found = match_views(survey, views, 0.3)
+        found = match_landmarks(survey, views, views.sigmas(0.3))
         landmarks = found.landmarks
         assert landmarks.names == ("post", "mast")
         assert landmarks.points.tolist() == [[0, 1, 2], [6, 7, 8]]
@@ -106,13 +106,13 @@ class TestTables:
         assert torch.as_tensor(landmarks.pixel_sigma).tolist() == [[1.0, 2.0], [0.5, 0.3]]
         assert found[1:] == (("lone",), ("mill",))
         with pytest.raises(InputError, match="must be the same in both files"):
-            match_views(Survey(("x",), torch.zeros(1, 3).double(), torch.ones(1, 3).double(), None), views, 0.3)
+            match_landmarks(Survey(("x",), torch.zeros(1, 3).double(), torch.ones(1, 3).double(), None), views, 0.3)
 
 
 class TestPositions:
     RIG = ring(4, 5000.0)
 
-    def views(self, **changes: object) -> tuple[torch.Tensor, ViewMarks]:
+    def views(self, **changes: object) -> tuple[torch.Tensor, Marks]:
         points = targets(5, torch.Generator().manual_seed(1))
         pixels = marks(self.RIG, points)
         pixels[1, 3] = math.nan
@@ -121,7 +121,7 @@ class TestPositions:
         pixels[3, 1, 0] += 40.0
         pixels[4] = math.nan
         names = tuple(f"thing {i}" for i in range(5))
-        return points, ViewMarks(names, pixels, torch.full((5, 4), math.nan).double(), {"time": list("01234")})
+        return points, Marks(names, pixels, extras={"time": list("01234")})
 
     def test_positions_and_what_is_said_of_them(self) -> None:
         points, views = self.views()
@@ -193,8 +193,8 @@ class TestPositions:
 
 
 def test_things_that_are_marked_again() -> None:
-    then = Marks(("a", "b", "d"), tensor([1, 2], [3, 4], [5, 6]), tensor([7, 8], [9, 10], [11, 12]))
-    now = Marks(("d", "c", "a"), tensor([21, 22], [23, 24], [25, 26]), tensor([27, 28], [29, 30], [31, 32]))
+    then = Marks.of_pair(("a", "b", "d"), tensor([1, 2], [3, 4], [5, 6]), tensor([7, 8], [9, 10], [11, 12]))
+    now = Marks.of_pair(("d", "c", "a"), tensor([21, 22], [23, 24], [25, 26]), tensor([27, 28], [29, 30], [31, 32]))
     found = seen_again(then, now, 0.4)
     assert found.names == ("a", "d")
     assert found.pixels[0].tolist() == [[1, 2], [7, 8], [25, 26], [31, 32]]
@@ -203,4 +203,4 @@ def test_things_that_are_marked_again() -> None:
     assert found.inverse_range_sigma.tolist() == [math.inf] * 2
     assert found.pixel_sigma == 0.4
     with pytest.raises(InputError, match="no name is in both"):
-        seen_again(then, Marks(("x",), tensor([1, 2]), tensor([1, 2])), 0.4)
+        seen_again(then, Marks.of_pair(("x",), tensor([1, 2]), tensor([1, 2])), 0.4)

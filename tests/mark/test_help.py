@@ -219,7 +219,7 @@ def survey_of(site: MarkingSite, names: list[str]) -> Survey:
 def marks_at(site: MarkingSite, names: list[str], sigma: float = 0.05) -> Marks:
     noise = sigma * np.random.default_rng(3).normal(size=(len(names), 2, 2))
     pixels = torch.from_numpy(np.array([site.pixels[name] for name in names]) + noise)
-    return Marks(tuple(names), pixels[:, 0], pixels[:, 1], sigma**2 * torch.eye(4).double().expand(len(names), 4, 4))
+    return Marks(tuple(names), pixels, sigma**2 * torch.eye(4).double().expand(len(names), 4, 4))
 
 
 class TestLiveRig:
@@ -248,12 +248,12 @@ class TestLiveRig:
             found = solve_live(cameras, survey, marks, 0.3)
             return [promise.rig or math.nan for promise in found.promises]
 
-        before = total(Marks(whole.names[:7], whole.left[:7], whole.right[:7], whole.covariance[:7]))
+        before = total(Marks.of_pair(whole.names[:7], whole.left[:7], whole.right[:7], whole.covariance[:7]))
         one, missing = whole.covariance.clone(), whole.right.clone()
         one[7, 2:], one[7, :, 2:], missing[7] = math.nan, math.nan, math.nan
-        half = Marks(whole.names, whole.left, missing, one)
+        half = Marks.of_pair(whole.names, whole.left, missing, one)
         assert half.typical_sigma(0.3) == pytest.approx(0.05)
-        by_hand = Marks(whole.names, whole.left, whole.right, whole.covariance.clone())
+        by_hand = Marks.of_pair(whole.names, whole.left, whole.right, whole.covariance.clone())
         assert by_hand.covariance is not None
         by_hand.covariance[7] = 0.3**2 * torch.eye(4)
         # The residuals of seven landmarks are not those of eight.
@@ -263,7 +263,7 @@ class TestLiveRig:
     def test_marks_have_their_own_sigmas(self) -> None:
         right = torch.tensor([[1.0, 1.0], [math.nan, math.nan]])
         variances = torch.tensor([[0.04, 0.02, 0.25, 0.25], [0.01, 0.01, math.nan, math.nan]]).double()
-        found = Marks(("a", "b"), torch.zeros(2, 2), right, torch.diag_embed(variances)).sigmas(0.3)
+        found = Marks.of_pair(("a", "b"), torch.zeros(2, 2), right, torch.diag_embed(variances)).sigmas(0.3)
         torch.testing.assert_close(found[0], torch.tensor([math.sqrt(0.03), 0.5]).double())
         assert float(found[1, 0]) == pytest.approx(0.1)
         assert math.isnan(float(found[1, 1]))

@@ -144,7 +144,7 @@ def test_marks_that_were_changed_outside_are_taken_over(tmp_path: Path, survey: 
     work(session)
     session.close()
     marks = read_marks(session.files.marks, single=True)
-    write_marks(session.files.marks, Marks(marks.names, marks.left + 1.0, marks.right, marks.covariance))
+    write_marks(session.files.marks, Marks.of_pair(marks.names, marks.left + 1.0, marks.right, marks.covariance))
     again = Session(tmp_path / "marks.csv", survey)
     left = again.state.items["post"].left
     assert left is not None
