@@ -202,58 +202,19 @@ class Timed(Protocol):
 F = TypeVar("F", bound=Timed)
 
 
-def paired_by_time(
-    left: Iterator[F], right: Iterator[F], late: Callable[[], float], apart_s: float
-) -> Iterator[tuple[F, F]]:
-    """Pair frames that are nearest to each other, so that the noise of no frame counts twice.
-
-    Frame rates may differ and vary. A frame without a partner is left out; what remains when one video ends, too.
-
-    Args:
-        left: frames in the order of their times.
-        right: the same of the other camera.
-        late: seconds by which the right images are later than their times say, as known at present.
-        apart_s: frames that are farther apart are not paired.
-
-    Example:
-        >>> from collections import namedtuple
-        >>> Frame = namedtuple("Frame", "time")
-        >>> slow, fast = (map(Frame, times) for times in ([0.0, 0.1, 0.2], [0.01, 0.05, 0.09, 0.13, 0.17, 0.21]))
-        >>> [(one.time, other.time) for one, other in paired_by_time(slow, fast, lambda: 0.0, 0.05)]
-        [(0.0, 0.01), (0.1, 0.09), (0.2, 0.21)]
-    """
-    now, before, after = next(left, None), None, next(right, None)
-    used = -math.inf
-    while now is not None:
-        upcoming = next(left, None)
-        wanted = now.time - late()
-        while after is not None and after.time <= wanted:
-            before, after = after, next(right, None)
-        if after is None and before is not None and before.time + apart_s < wanted:
-            return
-        around = [frame for frame in (before, after) if frame is not None]
-        if not around:
-            return
-        partner = min(around, key=lambda frame: abs(frame.time - wanted))
-        apart = abs(partner.time - wanted)
-        taken = upcoming is not None and abs(partner.time - wanted - (upcoming.time - now.time)) < apart
-        if apart <= apart_s and partner.time > used and not taken:
-            used = partner.time
-            yield now, partner
-        now = upcoming
-
-
 def frames_together(
-    cameras: Sequence[Iterator[F]], late: Callable[[int], float], apart_s: float
+    cameras: Sequence[Iterator[F]], late: Callable[[int], float], apart_s: float, *, whole: bool = False
 ) -> Iterator[tuple[float, list[F | None]]]:
     """Groups of frames in the order of their times, each with the time of its first one; None where there is no frame.
 
-    A frame waits for the next group if that is nearer. Frame rates may differ and vary, and a video may end earlier.
+    A frame waits for the next group if that is nearer, and the noise of no frame counts twice. Frame rates may differ
+    and vary, and a video may end earlier.
 
     Args:
         cameras: frames of each in the order of their times.
         late: seconds by which the images of a camera (its number) are later than their times say, as known at present.
         apart_s: frames that are later than the first one of a group by more are not in it.
+        whole: leave out groups in which a frame is missing, and end with the first video that ends.
 
     Example:
         >>> from collections import namedtuple
@@ -263,20 +224,21 @@ def frames_together(
         [[0.0, 0.01], [None, 0.05], [0.1, 0.09], [None, 0.13]]
     """
     now = [next(frames, None) for frames in cameras]
-    upcoming = [None if frame is None else next(frames, None) for frame, frames in zip(now, cameras, strict=True)]
-    while any(frame is not None for frame in now):
-        times, following = (
-            [math.inf if frame is None else frame.time + late(c) for c, frame in enumerate(frames)]
-            for frames in (now, upcoming)
-        )
+    while (all if whole else any)(frame is not None for frame in now):
+        times = [math.inf if frame is None else frame.time + late(c) for c, frame in enumerate(now)]
         begin = min(times)
         leader = times.index(begin)
-        taken = [time - begin <= min(apart_s, abs(following[leader] - time)) for time in times]
+        following = next(cameras[leader], None)
+        until = math.inf if following is None else following.time + late(leader)
+        taken = [time - begin <= min(apart_s, abs(until - time)) for time in times]
         taken[leader] = True
-        yield begin, [frame if there else None for frame, there in zip(now, taken, strict=True)]
+        if all(taken) or not whole:
+            yield begin, [frame if there else None for frame, there in zip(now, taken, strict=True)]
         for c, there in enumerate(taken):
             if there:
-                now[c], upcoming[c] = upcoming[c], None if upcoming[c] is None else next(cameras[c], None)
+                now[c] = following if c == leader else next(cameras[c], None)
+                if whole and now[c] is None:
+                    return
 
 
 # Frames of a live stream with calendar times; connected again when it breaks off.
@@ -490,14 +452,12 @@ class FramesTogether:
                 )
 
     def _grouped(self, frames: list[Iterator[TimedFrame]]) -> Iterator[Together]:
-        if self._pairs:
-            for pair in paired_by_time(frames[0], frames[1], lambda: self._late(1), self._apart):
-                self._met = True
-                yield pair[0].time, list(pair)
-            return
-        for began, group in frames_together(frames, lambda c: self._late(c) if c else 0.0, self._apart):
+        late = lambda c: self._late(c) if c else 0.0  # noqa: E731
+        for began, group in frames_together(frames, late, self._apart, whole=self._pairs):
             self._met = self._met or sum(frame is not None for frame in group) > 1
-            yield began, group
+            # The time of a pair is that of the left image.
+            first = group[0] if self._pairs else None
+            yield (began if first is None else first.time), group
 
     def close(self) -> None:
         """End the threads that decode."""

@@ -15,7 +15,7 @@ import av
 from video_scenes import SIZE, drawn_image, small_rig, write_video
 
 from kcal.errors import FileError
-from kcal.pipeline.video_source import file_frames, paired_by_time
+from kcal.pipeline.video_source import file_frames, frames_together
 from kcal.threads import Handover
 
 Frame = namedtuple("Frame", "time")
@@ -35,7 +35,8 @@ def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def paired(left: list[float], right: list[float], late: float = 0.0, apart: float = 0.5) -> list[tuple[float, float]]:
     frames = map(Frame, left), map(Frame, right)
-    return [(one.time, other.time) for one, other in paired_by_time(*frames, lambda: late, apart)]
+    found = frames_together(frames, lambda c: late if c else 0.0, apart, whole=True)
+    return [(one.time, other.time) for _, (one, other) in found]
 
 
 def test_frames_have_their_own_times_and_gray_levels(video: Path) -> None:
@@ -89,7 +90,8 @@ def test_nearest_frames_each_once() -> None:
 
 def test_a_video_that_ends_first_ends_the_pairs() -> None:
     frames = iter(map(Frame, np.arange(0.0, 1e6)))
-    assert len(list(paired_by_time(frames, map(Frame, (0.0, 1.0, 2.0)), lambda: 0.0, 0.4))) == 3
+    both = [frames, map(Frame, (0.0, 1.0, 2.0))]
+    assert len(list(frames_together(both, lambda _: 0.0, 0.4, whole=True))) == 3
     assert next(frames).time < 10
 
 
