@@ -349,24 +349,30 @@ def _jumped(after: TurnState, prior: TurnState) -> bool:
 
 # Tables that grow while they are read: the history of a watched rig, and temperatures.
 
-# Lines of a text file that another process writes, as they become whole.
 
-
-class GrowingFile:
-    """Read what has been added since the last time.
+class GrowingTable:
+    """Rows of a CSV file that another process writes, as they become whole.
 
     Args:
         path: of the file.
+        needed: columns that it must have.
+        wanted: what a file with other columns is not.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, needed: Sequence[str], wanted: str) -> None:
         self.path, self.number, self._offset = path, 0, 0
+        self._needed, self._wanted, self._columns = set(needed), wanted, list[str]()
 
-    def lines(self) -> Iterator[str]:
-        """The whole lines that have come, without their ends; `number` is that of the line, from 1.
+    @property
+    def where(self) -> str:
+        """The file, and the number of the line that was read last, from 1."""
+        return f"{self.path}: line {self.number}"
+
+    def rows(self) -> Iterator[dict[str, str]]:
+        """The rows that have come since the last call, by their columns.
 
         Raises:
-            FileError: the file cannot be read.
+            FileError: the file cannot be read, has other columns, or a row with another number of cells.
         """
         try:
             with open(self.path, "rb") as file:
@@ -377,7 +383,17 @@ class GrowingFile:
                         break
                     self._offset += len(line)
                     self.number += 1
-                    yield line.decode("utf-8-sig" if self.number == 1 else "utf-8", "replace").rstrip("\r\n")
+                    text = line.decode("utf-8-sig" if self.number == 1 else "utf-8", "replace")
+                    cells = [cell.strip() for cell in next(csv.reader([text]), [])]
+                    if self.number == 1:
+                        if not self._needed <= set(cells):
+                            raise FileError(f"{self.path}: {self._wanted}")
+                        self._columns = cells
+                    elif cells and len(cells) != len(self._columns):
+                        count = len(self._columns)
+                        raise FileError(f"{self.where}: {len(cells)} cells, not {count}: damaged; remove that line")
+                    elif cells:
+                        yield dict(zip(self._columns, cells, strict=True))
         except OSError as error:
             raise FileError(f"{self.path}: cannot read: {error.strerror or error}") from error
 
@@ -391,15 +407,19 @@ _TURN = tuple(f"{side}_{name}_deg" for side in _SIDES for name in _ANGLES)
 _BETWEEN = tuple(f"between_{k}_deg" for k in range(5))
 
 
-def _upper(size: int) -> list[tuple[int, int]]:
-    return [(i, j) for i in range(size) for j in range(i, size)]
+def _upper(size: int) -> tuple[Tensor, Tensor]:
+    rows, columns = torch.triu_indices(size, size)
+    return rows, columns
 
 
-_TURN_COVARIANCE = tuple(f"{side}_cov_{i}{j}_deg2" for side in _SIDES for i, j in _upper(3))
-_BETWEEN_COVARIANCE = tuple(f"between_cov_{i}{j}_deg2" for i, j in _upper(5))
+_TURN_COVARIANCE = tuple(f"{side}_cov_{i}{j}_deg2" for side in _SIDES for i in range(3) for j in range(i, 3))
+_BETWEEN_COVARIANCE = tuple(f"between_cov_{i}{j}_deg2" for i in range(5) for j in range(i, 5))
+# What was measured, each in a unit of degrees; and how much of it the left camera, the right one and both tell.
+_LOOK = (*_TURN, *_TURN_COVARIANCE, *_BETWEEN, *_BETWEEN_COVARIANCE)
+_UNITS = torch.tensor([math.degrees(1.0) ** (2 if "_cov_" in name else 1) for name in _LOOK], dtype=torch.float64)
+_TELLS = torch.tensor([0] * 3 + [1] * 3 + [0] * 6 + [1] * 6 + [2] * 20)
 COLUMNS = (
-    "time", "rig", *_TOLD, "left_features", "right_features", "matches", "lasting", "temperature_c",
-    *_TURN, *_TURN_COVARIANCE, *_BETWEEN, *_BETWEEN_COVARIANCE, "note",
+    "time", "rig", *_TOLD, "left_features", "right_features", "matches", "lasting", "temperature_c", *_LOOK, "note",
 )  # fmt: skip
 # Rows that are kept of a file: two weeks of a look a minute.
 MOST_ROWS = 20_000
@@ -437,21 +457,15 @@ def no_look() -> Look:
 
 def history_line(row: HistoryRow, fingerprint: str, told: tuple[Tensor, Tensor]) -> str:
     """A line of the file; `told` is the relative turn (3,) of the moment and its sigma (3,), radians."""
-    look, degrees = row.look, math.degrees(1.0)
-    cells: list[object] = [row.time, fingerprint, *(degrees * torch.cat(told)).tolist(), *row.features, row.matches]
-    cells += [float(look.lasting), None if math.isnan(row.temperature) else row.temperature]
-    seen = look.seen.tolist()
-    for side in (0, 1):
-        cells += (degrees * look.turn[3 * side : 3 * side + 3]).tolist() if seen[side] else [None] * 3
-    for side in (0, 1):
-        block = degrees**2 * look.covariance[3 * side : 3 * side + 3, 3 * side : 3 * side + 3]
-        cells += [float(block[i, j]) for i, j in _upper(3)] if seen[side] else [None] * 6
-    if bool(look.matched):
-        cells += (degrees * look.between).tolist()
-        cells += [degrees**2 * float(look.between_covariance[i, j]) for i, j in _upper(5)]
-    else:
-        cells += [None] * 20
-    return csv_line([*cells, row.note])
+    look, air = row.look, None if math.isnan(row.temperature) else row.temperature
+    blocks = look.covariance[:3, :3], look.covariance[3:, 3:]
+    parts = [look.turn, *(block[_upper(3)] for block in blocks), look.between, look.between_covariance[_upper(5)]]
+    there = torch.cat([look.seen, look.matched[None]])[_TELLS].tolist()
+    measured = [value if one else None for value, one in zip((_UNITS * torch.cat(parts)).tolist(), there, strict=True)]
+    degrees = (math.degrees(1.0) * torch.cat(told)).tolist()
+    return csv_line(
+        [row.time, fingerprint, *degrees, *row.features, row.matches, float(look.lasting), air, *measured, row.note]
+    )
 
 
 def history_head() -> str:
@@ -468,8 +482,10 @@ class HistoryTail:
     """
 
     def __init__(self, path: str | Path, fingerprint: str) -> None:
-        self._file, self._fingerprint, self._first = GrowingFile(path), fingerprint, math.nan
-        self._kelvin: Tensor | None = None
+        self._table = GrowingTable(path, COLUMNS, "not a history of this version of `kcal watch`")
+        self._fingerprint, self._first, self._kelvin = fingerprint, math.nan, None
+
+    _kelvin: Tensor | None
 
     def rows(self, since: float = -math.inf, until: float = math.inf) -> list[HistoryRow]:
         """The rows that have come since the last call: the last `MOST_ROWS` between two times.
@@ -478,25 +494,16 @@ class HistoryTail:
             FileError: no such file, no history, one of another rig, or a damaged line.
         """
         rows: deque[HistoryRow] = deque(maxlen=MOST_ROWS)
-        for line in self._file.lines():
-            row = self._row(line)
-            if row is not None and since <= row.time <= until:
+        for cells in self._table.rows():
+            row = _parsed_row(self._table.where, cells, self._fingerprint)
+            self._first = row.temperature if math.isnan(self._first) else self._first
+            row = warmed(row, self._first, self._kelvin)
+            self._kelvin = row.look.kelvin
+            if since <= row.time <= until:
                 rows.append(row)
-        if self._file.number == 0:
-            raise FileError(f"{self._file.path}: no rows yet: let `kcal watch` look at the scene first")
+        if self._table.number == 0:
+            raise FileError(f"{self._table.path}: no rows yet: let `kcal watch` look at the scene first")
         return list(rows)
-
-    def _row(self, line: str) -> HistoryRow | None:
-        cells = next(csv.reader([line]), [])
-        if self._file.number == 1:
-            if tuple(cells) != COLUMNS:
-                raise FileError(f"{self._file.path}: not a history of this version of `kcal watch`")
-            return None
-        row = parsed_row(f"{self._file.path}: line {self._file.number}", cells, self._fingerprint)
-        self._first = row.temperature if math.isnan(self._first) else self._first
-        row = warmed(row, self._first, self._kelvin)
-        self._kelvin = row.look.kelvin
-        return row
 
 
 def read_history(
@@ -514,58 +521,46 @@ def warmed(row: HistoryRow, first: float, before: Tensor | None) -> HistoryRow:
     return row._replace(look=row.look._replace(kelvin=kelvin))
 
 
-def parsed_row(where: str, cells: Sequence[str], fingerprint: str) -> HistoryRow:
+def _parsed_row(where: str, cells: dict[str, str], fingerprint: str) -> HistoryRow:
     """A row of its cells.
 
     Raises:
         FileError: a damaged row, or one of another rig.
     """
-    if len(cells) != len(COLUMNS):
-        raise FileError(f"{where}: {len(cells)} cells, not {len(COLUMNS)}: the file is damaged; remove that line")
-    by_name = dict(zip(COLUMNS, cells, strict=True))
-    if by_name["rig"] != fingerprint:
+    if cells["rig"] != fingerprint:
         raise FileError(
-            f"{where}: the history is of another rig ({by_name['rig']}, not {fingerprint}); give the rig file that "
+            f"{where}: the history is of another rig ({cells['rig']}, not {fingerprint}); give the rig file that "
             "was watched, or begin a new history"
         )
-
-    def numbers(names: Sequence[str]) -> Tensor:
-        values = [float(by_name[name]) for name in names]
-        if not all(map(math.isfinite, values)):
-            raise ValueError("not finite")
-        return torch.tensor(values, dtype=torch.float64)
-
+    told = torch.tensor([bool(cells[block[0]]) for block in (_TURN, _TURN[3:], _BETWEEN)])
+    there, warm = told[_TELLS].tolist(), cells["temperature_c"]
     try:
-        look, radian = no_look(), math.radians(1.0)
-        turn, covariance, seen = look.turn.clone(), look.covariance.clone(), look.seen.clone()
-        for side in (0, 1):
-            if by_name[_TURN[3 * side]]:
-                part = slice(3 * side, 3 * side + 3)
-                turn[part] = radian * numbers(_TURN[part])
-                covariance[part, part] = radian**2 * _from_upper(numbers(_TURN_COVARIANCE[6 * side : 6 * side + 6]), 3)
-                seen[side] = True
-        look = look._replace(turn=turn, covariance=covariance, seen=seen, lasting=numbers(["lasting"])[0])
-        if by_name[_BETWEEN[0]]:
-            look = look._replace(
-                between=radian * numbers(_BETWEEN),
-                between_covariance=radian**2 * _from_upper(numbers(_BETWEEN_COVARIANCE), 5),
-                matched=torch.tensor(True),
-            )
-        warm = by_name["temperature_c"]
+        every = [float(cells[name]) if one else 0.0 for name, one in zip(_LOOK, there, strict=True)]
+        every += [float(cells["lasting"]), float(cells["time"]), float(warm or 0.0)]
+        if not all(map(math.isfinite, every)):
+            raise ValueError("not finite")
+        turn, left, right, between, both = (torch.tensor(every[:-3]).double() / _UNITS).split([6, 6, 6, 5, 15])
+        look = no_look()._replace(
+            turn=turn, covariance=torch.block_diag(_symmetric(left, 3, told[0]), _symmetric(right, 3, told[1])),
+            seen=told[:2], lasting=torch.tensor(every[-3], dtype=torch.float64),
+            between=between, between_covariance=_symmetric(both, 5, told[2]), matched=told[2],
+        )  # fmt: skip
         return HistoryRow(
-            float(numbers(["time"])[0]), look, (int(by_name["left_features"]), int(by_name["right_features"])),
-            int(by_name["matches"]), float(numbers(["temperature_c"])[0]) if warm else math.nan, by_name["note"],
+            every[-2], look, (int(cells["left_features"]), int(cells["right_features"])), int(cells["matches"]),
+            every[-1] if warm else math.nan, cells["note"],
         )  # fmt: skip
     except ValueError as error:
         raise FileError(f"{where}: a number is damaged ({error}); remove that line") from error
 
 
-def _from_upper(upper: Tensor, size: int) -> Tensor:
-    matrix = torch.zeros(size, size, dtype=torch.float64)
-    for (i, j), value in zip(_upper(size), upper, strict=True):
-        matrix[i, j] = matrix[j, i] = value
-    if not bool(torch.linalg.eigvalsh(matrix)[0] > 0):
-        raise ValueError("a covariance is not positive definite")
+def _symmetric(upper: Tensor, size: int, there: Tensor) -> Tensor:
+    """A covariance of its upper triangle; the identity where there is none."""
+    matrix = torch.eye(size, dtype=torch.float64)
+    if bool(there):
+        rows, columns = _upper(size)
+        matrix[rows, columns] = matrix[columns, rows] = upper
+        if not bool(torch.linalg.eigvalsh(matrix)[0] > 0):
+            raise ValueError("a covariance is not positive definite")
     return matrix
 
 
@@ -603,13 +598,13 @@ class Temperatures:
     """
 
     def __init__(self, path: Path) -> None:
-        self._file = GrowingFile(path)
+        needed = "the columns time and temperature are needed"
+        self._table = GrowingTable(path, ("time", "temperature"), needed)
         self._times: list[float] = []
         self._values: list[float] = []
-        self._columns: list[str] = []
         self._take_all()
-        if not {"time", "temperature"} <= set(self._columns):
-            raise FileError(f"{path}: the columns time and temperature are needed")
+        if not self._table.number:
+            raise FileError(f"{path}: {needed}")
 
     def at(self, time: float) -> float:
         """°C at a moment, between the two nearest; NaN where the nearest is more than an hour away.
@@ -622,31 +617,19 @@ class Temperatures:
         around = [i for i in (k - 1, k) if 0 <= i < len(self._times) and abs(self._times[i] - time) <= _NEAR]
         if len(around) < 2:
             return self._values[around[0]] if around else math.nan
-        first, second = around
-        share = (time - self._times[first]) / (self._times[second] - self._times[first])
-        return (1.0 - share) * self._values[first] + share * self._values[second]
+        return float(np.interp(time, [self._times[i] for i in around], [self._values[i] for i in around]))
 
     def _take_all(self) -> None:
-        for line in self._file.lines():
-            self._take(line.strip())
-
-    def _take(self, line: str) -> None:
-        cells = [cell.strip() for cell in line.split(",")]
-        if not self._columns:
-            self._columns = cells
-            return
-        if not line or not {"time", "temperature"} <= set(self._columns):
-            return
-        try:
-            row = dict(zip(self._columns, cells, strict=True))
-            time, value = seconds_of(row["time"]), float(row["temperature"])
-            if not -100.0 < value < 150.0:
-                raise InputError(f"temperature {value:g}: °C are needed")
-        except (ValueError, InputError) as error:
-            raise FileError(f"{self._file.path}: line {self._file.number}: {error}") from error
-        if self._times and time <= self._times[-1]:
-            return
-        self._times.append(time)
-        self._values.append(value)
+        for cells in self._table.rows():
+            try:
+                time, value = seconds_of(cells["time"]), float(cells["temperature"])
+                if not -100.0 < value < 150.0:
+                    raise InputError(f"temperature {value:g}: °C are needed")
+            except (ValueError, InputError) as error:
+                raise FileError(f"{self._table.where}: {error}") from error
+            if self._times and time <= self._times[-1]:
+                continue
+            self._times.append(time)
+            self._values.append(value)
         if len(self._times) > _KEPT:
             del self._times[: _KEPT // 2], self._values[: _KEPT // 2]
