@@ -541,9 +541,9 @@ def _parsed_row(where: str, cells: dict[str, str], fingerprint: str) -> HistoryR
             raise ValueError("not finite")
         turn, left, right, between, both = (torch.tensor(every[:-3]).double() / _UNITS).split([6, 6, 6, 5, 15])
         look = no_look()._replace(
-            turn=turn, covariance=torch.block_diag(_symmetric(left, 3, told[0]), _symmetric(right, 3, told[1])),
+            turn=turn, covariance=torch.block_diag(_from_upper(left, 3, told[0]), _from_upper(right, 3, told[1])),
             seen=told[:2], lasting=torch.tensor(every[-3], dtype=torch.float64),
-            between=between, between_covariance=_symmetric(both, 5, told[2]), matched=told[2],
+            between=between, between_covariance=_from_upper(both, 5, told[2]), matched=told[2],
         )  # fmt: skip
         return HistoryRow(
             every[-2], look, (int(cells["left_features"]), int(cells["right_features"])), int(cells["matches"]),
@@ -553,7 +553,7 @@ def _parsed_row(where: str, cells: dict[str, str], fingerprint: str) -> HistoryR
         raise FileError(f"{where}: a number is damaged ({error}); remove that line") from error
 
 
-def _symmetric(upper: Tensor, size: int, there: Tensor) -> Tensor:
+def _from_upper(upper: Tensor, size: int, there: Tensor) -> Tensor:
     """A covariance of its upper triangle; the identity where there is none."""
     matrix = torch.eye(size, dtype=torch.float64)
     if bool(there):
