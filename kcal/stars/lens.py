@@ -13,10 +13,10 @@ from scipy import stats
 from torch import Tensor
 
 from kcal.calibrate.camera.result import CameraCalibrationResult
-from kcal.calibrate.hybrid.evidence import maximize_evidence, still_data
+from kcal.calibrate.hybrid.evidence_rounds import run_rounds
 from kcal.calibrate.hybrid.families import PriorFamilies, typical_hyperprior
 from kcal.calibrate.hybrid.fit import HybridFit
-from kcal.calibrate.hybrid.fitted_views import hybrid_unknowns
+from kcal.calibrate.hybrid.fitted_views import NO_MOTION, Estimate, FittedViews, hybrid_unknowns
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.parameters import FreeParameters, GaussianTerm
 from kcal.calibrate.problem.state import BoardState
@@ -119,12 +119,12 @@ def refine_by_stars(
         problem = stars.problem(model, unknowns, [known])
         return problem, minimize(problem, state, _EFFORT).state
 
-    for _ in range(_ROUNDS):
-        _, state = solved(state)
-        stars = stars.near(model, state, CUT)
-        if boards.hybrid is not None:
-            told = lens_rows(stars.problem(model, unknowns), state, stars.noise)
-            sigma = _by_evidence(boards.hybrid, unknowns, lens, told, state.parameters[index])
+    if boards.hybrid is not None:
+        sigma, stars, state = _by_evidence(boards.hybrid, lens, index, stars, state)
+    else:
+        for _ in range(_ROUNDS):
+            _, state = solved(state)
+            stars = stars.near(model, state, CUT)
     problem, state = solved(state)
     told = lens_rows(problem, state, stars.noise)
     change = state.parameters[index] - lens.estimate
@@ -168,27 +168,44 @@ def _known_lens(lens: CameraInformation, sigma: Tensor) -> Gaussian:
 
 
 def _by_evidence(
-    hybrid: HybridFit, unknowns: FreeParameters, lens: CameraInformation, stars: Tensor, x: Tensor
-) -> Tensor:
-    """(S,) standard deviations of the lens's unknowns beforehand, of largest evidence of boards and stars.
+    hybrid: HybridFit, lens: CameraInformation, index: Tensor, stars: StarViews, state: BoardState
+) -> tuple[Tensor, StarViews, BoardState]:
+    """Set amplitudes by the evidence of boards and stars together.
 
     Args:
         hybrid: how boards were fitted.
-        unknowns: of the lens.
-        lens: what boards say of them.
-        stars: (S, S + 1) rows at x.
-        x: (S,) the lens.
+        lens: what boards say of its unknowns.
+        index: (S,) of the parameters that these are.
+        stars: to begin with.
+        state: likewise.
+
+    Returns:
+        (S,) standard deviations of the lens's unknowns beforehand, and stars and state as they are then.
     """
     every = hybrid_unknowns(hybrid.model, hybrid.square)
     number = dict(zip(every.indices, every.slots, strict=True))
-    kept = torch.tensor([number[index] for index in unknowns.leading])
-    families = PriorFamilies(*(column[kept] for column in hybrid.families))
-    boards = torch.cat([lens.rows, (lens.rows @ (x - lens.estimate) + lens.residuals)[:, None]], 1)
-    data = still_data(torch.cat([boards, stars]).T[None], x - families.mean, 0.0)
+    kept = [number[place] for place in index.tolist()]
+    families = PriorFamilies(*(column[: len(every)] for column in hybrid.families))
+    slots = tuple((LENS_SLOT, place) for place in kept)
+    data = Gaussian(slots, lens.estimate, torch.cat([lens.rows, lens.residuals[:, None]], 1))
     assert hybrid.model.hybrid is not None
-    hyperprior = typical_hyperprior(hybrid.model.hybrid.modes)
-    best = maximize_evidence(data, families, hybrid.hyperparameters, 1.0, hyperprior, known_noise=True)
-    return families.deviation(best.h)
+    capture = dataclasses.replace(
+        stars.fitted(hybrid.size),
+        weights=stars.weights / stars.noise,
+        hyperprior=typical_hyperprior(hybrid.model.hybrid.modes),
+        square=hybrid.square,
+        known=data,
+    )
+
+    def near(capture: FittedViews, estimate: Estimate) -> FittedViews:
+        nonlocal stars
+        stars = stars.near(hybrid.model, estimate.state, CUT)
+        return dataclasses.replace(capture, weights=stars.weights / stars.noise)
+
+    estimate = Estimate(hybrid.model, families, state, hybrid.hyperparameters, NO_MOTION, 1.0, 1.0)
+    rounds = run_rounds(capture, estimate, cold=False, spent=0, rough=False, progress=lambda _: None, reweigh=near)
+    deviation = families.deviation(rounds.estimate.hyperparameters)[kept]
+    return deviation, stars, rounds.estimate.state
 
 
 def _with_star_rows(known: CameraInformation, stars: Tensor, change: Tensor) -> CameraInformation:

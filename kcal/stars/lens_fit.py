@@ -90,6 +90,20 @@ class StarViews(NamedTuple):
         weights = torch.where(size < cut * typical, self.stated, 0.0)
         return self._replace(weights=weights, variance=max(typical**2, 1e-12))
 
+    def fitted(self, size: tuple[int, int]) -> FittedViews:
+        """These for the default lens, of images (width, height): views of a board that has no modes."""
+        count, none = self.points.shape[1], self.points.new_zeros(0)
+        return FittedViews(
+            points=self.points,
+            board=BoardModes(self.points.new_zeros(0, 3, count), none, torch.zeros(0, dtype=torch.int64)),
+            pixels=self.pixels,
+            size=size,
+            weights=self.weights,
+            hyperprior=typical_hyperprior(),
+            exact=True,
+            turning=True,
+        )
+
 
 def star_state(parameters: Tensor, rotations: Sequence[Tensor]) -> BoardState:
     """A lens (5 + P,) and the rotation (3, 3) of each image: camera from the frame of its directions."""
@@ -177,7 +191,7 @@ def fit_star_lens(
         model = model_of(shape)
         estimate = _typical_estimate(model, focal, stars, size, state)
         held = torch.arange(len(estimate.families.mean)) >= PUPIL.start
-        _, estimate, _ = _fitted(stars, size).solved(estimate, _BASE_EFFORT, last_step=True, held=held)
+        _, estimate, _ = stars.fitted(size).solved(estimate, _BASE_EFFORT, last_step=True, held=held)
         state, parameters = estimate.state, estimate.state.parameters.clone()
         stars = stars.near(model, state, _FIRST_CUT)
         focal, shape = float(parameters[0]), shape + min(max(float(parameters[5]), -1.0), 1.0)
@@ -190,7 +204,7 @@ def fit_star_lens(
         weights = stars.near(model, estimate.state, CUT).weights
         return dataclasses.replace(capture, weights=weights)
 
-    capture = _fitted(stars, size)
+    capture = stars.fitted(size)
     rounds = run_rounds(
         capture, estimate, cold=False, spent=0, rough=False, progress=lambda _: None, reweigh=without_far
     )
@@ -203,28 +217,13 @@ def fit_star_lens(
     return star_lens(stars, state, camera, information.rows, information)
 
 
-def _fitted(stars: StarViews, size: tuple[int, int]) -> FittedViews:
-    """Images of stars as views of a board that has no modes."""
-    count, shapes = stars.points.shape[1], stars.points.new_zeros(0)
-    return FittedViews(
-        points=stars.points,
-        board=BoardModes(stars.points.new_zeros(0, 3, count), shapes, torch.zeros(0, dtype=torch.int64)),
-        pixels=stars.pixels,
-        size=size,
-        weights=stars.weights,
-        hyperprior=typical_hyperprior(),
-        exact=True,
-        turning=True,
-    )
-
-
 def _typical_estimate(
     model: LensModel, focal: float, stars: StarViews, size: tuple[int, int], state: BoardState
 ) -> Estimate:
     """With typical amplitudes, and noise as residuals tell it."""
     form = model.hybrid
     assert form is not None
-    families = prior_families(form, focal, _fitted(stars, size).board, size, 1.0)
+    families = prior_families(form, focal, stars.fitted(size).board, size, 1.0)
     return Estimate(model, families, state, typical_hyperprior().mean, NO_MOTION, stars.variance, 1.0)
 
 

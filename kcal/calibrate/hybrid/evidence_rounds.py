@@ -184,7 +184,15 @@ def run_rounds(
         most = 3 if turn == 0 and problem.readout is None else 2
         for roughly in (True,) if rough else (True, False):
             best = maximize_evidence(
-                data, estimate.families, best.h, best.variance, capture.hyperprior, best.log_ratio, tempering, roughly
+                data,
+                estimate.families,
+                best.h,
+                best.variance,
+                capture.hyperprior,
+                best.log_ratio,
+                tempering,
+                roughly,
+                known_noise=capture.known is not None,
             )
             change = max(_moved_by(estimate, best), abs(math.log(tempering / former)))
             # The solver may try several steps where it finds nothing that the evidence feels.

@@ -14,10 +14,12 @@ from kcal.calibrate.hybrid.board_modes import BoardModes
 from kcal.calibrate.hybrid.evidence import ViewData, view_data
 from kcal.calibrate.hybrid.families import PUPIL, Hyperprior, PriorFamilies
 from kcal.calibrate.problem.board_problem import POSE, TURN, BoardProblem
-from kcal.calibrate.problem.parameters import FreeParameters, GaussianPrior
+from kcal.calibrate.problem.parameters import FreeParameters, GaussianPrior, GaussianTerm
 from kcal.calibrate.problem.state import BoardState, Readout, stillness
 from kcal.calibrate.problem.views import LEAST_NOISE
+from kcal.gaussian import Gaussian, numbered
 from kcal.lens.camera import Camera
+from kcal.lens.information import LENS_SLOT
 from kcal.lens.model import LensModel
 from kcal.solve.lm import LMOptions, minimize
 from kcal.solve.problem import RobustLoss
@@ -120,6 +122,8 @@ class FittedViews:
         heights: (12, N) of the corners by which the board may bend by view, meters, if the evidence says so, or None.
         turning: views show points (V, N, 3) that are infinitely far, such as stars: poses are rotations, nothing
             depends on the pupil, and errors do not repeat within a view.
+        known: what other data say of the lens, by the numbers of its unknowns, in standard deviations as weighted
+            residuals are then, too; unknowns that it does not name are held. None: nothing.
     """
 
     points: Tensor
@@ -134,6 +138,7 @@ class FittedViews:
     exact: bool = False
     heights: Tensor | None = None
     turning: bool = False
+    known: Gaussian | None = None
 
     @functools.cached_property
     def _kept(self) -> list[tuple[LensModel, Tensor, BoardProblem]]:
@@ -169,9 +174,20 @@ class FittedViews:
     def held(self, estimate: Estimate) -> Tensor:
         """(S,) whether an unknown keeps its value, whatever the views show: of an exact board, of a pupil of stars."""
         held = torch.zeros_like(estimate.families.mean, dtype=torch.bool)
+        if self.known is not None:
+            named = set(self.known.slots)
+            return torch.tensor([slot not in named for slot in numbered(LENS_SLOT, len(held))])
         held[PUPIL] = self.turning
         held[len(held) - len(self.board.unit) :] = self.exact
         return held
+
+    def _told(self, model: LensModel) -> list[GaussianTerm]:
+        """What other data say of the lens, as residuals."""
+        if self.known is None:
+            return []
+        leading = hybrid_unknowns(model, self.square).leading
+        numbers = dict(zip(numbered(LENS_SLOT, len(leading)), leading, strict=True))
+        return [GaussianTerm(torch.tensor([numbers[slot] for slot in self.known.slots]), self.known, 1.0)]
 
     def problem(self, estimate: Estimate, held: Tensor | None = None) -> BoardProblem:
         """The least squares at amplitudes of an estimate, unknowns (S,) being held: those of `held` if not given."""
@@ -181,14 +197,15 @@ class FittedViews:
         fixed, still, kept = torch.isinf(precision), estimate.stillness, self._kept
         if kept and kept[0][0] is estimate.model and torch.equal(kept[0][1], fixed):
             # What corners say at the last state serves under other priors, too.
-            prior = hybrid_prior(estimate.model, len(self.board.shapes), estimate.families.mean, precision, self.square)
-            problem = kept[0][2].with_priors([prior], still)
+            problem = kept[0][2]
         else:
             problem = hybrid_problem(
                 self.points, self.board.shapes, self.pixels, self.weights, estimate.model, estimate.families.mean,
                 precision, self.readout, still, self.square, self.turning,
             )  # fmt: skip
             kept[:] = [(estimate.model, fixed, problem)]
+        prior = hybrid_prior(estimate.model, len(self.board.shapes), estimate.families.mean, precision, self.square)
+        problem = problem.with_priors([prior, *self._told(estimate.model)], still)
         if self.robust:
             return problem.with_weights(_cauchy_weights(problem, estimate.state, self.weights))
         return problem
@@ -223,6 +240,9 @@ class FittedViews:
                 for part in (products.right, products.score)
             )
             products = products._replace(right=right, score=score, total=total)
+        if self.known is not None:
+            told = self.known.placed(numbered(LENS_SLOT, count), problem.unknowns(state)).products
+            products = products._replace(total=products.total + told)
         found = view_data(products, problem.unknowns(state) - estimate.families.mean, state.motion, self.freedom)
         return found._replace(relative=estimate.relative)
 
