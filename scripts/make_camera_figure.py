@@ -13,7 +13,7 @@ from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.hybrid.cameras_fit import measure_board
 from kcal.lens.projection import pupil_depth
 from kcal.lens.uncertainty import image_sigma
-from kcal.report.calibration import save_board_picture
+from kcal.report.calibration import board_figure
 from kcal.report.figures import ACCENT, frame_image, new_figure, save_picture
 from scripts.bench.one_camera import stereo_images
 from scripts.shared.wide_lens import load
@@ -40,7 +40,7 @@ def main() -> None:
     left.set_title("Entrance pupil of a 150° lens, ± 2 σ", fontsize=10, loc="left")
 
     sides = stereo_images()
-    print(f"wrote {save_board_picture(FOLDER / 'board.png', measure_board(sides, names=('left', 'right'))[0])}")
+    print(f"wrote {save_picture(FOLDER / 'board.png', board_figure(measure_board(sides, names=('left', 'right'))[0]))}")
     camera = calibrate_camera(sides[0]).camera
     sigma, places = image_sigma(camera, 65, 49), camera.grid(65, 49).numpy()
     levels = [0.05, 0.1, 0.2, 0.5, 1.0]

@@ -62,7 +62,7 @@ PUBLIC = {
         TrackOptions Tracker group_objects matched_pixels pair_objects
     """,
     "kcal.report": """
-        Requirement calibration_figure camera_verdict positions_figure rig_figure rig_verdict save_map
+        Requirement calibration_figure camera_verdict positions_figure rig_figure rig_verdict save_map save_picture
         save_verdict_page
     """,
     "kcal.stars": """

@@ -100,7 +100,8 @@ def measure_command(
     from kcal.calibrate.hybrid.cameras_fit import fit_cameras
     from kcal.calibrate.hybrid.measured_board import save_measured_board
     from kcal.corners.observations import Observations
-    from kcal.report.calibration import board_text, save_board_picture
+    from kcal.report.calibration import board_figure, board_text
+    from kcal.report.figures import save_picture
 
     check_writable(output, *observations)
     if picture is not None:
@@ -114,7 +115,7 @@ def measure_command(
     board = dataclasses.replace(found.boards[0], name=output.name.split(".")[0])
     save_measured_board(board, output)
     if picture is not None:
-        save_board_picture(picture, board)
+        save_picture(picture, board_figure(board))
     out.print(f"{board.board}, {len(board.observations)} of {len(sets)} observations: {', '.join(board.observations)}")
     for line in board_text(board):
         out.print(f"  {line}")

@@ -383,9 +383,10 @@ def calibrate_command(
         source = place.observations.name
         result.save(place.output, name=place.name, source=source, temperature=temperature, setting=stated)
         if place.picture is not None:
-            from kcal.report.calibration import save_calibration_picture
+            from kcal.report.calibration import calibration_figure
+            from kcal.report.figures import save_picture
 
-            save_calibration_picture(place.picture, result, place.name)
+            save_picture(place.picture, calibration_figure(result, place.name))
         print_calibration(result, reject=reject, verbose=verbose or not options.hybrid)
         if result.shared_board is not None:
             others = ", ".join(places[i].name for i in result.shared_board.others)

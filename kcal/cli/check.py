@@ -94,9 +94,10 @@ def check_command(
         if against is not None:
             fine = _told_against(result, against, options, at) and fine
     if picture is not None:
-        from kcal.report.calibration import save_interval_picture
+        from kcal.report.calibration import interval_figure
+        from kcal.report.figures import save_picture
 
-        print_wrote(save_interval_picture(picture, found, result.observations, camera.name))
+        print_wrote(save_picture(picture, interval_figure(found, result.observations, camera.name)))
     print_wrote(kept)
     if not whole:
         err.print(f"interrupted after {len(done)} of {refits} refits; the same command continues", markup=False)

@@ -125,9 +125,10 @@ def diff_command(
     for line in difference_text(found):
         out.print(line, markup=False)
     if picture is not None:
-        from kcal.report.calibration import save_difference_picture
+        from kcal.report.calibration import difference_figure
+        from kcal.report.figures import save_picture
 
-        print_wrote(save_difference_picture(picture, found, title=f"{first} and {second}"))
+        print_wrote(save_picture(picture, difference_figure(found, title=f"{first} and {second}")))
 
 
 def _temperature(camera: Camera) -> float | None:

@@ -125,13 +125,14 @@ def detect_command(
         source = f"of {len(paths)} images"
     observations.save(output)
     if pictures:
-        from kcal.report.calibration import FailedImage, save_coverage, save_gallery
+        from kcal.report.calibration import FailedImage, coverage_figure, gallery_figure
+        from kcal.report.figures import save_picture
 
         if gallery is not None:
             tiles = [FailedImage(name, path, found.reason, found.rejected) for name, path, found in failed]
-            save_gallery(gallery, observations, tiles)
+            save_picture(gallery, gallery_figure(observations, tiles))
         if coverage is not None:
-            save_coverage(coverage, observations)
+            save_picture(coverage, coverage_figure(observations))
 
     width, height = observations.image_size
     found, unseen = len(observations.views), sum(view.pixels.count(None) for view in observations.views)

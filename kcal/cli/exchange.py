@@ -96,11 +96,12 @@ def export_command(
         out.print(f"not in the file: {', '.join(done.lost)}")
     fitted = [(camera, misfit) for camera, misfit in zip(names, done.misfits, strict=True) if misfit is not None]
     if picture is not None and fitted:
-        from kcal.report.calibration import save_difference_picture
+        from kcal.report.calibration import difference_figure
+        from kcal.report.figures import save_picture
 
         camera, misfit = max(fitted, key=lambda each: each[1].largest)
         title = f"{source}: {camera}" if len(names) > 1 else source
-        print_wrote(save_difference_picture(picture, misfit, title=title))
+        print_wrote(save_picture(picture, difference_figure(misfit, title=title)))
     elif picture is not None:
         out.print("no picture: nothing was refitted")
     print_wrote(*done.paths)

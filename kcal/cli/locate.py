@@ -86,9 +86,10 @@ def draw_positions(
 ) -> None:
     """Write the picture and the map, where they were asked for."""
     if picture is not None:
-        from kcal.report.positions import save_positions_picture, save_stations_picture
+        from kcal.report.figures import save_picture
+        from kcal.report.positions import positions_figure, stations_figure
 
-        (save_positions_picture if located.feet is None else save_stations_picture)(picture, located, true)
+        save_picture(picture, (positions_figure if located.feet is None else stations_figure)(located, true))
     if web_map is not None:
         from kcal.report.map_page import save_map
 

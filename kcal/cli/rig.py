@@ -294,9 +294,10 @@ def solve_command(
     print_rig(result, [*lines, *notes])
     save_rig(rig, output)
     if picture is not None:
-        from kcal.report.rig import save_rig_picture
+        from kcal.report.figures import save_picture
+        from kcal.report.rig import rig_figure
 
-        save_rig_picture(picture, result)
+        save_picture(picture, rig_figure(result))
     try:
         console.print_table(range_sigma_rows(range_sigmas(rig, pixel_sigma=noise), rig.covariance is not None))
         if note:

@@ -258,9 +258,10 @@ def read_skyline(
             images, list(cameras.values()), raster, origin, centers, sigma, error=given.error
         )
     if given.picture is not None:
-        from kcal.report.rig import save_skyline_picture
+        from kcal.report.figures import save_picture
+        from kcal.report.rig import skyline_figure
 
-        save_skyline_picture(given.picture, [(image.name, image.image) for image in images], found)
+        save_picture(given.picture, skyline_figure([(image.name, image.image) for image in images], found))
     lines = [line for image, one in zip(images, found, strict=True) for line in _lines(image, names, one)]
     for image, one in zip(images, found, strict=True):
         for text in one.warnings:

@@ -126,9 +126,10 @@ def sites_command(
     if output is not None:
         write_atomic(output, _map_text(field, now, later))
     if picture is not None:
-        from kcal.report.positions import save_siting_picture
+        from kcal.report.figures import save_picture
+        from kcal.report.positions import siting_figure
 
-        save_siting_picture(picture, field, standing, ranked)
+        save_picture(picture, siting_figure(field, standing, ranked))
     print_wrote(output, picture)
 
 
@@ -281,8 +282,9 @@ def budget_command(
             clock_sigma,
         )  # fmt: skip
     if picture is not None:
-        from kcal.report.positions import plotted_ranges, save_budget_picture
+        from kcal.report.figures import save_picture
+        from kcal.report.positions import budget_figure, plotted_ranges
 
         sweep = plotted_ranges(far)
-        save_budget_picture(picture, sweep, range_errors(chosen, sweep, errors), labels)
+        save_picture(picture, budget_figure(sweep, range_errors(chosen, sweep, errors), labels))
     print_wrote(picture)

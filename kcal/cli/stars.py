@@ -545,11 +545,12 @@ def _told(path: Path, found: NamedStars) -> dict[str, Any]:
 
 
 def _draw(picture: Path, image: Any, found: NamedStars, catalog: StarCatalog, title: str) -> None:
-    from kcal.report.rig import save_stars_picture
+    from kcal.report.figures import save_picture
+    from kcal.report.rig import stars_figure
 
     star = found.attitude.star.tolist()
     names = [catalog.name_of(int(catalog.number[i])) if i >= 0 else "" for i in star]
-    save_stars_picture(picture, image, found.detected.pixels, names, found.attitude.residual, title)
+    save_picture(picture, stars_figure(image, found.detected.pixels, names, found.attitude.residual, title))
 
 
 def _say_unknown(view: SkyView) -> None:

@@ -165,9 +165,10 @@ def solve_stations(
     )  # fmt: skip
     save_camera_rig(rig, output)
     if picture is not None:
-        from kcal.report.rig import save_rig_picture
+        from kcal.report.figures import save_picture
+        from kcal.report.rig import rig_figure
 
-        save_rig_picture(picture, result)
+        save_picture(picture, rig_figure(result))
     _print_stations(result, rig, [*notes, *told(result)])
     print_wrote(output, picture)
     if needs or report is not None:

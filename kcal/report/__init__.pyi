@@ -8,6 +8,7 @@ from kcal.report.verdict import Requirement as Requirement
 from kcal.report.verdict_page import save_verdict_page as save_verdict_page
 
 # Pictures
+from kcal.report.figures import save_picture as save_picture
 from kcal.report.calibration import calibration_figure as calibration_figure
 from kcal.report.rig import rig_figure as rig_figure
 from kcal.report.positions import positions_figure as positions_figure

@@ -30,7 +30,7 @@ from kcal.corners.observations import Observations, View
 from kcal.errors import FileError
 from kcal.lens.difference import CameraDifference, difference_text
 from kcal.lens.uncertainty import image_sigma
-from kcal.report.figures import INK, draw_arrows, frame_image, new_figure, save_picture, wrapped
+from kcal.report.figures import INK, draw_arrows, frame_image, new_figure, wrapped
 from kcal.texts import measured_text, percent_text
 from kcal.threads import in_one_thread
 
@@ -102,11 +102,6 @@ def calibration_figure(result: CameraCalibrationResult, name: str = "") -> Figur
     place = 0.3 / size[0], 1.0 - 0.2 / size[1]
     figure.text(*place, text, ha="left", va="top", fontsize=17, fontweight="bold", color=figures.INK)
     return figure
-
-
-def save_calibration_picture(path: str | Path, result: CameraCalibrationResult, name: str = "") -> Path:
-    """Write the picture of `calibration_figure` as PNG or SVG, atomically."""
-    return figures.save_picture(path, calibration_figure(result, name))
 
 
 def draw_coverage(axes: Axes, observations: Observations, result: CameraCalibrationResult) -> None:
@@ -253,11 +248,6 @@ def board_figure(board: MeasuredBoard) -> Figure:
     return figure
 
 
-def save_board_picture(path: str | Path, board: MeasuredBoard) -> Path:
-    """Write a picture of how a measured board differs from the ordered one as PNG or SVG; see `board_figure`."""
-    return figures.save_picture(path, board_figure(board))
-
-
 # Draw where stated intervals contain the truth: maps of the image, from repeated captures.
 
 _MOST = 3  # ranges that are drawn
@@ -315,16 +305,6 @@ def interval_figure(check: IntervalCheck, observations: Observations, title: str
     text += f"Share of {len(check.errors)} refits within the stated 95 % ellipse; dashed: what boards reached"
     figure.text(0.2 / across, 1.0 - 0.1 / down, text, va="top", fontsize=10, color=figures.INK)
     return figure
-
-
-def save_interval_picture(path: str | Path, check: IntervalCheck, observations: Observations, title: str = "") -> Path:
-    """Write the maps as PNG or SVG, atomically.
-
-    Raises:
-        InputError: a suffix other than .png and .svg.
-        FileError: the file cannot be written.
-    """
-    return figures.save_picture(path, interval_figure(check, observations, title))
 
 
 # Draw a detection: every view with its corners, worst first, and where in the image corners were seen.
@@ -444,16 +424,6 @@ def coverage_figure(observations: Observations) -> Figure:
     return figure
 
 
-def save_gallery(path: str | Path, observations: Observations, failed: Sequence[FailedImage] = ()) -> Path:
-    """Write a picture of failed images and of views with their corners as PNG or SVG; see `gallery_figure`."""
-    return figures.save_picture(path, gallery_figure(observations, failed))
-
-
-def save_coverage(path: str | Path, observations: Observations) -> Path:
-    """Write a picture of where in the image corners were seen as PNG or SVG; see `coverage_figure`."""
-    return figures.save_picture(path, coverage_figure(observations))
-
-
 def _order(views: Sequence[View]) -> tuple[list[int], int]:
     """Indices of the views that stand out, the worst first, then of the others in their order; how many stand out."""
     sigmas = [_predicted_sigma(view) or 0.0 for view in views]
@@ -528,8 +498,20 @@ _ARROWS = 17
 _WIDTH, _PANEL, _TALLEST = 5.2, 6.9, 8.0
 
 
-def difference_figure(found: CameraDifference | Misfit, title: str, lines: list[str]) -> Figure:
-    """Draw the shift as colors and magnified arrows; beside it, its sigma if there is one."""
+def difference_figure(found: CameraDifference | Misfit, title: str = "", lines: list[str] | None = None) -> Figure:
+    """Draw the shift as colors and magnified arrows; beside it, its sigma if there is one.
+
+    Args:
+        found: two cameras compared, or the misfit of an exported lens.
+        title: above all.
+        lines: below the title; those that sum it up if left out.
+    """
+    if lines is None:
+        lines = (
+            difference_text(found)
+            if isinstance(found, CameraDifference)
+            else [f"{found.model}: RMS {found.rms:.4g} px, largest {found.largest:.4g} px, at infinity"]
+        )
     sigma = found.sigma if isinstance(found, CameraDifference) else None
     low, high = (value.flatten(0, 1) for value in (found.pixels.amin((0, 1), True), found.pixels.amax((0, 1), True)))
     width, height = (round(float(value)) for value in (high - low)[0] + (1.0 if float(low[0, 0]) >= 0 else 0.0))
@@ -570,21 +552,3 @@ def _colors(axes: Axes, beside: Axes, places: NDArray[np.float64], values: Tenso
     levels = MaxNLocator(nbins=16).tick_values(0.0, max(most, 1e-12))
     drawn = axes.contourf(places[..., 0], places[..., 1], values.numpy(), levels=levels, cmap="viridis_r", alpha=0.85)
     axes.figure.colorbar(drawn, cax=beside, label=label)
-
-
-def save_difference_picture(
-    path: str | Path, found: CameraDifference | Misfit, title: str = "", lines: list[str] | None = None
-) -> Path:
-    """Write the picture of a comparison, or of the misfit of an exported lens, as PNG or SVG, atomically.
-
-    Raises:
-        InputError: a suffix other than .png and .svg.
-        FileError: the file cannot be written.
-    """
-    if lines is None:
-        lines = (
-            difference_text(found)
-            if isinstance(found, CameraDifference)
-            else [f"{found.model}: RMS {found.rms:.4g} px, largest {found.largest:.4g} px, at infinity"]
-        )
-    return save_picture(path, difference_figure(found, title, lines))

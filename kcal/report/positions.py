@@ -97,16 +97,6 @@ def positions_figure(located: Located, truth: Tensor | None = None) -> Figure:
     return figure
 
 
-def save_positions_picture(path: str | Path, located: Located, truth: Tensor | None = None) -> Path:
-    """Write the picture of `positions_figure` as PNG or SVG, atomically.
-
-    Raises:
-        InputError: a suffix other than .png and .svg, or a truth of the wrong shape.
-        FileError: the file cannot be written.
-    """
-    return figures.save_picture(path, positions_figure(located, truth))
-
-
 class _RangeScale:
     """Map ENU meters to the plane: azimuth unchanged, range as log(1 + range / r0), the rim at 1."""
 
@@ -387,16 +377,6 @@ def stations_figure(located: Located, truth: Tensor | None = None) -> Figure:
     return figure
 
 
-def save_stations_picture(path: str | Path, located: Located, truth: Tensor | None = None) -> Path:
-    """Write the plan to a .png or .svg file.
-
-    Raises:
-        InputError: another suffix.
-        FileError: the file cannot be written.
-    """
-    return figures.save_picture(path, stations_figure(located, truth))
-
-
 # Draw a depth budget: range errors against range, on logarithmic scales.
 
 _SOURCE_COLORS = {"disparity": "#2b6cb0", "yaw": "#c02a6b", "baseline": "#4b5563", "timing": "#dd7a1f"}
@@ -455,13 +435,6 @@ def budget_figure(distances: Tensor, found: dict[str, RangeError], labels: dict[
     axes.set_title("Range error by source: outward, inward, and to first order", fontsize=11, color="#374151")
     figure.subplots_adjust(left=0.1, right=0.98, top=0.94, bottom=0.09)
     return figure
-
-
-def save_budget_picture(
-    path: str | Path, distances: Tensor, found: dict[str, RangeError], labels: dict[str, str]
-) -> Path:
-    """Write a picture of range errors over the distance as PNG or SVG; see `budget_figure`."""
-    return figures.save_picture(path, budget_figure(distances, found, labels))
 
 
 # A picture of sites: how well an area is seen and located today, and with the candidates that are worth most.
@@ -523,30 +496,6 @@ def siting_figure(
                   fontsize=9)  # fmt: skip
     figure.text(0.07, 0.02, _siting_footer(maps[0][1], ranked), fontsize=9, color="#374151")
     return figure
-
-
-def save_siting_picture(
-    path: str | Path, area: Area, sites: Sequence[Site], ranked: Sequence[RankedSite] = (),
-    weights: torch.Tensor | None = None,
-) -> Path:  # fmt: skip
-    """Write the picture of `siting_figure` to a .png or .svg file.
-
-    Raises:
-        InputError: another suffix.
-        FileError: the file cannot be written.
-
-    Example:
-        >>> import tempfile
-        >>> from kcal.lens.rig import Origin
-        >>> from kcal.locate.ground import level_ground
-        >>> from kcal.locate.siting import area_of
-        >>> mill = Site(name="mill", origin=Origin(lat=45.0, lon=6.0, height=99.0))
-        >>> area = area_of((45.05, 5.95, 45.15, 6.05), level_ground(0.0), [mill], cells=10)
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     save_siting_picture(Path(folder, "sites.png"), area, [mill]).name
-        'sites.png'
-    """
-    return save_picture(path, siting_figure(area, sites, ranked, weights))
 
 
 def _map_sigma(found: SitingMap) -> NDArray[np.float64]:

@@ -6,7 +6,6 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,7 +29,6 @@ from kcal.report.figures import (
     field_outline,
     frame_image,
     new_figure,
-    save_picture,
     wrapped,
 )
 from kcal.skyline.attitude import SkylineAttitude
@@ -100,16 +98,6 @@ def rig_figure(result: RigResult) -> Figure:
     figure.text(0.015, 0.02, _footer(result), fontsize=9, color="#4b5563", va="bottom", linespacing=1.45)
     figure.subplots_adjust(left=0.015, right=0.975, top=0.9, bottom=0.19, wspace=0.28)
     return figure
-
-
-def save_rig_picture(path: str | Path, result: RigResult) -> Path:
-    """Write the picture of `rig_figure` as PNG or SVG, atomically.
-
-    Raises:
-        InputError: a suffix other than .png and .svg.
-        FileError: the file cannot be written.
-    """
-    return save_picture(path, rig_figure(result))
 
 
 def _flat(result: RigResult, points: Array) -> Array:
@@ -317,18 +305,6 @@ def _interpolated(places: NDArray[np.float64], count: int, values: NDArray[np.fl
     return np.interp(np.arange(count), places, values)
 
 
-def save_stars_picture(
-    path: str | Path,
-    image: NDArray[Any],
-    pixels: NDArray[np.float64],
-    names: Sequence[str],
-    residual: NDArray[np.float64],
-    title: str = "",
-) -> Path:
-    """Write a picture of named stars over a night image as PNG or SVG; see `stars_figure`."""
-    return save_picture(path, stars_figure(image, pixels, names, residual, title))
-
-
 # Draw the skyline of a terrain raster over an image, and how far the image's own is from it.
 
 # Images that are drawn at most; inches of one.
@@ -387,13 +363,6 @@ def _band(height: int, found: SkylineAttitude) -> tuple[int, int]:
     rows = np.concatenate([found.expected[np.isfinite(found.expected)], found.border.row[found.border.clear]])
     beside = max(0.08 * height, 20.0)
     return max(int(rows.min() - beside), 0), min(int(rows.max() + beside), height)
-
-
-def save_skyline_picture(
-    path: str | Path, images: Sequence[tuple[str, NDArray[Any]]], found: Sequence[SkylineAttitude]
-) -> Path:
-    """Write a picture of skylines as PNG or SVG; see `skyline_figure`."""
-    return save_picture(path, skyline_figure(images, found))
 
 
 # Draw the attitude of a watched rig over time, with its 95 % bands.

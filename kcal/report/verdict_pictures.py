@@ -14,9 +14,15 @@ from matplotlib.figure import Figure
 from kcal.calibrate.camera.advice import board_tilts
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.camera.trust import Examination
-from kcal.lens.difference import CameraDifference
-from kcal.report.calibration import board_figure, draw_coverage, draw_residuals, draw_uncertainty, draw_view_rms
-from kcal.report.figures import ACCENT, FAINT, GRAY, INK, WARN, draw_arrows, frame_image, new_figure
+from kcal.report.calibration import (
+    board_figure,
+    difference_figure,
+    draw_coverage,
+    draw_residuals,
+    draw_uncertainty,
+    draw_view_rms,
+)
+from kcal.report.figures import ACCENT, FAINT, INK, WARN, new_figure
 from kcal.report.verdict import FAULTS, RangeAnswer
 from kcal.texts import range_text
 
@@ -45,11 +51,11 @@ def camera_pictures(result: CameraCalibrationResult, examination: Examination | 
     if examination is not None:
         for half in examination.halves:
             title = f"Difference of cameras from halves: {half.label}"
-            found.setdefault("halves", png_bytes(_difference_figure(half.difference, title)))
+            found.setdefault("halves", png_bytes(difference_figure(half.difference, title)))
             if not half.alike and (half.difference.probability or 0.0) < 1e-3:
-                found["halves"] = png_bytes(_difference_figure(half.difference, title))
+                found["halves"] = png_bytes(difference_figure(half.difference, title))
         if examination.model is not None:
-            found["model"] = png_bytes(_difference_figure(examination.model, "Difference from the hybrid lens"))
+            found["model"] = png_bytes(difference_figure(examination.model, "Difference from the hybrid lens"))
     board = ((examination and examination.reference) or result).measured_board
     if board is not None and bool(board.amplitudes.any()):
         found["board"] = png_bytes(board_figure(board))
@@ -112,23 +118,3 @@ def _draw_poses(axes: Axes, result: CameraCalibrationResult) -> None:
     axes.margins(x=0.1)
     axes.spines[["top", "right"]].set_visible(False)
     axes.set_title("Poses; arrows: roll; gray: too little tilt for the focal length", fontsize=10, loc="left")
-
-
-def _difference_figure(found: CameraDifference, title: str) -> Figure:
-    places, length = found.pixels.numpy(), found.length.numpy()
-    low, high = (found.pixels.reshape(-1, 2)[i] for i in (0, -1))
-    size = round(float(high[0] - low[0]) + 1.0), round(float(high[1] - low[1]) + 1.0)
-    figure = new_figure(6.4, 4.8 * size[1] / size[0] + 1.0, dpi=110)
-    axes = figure.add_subplot()
-    drawn = axes.contourf(places[..., 0], places[..., 1], length, levels=14, cmap="viridis_r", alpha=0.85)
-    figure.colorbar(drawn, ax=axes, shrink=0.8, pad=0.02)
-    some = found.shift.numpy()[::3, ::3]
-    longest = float(np.nanmax(np.linalg.norm(some, axis=-1)))
-    if longest > 0:
-        draw_arrows(axes, places[::3, ::3], np.nan_to_num(some), size[0] / 14.0 / longest, color=INK, width=0.003)
-    frame_image(axes, size)
-    axes.set_title(f"{title}, px", fontsize=10, loc="left")
-    ratio = "" if found.ratio is None else f"; {found.ratio:.1f} times what the error bars predict"
-    axes.set_xlabel(f"RMS {found.rms:.2g} px{ratio}", color=GRAY)
-    figure.tight_layout()
-    return figure

@@ -72,7 +72,8 @@ def _hilltop(ground: Tensor, name: str, lat: float, lon: float) -> Site:
 
 def sites() -> list[str]:
     """Time of a map and of the order of candidates, and the picture of the how-to page."""
-    from kcal.report.positions import save_siting_picture
+    from kcal.report.figures import save_picture
+    from kcal.report.positions import siting_figure
 
     raster = hills(460)
     head = (
@@ -100,7 +101,7 @@ def sites() -> list[str]:
     rank_sites(area, towers, candidates)
     lap("10 candidates, all in order")
     folder = str(Path(__file__).parents[2] / "docs" / "howto")
-    show([str(save_siting_picture(Path(folder, "sites.png"), area, towers, ranked))])
+    show([str(save_picture(Path(folder, "sites.png"), siting_figure(area, towers, ranked)))])
     return [*table(["step", "CPU s"], rows), "", f"Peak memory {peak_megabytes():.0f} MB, libraries included."]
 
 

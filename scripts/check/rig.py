@@ -25,7 +25,8 @@ from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.localizer import StereoLocalizer
-from kcal.report.rig import save_rig_picture
+from kcal.report.figures import save_picture
+from kcal.report.rig import rig_figure
 from kcal.watch.turned import drift_of_turns, measure_drift
 from scripts.shared.long_range import ORIGIN, RANGES, rig
 from scripts.shared.page import DOCS, write_section
@@ -294,7 +295,7 @@ def example(path: Path) -> None:
     assert sources.features is not None
     sources.landmarks.points[4, 2] += 2.0
     sources.features.pixels[7, 1, 1] += 2.0
-    save_rig_picture(path, solve_rig(sources, STRAIGHT))
+    save_picture(path, rig_figure(solve_rig(sources, STRAIGHT)))
 
 
 def main() -> None:

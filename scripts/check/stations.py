@@ -339,7 +339,8 @@ def picture() -> None:
     """Towers and smoke, for the how-to page."""
     from kcal.locate.marks import Marks
     from kcal.locate.station_positions import locate_views
-    from kcal.report.positions import save_stations_picture
+    from kcal.report.figures import save_picture
+    from kcal.report.positions import stations_figure
 
     rig, generator = ring(3, 12_000.0), torch.Generator().manual_seed(5)
     rig = CameraRig(
@@ -357,7 +358,8 @@ def picture() -> None:
     seen[2, 1], seen[3, :2] = math.nan, math.nan
     views = Marks(("smoke 1", "smoke 2", "smoke 3", "smoke 4"), seen, sigma=torch.full((4, 3), 10.0).double())
     located = locate_views(rig, views)
-    show([str(save_stations_picture(Path(__file__).parents[2] / "docs" / "howto" / "stations.png", located, points))])
+    path = Path(__file__).parents[2] / "docs" / "howto" / "stations.png"
+    show([str(save_picture(path, stations_figure(located, points)))])
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -12,7 +12,8 @@ from matplotlib.quiver import Quiver
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard
 from kcal.corners.board import Board
 from kcal.errors import InputError
-from kcal.report.calibration import board_figure, board_text, save_board_picture
+from kcal.report.calibration import board_figure, board_text
+from kcal.report.figures import save_picture
 
 
 def bent_board(scale: float) -> MeasuredBoard:
@@ -48,7 +49,7 @@ def test_text_of_a_flat_board() -> None:
 
 
 def test_file(tmp_path: Path) -> None:
-    path = save_board_picture(tmp_path / "board.png", bent_board(0.0))
+    path = save_picture(tmp_path / "board.png", board_figure(bent_board(0.0)))
     assert path.read_bytes()[:4] == b"\x89PNG"
     with pytest.raises(InputError, match=r"must end with \.png"):
-        save_board_picture(tmp_path / "board.jpg", bent_board(0.0))
+        save_picture(tmp_path / "board.jpg", board_figure(bent_board(0.0)))

@@ -46,7 +46,7 @@ from kcal.report.positions import (
 )
 from kcal.report.rig import _above_sky, _edges, _places, attitude_figure, rig_figure, stars_figure
 from kcal.report.verdict import RangeAnswer, Requirement
-from kcal.report.verdict_pictures import _difference_figure, camera_pictures, range_picture
+from kcal.report.verdict_pictures import camera_pictures, range_picture
 
 
 def lines(axes: Axes, marker: str) -> np.ndarray[Any, Any]:
@@ -537,13 +537,15 @@ class TestVerdictPictures:
             result.camera.params + torch.tensor([4.0, 4.0, 0, 0, 0] + [0.0] * 4).double()
         )
         found = camera_difference(result.camera, other)
-        axes = _difference_figure(found, "halves").axes[0]
-        some = found.shift.numpy()[::3, ::3]
+        figure = difference_figure(found, "halves")
+        axes = figure.axes[0]
+        some = found.shift.numpy()[1::2, 1::2]
         longest = np.linalg.norm(some, axis=-1).max()
         scale = np.hypot(arrows(axes).U, arrows(axes).V).max() / longest
-        assert 0.4 * 640 / 14 < scale * longest <= 640 / 14
+        room = 1.5 * 2 * 640 / 33
+        assert 0.4 * room < scale * longest <= room
         np.testing.assert_allclose(arrows(axes).U, scale * some[..., 0].ravel())
-        assert axes.get_title(loc="left") == "halves, px"
+        assert figure.texts[0].get_text() == "halves"
         assert axes.get_xlim() == (-0.5, 639.5)
 
 

@@ -15,8 +15,8 @@ from kcal.lens.rig import Origin
 from kcal.locate.budget import RangeError
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.positions import Located, locate_points
-from kcal.report.figures import new_figure
-from kcal.report.positions import budget_figure, positions_figure, save_positions_picture
+from kcal.report.figures import new_figure, save_picture
+from kcal.report.positions import budget_figure, positions_figure
 
 HEADING = 300.0
 TRUTH = tensor([20.0, 0.0, 100.0], [-300.0, 5.0, 1000.0], [900.0, 0.0, 5000.0], [0.0, 0.0, 60_000.0])
@@ -112,7 +112,7 @@ def test_one_point_and_many_points(tmp_path: Path, count: int) -> None:
     points = torch.linspace(80, 6000, count, dtype=torch.float64)[:, None] * tensor([0.1, 0.0, 1.0])
     left, right, _ = rig(points)
     located = locate_points(rig, left, right, origin=Origin(lat=10.0, lon=20.0, height=0.0), heading_deg=0.0)
-    path = save_positions_picture(tmp_path / "map.png", located)
+    path = save_picture(tmp_path / "map.png", positions_figure(located))
     assert path.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
     assert list(tmp_path.iterdir()) == [path]
 
@@ -120,7 +120,7 @@ def test_one_point_and_many_points(tmp_path: Path, count: int) -> None:
 def test_nothing_to_draw_is_drawn_all_the_same(tmp_path: Path) -> None:
     rig, marks = pinhole_rig(), tensor([5000.0, 1.0])
     located = locate_points(rig, marks, marks, origin=Origin(lat=10.0, lon=20.0, height=0.0), heading_deg=0.0)
-    assert save_positions_picture(tmp_path / "map.png", located).stat().st_size > 10_000
+    assert save_picture(tmp_path / "map.png", positions_figure(located)).stat().st_size > 10_000
 
 
 def test_bad_arguments(tmp_path: Path) -> None:
@@ -128,7 +128,7 @@ def test_bad_arguments(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"truth: shape \(5, 3\)"):
         positions_figure(located, enu[:2])
     with pytest.raises(InputError, match=r"must end with \.png"):
-        save_positions_picture(tmp_path / "map.jpg", located)
+        save_picture(tmp_path / "map.jpg", positions_figure(located))
 
 
 # Taken for mathematics the first two stop the drawing, and the third loses its signs.
@@ -149,7 +149,7 @@ def test_names_are_drawn_as_they_are(tmp_path: Path) -> None:
     left, right, _ = pinhole_rig()(points)
     origin = Origin(lat=10.0, lon=20.0, height=0.0)
     located = locate_points(pinhole_rig(), left, right, origin=origin, heading_deg=0.0, names=list(HOSTILE))
-    save_positions_picture(tmp_path / "map.png", located)
+    save_picture(tmp_path / "map.png", positions_figure(located))
     figure = positions_figure(located)
     figure.canvas.draw()
     assert not any(text.get_parse_math() for text in figure.findobj(Text))
