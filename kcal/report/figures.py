@@ -163,6 +163,12 @@ def save_picture(path: str | Path, figure: Figure) -> Path:
     Raises:
         InputError: a suffix other than .png and .svg.
         FileError: the file cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     save_picture(Path(folder, "empty.svg"), new_figure(1.0, 1.0)).name
+        'empty.svg'
     """
     check_picture(path)
     data = io.BytesIO()

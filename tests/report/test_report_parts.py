@@ -324,7 +324,7 @@ class TestAnswers:
         # A solution that has just been found is judged as its file is; a source without freedom says nothing.
         found = landmarks_rig()
         (own,) = found.sources
-        open_one = dataclasses.replace(own, name="features", sigmas=math.nan)
+        open_one = dataclasses.replace(own, name="features", sigmas=None)
         for sources in (
             (dataclasses.replace(own, sigmas=3.1), open_one),
             (open_one, dataclasses.replace(own, sigmas=3.1)),
