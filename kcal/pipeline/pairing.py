@@ -40,6 +40,7 @@ class ObjectViews:
         score: (N,) of the detections.
         category: N names.
         ambiguous: (N,) bool: another grouping is about as likely.
+        track: N names that the detector's own tracker gave, or None; none if left out.
 
     Raises:
         InputError: shapes that do not fit each other, or times that are not finite where something was seen.
@@ -61,9 +62,13 @@ class ObjectViews:
     score: Tensor
     category: tuple[str, ...]
     ambiguous: Tensor
+    track: tuple[str | None, ...] = ()
 
     def __post_init__(self) -> None:
         count, cameras = len(self.category), self.seen.shape[-1]
+        if len(self.track) not in (0, count):
+            raise InputError(f"track: {count} names or None are needed, got {len(self.track)}")
+        object.__setattr__(self, "track", self.track or (None,) * count)
         wanted = {
             "pixels": (count, cameras, 2), "seen": (count, cameras), "time": (count, cameras), "score": (count,),
             "covariance": (count, 2 * cameras, 2 * cameras), "ambiguous": (count,),
@@ -115,6 +120,7 @@ class ObjectViews:
         score: Tensor,
         category: tuple[str, ...],
         ambiguous: Tensor | None = None,
+        track: tuple[str | None, ...] = (),
     ) -> ObjectViews:
         """Objects that both cameras of a rig see.
 
@@ -126,6 +132,7 @@ class ObjectViews:
             score: (N,) of the detections.
             category: N names.
             ambiguous: (N,) bool: another pairing is about as likely; none if left out.
+            track: N names that the detector's own tracker gave, or None.
 
         Raises:
             InputError: shapes that do not fit each other, values that are not finite, or a matrix that is not a
@@ -150,7 +157,7 @@ class ObjectViews:
         pixels = torch.stack([own.pop("left"), own.pop("right")], 1)
         seen = torch.ones_like(pixels[..., 0], dtype=torch.bool)
         ambiguous = ~seen[:, 0] if ambiguous is None else ambiguous
-        return cls(pixels=pixels, seen=seen, category=category, ambiguous=ambiguous, **own)
+        return cls(pixels=pixels, seen=seen, category=category, ambiguous=ambiguous, track=track, **own)
 
     @classmethod
     def from_matches(
@@ -647,4 +654,5 @@ def pair_objects(
         score=torch.minimum(first.score, second.score),
         category=first.category,
         ambiguous=found.ambiguous,
+        track=tuple(one or other for one, other in zip(first.track, second.track, strict=True)),
     )

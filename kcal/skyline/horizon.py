@@ -652,5 +652,5 @@ def columns_of(row: Floats, sigma: Floats, camera: Camera) -> Columns:
     clear = np.isfinite(row)
     pixel = np.stack([np.flatnonzero(clear).astype(np.float64), row[clear]], -1)
     rays, valid = camera.unproject(torch.from_numpy(pixel))
-    found = Columns(pixel, sigma[clear], (rays / rays.norm(dim=-1, keepdim=True)).numpy())
+    found = Columns(pixel, sigma[clear], rays.numpy())
     return found.some(valid.numpy())

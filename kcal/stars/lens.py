@@ -444,7 +444,7 @@ def _search(
         progress(f"{what}, focal length {guess:.0f} px")
         if len(inside) < 5:
             continue
-        rays = torch.nn.functional.normalize(camera.unproject(torch.from_numpy(found.pixels[inside]))[0], dim=-1)
+        rays, _ = camera.unproject(torch.from_numpy(found.pixels[inside]))
         field = 2 * (middle / guess if camera.model.fisheye else math.atan(middle / guess))
         here = identify(
             rays.numpy(), 1.5 / guess, catalog=catalog, scale_error=_SCALE_ERROR, field=field, corners=corners
@@ -463,9 +463,8 @@ def _search(
 
 def _by_camera(found: DetectedStars, camera: Camera, catalog: StarCatalog) -> Identification | None:
     rays, valid = camera.unproject(torch.from_numpy(found.pixels))
-    rays = (rays / rays.norm(dim=-1, keepdim=True))[valid]
     focal = float(camera.params[0])
-    return identify(rays.numpy(), _ROUGH_PX / focal, catalog=catalog, scale_error=0.003)
+    return identify(rays[valid].numpy(), _ROUGH_PX / focal, catalog=catalog, scale_error=0.003)
 
 
 def _from_middle_outward(

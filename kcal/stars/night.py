@@ -200,8 +200,7 @@ def _half_field(camera: Camera) -> float:
     rays, valid = camera.unproject(torch.tensor(border, dtype=torch.float64))
     if not bool(valid.any()):
         rays, valid = camera.unproject(camera.grid(9, 9).reshape(-1, 2))
-    rays = rays[valid] / rays[valid].norm(dim=-1, keepdim=True)
-    return min(float(torch.arccos(rays[:, 2].clamp(-1, 1)).max()), math.pi)
+    return min(float(torch.arccos(rays[valid, 2].clamp(-1, 1)).max()), math.pi)
 
 
 # From a night image to named stars and the camera's attitude, among the stars and on the Earth.
@@ -351,7 +350,7 @@ def name_stars(
     found = image if isinstance(image, tuple) else detect_stars(image)
     _refuse_no_night(found)
     rays, valid = camera.unproject(torch.from_numpy(found.pixels))
-    direction = (rays / rays.norm(dim=-1, keepdim=True)).numpy()[valid.numpy()]
+    direction = rays[valid].numpy()
     reach, field = _reach(camera), field_angle(camera)
     named = identify(direction, reach, catalog=catalog, field=field)
     if named is None:
@@ -441,7 +440,6 @@ def _reach(camera: Camera) -> float:
     """Radians of a pixel of error in the lens: by the camera's own rays in the middle of the image."""
     middle = torch.tensor([(camera.size[0] - 1) / 2, (camera.size[1] - 1) / 2], dtype=torch.float64)
     rays, _ = camera.unproject(torch.stack([middle, middle + torch.tensor([1.0, 0.0], dtype=torch.float64)]))
-    rays = rays / rays.norm(dim=-1, keepdim=True)
     return _LENS_PX * float((rays[0] - rays[1]).norm())
 
 

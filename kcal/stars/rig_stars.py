@@ -184,7 +184,6 @@ def _add_nameless(rows: _Rows, moment: Moment, cameras: Sequence[Camera], number
         if not len(free) or not len(others):
             continue
         rays, valid = cameras[first].unproject(torch.from_numpy(here.detected.pixels[free]))
-        rays = rays / rays.norm(dim=-1, keepdim=True)
         expected, seen = cameras[camera].project(FAR * rays @ (there.attitude.rotation @ here.attitude.rotation.T).T)
         expected = torch.where((valid & seen)[:, None], expected, 1e9)
         tree = cKDTree(there.detected.pixels[others])

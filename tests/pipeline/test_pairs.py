@@ -19,6 +19,7 @@ def pairs(**changes: object) -> ObjectViews:
         "time": torch.zeros(3, 2, dtype=torch.float64),
         "score": torch.ones(3),
         "category": ("ship", "buoy", "ship"),
+        "track": (None, "7", None),
         "ambiguous": torch.zeros(3, dtype=torch.bool),
     }
     return ObjectViews.of_pairs(**(given | changes))  # type: ignore[arg-type]
@@ -47,6 +48,7 @@ def test_no_objects() -> None:
         ({"right": torch.full((3, 2), torch.nan)}, "right: 6 of 6 values are not finite"),
         ({"time": torch.zeros(3, 2)}, "time: float64 is needed"),
         ({"score": torch.ones(2)}, "score"),
+        ({"track": (None,)}, "track: 3 names"),
         ({"ambiguous": torch.zeros(3)}, "ambiguous: bool"),
         ({"covariance": -torch.eye(4).expand(3, 4, 4)}, "3 of 3 are not symmetric or have a negative"),
         ({"covariance": torch.eye(4).index_put((torch.tensor(0), torch.tensor(1)), torch.tensor(0.5)).expand(3, 4, 4)},
