@@ -13,10 +13,9 @@ from scipy import stats
 from torch import Tensor
 
 from kcal.calibrate.camera.result import CameraCalibrationResult
-from kcal.calibrate.hybrid.evidence_rounds import run_rounds
 from kcal.calibrate.hybrid.families import PriorFamilies, typical_hyperprior
 from kcal.calibrate.hybrid.fit import HybridFit
-from kcal.calibrate.hybrid.fitted_views import NO_MOTION, Estimate, FittedViews, hybrid_unknowns
+from kcal.calibrate.hybrid.fitted_views import NO_MOTION, Estimate, FittedViews, hybrid_unknowns, run_rounds
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.parameters import FreeParameters, GaussianTerm
 from kcal.calibrate.problem.state import BoardState

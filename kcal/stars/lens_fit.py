@@ -12,9 +12,8 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from kcal.calibrate.hybrid.board_modes import BoardModes
-from kcal.calibrate.hybrid.evidence_rounds import LAST, run_rounds
 from kcal.calibrate.hybrid.families import PUPIL, prior_families, typical_hyperprior
-from kcal.calibrate.hybrid.fitted_views import NO_MOTION, Estimate, FittedViews
+from kcal.calibrate.hybrid.fitted_views import LAST, NO_MOTION, Estimate, FittedViews, run_rounds
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.covariance import information_of
 from kcal.calibrate.problem.parameters import FreeParameters, Term

@@ -152,40 +152,36 @@ class CameraFit:
 def fit_turned(
     seen: Observations,
     weights: Tensor | None,
-    modes: ZernikeModes | None,
-    turns: Tensor | None,
-    shape: Shape,
+    options: FitOptions,
+    turns: Tensor | None = None,
     one_type: bool = False,
-    lens: LensPrior | None = None,
     start: HybridFit | None = None,
-    first: HybridFit | None = None,
+    done: bool = False,
 ) -> CameraFit:
     """Fit one camera, turn its views that were read from another end, and fit again until none is left.
 
     Args:
         seen: what it saw.
         weights: (V, N) of the corners; one if not given.
-        modes: of the field.
+        options: see there.
         turns: (V,) quarter turns that are known already.
-        shape: of the board.
         one_type: the camera is one of a type, so that it tells of its lens, too.
-        lens: what is known of the lens.
         start: an earlier fit of the views with these turns, to begin with.
-        first: such a fit with these weights, board and lens, which is taken as it is.
+        done: it has these weights and options, and is taken as it is.
     """
-    board, pixels = seen.board, seen.pixels()
+    board, pixels, shape = seen.board, seen.pixels(), options.board
     weights = torch.ones_like(pixels[..., 0]) if weights is None else weights
     turns = torch.zeros(len(pixels), dtype=torch.long) if turns is None else turns
     for attempt in range(_MOST_FITS):
         ordered, weighted = (turned_corners(values, board, turns) for values in (pixels, weights))
-        if first is not None and attempt == 0:
-            fit = first
+        if start is not None and done and attempt == 0:
+            fit = start
         else:
-            options = FitOptions(modes=modes, board=shape, lens=lens)
             fit = fit_hybrid(board.points, ordered, seen.image_size, weighted, options, start=start)
         if shape == "exact" or len(board.quarter_turns) == 1 or attempt == _MOST_FITS - 1:
             break
-        prior = printed_prior(fit.board_shapes, fit.expected[BOARD:]) if shape == "printed" else shape.whole
+        known = options.known_board(board.points)
+        prior = printed_prior(fit.board_shapes, fit.expected[BOARD:]) if known is None else known.whole
         deviation = fit.families.deviation(fit.expected)[: -len(fit.state.board)]
         more = find_turns(_absolute_rows(fit, board.points, ordered, weighted), board, prior, deviation, fit.sigma**2)
         if not bool(more.any()):
@@ -193,10 +189,12 @@ def fit_turned(
         turns, start = (turns + more) % 4, None
     message = fit.information.board_message.weighted(math.sqrt(fit.wider))
     found = CameraFit(fit=fit, turns=turns, message=message)
-    return _with_its_type(found, board.points, ordered, weighted, shape) if one_type else found
+    return _with_its_type(found, board.points, ordered, weighted, options) if one_type else found
 
 
-def _with_its_type(camera: CameraFit, points: Tensor, pixels: Tensor, weights: Tensor, shape: Shape) -> CameraFit:
+def _with_its_type(
+    camera: CameraFit, points: Tensor, pixels: Tensor, weights: Tensor, options: FitOptions
+) -> CameraFit:
     """With what its data say about the amplitudes of lenses, and about its lens."""
     fit = camera.fit
     deviation = fit.families.deviation(fit.expected)
@@ -208,16 +206,17 @@ def _with_its_type(camera: CameraFit, points: Tensor, pixels: Tensor, weights: T
     flat[:, -1] *= -1.0
     pixels_of = Gaussian((*of_lens, *of_board), torch.cat([mean, torch.zeros_like(fit.state.board)]), flat)
     data = pixels_of.weighted(1.0 / fit.sigma)
-    if shape == "exact":
+    known = options.known_board(points)
+    if options.board == "exact":
         lens_alone = data.conditioned(of_board).compressed()
         pixels_of = pixels_of.conditioned(of_board).placed(pixels_of.slots, pixels_of.at)
-    elif shape == "printed":
+    elif known is None:
         sigma = deviation[len(of_lens) :]
         lens_alone = (data + Gaussian.independent(of_board, torch.zeros_like(sigma), sigma)).marginal(of_lens)
     else:
-        lens_alone = (data + shape.whole).marginal(of_lens)
+        lens_alone = (data + known.whole).marginal(of_lens)
         # In the variables of the fit's priors.
-        at, half = shape.whole.mean_and_half()
+        at, half = known.whole.mean_and_half()
         pixels_of = pixels_of.replaced(of_board, at, half.T, of_board)
     freedom = 2 * int((torch.isfinite(pixels).all(-1) & (weights > 0)).sum()) - 6 * len(pixels)
     hyper = _about_hyperparameters(fit, pixels_of.weighted(fit.tempering**-0.5), freedom / fit.tempering)
@@ -348,8 +347,8 @@ def _turned(camera: CameraFit, turn: int) -> CameraFit:
 
 # Calls a function for each of the numbered argument lists; numbers and results come in any order.
 Run = Callable[[Callable[..., CameraFit], dict[int, tuple[Any, ...]]], Iterable[tuple[int, CameraFit]]]
-# Of one fit: turns, shape, whether cameras are of one type, lens, a fit to begin with, a fit that is taken as it is.
-_Task = tuple[Tensor | None, Shape, bool, LensPrior | None, HybridFit | None, HybridFit | None]
+# Further arguments of `fit_turned`.
+_Task = tuple[FitOptions, Tensor | None, bool, HybridFit | None, bool]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -417,14 +416,15 @@ def fit_cameras(
     def fit(tasks: dict[int, _Task]) -> dict[int, CameraFit]:
         """Fits of some cameras; each is told on as it ends."""
         found = {}
-        for i, camera in run(fit_turned, {i: (sets[i], weights[i], modes, *task) for i, task in tasks.items()}):
+        for i, camera in run(fit_turned, {i: (sets[i], weights[i], *task) for i, task in tasks.items()}):
             found[i] = camera
             if advance is not None:
                 advance(names[i])
         return found
 
     fleet = one_type and len(sets) >= LEAST_CAMERAS
-    begun = fit({i: (None, alone, fleet, None, None, first[i] if first else None) for i in each})
+    own = FitOptions(modes=modes, board=alone)
+    begun = fit({i: (own, None, fleet, first[i] if first else None, True) for i in each})
     cameras = [begun[i] for i in each]
     fitted = [camera.turns for camera in cameras]
     if known is not None:
@@ -450,7 +450,8 @@ def fit_cameras(
             if fleet or shape is not alone:
                 # Views that were turned since, and lenses of another form, have other unknowns.
                 kept = lenses[i] is None and torch.equal(camera.turns, fitted[i])
-                tasks[i] = camera.turns, shape, fleet, lenses[i], camera.fit if kept else None, None
+                own = FitOptions(modes=modes, board=shape, lens=lenses[i])
+                tasks[i] = own, camera.turns, fleet, camera.fit if kept else None, False
         for i, again in fit(tasks).items():
             fitted[i] = again.turns
             cameras[i] = dataclasses.replace(again, board=cameras[i].board, nats=cameras[i].nats)

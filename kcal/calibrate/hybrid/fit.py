@@ -15,14 +15,6 @@ from torch import Tensor
 from kcal.calibrate.hybrid.base_fit import fit_base
 from kcal.calibrate.hybrid.board_modes import STRETCH, BoardModes, board_modes
 from kcal.calibrate.hybrid.evidence import WORTH, posterior_root
-from kcal.calibrate.hybrid.evidence_rounds import (
-    LAST,
-    Rounds,
-    columns_may_be_read,
-    expected_estimate,
-    motion_is_worth,
-    run_rounds,
-)
 from kcal.calibrate.hybrid.families import (
     BOARD,
     LEADING_UNKNOWNS,
@@ -30,7 +22,18 @@ from kcal.calibrate.hybrid.families import (
     PriorFamilies,
     typical_hyperprior,
 )
-from kcal.calibrate.hybrid.fitted_views import Estimate, FittedViews, hybrid_problem, hybrid_unknowns
+from kcal.calibrate.hybrid.fitted_views import (
+    LAST,
+    Estimate,
+    FittedViews,
+    Rounds,
+    columns_may_be_read,
+    expected_estimate,
+    hybrid_problem,
+    hybrid_unknowns,
+    motion_is_worth,
+    run_rounds,
+)
 from kcal.calibrate.hybrid.measured_board import BoardPrior, MeasuredBoard
 from kcal.calibrate.hybrid.network_fit import FieldTraining, train_network
 from kcal.calibrate.problem.board_problem import BoardProblem

@@ -18,9 +18,8 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call, jacrev, vmap
 
-from kcal.calibrate.hybrid.evidence_rounds import Rounds, run_rounds
 from kcal.calibrate.hybrid.families import LEADING_UNKNOWNS
-from kcal.calibrate.hybrid.fitted_views import Estimate, FittedViews
+from kcal.calibrate.hybrid.fitted_views import Estimate, FittedViews, Rounds, run_rounds
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.errors import InputError
 from kcal.lens.field_modes import NetworkModes
@@ -31,7 +30,7 @@ from kcal.solve.schur import products_of, without_local
 
 # Nats by which a turn must raise the evidence for another one.
 _WORTH = 1.0
-# Steps of the solver after each step of the network, as `kcal.calibrate.hybrid.evidence_rounds` has them.
+# Steps of the solver after each step of the network, as `kcal.calibrate.hybrid.fitted_views` has them.
 _FOLLOW = (12, 0.02)
 # Steps by Gauss-Newton in a turn; by Adam, as many times so many with everything else held.
 _STEPS, _ADAM_STEPS, _RATE = 5, 40, 0.01

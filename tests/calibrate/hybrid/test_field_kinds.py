@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal.calibrate.hybrid import evidence_rounds
+from kcal.calibrate.hybrid import fitted_views
 from kcal.calibrate.hybrid.board_modes import board_modes
 from kcal.calibrate.hybrid.families import SQUARE, prior_families, typical_hyperprior
 from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid
@@ -114,7 +114,7 @@ def test_pixels_are_square_or_have_two_focal_lengths() -> None:
 
 @pytest.mark.parametrize("rounds", [1, 12])
 def test_rounds_that_run_out_are_said(rounds: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(evidence_rounds, "_ROUNDS", rounds)
+    monkeypatch.setattr(fitted_views, "_ROUNDS", rounds)
     assert fit_hybrid(BOARD.points, capture(6), SIZE).converged == (rounds == 12)
 
 

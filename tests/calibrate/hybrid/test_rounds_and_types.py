@@ -15,11 +15,12 @@ from calibrate_scenes import observe
 from printed_boards import printed_points, printed_views
 from torch import Tensor
 
-from kcal.calibrate.hybrid import cameras_fit, evidence_rounds, fitted_views
+from kcal.calibrate.hybrid import cameras_fit, fitted_views
 from kcal.calibrate.hybrid.board_modes import board_modes
 from kcal.calibrate.hybrid.cameras_fit import CameraFit, _measured, fit_turned
-from kcal.calibrate.hybrid.evidence_rounds import Rounds, columns_may_be_read
 from kcal.calibrate.hybrid.families import Hyperprior, typical_hyperprior
+from kcal.calibrate.hybrid.fit import FitOptions
+from kcal.calibrate.hybrid.fitted_views import Rounds, columns_may_be_read
 from kcal.calibrate.hybrid.measured_board import printed_board
 from kcal.calibrate.problem.state import Readout, motion_sigma
 from kcal.corners.board import Board
@@ -67,14 +68,14 @@ class TestColumns:
         def maximum(columns: bool, *_: object, **__: object) -> SimpleNamespace:
             return SimpleNamespace(loss=losses[columns])
 
-        monkeypatch.setattr(evidence_rounds, "maximize_evidence", maximum)
+        monkeypatch.setattr(fitted_views, "maximize_evidence", maximum)
         assert self.asked(-3.0) is better
         assert self.asked(-3.0, readout=None) is False
         # There is no solution near which anything could be asked.
         assert self.asked(-3.0, converged=False) is True
         far = 20.0
         large = motion_sigma(np.full(4, far), 0.01)
-        assert max(large.turn, large.shift) > evidence_rounds._TOO_MUCH
+        assert max(large.turn, large.shift) > fitted_views._TOO_MUCH
         assert self.asked(far) is True
 
 
@@ -150,7 +151,8 @@ def test_what_a_camera_tells_of_its_lens(shape: Any, monkeypatch: pytest.MonkeyP
     pixels[2, 5] = torch.nan
     weights = torch.ones(9, 48).double()
     weights[1, :3] = 0.0
-    found = fit_turned(observe(pixels, board=BOARD, size=SIZE), weights, MODES, None, shape, one_type=True)
+    options = FitOptions(modes=MODES, board=shape)
+    found = fit_turned(observe(pixels, board=BOARD, size=SIZE), weights, options, one_type=True)
     assert freedoms == [pytest.approx(2 * (9 * 48 - 4) - 6 * 9)]
     assert found.hyper is not None
     assert found.lens is not None

@@ -13,10 +13,9 @@ from torch import Tensor
 from kcal.calibrate.hybrid.base_fit import fit_base
 from kcal.calibrate.hybrid.board_modes import board_modes
 from kcal.calibrate.hybrid.evidence import Quadratic, ViewData, maximize_evidence, view_data
-from kcal.calibrate.hybrid.evidence_rounds import motion_is_worth, run_rounds
 from kcal.calibrate.hybrid.families import prior_families, typical_hyperprior
 from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid
-from kcal.calibrate.hybrid.fitted_views import FittedViews, hybrid_problem
+from kcal.calibrate.hybrid.fitted_views import FittedViews, hybrid_problem, motion_is_worth, run_rounds
 from kcal.calibrate.problem import board_problem
 from kcal.calibrate.problem.board_problem import POSE, BoardProblem
 from kcal.calibrate.problem.state import (
