@@ -33,7 +33,8 @@ from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.marks import Marks, read_marks, write_marks
 from kcal.locate.positions import interval_coverage, locate_points
 from kcal.report.judge_rig import rig_verdict
-from kcal.report.tables import Part, chance_text, diagonal_rows, save_summary, truth_rows
+from kcal.report.pages import Part, save_summary
+from kcal.report.tables import chance_text, diagonal_rows, truth_rows
 from kcal.report.verdict import Requirement
 from kcal.sim.scene import DemoScene, NamedPoints, mark_points, render_demo
 from kcal.texts import length_text

@@ -105,7 +105,7 @@ def told_usable(
         page: to write.
         warned: names of findings of which the command has warned already.
     """
-    from kcal.report.verdict_page import range_rows, save_verdict_page
+    from kcal.report.pages import range_rows, save_verdict_page
 
     print_verdict(verdict, warned)
     if page is not None:
@@ -133,7 +133,7 @@ def _of_camera(
     path: Path, observations: list[Path], needs: tuple[Requirement, ...], baseline: float, mark_sigma: float
 ) -> Judged:
     from kcal.report.judge_camera import stored_verdict
-    from kcal.report.verdict_page import camera_tables
+    from kcal.report.pages import camera_tables
 
     camera = single_camera(str(path))
     name = (camera.calibration.name if camera.calibration else "") or path.name.split(".")[0]
@@ -158,7 +158,7 @@ def judged(
     """The verdict on a calibration, with the pictures and tables of its page; `stored` as in `camera_verdict`."""
     from kcal.calibrate.camera.trust import examine
     from kcal.report.judge_camera import camera_verdict
-    from kcal.report.verdict_page import camera_tables
+    from kcal.report.pages import camera_tables
     from kcal.report.verdict_pictures import camera_pictures
 
     with steps(f"checking {name}", None) as advance:
@@ -242,7 +242,7 @@ def judged_sides(
 def stored_tables(rig: StereoRig | CameraRig) -> list[list[list[str]]]:
     """Tables of all cameras, as the rig's file has them."""
     from kcal.report.judge_rig import named_cameras
-    from kcal.report.verdict_page import camera_tables
+    from kcal.report.pages import camera_tables
 
     return [table for name, camera in named_cameras(rig) for table in camera_tables(camera, name=name)]
 

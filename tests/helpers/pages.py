@@ -35,7 +35,7 @@ from kcal.pipeline.senders import LiveMap
 from kcal.pipeline.stream import track_columns
 from kcal.pipeline.tracks import Tracker, TrackOptions
 from kcal.report.map_page import save_map
-from kcal.report.tables import Part, save_summary
+from kcal.report.pages import Part, save_summary
 from kcal.web.serving import LocalServer
 from scripts.shared.marking_scene import LANDMARKS, TARGETS, MarkingSite, marking_site
 

@@ -17,11 +17,11 @@ from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import Origin, StereoRig
 from kcal.locate.positions import locate_points
 from kcal.report.calibration import difference_figure
+from kcal.report.pages import _correlations, _percent, _sentence, range_rows
 from kcal.report.positions import plotted_ranges
 from kcal.report.practice_score import score_lens, score_rig
 from kcal.report.tables import chance_text
 from kcal.report.verdict import RangeAnswer, Requirement, Verdict
-from kcal.report.verdict_page import _correlations, _percent, _sentence, range_rows
 
 CAMERA = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480), model="pinhole")
 

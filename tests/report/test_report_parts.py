@@ -50,8 +50,8 @@ from kcal.report.judge_rig import (
     rig_verdict,
 )
 from kcal.report.map_page import _box, _content, _placing, _tile, _warp, arcs_within, local_image
+from kcal.report.pages import _caption, _correlations, camera_tables
 from kcal.report.verdict import FAULTS, Finding, RangeAnswer, Requirement, weighed_findings
-from kcal.report.verdict_page import _caption, _correlations, camera_tables
 from kcal.report.verdict_pictures import _PART_COLORS
 
 CAMERA = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480), model="pinhole")

@@ -11,7 +11,7 @@ import pytest
 
 from kcal.errors import FileError, InputError
 from kcal.io.images import write_png
-from kcal.report.tables import Part, save_summary, summary_page
+from kcal.report.pages import Part, save_summary, summary_page
 
 
 def test_pictures_are_inside_and_nothing_is_fetched(tmp_path: Path) -> None:

@@ -23,8 +23,8 @@ from kcal.lens.rig import StereoRig
 from kcal.lens.uncertainty import image_sigma
 from kcal.report.judge_camera import camera_verdict, stored_verdict, view_findings
 from kcal.report.judge_rig import rig_verdict, synchrony
+from kcal.report.pages import range_rows, verdict_page
 from kcal.report.verdict import Finding, RangeAnswer, Requirement, Verdict
-from kcal.report.verdict_page import range_rows, verdict_page
 
 VIEWS, NOISE = 14, 0.08
 # Fast: an opencv5 truth, fitted with opencv5 unless a test plants another model.

@@ -7,8 +7,8 @@ import re
 from pathlib import Path
 
 import kcal.report
+from kcal.report.pages import verdict_page
 from kcal.report.verdict import FAULTS, Finding, RangeAnswer, Requirement, Verdict, weighed_findings
-from kcal.report.verdict_page import verdict_page
 
 MARKS = "mark targets more accurately"
 STRUCTURE = Finding(

@@ -1,8 +1,9 @@
-"""Write a verdict as one HTML page: the answer on its first screen, findings, numbers and pictures below."""
+"""Pages of one HTML file, without scripts, that fetch nothing: verdicts, and summaries of what was done."""
 
 from __future__ import annotations
 
 import base64
+import dataclasses
 import datetime
 import math
 from collections.abc import Mapping, Sequence
@@ -11,7 +12,8 @@ from typing import Any
 
 import kcal
 from kcal.calibrate.camera.result import CameraCalibrationResult
-from kcal.files import write_atomic
+from kcal.errors import InputError
+from kcal.files import read_bytes, write_atomic
 from kcal.lens.camera import Camera
 from kcal.report.verdict import RangeAnswer, Verdict
 from kcal.texts import length_text, number_text, page_policy, range_text, visible
@@ -48,27 +50,34 @@ def verdict_page(
         >>> "left &lt;camera&gt;" in page, "YES" in page, "http:" in page
         (True, True, False)
     """
-    import jinja2  # loaded here, like matplotlib below: answers without a page do without both
-
     drawn = dict(pictures or {})
     if any(math.isfinite(answer.sigma) for answer in verdict.answers):
         from kcal.report.verdict_pictures import range_picture
 
         drawn = {"ranges": range_picture(verdict.answers), **drawn}
-    style = (_HERE / "verdict_page.css").read_text(encoding="utf-8")
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(_HERE), autoescape=True, undefined=jinja2.StrictUndefined, finalize=_visible_text
-    )
-    environment.filters |= {"distance": range_text, "found": _found, "percent": _percent, "sentence": _sentence}
-    return environment.get_template("verdict_page.html").render(
+    return _from_template(
+        "verdict_page",
         verdict=verdict,
         pictures={name: base64.b64encode(data).decode("ascii") for name, data in drawn.items()},
         captions={name: _caption(name) for name in drawn},
         tables=tables,
-        style=jinja2.filters.Markup(style),
-        policy=jinja2.filters.Markup(page_policy(styles=[style])),
         made=f"Made by kcal {kcal.__version__}, {datetime.datetime.now(datetime.UTC):%Y-%m-%d %H:%M} UTC.",
     )
+
+
+def _from_template(name: str, **values: Any) -> str:
+    """Fill a template of this folder, with the style beside it; texts become texts, whatever is in them."""
+    import jinja2  # loaded here, like matplotlib above: answers without a page do without both
+
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(_HERE), autoescape=True, undefined=jinja2.StrictUndefined, finalize=_visible_text
+    )
+    environment.filters |= {
+        "distance": range_text, "found": _found, "percent": _percent, "sentence": _sentence, "embedded": _embedded,
+    }  # fmt: skip
+    style = (_HERE / f"{name}.css").read_text(encoding="utf-8")
+    policy = jinja2.filters.Markup(page_policy(styles=[style]))
+    return environment.get_template(f"{name}.html").render(style=jinja2.filters.Markup(style), policy=policy, **values)
 
 
 def save_verdict_page(
@@ -169,3 +178,66 @@ def _percent(value: float) -> str:
 def _sentence(text: str) -> str:
     """With a capital and a full stop."""
     return text[:1].upper() + text[1:].rstrip(".") + "."
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Part:
+    """A part of the page: a heading, sentences, and what belongs to them.
+
+    Args:
+        heading: its heading.
+        text: its paragraphs.
+        table: rows of cells, the first row with the heads; empty for no table.
+        pictures: PNG or JPEG files with their captions, side by side where there is room.
+        code: a command to copy, or "".
+    """
+
+    heading: str
+    text: tuple[str, ...] = ()
+    table: tuple[tuple[str, ...], ...] = ()
+    pictures: tuple[tuple[str | Path, str], ...] = ()
+    code: str = ""
+
+
+def summary_page(title: str, lead: str, parts: Sequence[Part]) -> str:
+    """Make a page as HTML that explains what was done and what came out.
+
+    Args:
+        title: its title.
+        lead: one paragraph under the title.
+        parts: the parts, in order.
+
+    Raises:
+        FileError: a picture cannot be read.
+        InputError: a picture that is neither PNG nor JPEG, or a table whose rows differ in length.
+
+    Example:
+        >>> part = Part(heading="Found", table=(("name", "m"), ("gate", "100")))
+        >>> page = summary_page("A rig", "Two cameras.", [part])
+        >>> "<td>gate</td><td>100</td>" in page, "http" in page
+        (True, False)
+    """
+    for part in parts:
+        if len(set(map(len, part.table))) > 1:
+            raise InputError(f"the table of {part.heading!r}: rows of different lengths")
+    return _from_template("summary_page", title=title, lead=lead, parts=parts)
+
+
+def save_summary(path: str | Path, title: str, lead: str, parts: Sequence[Part]) -> Path:
+    """Write the page of `summary_page`, atomically.
+
+    Raises:
+        FileError: the file cannot be written, or see `summary_page`.
+        InputError: see `summary_page`.
+    """
+    return write_atomic(path, summary_page(title, lead, parts))
+
+
+def _embedded(path: str | Path) -> str:
+    """A picture file as the address of an image."""
+    data = read_bytes(path)
+    kinds = {b"\x89PNG": "png", b"\xff\xd8\xff": "jpeg"}
+    kind = next((name for start, name in kinds.items() if data.startswith(start)), None)
+    if kind is None:
+        raise InputError(f"{path}: neither a PNG nor a JPEG picture")
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
