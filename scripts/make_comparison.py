@@ -28,7 +28,7 @@ from matplotlib.axes import Axes
 from torch import Tensor
 
 from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.calibrate.rig.sources import Landmarks
+from kcal.calibrate.rig.landmarks import Landmarks
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.report.figures import ACCENT, FAINT, GRAY, INK, WARN, new_figure, save_picture

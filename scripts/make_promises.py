@@ -21,6 +21,7 @@ from scripts.make_reference import returned_by
 
 DOORS = ("kcal", *(f"kcal.{name}" for name in
          ["lens", "corners", "calibrate", "rig", "locate", "track", "report", "stars", "solve", "nets"]))  # fmt: skip
+SOURCES = "kcal.calibrate.rig.source"
 FOLDER = Path(__file__).parents[1] / "tests" / "promises"
 
 
@@ -45,11 +46,14 @@ def _members(value: type) -> Iterator[tuple[str, str]]:
     fields = {each.name for each in dataclasses.fields(value)} if dataclasses.is_dataclass(value) else set()
     fields |= set(getattr(value, "_fields", ())) | set(getattr(value, "model_fields", ()))
     found = {name: "" for name in fields if not name.startswith("_")}
+    # What the solver asks of a rig's sources is no promise.
+    bases = [vars(base) for base in value.__mro__ if base.__module__ == SOURCES]
+    inner = {"model_config", *(name for base in bases for name in (*base, *base.get("__annotations__", ())))}
     for base in value.__mro__:
         if not base.__module__.startswith("kcal"):
             continue
         for name, member in vars(base).items():
-            if not name.startswith("_") and name not in found and name not in ("model_config",):
+            if not name.startswith("_") and name not in {*found, *inner}:
                 plain = inspect.isfunction(member) or isinstance(member, (classmethod, staticmethod))
                 found[name] = _arguments(getattr(value, name)) if plain else ""
     yield from sorted(found.items())

@@ -86,7 +86,8 @@ def _returns(module: str, name: str) -> set[tuple[str, str]]:
         (kind, home)
         for kind, home in homes
         # How a problem is solved is no result.
-        if home.startswith("kcal.") and not home.startswith("kcal.calibrate.problem.") and not kind.startswith("_")
+        if home.startswith("kcal.") and not kind.startswith("_")
+        if not home.startswith(("kcal.calibrate.problem.", "kcal.calibrate.rig.source"))
         if any(isinstance(node, ast.ClassDef) and node.name == kind for node in _tree(home).body)
     }
 

@@ -21,7 +21,7 @@ from kcal.errors import InputError
 from kcal.files import check_picture, check_writable, write_atomic
 
 if TYPE_CHECKING:
-    from kcal.calibrate.rig.sources import Landmarks
+    from kcal.calibrate.rig.landmarks import Landmarks
     from kcal.lens.rig import StereoRig
     from kcal.locate.marks import Marks
     from kcal.watch.turned import Drift

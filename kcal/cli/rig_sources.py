@@ -17,16 +17,13 @@ from kcal.files import check_picture
 from kcal.texts import measured_text
 
 if TYPE_CHECKING:
+    from kcal.calibrate.rig.boards import Boards
+    from kcal.calibrate.rig.features import Features
+    from kcal.calibrate.rig.landmarks import Landmarks
+    from kcal.calibrate.rig.measured import Baseline, MeasuredPosition
     from kcal.calibrate.rig.result import RigResult
-    from kcal.calibrate.rig.sources import (
-        Baseline,
-        Boards,
-        Features,
-        Landmarks,
-        MeasuredPosition,
-        RigData,
-        SkylineSource,
-    )
+    from kcal.calibrate.rig.skyline import SkylineSource
+    from kcal.calibrate.rig.sources import RigData
     from kcal.corners.observations import Observations
     from kcal.lens.calibration import CalibrationRecord
     from kcal.lens.camera import Camera
@@ -445,7 +442,7 @@ def parse_baselines(text: str, names: Sequence[str] = CAMERAS) -> tuple[Baseline
     Raises:
         InputError: something else, or a camera that is not there.
     """
-    from kcal.calibrate.rig.sources import Baseline
+    from kcal.calibrate.rig.measured import Baseline
 
     found = []
     for part in text.split(","):

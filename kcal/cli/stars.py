@@ -17,7 +17,8 @@ from kcal.files import check_writable
 
 if TYPE_CHECKING:
     from kcal.calibrate.camera.result import CameraCalibrationResult
-    from kcal.calibrate.rig.sources import MeasuredPosition, StarSource
+    from kcal.calibrate.rig.measured import MeasuredPosition
+    from kcal.calibrate.rig.stars import StarSource
     from kcal.lens.camera import Camera
     from kcal.lens.rig import Origin
     from kcal.stars.detect import DetectedStars
@@ -305,7 +306,7 @@ def read_stars(
     """
     import torch
 
-    from kcal.calibrate.rig.sources import MeasuredPosition
+    from kcal.calibrate.rig.measured import MeasuredPosition
     from kcal.stars.rig_stars import moments_of, star_source
 
     given = _images_by_camera(cameras, night.images)

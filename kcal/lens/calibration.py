@@ -242,6 +242,39 @@ class RigSource:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class ItemResidual:
+    """One thing that was seen or measured, and how well it agrees with the rest.
+
+    Args:
+        source: which kind it is: boards, landmarks, features, stars, skyline, baselines or positions.
+        name: its name.
+        pixels: RMS distance in px in each camera, of what was left out from where the others put it; None where a
+            camera did not see it.
+        meters: of a landmark between survey and adjusted position, of a measured position between measured and solved,
+            of a baseline its error; None for the others.
+        sigmas: root of χ² over its degrees of freedom, by the stated sigmas; 1 is typical.
+        over_limit: by how much χ² falls without it, over the most that noise and lenses explain
+            (`kcal.calibrate.rig.adjustment`): above 1, it contradicts the rest. 0 for what was measured.
+        used: whether it is part of the solution.
+        reason: why it was left out.
+    """
+
+    source: str
+    name: str
+    pixels: tuple[float | None, ...] = ()
+    meters: float | None = None
+    sigmas: float
+    over_limit: float = 0.0
+    used: bool = True
+    reason: str = ""
+
+    @property
+    def label(self) -> str:
+        """Kind and name: `landmark post 4`."""
+        return f"{self.source.removesuffix('s')} {self.name}"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class RigCalibration:
     """How a rig was solved.
 

@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.rig.explanations import AS_GOOD
-from kcal.calibrate.rig.initial_poses import consensus_pose
+from kcal.calibrate.rig.landmarks import Landmarks
+from kcal.calibrate.rig.resection import consensus_pose
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.calibrate.rig.sources import Landmarks, RigData
+from kcal.calibrate.rig.sources import RigData
 from kcal.errors import InputError, KcalError
 from kcal.lens.rig import Origin
 from kcal.locate.geodesy import enu_to_geodetic, geodetic_to_enu

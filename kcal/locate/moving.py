@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 from scipy.interpolate import Akima1DInterpolator, BSpline, make_smoothing_spline
 from torch import Tensor
 
-from kcal.calibrate.rig.initial_poses import consensus_pose, consensus_rotation
-from kcal.calibrate.rig.sources import Effect, Landmarks, MeasuredPosition
+from kcal.calibrate.rig.landmarks import Landmarks
+from kcal.calibrate.rig.measured import MeasuredPosition
+from kcal.calibrate.rig.resection import consensus_pose, consensus_rotation
+from kcal.calibrate.rig.source import Effect
 from kcal.errors import FileError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.rig import Origin

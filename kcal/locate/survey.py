@@ -12,7 +12,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.sources import Features, Landmarks, MeasuredPosition, inverse_range_beyond
+from kcal.calibrate.rig.features import Features, inverse_range_beyond
+from kcal.calibrate.rig.landmarks import Landmarks
+from kcal.calibrate.rig.measured import MeasuredPosition
 from kcal.errors import FileError, InputError
 from kcal.files import read_text
 from kcal.lens.rig import Origin

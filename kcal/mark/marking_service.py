@@ -10,10 +10,10 @@ import pydantic
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.result import ItemResidual
 from kcal.calibrate.rig.solve import RigOptions
 from kcal.calibrate.rig.sources import RigData
 from kcal.errors import InputError, KcalError
+from kcal.lens.calibration import ItemResidual
 from kcal.lens.camera import Camera
 from kcal.lens.rig import Origin, StereoRig
 from kcal.locate.budget import range_sigmas

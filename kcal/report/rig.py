@@ -14,7 +14,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from kcal.calibrate.rig.result import ItemResidual, RigResult
+from kcal.calibrate.rig.result import RigResult
+from kcal.lens.calibration import ItemResidual
 from kcal.lens.camera import Camera
 from kcal.locate.tabulate import middle_row_ends
 from kcal.report.figures import (

@@ -11,7 +11,7 @@ from kcal.locate.survey import match_landmarks as match_landmarks
 from kcal.locate.survey import read_features as read_features
 from kcal.scene.match import ImagePair as ImagePair
 from kcal.scene.match import scene_features as scene_features
-from kcal.calibrate.rig.sources import Effect as Effect
+from kcal.calibrate.rig.source import Effect as Effect
 
 # Skylines
 from kcal.skyline.attitude import skyline_source as skyline_source

@@ -11,7 +11,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from kcal.calibrate.rig.sources import Effect
+from kcal.calibrate.rig.source import Effect
 from kcal.lens.pose import side_axes
 from kcal.lens.rig import StereoRig
 from kcal.scene.refine import HALF

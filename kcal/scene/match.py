@@ -12,10 +12,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.adjustment import LOSS, ROUGHLY, Adjustment, over_limit, possible
-from kcal.calibrate.rig.initial_poses import Start
-from kcal.calibrate.rig.problem import held
-from kcal.calibrate.rig.sources import Baseline, Features, RigData
+from kcal.calibrate.rig.adjustment import LOSS, ROUGHLY, Adjustment, possible
+from kcal.calibrate.rig.features import Features
+from kcal.calibrate.rig.measured import Baseline
+from kcal.calibrate.rig.source import Start
+from kcal.calibrate.rig.sources import RigData
+from kcal.calibrate.rig.unknowns import held
 from kcal.corners.images import Gray
 from kcal.corners.match import Keypoints, keypoints, pose_between
 from kcal.errors import InputError
@@ -368,14 +370,11 @@ def _posed(rig: StereoRig, pixels: Tensor, covariance: Tensor) -> tuple[StereoRi
         center=torch.stack([torch.zeros(3, dtype=torch.float64), -turn.T @ shift]),
     )
     work = Adjustment(data, start, held(cameras), 1.0)
-    masks = work.none()._replace(features=torch.ones(count, dtype=torch.bool))
-    masks = possible(work, masks)
-    work.solve(masks, ROUGHLY, LOSS)
-    squares = work.squares(masks)
-    over = over_limit(work, masks, squares).features
-    over = torch.where(masks.features, over, torch.inf)
-    # Behind both cameras.
-    over = torch.where(work.state.inverse_range < -_UNIT_SIGMA, torch.inf, over)
+    mask = possible(work, ~work.none())
+    work.solve(mask, ROUGHLY, LOSS)
+    over = work.over_limit(mask, work.squares(mask))
+    # What has no projection, or is behind both cameras.
+    over = torch.where(mask & (work.state.items[:, 3] >= -_UNIT_SIGMA), over, torch.inf)
     rotation, center = work.state.rotation, work.state.center
     relative = rotation[1] @ rotation[0].T
     return StereoRig(*cameras, relative, rotation[1] @ (center[0] - center[1])), over

@@ -14,7 +14,7 @@ from scipy.signal import lfilter
 from torch import Tensor
 
 import kcal.skyline.fit as fits
-from kcal.calibrate.rig.sources import SkylineSource
+from kcal.calibrate.rig.skyline import SkylineSource
 from kcal.checks import variance_factor
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera

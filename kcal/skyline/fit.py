@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcal.calibrate.rig.uncertainty import gathered, joint_unknowns
+from kcal.calibrate.rig.unknowns import gathered, joint_unknowns
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector

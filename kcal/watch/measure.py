@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.sources import Features
+from kcal.calibrate.rig.features import Features
 from kcal.corners.images import Gray, to_8bit
 from kcal.corners.match import keypoints
 from kcal.corners.patches import fit_shifts, grid_of, has_samples, image_windows, sample

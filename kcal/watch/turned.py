@@ -12,14 +12,16 @@ import torch
 from torch import Tensor
 
 import kcal.calibrate.rig.adjustment as adjustment
-from kcal.calibrate.rig.blocks import KINDS, PerKind
-from kcal.calibrate.rig.initial_poses import Start
-from kcal.calibrate.rig.problem import held
-from kcal.calibrate.rig.result import ItemResidual, item_records
-from kcal.calibrate.rig.sources import Features, Landmarks, RigData
+from kcal.calibrate.rig.features import Features
+from kcal.calibrate.rig.landmarks import Landmarks
+from kcal.calibrate.rig.result import records
+from kcal.calibrate.rig.source import Start, typical_ratio
+from kcal.calibrate.rig.sources import RigData
 from kcal.calibrate.rig.uncertainty import SharedCovariance, goodness_of_fit, relative_rows, turn_rows
+from kcal.calibrate.rig.unknowns import held
 from kcal.checks import as_points, beyond_chance, chi2_quantile, variance_factor
 from kcal.errors import DegenerateError, InputError
+from kcal.lens.calibration import ItemResidual
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.lens.projection import FAR
@@ -176,7 +178,7 @@ class _MarksTwice:
 
 def _typical(turn: CameraTurn) -> float:
     """How much larger χ² typically is than the sigma of the marks says."""
-    return adjustment.typical_ratio(turn.squares, 2.0 * torch.isfinite(turn.off).all(-1))
+    return typical_ratio(turn.squares, 2.0 * torch.isfinite(turn.off).all(-1))
 
 
 def _over_limit(turn: CameraTurn, known: Tensor) -> Tensor:
@@ -495,17 +497,14 @@ def _against(
     data = RigData(cameras=cameras, names=_NAMES, features=features, landmarks=landmarks)
     unknowns = held(cameras).and_refraction(*refraction) if loose else held(cameras)
     work = adjustment.Adjustment(data, start, unknowns, 1.0, turning=[loose, True], moving=[False] * 2)
-    masks = _telling(data)
-    few = "too few of the images have a mark of it"
-    reasons = {
-        kind: dict.fromkeys((~mask).nonzero()[:, 0].tolist(), few) for kind, mask in zip(KINDS, masks, strict=True)
-    }
-    if sum(int(mask.sum()) for mask in masks) < 2:
+    mask = _telling(data)
+    reasons = dict.fromkeys((~mask).nonzero()[:, 0].tolist(), "too few of the images have a mark of it")
+    if int(mask.sum()) < 2:
         raise DegenerateError("drift: two features or landmarks at least are needed; more let wrong ones be found")
-    work.solve(masks, adjustment.ROUGHLY, adjustment.LOSS)
-    masks = adjustment.without_wrong(work, masks, _SOLVER)
-    problem, _ = work.solve(masks, _SOLVER)
-    state = work.part(masks)
+    work.solve(mask, adjustment.ROUGHLY, adjustment.LOSS)
+    mask = adjustment.without_wrong(work, mask, _SOLVER)
+    problem, _ = work.solve(mask, _SOLVER)
+    state = work.part(mask)
     fit = goodness_of_fit(problem, state)
     known = SharedCovariance(problem, state, fit.variance)
     covariance, determined = known.of(relative_rows(problem, state, 0, 1))
@@ -532,20 +531,19 @@ def _against(
         rig=StereoRig(rig.left, rig.right, relative, state.rotation[1] @ (state.center[0] - state.center[1])),
         pose_covariance=covariance,
         cam_from_local=state.rotation[0] if pose is not None else None,
-        items=item_records(work, masks, reasons),
+        items=records(work, mask, reasons).items,
         variance=fit.variance,
     )
 
 
-def _telling(data: RigData) -> PerKind:
-    """Landmarks with a mark; features of known range that both cameras see."""
-    nothing = torch.zeros(0, dtype=torch.bool)
-    marked = nothing if data.landmarks is None else torch.isfinite(data.landmarks.pixels).all(-1).any(-1)
-    ranged = nothing
+def _telling(data: RigData) -> Tensor:
+    """Which landmarks have a mark, and which features of known range both cameras see."""
+    found = [torch.zeros(0, dtype=torch.bool)]
+    if data.landmarks is not None:
+        found.append(data.landmarks.marked.any(-1))
     if data.features is not None:
-        seen = torch.isfinite(data.features.pixels).all(-1).all(-1)
-        ranged = seen & torch.isfinite(data.features.inverse_range_sigma)
-    return PerKind(nothing, marked, ranged)
+        found.append(data.features.marked.all(-1) & torch.isfinite(data.features.inverse_range_sigma))
+    return torch.cat(found)
 
 
 def check_rig(rig: StereoRig, *, features: Features | None = None, landmarks: Landmarks | None = None) -> Drift:

@@ -15,9 +15,11 @@ import math
 
 import torch
 
+from kcal.calibrate.rig.features import Features
+from kcal.calibrate.rig.measured import Baseline
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import solve_rig
-from kcal.calibrate.rig.sources import Baseline, Features, RigData
+from kcal.calibrate.rig.sources import RigData
 from kcal.calibrate.rig.uncertainty import turn_rows
 from kcal.errors import InputError
 from kcal.lens.pose import vector_from_rotation

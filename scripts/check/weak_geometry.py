@@ -23,8 +23,9 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.rig import assess, solve
+from kcal.calibrate.rig.landmarks import Landmarks
 from kcal.calibrate.rig.result import RigResult
-from kcal.calibrate.rig.sources import Landmarks, RigData
+from kcal.calibrate.rig.sources import RigData
 from kcal.errors import KcalError
 from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.geodesy import enu_from_cam

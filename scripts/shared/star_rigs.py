@@ -9,7 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.sources import Baseline, Effect, Features, MeasuredPosition, RigData, StarSource
+from kcal.calibrate.rig.features import Features
+from kcal.calibrate.rig.measured import Baseline, MeasuredPosition
+from kcal.calibrate.rig.source import Effect
+from kcal.calibrate.rig.sources import RigData
+from kcal.calibrate.rig.stars import StarSource
 from kcal.lens.camera import Camera
 from kcal.lens.projection import FAR
 from kcal.locate.geodesy import enu_from_cam

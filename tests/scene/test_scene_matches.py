@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from kcal.calibrate.rig.measured import Baseline
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.calibrate.rig.sources import Baseline, RigData
+from kcal.calibrate.rig.sources import RigData
 from kcal.errors import InputError
 from kcal.lens.pose import vector_from_rotation
 from kcal.scene.match import ImagePair, MatchedPair, match_scene, scene_features, scene_of

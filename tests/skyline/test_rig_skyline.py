@@ -10,11 +10,12 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from kcal.calibrate.rig.blocks import PosedCamera
-from kcal.calibrate.rig.problem import SkylineTerm
+from kcal.calibrate.rig.measured import MeasuredPosition
 from kcal.calibrate.rig.result import RigResult
+from kcal.calibrate.rig.skyline import SkylineSource
 from kcal.calibrate.rig.solve import solve_rig
-from kcal.calibrate.rig.sources import MeasuredPosition, RigData, SkylineSource
+from kcal.calibrate.rig.source import PosedCamera
+from kcal.calibrate.rig.sources import RigData
 from kcal.errors import InputError
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.lens.rig import Origin
@@ -117,7 +118,7 @@ def test_images_of_one_camera_share_its_surroundings(monkeypatch: pytest.MonkeyP
 
 def test_derivatives_of_the_term() -> None:
     given = source(0)
-    term, spot = SkylineTerm(given), camera()
+    spot = camera()
     random = np.random.default_rng(0)
     step = 1e-6
 
@@ -131,10 +132,10 @@ def test_derivatives_of_the_term() -> None:
             found.append(PosedCamera(spot, spot.params.detach(), rotation, given.center[c] + shift, none, *slots))
         return found
 
-    rows = term.rows(posed(torch.zeros(12).double()), 12)
+    rows = given.rows_at(posed(torch.zeros(12).double()), 12)
     for _ in range(3):
         way = torch.from_numpy(random.standard_normal(12))
-        ends = [term.rows(posed(sign * step * way), 12)[-1] for sign in (1.0, -1.0)]
+        ends = [given.rows_at(posed(sign * step * way), 12)[-1] for sign in (1.0, -1.0)]
         torch.testing.assert_close((ends[0] - ends[1]) / (2 * step), way @ rows[:-1], rtol=1e-5, atol=1e-5)
 
 

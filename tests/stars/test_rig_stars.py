@@ -13,8 +13,8 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
+from kcal.calibrate.rig.landmarks import Landmarks
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.calibrate.rig.sources import Landmarks
 from kcal.cli.main import app
 from kcal.errors import DegenerateError, InputError
 from kcal.io.camera_file import save_camera

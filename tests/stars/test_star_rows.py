@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-from kcal.calibrate.rig.sources import StarSource, shifts_of, star_turns
+from kcal.calibrate.rig.source import shifts_of
+from kcal.calibrate.rig.stars import StarSource, star_turns
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector

@@ -10,7 +10,7 @@ import torch
 from locate_rigs import pinhole_rig, real_rig, tensor
 from torch import Tensor
 
-from kcal.calibrate.rig.sources import Landmarks
+from kcal.calibrate.rig.landmarks import Landmarks
 from kcal.errors import InputError
 from kcal.io.camera_file import provenance
 from kcal.lens.calibration import RigCalibration

@@ -13,11 +13,13 @@ from torch import Tensor
 
 import kcal.calibrate.rig.explanations as explanations
 from kcal.calibrate.rig.adjustment import Adjustment
-from kcal.calibrate.rig.blocks import FeatureBlock, LandmarkBlock, PerKind, RigState
-from kcal.calibrate.rig.initial_poses import InitialPoses, distinct_poses
+from kcal.calibrate.rig.features import FeatureBlock
+from kcal.calibrate.rig.initial_poses import InitialPoses
 from kcal.calibrate.rig.motion import moved_warnings, scatter_warnings
-from kcal.calibrate.rig.problem import RigProblem, held
-from kcal.calibrate.rig.result import Reasons, RigResult, item_records, places, source_records
+from kcal.calibrate.rig.problem import RigProblem
+from kcal.calibrate.rig.resection import distinct_poses
+from kcal.calibrate.rig.result import Reasons, RigResult, places, records
+from kcal.calibrate.rig.source import RigState, as_items
 from kcal.calibrate.rig.uncertainty import (
     SharedCovariance,
     goodness_of_fit,
@@ -25,6 +27,7 @@ from kcal.calibrate.rig.uncertainty import (
     parameter_rows,
     relative_rows,
 )
+from kcal.calibrate.rig.unknowns import held
 from kcal.errors import DegenerateError, InputError
 from kcal.io.camera_file import provenance
 from kcal.lens.calibration import CameraCalibration
@@ -120,7 +123,8 @@ def check_poses(
         DegenerateError: a camera whose pose is so open; what to add is told.
     """
     warnings, missing = list[str](), list[Tensor]()
-    if not any(isinstance(block, LandmarkBlock) for block in problem.blocks) or not covariance.complete:
+    points = _surveyed(problem, state)
+    if points is None or not covariance.complete:
         return warnings
     still, at_rest = problem.linearize(state).step(_UNDAMPED)[0]
     for c, name in enumerate(names):
@@ -128,7 +132,7 @@ def check_poses(
         half = covariance.half_of(pose)
         if half is None or not bool(half.any()):
             continue
-        distance = float((state.points - state.center[c]).norm(dim=-1).median())
+        distance = float((points - state.center[c]).norm(dim=-1).median())
         ways = torch.linalg.svd(half / half.new_tensor([distance] * 3 + [1.0] * 3), full_matrices=False).U
         sigma, bent = half.square().sum(0).sqrt(), 0.0
         for way in ways.T[:_DIRECTIONS_TRIED]:
@@ -158,10 +162,11 @@ def _advice(problem: RigProblem, state: RigState) -> str:
     several = len(problem.cameras) > 1
     measure = f"or measure the position{'s of the cameras' if several else ' of the camera'}"
     rig = "the rig" if several else "the camera"
-    if not any(isinstance(block, LandmarkBlock) for block in problem.blocks):
+    points = _surveyed(problem, state)
+    if points is None:
         return f"Add surveyed landmarks, {measure}"
-    middle = state.points.mean(0)
-    extent = torch.linalg.svdvals(state.points - middle) / math.sqrt(len(state.points))
+    middle = points.mean(0)
+    extent = torch.linalg.svdvals(points - middle) / math.sqrt(len(points))
     long, wide, thick = (*extent.tolist(), 0.0, 0.0)[:3]
     if wide < _LINE * long:
         return (
@@ -179,6 +184,11 @@ def _advice(problem: RigProblem, state: RigState) -> str:
             f"landmarks well before or behind that plane, {measure}"
         )
     return f"Add surveyed landmarks that are nearer and spread over the image, mark them more precisely, {measure}"
+
+
+def _surveyed(problem: RigProblem, state: RigState) -> Tensor | None:
+    """(L, 3) where surveyed things are, meters; None without any."""
+    return next((own.items[:, :3] for block, own in problem.parts(state) if block.surveyed), None)
 
 
 class OpenPlace(NamedTuple):
@@ -304,7 +314,7 @@ def _targets(
     block = FeatureBlock(pixels, whitening, *nothing, state.center[first])
     turning, moving = ([slot is not None for slot in slots] for slots in (problem.turn, problem.shift))
     alone = RigProblem(problem.cameras, [block], (), problem.unknowns, turning, moving)
-    follow, own = alone.response(state._replace(direction=direction, inverse_range=inverse), block)
+    follow, own = alone.response(state._replace(items=as_items(direction, inverse[:, None])), block)
     rows = follow[:, -1].clone()
     slot = problem.shift[first]
     if slot is not None:
@@ -332,25 +342,25 @@ _OTHER = 100.0
 _GLANCE, _FAR = LMOptions(max_iterations=10, tolerance=1e-4, residual_floor=1e-8), 100.0
 
 
-def refuse_several(work: Adjustment, masks: PerKind) -> None:
+def refuse_several(work: Adjustment, mask: Tensor) -> None:
     """Raise `DegenerateError` if the cameras could as well stand elsewhere, as far as landmarks tell.
 
     Args:
         work: at its solution; it stays there.
-        masks: what agrees.
+        mask: what agrees.
     """
-    if not explanations.decided_by_landmarks(work, masks):
+    if not explanations.decided_by_landmarks(work, mask):
         return
     here = copy.copy(work)
     here.unknowns = held(work.data.cameras)
-    problem, _ = here.solve(masks, explanations.TRIAL)
-    own = goodness_of_fit(problem, here.part(masks))
-    matrix, scale = problem.linearize(here.part(masks)).information()
+    problem, _ = here.solve(mask, explanations.TRIAL)
+    own = goodness_of_fit(problem, here.part(mask))
+    matrix, scale = problem.linearize(here.part(mask)).information()
     found = [here.state]
-    for state in _other_places(here, masks):
+    for state in _other_places(here, mask):
         there = copy.copy(here)
         there.state = state
-        if not _as_good(there, masks, own.chi2, own.variance):
+        if not _as_good(there, mask, own.chi2, own.variance):
             continue
         steps = [_step(problem, other, there.state) / scale for other in found]
         if min(float(step @ matrix @ step) for step in steps) >= _OTHER:
@@ -369,15 +379,15 @@ def refuse_several(work: Adjustment, masks: PerKind) -> None:
         what = f"{names[which]} may stand in {len(found)} places up to {float(moved[:, which].max()):.3g} m apart"
     raise DegenerateError(
         f"the landmarks do not tell where the cameras stand: {what}, which fit alike ({own.freedom} degrees of "
-        f"freedom). {_advice(problem, here.part(masks))}"
+        f"freedom). {_advice(problem, here.part(mask))}"
     )
 
 
-def _as_good(work: Adjustment, masks: PerKind, chi2: float, variance: float) -> bool:
+def _as_good(work: Adjustment, mask: Tensor, chi2: float, variance: float) -> bool:
     """Whether the solution from here is as good; one that is far from it after a few steps is not followed."""
     for effort, times in ((_GLANCE, _FAR), (explanations.TRIAL, 1.0)):
-        problem, _ = work.solve(masks, effort)
-        if not 2.0 * float(problem.cost(work.part(masks))) < chi2 + times * explanations.AS_GOOD * variance:
+        problem, _ = work.solve(mask, effort)
+        if not 2.0 * float(problem.cost(work.part(mask))) < chi2 + times * explanations.AS_GOOD * variance:
             return False
     return True
 
@@ -414,14 +424,15 @@ def _reversed(rotation: Tensor, center: Tensor, points: Tensor) -> list[tuple[Te
     return found
 
 
-def _other_places(work: Adjustment, masks: PerKind) -> Iterator[RigState]:
+def _other_places(work: Adjustment, mask: Tensor) -> Iterator[RigState]:
     """States in which one camera, or all of them, stand where three of the landmarks would put them as well."""
-    marks, state = work.data.landmarks, work.state
+    marks, state = work.data.landmarks, work.at_survey(work.state)
     assert marks is not None
+    chosen_marks = mask[work.at("landmarks")]
     places: list[list[tuple[Tensor, Tensor]]] = []
     for c, camera in enumerate(work.data.cameras):
         rays, valid = camera.unproject(marks.pixels[:, c])
-        use = valid & masks.landmarks
+        use = valid & chosen_marks
         if int(use.sum()) < 3:
             places.append([])
             continue
@@ -436,7 +447,7 @@ def _other_places(work: Adjustment, masks: PerKind) -> Iterator[RigState]:
     together = itertools.product(*here) if work.terms else _one_at_a_time(here)
     for chosen in itertools.islice(together, 1, _MOST):
         rotation, center = (torch.stack(parts) for parts in zip(*chosen, strict=True))
-        yield state._replace(rotation=rotation, center=center, points=marks.points)
+        yield state._replace(rotation=rotation, center=center)
     # All cameras together, as they stand to each other.
     for c, own in enumerate(places):
         for rotation, center in own:
@@ -444,7 +455,6 @@ def _other_places(work: Adjustment, masks: PerKind) -> Iterator[RigState]:
             yield state._replace(
                 rotation=state.rotation @ turn.T,
                 center=(state.center - state.center[c]) @ turn.T + center,
-                points=marks.points,
             )
 
 
@@ -459,7 +469,7 @@ _HIGH_RMS = 1.0
 def rig_result(
     work: Adjustment,
     found: Result,
-    masks: PerKind,
+    mask: Tensor,
     reasons: Reasons,
     initial: InitialPoses,
     warnings: list[str],
@@ -469,9 +479,9 @@ def rig_result(
     """The result of a rig from its solution.
 
     Args:
-        work: with the solution of what the masks name.
+        work: with the solution of what the mask name.
         found: what the solver said.
-        masks: what took part.
+        mask: what took part.
         reasons: why the rest did not.
         initial: from where it began.
         warnings: that there are already.
@@ -481,7 +491,7 @@ def rig_result(
         InputError: a measured baseline or position that contradicts the rest, or several explanations.
         DegenerateError: relative poses that are not determined, or exactly, or so that no range is known.
     """
-    data, state, problem = work.data, work.part(masks), work.problem(masks)
+    data, state, problem = work.data, work.part(mask), work.problem(mask)
     fit = goodness_of_fit(problem, state)
     covariance = SharedCovariance(problem, state, fit.variance)
     undetermined = covariance.open_directions(data.names, absolute=data.absolute)
@@ -507,19 +517,14 @@ def rig_result(
         covariance = SharedCovariance(problem, state, widen**2 * fit.variance)
     more = check_poses(problem, state, covariance, data.names, refuse=refuse)
     doubts += [] if doubts else more
-    refuse_several(work, masks)
+    refuse_several(work, mask)
     against = explanations.contradictions(work, problem, state)
     certain = [one for one in against if one.sigmas > explanations.CERTAIN]
     if refuse and certain and certain[0].stated:
         raise InputError(certain[0].text)
-    squared, counts = torch.zeros(len(data.cameras)).double(), torch.zeros(len(data.cameras)).double()
-    for block in problem.blocks:
-        squared += block.errors(problem.posed(state), state).square().sum((0, 2, 3))
-        counts += block.seen.sum((0, 2))
-    if data.skyline is not None:
-        for c, many, px in zip(data.skyline.cameras, data.skyline.columns, data.skyline.rms_px, strict=True):
-            squared[c], counts[c] = squared[c] + many * px**2, counts[c] + many
-    rms, status = math.sqrt(float(squared.sum() / counts.sum())), SolverStatus(int(found.status))
+    told = records(work, mask, reasons)
+    rms = math.sqrt(float(told.squared.sum() / told.counts.sum()))
+    status = SolverStatus(int(found.status))
     warnings += [
         f"the {kind} differ from each other by {times:.1f} times what their sigmas say: their sigmas were multiplied "
         f"by {times:.1f}"
@@ -530,8 +535,8 @@ def rig_result(
         times = math.sqrt(fit.variance)
         warnings.append(f"residuals are {times:.1f} times as large as their sigmas say; the covariance was widened")
     warnings += [one.text for one in against]
-    only_boards = len(problem.blocks) == 1 and problem.blocks[0].kind == "boards"
-    if only_boards and (count := int(masks.boards.sum())) < _FEW_BOARDS:
+    only_boards = len(problem.blocks) == 1 and problem.blocks[0].many
+    if only_boards and (count := int(mask.sum())) < _FEW_BOARDS:
         warnings.append(f"{count} pair(s) only: a wrong one could not be noticed; 5 or more are good")
     focal = [float(camera.params[0]) for camera in data.cameras]
     warnings = scatter_warnings(focal, work.motion, work.sigma_corner) + warnings
@@ -549,7 +554,6 @@ def rig_result(
             "errors of the marks alone"
         )
     warnings += explanations.swap_warnings(data, problem, state, covariance)
-    items = item_records(work, masks, reasons)
     cameras = data.cameras
     if any(bool(part.any()) for part in problem.unknowns.cameras):
         cameras = tuple(
@@ -562,11 +566,11 @@ def rig_result(
         rotation=state.rotation,
         center=state.center,
         board_warp=state.board if len(problem.unknowns.shapes) == 2 else None,
-        sources=source_records(work, masks, items),
-        items=items,
+        sources=told.sources,
+        items=told.items,
         flipped=tuple(initial.flipped),
         rms=rms,
-        rms_px=tuple((squared / counts).sqrt().tolist()),
+        rms_px=tuple((told.squared / told.counts).sqrt().tolist()),
         chi2=fit.chi2,
         freedom=fit.freedom,
         variance=widen**2 * fit.variance,

@@ -12,9 +12,10 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.rig.adjustment import LOSS, MOST_WRONG, ROUGHLY, Adjustment, without_wrong
-from kcal.calibrate.rig.blocks import KINDS, Block, FeatureBlock, Kind, LandmarkBlock, PerKind, RigState
-from kcal.calibrate.rig.initial_poses import consensus_pose
+from kcal.calibrate.rig.features import FeatureBlock
 from kcal.calibrate.rig.problem import RigProblem, least
+from kcal.calibrate.rig.resection import consensus_pose
+from kcal.calibrate.rig.source import RigState
 from kcal.calibrate.rig.sources import RigData
 from kcal.calibrate.rig.uncertainty import SharedCovariance, goodness_of_fit
 from kcal.checks import variance_factor
@@ -41,11 +42,7 @@ def refuse_same_camera(data: RigData) -> None:
     """Raise `InputError` if two cameras have the same pixels of everything that both saw."""
     for one in range(len(data.cameras)):
         for other in range(one):
-            pairs = [
-                source.pixels[:, [other, one]].movedim(1, -2).flatten(0, -3)
-                for kind in KINDS
-                if (source := getattr(data, kind)) is not None
-            ]
+            pairs = [source.pixels[:, [other, one]].movedim(1, -2).flatten(0, -3) for source in data.seen]
             # Skylines and measured positions have no pixels in common.
             if not pairs:
                 continue
@@ -95,10 +92,10 @@ def cost_of_features_behind(problem: RigProblem, state: RigState) -> float:
     unknown range alike. This cost tells them apart.
     """
     posed, cost = problem.posed(state), 0.0
-    for block in problem.blocks:
+    for block, own in problem.parts(state):
         if isinstance(block, FeatureBlock):
-            by_inverse_range = block.rows(posed, state, problem.shared_size)[:, block.size - 1]
-            squares = (state.inverse_range.clamp_max(0.0)[:, None] * by_inverse_range).square().sum(-1)
+            by_inverse_range = block.rows(posed, own, problem.shared_size)[:, block.size - 1]
+            squares = (own.items[:, 3:4].clamp_max(0.0) * by_inverse_range).square().sum(-1)
             cost += 0.5 * float(squares.clamp_max(_MOST_BEHIND).sum())
     return cost
 
@@ -115,12 +112,12 @@ def _rightward(data: RigData, state: RigState, left: int, right: int) -> Tensor:
 
 def _features_behind(problem: RigProblem, state: RigState, covariance: SharedCovariance) -> tuple[int, int]:
     """How many features have an inverse range that is negative beyond chance, and how many there are."""
-    for block in problem.blocks:
+    for block, own in problem.parts(state):
         if isinstance(block, FeatureBlock):
             # The last local unknown is the inverse range; what the cameras' errors make of it is added.
-            follow, own = (value[:, -1] for value in problem.response(state, block))
-            variance = covariance.variances(follow) + own[:, -1]
-            return int((state.inverse_range < -_BEHIND_SIGMAS * variance.sqrt()).sum()), len(block)
+            follow, alone = (value[:, -1] for value in problem.response(state, block))
+            variance = covariance.variances(follow) + alone[:, -1]
+            return int((own.items[:, 3] < -_BEHIND_SIGMAS * variance.sqrt()).sum()), len(block)
     return 0, 0
 
 
@@ -134,9 +131,9 @@ def redundancy(problem: RigProblem) -> list[int | None]:
     """
     added = torch.zeros(len(problem.cameras), dtype=torch.long)
     for block in problem.blocks:
-        added += _added(block)
+        added += block.added
     for term in problem.terms:
-        added[list(term.cameras)] += term.count
+        added[list(term.about)] += term.count
     unknown = [
         0 if (turn, shift) == (None, None) else 3 * (turn is not None) + 3 * (shift is not None)
         for turn, shift in zip(problem.turn, problem.shift, strict=True)
@@ -147,20 +144,6 @@ def redundancy(problem: RigProblem) -> list[int | None]:
 def least_redundancy(problem: RigProblem) -> int:
     """The smallest `redundancy` of a camera."""
     return min(count for count in redundancy(problem) if count is not None)
-
-
-def _added(block: Block) -> torch.Tensor:
-    """(C,) residuals that a block's items have more with each camera than without it."""
-    seen = block.seen.sum(-1)
-    by_others = seen.sum(1, keepdim=True) - seen
-    if isinstance(block, LandmarkBlock):
-        return 2 * seen.sum(0)
-    if isinstance(block, FeatureBlock):
-        # What nobody else sees tells a camera nothing; what one other sees has a direction from it.
-        beyond = (block.counts - 2 * seen.sum(1) - block.size)[:, None]
-        before, after = (2 * count + beyond for count in (by_others, by_others + seen))
-        return torch.where(seen > 0, after.clamp_min(0) - before.clamp_min(0), 0).sum(0)
-    return (2 * seen * (by_others > 0)).sum(0)
 
 
 def refuse_exact(problem: RigProblem, names: Sequence[str], freedom: int) -> None:
@@ -174,7 +157,7 @@ def refuse_exact(problem: RigProblem, names: Sequence[str], freedom: int) -> Non
     exact = [name for name, count in zip(names, redundancy(problem), strict=True) if count is not None and count <= 0]
     if not exact and freedom > 0:
         return
-    marks = [block.seen.any(-1).sum(0).tolist() for block in problem.blocks if isinstance(block, LandmarkBlock)]
+    marks = [block.seen.any(-1).sum(0).tolist() for block in problem.blocks if block.surveyed]
     counted = [f"{marks[0][c]} landmarks" for c, name in enumerate(names) if marks and name in exact]
     who = " and ".join(exact) or "the cameras"
     why = f" ({', '.join(counted)}; three fit up to four places)" if counted else ""
@@ -274,7 +257,7 @@ def still_determined(problem: RigProblem, state: RigState) -> list[bool]:
 
 def _term_grams(problem: RigProblem, state: RigState) -> list[Tensor]:
     posed = problem.posed(state)
-    return [rows @ rows.T for rows in (term.rows(posed, problem.shared_size) for term in problem.terms)]
+    return [rows @ rows.T for rows in (term.rows_at(posed, problem.shared_size) for term in problem.terms)]
 
 
 def _parts(work: Adjustment, problem: RigProblem, state: RigState) -> list[_Part]:
@@ -340,7 +323,7 @@ def _what_contradicts(
     how = f"{apart} sigmas explain"
     if term is not None and len(group) == 1:
         without = least(_sum(parts, set(range(len(parts))) - set(group), known))
-        rows = problem.terms[term].rows(problem.posed(state), problem.shared_size)
+        rows = problem.terms[term].rows_at(problem.posed(state), problem.shared_size)
         off = rows[-1] + without.step @ rows[:-1]
         how = problem.terms[term].against(off, (rows[:-1].T @ without.root).square().sum(1).sqrt())
     return (
@@ -364,15 +347,15 @@ TRIAL = LMOptions(max_iterations=40, tolerance=1e-7, residual_floor=1e-8)
 
 
 class _Explanation(NamedTuple):
-    """What is left out, by masks and by indices of terms, what that is called, and the χ² of the rest."""
+    """What takes part, by a mask, what is left out by indices of terms, what is left out by its names, and χ²."""
 
-    masks: PerKind
+    mask: Tensor
     terms: frozenset[int]
     names: tuple[str, ...]
     chi2: float
 
 
-def explained(work: Adjustment, masks: PerKind, solver: LMOptions) -> PerKind:
+def explained(work: Adjustment, mask: Tensor, solver: LMOptions) -> Tensor:
     """As `kcal.calibrate.rig.adjustment.without_wrong`, but other explanations are compared.
 
     A measurement that is wrong can make good items look worse; so it is asked whether fewer are wrong without it. Where
@@ -383,23 +366,23 @@ def explained(work: Adjustment, masks: PerKind, solver: LMOptions) -> PerKind:
             it with; they are named.
     """
     failure: InputError | None = None
-    kept, robust = masks, work.state
+    kept, robust = mask, work.state
     try:
-        kept = without_wrong(work, masks, solver)
+        kept = without_wrong(work, mask, solver)
     except InputError as error:
         failure = error
-    few = decided_by_few(work, masks)
-    gone = _count(masks) - _count(kept)
+    few = decided_by_few(work, mask)
+    gone = int((mask & ~kept).sum())
     if not few and (failure is not None or gone):
-        _refuse_terms(work, masks, None if failure is not None else kept, robust, solver)
+        _refuse_terms(work, mask, None if failure is not None else kept, robust, solver)
     if failure is not None and not few:
         raise failure
-    if not few or (failure is None and not gone and _agree(work, masks)):
+    if not few or (failure is None and not gone and _agree(work, mask)):
         return kept
-    marks = int(masks.landmarks.sum())
+    marks = int(mask[work.at("landmarks")].sum())
     # Nothing stands out, and yet it does not fit: one may be wrong that bends the others towards itself.
     most = max(1, int(MOST_WRONG * marks)) if failure is not None or gone else 1
-    found = _explanations(work, masks, kept, robust, most)
+    found = _explanations(work, mask, kept, robust, most)
     if not found:
         if failure is not None:
             raise failure
@@ -407,7 +390,7 @@ def explained(work: Adjustment, masks: PerKind, solver: LMOptions) -> PerKind:
             return kept
         raise InputError(
             "the landmarks contradict each other, and whichever are left out, the rest does not agree, or too few are "
-            f"left to check it with ({marks} landmarks; worst: {_worst_names(work, masks, kept)}): check names, "
+            f"left to check it with ({marks} landmarks; worst: {_worst_names(work, mask, kept)}): check names, "
             "coordinates and marks, and add landmarks"
         )
     if len(found) > 1:
@@ -420,18 +403,14 @@ def explained(work: Adjustment, masks: PerKind, solver: LMOptions) -> PerKind:
     if best.terms:
         raise InputError(_blamed(best.names, best.chi2))
     work.state = robust
-    work.solve(best.masks, solver)
-    work.fit_corners(best.masks)
-    return best.masks
+    work.solve(best.mask, solver)
+    work.fit_corners(best.mask)
+    return best.mask
 
 
-def _count(masks: PerKind) -> int:
-    return sum(int(mask.sum()) for mask in masks)
-
-
-def _agree(work: Adjustment, masks: PerKind) -> bool:
+def _agree(work: Adjustment, mask: Tensor) -> bool:
     """Whether χ² is no larger than chance explains."""
-    return goodness_of_fit(work.problem(masks), work.part(masks)).variance == 1.0
+    return goodness_of_fit(work.problem(mask), work.part(mask)).variance == 1.0
 
 
 def _blamed(names: tuple[str, ...], chi2: float) -> str:
@@ -441,33 +420,33 @@ def _blamed(names: tuple[str, ...], chi2: float) -> str:
     )
 
 
-def _refuse_terms(work: Adjustment, masks: PerKind, kept: PerKind | None, robust: RigState, solver: LMOptions) -> None:
+def _refuse_terms(work: Adjustment, mask: Tensor, kept: Tensor | None, robust: RigState, solver: LMOptions) -> None:
     """Raise `InputError` if a baseline or position is as likely to be wrong as items that were left out.
 
     Args:
         work: at the solution of what was kept.
-        masks: items that may take part.
+        mask: items that may take part.
         kept: those that agree; None if not a few of them are wrong.
         robust: state to begin with.
         solver: options of the solver.
     """
     ways: list[_Way] = []
     if kept is not None:
-        names = tuple(name for kind in KINDS for name in _gone(work, masks, kept, kind))
+        names = tuple(_gone(work, mask & ~kept))
         ways.append(_way(work, kept, names, len(names)))
-    some = masks if kept is None else kept
+    some = mask if kept is None else kept
     for term, determined in enumerate(still_determined(work.problem(some), work.part(some))):
         if not determined:
             continue
         trial = copy.copy(work)
         trial.state, trial.without = robust, frozenset([term])
         # What it bent towards itself is bent back.
-        trial.solve(masks, ROUGHLY, LOSS)
+        trial.solve(mask, ROUGHLY, LOSS)
         try:
-            others = without_wrong(trial, masks, solver)
+            others = without_wrong(trial, mask, solver)
         except InputError:
             continue
-        ways.append(_way(trial, others, (work.term_labels[term],), 1 + _count(masks) - _count(others)))
+        ways.append(_way(trial, others, (work.term_labels[term],), 1 + int((mask & ~others).sum())))
     fewest = min((way.size for way in ways), default=0)
     ways = sorted((way for way in ways if way.size == fewest), key=lambda way: way.chi2 - way.freedom)
     if not ways:
@@ -496,39 +475,41 @@ class _Way(NamedTuple):
     freedom: int
 
 
-def _way(work: Adjustment, kept: PerKind, names: tuple[str, ...], size: int) -> _Way:
+def _way(work: Adjustment, kept: Tensor, names: tuple[str, ...], size: int) -> _Way:
     fit = goodness_of_fit(work.problem(kept), work.part(kept))
     return _Way(names, size, not work.without, fit.chi2, fit.freedom)
 
 
-def _gone(work: Adjustment, masks: PerKind, kept: PerKind, kind: Kind) -> list[str]:
-    """Names of the items of a kind that were left out."""
-    names = work.names(kind)
-    return [
-        f"{kind.removesuffix('s')} {names[i]}" for i in (getattr(masks, kind) & ~getattr(kept, kind)).nonzero()[:, 0]
-    ]
+def _gone(work: Adjustment, mask: Tensor) -> list[str]:
+    """What the items in the mask are called."""
+    return [work.labels[i] for i in mask.nonzero()[:, 0].tolist()]
 
 
-def _worst_names(work: Adjustment, masks: PerKind, kept: PerKind) -> str:
-    return ", ".join(_gone(work, masks, kept, "landmarks")) or "all of them"
+def _worst_names(work: Adjustment, mask: Tensor, kept: Tensor) -> str:
+    wrong, at = work.none(), work.at("landmarks")
+    wrong[at] = (mask & ~kept)[at]
+    return ", ".join(_gone(work, wrong)) or "all of them"
 
 
-def decided_by_few(work: Adjustment, masks: PerKind) -> bool:
+def decided_by_few(work: Adjustment, mask: Tensor) -> bool:
     """Whether a camera depends on landmarks, and these are few."""
-    return int(masks.landmarks.sum()) <= _FEW and decided_by_landmarks(work, masks)
+    return int(mask[work.at("landmarks")].sum()) <= _FEW and decided_by_landmarks(work, mask)
 
 
-def decided_by_landmarks(work: Adjustment, masks: PerKind) -> bool:
+def decided_by_landmarks(work: Adjustment, mask: Tensor) -> bool:
     """Whether a camera depends on landmarks."""
-    if not bool(masks.landmarks.any()):
+    others, at = mask.clone(), work.at("landmarks")
+    if not bool(mask[at].any()):
         return False
-    rest = work.problem(masks._replace(landmarks=torch.zeros_like(masks.landmarks)))
+    others[at] = False
+    rest = work.problem(others)
     return not rest.blocks or least_redundancy(rest) <= 0
 
 
-def _explanations(work: Adjustment, masks: PerKind, kept: PerKind, robust: RigState, most: int) -> list[_Explanation]:
+def _explanations(work: Adjustment, mask: Tensor, kept: Tensor, robust: RigState, most: int) -> list[_Explanation]:
     """All explanations that are as good as the best, of those that leave out the fewest."""
-    marks = masks.landmarks.nonzero()[:, 0].tolist()
+    at = work.at("landmarks")
+    marks = (at.start + mask[at].nonzero()[:, 0]).tolist()
     things: list[tuple[bool, int]] = [(True, i) for i in marks] + [(False, i) for i in range(len(work.terms))]
     labels = work.term_labels
     for size in range(1, most + 1):
@@ -539,14 +520,15 @@ def _explanations(work: Adjustment, masks: PerKind, kept: PerKind, robust: RigSt
             trial = copy.copy(work)
             trial.state = robust
             trial.without = frozenset(i for landmark, i in chosen if not landmark)
-            some = kept._replace(landmarks=masks.landmarks.clone())
-            some.landmarks[[i for landmark, i in chosen if landmark]] = False
+            some = kept.clone()
+            some[at] = mask[at]
+            some[[i for landmark, i in chosen if landmark]] = False
             if least_redundancy(trial.problem(some)) <= 0:
                 continue
             fit = _solved(trial, some)
             if fit is None:
                 continue
-            names = tuple(f"landmark {work.names('landmarks')[i]}" if landmark else labels[i] for landmark, i in chosen)
+            names = tuple(work.labels[i] if landmark else labels[i] for landmark, i in chosen)
             found.append(_Explanation(some, trial.without, names, fit))
         if found:
             best = min(one.chi2 for one in found)
@@ -554,28 +536,28 @@ def _explanations(work: Adjustment, masks: PerKind, kept: PerKind, robust: RigSt
     return []
 
 
-def _solved(trial: Adjustment, masks: PerKind) -> float | None:
+def _solved(trial: Adjustment, mask: Tensor) -> float | None:
     """The χ² of the best solution from here, or from where landmarks alone put the cameras; None if it is too large."""
-    for state in (trial.state, _resected(trial, masks)):
+    for state in (trial.state, _resected(trial, mask)):
         if state is None:
             continue
         trial.state = state
-        problem, _ = trial.solve(masks, TRIAL)
-        fit = goodness_of_fit(problem, trial.part(masks))
+        problem, _ = trial.solve(mask, TRIAL)
+        fit = goodness_of_fit(problem, trial.part(mask))
         if fit.freedom > 0 and fit.variance == 1.0:
             return fit.chi2
     return None
 
 
-def _resected(work: Adjustment, masks: PerKind) -> RigState | None:
-    """The state with the cameras where most of the landmarks in the masks put them; None if these do not suffice."""
-    marks, state = work.data.landmarks, work.state
+def _resected(work: Adjustment, mask: Tensor) -> RigState | None:
+    """The state with the cameras where most of the landmarks in the mask put them; None if these do not suffice."""
+    marks, state, at = work.data.landmarks, work.state, work.at("landmarks")
     assert marks is not None
     rotation, center = state.rotation.clone(), state.center.clone()
     for c, camera in enumerate(work.data.cameras):
         rays, valid = camera.unproject(marks.pixels[:, c])
-        found = consensus_pose(rays[valid & masks.landmarks], marks.points[valid & masks.landmarks])
+        found = consensus_pose(rays[valid & mask[at]], marks.points[valid & mask[at]])
         if found is None:
             return None
         rotation[c], center[c] = found[0], found[1]
-    return state._replace(rotation=rotation, center=center, points=marks.points)
+    return work.at_survey(state._replace(rotation=rotation, center=center))

@@ -18,7 +18,8 @@ from torch import Tensor
 from kcal.calibrate.problem.poses import poses_under, refine_poses
 from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.views import Views
-from kcal.calibrate.rig.sources import Boards, RigData
+from kcal.calibrate.rig.boards import Boards
+from kcal.calibrate.rig.sources import RigData
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations
 from kcal.errors import FileError, InputError
@@ -234,7 +235,6 @@ def boards_of_several(
 
 # Find the relative pose that pairs of board views agree on, before anything is refined jointly.
 
-MINIMUM_CORNERS = 6
 # A camera that leaves its own boards this far off (pixels) is not the camera that took them; one that is calibrated
 # leaves them less far off, though more than then if they move: by no more than these times, and hardly ever by less px.
 _FOREIGN_RMS, _MISFIT_TIMES, _HARDLY = 5.0, 20.0, 2.0

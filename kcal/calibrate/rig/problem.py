@@ -2,152 +2,20 @@
 
 from __future__ import annotations
 
-import dataclasses
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from kcal.calibrate.problem.state import warp_modes
-from kcal.calibrate.problem.views import free_parameters
-from kcal.calibrate.rig.blocks import LOCAL_SIZE, Block, Kind, PosedCamera, RigState
 from kcal.calibrate.rig.motion import CameraRows, summed_products
-from kcal.calibrate.rig.sources import SkylineSource
-from kcal.errors import InputError
+from kcal.calibrate.rig.source import LOCAL_SIZE, Block, Measurement, PosedCamera, RigState
+from kcal.calibrate.rig.unknowns import SharedUnknowns
 from kcal.gaussian import inverse_root
 from kcal.lens.camera import Camera
-from kcal.lens.pose import nearest_rotation, rotation_from_vector, vector_from_rotation
-from kcal.lens.rig import check_refraction
+from kcal.lens.pose import nearest_rotation, rotation_from_vector
 from kcal.solve.problem import RobustLoss, State
 from kcal.solve.schur import EliminatedItems, PartlyEliminated, SchurLinearization
-
-# What a rig's adjustment may change of its cameras, its board and the air: linear functions of a few unknowns.
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class SharedUnknowns:
-    """Unknowns y (K,): parameters of camera c change with them by cameras[c] y, the board by shapes · (board y).
-
-    Args:
-        cameras: (5 + P, K) of each.
-        shapes: (B, 3, N) displacements of the board's corners, meters.
-        board: (B, K).
-        begin: (K,) what they are for cameras and board as given.
-        known: (K,) whether an unknown is a standard normal beforehand; nothing is known of the others.
-        labels: (K,) names of those that have one.
-        refraction: coefficient of refraction of light for the unknowns as they begin.
-        by_refraction: (K,) of it by each unknown; None: it is held.
-        by_effects: (E, K) amount of each `Effect` of stars, then landmarks, and then features, by each unknown; None:
-            there are none.
-    """
-
-    cameras: tuple[Tensor, ...]
-    shapes: Tensor
-    board: Tensor
-    begin: Tensor
-    known: Tensor
-    labels: tuple[str, ...]
-    refraction: float = 0.0
-    by_refraction: Tensor | None = None
-    by_effects: Tensor | None = None
-
-    @property
-    def refine_lenses(self) -> bool:
-        """Whether lenses or board may change within what is known of them."""
-        return bool(torch.cat([*self.cameras, self.board])[:, self.known].any())
-
-    def __len__(self) -> int:
-        """How many unknowns there are."""
-        return len(self.known)
-
-    def and_warp(self, board_points: Tensor) -> SharedUnknowns:
-        """These, and two parabolas by which the board bends."""
-        shapes = warp_modes(board_points)
-        board = torch.cat([torch.zeros(2, len(self), dtype=torch.float64), torch.eye(2, dtype=torch.float64)], 1)
-        more = self._and("the board's warp along its rows", "the board's warp along its columns", known=False)
-        return dataclasses.replace(more, shapes=shapes, board=board)
-
-    def and_refraction(self, refraction: float, sigma: float) -> SharedUnknowns:
-        """These, and the coefficient of refraction with its standard deviation; with none, it is held."""
-        check_refraction(refraction, sigma)
-        if not sigma:
-            return dataclasses.replace(self, refraction=refraction)
-        more = self._and("the coefficient of refraction", known=True)
-        slope = torch.zeros(len(more), dtype=torch.float64)
-        slope[-1] = sigma
-        return dataclasses.replace(more, refraction=refraction, by_refraction=slope)
-
-    def and_effects(self, *names: str) -> SharedUnknowns:
-        """These, and amounts of what shifts stars, landmarks or features together, in standard deviations."""
-        more = self._and(*names, known=True)
-        count = len(names)
-        select = torch.zeros(count, len(more), dtype=torch.float64)
-        select[:, len(more) - count :] = torch.eye(count, dtype=torch.float64)
-        return dataclasses.replace(more, by_effects=select)
-
-    def _and(self, *labels: str, known: bool) -> SharedUnknowns:
-        """These, and more that change nothing yet."""
-
-        def wider(part: Tensor) -> Tensor:
-            return torch.nn.functional.pad(part, (0, len(labels)))
-
-        return SharedUnknowns(
-            cameras=tuple(map(wider, self.cameras)),
-            shapes=self.shapes,
-            board=wider(self.board),
-            begin=wider(self.begin),
-            known=torch.cat([self.known, torch.full((len(labels),), known)]),
-            labels=(*self.labels, *labels),
-            refraction=self.refraction,
-            by_refraction=None if self.by_refraction is None else wider(self.by_refraction),
-            by_effects=None if self.by_effects is None else wider(self.by_effects),
-        )
-
-
-def held(cameras: Sequence[Camera]) -> SharedUnknowns:
-    """Nothing: cameras and board are as they are, and light is straight."""
-    return SharedUnknowns(
-        cameras=tuple(torch.zeros(camera.params.shape[-1], 0, dtype=torch.float64) for camera in cameras),
-        shapes=torch.zeros(0, 3, 0, dtype=torch.float64),
-        board=torch.zeros(0, 0, dtype=torch.float64),
-        begin=torch.zeros(0, dtype=torch.float64),
-        known=torch.zeros(0, dtype=torch.bool),
-        labels=(),
-    )
-
-
-def free(cameras: Sequence[Camera], names: Sequence[str]) -> SharedUnknowns:
-    """All parameters of all cameras; nothing is known of them.
-
-    Raises:
-        InputError: hybrid cameras, whose parameters have meaning only with what their calibrations know.
-    """
-    if any(camera.model.hybrid for camera in cameras):
-        raise InputError(
-            "hybrid cameras cannot be refined without what their own calibrations know: hold them, take what their "
-            "calibrations know as prior, or calibrate parametric cameras"
-        )
-    chosen = [free_parameters(camera.model) for camera in cameras]
-    count = sum(len(own) for own in chosen)
-    maps, labels, end = [], [], 0
-    for camera, own, name in zip(cameras, chosen, names, strict=True):
-        part = torch.zeros(len(camera.names), count, dtype=torch.float64)
-        for column, index in enumerate(own, start=end):
-            part[index, column] = 1.0
-            labels.append(f"{camera.names[index]} of {name}")
-        end += len(own)
-        maps.append(part)
-    return dataclasses.replace(
-        held(cameras),
-        cameras=tuple(maps),
-        board=torch.zeros(0, count, dtype=torch.float64),
-        begin=torch.zeros(count, dtype=torch.float64),
-        known=torch.zeros(count, dtype=torch.bool),
-        labels=tuple(labels),
-    )
-
 
 # The least-squares problem of a rig: cameras that move or are held, what they see, and what was measured besides.
 #
@@ -156,85 +24,6 @@ def free(cameras: Sequence[Camera], names: Sequence[str]) -> SharedUnknowns:
 
 # Share of a residual that the others must leave open for an item to be tested by them; less is rounding.
 _LEAST_LEFT = 1e-9
-
-
-class SharedTerm(ABC):
-    """Residuals of the cameras alone, in units of their standard deviations.
-
-    Attributes:
-        cameras: the indices of those that it is about.
-        count: of residuals.
-    """
-
-    cameras: tuple[int, ...]
-    count: int
-
-    @abstractmethod
-    def rows(self, cameras: Sequence[PosedCamera], shared_size: int) -> Tensor:
-        """(S + 1, Q): derivatives of Q residuals by the shared unknowns, and last these."""
-
-    @abstractmethod
-    def against(self, off: Tensor, sigma: Tensor) -> str:
-        """What was stated, and what a solution without it says, in words.
-
-        Args:
-            off: (Q,) its residuals in that solution.
-            sigma: (Q,) their standard deviations there; both in units of the stated ones.
-        """
-
-
-class DistanceTerm(SharedTerm):
-    """A measured distance between two centers."""
-
-    def __init__(self, first: int, second: int, length: float, sigma: float) -> None:
-        self.cameras, self.count = (first, second), 1
-        self._pair, self._length, self._sigma = (first, second), length, sigma
-
-    def rows(self, cameras: Sequence[PosedCamera], shared_size: int) -> Tensor:
-        """See `SharedTerm.rows`."""
-        apart = cameras[self._pair[1]].center - cameras[self._pair[0]].center
-        length = torch.linalg.vector_norm(apart)
-        out = apart.new_zeros((shared_size + 1, 1))
-        for sign, number in zip((-1.0, 1.0), self._pair, strict=True):
-            shift = cameras[number].shift
-            if shift is not None:
-                out[shift, 0] = sign * apart / (length * self._sigma)
-        out[-1, 0] = (length - self._length) / self._sigma
-        return out
-
-    def against(self, off: Tensor, sigma: Tensor) -> str:
-        """See `SharedTerm.against`."""
-        found, spread = self._length + self._sigma * float(off[0]), self._sigma * float(sigma[0])
-        return (
-            f"{self._length:.6g} ± {self._sigma:.2g} m was stated, and without it the cameras are {found:.6g} ± "
-            f"{spread:.2g} m apart"
-        )
-
-
-class PlaceTerm(SharedTerm):
-    """A measured center, with a (3,) sigma along the axes."""
-
-    def __init__(self, camera: int, point: Tensor, sigma: Tensor) -> None:
-        self.cameras, self.count = (camera,), 3
-        self._camera, self._point, self._sigma = camera, point, sigma
-
-    def rows(self, cameras: Sequence[PosedCamera], shared_size: int) -> Tensor:
-        """See `SharedTerm.rows`."""
-        posed = cameras[self._camera]
-        out = self._point.new_zeros((shared_size + 1, 3))
-        if posed.shift is not None:
-            out[posed.shift] = torch.diag(1.0 / self._sigma)
-        out[-1] = (posed.center - self._point) / self._sigma
-        return out
-
-    def against(self, off: Tensor, sigma: Tensor) -> str:
-        """See `SharedTerm.against`."""
-        away, spread = off * self._sigma, float((sigma * self._sigma).norm())
-        east, north, up = away.tolist()
-        return (
-            f"without it the camera stands {float(away.norm()):.3g} ± {spread:.2g} m from where it was measured "
-            f"({east:+.3g} m east, {north:+.3g} m north, {up:+.3g} m up)"
-        )
 
 
 class RigProblem:
@@ -256,7 +45,7 @@ class RigProblem:
         self,
         cameras: Sequence[Camera],
         blocks: Sequence[Block],
-        terms: Sequence[SharedTerm],
+        terms: Sequence[Measurement],
         unknowns: SharedUnknowns,
         turning: Sequence[bool],
         moving: Sequence[bool],
@@ -265,7 +54,7 @@ class RigProblem:
         self.cameras, self.blocks, self.unknowns, self.loss = tuple(cameras), tuple(blocks), unknowns, loss
         self.terms = tuple(terms)
         # Of some marks, derivatives cost little more than the pixels themselves.
-        self.joint = all(block.kind != "boards" for block in self.blocks)
+        self.joint = not any(block.many for block in self.blocks)
         self.turn: list[slice | None] = []
         self.shift: list[slice | None] = []
         end = len(unknowns)
@@ -288,12 +77,22 @@ class RigProblem:
     def item_squares(self, state: RigState) -> list[Tensor]:
         """For each block (V,) the sum of squared residuals of each item."""
         posed = self.posed(state)
-        return [block.residuals(posed, state).square().sum(-1) for block in self.blocks]
+        return [block.residuals(posed, own).square().sum(-1) for block, own in self.parts(state)]
+
+    def parts(self, state: RigState) -> list[tuple[Block, RigState]]:
+        """Each block, and the state with its items alone."""
+        items = state.items.split([len(block) for block in self.blocks])
+        return [(block, state._replace(items=own)) for block, own in zip(self.blocks, items, strict=True)]
+
+    def squares_px(self, state: RigState) -> list[tuple[Tensor, Tensor]]:
+        """For each block (V, C) squared distances between projected and seen marks, px², and how many marks."""
+        posed = self.posed(state)
+        return [(block.errors(posed, own).square().sum((2, 3)), block.seen.sum(-1)) for block, own in self.parts(state)]
 
     def term_rows(self, state: RigState) -> Tensor:
         """(S + 1, Q) of what was measured of the cameras besides, and of what is known of lenses, board and air."""
         posed = self.posed(state)
-        return torch.cat([self.prior_rows(state), *(term.rows(posed, self.shared_size) for term in self.terms)], -1)
+        return torch.cat([self.prior_rows(state), *(term.rows_at(posed, self.shared_size) for term in self.terms)], -1)
 
     def prior_rows(self, state: RigState) -> Tensor:
         """(S + 1, Q) of what is known beforehand of lenses, board and air."""
@@ -331,7 +130,7 @@ class RigProblem:
         grams = [self._gram(block, parts) for block, parts in zip(self.blocks, found, strict=True)]
         total, falls = terms @ terms.T + sum(grams, torch.zeros(())), []
         for block, parts, own in zip(self.blocks, found, squares, strict=True):
-            if block.kind == "boards":
+            if block.many:
                 each = (self._gram(block, _of_item(parts, i)) for i in range(len(block)))
                 others = torch.stack([_others_fall(total, gram) for gram in each])
             else:
@@ -352,13 +151,14 @@ class RigProblem:
         Returns:
             (V, L, S) and (V, L, L).
         """
-        return EliminatedItems(block.rows(self.posed(state), state, self.shared_size), block.size).response()
+        own = next(own for one, own in self.parts(state) if one is block)
+        return EliminatedItems(block.rows(self.posed(state), own, self.shared_size), block.size).response()
 
     def _rows(self, state: RigState) -> tuple[list[list[CameraRows]], list[Tensor]]:
         """`Block.camera_rows` of all blocks with the loss's weights, and `item_squares`."""
         posed, found, squares = self.posed(state), list[list[CameraRows]](), list[Tensor]()
-        for block in self.blocks:
-            parts = list(block.camera_rows(posed, state))
+        for block, own in self.parts(state):
+            parts = list(block.camera_rows(posed, own))
             square = state.center.new_zeros(len(block))
             for part in parts:
                 square = square + part.rows[:, -1].square().sum(-1)
@@ -372,7 +172,7 @@ class RigProblem:
 
     def _gram(self, block: Block, parts: Sequence[CameraRows]) -> Tensor:
         """(S + 1, S + 1) products of rows, summed over the items, without what the items' own unknowns can do."""
-        if block.kind == "features":
+        if block.by_rows:
             return EliminatedItems(block.joined(parts, self.shared_size), block.size).gram
         return summed_products(parts, block.size, self.shared_size).off(block.size).total
 
@@ -384,7 +184,7 @@ class RigProblem:
         local, right = [total.new_zeros(0, LOCAL_SIZE, LOCAL_SIZE)], [total.new_zeros(0, LOCAL_SIZE, len(total))]
         matched: tuple[EliminatedItems, int] | None = None
         for block, parts in zip(self.blocks, found, strict=True):
-            if block.kind == "features":
+            if block.by_rows:
                 own = EliminatedItems(block.joined(parts, self.shared_size), block.size)
                 matched, total = (own, sum(map(len, local))), total + own.gram
                 continue
@@ -428,9 +228,12 @@ class RigProblem:
             rotation=rotation_from_vector(turns) @ state.rotation,
             center=state.center + shifts,
         )
-        for block, part in zip(self.blocks, local.split([len(block) for block in self.blocks]), strict=True):
-            state = block.retract(state, part[:, LOCAL_SIZE - block.size :])
-        return state
+        steps = local.split([len(block) for block in self.blocks])
+        moved = [
+            block.moved(own.items, step[:, LOCAL_SIZE - block.size :])
+            for (block, own), step in zip(self.parts(state), steps, strict=True)
+        ]
+        return state._replace(items=torch.cat([state.items[:0], *moved]))
 
     @staticmethod
     def tidy(state: State) -> RigState:
@@ -467,43 +270,6 @@ def _few_others_fall(total: Tensor, rows: Tensor) -> Tensor:
     testable = values[:, -1] < 1.0 - _LEAST_LEFT
     fall = (along.square() * values / (1.0 - values).clamp_min(_LEAST_LEFT)).sum(-1)
     return torch.where(testable, fall, 0.0)
-
-
-# The skylines of a rig as a term of its adjustment.
-
-
-class SkylineTerm(SharedTerm):
-    """The skylines of all images, as residuals of attitudes, centers and lenses."""
-
-    def __init__(self, source: SkylineSource) -> None:
-        self.cameras, self.count = tuple(sorted(set(source.cameras))), len(source.residual)
-        self._source = source
-        count = len(source.rotation)
-        sizes = [3] * (2 * count) + [len(one) for one in source.parameters]
-        parts = source.rows.split(sizes, 1)
-        self._turn, self._center, self._lens = parts[:count], parts[count : 2 * count], parts[2 * count :]
-
-    def rows(self, cameras: Sequence[PosedCamera], shared_size: int) -> Tensor:
-        """See `SharedTerm.rows`."""
-        out = self._source.residual.new_zeros((shared_size + 1, self.count))
-        out[-1] = self._source.residual
-        for c in self.cameras:
-            posed, source = cameras[c], self._source
-            turn, center, lens = self._turn[c], self._center[c], self._lens[c]
-            out[-1] += turn @ vector_from_rotation(posed.rotation @ source.rotation[c].T)
-            out[-1] += center @ (posed.center - source.center[c]) + lens @ (posed.parameters - source.parameters[c])
-            known = posed.by_unknown.shape[1]
-            out[:known] += (lens @ posed.by_unknown).T
-            if posed.turn is not None:
-                out[posed.turn] += turn.T
-            if posed.shift is not None:
-                out[posed.shift] += center.T
-        return out
-
-    def against(self, off: Tensor, sigma: Tensor) -> str:
-        """See `SharedTerm.against`."""
-        times = float((off.square() / (1.0 + sigma.square())).mean().sqrt())
-        return f"without it the cameras look elsewhere than their skylines say, by {times:.1f} times its sigmas"
 
 
 # How well each source of a rig fits itself: what its items leave over where nothing else is known of the cameras.
@@ -550,15 +316,13 @@ class OwnFit(NamedTuple):
     freedom: int
 
 
-def own_fits(problem: RigProblem, state: RigState) -> dict[Kind, OwnFit]:
-    """The fit of each source of items alone, with what is known beforehand, from their rows at a solution of all.
-
-    Boards have none: their corners' noise is estimated as it is.
-    """
-    prior, found = problem.prior_rows(state), dict[Kind, OwnFit]()
+def own_fits(problem: RigProblem, state: RigState) -> dict[str, OwnFit]:
+    """The fit of each kind of items alone, with what is known beforehand, from their rows at a solution of all."""
+    prior, found = problem.prior_rows(state), dict[str, OwnFit]()
     known = prior @ prior.T
     for block, gram in zip(problem.blocks, problem.block_grams(state), strict=True):
-        if block.kind != "boards":
+        # The noise of boards' corners is estimated as it is.
+        if not block.many:
             alone = least(gram + known)
             rows = int((block.counts - block.size).sum()) + prior.shape[1]
             found[block.kind] = OwnFit(alone.chi2, rows - alone.rank)

@@ -6,19 +6,19 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.adjustment import Adjustment, over_limit
-from kcal.calibrate.rig.blocks import KINDS, Kind, PerKind, RigState
+from kcal.calibrate.rig.adjustment import Adjustment, all_of
 from kcal.calibrate.rig.initial_poses import TurnedBoard
 from kcal.calibrate.rig.problem import RigProblem
+from kcal.calibrate.rig.source import RigState
 from kcal.calibrate.rig.sources import RigData
 from kcal.calibrate.rig.uncertainty import SharedCovariance, mounting_rows, parameter_rows, relative_rows
 from kcal.io.rig_file import save_rig
-from kcal.lens.calibration import Exclusion, RigCalibration, RigSource
+from kcal.lens.calibration import Exclusion, ItemResidual, RigCalibration, RigSource
 from kcal.lens.camera import Camera
 from kcal.lens.rig import CameraRig, CameraRigCalibration, Origin, RigCovariance, StereoRig
 from kcal.solve.lm import LMOptions
@@ -26,41 +26,6 @@ from kcal.solve.problem import SolverStatus
 from kcal.texts import brief
 
 # The result of solving a rig: cameras, residuals by source and by item, what was left out and why, covariances.
-
-Source = Literal["boards", "landmarks", "features", "stars", "skyline", "baselines", "positions"]
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ItemResidual:
-    """One thing that was seen or measured, and how well it agrees with the rest.
-
-    Args:
-        source: which kind it is.
-        name: its name.
-        pixels: RMS distance in px in each camera, of what was left out from where the others put it; None where a
-            camera did not see it.
-        meters: of a landmark between survey and adjusted position, of a measured position between measured and solved,
-            of a baseline its error; None for the others.
-        sigmas: root of χ² over its degrees of freedom, by the stated sigmas; 1 is typical.
-        over_limit: by how much χ² falls without it, over the most that noise and lenses explain
-            (`kcal.calibrate.rig.adjustment`): above 1, it contradicts the rest. 0 for baselines and positions.
-        used: whether it is part of the solution.
-        reason: why it was left out.
-    """
-
-    source: Source
-    name: str
-    pixels: tuple[float | None, ...] = ()
-    meters: float | None = None
-    sigmas: float
-    over_limit: float = 0.0
-    used: bool = True
-    reason: str = ""
-
-    @property
-    def label(self) -> str:
-        """Kind and name: `landmark post 4`."""
-        return f"{self.source.removesuffix('s')} {self.name}"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -119,7 +84,7 @@ class RigResult:
     _problem: RigProblem
     _state: RigState
     _covariance: SharedCovariance
-    _places: dict[Source, dict[str, Tensor]]
+    _places: dict[str, dict[str, Tensor]]
     _provenance: dict[str, Any]
 
     @property
@@ -248,7 +213,7 @@ class RigResult:
         """Write the rig of the first two cameras as `stereo` gives it; see `kcal.save_rig`."""
         return save_rig(self.stereo(), path)
 
-    def places(self) -> dict[Source, dict[str, Tensor]]:
+    def places(self) -> dict[str, dict[str, Tensor]]:
         """Where boards (their middle), landmarks and features are: (3,) meters in the local frame, by name.
 
         Features as far away as their inverse range says, at most 100 km.
@@ -297,179 +262,144 @@ class RigResult:
 
 # Report a solved rig: residuals of every item and of every source, in pixels, meters and sigmas.
 
-# Reasons for leaving items out, by their indices.
-Reasons = Mapping[Kind, Mapping[int, str]]
-# Fewest marks of an item whose residuals say anything about it.
-_MARKS: Mapping[Kind, int] = {"boards": 4, "landmarks": 1, "features": 2, "stars": 1}
-# 1/m: features are drawn no farther away than 100 km.
-_LEAST_INVERSE_RANGE = 1e-5
+# Reasons for leaving items out, by their places among all.
+Reasons = Mapping[int, str]
 
 
-def item_records(work: Adjustment, masks: PerKind, reasons: Reasons) -> tuple[ItemResidual, ...]:
-    """One record for each board, landmark, feature, baseline and position.
+class Records(NamedTuple):
+    """What is told of the residuals of a solved rig.
+
+    Attributes:
+        items: one record for each thing that was seen or measured.
+        sources: one for each source.
+        squared: (C,) squares of the residuals in each image, px².
+        counts: (C,) how many marks, or columns of a skyline, these are.
+    """
+
+    items: tuple[ItemResidual, ...]
+    sources: tuple[RigSource, ...]
+    squared: Tensor
+    counts: Tensor
+
+
+def records(work: Adjustment, mask: Tensor, reasons: Reasons) -> Records:
+    """One record for each item and measurement, and one for each source.
 
     What was left out is compared with where the others put it: a landmark at its surveyed place, a board or feature at
     the place that suits it best.
+
+    Args:
+        work: at the solution of the items in the mask.
+        mask: the items that take part.
+        reasons: why others could not take part, where that is known.
     """
-    items: list[ItemResidual] = []
-    outside = PerKind(*(~mask & _marked(work, kind, mask) for kind, mask in zip(KINDS, masks, strict=True)))
-    if any(bool(mask.any()) for mask in outside):
+    items = list[ItemResidual]()
+    telling = [source.marked.flatten(1).sum(-1) >= source.told_by for source, _ in work.sources]
+    outside = ~mask & all_of(telling, mask[:0])
+    if bool(outside.any()):
         work.solve(outside, LMOptions(residual_floor=1e-8), held=True)
-    for used, chosen in ((True, masks), (False, outside)):
-        squares, freedom, pixels = work.squares(chosen), work.freedom(chosen), _rms_by_camera(work, chosen, used)
-        over = over_limit(work, chosen, work.deletions(chosen)) if used else over_limit(work, chosen, squares, 0.999)
-        for k, kind in enumerate(KINDS):
-            times = work.widened[kind]
-            for i in chosen[k].nonzero()[:, 0].tolist():
-                sigmas = times * math.sqrt(float(squares[k][i]) / max(int(freedom[k][i]), 1))
-                why = (
-                    ""
-                    if used
-                    else reasons[kind].get(i) or _contradiction(work, kind, pixels[kind][i], sigmas, float(over[k][i]))
-                )
-                items.append(
-                    ItemResidual(
-                        source=kind,
-                        name=work.names(kind)[i],
-                        pixels=pixels[kind][i],
-                        meters=_off_survey(work, i) if kind == "landmarks" else None,
-                        sigmas=sigmas,
-                        over_limit=float(over[k][i]),
-                        used=used,
-                        reason=why,
-                    )
-                )
-    for kind, mask, marked in zip(KINDS, masks, outside, strict=True):
-        for i in (~mask & ~marked).nonzero()[:, 0].tolist():
-            name, why = work.names(kind)[i], reasons[kind][i]
+    square, freedom = work.squares(mask), work.freedom(mask)
+    squared, count = work.squares_px(mask, work.state)
+    over = work.over_limit(mask, work.deletions(mask))
+    items += _item_records(work, mask, (square, freedom, squared, count, over), reasons, used=True)
+    if bool(outside.any()):
+        gone = work.squares(outside)
+        fit = gone, work.freedom(outside), *work.squares_px(outside, work.at_survey(work.state))
+        items += _item_records(work, outside, (*fit, work.over_limit(outside, gone, 0.999)), reasons, used=False)
+    for source, at in work.sources:
+        for i in (~mask & ~outside)[at].nonzero()[:, 0].tolist():
+            name, why = source.names[i], reasons[at.start + i]
             items.append(
-                ItemResidual(source=kind, name=name, sigmas=math.inf, over_limit=math.inf, used=False, reason=why)
+                ItemResidual(
+                    source=source.kind, name=name, sigmas=math.inf, over_limit=math.inf, used=False, reason=why
+                )
             )
-    items += _measurement_records(work)
-    order = list(get_args(Source))
-    return tuple(sorted(items, key=lambda item: (order.index(item.source), not item.used)))
+    items += [item for term in work.terms for item in term.told(work.state.center, work.data.names)]
+    order = list(dict.fromkeys(source.kind for source in work.data.sources))
+    items.sort(key=lambda item: (order.index(item.source), not item.used))
+    sources = list[RigSource]()
+    for source, at in work.sources:
+        dof, times = int(freedom[at].sum()), work.widened[source.kind]
+        sigmas = times * math.sqrt(float(square[at].nansum()) / dof) if dof > 0 else None
+        sources += _source_record(source.kind, items, squared[at].sum(0), count[at].sum(0), sigmas)
+    squared, count = squared.sum(0), count.sum(0)
+    for kind in dict.fromkeys(term.kind for term in work.terms):
+        pixels = [found for term in work.terms if term.kind == kind and (found := term.squares_px()) is not None]
+        own = [torch.stack(values).sum(0) for values in zip(*pixels, strict=True)] or [torch.zeros(len(count))] * 2
+        sigmas = _root_mean_square([item.sigmas for item in items if item.source == kind])
+        sources += _source_record(kind, items, own[0], own[1], sigmas)
+        squared, count = squared + own[0], count + own[1]
+    return Records(tuple(items), tuple(sources), squared, count)
 
 
-def source_records(work: Adjustment, masks: PerKind, items: Sequence[ItemResidual]) -> tuple[RigSource, ...]:
-    """Each source that there is."""
-    squares, freedom, found = work.squares(masks), work.freedom(masks), list[RigSource]()
-    problem, state = work.problem(masks), work.part(masks)
-    rms_px: dict[Source, float] = {
-        block.kind: math.sqrt(float(block.errors(problem.posed(state), state).square().sum()) / int(block.seen.sum()))
-        for block in problem.blocks
-    }
-    skyline = work.data.skyline
-    if skyline is not None:
-        squares_px = [many * px**2 for many, px in zip(skyline.columns, skyline.rms_px, strict=True)]
-        rms_px["skyline"] = math.sqrt(sum(squares_px) / sum(skyline.columns))
-    for source in get_args(Source):
-        own = [item for item in items if item.source == source]
-        if not own:
-            continue
-        sigmas: float | None = _root_mean_square([item.sigmas for item in own])
-        if source in KINDS:
-            k = KINDS.index(source)
-            total, dof = float(squares[k].nansum()), int(freedom[k].sum())
-            sigmas = work.widened[KINDS[k]] * math.sqrt(total / dof) if dof > 0 else None
-        meters = [item.meters for item in own if item.used and item.meters is not None]
-        found.append(
-            RigSource(
-                name=source,
-                used=sum(item.used for item in own),
-                left_out=sum(not item.used for item in own),
-                rms_px=rms_px.get(source),
-                rms_m=_root_mean_square(meters) if meters else None,
-                sigmas=sigmas,
+def _item_records(
+    work: Adjustment, mask: Tensor, fit: tuple[Tensor, ...], reasons: Reasons, *, used: bool
+) -> list[ItemResidual]:
+    """Records of the items in the mask.
+
+    Args:
+        work: with their state.
+        mask: which.
+        fit: χ² (V,) of all items, their degrees of freedom (V,), squares of the distances of their marks (V, C), how
+            many marks (V, C), and how far they are over their limits (V,).
+        reasons: see `records`.
+        used: whether they take part.
+    """
+    square, freedom, squared, count, over = fit
+    rms, found = (squared / count.clamp_min(1)).sqrt().nan_to_num(math.inf).tolist(), list[ItemResidual]()
+    marks, limits = count.tolist(), over.tolist()
+    for source, at in work.sources:
+        meters = source.meters(work.state.items[at])
+        for i in mask[at].nonzero()[:, 0].tolist():
+            k = at.start + i
+            sigmas = work.widened[source.kind] * math.sqrt(float(square[k]) / max(int(freedom[k]), 1))
+            pixels = tuple(px if n else None for px, n in zip(rms[k], marks[k], strict=True))
+            seen = [(px, name) for px, name in zip(pixels, work.data.names, strict=True) if px is not None]
+            off = ", ".join(
+                f"{px:.2g} px in {name}" if math.isfinite(px) else f"not seen by {name}" for px, name in seen
             )
+            why = "" if used else reasons.get(k) or source.doubt(off, sigmas, limits[k])
+            found.append(
+                ItemResidual(
+                    source=source.kind,
+                    name=source.names[i],
+                    pixels=pixels,
+                    meters=None if meters is None else float(meters[i]),
+                    sigmas=sigmas,
+                    over_limit=limits[k],
+                    used=used,
+                    reason=why,
+                )
+            )
+    return found
+
+
+def _source_record(
+    kind: str, items: Sequence[ItemResidual], squared: Tensor, count: Tensor, sigmas: float | None
+) -> list[RigSource]:
+    """The record of a source, if it has items, from the squares (C,) of its residuals in each image and how many."""
+    own = [item for item in items if item.source == kind]
+    if not own:
+        return []
+    meters = [item.meters for item in own if item.used and item.meters is not None]
+    marks = int(count.sum())
+    return [
+        RigSource(
+            name=kind,
+            used=sum(item.used for item in own),
+            left_out=sum(not item.used for item in own),
+            rms_px=math.sqrt(float(squared.sum()) / marks) if marks else None,
+            rms_m=_root_mean_square(meters) if meters else None,
+            sigmas=sigmas,
         )
-    return tuple(found)
+    ]
 
 
 def _root_mean_square(values: Sequence[float]) -> float:
     return math.sqrt(sum(value**2 for value in values) / len(values))
 
 
-def _marked(work: Adjustment, kind: Kind, mask: Tensor) -> Tensor:
-    source = getattr(work.data, kind)
-    if source is None:
-        return mask.clone()
-    return torch.isfinite(source.pixels).all(-1).flatten(1).sum(-1) >= _MARKS[kind]
-
-
-def _rms_by_camera(work: Adjustment, masks: PerKind, used: bool) -> dict[Kind, dict[int, tuple[float | None, ...]]]:
-    """RMS distance in pixels of each item in each camera; of landmarks that are not used, from their surveyed place."""
-    problem, state = work.problem(masks), work.part(masks)
-    if not used and work.data.landmarks is not None:
-        state = state._replace(points=work.data.landmarks.points[masks.landmarks])
-    found: dict[Kind, dict[int, tuple[float | None, ...]]] = {}
-    for block in problem.blocks:
-        squared, count = block.errors(problem.posed(state), state).square().sum((2, 3)), block.seen.sum(-1)
-        rms = (squared / count.clamp_min(1)).sqrt().nan_to_num(math.inf)
-        rows = [
-            tuple(value if n else None for value, n in zip(values, ns, strict=True))
-            for values, ns in zip(rms.tolist(), count.tolist(), strict=True)
-        ]
-        found[block.kind] = dict(zip(getattr(masks, block.kind).nonzero()[:, 0].tolist(), rows, strict=True))
-    return found
-
-
-def _off_survey(work: Adjustment, index: int) -> float:
-    assert work.data.landmarks is not None
-    return float(torch.linalg.vector_norm(work.state.points[index] - work.data.landmarks.points[index]))
-
-
-def _contradiction(work: Adjustment, kind: Kind, pixels: Sequence[float | None], sigmas: float, over: float) -> str:
-    seen = [(value, name) for value, name in zip(pixels, work.data.names, strict=True) if value is not None]
-    text = ", ".join(
-        f"{value:.2g} px in {name}" if math.isfinite(value) else f"not seen by {name}" for value, name in seen
-    )
-    if kind == "landmarks":
-        return f"its marks are off the surveyed place by {text} ({sigmas:.0f} sigma): a wrong mark or survey"
-    if kind == "features":
-        return f"its marks do not meet: off by {text} ({sigmas:.0f} sigma): not the same thing, or it moved"
-    if kind == "stars":
-        return f"off by {text} ({sigmas:.0f} sigma): not that star, or an aircraft or satellite"
-    why = "it moved between the views, or a lens differs from its model"
-    # A board of many corners is wrong at few sigmas. One that is within its own limit was left out because the others
-    # fit better without it (`outliers.without_wrong`).
-    if over > 1.0:
-        most = f"{sigmas:.2f} sigma on average, where so many corners allow {sigmas / math.sqrt(over):.2f}"
-        return f"it does not fit the other boards: off by {text} ({most}): {why}"
-    return (
-        "it does not fit the other boards: with it, these fit worse than chance explains, though it is off by only "
-        f"{text} ({sigmas:.2f} sigma on average): {why}"
-    )
-
-
-def _measurement_records(work: Adjustment) -> list[ItemResidual]:
-    data, center, out = work.data, work.state.center, []
-    for b in data.baselines:
-        error = float(torch.linalg.vector_norm(center[b.first] - center[b.second])) - b.length
-        name = f"{data.names[b.first]} to {data.names[b.second]}"
-        out.append(ItemResidual(source="baselines", name=name, meters=error, sigmas=abs(error) / b.sigma))
-    if data.skyline is not None:
-        own = zip(data.skyline.names, data.skyline.cameras, data.skyline.rms_px, data.skyline.sigmas, strict=True)
-        for name, camera, rms, sigmas in own:
-            pixels = tuple(rms if c == camera else None for c in range(len(data.cameras)))
-            out.append(ItemResidual(source="skyline", name=name, pixels=pixels, sigmas=sigmas))
-    for p in data.positions:
-        off = center[p.camera] - p.point
-        sigmas = math.sqrt(float((off / p.sigma).square().mean()))
-        meters = float(torch.linalg.vector_norm(off))
-        out.append(ItemResidual(source="positions", name=data.names[p.camera], meters=meters, sigmas=sigmas))
-    return out
-
-
-def places(work: Adjustment) -> dict[Source, dict[str, Tensor]]:
+def places(work: Adjustment) -> dict[str, dict[str, Tensor]]:
     """Positions (3,) of boards (their middle), landmarks and features in the local frame, by name."""
-    data, state, found = work.data, work.state, dict[Source, dict[str, Tensor]]()
-    if data.boards is not None:
-        middle = data.boards.points.mean(0)
-        where = state.board_rotation @ middle + state.board_translation
-        found["boards"] = dict(zip(data.boards.names, where, strict=True))
-    if data.landmarks is not None:
-        found["landmarks"] = dict(zip(data.landmarks.names, state.points, strict=True))
-    if data.features is not None:
-        far = work.anchor + state.direction / state.inverse_range.clamp_min(_LEAST_INVERSE_RANGE)[:, None]
-        found["features"] = dict(zip(data.features.names, far, strict=True))
-    return found
+    each = [(source, source.places(work.state.items[at], work.anchor)) for source, at in work.sources]
+    return {source.kind: dict(zip(source.names, where, strict=True)) for source, where in each if where is not None}

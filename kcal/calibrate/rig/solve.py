@@ -7,7 +7,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -17,16 +17,15 @@ from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.parameters import FreeParameters
 from kcal.calibrate.problem.poses import spread_out
 from kcal.calibrate.problem.state import BoardState
-from kcal.calibrate.rig.adjustment import LOSS, ROUGHLY, Adjustment, possible
+from kcal.calibrate.rig.adjustment import LOSS, ROUGHLY, Adjustment, all_of, possible
 from kcal.calibrate.rig.assess import rig_result
-from kcal.calibrate.rig.blocks import KINDS, PerKind
+from kcal.calibrate.rig.boards import MINIMUM_CORNERS, Boards
 from kcal.calibrate.rig.explanations import cost_of_features_behind, explained, refuse_same_camera
 from kcal.calibrate.rig.initial_poses import InitialPoses, first_poses
-from kcal.calibrate.rig.pairs import MINIMUM_CORNERS, Pair, evenly, paired_boards, pose_alone
-from kcal.calibrate.rig.problem import SharedUnknowns, free, held
-from kcal.calibrate.rig.result import Reasons, RigResult, item_records
-from kcal.calibrate.rig.sources import Boards, RigData
-from kcal.calibrate.rig.uncertainty import gathered, joint_unknowns, less
+from kcal.calibrate.rig.pairs import Pair, evenly, paired_boards, pose_alone
+from kcal.calibrate.rig.result import Reasons, RigResult, records
+from kcal.calibrate.rig.sources import RigData
+from kcal.calibrate.rig.unknowns import SharedUnknowns, free, gathered, held, joint_unknowns, less
 from kcal.corners.observations import Observations
 from kcal.errors import InputError
 from kcal.gaussian import triangular
@@ -45,11 +44,9 @@ def without_rayless(data: RigData) -> tuple[RigData, list[str]]:
     Raises:
         InputError: most corners of a board are such pixels.
     """
-    warnings, changed = [], {}
-    for kind in KINDS:
-        source = getattr(data, kind)
-        if source is None:
-            continue
+    warnings, changed = list[str](), dict[str, Any]()
+    for source in data.seen:
+        kind = source.kind
         pixels = source.pixels.clone()
         for c, camera in enumerate(data.cameras):
             seen = torch.isfinite(pixels[:, c]).all(-1)
@@ -57,17 +54,17 @@ def without_rayless(data: RigData) -> tuple[RigData, list[str]]:
             lost = seen & ~valid
             if not bool(lost.any()):
                 continue
-            if kind == "boards":
-                few = (seen.sum(-1) >= MINIMUM_CORNERS) & ((seen & valid).sum(-1) < MINIMUM_CORNERS)
+            if source.least > 1:
+                few = (seen.sum(-1) >= source.least) & ((seen & valid).sum(-1) < source.least)
                 for i in few.nonzero()[:, 0].tolist():
                     raise InputError(
-                        f"board {source.names[i]}: the {data.names[c]} camera's lens model has no ray at most of its "
-                        "corners: it folds inside the image; calibrate with views nearer the image's border or with a "
-                        "smaller model"
+                        f"{kind.removesuffix('s')} {source.names[i]}: the {data.names[c]} camera's lens model has no "
+                        "ray at most of its corners: it folds inside the image; calibrate with views nearer the "
+                        "image's border or with a smaller model"
                     )
             warnings.append(f"{int(lost.sum())} pixels of {kind} left out where {data.names[c]}'s lens has no ray")
             pixels[:, c] = torch.where(lost[..., None], torch.nan, pixels[:, c])
-        changed[kind] = dataclasses.replace(source, pixels=pixels)
+        changed[kind] = dataclasses.replace(source, pixels=pixels)  # type: ignore[type-var]
     return dataclasses.replace(data, **changed), warnings
 
 
@@ -79,14 +76,15 @@ _CORNER_SIGMA = 0.2
 _SCREENING, _SCREENED = LMOptions(max_iterations=25, tolerance=1e-6, residual_floor=1e-8), 300
 
 
-def robust_solution(initial: InitialPoses, masks: PerKind, unknowns: SharedUnknowns) -> Adjustment:
+def robust_solution(initial: InitialPoses, mask: Tensor, unknowns: SharedUnknowns) -> Adjustment:
     """The best robust solution from all starts."""
     boards = initial.data.boards
     sigma = _CORNER_SIGMA if boards is None or boards.sigma is None else boards.sigma
     best: tuple[float, Adjustment] | None = None
-    some = masks._replace(features=_evenly_taken(masks.features, _SCREENED))
     for start in initial.starts:
         work = Adjustment(initial.data, start, unknowns, sigma)
+        some, features = mask.clone(), work.at("features")
+        some[features] = _evenly_taken(mask[features], _SCREENED)
         if unknowns.refine_lenses:
             # From poses that are far off, lenses would bend towards them, beyond their folds even.
             work.unknowns = held(initial.data.cameras)
@@ -94,11 +92,11 @@ def robust_solution(initial: InitialPoses, masks: PerKind, unknowns: SharedUnkno
         work.fit_corners(here, robust=True)
         problem, result = work.solve(here, _SCREENING, LOSS)
         cost = float(result.cost) + cost_of_features_behind(problem, work.part(here))
-        cost += 1e6 * sum(int((a & ~b).sum()) for a, b in zip(some, here, strict=True))
+        cost += 1e6 * int((some & ~here).sum())
         if best is None or cost < best[0]:
             best = (cost, work)
     assert best is not None
-    work, here = best[1], possible(best[1], masks)
+    work, here = best[1], possible(best[1], mask)
     work.unknowns = unknowns
     work.fit_corners(here, robust=True)
     work.solve(here, ROUGHLY, LOSS)
@@ -247,7 +245,7 @@ def solve_rig(
         (10.0, ())
     """
     options = options or RigOptions()
-    if not any((data.boards, data.landmarks, data.features, data.positions, data.stars)):
+    if not data.seen and not data.positions:
         raise InputError("a rig needs boards, landmarks or features; there is nothing to solve it from")
     if options.board_warp and data.boards is None:
         raise InputError("the board's warp cannot be estimated without boards")
@@ -260,61 +258,48 @@ def solve_rig(
     warnings += doubts
     progress("first poses")
     initial = first_poses(data, options.solver)
-    masks, reasons = _first_masks(initial, reject=options.reject)
+    mask, reasons = _first_mask(initial, reject=options.reject)
     progress("robust solution")
-    work = robust_solution(initial, masks, unknowns)
+    work = robust_solution(initial, mask, unknowns)
     if options.motion:
-        work.fit_motion(possible(work, masks))
+        work.fit_motion(possible(work, mask))
     # With lenses among the unknowns digits are dear, and what is wrong shows without them.
     looking = ROUGHLY if unknowns.refine_lenses else options.solver
     progress("what contradicts the rest")
     if options.reject:
-        masks = kept = explained(work, masks, looking)
+        mask = kept = explained(work, mask, looking)
     else:
-        masks = possible(work, masks)
-        kept, doubts = _suspicions(work, masks, reasons, looking)
+        mask = possible(work, mask)
+        kept, doubts = _suspicions(work, mask, reasons, looking)
         warnings += doubts
     if options.motion:
         work.fit_motion(kept)
     progress("solution")
     # The robust solution is near, so that the first step may be the undamped one.
     near = dataclasses.replace(options.solver, initial_damping=_NEAR_DAMPING)
-    _, found = work.solve(masks, near)
+    _, found = work.solve(mask, near)
     for _ in range(3):
-        change = max(work.fit_corners(masks), work.fit_widened(masks))
+        change = max(work.fit_corners(mask), work.fit_widened(mask))
         if change > 0.0:
-            _, found = work.solve(masks, near)
+            _, found = work.solve(mask, near)
         if change < 1e-3:
             break
     progress("uncertainty")
-    return rig_result(work, found, masks, reasons, initial, warnings, refuse=options.reject)
+    return rig_result(work, found, mask, reasons, initial, warnings, refuse=options.reject)
 
 
-def _first_masks(initial: InitialPoses, *, reject: bool) -> tuple[PerKind, Reasons]:
+def _first_mask(initial: InitialPoses, *, reject: bool) -> tuple[Tensor, Reasons]:
     """What can take part, and why not the others."""
-    data = initial.data
-    marks = [
-        torch.zeros(0) if source is None else torch.isfinite(source.pixels).all(-1).sum(-1)
-        for source in (data.landmarks, data.features, data.stars)
-    ]
-    boards = initial.usable.clone()
-    foreign = initial.foreign if reject else {}
-    boards[list(foreign)] = False
-    # A star without a name tells only how two cameras are turned against each other.
-    enough = marks[2] >= (2 if data.stars is None else 2 - data.stars.named.long())
-    masks = PerKind(boards, marks[0] >= 1, marks[1] >= 2, enough)
-    texts = (
-        "fewer than two cameras see enough of it",
-        "no camera has a mark of it",
-        "fewer than two cameras have a mark of it",
-        "fewer than two cameras have a mark of it",
-    )
-    reasons = {
-        kind: dict.fromkeys((~mask).nonzero()[:, 0].tolist(), text)
-        for kind, mask, text in zip(KINDS, masks, texts, strict=True)
-    }
-    reasons["boards"].update(foreign)
-    return masks, reasons
+    data, masks, reasons, count = initial.data, list[Tensor](), dict[int, str](), 0
+    for source in data.seen:
+        enough = source.enough(data.cameras)
+        reasons.update(dict.fromkeys((count + (~enough).nonzero()[:, 0]).tolist(), source.few))
+        foreign = initial.foreign if reject and source is data.boards else {}
+        enough[list(foreign)] = False
+        reasons.update({count + i: text for i, text in foreign.items()})
+        masks.append(enough)
+        count += len(enough)
+    return all_of(masks, torch.zeros(0, dtype=torch.bool)), reasons
 
 
 def _what_may_change(data: RigData, options: RigOptions) -> tuple[RigData, SharedUnknowns, list[str]]:
@@ -360,18 +345,18 @@ def _lens_unknowns(
     return joint_unknowns(cameras, gathered(cameras, known, None)[0], None)[0]
 
 
-def _suspicions(work: Adjustment, masks: PerKind, reasons: Reasons, solver: LMOptions) -> tuple[PerKind, list[str]]:
+def _suspicions(work: Adjustment, mask: Tensor, reasons: Reasons, solver: LMOptions) -> tuple[Tensor, list[str]]:
     """What agrees, and warnings that name what would be left out, were it not to be kept."""
     trial = copy.copy(work)
     try:
-        kept = explained(trial, masks, solver)
+        kept = explained(trial, mask, solver)
     except InputError as error:
-        return masks, [str(error)]
-    named = {(kind, work.names(kind)[i]) for kind in KINDS for i in reasons[kind]}
+        return mask, [str(error)]
+    named = {work.labels[i] for i in reasons}
     return kept, [
         f"{item.label}: {item.reason}; it was kept"
-        for item in item_records(trial, kept, reasons)
-        if not item.used and (item.source, item.name) not in named
+        for item in records(trial, kept, reasons).items
+        if not item.used and item.label not in named
     ]
 
 

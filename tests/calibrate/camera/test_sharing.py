@@ -22,7 +22,7 @@ from kcal.calibrate.camera.calibrate import (
 )
 from kcal.calibrate.camera.result import OutlierRejection
 from kcal.calibrate.hybrid.board_modes import turned_corners
-from kcal.calibrate.rig.uncertainty import gathered, joint_unknowns
+from kcal.calibrate.rig.unknowns import gathered, joint_unknowns
 from kcal.cli.main import app
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations

@@ -12,12 +12,14 @@ from torch import Tensor
 
 from kcal.calibrate.rig import assess
 from kcal.calibrate.rig.adjustment import Adjustment
-from kcal.calibrate.rig.blocks import PerKind
 from kcal.calibrate.rig.explanations import contradictions, redundancy
-from kcal.calibrate.rig.initial_poses import distinct_poses, first_poses, poses_from_three
-from kcal.calibrate.rig.problem import held
+from kcal.calibrate.rig.initial_poses import first_poses
+from kcal.calibrate.rig.landmarks import Landmarks
+from kcal.calibrate.rig.measured import Baseline, MeasuredPosition
+from kcal.calibrate.rig.resection import distinct_poses, poses_from_three
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.calibrate.rig.sources import Baseline, Landmarks, MeasuredPosition, RigData
+from kcal.calibrate.rig.sources import RigData
+from kcal.calibrate.rig.unknowns import held
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.pose import rotation_from_vector
 from kcal.report.judge_rig import rig_verdict
@@ -47,11 +49,11 @@ def positions(off: Tensor | None = None, sigma: float = 0.02) -> tuple[MeasuredP
     return tuple(MeasuredPosition(camera=c, point=places[c], sigma=spread) for c in (0, 1))
 
 
-def adjusted(sources: RigData) -> tuple[Adjustment, PerKind]:
+def adjusted(sources: RigData) -> tuple[Adjustment, Tensor]:
     """A plain solution of everything."""
     start = first_poses(sources, LMOptions()).starts[0]
     work = Adjustment(sources, start, held(sources.cameras), 0.1)
-    masks = PerKind(*(torch.ones(len(mask), dtype=torch.bool) for mask in work.none()))
+    masks = ~work.none()
     work.solve(masks, LMOptions(residual_floor=1e-8))
     return work, masks
 

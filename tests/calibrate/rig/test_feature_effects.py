@@ -8,9 +8,13 @@ import pytest
 import torch
 from torch import Tensor
 
+from kcal.calibrate.rig.features import Features
+from kcal.calibrate.rig.landmarks import Landmarks
+from kcal.calibrate.rig.measured import Baseline
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.calibrate.rig.sources import Baseline, Effect, Features, Landmarks, RigData, shifts_of
+from kcal.calibrate.rig.source import Effect, shifts_of
+from kcal.calibrate.rig.sources import RigData
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import vector_from_rotation

@@ -7,8 +7,10 @@ import dataclasses
 import pytest
 import torch
 
+from kcal.calibrate.rig.landmarks import Landmarks
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.calibrate.rig.sources import Effect, Landmarks, RigData, shifts_of
+from kcal.calibrate.rig.source import Effect, shifts_of
+from kcal.calibrate.rig.sources import RigData
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 

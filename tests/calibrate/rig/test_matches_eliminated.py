@@ -8,10 +8,13 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.rig.adjustment import Adjustment
-from kcal.calibrate.rig.blocks import LOCAL_SIZE, PerKind
-from kcal.calibrate.rig.initial_poses import Start
-from kcal.calibrate.rig.problem import RigProblem, _few_others_fall, _others_fall, held
-from kcal.calibrate.rig.sources import Baseline, Features, Landmarks, RigData
+from kcal.calibrate.rig.features import Features
+from kcal.calibrate.rig.landmarks import Landmarks
+from kcal.calibrate.rig.measured import Baseline
+from kcal.calibrate.rig.problem import RigProblem, _few_others_fall, _others_fall
+from kcal.calibrate.rig.source import LOCAL_SIZE, Start
+from kcal.calibrate.rig.sources import RigData
+from kcal.calibrate.rig.unknowns import held
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.solve.lm import LMOptions
@@ -42,7 +45,7 @@ def features(count: int = 40) -> Features:
     )
 
 
-def adjustment(matches: Features, *, landmarks: bool = True) -> tuple[Adjustment, PerKind]:
+def adjustment(matches: Features, *, landmarks: bool = True) -> tuple[Adjustment, Tensor]:
     points = torch.tensor([[-4.0, 1, 20], [5, -2, 30], [1, 3, 15], [-9, -4, 60]], dtype=torch.float64)
     survey = Landmarks(
         names=tuple("abcd"), points=points, sigma=torch.full((4, 3), 0.01).double(),
@@ -55,15 +58,15 @@ def adjustment(matches: Features, *, landmarks: bool = True) -> tuple[Adjustment
     )  # fmt: skip
     start = Start(rotation=torch.eye(3, dtype=torch.float64).repeat(2, 1, 1), center=CENTER + 0.01)
     work = Adjustment(data, start, held(data.cameras), 1.0)
-    return work, PerKind(*(torch.ones_like(mask) for mask in work.none()))
+    return work, ~work.none()
 
 
-def by_products(problem: RigProblem, work: Adjustment, masks: PerKind) -> SchurLinearization:
+def by_products(problem: RigProblem, work: Adjustment, masks: Tensor) -> SchurLinearization:
     """The same normal equations from the products of all rows of each item."""
     state = work.part(masks)
     posed, grams = problem.posed(state), []
-    for block in problem.blocks:
-        rows = block.rows(posed, state, problem.shared_size)
+    for block, own in problem.parts(state):
+        rows = block.rows(posed, own, problem.shared_size)
         missing = LOCAL_SIZE - block.size
         gram = torch.nn.functional.pad(rows @ rows.mT, (missing, 0, missing, 0))
         gram[:, range(missing), range(missing)] = 1.0
@@ -117,11 +120,12 @@ def test_the_fall_without_an_item_is_that_of_a_new_solution() -> None:
     matches.pixels[5, 1, 1] += 1.0
     work, masks = adjustment(matches)
     problem, _ = work.solve(masks, LMOptions(residual_floor=1e-8))
-    falls = work.deletions(masks).features
+    features_at = work.at("features")
+    falls = work.deletions(masks)[features_at]
     whole = float(problem.cost(work.part(masks)))
     for i in (0, 5):
-        some = masks._replace(features=masks.features.clone())
-        some.features[i] = False
+        some = masks.clone()
+        some[features_at.start + i] = False
         fewer, _ = work.solve(some, LMOptions(residual_floor=1e-8))
         assert 2.0 * (whole - float(fewer.cost(work.part(some)))) == pytest.approx(float(falls[i]), rel=0.02)
     assert int(falls.argmax()) == 5
@@ -142,8 +146,7 @@ def test_both_ways_to_leave_an_item_out_agree() -> None:
 def test_covariances_of_marks() -> None:
     plain = features()
     alike = dataclasses.replace(plain, covariance=0.01 * torch.eye(2).double().expand(40, 2, 2, 2))
-    for one, other in zip(*(adjustment(f)[0].squares(adjustment(f)[1]) for f in (plain, alike)), strict=True):
-        torch.testing.assert_close(one, other)
+    torch.testing.assert_close(*(adjustment(f)[0].squares(adjustment(f)[1]) for f in (plain, alike)))
     both = plain + dataclasses.replace(alike, names=tuple(f"again {i}" for i in range(40)))
     assert both.covariance is not None
     torch.testing.assert_close(both.covariance[:40], both.covariance[40:])
@@ -151,7 +154,7 @@ def test_covariances_of_marks() -> None:
     long = plain.pixels.new_zeros(40, 2, 2, 2)
     long[..., 0, 0], long[..., 1, 1] = 1.0, 0.01
     squares = [
-        float(work.squares(masks).features.sum())
+        float(work.squares(masks)[work.at("features")].sum())
         for work, masks in (
             adjustment(f, landmarks=False) for f in (alike, dataclasses.replace(plain, covariance=long))
         )

@@ -14,7 +14,7 @@ from torch import Tensor
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, calibrate_rig
-from kcal.calibrate.rig.uncertainty import gathered, joint_unknowns, less
+from kcal.calibrate.rig.unknowns import gathered, joint_unknowns, less
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations
 from kcal.lens.camera import Camera

@@ -23,15 +23,17 @@ from rig_scenes import (
 )
 from torch import Tensor
 
-from kcal.calibrate.rig.adjustment import _first_rays, typical_ratio
 from kcal.calibrate.rig.assess import _advice, _Targets
-from kcal.calibrate.rig.blocks import Block, BoardBlock, FeatureBlock, LandmarkBlock, RigState
+from kcal.calibrate.rig.boards import BoardBlock
 from kcal.calibrate.rig.explanations import _Part, _test, least_redundancy, redundancy, refuse_exact
-from kcal.calibrate.rig.initial_poses import Start
+from kcal.calibrate.rig.features import FeatureBlock
+from kcal.calibrate.rig.landmarks import LandmarkBlock
+from kcal.calibrate.rig.measured import Baseline, MeasuredPosition
 from kcal.calibrate.rig.motion import CameraRows, summed_products
-from kcal.calibrate.rig.problem import DistanceTerm, PlaceTerm, RigProblem, _of_item, held, least
-from kcal.calibrate.rig.sources import RigData
-from kcal.calibrate.rig.uncertainty import SharedCovariance, _moving, mounting_rows, relative_rows
+from kcal.calibrate.rig.problem import RigProblem, _of_item, least
+from kcal.calibrate.rig.source import Block, Measurement, RigState, Start, as_items, first_rays, typical_ratio
+from kcal.calibrate.rig.uncertainty import SharedCovariance, mounting_rows, relative_rows
+from kcal.calibrate.rig.unknowns import _moving, held
 from kcal.checks import chi2_quantile
 from kcal.errors import DegenerateError
 from kcal.lens.pose import vector_from_rotation
@@ -44,7 +46,7 @@ def white(pixels: Tensor) -> Tensor:
 
 
 def problem_of(
-    *blocks: Block, terms: tuple[DistanceTerm | PlaceTerm, ...] = (), loose: tuple[bool, ...] = (True, True)
+    *blocks: Block, terms: tuple[Measurement, ...] = (), loose: tuple[bool, ...] = (True, True)
 ) -> RigProblem:
     cameras = CAMERAS[: len(loose)]
     return RigProblem(cameras, list(blocks), terms, held(cameras), list(loose), list(loose))
@@ -86,7 +88,10 @@ class TestRedundancy:
         shown.pixels[1, 1] = torch.nan
         block = BoardBlock(shown.pixels, white(shown.pixels), BOARD.points)
         assert redundancy(problem_of(block)) == [2 * 42 - 6, 2 * 42 - 6]
-        terms = (DistanceTerm(0, 1, 10.0, 0.01), PlaceTerm(1, CENTER[1], tensor(0.1, 0.1, 0.1)))
+        terms = (
+            Baseline(first=0, second=1, length=10.0, sigma=0.01),
+            MeasuredPosition(camera=1, point=CENTER[1], sigma=tensor(0.1, 0.1, 0.1)),
+        )
         assert redundancy(problem_of(landmark_block(), terms=terms)) == [2 + 1, 2 + 1 + 3]
 
     def test_what_is_exact_is_refused(self) -> None:
@@ -191,11 +196,9 @@ class TestRows:
 
     def problem(self) -> tuple[RigProblem, RigState]:
         problem = problem_of(landmark_block())
-        nothing = torch.zeros(0, 3).double()
         state = RigState(
             torch.cat([camera.params.detach() for camera in CAMERAS[:2]]), torch.zeros(0).double(), tensor(0.13)[0],
-            ROTATION[:2], CENTER[:2], torch.zeros(0).double(), torch.zeros(0, 3, 3).double(), nothing,
-            landmarks(count=4).points, nothing, torch.zeros(0).double(),
+            ROTATION[:2], CENTER[:2], torch.zeros(0).double(), as_items(landmarks(count=4).points),
         )  # fmt: skip
         return problem, state
 
@@ -227,11 +230,10 @@ class TestRows:
         """From the anchor, at their ranges; of the first camera that has a mark, and up without one."""
         far = features(count=3, cameras=2)
         start = Start(rotation=ROTATION[:2], center=CENTER[:2])
-        some = RigData(cameras=CAMERAS[:2], names=NAMES[:2], features=far)
         pixels = far.pixels.clone()
         pixels[1, 0], pixels[2] = torch.nan, torch.nan
         anchor = CENTER[:2].mean(0)
-        direction = torch.nn.functional.normalize(_first_rays(some, start, pixels, far.inverse_range, anchor), dim=-1)
+        direction = first_rays(CAMERAS[:2], start, pixels, far.inverse_range, anchor)
         for k in (0, 1):
             place = anchor + direction[k] / far.inverse_range[k]
             camera = (0, 1)[k]
@@ -250,13 +252,7 @@ class TestOpen:
         block = FeatureBlock(pixels, white(pixels), *unknown, anchor)
         towards = points - anchor
         length = towards.norm(dim=-1)
-        state = (
-            TestRows()
-            .problem()[1]
-            ._replace(
-                points=torch.zeros(0, 3).double(), direction=towards / length[:, None], inverse_range=1.0 / length
-            )
-        )
+        state = TestRows().problem()[1]._replace(items=as_items(towards / length[:, None], 1.0 / length[:, None]))
         held_first = SharedCovariance(problem_of(block, loose=(False, True)), state, 4.0)
         scale = "the scale (how far apart the cameras stand)"
         assert held_first.open_directions(NAMES[:2], absolute=False) == (scale,)
@@ -298,9 +294,11 @@ class TestWeak:
         corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0]).double()] * 3) * tensor(*extent)
         middle = CENTER[0] + 100.0 * ROTATION[0, 2]
         marks = LandmarkBlock(torch.zeros(8, 2, 2).double(), torch.zeros(8, 2, 2, 2).double(), corners, corners)
-        state = TestRows().problem()[1]._replace(points=corners + middle)
+        state = TestRows().problem()[1]._replace(items=as_items(corners + middle))
         assert words in _advice(problem_of(marks), state)
-        assert _advice(problem_of(feature_block()), state).startswith("Add surveyed landmarks, or measure")
+        assert _advice(problem_of(feature_block()), TestRows().problem()[1]).startswith(
+            "Add surveyed landmarks, or measure"
+        )
 
 
 class TestTurns:

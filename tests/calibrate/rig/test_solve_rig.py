@@ -26,14 +26,19 @@ from rig_scenes import (
 )
 from torch import Tensor
 
-from kcal.calibrate.rig import adjustment, initial_poses, solve
-from kcal.calibrate.rig.blocks import BoardBlock, FeatureBlock, LandmarkBlock, PosedCamera, RigState
-from kcal.calibrate.rig.initial_poses import Start, consensus_pose, poses_from_three
-from kcal.calibrate.rig.problem import DistanceTerm, PlaceTerm, RigProblem, SharedUnknowns
+from kcal.calibrate.rig import boards as board_limits
+from kcal.calibrate.rig import initial_poses, solve
+from kcal.calibrate.rig.boards import BoardBlock
+from kcal.calibrate.rig.features import FeatureBlock, inverse_range_beyond
+from kcal.calibrate.rig.landmarks import LandmarkBlock
+from kcal.calibrate.rig.measured import Baseline, MeasuredPosition
+from kcal.calibrate.rig.problem import RigProblem
+from kcal.calibrate.rig.resection import consensus_pose, poses_from_three
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.calibrate.rig.sources import Baseline, MeasuredPosition, RigData, inverse_range_beyond
-from kcal.calibrate.rig.uncertainty import joint_unknowns
+from kcal.calibrate.rig.source import PosedCamera, RigState, Start, as_items
+from kcal.calibrate.rig.sources import RigData
+from kcal.calibrate.rig.unknowns import SharedUnknowns, joint_unknowns
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
@@ -110,7 +115,10 @@ def mixed_problem() -> tuple[RigProblem, RigState]:
         LandmarkBlock(marks.pixels, white(marks.pixels), marks.points, marks.sigma, unknowns.by_refraction),
         FeatureBlock(far.pixels, white(far.pixels), far.inverse_range, sigma, anchor),
     ]
-    terms = [DistanceTerm(0, 1, 10.0, 0.01), PlaceTerm(1, CENTER[1] + 0.1, tensor(0.1, 0.2, 0.3))]
+    terms = [
+        Baseline(first=0, second=1, length=10.0, sigma=0.01),
+        MeasuredPosition(camera=1, point=CENTER[1] + 0.1, sigma=tensor(0.1, 0.2, 0.3)),
+    ]
     problem = RigProblem(CAMERAS, blocks, terms, unknowns, [True, True, False], [False, True, True])
     towards = spread_points(4, 8000.0, 40_000.0, 9) - anchor
     length = towards.norm(dim=-1)
@@ -122,11 +130,16 @@ def mixed_problem() -> tuple[RigProblem, RigState]:
         ROTATION,
         CENTER,
         tensor(0.02, -0.01, 0.03),
-        ROTATION[0].T @ rotation_from_vector(tensor([0.3, 0.1, 0.0], [0.1, -0.3, 0.1])),
-        CENTER[0] + tensor([3.0, 1.0, 20.0], [5.0, -1.0, 25.0]) @ ROTATION[0],
-        marks.points + 0.01,
-        towards / length[:, None],
-        1.0 / length,
+        torch.cat(
+            [
+                as_items(
+                    ROTATION[0].T @ rotation_from_vector(tensor([0.3, 0.1, 0.0], [0.1, -0.3, 0.1])),
+                    CENTER[0] + tensor([3.0, 1.0, 20.0], [5.0, -1.0, 25.0]) @ ROTATION[0],
+                ),
+                as_items(marks.points + 0.01),
+                as_items(towards / length[:, None], 1.0 / length[:, None]),
+            ]
+        ),
     )
     return problem, state
 
@@ -134,7 +147,7 @@ def mixed_problem() -> tuple[RigProblem, RigState]:
 def residuals(problem: RigProblem, state: RigState, shared: Tensor, local: Tensor) -> Tensor:
     """All residuals after a step."""
     moved = problem.retract(state, (shared, local))
-    found = [block.residuals(problem.posed(moved), moved).flatten() for block in problem.blocks]
+    found = [block.residuals(problem.posed(moved), own).flatten() for block, own in problem.parts(moved)]
     return torch.cat([*found, problem.term_rows(moved)[-1]])
 
 
@@ -145,8 +158,8 @@ class TestDerivatives:
         local = torch.zeros(sum(map(len, problem.blocks)), 6, dtype=torch.float64)
         by_shared, by_local = torch.func.jacfwd(lambda s, v: residuals(problem, state, s, v), (0, 1))(shared, local)
         rows, item, start = [], 0, 0
-        for block in problem.blocks:
-            found = block.rows(problem.posed(state), state, problem.shared_size)
+        for block, state_of_block in problem.parts(state):
+            found = block.rows(problem.posed(state), state_of_block, problem.shared_size)
             rows.append(found[:, block.size : -1].movedim(1, -1).flatten(0, -2))
             for own in found[:, : block.size]:
                 stop = start + own.shape[-1]
@@ -165,7 +178,7 @@ class TestDerivatives:
         problem, state = mixed_problem()
         assert problem.blocks[0].counts.tolist() == [252, 250]
         assert problem.blocks[2].counts.tolist() == [7, 6, 7, 7]
-        rows = problem.blocks[0].rows(problem.posed(state), state, problem.shared_size)
+        rows = problem.blocks[0].rows(problem.posed(state), problem.parts(state)[0][1], problem.shared_size)
         assert bool((rows[1, :, 84 + 3] == 0).all())
         assert bool((rows[1, :, 84 + 42 + 3] == 0).all())
 
@@ -223,14 +236,14 @@ def test_features_of_hybrid_cameras_are_seen_where_they_are(distance: float) -> 
     nothing = torch.zeros(0, 3, dtype=torch.float64)
     state = RigState(
         hybrid.params.detach(), origin[:0], tensor(0.0), torch.eye(3).double()[None], origin[None], origin[:0],
-        nothing, nothing, nothing, direction, inverse,
+        as_items(direction, inverse[:, None]),
     )  # fmt: skip
     posed = [PosedCamera(hybrid, hybrid.params.detach(), torch.eye(3).double(), origin, nothing.T[:0], None, None)]
     assert float(block.errors(posed, state).abs().max()) < 1e-9
     rows = block.rows(posed, state, 0)
-    by_step = torch.func.jacfwd(lambda step: block.residuals(posed, block.retract(state, step)))(
-        torch.zeros(2, 3).double()
-    )
+    by_step = torch.func.jacfwd(
+        lambda step: block.residuals(posed, state._replace(items=block.moved(state.items, step)))
+    )(torch.zeros(2, 3).double())
     for i in range(2):
         torch.testing.assert_close(rows[i, :3].T, by_step[i, :, i], rtol=1e-9, atol=1e-7)
 
@@ -528,7 +541,7 @@ class TestWrong:
         assert solve_rig(data(boards=shown)).left_out == ()
         with monkeypatch.context() as without:
             for name in ("_LENS", "_BETWEEN"):
-                without.setattr(adjustment, name, 0.0)
+                without.setattr(board_limits, name, 0.0)
             assert len(solve_rig(data(boards=shown)).left_out) > 0
         # One that moved is found all the same.
         shown.pixels[5, 1] += tensor(1.0, 0.0)

@@ -1,0 +1,377 @@
+"""What a rig's adjustment may change of its cameras, its board and the air, and what calibrations know of it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kcal.calibrate.hybrid.board_modes import CLEAR, BoardModes, board_modes, mode_turn, turned
+from kcal.calibrate.hybrid.families import BOARD, typical_hyperprior
+from kcal.calibrate.hybrid.measured_board import printed_board, printed_prior
+from kcal.calibrate.problem.state import warp_modes
+from kcal.calibrate.problem.views import free_parameters
+from kcal.corners.board import Board
+from kcal.errors import InputError
+from kcal.gaussian import Gaussian, Slots, stacked, unit_scale, whitened
+from kcal.lens.camera import Camera
+from kcal.lens.information import CameraInformation
+from kcal.lens.projection import FAR, project_components
+from kcal.lens.rig import check_refraction
+
+# What a rig's adjustment may change of its cameras, its board and the air: linear functions of a few unknowns.
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class SharedUnknowns:
+    """Unknowns y (K,): parameters of camera c change with them by cameras[c] y, the board by shapes · (board y).
+
+    Args:
+        cameras: (5 + P, K) of each.
+        shapes: (B, 3, N) displacements of the board's corners, meters.
+        board: (B, K).
+        begin: (K,) what they are for cameras and board as given.
+        known: (K,) whether an unknown is a standard normal beforehand; nothing is known of the others.
+        labels: (K,) names of those that have one.
+        refraction: coefficient of refraction of light for the unknowns as they begin.
+        by_refraction: (K,) of it by each unknown; None: it is held.
+        by_effects: (E, K) amount of each `Effect` of stars, then landmarks, and then features, by each unknown; None:
+            there are none.
+    """
+
+    cameras: tuple[Tensor, ...]
+    shapes: Tensor
+    board: Tensor
+    begin: Tensor
+    known: Tensor
+    labels: tuple[str, ...]
+    refraction: float = 0.0
+    by_refraction: Tensor | None = None
+    by_effects: Tensor | None = None
+
+    @property
+    def refine_lenses(self) -> bool:
+        """Whether lenses or board may change within what is known of them."""
+        return bool(torch.cat([*self.cameras, self.board])[:, self.known].any())
+
+    def __len__(self) -> int:
+        """How many unknowns there are."""
+        return len(self.known)
+
+    def and_warp(self, board_points: Tensor) -> SharedUnknowns:
+        """These, and two parabolas by which the board bends."""
+        shapes = warp_modes(board_points)
+        board = torch.cat([torch.zeros(2, len(self), dtype=torch.float64), torch.eye(2, dtype=torch.float64)], 1)
+        more = self._and("the board's warp along its rows", "the board's warp along its columns", known=False)
+        return dataclasses.replace(more, shapes=shapes, board=board)
+
+    def and_refraction(self, refraction: float, sigma: float) -> SharedUnknowns:
+        """These, and the coefficient of refraction with its standard deviation; with none, it is held."""
+        check_refraction(refraction, sigma)
+        if not sigma:
+            return dataclasses.replace(self, refraction=refraction)
+        more = self._and("the coefficient of refraction", known=True)
+        slope = torch.zeros(len(more), dtype=torch.float64)
+        slope[-1] = sigma
+        return dataclasses.replace(more, refraction=refraction, by_refraction=slope)
+
+    def and_effects(self, *names: str) -> SharedUnknowns:
+        """These, and amounts of what shifts stars, landmarks or features together, in standard deviations."""
+        more = self._and(*names, known=True)
+        count = len(names)
+        select = torch.zeros(count, len(more), dtype=torch.float64)
+        select[:, len(more) - count :] = torch.eye(count, dtype=torch.float64)
+        return dataclasses.replace(more, by_effects=select)
+
+    def _and(self, *labels: str, known: bool) -> SharedUnknowns:
+        """These, and more that change nothing yet."""
+
+        def wider(part: Tensor) -> Tensor:
+            return torch.nn.functional.pad(part, (0, len(labels)))
+
+        return SharedUnknowns(
+            cameras=tuple(map(wider, self.cameras)),
+            shapes=self.shapes,
+            board=wider(self.board),
+            begin=wider(self.begin),
+            known=torch.cat([self.known, torch.full((len(labels),), known)]),
+            labels=(*self.labels, *labels),
+            refraction=self.refraction,
+            by_refraction=None if self.by_refraction is None else wider(self.by_refraction),
+            by_effects=None if self.by_effects is None else wider(self.by_effects),
+        )
+
+
+def held(cameras: Sequence[Camera]) -> SharedUnknowns:
+    """Nothing: cameras and board are as they are, and light is straight."""
+    return SharedUnknowns(
+        cameras=tuple(torch.zeros(camera.params.shape[-1], 0, dtype=torch.float64) for camera in cameras),
+        shapes=torch.zeros(0, 3, 0, dtype=torch.float64),
+        board=torch.zeros(0, 0, dtype=torch.float64),
+        begin=torch.zeros(0, dtype=torch.float64),
+        known=torch.zeros(0, dtype=torch.bool),
+        labels=(),
+    )
+
+
+def free(cameras: Sequence[Camera], names: Sequence[str]) -> SharedUnknowns:
+    """All parameters of all cameras; nothing is known of them.
+
+    Raises:
+        InputError: hybrid cameras, whose parameters have meaning only with what their calibrations know.
+    """
+    if any(camera.model.hybrid for camera in cameras):
+        raise InputError(
+            "hybrid cameras cannot be refined without what their own calibrations know: hold them, take what their "
+            "calibrations know as prior, or calibrate parametric cameras"
+        )
+    chosen = [free_parameters(camera.model) for camera in cameras]
+    count = sum(len(own) for own in chosen)
+    maps, labels, end = [], [], 0
+    for camera, own, name in zip(cameras, chosen, names, strict=True):
+        part = torch.zeros(len(camera.names), count, dtype=torch.float64)
+        for column, index in enumerate(own, start=end):
+            part[index, column] = 1.0
+            labels.append(f"{camera.names[index]} of {name}")
+        end += len(own)
+        maps.append(part)
+    return dataclasses.replace(
+        held(cameras),
+        cameras=tuple(maps),
+        board=torch.zeros(0, count, dtype=torch.float64),
+        begin=torch.zeros(count, dtype=torch.float64),
+        known=torch.zeros(count, dtype=torch.bool),
+        labels=tuple(labels),
+    )
+
+
+# What the calibrations of a rig's cameras know, together: lenses, and the board that they saw, as one Gaussian.
+#
+# Each camera brings square-root information on its parameters and its board. Rows of cameras that saw one board are
+# stacked over the same board, whose prior counts once. Views of a calibration that take part in the rig as well are
+# taken out of it first, so that no corner counts twice.
+
+# px that a direction must move something seen, for it to be an unknown of the rig.
+_FELT = 1e-3
+# Meters of a nearby thing, where the wandering of the entrance pupil shows, and px that a meter of board is there.
+_NEAR, _PX_PER_METER = 1.0, 1000.0
+
+
+def gathered(
+    cameras: Sequence[Camera], known: Sequence[CameraInformation | None], board: Board | None
+) -> tuple[tuple[CameraInformation | None, ...], tuple[tuple[int, int], ...]]:
+    """What is known of each camera, and of one board by those that saw it, by the evidence of both.
+
+    Args:
+        cameras: with their calibrations.
+        known: what each knows.
+        board: in the rig, if there is any; else that of the first camera that has one.
+
+    Returns:
+        What is known: of cameras that saw another board, what is said of the camera alone; None: nothing, it is held.
+        And pairs of cameras whose boards have one name, and shapes that contradict each other.
+    """
+    out: list[CameraInformation | None] = []
+    first: CameraInformation | None = None
+    begun = 0
+    apart: list[tuple[int, int]] = []
+    for number, (camera, own) in enumerate(zip(cameras, known, strict=True)):
+        record = None if camera.calibration is None else camera.calibration.record
+        sharing = None
+        if own is not None and own.board_size and record is not None:
+            board = board or Board.of(record.board)
+            if record.board == board.record:
+                sharing = own if first is None else _agreeing(first, own, board)
+                if sharing is None:
+                    apart.append((begun, number))
+                elif first is None:
+                    first, begun = sharing, number
+        out.append(sharing or (None if own is None else own.without_board()))
+    return tuple(out), tuple(apart)
+
+
+def _agreeing(first: CameraInformation, other: CameraInformation, board: Board) -> CameraInformation | None:
+    """The other camera's information with its board turned as the first camera's; None if they saw two boards."""
+    modes = board_modes(board.points)
+    one, two = first.board_message, other.board_message
+    apart = printed_board(modes, [one])[1] + printed_board(modes, [two])[1]
+    together = {turns: printed_board(modes, [one, turned(two, turns)])[1] - apart for turns in board.quarter_turns}
+    best = max(together, key=lambda turns: together[turns])
+    return _board_turned(other, best) if together[best] > -CLEAR else None
+
+
+def _board_turned(known: CameraInformation, turns: int) -> CameraInformation:
+    """The same with the board's modes turned."""
+    lens, turn = known.lens_size, mode_turn(turns)
+    estimate = torch.cat([known.estimate[:lens], turn @ known.estimate[lens:]])
+    out = dataclasses.replace(
+        known,
+        estimate=estimate,
+        mean=torch.cat([known.mean[:lens], turn @ known.mean[lens:]]),
+        sigma=torch.cat([known.sigma[:lens], turn.abs() @ known.sigma[lens:]]),
+        others=None if known.others is None else turned(known.told, turns).placed(known.board, estimate[lens:]).rows,
+    )
+    return out.with_data(turned(known.data, turns))
+
+
+def less(known: CameraInformation, rows: Tensor) -> CameraInformation:
+    """What is left of the data without some of them.
+
+    Args:
+        known: the whole.
+        rows: (R, U + 1) of the data that are taken out, in standard deviations, off all other unknowns; the last column
+            holds their residuals at the estimate.
+    """
+    scale = unit_scale(known.whole.rows[:, :-1])
+    gone, whole = rows[:, :-1] * scale, known.rows * scale
+    gradient = whole.T @ known.residuals - gone.T @ rows[:, -1]
+    values, vectors = torch.linalg.eigh(whole.T @ whole - gone.T @ gone)
+    # Weights differ a little between a calibration and a rig: what is left of directions taken out may be negative.
+    kept = values > 1e-10 * values[-1:].sum()
+    root = values[kept].sqrt()
+    return dataclasses.replace(
+        known,
+        rows=root[:, None] * vectors[:, kept].T / scale,
+        residuals=vectors[:, kept].T @ gradient / root,
+    )
+
+
+def joint_unknowns(
+    cameras: Sequence[Camera], parts: Sequence[CameraInformation | None], board: Board | None, *, measured: bool = False
+) -> tuple[SharedUnknowns, Tensor | None]:
+    """Unknowns that are standard normal beforehand, and the deviation (N, 3) of the board where they begin.
+
+    A board that no camera knows is one as printers make them, if a camera is hybrid and the board was not `measured`
+    otherwise; None: it is as it is given.
+
+    Args:
+        cameras: of the rig.
+        parts: what is known of each and of the board (`gathered`).
+        board: of the rig, or of the cameras.
+        measured: the board's shape is known.
+    """
+    shared = [part for part in parts if part is not None and part.board_size]
+    lenses = sum(part.lens_size for part in parts if part is not None)
+    modes = None
+    printed = not measured and any(camera.model.hybrid for camera in cameras)
+    if board is not None and (shared or printed):
+        modes = board_modes(board.points)
+    elif not shared and not lenses:
+        return held(cameras), None
+    prior, amplitudes = _board_beforehand(shared, modes)
+    said, given = [prior], list[_GivenBoard]()
+    for camera, part in zip(cameras, parts, strict=True):
+        if part is None:
+            nothing = torch.zeros(len(camera.names), 0, dtype=torch.float64)
+            by_board = nothing.new_zeros(len(nothing), len(amplitudes))
+            given.append(_GivenBoard(nothing, nothing[0], nothing[0] > 0, by_board))
+            continue
+        own = part.data + part.lens_prior
+        if len(shared) == 1:
+            # What cameras told each other of their board counts once: of two in one rig, each brings its own rows.
+            own = own + part.told
+        said.append(own.marginal(part.board))
+        given.append(_given_board(part, own, prior.slots, amplitudes))
+    told = stacked([one.placed(prior.slots, amplitudes) for one in said])
+    shape = whitened(told.rows[:, :-1], told.rows[:, -1])
+    given = [lens._replace(by_board=lens.by_board @ shape.change) for lens in given]
+    # Without a board in view, only what cameras say of theirs is left, and no corner moves.
+    shapes = torch.zeros(0, 3, 0, dtype=torch.float64) if modes is None else modes.shapes
+    of_board = shape.change[:0] if modes is None else shape.change
+    parts_begin, parts_known = ([getattr(one, name) for one in (*given, shape)] for name in ("begin", "known"))
+    turns = [torch.eye(len(known), dtype=torch.float64) for known in parts_known]
+    if any(camera.model.hybrid for camera in cameras):
+        corners = torch.einsum("bk,bcn->kcn", of_board, shapes).flatten(1)
+        turns = _felt(cameras, given, _PX_PER_METER * corners, parts_known)
+    # The unknowns of each camera, one after the other, and the board's: through these, lenses depend on each other.
+    columns, selected = torch.block_diag(*turns).split([len(known) for known in parts_known]), list[Tensor]()
+    for lens, own_columns in zip(given, columns, strict=False):
+        selected.append(lens.own @ own_columns + lens.by_board @ columns[-1])
+    found = SharedUnknowns(
+        cameras=tuple(selected),
+        shapes=shapes,
+        board=of_board @ columns[-1],
+        begin=torch.cat([turn.T @ begin for turn, begin in zip(turns, parts_begin, strict=True)]),
+        known=torch.cat([(turn[known] != 0).any(0) for turn, known in zip(turns, parts_known, strict=True)]),
+        labels=("",) * sum(turn.shape[1] for turn in turns),
+    )
+    return found, None if modes is None else torch.einsum("b,bcn->nc", amplitudes, shapes)
+
+
+class _GivenBoard(NamedTuple):
+    """A camera's parameters as functions of unknowns y that are independent of its board, and of the board.
+
+    Attributes:
+        own: (5 + P, Y) derivatives by y.
+        begin: (Y,) what y is for the camera and the board as given.
+        known: (Y,) whether y is a standard normal; nothing is known of the others.
+        by_board: (5 + P, B) derivatives by the board's unknowns while y is held.
+    """
+
+    own: Tensor
+    begin: Tensor
+    known: Tensor
+    by_board: Tensor
+
+
+def _given_board(part: CameraInformation, own: Gaussian, board: Slots, amplitudes: Tensor) -> _GivenBoard:
+    """What is known of a camera and its board, as if the board were known."""
+    size = part.lens_size
+    rows = own.placed((*part.lens, *board), torch.cat([part.estimate[:size], amplitudes])).rows
+    change, pull, known = whitened(rows[:, :size], rows[:, size:])
+    selection = part.selection()[:, :size]
+    return _GivenBoard(selection @ change, pull[:, -1], known, -selection @ change @ pull[:, :-1])
+
+
+def _board_beforehand(shared: Sequence[CameraInformation], modes: BoardModes | None) -> tuple[Gaussian, Tensor]:
+    """The prior of a board's modes, and amplitudes to begin with; of no unknowns for no board."""
+    if shared:
+        # Each camera's evidence set amplitudes of its own; what is in between is as good as either.
+        sigma = torch.stack([part.sigma[part.lens_size :].log() for part in shared]).mean(0).exp()
+        mean = torch.stack([part.mean[part.lens_size :] for part in shared]).mean(0)
+        return Gaussian.independent(shared[0].board, mean, sigma), shared[0].estimate[shared[0].lens_size :]
+    if modes is None:
+        nothing = torch.zeros(0, dtype=torch.float64)
+        return Gaussian.independent((), nothing, nothing), nothing
+    prior = printed_prior(modes, typical_hyperprior().mean[BOARD:])
+    return prior, torch.zeros_like(prior.at)
+
+
+def _felt(
+    cameras: Sequence[Camera], lenses: Sequence[_GivenBoard], by_corners: Tensor, known: Sequence[Tensor]
+) -> list[Tensor]:
+    """For each camera's unknowns, and last the board's, those directions (K, F) that matter, orthonormal.
+
+    Of the known unknowns they are those that move anything seen by `_FELT` px; all others stay.
+
+    Args:
+        cameras: of the rig.
+        lenses: their parameters by the unknowns.
+        by_corners: (B, 3 N) movements of the board by its unknowns, px.
+        known: of each camera's unknowns and of the board's, which are standard normals.
+    """
+    found, effects = list[Tensor](), [by_corners]
+    for camera, lens, standard in zip(cameras, lenses, known, strict=False):
+        rays, valid = camera.unproject(camera.grid(25, 17).reshape(-1, 2))
+        own = list[Tensor]()
+        for distance in (FAR, _NEAR):
+            points = (rays[valid] * distance).T
+            seen = project_components(points, camera.params.detach(), camera.model, list(range(len(lens.own))))
+            good = torch.where(seen.regular, seen.by_camera, 0.0).flatten(1)
+            own.append(lens.own.T @ good)
+            effects.append(lens.by_board.T @ good)
+        found.append(_moving(torch.cat(own, 1), standard))
+    return [*found, _moving(torch.cat(effects, 1), known[-1])]
+
+
+def _moving(effects: Tensor, known: Tensor) -> Tensor:
+    """(K, F): of the known ones of K unknowns those directions that move anything, by effects (K, N); all others."""
+    moved = effects[known]
+    _, vectors = torch.linalg.eigh(moved @ moved.T)
+    # The largest movement of any one place, not their sum.
+    felt = vectors[:, (vectors.T @ moved).abs().amax(1) > _FELT].flip(-1)
+    unit = torch.eye(len(known), dtype=felt.dtype)
+    return torch.cat([unit[:, known] @ felt, unit[:, ~known]], 1)
