@@ -3,7 +3,7 @@
 
 # Cameras and rigs
 from kcal.lens.camera import Camera as Camera
-from kcal.lens.rig import StereoRig as StereoRig
+from kcal.lens.rig import Rig as Rig
 from kcal.io.camera_file import load_camera as load_camera
 from kcal.io.camera_file import save_camera as save_camera
 from kcal.io.rig_file import load_rig as load_rig

@@ -31,8 +31,7 @@ _MANY, _NAMED = inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD
 # What makes the things that users most often pass something else for.
 _MAKERS = {
     "Camera": "Camera.build, Camera.from_opencv, kcal.load_camera or kcal.calibrate_camera(...).camera",
-    "StereoRig": "kcal.StereoRig, kcal.load_rig or kcal.solve_rig(...).stereo()",
-    "CameraRig": "kcal.rig.CameraRig, kcal.rig.load_camera_rig or kcal.solve_rig(...).stations()",
+    "Rig": "kcal.Rig.pair, kcal.load_rig or kcal.solve_rig(...).stereo()",
     "Observations": "kcal.detect or kcal.Observations.load",
     "Board": "kcal.Board or kcal.Board.parse",
     "RigData": "kcal.RigData",

@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from torch.func import functional_call, jvp, stack_module_state, vjp, vmap
 
 import kcal
-from kcal import Board, Camera, StereoRig
+from kcal import Board, Camera
 from kcal.calibrate.camera.layer import CalibrationLayer
 from kcal.calibrate.camera.result import CalibrationOptions
 from kcal.corners.refine import RefineCorners
@@ -34,7 +34,7 @@ from kcal.lens.baking import LookupCamera, bake
 from kcal.lens.camera_like import CameraRays, Unproject
 from kcal.lens.camera_parameters import CameraDistortion, ExtendedDistortion
 from kcal.lens.images import StereoRectification, Undistort, UndistortImage
-from kcal.lens.rig import CameraRig, Origin, RigCovariance
+from kcal.lens.rig import Origin, Rig, RigCovariance
 from kcal.lens.views import Cylinder
 from kcal.locate.disparity import DisparityRanges
 from kcal.locate.geodesy import enu_from_cam
@@ -106,10 +106,10 @@ def camera(number: int = 0, size: tuple[int, int] = (640, 480), model: str = "op
     return Camera.build(focal=(focal, 1.01 * focal), center=center, size=size, model=model, coefficients=lens)
 
 
-def rig(number: int = 0, size: tuple[int, int] = (640, 480), *, free: bool = True) -> StereoRig:
+def rig(number: int = 0, size: tuple[int, int] = (640, 480), *, free: bool = True) -> Rig:
     """Two cameras some meters apart, the right one turned."""
     turn = rotation_from_vector(torch.tensor([[0.01, 0.02 - 0.002 * number, -0.01]], dtype=torch.float64))[0]
-    made = StereoRig(camera(number, size), camera(1 - number, size), turn, torch.tensor([-5.0 - number, 0.1, 0.2]))
+    made = Rig.pair(camera(number, size), camera(1 - number, size), turn, torch.tensor([-5.0 - number, 0.1, 0.2]))
     return made.free() if free else made
 
 
@@ -118,7 +118,7 @@ PLACES = torch.tensor([[4.0, -8.0, 160.0], [-30.0, 14.0, 120.0], [2.0, 2.0, 40.0
 
 def pairs() -> Values:
     """Marked pixels of three points in both images."""
-    left, right, _ = rig()(PLACES)
+    left, right = rig()(PLACES)[0].unbind(-2)
     return {
         "pixels_left": left.detach() + 0.1 * noise(3, 2),
         "pixels_right": right.detach() + 0.1 * noise(3, 2, seed=1),
@@ -144,12 +144,12 @@ def stereo(number: int) -> StereoLocalizer:
     ).free()  # fmt: skip
 
 
-def stations(number: int = 0) -> CameraRig:
+def stations(number: int = 0) -> Rig:
     """Three cameras kilometers apart."""
     look = torch.stack([enu_from_cam(heading + number, 1.0, 0.5).T for heading in (0.0, 315.0, 45.0)])
     where = torch.tensor([[0.0, 0, 30], [5000.0, 0, 40], [-5000.0, 0, 35 + number]], dtype=torch.float64)
     each = [camera(number), camera(), camera(1)]
-    made = CameraRig(each, ["mill", "church", "mast"], look, where, origin=Origin(lat=19.07, lon=72.87, height=14.0))
+    made = Rig(each, ["mill", "church", "mast"], look, center=where, origin=Origin(lat=19.07, lon=72.87, height=14.0))
     return made.free()
 
 
@@ -232,10 +232,10 @@ def crossings() -> Values:
     }  # fmt: skip
 
 
-def plain_rig(number: int) -> StereoRig:
+def plain_rig(number: int) -> Rig:
     """Parallel pinholes with a small image."""
     one = Camera.build(focal=(90.0 + number, 90.0), center=(47.5, 35.5), size=(96, 72), model="pinhole")
-    return StereoRig(one, copy.deepcopy(one), torch.eye(3), torch.tensor([-2.0 - number, 0.0, 0.0]))
+    return Rig.pair(one, copy.deepcopy(one), torch.eye(3), torch.tensor([-2.0 - number, 0.0, 0.0]))
 
 
 def tables(number: int) -> LookupCamera:
@@ -286,12 +286,11 @@ CASES: dict[str, Case] = {
         make=lambda n: UndistortImage(camera(n, SMALL), camera(0, SMALL, "pinhole")),
         inputs=lambda: {"image": image()}, batched=("image",), forward=False,
     ),
-    "StereoRig": Case(make=rig, inputs=lambda: {"points_left": PLACES}, batched=("points_left",)),
     "StereoRectification": Case(
         make=rectification, inputs=lambda: {"left": image(), "right": image(seed=8)}, batched=("left", "right"),
-        constant=("rig.right_from_left",), forward=False,
+        constant=("rig.rotation", "rig.translation"), forward=False,
     ),
-    "CameraRig": Case(
+    "Rig": Case(
         make=stations, inputs=lambda: {"points": 10.0 * PLACES + torch.tensor([0.0, 4000, 0], dtype=torch.float64)},
         batched=("points",),
     ),

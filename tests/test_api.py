@@ -29,7 +29,7 @@ PUBLIC = {
     "kcal": """
         Baseline Board Boards CalibrationOptions Camera DegenerateError Features FileError InputError
         KcalError KcalWarning Landmarks MeasuredPosition Observations Origin PositionStatus RigData
-        RigOptions StereoLocalizer StereoRig View calibrate_camera calibrate_rig detect load_camera load_rig
+        RigOptions Rig StereoLocalizer View calibrate_camera calibrate_rig detect load_camera load_rig
         locate_points save_camera save_rig solve_rig
     """,
     "kcal.lens": """
@@ -47,7 +47,7 @@ PUBLIC = {
         examine load_measured_board measure_board save_measured_board
     """,
     "kcal.rig": """
-        CameraRig Effect ImagePair Mounting MovingOptions RasterError RigCovariance SkylineImage Survey Watched
+        Effect ImagePair Mounting MovingOptions RasterError RigCovariance SkylineImage Survey Watched
         check_rig import_survey load_camera_rig match_landmarks match_moving mounting_covariance
         pair_by_name paired_boards placed_rig planned_rig read_features read_pairs read_sightings
         read_tracks save_camera_rig scene_features skyline_attitude skyline_source

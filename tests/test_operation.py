@@ -16,7 +16,7 @@ from kcal.lens.camera_like import Unproject
 from kcal.lens.field_modes import NetworkModes
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.model import LensModel
-from kcal.lens.rig import Origin, RigCovariance, StereoRig
+from kcal.lens.rig import Origin, Rig, RigCovariance
 from kcal.lens.zernike import ZernikeModes
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.triangulate import Triangulate
@@ -37,8 +37,8 @@ def camera(modes: ZernikeModes | NetworkModes | None = None) -> Camera:
     return Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), coefficients=lens, model=model)
 
 
-def stereo(modes: ZernikeModes | NetworkModes | None = None) -> StereoRig:
-    return StereoRig(camera(modes), camera(modes), torch.eye(3), torch.tensor([-10.0, 0.1, 0.0]))
+def stereo(modes: ZernikeModes | NetworkModes | None = None) -> Rig:
+    return Rig.pair(camera(modes), camera(modes), torch.eye(3), torch.tensor([-10.0, 0.1, 0.0]))
 
 
 def localizer() -> StereoLocalizer:
@@ -48,10 +48,10 @@ def localizer() -> StereoLocalizer:
     return StereoLocalizer(rig, origin=origin, heading_deg=20.0, mounting=1e-6 * torch.eye(6).double())
 
 
-def marks(rig: StereoRig, count: int = 5) -> tuple[Tensor, Tensor]:
+def marks(rig: Rig, count: int = 5) -> tuple[Tensor, Tensor]:
     place = torch.linspace(-0.3, 0.3, count).double()
     depth = torch.linspace(300, 2000, count).double()
-    left, right, _ = rig(torch.stack([place, 0.5 * place, torch.ones_like(place)], -1) * depth[:, None])
+    left, right = rig(torch.stack([place, 0.5 * place, torch.ones_like(place)], -1) * depth[:, None])[0].unbind(-2)
     return left.detach() + 0.05, right.detach()
 
 

@@ -10,16 +10,16 @@ from typing import Any
 import torch
 
 import kcal
-from kcal import Board, Camera, Observations, Origin, StereoLocalizer, StereoRig, View
+from kcal import Board, Camera, Observations, Origin, Rig, StereoLocalizer, View
 from kcal.corners.detect import Detection
 from kcal.lens import rotation_from_vector
 from kcal.locate import Triangulate
-from kcal.rig import CameraRig, RigCovariance
+from kcal.rig import RigCovariance
 from kcal.texts import brief
 
 ROOT = Path(__file__).parents[1]
 CAMERA = Camera.build(focal=(1600, 1600.25), center=(959.5, 539.5), size=(1920, 1080), coefficients=[-0.1])
-RIG = StereoRig(CAMERA, CAMERA, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
+RIG = Rig.pair(CAMERA, CAMERA, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
 
 
 def calibrated() -> Any:
@@ -49,17 +49,17 @@ def check(value: Any, *told: str, lines: int = 3) -> str:
 
 def test_modules() -> None:
     check(CAMERA, "opencv5", "(1920, 1080)", "focal=(1600, 1600.25)", "whole image", lines=1)
-    check(RIG, "baseline=10.0 m", "(left): Camera(", "(right): Camera(", lines=5)
+    check(RIG, "left, right, baseline=10.0 m", "2 x Camera(", lines=6)
     assert "covariance" not in repr(RIG)
-    known = StereoRig(CAMERA, CAMERA, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
+    known = Rig.pair(CAMERA, CAMERA, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
     known.covariance = RigCovariance.of(known)
-    check(known, "baseline=10.0 m, covariance", lines=5)
+    check(known, "baseline=10.0 m, covariance", lines=6)
     look = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    stations = CameraRig([CAMERA] * 9, list("abcdefghi"), look.repeat(9, 1, 1), torch.eye(9)[:, :3] * 3000.0)
+    stations = Rig([CAMERA] * 9, list("abcdefghi"), look.repeat(9, 1, 1), center=torch.eye(9)[:, :3] * 3000.0)
     check(stations, "a, b, c", "up to 4240 m apart", "9 x Camera", lines=6)
     origin = Origin(lat=19.07, lon=72.87, height=14.0)
     localize = StereoLocalizer(RIG, origin=origin, heading_deg=35.0, pixel_sigma=0.1)
-    check(localize, "lat=19.07", "heading=35°", "pixel_sigma=0.1, errors of marks", "10.0 m", lines=8)
+    check(localize, "lat=19.07", "heading=35°", "pixel_sigma=0.1, errors of marks", "10.0 m", lines=9)
 
 
 def test_results() -> None:
@@ -88,7 +88,7 @@ def test_a_board_can_be_made_from_its_text() -> None:
 
 def test_a_rig_file() -> None:
     rig = kcal.load_rig(ROOT / "assets" / "sample-rig.json")
-    check(rig, "baseline=10.0", "covariance, mounting, calibration", lines=5)
+    check(rig, "baseline=10.0", "covariance, mounting, calibration", lines=7)
     check(rig.covariance, "RigCovariance(half=(")
     check(rig.mounting, "Mounting(heading_deg=", "origin=Origin(lat=", "covariance=(7, 7)")
     check(rig.calibration, "RigCalibration(rms=")

@@ -17,7 +17,7 @@ import kcal
 BOARD = kcal.Board(columns=7, rows=6, square=0.05)
 SIZE = (640, 480)
 CAMERA = kcal.Camera.build(focal=(700, 702), center=(321, 238), size=SIZE, model="pinhole")
-TRUTH = kcal.StereoRig(CAMERA, CAMERA, torch.eye(3), torch.tensor([-0.25, 0.0, 0.0]))
+TRUTH = kcal.Rig.pair(CAMERA, CAMERA, torch.eye(3), torch.tensor([-0.25, 0.0, 0.0]))
 ORIGIN = kcal.Origin(lat=19.07, lon=72.87, height=14.0)
 TARGETS = torch.tensor([[0.4, 0.1, 6.0], [-1.0, -0.3, 12.0]], dtype=torch.float64)
 
@@ -83,7 +83,7 @@ def test_from_images_to_positions(images: Path, tmp_path: Path) -> None:
     file = kcal.save_rig(rig, tmp_path / "rig.json")
 
     # A rig and pixels to positions, in a detector's graph and as a list.
-    left, right, _ = TRUTH(TARGETS)
+    left, right = TRUTH(TARGETS)[0].unbind(-2)
     localize = kcal.StereoLocalizer.from_file(file, pixel_sigma=0.1)
     found = localize(left, right)
     assert localize.included == ("marks", "calibration", "mounting")

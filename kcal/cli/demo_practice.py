@@ -22,7 +22,7 @@ from kcal.files import dump_json, make_folder, read_bytes, write_atomic
 from kcal.io.camera_file import load_camera
 from kcal.io.images import write_png, write_video
 from kcal.io.rig_file import load_rig
-from kcal.lens.rig import Origin, StereoRig
+from kcal.lens.rig import Origin, Rig
 from kcal.locate.geodesy import enu_to_geodetic
 from kcal.report.positions import save_site_sketch
 from kcal.report.practice_score import score_lens, score_positions, score_rig, score_tracks
@@ -326,7 +326,7 @@ def _score_cameras(folder: Path, truth: dict[str, Any]) -> None:
     _print_or_missing(rows)
 
 
-def _score_rig(folder: Path, truth: dict[str, Any]) -> StereoRig | None:
+def _score_rig(folder: Path, truth: dict[str, Any]) -> Rig | None:
     _head("Rig: error of ranges over the image, with marks that have no noise")
     path = folder / "rig.json"
     if not path.exists():

@@ -27,7 +27,7 @@ from kcal.errors import FileError
 from kcal.files import make_folder, write_atomic
 from kcal.io.images import write_png
 from kcal.io.rig_file import RigFile, load_rig
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.locate.geodesy import Origin
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.marks import Marks, read_marks, write_marks
@@ -344,7 +344,7 @@ def simulated_site(output: Path, seed: int) -> None:
     print_results(output, command)
 
 
-def _more_draws(scene: DemoScene, rig: StereoRig) -> str:
+def _more_draws(scene: DemoScene, rig: Rig) -> str:
     """How many intervals of this rig contain the true range over many draws of the noise in the marks."""
     draws, targets = 200, scene.points_rig(scene.targets)
     marks = mark_points(scene.rig, targets.repeat(draws, 1), scene.mark_sigma, scene.generator(-30))

@@ -24,7 +24,7 @@ from kcal.files import is_stream
 if TYPE_CHECKING:
     from kcal.io.foreign import ImportedCameras
     from kcal.lens.camera import Camera
-    from kcal.lens.rig import CameraRig, StereoRig
+    from kcal.lens.rig import Rig
 
 
 # Cameras from files of kcal or of other programs, as commands name them: FILE, or FILE:CAMERA.
@@ -57,7 +57,7 @@ def picked(found: ImportedCameras, name: str | None, source: str) -> Camera:
     return found.cameras[names.index(name)]
 
 
-def cameras_and_rig(path: Path) -> tuple[ImportedCameras, StereoRig | None]:
+def cameras_and_rig(path: Path) -> tuple[ImportedCameras, Rig | None]:
     """The cameras of a file of any program, and the rig that they are, if they are one."""
     from kcal.io.formats import import_cameras, recognized
     from kcal.io.rig_file import load_rig
@@ -393,7 +393,7 @@ PixelSigma: TypeAlias = Annotated[
 ]
 
 
-def pixel_sigma_of(given: float | None, rig: StereoRig | CameraRig | None = None) -> float:
+def pixel_sigma_of(given: float | None, rig: Rig | None = None) -> float:
     """The noise of marks, px: as given, or as the rig's file states, or assumed; the last two are said."""
     sigma, note = pixel_sigma_and_source(given, rig)
     if note:
@@ -401,7 +401,7 @@ def pixel_sigma_of(given: float | None, rig: StereoRig | CameraRig | None = None
     return sigma
 
 
-def pixel_sigma_and_source(given: float | None, rig: StereoRig | CameraRig | None = None) -> tuple[float, str]:
+def pixel_sigma_and_source(given: float | None, rig: Rig | None = None) -> tuple[float, str]:
     """The same, and what there is to say of it.
 
     Raises:

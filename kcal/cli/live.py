@@ -20,7 +20,7 @@ from kcal.files import check_writable
 from kcal.texts import measured_text
 
 if TYPE_CHECKING:
-    from kcal.lens.rig import StereoRig
+    from kcal.lens.rig import Rig
     from kcal.locate.localizer import StereoLocalizer
     from kcal.locate.multi_localizer import MultiViewLocalizer
     from kcal.locate.positions import Located
@@ -282,7 +282,7 @@ def _stations(rig: Path, pixel_sigma: float | None) -> tuple[MultiViewLocalizer,
 def _videos(
     videos: list[str],
     detector: str,
-    rig: StereoRig | MultiViewLocalizer,
+    rig: Rig | MultiViewLocalizer,
     tracker: Tracker,
     options: AssociationOptions,
     match_sigma: float,

@@ -23,7 +23,7 @@ from kcal.texts import one_line
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from kcal.lens.rig import Origin, StereoRig
+    from kcal.lens.rig import Origin, Rig
     from kcal.locate.positions import Located
     from kcal.locate.station_positions import PositionSample, ViewsLocator
     from kcal.locate.tables import PositionColumns
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 # Rows of a table that are located by a watched rig, each as the rig stood at its time.
 
 
-def located_at(history: Path, rig: StereoRig, locator: Callable[[StereoRig], Locator]) -> Locate:
+def located_at(history: Path, rig: Rig, locator: Callable[[Rig], Locator]) -> Locate:
     """What locates rows with a column `time`: by the rig of that second.
 
     Args:
@@ -301,7 +301,7 @@ def _of_pairs(rig: Path, points: Path, options: LocateOptions) -> LocateRun:
     elif own.grid is not None:
         heading = true_from_grid(heading, place, own.grid)
 
-    def locator(standing: StereoRig) -> Locator:
+    def locator(standing: Rig) -> Locator:
         errors = run_errors(
             standing, yaw_deg=yaw_sigma, heading_deg=own.heading_sigma, origin_m=own.origin_sigma,
             elsewhere=place is not None,

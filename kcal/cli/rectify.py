@@ -22,7 +22,7 @@ from kcal.strict_json import read_json
 if TYPE_CHECKING:
     from kcal.lens.camera import Camera
     from kcal.lens.images import StereoRectification, Undistort
-    from kcal.lens.rig import StereoRig
+    from kcal.lens.rig import Rig
 
 
 # Images of one camera, resampled into a folder: image by image, so that a run that was interrupted continues.
@@ -233,7 +233,7 @@ def rectify_command(
         _rectify_rig(rig, images or [], output, fov, maps, mask, alpha=alpha, size=shape, at=at)
 
 
-def rig_of(source: str) -> StereoRig | None:
+def rig_of(source: str) -> Rig | None:
     """The rig of a file of kcal or of another program; None for a camera."""
     path, name = named_source(source)
     return cameras_and_rig(path)[1] if name is None else None
@@ -297,7 +297,7 @@ def _rectify_camera(
 
 
 def _rectify_rig(
-    rig: StereoRig,
+    rig: Rig,
     images: list[str],
     folder: Path,
     fov: float | None,
@@ -323,7 +323,7 @@ def _rectify_rig(
 
     from kcal.io.rig_file import save_rig
     from kcal.lens.images import StereoRectification
-    from kcal.lens.rig import StereoRig
+    from kcal.lens.rig import Rig
 
     prepare(folder, extras)
     for name, files in targets.items():
@@ -338,7 +338,7 @@ def _rectify_rig(
                 before, failures = before + done, failures + wrong
     paths = [path for some in sides.values() for path in some]
     _refuse_none(paths, failures)
-    save_rig(StereoRig(module.camera, module.camera, torch.eye(3), -module.right_center), rig_path)
+    save_rig(Rig.pair(module.camera, module.camera, torch.eye(3), -module.right_center), rig_path)
     _save_array(matrix_path, module.depth_matrix)
     for name, side in zip(names, (module.left, module.right), strict=True):
         _write_extras(folder, name, side, maps, mask)

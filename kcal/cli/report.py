@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult
     from kcal.lens.camera import Camera
-    from kcal.lens.rig import CameraRig, StereoRig
+    from kcal.lens.rig import Rig
     from kcal.report.verdict import Requirement, Verdict
 
 # A verdict, how the pictures of its page are drawn, and its tables.
@@ -193,7 +193,7 @@ def _of_rig(path: Path, observations: list[Path], needs: tuple[Requirement, ...]
     from kcal.report.judge_rig import named_cameras
 
     pair = names_of_rig(path) == ("left", "right")
-    rig: StereoRig | CameraRig = load_rig(path) if pair else load_camera_rig(path)
+    rig: Rig = load_rig(path) if pair else load_camera_rig(path)
     mark_sigma = pixel_sigma_of(pixel_sigma, rig)
     cameras = named_cameras(rig)
     if pair and observations and len(observations) != 2:
@@ -208,16 +208,15 @@ def _of_rig(path: Path, observations: list[Path], needs: tuple[Requirement, ...]
 
 
 def judged_rig(
-    rig: StereoRig | CameraRig, observations: Sequence[Path], needs: tuple[Requirement, ...], *, mark_sigma: float,
+    rig: Rig, observations: Sequence[Path], needs: tuple[Requirement, ...], *, mark_sigma: float,
     name: str, cameras: Sequence[tuple[str, Camera]],
 ) -> Judged:  # fmt: skip
     """The verdict on a rig and, with the observations of `cameras`, each with its name, on these as well."""
-    from kcal.lens.rig import StereoRig
     from kcal.report.judge_rig import rig_verdict
 
     found = judged_sides(cameras, observations, mark_sigma)
     # Views of a rig that was solved without pairs may be of different moments, though their images are named alike.
-    if observations and isinstance(rig, StereoRig) and (rig.calibration is None or rig.calibration.pairs > 0):
+    if observations and len(rig) == 2 and (rig.calibration is None or rig.calibration.pairs > 0):
         pairs, unpaired = _pairs(rig, observations)
     else:
         pairs, unpaired = None, ""
@@ -239,7 +238,7 @@ def judged_sides(
     ]
 
 
-def stored_tables(rig: StereoRig | CameraRig) -> list[list[list[str]]]:
+def stored_tables(rig: Rig) -> list[list[list[str]]]:
     """Tables of all cameras, as the rig's file has them."""
     from kcal.report.judge_rig import named_cameras
     from kcal.report.pages import camera_tables
@@ -252,7 +251,7 @@ def side_pictures(cameras: Sequence[Judged]) -> dict[str, bytes]:
     return {f"{verdict.subject}-{name}": data for verdict, pictures, _ in cameras for name, data in pictures().items()}
 
 
-def _pairs(rig: StereoRig, observations: Sequence[Path]) -> tuple[tuple[Tensor, Tensor] | None, str]:
+def _pairs(rig: Rig, observations: Sequence[Path]) -> tuple[tuple[Tensor, Tensor] | None, str]:
     """Corners of the board and pixels of pairs of views, or why there are none."""
     from kcal.calibrate.rig.pairs import pair_by_name, paired_boards
     from kcal.corners.observations import Observations

@@ -22,7 +22,7 @@ from kcal.files import check_picture, check_writable, write_atomic
 
 if TYPE_CHECKING:
     from kcal.calibrate.rig.landmarks import Landmarks
-    from kcal.lens.rig import StereoRig
+    from kcal.lens.rig import Rig
     from kcal.locate.marks import Marks
     from kcal.watch.turned import Drift
 
@@ -326,7 +326,7 @@ def solve_command(
             raise typer.Exit(NO)
 
 
-def _calibrated_from(rig: StereoRig, pairs: tuple[Path, Path]) -> bool:
+def _calibrated_from(rig: Rig, pairs: tuple[Path, Path]) -> bool:
     """Whether these are the views from which both cameras were calibrated, as far as their names tell."""
     from kcal.corners.observations import Observations
 
@@ -424,7 +424,7 @@ def check(
     raise typer.Exit(DRIFTED)
 
 
-def _landmarks(rig: StereoRig, path: Path, now: Marks, sigma: float) -> Landmarks:
+def _landmarks(rig: Rig, path: Path, now: Marks, sigma: float) -> Landmarks:
     from kcal.locate.survey import match_landmarks, read_survey
 
     if rig.mounting is None:

@@ -27,7 +27,7 @@ from kcal.texts import number_text, setting_text
 if TYPE_CHECKING:
     from kcal.io.file_summary import CameraSummary, RigSummary
     from kcal.lens.camera import Camera
-    from kcal.lens.rig import StereoRig
+    from kcal.lens.rig import Rig
 
 # The block of a file, as it is stored, and what is derived of it.
 _Camera: TypeAlias = "tuple[dict[str, Any], CameraSummary]"
@@ -130,7 +130,7 @@ def _derived_camera(camera: Camera) -> _Camera:
     return content, CameraSummary.derived(camera, content)
 
 
-def _derived_rig(rig: StereoRig) -> tuple[list[_Camera], _Rig]:
+def _derived_rig(rig: Rig) -> tuple[list[_Camera], _Rig]:
     from kcal.io.file_summary import RigSummary, take_joint_errors
     from kcal.io.rig_file import rig_to_file
 

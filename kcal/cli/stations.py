@@ -21,7 +21,7 @@ from kcal.texts import length_text, measured_length, measured_text, number_text
 if TYPE_CHECKING:
     from kcal.calibrate.rig.result import RigResult
     from kcal.calibrate.rig.solve import RigOptions
-    from kcal.lens.rig import CameraRig, StereoRig
+    from kcal.lens.rig import Rig
     from kcal.report.verdict import Requirement
 
 
@@ -45,7 +45,7 @@ def source_lines(result: RigResult) -> list[str]:
     return ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip() for row in rows]
 
 
-def rig_lines(result: RigResult, rig: StereoRig, unpaired: int) -> list[str]:
+def rig_lines(result: RigResult, rig: Rig, unpaired: int) -> list[str]:
     """What a result says: residuals by source, the relative pose with its sigmas, the board's squares, the mounting."""
     from kcal.report.judge_rig import triangulated_sides
 
@@ -86,7 +86,7 @@ def rig_lines(result: RigResult, rig: StereoRig, unpaired: int) -> list[str]:
     return lines
 
 
-def _exact_line(result: RigResult, rig: StereoRig) -> str:
+def _exact_line(result: RigResult, rig: Rig) -> str:
     """Which cameras were taken as exact, what an error of their lenses does, and which files had no error bars."""
     far, share = 100.0 * float(rig.baseline), 10.0 / float(rig.left.focal.mean())
     text = (
@@ -183,7 +183,7 @@ def solve_stations(
             raise typer.Exit(NO)
 
 
-def _print_stations(result: RigResult, rig: CameraRig, notes: Sequence[str]) -> None:
+def _print_stations(result: RigResult, rig: Rig, notes: Sequence[str]) -> None:
 
     print_rig(result, [*source_lines(result), *notes])
     print_table(station_rows(rig))
@@ -193,7 +193,7 @@ def _print_stations(result: RigResult, rig: CameraRig, notes: Sequence[str]) -> 
         out.print("No latitudes were given: positions are meters of the local frame. --origin anchors it on the Earth.")
 
 
-def station_rows(rig: CameraRig) -> list[list[str]]:
+def station_rows(rig: Rig) -> list[list[str]]:
     """A table of how each camera stands, heads first, with error bars: on the Earth, or in the rig's own frame."""
     import torch
 
@@ -229,7 +229,7 @@ def station_rows(rig: CameraRig) -> list[list[str]]:
     return rows
 
 
-def _stands(rig: CameraRig) -> dict[str, dict[str, float]]:
+def _stands(rig: Rig) -> dict[str, dict[str, float]]:
     """How each camera stands, for --json."""
     from kcal.locate.stations import station_stands
 

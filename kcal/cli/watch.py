@@ -19,7 +19,7 @@ from kcal.texts import measured_text
 
 if TYPE_CHECKING:
     from kcal.corners.images import Gray
-    from kcal.lens.rig import StereoRig
+    from kcal.lens.rig import Rig
     from kcal.pipeline.video_source import FramesTogether
     from kcal.watch.watcher import Noticed, Watched, Watcher, Webhook
 
@@ -132,7 +132,7 @@ def watch_command(
         raise typer.Exit(DRIFTED)
 
 
-def _follow(watcher: Watcher, rig: StereoRig, sources: tuple[str, str], hooks: list[Webhook], *, ends: bool) -> None:
+def _follow(watcher: Watcher, rig: Rig, sources: tuple[str, str], hooks: list[Webhook], *, ends: bool) -> None:
     """Look until the sources end, it is stopped, or an alarm ends it."""
     frames = None if Path(sources[0]).is_dir() else _frame_pairs(rig, sources)
     stopped = False
@@ -162,7 +162,7 @@ def _follow(watcher: Watcher, rig: StereoRig, sources: tuple[str, str], hooks: l
             frames.close()
 
 
-def _frame_pairs(rig: StereoRig, sources: tuple[str, str]) -> FramesTogether:
+def _frame_pairs(rig: Rig, sources: tuple[str, str]) -> FramesTogether:
     with with_extra("video", "videos need"):
         from kcal.pipeline.video_source import FramesTogether
 

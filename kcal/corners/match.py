@@ -32,7 +32,7 @@ from kcal.corners.patches import (
     weighted_correlation,
 )
 from kcal.errors import InputError
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.texts import brief
 
 # Find a point of the left image in the right one: correlation along the epipolar line, then least squares.
@@ -125,7 +125,7 @@ class PatchMatch(NamedTuple):
 
 @torch.no_grad()
 def match_points(
-    rig: StereoRig, left: Tensor, right: Tensor, pixels_left: Tensor, options: MatchOptions | None = None
+    rig: Rig, left: Tensor, right: Tensor, pixels_left: Tensor, options: MatchOptions | None = None
 ) -> Matches:
     """Find in the right image what is at given pixels of the left one.
 
@@ -146,7 +146,7 @@ def match_points(
     Example:
         >>> from kcal import Camera
         >>> camera = Camera.build(focal=(400, 400), center=(79.5, 59.5), size=(160, 120))
-        >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
+        >>> rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
         >>> image = torch.rand(15, 20, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
         >>> left = torch.nn.functional.interpolate(image[None, None], scale_factor=8, mode="bicubic")[0, 0]
         >>> found = match_points(rig, left, left.roll(-12, 1), torch.tensor([[80.0, 60.0]]))  # disparity 12 px: 33 m
@@ -179,7 +179,7 @@ def joined(found: Sequence[PatchMatch]) -> Matches:
     return matches
 
 
-def _match_one(rig: StereoRig, left: Tensor, right: Tensor, pixel: Tensor, options: MatchOptions) -> PatchMatch:
+def _match_one(rig: Rig, left: Tensor, right: Tensor, pixel: Tensor, options: MatchOptions) -> PatchMatch:
     half = options.half
     patch = pixel + grid_of((half, half), pixel.device)
     normalized, valid = rig.left.normalize(patch.flatten(0, 1))

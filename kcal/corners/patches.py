@@ -12,7 +12,7 @@ from kcal.checks import require_finite
 from kcal.dispatch import is_differentiated
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 
 # Check single gray images and filter them with separable Gaussian kernels.
 #
@@ -527,7 +527,7 @@ class ObjectPlanes(NamedTuple):
     valid: Tensor
 
 
-def object_planes(rig: StereoRig, left: Tensor, right: Tensor, level: Tensor) -> ObjectPlanes:
+def object_planes(rig: Rig, left: Tensor, right: Tensor, level: Tensor) -> ObjectPlanes:
     """Planes for anchors (N, 2) in both images, with steps of about 2^level (N,) pixels of the left image."""
     rotation = rig.right_from_left_rotation
     along = -(rotation.T @ rig.right_from_left_translation)

@@ -18,7 +18,7 @@ from kcal.native_file import Record, digest
 
 if TYPE_CHECKING:
     from kcal.lens.camera import Camera
-    from kcal.lens.rig import StereoRig
+    from kcal.lens.rig import Rig
 
 
 class CameraSummary(Record):
@@ -78,7 +78,7 @@ def sigma_of(camera: Camera) -> dict[str, float | None]:
     return {name: _rounded(v**0.5) if v > 0 else None for name, v in zip(camera.names, variances, strict=True)}
 
 
-def take_joint_errors(rig: StereoRig) -> None:
+def take_joint_errors(rig: Rig) -> None:
     """Give the cameras the error bars that the rig has of them: those of each alone are of before it was solved."""
     if rig.covariance is None:
         return
@@ -129,7 +129,7 @@ class RigSummary(Record):
     sigma_deg: tuple[float, float, float] | None
 
     @classmethod
-    def made(cls, rig: StereoRig, content: dict[str, Any]) -> Self:
+    def made(cls, rig: Rig, content: dict[str, Any]) -> Self:
         """That of a rig."""
         from kcal.lens.pose import vector_from_rotation
 

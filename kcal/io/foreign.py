@@ -25,7 +25,7 @@ from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.lens.pose import nearest_rotation
-from kcal.lens.rig import CameraRig, StereoRig
+from kcal.lens.rig import Rig
 from kcal.strict_formats import MOST_YAML, read_yaml
 from kcal.texts import brief
 
@@ -88,7 +88,7 @@ class ImportedCameras:
             and float(_second_from_first(self.poses).translation.norm()) > 0
         )
 
-    def rig(self) -> StereoRig:
+    def rig(self) -> Rig:
         """Both cameras as a rig, the first one on the left.
 
         Raises:
@@ -100,16 +100,16 @@ class ImportedCameras:
                 f"({', '.join(self.names)}) and {len(self.poses)} poses"
             )
         left, right = self.cameras
-        return StereoRig(left, right, *_second_from_first(self.poses))
+        return Rig.pair(left, right, *_second_from_first(self.poses))
 
-    def camera_rig(self) -> CameraRig:
+    def camera_rig(self) -> Rig:
         """All cameras as a rig, in the frame of the file.
 
         Raises:
             InputError: cameras without poses, or with equal names.
         """
         turns, shifts = (torch.stack([pose[i] for pose in self.poses]) for i in (0, 1))
-        return CameraRig(self.cameras, self.names, turns, -(turns.mT @ shifts[..., None])[..., 0])
+        return Rig(self.cameras, self.names, turns, shifts)
 
     def __repr__(self) -> str:
         return brief(self)
@@ -122,9 +122,9 @@ def _second_from_first(poses: Sequence[CameraPose]) -> CameraPose:
     return CameraPose(rotation, second.translation - rotation @ first.translation)
 
 
-def rig_poses(rig: StereoRig) -> tuple[CameraPose, CameraPose]:
-    """Both cameras from the left one's frame."""
-    return STILL, CameraPose(rig.right_from_left_rotation, rig.right_from_left_translation)
+def rig_poses(rig: Rig) -> tuple[CameraPose, ...]:
+    """Each camera from the rig's frame."""
+    return tuple(map(CameraPose, rig.rotation, rig.translation))
 
 
 def each_readable(

@@ -25,7 +25,7 @@ from kcal.io.file_summary import RigSummary
 from kcal.io.record import Packed
 from kcal.lens.calibration import RigCalibration
 from kcal.lens.projection import INTRINSICS
-from kcal.lens.rig import CameraRig, CameraRigCalibration, Mounting, Origin, RigCovariance, StereoRig
+from kcal.lens.rig import CameraRigCalibration, Mounting, Origin, Rig, RigCovariance
 from kcal.native_file import NativeFile, Record, storing
 
 Triple = tuple[float, float, float]
@@ -40,7 +40,7 @@ class RigPose(Record):
     @pydantic.model_validator(mode="after")
     def _rigid(self) -> RigPose:
         rotation = self.matrix()
-        # As in StereoRig; checked here so that the error names the file.
+        # As in Rig; checked here so that the error names the file.
         error = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max()
         if not float(error) <= 1e-6 or float(torch.linalg.det(rotation)) < 0:
             raise ValueError("rotation is no rotation matrix (R Rᵀ must be 1 and det R = +1)")
@@ -109,7 +109,7 @@ class RigMounting(FrameOrigin):
         return cls(**dataclasses.asdict(mounting.origin), **own)
 
     def mounting(self) -> Mounting:
-        """As `StereoRig.mounting`."""
+        """As `Rig.mounting`."""
         content: dict[str, Any] = dict(self)
         origin = Origin(**{name: content.pop(name) for name in FrameOrigin.model_fields})
         for name in ("covariance", "link"):
@@ -135,7 +135,7 @@ class RigFile(NativeFile):
     Example:
         >>> from kcal import Camera
         >>> camera = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080))
-        >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
+        >>> rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
         >>> float(rig_to_file(rig).rig().baseline)
         10.0
     """
@@ -187,21 +187,21 @@ class RigFile(NativeFile):
         """The stored covariance."""
         return None if self.half is None else RigCovariance(half=self.half.tensor())
 
-    def rig(self, field: nn.Module | None = None) -> StereoRig:
+    def rig(self, field: nn.Module | None = None) -> Rig:
         """The rig, equal to the stored one to the last bit, with its covariance, mounting and calibration.
 
         `field` as for `load_rig`.
         """
         pose = self.right_from_left
         translation = torch.tensor(pose.translation, dtype=torch.float64)
-        rig = StereoRig(self.left.camera(field), self.right.camera(field), pose.matrix(), translation)
+        rig = Rig.pair(self.left.camera(field), self.right.camera(field), pose.matrix(), translation)
         rig.covariance = self.known()
         rig.mounting = None if self.mounting is None else self.mounting.mounting()
         rig.calibration = self.calibration
         return rig
 
 
-def rig_to_file(rig: StereoRig) -> RigFile:
+def rig_to_file(rig: Rig) -> RigFile:
     """Put a rig, with all that is known of it and of its cameras, in the form in which it is stored.
 
     Raises:
@@ -210,7 +210,7 @@ def rig_to_file(rig: StereoRig) -> RigFile:
     Example:
         >>> from kcal import Camera
         >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
-        >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
+        >>> rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
         >>> rig_to_file(rig).right_from_left.translation
         (-1.0, 0.0, 0.0)
     """
@@ -229,7 +229,7 @@ def rig_to_file(rig: StereoRig) -> RigFile:
     return file.model_copy(update={"summary": RigSummary.made(rig, file.model_dump(mode="json"))})
 
 
-def save_rig(rig: StereoRig, path: str | Path) -> Path:
+def save_rig(rig: Rig, path: str | Path) -> Path:
     """Write a rig with both cameras and all that is known of them: covariances, mounting and how they were calibrated.
 
     Raises:
@@ -240,7 +240,7 @@ def save_rig(rig: StereoRig, path: str | Path) -> Path:
         >>> import tempfile
         >>> from kcal import Camera
         >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
-        >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
+        >>> rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     float(load_rig(save_rig(rig, Path(folder, "rig.json"))).baseline)
         1.0
@@ -248,7 +248,7 @@ def save_rig(rig: StereoRig, path: str | Path) -> Path:
     return rig_to_file(rig).save(path)
 
 
-def load_rig(path: str | Path, *, field: nn.Module | None = None) -> StereoRig:
+def load_rig(path: str | Path, *, field: nn.Module | None = None) -> Rig:
     """Read the rig of a kcal rig file, with its covariance, mounting and calibration, and those of its cameras.
 
     `field` as for `kcal.load_camera`, for both cameras: each gets a copy with its own weights.
@@ -283,13 +283,13 @@ class CameraRigFile(NativeFile):
         poses: where they stand.
         origin: of the frame, east, north, up; None: the first camera's frame.
         refraction: coefficient.
-        root: (K, P) as `CameraRig.root`.
+        root: (K, P) as `Rig.root`.
         calibration: how the rig was solved, if it was.
 
     Example:
         >>> from kcal import Camera
         >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
-        >>> rig = CameraRig([camera] * 3, ["a", "b", "c"], torch.eye(3).repeat(3, 1, 1), torch.eye(3))
+        >>> rig = Rig([camera] * 3, ["a", "b", "c"], torch.eye(3).repeat(3, 1, 1), center=torch.eye(3))
         >>> camera_rig_to_file(rig).rig().names
         ('a', 'b', 'c')
     """
@@ -313,13 +313,13 @@ class CameraRigFile(NativeFile):
             self.rig()
         return self
 
-    def rig(self, field: nn.Module | None = None) -> CameraRig:
+    def rig(self, field: nn.Module | None = None) -> Rig:
         """The rig, equal to the stored one to the last bit; `field` as for `kcal.load_rig`."""
-        rig = CameraRig(
+        rig = Rig(
             [file.camera(field) for file in self.cameras],
             self.names,
             torch.tensor([pose.rotation for pose in self.poses], dtype=torch.float64).reshape(-1, 3, 3),
-            torch.tensor([pose.center for pose in self.poses], dtype=torch.float64).reshape(-1, 3),
+            center=torch.tensor([pose.center for pose in self.poses], dtype=torch.float64).reshape(-1, 3),
             origin=None if self.origin is None else Origin(**dict(self.origin)),
             refraction=self.refraction,
         )
@@ -328,7 +328,7 @@ class CameraRigFile(NativeFile):
         return rig
 
 
-def camera_rig_to_file(rig: CameraRig) -> CameraRigFile:
+def camera_rig_to_file(rig: Rig) -> CameraRigFile:
     """Put a rig, with all that is known of it and of its cameras, in the form in which it is stored.
 
     Raises:
@@ -350,7 +350,7 @@ def camera_rig_to_file(rig: CameraRig) -> CameraRigFile:
         )
 
 
-def save_camera_rig(rig: CameraRig, path: str | Path) -> Path:
+def save_camera_rig(rig: Rig, path: str | Path) -> Path:
     """Write a rig of any number of cameras with all that is known of it.
 
     Raises:
@@ -361,7 +361,7 @@ def save_camera_rig(rig: CameraRig, path: str | Path) -> Path:
         >>> import tempfile
         >>> from kcal import Camera
         >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
-        >>> rig = CameraRig([camera], ["tower"], torch.eye(3)[None], torch.zeros(1, 3))
+        >>> rig = Rig([camera], ["tower"], torch.eye(3)[None], center=torch.zeros(1, 3))
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     CameraRigFile.load(save_camera_rig(rig, Path(folder, "rig.json"))).names
         ('tower',)

@@ -27,7 +27,7 @@ class CameraLike(Protocol):
     """A camera of any make: of kcal, baked (`LookupCamera`), or of your own.
 
     Its rays start at the origin of the camera frame: x right, y down, z forward; pixel (0, 0) is the center of the
-    first pixel. Everything is float64. `StereoRig`, `CameraRig`, localizers and `Undistort` take one. What needs
+    first pixel. Everything is float64. `Rig`, localizers and `Undistort` take one. What needs
     parameters is refused: saving, exporting, freeing, error bars of the lens, which counts as exact.
 
     Example:

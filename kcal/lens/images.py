@@ -14,7 +14,7 @@ from kcal.dispatch import is_differentiated, may_branch, still
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.camera_like import CameraLike, as_camera
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.lens.views import (
     Cylinder,
     TurnedCamera,
@@ -342,7 +342,7 @@ class StereoRectification(Float64Module):
 
     Example:
         >>> camera = Camera.build(focal=(500, 500), center=(319.5, 239.5), size=(640, 480), coefficients=[-0.2])
-        >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-2.0, 0.0, 0.0]))
+        >>> rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-2.0, 0.0, 0.0]))
         >>> rectify = StereoRectification(rig)
         >>> left, right, mask_left, mask_right = rectify(torch.rand(1, 3, 480, 640), torch.rand(1, 3, 480, 640))
         >>> tuple(left.shape), bool(mask_left.all())
@@ -356,7 +356,7 @@ class StereoRectification(Float64Module):
 
     def __init__(
         self,
-        rig: StereoRig,
+        rig: Rig,
         *,
         alpha: float = 0.0,
         size: tuple[int, int] | None = None,
@@ -441,7 +441,7 @@ class StereoRectification(Float64Module):
         return found[0][0], found[1][0], found[0][1] & found[1][1]
 
 
-def _rectified_frame(rig: StereoRig) -> Tensor:
+def _rectified_frame(rig: Rig) -> Tensor:
     """(3, 3) left_from_rectified: x or y along the baseline, z as nearly as possible between both cameras' axes."""
     rotation = rig.right_from_left_rotation
     center = -rotation.T @ rig.right_from_left_translation

@@ -88,7 +88,7 @@ def parameters_from_kornia(camera: Any) -> tuple[Tensor, tuple[int, int], LensMo
 
 
 def posed_pinholes(left: CameraParameters, right: CameraParameters, turn: Tensor, shift: Tensor) -> tuple[Any, Any]:
-    """Cameras of a rig, and their poses in the first one's frame; see `StereoRig.to_kornia`."""
+    """Cameras of a rig, and their poses in the first one's frame; see `Rig.to_kornia`."""
     made = kornia_camera(left), kornia_camera(right)
     for word, camera in zip(("left", "right"), made, strict=True):
         if not isinstance(camera, PinholeCamera):
@@ -102,7 +102,7 @@ def posed_pinholes(left: CameraParameters, right: CameraParameters, turn: Tensor
 
 
 def unposed_pinhole(camera: Any) -> tuple[Any, Tensor]:
-    """A single posed camera of kornia without its pose, and the pose (4, 4) in float64; see `StereoRig.from_kornia`."""
+    """A single posed camera of kornia without its pose, and the pose (4, 4) in float64; see `Rig.from_kornia`."""
     if not isinstance(camera, PinholeCamera) or camera.extrinsics.shape != (1, 4, 4):
         found = tuple(camera.extrinsics.shape) if isinstance(camera, PinholeCamera) else type(camera).__name__
         raise InputError(f"from_kornia: a PinholeCamera with extrinsics (1, 4, 4) is needed, got {found}")

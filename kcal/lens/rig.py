@@ -7,16 +7,16 @@ import datetime
 import hashlib
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Self
 
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
-from kcal.checks import StatedModule, as_covariance, as_points, as_tensor, require_finite, require_root, scalar
+from kcal.checks import StatedModule, as_covariance, as_points, as_tensor, require_root, scalar
 from kcal.dispatch import is_differentiated
 from kcal.errors import InputError, warn_user
-from kcal.lens.calibration import Exclusion, RigCalibration, RigSource, UntilChanged
+from kcal.lens.calibration import Exclusion, RigSource, UntilChanged
 from kcal.lens.camera import Camera
 from kcal.lens.camera_like import CameraLike, as_camera
 from kcal.lens.pose import Movable, check_motion, rotation_from_vector
@@ -140,54 +140,134 @@ class Mounting:
     refraction: float | None = None
 
 
-# `StereoRig`: two cameras and where one stands from the other; `RigCovariance`: how well that is known.
+# `Rig`: cameras and where each stands in one frame; `RigCovariance`: how well two of them are known.
 
 
-class StereoRig(Movable):
-    """Two cameras, rigidly joined.
+class Rig(Movable, StatedModule):
+    """Cameras, rigidly joined, and the pose of each in one frame, the rig's.
 
-    Convention: the rig frame is the left camera's frame, and `points_right = rotation @ points_left + translation`
-    (meters). "Left" is only the first camera's name.
+    Convention: `points_cam = rotation[c] @ points_rig + translation[c]` (meters), `cam_from_rig` of camera c. Two
+    cameras are the ordinary case, made by `Rig.pair`: the rig frame is then the left camera's frame. "Left" is only the
+    first camera's name. With an `origin`, the frame is east, north, up there.
 
-    What else is known of the rig travels with it, is stored by `kcal.save_rig` and used by `StereoLocalizer`, but takes
-    no part in projection: the attributes `covariance` (a `RigCovariance`), `mounting` (a `Mounting`) and `calibration`
-    (a `RigCalibration`). Each is None until it is set, and again once a camera or the relative pose has changed.
+    `left`, `right`, `baseline`, `right_from_left`, `essential`, `fundamental` and `to_kornia` are views of a rig of two
+    cameras; any other number is an `InputError`.
+
+    What else is known of the rig travels with it and is stored in its file, but takes no part in projection. Each of
+    these attributes is None until it is set, and again once a camera or a pose has changed:
+
+    * `covariance` (a `RigCovariance`) and `mounting` (a `Mounting`), of two cameras;
+    * `root`, of any number: (K, P) with rootᵀ root the covariance of P quantities: all parameters of each camera in
+      turn (`Camera.names`); then for each camera its center (3, meters) and a small turn of it (3, radians), both along
+      and about the rig frame's axes; last the coefficient of refraction. None: cameras and poses count as exact;
+    * `calibration`: how the rig was solved.
 
     Args:
-        left: the first camera, or a `CameraLike`.
-        right: the second camera.
-        right_from_left_rotation: (3, 3) rotation matrix, such as R of `cv2.stereoCalibrate`.
-        right_from_left_translation: (3,) or (3, 1) meters, such as T if the board was measured in meters.
+        cameras: V of them, or `CameraLike`s; one or more.
+        names: of the cameras, unlike each other.
+        rotation: (V, 3, 3) rotation matrices cam_from_rig. Of two cameras also (3, 3), that of the second one: the
+            first camera's frame is then the rig's.
+        translation: (V, 3) meters, likewise; or (3,).
+        center: (V, 3) projection centers in the rig frame, meters, in place of the translation.
+        origin: where the frame is anchored on the Earth.
+        refraction: coefficient k, see `StereoLocalizer`.
 
     Raises:
-        InputError: wrong shapes, values that are not finite, or a matrix that is no rotation.
+        InputError: wrong shapes, values that are not finite, names that are there twice, or a matrix that is no
+            rotation.
 
-    The pose may be freed: `rig.free("pose")`, `rig.free("rotation")` or `rig.free("translation")` let gradients reach
-    it, through a step on top of what is stored (the parameter `pose_step`), so that a rotation stays one under any
-    optimizer. A pose with a graph keeps it, and a translation that is an `nn.Parameter` is used as it is.
-
-    A `KcalWarning` says where the right camera stands to the left of the left one, and where the baseline is beyond
-    1 mm to 1 km.
+    Poses may be freed: `rig.free("pose")`, `rig.free("rotation")`, `rig.free("translation")` or `rig.free("mill")`, of
+    the camera with this name, let gradients reach them through a step on top of what is stored (the parameter
+    `pose_step`), so that a rotation stays one under any optimizer. A first camera whose frame is the rig's is freed
+    only by its name. A pose with a graph keeps it, and a translation that is an `nn.Parameter` is used as it is.
 
     Example:
-        >>> camera = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080))
-        >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
-        >>> float(rig.baseline)
+        >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
+        >>> look = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # north
+        >>> rig = Rig([camera] * 3, ["a", "b", "c"], look.repeat(3, 1, 1), center=torch.eye(3) * 1000.0)
+        >>> rig.names, rig.quantities
+        (('a', 'b', 'c'), 34)
+        >>> float(Rig.pair(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0])).baseline)
         10.0
     """
 
+    refraction: Tensor
+    place: Tensor | None
     covariance = UntilChanged["RigCovariance"](lambda rig, value: value.check(rig))
     mounting = UntilChanged[Mounting]()
-    calibration = UntilChanged[RigCalibration]()
+    root = UntilChanged[Tensor](lambda rig, value: rig.check_root(value))
+    calibration = UntilChanged[Any]()
 
     def __init__(
         self,
+        cameras: Sequence[Camera | CameraLike],
+        names: Sequence[str],
+        rotation: Tensor | ArrayLike,
+        translation: Tensor | ArrayLike | None = None,
+        *,
+        center: Tensor | ArrayLike | None = None,
+        origin: Origin | None = None,
+        refraction: float = REFRACTION,
+    ) -> None:
+        super().__init__()
+        count, like = len(cameras), getattr(cameras[0], "params", None) if cameras else None
+        turns, moves = as_points("rotation", rotation, 3, like), translation if center is None else center
+        if moves is None or (translation is not None and center is not None):
+            raise InputError("rig: translations or centers are needed, one of the two")
+        shift = as_points("translation" if center is None else "center", moves, 3, like)
+        alone = count == 2 and center is None and turns.shape == (3, 3)
+        if not count or turns.shape[-3:] != ((3, 3) if alone else (count, 3, 3)) or shift.shape != turns.shape[:-1]:
+            raise InputError(
+                f"{count} cameras: rotation ({count}, 3, 3) and {'translation' if center is None else 'center'} "
+                f"({count}, 3) are needed, got {tuple(turns.shape)} and {tuple(shift.shape)}"
+            )
+        if len(names) != count or len(set(names)) != count or not all(names):
+            raise InputError(f"cameras: {count} unlike names are needed, got {', '.join(names) or 'none'}")
+        for name, turn, move in zip(names[alone:], turns.reshape(-1, 3, 3), shift.reshape(-1, 3), strict=True):
+            check_motion(f"camera {name}:", turn, move)
+        if isinstance(moves, nn.Parameter) and shift is not moves:
+            raise InputError(f"translation: as a parameter it must be float64 of shape {tuple(shift.shape)}")
+        check_refraction(refraction, 0.0)
+        if center is not None:
+            shift = -(turns @ shift[..., None])[..., 0]
+        if alone and not isinstance(rotation, nn.Parameter):
+            turns = torch.stack([torch.eye(3).to(turns), turns])
+            shift = moves if isinstance(moves, nn.Parameter) else torch.stack([torch.zeros_like(shift), shift])
+        self.cameras = nn.ModuleList(map(as_camera, cameras))
+        self.names = tuple(names)
+        self.register_buffer("place", None if origin is None else origin.geodetic.to(turns.device))
+        self.register_buffer("refraction", scalar(refraction, turns))
+        self._keep("rotation", rotation if isinstance(rotation, nn.Parameter) else turns, turns=True)
+        self._keep("translation", shift)
+
+    @classmethod
+    def pair(
+        cls,
         left: Camera | CameraLike,
         right: Camera | CameraLike,
         right_from_left_rotation: Tensor | ArrayLike,
         right_from_left_translation: Tensor | ArrayLike,
-    ) -> None:
-        super().__init__()
+    ) -> Self:
+        """Two cameras: `points_right = rotation @ points_left + translation`, in the left camera's frame.
+
+        A `KcalWarning` says where the right camera stands to the left of the left one, and where the baseline is beyond
+        1 mm to 1 km.
+
+        Args:
+            left: the first camera, or a `CameraLike`.
+            right: the second camera.
+            right_from_left_rotation: (3, 3) rotation matrix, such as R of `cv2.stereoCalibrate`.
+            right_from_left_translation: (3,) or (3, 1) meters, such as T if the board was measured in meters.
+
+        Raises:
+            InputError: wrong shapes, values that are not finite, or a matrix that is no rotation.
+
+        Example:
+            >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
+            >>> rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
+            >>> rig.names, float(rig.baseline)
+            (('left', 'right'), 1.0)
+        """
         like = getattr(left, "params", None)
         rotation = as_points("right_from_left_rotation", right_from_left_rotation, 3, like)
         translation = as_tensor("right_from_left_translation", right_from_left_translation)
@@ -195,61 +275,137 @@ class StereoRig(Movable):
         translation = translation[:, 0] if translation.shape == (3, 1) else translation
         translation = as_points("right_from_left_translation", translation, 3, like)
         check_motion("rig", rotation, translation)
-        self.left: Camera = as_camera(left)
-        self.right: Camera = as_camera(right)
         if isinstance(right_from_left_translation, nn.Parameter) and translation is not right_from_left_translation:
             raise InputError("right_from_left_translation: as a parameter it must be float64 of shape (3,)")
-        self._keep("right_from_left_rotation", rotation, turns=isinstance(right_from_left_rotation, nn.Parameter))
-        self._keep("right_from_left_translation", translation)
+        if isinstance(right_from_left_rotation, nn.Parameter):
+            rotation = right_from_left_rotation
         if doubt := _pose_doubt(rotation.detach(), translation.detach()):
             warn_user(doubt)
+        return cls([left, right], ("left", "right"), rotation, translation)
 
     @property
-    def right_from_left_rotation(self) -> Tensor:
-        """(3, 3) rotation matrix, with the step of `free`."""
-        kept, step = self._kept("right_from_left_rotation"), self.freed_step
+    def rotation(self) -> Tensor:
+        """(V, 3, 3) cam_from_rig, with the steps of `free`."""
+        kept, step = self._kept("rotation"), self.freed_step
         return kept if step is None else rotation_from_vector(step[0]) @ kept
 
     @property
-    def right_from_left_translation(self) -> Tensor:
-        """(3,) meters, likewise."""
-        kept, step = self._kept("right_from_left_translation"), self.freed_step
+    def translation(self) -> Tensor:
+        """(V, 3) meters, likewise."""
+        kept, step = self._kept("translation"), self.freed_step
+        kept = torch.stack([torch.zeros_like(kept), kept]) if kept.ndim == 1 else kept
         return kept if step is None else kept + step[1]
 
     @property
-    def pose_slots(self) -> dict[str, Any]:
-        """What `free` takes: `pose`, or `rotation` and `translation`; the step is that of `RigCovariance`."""
-        return {"pose": slice(0, 6), "rotation": slice(0, 3), "translation": slice(3, 6)}
-
-    def _zero_step(self) -> Tensor:
-        return torch.zeros(6, dtype=torch.float64, device=self._kept("right_from_left_rotation").device)
+    def center(self) -> Tensor:
+        """(V, 3) projection centers in the rig frame, meters."""
+        rotation = self.rotation
+        # A step of Newton's from the transpose to the inverse: a rotation from a file may have been rounded.
+        inverse = 2 * rotation.mT - rotation.mT @ rotation @ rotation.mT
+        return -(inverse @ self.translation[..., None])[..., 0]
 
     @property
-    def baseline(self) -> Tensor:
-        """Distance between the cameras' centers, meters."""
-        return torch.linalg.vector_norm(self.right_from_left_translation)
+    def origin(self) -> Origin | None:
+        """Where the frame is anchored on the Earth."""
+        return None if self.place is None else Origin.at(self.place)
+
+    @property
+    def constants(self) -> object:
+        """Names, in order."""
+        return self.names
+
+    @property
+    def in_first_frame(self) -> bool:
+        """Whether the rig's frame is the first camera's, and not one that is anchored on the Earth."""
+        first = self.rotation[0], self.translation[0]
+        return self.place is None and torch.equal(first[0], torch.eye(3).to(first[0])) and not bool(first[1].any())
+
+    @property
+    def pose_slots(self) -> dict[str, Any]:
+        """What `free` takes: `pose`, `rotation` and `translation`, or names of cameras; a step is that of `Movable`."""
+        free = slice(int(self.in_first_frame and len(self) > 1), None)
+        parts = {"pose": slice(0, 6), "rotation": slice(0, 3), "translation": slice(3, 6)}
+        named = {name: number for number, name in enumerate(self.names)}
+        return {**{name: (free, part) for name, part in parts.items()}, **named}
+
+    def _zero_step(self) -> Tensor:
+        return torch.zeros(len(self), 6, dtype=torch.float64, device=self._kept("rotation").device)
 
     def extra_repr(self) -> str:
-        """Baseline, and what else is known, for `repr`."""
-        known = (word for word in ("covariance", "mounting", "calibration") if getattr(self, word) is not None)
-        return ", ".join([f"baseline={length_text(float(self.baseline))}", *known])
+        """Names, distance of the cameras, origin, and what else is known, for `repr`."""
+        known = (word for word in ("covariance", "mounting", "root", "calibration") if getattr(self, word) is not None)
+        if len(self) == 2:
+            apart = f"baseline={length_text(float(self.baseline))}"
+        else:
+            apart = f"up to {length_text(float(torch.cdist(self.center, self.center).max()))} apart"
+        origin = [] if self.origin is None else [str(self.origin)]
+        return ", ".join([*self.names, apart, *origin, *known])
+
+    def __len__(self) -> int:
+        """How many cameras there are."""
+        return len(self.names)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """`rig.left` and `rig.right` may be set."""
+        if name in ("left", "right"):
+            _of_two(self, name)
+            self.cameras[int(name == "right")] = as_camera(value)
+        else:
+            super().__setattr__(name, value)
+
+    @property
+    def each(self) -> list[Camera]:
+        """The cameras."""
+        return list(self.cameras)  # type: ignore[arg-type]
 
     @property
     def fingerprint(self) -> str:
-        """Twelve hex digits that change with either camera and with the relative pose."""
-        pose = self.right_from_left_rotation.tolist(), self.right_from_left_translation.tolist()
-        return hashlib.sha256(repr((self.left.fingerprint, self.right.fingerprint, pose)).encode()).hexdigest()[:12]
+        """Twelve hex digits that change with any camera and any pose."""
+        own = [camera.fingerprint for camera in self.each]
+        if len(self) == 2 and self.in_first_frame:
+            pose = self.right_from_left_rotation.tolist(), self.right_from_left_translation.tolist()
+            # As in 1.0, whose histories of a rig that is watched name it.
+            return hashlib.sha256(repr((*own, pose)).encode()).hexdigest()[:12]
+        text = repr((own, self.rotation.tolist(), self.translation.tolist(), self.origin, float(self.refraction)))
+        return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+    @property
+    def left(self) -> Camera:
+        """The first of two cameras."""
+        return _of_two(self, "left").each[0]
+
+    @property
+    def right(self) -> Camera:
+        """The second of two cameras."""
+        return _of_two(self, "right").each[1]
+
+    @property
+    def right_from_left_rotation(self) -> Tensor:
+        """(3, 3) rotation matrix."""
+        rotation = _of_two(self, "right_from_left_rotation").rotation
+        return rotation[1] @ rotation[0].T
+
+    @property
+    def right_from_left_translation(self) -> Tensor:
+        """(3,) meters."""
+        translation = _of_two(self, "right_from_left_translation").translation
+        return translation[1] - self.right_from_left_rotation @ translation[0]
+
+    @property
+    def baseline(self) -> Tensor:
+        """Distance between the centers of two cameras, meters."""
+        return torch.linalg.vector_norm(_of_two(self, "baseline").right_from_left_translation)
 
     def to_kornia(self) -> tuple[Any, Any]:
-        """Both cameras as `PinholeCamera`s of kornia, posed in the left camera's frame.
+        """Two cameras as `PinholeCamera`s of kornia, posed in the left camera's frame.
 
         Raises:
             InputError: a lens, which a posed camera of kornia does not hold; rectify the images first.
 
         Example:
             >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
-            >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
-            >>> float(StereoRig.from_kornia(*rig.to_kornia()).baseline)
+            >>> rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
+            >>> float(Rig.from_kornia(*rig.to_kornia()).baseline)
             1.0
         """
         from kcal.lens.kornia_cameras import posed_pinholes  # kornia takes long to load
@@ -257,7 +413,7 @@ class StereoRig(Movable):
         return posed_pinholes(self.left, self.right, self.right_from_left_rotation, self.right_from_left_translation)
 
     @classmethod
-    def from_kornia(cls, left: Any, right: Any) -> StereoRig:
+    def from_kornia(cls, left: Any, right: Any) -> Self:
         """The rig of two `PinholeCamera`s of kornia with poses, whose extrinsics lead from one frame into the cameras.
 
         Raises:
@@ -267,7 +423,7 @@ class StereoRig(Movable):
 
         (first, one), (second, other) = unposed_pinhole(left), unposed_pinhole(right)
         turn = other[:3, :3] @ one[:3, :3].mT
-        return cls(Camera.from_kornia(first), Camera.from_kornia(second), turn, other[:3, 3] - turn @ one[:3, 3])
+        return cls.pair(Camera.from_kornia(first), Camera.from_kornia(second), turn, other[:3, 3] - turn @ one[:3, 3])
 
     @property
     def essential(self) -> Tensor:
@@ -299,293 +455,9 @@ class StereoRig(Movable):
         return fundamental_from_essential(self.essential[None], self.left.matrix[None], self.right.matrix[None])[0]
 
     def right_from_left(self, points_left: Tensor) -> Tensor:
-        """Move points (..., N, 3) from the left camera's frame into the right camera's."""
-        points = as_points("points_left", points_left, 3, self.right_from_left_translation)
-        return points @ self.right_from_left_rotation.T + self.right_from_left_translation
-
-    def forward(self, points_left: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Project points (..., N, 3) of the rig frame: pixels_left, pixels_right (..., N, 2), valid in both."""
-        pixels_left, valid_left = self.left.project(points_left)
-        pixels_right, valid_right = self.right.project(self.right_from_left(points_left))
-        return pixels_left, pixels_right, valid_left & valid_right
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class RigCovariance:
-    """How well a rig is known: one joint covariance, so that what is correlated stays so.
-
-    The order is: the parameters of the left camera as in `Camera.names`, those of the right one, the rotation of
-    right_from_left (3 radians: a rotation vector about the right camera's axes, `exp([ω]x) R`), its translation
-    (3 meters), as in `kcal.lens.pose`.
-
-    Args:
-        half: (K, P) float64, P = the two cameras' parameters + 6: halfᵀ half is the covariance. As a root it loses
-            nothing where coefficients are hardly determined one by one and their sum is.
-
-    Example:
-        >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
-        >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
-        >>> sigma = torch.tensor([0, 1e-4, 0, 0, 0, 0], dtype=torch.float64)  # relative yaw
-        >>> known = RigCovariance.of(rig, pose=torch.diag(sigma**2))
-        >>> tuple(known.half.shape), tuple(known.matrix.shape)
-        ((1, 16), (16, 16))
-    """
-
-    __repr__ = brief
-
-    half: Tensor
-
-    @classmethod
-    def of(
-        cls,
-        rig: StereoRig,
-        *,
-        left: Tensor | None = None,
-        right: Tensor | None = None,
-        pose: Tensor | None = None,
-        joint: Tensor | None = None,
-    ) -> RigCovariance:
-        """Put parts together, each independent of the others and exact where left out; or take a `joint` matrix.
-
-        Cameras and pose of a rig that was solved are not independent: errors of a lens are undone by the pose for all
-        that was seen. Parts of a joint covariance taken as independent give intervals that are far too wide.
-
-        Args:
-            rig: the rig that they belong to.
-            left: of the left camera's parameters, (5 + P, 5 + P).
-            right: of the right camera's.
-            pose: (6, 6) of the relative pose.
-            joint: all of it, in place of the parts.
-
-        Raises:
-            InputError: a wrong shape, a matrix that is no covariance, or parts and a joint matrix together.
-        """
-        sizes = (rig.left.values.shape[-1], rig.right.values.shape[-1], 6)
-        if joint is not None:
-            if not (left is None and right is None and pose is None):
-                raise InputError("rig covariance: give the joint matrix or its parts, not both")
-            return cls(half=half_of_covariance(as_covariance("joint covariance", joint, sum(sizes))))
-        names = ("left camera's covariance", "right camera's covariance", "pose covariance")
-        parts = [as_covariance(*item) for item in zip(names, (left, right, pose), sizes, strict=True)]
-        return cls(half=torch.block_diag(*map(half_of_covariance, parts)))
-
-    @property
-    def matrix(self) -> Tensor:
-        """(P, P) the covariance."""
-        return self.half.T @ self.half
-
-    def check(self, rig: StereoRig) -> None:
-        """Raise `InputError` unless it has the size of this rig's quantities, and is finite."""
-        size = rig.left.values.shape[-1] + rig.right.values.shape[-1] + 6
-        require_root("joint covariance", self.half, size)
-
-    def with_pose(self, covariance: Tensor) -> RigCovariance:
-        """This, and an independent error (6, 6) of the relative pose."""
-        more = half_of_covariance(as_covariance("pose covariance", covariance, 6)).to(self.half)
-        zero = more.new_zeros(len(more), self.half.shape[1] - 6)
-        return RigCovariance(half=torch.cat([self.half, torch.cat([zero, more], 1)]))
-
-    def checked_link(self, mounting: Tensor, link: Tensor) -> Tensor:
-        """`link` (P, M) as float64, after checking that it fits this covariance and that of the mounting (M, M).
-
-        Raises:
-            InputError: a wrong shape, or the three together are no covariance.
-        """
-        size, more = self.half.shape[1], len(mounting)
-        if not isinstance(link, Tensor) or tuple(link.shape) != (size, more):
-            raise InputError(f"link: a covariance of the calibration with the mounting, ({size}, {more}), is needed")
-        matrix = self.matrix
-        link, mounting = link.to(matrix), mounting.to(matrix)
-        whole = torch.cat([torch.cat([matrix, link], 1), torch.cat([link.T, mounting], 1)])
-        return as_covariance("covariance of calibration and mounting", whole, size + more)[:size, size:]
-
-
-def _pose_doubt(rotation: Tensor, translation: Tensor) -> str:
-    """Why a relative pose is more likely a slip; empty where there is no reason to doubt it."""
-    x, y, z = (-translation @ rotation).tolist()
-    baseline = math.hypot(x, y, z)
-    # Endoscopes have 4 mm. Masts are 10 to 500 m apart; beyond, cameras are stations.
-    if baseline and not 1e-3 <= baseline <= 1e3:
-        return (
-            f"StereoRig: the baseline is {length_text(baseline)}; the translation must be in meters (T of "
-            "cv2.stereoCalibrate has the unit of the board's points)"
-        )
-    # Side by side, and looking to the same side. One above the other, or facing each other, neither is on the left.
-    if x < -0.9 * baseline and float(rotation[2, 2]) > 0:
-        return (
-            f"StereoRig: the right camera stands {length_text(-x)} to the left of the left one: exchanged images, or a "
-            "pose left_from_right? points_right = rotation @ points_left + translation is needed"
-        )
-    return ""
-
-
-def half_of_covariance(matrix: Tensor) -> Tensor:
-    """(K, P) with halfᵀ half = matrix (P, P), K being its rank."""
-    if is_differentiated(matrix):
-        raise InputError("the root of a covariance has no derivatives; give RigCovariance(half=...)")
-    scale = matrix.diagonal().sqrt()
-    safe = torch.where(scale > 0, scale, 1.0)
-    values, vectors = torch.linalg.eigh(matrix / safe[:, None] / safe[None, :])
-    kept = values > 1e-14 * values[-1:].sum().clamp_min(1e-300)
-    return (scale[:, None] * vectors[:, kept] * values[kept].sqrt()).T
-
-
-# `CameraRig`: any number of cameras, and where each stands and looks in one frame.
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class CameraRigCalibration:
-    """How a rig of any number of cameras was solved.
-
-    Args:
-        rms: sqrt(mean ‖r‖²) over the pixels of all cameras.
-        rms_px: likewise of each camera; None for a camera with none.
-        sources: what the rig was solved from.
-        excluded: what was left out, with the reason.
-        undetermined: what the data leave open, camera by camera.
-        warnings: what should be doubted, a sentence each.
-        contradictions: which source contradicts the others, a sentence each; such a rig should not be used.
-        pixel_sigma: noise of marks along each axis, px, as stated; None if nobody did.
-        kcal_version: the version that solved.
-        created: when, with its time zone.
-    """
-
-    __repr__ = brief
-
-    rms: float
-    rms_px: tuple[float | None, ...]
-    sources: tuple[RigSource, ...] = ()
-    excluded: tuple[Exclusion, ...] = ()
-    undetermined: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
-    contradictions: tuple[str, ...] = ()
-    pixel_sigma: float | None = None
-    kcal_version: str
-    created: datetime.datetime
-
-
-class CameraRig(Movable, StatedModule):
-    """Any number of cameras: `points_cam = rotation[c] @ (points - center[c])`, meters.
-
-    The frame is east, north, up of `origin`; without one it is any right-handed frame, without refraction.
-
-    What is known of cameras and poses together is the attribute `root`: (K, P) with rootᵀ root the covariance of P
-    quantities: all parameters of each camera in turn (`Camera.names`); then for each camera its center (3, meters) and
-    a small turn of it (3, radians), both along and about the frame's axes; last the coefficient of refraction. None:
-    nothing is known, so that cameras and poses count as exact. It is None again once a camera or a pose has changed.
-    `calibration` (a `CameraRigCalibration`) tells how the rig was solved.
-
-    Poses may be freed: `rig.free("pose")` all of them, `rig.free("mill")` that of one camera, as in `StereoRig.free`.
-
-    Args:
-        cameras: C of them, one or more.
-        names: of the cameras, unlike each other.
-        rotation: (C, 3, 3) cam_from_frame.
-        center: (C, 3) projection centers, meters.
-        origin: where the frame is anchored on the Earth.
-        refraction: coefficient k, see `StereoLocalizer`.
-
-    Raises:
-        InputError: wrong shapes, names that are there twice, a matrix that is no rotation.
-
-    Example:
-        >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
-        >>> look = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # north
-        >>> rig = CameraRig([camera] * 3, ["a", "b", "c"], look.repeat(3, 1, 1), torch.eye(3) * 1000.0)
-        >>> rig.names, rig.quantities
-        (('a', 'b', 'c'), 34)
-    """
-
-    refraction: Tensor
-    place: Tensor | None
-    root = UntilChanged[Tensor](lambda rig, value: rig.check_root(value))
-    calibration = UntilChanged[CameraRigCalibration]()
-
-    def __init__(
-        self,
-        cameras: Sequence[Camera | CameraLike],
-        names: Sequence[str],
-        rotation: Tensor,
-        center: Tensor,
-        *,
-        origin: Origin | None = None,
-        refraction: float = REFRACTION,
-    ) -> None:
-        super().__init__()
-        rotation, center = as_points("rotation", rotation, 3), as_points("center", center, 3)
-        count = len(cameras)
-        if not count or rotation.shape != (count, 3, 3) or center.shape != (count, 3):
-            raise InputError(
-                f"{count} cameras: rotation ({count}, 3, 3) and center ({count}, 3) are needed, got "
-                f"{tuple(rotation.shape)} and {tuple(center.shape)}"
-            )
-        if len(names) != count or len(set(names)) != count or not all(names):
-            raise InputError(f"cameras: {count} unlike names are needed, got {', '.join(names) or 'none'}")
-        require_finite("rotation", rotation)
-        require_finite("center", center)
-        still = torch.eye(3, dtype=torch.float64, device=rotation.device)
-        error = (rotation @ rotation.mT - still).abs().amax((-2, -1))
-        for name, off, sign in zip(names, error.tolist(), torch.linalg.det(rotation).tolist(), strict=True):
-            if not off <= 1e-6 or sign < 0:
-                raise InputError(f"camera {name}: not a rotation matrix (R Rᵀ must be 1 and det R = +1)")
-        check_refraction(refraction, 0.0)
-        self.cameras = nn.ModuleList(map(as_camera, cameras))
-        self.names = tuple(names)
-        self.register_buffer("place", None if origin is None else origin.geodetic.to(rotation.device))
-        self.register_buffer("refraction", scalar(refraction, rotation))
-        self._keep("rotation", rotation, turns=True)
-        self._keep("center", center)
-
-    @property
-    def rotation(self) -> Tensor:
-        """(C, 3, 3) cam_from_frame, with the steps of `free`."""
-        kept, step = self._kept("rotation"), self.freed_step
-        return kept if step is None else kept @ rotation_from_vector(-step[1])
-
-    @property
-    def center(self) -> Tensor:
-        """(C, 3) meters, likewise."""
-        kept, step = self._kept("center"), self.freed_step
-        return kept if step is None else kept + step[0]
-
-    @property
-    def origin(self) -> Origin | None:
-        """Where the frame is anchored on the Earth."""
-        return None if self.place is None else Origin.at(self.place)
-
-    @property
-    def constants(self) -> object:
-        """Names, in order."""
-        return self.names
-
-    @property
-    def pose_slots(self) -> dict[str, Any]:
-        """What `free` takes: `pose` for all cameras, or names of cameras; a step is that of `root`: center, turn."""
-        return {"pose": slice(None), **{name: number for number, name in enumerate(self.names)}}
-
-    def _zero_step(self) -> Tensor:
-        return torch.zeros(len(self), 6, dtype=torch.float64, device=self._kept("center").device)
-
-    def extra_repr(self) -> str:
-        """Names, farthest distance of two cameras and origin, for `repr`."""
-        apart = length_text(float(torch.cdist(self.center, self.center).max()))
-        return ", ".join([*self.names, f"up to {apart} apart", *([] if self.origin is None else [str(self.origin)])])
-
-    def __len__(self) -> int:
-        """How many cameras there are."""
-        return len(self.names)
-
-    @property
-    def each(self) -> list[Camera]:
-        """The cameras."""
-        return list(self.cameras)  # type: ignore[arg-type]
-
-    @property
-    def fingerprint(self) -> str:
-        """Twelve hex digits that change with any camera and any pose."""
-        own = [camera.fingerprint for camera in self.each]
-        text = repr((own, self.rotation.tolist(), self.center.tolist(), self.origin, float(self.refraction)))
-        return hashlib.sha256(text.encode()).hexdigest()[:12]
+        """Move points (..., N, 3) from the left of two cameras' frame into the right camera's."""
+        shift = self.right_from_left_translation
+        return as_points("points_left", points_left, 3, shift) @ self.right_from_left_rotation.T + shift
 
     @property
     def sizes(self) -> tuple[int, ...]:
@@ -625,7 +497,7 @@ class CameraRig(Movable, StatedModule):
 
         Example:
             >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
-            >>> rig = CameraRig([camera], ["tower"], torch.eye(3)[None], torch.zeros(1, 3))
+            >>> rig = Rig([camera], ["tower"], torch.eye(3)[None], center=torch.zeros(1, 3))
             >>> tuple(rig.with_errors(position_m=0.02, attitude_deg=(0.01, 0.01, 0.02)).shape)
             (6, 12)
         """
@@ -638,11 +510,172 @@ class CameraRig(Movable, StatedModule):
         return more if self.root is None else torch.cat([self.root, more])
 
     def forward(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Project points (..., N, 3) of the frame along straight lines: pixels (..., N, C, 2), and which are seen."""
-        points = as_points("points", points, 3, self.center)
+        """Project points (..., N, 3) of the rig frame along straight lines: pixels (..., N, V, 2), and which are seen.
+
+        What is seen (..., N, V) is in the image and in the region where the lens is known.
+        """
+        points = as_points("points", points, 3, self.translation)
         pixels, seen = [], []
-        for camera, rotation, center in zip(self.each, self.rotation, self.center, strict=True):
-            pixel, valid = camera.project((points - center) @ rotation.T)
+        for camera, rotation, translation in zip(self.each, self.rotation, self.translation, strict=True):
+            pixel, valid = camera.project(points @ rotation.T + translation)
             pixels.append(pixel)
             seen.append(valid & camera.inside(pixel))
         return torch.stack(pixels, -2), torch.stack(seen, -1)
+
+
+def _of_two(rig: Rig, wanted: str) -> Rig:
+    """The rig, if it is one of two cameras."""
+    if len(rig) != 2:
+        raise InputError(f"{wanted}: a rig of two cameras is needed; this one has {len(rig)}: {', '.join(rig.names)}")
+    return rig
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RigCovariance:
+    """How well a rig is known: one joint covariance, so that what is correlated stays so.
+
+    The order is: the parameters of the left camera as in `Camera.names`, those of the right one, the rotation of
+    right_from_left (3 radians: a rotation vector about the right camera's axes, `exp([ω]x) R`), its translation
+    (3 meters), as in `kcal.lens.pose`.
+
+    Args:
+        half: (K, P) float64, P = the two cameras' parameters + 6: halfᵀ half is the covariance. As a root it loses
+            nothing where coefficients are hardly determined one by one and their sum is.
+
+    Example:
+        >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
+        >>> rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
+        >>> sigma = torch.tensor([0, 1e-4, 0, 0, 0, 0], dtype=torch.float64)  # relative yaw
+        >>> known = RigCovariance.of(rig, pose=torch.diag(sigma**2))
+        >>> tuple(known.half.shape), tuple(known.matrix.shape)
+        ((1, 16), (16, 16))
+    """
+
+    __repr__ = brief
+
+    half: Tensor
+
+    @classmethod
+    def of(
+        cls,
+        rig: Rig,
+        *,
+        left: Tensor | None = None,
+        right: Tensor | None = None,
+        pose: Tensor | None = None,
+        joint: Tensor | None = None,
+    ) -> RigCovariance:
+        """Put parts together, each independent of the others and exact where left out; or take a `joint` matrix.
+
+        Cameras and pose of a rig that was solved are not independent: errors of a lens are undone by the pose for all
+        that was seen. Parts of a joint covariance taken as independent give intervals that are far too wide.
+
+        Args:
+            rig: the rig that they belong to.
+            left: of the left camera's parameters, (5 + P, 5 + P).
+            right: of the right camera's.
+            pose: (6, 6) of the relative pose.
+            joint: all of it, in place of the parts.
+
+        Raises:
+            InputError: a wrong shape, a matrix that is no covariance, or parts and a joint matrix together.
+        """
+        sizes = (rig.left.values.shape[-1], rig.right.values.shape[-1], 6)
+        if joint is not None:
+            if not (left is None and right is None and pose is None):
+                raise InputError("rig covariance: give the joint matrix or its parts, not both")
+            return cls(half=half_of_covariance(as_covariance("joint covariance", joint, sum(sizes))))
+        names = ("left camera's covariance", "right camera's covariance", "pose covariance")
+        parts = [as_covariance(*item) for item in zip(names, (left, right, pose), sizes, strict=True)]
+        return cls(half=torch.block_diag(*map(half_of_covariance, parts)))
+
+    @property
+    def matrix(self) -> Tensor:
+        """(P, P) the covariance."""
+        return self.half.T @ self.half
+
+    def check(self, rig: Rig) -> None:
+        """Raise `InputError` unless it has the size of this rig's quantities, and is finite."""
+        size = rig.left.values.shape[-1] + rig.right.values.shape[-1] + 6
+        require_root("joint covariance", self.half, size)
+
+    def with_pose(self, covariance: Tensor) -> RigCovariance:
+        """This, and an independent error (6, 6) of the relative pose."""
+        more = half_of_covariance(as_covariance("pose covariance", covariance, 6)).to(self.half)
+        zero = more.new_zeros(len(more), self.half.shape[1] - 6)
+        return RigCovariance(half=torch.cat([self.half, torch.cat([zero, more], 1)]))
+
+    def checked_link(self, mounting: Tensor, link: Tensor) -> Tensor:
+        """`link` (P, M) as float64, after checking that it fits this covariance and that of the mounting (M, M).
+
+        Raises:
+            InputError: a wrong shape, or the three together are no covariance.
+        """
+        size, more = self.half.shape[1], len(mounting)
+        if not isinstance(link, Tensor) or tuple(link.shape) != (size, more):
+            raise InputError(f"link: a covariance of the calibration with the mounting, ({size}, {more}), is needed")
+        matrix = self.matrix
+        link, mounting = link.to(matrix), mounting.to(matrix)
+        whole = torch.cat([torch.cat([matrix, link], 1), torch.cat([link.T, mounting], 1)])
+        return as_covariance("covariance of calibration and mounting", whole, size + more)[:size, size:]
+
+
+def _pose_doubt(rotation: Tensor, translation: Tensor) -> str:
+    """Why a relative pose is more likely a slip; empty where there is no reason to doubt it."""
+    x, y, z = (-translation @ rotation).tolist()
+    baseline = math.hypot(x, y, z)
+    # Endoscopes have 4 mm. Masts are 10 to 500 m apart; beyond, cameras are stations.
+    if baseline and not 1e-3 <= baseline <= 1e3:
+        return (
+            f"Rig: the baseline is {length_text(baseline)}; the translation must be in meters (T of "
+            "cv2.stereoCalibrate has the unit of the board's points)"
+        )
+    # Side by side, and looking to the same side. One above the other, or facing each other, neither is on the left.
+    if x < -0.9 * baseline and float(rotation[2, 2]) > 0:
+        return (
+            f"Rig: the right camera stands {length_text(-x)} to the left of the left one: exchanged images, or a "
+            "pose left_from_right? points_right = rotation @ points_left + translation is needed"
+        )
+    return ""
+
+
+def half_of_covariance(matrix: Tensor) -> Tensor:
+    """(K, P) with halfᵀ half = matrix (P, P), K being its rank."""
+    if is_differentiated(matrix):
+        raise InputError("the root of a covariance has no derivatives; give RigCovariance(half=...)")
+    scale = matrix.diagonal().sqrt()
+    safe = torch.where(scale > 0, scale, 1.0)
+    values, vectors = torch.linalg.eigh(matrix / safe[:, None] / safe[None, :])
+    kept = values > 1e-14 * values[-1:].sum().clamp_min(1e-300)
+    return (scale[:, None] * vectors[:, kept] * values[kept].sqrt()).T
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CameraRigCalibration:
+    """How a rig of any number of cameras was solved.
+
+    Args:
+        rms: sqrt(mean ‖r‖²) over the pixels of all cameras.
+        rms_px: likewise of each camera; None for a camera with none.
+        sources: what the rig was solved from.
+        excluded: what was left out, with the reason.
+        undetermined: what the data leave open, camera by camera.
+        warnings: what should be doubted, a sentence each.
+        contradictions: which source contradicts the others, a sentence each; such a rig should not be used.
+        pixel_sigma: noise of marks along each axis, px, as stated; None if nobody did.
+        kcal_version: the version that solved.
+        created: when, with its time zone.
+    """
+
+    __repr__ = brief
+
+    rms: float
+    rms_px: tuple[float | None, ...]
+    sources: tuple[RigSource, ...] = ()
+    excluded: tuple[Exclusion, ...] = ()
+    undetermined: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    contradictions: tuple[str, ...] = ()
+    pixel_sigma: float | None = None
+    kcal_version: str
+    created: datetime.datetime

@@ -14,7 +14,7 @@ from kcal.checks import as_points
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import CameraRig, StereoRig
+from kcal.lens.rig import Rig
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.max_likelihood import calibration_effect
 from kcal.locate.mounting import by_mounting
@@ -68,9 +68,7 @@ class RangeError(NamedTuple):
     first_order: Tensor
 
 
-def planned_rig(
-    *, focal_px: float = 1600.0, baseline_m: float = 10.0, size: tuple[int, int] = (1920, 1080)
-) -> StereoRig:
+def planned_rig(*, focal_px: float = 1600.0, baseline_m: float = 10.0, size: tuple[int, int] = (1920, 1080)) -> Rig:
     """Two equal pinhole cameras side by side that look the same way: what Table 2 assumes.
 
     Example:
@@ -82,12 +80,12 @@ def planned_rig(
     center = ((size[0] - 1) / 2, (size[1] - 1) / 2)
     camera = Camera.build(focal=(focal_px, focal_px), center=center, size=size, model="pinhole")
     shift = torch.tensor([-baseline_m, 0.0, 0.0], dtype=torch.float64)
-    return StereoRig(camera, camera, torch.eye(3, dtype=torch.float64), shift)
+    return Rig.pair(camera, camera, torch.eye(3, dtype=torch.float64), shift)
 
 
 @in_one_thread
 def range_errors(
-    rig: StereoRig,
+    rig: Rig,
     distances: Tensor | Sequence[float],
     errors: BudgetErrors | None = None,
     *,
@@ -118,7 +116,10 @@ def range_errors(
             "disparity": lambda s: (rig, right + s * errors.disparity_px * along),
             "yaw": lambda s: (_yawed(rig, s * math.radians(errors.yaw_deg)), right),
             "baseline": lambda s: (_stretched(rig, s * errors.baseline_m), right),
-            "timing": lambda s: (rig, rig(points + s * _crossing(rig, ray) * errors.timing_s * errors.speed_mps)[1]),
+            "timing": lambda s: (
+                rig,
+                rig(points + s * _crossing(rig, ray) * errors.timing_s * errors.speed_mps)[0][..., 1, :],
+            ),
         }
         found = {}
         for name, move in moved.items():
@@ -133,7 +134,7 @@ def range_errors(
 
 @torch.no_grad()
 def points_at(
-    rig: StereoRig, distances: Tensor | Sequence[float], pixel: Sequence[float] | None = None
+    rig: Rig, distances: Tensor | Sequence[float], pixel: Sequence[float] | None = None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Points in one direction at several ranges: ranges (D,), points (D, 3) in the rig frame, left and right pixels.
 
@@ -149,25 +150,25 @@ def points_at(
     if not len(far) or not bool(((far > 0) & torch.isfinite(far)).all()):
         raise InputError("distances: positive numbers of meters are needed")
     points = far[:, None] * _direction(rig, pixel)
-    left, right, seen = rig(points)
-    good = seen & rig.left.inside(left) & rig.right.inside(right)
+    pixels, seen = rig(points)
+    (left, right), good = pixels.unbind(-2), seen.all(-1)
     if not bool(good.all()):
         raise InputError(f"the rig does not see a point at {float(far[~good][0]):g} m there; choose another pixel")
     return far, points, left, right
 
 
-def _apart(moved: tuple[StereoRig, Tensor], left: Tensor) -> tuple[StereoRig, Tensor, Tensor]:
+def _apart(moved: tuple[Rig, Tensor], left: Tensor) -> tuple[Rig, Tensor, Tensor]:
     return moved[0], left, moved[1]
 
 
-def _range(rig: StereoRig, left: Tensor, right: Tensor) -> Tensor:
+def _range(rig: Rig, left: Tensor, right: Tensor) -> Tensor:
     """Range from the left camera; infinite where the rays do not meet ahead."""
     lines = sight_lines(rig, left, right)
     distance = torch.linalg.vector_norm(lines.points, dim=-1)
     return torch.where(lines.status == int(PositionStatus.OK), distance, math.inf)
 
 
-def _direction(rig: StereoRig, pixel: Sequence[float] | None) -> Tensor:
+def _direction(rig: Rig, pixel: Sequence[float] | None) -> Tensor:
     if pixel is not None:
         place = as_points("pixel", torch.tensor([list(map(float, pixel))], dtype=torch.float64), 2)
         rays, valid = rig.left.unproject(place)
@@ -178,7 +179,7 @@ def _direction(rig: StereoRig, pixel: Sequence[float] | None) -> Tensor:
     return both / torch.linalg.vector_norm(both)
 
 
-def _crossing(rig: StereoRig, ray: Tensor) -> Tensor:
+def _crossing(rig: Rig, ray: Tensor) -> Tensor:
     """Unit vector along the baseline, across the line of sight: motion along it looks like disparity."""
     center = -rig.right_from_left_translation @ rig.right_from_left_rotation
     across = center - (center @ ray) * ray
@@ -188,24 +189,24 @@ def _crossing(rig: StereoRig, ray: Tensor) -> Tensor:
     return across / length
 
 
-def _epipolar_direction(rig: StereoRig, points: Tensor) -> Tensor:
+def _epipolar_direction(rig: Rig, points: Tensor) -> Tensor:
     """Unit direction in the right image in which a point moves as it comes nearer."""
-    before, after = rig.right.project(rig.right_from_left(points))[0], rig(points * (1.0 - 1e-4))[1]
+    before, after = rig.right.project(rig.right_from_left(points))[0], rig(points * (1.0 - 1e-4))[0][..., 1, :]
     step = after - before
     return step / torch.linalg.vector_norm(step, dim=-1, keepdim=True)
 
 
-def _yawed(rig: StereoRig, yaw: float) -> StereoRig:
+def _yawed(rig: Rig, yaw: float) -> Rig:
     turn = rotation_from_vector(torch.tensor([0.0, yaw, 0.0], dtype=torch.float64))
     # About its own center: the center stays where it is.
-    return StereoRig(rig.left, rig.right, turn @ rig.right_from_left_rotation, turn @ rig.right_from_left_translation)
+    return Rig.pair(rig.left, rig.right, turn @ rig.right_from_left_rotation, turn @ rig.right_from_left_translation)
 
 
-def _stretched(rig: StereoRig, more: float) -> StereoRig:
+def _stretched(rig: Rig, more: float) -> Rig:
     scale = 1.0 + more / float(rig.baseline)
     if scale <= 0:
         raise InputError("baseline_m: the error is larger than the baseline")
-    return StereoRig(rig.left, rig.right, rig.right_from_left_rotation, scale * rig.right_from_left_translation)
+    return Rig.pair(rig.left, rig.right, rig.right_from_left_rotation, scale * rig.right_from_left_translation)
 
 
 # How uncertain ranges of a solved rig are, by what to improve: marks, lenses, relative pose; and the mounting.
@@ -236,7 +237,7 @@ class RangeSigmas(NamedTuple):
     sideways: Tensor
 
 
-def usual_ranges(rig: StereoRig, baselines: Sequence[float] = (25.0, 100.0, 500.0)) -> list[float]:
+def usual_ranges(rig: Rig, baselines: Sequence[float] = (25.0, 100.0, 500.0)) -> list[float]:
     """Ranges at which a rig is near, usual and far: about so many baselines, as round numbers of meters.
 
     Example:
@@ -254,7 +255,7 @@ def _round_number(meters: float) -> float:
 
 
 def range_sigmas(
-    rig: StereoRig,
+    rig: Rig,
     distances: Tensor | Sequence[float] | None = None,
     *,
     pixel_sigma: float = 0.3,
@@ -324,7 +325,7 @@ _PLACES = (0.2, 0.35, 0.5, 0.65, 0.8)
 
 
 @torch.no_grad()
-def station_sigmas(rig: CameraRig, distance: float, *, pixel_sigma: float = 0.3) -> RangeSigmas | None:
+def station_sigmas(rig: Rig, distance: float, *, pixel_sigma: float = 0.3) -> RangeSigmas | None:
     """Split the standard deviation of ranges from each camera by its sources, where it is worst.
 
     Looked at are things at a distance from each camera, along the middle row of its image, that another camera sees
@@ -347,7 +348,7 @@ def station_sigmas(rig: CameraRig, distance: float, *, pixel_sigma: float = 0.3)
         >>> from kcal.locate import enu_from_cam
         >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
         >>> look = enu_from_cam(0.0).T.repeat(3, 1, 1)
-        >>> rig = CameraRig([camera] * 3, ["a", "b", "c"], look, torch.tensor([[0.0, 0, 0], [10, 0, 0], [20, 0, 0]]))
+        >>> rig = Rig([camera] * 3, ["a", "b", "c"], look, center=torch.tensor([[0.0, 0, 0], [10, 0, 0], [20, 0, 0]]))
         >>> found = station_sigmas(rig, 1000.0, pixel_sigma=0.1)
         >>> round(float(found.total), 1), bool(found.ranged)
         (4.4, True)
@@ -377,7 +378,7 @@ def station_sigmas(rig: CameraRig, distance: float, *, pixel_sigma: float = 0.3)
     return RangeSigmas(far, marks, by_lenses, pose, total, total * BEARING_SIGMAS <= far, torch.zeros_like(total))
 
 
-def _points_before(rig: CameraRig, distance: float) -> tuple[Tensor, Tensor]:
+def _points_before(rig: Rig, distance: float) -> tuple[Tensor, Tensor]:
     """(N, 3) places at a distance from each camera, along the middle row of its image, and their rays (N, 3)."""
     points, all_rays = [], []
     for camera, turn, center in zip(rig.each, rig.rotation, rig.center, strict=True):

@@ -47,7 +47,7 @@ class DisparityRanges(Float64Module):
     """Map disparities of rectified images to ranges and their standard deviations.
 
     Every pixel is located by `StereoLocalizer` in the images as they were taken, so that lenses, entrance pupils and
-    the joint covariance of the rig (`StereoRig.covariance`, exact if there is none) count in full. Results carry no
+    the joint covariance of the rig (`Rig.covariance`, exact if there is none) count in full. Results carry no
     gradients; those of `StereoRectification.points` and `StereoLocalizer` do.
 
     Args:
@@ -58,9 +58,9 @@ class DisparityRanges(Float64Module):
         InputError: a sigma that is not positive.
 
     Example:
-        >>> from kcal import Camera, StereoRig
+        >>> from kcal import Camera, Rig
         >>> camera = Camera.build(focal=(500, 500), center=(319.5, 239.5), size=(640, 480), model="pinhole")
-        >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-2.0, 0.0, 0.0]))
+        >>> rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-2.0, 0.0, 0.0]))
         >>> ranges = DisparityRanges(StereoRectification(rig), disparity_sigma=0.5)
         >>> disparity = torch.full((480, 640), 10.0)
         >>> found = ranges(disparity)

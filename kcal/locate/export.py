@@ -474,7 +474,7 @@ def write_positions(path: str | Path, located: Located) -> Path:
         >>> import torch
         >>> from kcal import Origin, locate_points
         >>> from kcal.rig import planned_rig
-        >>> left, right, _ = planned_rig()(torch.tensor([[0.0, 0.0, 1000.0]]))
+        >>> left, right = planned_rig()(torch.tensor([[0.0, 0.0, 1000.0]]))[0].unbind(-2)
         >>> located = locate_points(planned_rig(), left, right, origin=Origin(lat=19.07, lon=72.87, height=14.0),
         ...                         heading_deg=0.0)
         >>> with tempfile.TemporaryDirectory() as folder:

@@ -14,7 +14,7 @@ from kcal.dispatch import is_differentiated
 from kcal.errors import InputError
 from kcal.io.rig_file import load_rig
 from kcal.lens.pose import Movable, rotation_from_vector
-from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Origin, RigCovariance, StereoRig, check_refraction
+from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Origin, Rig, RigCovariance, check_refraction
 from kcal.locate.geodesy import anchor, enu_from_cam, mean_radius, place_enu
 from kcal.locate.max_likelihood import by_pose, calibration_effect, inverse_variance, position_slope, symmetric
 from kcal.locate.mounting import attitude, by_mounting
@@ -94,7 +94,7 @@ class StereoLocalizer(Operations, Movable):
     errors, weighed by the pixels' covariances), and carried with their covariance to east, north, up and to WGS84.
     Geometry runs in float64 whatever the pipeline around it uses. There is no branch on values under `torch.compile`
     and `torch.export`; gradients by pixels, covariances, cameras, poses and errors are exact and finite.
-    `free("origin")` and `free("attitude")` let them reach the mounting, as `StereoRig.free` the rig's pose.
+    `free("origin")` and `free("attitude")` let them reach the mounting, as `Rig.free` the rig's pose.
 
     The covariance of a position is the sum of four parts: noise in the marks, errors in the calibration
     (`calibration`, a joint covariance of cameras and rig), errors in the mounting (`mounting`) and, upward, what is not
@@ -130,7 +130,7 @@ class StereoLocalizer(Operations, Movable):
     Example:
         >>> from kcal import Camera
         >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
-        >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
+        >>> rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
         >>> localize = StereoLocalizer(rig, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0,
         ...                            pixel_sigma=0.1)
         >>> left, right = torch.tensor([[960.0, 540.0]]), torch.tensor([[944.0, 540.0]])
@@ -156,7 +156,7 @@ class StereoLocalizer(Operations, Movable):
 
     def __init__(
         self,
-        rig: StereoRig,
+        rig: Rig,
         *,
         origin: Origin | None = None,
         heading_deg: float | None = None,

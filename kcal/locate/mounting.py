@@ -11,7 +11,7 @@ from torch import Tensor
 
 from kcal.calibrate.rig.result import RigResult
 from kcal.errors import InputError
-from kcal.lens.rig import Mounting, Origin, RigCovariance, StereoRig
+from kcal.lens.rig import Mounting, Origin, Rig, RigCovariance
 from kcal.locate.geodesy import ecef_from_enu_rotation, enu_to_geodetic
 from kcal.threads import in_one_thread
 
@@ -79,7 +79,7 @@ def mounting_of(
 
 
 @in_one_thread
-def placed_rig(result: RigResult, origin: Origin) -> StereoRig:
+def placed_rig(result: RigResult, origin: Origin) -> Rig:
     """The rig of a result with everything that is known of it: also its mounting, if the data determine it.
 
     Args:
@@ -93,7 +93,7 @@ def placed_rig(result: RigResult, origin: Origin) -> StereoRig:
         >>> rig, generator = planned_rig(), torch.Generator().manual_seed(0)
         >>> points = torch.rand(12, 3, dtype=torch.float64, generator=generator) * 40 + torch.tensor([-20, -10, 60])
         >>> landmarks = Landmarks(names=tuple("abcdefghijkl"), points=points @ enu_from_cam(0.0).T,
-        ...                       sigma=torch.full((12, 3), 0.01).double(), pixels=torch.stack(rig(points)[:2], 1))
+        ...                       sigma=torch.full((12, 3), 0.01).double(), pixels=rig(points)[0])
         >>> data = RigData(cameras=(rig.left, rig.right), names=("left", "right"), landmarks=landmarks)
         >>> found = placed_rig(solve_rig(data), Origin(lat=19.07, lon=72.87, height=14.0))
         >>> round(found.mounting.heading_deg, 6) % 360.0, found.covariance is None
@@ -143,7 +143,7 @@ class RunErrors(NamedTuple):
 
 
 def run_errors(
-    rig: StereoRig, *, yaw_deg: float = 0.0, heading_deg: float = 0.0, origin_m: float = 0.0, elsewhere: bool = False
+    rig: Rig, *, yaw_deg: float = 0.0, heading_deg: float = 0.0, origin_m: float = 0.0, elsewhere: bool = False
 ) -> RunErrors:
     """The errors that a rig knows of itself, and independent ones that are stated besides.
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from kcal.checks import StatedModule, as_points, expanded, exportable, scalar
 from kcal.dispatch import is_differentiated, is_traced, known_true
 from kcal.errors import InputError
-from kcal.lens.rig import CameraRig
+from kcal.lens.rig import Rig
 from kcal.locate.geodesy import anchor, ecef_from_enu_rotation, enu_to_geodetic, mean_radius, place_enu
 from kcal.locate.ground import EarthFrame, Ground, stated_ahead
 from kcal.locate.max_likelihood import inverse_variance
@@ -89,7 +89,7 @@ class MultiViewLocalizer(StatedModule):
     """Locate what any of several cameras saw, each row on its own, with an error bar and a check of each view.
 
     A point is the most likely one given the noise of its pixels and the errors that a camera's pixels share: lens,
-    position, attitude and refraction (`CameraRig.root`), and clocks. All of them weigh the views, and the covariance
+    position, attitude and refraction (`Rig.root`), and clocks. All of them weigh the views, and the covariance
     contains them all. Two cameras or more give a position, one gives a bearing, or a position where the height is
     stated. With three views or more, one that contradicts the others is left out and named.
 
@@ -114,7 +114,7 @@ class MultiViewLocalizer(StatedModule):
         >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
         >>> look = torch.stack([enu_from_cam(heading).T for heading in (0.0, 315.0, 45.0)])
         >>> places = torch.tensor([[0.0, 0, 30], [5000.0, 0, 40], [-5000.0, 0, 35]])
-        >>> rig = CameraRig([camera] * 3, ["mill", "church", "mast"], look, places, refraction=0.0)
+        >>> rig = Rig([camera] * 3, ["mill", "church", "mast"], look, center=places, refraction=0.0)
         >>> rig.root = rig.with_errors(attitude_deg=0.01)
         >>> pixels, seen = rig(torch.tensor([[0.0, 5000, 100]]))
         >>> found = MultiViewLocalizer(rig)(pixels, seen)
@@ -136,7 +136,7 @@ class MultiViewLocalizer(StatedModule):
 
     def __init__(
         self,
-        rig: CameraRig,
+        rig: Rig,
         *,
         pixel_sigma: float = 0.3,
         root: Tensor | None = None,
@@ -343,9 +343,7 @@ def common_errors(localize: MultiViewLocalizer) -> CommonErrors | None:
     return CommonErrors(localize.lens, localize.errors, localize.bending_errors)
 
 
-def errors_by_camera(
-    rig: CameraRig, root: Tensor | None
-) -> tuple[Tensor | None, Tensor | None, tuple[tuple[int, ...], ...]]:
+def errors_by_camera(rig: Rig, root: Tensor | None) -> tuple[Tensor | None, Tensor | None, tuple[tuple[int, ...], ...]]:
     """What `CommonErrors` contains: `half`, `bending` per unit of k, and `lens`."""
     if root is None or not bool(root.any()):
         return None, None, ()

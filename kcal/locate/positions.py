@@ -16,7 +16,7 @@ from torch import Tensor
 
 from kcal.checks import as_points
 from kcal.errors import InputError
-from kcal.lens.rig import Origin, RigCovariance, StereoRig
+from kcal.lens.rig import Origin, Rig, RigCovariance
 from kcal.locate.geodesy import anchor, enu_to_geodetic, latitude_longitude
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.stereo import PositionStatus, checked_pairs
@@ -123,7 +123,7 @@ class Located:
 
 
 def locate_points(
-    rig: StereoRig,
+    rig: Rig,
     pixels_left: Tensor,
     pixels_right: Tensor,
     *,
@@ -172,7 +172,7 @@ def locate_points(
     Example:
         >>> from kcal import Camera
         >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
-        >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
+        >>> rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
         >>> located = locate_points(rig, torch.tensor([[960.0, 540.0]]), torch.tensor([[944.0, 540.0]]),
         ...                  origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
         >>> position = located.positions[0]
@@ -421,7 +421,7 @@ def read_truth(path: str | Path, located: Located) -> Tensor:
         >>> import tempfile
         >>> from kcal import locate_points
         >>> from kcal.rig import planned_rig
-        >>> left, right, _ = planned_rig()(torch.tensor([[0.0, 0.0, 1000.0]]))
+        >>> left, right = planned_rig()(torch.tensor([[0.0, 0.0, 1000.0]]))[0].unbind(-2)
         >>> located = locate_points(planned_rig(), left, right, names=["mast"], heading_deg=0.0,
         ...                         origin=Origin(lat=19.07, lon=72.87, height=14.0))
         >>> with tempfile.TemporaryDirectory() as folder:
@@ -447,9 +447,9 @@ def position_errors(located: Located, truth: Tensor) -> list[tuple[float, float,
         the range interval contains the true range.
 
     Example:
-        >>> from kcal import Camera, StereoRig, locate_points
+        >>> from kcal import Camera, Rig, locate_points
         >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
-        >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
+        >>> rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
         >>> found = locate_points(rig, torch.tensor([[960.0, 540.0]]), torch.tensor([[944.0, 540.0]]),
         ...                origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
         >>> [round(value, 6) for value in position_errors(found, torch.tensor([[3.0, 996.0, 0.0]]).double())[0][:1]]
@@ -484,7 +484,8 @@ def interval_coverage(localize: StereoLocalizer, left: Tensor, right: Tensor, ra
         >>> from kcal.rig import planned_rig
         >>> points = torch.tensor([[0.0, 0.0, 500.0], [9.0, 0.0, 800.0], [0.0, 9.0, 900.0]]).double()
         >>> localize = StereoLocalizer(planned_rig(), origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
-        >>> round(interval_coverage(localize, *planned_rig()(points)[:2], torch.tensor([500.0, 2000.0, 900.0])), 3)
+        >>> left, right = planned_rig()(points)[0].unbind(-2)
+        >>> round(interval_coverage(localize, left, right, torch.tensor([500.0, 2000.0, 900.0])), 3)
         0.667
     """
     found = localize(left, right)

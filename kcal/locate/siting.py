@@ -13,7 +13,7 @@ from torch import Tensor
 
 from kcal.errors import FileError, InputError
 from kcal.lens.camera import Camera
-from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, CameraRig, Origin
+from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Origin, Rig
 from kcal.locate.geodesy import anchor, ecef_from_enu_rotation, enu_from_cam, geodetic_to_enu, mean_radius, place_enu
 from kcal.locate.ground import Ground
 from kcal.locate.multi_localizer import errors_by_camera
@@ -543,7 +543,7 @@ def _table_site(row: TableRow, ground: Ground | None) -> Site:
 
 
 @torch.no_grad()
-def sites_of(rig: CameraRig, pixel_sigma: float = 0.3) -> list[Site]:
+def sites_of(rig: Rig, pixel_sigma: float = 0.3) -> list[Site]:
     """The cameras of a rig as sites, with what is known of lens and attitude together, half-way over the image.
 
     What errors of several cameras have in common is not part of it: `MultiViewLocalizer` knows it.
@@ -559,7 +559,7 @@ def sites_of(rig: CameraRig, pixel_sigma: float = 0.3) -> list[Site]:
         >>> from kcal import Camera
         >>> from kcal.locate import enu_from_cam
         >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
-        >>> rig = CameraRig([camera], ["mill"], enu_from_cam(90.0).T[None], torch.zeros(1, 3),
+        >>> rig = Rig([camera], ["mill"], enu_from_cam(90.0).T[None], center=torch.zeros(1, 3),
         ...                 origin=Origin(lat=45.0, lon=6.0, height=812.0))
         >>> rig.root = rig.with_errors(attitude_deg=(0.01, 0.01, 0.2))
         >>> site = sites_of(rig, pixel_sigma=1.0)[0]
@@ -584,7 +584,7 @@ def sites_of(rig: CameraRig, pixel_sigma: float = 0.3) -> list[Site]:
         position = 0.0
         if rig.root is not None:
             position = float((stands.covariance[:2, :2].trace() / 2).sqrt()) if stands.covariance is not None else 0.0
-            alone = CameraRig([camera], [name], rig.rotation[c : c + 1], rig.center[c : c + 1], refraction=0.0)
+            alone = Rig([camera], [name], rig.rotation[c : c + 1], center=rig.center[c : c + 1], refraction=0.0)
             first = sum(rig.sizes[:c])
             columns = torch.cat([rig.root[:, first : first + rig.sizes[c]], rig.root[:, rig.pose_columns(c)]], 1)
             root = torch.nn.functional.pad(columns, (0, 1))
@@ -600,7 +600,7 @@ def sites_of(rig: CameraRig, pixel_sigma: float = 0.3) -> list[Site]:
     return sites
 
 
-def _common_variance(alone: CameraRig, common: CommonErrors, rays: Tensor) -> Tensor:
+def _common_variance(alone: Rig, common: CommonErrors, rays: Tensor) -> Tensor:
     """(N, 2) variance that common errors of one camera give its pixels of things far away, in px²."""
     posed = PosedCameras(alone.each, alone.rotation, alone.center)
     used = torch.ones(len(rays), 1, dtype=torch.bool)

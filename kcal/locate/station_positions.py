@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.lens.rig import CameraRig
+from kcal.lens.rig import Rig
 from kcal.locate.geodesy import anchor, ecef_from_enu_rotation, enu_to_geodetic
 from kcal.locate.ground import Ground
 from kcal.locate.localizer import Localization
@@ -39,7 +39,7 @@ _TEXTS = {
 
 @torch.no_grad()
 def locate_views(
-    rig: CameraRig,
+    rig: Rig,
     views: Marks,
     *,
     pixel_sigma: float = 0.3,
@@ -70,7 +70,7 @@ def locate_views(
         >>> from kcal.locate import enu_from_cam
         >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
         >>> look = torch.stack([enu_from_cam(heading).T for heading in (0.0, 315.0)])
-        >>> rig = CameraRig([camera] * 2, ["mill", "mast"], look, torch.tensor([[0.0, 0, 30], [5000, 0, 30]]),
+        >>> rig = Rig([camera] * 2, ["mill", "mast"], look, center=torch.tensor([[0.0, 0, 30], [5000, 0, 30]]),
         ...                 origin=Origin(lat=45.0, lon=6.0, height=0.0), refraction=0.0)
         >>> pixels, _ = rig(torch.tensor([[100.0, 5000, 60]]))
         >>> views = Marks(("smoke",), pixels, sigma=torch.full((1, 2), 2.0))
@@ -87,7 +87,7 @@ class ViewsLocator:
 
     def __init__(
         self,
-        rig: CameraRig,
+        rig: Rig,
         *,
         pixel_sigma: float = 0.3,
         height: tuple[float, float] | None = None,
@@ -146,7 +146,7 @@ class ViewsLocator:
         )  # fmt: skip
 
 
-def own_axes(rig: CameraRig) -> Tensor:
+def own_axes(rig: Rig) -> Tensor:
     """(V, 3, 3) from the frame of a rig that has an origin to east, north, up of each camera."""
     assert rig.origin is not None
     base = anchor(rig.origin)[0]
@@ -177,15 +177,15 @@ def stations_head(localize: MultiViewLocalizer) -> Located:
     )
 
 
-def _camera_list(rig: CameraRig, which: Sequence[bool]) -> str:
+def _camera_list(rig: Rig, which: Sequence[bool]) -> str:
     return " ".join(name for name, one in zip(rig.names, which, strict=True) if one)
 
 
-def _misfits(rig: CameraRig, row: Sequence[float]) -> str:
+def _misfits(rig: Rig, row: Sequence[float]) -> str:
     return " ".join(f"{name}={value:.1f}" for name, value in zip(rig.names, row, strict=True) if value > 0)
 
 
-def _row_reasons(rig: CameraRig, found: ViewsLocalization) -> list[str]:
+def _row_reasons(rig: Rig, found: ViewsLocalization) -> list[str]:
     reasons = []
     rows = zip(found.status.tolist(), found.bad.tolist(), found.misfit.tolist(), strict=True)
     for status, bad, misfit in rows:

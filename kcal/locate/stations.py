@@ -10,7 +10,7 @@ from torch import Tensor
 from kcal.errors import InputError
 from kcal.files import read_bytes
 from kcal.io.rig_file import CameraRigFile, RigFile
-from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, CameraRig, Mounting, Origin, StereoRig, half_of_covariance
+from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Mounting, Origin, Rig, half_of_covariance
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.mounting import attitude, mounting_of
@@ -21,7 +21,7 @@ from kcal.strict_json import MOST_BYTES, read_json
 MOUNTING_ERRORS = 7
 
 
-def load_camera_rig(path: str | Path) -> CameraRig:
+def load_camera_rig(path: str | Path) -> Rig:
     """Read any rig file: one of many cameras, or one of two, named left and right.
 
     Raises:
@@ -50,7 +50,7 @@ def names_of_rig(path: str | Path) -> tuple[str, ...]:
     return tuple(map(str, names)) if isinstance(names, list) else ("left", "right")
 
 
-def stations_of(rig: StereoRig) -> CameraRig:
+def stations_of(rig: Rig) -> Rig:
     """A stereo rig as a rig of two cameras, with all that is known of it.
 
     The frame is east, north, up of the left camera if the rig says where it stands, and the left camera's otherwise.
@@ -109,17 +109,15 @@ def stations_at(localize: StereoLocalizer, *, errors: int | None = None) -> Mult
 
 
 @torch.no_grad()
-def _two_stations(
-    rig: StereoRig, left: Tensor, origin: Origin | None, refraction: float, half: Tensor | None
-) -> CameraRig:
+def _two_stations(rig: Rig, left: Tensor, origin: Origin | None, refraction: float, half: Tensor | None) -> Rig:
     """A stereo rig whose left camera is turned by `left` from the frame; halfᵀ half as in `_joint_covariance`."""
     shift = rig.right_from_left_translation
     left = left.to(shift)
     right = rig.right_from_left_rotation @ left
     apart = -right.T @ shift
     centers = torch.stack([torch.zeros_like(apart), apart])
-    stations = CameraRig(
-        [rig.left, rig.right], ("left", "right"), torch.stack([left, right]), centers, origin=origin,
+    stations = Rig(
+        [rig.left, rig.right], ("left", "right"), torch.stack([left, right]), center=centers, origin=origin,
         refraction=refraction,
     )  # fmt: skip
     if half is None:
@@ -148,7 +146,7 @@ def _crossed(vector: Tensor) -> Tensor:
     return vector.new_tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-def _joint_covariance(rig: StereoRig) -> Tensor | None:
+def _joint_covariance(rig: Rig) -> Tensor | None:
     """(P + 7, P + 7) of the calibration and the mounting of a rig; None where nothing is known."""
     known, stands = rig.covariance, rig.mounting
     if known is None and (stands is None or stands.covariance is None):
@@ -168,7 +166,7 @@ def _joint_covariance(rig: StereoRig) -> Tensor | None:
     return whole
 
 
-def station_mounting(rig: CameraRig, camera: int) -> Mounting:
+def station_mounting(rig: Rig, camera: int) -> Mounting:
     """How a camera stands: place on the Earth, heading, pitch and roll at its own vertical, and how well that is known.
 
     Raises:
@@ -178,7 +176,7 @@ def station_mounting(rig: CameraRig, camera: int) -> Mounting:
         >>> from kcal import Camera, Origin
         >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
         >>> there = torch.tensor([[0.0, 50_000.0, 0.0]])  # north of the origin, where the Earth has curved away
-        >>> rig = CameraRig([camera], ["tower"], enu_from_cam(90.0).T[None], there,
+        >>> rig = Rig([camera], ["tower"], enu_from_cam(90.0).T[None], center=there,
         ...                 origin=Origin(lat=45.0, lon=6.0, height=0.0))
         >>> stands = station_mounting(rig, 0)
         >>> round(stands.origin.height), round(stands.heading_deg, 3), round(stands.roll_deg, 3)
@@ -195,7 +193,7 @@ def station_mounting(rig: CameraRig, camera: int) -> Mounting:
     )
 
 
-def station_stands(rig: CameraRig, camera: int) -> tuple[tuple[float, ...], tuple[float, ...], Tensor | None]:
+def station_stands(rig: Rig, camera: int) -> tuple[tuple[float, ...], tuple[float, ...], Tensor | None]:
     """Place, then heading, pitch and roll (degrees), and their covariance, of a camera.
 
     The place is latitude, longitude, height where the rig has an origin, otherwise meters of its frame, whose axes are

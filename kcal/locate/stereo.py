@@ -16,7 +16,7 @@ from kcal.checks import as_points, expanded
 from kcal.dispatch import CHUNK, is_traced
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera_like import unproject_each
-from kcal.lens.rig import CameraRig, StereoRig
+from kcal.lens.rig import Rig
 from kcal.locate.angular import EPIPOLE, triangulate_pairs
 
 # The 95 % interval of a range, from one over the range and its standard deviation.
@@ -99,22 +99,20 @@ def flag_positions(code: Tensor, condition: Tensor, status: PositionStatus) -> T
     return torch.where(condition, code.new_full((), int(status)), code)
 
 
-def checked_rig(rig: StereoRig | CameraRig, pixel_sigma: float) -> float:
+def checked_rig(rig: Rig, pixel_sigma: float) -> float:
     """The sigma of the marks as a float, after checking that it is positive and that the rig has a baseline."""
     if not 1e-6 <= pixel_sigma <= 1e6:
         # Beyond, squares of it leave the range of float64, or the accuracy of the arithmetic.
         raise InputError(f"pixel_sigma: a positive number of pixels, 1e-6 to 1e6, is needed, got {pixel_sigma}")
-    if isinstance(rig, CameraRig) and len(rig) < 2:
+    if len(rig) < 2:
         raise InputError("a rig of two cameras or more is needed: one camera measures no range")
-    apart = rig.baseline if isinstance(rig, StereoRig) else (rig.center - rig.center[0]).norm(dim=-1).amax()
+    apart = (rig.center - rig.center[0]).norm(dim=-1).amax()
     if not float(apart.detach()) > 0:
         raise DegenerateError("the rig's cameras stand in the same place: no range can be measured")
     return float(pixel_sigma)
 
 
-def checked_pairs(
-    pixels_left: Tensor | ArrayLike, pixels_right: Tensor | ArrayLike, rig: StereoRig
-) -> tuple[Tensor, Tensor]:
+def checked_pairs(pixels_left: Tensor | ArrayLike, pixels_right: Tensor | ArrayLike, rig: Rig) -> tuple[Tensor, Tensor]:
     """Both as float64 (..., N, 2) on the rig's device, after checking types and shapes."""
     there = rig.right_from_left_translation
     left, right = as_points("pixels_left", pixels_left, 2, there), as_points("pixels_right", pixels_right, 2, there)
@@ -219,7 +217,7 @@ class SightLines(NamedTuple):
     along_baseline: Tensor
 
 
-def sight_lines(rig: StereoRig, pixels_left: Tensor, pixels_right: Tensor) -> SightLines:
+def sight_lines(rig: Rig, pixels_left: Tensor, pixels_right: Tensor) -> SightLines:
     """Rays, closed-form points and statuses of float64 pixels, both (..., N, 2)."""
     rotation, translation = rig.right_from_left_rotation, rig.right_from_left_translation
     rays, seen = unproject_each((rig.left, rig.right), torch.stack([pixels_left, pixels_right], -3))

@@ -20,7 +20,7 @@ from torch import Tensor
 from kcal.checks import as_points
 from kcal.errors import FileError, InputError
 from kcal.lens.camera import Camera
-from kcal.lens.rig import Origin, StereoRig
+from kcal.lens.rig import Origin, Rig
 from kcal.locate.geodesy import azimuth_elevation, enu_to_geodetic
 from kcal.locate.localizer import Localization, Sensitivity, StereoLocalizer
 from kcal.locate.stereo import PositionStatus
@@ -382,7 +382,7 @@ class Locator:
         options: of `StereoLocalizer`.
     """
 
-    def __init__(self, rig: StereoRig, *, geoid: Geoid | None = None, **options: Any) -> None:
+    def __init__(self, rig: Rig, *, geoid: Geoid | None = None, **options: Any) -> None:
         self.localize = StereoLocalizer(rig, **options)
         self.geoid = geoid
         with torch.no_grad():
@@ -491,7 +491,7 @@ def _explanation(status: PositionStatus, found: Localization, i: int, baseline: 
     return f"doubtful: the reprojection error of {worst:.1f} px is too large for noise; are the marks the same thing?"
 
 
-def _viewpoints(rig: StereoRig, enu_from_left: Tensor, origin: Origin) -> tuple[Viewpoint, Viewpoint]:
+def _viewpoints(rig: Rig, enu_from_left: Tensor, origin: Origin) -> tuple[Viewpoint, Viewpoint]:
     rotation, translation = rig.right_from_left_rotation.cpu(), rig.right_from_left_translation.cpu()
     enu_from_right = enu_from_left @ rotation.T
     enu = -enu_from_right @ translation

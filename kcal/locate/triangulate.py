@@ -12,7 +12,7 @@ from torch import Tensor
 from kcal.checks import StatedModule, exportable, scalar
 from kcal.dispatch import is_differentiated
 from kcal.errors import InputError
-from kcal.lens.rig import CameraRig, StereoRig
+from kcal.lens.rig import Rig
 from kcal.locate.angular import Method, triangulate
 from kcal.locate.max_likelihood import inverse_variance
 from kcal.locate.stereo import (
@@ -108,13 +108,13 @@ class Triangulate(Operations, StatedModule):
     Example:
         >>> from kcal import Camera
         >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
-        >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
+        >>> rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
         >>> left = torch.tensor([[960.0, 540.0]], dtype=torch.float64)
         >>> result = Triangulate(rig)(left, left - torch.tensor([3.2, 0.0], dtype=torch.float64))
         >>> round(result.points[0, 2].item(), 3), PositionStatus(int(result.status[0])).name
         (5000.0, 'OK')
         >>> centers = torch.tensor([[0.0, 0, 0], [10, 0, 0], [20, 0, 0]])
-        >>> three = CameraRig([camera] * 3, ["a", "b", "c"], torch.eye(3).repeat(3, 1, 1), centers)
+        >>> three = Rig([camera] * 3, ["a", "b", "c"], torch.eye(3).repeat(3, 1, 1), center=centers)
         >>> pixels = torch.tensor([[[960.0, 540.0], [944.0, 540.0], [928.0, 540.0]]])
         >>> found = Triangulate(three, pixel_sigma=0.1)(pixels)
         >>> round(found.points[0, 2].item(), 3), round(found.covariance[0, 2, 2].sqrt().item(), 2)
@@ -127,13 +127,13 @@ class Triangulate(Operations, StatedModule):
     )  # fmt: skip
     pixel_sigma: Tensor
 
-    def __init__(self, rig: StereoRig | CameraRig, pixel_sigma: float = 0.3, *, method: Method = "likelihood") -> None:
+    def __init__(self, rig: Rig, pixel_sigma: float = 0.3, *, method: Method = "likelihood") -> None:
         super().__init__()
         if method not in get_args(Method):
             raise InputError(f"method {method!r}: one of {', '.join(get_args(Method))} is needed")
-        like = rig.right_from_left_translation if isinstance(rig, StereoRig) else rig.center
-        self.register_buffer("pixel_sigma", scalar(checked_rig(rig, pixel_sigma), like))
+        self.register_buffer("pixel_sigma", scalar(checked_rig(rig, pixel_sigma), rig.translation))
         self.rig, self.method = rig, method
+        self._pair = len(rig) == 2 and rig.in_first_frame
 
     @property
     def constants(self) -> object:
@@ -143,7 +143,7 @@ class Triangulate(Operations, StatedModule):
     @property
     def posed(self) -> PosedCameras:
         """The cameras as they stand."""
-        if isinstance(self.rig, StereoRig):
+        if self._pair:
             return posed_pair(self.rig)
         return PosedCameras(self.rig.each, self.rig.rotation, self.rig.center)
 
@@ -166,7 +166,7 @@ class Triangulate(Operations, StatedModule):
         posed = self.posed
         views = checked_views(pixels, other, len(posed.cameras), posed.center)
         cov = checked_views_covariance(cov, views.pixels)
-        if isinstance(self.rig, StereoRig):
+        if self._pair:
             left, right = torch.where(views.seen[..., None], views.pixels, torch.nan).unbind(-2)
             return self._of_pairs(left, right, None if cov is None else joint_covariance(cov))
         pixels = views.pixels.reshape(-1, *views.pixels.shape[-2:])
@@ -189,7 +189,7 @@ class Triangulate(Operations, StatedModule):
 
     def _of_pairs(self, left: Tensor | ArrayLike, right: Tensor | ArrayLike, cov: Tensor | None) -> Triangulation:
         rig = self.rig
-        if not isinstance(rig, StereoRig):
+        if not self._pair:
             raise InputError(f"left and right pixels: this rig has {len(rig)} cameras; give all in one tensor")
         left, right = checked_pairs(left, right, rig)
         cov = checked_pair_covariance(cov, left)
@@ -210,7 +210,7 @@ class Triangulate(Operations, StatedModule):
         pixels: Tensor,
         flags: Sequence[tuple[Tensor, PositionStatus]],
     ) -> Triangulation:
-        behind = None if isinstance(self.rig, StereoRig) else found.behind(posed.center)
+        behind = None if self._pair else found.behind(posed.center)
         variance = found.variance * inverse_variance(found.fit, found.fit.covariance)
         reach = reach_of(found, variance, PositionStatus.OK, behind)
         code = reach.status

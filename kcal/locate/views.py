@@ -12,7 +12,7 @@ from kcal.dispatch import known_true
 from kcal.lens.camera import Camera
 from kcal.lens.camera_like import project_each, unproject_each
 from kcal.lens.pose import side_axes, step_rows
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.locate.angular import Found, Surroundings, first_seen, length_of_one, lifted, triangulate_angular
 from kcal.locate.max_likelihood import (
     PointFit,
@@ -368,7 +368,7 @@ def _weight(cov: Tensor | None, noise: Tensor | float, used: Tensor, moved: Tens
 
 
 def fit_pairs(
-    rig: StereoRig,
+    rig: Rig,
     left: Tensor,
     right: Tensor,
     cov: Tensor | None = None,
@@ -473,7 +473,7 @@ def reach_of(found: ViewsFit, variance: Tensor, weak_status: PositionStatus, beh
     return Reach(value, sigma, interval, weak, code)
 
 
-def posed_pair(rig: StereoRig) -> PosedCameras:
+def posed_pair(rig: Rig) -> PosedCameras:
     """Both cameras in the left one's frame."""
     rotation, shift = rig.right_from_left_rotation, rig.right_from_left_translation
     still = torch.eye(3, dtype=torch.float64, device=rotation.device)

@@ -22,7 +22,7 @@ from kcal.corners.video import VideoFrames
 from kcal.errors import InputError
 from kcal.lens.pose import side_axes, step_rows
 from kcal.lens.projection import FAR, project_components
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.locate.marks import Marks, read_marks
 from kcal.mark.items import Side
 from kcal.mark.shapes import snap, three_of
@@ -87,7 +87,7 @@ class RigBand:
         rig: with or without covariance.
     """
 
-    def __init__(self, rig: StereoRig) -> None:
+    def __init__(self, rig: Rig) -> None:
         self._rig = rig
         # The curve's end at infinity is as far away as matters to an entrance pupil that moves.
         self._inverse = torch.linspace(
@@ -122,7 +122,7 @@ class RigBand:
         return Curve(line, (moved * across).sum(-2).square().sum(0).sqrt())
 
 
-def _moved_curve(rig: StereoRig, points: Tensor, of_left: bool) -> Tensor:
+def _moved_curve(rig: Rig, points: Tensor, of_left: bool) -> Tensor:
     """(K, 2, M) by how much each of K independent errors of a rig moves an epipolar curve.
 
     Points of the curve go aside so that the pixel that they belong to stays, and are seen elsewhere in the other image.
@@ -157,9 +157,7 @@ def _moved_curve(rig: StereoRig, points: Tensor, of_left: bool) -> Tensor:
     return moved[other] - (by_aside[other] @ undone).permute(2, 1, 0)
 
 
-def propose(
-    rig: StereoRig, images: tuple[Gray, Gray], side: Side, u: float, v: float, band_sigma: float = 0.0
-) -> Proposal:
+def propose(rig: Rig, images: tuple[Gray, Gray], side: Side, u: float, v: float, band_sigma: float = 0.0) -> Proposal:
     """Match a pixel of one side in the other image, and back again: a match that does not lead back is refused.
 
     Args:
@@ -170,7 +168,7 @@ def propose(
         v: its row.
         band_sigma: of the rig across the epipolar line, px; a match may be three of it beside the line.
     """
-    back = StereoRig(rig.right, rig.left, rig.right_from_left_rotation.T,
+    back = Rig.pair(rig.right, rig.left, rig.right_from_left_rotation.T,
                      -rig.right_from_left_rotation.T @ rig.right_from_left_translation)  # fmt: skip
     there, return_way = (rig, back) if side == "left" else (back, rig)
     first, second = (torch.from_numpy(np.ascontiguousarray(image)) for image in images[:: 1 if side == "left" else -1])

@@ -15,7 +15,7 @@ from kcal.calibrate.rig.sources import RigData
 from kcal.errors import InputError, KcalError
 from kcal.lens.calibration import ItemResidual
 from kcal.lens.camera import Camera
-from kcal.lens.rig import Origin, StereoRig
+from kcal.lens.rig import Origin, Rig
 from kcal.locate.budget import range_sigmas
 from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic
 from kcal.locate.marks import Marks
@@ -67,7 +67,7 @@ class LiveRig(NamedTuple):
         warnings: of the solution.
     """
 
-    rig: StereoRig | None
+    rig: Rig | None
     origin: Origin | None
     items: tuple[ItemResidual, ...]
     promises: tuple[Promise, ...]
@@ -114,7 +114,7 @@ def solve_live(cameras: tuple[Camera, Camera], survey: Survey | None, marks: Mar
     return LiveRig(rig, survey.origin, items, promises, count, sigma, text, enough, result.warnings)
 
 
-def promised(rig: StereoRig, sigma: float) -> tuple[Promise, ...]:
+def promised(rig: Rig, sigma: float) -> tuple[Promise, ...]:
     """Predicted standard deviations of ranges; empty where the rig cannot see that way."""
     try:
         found = range_sigmas(rig, pixel_sigma=sigma)
@@ -150,7 +150,7 @@ def verdict(promises: tuple[Promise, ...], count: int) -> tuple[str, bool]:
     return f"not enough: {share}; {advice}", False
 
 
-def located(rig: StereoRig, marks: Marks, hand_sigma: float) -> Located:
+def located(rig: Rig, marks: Marks, hand_sigma: float) -> Located:
     """Positions of targets; without a mounting, in a frame whose heading and place mean nothing."""
     known = rig.mounting is not None
     return locate_points(
@@ -170,7 +170,7 @@ def located(rig: StereoRig, marks: Marks, hand_sigma: float) -> Located:
 _NOWHERE = Origin(lat=0.0, lon=0.0, height=0.0)
 
 
-def map_content(rig: StereoRig, located: Located | None, survey: Survey | None, *, anchored: bool) -> dict[str, Any]:
+def map_content(rig: Rig, located: Located | None, survey: Survey | None, *, anchored: bool) -> dict[str, Any]:
     """What the page draws with Leaflet.
 
     Args:
@@ -242,7 +242,7 @@ class Desk:
         pictures: Pictures,
         session: Session,
         cameras: tuple[Camera, Camera] | None = None,
-        rig: StereoRig | None = None,
+        rig: Rig | None = None,
         reference: Reference | None = None,
     ) -> None:
         self.pictures, self.session, self.reference = pictures, session, reference
@@ -276,7 +276,7 @@ class Desk:
         self.session.close()
 
     @property
-    def rig(self) -> StereoRig | None:
+    def rig(self) -> Rig | None:
         """The rig in use: from landmarks if they give one, otherwise the given one."""
         return self._live.rig or self._given
 

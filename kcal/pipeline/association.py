@@ -16,7 +16,7 @@ from kcal.corners.patches import as_gray
 from kcal.dispatch import is_differentiated, still
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.lens.uncertainty import pixel_slopes
 from kcal.locate.multi_localizer import MultiViewLocalizer, common_errors, posed_cameras
 from kcal.locate.stations import stations_of
@@ -99,7 +99,7 @@ class _Rays(NamedTuple):
 
 
 def near_epipolar_lines(
-    rig: StereoRig,
+    rig: Rig,
     left: Tensor,
     right: Tensor,
     sigma: float,
@@ -366,7 +366,7 @@ class Association(NamedTuple):
 
 @torch.no_grad()
 def associate(
-    rig: StereoRig,
+    rig: Rig,
     left: Detections,
     right: Detections,
     options: AssociationOptions | None = None,
@@ -456,7 +456,7 @@ class PairBoxes(StatedModule):
         ([[1, 0]], [[True, True]], [[[16.0, 0.0], [16.0, 0.0]]])
     """
 
-    def __init__(self, rig: StereoRig, options: AssociationOptions | None = None) -> None:
+    def __init__(self, rig: Rig, options: AssociationOptions | None = None) -> None:
         super().__init__()
         self.rig, self.options = rig, options or AssociationOptions()
         if isinstance(self.options.anchor, int):
@@ -551,7 +551,7 @@ class _Paired(NamedTuple):
 
 @torch.no_grad()
 def _paired(
-    rig: StereoRig,
+    rig: Rig,
     anchors: Sequence[Tensor],
     boxes: Sequence[Tensor],
     near: Tensor,
@@ -584,20 +584,20 @@ def _paired(
     return _Paired(chosen, doubts & (chosen >= 0), cost, possible)
 
 
-def _costs(rig: StereoRig, pixels: Tensor, boxes: Tensor, options: AssociationOptions) -> Tensor:
+def _costs(rig: Rig, pixels: Tensor, boxes: Tensor, options: AssociationOptions) -> Tensor:
     """(L,) squared standard deviations of what no point explains, of range and size; pixels (L, 2, 2), boxes (L, 2, 4).
 
     Infinite where impossible; differentiable by both.
     """
     # Where a mast stands does not matter.
-    alone = StereoRig(rig.left, rig.right, rig.right_from_left_rotation, rig.right_from_left_translation)
+    alone = Rig.pair(rig.left, rig.right, rig.right_from_left_rotation, rig.right_from_left_translation)
     alone.covariance = rig.covariance
     localize, both = MultiViewLocalizer(stations_of(alone)), torch.tensor([0, 1]).expand(len(pixels), 2)
     return pair_costs(localize, both, pixels, boxes, options, _nearest(rig, options)).cost
 
 
 def association_costs(
-    rig: StereoRig, anchors: Sequence[Tensor], boxes: Sequence[Tensor], among: Tensor, options: AssociationOptions
+    rig: Rig, anchors: Sequence[Tensor], boxes: Sequence[Tensor], among: Tensor, options: AssociationOptions
 ) -> Tensor:
     """(B, N, M) squared standard deviations of epipolar error, range and size of pairs; infinite where impossible.
 
@@ -611,7 +611,7 @@ def association_costs(
     return cost
 
 
-def _nearest(rig: StereoRig, options: AssociationOptions) -> float:
+def _nearest(rig: Rig, options: AssociationOptions) -> float:
     return options.nearest if options.nearest is not None else 10.0 * float(rig.baseline.detach())
 
 

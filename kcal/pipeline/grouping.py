@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.locate.multi_localizer import MultiViewLocalizer, common_errors, posed_cameras
 from kcal.pipeline.assignment import assign_groups
 from kcal.pipeline.association import MOST_BOXES, AssociationOptions, fit_some, pair_costs
@@ -73,12 +73,12 @@ def group_objects(
 
     Example:
         >>> from kcal import Camera, Origin
-        >>> from kcal.lens.rig import CameraRig
+        >>> from kcal.lens.rig import Rig
         >>> from kcal.locate import enu_from_cam
         >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
         >>> look = torch.stack([enu_from_cam(heading).T for heading in (0.0, 315.0, 45.0)])
         >>> places = torch.tensor([[0.0, 0, 30], [5000.0, 0, 40], [-5000.0, 0, 35]])
-        >>> rig = CameraRig([camera] * 3, ["mill", "church", "mast"], look, places, refraction=0.0,
+        >>> rig = Rig([camera] * 3, ["mill", "church", "mast"], look, center=places, refraction=0.0,
         ...                 origin=Origin(lat=45.0, lon=6.0, height=0.0))
         >>> pixels, _ = rig(torch.tensor([[0.0, 5000, 100], [400.0, 5500, 100]]))
         >>> boxes = [torch.cat([p - 5, p + 5], -1) for p in pixels.unbind(1)]
@@ -376,7 +376,7 @@ class Moment(NamedTuple):
 
 
 def read_moment(
-    line: str | bytes, rig: StereoRig | MultiViewLocalizer, options: AssociationOptions, pixel_sigma: float
+    line: str | bytes, rig: Rig | MultiViewLocalizer, options: AssociationOptions, pixel_sigma: float
 ) -> Moment:
     """Read one line.
 

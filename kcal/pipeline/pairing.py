@@ -17,7 +17,7 @@ from kcal.checks import StatedModule, as_points, as_tensor, exportable, require_
 from kcal.corners.match import MatchStatus
 from kcal.dispatch import still
 from kcal.errors import InputError
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.pipeline.association import AssociationOptions, associate
 from kcal.pipeline.detections import Detections
 from kcal.texts import brief
@@ -393,7 +393,7 @@ class ObjectDisparity(StatedModule):
         ([935.5, 531.5], 'GOOD')
     """
 
-    def __init__(self, rig: StereoRig, options: DisparityOptions | None = None) -> None:
+    def __init__(self, rig: Rig, options: DisparityOptions | None = None) -> None:
         super().__init__()
         self.rig = rig
         self.options = options or DisparityOptions()
@@ -593,7 +593,7 @@ def _brightest(image: Tensor, options: DisparityOptions) -> float:
 
 
 def pair_objects(
-    rig: StereoRig,
+    rig: Rig,
     left: Detections,
     right: Detections,
     images: tuple[Tensor, Tensor] | None = None,

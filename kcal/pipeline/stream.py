@@ -21,7 +21,7 @@ from torch import Tensor
 
 from kcal.errors import FileError, InputError
 from kcal.files import FileLock, read_bytes, write_atomic
-from kcal.lens.rig import CameraRig
+from kcal.lens.rig import Rig
 from kcal.locate.export import APPENDED, appended
 from kcal.locate.localizer import Localization
 from kcal.locate.positions import Located
@@ -331,7 +331,7 @@ _REASONS = {
 }
 
 
-def track_columns(tracks: Tracks, sequence: int, stations: CameraRig | None = None) -> PositionColumns:
+def track_columns(tracks: Tracks, sequence: int, stations: Rig | None = None) -> PositionColumns:
     """One row for each track; velocities, hits and times are further columns.
 
     Args:

@@ -330,7 +330,8 @@ class Tracker:
         >>> rig = planned_rig()
         >>> tracker = Tracker(StereoLocalizer(rig, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0))
         >>> for time in torch.arange(10).double() / 10:
-        ...     left, right, _ = rig(torch.tensor([[0.0, 0.0, 500.0]]) + time * torch.tensor([8.0, 0.0, 0.0]))
+        ...     place = torch.tensor([[0.0, 0.0, 500.0]]) + time * torch.tensor([8.0, 0.0, 0.0])
+        ...     left, right = rig(place)[0].unbind(-2)
         ...     pairs = ObjectViews.of_pairs(left, right, covariance=0.04 * torch.eye(4)[None],
         ...                                  time=time.expand(1, 2), score=torch.ones(1), category=("car",))
         ...     tracks = tracker(pairs)

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from kcal.errors import FileError, InputError
 from kcal.files import is_stream, source_name
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.pipeline.association import AssociationOptions
 from kcal.pipeline.detections import Detections, Detector, detect_in
@@ -518,7 +518,7 @@ class Videos:
     def __init__(
         self,
         videos: Sequence[str],
-        rig: StereoRig | MultiViewLocalizer,
+        rig: Rig | MultiViewLocalizer,
         detector: Detector,
         options: AssociationOptions,
         *,
@@ -531,7 +531,7 @@ class Videos:
             raise InputError(f"match_sigma: pixels, not negative, are needed, got {match_sigma}")
         self._compression = match_sigma**2 * torch.diag(torch.tensor([0.0, 0.0, 1.0, 1.0], dtype=torch.float64))
         self._match: ObjectDisparity | None = None
-        if isinstance(rig, StereoRig):
+        if isinstance(rig, Rig):
             self._sizes = {"left": rig.left.size, "right": rig.right.size}
             self._match = ObjectDisparity(rig)
         else:
@@ -564,7 +564,7 @@ class Videos:
         return Moment(time, found)
 
     def _objects(self, seen: list[Detections | None], group: list[TimedFrame | None]) -> ObjectViews:
-        if not isinstance(self._rig, StereoRig):
+        if not isinstance(self._rig, Rig):
             return group_objects(self._rig, seen, self._options)
         (left, right), (one, other) = seen, group
         assert left is not None and right is not None and one is not None and other is not None  # noqa: PT018

@@ -19,7 +19,7 @@ from kcal.lens.calibration import RigCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.pose import step_rows, vector_from_rotation
 from kcal.lens.projection import project_components
-from kcal.lens.rig import CameraRig, CameraRigCalibration, StereoRig
+from kcal.lens.rig import CameraRigCalibration, Rig
 from kcal.locate.budget import RangeSigmas, range_sigmas, station_sigmas
 from kcal.locate.stereo import PositionStatus
 from kcal.locate.triangulate import Triangulate
@@ -58,7 +58,7 @@ class Synchrony(NamedTuple):
 
 
 @torch.no_grad()
-def synchrony(rig: StereoRig, board_points: Tensor, pixels: Tensor) -> Synchrony:
+def synchrony(rig: Rig, board_points: Tensor, pixels: Tensor) -> Synchrony:
     """Compare the board's pose as each camera alone sees it, pair by pair.
 
     Args:
@@ -68,11 +68,11 @@ def synchrony(rig: StereoRig, board_points: Tensor, pixels: Tensor) -> Synchrony
 
     Example:
         >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480))
-        >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-0.1, 0.0, 0.0]))
+        >>> rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-0.1, 0.0, 0.0]))
         >>> points = torch.cartesian_prod(torch.arange(5.0), torch.arange(4.0), torch.zeros(1)).double() * 0.05
         >>> places = points + torch.tensor([[[-0.1, -0.1, 1.0]], [[0.0, 0.0, 1.2]]], dtype=torch.float64)
         >>> moved = places + torch.tensor([0.0, 0.01, 0.0], dtype=torch.float64)  # 1 cm between both exposures
-        >>> pixels = torch.stack([rig(places)[0], rig(moved)[1]], 1)
+        >>> pixels = torch.stack([rig(places)[0][..., 0, :], rig(moved)[0][..., 1, :]], 1)
         >>> round(synchrony(rig, points, pixels).shift, 3)
         0.01
     """
@@ -142,7 +142,7 @@ _MOST_VARIANCE = 9.0
 
 @in_one_thread
 def rig_verdict(
-    rig: StereoRig | CameraRig,
+    rig: Rig,
     requirements: Sequence[Requirement] = (),
     *,
     mark_sigma: float = 0.3,
@@ -179,7 +179,7 @@ def rig_verdict(
         ([True, False], 'at 5 km the range is known to ±6.8 %; 5 % are required; most of it is from relative pose')
     """
     findings = [*_inherited(rig, cameras), *_own_findings(rig, result)]
-    if isinstance(rig, StereoRig):
+    if _is_pair(rig):
         compared = _pairs_compared(rig, result, pairs)
         if compared is not None and compared.pairs:
             findings.append(_synchrony_finding(compared))
@@ -189,27 +189,28 @@ def rig_verdict(
     worst = [_worst_sigmas(rig, requirement.distance, mark_sigma) for requirement in requirements]
     both = list(zip(requirements, worst, strict=True))
     findings += [_unseen_finding(requirement.distance) for requirement, one in both if one is None]
-    known = (rig.covariance if isinstance(rig, StereoRig) else rig.root) is not None
+    known = rig.covariance is not None or rig.root is not None
     answers = tuple(_rig_answer(requirement, one, known, mark_sigma, beyond) for requirement, one in both)
     return Verdict(
         subject=subject,
         answers=answers,
         findings=weighed_findings(findings, answers),
         advice=tuple(f"{verdict.subject}: {text}" for verdict in cameras for text in verdict.advice),
-        basis=f"from the rig's own covariance, where {_LOOK[isinstance(rig, CameraRig)]}, with marks to "
-        f"{mark_sigma:g} px",
+        basis=f"from the rig's own covariance, where {_LOOK[not _is_pair(rig)]}, with marks to {mark_sigma:g} px",
         unexplained=max(beyond, default=0.0),
     )
 
 
-def named_cameras(rig: StereoRig | CameraRig) -> list[tuple[str, Camera]]:
-    """The cameras of a rig with their names: left and right of a rig of two."""
-    if isinstance(rig, StereoRig):
-        return [("left", rig.left), ("right", rig.right)]
+def _is_pair(rig: Rig) -> bool:
+    return len(rig) == 2 and rig.root is None
+
+
+def named_cameras(rig: Rig) -> list[tuple[str, Camera]]:
+    """The cameras of a rig with their names."""
     return list(zip(rig.names, rig.each, strict=True))
 
 
-def _inherited(rig: StereoRig | CameraRig, cameras: Sequence[Verdict]) -> list[Finding]:
+def _inherited(rig: Rig, cameras: Sequence[Verdict]) -> list[Finding]:
     """Findings about the cameras, each named; what is the same of several is said once."""
     found: dict[Finding, list[str]] = {}
     if cameras:
@@ -257,14 +258,14 @@ def _rig_answer(
     return RangeAnswer(requirement=requirement, parts=parts)
 
 
-def _worst_sigmas(rig: StereoRig | CameraRig, distance: float, mark_sigma: float) -> RangeSigmas | None:
+def _worst_sigmas(rig: Rig, distance: float, mark_sigma: float) -> RangeSigmas | None:
     """The worst of several places that two cameras see; None where there is none."""
-    if isinstance(rig, StereoRig):
+    if _is_pair(rig):
         return _worst_of_pair(rig, distance, mark_sigma)
     return station_sigmas(rig, distance, pixel_sigma=mark_sigma)
 
 
-def _worst_of_pair(rig: StereoRig, distance: float, mark_sigma: float) -> RangeSigmas:
+def _worst_of_pair(rig: Rig, distance: float, mark_sigma: float) -> RangeSigmas:
     """The worst of several places along the middle row of the left image that both cameras see."""
     width, height = rig.left.size
     worst: RangeSigmas | None = None
@@ -283,7 +284,7 @@ def _worst_of_pair(rig: StereoRig, distance: float, mark_sigma: float) -> RangeS
     return worst
 
 
-def _own_findings(rig: StereoRig | CameraRig, result: RigResult | None) -> list[Finding]:
+def _own_findings(rig: Rig, result: RigResult | None) -> list[Finding]:
     """What the rig's own solution says, and what could not be checked."""
     found = _doubts(rig, result)
     record = rig.calibration
@@ -295,9 +296,9 @@ def _own_findings(rig: StereoRig | CameraRig, result: RigResult | None) -> list[
     return found
 
 
-def _doubts(rig: StereoRig | CameraRig, result: RigResult | None) -> list[Finding]:
+def _doubts(rig: Rig, result: RigResult | None) -> list[Finding]:
     found = []
-    if (rig.root if isinstance(rig, CameraRig) else rig.covariance) is None:
+    if rig.root is None and rig.covariance is None:
         text = "the rig has no error bars: nobody can say how wrong its ranges are"
         found.append(Finding.of("error-bars", "stop", text, "solve it with kcal rig from cameras that kcal calibrated"))
     record = rig.calibration
@@ -334,11 +335,11 @@ def _doubts(rig: StereoRig | CameraRig, result: RigResult | None) -> list[Findin
     return found
 
 
-def _exact_lenses(rig: StereoRig | CameraRig, result: RigResult | None) -> tuple[str, ...]:
+def _exact_lenses(rig: Rig, result: RigResult | None) -> tuple[str, ...]:
     """Names of the cameras whose parameters have no error in the rig's covariance."""
     if result is not None:
         return result.exact
-    root = rig.root if isinstance(rig, CameraRig) else None if rig.covariance is None else rig.covariance.half
+    root = rig.root if rig.covariance is None else rig.covariance.half
     if root is None:
         return ()
     named = named_cameras(rig)
@@ -354,7 +355,7 @@ def _largest_variance(solved: RigResult | RigCalibration | CameraRigCalibration 
     return max((sigmas**2 for sigmas in known), default=0.0)
 
 
-def _pairs_compared(rig: StereoRig, result: RigResult | None, pairs: tuple[Tensor, Tensor] | None) -> Synchrony | None:
+def _pairs_compared(rig: Rig, result: RigResult | None, pairs: tuple[Tensor, Tensor] | None) -> Synchrony | None:
     if pairs is not None:
         return synchrony(rig, *pairs)
     boards = None if result is None else result.data.boards
@@ -417,7 +418,7 @@ class Sides(NamedTuple):
     spread: float
 
 
-def triangulated_sides(rig: StereoRig, columns: int, rows: int, pixels: Tensor, points: Tensor | None = None) -> Sides:
+def triangulated_sides(rig: Rig, columns: int, rows: int, pixels: Tensor, points: Tensor | None = None) -> Sides:
     """Triangulate every corner of boards seen by both cameras and measure the sides of the squares.
 
     Args:
@@ -438,9 +439,9 @@ def triangulated_sides(rig: StereoRig, columns: int, rows: int, pixels: Tensor, 
     Example:
         >>> from kcal import Camera
         >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
-        >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
+        >>> rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
         >>> corners = torch.tensor([[0, 0, 5], [0.1, 0, 5], [0, 0.1, 5], [0.1, 0.1, 5]], dtype=torch.float64)
-        >>> left, right, _ = rig(corners)
+        >>> left, right = rig(corners)[0].unbind(-2)
         >>> round(triangulated_sides(rig, 2, 2, torch.stack([left, right])[None]).mean, 9)
         0.1
     """

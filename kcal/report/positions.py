@@ -68,10 +68,10 @@ def positions_figure(located: Located, truth: Tensor | None = None) -> Figure:
 
     Example:
         >>> import torch
-        >>> from kcal import Camera, Origin, StereoRig, locate_points
+        >>> from kcal import Camera, Origin, Rig, locate_points
         >>> camera = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
-        >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
-        >>> left, right, _ = rig(torch.tensor([[50.0, 0.0, 900.0]]))
+        >>> rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
+        >>> left, right = rig(torch.tensor([[50.0, 0.0, 900.0]]))[0].unbind(-2)
         >>> located = locate_points(rig, left, right, origin=Origin(lat=19.0, lon=72.9, height=0.0), heading_deg=35.0)
         >>> len(positions_figure(located).axes)
         2

@@ -19,7 +19,7 @@ from torch import Tensor
 from kcal.errors import FileError, InputError
 from kcal.files import read_bytes
 from kcal.lens.camera import Camera
-from kcal.lens.rig import Origin, StereoRig
+from kcal.lens.rig import Origin, Rig
 from kcal.lens.turning import rotation_between
 from kcal.locate.budget import range_sigmas
 from kcal.locate.geodesy import geodetic_to_enu
@@ -106,7 +106,7 @@ class RangeScore(NamedTuple):
 
 
 @torch.no_grad()
-def score_rig(rig: StereoRig, truth: dict[str, Any]) -> list[RangeScore]:
+def score_rig(rig: Rig, truth: dict[str, Any]) -> list[RangeScore]:
     """Compare ranges of exact marks with the true ones, over the image."""
     placed = rig.mounting is not None
     localize = StereoLocalizer(

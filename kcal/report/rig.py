@@ -69,12 +69,12 @@ def rig_figure(result: RigResult) -> Figure:
 
     Example:
         >>> import torch
-        >>> from kcal import Camera, Landmarks, RigData, RigOptions, StereoRig, solve_rig
+        >>> from kcal import Camera, Landmarks, RigData, RigOptions, Rig, solve_rig
         >>> camera = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
-        >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
+        >>> rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
         >>> ahead = 80.0 * (1.0 + torch.arange(8).double())
         >>> places = torch.stack([ahead * torch.sin(ahead), ahead * torch.cos(ahead), 10 * ahead], -1) * 0.4
-        >>> left, right, _ = rig(places)
+        >>> left, right = rig(places)[0].unbind(-2)
         >>> seen = Landmarks(names=tuple("abcdefgh"), points=places, sigma=torch.full_like(places, 0.02),
         ...                  pixels=torch.stack([left, right], 1), pixel_sigma=0.1)
         >>> data = RigData(cameras=(camera, camera), names=("left", "right"), landmarks=seen)

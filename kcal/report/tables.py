@@ -123,7 +123,7 @@ def chance_text(located: Located, truth: Tensor) -> str:
         >>> from kcal.rig import planned_rig
         >>> import torch
         >>> points = torch.tensor([[0.0, 0.0, 1000.0]] * 7, dtype=torch.float64)
-        >>> left, right, _ = planned_rig()(points)
+        >>> left, right = planned_rig()(points)[0].unbind(-2)
         >>> found = locate_points(planned_rig(), left, right, origin=Origin(lat=19.0, lon=72.9, height=0.0),
         ...                       heading_deg=0.0)
         >>> chance_text(found, points[:, [0, 2, 1]])

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from kcal.calibrate.rig.source import Effect
 from kcal.lens.pose import side_axes
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.scene.refine import HALF
 
 # How far matches lie off their epipolar lines, and what turns and shifts of the rig change in that.
@@ -38,7 +38,7 @@ class LineErrors(NamedTuple):
         return (self.across[:, None] @ covariance @ self.across[..., None])[:, 0, 0].sqrt()
 
 
-def line_errors(rig: StereoRig, pixels: Tensor) -> LineErrors:
+def line_errors(rig: Rig, pixels: Tensor) -> LineErrors:
     """Matches (M, 2, 2), left and right pixels, beside their epipolar lines.
 
     What is off has slopes of its own, which a pose does not use: slopes are those on the line.

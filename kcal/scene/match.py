@@ -23,7 +23,7 @@ from kcal.corners.match import Keypoints, keypoints, pose_between
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import side_axes
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.scene.common_errors import line_errors, pose_variance_ratio, smooth_effects, with_common_errors
 from kcal.scene.refine import Stillness, refine_matches, still_there
 
@@ -41,7 +41,7 @@ _AT_ONCE = 1024
 _NO_SECOND = 2.0
 
 
-def rough_rig(cameras: tuple[Camera, Camera], points: tuple[Keypoints, Keypoints], name: str) -> StereoRig:
+def rough_rig(cameras: tuple[Camera, Camera], points: tuple[Keypoints, Keypoints], name: str) -> Rig:
     """How the right camera roughly stands, with a baseline of one, from keypoints alone.
 
     Raises:
@@ -62,7 +62,7 @@ def rough_rig(cameras: tuple[Camera, Camera], points: tuple[Keypoints, Keypoints
             f"{name}: both images have only {count} features in common; {_NEEDED} are needed. Are they of the same "
             "scene and moment, and is left left?"
         )
-    return StereoRig(cameras[0], cameras[1], rotation, shift)
+    return Rig.pair(cameras[0], cameras[1], rotation, shift)
 
 
 class _Epipolar:
@@ -74,7 +74,7 @@ class _Epipolar:
         valid: (N,) whether there is a ray.
     """
 
-    def __init__(self, rig: StereoRig, side: int, pixels: Tensor) -> None:
+    def __init__(self, rig: Rig, side: int, pixels: Tensor) -> None:
         rotation, shift = rig.right_from_left_rotation, rig.right_from_left_translation
         axis = -(rotation.T @ shift)
         axis = axis / torch.linalg.vector_norm(axis)
@@ -90,7 +90,7 @@ class _Epipolar:
         self.along = torch.acos((rays @ axis).clamp(-1.0, 1.0))
 
 
-def guided_matches(rig: StereoRig, points: tuple[Keypoints, Keypoints]) -> Tensor:
+def guided_matches(rig: Rig, points: tuple[Keypoints, Keypoints]) -> Tensor:
     """(M, 2) indices of keypoints that are each other's best along the epipolar line, at a positive distance."""
     left, right = (_Epipolar(rig, side, own.pixels) for side, own in enumerate(points))
     return _both_ways(points, (left, right, BAND / float(rig.left.focal[0].detach())), _GUIDED_RATIO)
@@ -214,7 +214,7 @@ class MatchedPair(NamedTuple):
     covariance: Tensor
     share: Tensor
     counts: PairCounts
-    rig: StereoRig
+    rig: Rig
 
     def at(self, which: Tensor, **counts: Any) -> MatchedPair:
         """Those at some places."""
@@ -347,7 +347,7 @@ def match_scene(cameras: tuple[Camera, Camera], pair: ImagePair) -> MatchedPair:
     return MatchedPair(pixels[good], covariance[good], share[good], counts, rig)
 
 
-def _guided(rig: StereoRig, points: tuple[Keypoints, Keypoints]) -> Tensor:
+def _guided(rig: Rig, points: tuple[Keypoints, Keypoints]) -> Tensor:
     index = guided_matches(rig, points)
     return torch.stack([own.pixels[index[:, k]] for k, own in enumerate(points)], 1)
 
@@ -357,7 +357,7 @@ def as_floats(pair: ImagePair) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(pair.left.astype(np.float32)), torch.from_numpy(pair.right.astype(np.float32))
 
 
-def _posed(rig: StereoRig, pixels: Tensor, covariance: Tensor) -> tuple[StereoRig, Tensor]:
+def _posed(rig: Rig, pixels: Tensor, covariance: Tensor) -> tuple[Rig, Tensor]:
     """The rig (baseline of one) that most of the matches make, and each one's χ² over its limit."""
     count = len(pixels)
     features = _features(tuple(map(str, range(count))), pixels, covariance)
@@ -377,7 +377,7 @@ def _posed(rig: StereoRig, pixels: Tensor, covariance: Tensor) -> tuple[StereoRi
     over = torch.where(mask & (work.state.items[:, 3] >= -_UNIT_SIGMA), over, torch.inf)
     rotation, center = work.state.rotation, work.state.center
     relative = rotation[1] @ rotation[0].T
-    return StereoRig(*cameras, relative, rotation[1] @ (center[0] - center[1])), over
+    return Rig.pair(*cameras, relative, rotation[1] @ (center[0] - center[1])), over
 
 
 def _still(pairs: Sequence[ImagePair], found: Sequence[MatchedPair], k: int) -> MatchedPair:

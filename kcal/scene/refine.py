@@ -25,7 +25,7 @@ from kcal.corners.patches import (
     weighted_correlation,
 )
 from kcal.lens.camera import Camera
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 
 # Refine matches to a fraction of a pixel: patches are compared through both lenses on one plane.
 #
@@ -67,7 +67,7 @@ class RefinedMatches(NamedTuple):
 
 
 @torch.no_grad()
-def refine_matches(rig: StereoRig, images: tuple[Tensor, Tensor], left: Tensor, right: Tensor) -> RefinedMatches:
+def refine_matches(rig: Rig, images: tuple[Tensor, Tensor], left: Tensor, right: Tensor) -> RefinedMatches:
     """Find where the right image shows what the left one shows at `left` (M, 2), from about `right` (M, 2) on.
 
     Args:
@@ -80,7 +80,7 @@ def refine_matches(rig: StereoRig, images: tuple[Tensor, Tensor], left: Tensor, 
     return RefinedMatches(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
-def _refined_part(rig: StereoRig, images: tuple[Tensor, Tensor], left: Tensor, right: Tensor) -> RefinedMatches:
+def _refined_part(rig: Rig, images: tuple[Tensor, Tensor], left: Tensor, right: Tensor) -> RefinedMatches:
     planes = object_planes(rig, left, right, torch.zeros(len(left), dtype=torch.float64))
     turn = rig.right_from_left_rotation
     here, steps, seen = _patch(rig.left, planes, planes.left, None)
@@ -164,9 +164,7 @@ class Stillness(enum.IntEnum):
 
 
 @torch.no_grad()
-def still_there(
-    rig: StereoRig, image: Tensor, others: tuple[Tensor, Tensor], pixels: Tensor, covariance: Tensor
-) -> Tensor:
+def still_there(rig: Rig, image: Tensor, others: tuple[Tensor, Tensor], pixels: Tensor, covariance: Tensor) -> Tensor:
     """(M,) `Stillness` of matches, by a pair of images of another time.
 
     Args:

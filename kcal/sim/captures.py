@@ -272,7 +272,7 @@ def drawn_lens(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrueRig:
-    """Two ray-traced cameras; the convention is `StereoRig`'s.
+    """Two ray-traced cameras; the convention is `Rig`'s.
 
     Args:
         left: the first camera, whose frame is the rig's.
@@ -295,11 +295,10 @@ class TrueRig:
         """Move points (..., N, 3) from the left camera's frame into the right camera's."""
         return points_left @ self.right_from_left_rotation.T + self.right_from_left_translation
 
-    def __call__(self, points_left: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Project points (..., N, 3) of the left frame: pixels_left, pixels_right (..., N, 2), valid in both."""
-        pixels_left, valid_left = self.left.project(points_left)
-        pixels_right, valid_right = self.right.project(self.right_from_left(points_left))
-        return pixels_left, pixels_right, valid_left & valid_right
+    def __call__(self, points_left: Tensor) -> tuple[Tensor, Tensor]:
+        """Project points (..., N, 3) of the left frame: pixels (..., N, 2, 2), and which are valid (..., N, 2)."""
+        left, right = self.left.project(points_left), self.right.project(self.right_from_left(points_left))
+        return torch.stack([left[0], right[0]], -2), torch.stack([left[1], right[1]], -1)
 
 
 def drawn_rig(

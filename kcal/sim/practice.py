@@ -392,7 +392,8 @@ def _pairs_record(site: PracticeSite, distance: float) -> dict[str, Any]:
     width, height = rig.left.size
     x, y = np.linspace(0.03 * width, 0.97 * width, _COARSE[0]), np.linspace(0.1 * height, 0.9 * height, _COARSE[1])
     rays, _ = rig.left.unproject(torch.from_numpy(np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)))
-    left, right, valid = rig(distance * rays)
+    pixels, valid = rig(distance * rays)
+    (left, right), valid = pixels.unbind(-2), valid.all(-1)
     seen = valid & rig.left.inside(left) & rig.right.inside(right)
     return {"range_m": distance, "left": left[seen].tolist(), "right": right[seen].tolist()}
 

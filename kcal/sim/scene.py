@@ -633,7 +633,8 @@ def mark_points(rig: TrueRig, points_rig: Tensor, sigma: float, generator: torch
     if not (sigma >= 0 and math.isfinite(sigma)):
         raise InputError(f"sigma {sigma}: pixels, not negative, are needed")
     with torch.no_grad():
-        left, right, valid = rig(points)
+        pixels, valid = rig(points)
+        (left, right), valid = pixels.unbind(-2), valid.all(-1)
     unseen = ~(valid & rig.left.inside(left) & rig.right.inside(right))
     if bool(unseen.any()):
         raise InputError(f"points_rig: point {int(unseen.nonzero()[0])} is not seen by both cameras")

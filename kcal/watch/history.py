@@ -18,7 +18,7 @@ from torch import Tensor
 
 from kcal.checks import chi2_quantile
 from kcal.errors import FileError, InputError
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.texts import csv_line, unix_seconds
 
 # How the cameras of a rig turn over time, and how that is learned from what was measured (maximum likelihood).
@@ -207,7 +207,7 @@ class Turns(NamedTuple):
     covariance: Tensor
 
 
-def between_rows(rig: StereoRig) -> Tensor:
+def between_rows(rig: Rig) -> Tensor:
     """(5, 6): what matches between the cameras can tell of turns of both.
 
     These are the turn of the right camera against the left one (3, about the right one's axes), and of the baseline's

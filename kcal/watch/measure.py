@@ -21,7 +21,7 @@ from kcal.files import read_bytes, write_atomic
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.lens.projection import FAR
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.lens.turning import fit_turn, seen_turned
 from kcal.scene.match import ImagePair, MatchedPair, match_scene
 from kcal.scene.refine import SAME, SWAY, whole_shifts
@@ -176,7 +176,7 @@ def renewed(reference: FixedFeatures, camera: Camera, image: Gray, turn: Tensor,
     return FixedFeatures(**both, variance=kept.variance + share**2 * covariance)
 
 
-def save_references(path: str | Path, rig: StereoRig, sides: tuple[FixedFeatures, FixedFeatures]) -> Path:
+def save_references(path: str | Path, rig: Rig, sides: tuple[FixedFeatures, FixedFeatures]) -> Path:
     """Write the references of both cameras to an .npz file."""
     arrays = {
         f"{word}_{name}": getattr(side, name).numpy()
@@ -187,7 +187,7 @@ def save_references(path: str | Path, rig: StereoRig, sides: tuple[FixedFeatures
     return write_atomic(path, buffer.getvalue())
 
 
-def load_references(path: str | Path, rig: StereoRig) -> tuple[FixedFeatures, FixedFeatures]:
+def load_references(path: str | Path, rig: Rig) -> tuple[FixedFeatures, FixedFeatures]:
     """Read what `save_references` wrote.
 
     Raises:
@@ -377,7 +377,7 @@ def _check_lens(camera: Camera, then: Tensor, now: Tensor, name: str) -> None:
 
 
 @torch.no_grad()
-def between_turn(rig: StereoRig, matched: MatchedPair) -> tuple[Tensor, Tensor]:
+def between_turn(rig: Rig, matched: MatchedPair) -> tuple[Tensor, Tensor]:
     """What matches between the cameras tell of their turns since the rig was solved: (5,), (5, 5); see `between_rows`.
 
     Args:
@@ -429,7 +429,7 @@ class TwoViews(NamedTuple):
 
 @torch.no_grad()
 def measured(
-    rig: StereoRig,
+    rig: Rig,
     references: tuple[FixedFeatures, FixedFeatures],
     images: tuple[Gray, Gray],
     turns: Tensor,

@@ -25,7 +25,7 @@ from kcal.lens.calibration import ItemResidual
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.lens.projection import FAR
-from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, RigCovariance, StereoRig
+from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Rig, RigCovariance
 from kcal.lens.turning import fit_turn, seen_turned
 from kcal.locate.budget import usual_ranges
 from kcal.locate.geodesy import enu_from_cam
@@ -227,8 +227,8 @@ class Drift:
     right_covariance: Tensor | None
     relative_covariance: Tensor
     chi2: float
-    old: StereoRig
-    rig: StereoRig
+    old: Rig
+    rig: Rig
     pose_covariance: Tensor
     cam_from_local: Tensor | None
     items: tuple[ItemResidual, ...]
@@ -284,8 +284,9 @@ class Drift:
         with torch.no_grad():
             axis = new.right_from_left_rotation[2] + new.right_from_left_rotation.new_tensor([0.0, 0.0, 1.0])
             points = far[:, None] * axis / torch.linalg.vector_norm(axis)
-            left, right, seen = new(points)
-            if not bool(seen.all()):
+            left, ahead = new.left.project(points)
+            right, beside = new.right.project(new.right_from_left(points))
+            if not bool((ahead & beside).all()):
                 raise InputError("the cameras do not look the same way: the effect of a drift cannot be computed")
             lines = sight_lines(old, left, right)
             found = torch.linalg.vector_norm(lines.points, dim=-1)
@@ -295,7 +296,7 @@ class Drift:
         return DriftEffect(far, torch.where(lines.status == int(PositionStatus.OK), found, math.inf), sigma)
 
     @in_one_thread
-    def relocked(self, note: str) -> StereoRig:
+    def relocked(self, note: str) -> Rig:
         """The old rig with the present attitudes; cameras and their places stay.
 
         The covariance of the drift is added to that of the rig: the errors of the first solution are still in it, and
@@ -311,7 +312,7 @@ class Drift:
             10.0
         """
         rig = self.old
-        new = StereoRig(rig.left, rig.right, self.rig.right_from_left_rotation, self.rig.right_from_left_translation)
+        new = Rig.pair(rig.left, rig.right, self.rig.right_from_left_rotation, self.rig.right_from_left_translation)
         new.covariance = (rig.covariance or RigCovariance.of(rig)).with_pose(self.pose_covariance)
         new.mounting = rig.mounting
         if rig.mounting is not None and self.cam_from_local is not None and self.left_covariance is not None:
@@ -342,22 +343,22 @@ class DriftEffect(NamedTuple):
     sigma: Tensor
 
 
-def _range_slope(rig: StereoRig, points: Tensor, axis: Tensor) -> Tensor:
+def _range_slope(rig: Rig, points: Tensor, axis: Tensor) -> Tensor:
     """Meters of range by a radian of the right camera about one of its axes (3,)."""
     ends = []
     for step in (-1e-8, 1e-8):
         turn = rotation_from_vector(step * axis)
-        turned = StereoRig(
+        turned = Rig.pair(
             rig.left, rig.right, turn @ rig.right_from_left_rotation, turn @ rig.right_from_left_translation
         )
-        left, right, _ = turned(points)
+        left, right = turned(points)[0].unbind(-2)
         ends.append(torch.linalg.vector_norm(sight_lines(rig, left, right).points, dim=-1))
     return (ends[1] - ends[0]) / 2e-8
 
 
 @in_one_thread
 def measure_drift(
-    rig: StereoRig,
+    rig: Rig,
     *,
     features: Features | None = None,
     landmarks: Landmarks | None = None,
@@ -392,11 +393,11 @@ def measure_drift(
         >>> from kcal import Camera
         >>> from kcal.lens import rotation_from_vector
         >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
-        >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
+        >>> rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
         >>> turn = rotation_from_vector(torch.tensor([0.0, 2e-4, 0.0], dtype=torch.float64))
-        >>> later = StereoRig(camera, camera, turn, turn @ rig.right_from_left_translation)
+        >>> later = Rig.pair(camera, camera, turn, turn @ rig.right_from_left_translation)
         >>> points = torch.tensor([[-900.0, 200, 3000], [800, -90, 2500], [40, 60, 4000], [300, 200, 2000]]).double()
-        >>> pixels = torch.stack([*rig(points)[:2], *later(points)[:2]], 1)
+        >>> pixels = torch.stack([*rig(points)[0].unbind(-2), *later(points)[0].unbind(-2)], 1)
         >>> known = torch.zeros(4).double(), torch.full((4,), torch.inf).double()
         >>> static = Features(names=tuple("abcd"), pixels=pixels, inverse_range=known[0], inverse_range_sigma=known[1])
         >>> round(float(measure_drift(rig, features=static).relative[1]), 9)
@@ -413,7 +414,7 @@ def measure_drift(
     return _since(rig, features, None if pose is None else as_points("pose rotation", pose[0], 3))
 
 
-def _since(rig: StereoRig, features: Features, cam_from_local: Tensor | None) -> Drift:
+def _since(rig: Rig, features: Features, cam_from_local: Tensor | None) -> Drift:
     """How the cameras have turned since the marks of then, with the left camera's attitude then, if it is known."""
     (left, right), items, variance = camera_turns((rig.left, rig.right), _NAMES, features)
     both = torch.cat([left.vector, right.vector])
@@ -422,7 +423,7 @@ def _since(rig: StereoRig, features: Features, cam_from_local: Tensor | None) ->
 
 
 def drift_of_turns(
-    rig: StereoRig,
+    rig: Rig,
     turns: Tensor,
     covariance: Tensor,
     cam_from_local: Tensor | None = None,
@@ -465,7 +466,7 @@ def drift_of_turns(
         relative_covariance=pose[:3, :3],
         chi2=float(drift @ torch.linalg.solve(pose[:3, :3], drift)),
         old=rig,
-        rig=StereoRig(rig.left, rig.right, change @ relative, turn @ shift),
+        rig=Rig.pair(rig.left, rig.right, change @ relative, turn @ shift),
         pose_covariance=pose,
         cam_from_local=None if cam_from_local is None else rotation_from_vector(left) @ cam_from_local,
         items=items,
@@ -474,7 +475,7 @@ def drift_of_turns(
 
 
 def _against(
-    rig: StereoRig,
+    rig: Rig,
     features: Features | None,
     landmarks: Landmarks | None,
     pose: tuple[Tensor, Tensor] | None,
@@ -528,7 +529,7 @@ def _against(
         relative_covariance=compared,
         chi2=float(drift @ torch.linalg.solve(compared, drift)),
         old=rig,
-        rig=StereoRig(rig.left, rig.right, relative, state.rotation[1] @ (state.center[0] - state.center[1])),
+        rig=Rig.pair(rig.left, rig.right, relative, state.rotation[1] @ (state.center[0] - state.center[1])),
         pose_covariance=covariance,
         cam_from_local=state.rotation[0] if pose is not None else None,
         items=records(work, mask, reasons).items,
@@ -546,7 +547,7 @@ def _telling(data: RigData) -> Tensor:
     return torch.cat(found)
 
 
-def check_rig(rig: StereoRig, *, features: Features | None = None, landmarks: Landmarks | None = None) -> Drift:
+def check_rig(rig: Rig, *, features: Features | None = None, landmarks: Landmarks | None = None) -> Drift:
     """Measure how the cameras have turned (`measure_drift`) with what the rig knows of itself.
 
     Its mounting gives the left camera's pose for landmarks, and its covariance says how well the attitudes were known.
@@ -563,7 +564,7 @@ def check_rig(rig: StereoRig, *, features: Features | None = None, landmarks: La
     Example:
         >>> from kcal.rig import planned_rig
         >>> rig, rows = planned_rig(), torch.tensor([[-90.0, 2, 300], [80, -9, 250], [4, 6, 400], [30, 20, 200]])
-        >>> pixels = torch.cat([torch.stack(rig(rows.double())[:2], 1)] * 2, 1)  # the same then and now
+        >>> pixels = torch.cat([rig(rows.double())[0]] * 2, 1)  # the same then and now
         >>> unknown = torch.zeros(4).double(), torch.full((4,), torch.inf).double()
         >>> static = Features(names=tuple("abcd"), pixels=pixels, inverse_range=unknown[0],
         ...                   inverse_range_sigma=unknown[1])

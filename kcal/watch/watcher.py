@@ -22,7 +22,7 @@ import kcal.watch.history as past
 import kcal.watch.measure as measure
 from kcal.corners.images import Gray
 from kcal.errors import FileError, InputError
-from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.lens.rig import Rig, RigCovariance
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.localizer import StereoLocalizer
 from kcal.pipeline.stream import Ledger
@@ -53,9 +53,7 @@ class Watched:
         10.0
     """
 
-    def __init__(
-        self, rig: StereoRig, rows: Sequence[past.HistoryRow] = (), model: past.TurnModel | None = None
-    ) -> None:
+    def __init__(self, rig: Rig, rows: Sequence[past.HistoryRow] = (), model: past.TurnModel | None = None) -> None:
         self.rig, self.model = rig, model or model_of(rows)
         self.between = past.between_rows(rig)
         # Of which moments the rows tell all that the history does.
@@ -68,7 +66,7 @@ class Watched:
             self.take(row)
 
     @classmethod
-    def read(cls, path: str | Path, rig: StereoRig, *, since: float = -math.inf, until: float = math.inf) -> Self:
+    def read(cls, path: str | Path, rig: Rig, *, since: float = -math.inf, until: float = math.inf) -> Self:
         """Read the history that `kcal watch` wrote, as far as it tells of moments between two times.
 
         Raises:
@@ -124,7 +122,7 @@ class Watched:
         """How the cameras have turned since the reference; see `turns_at`."""
         return drift_of_turns(self.rig, *self.turns_at(time, gusts=gusts), self.cam_from_local)
 
-    def rig_at(self, time: float) -> StereoRig:
+    def rig_at(self, time: float) -> Rig:
         """The rig as it stood at a moment: attitudes corrected, with the covariance of that moment on top.
 
         Args:
@@ -143,12 +141,12 @@ class Watched:
         return rig
 
 
-def _uncertain(rig: StereoRig) -> StereoRig:
+def _uncertain(rig: Rig) -> Rig:
     """The rig, with an exact mounting as one whose covariance is zero: a moment adds to it."""
     stands = rig.mounting
     if stands is None or stands.covariance is not None:
         return rig
-    same = StereoRig(rig.left, rig.right, rig.right_from_left_rotation, rig.right_from_left_translation)
+    same = Rig.pair(rig.left, rig.right, rig.right_from_left_rotation, rig.right_from_left_translation)
     same.covariance, same.calibration = rig.covariance, rig.calibration
     same.mounting = dataclasses.replace(stands, covariance=torch.zeros(6, 6, dtype=torch.float64))
     return same
@@ -181,7 +179,7 @@ _DAY, _HELD_OUT = 86400.0, 20
 class Relock(NamedTuple):
     """The corrected rig, None where it would not be surely better; and why."""
 
-    rig: StereoRig | None
+    rig: Rig | None
     reason: str
 
 
@@ -391,7 +389,7 @@ class Watcher:
 
     def __init__(
         self,
-        rig: StereoRig,
+        rig: Rig,
         history: Path,
         *,
         every_s: float = 60.0,

@@ -21,7 +21,7 @@ import orjson
 import torch
 
 from kcal.io.rig_file import save_rig
-from kcal.lens.rig import Mounting, Origin, RigCovariance, StereoRig
+from kcal.lens.rig import Mounting, Origin, Rig, RigCovariance
 from kcal.locate.budget import planned_rig
 from kcal.locate.localizer import StereoLocalizer
 from kcal.pipeline.pairing import ObjectViews
@@ -29,7 +29,7 @@ from kcal.pipeline.tracks import Tracker
 from scripts.shared.page import table, write_section
 
 
-def site_rig() -> StereoRig:
+def site_rig() -> Rig:
     rig = planned_rig()
     sigma = torch.tensor([0, 3e-5, 0, 0, 0, 0], dtype=torch.float64)
     rig.covariance = RigCovariance.of(rig, pose=torch.diag(sigma**2))
@@ -37,14 +37,14 @@ def site_rig() -> StereoRig:
     return rig
 
 
-def marks(rig: StereoRig, targets: int, second: float, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
+def marks(rig: Rig, targets: int, second: float, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
     """Targets that circle before the rig, each at its own range."""
     number = torch.arange(targets, dtype=torch.float64)
     z = 300.0 + 80.0 * number
     angle = second * 3.0 / 20.0 + number
     across = (number / max(targets - 1, 1) - 0.5) * 0.7 * z
     places = torch.stack([across + 20.0 * angle.cos(), 0.02 * z * number.cos(), z + 20.0 * angle.sin()], -1)
-    left, right, _ = rig(places)
+    left, right = rig(places)[0].unbind(-2)
     noise = 0.2 * torch.randn(2, targets, 2, generator=generator, dtype=torch.float64)
     return left + noise[0], right + noise[1]
 

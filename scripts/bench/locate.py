@@ -21,7 +21,7 @@ from torch import Tensor
 
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.projection import project_components
-from kcal.lens.rig import Origin, RigCovariance, StereoRig
+from kcal.lens.rig import Origin, Rig, RigCovariance
 from kcal.locate.angular import triangulate_linear, triangulate_pairs
 from kcal.locate.geodesy import enu_to_geodetic
 from kcal.locate.localizer import StereoLocalizer
@@ -137,7 +137,7 @@ def localizer(rounds: int, counts: tuple[int, ...]) -> list[str]:
     plain = StereoLocalizer(rig(), origin=ORIGIN, heading_deg=35.0, pixel_sigma=0.1)
     known = StereoLocalizer(rig(), origin=ORIGIN, heading_deg=35.0, pixel_sigma=0.1, calibration=known_to())
     for count in counts:
-        left, right, _ = rig()(some_points(count))
+        left, right = rig()(some_points(count))[0].unbind(-2)
         cov = (0.01 * torch.eye(4, dtype=torch.float64)).expand(count, 4, 4)
         found = times(
             [lambda: plain(left, right), lambda: plain(left, right, cov), lambda: known(left, right)],  # noqa: B023
@@ -166,7 +166,7 @@ def coverage(draws: int) -> list[str]:
         angle = -0.3 + 0.1 * i
         point = distance * torch.tensor([[math.sin(angle), 0.02 * i - 0.06, math.cos(angle)]], dtype=torch.float64)
         point = point * (distance / torch.linalg.vector_norm(point))
-        exact = torch.cat(there(point)[:2], -1)
+        exact = torch.cat(there(point)[0].unbind(-2), -1)
         marks = exact + 0.1 * torch.randn(draws, 4, dtype=torch.float64, generator=generator)
         found = plain(marks[:, :2], marks[:, 2:])
         inside = (found.range_low <= distance) & (distance <= found.range_high)
@@ -197,9 +197,7 @@ def coverage(draws: int) -> list[str]:
     return lines
 
 
-def _marks_of_drawn_rigs(
-    there: StereoRig, point: Tensor, factor: Tensor, draws: int, generator: torch.Generator
-) -> Tensor:
+def _marks_of_drawn_rigs(there: Rig, point: Tensor, factor: Tensor, draws: int, generator: torch.Generator) -> Tensor:
     """(draws, 4) exact marks in rigs whose parameters are drawn from the covariance."""
     steps = torch.randn(draws, factor.shape[1], dtype=torch.float64, generator=generator) @ factor.T
     cut = [there.left.values.shape[-1], there.right.values.shape[-1], 3, 3]

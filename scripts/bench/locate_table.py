@@ -49,7 +49,7 @@ print("measured", time.process_time() - start, peak)
 def write_table(path: Path, count: int) -> Path:
     """Marks with 0.1 px of noise."""
     with torch.no_grad():
-        left, right, _ = rig()(some_points(count))
+        left, right = rig()(some_points(count))[0].unbind(-2)
     marks = torch.cat([left, right], -1)
     marks += 0.1 * torch.randn(marks.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
     with path.open("w") as file:

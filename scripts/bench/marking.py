@@ -29,7 +29,7 @@ from kcal.io.camera_file import load_camera, save_camera
 from kcal.io.images import write_png
 from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.locate.marks import Marks
 from kcal.locate.survey import Survey
 from kcal.mark.guide import open_pictures
@@ -44,7 +44,7 @@ _SIGMA = 0.05  # px, of marks
 _SURVEY = 0.02  # m
 
 
-def seen_landmarks(rig: StereoRig, count: int, random: np.random.Generator) -> Iterator[tuple[torch.Tensor, ...]]:
+def seen_landmarks(rig: Rig, count: int, random: np.random.Generator) -> Iterator[tuple[torch.Tensor, ...]]:
     """Places (3,) east, north, up and true marks (2, 2) of landmarks that both cameras see, 60 m to 2 km away."""
     width, height = rig.left.size
     found = 0
@@ -52,7 +52,8 @@ def seen_landmarks(rig: StereoRig, count: int, random: np.random.Generator) -> I
         at = torch.tensor([[random.uniform(0.1, 0.9) * width, random.uniform(0.2, 0.8) * height]], dtype=torch.float64)
         rays, _ = rig.left.unproject(at)
         point = 10 ** random.uniform(1.8, 3.3) * rays
-        left, right, valid = rig(point)
+        pixels, valid = rig(point)
+        (left, right), valid = pixels.unbind(-2), valid.all(-1)
         if bool(valid) and bool(rig.left.inside(left).all() & rig.right.inside(right).all()):
             found += 1
             yield torch.stack([point[0, 0], point[0, 2], -point[0, 1]]), torch.cat([left, right])
@@ -62,7 +63,7 @@ def make_site(folder: Path, count: int) -> Marks:
     """Write pictures, a survey and a rig with its covariance, and return the marks of the landmarks."""
     left, right = (calibrate_camera(simulated(seed, 25, 0.1, False).seen).camera for seed in _SEEDS)
     rotation = rotation_from_vector(torch.tensor([0.003, 0.006, -0.008], dtype=torch.float64))
-    rig = StereoRig(left, right, rotation, -rotation @ torch.tensor([10.0, 0.04, -0.06], dtype=torch.float64))
+    rig = Rig.pair(left, right, rotation, -rotation @ torch.tensor([10.0, 0.04, -0.06], dtype=torch.float64))
     random = np.random.default_rng(0)
     points, pixels = (torch.stack(part) for part in zip(*seen_landmarks(rig, count, random), strict=True))
     points = points + _SURVEY * torch.from_numpy(random.normal(size=points.shape))

@@ -36,7 +36,7 @@ from kcal.corners.detect import detect
 from kcal.corners.images import expand_images
 from kcal.corners.observations import Observations
 from kcal.lens.camera import Camera
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from scripts.shared.mrcal_spline import splined
 from scripts.shared.page import write_row
 from scripts.shared.timing import row, show
@@ -100,7 +100,7 @@ def measure(name: str, seen: Observations, weight: Tensor, parts: list[np.ndarra
     return f"{math.sqrt(total / count):.4f} ({seconds / len(parts):.1f} s)"
 
 
-def epipolar(rig: StereoRig, left: Tensor, right: Tensor) -> Tensor:
+def epipolar(rig: Rig, left: Tensor, right: Tensor) -> Tensor:
     """Sampson's distances (N,) in pixels of matched corners (N, 2) from coplanarity."""
     pixels = torch.cat([left, right], -1).requires_grad_(True)
     rays = [camera.unproject(part)[0] for camera, part in zip((rig.left, rig.right), pixels.split(2, -1), strict=True)]
@@ -110,7 +110,7 @@ def epipolar(rig: StereoRig, left: Tensor, right: Tensor) -> Tensor:
     return (volume / slope.norm(dim=-1)).detach()
 
 
-def rig_of(model: str, sides: list[Observations]) -> StereoRig:
+def rig_of(model: str, sides: list[Observations]) -> Rig:
     """Both cameras and the rig by default, from the same pairs: lenses, board and pose are refined together."""
     name, _, prior = model.partition(", ")
     options = CalibrationOptions(model=name, weak_prior=0.3 if prior else None)

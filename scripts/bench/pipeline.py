@@ -25,7 +25,7 @@ from torch import Tensor
 
 from kcal.io.rig_file import load_rig
 from kcal.lens.camera import Camera
-from kcal.lens.rig import Origin, RigCovariance, StereoRig
+from kcal.lens.rig import Origin, Rig, RigCovariance
 from kcal.locate.budget import planned_rig
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.triangulate import Triangulate
@@ -79,7 +79,7 @@ def localizer(lens: str) -> tuple[StereoLocalizer, Tensor, Tensor]:
     values = LENSES[lens]
     if values is not None:
         camera = Camera.build(focal=(1600, 1605), center=(957, 541), size=SIZE, coefficients=values, model=lens)
-        whole = StereoRig(camera, camera, rig.right_from_left_rotation, rig.right_from_left_translation)
+        whole = Rig.pair(camera, camera, rig.right_from_left_rotation, rig.right_from_left_translation)
         own = torch.diag(torch.tensor([0.1, 0.1, 0.1, 0.1, 1e-3, *([1e-4] * len(values))], dtype=torch.float64) ** 2)
         whole.covariance = RigCovariance.of(whole, left=own, right=own, pose=1e-9 * torch.eye(6).double())
         rig = whole
@@ -87,7 +87,7 @@ def localizer(lens: str) -> tuple[StereoLocalizer, Tensor, Tensor]:
     random = torch.Generator().manual_seed(0)
     depth = 10 ** (2.0 + 1.5 * torch.rand(PAIRS, 1, generator=random).double())
     place = (torch.rand(PAIRS, 2, generator=random).double() - 0.5) * torch.tensor([0.9, 0.5])
-    left, right, _ = rig(torch.cat([place, torch.ones(PAIRS, 1)], -1) * depth)
+    left, right = rig(torch.cat([place, torch.ones(PAIRS, 1)], -1) * depth)[0].unbind(-2)
     return localize, left.detach() + 0.1, right.detach() + 0.1
 
 

@@ -40,7 +40,7 @@ from kcal.corners.observations import Observations, View
 from kcal.io.rig_file import save_camera_rig
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import CameraRig, Mounting, Origin, RigCovariance
+from kcal.lens.rig import Mounting, Origin, Rig, RigCovariance
 from kcal.locate.budget import planned_rig
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.multi_localizer import MultiViewLocalizer
@@ -139,7 +139,7 @@ def two(count: int) -> list[str]:
             rig.covariance = RigCovariance.of(rig, left=lens, right=lens, pose=pose)
         far = 200.0 + 2800.0 * torch.rand(count, 1, generator=generator).double()
         side = torch.randn(count, 2, generator=generator).double() * torch.tensor([0.15, 0.05]).double()
-        left, right, _ = rig(far * torch.cat([side, torch.ones(count, 1).double()], 1))
+        left, right = rig(far * torch.cat([side, torch.ones(count, 1).double()], 1))[0].unbind(-2)
         marked = torch.stack([left, right], 1) + 0.2 * torch.randn(count, 2, 2, generator=generator).double()
         with torch.no_grad():
             (ours, by_pair), (theirs, by_views) = (
@@ -217,7 +217,7 @@ def many(cameras: int, views: int) -> list[list[str]]:
     aim = torch.tensor([0.75, 0.75, 4.0], dtype=torch.float64)
     toward = torch.stack([-(aim - centers)[:, 1], (aim - centers)[:, 0], torch.zeros(cameras)], -1).double() / 4.2
     turns = rotation_from_vector(-toward + 0.02 * draw(cameras, 3))
-    rig = CameraRig(lenses, [f"c{c}" for c in range(cameras)], turns, centers, refraction=0.0)
+    rig = Rig(lenses, [f"c{c}" for c in range(cameras)], turns, center=centers, refraction=0.0)
     board, moments = Board(columns=9, rows=6, square=0.1), list[Tensor]()
     while len(moments) < views:
         shift = aim + draw(3) * torch.tensor([0.35, 0.2, 0.4]).double()
@@ -270,7 +270,7 @@ def several_rigs(counts: Sequence[int]) -> list[str]:
     return table([*heads, "after the best turn of all", "of attitudes °"], rows)
 
 
-def _errors(rig: CameraRig, rotation: Tensor, center: Tensor) -> list[str]:
+def _errors(rig: Rig, rotation: Tensor, center: Tensor) -> list[str]:
     """Against the truth, in the first camera's frame."""
     true_turn = rig.rotation @ rig.rotation[0].T
     true_center = (rig.center - rig.center[0]) @ rig.rotation[0].T

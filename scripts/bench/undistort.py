@@ -24,7 +24,7 @@ from kornia.geometry.calibration import undistort_image
 
 from kcal.lens.camera import Camera
 from kcal.lens.images import StereoRectification, Undistort, UndistortMaps, undistort_maps
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.lens.views import cylinder_view, looking, pinhole_view
 from scripts.shared.page import write_section
 from scripts.shared.timing import median, ratio, row, show, times
@@ -62,7 +62,7 @@ def views(rounds: int) -> list[str]:
     camera = Camera.build(focal=(1400, 1400), center=(957, 541), size=SIZE, coefficients=LENS, model="opencv8")
     fisheye = Camera.build(focal=(600, 600), center=(957, 541), size=SIZE, coefficients=[0.02], model="fisheye4")
     turn = looking(1.0, 0.5)
-    rig = StereoRig(camera, camera, turn, -turn @ torch.tensor([10.0, 0.1, 0.2], dtype=torch.float64))
+    rig = Rig.pair(camera, camera, turn, -turn @ torch.tensor([10.0, 0.1, 0.2], dtype=torch.float64))
     kinds: list[tuple[str, Callable[[], list[Undistort]]]] = [
         ("pinhole, alpha 0", lambda: [Undistort(camera)]),
         ("fisheye, 60 degrees at 40 degrees", lambda: [Undistort(fisheye, pinhole_view(60, SIZE), looking(40, 0))]),

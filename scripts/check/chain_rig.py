@@ -67,7 +67,8 @@ def targets(rig: TrueRig) -> Targets:
     x, y = ((torch.arange(n).double() + 0.5) * size / n - 0.5 for n, size in ((COLUMNS, width), (ROWS, height)))
     rays = rig.left.unproject(torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).reshape(-1, 2))[0]
     points = (torch.tensor(RANGES, dtype=torch.float64)[:, None, None] * rays).reshape(-1, 3)
-    left, right, valid = rig(points)
+    pixels, valid = rig(points)
+    (left, right), valid = pixels.unbind(-2), valid.all(-1)
     seen = valid & rig.left.inside(left) & rig.right.inside(right)
     ring = torch.arange(len(RANGES)).repeat_interleave(len(rays))[seen]
     inverse = 1.0 / points[seen].norm(dim=-1)
@@ -88,7 +89,8 @@ def landmarks(rig: TrueRig, generator: torch.Generator) -> tuple[Landmarks, Land
     pixels = EDGE + uniform(20 * LANDMARKS, 2) * (size - 2 * EDGE)
     distance = NEAR * (FAR / NEAR) ** uniform(20 * LANDMARKS, 1)
     points = distance * rig.left.unproject(pixels)[0]
-    left, right, valid = rig(points)
+    pixels, valid = rig(points)
+    (left, right), valid = pixels.unbind(-2), valid.all(-1)
     kept = (valid & ((right > EDGE) & (right < size - EDGE)).all(-1)).nonzero()[:LANDMARKS, 0]
     points, marks = points[kept] @ ENU_FROM_RIG.T, torch.stack([left, right], 1)[kept]
     exact = Landmarks(

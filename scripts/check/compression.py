@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from kcal.lens.camera import Camera
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.pipeline.association import AssociationOptions
 from kcal.pipeline.video_source import Videos
 from scripts.shared.object_scene import Floats, exposed, paint_plate, plate, true_box
@@ -43,9 +43,7 @@ def places(time: float, pace: float) -> Tensor:
     return torch.cat([start, depth[:, None]], 1) + time * pace * velocity
 
 
-def drawn(
-    rig: StereoRig, side: int, time: float, pace: float, random: np.random.Generator
-) -> tuple[Tensor, list[Floats]]:
+def drawn(rig: Rig, side: int, time: float, pace: float, random: np.random.Generator) -> tuple[Tensor, list[Floats]]:
     """Gray levels and the true boxes."""
     image = np.full(SIZE[::-1], 30.0)
     items = [
@@ -78,7 +76,7 @@ class Errors(NamedTuple):
     variance: Floats
 
 
-def errors_of(rig: StereoRig, films: list[list[Tensor]], boxes: list[list[Floats]], pace: float, crf: int) -> Errors:
+def errors_of(rig: Rig, films: list[list[Tensor]], boxes: list[list[Floats]], pace: float, crf: int) -> Errors:
     """Of videos of a quality."""
     found = Errors(*(np.full((FRAMES, len(DEPTHS)), np.nan) for _ in Errors._fields))
     with tempfile.TemporaryDirectory() as folder:
@@ -94,7 +92,7 @@ def errors_of(rig: StereoRig, films: list[list[Tensor]], boxes: list[list[Floats
         for frame, item in enumerate(source(0)):
             assert not isinstance(item.moment, Exception)
             pairs = item.moment.pairs
-            left, right, _ = rig(places(item.moment.time, pace))
+            left, right = rig(places(item.moment.time, pace))[0].unbind(-2)
             which = torch.cdist(pairs.left, left).argmin(-1)
             c = pairs.covariance
             error = (pairs.left - pairs.right)[:, 0] - (left - right)[which, 0]
@@ -110,7 +108,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     camera = Camera.build(focal=(FOCAL, FOCAL), center=(159.5, 119.5), size=SIZE, model="pinhole")
-    rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-2.0, 0.0, 0.0]))
+    rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-2.0, 0.0, 0.0]))
     rows: list[list[object]] = []
     for pace in PACES:
         films, boxes = [], []

@@ -24,7 +24,7 @@ from kcal.io.lookup_file import save_onnx
 from kcal.lens.camera import Camera
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.model import LensModel
-from kcal.lens.rig import Origin, RigCovariance, StereoRig
+from kcal.lens.rig import Origin, Rig, RigCovariance
 from kcal.lens.zernike import ZernikeModes
 from kcal.locate.localizer import Localization, StereoLocalizer
 from scripts.shared.page import table, write_section
@@ -44,7 +44,7 @@ def localizer(lens: str) -> StereoLocalizer:
     camera = Camera.build(
         focal=(1600, 1610), center=(955, 541), size=(1920, 1080), coefficients=lens_values, model=model
     )  # fmt: skip
-    rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.1, 0.2]))
+    rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.1, 0.2]))
     rig.covariance = RigCovariance.of(rig, pose=1e-8 * torch.eye(6, dtype=torch.float64))
     mounting = 1e-6 * torch.eye(6, dtype=torch.float64)
     origin = Origin(lat=19.07, lon=72.87, height=14.0)
@@ -53,7 +53,7 @@ def localizer(lens: str) -> StereoLocalizer:
 
 def marks(module: StereoLocalizer, repeats: int) -> tuple[Tensor, Tensor]:
     points = torch.tensor([[30.0, 10, 800], [-100, 40, 900], [5, 5, 100], [200, -30, 5000]], dtype=torch.float64)
-    left, right, _ = module.rig(points)
+    left, right = module.rig(points)[0].unbind(-2)
     bad = torch.tensor([[torch.nan, 3.0], [5000.0, 5.0]], dtype=torch.float64)
     fine = torch.tensor([[4.0, 3.0], [5.0, 5.0]], dtype=torch.float64)
     return torch.cat([left, bad]).repeat(repeats, 1), torch.cat([right, fine]).repeat(repeats, 1)

@@ -23,7 +23,7 @@ import torch
 import yaml
 from scipy.io import loadmat
 
-from kcal import Camera, StereoRig
+from kcal import Camera, Rig
 from kcal.lens import camera_difference, export_cameras, import_cameras
 from kcal.lens.hybrid_terms import HybridForm, radius_over_angle
 from kcal.lens.model import LensModel
@@ -204,7 +204,7 @@ def rig_rows(folder: Path, ros: str | None, mrcal: str | None) -> list[list[str]
     files = {"opencv": "pair.yaml", "ros": "pair.yaml", "kalibr": "chain.yaml", "mrcal": "pair.cameramodel",
              "matlab": "pair.mat"}  # fmt: skip
     for format_name, file in files.items():
-        rig = StereoRig(sample_camera("opencv4"), sample_camera("pinhole"), rotation, translation)
+        rig = Rig.pair(sample_camera("opencv4"), sample_camera("pinhole"), rotation, translation)
         done = export_cameras(rig, folder / file, format=format_name)
         back = import_cameras(*done.paths).rig()
         turn = float((back.right_from_left_rotation - rotation).abs().max())

@@ -89,9 +89,10 @@ def rig_numbers(rig: Path, folder: Path, *place: str) -> Numbers:
     for share in (0.35, 0.5, 0.65):
         ray = known.left.unproject(known.left.params.new_tensor([[share * width, (1 - share) * height]]))[0]
         for times in (10, 30, 100, 300, 1000):
-            left, right, valid = known(ray * times * known.baseline)
-            if bool(valid):
-                marks = [*left[0].tolist(), *right[0].tolist()]
+            point = ray * times * known.baseline
+            seen = known.left.project(point), known.right.project(known.right_from_left(point))
+            if all(bool(valid) for _, valid in seen):
+                marks = [value for pixels, _ in seen for value in pixels[0].tolist()]
                 rows.append(",".join([f"{share} at {times}", *map(str, marks)]))
     points, table = folder / f"{rig.stem}.points.csv", folder / f"{rig.stem}.positions.csv"
     points.write_text("\n".join(rows) + "\n")

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from kcal.errors import InputError
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.mark.guide import at_shape, propose
 from kcal.mark.shapes import snap
 from scripts.shared.marking_scene import KINDS, Floats, background, finished, inside_of, paint, seen, site_rig
@@ -59,7 +59,7 @@ def mark_of(u: float, v: float, cov: tuple[float, float, float], truth: Floats) 
     return Mark(error, float(error @ np.linalg.solve(matrix, error)), math.sqrt((cov[0] + cov[2]) / 2))
 
 
-def scene(rig: StereoRig, hills: list[Floats], random: np.random.Generator) -> tuple[torch.Tensor, list[Floats]]:
+def scene(rig: Rig, hills: list[Floats], random: np.random.Generator) -> tuple[torch.Tensor, list[Floats]]:
     """A point somewhere in both images, and copies of both backgrounds."""
     width, height = rig.left.size
     while True:
@@ -73,9 +73,7 @@ def scene(rig: StereoRig, hills: list[Floats], random: np.random.Generator) -> t
             return point, [image.copy() for image in hills]
 
 
-def trial(
-    rig: StereoRig, behind: str, hills: list[Floats], kind: str, contrast: float, random: np.random.Generator
-) -> Trial:
+def trial(rig: Rig, behind: str, hills: list[Floats], kind: str, contrast: float, random: np.random.Generator) -> Trial:
     point, images = scene(rig, hills, random)
     inside, sign, blur = inside_of(kind, random), random.choice([-1.0, 1.0]), random.uniform(0.5, 1.1)
     truth = []
@@ -102,7 +100,7 @@ def trial(
     return Trial(behind, kind, contrast, snapped, found.how, match, proposal)
 
 
-def trap(rig: StereoRig, hills: list[Floats], kind: str, random: np.random.Generator) -> bool | None:
+def trap(rig: Rig, hills: list[Floats], kind: str, random: np.random.Generator) -> bool | None:
     """Whether a proposal is false where a right one is hard or impossible; None if there is no proposal.
 
     `hidden`: something else stands before the target in the right image. `absent`: the right image shows the hills

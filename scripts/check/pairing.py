@@ -20,7 +20,7 @@ import torch
 from kcal.corners.match import MatchStatus
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.lens.rig import Rig, RigCovariance
 from kcal.pipeline.association import AssociationOptions, associate
 from kcal.pipeline.detections import Detections
 from kcal.pipeline.pairing import ObjectDisparity
@@ -35,7 +35,7 @@ OPTIONS = AssociationOptions(box_sigma=BOX_EDGE / np.sqrt(2), nearest=90.0)
 RANGES = ((100.0, 500.0), (500.0, 1500.0), (1500.0, 5000.0))
 
 
-def site_rig() -> StereoRig:
+def site_rig() -> Rig:
     """Two cameras 10 m apart with mild lenses, roughly parallel, whose relative pose is known to 0.003°."""
     lens = [-0.15, 0.04, 3e-4, -2e-4]
     cameras = [
@@ -43,7 +43,7 @@ def site_rig() -> StereoRig:
         for d in (0, 5)
     ]
     turn = rotation_from_vector(torch.tensor([0.004, -0.006, 0.01], dtype=torch.float64))
-    rig = StereoRig(cameras[0], cameras[1], turn, torch.tensor([-10.0, 0.15, 0.1]))
+    rig = Rig.pair(cameras[0], cameras[1], turn, torch.tensor([-10.0, 0.15, 0.1]))
     sigma = torch.tensor([5e-5, 5e-5, 1e-4, 5e-3, 5e-3, 5e-3], dtype=torch.float64)
     rig.covariance = RigCovariance.of(rig, pose=torch.diag(sigma**2))
     return rig
@@ -58,7 +58,7 @@ class Frame(NamedTuple):
     items: list[Plate]
 
 
-def frame(rig: StereoRig, random: np.random.Generator) -> Frame:
+def frame(rig: Rig, random: np.random.Generator) -> Frame:
     depths = np.sort(10 ** random.uniform(2.0, np.log10(5000.0), TARGETS))[::-1]
     items = []
     for depth in depths:
@@ -125,7 +125,7 @@ class Counts(NamedTuple):
     clear_right: int
 
 
-def associated(rig: StereoRig, view: Frame, *, looks: bool) -> tuple[Counts, list[tuple[int, int]]]:
+def associated(rig: Rig, view: Frame, *, looks: bool) -> tuple[Counts, list[tuple[int, int]]]:
     images = (view.images[0], view.images[1]) if looks else None
     found = associate(rig, view.seen[0], view.seen[1], OPTIONS, images)
     named = [
@@ -140,7 +140,7 @@ def associated(rig: StereoRig, view: Frame, *, looks: bool) -> tuple[Counts, lis
     return Counts(len(named), sum(good), there, sum(clear), both), right
 
 
-def disparities(rig: StereoRig, view: Frame, pairs: list[tuple[int, int]]) -> list[Pair]:
+def disparities(rig: Rig, view: Frame, pairs: list[tuple[int, int]]) -> list[Pair]:
     left, right = (view.seen[side].select(torch.tensor([pair[side] for pair in pairs])) for side in (0, 1))
     anchors, aims = left.anchors(), right.anchors()
     found = ObjectDisparity(rig)(view.images[0], view.images[1], left.boxes, aims)

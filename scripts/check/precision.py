@@ -32,7 +32,7 @@ from kcal.lens.baking import bake
 from kcal.lens.camera import Camera
 from kcal.lens.images import undistort_maps
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Origin, StereoRig
+from kcal.lens.rig import Origin, Rig
 from kcal.lens.views import new_pinhole
 from kcal.locate.geodesy import enu_to_geodetic, geodetic_to_enu
 from kcal.locate.stereo import PositionStatus
@@ -202,7 +202,7 @@ def pair_rows(count: int) -> list[list[str]]:
     left, right = (camera_of(name) for name in ("opencv5", "opencv14"))
     turn = rotation_from_vector(torch.tensor([0.01, -0.02, 0.015], dtype=torch.float64))
     center = torch.tensor([BASELINE, 0.3, -0.2], dtype=torch.float64)
-    rig = StereoRig(left, right, turn, -turn @ center)
+    rig = Rig.pair(left, right, turn, -turn @ center)
     pair, rows = Triangulate(rig, pixel_sigma=SIGMA), []
     matrix, shift = [exactly(line) for line in turn], exactly(-turn @ center)
     lefts, rights = exactly(left.params.detach()), exactly(right.params.detach())
@@ -310,7 +310,7 @@ def limit_rows() -> list[list[str]]:
     """What is answered beyond the domain, asked now."""
     camera, folding = camera_of("opencv5"), lens_of([-0.9])
     wide = camera_of("fisheye4")
-    pair = Triangulate(StereoRig(camera, camera, torch.eye(3), torch.tensor([-BASELINE, 0.0, 0.0])))
+    pair = Triangulate(Rig.pair(camera, camera, torch.eye(3), torch.tensor([-BASELINE, 0.0, 0.0])))
     middle = torch.tensor([[962.0, 538.0]], dtype=torch.float64)
 
     def mask(answer: tuple[Tensor, Tensor]) -> str:

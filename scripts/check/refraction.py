@@ -54,8 +54,8 @@ def site(refraction: float, far: bool, generator: torch.Generator) -> Site:
     def seen(enu: Tensor) -> tuple[Tensor, Tensor]:
         lift = 0.5 * refraction / mean_radius(ORIGIN.lat) * enu[:, :2].square().sum(-1)
         above = enu + lift[:, None] * torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-        left, right, valid = world(above @ ENU_FROM_CAM)
-        return torch.stack([left, right], 1), valid
+        pixels, valid = world(above @ ENU_FROM_CAM)
+        return pixels, valid.all(-1)
 
     def places(count: int, low: float, high: float) -> Tensor:
         pixels = 60.0 + uniform(8 * count, 2) * torch.tensor([1800.0, 960.0], dtype=torch.float64)

@@ -25,7 +25,7 @@ from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.sources import RigData
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
-from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.lens.rig import Rig, RigCovariance
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.localizer import StereoLocalizer
 from kcal.report.figures import save_picture
@@ -215,7 +215,7 @@ def wrong(draws: int) -> list[str]:
 
 
 @torch.no_grad()
-def found_at_5_km(old: StereoRig, new: StereoRig) -> float:
+def found_at_5_km(old: Rig, new: Rig) -> float:
     """The range, in meters, that the old rig finds of a target at 5 km from the new one."""
     still = drift_of_turns(old, torch.zeros(6, dtype=torch.float64), torch.eye(6, dtype=torch.float64))
     return float(dataclasses.replace(still, rig=new).effect((5000.0,)).found[0])
@@ -234,12 +234,12 @@ def drift(draws: int) -> list[str]:
     still = torch.zeros(2, 3, dtype=torch.float64)
     turned = torch.tensor([[0.0, 0.0, 0.0], [0.0, yaw, 0.0]], dtype=torch.float64)
     now = rotation_from_vector(turned[1])
-    later = StereoRig(
+    later = Rig.pair(
         TRUTH.left, TRUTH.right, now @ TRUTH.right_from_left_rotation, now @ TRUTH.right_from_left_translation
     )
     before = found_at_5_km(TRUTH, later) - 5000.0
 
-    def check(count: int, turns: Tensor, seed: int, images: int) -> tuple[Tensor, Tensor, bool, StereoRig]:
+    def check(count: int, turns: Tensor, seed: int, images: int) -> tuple[Tensor, Tensor, bool, Rig]:
         draw = generator(90_000 + seed)
         if images == 0:
             features = summits(draw, count)

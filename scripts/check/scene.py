@@ -41,7 +41,7 @@ from kcal.corners.match import keypoints
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import vector_from_rotation
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.locate.localizer import StereoLocalizer
 from kcal.scene.common_errors import line_errors, with_common_errors
 from kcal.scene.match import ImagePair, MatchedPair, counted, match_scene, scene_of, still_matches
@@ -280,7 +280,7 @@ def all_matches(scale: float, count: int, times: str, seed: int, folder: Path) -
 
 def noise_bound(rig: TrueRig, cameras: tuple[Camera, Camera], found: list[MatchedPair]) -> float:
     """Cramér-Rao bound of yaw in degrees from matches with unknown ranges whose errors are noise alone, independent."""
-    true = StereoRig(*cameras, rig.right_from_left_rotation, rig.right_from_left_translation)
+    true = Rig.pair(*cameras, rig.right_from_left_rotation, rig.right_from_left_translation)
     total = torch.zeros(5, 5, dtype=torch.float64)
     for one in found:
         lines = line_errors(true, one.pixels)
@@ -380,7 +380,8 @@ def landmarks(draw: torch.Generator) -> Landmarks:
     distance = 100.0 * 26.0 ** share[:, :1]
     ray = torch.stack([1.0 * (share[:, 1] - 0.5), 0.4 * (share[:, 2] - 0.5), torch.ones_like(share[:, 0])], -1)
     points = distance * ray / ray.norm(dim=-1, keepdim=True)
-    left, right, valid = RIG(points)
+    pixels, valid = RIG(points)
+    (left, right), valid = pixels.unbind(-2), valid.all(-1)
     seen = (valid & RIG.left.inside(left) & RIG.right.inside(right)).nonzero()[:count, 0]
     pixels = torch.stack([left, right], 1)[seen]
     enu = points[seen] @ torch.tensor([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]], dtype=torch.float64)
@@ -397,7 +398,7 @@ def at_five_km(found: RigResult, draw: torch.Generator) -> tuple[Tensor, Tensor]
     angle = torch.linspace(-0.4, 0.4, 9, dtype=torch.float64)
     ray = torch.stack([angle.sin(), 0.02 * torch.arange(9) - 0.08, angle.cos()], -1)
     ray = 5000.0 * ray / ray.norm(dim=-1, keepdim=True)
-    left, right, _ = RIG(ray)
+    left, right = RIG(ray)[0].unbind(-2)
     noise = MARK * torch.randn(2, 9, 2, dtype=torch.float64, generator=draw)
     where = StereoLocalizer(found.stereo(), origin=ORIGIN, heading_deg=0.0, pixel_sigma=MARK)(
         left + noise[0], right + noise[1]
@@ -454,7 +455,8 @@ def speed(write: bool) -> None:
         points = (
             50.0 * 400.0 ** share[:, :1] * RIG.left.unproject(share[:, 1:] * (torch.tensor(RIG.left.size) - 1.0))[0]
         )
-        left, right, valid = RIG(points)
+        pixels, valid = RIG(points)
+        (left, right), valid = pixels.unbind(-2), valid.all(-1)
         seen = (valid & RIG.left.inside(left) & RIG.right.inside(right)).nonzero()[:count, 0]
         places = left[seen], right[seen], torch.full((len(seen), 1, 1), 0.02).double() * torch.eye(2).double()
         data = rig_data((cameras[0], cameras[1]), drawn(places, 1, draw, 0.03), draw)

@@ -19,7 +19,7 @@ from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 from torch import Tensor
 
 from kcal.corners.match import keypoints
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.scene.common_errors import line_errors
 from kcal.scene.match import guided_matches
 from kcal.scene.refine import refine_matches
@@ -60,7 +60,7 @@ def kinds(terrain: Terrain, pixels: Tensor) -> Tensor:
 def errors_of(seed: int) -> Errors:
     """Of a terrain."""
     rig, cameras = rig_of(HALF), exact(HALF)
-    true = StereoRig(*cameras, rig.right_from_left_rotation, rig.right_from_left_translation)
+    true = Rig.pair(*cameras, rig.right_from_left_rotation, rig.right_from_left_translation)
     terrain, weather = Terrain(rig, seed), Weather()
     images = terrain.images(1, weather)
     light = [gaussian_filter(terrain.picture(side, 1, weather).light, weather.blur) for side in (0, 1)]

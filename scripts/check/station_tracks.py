@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from kcal.lens.camera import Camera
-from kcal.lens.rig import CameraRig
+from kcal.lens.rig import Rig
 from kcal.locate.geodesy import anchor, ecef_from_enu_rotation, enu_from_cam, enu_to_geodetic, geodetic_to_enu
 from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.pipeline.association import AssociationOptions
@@ -54,7 +54,7 @@ OPTIONS = TrackOptions(
 class Site(NamedTuple):
     """One draw: the believed rig, its errors, clocks (offset, rate) of each camera, and targets at second zero."""
 
-    rig: CameraRig
+    rig: Rig
     errors: Tensor
     clocks: Tensor
     start: Tensor
@@ -62,7 +62,7 @@ class Site(NamedTuple):
     kind: tuple[str, ...]
 
 
-def stations(count: int) -> CameraRig:
+def stations(count: int) -> Rig:
     camera = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=SIZE, model="pinhole")
     flat = torch.tensor([[e, n, 0.0] for e, n, *_ in PLACES[:count]], dtype=torch.float64)
     geodetic = enu_to_geodetic(flat, ORIGIN)
@@ -73,7 +73,7 @@ def stations(count: int) -> CameraRig:
         for (lat, lon, _), place in zip(geodetic.tolist(), PLACES, strict=False)
     ]
     names = [f"tower {c + 1}" for c in range(count)]
-    return CameraRig([camera] * count, names, torch.stack(turns), geodetic_to_enu(geodetic, ORIGIN), origin=ORIGIN)
+    return Rig([camera] * count, names, torch.stack(turns), center=geodetic_to_enu(geodetic, ORIGIN), origin=ORIGIN)
 
 
 def drawn_site(seed: int, count: int, targets: int = 12) -> Site:

@@ -38,7 +38,7 @@ import torch
 from torch import Tensor
 
 from kcal.lens.camera import Camera
-from kcal.lens.rig import CameraRig
+from kcal.lens.rig import Rig
 from kcal.locate.multi_localizer import MultiViewLocalizer, ViewsLocalization
 from kcal.locate.stereo import PositionStatus
 from kcal.locate.triangulate import Triangulate
@@ -52,7 +52,7 @@ Found = tuple[np.ndarray, float, int]
 Solve = Callable[[np.ndarray], np.ndarray]
 
 
-def around_a_person(count: int) -> CameraRig:
+def around_a_person(count: int) -> Rig:
     """Cameras 5 m from the middle, all about it, looking at it from 2 m."""
     camera = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
     turns, centers = [], []
@@ -64,7 +64,7 @@ def around_a_person(count: int) -> CameraRig:
         turns.append(torch.stack([right, torch.linalg.cross(forward, right), forward]))
         centers.append(center)
     names = [f"c{c}" for c in range(count)]
-    return CameraRig([camera] * count, names, torch.stack(turns), torch.stack(centers), refraction=0.0)
+    return Rig([camera] * count, names, torch.stack(turns), center=torch.stack(centers), refraction=0.0)
 
 
 def spoiled(pixels: Tensor, missing: float, wrong: float, generator: torch.Generator) -> Tensor:
@@ -80,14 +80,14 @@ def spoiled(pixels: Tensor, missing: float, wrong: float, generator: torch.Gener
     return torch.where(lost[..., None], math.nan, noisy)
 
 
-def projections(rig: CameraRig) -> np.ndarray:
+def projections(rig: Rig) -> np.ndarray:
     """(C, 3, 4) K [R | t]."""
     shift = -(rig.rotation @ rig.center[..., None])
     matrices = torch.stack([camera.matrix for camera in rig.each]) @ torch.cat([rig.rotation, shift], -1)
     return matrices.detach().numpy()
 
 
-def peers_of(rig: CameraRig) -> dict[str, tuple[Solve, int]]:
+def peers_of(rig: Rig) -> dict[str, tuple[Solve, int]]:
     """Functions from pixels (N, C, 2) to points (N, 3), and by how much fewer points they are timed on."""
     matrices, found = projections(rig), dict[str, tuple[Solve, int]]()
     shift = -(rig.rotation @ rig.center[..., None])
@@ -305,7 +305,7 @@ def real() -> list[str]:
             )
         )  # fmt: skip
     turn, shift = torch.from_numpy(data["R"]), torch.from_numpy(data["t"])
-    rig = CameraRig(cameras, list("abcd"), turn, -(turn.mT @ shift[..., None])[..., 0], refraction=0.0)
+    rig = Rig(cameras, list("abcd"), turn, center=-(turn.mT @ shift[..., None])[..., 0], refraction=0.0)
     keypoints = torch.from_numpy(data["keypoints"]).double().permute(0, 2, 1, 3)  # frames, joints, cameras, 3
     pixels, sure = keypoints[..., :2].reshape(-1, 4, 2), keypoints[..., 2].reshape(-1, 4)
     seen = (sure > 0.3) & torch.isfinite(pixels).all(-1)
@@ -343,11 +343,11 @@ def picture() -> None:
     from kcal.report.positions import stations_figure
 
     rig, generator = ring(3, 12_000.0), torch.Generator().manual_seed(5)
-    rig = CameraRig(
+    rig = Rig(
         rig.each,
         ("mill", "church", "mast"),
         rig.rotation,
-        rig.center,
+        center=rig.center,
         origin=rig.origin,
         refraction=float(rig.refraction),
     )

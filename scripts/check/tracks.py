@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Origin, RigCovariance, StereoRig
+from kcal.lens.rig import Origin, Rig, RigCovariance
 from kcal.locate.budget import planned_rig
 from kcal.locate.localizer import StereoLocalizer
 from kcal.pipeline.imm_filter import Motion
@@ -43,7 +43,7 @@ class Site(NamedTuple):
     """One draw: places and velocities (F, T, 3) at each tenth of a second, the true rig and the believed one."""
 
     localize: StereoLocalizer
-    true: StereoRig
+    true: Rig
     path: Tensor
     pace: Tensor
     generator: torch.Generator
@@ -60,7 +60,7 @@ def drawn_site(seed: int, frames: int) -> Site:
     )  # fmt: skip
     yaw = math.radians(YAW_SIGMA) * torch.randn((), generator=generator, dtype=torch.float64)
     turn = rotation_from_vector(torch.tensor([0.0, float(yaw), 0.0], dtype=torch.float64))
-    true = StereoRig(rig.left, rig.right, turn @ rig.right_from_left_rotation, rig.right_from_left_translation)
+    true = Rig.pair(rig.left, rig.right, turn @ rig.right_from_left_rotation, rig.right_from_left_translation)
     z = torch.cat([torch.logspace(2, math.log10(5000), TARGETS - 6), torch.full((6,), 5000.0)]).double()
     across = torch.linspace(-0.4, 0.4, TARGETS).double()[torch.randperm(TARGETS, generator=generator)]
     up = 0.25 * (torch.rand(TARGETS, generator=generator).double() - 0.5)

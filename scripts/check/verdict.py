@@ -99,7 +99,8 @@ def judge_pair(planted: PlantedPair) -> tuple[Verdict, float, float, dict[str, A
     for u, v in itertools.product((-0.3, 0.0, 0.3), (-0.2, 0.0, 0.2)):
         places.append(torch.tensor([0.5 + u, 0.5 + v]) * torch.tensor(planted.rig.left.size))
     rays = planted.rig.left.unproject(torch.stack(places).double())[0]
-    left, right, seen_by_both = planted.rig(need.distance * rays)
+    pixels, seen_by_both = planted.rig(need.distance * rays)
+    (left, right), seen_by_both = pixels.unbind(-2), seen_by_both.all(-1)
     from kcal.locate.stereo import sight_lines
 
     lines = sight_lines(rig, left, right)

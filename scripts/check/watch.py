@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Mounting, Origin, RigCovariance, StereoRig
+from kcal.lens.rig import Mounting, Origin, Rig, RigCovariance
 from kcal.locate.budget import planned_rig
 from kcal.locate.localizer import StereoLocalizer
 from kcal.watch.history import AngleSeries, Look, TurnModel, between_rows, first_state, learned, passed, taken, turns_of
@@ -180,12 +180,12 @@ def filtered(found: list[Look], every: float, model: TurnModel) -> Told:
     return Told(*(torch.stack(values) for values in zip(*told, strict=True)))
 
 
-def in_interval(watched: StereoRig, standing: StereoRig, seed: int) -> bool:
+def in_interval(watched: Rig, standing: Rig, seed: int) -> bool:
     """Whether the interval of a target at 5 km contains its range, when the rig stands otherwise than believed."""
     random = torch.Generator().manual_seed(seed)
     place = torch.tensor([[0.0, 0.0, 5000.0]]) + torch.tensor([[400.0, 200.0, 0.0]]) * (
         2.0 * torch.rand(1, 3, generator=random) - 1.0)  # fmt: skip
-    left, right, _ = standing(place.double())
+    left, right = standing(place.double())[0].unbind(-2)
     marks = [pixels + MARK * torch.randn(1, 2, generator=random, dtype=torch.float64) for pixels in (left, right)]
     found = StereoLocalizer(watched, pixel_sigma=MARK)(*marks)
     return bool(found.range_low[0] <= place.norm() <= found.range_high[0])
@@ -209,9 +209,7 @@ def coverage(true: Truth, told: Told, number: int) -> dict[str, Tensor]:
         error = error * torch.randn(1, generator=random, dtype=torch.float64)
         bent = true.slow[k, c] + true.wind[c] * torch.randn(6, generator=random, dtype=torch.float64)
         then = rotation_from_vector(error)
-        solved = StereoRig(
-            file.left, file.right, then @ file.right_from_left_rotation, file.right_from_left_translation
-        )
+        solved = Rig.pair(file.left, file.right, then @ file.right_from_left_rotation, file.right_from_left_translation)
         standing = drift_of_turns(solved, bent, torch.eye(6, dtype=torch.float64)).rig
         watched = drift_of_turns(file, told.later[k, c], told.covariance[k, c]).relocked("")
         inside["watch"].append(in_interval(watched, standing, n))

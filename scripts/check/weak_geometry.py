@@ -27,7 +27,7 @@ from kcal.calibrate.rig.landmarks import Landmarks
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.sources import RigData
 from kcal.errors import KcalError
-from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.lens.rig import Rig, RigCovariance
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.localizer import StereoLocalizer
 from scripts.shared.long_range import ORIGIN, RANGES, rig
@@ -102,7 +102,7 @@ def shaped(kind: str, distance: float, draw: Draw, many: int) -> Tensor:
     return torch.stack(groups, 1).flatten(0, 1)
 
 
-def drawn(kind: str, seed: int) -> tuple[StereoRig, Landmarks, dict[str, Any]]:
+def drawn(kind: str, seed: int) -> tuple[Rig, Landmarks, dict[str, Any]]:
     """A true rig, landmarks without noise, and what was drawn."""
     draw = Draw(FIRST * 10 + 10 * seed + list(KINDS).index(kind))
     if kind == "row at 1 km":
@@ -113,10 +113,9 @@ def drawn(kind: str, seed: int) -> tuple[StereoRig, Landmarks, dict[str, Any]]:
         mark, survey, distance = draw.log_uniform(0.1, 0.5), draw.log_uniform(0.01, 0.1), draw.log_uniform(200, 2000)
         points = shaped(kind, distance, draw, 40 * count)
     scale = baseline / float(TRUTH.baseline)
-    truth = StereoRig(
-        TRUTH.left, TRUTH.right, TRUTH.right_from_left_rotation, scale * TRUTH.right_from_left_translation
-    )
-    left, right, seen = truth(points)
+    truth = Rig.pair(TRUTH.left, TRUTH.right, TRUTH.right_from_left_rotation, scale * TRUTH.right_from_left_translation)
+    pixels, seen = truth(points)
+    (left, right), seen = pixels.unbind(-2), seen.all(-1)
     seen &= truth.left.inside(left) & truth.right.inside(right) & (points[:, 2] > 30.0)
     kept = seen.nonzero()[:count, 0]
     exact = Landmarks(
@@ -138,13 +137,14 @@ def noisy(exact: Landmarks, draw: Draw) -> Landmarks:
     )
 
 
-def judged(truth: StereoRig, found: RigResult, draw: Draw, widen: float = 1.0) -> tuple[list[float], list[float]]:
+def judged(truth: Rig, found: RigResult, draw: Draw, widen: float = 1.0) -> tuple[list[float], list[float]]:
     """For each range the share of intervals that contain it, and the RMS error of the inverse range over itself."""
     x, y = torch.linspace(-0.5, 0.5, 5).double(), torch.linspace(-0.28, 0.28, 3).double()
     rays = torch.stack([*torch.meshgrid(x, y, indexing="ij"), torch.ones(5, 3).double()], -1)
     rays = torch.nn.functional.normalize(rays.reshape(-1, 3), dim=-1)
     far = torch.tensor(RANGES, dtype=torch.float64)[:, None]
-    left, right, seen = truth(far[..., None] * rays)
+    pixels, seen = truth(far[..., None] * rays)
+    (left, right), seen = pixels.unbind(-2), seen.all(-1)
     seen &= truth.left.inside(left) & truth.right.inside(right)
     # Neither that of the landmarks nor another with each call.
     noise = MARK * Draw(draw.seed + 500).normal(2, *left.shape)
@@ -158,14 +158,14 @@ def judged(truth: StereoRig, found: RigResult, draw: Draw, widen: float = 1.0) -
     return (inside.sum(1) / seen.sum(1)).tolist(), error.sqrt().tolist()
 
 
-def unchecked(truth: StereoRig, seen: Landmarks) -> RigResult:
+def unchecked(truth: Rig, seen: Landmarks) -> RigResult:
     """What `solve_rig` would find without the check."""
     data = RigData(cameras=(truth.left, truth.right), names=("left", "right"), landmarks=seen)
     with mock.patch.object(solve, "check_places", return_value=(1.0, [])):
         return solve.solve_rig(data, solve.RigOptions(intrinsics="fixed", refraction=0.0, refraction_sigma=0.0))
 
 
-def graded(seed: int) -> tuple[StereoRig, Landmarks, dict[str, Any]]:
+def graded(seed: int) -> tuple[Rig, Landmarks, dict[str, Any]]:
     """A nearly degenerate set, with noise of marks and survey scaled so that its baseline is open by 2 to 50 %."""
     truth, exact, head = drawn(DEGENERATE[seed % len(DEGENERATE)], 10_000 + seed)
     head |= {"kind": "graded", "seed": seed}
@@ -209,7 +209,7 @@ def one(kind: str, seed: int) -> dict[str, Any]:
     return record | {"usable": 2 * sum(good) > len(good)}
 
 
-def checked(truth: StereoRig, found: RigResult, draw: Draw) -> dict[str, Any]:
+def checked(truth: Rig, found: RigResult, draw: Draw) -> dict[str, Any]:
     """What `solve_rig` makes of a result that was not checked."""
     solved = found._problem, found._state, found._covariance
     place = assess.open_place(*solved, 0, 1)

@@ -35,7 +35,7 @@ from kcal.io.lookup_file import load_lookup, save_lookup
 from kcal.io.rig_file import save_rig
 from kcal.lens.baking import bake
 from kcal.lens.camera import Camera
-from kcal.lens.rig import Mounting, Origin, StereoRig
+from kcal.lens.rig import Mounting, Origin, Rig
 from scripts.fuzz.damage import damage_bytes, damage_json, damage_table
 from scripts.fuzz.hunt import Overtime, Prepared, within
 from scripts.shared.small_photographs import photographs
@@ -73,7 +73,7 @@ def make_files(folder: Path) -> dict[str, bytes]:
     observations = Observations(board=BOARD, image_size=(320, 240), views=tuple(views))
     observations.save(folder / "obs.json")
     calibrate_camera(observations, CalibrationOptions(model="opencv4")).file(name="left").save(folder / "camera.json")
-    rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-2.0, 0.0, 0.0]))
+    rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-2.0, 0.0, 0.0]))
     rig.mounting = Mounting(origin=Origin(lat=10.0, lon=20.0, height=3.0), heading_deg=30.0)
     save_rig(rig, folder / "rig.json")
     half = 1e-5 * torch.eye(28, dtype=torch.float64)
@@ -81,7 +81,7 @@ def make_files(folder: Path) -> dict[str, bytes]:
     flat = MeasuredBoard(name="A", board=plate, amplitudes=0 * half[0], half=half, log_evidence=0.0)
     save_measured_board(flat, folder / "board.json")
     save_lookup(bake(camera, 0.05), folder / "lookup.npz")
-    left, right, _ = rig(torch.tensor([[0.0, 0.0, 50.0], [5.0, 1.0, 100.0]]))
+    left, right = rig(torch.tensor([[0.0, 0.0, 50.0], [5.0, 1.0, 100.0]]))[0].unbind(-2)
     rows = [f"p{i},{a},{b},{c},{d}" for i, (a, b, c, d) in enumerate(torch.cat([left, right], 1).tolist())]
     (folder / "marks.csv").write_text("\n".join(["name,left_u,left_v,right_u,right_v", *rows]) + "\n")
     photographs(folder / "photographs", 0, 1)

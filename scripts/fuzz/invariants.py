@@ -13,7 +13,7 @@ from pydantic import BaseModel
 from torch import Tensor, nn
 
 from kcal.lens.camera import Camera
-from kcal.lens.rig import Origin, StereoRig
+from kcal.lens.rig import Origin, Rig
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.stereo import PositionStatus
 
@@ -83,8 +83,8 @@ def require_status(value: Any) -> None:
         points = torch.tensor([[0.1, 0.1, 1.0], [-0.5, 0.2, 1.0], [0.0, 0.0, 1e6]], dtype=torch.float64)
         found, valid = value.project(points)
         assert bool(found[valid].isfinite().all()), "valid pixels are not finite"
-    if isinstance(value, StereoRig):
-        left, right, _ = value(torch.tensor([[1.0, 1.0, 60.0]], dtype=torch.float64))
+    if isinstance(value, Rig):
+        left, right = value(torch.tensor([[1.0, 1.0, 60.0]], dtype=torch.float64))[0].unbind(-2)
         if bool((left.isfinite() & right.isfinite()).all()):
             place: dict[str, Any] = (
                 {} if value.mounting else {"origin": Origin(lat=0.0, lon=0.0, height=0.0), "heading_deg": 0.0}

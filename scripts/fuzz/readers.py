@@ -27,7 +27,7 @@ from kcal.io.camera_file import load_camera, save_camera
 from kcal.io.lookup_file import load_lookup, save_lookup
 from kcal.io.rig_file import load_rig, save_camera_rig, save_rig
 from kcal.lens.baking import bake
-from kcal.lens.rig import Mounting, Origin, StereoRig
+from kcal.lens.rig import Mounting, Origin, Rig
 from kcal.locate.export import write_positions
 from kcal.locate.marks import COVARIANCE, read_marks, write_marks
 from kcal.locate.positions import locate_points
@@ -46,7 +46,7 @@ from scripts.fuzz import foreign_readers
 from scripts.fuzz.foreign_readers import BOARD, CAMERA, board_points
 from scripts.fuzz.reader import PROMISED, Reader, whole_text
 
-RIG = StereoRig(CAMERA, CAMERA, torch.eye(3), torch.tensor([-2.0, 0.0, 0.0]))
+RIG = Rig.pair(CAMERA, CAMERA, torch.eye(3), torch.tensor([-2.0, 0.0, 0.0]))
 
 
 def _observations(path: Path) -> None:
@@ -70,9 +70,9 @@ def _raster(path: Path) -> None:
         raster.write(np.ones((1, 8, 8), np.float32))
 
 
-def placed_rig() -> StereoRig:
+def placed_rig() -> Rig:
     """A rig that says where it stands."""
-    rig = StereoRig(CAMERA, CAMERA, torch.eye(3), torch.tensor([-2.0, 0.0, 0.0]))
+    rig = Rig.pair(CAMERA, CAMERA, torch.eye(3), torch.tensor([-2.0, 0.0, 0.0]))
     rig.mounting = Mounting(origin=Origin(lat=10.0, lon=20.0, height=3.0), heading_deg=30.0)
     return rig
 
@@ -120,7 +120,7 @@ def _whole_journal(path: Path) -> None:
 
 
 def _positions(path: Path) -> None:
-    left, right, _ = RIG(torch.tensor([[0.0, 0.0, 50.0], [5.0, 1.0, 100.0]], dtype=torch.float64))
+    left, right = RIG(torch.tensor([[0.0, 0.0, 50.0], [5.0, 1.0, 100.0]], dtype=torch.float64))[0].unbind(-2)
     write_positions(path, locate_points(placed_rig(), left, right, names=["a", "b"]))
 
 

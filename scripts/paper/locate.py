@@ -100,7 +100,8 @@ def far_points(scene: DemoScene) -> Far:
     v = torch.linspace(MARGIN, height - 1 - MARGIN, 7, dtype=torch.float64)
     rays, known = scene.rig.left.unproject(torch.stack(torch.meshgrid(u, v, indexing="xy"), -1).reshape(-1, 2))
     points = FAR * torch.nn.functional.normalize(rays, dim=-1)
-    left, right, valid = scene.rig(points)
+    pixels, valid = scene.rig(points)
+    (left, right), valid = pixels.unbind(-2), valid.all(-1)
     size = torch.tensor([width, height], dtype=torch.float64) - 1.0 - MARGIN
     both = known & valid & ((right >= MARGIN) & (right <= size)).all(-1)
     return Far(points[both] @ scene.enu_from_rig.T, (left[both], right[both]))
@@ -153,7 +154,8 @@ def by_kcal(scene: DemoScene, cameras: tuple[Camera, Camera]) -> Orient:
             return torch.where((found.status == 0)[..., None], enu, torch.nan)
 
         def project(enu: Tensor) -> tuple[Tensor, Tensor]:
-            left, right, valid = rig((enu - solved.center[0]) @ solved.rotation[0].T)
+            pixels, valid = rig((enu - solved.center[0]) @ solved.rotation[0].T)
+            (left, right), valid = pixels.unbind(-2), valid.all(-1)
             return torch.where(valid[:, None], left, torch.nan), torch.where(valid[:, None], right, torch.nan)
 
         return place, project

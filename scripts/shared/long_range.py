@@ -9,26 +9,26 @@ from torch import Tensor
 
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Origin, StereoRig
+from kcal.lens.rig import Origin, Rig
 
 RANGES = (100.0, 250.0, 500.0, 1000.0, 2000.0, 3500.0, 5000.0)
 ORIGIN = Origin(lat=19.07, lon=72.87, height=14.0)
 
 
-def rig() -> StereoRig:
+def rig() -> Rig:
     """10 m of baseline, f 1600 px, unlike lenses that converge a little."""
     size = (1920, 1080)
     left = Camera.build(focal=(1600, 1603), center=(957, 541), size=size, coefficients=[-0.2, 0.06, 3e-4, -2e-4])
     right = Camera.build(focal=(1605, 1601), center=(962, 538), size=size, coefficients=[-0.19, 0.05, -2e-4, 3e-4])
     rotation = rotation_from_vector(torch.tensor([0.003, 0.02, -0.004], dtype=torch.float64))
-    return StereoRig(left, right, rotation, rotation @ torch.tensor([-10.0, 0.15, 0.2], dtype=torch.float64))
+    return Rig.pair(left, right, rotation, rotation @ torch.tensor([-10.0, 0.15, 0.2], dtype=torch.float64))
 
 
-def range_sigma(project: Callable[[Tensor], tuple[Tensor, Tensor, Tensor]], points: Tensor, mark: float) -> Tensor:
+def range_sigma(project: Callable[[Tensor], tuple[Tensor, Tensor]], points: Tensor, mark: float) -> Tensor:
     """(N,) meters: standard deviation of each range that noise in the marks leaves, with the rig known exactly.
 
     Args:
-        project: the rig: its points (N, 3) to pixels_left, pixels_right (N, 2) and whether both see them.
+        project: the rig: its points (N, 3) to pixels (N, 2, 2), and which are seen (N, 2).
         points: (N, 3) in the left camera's frame.
         mark: standard deviation of a mark along each axis, px.
     """
@@ -36,7 +36,7 @@ def range_sigma(project: Callable[[Tensor], tuple[Tensor, Tensor, Tensor]], poin
     length = points.norm(dim=-1, keepdim=True)
     for axis in torch.eye(3, dtype=torch.float64):
         step = 1e-5 * length * axis
-        ahead, behind = (torch.cat(project(points + sign * step)[:2], -1) for sign in (1, -1))
+        ahead, behind = (project(points + sign * step)[0].flatten(-2) for sign in (1, -1))
         columns.append((ahead - behind) / (2e-5 * length))
     jacobian = torch.stack(columns, -1)
     covariance = torch.linalg.inv(jacobian.transpose(-1, -2) @ jacobian) * mark**2

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 
 Floats = NDArray[np.float64]
 Inside = Callable[[Floats, Floats], NDArray[np.bool_]]
@@ -92,7 +92,7 @@ def finished(image: Floats, noise: float, random: np.random.Generator) -> NDArra
     return np.clip(np.rint(image + random.normal(0, noise, image.shape)), 0, 255).astype(np.uint8)
 
 
-def site_rig(width: int = 1280, height: int = 720) -> StereoRig:
+def site_rig(width: int = 1280, height: int = 720) -> Rig:
     """Two unlike, distorted cameras 10 m apart; f 1600 px at a width of 1920."""
     unit = width / 1920
     lenses = (
@@ -107,7 +107,7 @@ def site_rig(width: int = 1280, height: int = 720) -> StereoRig:
     ]
     rotation = rotation_from_vector(torch.tensor([0.003, 0.006, -0.008], dtype=torch.float64))
     center = torch.tensor([10.0, 0.04, -0.06], dtype=torch.float64)
-    return StereoRig(cameras[0], cameras[1], rotation, -rotation @ center)
+    return Rig.pair(cameras[0], cameras[1], rotation, -rotation @ center)
 
 
 class SitePoint(NamedTuple):
@@ -149,7 +149,7 @@ class MarkingSite:
         points: (3,) meters east, north, up of the left camera, which looks north, by name.
     """
 
-    rig: StereoRig
+    rig: Rig
     images: tuple[NDArray[np.uint8], NDArray[np.uint8]]
     pixels: dict[str, tuple[Floats, Floats]]
     points: dict[str, Tensor]
@@ -188,7 +188,7 @@ def marking_site(seed: int = 0, width: int = 1280, height: int = 720, noise: flo
     return MarkingSite(rig=rig, images=(first, second), pixels=pixels, points=points)
 
 
-def seen(rig: StereoRig, point: Tensor, side: int) -> tuple[Floats, Floats]:
+def seen(rig: Rig, point: Tensor, side: int) -> tuple[Floats, Floats]:
     """Pixel (2,) of a point of the rig frame, and the matrix from pixels there to pixels of the left image."""
     reach = 1e-3 * float(point.norm())
     around = torch.stack([point, point + torch.tensor([reach, 0, 0]), point + torch.tensor([0, reach, 0])])
@@ -198,7 +198,7 @@ def seen(rig: StereoRig, point: Tensor, side: int) -> tuple[Floats, Floats]:
     return here[0].numpy(), slopes[0] @ np.linalg.inv(slopes[1])
 
 
-def background(rig: StereoRig, side: int, random: np.random.Generator, amplitude: float = 1.6) -> Floats:
+def background(rig: Rig, side: int, random: np.random.Generator, amplitude: float = 1.6) -> Floats:
     """Sky, hills and ground as a function of the direction alone, so that both images show the same at infinity.
 
     The hills' gray levels vary by 3.5 times the amplitude (standard deviation), over 10 px and more.

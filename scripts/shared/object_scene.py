@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 
 Floats = NDArray[np.float64]
 _RAYS = 4  # across a pixel
@@ -64,7 +64,7 @@ def plate(
     return Plate(point=point, half=half, waves=waves, level=120.0 + random.uniform(-30, 30))
 
 
-def paint_plate(image: Floats, rig: StereoRig, side: int, item: Plate) -> None:
+def paint_plate(image: Floats, rig: Rig, side: int, item: Plate) -> None:
     """Paint an object over what an image (H, W) of the left (0) or right (1) camera shows."""
     rotation, shift = rig.right_from_left_rotation, rig.right_from_left_translation
     camera = rig.left if side == 0 else rig.right
@@ -106,7 +106,7 @@ def exposed(image: Floats, sigma: float, random: np.random.Generator) -> Tensor:
     return torch.from_numpy(gaussian_filter(image, OPTICAL_BLUR) + random.normal(0, sigma, image.shape))
 
 
-def true_box(rig: StereoRig, side: int, item: Plate) -> Floats:
+def true_box(rig: Rig, side: int, item: Plate) -> Floats:
     """Edges (4,) of the object's box in an image."""
     angle = torch.linspace(0, 2 * math.pi, 65, dtype=torch.float64)[:-1]
     ring = torch.stack([item.half[0] * angle.cos(), item.half[1] * angle.sin(), torch.zeros_like(angle)], -1)

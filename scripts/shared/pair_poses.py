@@ -5,12 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.sim.captures import BoardLike, BoardPose, PoseOptions, TrueRig, check_draws, choose_poses, draw_poses
 
 
 def sample_pair_poses(
-    rig: StereoRig | TrueRig,
+    rig: Rig | TrueRig,
     board: BoardLike,
     count: int,
     generator: torch.Generator,
@@ -37,7 +37,7 @@ def sample_pair_poses(
     Example:
         >>> from kcal import Camera
         >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480))
-        >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
+        >>> rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
         >>> from kcal.sim.captures import BoardSize, project_board
         >>> board = BoardSize(9, 6, 0.1)
         >>> poses = sample_pair_poses(rig, board, 4, torch.Generator().manual_seed(1), distance=(4.0, 6.0))
@@ -53,7 +53,7 @@ def sample_pair_poses(
     return choose_poses(drawn, [(rig.left, *still), (rig.right, rotation, translation)], board, count, options)
 
 
-def rig_pose(rig: StereoRig | TrueRig, left_from_board: tuple[Tensor, Tensor]) -> BoardPose:
+def rig_pose(rig: Rig | TrueRig, left_from_board: tuple[Tensor, Tensor]) -> BoardPose:
     """Convert left_from_board to right_from_board."""
     rotation, translation = left_from_board
     return BoardPose(rig.right_from_left_rotation @ rotation, rig.right_from_left(translation))

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import CameraRig, Origin
+from kcal.lens.rig import Origin, Rig
 from kcal.locate.geodesy import (
     anchor,
     ecef_from_enu_rotation,
@@ -22,7 +22,7 @@ from kcal.locate.geodesy import (
 ORIGIN = Origin(lat=45.0, lon=6.0, height=800.0)
 
 
-def ring(count: int, radius: float, focal: float = 1600.0, refraction: float = 0.13) -> CameraRig:
+def ring(count: int, radius: float, focal: float = 1600.0, refraction: float = 0.13) -> Rig:
     """Stations around a place `radius` m away, over half a circle, level at their own verticals."""
     camera = Camera.build(focal=(focal, focal), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
     angles = [math.pi * (c + 0.5) / count for c in range(count)]
@@ -36,7 +36,7 @@ def ring(count: int, radius: float, focal: float = 1600.0, refraction: float = 0
         way = to_own @ -place
         turns.append(enu_from_cam(math.degrees(math.atan2(float(way[0]), float(way[1])))).T @ to_own)
     names = [f"tower {c + 1}" for c in range(count)]
-    return CameraRig([camera] * count, names, torch.stack(turns), center, origin=ORIGIN, refraction=refraction)
+    return Rig([camera] * count, names, torch.stack(turns), center=center, origin=ORIGIN, refraction=refraction)
 
 
 def drawn_errors(root: Tensor, count: int, generator: torch.Generator) -> Tensor:
@@ -44,7 +44,7 @@ def drawn_errors(root: Tensor, count: int, generator: torch.Generator) -> Tensor
     return torch.randn(count, len(root), dtype=torch.float64, generator=generator) @ root
 
 
-def marks(rig: CameraRig, points: Tensor, errors: Tensor | None = None) -> Tensor:
+def marks(rig: Rig, points: Tensor, errors: Tensor | None = None) -> Tensor:
     """(N, C, 2) where points (N, 3) are seen through bent light by rigs off by `errors` (N, P), lenses excepted.
 
     Not as kcal computes it: in each station's own east, north, up.

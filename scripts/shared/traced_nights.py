@@ -181,7 +181,7 @@ def data_of(made: Lenses, case: Case, seed: int) -> RigData:
     else:
         way = draw.uniform((-0.4, -0.2), (0.4, 0.2), (MATCHES, 2))
         rays = torch.nn.functional.pad(torch.from_numpy(way), (0, 1), value=1.0)
-        left, right, _ = rig(torch.from_numpy(draw.uniform(100, 1500, (MATCHES, 1))) * rays)
+        left, right = rig(torch.from_numpy(draw.uniform(100, 1500, (MATCHES, 1))) * rays)[0].unbind(-2)
         marks = torch.stack([left, right], 1)
         features = Features(
             names=tuple(f"match {k}" for k in range(MATCHES)),

@@ -22,7 +22,7 @@ from kcal.io.camera_file import CameraFile, camera_to_file
 from kcal.io.rig_file import RigFile
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.texts import number_text
 
 BOARD = Board(columns=7, rows=6, square=0.05)
@@ -30,7 +30,7 @@ SIZE = (640, 480)
 LEFT = Camera.build(focal=(500, 505), center=(325, 235), size=SIZE, coefficients=[-0.2, 0.05])
 RIGHT = Camera.build(focal=(560, 555), center=(310, 250), size=SIZE, coefficients=[-0.15, 0.03])
 TURN = rotation_from_vector(torch.tensor([0.02, 0.1, 0.01], dtype=torch.float64))
-RIG = StereoRig(LEFT, RIGHT, TURN, torch.tensor([-0.12, 0.005, 0.01], dtype=torch.float64))
+RIG = Rig.pair(LEFT, RIGHT, TURN, torch.tensor([-0.12, 0.005, 0.01], dtype=torch.float64))
 
 
 def observations(side: int, count: int, noise: float = 0.1) -> Observations:

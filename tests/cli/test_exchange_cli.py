@@ -17,7 +17,7 @@ from kcal.io.camera_file import load_camera, save_camera
 from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.locate.survey import read_survey
 
 
@@ -68,7 +68,7 @@ def test_a_fitted_lens_is_told_with_a_picture(tmp_path: Path, camera: Path) -> N
 
 def test_rigs(tmp_path: Path, camera: Path) -> None:
     one = load_camera(camera)
-    rig = StereoRig(one, one, torch.eye(3), torch.tensor([-1.5, 0.0, 0.0]))
+    rig = Rig.pair(one, one, torch.eye(3), torch.tensor([-1.5, 0.0, 0.0]))
     save_rig(rig, tmp_path / "rig.json")
     text = run("export", tmp_path / "rig.json", "--format", "ros", "-o", tmp_path / "ros.yaml")
     assert "ros_left.yaml" in text
@@ -116,7 +116,7 @@ def test_error_bars_come_along_and_a_rig_says_who_has_none(tmp_path: Path, camer
     known, bare = load_camera(tmp_path / "b.json"), Camera.build(focal=(1000, 1000), center=(320, 240), size=(640, 480))
     assert known.calibration is not None
     assert known.calibration.covariance is not None
-    rig = StereoRig(bare, known, torch.eye(3), torch.tensor([-2.0, 0, 0]))
+    rig = Rig.pair(bare, known, torch.eye(3), torch.tensor([-2.0, 0, 0]))
     data = SimpleNamespace(cameras=(bare, known))
     line = _exact_line(SimpleNamespace(exact=("left",), names=("left", "right"), data=data), rig)  # type: ignore[arg-type]
     assert "An error of 0.1 px in one of them is 1.0 % of a range of 200 m" in line

@@ -11,7 +11,7 @@ from capture_frames import images
 from interrupted import interrupt
 from scene_pairs import pair, small_rig
 
-from kcal import Camera, StereoRig, save_camera, save_rig
+from kcal import Camera, Rig, save_camera, save_rig
 from kcal.cli.demo_practice import practice_site
 from kcal.io.images import write_png
 
@@ -30,7 +30,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
         save_camera(camera, folder / f"{side}.camera.json")
         save_camera(getattr(small_rig(), side), folder / f"{side}-scene.camera.json")
         write_png(folder / f"{side}-scene.png", getattr(pair(1), side))
-    save_rig(StereoRig(near, near, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0])), folder / "planned.json")
+    save_rig(Rig.pair(near, near, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0])), folder / "planned.json")
     truth = json.loads((folder / ".truth" / "truth.json").read_text())
     marks = [f"{name},left,{u},{v}" for name, (u, v, *_) in truth["marks"].items() if name in truth["landmarks"]]
     (folder / "marks.csv").write_text("\n".join(["name,camera,u,v", *marks]) + "\n")

@@ -24,7 +24,7 @@ from waiting import wait_for
 from kcal.cli.main import app
 from kcal.errors import FileError, InputError
 from kcal.io.rig_file import save_camera_rig, save_rig
-from kcal.lens.rig import CameraRig, Origin, StereoRig
+from kcal.lens.rig import Origin, Rig
 from kcal.pipeline.stream import Stream
 from kcal.threads import Handover
 
@@ -114,16 +114,16 @@ def test_three_videos_of_three_cameras(tmp_path: Path, monkeypatch: pytest.Monke
     pair = small_rig()
     camera, north = pair.left, torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     center = torch.tensor([[0.0, 0, 0], [2.0, 0, 0], [-2.0, 0, 0]])
-    rig = CameraRig(
+    rig = Rig(
         [camera] * 3,
         ["left", "right", "third"],
         north.repeat(3, 1, 1),
-        center,
+        center=center,
         origin=Origin(lat=19.07, lon=72.87, height=14.0),
     )
     rig.root = rig.with_errors(position_m=0.001, attitude_deg=0.001)
     save_camera_rig(rig, tmp_path / "rig.json")
-    west = StereoRig(camera, camera, torch.eye(3), torch.tensor([2.0, 0.0, 0.0]))
+    west = Rig.pair(camera, camera, torch.eye(3), torch.tensor([2.0, 0.0, 0.0]))
     times = [number / 15 for number in range(FRAMES)]
     for name, scene, side, count in (("left", pair, 0, FRAMES), ("right", pair, 1, FRAMES), ("third", west, 1, 8)):
         write_video(tmp_path / f"{name}.mp4", film(scene, side, times[:count]), times[:count], crf=23)

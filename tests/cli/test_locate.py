@@ -14,7 +14,7 @@ from kcal.io.camera_file import provenance, save_camera
 from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.calibration import RigCalibration
 from kcal.lens.camera import Camera
-from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, StereoRig
+from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Rig
 
 HEADER = "name,left_u,left_v,right_u,right_v\n"
 ORIGIN = "-33.9,151.2,10"
@@ -23,7 +23,7 @@ ORIGIN = "-33.9,151.2,10"
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     camera = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
-    save_rig(StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0])), tmp_path / "rig.json")
+    save_rig(Rig.pair(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0])), tmp_path / "rig.json")
     save_camera(camera, tmp_path / "mast.camera.json")
     (tmp_path / "long.csv").write_text("name,camera,u,v\ncorner,mast,113,360\n")
     (tmp_path / "points.csv").write_text(HEADER + "[b]mast,975.5,539.5,959.5,539.5\nlost,-40,5,1,5\n")

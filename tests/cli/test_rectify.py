@@ -19,7 +19,7 @@ from kcal.io.images import encode_png
 from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.camera import Camera
 from kcal.lens.images import StereoRectification, Undistort
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.lens.views import new_pinhole
 
 CAMERA = Camera.build(focal=(60, 60), center=(31, 24), size=(64, 48), coefficients=[-0.2, 0.02, 1e-3, -1e-3])
@@ -177,7 +177,7 @@ def test_maps_are_those_of_the_image(folder: Path, monkeypatch: pytest.MonkeyPat
 def test_rig(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Two folders of images, the rig of the new images, and a table of ranges."""
     other = Camera.build(focal=(62, 61), center=(33, 22), size=(64, 48), coefficients=[-0.1])
-    save_rig(StereoRig(CAMERA, other, torch.eye(3), torch.tensor([-0.5, 0.01, 0.0])), folder / "rig.json")
+    save_rig(Rig.pair(CAMERA, other, torch.eye(3), torch.tensor([-0.5, 0.01, 0.0])), folder / "rig.json")
     for side in ("left", "right"):
         (folder / side).mkdir()
         (folder / side / "1.png").write_bytes(encode_png(picture(np.uint8, 3)))
@@ -212,7 +212,7 @@ def test_sides_of_a_rig(
     monkeypatch.setenv("COLUMNS", "300")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        save_rig(StereoRig(CAMERA, CAMERA, torch.eye(3), torch.tensor(place)), folder / "rig.json")
+        save_rig(Rig.pair(CAMERA, CAMERA, torch.eye(3), torch.tensor(place)), folder / "rig.json")
     assert run(monkeypatch, "rig.json") == 1
     assert "or --maps for the maps alone" in capsys.readouterr().err
     assert run(monkeypatch, "rig.json", "--maps", "-o", "out") == 0

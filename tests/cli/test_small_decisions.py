@@ -21,7 +21,7 @@ from kcal.io.camera_file import save_camera
 from kcal.io.images import write_png
 from kcal.io.rig_file import save_rig
 from kcal.lens.camera import Camera
-from kcal.lens.rig import Origin, StereoRig
+from kcal.lens.rig import Origin, Rig
 
 CAMERAS = [
     Camera.build(focal=(1600 + 5 * k, 1600), center=(960, 540), size=(1920, 1080), model="pinhole") for k in range(2)
@@ -67,7 +67,7 @@ class TestMark:
         for name in ("l", "r"):
             write_png(tmp_path / f"{name}.png", np.arange(48 * 64).reshape(48, 64).astype(np.uint8))
             save_camera(lens, tmp_path / f"{name}.json")
-        save_rig(StereoRig(lens, lens, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0])), tmp_path / "rig.json")
+        save_rig(Rig.pair(lens, lens, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0])), tmp_path / "rig.json")
         (tmp_path / "old.csv").write_text("name,left_u,left_v,right_u,right_v\np,30,20,29,20\n")
         return tmp_path
 

@@ -20,7 +20,7 @@ from kcal.io.camera_file import save_camera
 from kcal.io.rig_file import save_camera_rig
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import CameraRig, Origin
+from kcal.lens.rig import Origin, Rig
 from kcal.locate.budget import station_sigmas
 from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic, geodetic_to_enu
 from kcal.locate.stations import load_camera_rig
@@ -261,7 +261,7 @@ def test_show_says_how_each_camera_stands() -> None:
     assert "20 mm  50 mm" in line
 
 
-def boards_of(rig: CameraRig, folder: Path) -> list[str]:
+def boards_of(rig: Rig, folder: Path) -> list[str]:
     """Observations of a board shown to three cameras of one mast, each to two or three of them; names of the files."""
     board = Board(columns=8, rows=6, square=0.25)
     generator, files = torch.Generator().manual_seed(1), []
@@ -290,7 +290,7 @@ def test_boards_seen_by_any_two_of_three_and_distances_of_named_pairs(tmp_path: 
     ]
     centers = torch.tensor([[0.0, 0, 0], [1.5, 0.1, 0], [3.0, -0.1, 0.2]], dtype=torch.float64)
     turns = torch.stack([rotation_from_vector(torch.tensor([0.0, -0.1 * c, 0.02 * c]).double()) for c in range(3)])
-    rig = CameraRig(camera, NAMES[:3], turns, centers, refraction=0.0)
+    rig = Rig(camera, NAMES[:3], turns, center=centers, refraction=0.0)
     for one, name in zip(camera, NAMES, strict=False):
         save_camera(one, tmp_path / f"{name}.camera.json")
     three = [f"{name}.camera.json" for name in NAMES[:3]]
@@ -338,7 +338,7 @@ def test_a_rig_of_four_is_judged(folder: Path) -> None:
     assert answer["sigma_m"] == pytest.approx(float(worst.total))
     # Turned away from each other, no two see the same.
     away = rig.rotation @ torch.diag(torch.tensor([-1.0, -1, 1], dtype=torch.float64))
-    apart = CameraRig(rig.each, NAMES, away, rig.center, origin=rig.origin)
+    apart = Rig(rig.each, NAMES, away, center=rig.center, origin=rig.origin)
     save_camera_rig(apart, folder / "apart.json")
     result = CliRunner().invoke(app, ["report", str(folder / "apart.json"), "--require", "1km:5%"])
     assert result.exit_code == 3

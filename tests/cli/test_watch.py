@@ -80,7 +80,7 @@ def marks(folder: Path, times: list[str]) -> Path:
     """A target at 2 km, as the turned rig sees it, at some times."""
     rig = planned_rig()
     point = torch.tensor([[0.0, 0.0, 2000.0]], dtype=torch.float64)
-    left, right, _ = rig(point)
+    left, right = rig(point)[0].unbind(-2)
     right = right + torch.tensor([[1600.0 * math.tan(math.radians(0.01)), 0.0]])
     lines = ["name,left_u,left_v,right_u,right_v,time"]
     for k, time in enumerate(times):
@@ -128,7 +128,7 @@ def test_live_tracks_have_the_sigma_of_the_moment(watched: Path) -> None:
     for name, start in (("day", START + 1800.0), ("dark", START + 36_000.0)):
         lines = []
         for k in range(12):
-            left, right, _ = rig(torch.tensor([[5.0 * k / 10.0, 0.0, 1500.0]], dtype=torch.float64))
+            left, right = rig(torch.tensor([[5.0 * k / 10.0, 0.0, 1500.0]], dtype=torch.float64))[0].unbind(-2)
             right = right + torch.tensor([[1600.0 * math.tan(math.radians(0.01)), 0.0]])
             lines.append(orjson.dumps({"time": start + k / 10.0, "left": left.tolist(), "right": right.tolist(),
                                        "sigma": 0.02}))  # fmt: skip

@@ -10,7 +10,7 @@ from kcal.corners.patches import filtered, gaussian_kernel, has_samples, image_w
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 
 
 def corner_image(u, v, noise=0.0, seed=0, size=60):
@@ -99,7 +99,7 @@ def stereo(distance=60.0, noise=0.0, seed=0):
     left = Camera.build(**build, coefficients=[-0.2, 0.05])
     right = Camera.build(focal=(930, 925), center=(158.0, 122.0), size=(320, 240), coefficients=[-0.1, 0.02, 1e-3])
     turn = rotation_from_vector(torch.tensor([0.004, -0.01, 0.03], dtype=torch.float64))
-    rig = StereoRig(left, right, turn, torch.tensor([-2.0, 0.05, 0.1], dtype=torch.float64))
+    rig = Rig.pair(left, right, turn, torch.tensor([-2.0, 0.05, 0.1], dtype=torch.float64))
     generator = torch.Generator().manual_seed(seed)
     images = []
     for camera, R, t in (
@@ -118,7 +118,7 @@ def stereo(distance=60.0, noise=0.0, seed=0):
 def truth_of(rig, pixels, distance):
     normalized, _ = rig.left.normalize(pixels)
     points = torch.cat([normalized, torch.ones_like(normalized[:, :1])], -1) * distance
-    return rig(points)[1]
+    return rig(points)[0][..., 1, :]
 
 
 PIXELS = torch.tensor([[160.0, 120.0], [110.4, 80.7], [220.2, 170.9], [130.5, 160.5]], dtype=torch.float64)
@@ -161,7 +161,7 @@ class TestMatch:
         rig, left, right = stereo()
         parameters = rig.right.params.clone()
         parameters[3] += 0.5
-        crooked = StereoRig(
+        crooked = Rig.pair(
             rig.left,
             Camera(parameters, size=rig.right.size, model=rig.right.model),
             rig.right_from_left_rotation,
@@ -174,7 +174,7 @@ class TestMatch:
 
     def test_agrees_with_phase_correlation_on_a_pure_shift(self):
         camera = Camera.build(focal=(400, 400), center=(79.5, 79.5), size=(160, 160))
-        rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
+        rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
         left = texture(5, camera.grid(160, 160) / 160)
         right = texture(5, (camera.grid(160, 160) + torch.tensor([7.37, 0.0])) / 160)
         found = match_points(rig, left, right, torch.tensor([[80.0, 80.0]]))
@@ -198,7 +198,7 @@ class TestMatch:
         noise = torch.rand(right.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
         assert match_points(rig, left, noise, middle, options).status.tolist() == [MatchStatus.NO_MATCH]
         stripes = torch.sin(torch.arange(320, dtype=torch.float64) * 2 * math.pi / 12).expand(240, 320)
-        straight = StereoRig(rig.left, rig.left, torch.eye(3), torch.tensor([-2.0, 0.0, 0.0]))
+        straight = Rig.pair(rig.left, rig.left, torch.eye(3), torch.tensor([-2.0, 0.0, 0.0]))
         assert match_points(straight, stripes, stripes, middle, options).status.tolist() == [MatchStatus.AMBIGUOUS]
         assert match_points(rig, left, right, torch.zeros(0, 2)).pixels.shape == (0, 2)
 

@@ -32,7 +32,7 @@ class TestPlanes:
 
     def test_one_place_of_any_distance_is_in_one_row(self) -> None:
         """A point and one behind it differ in the column alone, by the parallax; whatever the lenses."""
-        left, right, _ = RIG(self.POINTS)
+        left, right = RIG(self.POINTS)[0].unbind(-2)
         planes = object_planes(RIG, left, right, torch.zeros(4))
         assert bool(planes.valid.all())
         torch.testing.assert_close(
@@ -51,7 +51,7 @@ class TestPlanes:
         torch.testing.assert_close(planes.left[:, 0] - planes.right[:, 0], RIG.baseline / depth, rtol=1e-9, atol=0)
 
     def test_a_step_is_a_pixel_of_the_left_image_along_the_baseline(self) -> None:
-        left, right, _ = RIG(self.POINTS)
+        left, right = RIG(self.POINTS)[0].unbind(-2)
         for level in (0, 2):
             planes = object_planes(RIG, left, right, torch.full((4,), level))
             ends = planes.left[:, None] + planes.step[:, None, None] * tensor([-0.5, 0.0], [0.5, 0.0])
@@ -60,7 +60,7 @@ class TestPlanes:
             torch.testing.assert_close(length, torch.full((4,), 2.0**level).double(), rtol=1e-4, atol=0)
 
     def test_pixels_and_places_are_each_others_inverse(self) -> None:
-        left, right, _ = RIG(self.POINTS)
+        left, right = RIG(self.POINTS)[0].unbind(-2)
         planes = object_planes(RIG, left, right, torch.zeros(4))
         places = planes.left + tensor([0.01, 0.02], [-0.03, 0.0], [0.0, 0.05], [0.02, -0.02])
         pixels, valid = plane_pixels(RIG.left, planes, places[:, None])
@@ -72,7 +72,7 @@ class TestPlanes:
         torch.testing.assert_close(found, places, rtol=0, atol=1e-10)
 
     def test_what_has_no_plane_is_said(self) -> None:
-        left, right, _ = RIG(self.POINTS[:3])
+        left, right = RIG(self.POINTS[:3])[0].unbind(-2)
         left[0], right[1] = math.nan, math.nan
         planes = object_planes(RIG, left, right, torch.zeros(3))
         assert planes.valid.tolist() == [False, False, True]

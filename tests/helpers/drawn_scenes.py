@@ -52,7 +52,7 @@ PLACE = Origin(lat=10.0, lon=20.0, height=0.0)
 @functools.cache
 def located(heading: float = 300.0) -> tuple[Located, torch.Tensor]:
     """Four things, the last too far for a range, and their true places."""
-    left, right, _ = pinhole_rig()(PLACES)
+    left, right = pinhole_rig()(PLACES)[0].unbind(-2)
     names = ["gate", "mast", "ship", "cloud"]
     found = locate_points(
         pinhole_rig(), left, right + tensor([0.3, 0.0]), origin=PLACE, heading_deg=heading, names=names
@@ -99,14 +99,14 @@ def calibrated() -> CameraCalibrationResult:
 
 def stations() -> Located:
     """Things seen by three towers, one of them by one tower alone."""
-    from kcal.lens.rig import CameraRig
+    from kcal.lens.rig import Rig
     from kcal.locate.marks import Marks
     from kcal.locate.station_positions import locate_views
 
     lens = Camera.build(focal=(900, 900), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
     centers = tensor([0.0, 0.0, 30.0], [3000.0, 200.0, 40.0], [1500.0, -900.0, 35.0])
     turns = torch.stack([enu_from_cam(heading).T for heading in (20.0, -30.0, 0.0)])
-    rig = CameraRig((lens,) * 3, ("mill", "mast", "roof"), turns, centers, origin=PLACE, refraction=0.0)
+    rig = Rig((lens,) * 3, ("mill", "mast", "roof"), turns, center=centers, origin=PLACE, refraction=0.0)
     things = tensor([1200.0, 4000.0, 10.0], [2000.0, 3000.0, 10.0], [-800.0, 2500.0, 10.0])
     pixels = torch.stack([lens.project((things - c) @ turn.T)[0] for c, turn in zip(centers, turns, strict=True)], 1)
     pixels[2, 1:] = math.nan

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from kcal.lens.camera import Camera
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 
 SIZE = (1920, 1080)
 
@@ -17,10 +17,10 @@ def tensor(*values: object) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
 
 
-def pinhole_rig(focal: float = 1600.0, baseline: float = 10.0) -> StereoRig:
+def pinhole_rig(focal: float = 1600.0, baseline: float = 10.0) -> Rig:
     """Parallel pinhole cameras: disparity = focal * baseline / Z."""
     camera = Camera.build(focal=(focal, focal), center=(959.5, 539.5), size=SIZE, model="pinhole")
-    return StereoRig(camera, camera, torch.eye(3), tensor(-baseline, 0.0, 0.0))
+    return Rig.pair(camera, camera, torch.eye(3), tensor(-baseline, 0.0, 0.0))
 
 
 def turned(yaw_deg: float, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Tensor:
@@ -31,7 +31,7 @@ def turned(yaw_deg: float, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Ten
     return yaw @ pitch @ roll
 
 
-def real_rig() -> StereoRig:
+def real_rig() -> Rig:
     """Unlike, distorted, converging cameras on an uneven mast."""
     left = Camera.build(
         focal=(1610, 1604), center=(951.3, 545.8), size=SIZE, coefficients=[-0.21, 0.08, 1e-3, -5e-4, -0.01]
@@ -40,7 +40,7 @@ def real_rig() -> StereoRig:
         focal=(1588, 1592), center=(968.1, 532.4), size=SIZE, coefficients=[-0.19, 0.06, -7e-4, 4e-4, 0.0]
     )
     rotation = turned(1.0, -0.4, 0.7)
-    return StereoRig(left, right, rotation, rotation @ tensor(-10.0, 0.35, 0.6))
+    return Rig.pair(left, right, rotation, rotation @ tensor(-10.0, 0.35, 0.6))
 
 
 def spread_points(ranges: Tensor) -> Tensor:

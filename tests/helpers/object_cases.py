@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from scripts.shared.marking_scene import background
 from scripts.shared.object_scene import exposed, paint_plate, plate, texture_gradient, true_box
 
@@ -18,15 +18,15 @@ SIZE = (240, 160)
 FOCAL = 800.0
 
 
-def rig_of(lens: tuple[float, ...] = (-0.3, 0.1), roll: float = 0.02) -> StereoRig:
+def rig_of(lens: tuple[float, ...] = (-0.3, 0.1), roll: float = 0.02) -> Rig:
     camera = Camera.build(focal=(FOCAL, FOCAL), center=(119.5, 79.5), size=SIZE, coefficients=lens)
     other = Camera.build(focal=(790, 795), center=(121.0, 78.0), size=SIZE, coefficients=lens)
     turn = rotation_from_vector(torch.tensor([0.003, -0.002, roll], dtype=torch.float64))
-    return StereoRig(camera, other, turn, torch.tensor([-5.0, 0.2, 0.1]))
+    return Rig.pair(camera, other, turn, torch.tensor([-5.0, 0.2, 0.1]))
 
 
 class Case(NamedTuple):
-    rig: StereoRig
+    rig: Rig
     left: Tensor
     right: Tensor
     boxes: Tensor

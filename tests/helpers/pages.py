@@ -114,7 +114,7 @@ def crowded_map(targets: int) -> Iterator[LiveMap]:
     page = LiveMap(located_by(Locator(site.rig, origin=site.origin, heading_deg=0.0)), 0)
     reach = 100.0 * 30.0 ** torch.linspace(0, 1, targets).double()
     side = 0.3 * reach * torch.sin(2.4 * torch.arange(targets).double())
-    left, right, _ = site.rig(torch.stack([side, 0 * side, reach], -1))
+    left, right = site.rig(torch.stack([side, 0 * side, reach], -1))[0].unbind(-2)
     page.show(track_columns(Tracker(site, TrackOptions(confirm_hits=1))(pairs_of(left, right, 1.0, 0.05)), 1), 1)
     yield page
     page.close()
@@ -149,7 +149,7 @@ def written_map(folder: Path) -> Iterator[Opened]:
     """The map of `kcal locate`, with true positions."""
     truth = torch.tensor([[20, 0, 100], [26, 0, 104], [-300, 5, 1000], [900, 0, 5000]]).double()
     rig = pinhole_rig()
-    left, right, _ = rig(truth)
+    left, right = rig(truth)[0].unbind(-2)
     located = locate_points(
         rig, left, right + torch.tensor([0.6, 0.0]), origin=ORIGIN, heading_deg=0.0,
         names=["gate", "a second gate beside it", "mast", "ship"],

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.scene.match import ImagePair
 from kcal.sim.coast import exposed, smooth_noise
 
@@ -23,12 +23,12 @@ STILL = (
 VAN = (30.0, 4.0, 12.0, -8.0, -1.0)
 
 
-def small_rig() -> StereoRig:
+def small_rig() -> Rig:
     """Lenses that distort, turned a little."""
     left = Camera.build(focal=(500, 501), center=(238, 161), size=SIZE, coefficients=[-0.12, 0.03, 2e-4, -1e-4])
     right = Camera.build(focal=(502, 500), center=(241, 158), size=SIZE, coefficients=[-0.11, 0.02, -1e-4, 2e-4])
     turn = rotation_from_vector(torch.tensor([0.01, 0.03, -0.02], dtype=torch.float64))
-    return StereoRig(left, right, turn, turn @ torch.tensor([-2.0, 0.05, 0.1], dtype=torch.float64))
+    return Rig.pair(left, right, turn, turn @ torch.tensor([-2.0, 0.05, 0.1], dtype=torch.float64))
 
 
 def drawn_pixels(draw: torch.Generator, count: int) -> torch.Tensor:
@@ -36,7 +36,7 @@ def drawn_pixels(draw: torch.Generator, count: int) -> torch.Tensor:
     rig, size = small_rig(), torch.tensor(SIZE, dtype=torch.float64)
     left = torch.rand(2 * count, 2, dtype=torch.float64, generator=draw) * (size - 1.0)
     ranges = 40.0 * 20.0 ** torch.rand(len(left), 1, dtype=torch.float64, generator=draw)
-    right = rig(ranges * rig.left.unproject(left)[0])[1]
+    right = rig(ranges * rig.left.unproject(left)[0])[0][:, 1]
     seen = rig.right.inside(right)
     return torch.stack([left, right], 1)[seen][:count]
 
@@ -70,11 +70,11 @@ def true_right(left: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         at = distance * rays
         inside = (at[:, 0] > low) & (at[:, 0] < high) & (at[:, 1] > top) & (at[:, 1] < bottom)
         depth = torch.where(inside, distance, depth)
-    return rig(depth[:, None] * rays)[1], depth
+    return rig(depth[:, None] * rays)[0][:, 1], depth
 
 
 def _light(
-    rig: StereoRig, side: int, planes: list[tuple[float, ...]], texture: float, turn: torch.Tensor | None
+    rig: Rig, side: int, planes: list[tuple[float, ...]], texture: float, turn: torch.Tensor | None
 ) -> NDArray[np.float64]:
     grid = torch.stack(torch.meshgrid(*(torch.arange(n).double() for n in SIZE), indexing="xy"), -1).reshape(-1, 2)
     rays, _ = (rig.right if side else rig.left).unproject(grid)

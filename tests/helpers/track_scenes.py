@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Origin, RigCovariance, StereoRig
+from kcal.lens.rig import Origin, Rig, RigCovariance
 from kcal.locate.budget import planned_rig
 from kcal.locate.localizer import StereoLocalizer
 from kcal.pipeline.pairing import ObjectViews
@@ -17,10 +17,10 @@ from kcal.pipeline.pairing import ObjectViews
 ORIGIN = Origin(lat=19.07, lon=72.87, height=14.0)
 
 
-def yawed_rig(rig: StereoRig, yaw: float) -> StereoRig:
+def yawed_rig(rig: Rig, yaw: float) -> Rig:
     """The rig with its right camera turned about its y axis, radians."""
     turn = rotation_from_vector(torch.tensor([0.0, yaw, 0.0], dtype=torch.float64))
-    return StereoRig(rig.left, rig.right, turn @ rig.right_from_left_rotation, rig.right_from_left_translation)
+    return Rig.pair(rig.left, rig.right, turn @ rig.right_from_left_rotation, rig.right_from_left_translation)
 
 
 def tracked_site(yaw_deg: float = 0.0, **options: object) -> StereoLocalizer:
@@ -49,7 +49,7 @@ def pairs_of(
 
 
 def seen_by(
-    rig: StereoRig, places: Tensor, sigma: float, generator: torch.Generator, later: Tensor | None = None
+    rig: Rig, places: Tensor, sigma: float, generator: torch.Generator, later: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Marks of places (N, 3) in the rig frame with noise; the right camera sees them where they are `later`."""
     left = rig.left.project(places)[0]

@@ -14,7 +14,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from kcal.lens.camera import Camera
-from kcal.lens.rig import Mounting, Origin, StereoRig
+from kcal.lens.rig import Mounting, Origin, Rig
 from scripts.shared.object_scene import Plate, exposed, paint_plate, plate
 
 SIZE = (320, 240)
@@ -23,10 +23,10 @@ VELOCITY = torch.tensor([[2.0, 0.5, 1.0], [-3.0, 0.0, -2.0]]).double()
 Image = npt.NDArray[np.uint8]
 
 
-def small_rig() -> StereoRig:
+def small_rig() -> Rig:
     """Two pinholes of 320 x 240 px, 2 m apart, that look north."""
     camera = Camera.build(focal=(400, 400), center=(159.5, 119.5), size=SIZE, model="pinhole")
-    rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-2.0, 0.0, 0.0]))
+    rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-2.0, 0.0, 0.0]))
     rig.mounting = Mounting(origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
     return rig
 
@@ -36,7 +36,7 @@ def places(time: float) -> Tensor:
     return START + time * VELOCITY
 
 
-def drawn_image(rig: StereoRig, side: int, time: float, random: np.random.Generator) -> Image:
+def drawn_image(rig: Rig, side: int, time: float, random: np.random.Generator) -> Image:
     """Gray levels of the left (0) or right (1) camera at a time: bright plates before a dark wall."""
     image = np.full(SIZE[::-1], 30.0)
     for number, point in enumerate(places(time)):
@@ -72,7 +72,7 @@ def write_video(
     return path
 
 
-def film(rig: StereoRig, side: int, times: Sequence[float], late: float = 0.0) -> list[Image]:
+def film(rig: Rig, side: int, times: Sequence[float], late: float = 0.0) -> list[Image]:
     """What a camera sees at some times of a clock; it exposes `late` seconds later."""
     random = np.random.default_rng(side)
     return [drawn_image(rig, side, time + late, random) for time in times]

@@ -16,7 +16,7 @@ from kcal.io.camera_file import CameraFile, camera_to_file, load_camera, save_ca
 from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 
 
 @pytest.mark.parametrize("kind", ["webcam", "wide"])
@@ -59,7 +59,7 @@ def test_covariance_and_rig(tmp_path: Path) -> None:
     again = file.covariance_matrix()
     assert again is not None
     assert torch.equal(again, factor @ factor.T)
-    rig = StereoRig(camera, hybrid_camera("wide", modes=FEW_MODES), torch.eye(3), torch.tensor([-0.5, 0.0, 0.0]))
+    rig = Rig.pair(camera, hybrid_camera("wide", modes=FEW_MODES), torch.eye(3), torch.tensor([-0.5, 0.0, 0.0]))
     back = load_rig(save_rig(rig, tmp_path / "rig.json"))
     assert (back.left.fingerprint, back.right.fingerprint) == (rig.left.fingerprint, rig.right.fingerprint)
 

@@ -18,7 +18,7 @@ from kcal.io.formats import import_cameras
 from kcal.io.lookup_file import load_lookup, save_lookup
 from kcal.lens.baking import bake
 from kcal.lens.camera import Camera
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def test_what_is_no_lookup_camera_is_refused(camera: Camera, tmp_path: Path, mon
 
 
 def test_a_matlab_pair_without_a_unit_is_in_millimeters_and_that_is_said(camera: Camera, tmp_path: Path) -> None:
-    rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-0.5, 0.0, 0.0]))
+    rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-0.5, 0.0, 0.0]))
     (path,) = write_matlab([rig.left, rig.right], rig_poses(rig), tmp_path / "two.mat")
     assert import_cameras(path).notes == ()
     content = {key: value for key, value in loadmat(path).items() if not key.startswith("__")}

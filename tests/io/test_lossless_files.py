@@ -18,7 +18,7 @@ from kcal.io.record import Packed
 from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
-from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.lens.rig import Rig, RigCovariance
 from kcal.locate.stations import load_camera_rig
 
 # Cameras, covariances, mounting with link, sources, records.
@@ -119,7 +119,7 @@ def test_it_does_not_outlive_the_parameters() -> None:
     with torch.no_grad():
         rig.left.params.copy_(load_rig(SAMPLE).left.params)
     assert rig.left.calibration is known
-    turned = StereoRig(rig.left, rig.right, rig.right_from_left_rotation, 2 * rig.right_from_left_translation)
+    turned = Rig.pair(rig.left, rig.right, rig.right_from_left_rotation, 2 * rig.right_from_left_translation)
     assert turned.covariance is None
     turned.load_state_dict(rig.state_dict())
     assert turned.covariance is None

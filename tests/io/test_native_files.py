@@ -26,7 +26,7 @@ from kcal.io.rig_file import RigFile, load_rig, rig_to_file, save_rig
 from kcal.lens.calibration import BoardRecord, CalibrationRecord, CameraCalibration, Exclusion, RigCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.model import PRESETS, LensModel
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.native_file import digest
 
 
@@ -50,9 +50,9 @@ def camera() -> Camera:
 
 
 @pytest.fixture(scope="module")
-def rig(camera: Camera) -> StereoRig:
+def rig(camera: Camera) -> Rig:
     rotation = rotation_about([0.6, 0.0, 0.8], 0.1)
-    return StereoRig(camera, awkward_camera("opencv5"), rotation, torch.tensor([-10.1, 0.2, 1 / 3]).double())
+    return Rig.pair(camera, awkward_camera("opencv5"), rotation, torch.tensor([-10.1, 0.2, 1 / 3]).double())
 
 
 def camera_calibration() -> CalibrationRecord:
@@ -277,14 +277,14 @@ class TestCamera:
 
 
 class TestRig:
-    def test_round_trip_is_exact(self, tmp_path: Path, rig: StereoRig) -> None:
+    def test_round_trip_is_exact(self, tmp_path: Path, rig: Rig) -> None:
         after = load_rig(save_rig(rig, tmp_path / "rig.json"))
         assert after.left.fingerprint == rig.left.fingerprint
         assert after.right.fingerprint == rig.right.fingerprint
         assert torch.equal(after.right_from_left_rotation, rig.right_from_left_rotation)
         assert torch.equal(after.right_from_left_translation, rig.right_from_left_translation)
 
-    def test_record_round_trip(self, tmp_path: Path, rig: StereoRig) -> None:
+    def test_record_round_trip(self, tmp_path: Path, rig: Rig) -> None:
         rig = copy.deepcopy(rig)
         rig.left.calibration = CameraCalibration(name="west", record=camera_calibration())
         rig.calibration = rig_calibration(float(rig.baseline))
@@ -295,7 +295,7 @@ class TestRig:
         assert after.calibration is not None
         assert after.calibration.frame == "left camera"
 
-    def test_kinds_are_told_apart(self, tmp_path: Path, rig: StereoRig) -> None:
+    def test_kinds_are_told_apart(self, tmp_path: Path, rig: Rig) -> None:
         rig_path = save_rig(rig, tmp_path / "rig.json")
         camera_path = save_camera(rig.left, tmp_path / "camera.json")
         with pytest.raises(FileError, match=r"rig\.json: this is a kcal rig file; a kcal camera file is needed"):
@@ -318,26 +318,24 @@ class TestRig:
             (["calibration", "pairs"], 5, "per_pair_rms has 1"),
         ],
     )
-    def test_wrong_field(
-        self, tmp_path: Path, rig: StereoRig, path_in_file: list[Any], value: Any, message: str
-    ) -> None:
+    def test_wrong_field(self, tmp_path: Path, rig: Rig, path_in_file: list[Any], value: Any, message: str) -> None:
         rig = copy.deepcopy(rig)
         rig.calibration = rig_calibration(float(rig.baseline))
         content = rig_to_file(rig).dump()
         assert_refused(load_rig, tmp_path, content, path_in_file, value, message)
 
-    def test_a_ragged_link_is_refused_by_its_name(self, tmp_path: Path, rig: StereoRig) -> None:
+    def test_a_ragged_link_is_refused_by_its_name(self, tmp_path: Path, rig: Rig) -> None:
         content = rig_to_file(rig).dump()
         content["mounting"] = {"lat": 1, "lon": 2, "height": 3, "heading_deg": 4, "pitch_deg": 5, "roll_deg": 6}
         content["mounting"]["covariance"] = [[float(i == j) for j in range(6)] for i in range(6)]
         content["mounting"]["link"] = [[0.0] * 6, [0.0] * 5]
         assert_refused(load_rig, tmp_path, content, ["mounting", "roll_deg"], 6, "the mounting's link must be 2 x 6")
 
-    def test_old_file_survives_a_refused_save(self, tmp_path: Path, rig: StereoRig) -> None:
+    def test_old_file_survives_a_refused_save(self, tmp_path: Path, rig: Rig) -> None:
         path = save_rig(rig, tmp_path / "rig.json")
         text = path.read_text()
         broken = copy.deepcopy(rig)
-        broken.right_from_left_translation[0] = math.nan
+        broken.translation[1, 0] = math.nan
         with pytest.raises(InputError, match=r"this rig cannot be stored: translation\.0: .*finite"):
             save_rig(broken, path)
         assert path.read_text() == text
@@ -346,7 +344,7 @@ class TestRig:
 
 @pytest.mark.parametrize("at", [["summary"], ["summary", "left"], ["left", "summary"]])
 @pytest.mark.parametrize("damage", ["none", "text", "without a field", "with one more", "wrong type"])
-def test_a_wrong_summary_counts_as_none(damage: str, at: list[str], rig: StereoRig, tmp_path: Path) -> None:
+def test_a_wrong_summary_counts_as_none(damage: str, at: list[str], rig: Rig, tmp_path: Path) -> None:
     content = rig_to_file(rig).dump()
     paths = (tmp_path / "good.json", tmp_path / "damaged.json")
     paths[0].write_text(json.dumps(content))

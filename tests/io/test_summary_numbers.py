@@ -12,7 +12,7 @@ from kcal.io.file_summary import CameraSummary, RigSummary, sigma_of, sigma_over
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.lens.rig import Rig, RigCovariance
 from kcal.lens.uncertainty import image_sigma
 from kcal.native_file import digest
 
@@ -71,11 +71,11 @@ def test_a_camera_at_a_glance() -> None:
     assert found.sigma_px is not None
 
 
-def rig(covariance: bool) -> StereoRig:
+def rig(covariance: bool) -> Rig:
     turn = rotation_from_vector(torch.tensor([0.01, -0.02, 0.03]).double())
     half = torch.randn(30, 26, generator=torch.Generator().manual_seed(4), dtype=torch.float64) * 1e-3
     half[:, -6:-3] *= 0.1
-    made = StereoRig(camera(), camera(), turn, torch.tensor([-10.0, 0.1, 0.2]).double())
+    made = Rig.pair(camera(), camera(), turn, torch.tensor([-10.0, 0.1, 0.2]).double())
     if covariance:
         made.covariance = RigCovariance(half=half)
     return made

@@ -13,7 +13,7 @@ from kcal.io.formats import FORMATS, import_cameras
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 
 LENS = (-0.21, 0.052, 1.1e-3, -2.3e-3, 0.013, 0.021, -0.032, 0.0041, 5e-4, -6e-4, 7e-4, -8e-4)
 SUFFIXES = {
@@ -69,7 +69,7 @@ def test_a_pair(name: str, tmp_path: Path) -> None:
     """Turned about all axes, the right camera not beside the left one alone."""
     model = "opencv5" if "opencv5" in FORMATS[name].models else "opencv4"
     turn = rotation_from_vector(torch.tensor([0.02, -0.05, 0.03]).double())
-    rig = StereoRig(camera(model), camera(model, 5), turn, torch.tensor([-0.52, 0.013, -0.021]).double())
+    rig = Rig.pair(camera(model), camera(model, 5), turn, torch.tensor([-0.52, 0.013, -0.021]).double())
     paths = FORMATS[name].write([rig.left, rig.right], rig_poses(rig), tmp_path / f"two{SUFFIXES[name][0]}")
     found = [import_cameras(path, format=name) for path in paths]
     cameras = [one for part in found for one in part.cameras]

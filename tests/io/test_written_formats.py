@@ -16,7 +16,7 @@ from kcal.io.format_mrcal import fit_spline, project_spline
 from kcal.io.format_opencv import write_matlab
 from kcal.io.formats import import_cameras
 from kcal.lens.camera import Camera
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 
 
 def lens(center: tuple[float, float] = (319.5, 239.5)) -> Camera:
@@ -25,8 +25,8 @@ def lens(center: tuple[float, float] = (319.5, 239.5)) -> Camera:
     )
 
 
-def pair() -> StereoRig:
-    return StereoRig(lens(), lens((300.0, 250.0)), torch.eye(3), torch.tensor([-0.1, 0.0, 0.0]))
+def pair() -> Rig:
+    return Rig.pair(lens(), lens((300.0, 250.0)), torch.eye(3), torch.tensor([-0.1, 0.0, 0.0]))
 
 
 def test_a_spline_covers_the_wider_side() -> None:

@@ -15,7 +15,7 @@ from kcal.lens.baking import bake
 from kcal.lens.camera import Camera
 from kcal.lens.camera_like import CameraLike
 from kcal.lens.images import Undistort, undistort_maps
-from kcal.lens.rig import CameraRig, Origin, StereoRig
+from kcal.lens.rig import Origin, Rig
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.locate.triangulate import Triangulate
@@ -52,8 +52,8 @@ every = pytest.mark.parametrize("kind", KINDS)
 POINTS = torch.tensor([[3.0, 2.0, 60.0], [15.0, -8.0, 120.0], [5.0, 1.0, 900.0]], dtype=torch.float64)
 
 
-def rig(*cameras: Any) -> StereoRig:
-    return StereoRig(*cameras, torch.eye(3), torch.tensor([-8.0, 0.0, 0.0]))
+def rig(*cameras: Any) -> Rig:
+    return Rig.pair(*cameras, torch.eye(3), torch.tensor([-8.0, 0.0, 0.0]))
 
 
 @every
@@ -61,7 +61,7 @@ def test_positions_are_those_of_the_camera_that_it_stands_for(kind: str) -> None
     """One of each make in a rig, too."""
     make, camera = KINDS[kind]
     assert isinstance(make(), CameraLike)
-    pixels = rig(camera, camera)(POINTS)[:2]
+    pixels = rig(camera, camera)(POINTS)[0].unbind(-2)
     origin = Origin(lat=50.0, lon=8.0, height=100.0)
     for pair in ((make(), make()), (make(), camera), (camera, make())):
         localize = [
@@ -73,7 +73,7 @@ def test_positions_are_those_of_the_camera_that_it_stands_for(kind: str) -> None
         # The table's error: 1e-5 px at a parallax of 8 px, for the farthest point.
         torch.testing.assert_close(found.enu, wanted.enu, rtol=1e-5, atol=1e-6)
         torch.testing.assert_close(found.covariance, wanted.covariance, rtol=1e-3, atol=1e-9)
-    many = CameraRig([make(), camera, make()], ["a", "b", "c"], torch.eye(3).repeat(3, 1, 1), 4.0 * torch.eye(3))
+    many = Rig([make(), camera, make()], ["a", "b", "c"], torch.eye(3).repeat(3, 1, 1), center=4.0 * torch.eye(3))
     seen, visible = many(POINTS)
     assert bool(visible.all())
     located = MultiViewLocalizer(many, pixel_sigma=0.1)(seen)
@@ -82,7 +82,7 @@ def test_positions_are_those_of_the_camera_that_it_stands_for(kind: str) -> None
 
 def test_gradients_reach_the_weights_of_a_users_camera() -> None:
     mine = Mine()
-    pixels = [part.detach() for part in rig(PLAIN, PLAIN)(POINTS)[:2]]
+    pixels = [part.detach() for part in rig(PLAIN, PLAIN)(POINTS)[0].unbind(-2)]
     triangulate = Triangulate(rig(mine, mine))
     (gradient,) = torch.autograd.grad(triangulate(*pixels).points[..., 2].sum(), mine.focal_length)
     # The depth is the focal length times the baseline over the disparity.

@@ -1,4 +1,4 @@
-"""`Camera` and `StereoRig` as modules: precision, devices' dtypes, state, batches, refusals."""
+"""`Camera` and `Rig` as modules: precision, devices' dtypes, state, batches, refusals."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from kcal.errors import InputError
 from kcal.lens.baking import bake
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 
 POINTS = torch.tensor([[0.1, -0.2, 1.1], [-0.6, 0.5, 1.3], [1.2, 0.9, 2.5]], dtype=torch.float64)
 
@@ -26,9 +26,9 @@ def make_camera(model: str | LensModel = "opencv14") -> Camera:
     return Camera(vector, size=(1920, 1080), model=model)
 
 
-def make_rig() -> StereoRig:
+def make_rig() -> Rig:
     rotation = torch.linalg.matrix_exp(torch.tensor([[0, -0.1, 0.2], [0.1, 0, -0.3], [-0.2, 0.3, 0]]).double())
-    return StereoRig(
+    return Rig.pair(
         make_camera(), make_camera("opencv5"), rotation, torch.tensor([-1 / 3, 0.1, 0.2], dtype=torch.float64)
     )
 
@@ -227,25 +227,27 @@ class TestRefusals:
     )
     def test_rig(self, rotation: torch.Tensor, translation: torch.Tensor, message: str) -> None:
         with pytest.raises(InputError, match=message):
-            StereoRig(make_camera(), make_camera(), rotation, translation)
+            Rig.pair(make_camera(), make_camera(), rotation, translation)
 
 
 class TestRig:
     def test_forward_is_its_parts(self) -> None:
         rig = make_rig()
-        left, right, valid = rig(POINTS)
+        pixels, valid = rig(POINTS)
+        left, right = pixels.unbind(-2)
         assert torch.equal(left, rig.left.project(POINTS)[0])
         right_points = POINTS @ rig.right_from_left_rotation.T + rig.right_from_left_translation
         assert torch.equal(right, rig.right.project(right_points)[0])
-        assert torch.equal(valid, rig.left.project(POINTS)[1] & rig.right.project(right_points)[1])
+        assert torch.equal(valid[:, 0], rig.left.project(POINTS)[1] & rig.left.inside(left))
+        assert torch.equal(valid[:, 1], rig.right.project(right_points)[1] & rig.right.inside(right))
 
     def test_valid_only_if_both_see(self) -> None:
         camera = Camera.build(focal=(100, 100), center=(50, 50), size=(101, 101), model="pinhole")
         turned = torch.diag(torch.tensor([-1.0, 1.0, -1.0]))
-        rig = StereoRig(camera, camera, turned, torch.tensor([0.0, 0.0, 5.0]))
+        rig = Rig.pair(camera, camera, turned, torch.tensor([0.0, 0.0, 5.0]))
         # The cameras face each other 5 m apart: only what lies between is in front of both.
         points = torch.tensor([[0.0, 0.0, 2.0], [0.0, 0.0, 6.0], [0.0, 0.0, -1.0]])
-        assert rig(points)[2].tolist() == [True, False, False]
+        assert rig(points)[1].all(-1).tolist() == [True, False, False]
 
     def test_baseline(self) -> None:
         assert float(make_rig().baseline) == pytest.approx((1 / 9 + 0.01 + 0.04) ** 0.5, rel=1e-15)

@@ -17,7 +17,7 @@ from kcal.io.lookup_file import save_onnx
 from kcal.lens.camera import Camera
 from kcal.lens.camera_like import Unproject
 from kcal.lens.model import PRESETS
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 
 # In front, beside the axis, off the image but in the lens, behind, and not a number.
 POINTS = torch.tensor(
@@ -214,9 +214,9 @@ class TestFiles:
     def test_a_whole_rig(self, tmp_path: Path) -> None:
         turn = torch.linalg.matrix_exp(torch.tensor([[0, -0.1, 0.2], [0.1, 0, -0.3], [-0.2, 0.3, 0]]).double())
         shift = torch.tensor([-1 / 3, 0.1, 0.2], dtype=torch.float64)
-        rig = StereoRig(make_camera("ext20"), make_camera("opencv5"), turn, shift)
+        rig = Rig.pair(make_camera("ext20"), make_camera("opencv5"), turn, shift)
         path = tmp_path / "rig.safetensors"
         safetensors.torch.save_file(rig.state_dict(), str(path))
-        other = StereoRig(make_camera("ext20", 0.1), make_camera("opencv5", 0.1), torch.eye(3), torch.ones(3))
+        other = Rig.pair(make_camera("ext20", 0.1), make_camera("opencv5", 0.1), torch.eye(3), torch.ones(3))
         other.load_state_dict(safetensors.torch.load_file(str(path)))
         assert all(torch.equal(a, b) for a, b in zip(other(POINTS[:3]), rig(POINTS[:3]), strict=True))

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from kcal import Camera, StereoLocalizer, StereoRig, load_rig, save_rig
+from kcal import Camera, Rig, StereoLocalizer, load_rig, save_rig
 from kcal.errors import InputError
 from kcal.lens import rotation_from_vector
 from kcal.lens.rig import Mounting, Origin
@@ -16,22 +16,22 @@ from kcal.locate import Triangulate
 from scripts.make_modules import PLACES, pairs, rig, stations, stereo
 
 
-def marks(truth: StereoRig) -> tuple[Tensor, Tensor]:
-    left, right, _ = truth(PLACES)
+def marks(truth: Rig) -> tuple[Tensor, Tensor]:
+    left, right = truth(PLACES)[0].unbind(-2)
     return left.detach(), right.detach()
 
 
 def test_an_optimizer_finds_a_turn_and_keeps_rotations() -> None:
     truth = rig(free=False)
     turn = rotation_from_vector(torch.tensor([[0.002, -0.003, 0.001]], dtype=torch.float64))[0]
-    off = StereoRig(truth.left, truth.right, turn @ truth.right_from_left_rotation, truth.right_from_left_translation)
+    off = Rig.pair(truth.left, truth.right, turn @ truth.right_from_left_rotation, truth.right_from_left_translation)
     assert not list(p for p in off.parameters() if p.requires_grad)
     off.free("rotation")
     optimizer = torch.optim.LBFGS([p for p in off.parameters() if p.requires_grad], line_search_fn="strong_wolfe")
 
     def loss() -> Tensor:
         optimizer.zero_grad()
-        pixels = torch.stack(off(PLACES)[:2])
+        pixels = torch.stack(off(PLACES)[0].unbind(-2))
         value: Tensor = (pixels - torch.stack(marks(truth))).square().sum()
         value.backward()  # type: ignore[no-untyped-call]
         return value
@@ -73,15 +73,15 @@ def test_states_with_and_without_a_step() -> None:
 
 
 def test_what_has_a_graph_keeps_it() -> None:
-    """Found: `StereoRig(..., nn.Parameter)` detached without a word."""
+    """Found: `Rig(..., nn.Parameter)` detached without a word."""
     start = rig(free=False)
     shift = nn.Parameter(start.right_from_left_translation.clone())
-    own = StereoRig(start.left, start.right, start.right_from_left_rotation, shift)
-    assert dict(own.named_parameters())["right_from_left_translation"] is shift
+    own = Rig.pair(start.left, start.right, start.right_from_left_rotation, shift)
+    assert dict(own.named_parameters())["translation"] is shift
     found = Triangulate(own)(*pairs().values())
     (by_shift,) = torch.autograd.grad(found.points.sum(), shift)
     vector = torch.zeros(1, 3, dtype=torch.float64, requires_grad=True)
-    made = StereoRig(start.left, start.right, rotation_from_vector(vector)[0], start.right_from_left_translation)
+    made = Rig.pair(start.left, start.right, rotation_from_vector(vector)[0], start.right_from_left_translation)
     (by_turn,) = torch.autograd.grad(Triangulate(made)(*pairs().values()).inverse_range.sum(), vector)
     assert bool((by_shift != 0).all() and (by_turn != 0).all())
 
@@ -90,9 +90,9 @@ def test_what_cannot_be_had_is_said() -> None:
     start = rig(free=False)
     turn, shift = start.right_from_left_rotation, start.right_from_left_translation
     with pytest.raises(InputError, match="free"):
-        StereoRig(start.left, start.right, nn.Parameter(turn), shift)
+        Rig.pair(start.left, start.right, nn.Parameter(turn), shift)
     with pytest.raises(InputError, match="float64"):
-        StereoRig(start.left, start.right, turn, nn.Parameter(shift.float()))
+        Rig.pair(start.left, start.right, turn, nn.Parameter(shift.float()))
     with pytest.raises(InputError, match="pose, rotation, translation"):
         start.free("yaw")
 
@@ -120,7 +120,7 @@ def test_one_station_of_several_and_a_mounting() -> None:
 
 def test_ranges_and_covariance_without_the_earth() -> None:
     one = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
-    own = StereoRig(one, one, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
+    own = Rig.pair(one, one, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
     left = torch.tensor([[960.0, 540.0], [960.0, 540.0], [float("nan"), 0.0]], dtype=torch.float64)
     right = left - torch.tensor([[16.0, 0.0], [-1.0, 0.0], [0.0, 0.0]], dtype=torch.float64)
     found = Triangulate(own, 0.1)(left, right)

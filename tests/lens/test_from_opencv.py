@@ -12,7 +12,7 @@ import torch
 
 from kcal.errors import InputError, KcalWarning
 from kcal.lens.camera import Camera
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 
 K = np.array([[800.0, 0, 322], [0, 820, 238], [0, 0, 1]])
 D = np.array([-0.2, 0.05, 1e-3, -2e-3, 0.01, 0.02, -0.01, 2e-3, 1e-3, -5e-4, 4e-4, 1e-4, 0.01, -0.02])
@@ -48,9 +48,9 @@ def test_a_fisheye_with_skew() -> None:
 def test_a_rig_of_stereo_calibrate() -> None:
     rotation, shift = cv2.Rodrigues(np.array([0.01, -0.02, 0.03]))[0], np.array([[-0.12], [0.001], [0.002]])
     camera = Camera.from_opencv(K, D[:5], SIZE)
-    rig = StereoRig(camera, camera, rotation, shift)
+    rig = Rig.pair(camera, camera, rotation, shift)
     expected = cv2.projectPoints(POINTS, cv2.Rodrigues(rotation)[0], shift, K, D[:5])[0][:, 0]
-    np.testing.assert_allclose(rig(POINTS)[1], expected, atol=1e-9)
+    np.testing.assert_allclose(rig(POINTS)[0][..., 1, :], expected, atol=1e-9)
     assert rig.right_from_left_translation.shape == (3,)
 
 
@@ -119,9 +119,9 @@ def test_what_is_not_doubted() -> None:
         )
 
 
-def make_rig(*shift: float, turn: tuple[float, float, float] = (0, 0, 0)) -> StereoRig:
+def make_rig(*shift: float, turn: tuple[float, float, float] = (0, 0, 0)) -> Rig:
     camera = Camera.from_opencv(K, None, SIZE)
-    return StereoRig(camera, camera, cv2.Rodrigues(np.array(turn, dtype=float))[0], np.array(shift)[:, None])
+    return Rig.pair(camera, camera, cv2.Rodrigues(np.array(turn, dtype=float))[0], np.array(shift)[:, None])
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.camera_conversions import ImageTransform
 from kcal.lens.images import Undistort, UndistortImage
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from scripts.make_kornia_vectors import PATH, vectors
 
 POINTS = torch.tensor([[0.1, -0.2, 1.1], [-0.3, 0.2, 1.3], [0.4, 0.3, 2.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
@@ -113,16 +113,16 @@ def test_unprojection_agrees() -> None:
     assert torch.allclose(theirs, POINTS, rtol=0, atol=1e-3)  # five steps of a fixed iteration
 
 
-def rig_with(lens: list[float]) -> StereoRig:
+def rig_with(lens: list[float]) -> Rig:
     turn = rotation_from_vector(torch.tensor([0.01, -0.03, 0.02], dtype=torch.float64))
     right = Camera.build(focal=(700, 705), center=(330, 236), size=(640, 480), coefficients=lens)
-    return StereoRig(camera_with("opencv5", lens), right, turn, torch.tensor([-1.0, 0.05, 0.02]))
+    return Rig.pair(camera_with("opencv5", lens), right, turn, torch.tensor([-1.0, 0.05, 0.02]))
 
 
 def test_a_pinhole_rig_in_the_epipolar_functions() -> None:
     rig = rig_with([])
     points = POINTS * 5
-    left, right, _ = rig(points)
+    left, right = rig(points)[0].unbind(-2)
     distance = epi.sampson_epipolar_distance(left[None], right[None], rig.fundamental[None])
     assert float(distance.max()) < 1e-18
     wrong = epi.sampson_epipolar_distance(left[None], right[None] + torch.tensor([0.0, 1.0]), rig.fundamental[None])
@@ -139,7 +139,7 @@ def test_a_pinhole_rig_in_the_epipolar_functions() -> None:
 
 def test_a_rig_with_lenses_by_rays() -> None:
     rig = rig_with([-0.25, 0.05])
-    left, right, _ = rig(POINTS * 5)
+    left, right = rig(POINTS * 5)[0].unbind(-2)
     planes = [camera.normalize(pixels)[0][None] for camera, pixels in ((rig.left, left), (rig.right, right))]
     assert float(epi.sampson_epipolar_distance(*planes, rig.essential[None]).max()) < 1e-24
     shift = rig.right_from_left_translation
@@ -157,20 +157,20 @@ def test_a_posed_rig_goes_to_kornia_and_comes_back() -> None:
     left, right = rig.to_kornia()
     points = POINTS * 5
     seen = rig(points)
-    for camera, pixels in zip((left, right), seen[:2], strict=True):
+    for camera, pixels in zip((left, right), seen[0].unbind(-2), strict=True):
         assert torch.allclose(camera.project(points[None])[0], pixels, rtol=0, atol=1e-9)
     # The frame may stand anywhere.
     moved = torch.eye(4).double()
     moved[:3, :3], moved[:3, 3] = rotation_from_vector(torch.tensor([0.3, -0.5, 1.0]).double()), torch.tensor([5, 6, 7])
     placed = [PinholeCamera(c.intrinsics, c.extrinsics @ moved, c.height, c.width) for c in (left, right)]
-    again = StereoRig.from_kornia(*placed)
+    again = Rig.from_kornia(*placed)
     assert torch.allclose(again.right_from_left_rotation, rig.right_from_left_rotation, atol=1e-14)
     assert torch.allclose(again.right_from_left_translation, rig.right_from_left_translation, atol=1e-13)
     assert torch.equal(again.left.params, Camera.from_kornia(camera_with("pinhole", []).to_kornia()).params)
     with pytest.raises(InputError, match="left camera has a lens"):
         rig_with([-0.2]).to_kornia()
     with pytest.raises(InputError, match=r"extrinsics \(1, 4, 4\) is needed, got Tensor"):
-        StereoRig.from_kornia(torch.eye(3), right)
+        Rig.from_kornia(torch.eye(3), right)
 
 
 @pytest.mark.parametrize(

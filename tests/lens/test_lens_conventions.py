@@ -12,7 +12,7 @@ from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.model import PRESETS, LensModel
 from kcal.lens.projection import INTRINSICS, parameter_names
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from scripts.shared.distorted import distort
 
 OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
@@ -68,13 +68,14 @@ class TestFrames:
 
     def test_rig_frame_is_the_left_camera(self) -> None:
         # The right camera stands 10 m to the right: its points are 10 m further left.
-        rig = StereoRig(self.camera, self.camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
-        left, right, valid = rig(torch.tensor([[0.0, 0.0, 100.0]]))
+        rig = Rig.pair(self.camera, self.camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
+        pixels, valid = rig(torch.tensor([[0.0, 0.0, 100.0]]))
+        (left, right), valid = pixels.unbind(-2), valid.all(-1)
         assert (left.tolist(), right.tolist(), valid.tolist()) == ([[640.0, 360.0]], [[540.0, 360.0]], [True])
 
     def test_rig_rotation_applies_before_translation(self) -> None:
         quarter = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
-        rig = StereoRig(self.camera, self.camera, quarter, torch.tensor([1.0, 2.0, 3.0]))
+        rig = Rig.pair(self.camera, self.camera, quarter, torch.tensor([1.0, 2.0, 3.0]))
         assert rig.right_from_left(torch.tensor([[4.0, 5.0, 6.0]])).tolist() == [[7.0, 7.0, -1.0]]
 
 

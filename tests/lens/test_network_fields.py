@@ -23,7 +23,7 @@ from kcal.lens.field_modes import NetworkModes
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.images import Undistort
 from kcal.lens.model import LensModel
-from kcal.lens.rig import CameraRig, Origin, StereoRig
+from kcal.lens.rig import Origin, Rig
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.triangulate import Triangulate
 
@@ -171,9 +171,9 @@ def test_a_users_own_loop_trains_it_through_rays() -> None:
 
 def test_positions_carry_gradients_to_the_weights() -> None:
     """Of triangulation and of the localizer, against differences."""
-    rig = StereoRig(camera("waves"), camera("waves"), torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
+    rig = Rig.pair(camera("waves"), camera("waves"), torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
     rig.left.free("field")
-    pixels = [part[:2] for part in rig(torch.tensor([[3.0, 2.0, 300.0], [20.0, -8.0, 150.0]], dtype=torch.float64))]
+    pixels = rig(torch.tensor([[3.0, 2.0, 300.0], [20.0, -8.0, 150.0]], dtype=torch.float64))[0].unbind(-2)
     assert rig.left.field is not None
     weight = rig.left.get_parameter("field.gate")
     origin = Origin(lat=50.0, lon=8.0, height=100.0)
@@ -266,9 +266,9 @@ def test_files(kind: str, tmp_path: Path) -> None:
     after = load_camera(path, field=field)
     assert after.fingerprint == own.fingerprint
     assert after.model == own.model
-    rig = StereoRig(own, own, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
+    rig = Rig.pair(own, own, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
     assert load_rig(save_rig(rig, tmp_path / "rig.json"), field=field).fingerprint == rig.fingerprint
-    many = CameraRig([own] * 3, ["a", "b", "c"], torch.eye(3).repeat(3, 1, 1), torch.eye(3))
+    many = Rig([own] * 3, ["a", "b", "c"], torch.eye(3).repeat(3, 1, 1), center=torch.eye(3))
     saved = save_camera_rig(many, tmp_path / "many.json")
     assert CameraRigFile.load(saved).rig(field).fingerprint == many.fingerprint
     if kind != "chain":

@@ -16,7 +16,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.camera_like import CameraRays, ray_error
 from kcal.lens.images import StereoRectification, Undistort, undistort_maps
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.lens.rig import Rig, RigCovariance
 from kcal.lens.views import Cylinder, cylinder_view, looking, pinhole_view, pupil_shift, shown_by
 from kcal.locate.disparity import DisparityRanges
 from tests.helpers.lenses import HYBRID
@@ -25,7 +25,7 @@ F64 = torch.float64
 LEFT = Camera.build(focal=(500, 500), center=(322, 238), size=(640, 480), coefficients=[-0.2, 0.03])
 RIGHT = Camera.build(focal=(510, 508), center=(312, 242), size=(640, 480), coefficients=[-0.18, 0.02, 1e-3, 5e-4])
 TURN = rotation_from_vector(torch.tensor([0.02, -0.1, 0.03], dtype=F64))
-RIG = StereoRig(LEFT, RIGHT, TURN, -TURN @ torch.tensor([2.0, 0.1, 0.05], dtype=F64))
+RIG = Rig.pair(LEFT, RIGHT, TURN, -TURN @ torch.tensor([2.0, 0.1, 0.05], dtype=F64))
 
 
 def with_pupil(first: float = 0.004) -> Camera:
@@ -130,7 +130,7 @@ class TestStereo:
         shift = -turn @ torch.tensor(place, dtype=F64)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            rig = StereoRig(LEFT, RIGHT, turn, shift)
+            rig = Rig.pair(LEFT, RIGHT, turn, shift)
         rectify, there = StereoRectification(rig, **options), points()
         if not rolled:
             lens, more = np.array([-0.2, 0.03, 0, 0, 0]), np.array([-0.18, 0.02, 1e-3, 5e-4, 0])
@@ -145,7 +145,8 @@ class TestStereo:
         if not options:
             assert bool(rectify.left.mask.all() and rectify.right.mask.all())
             assert rectify.camera.focal[0] < (2000 if place[1] == -1.6 else 900)
-        seen_left, seen_right, valid = rig(there)
+        pixels, valid = rig(there)
+        (seen_left, seen_right), valid = pixels.unbind(-2), valid.all(-1)
         turned = there @ rectify.rotation
         left, _ = rectify.camera.project(turned)
         right, _ = rectify.camera.project(turned - rectify.right_center)
@@ -190,7 +191,7 @@ class TestStereo:
         assert int(ok.sum()) > 30
         assert float((found.range - ranges)[ok].abs().max()) < 1e-4
         assert float((found.sigma / (0.3 * ranges / disparity) - 1)[ok].abs().max()) < 0.05
-        known = StereoRig(LEFT, RIGHT, TURN, RIG.right_from_left_translation)
+        known = Rig.pair(LEFT, RIGHT, TURN, RIG.right_from_left_translation)
         yaw = torch.zeros(6, dtype=F64)
         yaw[1] = 1e-3**2
         known.covariance = RigCovariance.of(known, pose=torch.diag(yaw))
@@ -203,7 +204,7 @@ class TestStereo:
         assert bool(nothing.sigma.isinf().all())
 
     def test_refused(self) -> None:
-        ahead = StereoRig(LEFT, RIGHT, torch.eye(3), torch.tensor([0.0, 0.0, -1.0]))
+        ahead = Rig.pair(LEFT, RIGHT, torch.eye(3), torch.tensor([0.0, 0.0, -1.0]))
         with pytest.raises(DegenerateError, match="the left camera looks 0 degrees from the baseline"):
             StereoRectification(ahead)
         with pytest.raises(InputError, match="alpha"):
@@ -215,7 +216,7 @@ class TestStereo:
         ):
             turn = rotation_from_vector(torch.tensor([math.radians(degrees), 0.0, 0.0], dtype=F64))
             with pytest.raises(DegenerateError, match=text):
-                StereoRectification(StereoRig(LEFT, RIGHT, turn, -turn[:, 0]), **options)
+                StereoRectification(Rig.pair(LEFT, RIGHT, turn, -turn[:, 0]), **options)
 
 
 class TestRays:
@@ -264,7 +265,7 @@ class TestRays:
 def test_rectified_pairs_stay_upright_wherever_the_second_camera_is(place: tuple[float, float, float]) -> None:
     """A dot near the top of the image stays there, but where the baseline is vertical, and nothing is refused."""
     camera = Camera.build(focal=(450, 450), center=(319.5, 179.5), size=(640, 360), model="pinhole")
-    rig = StereoRig(camera, camera, torch.eye(3, dtype=F64), torch.tensor(place, dtype=F64))
+    rig = Rig.pair(camera, camera, torch.eye(3, dtype=F64), torch.tensor(place, dtype=F64))
     image = torch.zeros(1, 1, 360, 640, dtype=F64)
     image[..., 50, 320] = 1
     seen = StereoRectification(rig, field_of_view=60.0)(image, image)[0][0, 0]

@@ -80,7 +80,7 @@ class TestDisparities:
 def test_errors_against_a_truth() -> None:
     """Across east and north, along the range, and whether the interval contains it."""
     points = tensor([0.0, 0.0, 500.0], [9.0, 0.0, 800.0], [0.0, 0.0, 900.0])
-    left, right, _ = RIG(points)
+    left, right = RIG(points)[0].unbind(-2)
     left[2] = math.nan
     located = locate_points(RIG, left, right, origin=ORIGIN, heading_deg=0.0, **STRAIGHT)
     # The second is said to be 3 m to the east, 4 m to the south and 200 m farther than it is.
@@ -105,7 +105,7 @@ def test_errors_against_a_truth() -> None:
 def test_rows_of_a_file_that_grows(suffix: str) -> None:
     """What begins the file stands before the first rows only; each thing has rows of its own."""
     points = tensor([0.0, 0.0, 500.0], [9.0, 0.0, 800.0])
-    left, right, _ = RIG(points)
+    left, right = RIG(points)[0].unbind(-2)
     run = locate_points(RIG, left, right, origin=ORIGIN, heading_deg=0.0, names=["mast", "mill"], **STRAIGHT)
     time = datetime.datetime(2026, 1, 2, 3, 4, 5, tzinfo=datetime.UTC)
     first, later = (appended(suffix, run, run.columns, time, first=one).decode() for one in (True, False))
@@ -127,7 +127,7 @@ def test_the_direction_that_no_point_explains() -> None:
     """Of four pixel coordinates: of length one, across the derivatives by the point, so along the epipolar error."""
     rig = real_rig()
     points = spread_points(torch.tensor([80.0, 300.0, 2000.0], dtype=torch.float64))
-    left, right, _ = rig(points)
+    left, right = rig(points)[0].unbind(-2)
     found = fit_pairs(rig, left, right)
     assert found.status.tolist() == [PositionStatus.OK] * 3
     # What the gain does not reach: its null space.

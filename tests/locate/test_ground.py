@@ -12,7 +12,7 @@ import torch
 
 from kcal.errors import FileError, InputError
 from kcal.lens.camera import Camera
-from kcal.lens.rig import CameraRig, Mounting, Origin
+from kcal.lens.rig import Mounting, Origin, Rig
 from kcal.locate.geodesy import enu_from_cam, geodetic_to_enu
 from kcal.locate.ground import level_ground, locate_on_ground
 from kcal.locate.mounting import mounting_covariance
@@ -191,7 +191,7 @@ def test_one_camera_of_a_rig_meets_the_ground_as_a_camera_alone_does(tmp_path: P
     stand = stands(heading_deg=0.0, pitch_deg=0.0, roll_deg=0.0, refraction=0.2, covariance=known)
     look = enu_from_cam(0.0).T
     centers = torch.tensor([[0.0, 0, 0], [200.0, 0, 0]], dtype=torch.float64)
-    rig = CameraRig([CAMERA] * 2, ["a", "b"], torch.stack([look, look]), centers, origin=ORIGIN, refraction=0.2)
+    rig = Rig([CAMERA] * 2, ["a", "b"], torch.stack([look, look]), center=centers, origin=ORIGIN, refraction=0.2)
     rig.root = rig.with_errors(position_m=(0.5, 0.5, 0.3), attitude_deg=(0.01, 0.01, 0.02), refraction=0.1)
     # The plain, the ridge, unknown ground over it, the sky.
     aims = [[0.0, 300, -50], [40, 700, -50], [0, 1000, -50], [0, 2000, 1], [0, 1000, 50]]

@@ -12,7 +12,7 @@ from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.projection import project_components
-from kcal.lens.rig import Origin, RigCovariance, StereoRig
+from kcal.lens.rig import Origin, Rig, RigCovariance
 from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic
 from kcal.locate.localizer import Localization, StereoLocalizer
 from kcal.locate.mounting import mounting_covariance
@@ -25,7 +25,7 @@ ATTITUDE = {"heading_deg": 200.0, "pitch_deg": 3.0, "roll_deg": -2.0}
 N = 8000
 
 
-def localizer(rig: StereoRig = RIG, **options: object) -> StereoLocalizer:
+def localizer(rig: Rig = RIG, **options: object) -> StereoLocalizer:
     """Of a rig that sees along straight lines."""
     straight = {"refraction": 0.0, "refraction_sigma": 0.0}
     return StereoLocalizer(rig, **{"origin": ORIGIN, **ATTITUDE, **straight, **options})
@@ -41,7 +41,7 @@ def covered(found: Localization, truth: torch.Tensor) -> float:
 
 def test_exact_marks_give_enu_and_wgs84() -> None:
     points = spread_points(torch.logspace(1.8, 4, 40, dtype=torch.float64))
-    left, right, _ = RIG(points)
+    left, right = RIG(points)[0].unbind(-2)
     found = localizer(pixel_sigma=0.01)(left, right)
     enu = points @ enu_from_cam(*ATTITUDE.values()).T
     assert (found.status == PositionStatus.OK).all()
@@ -56,13 +56,13 @@ def test_exact_marks_give_enu_and_wgs84() -> None:
 
 
 def test_the_point_has_the_least_weighted_reprojection_error() -> None:
-    left, right, _ = RIG(spread_points(tensor(80.0, 400.0, 2500.0)))
+    left, right = RIG(spread_points(tensor(80.0, 400.0, 2500.0)))[0].unbind(-2)
     left, right = left + noise(0.4, 3, 2), right + noise(0.4, 3, 2, seed=4)
     root = noise(0.3, 3, 4, 4, seed=5) + 0.3 * torch.eye(4, dtype=torch.float64)
     cov = root @ root.mT + 0.02 * torch.eye(4, dtype=torch.float64)
     points = localizer()(left, right, cov).enu @ enu_from_cam(*ATTITUDE.values())
     points = points.requires_grad_()
-    again = torch.cat(RIG(points)[:2], -1)
+    again = torch.cat(RIG(points)[0].unbind(-2), -1)
     misses = again - torch.cat([left, right], -1)
     cost = (misses[:, None] @ torch.linalg.inv(cov) @ misses[..., None]).sum()
     (gradient,) = torch.autograd.grad(cost, points)
@@ -73,7 +73,7 @@ def test_the_point_has_the_least_weighted_reprojection_error() -> None:
 @pytest.mark.parametrize("z", [100.0, 1000.0, 5000.0])
 def test_covariance_and_interval_cover_what_noise_does(z: float) -> None:
     point = z * tensor([0.2, -0.05, 1.0])
-    left, right, _ = RIG(point)
+    left, right = RIG(point)[0].unbind(-2)
     # Unlike and correlated noise in the four coordinates.
     root = 0.1 * tensor([1.0, 0, 0, 0], [0.3, 0.8, 0, 0], [0.2, 0, 1.5, 0], [0, 0.1, 0.4, 0.5])
     marks = torch.cat([left, right], -1) + noise(1.0, N, 4) @ root.T
@@ -91,7 +91,7 @@ def test_covariance_and_interval_cover_what_noise_does(z: float) -> None:
 def test_errors_of_the_calibration_are_in_the_interval(z: float) -> None:
     """Rigs drawn from their own covariance, with correlations, seen by a user who believes the mean rig."""
     left = Camera.build(focal=(1600, 1605), center=(957, 541), size=SIZE, coefficients=[-0.2, 0.05], model="opencv4")
-    rig = StereoRig(left, left, turned(0.5, 0.2), tensor(-10.0, 0.1, 0.3))
+    rig = Rig.pair(left, left, turned(0.5, 0.2), tensor(-10.0, 0.1, 0.3))
     sigma = torch.cat(
         [tensor(0.4, 0.4, 0.3, 0.3, 0.0, 1e-4, 1e-4, 1e-5, 1e-5)] * 2 + [tensor(3e-5, 3e-5, 3e-5, 1e-3, 1e-3, 1e-3)]
     )
@@ -119,7 +119,7 @@ def test_errors_of_the_calibration_are_in_the_interval(z: float) -> None:
 
 
 def test_mounting_adds_the_origin_and_what_a_turn_does_at_a_distance() -> None:
-    left, right, _ = RIG(spread_points(tensor(1000.0)))
+    left, right = RIG(spread_points(tensor(1000.0)))[0].unbind(-2)
     plain = localizer()(left, right)
     standing = mounting_covariance(origin_m=(0.5, 0.0, 0.0), attitude_deg=(0.0, 0.0, 0.1))
     added = localizer(mounting=standing)(left, right).covariance - plain.covariance
@@ -135,7 +135,7 @@ def test_mounting_adds_the_origin_and_what_a_turn_does_at_a_distance() -> None:
 
 def test_places_follow_the_origin_and_turns_of_the_mounting() -> None:
     """By autograd through a rigid motion; with origin and attitude correlated, the signs of turns show."""
-    left, right, _ = RIG(spread_points(tensor(300.0, 1000.0)))
+    left, right = RIG(spread_points(tensor(300.0, 1000.0)))[0].unbind(-2)
     plain = localizer()(left, right)
 
     def moved(standing: torch.Tensor, enu: torch.Tensor) -> torch.Tensor:
@@ -149,7 +149,7 @@ def test_places_follow_the_origin_and_turns_of_the_mounting() -> None:
 
 
 def test_refraction_lowers_the_point() -> None:
-    left, right, _ = RIG(spread_points(tensor(5000.0)))
+    left, right = RIG(spread_points(tensor(5000.0)))[0].unbind(-2)
     straight, bent = localizer()(left, right), localizer(refraction=0.13)(left, right)
     assert (straight.enu - bent.enu)[0, 2].item() == pytest.approx(
         0.13 * float(straight.enu[0, :2].norm()) ** 2 / 2 / 6.37e6, rel=5e-3
@@ -159,7 +159,7 @@ def test_refraction_lowers_the_point() -> None:
 
 def test_refraction_of_standard_air_is_the_default() -> None:
     """k = 0.13 ± 0.1: the up component alone moves, and what is not known of k is added to its variance."""
-    left, right, _ = RIG(spread_points(tensor(300.0, 1000.0, 5000.0)))
+    left, right = RIG(spread_points(tensor(300.0, 1000.0, 5000.0)))[0].unbind(-2)
     straight, found = localizer()(left, right), StereoLocalizer(RIG, origin=ORIGIN, **ATTITUDE)(left, right)
     bend = straight.enu[:, :2].square().sum(-1) / (2 * 6.371e6)
     torch.testing.assert_close(found.enu[:, :2], straight.enu[:, :2], rtol=0, atol=0)
@@ -183,7 +183,7 @@ def test_heights_are_inside_their_intervals_where_light_bends() -> None:
     enu = 5000.0 * torch.stack([azimuth.sin(), azimuth.cos(), torch.zeros_like(azimuth)], -1)
     k = 0.13 + 0.1 * torch.randn(len(enu), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     seen = enu + torch.stack([0 * k, 0 * k, k * enu[:, :2].square().sum(-1) / (2 * 6.371e6)], -1)
-    left, right, _ = RIG(seen @ enu_from_cam(*ATTITUDE.values()))
+    left, right = RIG(seen @ enu_from_cam(*ATTITUDE.values()))[0].unbind(-2)
     found = StereoLocalizer(RIG, origin=ORIGIN, **ATTITUDE, pixel_sigma=0.05)(
         left + noise(0.05, 400, 2), right + noise(0.05, 400, 2, seed=4)
     )
@@ -250,7 +250,7 @@ def test_statuses_and_no_nan_in_values_or_gradients() -> None:
 
 
 def test_gradients_of_everything() -> None:
-    left, right, _ = RIG(spread_points(tensor(60.0, 900.0)))
+    left, right = RIG(spread_points(tensor(60.0, 900.0)))[0].unbind(-2)
     left, right = left + noise(0.5, 2, 2), right + noise(0.5, 2, 2, seed=4)
     cov = 0.1 * torch.eye(4, dtype=torch.float64).repeat(2, 1, 1) + 0.02
     module = localizer()
@@ -276,7 +276,7 @@ def test_gradients_of_everything() -> None:
 
 def test_gradients_reach_freed_parameters_of_a_camera() -> None:
     rig = real_rig()
-    left, right, _ = rig(spread_points(tensor(800.0)))
+    left, right = rig(spread_points(tensor(800.0)))[0].unbind(-2)
     module = localizer(rig)
     rig.right.free("cx")
     module(left, right).enu.norm().backward()
@@ -286,7 +286,7 @@ def test_gradients_reach_freed_parameters_of_a_camera() -> None:
     }
     ranges = {}
     for sign, camera in moved.items():
-        other = StereoRig(rig.left, camera, rig.right_from_left_rotation, rig.right_from_left_translation)
+        other = Rig.pair(rig.left, camera, rig.right_from_left_rotation, rig.right_from_left_translation)
         ranges[sign] = localizer(other)(left, right).enu.norm().item()
     slope = (ranges[1] - ranges[-1]) / 2e-3
     assert rig.right.params.grad[2].item() == pytest.approx(slope, rel=1e-6)
@@ -294,7 +294,7 @@ def test_gradients_reach_freed_parameters_of_a_camera() -> None:
 
 def test_batches_pieces_and_precision() -> None:
     points = spread_points(torch.linspace(50, 3000, 40_000, dtype=torch.float64))
-    left, right, _ = RIG(points)
+    left, right = RIG(points)[0].unbind(-2)
     module = localizer()
     flat = module(left, right)
     deep = module(left[:24].reshape(2, 3, 4, 2), right[:24].reshape(2, 3, 4, 2))
@@ -312,7 +312,7 @@ def test_batches_pieces_and_precision() -> None:
 
 
 def test_agrees_with_triangulate() -> None:
-    left, right, _ = RIG(spread_points(torch.logspace(2, 3.7, 9, dtype=torch.float64)))
+    left, right = RIG(spread_points(torch.logspace(2, 3.7, 9, dtype=torch.float64)))[0].unbind(-2)
     ours, theirs = localizer(pixel_sigma=0.1)(left, right), Triangulate(RIG, 0.1)(left, right)
     assert torch.equal(ours.range_high, theirs.range_high)
     assert torch.equal(ours.range_low, theirs.range_low)
@@ -322,13 +322,13 @@ def test_agrees_with_triangulate() -> None:
 
 def test_sensitivities() -> None:
     rig = pinhole_rig(1600.0, 10.0)
-    left, right, _ = rig(tensor([0.0, 0.0, 5000.0], [0.0, 0.0, 1000.0]))
+    left, right = rig(tensor([0.0, 0.0, 5000.0], [0.0, 0.0, 1000.0]))[0].unbind(-2)
     slopes = StereoLocalizer(rig, origin=ORIGIN, heading_deg=0.0).sensitivity(left, right)
     # Z² / (f b) m/px, and Z² / b m/rad: 436 m for 0.01° at 5 km.
     assert slopes.meters_per_pixel.tolist() == pytest.approx([1562.5, 62.5], rel=1e-3)
     assert slopes.meters_per_degree.tolist() == pytest.approx([43_633, 1745.3], rel=1e-3)
     # By turning the rig and locating again.
-    turned_rig = StereoRig(rig.left, rig.right, turned(1e-4), rig.right_from_left_translation)
+    turned_rig = Rig.pair(rig.left, rig.right, turned(1e-4), rig.right_from_left_translation)
     module = StereoLocalizer(turned_rig, origin=ORIGIN, heading_deg=0.0)
     moved = module(left, right).enu.norm(dim=-1) - tensor(5000.0, 1000.0)
     assert moved.abs().tolist() == pytest.approx([4.3633, 0.17453], rel=2e-3)
@@ -357,7 +357,7 @@ def test_a_detector_is_trained_through_it() -> None:
     truth = torch.stack(
         [torch.linspace(-30, 30, 16), torch.linspace(8, -8, 16), torch.linspace(250, 600, 16)], -1
     ).double()
-    left, right, _ = rig(truth)
+    left, right = rig(truth)[0].unbind(-2)
     corners = [pixels.detach().round() - 16 for pixels in (left, right)]
     grid = torch.arange(33.0)
     crops = []
@@ -417,4 +417,4 @@ def test_bad_arguments() -> None:
     with pytest.raises(InputError, match="sigmas"):
         mounting_covariance(origin_m=(-1.0, 0.0, 0.0))
     with pytest.raises(DegenerateError, match="same place"):
-        localizer(StereoRig(RIG.left, RIG.left, torch.eye(3), torch.zeros(3)))
+        localizer(Rig.pair(RIG.left, RIG.left, torch.eye(3), torch.zeros(3)))

@@ -36,7 +36,7 @@ ROWS = 250
 
 def pixels() -> torch.Tensor:
     """(250, 2, 2): located ones, and one of each failure that marks can cause."""
-    left, right, _ = real_rig()(spread_points(torch.logspace(2, 4.5, ROWS, dtype=torch.float64)))
+    left, right = real_rig()(spread_points(torch.logspace(2, 4.5, ROWS, dtype=torch.float64)))[0].unbind(-2)
     both = torch.stack([left, right], 1).detach()
     both[3] = torch.tensor([[-5.0, 3.0], [1.0, 3.0]])
     both[100, 1, 0] += 40.0

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.lens.rig import CameraRig
+from kcal.lens.rig import Rig
 from kcal.locate.geodesy import enu_to_geodetic
 from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.locate.stereo import PositionStatus
@@ -69,8 +69,9 @@ def test_any_subset_of_cameras_is_as_if_the_others_were_not_there() -> None:
         seen = torch.zeros(3, 5, dtype=torch.bool)
         seen[:, chosen] = True
         found = MultiViewLocalizer(rig, root=root)(torch.where(seen[..., None], pixels, math.nan), seen)
-        few = CameraRig(
-            [rig.each[c] for c in chosen], [rig.names[c] for c in chosen], rig.rotation[chosen], rig.center[chosen],
+        few = Rig(
+            [rig.each[c] for c in chosen], [rig.names[c] for c in chosen], rig.rotation[chosen],
+            center=rig.center[chosen],
             origin=ORIGIN,
         )  # fmt: skip
         less = few.with_errors(position_m=0.1, attitude_deg=0.01, refraction=0.1)
@@ -213,7 +214,7 @@ def test_one_camera_with_a_stated_height() -> None:
 @pytest.mark.parametrize("count", [1, 3])
 def test_one_camera_alone_is_as_one_of_several(count: int) -> None:
     rig, points = ring(3, 9000.0), targets(4) - torch.tensor([0.0, 0.0, 400.0])
-    few = CameraRig(rig.each[:count], rig.names[:count], rig.rotation[:count], rig.center[:count], origin=ORIGIN)
+    few = Rig(rig.each[:count], rig.names[:count], rig.rotation[:count], center=rig.center[:count], origin=ORIGIN)
     pixels = marks(rig, points)[:, :count]
     seen = torch.arange(count).expand(4, count) == 0
     height = enu_to_geodetic(points, ORIGIN)[:, 2]
@@ -240,4 +241,4 @@ def test_bad_arguments() -> None:
     with pytest.raises(InputError, match="a root"):
         MultiViewLocalizer(rig, root=torch.ones(2, 5))
     with pytest.raises(InputError, match="unlike names"):
-        CameraRig(rig.each, ["a", "a", "b"], rig.rotation, rig.center)
+        Rig(rig.each, ["a", "a", "b"], rig.rotation, center=rig.center)

@@ -8,7 +8,7 @@ from locate_rigs import SIZE, tensor, turned
 
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
-from kcal.lens.rig import CameraRig
+from kcal.lens.rig import Rig
 from kcal.locate.stereo import PositionStatus
 from kcal.locate.triangulate import Method, Triangulate
 
@@ -35,7 +35,7 @@ def views(
 ) -> Triangulate:
     pose = poses() if pose is None else pose
     turn, shift = pose[:, :, :3], pose[:, :, 3:]
-    rig = CameraRig(cameras, [str(c) for c in range(len(cameras))], turn, -(turn.mT @ shift)[..., 0])
+    rig = Rig(cameras, [str(c) for c in range(len(cameras))], turn, center=-(turn.mT @ shift)[..., 0])
     return Triangulate(rig, method=method)
 
 

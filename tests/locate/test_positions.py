@@ -43,7 +43,7 @@ def mixed() -> Located:
 
 def test_end_to_end_with_real_lenses() -> None:
     rig, truth = real_rig(), spread_points(torch.logspace(2, 3.7, 9, dtype=torch.float64))
-    left, right, _ = rig(truth)
+    left, right = rig(truth)[0].unbind(-2)
     located = locate_points(
         rig, left, right, origin=ORIGIN, heading_deg=200.0, pitch_deg=3.0, roll_deg=-2.0, **STRAIGHT
     )

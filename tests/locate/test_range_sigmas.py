@@ -9,7 +9,7 @@ import torch
 from locate_rigs import real_rig, tensor
 
 from kcal.errors import InputError
-from kcal.lens.rig import Mounting, Origin, RigCovariance, StereoRig
+from kcal.lens.rig import Mounting, Origin, Rig, RigCovariance
 from kcal.locate.budget import planned_rig, range_sigmas, usual_ranges
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.mounting import mounting_covariance
@@ -19,14 +19,14 @@ ORIGIN = Origin(lat=-33.9, lon=151.2, height=40.0)
 SIZE = len(planned_rig().left.names)
 
 
-def known(rig: StereoRig, *errors: torch.Tensor) -> StereoRig:
+def known(rig: Rig, *errors: torch.Tensor) -> Rig:
     """The rig with independent errors, each of which moves all of its quantities."""
     half = torch.stack(errors)
     rig.covariance = RigCovariance.of(rig, joint=half.T @ half)
     return rig
 
 
-def error(rig: StereoRig, **parts: float) -> torch.Tensor:
+def error(rig: Rig, **parts: float) -> torch.Tensor:
     """One error of a planned rig: left_cx in px, yaw in radians."""
     value = torch.zeros(2 * SIZE + 6, dtype=torch.float64)
     value[rig.left.names.index("cx")] = parts.get("left_cx", 0.0)
@@ -73,7 +73,7 @@ def test_parts_sum_to_what_the_localizer_says_and_pose_is_conditional() -> None:
     squares = torch.stack([found.marks, found.lenses, found.pose]).square().sum(0)
     torch.testing.assert_close(squares, found.total.square())
     both = rig.right_from_left_rotation[2] + tensor(0.0, 0.0, 1.0)
-    left, right, _ = rig(found.distance[:, None] * both / both.norm())
+    left, right = rig(found.distance[:, None] * both / both.norm())[0].unbind(-2)
     located = StereoLocalizer(rig, pixel_sigma=0.1)(left, right)
     torch.testing.assert_close(found.total, located.inverse_range_sigma * found.distance**2, rtol=1e-6, atol=0)
     # With exact lenses: the covariance of the pose is its Schur complement, and that of the lenses is zero.

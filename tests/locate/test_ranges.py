@@ -17,7 +17,7 @@ def test_interval_covers_95_percent_of_noisy_marks(z: float) -> None:
     # f b = 16 000 px m: 16, 3.2 and 1 px of disparity against 0.42 px of noise in it.
     rig = pinhole_rig(1600.0, 10.0)
     point = tensor([150.0, -40.0, z])
-    left, right, _ = rig(point)
+    left, right = rig(point)[0].unbind(-2)
     generator = torch.Generator().manual_seed(11)
     noise = 0.3 * torch.randn(2, N, 2, dtype=torch.float64, generator=generator)
     result = Triangulate(rig, pixel_sigma=0.3)(left + noise[0], right + noise[1])
@@ -33,7 +33,8 @@ def test_interval_covers_95_percent_of_noisy_marks(z: float) -> None:
 def test_interval_covers_through_real_lenses_and_off_axis() -> None:
     rig = real_rig()
     point = tensor([900.0, 500.0, 2000.0])
-    left, right, seen = rig(point)
+    pixels, seen = rig(point)
+    (left, right), seen = pixels.unbind(-2), seen.all(-1)
     assert seen.all()
     generator = torch.Generator().manual_seed(12)
     noise = 0.5 * torch.randn(2, N, 2, dtype=torch.float64, generator=generator)

@@ -10,7 +10,7 @@ from locate_rigs import real_rig, tensor
 
 from kcal.errors import InputError
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Mounting, Origin, RigCovariance, StereoRig
+from kcal.lens.rig import Mounting, Origin, Rig, RigCovariance
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.mounting import run_errors
@@ -34,13 +34,13 @@ def located(link: bool) -> tuple[torch.Tensor, torch.Tensor]:
         rig, origin=ORIGIN, heading_deg=35.0, pitch_deg=-1.0, roll_deg=0.5, pixel_sigma=0.1, calibration=known,
         mounting=whole[6:, 6:], link=cross if link else None,
     )  # fmt: skip
-    found = localize(*rig(POINTS)[:2])
+    found = localize(*rig(POINTS)[0].unbind(-2))
     return found.enu, found.covariance
 
 
 def test_covariance_is_that_of_moving_rig_and_mounting() -> None:
     rig = real_rig()
-    left, right, _ = rig(POINTS)
+    left, right = rig(POINTS)[0].unbind(-2)
     plain = StereoLocalizer(rig, origin=ORIGIN, heading_deg=35.0, pitch_deg=-1.0, roll_deg=0.5, pixel_sigma=0.1)
     start = plain(left, right)
     expected = start.covariance.clone()
@@ -50,7 +50,7 @@ def test_covariance_is_that_of_moving_rig_and_mounting() -> None:
         for sign in (-1e-3, 1e-3):
             turn = rotation_from_vector(sign * step[:3])
             pose = turn @ rig.right_from_left_rotation, rig.right_from_left_translation + sign * step[3:6]
-            moved = StereoLocalizer(StereoRig(rig.left, rig.right, *pose), origin=ORIGIN, heading_deg=35.0)
+            moved = StereoLocalizer(Rig.pair(rig.left, rig.right, *pose), origin=ORIGIN, heading_deg=35.0)
             in_rig = moved(left, right).enu @ enu_from_cam(35.0)
             turned = rotation_from_vector(sign * step[9:]) @ enu_from_cam(35.0, -1.0, 0.5)
             ends.append(in_rig @ turned.T + sign * step[6:9])

@@ -15,7 +15,7 @@ from kcal.calibrate.rig.solve import solve_rig
 from kcal.calibrate.rig.sources import RigData
 from kcal.errors import DegenerateError, FileError
 from kcal.io.rig_file import load_rig, save_camera_rig, save_rig
-from kcal.lens.rig import CameraRig, Mounting, RigCovariance
+from kcal.lens.rig import Mounting, Rig, RigCovariance
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.mounting import placed_rig
 from kcal.locate.multi_localizer import MultiViewLocalizer
@@ -25,7 +25,7 @@ from scripts.shared.station_scenes import ORIGIN, marks, ring, targets
 RIG = Path(__file__).parents[1] / "io" / "rig.json"
 
 
-def survey(count: int = 4, seed: int = 0) -> tuple[CameraRig, RigData, Tensor]:
+def survey(count: int = 4, seed: int = 0) -> tuple[Rig, RigData, Tensor]:
     """Stations 5 km from the middle that see landmarks of their own, and few in common."""
     rig, generator = ring(count, 5000.0), torch.Generator().manual_seed(seed)
     groups = [targets(8, generator, 800.0)]
@@ -144,7 +144,7 @@ def test_a_stereo_rig_gives_the_same_positions_and_covariances(tmp_path: Path, m
             link=joint[:size, size:], refraction=0.1,
         )  # fmt: skip
     points = spread_points(torch.linspace(80.0, 400.0, 5, dtype=torch.float64))
-    left, right, _ = rig(points)
+    left, right = rig(points)[0].unbind(-2)
     right = right + tensor(0.05, 0.0)
     many = MultiViewLocalizer(load_camera_rig(save_rig(rig, tmp_path / "rig.json")))
     found = many(torch.stack([left, right], 1))

@@ -12,7 +12,7 @@ from whole_graphs import traced_whole
 
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.locate.stereo import PositionStatus
 from kcal.locate.triangulate import Triangulate
 from kcal.locate.views import fit_pairs
@@ -22,7 +22,8 @@ RIG = real_rig()
 
 def test_exact_marks_give_the_point_back_through_real_lenses() -> None:
     points = spread_points(torch.logspace(1.8, 4, 60, dtype=torch.float64))
-    left, right, seen = RIG(points)
+    pixels, seen = RIG(points)
+    (left, right), seen = pixels.unbind(-2), seen.all(-1)
     assert seen.all()
     result = Triangulate(RIG)(left, right)
     near = points[:, 2] < 1000
@@ -37,9 +38,10 @@ def test_pupils_move_by_meters_at_any_range() -> None:
     left, right = hybrid_camera("wide", 1), hybrid_camera("wide", 2)
     right = right.with_parameters(right.params.index_put((tensor(6).long(),), tensor(-0.004)))
     rotation = turned(0.5, 0.3, -1.0)
-    rig = StereoRig(left, right, rotation, rotation @ -tensor(10, 0.1, -0.2))
+    rig = Rig.pair(left, right, rotation, rotation @ -tensor(10, 0.1, -0.2))
     points = spread_points(torch.logspace(0.8, 5, 60, dtype=torch.float64))
-    seen_left, seen_right, seen = rig(points)
+    pixels, seen = rig(points)
+    (seen_left, seen_right), seen = pixels.unbind(-2), seen.all(-1)
     result = Triangulate(rig)(seen_left[seen], seen_right[seen])
     assert int(seen.sum()) > 40
     torch.testing.assert_close(1 / result.points.norm(dim=-1), 1 / points[seen].norm(dim=-1), rtol=0, atol=1e-13)
@@ -62,9 +64,10 @@ def test_round_trip_for_any_rig(
     camera = Camera.build(focal=(900, 900), center=(959.5, 539.5), size=SIZE, coefficients=[-0.1, 0.01])
     rotation = turned(yaw, pitch, roll)
     offset = -baseline * tensor(math.cos(angle), math.sin(angle), 0.1)
-    rig = StereoRig(camera, camera, rotation, rotation @ offset)
+    rig = Rig.pair(camera, camera, rotation, rotation @ offset)
     point = depth * tensor([x, y, 1.0])
-    left, right, seen = rig(point)
+    pixels, seen = rig(point)
+    (left, right), seen = pixels.unbind(-2), seen.all(-1)
     result = Triangulate(rig)(left, right)
     if bool(seen[0]) and bool(rig.left.inside(left)[0] & rig.right.inside(right)[0]):
         assert result.status.item() == PositionStatus.OK
@@ -78,7 +81,7 @@ def test_round_trip_for_any_rig(
 def test_range_slope_is_z_squared_over_focal_times_baseline() -> None:
     focal, baseline, z = 1600.0, 10.0, 5000.0
     rig = pinhole_rig(focal, baseline)
-    left, right, _ = rig(tensor([0.0, 0.0, z]))
+    left, right = rig(tensor([0.0, 0.0, z]))[0].unbind(-2)
     left.requires_grad_()
     right.requires_grad_()
     Triangulate(rig)(left, right).points[0, 2].backward()
@@ -91,7 +94,7 @@ def test_range_slope_is_z_squared_over_focal_times_baseline() -> None:
 
 
 def test_gradients_through_the_lenses() -> None:
-    left, right, _ = RIG(spread_points(tensor(60.0, 150.0, 300.0)))
+    left, right = RIG(spread_points(tensor(60.0, 150.0, 300.0)))[0].unbind(-2)
     right = right + tensor([0.0, 0.4])
     triangulate = Triangulate(RIG)
 
@@ -107,7 +110,7 @@ def test_gradients_through_the_lenses() -> None:
 
 def test_batches_and_dtypes() -> None:
     points = spread_points(torch.linspace(50, 3000, 12, dtype=torch.float64))
-    left, right, _ = RIG(points)
+    left, right = RIG(points)[0].unbind(-2)
     triangulate = Triangulate(RIG)
     flat = triangulate(left, right)
     deep = triangulate(left.reshape(2, 1, 6, 2), right.reshape(2, 1, 6, 2))
@@ -133,11 +136,11 @@ def test_batches_and_dtypes() -> None:
             Triangulate(RIG, pixel_sigma=sigma)
     camera = RIG.left
     with pytest.raises(DegenerateError, match="same place"):
-        Triangulate(StereoRig(camera, camera, torch.eye(3), torch.zeros(3)))
+        Triangulate(Rig.pair(camera, camera, torch.eye(3), torch.zeros(3)))
 
 
 def test_low_precision_around_the_module_changes_nothing() -> None:
-    left, right, _ = RIG(spread_points(torch.linspace(50, 5000, 9, dtype=torch.float64)))
+    left, right = RIG(spread_points(torch.linspace(50, 5000, 9, dtype=torch.float64)))[0].unbind(-2)
     expected = Triangulate(RIG)(left, right)
     halved = Triangulate(real_rig()).half()
     with torch.autocast("cpu", dtype=torch.bfloat16):
@@ -182,7 +185,7 @@ def test_outside_the_lens() -> None:
     camera = Camera.build(
         focal=(1000, 1000), center=(2000, 500), size=(4001, 1001), coefficients=[-1 / 12], model="opencv4"
     )
-    rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
+    rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
     result = Triangulate(rig)(tensor([3400.0, 500.0], [2100.0, 500.0]), tensor([3390.0, 500.0], [2090.0, 500.0]))
     assert [PositionStatus(s).name for s in result.status.tolist()] == ["OUTSIDE_LENS", "OK"]
 
@@ -190,10 +193,10 @@ def test_outside_the_lens() -> None:
 def test_lines_that_cross_behind_one_camera() -> None:
     # The right camera stands 10 m ahead and looks the same way: it is ahead of the crossing point of these lines.
     camera = Camera.build(focal=(800, 800), center=(959.5, 539.5), size=SIZE, model="pinhole")
-    rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, -10.0]))
+    rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, -10.0]))
     # The lines meet at (0.5 m, 0, 4 m): 6 m behind the right camera, whose ray leads away from it.
     behind = Triangulate(rig)(tensor([959.5 + 800 / 8, 539.5]), tensor([959.5 + 800 / 12, 539.5]))
-    left, right, _ = rig(tensor([3.0, 0.0, 20.0]))
+    left, right = rig(tensor([3.0, 0.0, 20.0]))[0].unbind(-2)
     ahead = Triangulate(rig)(left, right)
     assert PositionStatus(int(ahead.status)).name == "OK"
     assert PositionStatus(int(behind.status)).name == "BEHIND"
@@ -202,7 +205,7 @@ def test_lines_that_cross_behind_one_camera() -> None:
 
 def test_along_the_baseline_there_is_no_range() -> None:
     camera = Camera.build(focal=(800, 800), center=(959.5, 539.5), size=SIZE, model="pinhole")
-    rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([0.0, 0.0, -10.0]))
+    rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([0.0, 0.0, -10.0]))
     marks = tensor([959.5, 539.5]).requires_grad_()
     result = Triangulate(rig)(marks, marks)
     assert PositionStatus(int(result.status)).name == "PARALLEL"
@@ -215,7 +218,7 @@ def test_parallax_and_its_noise_use_the_local_size_of_a_pixel() -> None:
     rig = pinhole_rig(focal, 1e-3)
     # A baseline of 1 mm: both cameras see the point at the same place in the image.
     points = tensor([0.0, 0.0, 1.0], [0.5, 0.0, 1.0], [0.0, 0.3, 1.0])
-    left, right, _ = rig(points)
+    left, right = rig(points)[0].unbind(-2)
     result = Triangulate(rig, sigma)(left, right)
     # Along u, off axis by angle a: d(angle)/du = cos²(a) / f; above the axis only the distance grows: cos(a) / f.
     expected = tensor(1.0, 1 / 1.25, 1 / math.sqrt(1.09)) * math.sqrt(2) * sigma / focal
@@ -238,7 +241,7 @@ class ClosedForm(Camera):
 @traced_whole
 def test_compiles_as_one_graph() -> None:
     camera = ClosedForm.build(focal=(1600, 1600), center=(959.5, 539.5), size=SIZE, model="pinhole")
-    triangulate = Triangulate(StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0])))
+    triangulate = Triangulate(Rig.pair(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0])))
     left, right = tensor([980.0, 540.0], [960.0, 540.0]), tensor([970.0, 540.0], [970.0, 540.0])
     compiled = torch.compile(triangulate, fullgraph=True, backend="eager")
     for a, b in zip(triangulate(left, right), compiled(left, right), strict=True):
@@ -248,7 +251,7 @@ def test_compiles_as_one_graph() -> None:
 def test_ranges_do_not_hang_on_the_length_of_the_direction() -> None:
     """A direction need not have length one: twice as long with twice the inverse it is the same point."""
     points = spread_points(torch.logspace(1.8, 3.5, 12, dtype=torch.float64))
-    left, right, _ = RIG(points)
+    left, right = RIG(points)[0].unbind(-2)
     found = fit_pairs(RIG, left, right)
     torch.testing.assert_close(1.0 / (found.fit.inverse / (found.scale * found.length)), points.norm(dim=-1))
     longer = found._replace(

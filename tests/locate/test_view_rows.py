@@ -5,21 +5,21 @@ from __future__ import annotations
 import torch
 
 from kcal.lens.camera import Camera
-from kcal.lens.rig import CameraRig, Origin
+from kcal.lens.rig import Origin, Rig
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.multi_localizer import MultiViewLocalizer, common_errors, posed_cameras
 from kcal.locate.views import shared_pixels
 from kcal.pipeline.measurements import ALONE_M, known_views, view_rows
 
 
-def mixed_stations() -> CameraRig:
+def mixed_stations() -> Rig:
     """Three cameras of two lens models, 1.5 km apart, with errors of attitude, lens and refraction."""
     curved = Camera.build(focal=(2000, 2010), center=(960, 540), size=(1920, 1080), coefficients=[-0.2, 0.05, 1e-3])
     plain = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
     look = torch.stack([enu_from_cam(heading).T for heading in (0.0, 345.0, 15.0)])
     places = torch.tensor([[0.0, 0.0, 30.0], [1500.0, 0.0, 40.0], [-1500.0, 0.0, 35.0]], dtype=torch.float64)
     origin = Origin(lat=45.0, lon=6.0, height=100.0)
-    rig = CameraRig([curved, curved, plain], ["a", "b", "c"], look, places, origin=origin, refraction=0.0)
+    rig = Rig([curved, curved, plain], ["a", "b", "c"], look, center=places, origin=origin, refraction=0.0)
     lens = torch.zeros(3, rig.quantities, dtype=torch.float64)
     lens[0, 0], lens[1, 5], lens[2, sum(rig.sizes[:2]) + 1], lens[2, -1] = 0.5, 1e-3, 0.7, 0.02
     rig.root = torch.cat([rig.with_errors(attitude_deg=0.01), lens])

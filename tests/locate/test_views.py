@@ -10,7 +10,7 @@ import torch
 from locate_rigs import tensor
 
 from kcal.errors import FileError, InputError
-from kcal.lens.rig import CameraRig
+from kcal.lens.rig import Rig
 from kcal.locate.geodesy import enu_to_geodetic
 from kcal.locate.marks import Marks, is_long, read_marks
 from kcal.locate.station_positions import locate_views
@@ -187,7 +187,7 @@ class TestPositions:
         assert wider.cep95_m > 2.0 * found.cep95_m
 
     def test_a_rig_without_a_place_is_refused(self) -> None:
-        bare = CameraRig(list(self.RIG.each), self.RIG.names, self.RIG.rotation, self.RIG.center)
+        bare = Rig(list(self.RIG.each), self.RIG.names, self.RIG.rotation, center=self.RIG.center)
         with pytest.raises(InputError, match="no place on the Earth"):
             locate_views(bare, self.views()[1])
 

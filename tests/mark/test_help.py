@@ -15,7 +15,7 @@ from kcal.corners.match import Matches, MatchStatus, find_again
 from kcal.errors import InputError
 from kcal.io.images import write_png
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Origin, RigCovariance, StereoRig
+from kcal.lens.rig import Origin, Rig, RigCovariance
 from kcal.locate.marks import Marks, write_marks
 from kcal.locate.positions import locate_points
 from kcal.locate.survey import Survey
@@ -97,7 +97,7 @@ class TestCurve:
 
     def test_the_band_is_the_spread_of_curves(self, site: MarkingSite) -> None:
         pose = torch.diag(torch.tensor([2e-4, 1e-4, 3e-4, 1e-3, 1e-2, 1e-2]).double() ** 2)
-        rig = StereoRig(site.rig.left, site.rig.right, site.rig.right_from_left_rotation,
+        rig = Rig.pair(site.rig.left, site.rig.right, site.rig.right_from_left_rotation,
                         site.rig.right_from_left_translation)  # fmt: skip
         rig.covariance = RigCovariance.of(rig, pose=pose)
         curve = RigBand(rig).curve("left", 300.0, 200.0)
@@ -123,7 +123,7 @@ class TestCurve:
         cameras = [lens.with_parameters(value) for lens, value in zip(lenses, values, strict=True)]
         turn = rotation_from_vector(torch.tensor([0.01, -0.03, 0.02]).double())
         shift = torch.tensor([-10.0, 0.1, 0.3]).double()
-        rig = StereoRig(cameras[0], cameras[1], turn, shift)
+        rig = Rig.pair(cameras[0], cameras[1], turn, shift)
         ends = [len(value) for value in values]
         size = torch.cat([*(1e-3 * value.abs() + 1e-5 for value in values), torch.full((6,), 1e-3).double()])
         generator = torch.Generator().manual_seed(0)
@@ -134,7 +134,7 @@ class TestCurve:
         across, squares = torch.stack([-along[:, 1], along[:, 0]], -1), torch.zeros(len(along)).double()
         for move in 1e-3 * half:
             left, right, pose = move.tensor_split([ends[0], sum(ends)])
-            moved = StereoRig(
+            moved = Rig.pair(
                 cameras[0].with_parameters(values[0] + left), cameras[1].with_parameters(values[1] + right),
                 rotation_from_vector(pose[:3]) @ turn, shift + pose[3:],
             )  # fmt: skip
@@ -150,7 +150,7 @@ class TestCurve:
         moved = camera.with_parameters(
             camera.params + torch.tensor([0.05 * (name == "pupil1") for name in camera.names])
         )
-        rig = StereoRig(moved, moved, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
+        rig = Rig.pair(moved, moved, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
         pixel = torch.tensor([[200.0, 300.0]]).double()
         curve = RigBand(rig).curve("left", *pixel[0].tolist())
         torch.testing.assert_close(curve.pixels[0], pixel[0], rtol=0, atol=1e-6)
@@ -344,7 +344,7 @@ def test_the_map_shows_each_region_at_its_target(site: MarkingSite) -> None:
     left, right = (torch.tensor(marks, dtype=torch.float64) for marks in zip(*site.pixels.values(), strict=True))
     far = site.rig.left.project(torch.tensor([[0.0, 0.0, 1e7]]).double())[0]
     left = torch.cat([far, left])
-    right = torch.cat([site.rig(torch.tensor([[0.0, 0.0, 1e7]]).double())[1], right])
+    right = torch.cat([site.rig(torch.tensor([[0.0, 0.0, 1e7]]).double())[0][:, 1], right])
     names = ["far", *site.pixels]
     located = locate_points(site.rig, left, right, names=names, origin=Origin(lat=0, lon=0, height=0), heading_deg=0.0)
     shown = {target["name"]: target for target in map_content(site.rig, located, None, anchored=False)["targets"]}

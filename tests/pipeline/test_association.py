@@ -12,7 +12,7 @@ from torch import Tensor
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.lens.rig import Rig, RigCovariance
 from kcal.locate.views import PosedCameras, fit_views
 from kcal.pipeline.assignment import assign_groups, best_assignment
 from kcal.pipeline.association import Association, AssociationOptions, associate, association_costs, near_epipolar_lines
@@ -21,10 +21,10 @@ from kcal.pipeline.detections import Detections
 SIZE = (1920, 1080)
 
 
-def rig_of(baseline: float = 10.0) -> StereoRig:
+def rig_of(baseline: float = 10.0) -> Rig:
     camera = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=SIZE, coefficients=[-0.1, 0.02])
     turn = rotation_from_vector(torch.tensor([0.003, -0.01, 0.004], dtype=torch.float64))
-    return StereoRig(camera, camera, turn, torch.tensor([-baseline, 0.2, 0.1]))
+    return Rig.pair(camera, camera, turn, torch.tensor([-baseline, 0.2, 0.1]))
 
 
 def seen(pixels: Tensor, half: float = 6.0, **more: object) -> Detections:
@@ -34,21 +34,21 @@ def seen(pixels: Tensor, half: float = 6.0, **more: object) -> Detections:
     return Detections(boxes=boxes, score=torch.ones(count), size=SIZE, **given)  # type: ignore[arg-type]
 
 
-def site(count: int, seed: int, sigma: float = 1.0) -> tuple[StereoRig, Detections, Detections, Tensor]:
+def site(count: int, seed: int, sigma: float = 1.0) -> tuple[Rig, Detections, Detections, Tensor]:
     """Targets from 100 m to 5 km, and boxes whose middles err; right ones in another order."""
     random = torch.Generator().manual_seed(seed)
     rig = rig_of()
     distance = 10 ** torch.empty(count, dtype=torch.float64).uniform_(2.0, 3.7, generator=random)
     place = torch.stack([torch.empty(count).uniform_(-low, low, generator=random) for low in (0.4, 0.2)], -1).double()
     points = torch.cat([place, torch.ones(count, 1)], -1) * distance[:, None]
-    left, right, _ = rig(points)
+    left, right = rig(points)[0].unbind(-2)
     order = torch.randperm(count, generator=random)
     noise = sigma * torch.randn(2, count, 2, dtype=torch.float64, generator=random)
     return rig, seen(left + noise[0]), seen((right + noise[1])[order]), order
 
 
 def costs_of(
-    rig: StereoRig, left: Detections, right: Detections, options: AssociationOptions, among: Tensor | None = None
+    rig: Rig, left: Detections, right: Detections, options: AssociationOptions, among: Tensor | None = None
 ) -> Tensor:
     """(N, M) of one moment."""
     among = torch.ones(len(left), len(right), dtype=torch.bool) if among is None else among
@@ -89,7 +89,7 @@ def test_the_assignment_is_the_best_one() -> None:
     rig = rig_of()
     for _ in range(5):
         points = torch.cat([0.01 * torch.randn(4, 2, generator=random), torch.ones(4, 1)], -1).double() * 800
-        left, right, _ = rig(points)
+        left, right = rig(points)[0].unbind(-2)
         left, right = seen(left), seen((right + torch.randn(4, 2, generator=random))[:3])
         options = AssociationOptions(box_sigma=2.0)
         found = associate(rig, left, right, options)
@@ -97,13 +97,13 @@ def test_the_assignment_is_the_best_one() -> None:
         assert total(found, (4, 3), 16.0) == pytest.approx(brute(cost, 16.0))
 
 
-def fisheye_rig(offset: float) -> StereoRig:
+def fisheye_rig(offset: float) -> Rig:
     """Two fisheyes 2 m apart that look past each other, with errors of lenses and pose."""
     camera = Camera.build(
         focal=(600, 600), center=(959.5, 539.5), size=SIZE, coefficients=[0.02, -0.01], model="fisheye4"
     )
     turn = rotation_from_vector(torch.tensor([0.02, -0.3, 0.1], dtype=torch.float64))
-    rig = StereoRig(camera, camera, turn, torch.tensor([-2.0, 0.2, offset]))
+    rig = Rig.pair(camera, camera, turn, torch.tensor([-2.0, 0.2, offset]))
     lens = torch.diag(torch.tensor([1.0, 1.0, 2.0, 2.0, 0.0, 1e-3, 1e-3, 0, 0], dtype=torch.float64) ** 2)
     pose = torch.diag(torch.tensor([1e-3, 2e-3, 1e-3, 0.01, 0.01, 0.01], dtype=torch.float64) ** 2)
     rig.covariance = RigCovariance.of(rig, left=lens, right=lens, pose=pose)
@@ -206,8 +206,8 @@ def test_a_crowd_takes_bounded_time_and_memory(monkeypatch: pytest.MonkeyPatch) 
 def test_two_that_could_be_swapped_are_ambiguous() -> None:
     """Side by side at one height: both pairings have a range, and neither is likelier by its epipolar error."""
     rig = rig_of()
-    near, _, _ = rig(torch.tensor([[0.0, 0, 1000.0]]).double())
-    left, right, _ = rig(torch.tensor([[0.0, 0, 1000.0], [2.0, 0, 1000.0], [0, 200.0, 1000.0]]).double())
+    near = rig(torch.tensor([[0.0, 0, 1000.0]]).double())[0][..., 0, :]
+    left, right = rig(torch.tensor([[0.0, 0, 1000.0], [2.0, 0, 1000.0], [0, 200.0, 1000.0]]).double())[0].unbind(-2)
     found = associate(rig, seen(left), seen(right))
     assert found.left.tolist() == [0, 1, 2]
     assert found.ambiguous.tolist() == [True, True, False]
@@ -221,7 +221,7 @@ def test_two_that_could_be_swapped_are_ambiguous() -> None:
 
 def test_looks_settle_what_geometry_leaves_open() -> None:
     rig = rig_of()
-    left, right, _ = rig(torch.tensor([[0.0, 0, 400.0], [5.0, 0, 400.0]]).double())
+    left, right = rig(torch.tensor([[0.0, 0, 400.0], [5.0, 0, 400.0]]).double())[0].unbind(-2)
     random = torch.Generator().manual_seed(0)
     textures = [80 * torch.rand(12, 12, dtype=torch.float64, generator=random) for _ in range(2)]
     images = []
@@ -239,7 +239,7 @@ def test_looks_settle_what_geometry_leaves_open() -> None:
 
 def test_range_gate() -> None:
     rig = rig_of()
-    left, right, _ = rig(torch.tensor([[0.0, 0, 300.0]]).double())
+    left, right = rig(torch.tensor([[0.0, 0, 300.0]]).double())[0].unbind(-2)
     options = {"box_sigma": 1.0}
     assert len(associate(rig, seen(left), seen(right), AssociationOptions(**options)).left) == 1  # type: ignore[arg-type]
     for limits in ({"nearest": 400.0}, {"farthest": 250.0}):
@@ -255,15 +255,16 @@ def test_the_epipolar_cost_is_chi_square_with_the_errors_of_the_rig() -> None:
     known = RigCovariance.of(truth, pose=torch.diag(sigma**2))
     random = torch.Generator().manual_seed(7)
     points = torch.tensor([[20.0, 30, 400], [-100, 50, 900], [0, -40, 200]]).double()
-    believed = StereoRig(truth.left, truth.right, truth.right_from_left_rotation, truth.right_from_left_translation)
+    believed = Rig.pair(truth.left, truth.right, truth.right_from_left_rotation, truth.right_from_left_translation)
     marks = []
     for _ in range(60):
         step = sigma * torch.randn(6, dtype=torch.float64, generator=random)
-        drawn = StereoRig(
+        drawn = Rig.pair(
             truth.left, truth.right, rotation_from_vector(step[:3]) @ truth.right_from_left_rotation,
             truth.right_from_left_translation + step[3:],
         )  # fmt: skip
-        marks.append(torch.stack(drawn(points)[:2]) + 0.5 * torch.randn(2, 3, 2, dtype=torch.float64, generator=random))
+        noise = 0.5 * torch.randn(2, 3, 2, dtype=torch.float64, generator=random)
+        marks.append(torch.stack(drawn(points)[0].unbind(-2)) + noise)
     # Boxes so small that their sizes tell nothing.
     left, right = (seen(both, 1e-3) for both in torch.cat(marks, 1))
     mean = []

@@ -8,7 +8,7 @@ from elsewhere import DEVICE, Elsewhere
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.lens.rig import Mounting, Origin, RigCovariance, StereoRig
+from kcal.lens.rig import Mounting, Origin, Rig, RigCovariance
 from kcal.locate.budget import planned_rig
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.multi_localizer import MultiViewLocalizer
@@ -22,7 +22,7 @@ SIZE = (1920, 1080)
 OPTIONS = AssociationOptions(box_sigma=1.0)
 
 
-def rig_with_errors() -> StereoRig:
+def rig_with_errors() -> Rig:
     rig = planned_rig()
     sigma = torch.tensor([1e-4, 1e-4, 1e-4, 1e-3, 1e-3, 1e-3], dtype=torch.float64)
     rig.covariance = RigCovariance.of(rig, pose=torch.diag(sigma**2))
@@ -30,12 +30,12 @@ def rig_with_errors() -> StereoRig:
     return rig
 
 
-def moments(count: int = 4, things: int = 9, spread: float = 1.0) -> tuple[StereoRig, Tensor, Tensor, Tensor, Tensor]:
+def moments(count: int = 4, things: int = 9, spread: float = 1.0) -> tuple[Rig, Tensor, Tensor, Tensor, Tensor]:
     """Boxes (B, 9, 4) left and (B, 8, 4) right, some of them masked, whose middles err."""
     g, rig = torch.Generator().manual_seed(4), rig_with_errors()
     away = 10 ** (2.2 + 1.2 * torch.rand(count, things, 1, generator=g).double())
     place = torch.rand(count, things, 2, generator=g).double() * torch.tensor([0.8, 0.3]) - torch.tensor([0.4, 0.15])
-    left, right, _ = rig(torch.cat([place, torch.ones_like(away)], -1) * away)
+    left, right = rig(torch.cat([place, torch.ones_like(away)], -1) * away)[0].unbind(-2)
     left, right = (some + spread * torch.randn(some.shape, generator=g).double() for some in (left, right))
     order = torch.rand(count, things, generator=g).argsort(-1)[:, : things - 1]
     half = 2000.0 / away

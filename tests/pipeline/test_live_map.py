@@ -43,7 +43,7 @@ def page() -> Iterator[LiveMap]:
 
 def show(page: LiveMap, category: str = "car") -> PositionColumns:
     tracker = Tracker(SITE, TrackOptions(confirm_hits=1))
-    left, right, _ = SITE.rig(torch.tensor([[0.0, 0.0, 500.0], [30.0, 0.0, 90_000.0]]).double())
+    left, right = SITE.rig(torch.tensor([[0.0, 0.0, 500.0], [30.0, 0.0, 90_000.0]]).double())[0].unbind(-2)
     columns = track_columns(tracker(pairs_of(left, right, 1.0)), 1)
     columns.extras["category"][0] = category
     page.show(columns, 7)
@@ -101,7 +101,7 @@ def test_fields_of_view_are_those_of_the_cameras(page: LiveMap) -> None:
 def test_nothing_jumps_at_the_antimeridian() -> None:
     site = tracked_site(origin=Origin(lat=10.0, lon=179.9999, height=0.0), heading_deg=90.0)
     live = LiveMap(located_by(Locator(site.rig, origin=site.origin, heading_deg=90.0)), 0)
-    left, right, _ = site.rig(torch.tensor([[0.0, 0.0, 500.0]]).double())
+    left, right = site.rig(torch.tensor([[0.0, 0.0, 500.0]]).double())[0].unbind(-2)
     live.show(track_columns(Tracker(site, TrackOptions(confirm_hits=1))(pairs_of(left, right, 1.0)), 1), 1)
     told = events(live, 2)
     live.close()

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.lens.rig import Origin, StereoRig
+from kcal.lens.rig import Origin, Rig
 from kcal.locate.budget import planned_rig
 from kcal.locate.localizer import StereoLocalizer
 from kcal.pipeline.association import AssociationOptions
@@ -24,7 +24,7 @@ class Site:
 
     def __init__(self, seed: int = 0) -> None:
         random = np.random.default_rng(seed)
-        self.rig: StereoRig = planned_rig()
+        self.rig: Rig = planned_rig()
         self.depths = torch.tensor([400.0, 900.0, 1800.0, 4000.0], dtype=torch.float64)
         columns, rows = torch.tensor([-0.2, -0.05, 0.1, 0.25]), torch.tensor([0.1, -0.1, 0.05, 0.0])
         self.points = self.depths[:, None] * torch.stack([columns, rows, torch.ones(4)], -1).double()

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.lens.rig import CameraRig, Mounting
+from kcal.lens.rig import Mounting, Rig
 from kcal.locate.budget import planned_rig
 from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.locate.stations import stations_of
@@ -43,7 +43,7 @@ def views_of(pixels: Tensor, seen: Tensor, time: Tensor | float, sigma: float = 
     )  # fmt: skip
 
 
-def stations(count: int = 3, radius: float = 8000.0) -> CameraRig:
+def stations(count: int = 3, radius: float = 8000.0) -> Rig:
     rig = ring(count, radius)
     rig.root = rig.with_errors(position_m=0.3, attitude_deg=0.004, refraction=0.05)
     return rig
@@ -61,7 +61,7 @@ def test_two_cameras_of_one_mast_are_paired_as_ever() -> None:
     g = torch.Generator().manual_seed(1)
     z = torch.linspace(200.0, 900.0, 30).double()
     places = torch.stack([(torch.rand(30, generator=g).double() - 0.5) * 0.8 * z, 0.1 * z * torch.sin(z), z], -1)
-    left, right, _ = rig(places)
+    left, right = rig(places)[0].unbind(-2)
     left, right = (p + 0.5 * torch.randn(30, 2, generator=g).double() for p in (left, right))
     seen = boxes(left), boxes(right[torch.randperm(30, generator=g)])
     # The nearest range is a default of masts.

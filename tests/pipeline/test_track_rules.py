@@ -14,7 +14,7 @@ from track_scenes import pairs_of, tracked_site
 
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.pipeline.association import _patches, appearance, near_epipolar_lines
 from kcal.pipeline.imm_filter import Motion
 from kcal.pipeline.pairing import ObjectViews
@@ -32,7 +32,7 @@ class Scene:
         self.tracker, self.rig = Tracker(localize, options), localize.rig
 
     def pairs(self, time: float, *places: tuple[float, float, float], doubt: bool = False) -> ObjectViews:
-        left, right, _ = self.rig(torch.tensor(places).double().reshape(-1, 3))
+        left, right = self.rig(torch.tensor(places).double().reshape(-1, 3))[0].unbind(-2)
         return pairs_of(left, right, time, 0.2, [doubt] * len(places))
 
     def see(self, time: float, *places: tuple[float, float, float], doubt: bool = False) -> tuple[int, ...]:
@@ -158,7 +158,7 @@ class TestRules:
 
 
 class TestBands:
-    RIG = StereoRig(
+    RIG = Rig.pair(
         Camera.build(focal=(800, 810), center=(320, 240), size=(640, 480), model="pinhole"),
         Camera.build(focal=(790, 780), center=(315, 250), size=(640, 480), model="pinhole"),
         rotation_from_vector(torch.tensor([0.01, -0.02, 0.1], dtype=torch.float64)),

@@ -33,7 +33,7 @@ def test_one_sighting_is_what_the_localizer_says() -> None:
     localize = StereoLocalizer(rig, origin=ORIGIN, heading_deg=35.0, pitch_deg=-1.0, roll_deg=0.5, calibration=known,
                                mounting=whole[6:, 6:], link=link)  # fmt: skip
     points = tensor([10.0, -3.0, 120.0], [-150.0, 20.0, 900.0], [300.0, 60.0, 2500.0], [0.0, 40.0, 90_000.0])
-    left, right, _ = rig(points)
+    left, right = rig(points)[0].unbind(-2)
     pairs = pairs_of(left, right + tensor([0.0, 0.4]), 7.0)
     expected = localize(pairs.left, pairs.right, pairs.covariance)
     stations = stations_at(localize)
@@ -165,7 +165,7 @@ def test_the_effect_of_a_calibration_error_is_that_of_making_it() -> None:
     for error in (0.0, 0.05):
         tracker = Tracker(localize, TrackOptions(motions=(Motion(acceleration=3.0),), confirm_hits=1))
         for frame in range(25):
-            left, right, _ = rig(torch.tensor([[-40.0 + 3.0 * frame, 0.0, 120.0]]).double())
+            left, right = rig(torch.tensor([[-40.0 + 3.0 * frame, 0.0, 120.0]]).double())[0].unbind(-2)
             # The true focal length is larger, and the marks are farther from the middle: it is believed too small.
             right = right + error / 1600.0 * (right - rig.right.center) * torch.tensor([1.0, 0.0])
             tracker(pairs_of(left, right, frame / 10.0))
@@ -256,7 +256,7 @@ def test_recognized_by_its_motion_after_an_occlusion(again: float, number: int) 
 def test_what_is_seen_once_is_not_told() -> None:
     localize = tracked_site()
     tracker = Tracker(localize)
-    left, right, _ = localize.rig(torch.tensor([[0.0, 0.0, 300.0]]).double())
+    left, right = localize.rig(torch.tensor([[0.0, 0.0, 300.0]]).double())[0].unbind(-2)
     assert tracker(pairs_of(left, right, 0.0)).number == ()
     nothing = pairs_of(left[:0], right[:0], 0.0)
     assert tracker(nothing, 5.0).number == ()

@@ -28,7 +28,7 @@ from kcal.io.rig_file import load_rig, save_camera_rig, save_rig
 from kcal.lens.baking import bake
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import CameraRig, Origin, StereoRig
+from kcal.lens.rig import Origin, Rig
 
 SIZE = (640, 480)
 MODELS = ("hybrid", "opencv5", "opencv14", "fisheye4")
@@ -74,7 +74,7 @@ def camera_rig(folder: Path, out: dict[str, object]) -> None:
     turns = rotation_from_vector(torch.tensor([[0.0, 0, 0], [0, 0.3, 0], [0.02, -0.2, 0.01]], dtype=torch.float64))
     centers = torch.tensor([[0.0, 0, 0], [12_000.5, 300, 45], [-8_000, 9_000.25, 120]], dtype=torch.float64)
     site = Origin(lat=19.07, lon=72.87, height=14.0)
-    rig = CameraRig(cameras, [*lens], turns @ north, centers, origin=site, refraction=0.14)
+    rig = Rig(cameras, [*lens], turns @ north, center=centers, origin=site, refraction=0.14)
     rig.root = rig.with_errors(position_m=(0.02, 0.02, 0.05), attitude_deg=0.01, refraction=0.05)
     save_camera_rig(rig, folder / "camera-rig.json")
     out["camera-rig.json"] = {
@@ -105,7 +105,7 @@ def main(folder: Path) -> None:
         out["board.json"] = {"points": load_measured_board(folder / "board.json").points.tolist()}
     turned = rotation_from_vector(torch.tensor([0.01, -0.02, 0.005], dtype=torch.float64))
     save_rig(
-        StereoRig(cameras["hybrid"], cameras["opencv14"], turned, torch.tensor([-10.0, 0.02, 0.1])), folder / "rig.json"
+        Rig.pair(cameras["hybrid"], cameras["opencv14"], turned, torch.tensor([-10.0, 0.02, 0.1])), folder / "rig.json"
     )
     rig = load_rig(folder / "rig.json")
     out["rig.json"] = {

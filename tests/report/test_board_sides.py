@@ -4,7 +4,7 @@ import torch
 from kcal.corners.board import Board
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.report.judge_rig import triangulated_sides
 
 
@@ -13,8 +13,8 @@ def test_sides_of_boards_of_unlike_distances(text):
     """Each distance of neighbors counts as that of the first two points: alike on an exact board of any kind."""
     board = Board.parse(text, "50mm")
     camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
-    rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-0.5, 0.0, 0.0]))
-    left, right, _ = rig(board.points * 1.02 + torch.tensor([-0.2, 0.1, 2.0], dtype=torch.float64))
+    rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-0.5, 0.0, 0.0]))
+    left, right = rig(board.points * 1.02 + torch.tensor([-0.2, 0.1, 2.0], dtype=torch.float64))[0].unbind(-2)
     sides = triangulated_sides(rig, board.columns, board.rows, torch.stack([left, right])[None], board.points)
     first = float((board.points[1] - board.points[0]).norm())
     assert sides.mean == pytest.approx(1.02 * first, rel=1e-9)

@@ -210,7 +210,7 @@ class TestTables:
 
     def test_a_target_that_has_no_range(self) -> None:
         true = tensor([0.0, 60_000.0, 0.0])
-        left, right, _ = pinhole_rig()(tensor([0.0, 0.0, 60_000.0]))
+        left, right = pinhole_rig()(tensor([0.0, 0.0, 60_000.0]))[0].unbind(-2)
         origin = Origin(lat=10.0, lon=20.0, height=0.0)
         far = locate_points(pinhole_rig(), left, right, origin=origin, heading_deg=0.0, names=["cloud"])
         heads, row = truth_rows(far, far, true)

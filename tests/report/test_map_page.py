@@ -27,7 +27,7 @@ TRUTH = tensor([20.0, 0.0, 100.0], [-300.0, 5.0, 1000.0], [900.0, 0.0, 5000.0], 
 
 
 def scene(origin: Origin = ORIGIN) -> tuple[Located, torch.Tensor]:
-    left, right, _ = pinhole_rig()(TRUTH)
+    left, right = pinhole_rig()(TRUTH)[0].unbind(-2)
     names = ["gate", "</script><b>mast", "ship", "cloud"]
     located = locate_points(
         pinhole_rig(), left, right + tensor([0.3, 0.0]), origin=origin, heading_deg=300.0, names=names
@@ -103,7 +103,7 @@ HOSTILE = (
 
 @needs_browser
 def test_names_are_texts_in_a_browser(tmp_path: Path) -> None:
-    left, right, _ = pinhole_rig()(TRUTH)
+    left, right = pinhole_rig()(TRUTH)[0].unbind(-2)
     located = locate_points(pinhole_rig(), left, right, origin=ORIGIN, heading_deg=300.0, names=list(HOSTILE))
     tiles = tmp_path / HOSTILE[1]
     (tiles / "13" / "5754").mkdir(parents=True)

@@ -24,7 +24,7 @@ TRUTH = tensor([20.0, 0.0, 100.0], [-300.0, 5.0, 1000.0], [900.0, 0.0, 5000.0], 
 
 def scene() -> tuple[Located, torch.Tensor]:
     rig = pinhole_rig()
-    left, right, _ = rig(TRUTH)
+    left, right = rig(TRUTH)[0].unbind(-2)
     # One pair more, outside the image, of which the truth is not known.
     left, right = torch.cat([left, tensor([5000.0, 1.0])]), torch.cat([right, tensor([1.0, 1.0])])
     right = right + tensor([0.3, 0.0])
@@ -97,7 +97,7 @@ def test_arrows_lead_from_truth_to_estimate_only_where_they_differ() -> None:
 @pytest.mark.parametrize(("count", "named"), [(40, True), (41, False)])
 def test_no_more_than_forty_points_have_names(count: int, named: bool) -> None:
     points = torch.linspace(80, 6000, count, dtype=torch.float64)[:, None] * tensor([0.1, 0.0, 1.0])
-    left, right, _ = pinhole_rig()(points)
+    left, right = pinhole_rig()(points)[0].unbind(-2)
     names = [f"p{i}" for i in range(count)]
     origin = Origin(lat=10.0, lon=20.0, height=0.0)
     figure = positions_figure(locate_points(pinhole_rig(), left, right, origin=origin, heading_deg=0.0, names=names))
@@ -110,7 +110,7 @@ def test_no_more_than_forty_points_have_names(count: int, named: bool) -> None:
 def test_one_point_and_many_points(tmp_path: Path, count: int) -> None:
     rig = pinhole_rig()
     points = torch.linspace(80, 6000, count, dtype=torch.float64)[:, None] * tensor([0.1, 0.0, 1.0])
-    left, right, _ = rig(points)
+    left, right = rig(points)[0].unbind(-2)
     located = locate_points(rig, left, right, origin=Origin(lat=10.0, lon=20.0, height=0.0), heading_deg=0.0)
     path = save_picture(tmp_path / "map.png", positions_figure(located))
     assert path.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
@@ -146,7 +146,7 @@ HOSTILE = (
 
 def test_names_are_drawn_as_they_are(tmp_path: Path) -> None:
     points = torch.linspace(80, 6000, len(HOSTILE), dtype=torch.float64)[:, None] * tensor([0.1, 0.0, 1.0])
-    left, right, _ = pinhole_rig()(points)
+    left, right = pinhole_rig()(points)[0].unbind(-2)
     origin = Origin(lat=10.0, lon=20.0, height=0.0)
     located = locate_points(pinhole_rig(), left, right, origin=origin, heading_deg=0.0, names=list(HOSTILE))
     save_picture(tmp_path / "map.png", positions_figure(located))

@@ -14,7 +14,7 @@ from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.difference import camera_difference, difference_text
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Origin, StereoRig
+from kcal.lens.rig import Origin, Rig
 from kcal.locate.positions import locate_points
 from kcal.report.calibration import difference_figure
 from kcal.report.pages import _correlations, _percent, _sentence, range_rows
@@ -26,9 +26,9 @@ from kcal.report.verdict import RangeAnswer, Requirement, Verdict
 CAMERA = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480), model="pinhole")
 
 
-def rig(yaw: float = 0.0) -> StereoRig:
+def rig(yaw: float = 0.0) -> Rig:
     turn = rotation_from_vector(torch.tensor([0.0, yaw, 0.0], dtype=torch.float64))
-    return StereoRig(CAMERA, CAMERA, turn, turn @ torch.tensor([-10.0, 0.0, 0.0], dtype=torch.float64))
+    return Rig.pair(CAMERA, CAMERA, turn, turn @ torch.tensor([-10.0, 0.0, 0.0], dtype=torch.float64))
 
 
 class TestScores:
@@ -61,7 +61,7 @@ class TestScores:
     def test_ranges_of_a_rig_with_a_wrong_yaw(self) -> None:
         """At 1 km a yaw of 1e-5 rad is 1 m, of 10 m of baseline; farther or nearer by its sign."""
         points = torch.tensor([[x, 0.0, math.sqrt(1e6 - x * x)] for x in (-100.0, 0.0, 100.0)], dtype=torch.float64)
-        left, right, _ = rig()(points)
+        left, right = rig()(points)[0].unbind(-2)
         truth = {"pairs": [{"range_m": 1000.0, "left": left.tolist(), "right": right.tolist()}]}
         (exact,) = score_rig(rig(), truth)
         assert exact.mean == pytest.approx(0.0, abs=1e-5)
@@ -79,7 +79,7 @@ class TestSentences:
     def test_misses_and_chance(self, wrong: int, share: str, hardly: bool) -> None:
         """By the binomial distribution of 20 intervals of 95 %."""
         points = torch.tensor([[0.0, 0.0, 500.0]] * 20, dtype=torch.float64)
-        left, right, _ = rig()(points)
+        left, right = rig()(points)[0].unbind(-2)
         found = locate_points(rig(), left, right, origin=Origin(lat=19.0, lon=72.0, height=0.0), heading_deg=0.0)
         true = points[:, [0, 2, 1]]
         true[:wrong] *= 2.0

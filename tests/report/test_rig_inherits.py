@@ -18,7 +18,7 @@ from kcal.cli.rig_sources import check_views_of
 from kcal.errors import InputError
 from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.calibration import BoardRecord, CalibrationRecord, CameraCalibration, RigCalibration, RigSource
-from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.lens.rig import Rig, RigCovariance
 from kcal.report.judge_camera import record_findings
 from kcal.report.judge_rig import rig_verdict
 from kcal.report.verdict import FAULTS, Finding, Requirement, Verdict
@@ -37,9 +37,9 @@ def record(names: list[str], tempering: float = 1.0, warnings: tuple[str, ...] =
     )  # fmt: skip
 
 
-def solved(left: CalibrationRecord, right: CalibrationRecord | None = None, **changes: object) -> StereoRig:
+def solved(left: CalibrationRecord, right: CalibrationRecord | None = None, **changes: object) -> Rig:
     first = pinhole_rig()
-    rig = StereoRig(
+    rig = Rig.pair(
         first.left, first.left.with_parameters(first.left.params + 1e-3), first.right_from_left_rotation,
         first.right_from_left_translation,
     )  # fmt: skip

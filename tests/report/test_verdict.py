@@ -19,7 +19,7 @@ from kcal.corners.observations import Observations, View
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.lens.uncertainty import image_sigma
 from kcal.report.judge_camera import camera_verdict, stored_verdict, view_findings
 from kcal.report.judge_rig import rig_verdict, synchrony
@@ -297,14 +297,14 @@ def test_a_file_alone_is_believed_and_said_so(clean: CameraCalibrationResult) ->
     assert names(bare, "stop") == {"error-bars"}
 
 
-def pair_pixels(moved: Tensor, poses: tuple[Tensor, Tensor]) -> tuple[StereoRig, Tensor]:
+def pair_pixels(moved: Tensor, poses: tuple[Tensor, Tensor]) -> tuple[Rig, Tensor]:
     lens = camera("opencv5")
-    rig = StereoRig(lens, lens, torch.eye(3), torch.tensor([-0.1, 0.0, 0.0]))
+    rig = Rig.pair(lens, lens, torch.eye(3), torch.tensor([-0.1, 0.0, 0.0]))
     rotation, translation = poses
     generator = torch.Generator().manual_seed(1)
     noise = NOISE * torch.randn(2, VIEWS, BOARD.corners, 2, dtype=torch.float64, generator=generator)
     places = BOARD.points @ rotation.transpose(-1, -2) + translation[:, None]
-    left, right = rig(places)[0], rig(places + moved[:, None])[1]
+    left, right = rig(places)[0][..., 0, :], rig(places + moved[:, None])[0][..., 1, :]
     return rig, torch.stack([left, right], 1) + noise.movedim(0, 1)
 
 

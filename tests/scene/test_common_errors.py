@@ -26,9 +26,9 @@ def spread_places(step: float, sway: float) -> tuple[torch.Tensor, torch.Tensor]
     axes = [torch.arange(30.0, size - 30.0, step, dtype=torch.float64) for size in SIZE]
     left = torch.stack(torch.meshgrid(*axes, indexing="xy"), -1).reshape(-1, 2)
     ranges = 40.0 * 20.0 ** torch.rand(len(left), 1, dtype=torch.float64, generator=draw)
-    seen = RIG.right.inside(RIG(ranges * RIG.left.unproject(left)[0])[1])
+    seen = RIG.right.inside(RIG(ranges * RIG.left.unproject(left)[0])[0][:, 1])
     left, ranges = left[seen] + sway, ranges[seen]
-    return left, RIG(ranges * RIG.left.unproject(left)[0])[1]
+    return left, RIG(ranges * RIG.left.unproject(left)[0])[0][:, 1]
 
 
 def counted(pairs: int, *, step: float = 16.0, own: float = SIGMA, common: float = 0.0, sway: float = 0.0) -> float:

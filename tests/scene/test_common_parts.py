@@ -11,7 +11,7 @@ from torch import Tensor
 
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.scene import common_errors as parts
 from kcal.scene.common_errors import line_errors
 
@@ -19,11 +19,11 @@ DRAW = torch.Generator().manual_seed(8)
 FLAT = torch.zeros(3, dtype=torch.float64)
 
 
-def level_rig(roll: float = 0.0) -> StereoRig:
+def level_rig(roll: float = 0.0) -> Rig:
     """Pinholes side by side, f 500 px, a meter apart; the right one rolled about its axis."""
     camera = Camera.build(focal=(500, 500), center=(240, 160), size=(481, 321), model="pinhole")
     turn = rotation_from_vector(torch.tensor([0.0, 0.0, roll], dtype=torch.float64))
-    return StereoRig(camera, camera, turn, turn @ torch.tensor([-1.0, 0.0, 0.0], dtype=torch.float64))
+    return Rig.pair(camera, camera, turn, turn @ torch.tensor([-1.0, 0.0, 0.0], dtype=torch.float64))
 
 
 @pytest.mark.parametrize("roll", [0.0, 0.5, -1.2])

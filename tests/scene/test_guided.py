@@ -28,7 +28,7 @@ def scene(count: int = 400) -> tuple[Keypoints, Keypoints]:
     generator = torch.Generator().manual_seed(3)
     share = torch.rand(count, 3, generator=generator, dtype=torch.float64)
     points = 4.0 * 150.0 ** share[:, :1] * torch.cat([share[:, 1:] - 0.5, torch.ones(count, 1)], 1)
-    left, right, _ = RIG(points)
+    left, right = RIG(points)[0].unbind(-2)
     noise = torch.randn(2, count, 2, generator=generator, dtype=torch.float64)
     kinds = descriptors(count, 1)
     other = torch.nn.functional.normalize(kinds + 0.03 * torch.randn(kinds.shape, generator=generator).abs(), dim=1)

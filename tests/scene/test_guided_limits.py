@@ -10,13 +10,13 @@ from torch import Tensor
 from kcal.corners.match import Keypoints
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.scene import refine
 from kcal.scene.match import ImagePair, _both_ways, guided_matches, match_scene
 from tests.helpers.scene_pairs import small_rig
 
 CAMERA = Camera.build(focal=(500, 500), center=(240, 160), size=(481, 321), model="pinhole")
-LEVEL = StereoRig(CAMERA, CAMERA, torch.eye(3).double(), torch.tensor([-2.0, 0.0, 0.0]).double())
+LEVEL = Rig.pair(CAMERA, CAMERA, torch.eye(3).double(), torch.tensor([-2.0, 0.0, 0.0]).double())
 
 
 def seen(pixels: list[list[float]]) -> Keypoints:
@@ -88,7 +88,7 @@ def test_a_patch_that_is_not_seen_is_no_match(monkeypatch: pytest.MonkeyPatch) -
     left = torch.tensor([[150.0, 100.0], [220.0, 120.0], [300.0, 160.0], [350.0, 200.0]]).double()
     planes, patch = refine.object_planes, refine._patch
 
-    def without_one(rig: StereoRig, *arguments: Tensor) -> refine.ObjectPlanes:
+    def without_one(rig: Rig, *arguments: Tensor) -> refine.ObjectPlanes:
         made = planes(rig, *arguments)
         return made._replace(valid=made.valid & torch.tensor([False, True, True, True]))
 

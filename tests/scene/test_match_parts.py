@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kcal.corners.patches import object_planes, plane_pixels
 from kcal.lens.camera import Camera
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.scene import match, refine
 from kcal.scene.match import ImagePair, MatchedPair, PairCounts
 from kcal.scene.refine import HALF, SWAY, RefinedMatches, Stillness, _patch, refine_matches, still_there, whole_shifts
@@ -125,7 +125,7 @@ def test_whole_shifts() -> None:
 def test_patches_are_those_of_the_lens() -> None:
     """Nine places and a parabola against the projection of all; slopes against differences."""
     left = torch.tensor([[300.0, 200.0], [60.0, 40.0]]).double()
-    right = RIG(80.0 * RIG.left.unproject(left)[0])[1]
+    right = RIG(80.0 * RIG.left.unproject(left)[0])[0][:, 1]
     planes = object_planes(RIG, left, right, torch.zeros(2).double())
     for camera, middle, turn in (
         (RIG.left, planes.left, None),
@@ -193,7 +193,7 @@ def test_refined_from_a_plane_at_a_known_range() -> None:
     """A textured plane far away through two equal pinholes side by side: the right image is the left one, moved."""
     camera = Camera.build(focal=(500, 500), center=(240, 160), size=(480, 320), model="pinhole")
     shift = torch.tensor([-1.0, 0.0, 0.0]).double()
-    rig = StereoRig(camera, camera, torch.eye(3).double(), shift)
+    rig = Rig.pair(camera, camera, torch.eye(3).double(), shift)
     picture = torch.nn.functional.avg_pool2d(noise(320, 480)[None, None], 5, 1, 2)[0, 0]
     left = torch.tensor([[250.0, 150.0], [120.0, 200.0], [5.0, 100.0], [300.0, 12.0], [8.0, 100.0]]).double()
     truth = left + torch.tensor([-4.0, 0.0]).double()

@@ -10,13 +10,13 @@ from torch import Tensor
 
 from kcal.corners.patches import image_windows, sample, warped_blur_windows
 from kcal.lens.camera import Camera
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.scene import refine
 from kcal.scene.refine import refine_matches
 
 SIZE = (320, 240)
 CAMERA = Camera.build(focal=(300, 300), center=(160, 120), size=SIZE, model="pinhole")
-RIG = StereoRig(CAMERA, CAMERA, torch.eye(3).double(), torch.tensor([-1.0, 0.0, 0.0]).double())
+RIG = Rig.pair(CAMERA, CAMERA, torch.eye(3).double(), torch.tensor([-1.0, 0.0, 0.0]).double())
 # Pixels of the right image by those of the left: a ground 1.4 baselines below the cameras.
 WARP = torch.tensor([[1.0, -1.0 / 1.4], [0.0, 1.0]]).double()
 MIDDLE = torch.tensor([160.0, 120.0]).double()

@@ -11,7 +11,7 @@ from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.source import Effect
 from kcal.calibrate.rig.sources import RigData
 from kcal.lens.pose import rotation_from_vector, side_axes
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.scene import common_errors
 from kcal.scene.common_errors import line_errors, smooth_effects
 from kcal.scene.match import MatchedPair, PairCounts, counted
@@ -87,9 +87,9 @@ def test_slopes_are_those_of_differences() -> None:
     covariance = torch.eye(2, dtype=torch.float64).expand(len(pixels), 2, 2)
     turn, shift, step = RIG.right_from_left_rotation, RIG.right_from_left_translation, 1e-6
     turned = [rotation_from_vector(step * axis) @ turn for axis in torch.eye(3, dtype=torch.float64)]
-    moved = [StereoRig(RIG.left, RIG.right, one, shift) for one in turned]
+    moved = [Rig.pair(RIG.left, RIG.right, one, shift) for one in turned]
     axes = torch.cat(side_axes(shift[None] / RIG.baseline))
-    moved += [StereoRig(RIG.left, RIG.right, turn, shift + step * RIG.baseline * axis) for axis in axes]
+    moved += [Rig.pair(RIG.left, RIG.right, turn, shift + step * RIG.baseline * axis) for axis in axes]
     expected = torch.stack([line_errors(rig, pixels).off for rig in moved], -1) / step
     found = line_errors(RIG, pixels)
     sigma = found.sigma(covariance)

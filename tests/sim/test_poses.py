@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.sim.captures import BoardSize, PoseOptions, board_points, project_board, sample_board_poses
 from kcal.sim.scene import demo_rig
 from scripts.shared.pair_poses import rig_pose, sample_pair_poses
@@ -99,7 +99,7 @@ def test_pairs_are_seen_by_both_cameras():
 def test_impossible_views_are_refused():
     with pytest.raises(InputError, match="completely seen"):
         sample_board_poses(CAMERA, BOARD, 3, seeded(0), fill=(2.0, 3.0))
-    apart = StereoRig(CAMERA, CAMERA, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
+    apart = Rig.pair(CAMERA, CAMERA, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
     with pytest.raises(InputError, match="completely seen"):
         sample_pair_poses(apart, BOARD, 3, seeded(0), distance=(1.0, 2.0))
 

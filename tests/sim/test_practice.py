@@ -69,7 +69,7 @@ def test_true_pixels_are_those_of_the_lens_and_bent_light(small: PracticeSite) -
     scene = small.scene
     lifted = scene.targets.enu.clone()
     lifted[:, 2] += 0.13 * lifted[:, :2].square().sum(-1) / (2 * EARTH)
-    left, right, _ = scene.rig(lifted @ scene.enu_from_rig)
+    left, right = scene.rig(lifted @ scene.enu_from_rig)[0].unbind(-2)
     for side, pixels in zip(SIDES, (left, right), strict=True):
         np.testing.assert_allclose(small.true_pixels(side, scene.targets.enu), pixels.numpy(), atol=1e-6)
 

@@ -15,7 +15,7 @@ from kcal.errors import InputError
 from kcal.io.camera_file import provenance
 from kcal.lens.calibration import RigCalibration
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Mounting, Origin, RigCovariance, StereoRig
+from kcal.lens.rig import Mounting, Origin, Rig, RigCovariance
 from kcal.locate.geodesy import enu_from_cam
 from kcal.watch.turned import DriftEffect, check_rig, drift_of_turns, measure_drift
 
@@ -24,24 +24,24 @@ STANDING = torch.diag(tensor(0.1, 0.2, 0.3, 1e-5, 2e-5, 3e-5, 0.0) ** 2)
 ORIGIN = Origin(lat=19.07, lon=72.87, height=14.0)
 
 
-def eastward(rig: StereoRig, turn: Tensor) -> Landmarks:
+def eastward(rig: Rig, turn: Tensor) -> Landmarks:
     """Exact landmarks for a level rig that looks east, both cameras turned by `turn` about their centers."""
     draw = torch.rand(14, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2)) - 0.5
     points = 300.0 * tensor(0.0, 0.0, 1.0) + draw * tensor(150.0, 60.0, 300.0)
     rotation = rotation_from_vector(turn)
-    turned = StereoRig(rig.left, rig.right, torch.eye(3), rotation @ rig.right_from_left_translation)
-    left, right, seen = turned(points @ rotation.T)
+    turned = Rig.pair(rig.left, rig.right, torch.eye(3), rotation @ rig.right_from_left_translation)
+    pixels, seen = turned(points @ rotation.T)
     assert bool(seen.all())
     return Landmarks(
         names=tuple("abcdefghijklmn"),
         points=points @ enu_from_cam(90.0).T,
         sigma=torch.full((14, 3), 0.01, dtype=torch.float64),
-        pixels=torch.stack([left, right], 1),
+        pixels=pixels,
         pixel_sigma=0.1,
     )
 
 
-def standing_rig(covariance: Tensor | None = STANDING) -> StereoRig:
+def standing_rig(covariance: Tensor | None = STANDING) -> Rig:
     rig = pinhole_rig()
     rig.covariance = RigCovariance.of(rig, pose=torch.diag(tensor(1e-6, 2e-6, 3e-6, 1e-2, 2e-2, 3e-2) ** 2))
     rig.mounting = Mounting(origin=ORIGIN, heading_deg=90.0, covariance=covariance, refraction=0.0)
@@ -102,7 +102,7 @@ def test_an_exact_mounting_stays_exact_and_none_is_refused() -> None:
         check_rig(rig, landmarks=marks)
 
 
-def effect_of(old: StereoRig, new: StereoRig, covariance: Tensor, distances: tuple[float, ...]) -> DriftEffect:
+def effect_of(old: Rig, new: Rig, covariance: Tensor, distances: tuple[float, ...]) -> DriftEffect:
     still = drift_of_turns(old, torch.zeros(6).double(), torch.eye(6).double())
     return dataclasses.replace(still, rig=new, relative_covariance=covariance).effect(distances)
 
@@ -116,9 +116,7 @@ def test_sigma_of_a_drift_is_what_each_of_its_turns_does() -> None:
     squares = torch.zeros(2).double()
     for column in root.T:
         turn = rotation_from_vector(1e-3 * column)
-        new = StereoRig(
-            rig.left, rig.right, turn @ rig.right_from_left_rotation, turn @ rig.right_from_left_translation
-        )
+        new = Rig.pair(rig.left, rig.right, turn @ rig.right_from_left_rotation, turn @ rig.right_from_left_translation)
         shift = effect_of(rig, new, root @ root.T, (250.0, 1000.0)).found - effect.distance
         squares += (1e3 * shift) ** 2
     torch.testing.assert_close(effect.sigma, squares.sqrt(), rtol=1e-3, atol=0)

@@ -14,11 +14,11 @@ from kcal.calibrate.rig.features import Features
 from kcal.calibrate.rig.landmarks import Landmarks
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.watch.turned import measure_drift
 
 RELATIVE = ROTATION[1] @ ROTATION[0].T
-RIG = StereoRig(CAMERAS[0], CAMERAS[1], RELATIVE, ROTATION[1] @ (CENTER[0] - CENTER[1]))
+RIG = Rig.pair(CAMERAS[0], CAMERAS[1], RELATIVE, ROTATION[1] @ (CENTER[0] - CENTER[1]))
 TURN = tensor([4e-5, -6e-5, 9e-5], [-2e-5, math.radians(0.01), 5e-5])
 
 
@@ -46,7 +46,7 @@ def static(count: int, noise: float = 0.0, seed: int = 0, turns: Tensor = TURN) 
 
 # The same cameras, the right one rolled by 70°: what is transposed, or in the other camera's axes, shows.
 ROLLED = torch.stack([ROTATION[0], rotation_from_vector(tensor(0.0, 0.0, math.radians(70.0))) @ ROTATION[1]])
-ROLLED_RIG = StereoRig(*CAMERAS[:2], ROLLED[1] @ ROLLED[0].T, ROLLED[1] @ (CENTER[0] - CENTER[1]))
+ROLLED_RIG = Rig.pair(*CAMERAS[:2], ROLLED[1] @ ROLLED[0].T, ROLLED[1] @ (CENTER[0] - CENTER[1]))
 
 
 def seen_rolled(points: Tensor, turns: Tensor) -> Tensor:
@@ -89,7 +89,7 @@ class TestFeatures:
 
     def test_equal_marks_give_exactly_no_drift_whatever_errors_the_rig_has(self) -> None:
         wrong = rotation_from_vector(tensor(3e-4, -2e-4, 1e-4))
-        rig = StereoRig(
+        rig = Rig.pair(
             RIG.left, RIG.right, wrong @ RIG.right_from_left_rotation, wrong @ RIG.right_from_left_translation
         )
         features = static(20, 0.1)

@@ -141,7 +141,7 @@ def test_references_are_stored(tmp_path: Path, then: tuple[FixedFeatures, FixedF
     with pytest.raises(FileError, match=r"a\.reference\.npz"):
         load_references(path, RIG)
     other = small_rig()
-    other.right_from_left_translation += 0.1
+    other.translation[1] += 0.1
     save_references(path, other, then)
     with pytest.raises(FileError, match="another rig"):
         load_references(path, RIG)

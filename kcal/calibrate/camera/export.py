@@ -29,7 +29,7 @@ from kcal.lens.difference import PixelShift
 from kcal.lens.images import undistort_maps
 from kcal.lens.model import LensModel
 from kcal.lens.projection import INTRINSICS, parameter_names, project_components
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.lens.uncertainty import carried_covariance
 from kcal.lens.views import new_pinhole
 from kcal.solve.lm import DenseProblem, LMOptions, minimize
@@ -197,7 +197,7 @@ def _written() -> list[str]:
 
 
 def export_cameras(
-    cameras: Camera | StereoRig | Sequence[Camera],
+    cameras: Camera | Rig | Sequence[Camera],
     path: str | Path,
     *,
     format: str | None = None,
@@ -237,11 +237,10 @@ def export_cameras(
     """
     path = Path(path)
     poses: tuple[CameraPose, ...] = ()
-    rig = cameras if isinstance(cameras, StereoRig) else None
-    if rig is not None:
-        several, poses = [rig.left, rig.right], rig_poses(rig)
+    rig = None
+    if isinstance(cameras, Rig):
+        rig, several, poses = cameras, cameras.each, rig_poses(cameras)
     else:
-        assert not isinstance(cameras, StereoRig)
         several = [cameras] if isinstance(cameras, Camera) else list(cameras)
     if not several or any(camera.params.ndim != 1 for camera in several):
         raise InputError("export_cameras: single cameras are needed, not batches")
@@ -408,9 +407,7 @@ def _nearer_omni(
     return (values, tuple(misfits)) if nearer else None
 
 
-def _lost(
-    cameras: Sequence[Camera], rig: StereoRig | None, known: CameraFormat, carried: bool = False
-) -> tuple[str, ...]:
+def _lost(cameras: Sequence[Camera], rig: Rig | None, known: CameraFormat, carried: bool = False) -> tuple[str, ...]:
     """What the cameras have that the format does not, in words."""
     records = [camera.calibration for camera in cameras if camera.calibration is not None]
     found = {
@@ -419,8 +416,8 @@ def _lost(
         "calibration record": any(record.record is not None for record in records),
         "entrance pupil": any(bool((camera.coefficients[1:3] != 0).any()) for camera in cameras if camera.model.hybrid),
         "relative pose": rig is not None and not known.pose,
-        "covariance of the rig": rig is not None and rig.covariance is not None,
-        "mounting": rig is not None and rig.mounting is not None,
+        "covariance of the rig": rig is not None and (rig.covariance is not None or rig.root is not None),
+        "mounting": rig is not None and (rig.mounting is not None or rig.origin is not None),
     }
     return tuple(what for what, there in found.items() if there)
 

@@ -20,7 +20,7 @@ from kcal.calibrate.rig.uncertainty import SharedCovariance, mounting_rows, para
 from kcal.io.rig_file import save_rig
 from kcal.lens.calibration import Exclusion, ItemResidual, RigCalibration, RigSource
 from kcal.lens.camera import Camera
-from kcal.lens.rig import CameraRig, CameraRigCalibration, Origin, RigCovariance, StereoRig
+from kcal.lens.rig import CameraRigCalibration, Origin, Rig, RigCovariance
 from kcal.solve.lm import LMOptions
 from kcal.solve.problem import SolverStatus
 from kcal.texts import brief
@@ -149,7 +149,7 @@ class RigResult:
         along = shift / torch.linalg.vector_norm(shift)
         return math.sqrt(float(along @ self.relative_covariance()[3:, 3:] @ along))
 
-    def stereo(self, first: int = 0, second: int = 1) -> StereoRig:
+    def stereo(self, first: int = 0, second: int = 1) -> Rig:
         """Two of the cameras as a rig, with its covariance and with how it was solved.
 
         `kcal.rig.placed_rig` adds where it stands on the Earth. The covariance is left out where the data do not
@@ -157,7 +157,7 @@ class RigResult:
         """
         rotation = self.rotation[second] @ self.rotation[first].T
         translation = self.rotation[second] @ (self.center[first] - self.center[second])
-        rig = StereoRig(self.cameras[first], self.cameras[second], rotation, translation)
+        rig = Rig.pair(self.cameras[first], self.cameras[second], rotation, translation)
         half = self._covariance.half_of(self._joint_rows(first, second))
         if half is not None:
             rig.covariance = RigCovariance(half=half)
@@ -174,15 +174,15 @@ class RigResult:
         )
         return rig
 
-    def stations(self, origin: Origin | None = None) -> CameraRig:
+    def stations(self, origin: Origin | None = None) -> Rig:
         """All cameras with what is known of them together, which is left out where the data leave something open.
 
         Args:
             origin: of the frame in which landmarks and positions were given.
         """
         each = range(len(self.cameras))
-        rig = CameraRig(
-            self.cameras, self.names, self.rotation, self.center, origin=origin if self.absolute else None,
+        rig = Rig(
+            self.cameras, self.names, self.rotation, center=self.center, origin=origin if self.absolute else None,
             refraction=self.refraction if self.absolute and origin is not None else 0.0,
         )  # fmt: skip
         poses = [mounting_rows(self._problem, self._state, camera) for camera in each]

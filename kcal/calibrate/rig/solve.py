@@ -393,16 +393,16 @@ def calibrate_rig(
         DegenerateError: no pair is left.
 
     Example:
-        >>> from kcal import Board, StereoRig, View
+        >>> from kcal import Board, Rig, View
         >>> from kcal.lens import rotation_from_vector
         >>> board = Board(columns=7, rows=6, square=0.05)
         >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480))
-        >>> truth = StereoRig(camera, camera, torch.eye(3), torch.tensor([-0.2, 0.0, 0.0]))
+        >>> truth = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-0.2, 0.0, 0.0]))
         >>> tilts = torch.tensor([[0.4, 0, 0], [-0.4, 0.1, 0], [0, 0.4, 0.2]], dtype=torch.float64)
         >>> sides = ([], [])
         >>> for i, rotation in enumerate(rotation_from_vector(tilts)):
         ...     points = board.points @ rotation.T + torch.tensor([-0.1, -0.1, 1.0], dtype=torch.float64)
-        ...     for views, pixels in zip(sides, truth(points)[:2]):
+        ...     for views, pixels in zip(sides, truth(points)[0].unbind(-2)):
         ...         views.append(View(name=f"{i}.png", pixels=pixels.tolist()))
         >>> left, right = (Observations(board=board, image_size=(640, 480), views=views) for views in sides)
         >>> pairs = [(name, name) for name in left.names]

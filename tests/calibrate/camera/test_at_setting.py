@@ -23,7 +23,7 @@ from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.calibration import BoardRecord, CalibrationRecord, CameraCalibration, LensSetting
 from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.lens.uncertainty import pixel_covariance, pixel_errors
 
 SIZE, SETTINGS = (640, 480), (0.0, 1.0, 2.0, 3.5, 5.0)
@@ -271,7 +271,7 @@ def test_files_keep_the_setting(tmp_path: Path) -> None:
         values={"focus": 2.5}, interpolated_from=("f0", "f1", "f2", "f3.5", "f5")
     )
     assert torch.allclose(covariance_of(read), covariance_of(found))
-    rig = StereoRig(found, calibrated(1.0), torch.eye(3), torch.tensor([-10.0, 0, 0]))
+    rig = Rig.pair(found, calibrated(1.0), torch.eye(3), torch.tensor([-10.0, 0, 0]))
     both = load_rig(save_rig(rig, tmp_path / "rig.json"))
     assert [one.calibration.setting.values for one in (both.left, both.right)] == [{"focus": 2.5}, {"focus": 1.0}]  # type: ignore[union-attr]
     with pytest.raises(InputError, match="each number needs a name"):

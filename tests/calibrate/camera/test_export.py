@@ -17,7 +17,7 @@ from kcal.io.format_mrcal import SplineGrid
 from kcal.io.formats import FORMATS, import_cameras
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 
 LENSES = {
     "pinhole": [],
@@ -53,7 +53,7 @@ def test_what_a_format_holds_comes_back(tmp_path: Path, name: str, model: str) -
 
 @pytest.mark.parametrize("name", [name for name in FORMATS if FORMATS[name].pose])
 def test_a_rig_comes_back(tmp_path: Path, name: str) -> None:
-    rig = StereoRig(camera("opencv4"), camera("pinhole"), ROTATION, TRANSLATION)
+    rig = Rig.pair(camera("opencv4"), camera("pinhole"), ROTATION, TRANSLATION)
     back = import_cameras(*export_cameras(rig, tmp_path / FILES[name], format=name).paths).rig()
     assert float((back.right_from_left_rotation - ROTATION).abs().max()) < 1e-12
     assert float((back.right_from_left_translation - TRANSLATION).abs().max()) < 1e-12

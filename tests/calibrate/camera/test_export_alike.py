@@ -9,7 +9,7 @@ import torch
 from kcal.calibrate.camera.export import export_cameras
 from kcal.io.formats import import_cameras
 from kcal.lens.camera import Camera
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 
 
 def camera(focal: float, model: str, *coefficients: float) -> Camera:
@@ -23,8 +23,8 @@ NARROW = camera(420, "opencv5", -0.02, 0.012, 0.001, 0.0, -0.001)
 WIDE = camera(330, "opencv8", 0.4, 0.02, 0.001, 0.0, 0.01, 0.7, 0.08, 0.012)
 
 
-def rig(left: Camera, right: Camera) -> StereoRig:
-    return StereoRig(left, right, torch.eye(3), torch.tensor([-0.1, 0.0, 0.0]))
+def rig(left: Camera, right: Camera) -> Rig:
+    return Rig.pair(left, right, torch.eye(3), torch.tensor([-0.1, 0.0, 0.0]))
 
 
 def test_a_wide_pair_becomes_omni_in_kalibr(tmp_path: Path) -> None:

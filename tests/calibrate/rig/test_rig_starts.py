@@ -38,7 +38,7 @@ from kcal.calibrate.rig.source import Start
 from kcal.calibrate.rig.sources import RigData
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import Rig
 from kcal.lens.turning import rotation_between
 from kcal.report.judge_rig import synchrony
 
@@ -295,7 +295,7 @@ class TestPlaces:
 
 class TestSynchrony:
     CAMERA = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480))
-    RIG = StereoRig(CAMERA, CAMERA, rotation_from_vector(tensor(0.01, -0.02, 0.03)), tensor(-0.1, 0.0, 0.01))
+    RIG = Rig.pair(CAMERA, CAMERA, rotation_from_vector(tensor(0.01, -0.02, 0.03)), tensor(-0.1, 0.0, 0.01))
     POINTS = torch.cartesian_prod(torch.arange(5.0), torch.arange(4.0), torch.zeros(1)).double() * 0.05
 
     def seen(self, count: int, late: float, noise: float = 0.0, seed: int = 1) -> Tensor:
@@ -306,7 +306,7 @@ class TestSynchrony:
             return self.POINTS @ rotation_from_vector(tensor(0.3, -0.2, 0.1)).T + where[:, None]
 
         at = torch.arange(count).double()
-        pixels = torch.stack([self.RIG(places(at))[0], self.RIG(places(at + late))[1]], 1)
+        pixels = torch.stack([self.RIG(places(at))[0][..., 0, :], self.RIG(places(at + late))[0][..., 1, :]], 1)
         return pixels + noise * normal(tuple(pixels.shape), seed)
 
     @pytest.mark.parametrize("late", [0.3, -0.2])

@@ -151,7 +151,8 @@ class TestOrdinary:
         assert targets is not None
         localize = StereoLocalizer(rig, origin=ORIGIN, heading_deg=0.0, pixel_sigma=0.1)
         for far in (200.0, 370.0, 900.0, 5000.0):
-            left, right, good = rig(far * targets.rays)
+            pixels, good = rig(far * targets.rays)
+            (left, right), good = pixels.unbind(-2), good.all(-1)
             wanted = localize(left, right).inverse_range_sigma[good]
             by_rig = targets.at(torch.full((len(targets.rays),), 1.0 / far).double()).square().sum(-1)
             # The variance by the marks is that at infinity.
