@@ -154,7 +154,7 @@ class InformationRecord(Record):
         return cls(
             unknowns=tuple(map(tuple, groups)),
             board=tuple(known.estimate[known.lens_size :].tolist()),
-            triangle=Packed.of(_above(known.triangle())),
+            triangle=Packed.of(_above(known.data.compressed().rows)),
             mean=tuple(known.mean.tolist()),
             sigma=tuple(value if math.isfinite(value) else None for value in known.sigma.tolist()),
             others=others,

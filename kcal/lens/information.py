@@ -84,7 +84,7 @@ class CameraInformation:
 
     @classmethod
     def from_covariance(cls, params: Tensor, covariance: Tensor) -> CameraInformation:
-        """Of a covariance (5 + P, 5 + P) of the parameters (5 + P,) of a camera; those without variance are held.
+        """From a camera's parameters (5 + P,) and their covariance (5 + P, 5 + P); those without variance are held.
 
         Raises:
             InputError: a wrong shape, values that are not finite, or no covariance.
@@ -111,7 +111,7 @@ class CameraInformation:
 
     @property
     def board_size(self) -> int:
-        """How many are the board's."""
+        """How many of the unknowns are the board's."""
         return len(self.estimate) - self.lens_size
 
     @property
@@ -121,7 +121,7 @@ class CameraInformation:
 
     @property
     def board(self) -> Slots:
-        """Names of the board's."""
+        """Names of the board's unknowns."""
         return numbered(BOARD_SLOT, self.board_size)
 
     @property
@@ -131,12 +131,12 @@ class CameraInformation:
 
     @property
     def lens_prior(self) -> Gaussian:
-        """What was assumed of the camera; only of those unknowns of which anything was."""
+        """The prior of the camera: only of unknowns that have one."""
         return self._prior(range(self.lens_size))
 
     @property
     def board_prior(self) -> Gaussian:
-        """What was assumed of the board."""
+        """The prior of the board."""
         return self._prior(range(self.lens_size, len(self.estimate)))
 
     def _prior(self, numbers: range) -> Gaussian:
@@ -147,7 +147,7 @@ class CameraInformation:
 
     @property
     def board_message(self) -> Gaussian:
-        """What the data say of the board, whatever the camera is within its prior."""
+        """What the data say of the board: the camera, with its prior, is integrated out."""
         return (self.data + self.lens_prior).marginal(self.board)
 
     @property
@@ -161,28 +161,8 @@ class CameraInformation:
         """Data, priors, and what other cameras say of the board, about the estimate."""
         return self.data + self.lens_prior + self.board_prior + self.told
 
-    def data_rows(self) -> Tensor:
-        """(R, U + 1) rows of the data; the last column holds their residuals at the estimate."""
-        return self.data.rows
-
-    def prior_rows(self, *, board: bool) -> Tensor:
-        """(Q, U + 1) likewise of the prior of the board's unknowns, or of the camera's."""
-        return (self.board_prior if board else self.lens_prior).placed(self.data.slots, self.estimate).rows
-
-    def board_rows(self) -> Tensor:
-        """(Q, U + 1) likewise of all that is known of the board otherwise: its prior, and what other cameras say."""
-        return (self.board_prior + self.told).placed(self.data.slots, self.estimate).rows
-
-    def all_rows(self) -> Tensor:
-        """(R + Q, U + 1) rows of data, priors, and what other cameras say of the board."""
-        return self.whole.rows
-
-    def triangle(self) -> Tensor:
-        """(U, U + 1) upper triangle of the data's rows, their residuals last; the rest says nothing of the unknowns."""
-        return self.data.compressed().rows
-
     def with_data(self, data: Gaussian) -> CameraInformation:
-        """The same with other data."""
+        """What is known when other data take the place of these: the same priors, about the same estimate."""
         rows = data.placed(self.data.slots, self.estimate).rows
         return dataclasses.replace(self, rows=rows[:, :-1], residuals=rows[:, -1])
 
@@ -209,7 +189,7 @@ class CameraInformation:
         return half.T @ half
 
     def without_board(self) -> CameraInformation:
-        """What is said of the camera alone, whatever its board is."""
+        """What is known of the camera alone: the board is integrated out."""
         count = self.lens_size
         if not self.board_size:
             return self

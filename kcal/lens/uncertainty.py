@@ -312,7 +312,7 @@ def square_root_information(camera: Camera, order: Sequence[int]) -> tuple[Tenso
     mean = (share / share.sum(0)).T
     held = share.sum(1) == 0
     rows = [
-        lens.all_rows()[:, :-1] @ mean,
+        lens.whole.rows[:, :-1] @ mean,
         torch.diag(stiff)[held],
         stiff[:, None] * (torch.diag(1.0 * ~held) - share @ mean),
     ]

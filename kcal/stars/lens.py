@@ -162,7 +162,7 @@ def joint_calibration(
 
 def _known_lens(lens: CameraInformation, sigma: Tensor) -> Gaussian:
     """What boards say of the lens, under a prior of standard deviations (S,)."""
-    rows = dataclasses.replace(lens, sigma=sigma).all_rows()
+    rows = dataclasses.replace(lens, sigma=sigma).whole.rows
     return Gaussian(numbered(LENS_SLOT, len(sigma)), lens.estimate, rows)
 
 
@@ -215,21 +215,15 @@ def _with_star_rows(known: CameraInformation, stars: Tensor, change: Tensor) -> 
         stars: (S, S + 1) rows of the lens, residuals at the new estimate.
         change: (S,) of the lens.
     """
-    rows, count = known.all_rows(), len(change)
-    aim = rows[:, :count] @ change + rows[:, -1]
-    board = -torch.linalg.lstsq(rows[:, count:-1], aim[:, None]).solution[:, 0] if known.board_size else change[:0]
-    step = torch.cat([change, board])
-    wide = torch.cat([stars[:, :-1], stars.new_zeros(len(stars), known.board_size)], 1)
-    others = known.others
-    if others is not None:
-        others = torch.cat([others[:, :-1], (others[:, -1] + others[:, :-1] @ board)[:, None]], 1)
-    return dataclasses.replace(
-        known,
-        estimate=known.estimate + step,
-        rows=torch.cat([known.rows, wide]),
-        residuals=torch.cat([known.residuals + known.rows @ step, stars[:, -1]]),
-        others=others,
-    )
+    lens = known.estimate[: len(change)] + change
+    board = known.estimate[len(change) :]
+    if known.board_size:
+        there = known.whole.placed(known.data.slots, torch.cat([lens, board]))
+        board = there.conditioned(known.lens).mean
+    moved = dataclasses.replace(known, estimate=torch.cat([lens, board]))
+    if known.others is not None:
+        moved = dataclasses.replace(moved, others=known.told.placed(known.board, board).rows)
+    return moved.with_data(known.data + Gaussian(known.lens, lens, stars))
 
 
 def _star_noise(stars: StarViews) -> tuple[int, float]:

@@ -56,15 +56,16 @@ def test_without_board_is_the_marginal() -> None:
 def test_rows_are_those_of_its_parts() -> None:
     """Data, priors and what others say, in the order of the unknowns, with residuals at the estimate."""
     known = dataclasses.replace(information(), others=torch.ones(1, 3, dtype=torch.float64))
-    assert torch.equal(known.data_rows(), torch.cat([known.rows, known.residuals[:, None]], 1))
+    assert torch.equal(known.data.rows, torch.cat([known.rows, known.residuals[:, None]], 1))
     pull = (known.estimate - known.mean) / known.sigma
-    for board, own in ((False, [3, 4]), (True, [5, 6])):
-        rows = known.prior_rows(board=board)
+    slots = known.data.slots
+    for prior, own in ((known.lens_prior, [3, 4]), (known.board_prior, [5, 6])):
+        rows = prior.placed(slots, known.estimate).rows
         assert torch.equal(rows[:, own], torch.diag(1.0 / known.sigma[own]))
         torch.testing.assert_close(rows[:, -1], pull[own])
-    assert known.board_rows()[-1].tolist() == [0.0] * 5 + [1.0] * 3
-    torch.testing.assert_close(known.triangle().T @ known.triangle(), known.data.compressed().products)
-    assert known.all_rows().shape == (40 + 2 + 2 + 1, 8)
+    assert known.told.placed(slots, known.estimate).rows[-1].tolist() == [0.0] * 5 + [1.0] * 3
+    torch.testing.assert_close(known.data.compressed().products[:-1], known.data.products[:-1])
+    assert known.whole.rows.shape == (40 + 2 + 2 + 1, 8)
 
 
 def test_from_covariance_and_back() -> None:

@@ -245,7 +245,7 @@ class TestPosterior:
             others=others,
         )  # fmt: skip
         # At its minimum.
-        step = -torch.linalg.lstsq(known.all_rows()[:, :-1], known.all_rows()[:, -1:]).solution[:, 0]
+        step = -torch.linalg.lstsq(known.whole.rows[:, :-1], known.whole.rows[:, -1:]).solution[:, 0]
         return CameraInformation(
             slots=known.slots, estimate=known.estimate + step, rows=rows, residuals=rows @ step, mean=known.mean,
             sigma=known.sigma, others=torch.cat([others[:, :1], others[:, 1:] + others[:, :1] * step[2]], 1),
@@ -254,15 +254,15 @@ class TestPosterior:
     def test_rows_of_stars_move_the_board_along(self) -> None:
         """Against one least squares of everything at once."""
         known = self.lens()
-        assert float((known.all_rows()[:, :-1].T @ known.all_rows()[:, -1]).abs().max()) < 1e-12
+        assert float((known.whole.rows[:, :-1].T @ known.whole.rows[:, -1]).abs().max()) < 1e-12
         stars = torch.randn(4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
         wide = torch.cat([stars[:, :2], torch.zeros(4, 1).double(), stars[:, 2:]], 1)
-        every = torch.cat([known.all_rows(), wide])
+        every = torch.cat([known.whole.rows, wide])
         step = -torch.linalg.lstsq(every[:, :-1], every[:, -1:]).solution[:, 0]
         moved = torch.cat([stars[:, :2], (stars[:, 2] + stars[:, :2] @ step[:2])[:, None]], 1)
         found = _with_star_rows(known, moved, step[:2])
         torch.testing.assert_close(found.estimate, known.estimate + step)
-        rows = found.all_rows()
+        rows = found.whole.rows
         assert float((rows[:, :-1].T @ rows[:, -1]).abs().max()) < 1e-10
         half = found.half()
         torch.testing.assert_close(half.T @ half, torch.linalg.inv(every[:, :-1].T @ every[:, :-1]))

@@ -72,7 +72,7 @@ def test_the_posterior_is_at_its_minimum(both: StarCamera) -> None:
     known = both.lens.camera.calibration
     assert known is not None
     assert known.information is not None
-    rows = known.information.all_rows()
+    rows = known.information.whole.rows
     slope = rows[:, :-1].T @ rows[:, -1]
     half = known.information.half()
     assert float((half @ slope).abs().max()) < 1e-4
