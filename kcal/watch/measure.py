@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.features import Features
 from kcal.corners.images import Gray, to_8bit
 from kcal.corners.match import keypoints
 from kcal.corners.patches import fit_shifts, grid_of, has_samples, image_windows, sample
@@ -290,21 +289,15 @@ def seen_by(camera: Camera, reference: FixedFeatures, image: Gray, turn: Tensor,
         full = _is_full(image)
         why = "nothing of the reference is there" if full else "dark, fog, or a dirty lens?"
         return nothing._replace(note=f"{name}: {count} features ({why})", lost=full)
-    then = torch.where(good[:, None], reference.pixels, math.nan)
-    features = Features(
-        names=tuple(map(str, range(len(good)))),
-        pixels=torch.stack([then, torch.where(good[:, None], now, math.nan)], 1),
-        inverse_range=torch.zeros(len(good)).double(),
-        inverse_range_sigma=torch.full((len(good),), math.inf).double(),
-        # Of both marks: the features together tell how much larger it is.
-        pixel_sigma=max(_FLOOR, float(sigma[good].square().mean().sqrt())) / math.sqrt(2.0),
-    )
+    then, now = (torch.where(good[:, None], marks, math.nan) for marks in (reference.pixels, now))
+    # Of both marks: the features together tell how much larger it is.
+    pair_sigma = max(_FLOOR, float(sigma[good].square().mean().sqrt()))
     try:
-        (found,), items, _ = camera_turns([camera], [name], features)
+        turns = camera_turns([camera], [name], then[:, None], now[:, None], pair_sigma)
     except (InputError, DegenerateError) as error:
         _check_lens(camera, reference.pixels[good], now[good], name)
         return nothing._replace(note=f"{name}: {str(error).removeprefix('drift: ')}", lost=_is_full(image))
-    used = torch.tensor([item.used for item in items]) & good
+    (found,), used = turns.each, turns.used
     _check_lens(camera, reference.pixels[used], now[used], name)
     off = torch.where(good[:, None], found.off, 0.0)
     old = used & (reference.looks >= 10)

@@ -61,25 +61,38 @@ class CameraTurn(NamedTuple):
     squares: Tensor
 
 
+class CameraTurns(NamedTuple):
+    """How cameras have turned, by features that stand still.
+
+    Attributes:
+        each: camera's turn; covariances are multiplied by the variance.
+        used: (F,) features that have not moved.
+        over_limit: (F,) χ² of each in the camera where it fits worst, over the largest that noise explains.
+        variance: how many times larger the squares of residuals are than the sigma of the marks says, at least 1.
+    """
+
+    each: list[CameraTurn]
+    used: Tensor
+    over_limit: Tensor
+    variance: float
+
+
 def camera_turns(
-    cameras: Sequence[Camera], names: Sequence[str], features: Features
-) -> tuple[list[CameraTurn], tuple[ItemResidual, ...], float]:
+    cameras: Sequence[Camera], names: Sequence[str], then: Tensor, now: Tensor, sigma: float
+) -> CameraTurns:
     """Find how each camera has turned; features that moved are left out.
 
     Args:
         cameras: C cameras.
         names: of the cameras.
-        features: pixels (F, 2 C, 2): in all cameras then, and in all now. What is known of ranges is not used.
-
-    Returns:
-        each camera's turn; the residuals of the features; and by how much the covariances were multiplied because
-        residuals are larger than the marks' sigma explains.
+        then: (F, C, 2) marks in all cameras; NaN where there is none.
+        now: (F, C, 2) likewise.
+        sigma: of the difference between two marks along an axis, px.
 
     Raises:
         InputError: many features moved.
         DegenerateError: a camera has fewer than two features with marks then and now, or all in one place.
     """
-    then, now = features.pixels.unflatten(1, (2, len(cameras))).unbind(1)
     views = [_MarksTwice(camera, then[:, c], now[:, c]) for c, camera in enumerate(cameras)]
     known = torch.stack([view.known for view in views])
     for name, marked in zip(names, known, strict=True):
@@ -88,7 +101,7 @@ def camera_turns(
                 f"drift: two features or landmarks at least are needed; {name} has {int(marked.sum())} with marks "
                 "then and now. More let wrong ones be found"
             )
-    matched, sigma = known.any(0), math.sqrt(2.0) * features.pixel_sigma
+    matched = known.any(0)
     found = [view.turn(matched, sigma, robust=True) for view in views]
     if (times := max(math.sqrt(_typical(turn)) for turn in found)) > adjustment.WRONG_AS_A_WHOLE:
         raise InputError(
@@ -111,24 +124,7 @@ def camera_turns(
     chi2 = sum(float((turn.off[used].nan_to_num() / sigma).square().sum()) for turn in found)
     freedom = 2 * int((known & used).sum()) - 3 * len(cameras)
     variance = variance_factor(chi2, freedom)
-    items = []
-    for i, feature in enumerate(features.names):
-        off = {name: float(turn.off[i].norm()) for name, turn in zip(names, found, strict=True)}
-        off = {name: length for name, length in off.items() if math.isfinite(length)}
-        moved = ", ".join(f"{length:.1f} px ({name})" for name, length in off.items())
-        reason = f"it has moved by {moved}" if off else "no camera has a mark of it both then and now"
-        items.append(
-            ItemResidual(
-                source="features",
-                name=feature,
-                pixels=tuple(off.get(name) for name in names),
-                sigmas=math.hypot(*off.values()) / (sigma * math.sqrt(2 * len(off))) if off else math.inf,
-                over_limit=float(over[i]),
-                used=bool(used[i]),
-                reason="" if used[i] else reason,
-            )
-        )
-    return [turn._replace(covariance=variance * turn.covariance) for turn in found], tuple(items), variance
+    return CameraTurns([turn._replace(covariance=variance * turn.covariance) for turn in found], used, over, variance)
 
 
 class _MarksTwice:
@@ -416,10 +412,31 @@ def measure_drift(
 
 def _since(rig: Rig, features: Features, cam_from_local: Tensor | None) -> Drift:
     """How the cameras have turned since the marks of then, with the left camera's attitude then, if it is known."""
-    (left, right), items, variance = camera_turns((rig.left, rig.right), _NAMES, features)
-    both = torch.cat([left.vector, right.vector])
-    return drift_of_turns(rig, both, torch.block_diag(left.covariance, right.covariance), cam_from_local,
-                          items=items, variance=variance)  # fmt: skip
+    then, now = features.pixels.unflatten(1, (2, 2)).unbind(1)
+    sigma = math.sqrt(2.0) * features.pixel_sigma
+    found = camera_turns((rig.left, rig.right), _NAMES, then, now, sigma)
+    items = []
+    for i, feature in enumerate(features.names):
+        off = {name: float(turn.off[i].norm()) for name, turn in zip(_NAMES, found.each, strict=True)}
+        off = {name: length for name, length in off.items() if math.isfinite(length)}
+        moved = ", ".join(f"{length:.1f} px ({name})" for name, length in off.items())
+        reason = f"it has moved by {moved}" if off else "no camera has a mark of it both then and now"
+        items.append(
+            ItemResidual(
+                source="features",
+                name=feature,
+                pixels=tuple(off.get(name) for name in _NAMES),
+                sigmas=math.hypot(*off.values()) / (sigma * math.sqrt(2 * len(off))) if off else math.inf,
+                over_limit=float(found.over_limit[i]),
+                used=bool(found.used[i]),
+                reason="" if found.used[i] else reason,
+            )
+        )
+    vectors, covariances = zip(*((turn.vector, turn.covariance) for turn in found.each), strict=True)
+    return drift_of_turns(
+        rig, torch.cat(vectors), torch.block_diag(*covariances), cam_from_local, items=tuple(items),
+        variance=found.variance,
+    )  # fmt: skip
 
 
 def drift_of_turns(
