@@ -203,20 +203,6 @@ _ONLINE = {
     "url": "https://tile.openstreetmap.org/{z}/{x}/{y}.png",
     "attribution": "© OpenStreetMap contributors, openstreetmap.org/copyright",
 }
-_MAP_STYLE = """
-html, body { margin: 0; height: 100%; font: 14px/1.4 system-ui, sans-serif; color: #111827; }
-body { display: flex; flex-direction: column; }
-header { padding: 8px 14px; border-bottom: 1px solid #d1d5db; }
-header h1 { font-size: 16px; margin: 0; }
-header p { margin: 2px 0 0; color: #4b5563; font-size: 12px; }
-#map { flex: 1; background: #f3f1ea; }
-.north { pointer-events: none; font: 700 14px system-ui, sans-serif; margin-left: 17px !important; }
-.leaflet-control-layers-toggle::after { content: "\\2630"; display: block; text-align: center; line-height: 36px;
-  color: #374151; font-size: 20px; }
-.leaflet-control-layers-toggle { text-decoration: none; }
-.leaflet-popup-content td { padding: 1px 8px 1px 0; white-space: nowrap; }
-.head, .head svg { overflow: visible; }
-"""
 LatLon = tuple[float, float]
 
 
@@ -256,9 +242,9 @@ def map_page(
     # This page does not show the controls of these pictures.
     for picture in ("images/layers.png", "images/layers-2x.png", "images/marker-icon.png"):
         style = style.replace(f"url({picture})", "none")
-    shared = resources.files("kcal.web") / "map"
-    style += (shared / "map.css").read_text(encoding="utf-8")
-    sources = (library / "leaflet.js", shared / "map.js", resources.files("kcal.report") / "map_page.js")
+    shared, own = resources.files("kcal.web") / "map", resources.files("kcal.report")
+    style += "".join(sheet.read_text(encoding="utf-8") for sheet in (shared / "map.css", own / "map_page.css"))
+    sources = (library / "leaflet.js", shared / "map.js", own / "map_page.js")
     scripts = [source.read_text(encoding="utf-8") for source in sources]
     allowed = "data: https://tile.openstreetmap.org" if online else "data:"
     title = located.count_note
@@ -275,10 +261,9 @@ def map_page(
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <meta http-equiv="Content-Security-Policy"
- content="{page_policy(scripts=scripts, styles=(style, _MAP_STYLE), images=allowed)}">
+ content="{page_policy(scripts=scripts, styles=(style,), images=allowed)}">
 <title>{page_text(title)}</title>
 <style>{style}</style>
-<style>{_MAP_STYLE}</style>
 </head>
 <body>
 <header><h1>{page_text(title)}</h1><p>{page_text(note)}<br>{page_text(key)}</p></header>

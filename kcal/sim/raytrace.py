@@ -16,9 +16,9 @@ from kcal.lens.pose import rotation_from_vector
 
 # Lens prescriptions: radii, thicknesses and refractive indices of real designs, and their paraxial properties.
 #
-# A prescription is what a lens designer publishes. Scaled to a focal length and traced ray by ray
-# , it distorts like a real lens, without any lens model of kcal. Lengths are millimeters and light
-# travels along +z, as in the literature; indices are those of the helium d line (587.6 nm).
+# A prescription is what a lens designer publishes. Scaled to a focal length and traced ray by ray, it distorts like a
+# real lens, without any lens model of kcal. Lengths are millimeters and light travels along +z, as in the literature;
+# indices are those of the helium d line (587.6 nm).
 
 
 @dataclass(frozen=True, kw_only=True)
