@@ -124,7 +124,7 @@ def fit_projection(
 
 
 def _no_modes(points: Tensor) -> BoardModes:
-    """No modes."""
+    """A board that does not differ from the one that was ordered."""
     return BoardModes(points.new_zeros(0, 3, len(points)), points.new_zeros(0), torch.zeros(0, dtype=torch.long))
 
 
@@ -222,7 +222,7 @@ def may_be_unequal(points: Tensor, pixels: Tensor, size: tuple[int, int]) -> boo
 def fit_base(
     capture: FittedViews, modes: FieldModes, known_focal: float | None = None, lens: LensPrior | None = None
 ) -> tuple[Estimate, int]:
-    """Fit the base projection alone: its focal length and shape become constants of the lens. Also the trial steps."""
+    """Fit the base projection, whose focal length and shape become constants of the lens; also the trial steps."""
     board, h = capture.board, capture.hyperprior.mean
     if lens is not None:
         return _fit_known(capture, lens)
@@ -247,7 +247,7 @@ def fit_base(
 
 
 def _fit_known(capture: FittedViews, lens: LensPrior) -> tuple[Estimate, int]:
-    """Likewise for a camera of a known type, whose constants and typical field are given."""
+    """As `fit_base`, for a camera of a known type, whose constants and typical field are given."""
     start = _base_start(capture, None, lens)
     aspect = None if capture.square else 1.0
     families = lens.families(prior_families(lens.form, lens.focal, capture.board, capture.size, start.distance, aspect))

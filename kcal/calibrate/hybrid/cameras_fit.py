@@ -195,7 +195,7 @@ def fit_turned(
 def _with_its_type(
     camera: CameraFit, points: Tensor, pixels: Tensor, weights: Tensor, options: FitOptions
 ) -> CameraFit:
-    """With what its data say about the amplitudes of lenses, and about its lens."""
+    """Add what its data say about the amplitudes of lenses, and about its lens."""
     fit = camera.fit
     deviation = fit.families.deviation(fit.expected)
     of_board = numbered(BOARD_SLOT, len(fit.state.board))
@@ -292,7 +292,7 @@ class _SharedBoard:
 
 
 def compared(camera: CameraFit, known: Gaussian, kind: Board) -> CameraFit:
-    """With the evidence that the board is the measured one, and all views turned if it was read from another end."""
+    """Add the evidence that the board is the measured one; turn all views if it was read from another end."""
 
     def nats(camera: CameraFit) -> float:
         return evidence(known, [camera.message]) - _evidence([camera.message], camera)
@@ -311,7 +311,7 @@ def others_of(cameras: Sequence[CameraFit], board: int) -> dict[int, Gaussian | 
 
 
 def _but_one(messages: Sequence[Gaussian]) -> list[Gaussian | None]:
-    """For each message, all others merged; None where there is no other. As many merges as there are messages."""
+    """For each message, all others merged; None where there is no other. The work is linear in the messages."""
 
     def running(messages: Sequence[Gaussian]) -> list[Gaussian | None]:
         out: list[Gaussian | None] = [None]
@@ -325,7 +325,7 @@ def _but_one(messages: Sequence[Gaussian]) -> list[Gaussian | None]:
 
 
 def _merged(messages: Sequence[Gaussian]) -> Gaussian:
-    """All that they say, in few rows."""
+    """The sum of the messages, in as many rows as there are unknowns."""
     return stacked(messages).compressed()
 
 
@@ -335,7 +335,7 @@ def _evidence(messages: Sequence[Gaussian], like: CameraFit) -> float:
 
 
 def _turned(camera: CameraFit, turn: int) -> CameraFit:
-    """With all views read from another end."""
+    """The camera with all views read from another end."""
     return dataclasses.replace(camera, turns=(camera.turns + turn) % 4, message=turned(camera.message, turn))
 
 
@@ -507,7 +507,7 @@ def measure_board(
 
 
 def _begun_fleet(cameras: Sequence[CameraFit]) -> LensPrior:
-    """One form for the lenses of a type, that of the camera of middle focal length, and the amplitudes of all.
+    """A lens prior for a type: the form of the camera of median focal length, and the amplitudes of all cameras.
 
     Where pixels of one camera are not square, those of its type need not be.
     """
@@ -521,7 +521,7 @@ def _begun_fleet(cameras: Sequence[CameraFit]) -> LensPrior:
 
 
 def _learned_fleet(cameras: Sequence[CameraFit], typical: LensPrior) -> tuple[LensPrior, list[LensPrior]]:
-    """The lens of the next camera, and each camera's from all others: what a camera tells does not enter its prior."""
+    """Lens priors from all cameras for the next one, and for each camera from all others but itself."""
     following, each = fleet_priors([c.lens for c in cameras if c.lens is not None], typical.unknowns)
     return typical._replace(unknowns=following), [typical._replace(unknowns=prior) for prior in each]
 

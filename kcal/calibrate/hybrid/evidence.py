@@ -69,7 +69,7 @@ class Quadratic(NamedTuple):
         return float(self.products[-1, -1])
 
     def tempered(self, tempering: float) -> Quadratic:
-        """The same data, counting less."""
+        """The same data, whose log likelihood is divided by the tempering."""
         return Quadratic(self.products / tempering, self.freedom / tempering, self.at) if tempering != 1.0 else self
 
 
@@ -104,7 +104,7 @@ class ViewData(NamedTuple):
         return 0.5 * _TAILS * float((precision - 1.0 - precision.log()).sum())
 
     def only(self, amplitudes: Sequence[int]) -> ViewData:
-        """With some of the amplitudes of views, all other numbers being zero."""
+        """These data with some of the amplitudes of motion and bending; all other motions are zero."""
         bends = self.relative is not None
         count = (self.own.shape[-1] - BENDS * bends) // AXES + bends
         kept = np.isin(amplitudes_of(count), amplitudes)
@@ -112,7 +112,7 @@ class ViewData(NamedTuple):
         return self._replace(own=self.own[:, kept][..., kept], cross=self.cross[:, kept], relative=relative)
 
     def integrated(self, log_ratio: Array) -> Integrated:
-        """With motions integrated out, whose standard deviation over the noise has these logarithms by order."""
+        """Integrate motions out, whose standard deviations over the noise have these logarithms."""
         if not self.moving:
             return Integrated(self.still, 0.0, self.own, self.cross)
         ratio = by_number(log_ratio, self.relative)
@@ -246,7 +246,7 @@ def still_data(rows: Tensor, x: Tensor, freedom: float) -> ViewData:
 
 
 def overdispersion(score: Tensor, K: Tensor, deviation: Tensor, variance: float) -> float:
-    """How much more the scores (V, S) of views scatter than independent corners explain, in determined directions."""
+    """Scatter of the views' scores (V, S) over what independent corners explain, in directions that data determine."""
     score = score - score.mean(0)
     inverse = posterior_root(K, deviation, variance)
     effective = len(K) - float(inverse.square().sum())
@@ -347,7 +347,7 @@ def _best(data: Quadratic, families: PriorFamilies, h: np.ndarray, log_variance:
 
 
 def _posterior(data: Quadratic, families: PriorFamilies, h: np.ndarray, log_variance: float) -> _Posterior | None:
-    """None where priors are too wide for the precision of numbers."""
+    """The posterior with its derivatives; None where priors are too wide for the precision of numbers."""
     best = _best(data, families, h, log_variance)
     if not np.isfinite(best.value):
         return None
@@ -479,7 +479,7 @@ class EvidenceLoss:
         self._mean, self._sd = prior.mean.numpy(), prior.sd.numpy()
 
     def values(self, many: np.ndarray) -> np.ndarray:
-        """(N,) values alone, of many v (N, H + 5), at a fraction of the cost; infinite beyond numbers."""
+        """(N,) values of many v (N, H + 5) without derivatives, far cheaper; infinite where numbers overflow."""
         data, determinants = self._data.still, np.zeros(len(many))
         if self._data.moving:
             each = [self._data.integrated(self._parts(v)[1]) for v in many]
@@ -533,7 +533,7 @@ class EvidenceLoss:
 
 
 def with_tempering(loss: float, data_freedom: float, variance: float, own: float, tempering: float) -> float:
-    """The loss at a maximum as it were had another tempering been taken: losses compare only at the same one.
+    """The loss at a maximum, converted to another tempering: only losses at the same tempering can be compared.
 
     Otherwise they differ by the choice of the unit of residuals: 5 % of tempering were 200 nats for 24 views. To first
     order in 1/T, which at a maximum is all but exact.
@@ -551,7 +551,7 @@ def with_tempering(loss: float, data_freedom: float, variance: float, own: float
 def evidence_of_motion(
     data: ViewData, best: Maximum, families: PriorFamilies, tempering: float, some: Sequence[int] | None = None
 ) -> float:
-    """By how much motions raise the logarithm of the evidence (nats), all other amplitudes as they are.
+    """Gain of the log evidence (nats) by motions, with all other amplitudes unchanged.
 
     Or some of the amplitudes of views, by their numbers, such as that of bending.
     """
@@ -675,6 +675,6 @@ def expected_amplitudes(
 
 
 def _inverse(bend: np.ndarray) -> np.ndarray:
-    """The inverse of the Hessian; where it does not bend upward, the widest."""
+    """The inverse of the Hessian; a direction without upward curvature gets the largest variance that is allowed."""
     values, vectors = np.linalg.eigh(bend)
     return np.asarray((vectors / np.maximum(values, _WIDEST**-2)) @ vectors.T)

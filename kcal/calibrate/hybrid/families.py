@@ -71,7 +71,7 @@ class PriorFamilies(NamedTuple):
     degree: Tensor
 
     def with_board(self, board: BoardModes) -> PriorFamilies:
-        """The same camera, and another board, or the same in other variables."""
+        """The priors with other modes of the board, such as the same board in other variables."""
         lens = len(self.mean) - len(board.unit)
         family = torch.where(board.family == KNOWN, -1, self.amplitude[PUPIL.start] + 1 + board.family)
         return self._replace(
@@ -116,7 +116,7 @@ class LensPrior(NamedTuple):
         return len(self.unknowns.mean) == LEADING_UNKNOWNS + len(self.form.modes)
 
     def families(self, usual: PriorFamilies) -> PriorFamilies:
-        """Priors with this lens, and the board of others."""
+        """The usual priors with those of the lens replaced by these."""
         own = torch.arange(len(usual.mean)) < len(self.unknowns.mean)
         mean, log_unit = usual.mean.clone(), usual.log_unit.clone()
         mean[own], log_unit[own] = self.unknowns.mean, self.unknowns.sd.log()
@@ -180,7 +180,7 @@ def _numbers(indices: Sequence[int | None]) -> list[int]:
 
 
 def typical_hyperprior(modes: FieldModes | None = None) -> Hyperprior:
-    """That of a camera and a board of which nothing is known; without modes, for the default field."""
+    """The prior for a camera and a board of which nothing is known; modes default to those of the default field."""
     mean, sd, most = np.array((modes or ZernikeModes()).hyperprior).T
     return Hyperprior(
         torch.from_numpy(np.concatenate([mean, _MEAN])),

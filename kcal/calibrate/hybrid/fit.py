@@ -71,7 +71,7 @@ def aspect_score(rounds: Rounds) -> float:
 
 
 def _standing(rounds: Rounds) -> float:
-    """The same at the amplitudes of the rounds, the board's stretch being hardly known."""
+    """As `aspect_score`, at the amplitudes of the rounds, with a wide prior of the board's stretch."""
     estimate, data = rounds.estimate, rounds.data
     families, h = estimate.families, estimate.hyperparameters.clone()
     h[BOARD + STRETCH] = h[BOARD + STRETCH].clamp_min(math.log(_PRINTED))
@@ -87,12 +87,12 @@ def _standing(rounds: Rounds) -> float:
 
 
 def pixels_are_square(score: float) -> bool:
-    """Whether an aspect ratio that is so many standard deviations off cannot be told from one."""
+    """Whether an aspect ratio so many standard deviations from one is explained by noise."""
     return not abs(score) > _CLEAR
 
 
 def with_square_pixels(estimate: Estimate, board: BoardModes) -> Estimate | None:
-    """An estimate with two focal lengths as one with a single one; None where they differ by more than a little."""
+    """The estimate with one focal length in place of two; None where the two differ by more than a few percent."""
     params = estimate.state.parameters.clone()
     if not abs(float(params[1] / params[0]) - 1.0) < _NEARLY:
         return None
@@ -109,7 +109,7 @@ def with_square_pixels(estimate: Estimate, board: BoardModes) -> Estimate | None
 
 
 class FitStart(NamedTuple):
-    """With what a fit of the same views under other weights begins.
+    """A start for another fit of the same views, for example with other weights.
 
     Attributes:
         estimate: camera, board, poses, motions and amplitudes.
@@ -256,7 +256,7 @@ def rough_start(
     options: FitOptions | None = None,
     progress: Callable[[str], object] = lambda _: None,
 ) -> FitStart:
-    """With what a fit of these views under other weights begins: no error bars, and not entirely at rest.
+    """Fit roughly, as a start for a fit with other weights: without error bars, and not entirely at rest.
 
     Raises:
         InputError: as `fit_hybrid`.
@@ -293,7 +293,7 @@ _UNFELT = 1e-6
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class HybridFit:
-    """A camera, its board, and what is not known of both.
+    """A camera, its board, and the uncertainty of both.
 
     Args:
         model: of the lens.
@@ -394,7 +394,7 @@ class HybridFit:
         return self.state.motion[:, -BENDS:] @ self.readout.bends
 
     def problem(self, points: Tensor, pixels: Tensor, weights: Tensor, mean: Tensor, precision: Tensor) -> BoardProblem:
-        """The least squares of this lens, board and motion with other data and priors; see `hybrid_problem`."""
+        """The least-squares problem of this lens, board and motion, for given data and priors; see `hybrid_problem`."""
         shapes = self.board_shapes.shapes
         return hybrid_problem(
             points, shapes, pixels, weights, self.model, mean, precision, self.readout, self.own_stillness, self.square
@@ -411,7 +411,7 @@ class HybridFit:
         return torch.where(valid[..., None], found, torch.inf) - pixels
 
     def only(self, views: Sequence[int]) -> HybridFit:
-        """This fit with some of its views; the others were left out of it."""
+        """This fit with some of its views, where the others had no weight in it."""
         at, state = list(views), self.state
         state = state._replace(rotation=state.rotation[at], translation=state.translation[at], motion=state.motion[at])
         relative = None if self.relative is None else self.relative[at]
@@ -420,7 +420,7 @@ class HybridFit:
         )
 
     def among(self, views: Sequence[int], count: int) -> HybridFit:
-        """This fit of some views as one of `count` views: NaN for the others."""
+        """This fit with entries for `count` views: NaN for those that it did not use."""
         own = self.state
         rotation, translation, motion, residuals, weights = (
             among(values, views, count)
@@ -432,7 +432,7 @@ class HybridFit:
 
     @property
     def as_start(self) -> FitStart:
-        """With what another fit begins."""
+        """A start for another fit."""
         estimate = Estimate(
             self.model,
             self.families,

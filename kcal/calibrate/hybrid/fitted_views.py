@@ -109,7 +109,18 @@ NO_MOTION = np.zeros(0)
 
 
 class Estimate(NamedTuple):
-    """Where a fit stands; last how much the board bends in each view (V,), relative to the others (None: alike)."""
+    """The present solution of a fit: its lens, the priors of all unknowns, their values and amplitudes.
+
+    Attributes:
+        model: of the lens.
+        families: which amplitudes set the prior of each unknown.
+        state: values of camera, board, poses and motions.
+        hyperparameters: (H,) log amplitudes and decays.
+        log_ratio: logarithms of standard deviations of motions and bending over the noise; () where views stand still.
+        variance: of the noise, tempering included, px².
+        tempering: factor by which the data count less, because residuals repeat within views.
+        relative: (V,) how much the board bends in each view, relative to the others; None: alike in all.
+    """
 
     model: LensModel
     families: PriorFamilies
@@ -164,7 +175,7 @@ class FittedViews:
 
     @functools.cached_property
     def _kept(self) -> list[tuple[LensModel, Tensor, BoardProblem]]:
-        """The last problem, with its lens and what was held."""
+        """The last problem, with its lens and the mask of held unknowns."""
         return []
 
     @property
@@ -177,7 +188,7 @@ class FittedViews:
         return torch.where(self.seen[..., None], errors.transpose(-1, -2), torch.nan)
 
     def of_corners(self, kept: Tensor) -> FittedViews:
-        """These views, standing still, with some corners of the board alone, by their numbers."""
+        """These views without motion, of some of the board's corners, given by their numbers."""
         return dataclasses.replace(
             self,
             points=self.points[kept],
@@ -190,7 +201,7 @@ class FittedViews:
 
     @property
     def freedom(self) -> int:
-        """Residuals without those that poses take up."""
+        """Number of residuals less the unknowns of all poses."""
         return 2 * int(self.seen.sum()) - (TURN if self.turning else POSE) * len(self.pixels)
 
     def held(self, estimate: Estimate) -> Tensor:
@@ -249,7 +260,7 @@ class FittedViews:
         return problem, estimate._replace(state=result.state), int(result.iterations)
 
     def data(self, problem: BoardProblem, estimate: Estimate) -> ViewData:
-        """What the views say near an estimate."""
+        """The data near an estimate as a quadratic form."""
         state, products = estimate.state, problem.products(estimate.state).off(problem.pose)
         count = problem.unknown_count
         if len(problem.moving) < count:
@@ -307,11 +318,11 @@ _BENT = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2)
 
 
 class Rounds(NamedTuple):
-    """Where the rounds ended.
+    """The result of `run_rounds`.
 
     Attributes:
-        capture: what was fitted; views that do not move have lost their readout.
-        readout: with which they began.
+        capture: what was fitted; without a readout where views turned out not to move.
+        readout: with which the rounds began.
         estimate: camera, board, poses and amplitudes.
         data: near it.
         loss: the negative logarithm of the evidence; of data that count less by the tempering, where views stand still.
@@ -331,14 +342,17 @@ class Rounds(NamedTuple):
 
     @property
     def untempered_loss(self) -> float:
-        """The same of data that count fully, so that it compares with that of other rounds."""
+        """`loss` for data that count fully: only such losses of different rounds can be compared."""
         tempering = self.estimate.tempering
         own, variance = 1.0 if self.data.moving else tempering, self.estimate.variance / tempering
         return with_tempering(self.loss, self.data.still.freedom, variance, own, 1.0)
 
 
 def begin_motion(capture: FittedViews, estimate: Estimate) -> Estimate:
-    """An estimate with the numbers of views that a capture has: those it had stay, others begin as a hand moves."""
+    """An estimate with motion and bending as the capture's readout has them.
+
+    Values that the estimate has already are kept; new ones begin at zero, with the amplitude of a hand's motion.
+    """
     readout, old, ratios = capture.readout, estimate.state.motion, estimate.log_ratio
     has = (False, False) if readout is None else (readout.moves, readout.bends is not None)
     had = (len(ratios) >= AMPLITUDES, len(ratios) % AMPLITUDES > 0)
@@ -360,7 +374,7 @@ def begin_motion(capture: FittedViews, estimate: Estimate) -> Estimate:
 def _least_gained(
     readout: Readout, data: ViewData, best: Maximum, families: PriorFamilies, tempering: float
 ) -> tuple[float, bool]:
-    """By how many nats motion, or bending, raises the evidence beside the other: the lesser, and whether of motion."""
+    """The smaller gain of evidence (nats), of motion beside bending or of bending beside motion; whether of motion."""
     parts = [(list(range(AMPLITUDES)), True)] * readout.moves
     parts += [([len(best.log_ratio) - 1], False)] * (readout.bends is not None)
     return min((evidence_of_motion(data, best, families, tempering, part), moves) for part, moves in parts)
@@ -369,9 +383,9 @@ def _least_gained(
 def _with_bending(
     capture: FittedViews, estimate: Estimate, best: Maximum, tempering: float
 ) -> tuple[FittedViews, Estimate] | None:
-    """The same of a board that bends by view; None where that explains the views no better.
+    """Views and estimate with a board that bends by view; None where that explains the views no better.
 
-    It is told near the estimate, from one linearization: nothing is fitted.
+    This is decided from one linearization at the estimate: nothing is fitted.
     """
     readout = capture.readout or Readout(center=capture.points.mean(0), distance=1.0, size=capture.size, moves=False)
     if capture.heights is None or readout.bends is not None:
@@ -397,7 +411,7 @@ def run_rounds(
     progress: Callable[[str], object],
     reweigh: Callable[[FittedViews, Estimate], FittedViews] | None = None,
 ) -> Rounds:
-    """Solve and set amplitudes in turn.
+    """Solve for all unknowns and set amplitudes by the evidence, in turn, until both come to rest.
 
     Args:
         capture: what is fitted.
@@ -507,7 +521,7 @@ def run_rounds(
 
 
 def expected_estimate(rounds: Rounds) -> Estimate:
-    """The estimate with the amplitudes that are to be expected in place of the most likely ones."""
+    """The estimate with expected amplitudes (`expected_maximum`) in place of the most likely ones."""
     estimate, data = rounds.estimate, rounds.data
     variance = estimate.variance / estimate.tempering
     best = Maximum(estimate.hyperparameters, estimate.log_ratio, variance, rounds.loss)
@@ -518,7 +532,7 @@ def expected_estimate(rounds: Rounds) -> Estimate:
 
 
 def motion_is_worth(rounds: Rounds, readout: Readout) -> bool:
-    """Whether motion would explain views better that were fitted as standing still; to first order, near the fit."""
+    """Whether views that were fitted as standing still are explained better by motion, to first order at the fit."""
     capture = dataclasses.replace(rounds.capture, readout=readout)
     estimate = rounds.estimate
     moving = begin_motion(capture, estimate)
@@ -560,7 +574,7 @@ def columns_may_be_read(rounds: Rounds) -> bool:
 
 
 def _moved_by(estimate: Estimate, best: Maximum) -> float:
-    """By how much the hyperparameters moved."""
+    """The largest change of a hyperparameter or ratio."""
     change = float((best.h - estimate.hyperparameters).abs().max())
     if len(best.log_ratio):
         change = max(change, float(np.abs(best.log_ratio - estimate.log_ratio).max()))

@@ -30,7 +30,7 @@ from kcal.texts import brief
 
 
 class BoardPrior(NamedTuple):
-    """A board before a camera is calibrated.
+    """What is known of a board before a camera is calibrated.
 
     Attributes:
         own: as it was printed, or as it was measured.
@@ -69,7 +69,7 @@ class BoardPrior(NamedTuple):
         return torch.linalg.solve_triangular(half, (amplitudes - mean)[None], upper=False, left=False)[0]
 
     def in_modes(self, known: CameraInformation, amplitudes: Tensor) -> CameraInformation:
-        """What is known of a camera and of the variables of `applied`, by the board's own modes and what others told.
+        """Convert what is known from the variables of `applied` to the board's own modes, with what others told apart.
 
         Args:
             known: with these variables as the board's unknowns.

@@ -318,8 +318,11 @@ class _Imaged(NamedTuple):
 
 # Least squares of one camera and the boards that it sees, for every lens alike (Eq. 5 and 7 of the paper).
 #
-# Shared unknowns: those of the camera's parameters that are free, and amplitudes of the board's modes. Local ones: for
-# each view the pose of the board, and its motion while the image is read (`kcal.calibrate.problem.state`).
+# Shared unknowns: the camera's free parameters (`FreeParameters`; tied ones share one), then the amplitudes of the
+# board's modes. A `Gaussian` of them has the names (LENS_SLOT, 0), ... and (BOARD_SLOT, 0), ... in that order, without
+# those that are held. Local unknowns are eliminated view by view: the pose of the board, of which only the rotation is
+# unknown where points are infinitely far, and its motion while the image is read (`kcal.calibrate.problem.state`).
+# Terms are residuals of the shared unknowns alone: priors, barriers, what other data say.
 
 # Numbers in the rows of derivatives that are formed at a time: with fewer, default cameras took longer (measured).
 _CHUNK = 600_000
