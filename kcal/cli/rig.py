@@ -272,17 +272,17 @@ def solve_command(
         return console.mark_again(landmarks, marks, cameras=(left, right))
 
     with console.ending_with(cure):
-        data, frame, unpaired, notes, stated, told = rig_sources.read_sources(calibrated, sources)
+        read = rig_sources.read_sources(calibrated, sources)
+        frame = read.origin
         with console.steps("solving the rig", None) as advance:
-            result = solve_surveyed(data, frame, options, advance)
-        notes = (*notes, *told(result))
+            result = solve_surveyed(read.data, frame, options, advance)
     rig = result.stereo() if frame is None else placed_rig(result, frame)
-    known = stated if pixel_sigma is None else pixel_sigma
+    known = read.pixel_sigma if pixel_sigma is None else pixel_sigma
     if rig.calibration is not None and known is not None:
         rig.calibration = dataclasses.replace(rig.calibration, pixel_sigma=known)
     noise, note = inputs.pixel_sigma_and_source(pixel_sigma, rig)
     # Everything that can fail comes before the file.
-    lines = rig_lines(result, rig, unpaired)
+    lines = rig_lines(result, rig, read.unpaired)
     console.tell(
         rms_px=result.rms,
         baseline_m=float(rig.baseline),
@@ -291,7 +291,7 @@ def solve_command(
         left_out={item.label: item.reason for item in result.left_out},
         warnings=list(result.warnings),
     )
-    print_rig(result, [*lines, *notes])
+    print_rig(result, [*lines, *read.told(result)])
     save_rig(rig, output)
     if picture is not None:
         from kcal.report.figures import save_picture

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from kcal.cli.console import err, steps, warn
 from kcal.cli.inputs import typed_with
@@ -17,18 +18,13 @@ from kcal.files import check_picture
 from kcal.texts import measured_text
 
 if TYPE_CHECKING:
-    from kcal.calibrate.rig.boards import Boards
-    from kcal.calibrate.rig.features import Features
-    from kcal.calibrate.rig.landmarks import Landmarks
     from kcal.calibrate.rig.measured import Baseline, MeasuredPosition
     from kcal.calibrate.rig.result import RigResult
-    from kcal.calibrate.rig.skyline import SkylineSource
     from kcal.calibrate.rig.sources import RigData
     from kcal.corners.observations import Observations
     from kcal.lens.calibration import CalibrationRecord
     from kcal.lens.camera import Camera
     from kcal.lens.rig import Origin
-    from kcal.locate.moving import MovingControl, MovingOptions
     from kcal.skyline.attitude import SkylineAttitude, SkylineImage
     from kcal.skyline.horizon import RasterError
 
@@ -36,75 +32,55 @@ if TYPE_CHECKING:
 # Drones, ships and aircraft that tell where they are, for `kcal rig --tracks`.
 
 
-def read_moving(
-    cameras: Sequence[Camera],
-    names: Sequence[str],
-    files: tuple[Path, Path],
-    origin: Origin | None,
-    positions: Sequence[MeasuredPosition],
-    options: MovingOptions,
-    *,
-    placed: bool,
-) -> tuple[MovingControl, Origin | None, list[str]]:
-    """Landmarks from the tracks and sightings, the origin of the frame, and lines that say what was what.
-
-    Args:
-        cameras: of the rig.
-        names: of these.
-        files: tables of tracks and of sightings.
-        origin: of the frame, as far as it is known.
-        positions: of the cameras, as far as they were measured.
-        options: what is known of clocks and marks.
-        placed: whether landmarks or positions are there already, so that the frame is theirs.
+def _add_tracks(read: RigReading, files: tuple[Path, Path]) -> None:
+    """Landmarks from tables of tracks and of sightings; once the rig is solved, how late the cameras' clocks are.
 
     Raises:
         InputError: tables in another kind of frame; nothing to match.
     """
-    from kcal.locate.moving import match_moving, read_sightings, read_tracks
+    from kcal.locate.moving import CLOCK, MovingOptions, match_moving, read_sightings, read_tracks
 
-    tracks, frame = read_tracks(files[0], origin)
-    if placed and frame != origin:
+    given, names = read.given, list(read.cameras)
+    tracks, frame = read_tracks(files[0], read.origin)
+    if (read.positions or "landmarks" in read.sources) and frame != read.origin:
         raise InputError(f"{files[0]}: it has latitudes, the landmarks or positions local meters; give an --origin")
-    found = match_moving(tracks, read_sightings(files[1], names), cameras, names, positions, options)
+    options = MovingOptions(
+        clock_sigma=given.tracks_clock, between_sigma=given.clock_sigma, pixel_sigma=given.mark_sigma
+    )
+    sightings = read_sightings(files[1], names)
+    found = match_moving(tracks, sightings, list(read.cameras.values()), names, read.positions, options)
     wrong = [one for one in found.identities if one.track != one.label]
     unknown = [one for one in wrong if one.track is None]
-    lines = [
+    read.notes.append(
         f"tracks: {len(found.landmarks.names)} fixes of {len({one.track for one in found.identities} - {None})} things "
         f"in {len(found.identities) - len(unknown)} of {len(found.identities)} sightings"
-    ]
+    )
     known = {track.name for track in tracks}
-    lines += [
+    read.notes += [
         f"{names[one.camera]}: {one.label} is {one.track}" + (", not what it is called" if one.label in known else "")
         for one in wrong
         if one.track is not None
     ]
     if unknown:
         listed = ", ".join(f"{one.label} ({names[one.camera]})" for one in unknown)
-        lines.append(f"follow no track, or it is not clear which: {listed}")
-    return found, frame, lines
+        read.notes.append(f"follow no track, or it is not clear which: {listed}")
 
+    def clock(result: RigResult) -> list[str]:
+        if CLOCK not in (amounts := result.effects()):
+            return []
+        offset, sigma = (options.clock_sigma * value for value in amounts[CLOCK])
+        return [f"the tracks' clock is {measured_text(found.clock + offset, sigma)} s ahead of the cameras'"]
 
-def clock_line(result: RigResult, control: MovingControl, options: MovingOptions) -> list[str]:
-    """How late the cameras' clocks turned out to be."""
-    from kcal.locate.moving import CLOCK
-
-    amount = result.effects().get(CLOCK)
-    if amount is None:
-        return []
-    offset, sigma = control.clock + options.clock_sigma * amount[0], options.clock_sigma * amount[1]
-    return [f"the tracks' clock is {measured_text(offset, sigma)} s ahead of the cameras'"]
+    read.origin = frame
+    read.add("landmarks", found.landmarks)
+    read.tellers.append(clock)
 
 
 # Pairs of images of the scene itself, for `kcal rig --scene`.
 
 
-def read_scene(cameras: tuple[Camera, Camera], given: tuple[str, str], *, scaled: bool) -> tuple[Features, list[str]]:
-    """Matches of all pairs of images, and lines that say what was matched and left out.
-
-    Args:
-        cameras: left and right.
-        given: images of each: a file, a folder or a wildcard.
-        scaled: whether anything else tells a length.
+def _add_scene(read: RigReading, given: tuple[str, str]) -> None:
+    """Matches of all pairs of images, and what was matched and left out.
 
     Raises:
         InputError: nothing tells a length, or images without partners or with too little in common.
@@ -113,7 +89,9 @@ def read_scene(cameras: tuple[Camera, Camera], given: tuple[str, str], *, scaled
     from kcal.corners.images import expand_images, read_gray
     from kcal.scene.match import ImagePair, match_scene, scene_of
 
-    if not scaled:
+    first, second = read.cameras.values()
+    # One position alone tells no length; GNSS of both does.
+    if not any((*map(read.sources.get, ("boards", "landmarks")), read.given.baseline, len(read.positions) > 1)):
         raise InputError(
             "--scene alone leaves the scale open: with twice the baseline everything would be twice as far away, and "
             "the images the same. Add --baseline, --landmarks, --positions or boards (--pairs)"
@@ -128,7 +106,7 @@ def read_scene(cameras: tuple[Camera, Camera], given: tuple[str, str], *, scaled
         for left, right in chosen:
             pair = ImagePair(left, read_gray(files[0][left]), read_gray(files[1][right]))
             try:
-                found.append(match_scene(cameras, pair))
+                found.append(match_scene((first, second), pair))
                 pairs.append(pair)
             except InputError as error:
                 refused.append(str(error))
@@ -137,20 +115,20 @@ def read_scene(cameras: tuple[Camera, Camera], given: tuple[str, str], *, scaled
         raise InputError(f"--scene: {refused[0]}")
     for text in refused:
         warn(f"{text}; left out")
-    features, counts = scene_of(cameras, pairs, found)
+    features, counts = scene_of((first, second), pairs, found)
     rows: list[tuple[str, ...]] = [("scene", "matched", "no texture", "off the line", "moved", "thinned", "used")]
     rows += [
         (one.name, *map(str, (one.matched, one.untextured, one.off_line, one.moved, one.thinned, one.used)))
         for one in counts
     ]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows]
+    read.notes += ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows]
     alone = len(named[0]) + len(named[1]) - 2 * len(chosen)
     if alone:
-        lines.append(f"{alone} images of the scene without partner")
+        read.notes.append(f"{alone} images of the scene without partner")
     if len(pairs) == 1:
-        lines.append("one pair: what moves cannot be told from what stands still; give pairs of several times")
-    return features, lines
+        read.notes.append("one pair: what moves cannot be told from what stands still; give pairs of several times")
+    read.add("features", features)
 
 
 # A terrain raster and images of the skyline, for `kcal rig --skyline` and `kcal station --skyline`.
@@ -217,16 +195,8 @@ def skyline_options(
     return SkylineOptions(raster=raster, images=found, geoid=geoid or 0.0, error=error, picture=picture)
 
 
-def read_skyline(
-    cameras: Mapping[str, Camera], given: SkylineOptions, origin: Origin | None, positions: Sequence[MeasuredPosition]
-) -> tuple[SkylineSource, list[str]]:
-    """What the skylines tell, and lines that say what was found.
-
-    Args:
-        cameras: by their names, in order.
-        given: what the user gave.
-        origin: of the rig's frame.
-        positions: measured ones, of all cameras with images.
+def _add_skyline(read: RigReading, given: SkylineOptions) -> None:
+    """What the skylines tell, and what was found in each image.
 
     Raises:
         InputError: a camera without a place, and what `skyline_source` refuses.
@@ -236,11 +206,11 @@ def read_skyline(
     from kcal.locate.raster import terrain
     from kcal.skyline.attitude import skyline_source
 
-    names = list(cameras)
+    names = list(read.cameras)
     images = _read_images(names, given.images)
-    places = {position.camera: position for position in positions}
+    places = {position.camera: position for position in read.positions}
     without = sorted({names[image.camera] for image in images if image.camera not in places})
-    if origin is None or without:
+    if read.origin is None or without:
         raise InputError(
             f"--skyline needs the place of {' and '.join(without) or 'each camera'} on the Earth: measure it (GNSS) "
             f"and give --position{'s' * (len(names) > 1)} with latitudes and longitudes (or with local meters and "
@@ -252,18 +222,18 @@ def read_skyline(
     with steps("comparing skylines with the terrain", None):
         raster = terrain(given.raster, given.geoid)
         source, found = skyline_source(
-            images, list(cameras.values()), raster, origin, centers, sigma, error=given.error
+            images, list(read.cameras.values()), raster, read.origin, centers, sigma, error=given.error
         )
     if given.picture is not None:
         from kcal.report.figures import save_picture
         from kcal.report.rig import skyline_figure
 
         save_picture(given.picture, skyline_figure([(image.name, image.image) for image in images], found))
-    lines = [line for image, one in zip(images, found, strict=True) for line in _lines(image, names, one)]
+    read.notes += [line for image, one in zip(images, found, strict=True) for line in _lines(image, names, one)]
     for image, one in zip(images, found, strict=True):
         for text in one.warnings:
             warn(f"skyline {image.name}: {text}")
-    return source, lines
+    read.add("skyline", source)
 
 
 def _read_images(names: Sequence[str], given: Mapping[str, str]) -> list[SkylineImage]:
@@ -412,28 +382,50 @@ class Sources:
         return [*more, *(path for path in single if path is not None)]
 
 
-def _nothing(_: RigResult) -> list[str]:
-    return []
+@dataclasses.dataclass(kw_only=True)
+class RigReading:
+    """What has been read so far. Each reader adds a source, notes of what was read, and what tells of it later.
 
-
-class RigInput(NamedTuple):
-    """What was read.
-
-    Attributes:
-        data: everything in one frame.
+    Args:
+        cameras: of the rig, by their names.
+        given: what the user gave.
         origin: of the frame; None where no latitude is known.
+        sources: fields of `RigData`.
+        notes: what there is to say of the sources.
+        tellers: what there is to say of them once the rig is solved.
         unpaired: how many views of the boards have no partner.
-        notes: what else there is to say of the sources.
         pixel_sigma: px, the typical noise of marks along an axis, where the file of the marks states it.
-        told: what there is to say of the sources once the rig is solved.
     """
 
-    data: RigData
+    cameras: dict[str, Camera]
+    given: Sources
     origin: Origin | None
-    unpaired: int
-    notes: tuple[str, ...] = ()
+    sources: dict[str, Any] = dataclasses.field(default_factory=dict)
+    notes: list[str] = dataclasses.field(default_factory=list)
+    tellers: list[Callable[[RigResult], list[str]]] = dataclasses.field(default_factory=list)
+    unpaired: int = 0
     pixel_sigma: float | None = None
-    told: Callable[[RigResult], list[str]] = _nothing
+
+    @property
+    def positions(self) -> tuple[MeasuredPosition, ...]:
+        """Of the cameras, as far as they were measured."""
+        return self.sources.get("positions", ())
+
+    def add(self, field: str, source: Any) -> None:
+        """Add to a field of `RigData`, to what is there already."""
+        before = self.sources.get(field)
+        self.sources[field] = source if before is None else before + source
+
+    @functools.cached_property
+    def data(self) -> RigData:
+        """Everything in one frame."""
+        from kcal.calibrate.rig.sources import RigData
+
+        return RigData(cameras=tuple(self.cameras.values()), names=tuple(self.cameras), **self.sources)
+
+    def told(self, result: RigResult) -> list[str]:
+        """What there is to say once the rig is solved."""
+        return [*self.notes, *(line for tell in self.tellers for line in tell(result))]
 
 
 def parse_baselines(text: str, names: Sequence[str] = CAMERAS) -> tuple[Baseline, ...]:
@@ -463,12 +455,100 @@ def parse_baselines(text: str, names: Sequence[str] = CAMERAS) -> tuple[Baseline
     return tuple(found)
 
 
-def read_sources(cameras: Sequence[Camera], sources: Sources) -> RigInput:
-    """Read everything; warnings about it are printed. Two cameras are left and right, one or more have their names."""
-    from kcal.calibrate.rig.sources import RigData
-    from kcal.lens.rig import Origin
+def _add_positions(read: RigReading, path: Path) -> None:
+    """Places of the cameras."""
+    from kcal.locate.survey import camera_positions, import_survey
+
+    given = read.given
+    placed = import_survey(path, read.origin, sigma=given.survey_sigma, geoid=given.geoid)
+    read.origin = placed.origin
+    read.add("positions", camera_positions(placed, tuple(read.cameras)))
+
+
+def _add_landmarks(read: RigReading, path: Path) -> None:
+    """Surveyed places with their marks."""
     from kcal.locate.marks import read_marks
-    from kcal.locate.survey import camera_positions, import_survey, match_landmarks, read_features
+    from kcal.locate.survey import import_survey, match_landmarks
+
+    given = read.given
+    assert given.marks is not None
+    survey = import_survey(path, read.origin, sigma=given.survey_sigma, geoid=given.geoid)
+    if given.positions is not None and survey.origin != read.origin:
+        raise InputError("landmarks and positions: one has latitudes, the other local meters; give an --origin")
+    read.origin = survey.origin
+    marks = read_marks(given.marks, given.names, single=True, others=len(read.cameras) == 1)
+    found = match_landmarks(survey, marks, marks.sigmas(given.mark_sigma))
+    if marks.covariance is not None:
+        read.pixel_sigma = marks.typical_sigma(given.mark_sigma)
+    read.add("landmarks", found.landmarks)
+    for some, text in ((found.unmarked, "surveyed, but not marked"), (found.unsurveyed, "marked, not surveyed")):
+        if some:
+            err.print(f"[yellow]warning:[/] {text}:", ", ".join(some), markup=True)
+
+
+def _add_stars(read: RigReading, night: NightOptions) -> None:
+    """Stars of night images."""
+    placed = "landmarks" in read.sources
+    stars, positions, lines = read_stars(read.cameras, night, read.origin, read.positions, placed=placed)
+    read.sources |= {"stars": stars, "positions": positions}
+    read.notes += lines
+
+
+def _add_features(read: RigReading, path: Path) -> None:
+    """A table of things that several cameras see."""
+    from kcal.locate.survey import read_features
+
+    read.add("features", read_features(path, read.given.mark_sigma, read.given.names))
+
+
+def _add_pairs(read: RigReading, files: tuple[Path, Path]) -> None:
+    """Boards that two cameras saw."""
+    from kcal.calibrate.rig.pairs import pair_by_name, paired_boards, read_pairs
+    from kcal.corners.observations import Observations
+
+    match = read.given.match
+    first, second = read.cameras.values()
+    seen = Observations.load(files[0]), Observations.load(files[1])
+    check_views_of((first, second), seen, files)
+    views = seen[0].names, seen[1].names
+    matched = pair_by_name(*views) if match is None else read_pairs(match, *views)
+    read.add("boards", paired_boards((first, second), seen, matched))
+    read.unpaired = len(views[0]) + len(views[1]) - 2 * len(matched)
+
+
+def _add_observations(read: RigReading, files: tuple[Path, ...]) -> None:
+    """Boards that any of the cameras saw."""
+    from kcal.calibrate.rig.pairs import boards_of_several
+    from kcal.corners.observations import Observations
+
+    names = read.given.names
+    own = {c: Observations.load(path) for c, path in zip(cameras_of_files(files, names), files, strict=True)}
+    read.add("boards", boards_of_several(list(read.cameras.values()), names, own))
+
+
+def _add_baselines(read: RigReading, text: str) -> None:
+    """Measured distances between cameras."""
+    read.add("baselines", parse_baselines(text, tuple(read.cameras)))
+
+
+# What reads each option of `Sources`, in this order: later ones need the frame of the first.
+READERS: dict[str, Callable[[RigReading, Any], None]] = {
+    "positions": _add_positions,
+    "landmarks": _add_landmarks,
+    "pairs": _add_pairs,
+    "observations": _add_observations,
+    "stars": _add_stars,
+    "skyline": _add_skyline,
+    "features": _add_features,
+    "scene": _add_scene,
+    "tracks": _add_tracks,
+    "baseline": _add_baselines,
+}
+
+
+def read_sources(cameras: Sequence[Camera], sources: Sources) -> RigReading:
+    """Read everything; warnings about it are printed. Two cameras are left and right, one or more have their names."""
+    from kcal.lens.rig import Origin
 
     if (sources.landmarks is None) != (sources.marks is None):
         raise InputError("--landmarks and --marks belong together: places by name, and where they are in the images")
@@ -480,78 +560,11 @@ def read_sources(cameras: Sequence[Camera], sources: Sources) -> RigInput:
         )
     names = CAMERAS if pair else sources.names
     origin = None if sources.origin is None else Origin.parse(sources.origin)
-    landmarks, pixel_sigma = None, None
-    positions: tuple[MeasuredPosition, ...] = ()
-    if sources.positions is not None:
-        placed = import_survey(sources.positions, origin, sigma=sources.survey_sigma, geoid=sources.geoid)
-        origin, positions = placed.origin, camera_positions(placed, names)
-    if sources.landmarks is not None and sources.marks is not None:
-        survey = import_survey(sources.landmarks, origin, sigma=sources.survey_sigma, geoid=sources.geoid)
-        if sources.positions is not None and survey.origin != origin:
-            raise InputError("landmarks and positions: one has latitudes, the other local meters; give an --origin")
-        origin = survey.origin
-        marks = read_marks(sources.marks, sources.names, single=True, others=len(cameras) == 1)
-        found = match_landmarks(survey, marks, marks.sigmas(sources.mark_sigma))
-        if marks.covariance is not None:
-            pixel_sigma = marks.typical_sigma(sources.mark_sigma)
-        landmarks = found.landmarks
-        for some, text in ((found.unmarked, "surveyed, but not marked"), (found.unsurveyed, "marked, not surveyed")):
-            if some:
-                err.print(f"[yellow]warning:[/] {text}:", ", ".join(some), markup=True)
-    boards, unpaired = _read_boards(cameras, sources)
-    stars, notes = None, list[str]()
-    if sources.stars is not None:
-        stars, positions, notes = read_stars(
-            dict(zip(names, cameras, strict=True)), sources.stars, origin, positions, placed=landmarks is not None
-        )
-    skyline = None
-    if sources.skyline is not None:
-        skyline, more = read_skyline(dict(zip(names, cameras, strict=True)), sources.skyline, origin, positions)
-        notes = [*notes, *more]
-    features = None
-    if sources.features is not None:
-        features = read_features(sources.features, sources.mark_sigma, sources.names)
-    if sources.scene is not None:
-        # One position alone tells no length; GNSS of both does.
-        scaled = any((boards, landmarks, sources.baseline, len(positions) > 1))
-        seen_by_both, more = read_scene((cameras[0], cameras[1]), sources.scene, scaled=scaled)
-        features = seen_by_both if features is None else features + seen_by_both
-        notes = [*notes, *more]
-    told: Callable[[RigResult], list[str]] = _nothing
-    if sources.tracks is not None:
-        landmarks, origin, more, told = _with_tracks(cameras, sources, origin, positions, landmarks)
-        notes = [*notes, *more]
-    data = RigData(
-        cameras=tuple(cameras),
-        names=names,
-        boards=boards,
-        landmarks=landmarks,
-        features=features,
-        baselines=() if sources.baseline is None else parse_baselines(sources.baseline, names),
-        positions=positions,
-        stars=stars,
-        skyline=skyline,
-    )
-    return RigInput(data, origin, unpaired, tuple(notes), pixel_sigma, told)
-
-
-def _read_boards(cameras: Sequence[Camera], sources: Sources) -> tuple[Boards | None, int]:
-    """Boards seen by two cameras or more, and how many views of a pair of cameras have no partner."""
-    from kcal.calibrate.rig.pairs import boards_of_several, pair_by_name, paired_boards, read_pairs
-    from kcal.corners.observations import Observations
-
-    if sources.pairs is not None:
-        first, second = cameras
-        seen = Observations.load(sources.pairs[0]), Observations.load(sources.pairs[1])
-        check_views_of((first, second), seen, sources.pairs)
-        views = seen[0].names, seen[1].names
-        matched = pair_by_name(*views) if sources.match is None else read_pairs(sources.match, *views)
-        boards = paired_boards((first, second), seen, matched)
-        return boards, len(views[0]) + len(views[1]) - 2 * len(matched)
-    if not sources.observations:
-        return None, 0
-    own = dict(zip(cameras_of_files(sources.observations, sources.names), sources.observations, strict=True))
-    return boards_of_several(cameras, sources.names, {number: Observations.load(own[number]) for number in own}), 0
+    read = RigReading(cameras=dict(zip(names, cameras, strict=True)), given=sources, origin=origin)
+    for option, reader in READERS.items():
+        if value := getattr(sources, option):
+            reader(read, value)
+    return read
 
 
 def cameras_of_files(paths: Sequence[Path], names: Sequence[str]) -> list[int]:
@@ -569,24 +582,3 @@ def cameras_of_files(paths: Sequence[Path], names: Sequence[str]) -> list[int]:
             raise InputError(f"{path}: a second file of camera {name!r}; give one for each")
         found.append(names.index(name))
     return found
-
-
-def _with_tracks(
-    cameras: Sequence[Camera],
-    sources: Sources,
-    origin: Origin | None,
-    positions: tuple[MeasuredPosition, ...],
-    landmarks: Landmarks | None,
-) -> tuple[Landmarks, Origin | None, list[str], Callable[[RigResult], list[str]]]:
-    """Landmarks with those that move, the origin, what to say of them, and what to say once the rig is solved."""
-    from kcal.locate.moving import MovingOptions
-
-    assert sources.tracks is not None
-    names = CAMERAS if len(cameras) == 2 else sources.names
-    options = MovingOptions(
-        clock_sigma=sources.tracks_clock, between_sigma=sources.clock_sigma, pixel_sigma=sources.mark_sigma
-    )
-    placed = landmarks is not None or bool(positions)
-    moving, origin, lines = read_moving(cameras, names, sources.tracks, origin, positions, options, placed=placed)
-    both = moving.landmarks if landmarks is None else landmarks + moving.landmarks
-    return both, origin, lines, lambda result: clock_line(result, moving, options)

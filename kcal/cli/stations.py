@@ -153,10 +153,10 @@ def solve_stations(
             raise InputError(f"{option} is for rigs of two cameras; {instead}")
     check_writable(output, *paths, *sources.files)
     sources = dataclasses.replace(sources, names=names)
-    data, origin, _, notes, _, told = rig_sources.read_sources(tuple(map(load_camera, paths)), sources)
+    read = rig_sources.read_sources(tuple(map(load_camera, paths)), sources)
     with steps("solving the stations", None) as advance:
-        result = solve_surveyed(data, origin, options, advance)
-    rig = result.stations(origin)
+        result = solve_surveyed(read.data, read.origin, options, advance)
+    rig = result.stations(read.origin)
     assert rig.calibration is not None
     rig.calibration = dataclasses.replace(rig.calibration, pixel_sigma=sources.mark_sigma)
     tell(
@@ -169,7 +169,7 @@ def solve_stations(
         from kcal.report.rig import rig_figure
 
         save_picture(picture, rig_figure(result))
-    _print_stations(result, rig, [*notes, *told(result)])
+    _print_stations(result, rig, read.told(result))
     print_wrote(output, picture)
     if needs or report is not None:
         from kcal.report.judge_rig import rig_verdict

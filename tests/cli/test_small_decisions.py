@@ -111,7 +111,7 @@ class TestSources:
             given = dataclasses.replace(given, landmarks=survey, marks=marks)
         found = read_sources(CAMERAS, given)
         assert told == [(["left", "right"], landmarks)]
-        assert found.notes == ("a note of the stars",)
+        assert found.notes == ["a note of the stars"]
         assert (found.data.landmarks is not None) is landmarks
 
     def test_landmarks_and_marks_belong_together(self) -> None:
