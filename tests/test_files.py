@@ -1,4 +1,4 @@
-"""Files are whole or absent, and are what they say they are."""
+"""Files: atomic writing, kinds and locks."""
 
 from __future__ import annotations
 
@@ -16,10 +16,13 @@ import pydantic
 import pytest
 
 from kcal.errors import FileError, InputError
-from kcal.files import check_writable, dump_json, read_bytes, write_atomic
+from kcal.file_kind import WORDS, file_kind
+from kcal.files import FileLock, check_writable, dump_json, read_bytes, try_lock, write_atomic
 from kcal.lens.calibration import Exclusion
 from kcal.native_file import NativeFile, digest
 from kcal.strict_json import read_json
+
+# Files are whole or absent, and are what they say they are.
 
 
 def test_a_digest_is_of_the_values_and_not_of_their_order() -> None:
@@ -339,3 +342,126 @@ class TestNativeFile:
         binary.write_bytes(b"\xff\xfe\x00")
         with pytest.raises(FileError, match="not a JSON file"):
             Note.load(binary)
+
+
+# What a file is, by its first bytes; each of the kinds that messages name.
+
+
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "kind"),
+    [
+        ("a", b"", "empty"),
+        ("a", b" \n\t", "empty"),
+        ("a.txt", b'{"kcal": "camera", "version": 1}', "camera"),
+        ("a.txt", b' \n{ "kcal" : "rig"}', "rig"),
+        ("a.json", b'{"version": 1, "kcal": "board"}', "board"),
+        ("a.json", b'{"version": 1, "kcal": 5}', "json"),
+        ("a.json", b'{"version": 1, "kcal": "board"', "json"),
+        ("a.json", b'[1, "kcal"]', "json"),
+        ("a.json", b'{"a": 1}', "json"),
+        ("a.json", b'\xef\xbb\xbf{"a": 1}', "json"),
+        ("a.json", b'{"type": "FeatureCollection", "features": []}', "geojson"),
+        ("a.json", b'{"type": "Feature"}', "geojson"),
+        ("a.png", b'{"type": "Point"}', "json"),
+        ("a.csv", PNG + bytes(50), "image"),
+        ("a.txt", b"\xff\xd8\xff\xe0" + bytes(50), "image"),
+        ("a.txt", b"BMW, a car, and more than thirty letters of it", "table"),
+        ("a", b"\0\0\0\x18ftypmp42", "video"),
+        ("a", b"\x1aE\xdf\xa3" + bytes(9), "video"),
+        ("a", b"RIFF....AVI LIST", "video"),
+        ("a", b"\0\0\1\xba" + bytes(9), "video"),
+        ("a.xml", b'<?xml version="1.0"?>\n<gpx version="1.1">', "gpx"),
+        ("a.xml", b"<?xml version='1.0'?><opencv_storage>", "foreign"),
+        ("a.yml", b"%YAML:1.0\n---\n", "foreign"),
+        ("a.yaml", b"cam0:\n  resolution: [1, 2]", "foreign"),
+        ("a.yaml", b"image_width: 640", "foreign"),
+        ("a.cameramodel", b"# generated\n{ 'lensmodel': 1 }", "foreign"),
+        ("a.mat", b"MATLAB 5.0" + bytes(120), "foreign"),
+        ("a.npz", b"PK\3\4" + bytes(120), "foreign"),
+        ("a.xyz", b"PK\3\4" + bytes(120), "unknown"),
+        ("a.html", b"<!DOCTYPE HTML>\n<p>", "page"),
+        ("a.html", b"\n<html lang=en>", "page"),
+        ("a.csv", b"name,left_u,left_v,right_u,right_v\n", "marks"),
+        ("a.csv", b'name;"LEFT_U"\n', "marks"),
+        ("a.csv", b"name\tlat\tlon\n", "survey"),
+        ("a.csv", b"name, East, up\n", "survey"),
+        ("a.csv", b"name,place\n1,2\n", "table"),
+        ("a.csv", b"words without a comma\n1,2\n", "unknown"),
+    ],
+)
+def test_kinds(name: str, content: bytes, kind: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    path.write_bytes(content)
+    assert file_kind(path) == kind
+    assert kind in WORDS
+
+
+def test_what_is_no_file(tmp_path: Path) -> None:
+    assert file_kind(tmp_path) == "folder"
+    assert file_kind(tmp_path / "none") == "missing"
+    assert file_kind("a\0b") == "missing"
+    os.mkfifo(tmp_path / "pipe")
+    assert file_kind(tmp_path / "pipe") == "device"
+
+
+# One process at a time: who has a file is said, and what a process leaves behind locks nothing.
+
+
+OTHER = (
+    "import sys\nfrom pathlib import Path\nfrom kcal.errors import FileError\nfrom kcal.files import FileLock\n"
+    "try: lock = FileLock([Path(part) for part in sys.argv[1:]], 'the other')\n"
+    "except FileError as error: print(error)\n"
+    "else: print('locked')\n"
+)
+
+
+def other(*paths: Path) -> str:
+    done = subprocess.run([sys.executable, "-c", OTHER, *map(str, paths)], capture_output=True, text=True, check=True)
+    return done.stdout.strip()
+
+
+def test_another_process_is_told_who_has_it(tmp_path: Path) -> None:
+    a, b, link = tmp_path / "a.csv", tmp_path / "b.csv", tmp_path / "link.csv"
+    link.symlink_to(a)
+    with FileLock([a, link, b], "the first"):
+        assert sorted(os.listdir(tmp_path)) == [".a.csv.lock", ".b.csv.lock", "link.csv"]
+        written = (tmp_path / ".a.csv.lock").read_text()
+        assert written.startswith(f"the first, process {os.getpid()}, since 20")
+        assert written.endswith("\n")
+        said = other(b)
+        assert said.startswith(f"{b}: the first, process {os.getpid()}, since 20")
+        assert said.endswith("writes it; end that first, or choose another output")
+        # What it got before it was refused it lets go.
+        assert other(tmp_path / "c.csv", link).startswith(f"{a}: the first")
+        assert not (tmp_path / ".c.csv.lock").exists()
+    assert os.listdir(tmp_path) == ["link.csv"]
+    assert other(a, b) == "locked"
+
+
+def test_what_a_process_left_behind_locks_nothing(tmp_path: Path) -> None:
+    left = tmp_path / ".a.csv.lock"
+    left.write_text("a long text of a process that was killed long ago\n" * 9)
+    with FileLock([tmp_path / "a.csv"], "x"):
+        assert left.read_text().startswith("x, process ")
+        assert left.read_text().count("\n") == 1
+
+
+def test_a_lock_that_says_nothing(tmp_path: Path) -> None:
+    path = tmp_path / ".a.csv.lock"
+    handle = os.open(path, os.O_RDWR | os.O_CREAT)
+    assert try_lock(handle)
+    again = os.open(path, os.O_RDWR)
+    assert not try_lock(again)
+    with pytest.raises(FileError, match="another process writes it"):
+        FileLock([tmp_path / "a.csv"], "x")
+    os.close(handle)
+    assert try_lock(again)
+    os.close(again)
+
+
+def test_a_folder_that_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(FileError, match=r"cannot lock it with .*\.a\.csv\.lock: No such file"):
+        FileLock([tmp_path / "none" / "a.csv"], "x")

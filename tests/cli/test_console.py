@@ -1,19 +1,38 @@
-"""What reaches the terminal is shown and does nothing else; errors are one line."""
+"""The command line itself: what it prints, settings, refusals, and its start."""
 
 from __future__ import annotations
 
+import json
+import re
+import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
+import torch
 import typer
-from typer.testing import CliRunner
+from board_render import homography, render
+from calibrate_scenes import BOARD, camera, motions, observe, pixels_of
+from locate_rigs import pinhole_rig
+from typer.main import get_command
+from typer.testing import CliRunner, Result
 from waiting import PATIENCE
 
+from kcal import Board, Camera, Observations, View, load_rig, save_camera
 from kcal.cli.console import err, out, print_table, print_wrote, steps, warn
 from kcal.cli.main import app, main, usage_errors_shown
+from kcal.cli.settings import SETTINGS, defaults_of, read_settings, toml_text
+from kcal.errors import FileError
 from kcal.files import write_atomic
+from kcal.io.rig_file import save_rig
+from scripts.bench.startup import helps, measure
+
+# What reaches the terminal is shown and does nothing else; errors are one line.
+
 
 ESCAPE = "a\x1b]0;title\x07\x1b[2J\x9b31m\x85:bomb:"
 
@@ -153,3 +172,311 @@ def test_a_missing_file_is_refused_before_torch_is_loaded(command: str, tmp_path
     assert found.returncode == 1
     assert "cannot read: No such file" in found.stderr
     assert found.stdout.strip() == "False"
+
+
+# `kcal.toml`, the noise of marks by one name, options by their old names, and short help.
+
+
+ASSETS = Path(__file__).parents[2] / "assets"
+
+EXAMPLE = {"board": "9x6", "square": "25mm", "camera": "camera:0", "origin": "1,2,3", "heading": 4.0,
+           "pixel_sigma": 0.2, "require": "5km:10%", "baseline": 12.5}  # fmt: skip
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    shutil.copyfile(ASSETS / "sample-rig.json", "rig.json")
+    shutil.copyfile(ASSETS / "sample-points.csv", "points.csv")
+    return tmp_path
+
+
+def kcal(*words: str) -> Result:
+    return CliRunner().invoke(app, list(words))
+
+
+def test_what_is_written_is_read(folder: Path) -> None:
+    assert set(EXAMPLE) == set(SETTINGS)
+    words = [word for key, value in EXAMPLE.items() for word in (f"--{key.replace('_', '-')}", str(value))]
+    assert kcal("init", *words).exit_code == 0
+    assert read_settings(folder) == EXAMPLE
+    with pytest.raises(FileError, match="kcal init --force"):
+        raise kcal("init").exception or AssertionError
+    assert kcal("init", "--force").exit_code == 0
+    assert read_settings(folder) == {}
+
+
+def test_odd_texts_survive(folder: Path) -> None:
+    odd = {"camera": 'C:\\"a"\n\t\x07é'}
+    Path("kcal.toml").write_text(toml_text(odd), encoding="utf-8")
+    assert read_settings(folder) == odd
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("bord = '9x6'", "unknown key 'bord'; did you mean board"),
+        ("board = 9", 'board must be a text in quotation marks, for example board = "9x6"'),
+        ("pixel_sigma = '0.1'", "pixel_sigma must be a number"),
+        ("pixel_sigma = nan", "pixel_sigma must be a number"),
+        ("baseline = true", "baseline must be a number"),
+        ("board = ", "not TOML"),
+        ("a = " + 5000 * "[", "not TOML"),
+    ],
+)
+def test_what_is_not_understood_is_refused(text: str, message: str, folder: Path) -> None:
+    Path("kcal.toml").write_text(text)
+    with pytest.raises(FileError, match=r"kcal\.toml: ") as refused:
+        raise kcal("budget").exception or AssertionError
+    assert message in str(refused.value)
+
+
+def test_every_setting_is_a_parameter_of_its_commands() -> None:
+    group = get_command(app)
+    for setting in SETTINGS.values():
+        for words, parameter in setting.takers:
+            command = group
+            for word in words.split():
+                command = command.commands[word]
+            assert parameter in [each.name for each in command.params], (words, parameter)
+
+
+def test_commands_take_what_is_not_typed_and_say_so(folder: Path) -> None:
+    Path("kcal.toml").write_text(toml_text({"board": "9x6", "square": "25mm", "pixel_sigma": 0.25}))
+    printed = kcal("board", "-o", "board.svg")
+    assert "board.svg: 9x6 inner corners, 25 mm squares" in printed.stdout
+    assert "from kcal.toml: board 9x6, square 25mm" in printed.stderr
+    printed = kcal("board", "-o", "board.svg", "--board", "7x4")
+    assert "board.svg: 7x4 inner corners, 25 mm squares" in printed.stdout
+    assert "from kcal.toml: square 25mm\n" in printed.stderr
+    assert "0.354 px" in kcal("budget").stdout
+    assert defaults_of({"pixel_sigma": 0.25})["rig"]["check"] == {"pixel_sigma": 0.25}
+
+
+def test_the_position_of_a_rig_goes_before_that_of_the_folder(folder: Path) -> None:
+    plain = kcal("locate", "rig.json", "points.csv").stdout
+    Path("kcal.toml").write_text(toml_text({"origin": "1,2,3", "heading": 4.0}))
+    printed = kcal("locate", "rig.json", "points.csv")
+    assert printed.stdout == plain
+    assert "that in its file, not that in kcal.toml" in printed.stderr
+    assert kcal("locate", "rig.json", "points.csv", "--origin", "1,2,3", "--heading", "4").stdout != plain
+
+
+def test_the_noise_of_marks_is_that_of_the_rig(folder: Path) -> None:
+    assert load_rig("rig.json").calibration.pixel_sigma == 0.1
+    stated = kcal("locate", "rig.json", "points.csv")
+    assert "noise of marks: 0.1 px, from the rig's file" in stated.stderr
+    assert stated.stdout == kcal("locate", "rig.json", "points.csv", "--pixel-sigma", "0.1").stdout
+    assert stated.stdout != kcal("locate", "rig.json", "points.csv", "--pixel-sigma", "0.3").stdout
+    assert "noise of marks: 0.3 px, assumed; --pixel-sigma states it" in kcal("budget").stderr
+    assert "noise of marks 0.1 px along each axis" in kcal("show", "rig.json").stdout
+
+
+@pytest.mark.parametrize("words", [["calibrate"], ["rig", "solve"], ["locate"], ["live"]])
+def test_help_is_short_and_help_all_is_whole(words: list[str]) -> None:
+    command = get_command(app)
+    for word in words:
+        command = command.commands[word]
+    names = {param.opts[0]: param.hidden for param in command.params if param.opts[0].startswith("-")}
+    short, whole = kcal(*words, "--help").stdout, kcal(*words, "--help-all").stdout
+    assert sum(not hidden for hidden in names.values()) <= 12
+    assert "--help-all shows" in short
+    for name, hidden in names.items():
+        row = rf"│ +(\* +)?(--\w+ +)?{name[:18]}"
+        assert bool(re.search(row, short)) != hidden, name
+        assert re.search(row, whole), name
+    assert kcal(*words, "--help").stdout == short
+
+
+def test_help_all_of_a_short_command_is_its_help() -> None:
+    assert kcal("show", "--help-all").stdout == kcal("show", "--help").stdout
+
+
+# Which large libraries a command loads: `--help` and `show` none, others only what they compute with.
+
+
+SAMPLE = Path(__file__).parents[2] / "assets" / "sample-rig.json"
+
+PIXELS = tuple((100.0 + 50.0 * column, 100.0 + 50.0 * row) for row in range(3) for column in range(4))
+
+
+@pytest.fixture(scope="module")
+def start_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    start_folder = tmp_path_factory.mktemp("startup")
+    rig = load_rig(SAMPLE)
+    save_camera(rig.left, start_folder / "left.json")
+    plain = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), coefficients=[-0.1, 0.01, 0, 0])
+    save_camera(plain, start_folder / "plain.json", name="plain")
+    views = (View(name="a.png", pixels=PIXELS),)
+    Observations(board=Board(columns=4, rows=3, square=0.1), image_size=(640, 480), views=views).save(
+        start_folder / "seen.json"
+    )
+    return start_folder
+
+
+def test_help_loads_no_large_library(tmp_path: Path) -> None:
+    assert len(helps()) > 20
+    code = """import contextlib, io
+from kcal.cli.main import app
+for words in {}:
+    with contextlib.suppress(SystemExit), contextlib.redirect_stdout(io.StringIO()):
+        app(words)"""
+    _, _, loaded = measure([], tmp_path, code.format(helps()))
+    assert loaded == []
+
+
+@pytest.mark.parametrize("name", ["left.json", "plain.json", "seen.json", str(SAMPLE)])
+def test_show_loads_no_large_library(name: str, start_folder: Path) -> None:
+    _, code, loaded = measure(["show", name], start_folder)
+    assert (code, loaded) == (0, [])
+
+
+@pytest.mark.parametrize(
+    ("line", "libraries"),
+    [
+        ("board --board charuco:9x6 --square 25mm -o board.svg", "cv2"),
+        ("diff left.json left.json", "kornia torch"),
+        ("export plain.json -o plain.yaml", "cv2 torch"),
+        ("report left.json", "torch"),
+        (f"report {SAMPLE}", "torch"),
+        (f"locate {SAMPLE} {SAMPLE.with_name('sample-points.csv')}", "pyproj torch"),
+        ("budget", "kornia pyproj torch"),
+    ],
+)
+def test_a_command_loads_what_it_computes_with_and_no_more(line: str, libraries: str, start_folder: Path) -> None:
+    _, code, loaded = measure(line.split(), start_folder)
+    assert code in (0, 3)
+    assert loaded == libraries.split()
+
+
+@pytest.mark.parametrize(
+    ("modules", "without"),
+    [
+        ("kcal.mark.server, kcal.mark.marking_service", {"kornia", "matplotlib", "scipy.stats", "skimage"}),
+        ("kcal.capture.session, kcal.calibrate.camera.calibrate", {"matplotlib", "scipy", "pyproj", "skimage"}),
+        ("kcal.corners.detect", {"kornia", "matplotlib", "scipy", "pyproj", "skimage"}),
+    ],
+)
+def test_long_commands_do_not_wait_for_what_they_may_never_use(modules: str, without: set[str], tmp_path: Path) -> None:
+    _, code, loaded = measure([], tmp_path, f"import {modules}")
+    assert code == 0
+    assert "torch" in loaded
+    assert not without & set(loaded)
+
+
+def test_what_is_stored_is_what_is_computed(start_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("left.json", "plain.json", str(SAMPLE)):
+        stored = CliRunner().invoke(app, ["show", str(start_folder / name)]).output
+        with monkeypatch.context() as patch:
+            patch.setattr("kcal.cli.show._as_written", lambda content: None)
+            assert CliRunner().invoke(app, ["show", str(start_folder / name)]).output == stored
+
+
+def test_a_file_that_was_changed_is_computed_anew(start_folder: Path) -> None:
+    content = json.loads((start_folder / "plain.json").read_text())
+    assert "focal length 800.000 px" in CliRunner().invoke(app, ["show", str(start_folder / "plain.json")]).output
+    content["intrinsics"] |= {"fx": 900.0, "fy": 900.0}
+    (start_folder / "changed.json").write_text(json.dumps(content))
+    assert "focal length 900.000 px" in CliRunner().invoke(app, ["show", str(start_folder / "changed.json")]).output
+
+
+# Data that are refused: each refusal names what is wrong, and ends with a command that can be pasted.
+
+
+COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+
+PLACES = ["a,0,100,0,0.02", "b,30,120,5,0.02", "c,-30,140,-5,0.02", "d,10,200,3,0.02"]
+
+RIG = "rig left.camera.json right.camera.json -o rig.json --origin 19,72,0"
+
+FEW = "kcal capture camera:0 --board 7x6 --square 50mm -o"
+
+SEEN = "kcal detect images/ --board 7x6 --square 50mm -o"
+
+MARK = "kcal mark left.png right.png"
+
+TWICE = "rig left.camera.json left.camera.json -o rig.json --pairs"
+
+PAIRS = "rig left.camera.json right.camera.json -o rig.json --pairs"
+
+
+@pytest.fixture(scope="module")
+def refusal_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    here = tmp_path_factory.mktemp("refused")
+    truth = camera("opencv5")
+    pixels = pixels_of(truth, motions(truth, 12, 1), noise=0.05)
+    observe(pixels[:2]).save(here / "few.obs.json")
+    wild = pixels.clone()
+    wild[::2] = wild[::2][:, torch.randperm(42, generator=torch.Generator().manual_seed(0))]
+    observe(wild).save(here / "wild.obs.json")
+    flat = (
+        torch.eye(3).double().expand(6, 3, 3),
+        torch.tensor([[-0.15 + 0.02 * i, -0.12, 0.6] for i in range(6)]).double(),
+    )
+    observe(pixels_of(camera("pinhole"), flat)).save(here / "flat.obs.json")
+    for name in ("a", "b"):
+        (here / name).mkdir()
+        observe(pixels).save(here / name / "left.obs.json")
+    observe(pixels[:, :30], board=Board(columns=6, rows=5, square=0.05)).save(here / "other.obs.json")
+    observe(pixels, names=[f"x{chr(97 + i)}" for i in range(12)]).save(here / "named.obs.json")
+    save_rig(pinhole_rig(), here / "placeless.json")
+    for side, focal in (("left", 500.0), ("right", 510.0)):
+        save_camera(camera("opencv5", focal), here / f"{side}.camera.json", name=side)
+    (here / "survey.csv").write_text("\n".join(["name,east,north,up,sigma", *PLACES]))
+    (here / "marks.csv").write_text("name,left_u,left_v,right_u,right_v\na,1,2,3,4\nb,5,6,7,8\nc,9,9,9,9")
+    (here / "far.csv").write_text("name,left_u,left_v,right_u,right_v\na,100,200,900,200")
+    image, _ = render(
+        Board(columns=7, rows=6, square=0.02), (640, 480), homography(BOARD, (640, 480), 40), supersample=2
+    )
+    cv2.imwrite(str(here / "board.png"), image)
+    cv2.imwrite(str(here / "blank.png"), np.full((480, 640), 128, np.uint8))
+    return here
+
+
+@pytest.mark.parametrize(
+    ("line", "named", "cure"),
+    [
+        ("calibrate few.obs.json -o x.json", "2 view(s)", f"{FEW} few.obs.json"),
+        ("calibrate flat.obs.json -o x.json", "tilted", f"{FEW} flat.obs.json"),
+        ("calibrate wild.obs.json -o x.json --model opencv5", "v0", f"{SEEN} wild.obs.json"),
+        ("calibrate a/left.obs.json b/left.obs.json -o x", "both named left", "mv b/left.obs.json b/b-left.obs.json"),
+        (f"{RIG} --landmarks survey.csv", "belong together", f"{MARK} --cameras left.camera.json"),
+        (f"{RIG} --landmarks survey.csv --marks marks.csv", "left", f"{MARK} --cameras left.camera.json"),
+        (f"{PAIRS} a/left.obs.json other.obs.json", "different boards", f"{SEEN} a/left.obs.json"),
+        (f"{PAIRS} a/left.obs.json named.obs.json", "v00", f"{SEEN} a/left.obs.json"),
+        (f"{TWICE} a/left.obs.json b/left.obs.json", "the same camera", "kcal calibrate left.obs.json right.obs.json"),
+        (
+            "locate placeless.json far.csv -o p.csv",
+            "placeless.json",
+            "kcal locate placeless.json far.csv -o p.csv --",
+        ),
+        ("locate placeless.json far.csv --origin 0,0,0 --heading 0", "far.csv", f"{MARK} --rig placeless.json"),
+        ("detect board.png --board 9x6 --square 25mm -o x.json", "7x6", "kcal detect board.png --board 7x6 --square"),
+        ("detect blank.png --board 9x6 --square 25mm -o x.json", "blank.png", "kcal board --board 9x6 --square 25mm"),
+    ],
+)
+def test_it_ends_with_a_command(
+    line: str,
+    named: str,
+    cure: str,
+    refusal_folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(refusal_folder)
+    monkeypatch.setattr("sys.argv", ["kcal", *line.split()])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 1
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said.startswith("error: ")
+    assert named in said
+    assert cure in said
+    assert not list(refusal_folder.glob("x.*"))
+    if cure.startswith("kcal "):
+        # Its options and arguments are those of the command.
+        name, *words = shlex.split(said[said.rindex("kcal ") :])[1:]
+        command = COMMANDS[name]
+        if name == "board":
+            words, command = ["print", *words], command
+        command.make_context(name, words, resilient_parsing=False)

@@ -1,8 +1,12 @@
-"""Ctrl-C: a command ends with one line and exit code 130, whatever it is doing, and leaves nothing torn behind."""
+"""Commands that are interrupted, and pages of captures."""
 
 from __future__ import annotations
 
+import json
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -11,11 +15,19 @@ import torch
 from board_render import render
 from calibrate_scenes import BOARD, camera, motions, observe, pixels_of
 from interrupted import interrupt
+from typer.testing import CliRunner, Result
 
 from kcal import load_rig, save_camera
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+from kcal.cli.main import app
+from kcal.corners.observations import Observations
+from kcal.io.camera_file import load_camera
+
+# Ctrl-C: a command ends with one line and exit code 130, whatever it is doing, and leaves nothing torn behind.
+
 
 SAMPLE = Path(__file__).parents[2] / "assets" / "sample-rig.json"
+
 POINTS = SAMPLE.with_name("sample-points.csv")
 
 
@@ -114,3 +126,149 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rows = [",".join([n, *map(str, row)]) for n, row in zip(names, marks.tolist(), strict=True)]
     (folder / "marks.csv").write_text("\n".join(["name,left_u,left_v,right_u,right_v", *rows]))
     return folder
+
+
+# The page of `kcal capture`: its address is told on one line and opened, and a capture without a board is an error.
+
+
+ADDRESS = "http://127.0.0.1:8348/#" + 60 * "t"
+
+
+class Server:
+    """In place of the one that answers browsers: it runs until it is told to stop."""
+
+    made: ClassVar[list[tuple[int, bool]]] = []
+
+    def __init__(self, make_app: Callable[..., object], port: int, *, fallback: bool) -> None:
+        self.address, self._stopped = ADDRESS, threading.Event()
+        self.made.append((port, fallback))
+
+    def run(self) -> None:
+        self._stopped.wait()
+
+    def stop(self) -> None:
+        self._stopped.set()
+
+
+@pytest.fixture
+def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Addresses that were opened, of captures whose source shows nothing."""
+    found: list[str] = []
+
+    def nothing(*_: object) -> Iterator[None]:
+        return iter(())
+
+    monkeypatch.setattr("kcal.capture.session.shots", nothing)
+    monkeypatch.setattr("kcal.web.serving.LocalServer", Server)
+    monkeypatch.setattr("webbrowser.open", found.append)
+    monkeypatch.setattr("time.sleep", lambda seconds: None)
+    monkeypatch.setattr(Server, "made", [])
+    return found
+
+
+def capture(folder: Path, *options: str) -> Result:
+    words = ["capture", "camera:0", "--board", "9x6", "--square", "25mm", "-o", str(folder / "left.obs.json"), *options]
+    return CliRunner().invoke(app, words, env={"COLUMNS": "40"})
+
+
+def test_the_address_is_on_one_line_and_opened(tmp_path: Path, opened: list[str]) -> None:
+    """A wrapped one cannot be clicked; the usual port may be taken, and a port that was asked for may not."""
+    done = capture(tmp_path)
+    assert f"capture page: {ADDRESS}\n" in done.output
+    assert opened == [ADDRESS]
+    assert done.exit_code != 0
+    assert "no frame showed the board" in str(done.exception)
+    capture(tmp_path, "--no-browser", "--port", "9000")
+    assert opened == [ADDRESS]
+    assert Server.made == [(8348, True), (9000, False)]
+
+
+def test_no_page(tmp_path: Path, opened: list[str]) -> None:
+    done = capture(tmp_path, "--no-page")
+    assert "capture page" not in done.output
+    assert opened == []
+    assert Server.made == []
+
+
+def test_an_interruption_before_all_has_started(
+    tmp_path: Path, opened: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What has started ends: a thread that was left behind would keep the command alive."""
+    start, begun, ended, given_up = threading.Thread.start, [], threading.Event(), threading.Event()
+
+    def endless(source: str, stopped: Callable[[], bool], tell: object) -> Iterator[None]:
+        while not (stopped() or given_up.wait(0.01)):
+            pass
+        ended.set()
+        return iter(())
+
+    def interrupted(thread: threading.Thread) -> None:
+        begun.append(thread)
+        if len(begun) == 2:
+            raise KeyboardInterrupt
+        start(thread)
+
+    monkeypatch.setattr("kcal.capture.session.shots", endless)
+    with monkeypatch.context() as patched:
+        patched.setattr(threading.Thread, "start", interrupted)
+        done = capture(tmp_path, "--no-page")
+    try:
+        assert done.exit_code == 130
+        assert ended.is_set()
+    finally:
+        given_up.set()
+
+
+# As a user goes with somebody's capture: calibrate both cameras, ask whether they may be used, solve the rig, ask.
+
+
+def kcal(*words: object) -> tuple[int, str]:
+    found = CliRunner().invoke(app, [str(word) for word in words])
+    return found.exit_code, found.output
+
+
+def test_files_that_follow_one_option_are_refused_with_the_command(tmp_path: Path) -> None:
+    words = ("report", "rig.json", "--observations", "left.obs.json", "right.obs.json", "--require", "1km:5%")
+    code, text = kcal(*words)
+    assert code == 2
+    plain = " ".join(text.replace("│", " ").split())
+    assert (
+        "--observations takes one file; give it before each: kcal report rig.json --observations left.obs.json "
+        "--observations right.obs.json --require 1km:5%" in plain
+    )
+    # Another slip gets no such advice.
+    assert "give it before each" not in kcal("report", "rig.json", "other.json")[1]
+
+
+@pytest.mark.slow
+def test_a_stereo_capture_from_observations_to_the_verdict_on_its_rig(kcal_data: Path, tmp_path: Path) -> None:
+    """Ten of the pairs of a webcam rig, of which nobody knows the truth: what must agree, agrees."""
+    seen, cameras = [], []
+    for side in ("left", "right"):
+        file, camera = tmp_path / f"{side}.obs.json", tmp_path / f"{side}.camera.json"
+        whole = Observations.load(kcal_data / "captures" / f"st1_{side[0]}.obs.json")
+        whole.model_copy(update={"views": whole.views[:10]}).save(file)
+        code, text = kcal("calibrate", file, "-o", camera)
+        assert code == 0, text
+        seen.append(file)
+        cameras.append(camera)
+        lens = load_camera(camera)
+        assert lens.calibration is not None
+        assert lens.calibration.record is not None
+        assert lens.calibration.record.rms < 0.5
+    code, text = kcal("report", cameras[0], "--observations", seen[0], "-o", tmp_path / "left.html", "--json")
+    told = json.loads(text[text.index("{") :])
+    assert code == (0 if told["verdict"]["usable"] else 3)
+    assert (tmp_path / "left.html").stat().st_size > 100_000
+    code, text = kcal("rig", *cameras, "--pairs", *seen, "-o", tmp_path / "rig.json")
+    assert code == 0, text
+    rig = load_rig(tmp_path / "rig.json")
+    assert rig.calibration is not None
+    assert rig.calibration.pairs >= 7
+    assert rig.covariance is not None
+    assert 0.02 < float(rig.baseline) < 0.5
+    code, text = kcal("report", tmp_path / "rig.json", *(word for file in seen for word in ("--observations", file)))
+    assert code in (0, 3)
+    assert ("YES" if code == 0 else "NO") in text
+    # Each finding in words, none by its internal name.
+    assert not any(name in text for name in ("\n  halves:", "\n  patterns:", "\n  other-views:", "\n  exact-lenses:"))

@@ -1,4 +1,4 @@
-"""The main job from images to positions, through the command line as a user types it."""
+"""From images to a camera and its report: the main job, its messages, and settings of the lens."""
 
 from __future__ import annotations
 
@@ -15,15 +15,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from calibrate_scenes import camera, motions, observe, pixels_of
+from typer.testing import CliRunner
 
 import kcal.sim.scene
-from kcal.cli.main import main
+from kcal.calibrate.camera.calibrate import calibrate_camera
+from kcal.cli.console import more_views
+from kcal.cli.main import app, main
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
-from kcal.io.camera_file import CameraFile
+from kcal.errors import DegenerateError
+from kcal.io.camera_file import CameraFile, load_camera, save_camera
 from kcal.io.images import write_png
 from kcal.io.rig_file import RigFile
+from kcal.lens.calibration import CameraCalibration, LensSetting
+from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
+from kcal.lens.uncertainty import paraxial_focal
+
+# The main job from images to positions, through the command line as a user types it.
+
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -290,3 +301,139 @@ def test_help_has_examples(run: Run, command: str) -> None:
     assert code == 0
     assert "Examples" in text
     assert f"kcal {command}" in text
+
+
+# What `kcal calibrate` says to people: focal lengths on the axis, and errors that end with the command to run.
+
+
+RUNNER = CliRunner()
+
+
+def write(path: Path, count: int, seed: int = 1) -> Path:
+    truth = camera("opencv4")
+    observe(pixels_of(truth, motions(truth, count, seed), noise=0.1, seed=seed)).save(path)
+    return path
+
+
+def test_too_few_views_end_with_the_command_that_adds_some(tmp_path: Path) -> None:
+    path = write(tmp_path / "my left.obs.json", 2)
+    result = RUNNER.invoke(app, ["calibrate", str(path), "-o", str(tmp_path / "left.camera.json")])
+    assert isinstance(result.exception, DegenerateError)
+    text = str(result.exception)
+    assert text.startswith("2 view(s) of the board: at least 3")
+    command = shlex.split(text.split("To add views: ")[1])
+    assert command[:2] == ["kcal", "capture"]
+    options = dict(zip(command[3::2], command[4::2], strict=True))
+    assert options == {"--board": "7x6", "--square": "50mm", "-o": str(path)}
+    assert not (tmp_path / "left.camera.json").exists()
+
+
+def test_the_command_names_the_same_board() -> None:
+    sizes = ["9x6", "charuco:9x6:5x5_100:15mm", "charuco:9x6:5x5_100:15mm:id3", "circles:7x6", "circles:7x6:10mm"]
+    for size in (*sizes, "asymmetric:4x11", "aprilgrid:6x6:0.3", "aprilgrid:6x5:2mm:id7"):
+        board = Board.parse(size, "24.23mm")
+        words = shlex.split(more_views(board, Path("a.obs.json")))
+        assert Board.parse(words[words.index("--board") + 1], words[words.index("--square") + 1]) == board
+
+
+def test_one_of_several_cameras(tmp_path: Path) -> None:
+    paths = [write(tmp_path / "a.obs.json", 8), write(tmp_path / "b.obs.json", 2)]
+    result = RUNNER.invoke(app, ["calibrate", *map(str, paths), "-o", str(tmp_path / "out")])
+    assert "1 of 2 cameras failed: b" in str(result.exception)
+    assert f"To add views: kcal capture camera:0 --board 7x6 --square 50mm -o {paths[1]}" in result.output.replace(
+        "\n", ""
+    )
+    assert (tmp_path / "out" / "a.camera.json").exists()
+
+
+def test_focal_lengths_are_those_on_the_axis(tmp_path: Path) -> None:
+    """Printed by calibrate, show and diff alike, and told to programs; fx of the file is another number."""
+    path, file = write(tmp_path / "a.obs.json", 8), tmp_path / "a.camera.json"
+    told = json.loads(RUNNER.invoke(app, ["calibrate", str(path), "-o", str(file), "--json"]).stdout)
+    saved = load_camera(file)
+    found = paraxial_focal(saved)
+    assert any(f"focal length {found}; principal point" in line for line in told["text"])
+    assert abs(found.mean[0] - float(saved.focal[0])) > 0.1
+    assert f"focal length {found}, on its axis; fx and fy below" in RUNNER.invoke(app, ["show", str(file)]).output
+    assert RUNNER.invoke(app, ["diff", str(file), str(file)]).output.count(f"focal length {found}") == 2
+    numbers = told["cameras"]["a"]
+    assert numbers["focal_px"] == pytest.approx(found.value.tolist())
+    assert numbers["focal_sigma_px"] == pytest.approx(found.sigma.tolist(), rel=1e-6)
+
+
+def test_parametric_lenses_show_their_parameter(tmp_path: Path) -> None:
+    path, file = write(tmp_path / "a.obs.json", 8), tmp_path / "a.camera.json"
+    RUNNER.invoke(app, ["calibrate", str(path), "-o", str(file), "--model", "opencv4"])
+    fx, fy = load_camera(file).focal.tolist()
+    text = RUNNER.invoke(app, ["show", str(file)]).output
+    match = re.search(r"focal length ([\d.]+) ± [\d.]+ px along rows, ([\d.]+) ± [\d.]+ px along columns\n", text)
+    assert match is not None
+    # Rounded to two digits of sigma.
+    assert [float(value) for value in match.groups()] == pytest.approx([fx, fy], abs=1e-2)
+
+
+def test_the_library_names_no_command() -> None:
+    with pytest.raises(DegenerateError) as caught:
+        calibrate_camera(observe(torch.zeros(2, 42, 2).double() + torch.rand(2, 42, 2).double() * 100))
+    assert "kcal capture" not in str(caught.value)
+
+
+# `kcal calibrate --setting` and `kcal interpolate`.
+
+
+def stored(folder: Path, focus: float) -> str:
+    made = Camera.build(focal=(500 + focus**2,) * 2, center=(320, 240), size=(640, 480), model="pinhole")
+    covariance = torch.diag(torch.tensor([1.0, 1, 1, 1, 0])).double()
+    made.calibration = CameraCalibration(covariance=covariance, setting=LensSetting(values={"focus": focus}))
+    return str(save_camera(made, folder / f"f{focus:g}.camera.json"))
+
+
+def test_several_settings_in_one_call(tmp_path: Path) -> None:
+    truth = camera("opencv4")
+    seen = [tmp_path / name for name in ("near.obs.json", "far.obs.json")]
+    for i, path in enumerate(seen):
+        observe(pixels_of(truth, motions(truth, 6, i + 1), noise=0.1, seed=i + 1)).save(path)
+    words = ["calibrate", *map(str, seen), "-o", str(tmp_path / "out"), "--model", "opencv4"]
+    done = RUNNER.invoke(app, [*words, "--setting", "focus=1,2.5", "--setting", "zoom=12"])
+    assert done.exit_code == 0, done.output
+    found = [load_camera(tmp_path / "out" / f"{name}.camera.json").calibration for name in ("near", "far")]
+    assert [one and one.setting and one.setting.values for one in found] == [
+        {"focus": 1.0, "zoom": 12.0},
+        {"focus": 2.5, "zoom": 12.0},
+    ]
+    assert "setting focus=2.5 zoom=12" in RUNNER.invoke(app, ["show", str(tmp_path / "out/far.camera.json")]).output
+    for option, message in (
+        ("focus=1,2,3", "3 numbers for 2 cameras"),
+        ("focus", "write NAME=NUMBER"),
+        ("focus=a", "'a' is not a number"),
+    ):
+        assert message in str(RUNNER.invoke(app, [*words, "--setting", option]).exception)
+    twice = RUNNER.invoke(app, [*words, "--setting", "focus=1", "--setting", "focus=2"])
+    assert "focus is stated twice" in str(twice.exception)
+
+
+def test_interpolate(tmp_path: Path) -> None:
+    paths = [stored(tmp_path, focus) for focus in (0.0, 1.0, 2.0, 3.0)]
+    made = tmp_path / "now.camera.json"
+    words = ["interpolate", *paths, "--setting", "focus=1.5", "-o", str(made)]
+    done = RUNNER.invoke(app, [*words, "--setting-sigma", "focus=0.1"])
+    assert done.exit_code == 0, done.output
+    assert "focus=1.5, interpolated: far directions ± " in done.output
+    assert all(f" by {part}" in done.output for part in ("calibrations", "interpolation", "setting"))
+    known = load_camera(made).calibration
+    assert known is not None
+    assert known.setting is not None
+    assert (known.name, known.setting.interpolated_from) == ("now", tuple(paths))
+    assert f"setting focus=1.5, interpolated from {paths[0]}, " in RUNNER.invoke(app, ["show", str(made)]).output
+    told = json.loads(RUNNER.invoke(app, [*words, "--json"]).stdout)
+    assert told["sigma_px"]["setting"] == 0.0 < told["sigma_px"]["interpolation"]
+    assert sum(told["weights"]) == pytest.approx(1.0)
+    same = RUNNER.invoke(app, ["interpolate", *paths, "--setting", "focus=2", "-o", str(made)])
+    assert "focus=2, calibrated: far directions ± " in same.output
+    assert load_camera(made).focal.tolist() == [504.0, 504.0]
+    made.unlink()
+    beyond = RUNNER.invoke(app, ["interpolate", *paths, "--setting", "focus=3.5", "-o", str(made)])
+    assert "focus=3.5 is outside the calibrated focus of 0 to 3" in str(beyond.exception)
+    several = RUNNER.invoke(app, [*words, "--setting-sigma", "focus=1,2"])
+    assert "--setting-sigma focus: one number is needed" in str(several.exception)
+    assert not made.exists()

@@ -1,4 +1,4 @@
-"""`kcal rig` from a survey, `kcal rig check`, `kcal locate` with what the rig file knows; across the antimeridian."""
+"""Rigs from other things than boards: stars, the scene, the skyline, moving cameras."""
 
 from __future__ import annotations
 
@@ -8,27 +8,41 @@ import math
 import sys
 from pathlib import Path
 
+import cv2
 import pytest
 import torch
 from torch import Tensor
+from typer.testing import CliRunner
 
-from kcal.cli.main import main
+from kcal.cli.main import app, main
 from kcal.cli.rig_sources import Sources, read_sources
-from kcal.io.camera_file import camera_to_file
-from kcal.io.rig_file import RigFile
+from kcal.io.camera_file import camera_to_file, save_camera
+from kcal.io.images import write_png
+from kcal.io.rig_file import RigFile, load_rig
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.lens.rig import Origin
 from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic
 from kcal.locate.marks import read_marks, write_marks
+from kcal.locate.stations import load_camera_rig, station_mounting
+from scripts.check.moving import CAMERA, CENTERS, LATE, NAMES, simulated
+from tests.helpers.scene_pairs import pair, small_rig
+from tests.helpers.skyline_site import camera, heights, small_site, write_raster
+
+# `kcal rig` from a survey, `kcal rig check`, `kcal locate` with what the rig file knows; across the antimeridian.
+
 
 ORIGIN = Origin(lat=-17.5, lon=179.9999, height=40.0)
+
 CAMERAS = [
     Camera.build(focal=(1602, 1600), center=(968, 534), size=(1920, 1080), coefficients=[-0.2, 0.06, 3e-4, -2e-4]),
     Camera.build(focal=(1611, 1610), center=(951, 546), size=(1920, 1080), coefficients=[-0.19, 0.05, -2e-4, 3e-4]),
 ]
+
 ROTATION = [enu_from_cam(16.0, -0.5, 0.4).T, enu_from_cam(16.2, -0.3, -0.2).T]
+
 CENTER = torch.tensor([[2.0, -1.0, 3.0], [11.6, -3.7, 3.1]], dtype=torch.float64)
+
 HEADER = "name,left_u,left_v,right_u,right_v"
 
 
@@ -59,8 +73,8 @@ def marks_table(path: Path, prefix: str, pixels: Tensor, header: str = HEADER, *
 @pytest.fixture
 def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
-    for name, camera in zip(("left", "right"), CAMERAS, strict=True):
-        camera_to_file(camera, name=name).save(tmp_path / f"{name}.json")
+    for name, one in zip(("left", "right"), CAMERAS, strict=True):
+        camera_to_file(one, name=name).save(tmp_path / f"{name}.json")
     posts = points(12, 60.0, 2000.0, 5)
     places = enu_to_geodetic(posts, ORIGIN)
     places[4, 2] += 3.0
@@ -346,3 +360,149 @@ def test_the_rig_file_states_the_noise_of_its_marks(
         assert calibration is not None
         assert calibration.pixel_sigma == (None if stated is None else pytest.approx(stated))
         assert said in capsys.readouterr().out
+
+
+# `kcal rig --tracks`: a rig from a drone's flight, and refusals.
+
+
+@pytest.fixture(scope="module")
+def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("moving")
+    site = simulated("drone", 3)
+    focal = CAMERA.params.clone()
+    focal[0] += 1e-3  # two cameras of one fingerprint would be one camera
+    save_camera(CAMERA, folder / "left.camera.json")
+    save_camera(CAMERA.with_parameters(focal), folder / "right.camera.json")
+    rows = ["name,time,east,north,up,sigma"]
+    for track in site.tracks:
+        rows += [
+            f"{track.name},{t:.3f},{x:.4f},{y:.4f},{z:.4f},0.02"
+            for t, (x, y, z) in zip(track.times.tolist(), track.points.tolist(), strict=True)
+        ]
+    (folder / "tracks.csv").write_text("\n".join(rows) + "\n")
+    rows = ["name,camera,time,u,v"]
+    for one in site.sightings:
+        rows += [
+            f"{one.label},{NAMES[one.camera]},{t:.3f},{u:.3f},{v:.3f}"
+            for t, (u, v) in zip(one.times.tolist(), one.pixels.tolist(), strict=True)
+        ]
+    (folder / "seen.csv").write_text("\n".join(rows) + "\n")
+    rows = ["name,east,north,up,sigma"]
+    rows += [
+        f"{name},{','.join(f'{x:.3f}' for x in center)},0.02"
+        for name, center in zip(NAMES, CENTERS.tolist(), strict=False)
+    ]
+    (folder / "gnss.csv").write_text("\n".join(rows) + "\n")
+    return folder
+
+
+def arguments(folder: Path, tracks: str = "tracks.csv") -> list[str]:
+    cameras = [str(folder / f"{name}.camera.json") for name in NAMES]
+    files = [str(folder / tracks), str(folder / "seen.csv")]
+    return ["rig", *cameras, "--tracks", *files, "-o", str(folder / "rig.json")]
+
+
+def test_a_rig_from_a_drone(given: Path) -> None:
+    more = ["--positions", str(given / "gnss.csv"), "--baseline", "10.0+-0.02", "--intrinsics", "fixed"]
+    result = CliRunner().invoke(app, [*arguments(given), *more])
+    assert result.exit_code == 0, result.output
+    assert "1 things in 2 of 2 sightings" in result.output
+    (line,) = [line for line in result.output.splitlines() if "ahead of the cameras" in line]
+    assert float(line.split(" is ")[1].split()[0]) == pytest.approx(LATE, abs=0.01)
+    assert float(load_rig(given / "rig.json").baseline) == pytest.approx(10.0, abs=0.05)
+
+
+def test_latitudes_beside_local_positions_are_refused(given: Path) -> None:
+    rows = "".join(f"drone0,{t},54.1,7.9,{t},0.02\n" for t in range(60))
+    (given / "earth.csv").write_text("name,time,lat,lon,height,sigma\n" + rows)
+    result = CliRunner().invoke(app, [*arguments(given, "earth.csv"), "--positions", str(given / "gnss.csv")])
+    assert result.exit_code == 1
+    assert "--origin" in str(result.exception)
+
+
+# `kcal rig --scene`: a rig from images and a tape; without a length it is refused.
+
+
+@pytest.fixture
+def scene_given(tmp_path: Path) -> list[str]:
+    rig, images = small_rig(), pair(1)
+    names = []
+    for side in ("left", "right"):
+        save_camera(getattr(rig, side), tmp_path / f"{side}.camera.json")
+        write_png(tmp_path / f"{side}.png", getattr(images, side))
+        names.append(str(tmp_path / side))
+    cameras = [f"{name}.camera.json" for name in names]
+    return ["rig", *cameras, "--scene", *(f"{name}.png" for name in names), "-o", str(tmp_path / "rig.json")]
+
+
+def test_a_rig_from_images_and_a_tape(scene_given: list[str], tmp_path: Path) -> None:
+    length = float(small_rig().baseline)
+    result = CliRunner().invoke(app, [*scene_given, "--baseline", f"{length:.4f}+-0.002"])
+    assert result.exit_code == 0, result.output
+    assert "off the line" in result.output
+    assert "one pair: what moves cannot be told" in result.output
+    assert float(load_rig(tmp_path / "rig.json").baseline) == pytest.approx(length, abs=0.002)
+
+
+def test_without_a_length_it_is_refused(scene_given: list[str], tmp_path: Path) -> None:
+    result = CliRunner().invoke(app, scene_given)
+    assert result.exit_code == 1
+    assert "leaves the scale open" in str(result.exception)
+    assert not (tmp_path / "rig.json").exists()
+
+
+# `kcal rig --skyline` and `kcal station --skyline`.
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A camera, its place, an image and a raster."""
+    folder = tmp_path_factory.mktemp("skyline")
+    site = small_site()
+    save_camera(camera(), folder / "mast.camera.json")
+    write_raster(folder / "dem.asc", heights())
+    cv2.imwrite(str(folder / "noon.png"), site.image)
+    height = site.place.height
+    (folder / "gnss.csv").write_text(f"name,lat,lon,height,sigma\nmast,47.0,11.0,{height:.3f},0.3\n")
+    return folder
+
+
+def run_skyline(folder: Path, *options: str) -> tuple[int, str]:
+    """`kcal station` with a camera."""
+    given = ["station", str(folder / "mast.camera.json"), "-o", str(folder / "mast.rig.json")]
+    result = CliRunner().invoke(app, [*given, *options])
+    return result.exit_code, " ".join(f"{result.stdout} {result.stderr} {result.exception}".split())
+
+
+def test_a_station_from_its_skyline(files: Path) -> None:
+    code, text = run_skyline(
+        files, "--position", str(files / "gnss.csv"), "--skyline", str(files / "dem.asc"), "--skyline-images",
+        str(files / "noon.png"), "--skyline-sigma", "0.5", "--skyline-picture", str(files / "fit.png"),
+    )  # fmt: skip
+    assert code == 0, text
+    assert "variance of its heading: " in text
+    assert "next best heading" in text
+    assert (files / "fit.png").stat().st_size > 10_000
+    stands = station_mounting(load_camera_rig(files / "mast.rig.json"), 0)
+    assert stands.covariance is not None
+    assert stands.heading_deg == pytest.approx(40.0, abs=3 * float(stands.covariance[5, 5].sqrt().rad2deg()))
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--skyline", "dem.asc"], "--skyline needs images"),
+        (["--skyline-images", "noon.png"], "give surveyed places and --marks, or a raster"),
+        (["--skyline", "dem.asc", "--skyline-images", "noon.png"], "needs the place of mast"),
+        (["--skyline", "dem.asc", "--skyline-images", "left=noon.png", "--position", "gnss.csv"], "cameras are mast"),
+        (["--skyline", "noon.png", "--skyline-images", "noon.png", "--position", "gnss.csv"], "coordinate|raster"),
+    ],
+)  # fmt: skip
+def test_what_is_missing(files: Path, options: list[str], said: str) -> None:
+    given = [
+        str(files / one) if one.endswith((".asc", ".csv")) or one == "noon.png" else
+        one.replace("noon.png", str(files / "noon.png")) for one in options
+    ]  # fmt: skip
+    code, text = run_skyline(files, *given)
+    assert code != 0
+    assert any(part in text for part in said.split("|")), text

@@ -1,24 +1,42 @@
-"""Every command with every file in the wrong place: what it is, what is needed, and a command that can be pasted."""
+"""Files of the wrong kind and damaged ones, small commands for boards and lookups."""
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
+import json
+import random
 import shlex
 import shutil
+import sys
+import time
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import torch
+from calibrate_scenes import observe
+from click.testing import Result
+from printed_boards import printed_points, printed_views
 from typer.main import get_command
+from typer.testing import CliRunner
 
 from kcal import Board, Observations, View, load_camera, load_rig, save_camera, save_rig
-from kcal.cli.main import app
-from kcal.errors import KcalError
+from kcal.calibrate.hybrid.measured_board import load_measured_board
+from kcal.cli.main import app, main
+from kcal.errors import FileError, KcalError
 from kcal.file_kind import file_kind
+from kcal.io.lookup_file import load_lookup
+from kcal.lens.camera import Camera
+from scripts.fuzz import commands as fuzz
+from scripts.fuzz.damage import damage_json
+
+# Every command with every file in the wrong place: what it is, what is needed, and a command that can be pasted.
+
 
 ROOT = Path(__file__).parents[2]
+
 # Each line is right; the words that name files are exchanged one by one.
 LINES = [
     "calibrate seen.json -o new.json",
@@ -46,6 +64,7 @@ LINES = [
     "rig check rig.json --marks marks.csv --landmarks survey.csv",
     "rig check rig.json --marks marks.csv --reference marks.csv",
 ]
+
 FILES = {
     "camera.json": "camera",
     "rig.json": "rig",
@@ -59,6 +78,7 @@ FILES = {
     "other.json": "json",
     "board.json": "board",
 }
+
 # Of these, a file of the other kind will do as well, or the reader says more of what is wrong in it.
 FINE = {
     ("picture.png", "folder"), ("picture.png", "empty.json"), ("picture.png", "foreign.yaml"),
@@ -218,3 +238,154 @@ def test_views_of_the_left_camera_given_for_the_right_one_are_refused(
     text = run(line.split(), monkeypatch)
     assert "exchanged" in text
     assert text.endswith("kcal rig left.camera.json right.camera.json --pairs left.obs.json right.obs.json -o n.json")
+
+
+# A short seeded run of `scripts/fuzz/commands.py`, and that it sees what it is there for.
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    return fuzz.make_files(tmp_path_factory.mktemp("whole"))
+
+
+@pytest.mark.parametrize("case", [*range(24), 134, 1171])
+def test_nothing_is_found(case: int, whole: dict[str, bytes]) -> None:
+    assert fuzz.run_case(case, whole, 60.0) == []
+
+
+@pytest.mark.slow
+def test_whole_files_are_accepted(
+    whole: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "u").mkdir()
+    for name, content in whole.items():
+        (tmp_path / name).write_bytes(content)
+    for name, commands in fuzz.COMMANDS.items():
+        for command in commands:
+            assert fuzz._run(command, tmp_path / name), (command, capsys.readouterr())
+    assert fuzz.odd_numbers(tmp_path) == ""
+
+
+def _case(whole: dict[str, bytes], kind: str, damage: str) -> int:
+    """The first case that does this damage to this kind of file."""
+    for case in range(20_000):
+        rng = random.Random(case)
+        right = rng.choice(sorted(whole)) == kind and rng.random() < 0.85
+        if right and damage in damage_json(whole[kind], rng)[1]:
+            return case
+    raise AssertionError("no such case")
+
+
+def test_what_is_planted_is_found(whole: dict[str, bytes], monkeypatch: pytest.MonkeyPatch) -> None:
+    small = {name: whole[name] for name in ("board.json", "camera.json")}
+    case = _case(small, "board.json", ": true")
+    assert fuzz.run_case(case, small, 60.0) == []
+
+    def lenient(path: Path) -> object:
+        return json.loads(path.read_bytes())
+
+    monkeypatch.setitem(fuzz.COMMANDS, "board.json", [lenient])
+    assert [finding.what for finding in fuzz.run_case(case, small, 60.0)] == ["silent number"]
+    monkeypatch.setitem(fuzz.COMMANDS, "board.json", [lambda _: 1 / 0])
+    assert [finding.what for finding in fuzz.run_case(case, small, 60.0)] == ["traceback"]
+    monkeypatch.setitem(fuzz.COMMANDS, "board.json", [lambda _: time.sleep(5)])
+    assert [finding.what for finding in fuzz.run_case(case, small, 0.1)] == ["hang"]
+
+
+# `kcal board`: printing is the default, measuring a command of its own.
+
+
+BOARD = Board(columns=8, rows=6, square=0.03)
+
+SIZE = (1280, 960)
+
+
+def kcal(*arguments: object) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def capture(folder: Path, name: str, points: torch.Tensor, seed: int) -> Path:
+    camera = Camera.build(focal=(800, 800), center=(645, 476), size=SIZE, coefficients=[-0.12, 0.03], model="opencv5")
+    pixels = printed_views(camera, BOARD, points, 8, seed, noise=0.1)
+    return observe(pixels, board=BOARD, size=SIZE).save(folder / f"{name}.obs.json")
+
+
+def test_one_board(tmp_path: Path) -> None:
+    points = printed_points(BOARD, 3)
+    output, picture = tmp_path / "plate.board.json", tmp_path / "plate.png"
+    files = [capture(tmp_path, name, points, seed) for name, seed in (("left", 1), ("right", 2))]
+    result = kcal("board", "measure", *files, "-o", output, "--picture", picture)
+    assert result.exit_code == 0
+    board = load_measured_board(output)
+    assert (board.name, board.observations) == ("plate", ("left", "right"))
+    assert f"bending {1e3 * board.bending.value:.3f} ± {1e3 * board.bending.sigma:.3f} mm" in result.output
+    assert "2 of 2 observations: left, right" in result.output
+    assert "evidence that they saw one board" in result.output
+    assert picture.read_bytes()[:4] == b"\x89PNG"
+
+
+def test_two_boards(tmp_path: Path) -> None:
+    files = [capture(tmp_path, name, printed_points(BOARD, seed), seed) for name, seed in (("left", 3), ("right", 4))]
+    result = kcal("board", "measure", *files, "-o", tmp_path / "plate.board.json")
+    assert result.exit_code == 0
+    assert "these observations show 2 boards" in result.output
+    assert load_measured_board(tmp_path / "plate.board.json").observations == ("left",)
+
+
+def test_refusals(tmp_path: Path) -> None:
+    for arguments, message in (
+        (["none.obs.json", "-o", tmp_path / "x.board.json"], "cannot read"),
+        ([tmp_path / "a.obs.json", "-o", tmp_path / "none" / "x.board.json"], "does not exist"),
+    ):
+        result = kcal("board", "measure", *arguments)
+        assert isinstance(result.exception, FileError)
+        assert message in str(result.exception)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("command", [["board"], ["board", "print"]])
+def test_printing_is_the_default(tmp_path: Path, command: list[str]) -> None:
+    output = tmp_path / "board.svg"
+    assert kcal(*command, "--board", "9x6", "--square", "25mm", "-o", output).exit_code == 0
+    assert output.read_bytes().startswith(b"<?xml")
+
+
+# `kcal bake`: tables beside the camera, with their error in words.
+
+
+def run_bake(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["kcal", "bake", *arguments])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    return int(stop.value.code or 0)
+
+
+def test_it_writes_what_it_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    camera = Camera.build(focal=(60, 60), center=(31, 24), size=(64, 48), coefficients=[-0.2, 0.02, 1e-3, -1e-3])
+    path = save_camera(camera, tmp_path / "left.camera.json")
+    assert run_bake(monkeypatch, str(path), "--tolerance", "1e-4") == 0
+    said = capsys.readouterr().out
+    lookup = load_lookup(tmp_path / "left_lookup.npz")
+    assert lookup.source == camera.fingerprint
+    assert max(lookup.bound) <= 1e-4
+    for bound in lookup.bound:
+        assert f"error at most {bound:.1e} px" in said
+    assert "left_lookup.npz" in said
+    assert "answers for" not in said
+
+
+def test_it_refuses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_bake(monkeypatch, str(tmp_path / "none.json")) == 1
+    assert "cannot read" in capsys.readouterr().err
+    camera = Camera.build(focal=(60, 60), center=(31, 24), size=(64, 48), model="pinhole")
+    path = save_camera(camera, tmp_path / "left.camera.json")
+    assert run_bake(monkeypatch, str(path), "-o", str(path)) == 1
+    assert "input" in capsys.readouterr().err
+    assert run_bake(monkeypatch, str(path), "--tolerance", "0") == 2
+    # A table fine enough for a focal length of 1 px would take minutes, only to fail.
+    camera = Camera.build(focal=(60, 0.1), center=(31, 24), size=(64, 48), coefficients=[-0.2, 0.05])
+    assert run_bake(monkeypatch, str(save_camera(camera, path))) == 1
+    assert "check the camera's focal lengths" in capsys.readouterr().err

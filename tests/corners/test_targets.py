@@ -1,19 +1,28 @@
-"""What boards are: texts, target files of Kalibr, where their points lie, and what files keep of them."""
+"""What boards are, and files of corners: kcal's own and those of other programs."""
+
+from __future__ import annotations
 
 import json
 import re
+from math import nan
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from scipy.io import savemat
 
 from kcal.corners.board import DICTIONARIES, Board
+from kcal.corners.detect import Detection, view_of
+from kcal.corners.foreign_corners import import_corners
 from kcal.corners.markers import opencv_dictionary
 from kcal.corners.observations import Observations, View
 from kcal.corners.print_board import Circle, Drawing, board_sheet, pattern_shapes, tag_cells, to_pdf, to_svg
 from kcal.errors import FileError, InputError
 from kcal.lens.calibration import BoardRecord
+
+# What boards are: texts, target files of Kalibr, where their points lie, and what files keep of them.
 
 
 def test_texts():
@@ -245,3 +254,182 @@ def test_drawn_circles_are_round():
     assert ends[-1] == pytest.approx(ends[0], abs=1e-3)
     assert ends[3] == pytest.approx([0, 6], abs=1e-3)
     assert "M14 15a6 6 0 1 0 12 0a6 6 0 1 0 -12 0z" in to_svg(page)
+
+
+# Corners of other programs: their order, pixel origins and weights.
+
+
+BOARD = Board(columns=3, rows=2, square=0.025)
+
+SIZE = (640, 480)
+
+
+def test_vnl_levels_are_weights(tmp_path: Path) -> None:
+    lines = ["## made by mrgingham", "# filename x y level", "none.png - - -"]
+    lines += [f"a.png {10 * i}.5 {i} {level}" for i, level in enumerate((0, 1, 2, 0, 0))] + ["a.png - - -"]
+    path = tmp_path / "corners.vnl"
+    path.write_text("\n".join(lines))
+    seen = import_corners(path, BOARD, SIZE)
+    assert seen.names == ("a.png",)
+    assert seen.views[0].pixels[1] == (10.5, 1.0)
+    assert seen.views[0].pixels[5] is None
+    assert seen.views[0].covariance is not None
+    assert [spread and spread[0] for spread in seen.views[0].covariance] == [1.0, 4.0, 16.0, 1.0, 1.0, None]
+
+
+def test_vnl_weights_and_outliers(tmp_path: Path) -> None:
+    path = tmp_path / "corners.vnl"
+    rows = [f"a.png {i} {i} {weight}" for i, weight in enumerate((1, 0.5, 0, -1, 1, 1))]
+    path.write_text("\n".join(["# filename x y weight", *rows]))
+    view = import_corners(path, BOARD, SIZE).views[0]
+    assert [pixel is None for pixel in view.pixels] == [False, False, True, True, False, False]
+    assert view.covariance is not None
+    assert view.covariance[1] == (4.0, 0.0, 4.0)
+
+
+@pytest.mark.parametrize("by", ["corner", "column,row"])
+def test_csv_in_any_order(tmp_path: Path, by: str) -> None:
+    path = tmp_path / "corners.csv"
+    places = {"corner": ("4", "0"), "column,row": ("1,1", "0,0")}[by]
+    path.write_text(f"image,{by},u,v,weight\na,{places[0]},7,8,1\na,{places[1]},1,2,0.25\n")
+    view = import_corners(path, BOARD, SIZE).views[0]
+    assert (view.pixels[4], view.pixels[0], view.pixels[1]) == ((7.0, 8.0), (1.0, 2.0), None)
+    assert view.covariance is not None
+    assert view.covariance[0] == (16.0, 0.0, 16.0)
+
+
+def test_opencv(tmp_path: Path) -> None:
+    path = tmp_path / "out.yml"
+    points = np.arange(24, dtype=np.float32).reshape(2, 6, 2)
+    file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    for name, value in (("image_width", 640), ("image_height", 480), ("image_points", points)):
+        file.write(name, value)
+    file.release()
+    seen = import_corners(path, BOARD)
+    assert (seen.image_size, seen.names) == (SIZE, ("001", "002"))
+    assert seen.views[1].pixels[5] == (22.0, 23.0)
+    assert seen.views[1].covariance is None
+
+
+@pytest.mark.parametrize("world", [True, False])
+def test_matlab_goes_down_the_columns_from_pixel_one(tmp_path: Path, world: bool) -> None:
+    path = tmp_path / "corners.mat"
+    columns, rows = np.repeat(np.arange(3), 2), np.tile(np.arange(2), 3)
+    points = np.stack([100.0 * columns + 1, 10.0 * rows + 1], 1)[..., None].repeat(2, 2)
+    points[3, :, 1] = np.nan
+    content = {"imagePoints": points, "imageSize": [480, 640]}
+    savemat(path, content | ({"worldPoints": 25.0 * np.stack([columns, rows], 1)} if world else {}))
+    seen = import_corners(path, BOARD)
+    assert seen.image_size == SIZE
+    assert seen.views[0].pixels == tuple((100.0 * (i % 3), 10.0 * (i // 3)) for i in range(6))
+    assert seen.views[1].pixels[4] is None
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "what"),
+    [
+        ("a.vnl", "# filename x y level\na 1 2 0\n", "a has 1 corners, the board 6"),
+        ("a.vnl", "# file x y\na 1 2 0\n", "the header is"),
+        ("a.vnl", "# filename x y level\na 1 2\n", "line 2"),
+        ("a.csv", "image,u,v,size\na,1,2,3\n", "the header is"),
+        ("a.csv", "image,corner,u,v\na,6,1,2\n", "line 2: corner 6"),
+        ("a.csv", "image,corner,u,v\na,1,1,2\na,1,1,2\n", "occurs twice"),
+        ("a.csv", "image,corner,u,v\na,1,inf,2\n", "no finite numbers"),
+        ("a.csv", "image,corner,u,v\na,1,,2\n", "no view with corners"),
+        ("a.mat", "nothing", r"not a \.mat file"),
+    ],
+)
+def test_bad_files(tmp_path: Path, name: str, text: str, what: str) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(FileError, match=what):
+        import_corners(tmp_path / name, BOARD, SIZE)
+
+
+def test_what_is_not_in_the_file(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("image,corner,u,v\na,1,1,2\n")
+    with pytest.raises(InputError, match="--size"):
+        import_corners(tmp_path / "a.csv", BOARD)
+    with pytest.raises(InputError, match=r"\.vnl"):
+        import_corners(tmp_path / "a.doc", BOARD)
+
+
+# Files of observed corners: their covariances read as they were packed, and what contradicts itself refused.
+
+
+SMALL_BOARD = Board(columns=2, rows=2, square=0.1)
+
+PIXELS = ((1.0, 2.0), (8.0, 2.5), None, (8.5, 7.0))
+
+SPREAD = ((0.01, 0.002, 0.04), (0.02, -0.01, 0.03), None, (0.5, 0.0, 0.1))
+
+
+def observed(**changes):
+    view = {"name": "a.png", "pixels": PIXELS, "covariance": SPREAD, **changes}
+    return Observations(board=SMALL_BOARD, image_size=(10, 9), views=(View(**view),))
+
+
+def test_covariances_are_uu_uv_vv():
+    found = observed().covariances()
+    for n, spread in enumerate(SPREAD):
+        if spread is None:
+            assert bool(found[0, n].isnan().all())
+        else:
+            uu, uv, vv = spread
+            assert found[0, n].tolist() == [[uu, uv], [uv, vv]]
+    assert observed(covariance=None).covariances() is None
+
+
+def test_a_detection_comes_back_from_its_file(tmp_path):
+    root = torch.randn(4, 2, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    pixels = torch.tensor([[nan if x is None else x for x in pixel or (None,) * 2] for pixel in PIXELS]).double()
+    spread = root @ root.mT + 0.1 * torch.eye(2).double()
+    spread[2] = nan
+    view = view_of(Detection(pixels, covariance=spread), "a")
+    path = Observations(board=SMALL_BOARD, image_size=(10, 9), views=(view,)).save(tmp_path / "a.json")
+    found = Observations.load(path)
+    seen = torch.tensor([0, 1, 3])
+    assert bool(found.pixels()[0, 2].isnan().all())
+    torch.testing.assert_close(found.pixels()[0, seen], pixels[seen], rtol=0, atol=0)
+    torch.testing.assert_close(found.covariances()[0, seen], spread[seen], rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"covariance": (*SPREAD[:3], None)}, "seen corners, and only these"),
+        ({"covariance": (*SPREAD[:2], (1.0, 0.0, 1.0), SPREAD[3])}, "seen corners, and only these"),
+        ({"covariance": SPREAD[:3]}, "has 3 covariances"),
+        ({"covariance": ((0.01, 0.021, 0.04), *SPREAD[1:])}, "not positive definite"),
+        ({"covariance": ((-0.01, 0.0, -0.04), *SPREAD[1:])}, "not positive definite"),
+        ({"pixels": PIXELS[:3], "covariance": None}, "has 3 corners, the board 4"),
+    ],
+)
+def test_what_contradicts_itself_is_refused(changes, message):
+    with pytest.raises(InputError, match=message):
+        observed(**changes)
+
+
+@pytest.mark.parametrize("outside", [(-2.6, 2.0), (11.6, 2.0), (1.0, -2.6), (1.0, 10.6), (2.0, 14.0)])
+def test_corners_outside_the_image_are_refused(outside, tmp_path):
+    # Two pixels beyond the edges are noise.
+    assert observed(pixels=((-2.5, -2.5), (11.5, 10.5), None, (11.5, -2.5))).image_size == (10, 9)
+    message = rf"view 'a\.png': 1 corner\(s\) lie outside the image of 10x9 px, one at \({outside[0]:.1f}, "
+    with pytest.raises(InputError, match=message):
+        observed(pixels=(*PIXELS[:3], outside))
+    path = observed().save(tmp_path / "a.json")
+    path.write_text(path.read_text().replace("8.5", str(outside[0]), 1).replace("7.0", str(outside[1]), 1))
+    with pytest.raises(FileError, match=message):
+        Observations.load(path)
+
+
+def test_subset_keeps_the_order_that_was_asked_for():
+    one = observed()
+    both = Observations(board=SMALL_BOARD, image_size=(10, 9), views=(*one.views, View(name="b.png", pixels=PIXELS)))
+    assert both.subset(["b.png", "a.png"]).names == ("b.png", "a.png")
+    assert both.covariances() is None
+    with pytest.raises(InputError, match=r"no view named 'c\.png'"):
+        both.subset(["a.png", "c.png"])
+    with pytest.raises(InputError, match=r"share the name 'a\.png'"):
+        Observations(board=SMALL_BOARD, image_size=(10, 9), views=(*one.views, *one.views))
+    with pytest.raises(InputError, match="no view with a board"):
+        both.subset([]).pixels()

@@ -1,3 +1,5 @@
+"""Images: undistorted, turned, and a stack of cameras."""
+
 from __future__ import annotations
 
 import copy
@@ -10,11 +12,17 @@ import pytest
 import torch
 from image_cameras import BARREL, F64, LITTLE, OTHER, PINCUSHION, SMALL, build
 from kornia.geometry.transform import remap
+from lenses import HYBRID, strong
 from torch import Tensor
 
 from kcal.errors import InputError
+from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
+from kcal.lens.camera_conversions import ImageTransform
+from kcal.lens.camera_like import project_each, stackable, unproject_each
 from kcal.lens.images import Undistort, undistort_maps
+from kcal.lens.model import PRESETS
+from kcal.lens.projection import project_components
 from kcal.lens.views import new_pinhole, source_pixels
 
 
@@ -276,3 +284,193 @@ class TestGradients:
         gradient = undistort.camera.params.grad
         assert gradient is not None
         assert gradient.abs().max() > 0
+
+
+# Resized, cropped and letterboxed: pixels, cameras and error bars agree with each other and with real resampling.
+
+
+FULL = (1920, 1080)
+
+TRANSFORMS = {
+    "resize": ImageTransform.resize(FULL, (800, 640)),
+    "crop": ImageTransform.crop(FULL, 300, 200, (640, 480)),
+    "letterbox": ImageTransform.letterbox(FULL, (640, 640)),
+    "chain": ImageTransform.crop(FULL, 11, 7, (1001, 701)).then(ImageTransform.letterbox((1001, 701), (416, 352))),
+}
+
+
+def camera_of(name: str) -> Camera:
+    model = HYBRID if name == "hybrid" else PRESETS[name]
+    lens = torch.tensor([0.02, -0.01, 0.003, -0.0005]) if model.fisheye else 0.3 * strong(model)
+    return Camera(torch.cat([torch.tensor([1600.0, 1610.0, 955.0, 541.0, 2.0]), lens]).double(), size=FULL, model=model)
+
+
+@pytest.mark.parametrize("transform", TRANSFORMS.values(), ids=TRANSFORMS)
+@pytest.mark.parametrize("lens", ["opencv5", "opencv14", "fisheye4", "hybrid"])
+def test_the_camera_of_the_input_sees_the_pixels_of_the_input(lens: str, transform: ImageTransform) -> None:
+    camera = camera_of(lens)
+    pixels = torch.stack([torch.linspace(400, 900, 40), torch.linspace(250, 600, 40)], -1).double()
+    rays, valid = camera.unproject(pixels)
+    seen, also = camera.transformed(transform).project_rays(rays)
+    assert bool((valid & also).all())
+    assert torch.allclose(seen, transform.to_input(pixels), rtol=0, atol=1e-9)
+    assert torch.allclose(transform.to_full(transform.to_input(pixels)), pixels, rtol=0, atol=1e-9)
+
+
+def test_edges_coincide_as_in_torch() -> None:
+    """A ramp, resampled by torch: its value at an input pixel is where that pixel lies in the full image."""
+    columns = torch.arange(64.0).expand(1, 1, 48, 64)
+    rows = torch.arange(48.0)[:, None].expand(1, 1, 48, 64)
+    size = (40, 36)
+    transform = ImageTransform.resize((64, 48), size)
+    images = torch.cat([columns, rows], 1)
+    resized = torch.nn.functional.interpolate(images, size=size[::-1], mode="bilinear")[0]
+    pixels = torch.stack(torch.meshgrid(torch.arange(3.0, 37), torch.arange(3.0, 33), indexing="xy"), -1)
+    found = torch.stack([image[3:33, 3:37] for image in resized], -1).double()
+    assert torch.allclose(transform.to_full(pixels), found, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("full", "size", "pad", "inner"),
+    [
+        ((1920, 1080), (640, 640), (0, 140), (640, 360)),
+        ((1279, 720), (640, 640), (0, 140), (640, 360)),  # 360.28 rows are 360
+        ((810, 1080), (640, 640), (80, 0), (480, 640)),
+        ((1000, 701), (416, 352), (0, 30), (416, 292)),  # 60 rows to pad
+        ((1000, 703), (416, 353), (0, 30), (416, 292)),  # 61: the odd one goes below
+    ],
+)
+def test_letterbox_is_that_of_ultralytics(
+    full: tuple[int, int], size: tuple[int, int], pad: tuple[int, int], inner: tuple[int, int]
+) -> None:
+    found = ImageTransform.letterbox(full, size)
+    assert found.offset == pad
+    assert found.scale == (inner[0] / full[0], inner[1] / full[1])
+    corner = torch.tensor([full[0] - 0.5, full[1] - 0.5])
+    wanted = torch.tensor([p + i - 0.5 for p, i in zip(pad, inner, strict=True)], dtype=torch.float64)
+    assert torch.allclose(found.to_input(corner), wanted)
+
+
+def test_small_images_may_stay_small_and_padding_may_go_to_one_side() -> None:
+    assert ImageTransform.letterbox((320, 240), (640, 640), enlarge=False).scale == (1.0, 1.0)
+    assert ImageTransform.letterbox((1920, 1080), (640, 640), centered=False).offset == (0, 0)
+
+
+def test_methods_of_the_camera() -> None:
+    camera = camera_of("opencv5")
+    assert camera.resized((960, 540)).focal.tolist() == [800.0, 805.0]
+    assert camera.cropped(100, 50, (640, 480)).center.tolist() == [855.0, 491.0]
+    assert camera.letterboxed((640, 640)).size == (640, 640)
+
+
+def test_error_bars_travel_exactly() -> None:
+    """The sigma of a projected pixel, in input pixels, is that of the full image times the scale."""
+    camera = camera_of("opencv5")
+    root = torch.randn(10, 10, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) * 1e-3
+    names = dict.fromkeys(camera.names, 0.5) | {"skew": None}
+    camera.calibration = CameraCalibration(name="left", sigma=names, covariance=root @ root.T)
+    transform = TRANSFORMS["resize"]
+    small = camera.transformed(transform)
+    assert small.calibration is not None
+    assert small.calibration.name == "left"
+    assert small.calibration.sigma is not None
+    assert small.calibration.sigma["skew"] is None
+    assert math.isclose(small.calibration.sigma["cx"] or 0.0, 0.5 * 800 / 1920)
+    points = torch.tensor([[0.3, 0.2, 1.0]], dtype=torch.float64)
+    found = []
+    for one in (camera, small):
+        slope = torch.autograd.functional.jacobian(
+            lambda values, one=one: _with(one, values).project(points)[0][0],
+            one.params.detach(),
+        )
+        assert one.calibration is not None
+        found.append(slope @ one.calibration.covariance @ slope.T)
+    scale = torch.tensor(transform.scale, dtype=torch.float64)
+    assert torch.allclose(found[1], scale[:, None] * found[0] * scale, rtol=1e-9)
+
+
+def _with(camera: Camera, values: torch.Tensor) -> Camera:
+    other = camera.with_parameters(values)
+    del other.params
+    other.params = values
+    return other
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ImageTransform.crop(FULL, 1900, 0, (640, 480)), "does not lie inside"),
+        (lambda: ImageTransform.resize(FULL, (0, 640)), "must be positive"),
+        (lambda: camera_of("opencv5").transformed(ImageTransform.resize((640, 480), (320, 240))), "the camera has"),
+        (lambda: TRANSFORMS["crop"].then(TRANSFORMS["resize"]), "the second begins with"),
+        (lambda: TRANSFORMS["crop"].to_full(torch.ones(3, 2, dtype=torch.int64)), "floating point"),
+    ],
+)
+def test_what_cannot_be(make: object, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        make()  # type: ignore[operator]
+
+
+# Cameras in one call give what each gives alone.
+
+
+NAMED = {**PRESETS, "hybrid": HYBRID}
+
+
+def make_camera(preset: str, focal: float) -> Camera:
+    model = NAMED[preset]
+    lens = (
+        torch.tensor([0.02, -0.01, 0.003, -0.0005], dtype=torch.float64) if model.fisheye else torch.zeros(0).double()
+    )
+    if model.size and not model.fisheye:
+        lens = 0.3 * focal / 1600 * strong(model)
+    head = torch.tensor([focal, focal + 9.0, 955.0, 541.0, 2.0], dtype=torch.float64)
+    return Camera(torch.cat([head, lens]), size=(1920, 1080), model=model)
+
+
+def some_pixels(*shape: int) -> Tensor:
+    """In the image, around it, and one that is not finite."""
+    random = torch.Generator().manual_seed(1)
+    pixels = torch.rand(*shape, 2, generator=random, dtype=torch.float64) * torch.tensor([2400.0, 1500.0]) - 200.0
+    pixels[..., 3, 0] = torch.nan
+    return pixels
+
+
+@pytest.mark.parametrize("kinds", [(name, name) for name in NAMED] + [("fisheye4", "opencv5", "opencv5")])
+def test_rays_are_those_of_each_camera(kinds: tuple[str, ...]) -> None:
+    cameras = [make_camera(kind, 1500.0 + 100.0 * number) for number, kind in enumerate(kinds)]
+    assert stackable(cameras) == (len(set(kinds)) == 1 and kinds[0] != "hybrid")
+    for shape in ((len(cameras), 40), (2, len(cameras), 40)):
+        pixels = some_pixels(*shape)
+        rays, valid = unproject_each(cameras, pixels)
+        alone = [camera.unproject(pixels[..., number, :, :]) for number, camera in enumerate(cameras)]
+        assert torch.equal(valid, torch.stack([seen for _, seen in alone], -2))
+        assert torch.allclose(rays, torch.stack([ray for ray, _ in alone], -3), rtol=0, atol=1e-13)
+
+
+def test_gradients_reach_each_camera() -> None:
+    cameras = [make_camera("opencv14", focal).free() for focal in (1500.0, 1600.0)]
+    pixels = some_pixels(2, 20)
+    weight = torch.rand(2, 20, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    slopes = []
+    alone = [camera.unproject(some)[0] for camera, some in zip(cameras, pixels, strict=True)]
+    for rays in (unproject_each(cameras, pixels)[0], torch.stack(alone)):
+        slopes.append(torch.autograd.grad((weight * rays).sum(), [camera.params for camera in cameras]))
+    for one, other in zip(*slopes, strict=True):
+        assert float(one.abs().max()) > 0
+        assert torch.allclose(one, other, rtol=1e-10, atol=1e-14)
+
+
+@pytest.mark.parametrize("kinds", [("opencv14", "opencv14"), ("fisheye4", "hybrid"), ("hybrid", "hybrid")])
+def test_projections_are_those_of_each_camera(kinds: tuple[str, str]) -> None:
+    cameras = [make_camera(kind, 1500.0 + 100.0 * number) for number, kind in enumerate(kinds)]
+    random = torch.Generator().manual_seed(3)
+    points = torch.randn(2, 3, 15, generator=random, dtype=torch.float64) + torch.tensor([[0.0], [0.0], [6.0]])
+    meter = torch.full((15,), 0.01, dtype=torch.float64)
+    wanted = [list(range(len(camera.names))) for camera in cameras]
+    for number, found in enumerate(project_each(cameras, points, wanted, meter)):
+        camera = cameras[number]
+        alone = project_components(points[number], camera.values, camera.model, wanted[number], meter)
+        for one, other in zip(found, alone, strict=True):
+            assert (one is None) == (other is None)
+            assert one is None or torch.allclose(one, other, rtol=1e-13, atol=1e-12)

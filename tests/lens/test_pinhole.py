@@ -1,6 +1,9 @@
+"""Projections in closed form: the pinhole, its gradients, the paraxial limit."""
+
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -8,10 +11,20 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from image_cameras import BARREL, F64, FOLDING, PINCUSHION, build
+from lenses import FEW_MODES, HYBRID, KINDS, MODELS, distort_with_jacobian, hybrid_camera, parameters, strong
+from torch import Tensor, nn
+from torch.autograd import gradcheck, gradgradcheck
+from torch.func import functional_call, jacrev
 
 from kcal.errors import DegenerateError, InputError
+from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.images import NOWHERE, undistort_maps
+from kcal.lens.information import CameraInformation
+from kcal.lens.inverse import undistort
+from kcal.lens.model import PRESETS, LensModel
+from kcal.lens.projection import FAR, project_components
+from kcal.lens.uncertainty import ParaxialFocal, paraxial_focal
 from kcal.lens.views import new_pinhole
 
 
@@ -142,3 +155,245 @@ class TestFold:
         # The rim itself is no longer valid: 1e-9 inside, and the rectangle is narrowed down to as much.
         assert torch.allclose(torch.linalg.vector_norm(half / inner.focal), torch.tensor(radius, dtype=F64), rtol=1e-8)
         assert torch.allclose(half / outer.focal, torch.tensor([radius, radius], dtype=F64), rtol=1e-8)
+
+
+# Gradients through `Camera`: to points, pixels and parameters, and second derivatives of the inverse.
+
+
+POINTS = torch.tensor([[0.1, -0.2, 1.1], [-0.6, 0.5, 1.3], [1.2, 0.9, 2.5]], dtype=torch.float64)
+
+
+class Method(nn.Module):
+    """Makes a method of a camera reachable for `functional_call`."""
+
+    def __init__(self, camera: Camera, name: str) -> None:
+        super().__init__()
+        self.camera, self.name = camera, name
+
+    def forward(self, value: Tensor) -> tuple[Tensor, Tensor]:
+        return getattr(self.camera, self.name)(value)
+
+
+def of_parameters(camera: Camera, name: str) -> Callable[[Tensor, Tensor], Tensor]:
+    module = Method(camera, name)
+
+    def function(value: Tensor, vector: Tensor) -> Tensor:
+        result, valid = functional_call(module, {"camera.params": vector}, (value,))
+        assert bool(valid.all())
+        return result
+
+    return function
+
+
+def small_camera(model: str | LensModel) -> Camera:
+    return Camera(parameters(model, strong(model)), size=(4, 3), model=model)
+
+
+@pytest.mark.parametrize("model", ["pinhole", *MODELS, HYBRID], ids=str)
+def test_first_derivatives(model: str | LensModel) -> None:
+    vector = parameters(model, strong(model))
+    camera = Camera(vector, size=(4, 3), model=model)
+    pixels = camera.project(POINTS)[0]
+    vector.requires_grad_(True)
+    # gradcheck's numbers are second-order differences with step 1e-6: 1e-8 is what they can show.
+    tolerance = {"eps": 1e-6, "atol": 1e-8, "rtol": 1e-6}
+    assert gradcheck(of_parameters(camera, "project"), (POINTS.clone().requires_grad_(True), vector), **tolerance)
+    assert gradcheck(of_parameters(camera, "unproject"), (pixels.clone().requires_grad_(True), vector), **tolerance)
+
+
+@pytest.mark.parametrize("model", ["opencv5", "opencv14", "ext20", HYBRID], ids=str)
+def test_second_derivatives_of_the_inverse(model: str | LensModel) -> None:
+    vector = parameters(model, strong(model))
+    camera = Camera(vector, size=(4, 3), model=model)
+    pixels = camera.project(POINTS)[0].requires_grad_(True)
+    vector.requires_grad_(True)
+    assert gradgradcheck(of_parameters(camera, "unproject"), (pixels, vector), eps=1e-6, atol=1e-7, rtol=1e-5)
+
+
+@pytest.mark.parametrize("model", [*MODELS, HYBRID], ids=str)
+def test_inverse_has_the_inverse_jacobian(model: str | LensModel) -> None:
+    """The implicit function theorem, written out: dx/dx_D = J⁻¹ and dx/dc = -J⁻¹ ∂x_D/∂c."""
+    lens = strong(model)
+    normalized = POINTS[:, :2] / POINTS[:, 2:]
+    distorted, by_point, by_coefficients = distort_with_jacobian(normalized, lens, model)
+    inverse = torch.linalg.inv(by_point)
+    for n in range(len(POINTS)):
+
+        def solve(target: Tensor, coefficients: Tensor) -> Tensor:
+            return undistort(target[None], coefficients, model)[0][0]
+
+        target = distorted[n].clone()
+        by_target, by_lens = jacobian(solve, target, lens)
+        # Newton stops within 1e-13 of the root; J there differs from J at the root by as much.
+        torch.testing.assert_close(by_target, inverse[n], rtol=0, atol=1e-11)
+        torch.testing.assert_close(by_lens, -inverse[n] @ by_coefficients[n], rtol=0, atol=1e-11)
+
+
+def jacobian(function: Callable[[Tensor, Tensor], Tensor], *inputs: Tensor) -> tuple[Tensor, Tensor]:
+    by_target, by_lens = torch.autograd.functional.jacobian(function, inputs)
+    return by_target, by_lens
+
+
+def test_invalid_pixels_leave_no_nan_in_gradients() -> None:
+    # k1 alone folds at r = sqrt(1 / 0.9), r_D = 0.70: the second and third pixels have no preimage.
+    camera = Camera.build(focal=(100, 100), center=(50, 50), size=(101, 101), coefficients=[-0.3], model="opencv4")
+    camera.requires_grad_(True)
+    pixels = torch.tensor([[60.0, 50.0], [300.0, 50.0], [float("nan"), 50.0]], dtype=torch.float64, requires_grad=True)
+    rays, valid = camera.unproject(pixels)
+    assert valid.tolist() == [True, False, False]
+    rays[..., 0].sum().backward()
+    assert pixels.grad is not None
+    assert camera.params.grad is not None
+    assert bool(torch.isfinite(camera.params.grad).all())
+    assert pixels.grad[1].tolist() == [0.0, 0.0]
+    assert float(pixels.grad[0, 0]) > 0.009
+
+
+@pytest.mark.parametrize("model", ["opencv14", HYBRID], ids=str)
+def test_invalid_points_leave_no_nan_in_gradients(model: str | LensModel) -> None:
+    camera = small_camera(model).requires_grad_(True)
+    points = torch.tensor([[0.1, 0.1, 1.0], [0.0, 0.0, 0.0], [1.0, 1.0, -1.0], [float("nan"), 0.0, 1.0]]).double()
+    points.requires_grad_(True)
+    pixels, valid = camera.project(points)
+    assert valid.tolist() == [True, False, False, False]
+    assert bool(torch.isfinite(pixels).all())
+    pixels.sum().backward()
+    assert points.grad is not None
+    assert camera.params.grad is not None
+    assert bool(torch.isfinite(camera.params.grad).all())
+    assert torch.equal(points.grad[1:], torch.zeros(3, 3, dtype=torch.float64))
+
+
+def test_gradients_reach_through_low_precision_inputs() -> None:
+    camera = small_camera("opencv5")
+    points = POINTS.to(torch.float32).requires_grad_(True)
+    camera.project(points)[0].sum().backward()
+    assert points.grad is not None
+    assert points.grad.dtype == torch.float32
+    expected = jacrev(lambda value: camera.project(value)[0].sum())(POINTS.to(torch.float32).double())
+    torch.testing.assert_close(points.grad, expected.float(), rtol=0, atol=0)
+
+
+# The focal length on the optical axis: against projections a little off it, and its σ against drawn cameras.
+
+
+PLAIN = [name for name, model in PRESETS.items() if not model.tilt]
+
+
+def strong_camera(model: str) -> Camera:
+    head = torch.tensor([520.0, 515.0, 325.0, 235.0, 0.4], dtype=torch.float64)
+    return Camera(torch.cat([head, strong(model)]), size=(640, 480), model=model)
+
+
+STEP = 1e-3
+
+ENDS = torch.tensor([-2.0, -1.0, 1.0, 2.0], dtype=torch.float64) * STEP
+
+WEIGHT = torch.tensor([1.0, -8.0, 8.0, -1.0], dtype=torch.float64) / (12.0 * STEP)
+
+
+def near_the_axis(camera: Camera, values: Tensor | None = None) -> Tensor:
+    """(..., 2) from pixels of directions a step off the axis, by differences of fourth order.
+
+    Of the camera, or of its lens with other values (..., 5 + P): cameras take long to make.
+    """
+    found = []
+    for axis in (0, 1):
+        rays = torch.zeros(4, 3, dtype=torch.float64)
+        rays[:, 2], rays[:, axis] = 1.0, ENDS
+        if values is None:
+            pixels, valid = camera.project_rays(rays)
+            assert bool(valid.all())
+        else:
+            points = (FAR * rays.T).expand(*values.shape[:-1], -1, -1)
+            pixels = project_components(points, values, camera.model).pixels.mT
+        found.append(pixels[..., axis] @ WEIGHT)
+    return torch.stack(found, -1)
+
+
+@pytest.mark.parametrize("kind", [*KINDS, *PRESETS])
+def test_it_is_the_derivative_of_the_projection(kind: str) -> None:
+    camera = hybrid_camera(kind, modes=FEW_MODES) if kind in KINDS else strong_camera(kind)
+    torch.testing.assert_close(paraxial_focal(camera).value, near_the_axis(camera), rtol=1e-8, atol=0)
+
+
+@pytest.mark.parametrize("model", PLAIN)
+def test_of_a_parametric_lens_without_tilt_it_is_the_parameter(model: str) -> None:
+    camera = strong_camera(model)
+    assert paraxial_focal(camera).value.tolist() == camera.focal.tolist()
+
+
+def test_of_others_it_is_not() -> None:
+    tilted, field = (
+        strong_camera("opencv14"),
+        Camera(
+            torch.cat([torch.tensor([520.0, 520.0, 325.0, 235.0, 0.0]).double(), strong(HYBRID)]),
+            size=(640, 480),
+            model=HYBRID,
+        ),
+    )
+    for camera in (tilted, field):
+        assert float((paraxial_focal(camera).value / camera.focal - 1.0).abs().min()) > 1e-4
+
+
+@pytest.mark.parametrize("kind", ["hybrid", "opencv14"])
+@pytest.mark.parametrize("by", ["covariance", "information"])
+def test_sigma_is_the_scatter_of_cameras_drawn(kind: str, by: str) -> None:
+    """fx and the field nearly make up for each other, as in a calibration; what is left must be right."""
+    camera = strong_camera("opencv14") if kind == "opencv14" else hybrid_camera("webcam", modes=FEW_MODES)
+    generator = torch.Generator().manual_seed(3)
+    mean = camera.params.detach()
+    count = len(mean)
+    root = 1e-6 * torch.randn(count, count, generator=generator, dtype=torch.float64)
+    root[:, :2] = 0.5 * torch.randn(count, 1, generator=generator, dtype=torch.float64)
+    if kind == "hybrid":
+        # fx together with the weight that makes up for it on the axis, but for a hundredth.
+        steps = 1e-3 * torch.eye(count, dtype=torch.float64)
+        slopes = (near_the_axis(camera, mean + steps) - near_the_axis(camera, mean)).mean(1)
+        weight = 8 + int(slopes[8:].abs().argmax())
+        root[:, weight] -= 0.99 * root[:, 0] * float(slopes[:2].sum() / slopes[weight])
+    covariance = root.T @ root
+    if by == "covariance":
+        known = CameraCalibration(covariance=covariance)
+    else:
+        known = CameraCalibration(information=CameraInformation.from_covariance(mean, covariance))
+    drawn = torch.randn(2000, count, generator=generator, dtype=torch.float64) @ root
+    camera = camera.with_parameters(mean)
+    camera.calibration = known
+    found, values = paraxial_focal(camera), near_the_axis(camera, mean + drawn)
+    if kind == "hybrid":
+        assert float(found.sigma.max()) < 0.2 * float(covariance[0, 0].sqrt())
+    # The σ of 2000 draws is known to 1.6 %.
+    torch.testing.assert_close(found.sigma, values.std(0), rtol=0.07, atol=0)
+    assert found.mean[1] == pytest.approx(float(values.mean(1).std()), rel=0.07)
+    assert found.aspect[1] == pytest.approx(float((values[:, 1] / values[:, 0]).std()), rel=0.07)
+
+
+def test_without_error_bars_sigma_is_unknown() -> None:
+    camera = strong_camera("opencv5")
+    assert bool(paraxial_focal(camera).sigma.isnan().all())
+    assert str(paraxial_focal(camera)) == "520.000 px along rows, 515.000 px along columns"
+    camera.calibration = CameraCalibration(sigma={"fx": 0.5, "fy": None})
+    assert bool(paraxial_focal(camera).sigma.isnan().all())
+    camera.calibration = CameraCalibration(sigma={"fx": 0.5, "fy": 0.25})
+    assert paraxial_focal(camera).sigma.tolist() == [0.5, 0.25]
+    tilted = strong_camera("opencv14")
+    # How the tilt varies together with fx, sigmas do not tell.
+    tilted.calibration = CameraCalibration(sigma=dict.fromkeys(tilted.names, 0.5))
+    assert bool(paraxial_focal(tilted).sigma.isnan().all())
+
+
+def test_one_number_where_both_are_equal_as_far_as_is_known() -> None:
+    value, covariance = torch.tensor([500.0, 501.0]).double(), torch.tensor([[1.0, 0.9], [0.9, 1.0]]).double()
+    assert ParaxialFocal(value, covariance.diagonal().sqrt(), covariance).aspect[1] == pytest.approx(9e-4, rel=0.02)
+    assert str(ParaxialFocal(value, covariance.diagonal().sqrt(), covariance)) == "500.50 ± 0.97 px"
+    sure = 0.1 * covariance
+    text = "500.00 ± 0.32 px along rows, 501.00 ± 0.32 px along columns"
+    assert str(ParaxialFocal(value, sure.diagonal().sqrt(), sure)) == text
+
+
+def test_a_batch_is_refused() -> None:
+    camera = strong_camera("opencv5")
+    with pytest.raises(InputError, match="single camera"):
+        paraxial_focal(Camera(camera.params.detach().expand(2, -1).clone(), size=(640, 480), model="opencv5"))
+    assert math.isfinite(paraxial_focal(camera).mean[0])

@@ -1,4 +1,4 @@
-"""Eq. 12: both terms of the loss, its derivatives, and which method ends lower."""
+"""Joint training, and the residual networks."""
 
 from __future__ import annotations
 
@@ -13,9 +13,14 @@ from torch import Tensor
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.projection import from_pixels, plane_from_points
-from kcal.nets.inverse import InverseNet, train_inverse
+from kcal.nets.inverse import InverseNet, initial_weights, train_inverse
 from kcal.nets.joint import JointFit, JointOptions, ResidualNet, _JointProblem, train_jointly
+from kcal.solve.lm import LMOptions, minimize
 from kcal.solve.problem import SolverStatus
+from scripts.paper.pure_lens import PureLensNet, PureLensProblem, train_pure_lens
+
+# Eq. 12: both terms of the loss, its derivatives, and which method ends lower.
+
 
 BALANCE = 0.7
 
@@ -139,3 +144,178 @@ def test_bad_input_is_refused() -> None:
     for wrong in ({"method": "sgd"}, {"steps": 0}, {"hidden": (0, 2)}, {"inverse_weight": -1.0}):
         with pytest.raises(InputError, match="JointOptions"):
             JointOptions(**wrong)  # type: ignore[arg-type]
+
+
+# Eq. 11 read literally: a constant offset, with no more to fit than the parameters have.
+
+
+def start_of(model: str = "opencv5") -> Camera:
+    """A* and K*: a camera that is some pixels wrong."""
+    start = camera(model).params.detach().clone()
+    start[:4] += torch.tensor([3.0, -2.0, 1.5, 2.5])
+    start[5] += 0.01
+    return Camera(start, size=SIZE, model=model)
+
+
+def random_weights(residual: ResidualNet, seed: int) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return 0.3 * torch.randn(residual.weights.shape, generator=generator, dtype=torch.float64)
+
+
+def test_a_new_one_corrects_nothing_and_leaves_skew_alone() -> None:
+    start = start_of()
+    residual = ResidualNet(start)
+    assert torch.equal(residual(), start.params)
+    residual.weights.copy_(random_weights(residual, 0))
+    moved = residual() - start.params
+    assert float(moved[4]) == 0.0
+    assert int((moved != 0).sum()) == 4 + start.model.size
+    assert torch.equal(residual.camera().params, residual())
+
+
+def test_slopes_are_those_of_autograd_and_numeric_ones() -> None:
+    start = start_of("opencv14")
+    residual = ResidualNet(start, hidden=3)
+    weights = random_weights(residual, 1)
+    wanted = torch.func.jacrev(residual.parameters_at)(weights)[list(residual.corrected)]
+    torch.testing.assert_close(residual.slopes(weights), wanted)
+    assert torch.autograd.gradcheck(residual.parameters_at, (weights.requires_grad_(),), atol=1e-5)
+
+
+@pytest.mark.parametrize("model", ["opencv5", "ext20"])
+def test_it_has_no_capacity_beyond_the_parameters(model: str) -> None:
+    """However many weights: what they can do to pixels is what the parameters can."""
+    start = start_of(model)
+    residual = ResidualNet(start, hidden=16)
+    weights = random_weights(residual, 2)
+    rays, valid = start.unproject(start.grid(9, 7).reshape(-1, 2))
+    assert bool(valid.all())
+
+    def pixels(parameters: Tensor) -> Tensor:
+        return torch.func.functional_call(start, {"params": parameters}, (rays,))[0]
+
+    by_weights = torch.func.jacrev(residual.parameters_at)(weights)
+    at = residual.parameters_at(weights)
+    by_parameters = torch.func.jacfwd(pixels)(at).flatten(0, 1)[:, list(residual.corrected)]
+    through = torch.func.jacrev(lambda w: pixels(residual.parameters_at(w)))(weights).flatten(0, 1)
+    count = 4 + start.model.size
+    assert residual.weights.numel() > 10 * count
+    assert int(torch.linalg.matrix_rank(by_weights)) == count
+    # The same column space: each is a combination of the other's columns.
+    scaled = by_parameters / torch.linalg.vector_norm(by_parameters, dim=0)
+    basis, _, _ = torch.linalg.svd(scaled, full_matrices=False)
+    beside = through - basis @ (basis.T @ through)
+    assert float(beside.abs().max()) < 1e-9 * float(through.abs().max())
+
+
+def test_residual_net_refuses_bad_input() -> None:
+    start = start_of()
+    with pytest.raises(InputError, match="single"):
+        ResidualNet(Camera(start.params.expand(2, -1), size=start.size, model=start.model))
+    with pytest.raises(InputError, match="distortion vector"):
+        ResidualNet(Camera.build(focal=(100, 100), center=(50, 50), size=(100, 100), model="pinhole"))
+
+
+def test_state_and_precision() -> None:
+    start = start_of()
+    residual, other = ResidualNet(start), ResidualNet(start, seed=1)
+    residual.weights.copy_(random_weights(residual, 4))
+    other.load_state_dict(residual.state_dict())
+    assert torch.equal(other.half()(), residual())
+    assert torch.equal(residual.weights, other.weights)
+    assert residual.weights.numel() == len(initial_weights(residual.widths))
+
+
+# The pure network lens: what it computes, its derivatives, and that Levenberg-Marquardt fits it.
+
+
+INTRINSICS = torch.tensor([500.0, 505.0, 325.0, 236.0], dtype=torch.float64)
+
+
+def scene(views: int = 8, noise: float = 0.0) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+    truth = camera("opencv5")
+    poses = motions(truth, views, 4)
+    return pixels_of(truth, poses, noise=noise, seed=1), poses
+
+
+def perturbed(lens: PureLensNet) -> Tensor:
+    generator = torch.Generator().manual_seed(6)
+    return lens.weights + 0.1 * torch.randn(lens.weights.shape, generator=generator, dtype=torch.float64)
+
+
+def test_with_a_skip_it_begins_as_a_pinhole() -> None:
+    lens = PureLensNet(INTRINSICS, skip=True, reach=0.7)
+    points = torch.tensor([[0.1, -0.2, 2.0], [0.3, 0.1, 1.0], [0.1, 0.1, -1.0], [torch.nan, 0.0, 1.0]])
+    pixels, valid = lens(points)
+    wanted = INTRINSICS[:2] * points[:2, :2].double() / points[:2, 2:].double() + INTRINSICS[2:]
+    torch.testing.assert_close(pixels[:2], wanted)
+    assert valid.tolist() == [True, True, False, False]
+    assert torch.equal(pixels[2:], INTRINSICS[2:].expand(2, 2))
+    # Without one it begins as a random map.
+    assert float((PureLensNet(INTRINSICS)(points)[0][:2] - wanted).norm()) > 50
+
+
+@pytest.mark.parametrize("skip", [True, False])
+def test_rows_are_the_derivatives(skip: bool) -> None:
+    pixels, poses = scene(3)
+    lens = PureLensNet(INTRINSICS, hidden=3, skip=skip, reach=0.8)
+    problem = PureLensProblem(BOARD.points, pixels, lens)
+    state = problem.start(*poses)
+    state = (perturbed(lens), *state[1:])
+    rows = problem.rows(state)
+    shared = torch.zeros(problem.shared_size, dtype=torch.float64)
+    local = torch.zeros(3, 6, dtype=torch.float64)
+
+    def residuals(s: Tensor, p: Tensor) -> Tensor:
+        return problem.residuals(problem.retract(state, (s, p)))
+
+    by_shared, by_local = torch.func.jacfwd(residuals, argnums=(0, 1))(shared, local)
+    torch.testing.assert_close(rows[:, -1], residuals(shared, local))
+    torch.testing.assert_close(rows[:, 6:-1], by_shared.transpose(1, 2))
+    own = by_local.diagonal(dim1=0, dim2=2).permute(2, 1, 0)
+    torch.testing.assert_close(rows[:, :6], own)
+
+
+def test_levenberg_marquardt_fits_it() -> None:
+    """To the noise, from no distortion: the network is no worse an approximation than the formula it replaces."""
+    pixels, poses = scene(10, noise=0.1)
+    lens = PureLensNet(INTRINSICS, skip=True, reach=0.7)
+    problem = PureLensProblem(BOARD.points, pixels, lens)
+    start = problem.start(*poses)
+    result = train_pure_lens(lens, BOARD.points, pixels, poses, LMOptions(max_iterations=60))
+    rms = (4.0 * result.cost / problem.residual_count).sqrt()
+    assert float((4.0 * problem.cost(start) / problem.residual_count).sqrt()) > 3.0
+    assert float(rms) < 0.15
+
+    # Its poses alone, the lens held: nothing shared is left, and the fit cannot get worse.
+    alone = PureLensProblem(BOARD.points, pixels, lens, fixed=True)
+    again = minimize(alone, alone.start(*poses), LMOptions(max_iterations=60))
+    assert float(again.cost) == pytest.approx(float(alone.cost(result.state)), rel=1e-3)
+
+
+def test_corners_behind_the_camera_have_no_cost() -> None:
+    pixels, (rotation, translation) = scene(3)
+    problem = PureLensProblem(BOARD.points, pixels, PureLensNet(INTRINSICS, skip=True))
+    assert bool(torch.isnan(problem.cost(problem.start(rotation, -translation))))
+
+
+def test_state_gradients_graphs_and_precision() -> None:
+    torch.compiler.reset()
+    lens, other = PureLensNet(INTRINSICS, hidden=3, seed=1), PureLensNet(2 * INTRINSICS, hidden=3, seed=2)
+    other.load_state_dict(lens.state_dict())
+    points = torch.tensor([[0.1, -0.2, 2.0], [0.3, 0.1, 1.0]], dtype=torch.float64, requires_grad=True)
+    wanted = lens(points)
+    assert torch.equal(other.half()(points)[0], wanted[0])
+    compiled = torch.compile(lens, fullgraph=True, backend="eager")(points)
+    torch.testing.assert_close(compiled[0], wanted[0], rtol=1e-12, atol=1e-12)
+    assert torch.autograd.gradcheck(
+        lambda p, w: torch.func.functional_call(lens, {"weights": w}, (p,))[0],
+        (points, lens.weights.detach().requires_grad_()),
+        atol=1e-4,
+    )
+
+
+@pytest.mark.parametrize("bad", [torch.ones(3), torch.tensor([-1.0, 1.0, 0.0, 0.0]), torch.ones(2, 4)])
+def test_pure_lens_refuses_bad_input(bad: Tensor) -> None:
+    with pytest.raises(InputError):
+        PureLensNet(bad)

@@ -1,4 +1,4 @@
-"""Parts of the tracker against closed forms: shared errors, mixtures, one update, looks of cameras, times, sizes."""
+"""Parts of the tracker against closed forms and brute force."""
 
 from __future__ import annotations
 
@@ -9,12 +9,43 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
+from track_scenes import pairs_of, seen_by, tracked_site, yawed_rig
 
+from kcal.errors import InputError
+from kcal.lens.pose import rotation_from_vector
 from kcal.pipeline.assignment import SeenFrom, looks_of, nearby
 from kcal.pipeline.association import appearance, size_cost
-from kcal.pipeline.imm_filter import Beliefs, Timing, by_rates, fit_of, innovations, rates, updated
-from kcal.pipeline.measurements import Anchored, ClockEstimate, ClockPrior, SharedErrors
+from kcal.pipeline.imm_filter import (
+    MOTIONS,
+    Beliefs,
+    Motion,
+    Timing,
+    Transition,
+    by_rates,
+    fit_of,
+    innovations,
+    moved,
+    rates,
+    step_numbers,
+    transition,
+    updated,
+)
+from kcal.pipeline.measurements import (
+    Anchored,
+    ClockEstimate,
+    ClockPrior,
+    SharedErrors,
+    congruent,
+    eliminate,
+    outer,
+    product,
+    solved,
+    squared,
+)
 from kcal.pipeline.stream import MomentOrder
+from kcal.pipeline.tracks import Tracker, TrackOptions
+
+# Parts of the tracker against closed forms: shared errors, mixtures, one update, looks of cameras, times, sizes.
 
 
 def draw(*shape: int, seed: int = 0) -> Tensor:
@@ -329,3 +360,242 @@ class TestMoments:
             order.put("a", time)
             assert order.end().moments == taken
         assert MomentOrder[str](time=100.0).end().moments == []
+
+
+# Motion of targets: exact straight lines and circles, exact derivatives, noise as integrated by brute force.
+
+
+UP = torch.tensor([[0.0], [-1.0], [0.0]], dtype=torch.float64)
+
+
+def after(motions: tuple[Motion, ...], seconds: float) -> Transition:
+    return transition(torch.tensor(step_numbers(motions, seconds), dtype=torch.float64), UP)
+
+
+def state_of(place: torch.Tensor, velocity: torch.Tensor) -> torch.Tensor:
+    """(6, 1, 1) from vectors."""
+    return (torch.cat([place[:2], torch.ones(1).double(), velocity]) / place[2])[:, None, None]
+
+
+def test_straight_motion_is_exact_also_in_a_turned_frame() -> None:
+    place, velocity = torch.tensor([30.0, -5.0, 400.0]).double(), torch.tensor([8.0, 1.0, -20.0]).double()
+    turn = rotation_from_vector(torch.tensor([0.1, -0.3, 0.2]).double())
+    found = moved(state_of(place, velocity), after((Motion(acceleration=0.0),), 1.5), turn[..., None])
+    true = state_of(turn @ (place + 1.5 * velocity), turn @ velocity)
+    torch.testing.assert_close(found.state, true, rtol=1e-12, atol=1e-15)
+    assert not bool(found.noise.any())
+
+
+def test_a_turning_target_goes_in_a_circle_to_the_left() -> None:
+    place, velocity = torch.tensor([0.0, 0.0, 300.0]).double(), torch.tensor([10.0, 0.0, 0.0]).double()
+    state = state_of(place, velocity)
+    rate = 2 * math.pi / 40
+    for step in range(40):
+        state = moved(state, after((Motion(acceleration=0.0, turn_rate=rate),), 1.0)).state
+        if step == 9:
+            # A quarter, seen from above, to the left of eastward is away from the camera.
+            expected = torch.tensor([0.0, 0.0, 10.0]).double()
+            torch.testing.assert_close(state[3:, 0, 0] / state[2, 0, 0], expected)
+    torch.testing.assert_close(state, state_of(place, velocity), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_derivatives(turned: bool) -> None:
+    state = torch.tensor([0.1, -0.05, 0.002, 0.03, -0.01, 0.02]).double()
+    turn = rotation_from_vector(torch.tensor([0.1, -0.3, 0.2]).double())[..., None] if turned else None
+    step = after(MOTIONS, 0.7)
+    models = len(MOTIONS)
+    here = state[:, None, None].expand(6, models, 1)
+    found = moved(here, step, turn)
+    slope = found.through(torch.eye(6).double()[..., None, None].expand(6, 6, models, 1))
+    for model in range(models):
+        by_autograd = torch.autograd.functional.jacobian(
+            lambda s, model=model: moved(s[:, None, None].expand(6, models, 1), step, turn).state[:, model, 0], state
+        )
+        torch.testing.assert_close(slope[..., model, 0], by_autograd, rtol=1e-10, atol=1e-12)
+    torch.linalg.cholesky(found.noise[..., 0].movedim(-1, 0))
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_noise_reaches_the_state_by_its_derivatives(turned: bool) -> None:
+    """Meters and meters per second are added to the place and velocity that the new state stands for."""
+    state = torch.tensor([0.1, -0.05, 0.002, 0.03, -0.01, 0.02]).double()[:, None, None]
+    turn = rotation_from_vector(torch.tensor([0.1, -0.3, 0.2]).double())[..., None] if turned else None
+    step = after((MOTIONS[2],), 0.7)
+    found = moved(state, step, turn)
+
+    def pushed(push: torch.Tensor) -> torch.Tensor:
+        """The new state, if its place (meters) and velocity are changed by this."""
+        z = 1.0 / found.state[2, 0, 0]
+        place = torch.cat([found.state[:2, 0, 0], torch.ones(1).double()]) * z + push[:3]
+        return state_of(place, found.state[3:, 0, 0] * z + push[3:])[:, 0, 0]
+
+    slope = torch.autograd.functional.jacobian(pushed, torch.zeros(6).double())
+    place, both, velocity = step.noise[:, 0, 0].tolist()
+    cartesian = torch.kron(torch.tensor([[place, both], [both, velocity]], dtype=torch.float64), torch.eye(3).double())
+    torch.testing.assert_close(found.noise[..., 0, 0], slope @ cartesian @ slope.T, rtol=1e-10, atol=1e-18)
+
+
+def test_rates_are_those_of_straight_motion() -> None:
+    state = torch.tensor([0.1, -0.05, 0.002, 0.03, -0.01, 0.02], dtype=torch.float64)
+    found, by_state = rates(state), by_rates(torch.eye(3, dtype=torch.float64), state)
+
+    def later(seconds: float) -> torch.Tensor:
+        return moved(state[:, None, None], after((Motion(acceleration=0.0),), seconds)).state[:3, 0, 0]
+
+    # The second derivative is left out: 1e-6 s of half of 1e-3 a second.
+    torch.testing.assert_close((later(1e-6) - later(0.0)) / 1e-6, found, rtol=1e-6, atol=1e-9)
+    by_autograd = torch.autograd.functional.jacobian(rates, state)
+    torch.testing.assert_close(by_state, by_autograd, rtol=1e-12, atol=0.0)
+
+
+@pytest.mark.parametrize("memory", [math.inf, 0.8, 5000.0])
+def test_noise_is_that_of_many_small_steps(memory: float) -> None:
+    motion = Motion(acceleration=2.0, memory_s=memory)
+    covariance = torch.zeros(2, 2, dtype=torch.float64)
+    small = after((motion,), 0.01)
+    # Along one axis.
+    push = torch.tensor([[1.0, float(small.reach[0, 0])], [0.0, float(small.keep[0, 0])]]).double()
+    added = torch.tensor([[0.0, 0.0], [0.0, 0.01 * 4.0]]).double()
+    for _ in range(100):
+        covariance = push @ covariance @ push.T + added
+    place, both, velocity = after((motion,), 1.0).noise[:, 0, 0]
+    found = torch.stack([place, both, both, velocity]).reshape(2, 2)
+    torch.testing.assert_close(found, covariance, rtol=0.025, atol=1e-3)
+
+
+def test_a_hovering_target_forgets_its_velocity() -> None:
+    step = after((Motion(acceleration=0.0, memory_s=2.0),), 4.0)
+    torch.testing.assert_close(step.keep[..., 0, 0], math.exp(-2) * torch.eye(3).double())
+    torch.testing.assert_close(step.reach[..., 0, 0], 2 * (1 - math.exp(-2)) * torch.eye(3).double())
+
+
+@pytest.mark.parametrize("wrong", [{"acceleration": -1.0}, {"acceleration": 1.0, "memory_s": 0.0},
+                                   {"acceleration": 1.0, "turn_rate": math.nan}])  # fmt: skip
+def test_impossible_motions(wrong: dict[str, float]) -> None:
+    with pytest.raises(InputError, match="motion"):
+        Motion(**wrong)
+
+
+def test_another_origin() -> None:
+    """Counted from 30 m to the side and 100 m behind; derivatives are those of the map."""
+    place, velocity = torch.tensor([30.0, -5.0, 400.0]).double(), torch.tensor([8.0, 1.0, -20.0]).double()
+    shift = torch.tensor([-30.0, 4.0, 100.0]).double()
+    turn = rotation_from_vector(torch.tensor([0.1, -0.3, 0.2]).double())
+    step = after((Motion(acceleration=0.5),), 1.5)
+    state = state_of(place, velocity)
+    found = moved(state, step, turn[..., None], shift[:, None])
+    true = state_of(turn @ (place + 1.5 * velocity) + shift, turn @ velocity)
+    torch.testing.assert_close(found.state, true, rtol=1e-12, atol=1e-15)
+    by_autograd = torch.autograd.functional.jacobian(
+        lambda s: moved(s[:, None, None], step, turn[..., None], shift[:, None]).state[:, 0, 0], state[:, 0, 0]
+    )
+    slope = found.through(torch.eye(6).double()[..., None, None])
+    torch.testing.assert_close(slope[:, :, 0, 0], by_autograd)
+
+
+# Small matrices with their number as the last axis: the same as torch's, matrix by matrix.
+
+
+def lanes(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.randn(*shape, 3, 5, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def stacked(value: torch.Tensor) -> torch.Tensor:
+    """The same with the number of matrices first."""
+    return value.movedim((-2, -1), (0, 1))
+
+
+def test_products() -> None:
+    first, second, square = lanes(4, 6), lanes(6, 2, seed=1), lanes(6, 6, seed=2)
+    torch.testing.assert_close(stacked(product(first, second)), stacked(first) @ stacked(second))
+    torch.testing.assert_close(stacked(squared(first)), stacked(first) @ stacked(first).mT)
+    torch.testing.assert_close(stacked(congruent(first, square)), stacked(first) @ stacked(square) @ stacked(first).mT)
+    rows, columns = lanes(4), lanes(6, seed=3)
+    assert torch.equal(outer(rows, columns)[2, 5], rows[2] * columns[5])
+
+
+@pytest.mark.parametrize("size", [1, 2, 4, 6])
+def test_elimination_whatever_the_units(size: int) -> None:
+    unit = torch.logspace(-9, 3, size, dtype=torch.float64)[:, None, None]
+    matrix = squared(lanes(size, size + 2)) * unit[:, None] * unit
+    columns = lanes(size, 3, seed=1) * unit[:, None]
+    done = eliminate(matrix, columns)
+    scale = unit[:, None]
+    torch.testing.assert_close(solved(done) * scale, stacked_solution(matrix, columns, unit), rtol=1e-9, atol=1e-10)
+    torch.testing.assert_close(done.pivots.log().sum(0), torch.linalg.slogdet(stacked(matrix))[1], rtol=1e-9, atol=1e-9)
+    white = (done.columns.square() / done.pivots[:, None]).sum(0)
+    expected = (columns * solved(done)).sum(0)
+    torch.testing.assert_close(white, expected, rtol=1e-9, atol=0.0)
+
+
+def stacked_solution(matrix: torch.Tensor, columns: torch.Tensor, unit: torch.Tensor) -> torch.Tensor:
+    """By torch, in units in which all rows are alike; times `unit`."""
+    scaled = torch.linalg.solve(stacked(matrix / unit[:, None] / unit), stacked(columns / unit[:, None]))
+    return scaled.movedim((0, 1), (-2, -1))
+
+
+def test_what_is_not_positive_gives_numbers_all_the_same() -> None:
+    done = eliminate(torch.zeros(2, 2, 1, dtype=torch.float64), torch.zeros(2, 1, 1, dtype=torch.float64))
+    assert bool((done.pivots > 0).all())
+    assert bool(torch.isfinite(solved(done)).all())
+
+
+# Smoothing: consistent, better than the filter, and honest about what is shared.
+
+
+def test_smoothed_states_are_consistent_and_sharper() -> None:
+    localize, count, frames = tracked_site(0.003), 40, 16
+    generator = torch.Generator().manual_seed(0)
+    z = torch.linspace(300.0, 2500.0, count).double()
+    across, up = torch.linspace(-0.4, 0.4, count).double(), 0.15 * torch.randn(count, generator=generator).double()
+    start = torch.stack([across * z, up * z, z], -1)
+    velocity = 8.0 * torch.randn(count, 3, generator=generator).double()
+    yaws = math.radians(0.003) * torch.randn(count, generator=generator).double()
+    rigs = [yawed_rig(localize.rig, float(yaw)) for yaw in yaws]
+    options = TrackOptions(motions=(Motion(acceleration=0.01),), speed_mps=8.0)
+    tracker = Tracker(localize, options, record=True)
+    places = []
+    for frame in range(frames):
+        places.append(start + frame / 10.0 * velocity)
+        marks = [seen_by(rig, places[-1][i : i + 1], 0.3, generator) for i, rig in enumerate(rigs)]
+        left, right = (torch.cat(side) for side in zip(*marks, strict=True))
+        tracks = tracker(pairs_of(left, right, frame / 10.0))
+    found = tracker.smoothed()
+    assert [track.number for track in found] == list(tracks.number) == list(range(1, count + 1))
+    middle = torch.stack([track.state.inverse_range[8] for track in found])
+    sigma = torch.stack([track.state.inverse_range_sigma[8] for track in found])
+    ratio = (middle - 1.0 / torch.linalg.vector_norm(places[8], dim=-1)) / sigma
+    assert 0.75 < float(ratio.square().mean().sqrt()) < 1.25
+    velocities = torch.stack([track.state.velocity[8] for track in found])
+    true = velocity @ localize.enu_from_rig.T
+    covariance = torch.stack([track.state.velocity_covariance[8] for track in found])
+    error = (velocities - true)[..., None]
+    # 40 values of chi-squared with three degrees of freedom.
+    assert 2.2 < float((error.mT @ torch.linalg.solve(covariance, error)).mean()) < 3.9
+    # The last moment is the filter's, and the first is much better known than when it was seen.
+    last = torch.stack([track.state.enu[-1] for track in found])
+    torch.testing.assert_close(last, tracks.state.enu)
+    first = torch.stack([track.state.covariance[0, 1, 1] - track.state.systematic[0, 1, 1] for track in found])
+    one = localize(*(torch.cat(side) for side in zip(*marks, strict=True)))
+    assert bool((first < 0.5 * one.covariance[:, 1, 1]).all())
+
+
+def test_a_clock_that_is_known_at_the_end_corrects_the_beginning() -> None:
+    localize, late = tracked_site(), 0.05
+    generator = torch.Generator().manual_seed(1)
+    start = torch.tensor([[-30.0, 10.0, 300.0], [0.0, -20.0, 200.0], [10.0, 0.0, 250.0]]).double()
+    velocity = torch.tensor([[9.0, 0.0, 0.0], [0.0, 6.0, 2.0], [-8.0, -5.0, 1.0]]).double()
+    tracker = Tracker(
+        localize, TrackOptions(motions=(Motion(acceleration=0.02),)), clock=ClockPrior(offset_sigma_s=0.1), record=True
+    )
+    for frame in range(40):
+        time = frame / 10.0
+        left, right = seen_by(localize.rig, start + time * velocity, 0.2, generator, start + (time + late) * velocity)
+        tracker(pairs_of(left, right, time, 0.2))
+    offset, sigma = tracker.clock_estimate().offset(4.0)
+    assert abs(offset - late) < 3 * sigma < 0.006
+    for track, place, pace in zip(tracker.smoothed(), start, velocity, strict=True):
+        true = 1.0 / torch.linalg.vector_norm(place + track.time[:, None] * pace, dim=-1)
+        error = (true - track.state.inverse_range) / track.state.inverse_range_sigma
+        assert float(error.abs().max()) < 3.0

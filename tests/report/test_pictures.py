@@ -1,10 +1,16 @@
-"""Pictures of cameras: no title is cut, panels fill the page, and they say the same as the commands do."""
+"""Pictures of reports: boards, every picture, and marks that are small."""
 
 from __future__ import annotations
 
+import functools
+import itertools
+from pathlib import Path
+
+import numpy as np
 import pytest
 import torch
 from calibrate_scenes import BOARD, camera, motions
+from drawn_scenes import FIGURES, boxes, calibrated, landmarks_rig, sites
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -13,16 +19,29 @@ from matplotlib.quiver import Quiver
 from kcal.calibrate.camera.advice import unreached_share
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.camera.export import Misfit
+from kcal.calibrate.hybrid.measured_board import MeasuredBoard
+from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
+from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.difference import camera_difference
+from kcal.locate.siting import siting_map
 from kcal.report.calibration import (
+    board_figure,
+    board_text,
     calibration_figure,
     coverage_figure,
     difference_figure,
     difference_text,
+    draw_coverage,
     gallery_figure,
 )
+from kcal.report.figures import save_picture
+from kcal.report.positions import _sigma_levels
+from kcal.report.rig import rig_figure
+
+# Pictures of cameras: no title is cut, panels fill the page, and they say the same as the commands do.
+
 
 LONG = "/home/somebody/a long folder of a site/with the date 2026-11-24/and more of it/rig.json: the left camera"
 
@@ -124,3 +143,124 @@ def test_a_gallery_is_in_order_after_what_stands_out() -> None:
     assert order == ["02", "04", "00", "01", "03", "05"]
     assert "the first 2 stand out" in figure.texts[0].get_text()
     assert "stand" not in gallery_figure(seen).texts[0].get_text()
+
+
+# The picture of a measured board.
+
+
+def bent_board(scale: float) -> MeasuredBoard:
+    amplitudes = torch.zeros(28, dtype=torch.float64)
+    amplitudes[1], amplitudes[12] = scale, scale
+    half = 1e-5 * torch.eye(28, dtype=torch.float64)
+    board = Board(columns=6, rows=9, square=0.02)
+    return MeasuredBoard(name="plate", board=board, amplitudes=amplitudes, half=half, log_evidence=0.0)
+
+
+def test_heights_and_arrows() -> None:
+    """The second mode is a saddle: corners of opposite heights; stretch moves the corners left and right."""
+    figure = board_figure(bent_board(2e-4))
+    axes = figure.axes[0]
+    assert "plate: 6x9 inner corners" in figure.texts[0].get_text()
+    assert "bending 0.200 ± 0.0" in figure.texts[0].get_text()
+    levels = axes.collections[0].norm
+    assert 0.2 <= float(levels.vmax) < 0.3
+    assert float(levels.vmin) == -float(levels.vmax)
+    (arrows,) = [part for part in axes.collections if isinstance(part, Quiver)]
+    assert arrows.N == 54
+    across, down = np.array(arrows.U), np.array(arrows.V)
+    x = 1e3 * bent_board(0.0).board.points[:, 0].numpy()
+    np.testing.assert_array_equal(np.sign(np.round(across, 9)), np.sign(x - x.mean()))
+    # Nothing longer than the distance of the corners, 20 mm.
+    assert 8.0 < float(np.hypot(across, down).max()) <= 20.0
+
+
+def test_text_of_a_flat_board() -> None:
+    lines = board_text(bent_board(0.0))
+    assert lines[0].startswith("bending 0.000 ± 0.0")
+    assert [line.split()[0] for line in lines] == ["bending", "stretch", "shear", "print"]
+
+
+def test_file(tmp_path: Path) -> None:
+    path = save_picture(tmp_path / "board.png", board_figure(bent_board(0.0)))
+    assert path.read_bytes()[:4] == b"\x89PNG"
+    with pytest.raises(InputError, match=r"must end with \.png"):
+        save_picture(tmp_path / "board.jpg", board_figure(bent_board(0.0)))
+
+
+# Every picture: nothing is cut, nothing covers another thing, nothing is lost in a corner.
+
+
+# Points of data stand where they are: their names may meet.
+_DATA = {"positions", "rig", "wide rig", "stations", "sites", "stars"}
+
+
+@functools.cache
+def drawn(name: str) -> Figure:
+    return FIGURES[name]()
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_no_text_is_cut(name: str) -> None:
+    figure = drawn(name)
+    wide, tall = figure.canvas.get_width_height()
+    cut = [text for text, box in boxes(figure)[0]
+           if box.x0 < -2 or box.y0 < -2 or box.x1 > wide + 2 or box.y1 > tall + 2]  # fmt: skip
+    assert cut == []
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_no_axes_cover_each_other(name: str) -> None:
+    figure = drawn(name)
+    wide, tall = figure.canvas.get_width_height()
+    _, axes = boxes(figure)
+    for box in axes:
+        assert -1 <= box.x0 < box.x1 <= wide + 1
+        assert -1 <= box.y0 < box.y1 <= tall + 1
+    for one, other in itertools.combinations(axes, 2):
+        across = min(one.x1, other.x1) - max(one.x0, other.x0)
+        down = min(one.y1, other.y1) - max(one.y0, other.y0)
+        assert min(across, down) < 1
+    # Most of the page is used.
+    assert sum(box.width * box.height for box in axes) > 0.3 * wide * tall
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_no_text_covers_another(name: str) -> None:
+    texts, _ = boxes(drawn(name))
+    covered = []
+    for (first, one), (second, other) in itertools.combinations(texts, 2):
+        across = min(one.x1, other.x1) - max(one.x0, other.x0)
+        down = min(one.y1, other.y1) - max(one.y0, other.y0)
+        small = min(one.height, other.height)
+        if across > 2 and down > 0.35 * small and first != second:
+            covered.append((first[:40], second[:40]))
+    assert len(covered) <= (3 if name in _DATA else 0), covered
+
+
+# Arrows of pictures: of a plan's north, and of residuals, as long as there is room; levels of very small errors.
+
+
+def test_north_is_up() -> None:
+    plan = rig_figure(landmarks_rig()).axes[0]
+    (arrow,) = [text for text in plan.texts if getattr(text, "xycoords", "") == "axes fraction"]
+    assert (arrow.xy, arrow.xyann) == ((0.04, 1.0), (0.04, 0.89))
+
+
+def test_a_typical_residual_is_a_sixtieth_of_the_image() -> None:
+    result = calibrated()
+    axes = Figure().add_subplot()
+    draw_coverage(axes, result.observations, result)
+    (drawn,) = [part for part in axes.collections if isinstance(part, Quiver)]
+    error = -result.residuals.numpy().reshape(-1, 2)
+    scale = float(axes.get_title(loc="left").rpartition("x ")[2])
+    wanted = 640 / 60 / np.sqrt((error**2).mean())
+    # The round factor at or below it.
+    assert 0.4 * wanted < scale <= wanted
+    np.testing.assert_allclose(np.stack([drawn.U, drawn.V], -1), scale * error)
+
+
+def test_levels_below_a_millimeter() -> None:
+    area, towers, _ = sites()
+    found = siting_map(area, towers)
+    tiny = found._replace(sigma=1e-7 * found.sigma)
+    assert _sigma_levels([tiny]) == pytest.approx([1e-3, 2e-3, 5e-3])

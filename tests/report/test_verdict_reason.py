@@ -1,21 +1,34 @@
-"""The one reason of a verdict, and the next step: those of the largest contribution to what misses a requirement."""
+"""Summaries and the reason of a verdict."""
 
 from __future__ import annotations
 
+import base64
 import math
 import re
 from pathlib import Path
 
+import numpy as np
+import pytest
+
 import kcal.report
-from kcal.report.pages import verdict_page
+from kcal.errors import FileError, InputError
+from kcal.io.images import write_png
+from kcal.report.pages import Part, save_summary, summary_page, verdict_page
 from kcal.report.verdict import FAULTS, Finding, RangeAnswer, Requirement, Verdict, weighed_findings
 
+# The one reason of a verdict, and the next step: those of the largest contribution to what misses a requirement.
+
+
 MARKS = "mark targets more accurately"
+
 STRUCTURE = Finding(
     name="model", severity="stop", text="residuals are not noise", action="check the board", part=FAULTS
 )
+
 SLIGHT = Finding(name="model", severity="doubt", text="it bends", action="measure the board", part=FAULTS)
+
 TILT = Finding(name="tilt", severity="stop", text="no tilted views", action="tilt the board", part="lenses")
+
 MIRRORED = Finding(name="mirrored", severity="stop", text="all views are mirrored", action="switch it off")
 
 
@@ -111,3 +124,35 @@ def test_findings_are_called_by_words() -> None:
     assert titles["names"] == titles["changed"] == "two cameras"
     page = verdict_page(Verdict(subject="left", findings=(Finding(name="halves", severity="doubt", text="t"),)))
     assert "<b>check by halves of the views</b>" in page
+
+
+# The one-page summary: pictures inside, nothing from outside, text as text.
+
+
+def test_pictures_are_inside_and_nothing_is_fetched(tmp_path: Path) -> None:
+    picture = write_png(tmp_path / "a.png", np.full((4, 6), 128, np.uint8))
+    part = Part(heading="P", pictures=((picture, "gray"),))
+    page = save_summary(tmp_path / "s.html", "T", "Lead", [part]).read_text()
+    (inside,) = re.findall(r'src="data:image/png;base64,([^"]+)"', page)
+    assert base64.b64decode(inside) == picture.read_bytes()
+    assert re.findall(r"(?:src|href)=\"(?!data:)", page) == []
+    assert "http" not in page
+
+
+def test_text_is_text() -> None:
+    nasty = '<script>alert("1")</script> & more'
+    part = Part(heading=nasty, text=(nasty,), table=((nasty, "m"), ("gate", nasty)), code=nasty)
+    page = summary_page(nasty, nasty, [part])
+    assert "<script" not in page
+    assert page.count("&lt;script&gt;") == 8  # title twice, lead, heading, paragraph, two cells, command
+    assert page.count("<tr>") == 2
+
+
+def test_what_cannot_be_shown_is_refused(tmp_path: Path) -> None:
+    Path(tmp_path, "a.txt").write_text("no picture")
+    with pytest.raises(InputError, match="neither a PNG nor a JPEG"):
+        summary_page("t", "l", [Part(heading="h", pictures=((tmp_path / "a.txt", ""),))])
+    with pytest.raises(FileError):
+        summary_page("t", "l", [Part(heading="h", pictures=((tmp_path / "none.png", ""),))])
+    with pytest.raises(InputError, match="different lengths"):
+        summary_page("t", "l", [Part(heading="h", table=(("a", "b"), ("c",)))])

@@ -1,4 +1,4 @@
-"""Gradients through a solution."""
+"""Derivatives of the solution: implicit gradients and the Hessian."""
 
 from __future__ import annotations
 
@@ -8,8 +8,14 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from kcal.errors import InputError
+from kcal.errors import DegenerateError, InputError
+from kcal.solve.hessian import HessianSolve, implicit_step, newton_minimum
 from kcal.solve.lm import LevenbergMarquardt, LMOptions
+from kcal.solve.problem import State
+from kcal.solve.schur import SchurLinearization, SchurProblem
+
+# Gradients through a solution.
+
 
 TIMES = torch.linspace(0.0, 2.0, 9, dtype=torch.float64)
 
@@ -159,3 +165,168 @@ class TestWeightsOfAResidual:
             torch.func.vmap(lambda w: torch.func.functional_call(solver, {"residual.w": w}, (self.start, self.data)).x)(
                 torch.ones(2, 3).double()
             )
+
+
+# Systems with the exact Hessian of a cost with local blocks, and minima to rounding.
+
+
+def quadratic(shared: int, views: int, local: int) -> tuple[Tensor, Tensor]:
+    """A positive matrix over (shared, local of each view) whose views are coupled through the shared part alone."""
+    generator = torch.Generator().manual_seed(4)
+    size = shared + views * local
+    matrix = torch.zeros(size, size, dtype=torch.float64)
+    for v in range(views):
+        which = [*range(shared), *range(shared + v * local, shared + (v + 1) * local)]
+        root = torch.randn(len(which), len(which) + 2, generator=generator, dtype=torch.float64)
+        matrix[torch.tensor(which)[:, None], torch.tensor(which)] += root @ root.T
+    return matrix, torch.randn(size, generator=generator, dtype=torch.float64)
+
+
+@pytest.mark.parametrize(("shared", "views", "local"), [(3, 4, 2), (1, 2, 6), (5, 1, 1)])
+def test_a_quadratic_gives_its_matrix_back_and_newton_its_minimum(shared: int, views: int, local: int) -> None:
+    matrix, slope = quadratic(shared, views, local)
+
+    def cost(s: Tensor, own: Tensor) -> Tensor:
+        x = torch.cat([s, own.flatten()])
+        return slope @ x + 0.5 * x @ matrix @ x
+
+    # A preconditioner that is a tenth off.
+    near = matrix + 0.1 * torch.diag(matrix.diagonal())
+    gram = torch.zeros(views, local + shared + 1, local + shared + 1, dtype=torch.float64)
+    for v in range(views):
+        own = torch.arange(shared + v * local, shared + (v + 1) * local)
+        gram[v, :local, :local] = near[own[:, None], own]
+        gram[v, :local, local:-1] = near[own[:, None], torch.arange(shared)]
+    gram[0, local:-1, local:-1] = near[:shared, :shared]
+    zero = torch.zeros(shared, dtype=torch.float64), torch.zeros(views, local, dtype=torch.float64)
+    solve = HessianSolve(cost, SchurLinearization.of_gram(gram, local), zero)
+    gradient = solve.gradient()
+    torch.testing.assert_close(torch.cat([part.flatten() for part in gradient]), slope, rtol=1e-13, atol=1e-13)
+    step = torch.cat([part.flatten() for part in solve(gradient)])
+    # As well as the matrix is conditioned.
+    torch.testing.assert_close(step, torch.linalg.solve(matrix, slope), rtol=1e-9, atol=1e-9)
+
+
+def test_a_saddle_has_no_minimum() -> None:
+    gram = torch.diag(torch.tensor([2.0, 2.0, 0.0], dtype=torch.float64))[None]
+    zero = torch.zeros(1, dtype=torch.float64), torch.zeros(1, 1, dtype=torch.float64)
+
+    def cost(s: Tensor, own: Tensor) -> Tensor:
+        return s.square().sum() - own.square().sum()
+
+    solve = HessianSolve(cost, SchurLinearization.of_gram(gram, 1), zero)
+    with pytest.raises(DegenerateError, match="no minimum"):
+        solve((zero[0] + 1.0, zero[1] + 2.0))
+
+
+def test_rows_of_the_shared_parameters_alone_count_once() -> None:
+    """As if a view of their own had them, whatever their number."""
+    generator = torch.Generator().manual_seed(5)
+    rows = torch.randn(3, 2 + 3 + 1, 12, generator=generator, dtype=torch.float64)
+    alone = torch.randn(3 + 1, 7, generator=generator, dtype=torch.float64)
+    found = SchurLinearization.of_gram(rows @ rows.mT, 2, alone @ alone.T)
+    # The same residuals in the first view, whose own parameters do not touch them.
+    wider = torch.zeros(3, 6, 12 + 7, dtype=torch.float64)
+    wider[..., :12], wider[0, 2:, 12:] = rows, alone
+    expected = SchurLinearization.of_gram(wider @ wider.mT, 2)
+    torch.testing.assert_close(found.cost, expected.cost, rtol=1e-13, atol=0)
+    lam = torch.full((), 0.1, dtype=torch.float64)
+    for own, other in zip(found.step(lam)[0], expected.step(lam)[0], strict=True):
+        torch.testing.assert_close(own, other, rtol=1e-11, atol=1e-12)
+
+
+def test_a_minimum_follows_its_data() -> None:
+    """Of dᵀx + ½ xᵀ M x, the minimum is -M⁻¹ d: so are its derivatives, sign and scale included."""
+    shared, views, local = 3, 2, 2
+    matrix, slope = quadratic(shared, views, local)
+
+    def cost(s: Tensor, own: Tensor, data: Tensor) -> Tensor:
+        x = torch.cat([s, own.flatten()])
+        return data @ x + 0.5 * x @ matrix @ x
+
+    zero = torch.zeros(shared, dtype=torch.float64), torch.zeros(views, local, dtype=torch.float64)
+    gram = torch.zeros(views, local + shared + 1, local + shared + 1, dtype=torch.float64)
+    for v in range(views):
+        which = torch.tensor([*range(shared + v * local, shared + (v + 1) * local), *range(shared)])
+        gram[v, :-1, :-1] = matrix[which[:, None], which]
+        gram[v, local:-1, local:-1] /= views
+    found = HessianSolve(lambda s, own: cost(s, own, slope), SchurLinearization.of_gram(gram, local), zero)
+    data = slope.clone().requires_grad_(True)
+    step = torch.cat([part.flatten() for part in implicit_step(cost, found, (data,))])
+    weight = torch.arange(1.0, len(slope) + 1, dtype=torch.float64)
+    (by_data,) = torch.autograd.grad(weight @ step, data)
+    torch.testing.assert_close(by_data, -torch.linalg.solve(matrix, weight), rtol=1e-9, atol=1e-9)
+
+
+class Decays(SchurProblem[State]):
+    """Curves a_v exp(-s x), one a view, with their own heights: large residuals, so that their curvature counts."""
+
+    batch, local_size = (), 1
+    x = torch.linspace(0.0, 2.0, 15, dtype=torch.float64)
+
+    def __init__(self, y: Tensor) -> None:
+        self.y, self.residual_count = y, y.numel()
+
+    def residuals(self, state: State) -> Tensor:
+        shared, local = state
+        return local * torch.exp(-shared.sum() * self.x) - self.y
+
+    def rows(self, state: State) -> Tensor:
+        shared, local = state
+        shape = torch.exp(-shared.sum() * self.x).expand_as(self.y)
+        slope = -local * self.x * shape
+        return torch.stack([shape, *[slope] * len(shared), local * shape - self.y], -2)
+
+    def retract(self, state: State, step: State) -> State:
+        return state[0] + step[0], state[1] + step[1]
+
+
+def decays(noise: float, views: int = 4) -> tuple[Decays, State]:
+    """The problem, and a state that a few steps bring near its minimum."""
+    draw = torch.randn(views, 15, generator=torch.Generator().manual_seed(8), dtype=torch.float64)
+    height = torch.arange(1.0, views + 1, dtype=torch.float64)[:, None]
+    y = height * torch.exp(-0.9 * Decays.x) + noise * draw
+    return Decays(y), (torch.tensor([0.7]).double(), torch.ones(views, 1).double())
+
+
+@pytest.mark.parametrize("noise", [0.3, 1e-3])
+def test_newton_ends_at_the_minimum_to_rounding(noise: float) -> None:
+    """After a solver that stops early; and the systems are those of the Hessian there."""
+    problem, start = decays(noise)
+    rough = LMOptions(max_iterations=4, tolerance=0.1)
+    (shared, local), solve = newton_minimum(problem, start, rough)
+    flat = torch.cat([shared, local.flatten()])
+
+    def cost(x: Tensor) -> Tensor:
+        return problem.cost((x[:1], x[1:, None]))
+
+    gradient, hessian = torch.func.grad(cost)(flat), torch.func.hessian(cost)(flat)
+    away = torch.linalg.solve(hessian, gradient)
+    # Of steps against standard deviations: rounding alone.
+    assert float((away.abs() / (noise * torch.linalg.inv(hessian).diagonal().sqrt())).max()) < 1e-9
+    right = torch.arange(1.0, len(flat) + 1, dtype=torch.float64)
+    found = solve((right[:1], right[1:, None]))
+    expected = torch.linalg.solve(hessian, right)
+    torch.testing.assert_close(torch.cat([found[0], found[1].flatten()]), expected, rtol=1e-9, atol=1e-12)
+
+
+def test_newton_accepts_data_without_noise() -> None:
+    problem, start = decays(0.0)
+    (shared, local), _ = newton_minimum(problem, start, LMOptions(max_iterations=30))
+    assert float(shared[0]) == pytest.approx(0.9, abs=1e-12)
+    torch.testing.assert_close(local[:, 0], torch.arange(1.0, 5.0).double(), rtol=1e-12, atol=0)
+
+
+def test_newton_refuses_a_flat_cost() -> None:
+    """Two shared unknowns of which only the sum counts."""
+    problem, start = decays(0.1)
+    with pytest.raises(DegenerateError, match="no minimum"):
+        newton_minimum(problem, (torch.tensor([0.3, 0.4]).double(), start[1]), LMOptions(max_iterations=30))
+
+
+def test_newton_refuses_a_start_far_from_a_minimum() -> None:
+    """A cost whose curvature is negative there: no step of Newton's leads to a minimum."""
+    problem, _ = decays(0.1)
+    far = torch.tensor([60.0]).double(), torch.full((4, 1), 1e-3).double()
+    with pytest.raises(DegenerateError, match="no minimum"):
+        newton_minimum(problem, far, LMOptions(max_iterations=1))

@@ -1,14 +1,22 @@
-"""Eliminating the local blocks changes nothing but the work: Schur equals dense."""
+"""Normal equations: elimination, batches, dense problems and weights."""
 
 from __future__ import annotations
 
+import math
+from types import SimpleNamespace
+
 import pytest
 import torch
+from solve_problems import rosenbrock
 from torch import Tensor
 
-from kcal.solve.lm import DenseLinearization, LevenbergMarquardt, minimize
-from kcal.solve.problem import SolverStatus, State
-from kcal.solve.schur import SchurLinearization, SchurProblem
+from kcal.errors import InputError
+from kcal.solve.lm import DenseLinearization, DenseProblem, LevenbergMarquardt, LMOptions, minimize
+from kcal.solve.problem import RobustLoss, SolverStatus, State
+from kcal.solve.schur import EliminatedItems, PartlyEliminated, SchurLinearization, SchurProblem, without_local
+
+# Eliminating the local blocks changes nothing but the work: Schur equals dense.
+
 
 # (batch, views, local, shared, residuals a view)
 SIZES = [
@@ -207,3 +215,260 @@ def test_batch_of_starts_is_one_by_one() -> None:
         torch.testing.assert_close(together.cost[i], alone.cost, rtol=1e-12, atol=0)
         # Both stop where the cost is flat to 1e-12 of itself.
         torch.testing.assert_close(together.state[0][i], alone.state[0], rtol=0, atol=1e-8)
+
+
+# Items that are eliminated before a system is damped: the same solution, and what their own unknowns do after.
+
+
+ITEMS, OWN, SHARED, RESIDUALS = 6, 3, 4, 5
+
+
+def rows_of(items: int, own: int, residuals: int, seed: int) -> Tensor:
+    """(V, L + S + 1, R) whose columns differ in size."""
+    generator = torch.Generator().manual_seed(seed)
+    rows = torch.randn(items, own + SHARED + 1, residuals, generator=generator, dtype=torch.float64)
+    sizes = 10.0 ** torch.linspace(-2.0, 2.0, own + SHARED + 1, dtype=torch.float64)
+    sizes[-1] = 1.0
+    return rows * sizes[:, None]
+
+
+ROWS = rows_of(ITEMS, OWN, RESIDUALS, 1)
+
+
+def test_residuals_that_are_left_are_what_own_unknowns_cannot_change() -> None:
+    """Products of what is left are those of rows off the own ones, by pseudo-inverse as by QR."""
+    items = EliminatedItems(ROWS, OWN)
+    assert items.rows.shape == (ITEMS, SHARED + 1, RESIDUALS - OWN)
+    off = ROWS[:, OWN:] - ROWS[:, OWN:] @ torch.linalg.pinv(ROWS[:, :OWN]) @ ROWS[:, :OWN]
+    torch.testing.assert_close(items.rows @ items.rows.mT, off @ off.mT, rtol=1e-10, atol=1e-12)
+    torch.testing.assert_close(items.gram, (off @ off.mT).sum(0), rtol=1e-10, atol=1e-12)
+    torch.testing.assert_close(without_local(ROWS, OWN), off, rtol=1e-9, atol=1e-11)
+
+
+def test_an_unknown_without_effect_is_no_reason_to_fail() -> None:
+    rows = ROWS.clone()
+    rows[2, 1] = 0.0
+    off = without_local(rows, OWN)
+    assert bool(off.isfinite().all())
+    kept = rows[2, [0, 2]]
+    # What two columns can do is out of the rows; the third takes out one direction more, whichever it is.
+    torch.testing.assert_close(off[2] @ kept.mT, torch.zeros(SHARED + 1, 2).double(), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("damping", [1e-9, 0.3, 50.0])
+def test_own_steps_solve_the_damped_equations(damping: float) -> None:
+    """With the shared step held; what they gain beyond `rows` makes up the fall of all squares."""
+    items = EliminatedItems(ROWS, OWN)
+    shared = torch.tensor([3.0, -0.2, 0.05, 0.01], dtype=torch.float64)
+    step, gain = items.step(shared, torch.tensor(damping, dtype=torch.float64))
+    own, moved = ROWS[:, :OWN], ROWS[:, -1] + shared @ ROWS[:, OWN:-1]
+    normal = own @ own.mT
+    normal = normal + damping * torch.diag_embed(normal.diagonal(dim1=-2, dim2=-1))
+    expected = -torch.linalg.solve(normal, (own @ moved[..., None])[..., 0])
+    torch.testing.assert_close(step, expected, rtol=1e-7, atol=1e-12)
+    after = moved + (step[:, None] @ own)[:, 0]
+    left = items.rows[:, -1] + shared @ items.rows[:, :-1]
+    fall = ROWS[:, -1].square().sum() - after.square().sum()
+    beside = items.rows[:, -1].square().sum() - left.square().sum()
+    torch.testing.assert_close(gain, 0.5 * (fall - beside), rtol=1e-9, atol=1e-12)
+
+
+def test_own_unknowns_follow_the_shared_ones() -> None:
+    follow, inverse = EliminatedItems(ROWS, OWN).response()
+    gram = ROWS @ ROWS.mT
+    own = torch.linalg.inv(gram[:, :OWN, :OWN])
+    torch.testing.assert_close(follow, -own @ gram[:, :OWN, OWN:-1], rtol=1e-7, atol=1e-12)
+    torch.testing.assert_close(inverse, own, rtol=1e-7, atol=1e-14)
+
+
+@pytest.mark.parametrize("first", [0, 2, 4])
+def test_a_step_is_that_of_all_items_together(first: int) -> None:
+    """Others have four unknowns each; items with three come after the first so many of them, with a zero before."""
+    rest = rows_of(4, 4, 9, 2)
+    padded = torch.nn.functional.pad(ROWS @ ROWS.mT, (1, 0, 1, 0))
+    padded[:, 0, 0] = 1.0
+    grams = rest @ rest.mT
+    whole = SchurLinearization.of_gram(torch.cat([grams[:first], padded, grams[first:]]), 4)
+    items = EliminatedItems(ROWS, OWN)
+    others = SchurLinearization.of_gram(grams, 4, items.gram)
+    cost = torch.tensor(7.0).double()
+    partly = PartlyEliminated(others, items, first, cost)
+    assert partly.cost is cost
+    (shared, local), predicted = partly.step(torch.tensor(1e-13, dtype=torch.float64))
+    (expected, own), decrease = whole.step(torch.tensor(1e-13, dtype=torch.float64))
+    torch.testing.assert_close(shared, expected, rtol=1e-7, atol=1e-12)
+    torch.testing.assert_close(local, own, rtol=1e-6, atol=1e-11)
+    torch.testing.assert_close(predicted, decrease, rtol=1e-8, atol=0)
+    for part, other in zip(partly.information(), others.information(), strict=True):
+        assert torch.equal(part, other)
+    second = PartlyEliminated(others, items, first, cost)
+    assert partly.blend(torch.tensor(True), second) is second
+    assert partly.blend(torch.tensor(False), second) is partly
+
+
+# Dense normal equations.
+
+
+GENERATOR = torch.Generator().manual_seed(3)
+
+JACOBIAN = torch.randn(2, 9, 4, generator=GENERATOR, dtype=torch.float64) * torch.tensor([1e3, 1.0, 1e-3, 1.0])
+
+DENSE_RESIDUALS = torch.randn(2, 9, generator=GENERATOR, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("damping", [1e-9, 1e-3, 10.0])
+def test_a_parameter_without_effect_does_not_move(damping: float) -> None:
+    jacobian = JACOBIAN.clone()
+    jacobian[..., 1] = 0.0
+    plain = DenseLinearization(DENSE_RESIDUALS, jacobian)
+    torch.testing.assert_close(plain.cost, 0.5 * DENSE_RESIDUALS.square().sum(-1), rtol=1e-14, atol=0)
+    (step,), _ = plain.step(torch.full((2,), damping, dtype=torch.float64))
+    assert bool((step[:, 1] == 0).all())
+    assert bool((step[:, [0, 2, 3]] != 0).all())
+
+
+def test_the_undamped_step_is_that_of_least_squares() -> None:
+    (step,), decrease = DenseLinearization(DENSE_RESIDUALS, JACOBIAN).step(torch.zeros(2).double())
+    expected = torch.linalg.lstsq(JACOBIAN, -DENSE_RESIDUALS[..., None]).solution[..., 0]
+    torch.testing.assert_close(step, expected, rtol=1e-10, atol=0)
+    left = DENSE_RESIDUALS + (JACOBIAN @ step[..., None])[..., 0]
+    torch.testing.assert_close(decrease, 0.5 * (DENSE_RESIDUALS.square() - left.square()).sum(-1), rtol=1e-10, atol=0)
+
+
+def test_blending_takes_elements_from_both() -> None:
+    one, other = DenseLinearization(DENSE_RESIDUALS, JACOBIAN), DenseLinearization(2.0 * DENSE_RESIDUALS, JACOBIAN)
+    both = one.blend(torch.tensor([True, False]), other)
+    assert both.cost.tolist() == [other.cost[0].item(), one.cost[1].item()]
+
+
+# Batches whose elements stop at different times end as each of them alone does.
+
+
+STARTS = torch.tensor([[1.0, 1.0], [-1.2, 1.0], [-12.0, 10.0], [0.5, 2.0], [3.0, -4.0]], dtype=torch.float64)
+
+
+class Joint(DenseProblem):
+    """One that linearizes trial states."""
+
+    joint = True
+
+
+def test_trial_states_may_be_linearized() -> None:
+    """Where some elements of a batch accept a step and others do not, too: not a bit is different."""
+    usual = minimize(DenseProblem(rosenbrock, (5,)), (STARTS,))
+    joint = minimize(Joint(rosenbrock, (5,)), (STARTS,))
+    for name in ("cost", "status", "iterations", "history"):
+        assert torch.equal(getattr(joint, name), getattr(usual, name)), name
+    assert torch.equal(joint.state[0], usual.state[0])
+    accepted = usual.history[1:] < usual.history[:-1]
+    assert bool((accepted.any(1) & ~accepted.all(1)).any())
+    one = minimize(Joint(rosenbrock, ()), (STARTS[1],))
+    torch.testing.assert_close(one.state[0], torch.ones(2).double(), rtol=0, atol=1e-9)
+    assert int(one.iterations) == int(usual.iterations[1])
+
+
+class ScriptedBatch:
+    """Elements whose costs and promised decreases are given, trial by trial: (E, T) each."""
+
+    joint, residual_count = False, 1
+
+    def __init__(self, costs: Tensor, promised: Tensor) -> None:
+        self.costs, self.promised, self.trial = costs, promised, 0
+
+    def linearize(self, state: tuple[Tensor]) -> SimpleNamespace:
+        return SimpleNamespace(cost=torch.ones(len(self.costs)).double(), step=self.step)
+
+    def step(self, damping: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.zeros(len(self.costs)).double(), self.promised[:, self.trial]
+
+    def retract(self, state: tuple[Tensor], step: Tensor) -> tuple[Tensor]:
+        return state
+
+    def cost(self, state: tuple[Tensor]) -> Tensor:
+        self.trial += 1
+        return self.costs[:, self.trial - 1]
+
+    def select(self, elements: Tensor) -> ScriptedBatch:
+        smaller = ScriptedBatch(self.costs[elements], self.promised[elements])
+        smaller.trial = self.trial
+        return smaller
+
+
+@pytest.mark.parametrize(("promised", "steps"), [(5e-6, 20), (1e-9, 100)])
+def test_little_gain_is_counted_from_each_elements_own_costs(promised: float, steps: int) -> None:
+    """Three of four converge at once and are dropped; the last, which is not the first, gains little all the time."""
+    trials = torch.arange(1.0, 200.0, dtype=torch.float64)
+    costs = torch.stack([0.5 - 0 * trials, 0.5 - 0 * trials, 1.0 - 1e-9 * trials, 0.5 - 0 * trials])
+    decreases = torch.stack([0 * trials, 0 * trials, promised + 0 * trials, 0 * trials])
+    options = LMOptions(flatness=1e-6, residual_floor=0.0)
+    found = minimize(ScriptedBatch(costs, decreases), (torch.zeros(4, 1).double(),), options)  # type: ignore[arg-type,type-var]
+    assert found.status.tolist() == [SolverStatus.CONVERGED] * 2 + [SolverStatus.FLAT, SolverStatus.CONVERGED]
+    assert found.iterations.tolist() == [1, 1, steps, 1]
+    assert found.cost.tolist() == [0.5, 0.5, pytest.approx(1.0 - 1e-9 * steps, rel=1e-15), 0.5]
+    assert found.history.shape == (steps + 1, 4)
+
+
+@pytest.mark.parametrize(("promised", "steps"), [(5e-6, 20), (1e-9, 100)])
+def test_only_the_last_steps_count(promised: float, steps: int) -> None:
+    """Thirty steps gain much, each half of the cost; those after them little."""
+    costs = torch.cat([0.5 ** torch.arange(1.0, 31.0), torch.full((200,), 0.5**30)]).double()
+    costs = costs * (1.0 - 1e-9 * torch.arange(len(costs), dtype=torch.float64))
+    options = LMOptions(flatness=1e-6, residual_floor=0.0)
+    problem = ScriptedBatch(costs[None], promised * costs[None])
+    found = minimize(problem, (torch.zeros(1, 1).double(),), options)  # type: ignore[arg-type,type-var]
+    assert found.status.tolist() == [SolverStatus.FLAT]
+    assert found.iterations.tolist() == [30 + steps]
+
+
+# Robust losses: their values, and weights that are their derivatives.
+
+
+KINDS = ("huber", "cauchy", "tukey")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_weight_is_the_derivative_of_value(kind: str) -> None:
+    squared = torch.tensor([0.0, 0.3, 2.2, 2.3, 90.0], dtype=torch.float64, requires_grad=True)
+    loss = RobustLoss(kind=kind, scale=1.5)
+    (slope,) = torch.autograd.grad(loss.value(squared).sum(), squared)
+    torch.testing.assert_close(loss.weight(squared.detach()), slope, rtol=1e-12, atol=1e-14)
+    assert loss.weight(torch.zeros(1)).item() == 1.0
+    assert torch.autograd.gradcheck(loss.weight, squared)
+
+
+@pytest.mark.parametrize(
+    ("kind", "squared", "value", "weight"),
+    [
+        ("huber", 4.0, 4.0, 1.0),
+        ("huber", 9.0, 8.0, 2.0 / 3.0),
+        ("cauchy", 4.0, 4.0 * math.log(2.0), 0.5),
+        ("cauchy", 12.0, 4.0 * math.log(4.0), 0.25),
+        ("tukey", 1.0, 4.0 / 3.0 * (1.0 - 0.75**3), 0.75**2),
+        ("tukey", 4.0, 4.0 / 3.0, 0.0),
+        ("tukey", 400.0, 4.0 / 3.0, 0.0),
+    ],
+)
+def test_known_values(kind: str, squared: float, value: float, weight: float) -> None:
+    """For a scale of 2, worked out by hand."""
+    loss, place = RobustLoss(kind=kind, scale=2.0), torch.tensor([squared], dtype=torch.float64)  # type: ignore[arg-type]
+    assert loss.value(place).item() == pytest.approx(value, rel=1e-14)
+    assert loss.weight(place).item() == pytest.approx(weight, rel=1e-14)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_small_residuals_count_fully_and_nan_stays(kind: str) -> None:
+    loss = RobustLoss(kind=kind, scale=3.0)
+    # The next term of each series is s²/c² at most.
+    assert loss.value(torch.tensor([1e-6]).double()).item() == pytest.approx(1e-6, rel=1e-6)
+    assert loss.value(torch.tensor([torch.nan])).isnan().all()
+    assert loss.weight(torch.tensor([torch.nan])).isnan().all()
+
+
+def test_huber_with_a_scale_of_one_unless_told_otherwise() -> None:
+    assert RobustLoss() == RobustLoss(kind="huber", scale=1.0)
+
+
+@pytest.mark.parametrize("wrong", [{"kind": "square"}, {"scale": 0.0}, {"scale": -1.0}, {"scale": math.inf}])
+def test_what_cannot_be_is_refused(wrong: dict) -> None:
+    with pytest.raises(InputError, match="robust loss"):
+        RobustLoss(**wrong)

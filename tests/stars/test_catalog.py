@@ -1,4 +1,4 @@
-"""The catalogue in the package, and where its stars are seen."""
+"""The catalogue of stars, and chance matches."""
 
 from __future__ import annotations
 
@@ -9,9 +9,13 @@ import pytest
 
 from kcal.errors import InputError
 from kcal.lens.rig import Origin
-from kcal.stars.sky import _NAMES, Air, StarCatalog, celestial_directions, observed_directions, parse_time
+from kcal.stars.sky import _NAMES, Air, StarCatalog, _by_chance, celestial_directions, observed_directions, parse_time
+
+# The catalogue in the package, and where its stars are seen.
+
 
 SIRIUS, POLARIS = 2491, 424
+
 CATALOG = StarCatalog.bundled()
 
 
@@ -78,3 +82,20 @@ def test_refraction_lifts() -> None:
     bent = np.degrees(np.arcsin(observed_directions(CATALOG, time, place, Air(hectopascal=1013.0))[:, 2]))
     at_ten = np.abs(straight - 10.0) < 0.2
     assert 60 * (bent - straight)[at_ten].mean() == pytest.approx(5.3, abs=0.15)  # minutes of arc (Bennett 1982)
+
+
+# How probable it is that chance explains matches: what proves a name.
+
+
+def test_three_matches_are_those_of_the_triangle() -> None:
+    every = np.ones(6, bool)
+    # Three sizes are tried; all of six are met, three of them by chance.
+    assert _by_chance(every, 0.1) == pytest.approx(3 * 0.1**3)
+    assert _by_chance(every[:4], 0.1) == pytest.approx(0.1)
+    # One of four met beyond the triangle: that is the best that there is.
+    fainter = np.array([True, True, True, True, False, False])
+    assert _by_chance(fainter, 0.1) == pytest.approx(3 * 0.1)
+    assert _by_chance(~every, 0.1) == pytest.approx(3.0)
+    # Of five, two by chance, the first is not met: 1 - (1 - p)^1 at four, then the other sizes.
+    late = np.array([False, True, True, True, True])
+    assert _by_chance(late, 0.1) == pytest.approx(2 * (1 - 0.9**2))

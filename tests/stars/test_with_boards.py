@@ -1,11 +1,13 @@
-"""Boards and stars together: one posterior, and whether they contradict each other."""
+"""Stars together with boards, and in two images."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
+import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from typer.testing import CliRunner
@@ -16,13 +18,19 @@ from kcal.cli.main import app
 from kcal.errors import InputError
 from kcal.io.camera_file import load_camera
 from kcal.io.images import write_png
-from kcal.stars.detect import DetectedStars
+from kcal.lens.camera import Camera
+from kcal.stars.detect import DetectedStars, NightPlan, planned_stars
 from kcal.stars.lens import StarCamera, calibrate_by_stars, refine_by_stars
+from kcal.stars.lens_fit import StarField, fit_star_lens
 from kcal.stars.night import SkyView
+from kcal.stars.sky import StarCatalog, cache_folder, pair_table
 from scripts.shared.infinity import error_at_infinity
 from scripts.shared.night_scenes import PLACE, rendered
-from scripts.shared.star_lenses import SIZE, star_images, true_lens
+from scripts.shared.star_lenses import SIZE, lens_difference, star_images, true_lens
 from scripts.shared.traced import capture
+
+# Boards and stars together: one posterior, and whether they contradict each other.
+
 
 Night = tuple[list[DetectedStars], list[SkyView]]
 
@@ -131,3 +139,178 @@ def test_the_command(night: Night, tmp_path: Path) -> None:
     assert error_at_infinity(load_camera(output), true_lens()).rms < 0.1
     two = CliRunner().invoke(app, [command[0], command[1], command[1], *command[2:], "-o", str(tmp_path / "two")])
     assert "--stars are of one camera" in str(two.exception)
+
+
+# A lens from two images of the simulated sky, in a few seconds, and the table of pairs that names their stars.
+
+
+@pytest.fixture(scope="module")
+def found() -> StarCamera:
+    images, views = star_images(35.0, 2, seed=1)
+    told: list[str] = []
+    made = calibrate_by_stars(images, views, SIZE, focal=1100.0, progress=told.append)
+    # The image of most stars comes first; images are counted from one.
+    most = max(range(2), key=lambda number: len(images[number].pixels))
+    assert told[0] == f"search 1 of 3: image {most + 1}, focal length 1100 px"
+    assert [text for text in told if not text.startswith("search 1")] == ["names", "lens", "lens", "lens"]
+    return made
+
+
+def test_the_lens_is_found(found: StarCamera) -> None:
+    lens = found.lens
+    error = lens_difference(found)
+    assert np.sqrt((error**2).mean()) < 0.06
+    assert error.max() < 0.3
+    assert lens.rms_px == pytest.approx(0.1, rel=0.2)
+    # Of 178 stars with two coordinates: a scatter of 5 %.
+    assert lens.widened == pytest.approx(1.0, abs=0.15)
+    for residuals, used in zip(lens.residuals, lens.used, strict=True):
+        assert bool((residuals.abs().amax(-1) < 0.6)[used].all())
+        assert int((~used).sum()) <= 2
+
+
+def test_its_uncertainty(found: StarCamera) -> None:
+    known = found.lens.camera.calibration
+    assert known is not None
+    assert known.sigma is not None
+    for name in ("fx", "cx", "cy"):
+        place = found.lens.camera.names.index(name)
+        sigma = known.sigma[name]
+        assert sigma is not None
+        assert 0.05 < sigma < 0.6
+        assert abs(float(found.lens.camera.params[place] - true_lens().params[place])) < 3.5 * sigma
+    # Focal length, center, and as much of the field as some 180 stars tell.
+    assert 5 < found.lens.effective < 40
+
+
+def test_points_that_are_no_stars_get_no_names(found: StarCamera) -> None:
+    images, _ = star_images(35.0, 2, seed=1)
+    for image, star in zip(images, found.stars, strict=True):
+        assert 0.7 * (len(image.pixels) - 5) < len(star) <= len(image.pixels) - 5
+
+
+def test_all_pairs_of_bright_stars_are_in_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("KCAL_CACHE", str(tmp_path))
+    for field_deg, limit_deg in ((2.0, 3.0), (7.5, 7.0), (70.0, 60.0), (150.0, 60.0)):
+        table = pair_table(StarCatalog.bundled(), np.radians(field_deg))
+        assert len(table.pairs) == len(table.angle)
+        # Fewer stars take part for wide angles: some 700,000 pairs, each both ways.
+        assert len(table.angle) < 2 * 700_000 * 1.2
+        if table.stars < len(table.order):
+            assert len(table.angle) > 2 * 700_000 * 0.8
+        bright = min(150, table.stars)
+        angle = np.arccos(np.clip(table.directions[:bright] @ table.directions[:bright].T, -1, 1))
+        wanted = np.sort(angle[(angle < np.radians(limit_deg)) & ~np.eye(bright, dtype=bool)])
+        own = (table.pairs < bright).all(1)
+        np.testing.assert_allclose(np.sort(table.angle[own]), wanted, atol=1e-4)
+        assert np.all(np.diff(table.angle) >= 0)
+
+
+@pytest.mark.parametrize(
+    ("platform", "folder"),
+    [("win32", "AppData/Local/kcal"), ("darwin", "Library/Caches/kcal"), ("linux", ".cache/kcal")],
+)
+def test_folders_of_caches(platform: str, folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("KCAL_CACHE", "LOCALAPPDATA", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(Path, "home", lambda: tmp_path)
+    monkeypatch.setattr("sys.platform", platform)
+    assert cache_folder() == tmp_path / folder
+    monkeypatch.setenv("LOCALAPPDATA", "/local")
+    monkeypatch.setenv("XDG_CACHE_HOME", "/xdg")
+    assert str(cache_folder()) == {"win32": "/local/kcal", "linux": "/xdg/kcal"}.get(platform, str(tmp_path / folder))
+    monkeypatch.setenv("KCAL_CACHE", "/given")
+    assert str(cache_folder()) == "/given"
+
+
+# A lens from stars alone: simulated, of which nothing is known, and from six real images.
+
+
+REAL = Path(os.environ.get("KCAL_DATA", ""), "stars")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("focal", [None, 1100.0])
+def test_a_lens_from_stars(focal: float | None) -> None:
+    images, views = star_images(35.0, 6, seed=1)
+    found = calibrate_by_stars(images, views, SIZE, focal=focal)
+    assert found.images == tuple(range(6))
+    assert all(len(star) > 0.7 * (len(image.pixels) - 5) for star, image in zip(found.stars, images, strict=True))
+    assert found.lens.rms_px == pytest.approx(0.1, rel=0.15)
+    error = lens_difference(found)
+    assert np.sqrt((error**2).mean()) < 0.06
+    # The lens of an image without distortion would be off by 19 px in the corners.
+    assert error.max() < 0.3
+    known = found.lens.camera.calibration
+    assert known is not None
+    assert known.information is not None
+    assert known.sigma is not None
+    focal_sigma = known.sigma["fx"]
+    assert focal_sigma is not None
+    assert abs(float(found.lens.camera.params[0] - true_lens().params[0])) < 5 * focal_sigma
+
+
+def test_a_fisheye_of_which_nothing_is_known() -> None:
+    """140 degrees between the corners, which no pinhole has."""
+    lens = Camera.build(focal=(618, 618), center=(642, 396), size=SIZE, model="fisheye4")
+    lens = lens.with_parameters(lens.params.detach() + torch.tensor([0, 0, 0, 0, 0, -1 / 24, 0, 0, 0]).double())
+    images, views = star_images(50.0, 1, seed=1, lens=lens, faintest=4.4)
+    told: list[str] = []
+    found = calibrate_by_stars(images, views, SIZE, progress=told.append)
+    assert found.images == (0,)
+    assert found.lens.rms_px < 0.13
+    assert error_at_infinity(found.lens.camera, lens, columns=17, rows=11).rms < 0.2
+    assert "search 1 of 2: image 1, focal length" in told[0]
+
+
+def test_too_few_stars() -> None:
+    empty = torch.zeros(3, 3).double()
+    with pytest.raises(InputError, match="3 named stars tell no lens"):
+        fit_star_lens([StarField(empty, empty[:, :2], torch.ones(3).double())], [torch.eye(3).double()], SIZE, 900.0)
+    nothing = DetectedStars(np.empty((0, 2)), np.empty(0), np.empty(0), 0.0, {})
+    _, views = star_images(35.0, 1, seed=1)
+    with pytest.raises(InputError, match="in none of 1 images stars have names"):
+        calibrate_by_stars([nothing], views, SIZE)
+
+
+def test_planned_stars() -> None:
+    """More light and a darker sky give more stars; a level camera sees half of the sky."""
+    plans = {
+        name: planned_stars(NightPlan(focal_px=1600, size=(1920, 1080), aperture_mm=2.9, **more))
+        for name, more in {
+            "plain": {}, "short": {"seconds": 0.25}, "suburb": {"sky_magnitude": 18.0}, "up": {"altitude_deg": 45.0},
+        }.items()
+    }  # fmt: skip
+    plain = plans["plain"]
+    assert plans["short"].stars < 0.5 * plain.stars
+    assert plans["suburb"].stars < 0.7 * plain.stars
+    assert plans["up"].stars > 2 * plain.stars
+    assert plain.range_share(5000.0, 10.0, 1, 1.0) > 0.03
+    assert plain.range_share(5000.0, 10.0, 20) == pytest.approx(plain.range_share(5000.0, 10.0) / 20**0.5)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not REAL.is_dir(), reason="needs KCAL_DATA/stars")
+def test_six_real_images(tmp_path: Path) -> None:
+    """Names, lens and attitude on the Earth of a camera of which only time and place are known."""
+    camera = tmp_path / "camera.json"
+    place = ["--time", "name:Z"]
+    done = CliRunner().invoke(
+        app, ["calibrate", "--stars", str(REAL), *place, "--place", "52,4.37,0", "-o", str(camera)]
+    )
+    assert done.exit_code == 0, done.output
+    assert float(load_camera(camera).params[0]) == pytest.approx(5117, abs=3)
+    picture = tmp_path / "named.png"
+    where = ["--lat", "52", "--lon", "4.37", "--picture", str(picture), "--json"]
+    done = CliRunner().invoke(app, ["stars", str(REAL), "--camera", str(camera), *place, *where])
+    assert done.exit_code == 0, done.output
+    told = json.loads(done.stdout)["images"]
+    assert len(told) == 6
+    for image in told:
+        # Altitude and azimuth of the axis stand in the names, roughly.
+        altitude, azimuth = (float(part[3:]) for part in image["image"].split("_")[1:3])
+        assert image["pitch_deg"] == pytest.approx(altitude, abs=1.6)
+        assert (image["heading_deg"] - azimuth + 180) % 360 - 180 == pytest.approx(0.0, abs=1.2)
+        assert image["rms_px"] < 0.12
+        assert image["identified"] >= 7
+    assert picture.stat().st_size > 10_000

@@ -1,22 +1,39 @@
-"""Messages about a board: products, evidence and turns are those of dense Gaussians."""
+"""Boards: their prior, bending, and fleets of cameras that saw one."""
 
 from __future__ import annotations
 
+import functools
 import math
+import os
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from standing_views import quadratic, standing
 from torch import Tensor
 
+from kcal.calibrate.camera.calibrate import calibrate_camera
+from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult
 from kcal.calibrate.hybrid.board_modes import board_modes, find_turns, mode_turn, turned, turned_corners
-from kcal.calibrate.hybrid.families import BOARD, typical_hyperprior
+from kcal.calibrate.hybrid.cameras_fit import fleet_priors, hyper_likelihood
+from kcal.calibrate.hybrid.evidence import maximize_evidence, negative_log_evidence
+from kcal.calibrate.hybrid.families import BOARD, Hyperprior, PriorFamilies, typical_hyperprior
 from kcal.calibrate.hybrid.measured_board import BoardPrior, evidence, printed_board, printed_prior
 from kcal.corners.board import Board
+from kcal.corners.observations import Observations
 from kcal.gaussian import Gaussian, numbered
 from kcal.lens.information import BOARD_SLOT
+from scripts.shared.infinity import error_at_infinity
+from scripts.shared.simulated import Simulated, bends, simulated, terms
+
+# Messages about a board: products, evidence and turns are those of dense Gaussians.
+
 
 F64 = torch.float64
+
 BOARD_86 = Board(columns=8, rows=6, square=0.03)
+
 MODES = board_modes(BOARD_86.points)
 
 
@@ -149,3 +166,178 @@ def test_views_are_turned_to_a_known_board() -> None:
     a = 5e-4 * MODES.unit * normal(28, seed=13)
     known = Gaussian.independent(numbered(BOARD_SLOT, 28), a, 1e-5 * MODES.unit)
     assert torch.equal(find_turns(linear_views(a, turns, 30), BOARD_86, known, lens, 1.0), turns)
+
+
+# A board that bends from view to view: found where it does, told from motion, and named.
+
+
+SIGMA = 0.08
+
+# Seed, whether by hand, millimeters by which the board bends, and in what share of the views.
+CASES = {
+    "stand": (1, False, 0.0, 1.0),
+    "bent": (1, False, 1.0, 1.0),
+    "few": (1, False, 3.0, 0.2),
+    "both": (2, True, 1.0, 1.0),
+    "hand": (2, True, 0.0, 1.0),
+}
+
+
+@functools.cache
+def case(name: str) -> Simulated:
+    seed, by_hand, bent, share = CASES[name]
+    return simulated(seed, 20, SIGMA, by_hand, bent=1e-3 * bent, share=share)
+
+
+@functools.cache
+def found(name: str, bending: bool = True) -> CameraCalibrationResult:
+    return calibrate_camera(case(name).seen, CalibrationOptions(bending=bending))
+
+
+def said(result: CameraCalibrationResult) -> list[str]:
+    return [text for text in result.warnings if "the board bends" in text]
+
+
+@pytest.mark.parametrize(
+    ("name", "wanted"),
+    [("stand", []), ("bent", ["bending"]), ("few", ["bending"]), ("both", ["motion", "bending"]), ("hand", ["motion"])],
+)
+def test_what_views_do_is_told_by_the_evidence(name: str, wanted: list[str]) -> None:
+    fit = found(name).hybrid
+    assert fit is not None
+    assert terms(fit) == wanted
+    assert len(said(found(name))) == ("bending" in wanted)
+    assert fit.sigma == pytest.approx(SIGMA, rel=0.1 if name != "both" else 0.6)
+
+
+def test_bending_is_taken_out() -> None:
+    """The camera is nearer the truth than that of a board that is held to be stiff; heights are those of the views."""
+    fit, stiff = found("bent").hybrid, found("bent", bending=False).hybrid
+    assert fit is not None
+    assert fit.bends is not None
+    assert stiff is not None
+    assert stiff.bends is None
+    off, other = (error_at_infinity(one.camera, case("bent").lens).rms for one in (fit, stiff))
+    assert off < 0.7 * other
+    true = bends(20, 1e-3, 1.0, torch.Generator().manual_seed(9001))
+    # A shape that all views share, and a plane in each, are no bending by view.
+    flat = torch.cat([case("bent").seen.board.points[:, :2], torch.ones(true.shape[1], 1).double()], 1)
+    basis, _ = torch.linalg.qr(flat)
+    ours, theirs = (
+        (one - one.mean(0)) @ (torch.eye(len(basis)).double() - basis @ basis.T) for one in (fit.bends, true)
+    )
+    assert float((ours - theirs).square().mean().sqrt()) < 0.2 * float(theirs.square().mean().sqrt())
+    again = fit.residuals_of(case("bent").seen.pixels())
+    torch.testing.assert_close(again, fit.residuals, rtol=0, atol=1e-9, equal_nan=True)
+
+
+def test_a_few_views_do_not_loosen_the_others() -> None:
+    """They have large factors of their own, and are named."""
+    result = found("few")
+    fit = result.hybrid
+    assert fit is not None
+    assert fit.relative is not None
+    bent = bends(20, 3e-3, 0.2, torch.Generator().manual_seed(9001)).abs().amax(1) > 0.0
+    assert int(bent.sum()) == 4
+    assert float(fit.relative[bent].min()) > 2.0
+    assert float(fit.relative[~bent].max()) < 1.0
+    (text,) = said(result)
+    assert f"most in {int(bent.sum())} of 20 views" in text
+    assert all(result.observations.names[i] in text for i in bent.nonzero()[:, 0].tolist())
+    # Views are refitted as they were: a part of them keeps its own factors.
+    part = fit.only([3, 5])
+    torch.testing.assert_close(part.own_stillness, fit.own_stillness[[3, 5]])
+
+
+def real(name: str) -> Observations:
+    path = Path(os.environ.get("KCAL_DATA", "")) / f"captures/{name}.obs.json"
+    if not path.exists():
+        pytest.skip("KCAL_DATA has no such capture")
+    return Observations.load(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "wanted", "noise"),
+    [("camodocal", ["motion", "bending"], 0.04), ("carnd18", ["bending"], 0.3), ("st1_r", ["motion"], 0.06)],
+)
+def test_captures_of_strangers(name: str, wanted: list[str], noise: float) -> None:
+    """Boards that bend, of a car's fisheye and on a wall: no second camera is blamed for it, nor a shutter alone."""
+    result = calibrate_camera(real(name))
+    assert result.hybrid is not None
+    assert terms(result.hybrid) == wanted
+    assert result.hybrid.sigma < noise
+    assert len(said(result)) == ("bending" in wanted)
+    assert not any("not of one camera" in text for text in result.warnings)
+
+
+# What cameras of one type have in common is learned from them.
+
+
+TYPICAL = Hyperprior(torch.tensor([0.0, -7.0], dtype=F64), torch.tensor([1.5, 2.0], dtype=F64))
+
+
+def cameras(count: int, information: float, seed: int) -> tuple[list[Gaussian], torch.Tensor]:
+    """Cameras whose h scatter by .2 about (2, -9), each known to 1 / √information."""
+    generator = torch.Generator().manual_seed(seed)
+    true = torch.tensor([2.0, -9.0], dtype=F64) + 0.2 * torch.randn(count, 2, generator=generator, dtype=F64)
+    seen = true + torch.randn(count, 2, generator=generator, dtype=F64) / math.sqrt(information)
+    sigma = torch.full((2,), 1.0 / math.sqrt(information), dtype=F64)
+    return [Gaussian.independent((0, 1), h, sigma) for h in seen], true
+
+
+def test_many_cameras_tell_their_type() -> None:
+    told, true = cameras(100, 25.0, 1)
+    found, each = fleet_priors(told, TYPICAL)
+    torch.testing.assert_close(found.mean, true.mean(0), rtol=0, atol=0.1)
+    # The spread of the cameras (.2), not that of their noisy estimates (.28).
+    assert bool((found.sd > 0.16).all() & (found.sd < 0.25).all())
+    # Without itself each knows nearly as much.
+    assert bool((torch.stack([prior.mean for prior in each]) - found.mean).abs().max() < 0.01)
+
+
+def test_few_cameras_are_wide() -> None:
+    """Five predict the sixth: over many draws its distance is as large as said, not smaller; three tell no spread."""
+    squares = []
+    for seed in range(100):
+        told, true = cameras(6, 1e4, seed)
+        found, _ = fleet_priors(told[:5], TYPICAL)
+        squares.append(((true[5] - found.mean) / found.sd).square())
+    assert 0.5 < float(torch.stack(squares).mean()) < 1.3
+    for prior in fleet_priors(cameras(2, 1e4, 0)[0], TYPICAL)[1]:
+        assert prior is TYPICAL
+
+
+def test_blind_cameras_tell_nothing() -> None:
+    blind = Gaussian((0, 1), torch.zeros(2, dtype=F64), torch.zeros(0, 3, dtype=F64))
+    found, _ = fleet_priors([blind] * 6, TYPICAL)
+    torch.testing.assert_close(found.mean, TYPICAL.mean, rtol=0, atol=1e-6)
+    torch.testing.assert_close(found.sd, TYPICAL.sd, rtol=1e-6, atol=0)
+
+
+def test_likelihood_of_hyperparameters() -> None:
+    """At the maximum of the posterior the likelihood's slope is against the hyperprior's, and its Hessian is right."""
+    generator = torch.Generator().manual_seed(3)
+    count = 40
+    index = torch.arange(count) % 2
+    none = torch.full((count,), -1)
+    zero = torch.zeros(count, dtype=F64)
+    families = PriorFamilies(zero, zero, index, none, zero)
+    x = torch.exp(TYPICAL.mean + 1.0)[index] * torch.randn(count, generator=generator, dtype=F64)
+    A = 100.0 * torch.randn(300, count, generator=generator, dtype=F64)
+    target = A @ x + 0.1 * torch.randn(300, generator=generator, dtype=F64)
+    data = quadratic(A, target, zero)
+    h, variance = TYPICAL.mean, 0.02
+    for _ in range(3):
+        h, _, variance, _ = maximize_evidence(standing(data), families, h, variance, TYPICAL)
+    found = hyper_likelihood(data, families, h, variance)
+    # Of a spread known from n draws the log has information 2 n.
+    told = found.placed(found.slots, h).products
+    torch.testing.assert_close(told.diagonal()[:2], torch.full((2,), 40.0, dtype=F64), rtol=0.35, atol=0)
+    slope = told[:2, 2]
+    torch.testing.assert_close(slope, (TYPICAL.mean - h) / TYPICAL.sd.square(), rtol=0, atol=0.05)
+    at = np.append(h.numpy(), math.log(variance))
+    value = negative_log_evidence(data, families, at)[0]
+    step = np.array([0.1, 0.0, 0.0])
+    there = negative_log_evidence(data, families, at + step)[0]
+    predicted = 0.1 * float(slope[0]) + 0.005 * float(told[0, 0])
+    assert abs(there - value - predicted) < 0.05

@@ -1,31 +1,44 @@
-"""The evidence of lens, board and motions against the density of the residuals, written out; its gradient."""
+"""Evidence, amplitudes and unknowns of the default lens."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 import torch
-from scipy import stats
+from scipy import integrate, stats
 
 from kcal.calibrate.hybrid.evidence import (
     EvidenceLoss,
     Maximum,
     ViewData,
     evidence_of_motion,
+    expected_amplitudes,
     hyper_bounds,
     maximize_evidence,
     relative_bends,
     view_data,
 )
 from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies
+from kcal.calibrate.hybrid.fitted_views import hybrid_problem, hybrid_unknowns
 from kcal.calibrate.problem.state import AMPLITUDES, MEDIAN, MOTION, SPREAD
+from kcal.corners.board import Board
+from kcal.lens.hybrid_terms import HybridForm
+from kcal.lens.model import LensModel
+from kcal.lens.zernike import ZernikeModes
 from kcal.solve.schur import Products
 
+# The evidence of lens, board and motions against the density of the residuals, written out; its gradient.
+
+
 F64 = torch.float64
+
 VIEWS, ROWS, UNKNOWNS = 3, 20, 5
+
 PRIOR = Hyperprior(torch.tensor([0.2, -0.5], dtype=F64), torch.tensor([1.5, 2.0], dtype=F64))
+
 # Two unknowns of one amplitude, one of the other with a decay, one that is given.
 FAMILIES = PriorFamilies(
     mean=torch.zeros(UNKNOWNS, dtype=F64),
@@ -34,6 +47,7 @@ FAMILIES = PriorFamilies(
     decay=torch.tensor([-1, -1, 0, -1, -1]),
     degree=torch.tensor([0.0, 0.0, 0.7, 0.0, 0.0], dtype=F64),
 )
+
 # h, logarithms of the ratios, ln σ².
 AT = np.array([0.4, -0.3, 0.2, -0.4, 0.1, 0.5, -0.6])
 
@@ -182,3 +196,111 @@ def test_bounds_of_hyperparameters() -> None:
     assert hyper_bounds(PRIOR, 0, -3.0)[0] == (0.2 - 7.5, 0.2 + 7.5)
     # No noise below a thousandth of a pixel.
     assert hyper_bounds(PRIOR, 0, -8.0)[-1] == pytest.approx((2.0 * math.log(1e-3), None))
+
+
+# The mean square of an amplitude, over what views leave of it, is the variance of modes that they do not tell.
+
+
+WIDE: list[tuple[float, float | None]] = [(-12.0, 12.0), (-12.0, 12.0), (-40.0, None)]
+
+Loss = Callable[[np.ndarray], tuple[float, np.ndarray]]
+
+
+def bend(loss: Loss, at: np.ndarray) -> np.ndarray:
+    """The Hessian."""
+    steps = 1e-4 * np.eye(len(at))
+    return np.stack([loss(at + step)[1] - loss(at - step)[1] for step in steps]) / 2e-4
+
+
+def weights_seen(sizes: list[float], sigma: float) -> Loss:
+    """-ln p of ln A where modes of weights ~ N(0, A²) were each seen with an error of σ, under a broad prior."""
+    squares = float(np.square(sizes).sum())
+
+    def loss(v: np.ndarray) -> tuple[float, np.ndarray]:
+        variance = math.exp(2.0 * v[0]) + sigma**2
+        value = 0.5 * (len(sizes) * math.log(variance) + squares / variance) + 0.5 * float(v @ v) / 4.0
+        slope = v / 4.0
+        slope[0] += math.exp(2.0 * v[0]) * (len(sizes) / variance - squares / variance**2)
+        return value, slope
+
+    return loss
+
+
+def values_of(loss: Loss) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda many: np.array([loss(v)[0] for v in many])
+
+
+def smallest(loss: Loss) -> np.ndarray:
+    places = np.linspace(-8.0, 4.0, 4001)
+    best = min(places, key=lambda x: loss(np.array([x, 0.0, 0.0]))[0])
+    return np.array([best, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("sizes", [[1.0, -0.8, 1.2, 0.7, -1.1], [0.3, -0.1, 0.2], [0.01, 0.02]])
+def test_mean_square_is_that_of_the_integral(sizes: list[float]) -> None:
+    """Where the amplitude is well determined, where it is not, and where nothing but an upper bound is known."""
+    loss = weights_seen(sizes, 0.2)
+    at = smallest(loss)
+    found = expected_amplitudes(bend(loss, at), values_of(loss), at, [0], WIDE)
+
+    def density(x: float, power: float) -> float:
+        return math.exp(loss(at)[0] - loss(np.array([x, 0.0, 0.0]))[0] + power * x)
+
+    total, square = (integrate.quad(density, -12.0, 8.0, args=(p,), limit=200)[0] for p in (0.0, 2.0))
+    # Nine places along a skewed density: the smallest case is the widest.
+    assert found[0] == pytest.approx(0.5 * math.log(square / total), abs=0.15)
+    assert found[0] > at[0]
+    assert found[1:].tolist() == at[1:].tolist()
+
+
+def test_others_follow() -> None:
+    """Two amplitudes of which only the sum of the logarithms is known well: the trial of one takes the other along."""
+    precision = np.linalg.inv(np.array([[1.0, -0.9], [-0.9, 1.0]]))
+
+    def loss(v: np.ndarray) -> tuple[float, np.ndarray]:
+        return 0.5 * float(v @ precision @ v), precision @ v
+
+    found = expected_amplitudes(precision, values_of(loss), np.zeros(2), [0, 1], WIDE[:2])
+    # ln A has a variance of 1 each: ½ ln <A²> = 1.
+    assert found == pytest.approx([1.0, 1.0], abs=0.02)
+
+
+def test_bounds_hold() -> None:
+    loss = weights_seen([0.01, 0.02], 0.2)
+    at = smallest(loss)
+    top = float(at[0]) + 0.4
+    found = expected_amplitudes(bend(loss, at), values_of(loss), at, [0], [(-12.0, top), *WIDE[1:]])
+    assert at[0] - 1.0 < found[0] <= top
+
+
+# Which parameters are one unknown, and that priors stand where these unknowns do.
+
+
+MODEL = LensModel(hybrid=HybridForm(shape=0.5, radius=0.6, modes=ZernikeModes()))
+
+SIZE = MODEL.size
+
+
+def test_square_pixels_have_one_focal_length() -> None:
+    """fx and fy are the first unknown; the principal point, the coefficients follow; a second focal length is last."""
+    square, others = hybrid_unknowns(MODEL), hybrid_unknowns(MODEL, square=False)
+    names = [0, 1, 2, 3, *range(5, 5 + SIZE)]  # without the skew
+    assert list(square.indices) == list(others.indices) == names
+    assert list(square.slots) == [0, 0, *range(1, 3 + SIZE)]
+    assert list(others.slots) == [0, 3 + SIZE, *range(1, 3 + SIZE)]
+
+
+def test_priors_are_of_the_unknowns_that_are_not_held() -> None:
+    board = Board(columns=4, rows=3, square=0.1)
+    shapes = torch.zeros(2, 3, board.corners, dtype=torch.float64)
+    pixels = torch.zeros(1, board.corners, 2, dtype=torch.float64)
+    count = 3 + SIZE + 2
+    mean = torch.arange(count, dtype=torch.float64)
+    precision = torch.full((count,), 4.0, dtype=torch.float64)
+    precision[[1, -1]] = torch.inf
+    problem = hybrid_problem(board.points, shapes, pixels, torch.ones(1, board.corners), MODEL, mean, precision)
+    (prior,) = problem.terms
+    # cx is held, and the last mode of the board.
+    assert prior.index.tolist() == [0, 3, *range(5, 5 + SIZE), 5 + SIZE]  # type: ignore[attr-defined]
+    assert prior.mean.tolist() == [0.0, *mean[2:-1].tolist()]  # type: ignore[attr-defined]
+    assert prior.weight.tolist() == [2.0] * (count - 2)  # type: ignore[attr-defined]

@@ -1,15 +1,25 @@
-"""Steps along twists, barriers before folds, and priors as residuals."""
+"""Terms of the board problem, weights, and robust losses."""
 
 from __future__ import annotations
 
 import pytest
 import torch
+from calibrate_scenes import BOARD, camera, motions, observe, pixels_of
 from torch import Tensor
 
-from kcal.calibrate.problem.board_problem import apply_twist
+from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+from kcal.calibrate.problem.board_problem import BoardProblem, apply_twist
 from kcal.calibrate.problem.parameters import FoldBarrier, GaussianPrior, Term
+from kcal.calibrate.problem.state import BoardState
+from kcal.calibrate.problem.views import free_parameters, whitening
+from kcal.corners.observations import Observations
+from kcal.errors import InputError
 from kcal.lens.model import LensModel
 from kcal.lens.pose import rotation_from_vector
+from kcal.solve.lm import LMOptions, minimize
+from kcal.solve.problem import RobustLoss
+
+# Steps along twists, barriers before folds, and priors as residuals.
 
 
 @pytest.mark.parametrize("size", [1e-7, 0.0099, 0.0101, 0.3, 3.0])
@@ -136,3 +146,160 @@ def test_a_barrier_counts_in_proportion_to_its_weight_and_grows_towards_the_fold
     q = 1.0 + 2.0 * -0.32 / (1.0 - 0.32)
     rows = FoldBarrier(model, 1.0, 0.1).rows(barrier_values(model, {"k1": -0.32}))
     assert float(rows[-1].max()) == pytest.approx(0.1 * torch.log(torch.tensor(0.1 / q)).item(), rel=1e-5)
+
+
+# Robust losses, and a focal length given as a hint.
+
+
+KINDS = ("huber", "cauchy", "tukey")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_wrong_corners_hardly_matter(kind: str) -> None:
+    """Two of a hundred corners are 15 px off: plain least squares is thrown off ten times as far."""
+    truth = camera()
+    poses = motions(truth, 12, 5)
+    pixels = pixels_of(truth, poses, noise=0.1, seed=2)
+    clean = calibrate_camera(observe(pixels), CalibrationOptions(model="opencv5")).camera.params
+    generator = torch.Generator().manual_seed(3)
+    wrong = torch.rand(pixels.shape[:2], generator=generator) < 0.02
+    pixels[wrong] += torch.where(pixels[wrong] < 460.0, 15.0, -15.0)  # within the image
+    spoilt = calibrate_camera(observe(pixels), CalibrationOptions(model="opencv5")).camera.params
+    result = calibrate_camera(
+        observe(pixels), CalibrationOptions(model="opencv5", loss=RobustLoss(kind=kind, scale=0.4))
+    )
+    robust = result.camera.params
+    assert float((robust - clean)[:4].norm()) < 0.1 * float((spoilt - clean)[:4].norm())
+    assert result.weighted_rms is not None
+    assert result.weighted_rms < 0.5 * result.rms
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_solver_stops_where_the_robust_cost_is_flat(kind: str) -> None:
+    """Its gradient by autograd through the residuals, not through the rows that the solver used."""
+    truth = camera()
+    poses = motions(truth, 6, 5)
+    pixels = pixels_of(truth, poses, noise=0.1, seed=2)
+    pixels[0, 3] += 2.0
+    loss = RobustLoss(kind=kind, scale=0.3)
+    problem = BoardProblem(BOARD.points, pixels, truth.model, free_parameters(truth.model), loss=loss)
+    start = BoardState.flat(truth.params.detach(), *poses)
+    result = minimize(problem, start, LMOptions(tolerance=1e-15))
+    steps = (torch.zeros(problem.shared_size).double(), torch.zeros(6, 6).double())
+
+    def cost(*step: torch.Tensor) -> torch.Tensor:
+        return problem.cost(problem.retract(result.state, step))
+
+    gradient = torch.func.grad(cost, argnums=(0, 1))(*steps)
+    before = torch.func.grad(lambda *step: problem.cost(problem.retract(start, step)), argnums=(0, 1))(*steps)
+    for now, then in zip(gradient, before, strict=True):
+        assert float(now.norm()) < 1e-4 * float(then.norm())
+
+
+def test_a_focal_hint_is_tried_first_and_changes_nothing_else() -> None:
+    truth = camera()
+    seen = observe(pixels_of(truth, motions(truth, 10, 5), noise=0.1, seed=2))
+    plain = calibrate_camera(seen, CalibrationOptions(model="opencv5"))
+    for focal in (350.0, 500.0, 800.0):
+        hinted = calibrate_camera(seen, CalibrationOptions(model="opencv5", focal=focal))
+        assert hinted.rms == pytest.approx(plain.rms, rel=1e-9)
+        torch.testing.assert_close(hinted.camera.focal, plain.camera.focal, rtol=1e-6, atol=0)
+
+
+def test_refusals() -> None:
+    with pytest.raises(InputError, match="focal must be positive"):
+        CalibrationOptions(model="opencv5", focal=-3.0)
+
+
+def with_covariance(seen, sigma):
+    """The observations with a covariance of sigma² (V,) for each view's corners."""
+    views = []
+    for view, value in zip(seen.views, sigma.tolist(), strict=True):
+        spread = tuple(None if pixel is None else (value**2, 0.0, value**2) for pixel in view.pixels)
+        views.append(view.model_copy(update={"covariance": spread}))
+    return Observations.model_validate(seen.model_copy(update={"views": tuple(views)}).model_dump())
+
+
+def mixed(seed):
+    """Views of which every second one is ten times as blurred, and what is known about that."""
+    truth = camera()
+    poses = motions(truth, 12, seed)
+    sigma = torch.where(torch.arange(12) % 2 == 0, 0.02, 0.3).double()
+    exact = pixels_of(truth, poses)
+    noise = torch.randn(exact.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return truth, with_covariance(observe(exact + sigma[:, None, None] * noise), sigma)
+
+
+def test_weights_follow_the_covariances():
+    generator = torch.Generator().manual_seed(0)
+    root = torch.randn(3, 5, 2, 2, generator=generator, dtype=torch.float64)
+    covariances = root @ root.mT + 0.1 * torch.eye(2, dtype=torch.float64)
+    own = float(covariances.diagonal(dim1=-2, dim2=-1).mean())
+    W = whitening(covariances, own + 0.3)
+    product = W @ (covariances + 0.3 * torch.eye(2, dtype=torch.float64)) @ W.mT
+    scale = product[0, 0, 0, 0]
+    torch.testing.assert_close(product, scale * torch.eye(2).double().expand_as(product), rtol=1e-12, atol=1e-12)
+    assert float((W.mT @ W).diagonal(dim1=-2, dim2=-1).mean()) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_equal_covariances_change_nothing():
+    truth = camera()
+    seen = observe(pixels_of(truth, motions(truth, 6, 1), noise=0.1))
+    plain = calibrate_camera(seen, CalibrationOptions(model="opencv5"))
+    weighted = calibrate_camera(with_covariance(seen, torch.full((6,), 0.05)), CalibrationOptions(model="opencv5"))
+    # Both stop at a minimum found to 1e-12 of its cost, which is flat: parameters to 1e-6 of their σ.
+    torch.testing.assert_close(weighted.camera.params, plain.camera.params, rtol=1e-6, atol=1e-6)
+    assert weighted.rms == pytest.approx(plain.rms, rel=1e-12)
+    assert weighted.weighted_rms == pytest.approx(plain.rms, rel=1e-9)
+    assert plain.weighted_rms is None
+
+
+def test_weights_beat_no_weights_and_know_their_error():
+    error = {True: [], False: []}
+    pull = []
+    for seed in range(4):
+        truth, seen = mixed(seed)
+        for weighted in (True, False):
+            result = calibrate_camera(seen, CalibrationOptions(model="opencv5", weighted=weighted))
+            away = result.camera.params[:4] - truth.params[:4]
+            error[weighted].append(away)
+            if weighted:
+                pull.append(away / torch.tensor([result.sigma[name] for name in ("fx", "fy", "cx", "cy")]))
+                # The plain RMS stays OpenCV's: 0.3 px in half of the views, two axes.
+                assert result.rms == pytest.approx(0.3, rel=0.15)
+                assert result.weighted_rms < 0.5 * result.rms
+    good, bad = (torch.stack(error[key]).square().mean().sqrt() for key in (True, False))
+    assert float(good) < 0.4 * float(bad)
+    # 16 numbers, of which four at a time depend on each other.
+    assert 0.4 < float(torch.stack(pull).square().mean().sqrt()) < 1.8
+
+
+def test_rows_are_the_derivatives_of_weighted_residuals():
+    truth = camera()
+    rotation, translation = motions(truth, 3, 2)
+    pixels = pixels_of(truth, (rotation, translation), noise=0.2)
+    pixels[1, 4] = torch.nan
+    root = torch.randn(*pixels.shape, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    weights = torch.where(torch.isnan(pixels)[..., None], torch.nan, root)
+    board = observe(pixels).board.points
+    free = [0, 1, 2, 3, 5, 6]
+    problem = BoardProblem(board, pixels, truth.model, free, weights=weights)
+    state = BoardState.flat(
+        truth.params.detach() + 0.01,
+        rotation_from_vector(torch.full((3, 3), 1e-3, dtype=torch.float64)) @ rotation,
+        translation + 1e-3,
+    )
+    errors = problem.pixel_errors(state).mT  # (V, N, 2)
+    by_hand = (torch.nan_to_num(weights) @ errors[..., None])[..., 0]
+    torch.testing.assert_close(problem.residuals(state), by_hand.mT.flatten(-2), rtol=1e-12, atol=1e-12)
+    rows = problem.rows(state)
+    torch.testing.assert_close(rows[:, -1], problem.residuals(state), rtol=1e-12, atol=1e-12)
+    step = 1e-6
+    for k in range(problem.shared_size):
+        shared, local = torch.zeros(problem.shared_size).double(), torch.zeros(3, 6).double()
+        shared[k] = step * max(1.0, float(state.parameters[free[k]]))
+        plus = problem.residuals(problem.retract(state, (shared, local)))
+        minus = problem.residuals(problem.retract(state, (-shared, local)))
+        difference = (plus - minus) / (2 * shared[k])
+        # Central differences: 1e-16 x residuals of 1 over steps of 1e-6.
+        torch.testing.assert_close(rows[:, 6 + k], difference, rtol=1e-6, atol=1e-6 * float(difference.abs().max()))
