@@ -23,7 +23,7 @@ from kcal.lens.camera import Camera
 from kcal.sim.captures import board_points
 from scripts.shared.captures import PAPER_BOARD, capture_corners
 from scripts.shared.infinity import error_at_infinity
-from scripts.shared.page import table, write_section
+from scripts.shared.page import table, tell
 from scripts.shared.timing import show
 from scripts.shared.traced import BOARD, as_observations
 from scripts.shared.views import TRUTH
@@ -91,9 +91,7 @@ def main() -> None:
         "",
         *table(header, rows),
     ]
-    show(lines)
-    if arguments.write:
-        write_section("one-camera.md", "exact-models", "\n".join(lines))
+    tell("one-camera.md", "exact-models", lines, write=arguments.write)
 
 
 if __name__ == "__main__":

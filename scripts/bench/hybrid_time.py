@@ -28,7 +28,7 @@ from kcal.corners.board import Board
 from scripts.bench import solver
 from scripts.shared.memory import peak_megabytes
 from scripts.shared.mrcal_spline import splined
-from scripts.shared.page import table, write_section
+from scripts.shared.page import table, tell
 from scripts.shared.timing import show
 from scripts.shared.views import COLUMNS, ROWS, SIZE, SQUARE, observed, simulate
 
@@ -127,9 +127,7 @@ def main() -> None:
             rows.append([str(cell) for cell in compare(views, arguments.repeats, arguments.timeout)])
             show([" | ".join(rows[-1])])
         lines, section = table([*header, "peak memory of the default"], rows), "time"
-    show(lines)
-    if arguments.write:
-        write_section("one-camera.md", section, "\n".join(lines))
+    tell("one-camera.md", section, lines, write=arguments.write)
 
 
 if __name__ == "__main__":

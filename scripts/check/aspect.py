@@ -21,10 +21,9 @@ import torch
 
 from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.errors import KcalError
-from scripts.shared.page import table, write_section
+from scripts.shared.page import table, tell
 from scripts.shared.records import Record, finish, read, seeds
 from scripts.shared.simulated import simulated
-from scripts.shared.timing import show
 
 PAGE = "ordinary.md"
 SAID = "pixels are not square"
@@ -90,9 +89,7 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.seeds is not None:
         finish(arguments.out[0], [(arguments.stretch, seed) for seed in arguments.seeds], judged, line)
-    text = show(lines(read(arguments.out)))
-    if arguments.write:
-        write_section(PAGE, "aspect", "\n".join(text))
+    tell(PAGE, "aspect", lines(read(arguments.out)), write=arguments.write)
 
 
 if __name__ == "__main__":

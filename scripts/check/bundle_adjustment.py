@@ -25,10 +25,9 @@ import torch
 from kcal import Camera, calibrate_camera
 from kcal.calibrate.camera.calibrate import CalibrationOptions
 from kcal.lens import export_cameras
-from scripts.shared.page import table, write_section
+from scripts.shared.page import table, tell
 from scripts.shared.records import seeds
 from scripts.shared.simulated import simulated
-from scripts.shared.timing import show
 from scripts.shared.views import observed, simulate
 
 PAGE = Path(__file__).parents[2] / "docs" / "howto" / "bundle-adjustment.md"
@@ -243,9 +242,7 @@ def main() -> None:
         rows.append([*key, *(f"{value:.3f}" for value in reprojection), *(f"{value:.3g}" for value in error)])
     heads = ["true lens", "scene", "program", *(f"{way}: reprojection, px" for way in WAYS),
              *(f"{way}: structure, ‰" for way in WAYS)]  # fmt: skip
-    lines = show(table(heads, rows))
-    if args.write:
-        write_section("other-programs.md", "bundle adjustment", "\n".join(lines))
+    tell("other-programs.md", "bundle adjustment", table(heads, rows), write=args.write)
 
 
 if __name__ == "__main__":

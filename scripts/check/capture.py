@@ -37,8 +37,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.sim.captures import BoardPose, BoardSize, sample_board_poses
 from kcal.sim.scene import RenderOptions, render_board
-from scripts.shared.page import table, write_section
-from scripts.shared.timing import show
+from scripts.shared.page import table, tell
 
 BOARD = Board(columns=9, rows=6, square=0.025)
 PRINT = BoardSize(BOARD.columns, BOARD.rows, BOARD.square)
@@ -163,9 +162,7 @@ def main() -> None:
                     file.write(json.dumps(records[-1]) + "\n")
                 print(json.dumps(records[-1]), flush=True)
     lines = tables(records)
-    show(lines)
-    if arguments.write:
-        write_section("ordinary.md", "capture", "\n".join(lines))
+    tell("ordinary.md", "capture", lines, write=arguments.write)
 
 
 if __name__ == "__main__":

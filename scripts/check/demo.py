@@ -25,8 +25,7 @@ from kcal.cli.demo_run import simulated_site
 from kcal.io.rig_file import load_rig
 from kcal.locate.positions import locate_points, position_errors
 from kcal.sim.scene import DemoScene
-from scripts.shared.page import table, write_section
-from scripts.shared.timing import show
+from scripts.shared.page import table, tell
 
 
 def outcome(seed: int) -> dict[str, Any]:
@@ -93,9 +92,7 @@ def main() -> None:
             with arguments.out.open("a") as file:
                 file.write(json.dumps(records[-1]) + "\n")
     lines = tables(records)
-    show(lines)
-    if arguments.write:
-        write_section("chain.md", "demo", "\n".join(lines))
+    tell("chain.md", "demo", lines, write=arguments.write)
 
 
 if __name__ == "__main__":

@@ -27,10 +27,9 @@ from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.sim.captures import BoardPose, BoardSize, sample_board_poses
 from scripts.shared.moving_captures import Hands, MovingCapture, moving_capture
-from scripts.shared.page import table, write_section
+from scripts.shared.page import table, tell
 from scripts.shared.records import Record, finish, read, seeds
 from scripts.shared.simulated import view_of
-from scripts.shared.timing import show
 
 PAGE = "ordinary.md"
 BOARD, SIZE = Board(columns=9, rows=6, square=0.05), BoardSize(9, 6, 0.05)
@@ -110,9 +109,7 @@ def main() -> None:
     if arguments.seeds is not None:
         keys = list(itertools.product(("hand", "stand"), arguments.seeds, ("default", "still")))
         finish(arguments.out[0], keys, captured, line)
-    text = show(lines(read(arguments.out)))
-    if arguments.write:
-        write_section(PAGE, "rigs", "\n".join(text))
+    tell(PAGE, "rigs", lines(read(arguments.out)), write=arguments.write)
 
 
 if __name__ == "__main__":

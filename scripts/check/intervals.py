@@ -36,10 +36,9 @@ from kcal.errors import KcalError
 from kcal.lens.uncertainty import pixel_covariance, pixel_errors
 from kcal.report.judge_camera import fault_of_views
 from scripts.shared.infinity import error_at_infinity
-from scripts.shared.page import table, write_section
+from scripts.shared.page import table, tell
 from scripts.shared.records import Record, finish, read, seeds
 from scripts.shared.simulated import figures, simulated
-from scripts.shared.timing import show
 
 PAGE, SECTION = "ordinary.md", "intervals"
 SIGMA, VIEWS, MODELS = 0.08, (5, 8, 12, 20), ("hybrid", "opencv5")
@@ -158,18 +157,14 @@ def main() -> None:
     parser.add_argument("--write", action="store_true", help="write the table in docs/measured, and stop")
     arguments = parser.parse_args()
     if arguments.cold:
-        text = show(cold_and_warm(arguments.cold))
-        if arguments.write:
-            write_section(PAGE, "warm refits", "\n".join(text))
+        tell(PAGE, "warm refits", cold_and_warm(arguments.cold), write=arguments.write)
         return
     if not arguments.out:
         parser.error("--out is needed")
     if not arguments.write:
         keys = itertools.product(arguments.models, arguments.seeds, [arguments.refits])
         finish(arguments.out[0], keys, judged, line)
-    text = show(lines(read(arguments.out)))
-    if arguments.write:
-        write_section(PAGE, SECTION, "\n".join(text))
+    tell(PAGE, SECTION, lines(read(arguments.out)), write=arguments.write)
 
 
 if __name__ == "__main__":

@@ -35,11 +35,10 @@ from kcal.lens.difference import camera_difference
 from kcal.report.judge_camera import camera_verdict
 from scripts.shared.held_out import Projection, held_out
 from scripts.shared.mrcal_camera import splined_camera
-from scripts.shared.page import table, write_section
+from scripts.shared.page import table, tell
 from scripts.shared.peer_lenses import fisheye, opencv
 from scripts.shared.real_captures import RealCapture, data_folder, load, names
 from scripts.shared.records import Record, finish
-from scripts.shared.timing import show
 
 PAGE = "ordinary.md"
 MODELS = ("kcal", "opencv5", "opencv8", "fisheye", "mrcal")
@@ -194,9 +193,7 @@ def main() -> None:
     records = finish(arguments.out, [(name,) for name in wanted], lambda name: judged(name, arguments.cache), line)
     order = {name: place for place, name in enumerate(wanted)}
     records = sorted((r for r in records if r["key"][0] in order), key=lambda r: order[r["key"][0]])
-    section = show(lines(records))
-    if arguments.write:
-        write_section(PAGE, "real", "\n".join(section))
+    tell(PAGE, "real", lines(records), write=arguments.write)
 
 
 if __name__ == "__main__":

@@ -37,8 +37,7 @@ from scripts.check.exchange import (
     random_points,
     sample_camera,
 )
-from scripts.shared.page import table, write_section
-from scripts.shared.timing import show
+from scripts.shared.page import table, tell
 
 HEADS = ["program", "direction", "lens", "σ", "pupil", "board", "largest error, px", "reader"]
 K, D = np.array([[1000.1, 0, 640.3], [0, 1001.3, 359.2], [0, 0, 1]]), np.array([-0.2, 0.05, 1e-3, -2e-3, 0.01])
@@ -280,9 +279,7 @@ def main() -> None:
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         rows = [*out_rows(Path(name), args.mrcal), *in_rows(Path(name), args.mrcal)]
-    lines = show(table(HEADS, rows))
-    if args.write:
-        write_section("other-programs.md", "round trips", "\n".join(lines))
+    tell("other-programs.md", "round trips", table(HEADS, rows), write=args.write)
 
 
 if __name__ == "__main__":

@@ -36,7 +36,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.uncertainty import pixel_covariance, pixel_errors
 from kcal.sim.raytrace import Misalignment, focal_length, system_matrix
 from kcal.sim.truth import TruthLens
-from scripts.shared.page import table, write_section
+from scripts.shared.page import table, tell
 from scripts.shared.prescriptions import MACHINE_VISION
 from scripts.shared.records import Record, finish
 from scripts.shared.traced import BOARD, captures, printed
@@ -202,9 +202,7 @@ def main() -> None:
     wanted = [list(key) for key in keys]
     found = sorted((one for one in records if one["key"] in wanted), key=lambda one: wanted.index(one["key"]) % 2)
     text = lines(found, options.noises)
-    print("\n".join(text))
-    if options.write:
-        write_section("settings.md", "settings", "\n".join(text))
+    tell("settings.md", "settings", text, write=options.write)
 
 
 if __name__ == "__main__":

@@ -26,8 +26,7 @@ from kcal.calibrate.camera.trust import seen_pixels
 from kcal.lens.camera import Camera
 from kcal.nets.inverse import InverseFit, InverseNetOptions, train_inverse
 from kcal.nets.joint import JointFit, JointOptions, train_jointly
-from scripts.shared.page import table, write_section
-from scripts.shared.timing import show
+from scripts.shared.page import table, tell
 from scripts.shared.views import observed, simulate
 from scripts.shared.wide_lens import held_out, warped
 
@@ -105,9 +104,7 @@ def main() -> None:
     parser.add_argument("--write", action="store_true", help=f"also write the section of docs/measured/{PAGE}")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    lines = show(table(HEADS, rows(arguments.steps, arguments.views)))
-    if arguments.write:
-        write_section(PAGE, "eq 12", "\n".join(lines))
+    tell(PAGE, "eq 12", table(HEADS, rows(arguments.steps, arguments.views)), write=arguments.write)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from scripts.shared.timing import row
+from scripts.shared.timing import row, show
 
 DOCS = Path(__file__).parents[2] / "docs" / "measured"
 
@@ -26,6 +26,13 @@ def write_section(page: str, name: str, text: str) -> None:
     else:
         whole = f"{whole.rstrip()}\n\n{block}\n"
     path.write_text(whole, encoding="utf-8")
+
+
+def tell(page: str, name: str, lines: list[str], *, write: bool) -> None:
+    """Print a section, and put it into its page if `write`."""
+    show(lines)
+    if write:
+        write_section(page, name, "\n".join(lines))
 
 
 def read_section(page: str, name: str) -> str:
