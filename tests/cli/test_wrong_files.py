@@ -9,7 +9,6 @@ import random
 import shlex
 import shutil
 import sys
-import time
 from pathlib import Path
 
 import cv2
@@ -250,7 +249,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 
 @pytest.mark.parametrize("case", [*range(24), 134, 1171])
 def test_nothing_is_found(case: int, whole: dict[str, bytes]) -> None:
-    assert fuzz.run_case(case, whole, 60.0) == []
+    fuzz.run_case(case, whole)
 
 
 @pytest.mark.slow
@@ -280,17 +279,17 @@ def _case(whole: dict[str, bytes], kind: str, damage: str) -> int:
 def test_what_is_planted_is_found(whole: dict[str, bytes], monkeypatch: pytest.MonkeyPatch) -> None:
     small = {name: whole[name] for name in ("board.json", "camera.json")}
     case = _case(small, "board.json", ": true")
-    assert fuzz.run_case(case, small, 60.0) == []
+    fuzz.run_case(case, small)
 
     def lenient(path: Path) -> object:
         return json.loads(path.read_bytes())
 
     monkeypatch.setitem(fuzz.COMMANDS, "board.json", [lenient])
-    assert [finding.what for finding in fuzz.run_case(case, small, 60.0)] == ["silent number"]
+    with pytest.raises(AssertionError, match="must be refused"):
+        fuzz.run_case(case, small)
     monkeypatch.setitem(fuzz.COMMANDS, "board.json", [lambda _: 1 / 0])
-    assert [finding.what for finding in fuzz.run_case(case, small, 60.0)] == ["traceback"]
-    monkeypatch.setitem(fuzz.COMMANDS, "board.json", [lambda _: time.sleep(5)])
-    assert [finding.what for finding in fuzz.run_case(case, small, 0.1)] == ["hang"]
+    with pytest.raises(ZeroDivisionError):
+        fuzz.run_case(case, small)
 
 
 # `kcal board`: printing is the default, measuring a command of its own.
