@@ -11,6 +11,7 @@ import hypothesis
 import numpy as np
 import pytest
 import torch
+from command_line import Command
 from waiting import Watch
 
 # The same examples each time: a failure belongs to the change that is tested. Time is not what is tested.
@@ -51,3 +52,8 @@ def kcal_data() -> Path:
     path = Path(folder)
     assert path.is_dir(), f"KCAL_DATA={folder} is no folder"
     return path
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
+    return Command(monkeypatch, capsys)

@@ -6,15 +6,15 @@ import json
 import math
 import os
 import re
-import sys
 from pathlib import Path
 
 import pytest
 import torch
+from command_line import Command
 from torch import Tensor
 from typer.testing import CliRunner
 
-from kcal.cli.main import app, main
+from kcal.cli.main import app
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.errors import DegenerateError
@@ -68,46 +68,13 @@ def cameras(folder: Path) -> Path:
     return folder
 
 
-def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["kcal", *arguments])
-    with pytest.raises(SystemExit) as stopped:
-        main()
-    code = stopped.value.code
-    return code if isinstance(code, int) else 0
-
-
-def refuse(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """Run what must fail; the one line it says. Nothing may appear or change in the folder."""
-    before = {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
-    assert run(monkeypatch, *arguments) == 1
-    printed = capsys.readouterr()
-    assert printed.err.startswith("error: "), printed.err
-    assert len(printed.err.splitlines()) == 1, printed.err
-    assert "Traceback" not in printed.out + printed.err
-    assert {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()} == before
-    return printed.err
-
-
-PAIRS = ["--pairs", "left.obs.json", "right.obs.json"]
+PAIRS = "--pairs left.obs.json right.obs.json"
 
 
 class TestCalibrate:
-    def test_writes_a_camera_file(
-        self, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        arguments = [
-            "left.obs.json",
-            "-o",
-            "left.camera.json",
-            "--model",
-            "opencv4",
-            "--name",
-            "mast",
-            "--picture",
-            "left.png",
-        ]
-        assert run(monkeypatch, "calibrate", *arguments) == 0
-        printed = capsys.readouterr()
+    def test_writes_a_camera_file(self, folder: Path, command: Command) -> None:
+        arguments = "left.obs.json -o left.camera.json --model opencv4 --name mast --picture left.png"
+        printed = command("calibrate", arguments)
         assert "6 views, 252 corners, 640x480 px, model opencv4" in printed.out
         assert "wrote left.camera.json" in printed.out
         assert "wrote left.png" in printed.out
@@ -127,15 +94,12 @@ class TestCalibrate:
         assert row[1] == number_text(float(found.focal[0]), file.standard_deviations["fx"])
         assert (folder / "left.png").read_bytes().startswith(b"\x89PNG")
 
-    def test_outliers_are_left_out_and_listed(
-        self, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-    ) -> None:
+    def test_outliers_are_left_out_and_listed(self, folder: Path, command: Command) -> None:
         content = json.loads((folder / "left.obs.json").read_text())
         u, v = content["views"][2]["pixels"][5]
         content["views"][2]["pixels"][5] = [u + 12.0, v]
         (folder / "one.obs.json").write_text(json.dumps(content))
-        assert run(monkeypatch, "calibrate", "one.obs.json", "-o", "one.json", "--reject") == 0
-        printed = capsys.readouterr()
+        printed = command("calibrate one.obs.json -o one.json --reject")
         assert "6 views, 251 corners" in printed.out
         assert "left out: 0.40 % of the corners" in printed.out
         assert "left02.png corner 5: " in printed.out
@@ -143,48 +107,26 @@ class TestCalibrate:
         assert calibration is not None
         assert [entry.name for entry in calibration.excluded] == ["left02.png corner 5"]
         assert calibration.points == 251
-        assert run(monkeypatch, "calibrate", "one.obs.json", "-o", "one.json") == 0
-        assert "corner 5 of view left02.png" in capsys.readouterr().err
+        assert "corner 5 of view left02.png" in command("calibrate one.obs.json -o one.json").err
 
-    def test_a_known_camera_and_a_weak_prior(
-        self, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        assert run(monkeypatch, "calibrate", "left.obs.json", "-o", "left.json", "--weak-prior", "0.3") == 0
+    def test_a_known_camera_and_a_weak_prior(self, folder: Path, command: Command) -> None:
+        command("calibrate left.obs.json -o left.json --weak-prior 0.3")
         first = CameraFile.load(folder / "left.json")
         matrix = first.covariance_matrix()
         assert first.standard_deviations is not None
         assert matrix is not None
         assert float(matrix[0, 0]) ** 0.5 == pytest.approx(first.standard_deviations["fx"])
-        assert run(monkeypatch, "calibrate", "left.obs.json", "-o", "again.json", "--camera", "left.json") == 0
-        assert "fixed" in capsys.readouterr().out
+        assert "fixed" in command("calibrate left.obs.json -o again.json --camera left.json").out
         again = CameraFile.load(folder / "again.json")
         assert again.camera().fingerprint == first.camera().fingerprint
         assert again.information is None
-        both = ["--camera", "left.json", "--fix", "cx"]
-        assert "known camera" in refuse(
-            folder, monkeypatch, capsys, "calibrate", "left.obs.json", "-o", "a.json", *both
-        )
+        both = "--camera left.json --fix cx"
+        assert "known camera" in command.refuses("calibrate left.obs.json -o a.json", both)
 
-    def test_parameters_by_name(
-        self, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        arguments = [
-            "calibrate",
-            "left.obs.json",
-            "-o",
-            "named.json",
-            "--model",
-            "opencv5",
-            "--fov",
-            "65",
-            "--fix",
-            "cx=321",
-            "--fix",
-            "k3",
-        ]
-        arguments += ["--tie", "fx=fy", "--prior", "cy=240+-1", "--free", "skew"]
-        assert run(monkeypatch, *arguments) == 0
-        rows = {words[0]: words[1:] for words in map(str.split, capsys.readouterr().out.splitlines()) if words}
+    def test_parameters_by_name(self, folder: Path, command: Command) -> None:
+        arguments = "calibrate left.obs.json -o named.json --model opencv5 --fov 65 --fix cx=321 --fix k3"
+        arguments += " --tie fx=fy --prior cy=240+-1 --free skew"
+        rows = {words[0]: words[1:] for words in map(str.split, command(arguments).out.splitlines()) if words}
         assert rows["cx"] == ["321.000", "fixed"]
         assert rows["k3"] == ["0", "fixed"]
         assert rows["fx"] == rows["fy"]
@@ -194,40 +136,26 @@ class TestCalibrate:
     @pytest.mark.parametrize(
         ("arguments", "message"),
         [
-            (["--fix", "cz"], "unknown parameter 'cz'"),
-            (["--fix", "k4"], "opencv5 has no parameter 'k4'"),
-            (["--fix", "cx=a"], "'a' is not a number"),
-            (["--fix", "cx", "--fix", "cx=3"], "fixed twice"),
-            (["--prior", "cx=3"], "NAME=VALUE±SIGMA"),
-            (["--prior", "cx=3±0"], "positive standard deviation"),
-            (["--fix", "cx", "--prior", "cx=3±1"], "fixed and given a prior"),
-            (["--tie", "fx"], "two parameters"),
+            ("--fix cz", "unknown parameter 'cz'"),
+            ("--fix k4", "opencv5 has no parameter 'k4'"),
+            ("--fix cx=a", "'a' is not a number"),
+            ("--fix cx --fix cx=3", "fixed twice"),
+            ("--prior cx=3", "NAME=VALUE±SIGMA"),
+            ("--prior cx=3±0", "positive standard deviation"),
+            ("--fix cx --prior cx=3±1", "fixed and given a prior"),
+            ("--tie fx", "two parameters"),
         ],
     )
-    def test_names_that_do_not_fit(
-        self,
-        folder: Path,
-        monkeypatch: pytest.MonkeyPatch,
-        capsys: pytest.CaptureFixture[str],
-        arguments: list[str],
-        message: str,
-    ) -> None:
-        text = refuse(
-            folder, monkeypatch, capsys, "calibrate", "left.obs.json", "-o", "a.json", "--model", "opencv5", *arguments
-        )
+    def test_names_that_do_not_fit(self, folder: Path, command: Command, arguments: str, message: str) -> None:
+        text = command.refuses("calibrate left.obs.json -o a.json --model opencv5", arguments)
         assert message in text
 
-    def test_board_warp_and_a_warning(
-        self, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-    ) -> None:
+    def test_board_warp_and_a_warning(self, folder: Path, command: Command) -> None:
         content = json.loads((folder / "left.obs.json").read_text())
         for i, pixel in enumerate(content["views"][2]["pixels"]):
             content["views"][2]["pixels"][i] = [pixel[0] + 4 * (i % 2), pixel[1] - 3 * (i % 3)]
         (folder / "bad.obs.json").write_text(json.dumps(content))
-        assert (
-            run(monkeypatch, "calibrate", "bad.obs.json", "-o", "bad.json", "--model", "opencv5", "--board-warp") == 0
-        )
-        printed = capsys.readouterr()
+        printed = command("calibrate bad.obs.json -o bad.json --model opencv5 --board-warp")
         assert "mm along its rows" in printed.out
         assert "warning: view left02.png: RMS" in printed.err
         assert CameraFile.load(folder / "bad.json").name == "bad"
@@ -235,23 +163,16 @@ class TestCalibrate:
     @pytest.mark.parametrize(
         ("arguments", "message"),
         [
-            (["none.obs.json", "-o", "a.json"], "none.obs.json: cannot read: No such file"),
-            (["left.obs.json", "-o", "no/a.json"], "the folder no does not exist; make it first"),
-            (["left.obs.json", "-o", "."], "is a folder; give a file name"),
-            (["left.obs.json", "-o", "a.json", "--model", "opencv6"], "unknown lens model 'opencv6'; choose one of"),
-            (["left.obs.json", "-o", "a.json", "--picture", "a.jpg"], "end with .png"),
-            (["left.obs.json", "-o", "a.json", "--picture", "no/a.png"], "the folder no does not exist"),
+            ("none.obs.json -o a.json", "none.obs.json: cannot read: No such file"),
+            ("left.obs.json -o no/a.json", "the folder no does not exist; make it first"),
+            ("left.obs.json -o .", "is a folder; give a file name"),
+            ("left.obs.json -o a.json --model opencv6", "unknown lens model 'opencv6'; choose one of"),
+            ("left.obs.json -o a.json --picture a.jpg", "end with .png"),
+            ("left.obs.json -o a.json --picture no/a.png", "the folder no does not exist"),
         ],
     )
-    def test_refusals(
-        self,
-        folder: Path,
-        monkeypatch: pytest.MonkeyPatch,
-        capsys: pytest.CaptureFixture[str],
-        arguments: list[str],
-        message: str,
-    ) -> None:
-        assert message in refuse(folder, monkeypatch, capsys, "calibrate", *arguments)
+    def test_refusals(self, folder: Path, command: Command, arguments: str, message: str) -> None:
+        assert message in command.refuses("calibrate", arguments)
 
     @pytest.mark.parametrize(
         ("content", "message"),
@@ -262,58 +183,40 @@ class TestCalibrate:
             ('{"kcal": "observations", "version": 1}', "bad observations file: board: "),
         ],
     )
-    def test_files_that_are_something_else(
-        self,
-        folder: Path,
-        monkeypatch: pytest.MonkeyPatch,
-        capsys: pytest.CaptureFixture[str],
-        content: str,
-        message: str,
-    ) -> None:
+    def test_files_that_are_something_else(self, folder: Path, command: Command, content: str, message: str) -> None:
         (folder / "odd.json").write_text(content)
-        text = refuse(folder, monkeypatch, capsys, "calibrate", "odd.json", "-o", "a.json")
+        text = command.refuses("calibrate odd.json -o a.json")
         assert text.startswith("error: odd.json: ")
         assert message in text
 
     @pytest.mark.parametrize("count", [0, 1, 2])
-    def test_too_few_views(
-        self, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], count: int
-    ) -> None:
+    def test_too_few_views(self, folder: Path, command: Command, count: int) -> None:
         observations(0, count).save(folder / "few.obs.json")
-        text = refuse(folder, monkeypatch, capsys, "calibrate", "few.obs.json", "-o", "a.json")
+        text = command.refuses("calibrate few.obs.json -o a.json")
         assert ("no view with a board" if count == 0 else f"{count} view(s) of the board: at least 3") in text
 
-    def test_an_old_file_survives_a_failure(
-        self, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-    ) -> None:
+    def test_an_old_file_survives_a_failure(self, folder: Path, command: Command) -> None:
         (folder / "old.json").write_text("precious")
         observations(0, 2).save(folder / "few.obs.json")
-        refuse(folder, monkeypatch, capsys, "calibrate", "few.obs.json", "-o", "old.json")
+        command.refuses("calibrate few.obs.json -o old.json")
 
     @pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="the superuser may write anywhere")
-    def test_no_permission_is_told_before_any_work(
-        self, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-    ) -> None:
+    def test_no_permission_is_told_before_any_work(self, folder: Path, command: Command) -> None:
         (folder / "shut").mkdir(mode=0o500)
-        text = refuse(folder, monkeypatch, capsys, "calibrate", "left.obs.json", "-o", "shut/a.json")
+        text = command.refuses("calibrate left.obs.json -o shut/a.json")
         assert "no permission to write here" in text
 
-    def test_output_is_checked_before_the_input_is_read(
-        self, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-    ) -> None:
+    def test_output_is_checked_before_the_input_is_read(self, folder: Path, command: Command) -> None:
         """With both wrong, the output is named: no minute is spent on what cannot be written."""
-        assert "make it first" in refuse(folder, monkeypatch, capsys, "calibrate", "none.json", "-o", "no/a.json")
-        text = refuse(folder, monkeypatch, capsys, "rig", "none.json", "none.json", *PAIRS, "-o", "no/a.json")
+        assert "make it first" in command.refuses("calibrate none.json -o no/a.json")
+        text = command.refuses("rig none.json none.json", PAIRS, "-o no/a.json")
         assert "make it first" in text
 
 
 class TestRig:
     @pytest.mark.slow
-    def test_writes_a_rig_file(
-        self, cameras: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        assert run(monkeypatch, "rig", "left.camera.json", "right.camera.json", *PAIRS, "-o", "rig.json") == 0
-        printed = capsys.readouterr()
+    def test_writes_a_rig_file(self, cameras: Path, command: Command) -> None:
+        printed = command("rig left.camera.json right.camera.json", PAIRS, "-o rig.json")
         assert "6 of 6 pairs used, 0 views without partner" in printed.out
         assert "wrote rig.json" in printed.out
         assert printed.err == ""
@@ -328,16 +231,13 @@ class TestRig:
         assert side == pytest.approx(50.0, rel=2e-3)
 
     @pytest.mark.slow
-    def test_boards_in_the_joint_adjustment(
-        self, cameras: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-    ) -> None:
+    def test_boards_in_the_joint_adjustment(self, cameras: Path, command: Command) -> None:
         """With a measured baseline beside them, which agrees with what the boards say to a few of its sigmas."""
         content = json.loads((cameras / "right.obs.json").read_text())
         content["views"][1]["pixels"].reverse()
         (cameras / "right.obs.json").write_text(json.dumps(content))
-        more = ["--baseline", f"{float(RIG.baseline)}±0.0002", "-o", "joint.json", "--picture", "rig.png"]
-        assert run(monkeypatch, "rig", "left.camera.json", "right.camera.json", *PAIRS, *more) == 0
-        printed = capsys.readouterr()
+        more = f"--baseline {float(RIG.baseline)}±0.0002 -o joint.json --picture rig.png"
+        printed = command("rig left.camera.json right.camera.json", PAIRS, more)
         assert printed.out.startswith("source")
         assert "σ of range" in printed.out
         assert "taken as exact" not in printed.out
@@ -354,23 +254,16 @@ class TestRig:
     @pytest.mark.parametrize("keep_all", [False, True])
     @pytest.mark.parametrize("shift", [1.5, 40.0])
     def test_pictures_change_nothing_and_all_can_be_kept(
-        self,
-        cameras: Path,
-        monkeypatch: pytest.MonkeyPatch,
-        capsys: pytest.CaptureFixture[str],
-        shift: float,
-        keep_all: bool,
+        self, cameras: Path, command: Command, shift: float, keep_all: bool
     ) -> None:
         """A board that moved between the two exposures."""
         content = json.loads((cameras / "right.obs.json").read_text())
         for pixel in content["views"][4]["pixels"]:
             pixel[1] += shift
         (cameras / "right.obs.json").write_text(json.dumps(content))
-        arguments = ["rig", "left.camera.json", "right.camera.json", *PAIRS, *(["--keep-all"] if keep_all else [])]
-        assert run(monkeypatch, *arguments, "-o", "plain.json") == 0
-        printed = capsys.readouterr()
-        assert run(monkeypatch, *arguments, "-o", "drawn.json", "--picture", "rig.png") == 0
-        drawn = capsys.readouterr()
+        arguments = f"rig left.camera.json right.camera.json {PAIRS}{' --keep-all' if keep_all else ''}"
+        printed = command(arguments, "-o plain.json")
+        drawn = command(arguments, "-o drawn.json --picture rig.png")
         assert drawn.err == printed.err
         assert drawn.out.replace("drawn", "plain").replace("wrote rig.png\n", "") == printed.out
         plain, picture = (RigFile.load(cameras / name) for name in ("plain.json", "drawn.json"))
@@ -381,65 +274,54 @@ class TestRig:
         assert ("left out: board left04.png right04.png: " in printed.err) != keep_all
 
     @pytest.mark.slow
-    def test_a_failure_leaves_no_file(
-        self, cameras: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-    ) -> None:
+    def test_a_failure_leaves_no_file(self, cameras: Path, monkeypatch: pytest.MonkeyPatch, command: Command) -> None:
         def fails(*_: object) -> None:
             raise DegenerateError("no side of a square could be triangulated")
 
         monkeypatch.setattr("kcal.report.judge_rig.triangulated_sides", fails)
-        arguments = ["rig", "left.camera.json", "right.camera.json", *PAIRS, "-o", "rig.json"]
-        assert "no side of a square" in refuse(cameras, monkeypatch, capsys, *arguments)
+        arguments = f"rig left.camera.json right.camera.json {PAIRS} -o rig.json"
+        assert "no side of a square" in command.refuses(arguments)
 
     @pytest.mark.slow
-    def test_swapped_throughout(
-        self, cameras: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-    ) -> None:
+    def test_swapped_throughout(self, cameras: Path, command: Command) -> None:
         """Cameras and observations agree; the right camera is on the left."""
-        pairs = ["--pairs", "right.obs.json", "left.obs.json"]
+        pairs = "--pairs right.obs.json left.obs.json"
         both = ["right.camera.json", "left.camera.json"]
-        assert run(monkeypatch, "rig", *both, *pairs, "-o", "rig.json") == 1
-        assert "this camera is named 'right', and left.camera.json 'left'" in capsys.readouterr().err
+        said = command("rig", *both, pairs, "-o rig.json", code=1).err
+        assert "this camera is named 'right', and left.camera.json 'left'" in said
         # Names that do not tell: the solution does.
         for name in both:
             content = json.loads((cameras / name).read_text())
             (cameras / name).write_text(json.dumps({**content, "name": "some"}))
-        assert run(monkeypatch, "rig", *both, *pairs, "-o", "rig.json") == 0
-        assert "to the left of the left camera: left and right are swapped" in capsys.readouterr().err
+        said = command("rig", *both, pairs, "-o rig.json").err
+        assert "to the left of the left camera: left and right are swapped" in said
 
-    def test_pairs_from_a_csv(
-        self, cameras: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-    ) -> None:
+    def test_pairs_from_a_csv(self, cameras: Path, command: Command) -> None:
         (cameras / "pairs.csv").write_text(
             "left,right\n" + "".join(f"left{i:02}.png,right{i:02}.png\n" for i in (1, 3, 4))
         )
-        arguments = ["left.camera.json", "right.camera.json", *PAIRS, "-o", "rig.json", "--match", "pairs.csv"]
-        text = refuse(cameras, monkeypatch, capsys, "rig", *arguments, "--intrinsics", "free")
+        arguments = f"left.camera.json right.camera.json {PAIRS} -o rig.json --match pairs.csv"
+        text = command.refuses("rig", arguments, "--intrinsics free")
         assert "hybrid" in text
         for side in ("left", "right"):
-            plain = [f"{side}.obs.json", "-o", f"{side}.camera.json", "--model", "opencv5"]
-            assert run(monkeypatch, "calibrate", *plain) == 0
-        capsys.readouterr()
-        assert run(monkeypatch, "rig", *arguments, "--intrinsics", "free", "--board-warp") == 0
-        printed = capsys.readouterr().out
+            plain = f"{side}.obs.json -o {side}.camera.json --model opencv5"
+            command("calibrate", plain)
+        printed = command("rig", arguments, "--intrinsics free --board-warp").out
         assert "3 of 3 pairs used, 6 views without partner" in printed
         assert "mm along its rows" in printed
         (cameras / "pairs.csv").write_text("left,right\nleft01.png,right77.png\n")
         (cameras / "rig.json").unlink()
-        text = refuse(cameras, monkeypatch, capsys, "rig", *arguments)
+        text = command.refuses("rig", arguments)
         assert "pairs.csv: line 2: no view of the right camera is named 'right77.png'" in text
 
     @pytest.mark.slow
-    def test_turned_and_wrong_pairs_are_listed(
-        self, cameras: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-    ) -> None:
+    def test_turned_and_wrong_pairs_are_listed(self, cameras: Path, command: Command) -> None:
         content = json.loads((cameras / "right.obs.json").read_text())
         content["views"][1]["pixels"].reverse()
         for pixel in content["views"][4]["pixels"]:
             pixel[1] += 40.0
         (cameras / "right.obs.json").write_text(json.dumps(content))
-        assert run(monkeypatch, "rig", "left.camera.json", "right.camera.json", *PAIRS, "-o", "rig.json") == 0
-        printed = capsys.readouterr()
+        printed = command("rig left.camera.json right.camera.json", PAIRS, "-o rig.json")
         assert "turned by 180°: left01.png right01.png (right; the board" in printed.out
         assert "left out: board left04.png right04.png: " in printed.err
         record = RigFile.load(cameras / "rig.json").calibration
@@ -452,52 +334,38 @@ class TestRig:
     @pytest.mark.parametrize(
         ("arguments", "message"),
         [
-            (["left.obs.json", "right.camera.json", *PAIRS], "this is a kcal observations file; a kcal camera file"),
+            (f"left.obs.json right.camera.json {PAIRS}", "this is a kcal observations file; a kcal camera file"),
             (
-                ["left.camera.json", "right.camera.json", "--pairs", "left.obs.json", "right.camera.json"],
+                "left.camera.json right.camera.json --pairs left.obs.json right.camera.json",
                 "this is a kcal camera file; a kcal observations file is needed here",
             ),
-            (["none.json", "right.camera.json", *PAIRS], "none.json: cannot read"),
-            (["right.camera.json", "left.camera.json", *PAIRS], "left and right are exchanged"),
+            (f"none.json right.camera.json {PAIRS}", "none.json: cannot read"),
+            (f"right.camera.json left.camera.json {PAIRS}", "left and right are exchanged"),
             (
-                ["left.camera.json", "right.camera.json", "--pairs", "right.obs.json", "left.obs.json"],
+                "left.camera.json right.camera.json --pairs right.obs.json left.obs.json",
                 "they are exchanged",
             ),
-            (["left.camera.json", "right.camera.json", *PAIRS, "--match", "none.csv"], "none.csv: cannot read"),
-            (["left.camera.json", "left.camera.json", *PAIRS], "the same camera twice"),
-            (["left.camera.json", "left.camera.json", "--pairs", "left.obs.json", "left.obs.json"], "camera twice"),
-            (["left.camera.json", "right.camera.json", "--pairs", "left.obs.json", "left.obs.json"], "camera twice"),
+            (f"left.camera.json right.camera.json {PAIRS} --match none.csv", "none.csv: cannot read"),
+            (f"left.camera.json left.camera.json {PAIRS}", "the same camera twice"),
+            ("left.camera.json left.camera.json --pairs left.obs.json left.obs.json", "camera twice"),
+            ("left.camera.json right.camera.json --pairs left.obs.json left.obs.json", "camera twice"),
         ],
     )
-    def test_refusals(
-        self,
-        cameras: Path,
-        monkeypatch: pytest.MonkeyPatch,
-        capsys: pytest.CaptureFixture[str],
-        arguments: list[str],
-        message: str,
-    ) -> None:
-        assert message in refuse(cameras, monkeypatch, capsys, "rig", *arguments, "-o", "rig.json")
+    def test_refusals(self, cameras: Path, command: Command, arguments: str, message: str) -> None:
+        assert message in command.refuses("rig", arguments, "-o rig.json")
 
     @pytest.mark.slow
-    def test_a_rig_file_is_no_camera_file(
-        self, cameras: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        assert run(monkeypatch, "rig", "left.camera.json", "right.camera.json", *PAIRS, "-o", "rig.json") == 0
-        capsys.readouterr()
-        text = refuse(cameras, monkeypatch, capsys, "rig", "rig.json", "right.camera.json", *PAIRS, "-o", "b.json")
+    def test_a_rig_file_is_no_camera_file(self, cameras: Path, command: Command) -> None:
+        command("rig left.camera.json right.camera.json", PAIRS, "-o rig.json")
+        text = command.refuses("rig rig.json right.camera.json", PAIRS, "-o b.json")
         assert "rig.json: this is a kcal rig file; a kcal camera file is needed here" in text
 
-    def test_views_that_cannot_be_paired(
-        self, cameras: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-    ) -> None:
+    def test_views_that_cannot_be_paired(self, cameras: Path, command: Command) -> None:
         content = json.loads((cameras / "right.obs.json").read_text())
         for i, view in enumerate(content["views"]):
             view["name"] = "abcdef"[i]
         (cameras / "right.obs.json").write_text(json.dumps(content))
-        text = refuse(
-            cameras, monkeypatch, capsys, "rig", "left.camera.json", "right.camera.json", *PAIRS, "-o", "r.json"
-        )
+        text = command.refuses("rig left.camera.json right.camera.json", PAIRS, "-o r.json")
         assert "give a CSV of pairs" in text
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from command_line import Command
 
-from kcal.cli.main import main
 from kcal.io.camera_file import provenance, save_camera
 from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.calibration import RigCalibration
@@ -18,6 +18,7 @@ from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Rig
 
 HEADER = "name,left_u,left_v,right_u,right_v\n"
 ORIGIN = "-33.9,151.2,10"
+POINTS = f"rig.json points.csv --origin {ORIGIN}"
 
 
 @pytest.fixture
@@ -32,21 +33,10 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["kcal", "locate", *arguments])
-    with pytest.raises(SystemExit) as stopped:
-        main()
-    code = stopped.value.code
-    return code if isinstance(code, int) else 0
-
-
-@pytest.mark.parametrize("origin", [["--origin", ORIGIN], [f"--origin={ORIGIN}"]])
-def test_writes_files_and_a_table(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], origin: list[str]
-) -> None:
-    outputs = ["-o", "out.geojson", "-o", "out.csv", "--picture", "map.png"]
-    assert run(monkeypatch, "rig.json", "points.csv", *origin, "--heading", "-90", *outputs) == 0
-    printed = capsys.readouterr().out
+@pytest.mark.parametrize("origin", [f"--origin {ORIGIN}", f"--origin={ORIGIN}"])
+def test_writes_files_and_a_table(folder: Path, command: Command, origin: str) -> None:
+    outputs = "-o out.geojson -o out.csv --picture map.png"
+    printed = command("locate rig.json points.csv", origin, "--heading -90", outputs).out
     line = next(line for line in printed.splitlines() if line.startswith("[b]mast"))
     # 1 km west (0.0108116 degrees) and 10 m north (9.0e-5); a straight line west bends 5 cm north of the parallel.
     assert line.split()[1:5] == ["-33.8999094", "151.1891884", "10.07", "1000"]
@@ -59,34 +49,26 @@ def test_writes_files_and_a_table(
     assert (folder / "map.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_what_is_doubted_of_a_rig_travels_with_it(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_doubted_of_a_rig_travels_with_it(folder: Path, command: Command) -> None:
     rig, doubt = load_rig(folder / "rig.json"), "the [landmarks] lie nearly in one line"
     rig.calibration = RigCalibration(
         rms=0.1, rms_left=0.1, rms_right=0.1, pairs=0, per_pair_rms={}, baseline_m=10.0, warnings=(doubt,),
         **provenance(),
     )  # fmt: skip
     save_rig(rig, folder / "rig.json")
-    assert run(monkeypatch, "rig.json", "points.csv", "--origin", ORIGIN, "--heading", "0", "--json") == 0
-    shown = capsys.readouterr()
+    shown = command("locate", POINTS, "--heading 0 --json")
     assert f"warning: rig.json: {doubt}" in shown.err
     assert json.loads(shown.out)["warnings"] == [doubt]
-    monkeypatch.setattr(sys, "argv", ["kcal", "show", "rig.json"])
-    with pytest.raises(SystemExit):
-        main()
-    assert f"warning: {doubt}" in capsys.readouterr().out
+    assert f"warning: {doubt}" in command("show rig.json").out
 
 
-def test_options_for_errors_grids_and_formats(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    arguments = ["rig.json", "points.csv", "--origin", "19.07,72.87,14", "--heading", "0.0", "-o", "out.csv"]
-    assert run(monkeypatch, *arguments, "--pixel-sigma", "0.1", "--refraction", "0") == 0
+def test_options_for_errors_grids_and_formats(folder: Path, command: Command) -> None:
+    arguments = "rig.json points.csv --origin 19.07,72.87,14 --heading 0.0 -o out.csv"
+    command("locate", arguments, "--pixel-sigma 0.1 --refraction 0")
     plain = next(iter(csv.DictReader((folder / "out.csv").open())))
-    more = ["--grid", "EPSG:32643", "--yaw-sigma", "0.05", "--heading-sigma", "0.1", "--refraction", "0.13"]
-    outputs = ["-o", "out.kml", "-o", "out.cot"]
-    assert run(monkeypatch, *arguments, "--pixel-sigma", "0.1", *more, *outputs) == 0
+    more = "--grid EPSG:32643 --yaw-sigma 0.05 --heading-sigma 0.1 --refraction 0.13"
+    outputs = "-o out.kml -o out.cot"
+    printed = command("locate", arguments, "--pixel-sigma 0.1", more, outputs).out
     row = next(iter(csv.DictReader((folder / "out.csv").open())))
     # Grid north of Mumbai's UTM zone is 0.70 degrees west of true north; the mark lies 0.57 degrees to the right.
     assert float(row["azimuth_deg"]) == pytest.approx(float(plain["azimuth_deg"]) - 0.6962 + 360, abs=1e-3)
@@ -94,24 +76,20 @@ def test_options_for_errors_grids_and_formats(
     assert float(row["range_high_m"]) - 1000 > 5 * (float(plain["range_high_m"]) - 1000)
     assert float(row["up_m"]) < float(plain["up_m"])
     # The library's own defaults, which the command states for its help.
-    assert run(monkeypatch, *arguments) == 0
+    command("locate", arguments)
     usual = (folder / "out.csv").read_text()
-    defaults = ["--refraction", str(REFRACTION), "--refraction-sigma", str(REFRACTION_SIGMA)]
-    assert run(monkeypatch, *arguments, *defaults) == 0
+    defaults = f"--refraction {REFRACTION} --refraction-sigma {REFRACTION_SIGMA}"
+    command("locate", arguments, defaults)
     assert (folder / "out.csv").read_text() == usual
-    printed = capsys.readouterr().out
     assert "noise in the marks and of the errors in calibration and mounting" in printed
     assert "geoid: " in printed
     assert (folder / "out.kml").read_text().startswith("<?xml")
     assert "<event " in (folder / "out.cot").read_text()
 
 
-def test_nothing_located_is_a_failure_with_its_reasons(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_nothing_located_is_a_failure_with_its_reasons(folder: Path, command: Command) -> None:
     (folder / "points.csv").write_text(HEADER + "lost,-40,5,1,5\n")
-    assert run(monkeypatch, "rig.json", "points.csv", "--origin", ORIGIN, "--heading", "0") == 1
-    printed = capsys.readouterr()
+    printed = command("locate", POINTS, "--heading 0", code=1)
     assert "lost: a mark lies outside its image" in printed.out
     assert printed.err.splitlines()[-1].startswith("error: points.csv: none of the 1 pairs")
 
@@ -119,35 +97,23 @@ def test_nothing_located_is_a_failure_with_its_reasons(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["rig.json", "points.csv", "--origin", "151.2,-33.9,10", "--heading", "0"], "longitude came first"),
-        (["rig.json", "points.csv", "--origin", ORIGIN, "--heading", "nan"], "heading nan"),
-        (["rig.json", "points.csv", "--origin", ORIGIN, "--heading", "0", "--pixel-sigma", "0"], "--pixel-sigma 0.0"),
-        (["rig.json", "nothing.csv", "--origin", ORIGIN, "--heading", "0"], "nothing.csv: cannot read"),
+        ("rig.json points.csv --origin 151.2,-33.9,10 --heading 0", "longitude came first"),
+        (f"{POINTS} --heading nan", "heading nan"),
+        (f"{POINTS} --heading 0 --pixel-sigma 0", "--pixel-sigma 0.0"),
+        (f"rig.json nothing.csv --origin {ORIGIN} --heading 0", "nothing.csv: cannot read"),
         (
-            ["points.csv", "points.csv", "--origin", ORIGIN, "--heading", "0"],
+            f"points.csv points.csv --origin {ORIGIN} --heading 0",
             "points.csv: this is a table of marks; a kcal rig file is needed",
         ),
-        (["mast.camera.json", "long.csv"], "To make one: kcal station mast.camera.json survey.csv --marks marks.csv"),
-        (["mast.camera.json", "points.csv"], "To make one: kcal rig mast.camera.json right.camera.json"),
-        (["rig.json", "points.csv", "--origin", ORIGIN, "--heading", "0", "-o", "a.shp"], "a.shp: unknown format"),
-        (["rig.json", "points.csv", "--origin", ORIGIN, "--heading", "0", "-o", "no/a.csv"], "does not exist"),
-        (["rig.json", "points.csv", "--origin", ORIGIN, "--heading", "0", "--picture", "a.pdf"], "end with .png"),
+        ("mast.camera.json long.csv", "To make one: kcal station mast.camera.json survey.csv --marks marks.csv"),
+        ("mast.camera.json points.csv", "To make one: kcal rig mast.camera.json right.camera.json"),
+        (f"{POINTS} --heading 0 -o a.shp", "a.shp: unknown format"),
+        (f"{POINTS} --heading 0 -o no/a.csv", "does not exist"),
+        (f"{POINTS} --heading 0 --picture a.pdf", "end with .png"),
     ],
 )
-def test_refusals_are_one_line_and_write_nothing(
-    folder: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    arguments: list[str],
-    message: str,
-) -> None:
-    before = sorted(folder.iterdir())
-    assert run(monkeypatch, *arguments) == 1
-    printed = capsys.readouterr()
-    assert printed.err.startswith("error: ")
-    assert message in printed.err
-    assert len(printed.err.splitlines()) == 1
-    assert sorted(folder.iterdir()) == before
+def test_refusals_are_one_line_and_write_nothing(folder: Path, command: Command, arguments: str, message: str) -> None:
+    assert message in command.refuses("locate", arguments)
 
 
 def test_help_needs_no_heavy_imports() -> None:

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 import warnings
 from pathlib import Path
 
@@ -10,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from command_line import Command
 
-from kcal.cli.main import main
 from kcal.corners.images import decode_image
 from kcal.errors import FileError, InputError
 from kcal.io.camera_file import load_camera, save_camera
@@ -40,21 +39,11 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["kcal", "rectify", *arguments])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    return int(stop.value.code or 0)
-
-
 @pytest.mark.parametrize(("kind", "channels"), [(np.uint8, 1), (np.uint8, 3), (np.uint16, 1), (np.uint16, 3)])
-def test_depth_and_colors_are_kept(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], kind: type, channels: int
-) -> None:
+def test_depth_and_colors_are_kept(folder: Path, command: Command, kind: type, channels: int) -> None:
     image = picture(kind, channels)
     (folder / "in" / "a[1].png").write_bytes(encode_png(image))
-    assert run(monkeypatch, "left.camera.json", "in", "-o", "new/out", "--alpha", "1", "--mask") == 0
-    printed = capsys.readouterr().out
+    printed = command("rectify left.camera.json in -o new/out --alpha 1 --mask").out
     assert "1 of 1 images rectified, 64x48 px" in printed
 
     camera = load_camera(folder / "new/out/left_rectified.json")
@@ -70,15 +59,12 @@ def test_depth_and_colors_are_kept(
     ]  # fmt: skip
 
 
-def test_a_bad_image_does_not_stop_the_others(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_bad_image_does_not_stop_the_others(folder: Path, command: Command) -> None:
     whole = cv2.imencode(".jpg", picture(np.uint8, 3))[1].tobytes()
     (folder / "in" / "1.jpg").write_bytes(whole[: len(whole) // 2])
     (folder / "in" / "2.jpg").write_bytes(whole)
     (folder / "in" / "3.png").write_bytes(encode_png(np.ascontiguousarray(picture(np.uint8, 1).T)))
-    assert run(monkeypatch, "left.camera.json", "in", "-o", "out") == 1
-    printed = capsys.readouterr()
+    printed = command("rectify left.camera.json in -o out", code=1)
     assert "1 of 3 images rectified" in printed.out
     assert "100.0 % of pixels valid" in printed.out
     assert "in/3.png: the image is 48x64 px, the camera 64x48 px" in printed.err
@@ -86,66 +72,50 @@ def test_a_bad_image_does_not_stop_the_others(
     assert sorted(path.name for path in (folder / "out").iterdir()) == ["2.png", "left_rectified.json", "rectify.json"]
 
 
-def test_nothing_usable_writes_nothing(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_nothing_usable_writes_nothing(folder: Path, command: Command) -> None:
     (folder / "in" / "1.png").write_bytes(b"no image")
-    assert run(monkeypatch, "left.camera.json", "in", "-o", "out") == 1
-    assert "none of 1 images could be resampled: in/1.png: not an image" in capsys.readouterr().err
+    said = command("rectify left.camera.json in -o out", code=1).err
+    assert "none of 1 images could be resampled: in/1.png: not an image" in said
     assert list((folder / "out").iterdir()) == []
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["left.camera.json", "in", "-o", "in"], "in/a.png: an input image would be overwritten"),
-        (["left.camera.json", "in", "b/a.jpg", "-o", "out"], "both in/a.png and b/a.jpg would become this file"),
-        (["nothing.json", "in", "-o", "out"], "nothing.json: cannot read"),
-        (["left.camera.json", "in", "-o", "left.camera.json"], "cannot make this folder"),
-        (["left.camera.json", "no", "-o", "out"], "no: no such file or folder"),
+        ("left.camera.json in -o in", "in/a.png: an input image would be overwritten"),
+        ("left.camera.json in b/a.jpg -o out", "both in/a.png and b/a.jpg would become this file"),
+        ("nothing.json in -o out", "nothing.json: cannot read"),
+        ("left.camera.json in -o left.camera.json", "cannot make this folder"),
+        ("left.camera.json no -o out", "no: no such file or folder"),
     ],
 )
-def test_refused_before_anything_is_written(
-    folder: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    arguments: list[str],
-    message: str,
-) -> None:
+def test_refused_before_anything_is_written(folder: Path, command: Command, arguments: str, message: str) -> None:
     (folder / "b").mkdir()
     for name in ("in/a.png", "b/a.jpg"):
         (folder / name).write_bytes(encode_png(picture(np.uint8, 1)))
-    before = sorted(folder.rglob("*"))
-    assert run(monkeypatch, *arguments) == 1
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1
-    assert message in lines[0]
-    assert sorted(folder.rglob("*")) == before
+    assert message in command.refuses("rectify", arguments)
 
 
-def test_alpha_out_of_range(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert run(monkeypatch, "left.camera.json", "in", "-o", "out", "--alpha", "1.5") == 2
+def test_alpha_out_of_range(folder: Path, command: Command) -> None:
+    command("rectify left.camera.json in -o out --alpha 1.5", code=2)
 
 
-def test_new_camera_file_is_a_pinhole(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_new_camera_file_is_a_pinhole(folder: Path, command: Command) -> None:
     (folder / "in" / "a.png").write_bytes(encode_png(picture(np.uint8, 4)))
-    assert run(monkeypatch, "left.camera.json", "in", "-o", "out") == 0
+    command("rectify left.camera.json in -o out")
     content = json.loads((folder / "out" / "left_rectified.json").read_text())
     assert content["name"] == "left rectified"
     assert content["coefficients"] == {}
 
 
-def test_done_images_are_not_made_again(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_done_images_are_not_made_again(folder: Path, command: Command) -> None:
     """They are after a change of the image, of the view, or where the output is gone."""
     for name in "ab":
         (folder / "in" / f"{name}.png").write_bytes(encode_png(picture(np.uint8, 1)))
-    arguments = ("left.camera.json", "in", "-o", "out")
+    arguments = "left.camera.json in -o out"
 
-    def before(*more: str) -> str:
-        assert run(monkeypatch, *arguments, *more) == 0
-        return capsys.readouterr().out.splitlines()[0]
+    def before(more: str = "") -> str:
+        return command("rectify", arguments, more).out.splitlines()[0]
 
     assert "before" not in before()
     first = (folder / "out" / "a.png").read_bytes()
@@ -155,16 +125,16 @@ def test_done_images_are_not_made_again(
     assert (folder / "out" / "a.png").read_bytes() != first
     (folder / "out" / "b.png").unlink()
     assert "(1 of them before)" in before()
-    assert "before" not in before("--alpha", "1")
+    assert "before" not in before("--alpha 1")
     assert "before" not in before()
 
 
-def test_maps_are_those_of_the_image(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_maps_are_those_of_the_image(folder: Path, command: Command) -> None:
     """By cv2.remap and by torch's grid_sample."""
     image = picture(np.uint8, 1)
     (folder / "in" / "a.png").write_bytes(encode_png(image))
-    options = ("--fov", "40", "--pan", "8", "--tilt", "-5", "--size", "50x40", "--maps")
-    assert run(monkeypatch, "left.camera.json", "in", "-o", "out", *options) == 0
+    options = "--fov 40 --pan 8 --tilt -5 --size 50x40 --maps"
+    command("rectify left.camera.json in -o out", options)
     made = decode_image((folder / "out" / "a.png").read_bytes(), "a").astype(float)
     map_x, map_y = np.load(folder / "out" / "left_map.npy")
     assert made.shape == map_x.shape == (40, 50)
@@ -174,17 +144,15 @@ def test_maps_are_those_of_the_image(folder: Path, monkeypatch: pytest.MonkeyPat
     assert np.abs(sampled[0, 0].numpy() - made).max() <= 0.5 + 1e-3
 
 
-def test_rig(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_rig(folder: Path, command: Command) -> None:
     """Two folders of images, the rig of the new images, and a table of ranges."""
     other = Camera.build(focal=(62, 61), center=(33, 22), size=(64, 48), coefficients=[-0.1])
     save_rig(Rig.pair(CAMERA, other, torch.eye(3), torch.tensor([-0.5, 0.01, 0.0])), folder / "rig.json")
     for side in ("left", "right"):
         (folder / side).mkdir()
         (folder / side / "1.png").write_bytes(encode_png(picture(np.uint8, 3)))
-    assert run(monkeypatch, "rig.json", "left", "-o", "out") == 1
-    assert "a rig needs LEFT and RIGHT" in capsys.readouterr().err
-    assert run(monkeypatch, "rig.json", "left", "right", "-o", "out") == 0
-    printed = capsys.readouterr()
+    assert "a rig needs LEFT and RIGHT" in command("rectify rig.json left -o out", code=1).err
+    printed = command("rectify rig.json left right -o out")
     assert "left: " in printed.out
     assert "disparity, px" in printed.out
     assert "the rig has no error bars" in printed.err
@@ -205,18 +173,20 @@ def test_rig(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
     ],
 )
 def test_sides_of_a_rig(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-    place: tuple[float, float, float], line: str, warned: str,
-) -> None:  # fmt: skip
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    command: Command,
+    place: tuple[float, float, float],
+    line: str,
+    warned: str,
+) -> None:
     """Maps without images; what a disparity is, is said; the rig that is written rectifies to itself."""
     monkeypatch.setenv("COLUMNS", "300")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         save_rig(Rig.pair(CAMERA, CAMERA, torch.eye(3), torch.tensor(place)), folder / "rig.json")
-    assert run(monkeypatch, "rig.json") == 1
-    assert "or --maps for the maps alone" in capsys.readouterr().err
-    assert run(monkeypatch, "rig.json", "--maps", "-o", "out") == 0
-    printed = capsys.readouterr()
+    assert "or --maps for the maps alone" in command("rectify rig.json", code=1).err
+    printed = command("rectify rig.json --maps -o out")
     assert line in printed.out
     assert warned in printed.err
     with warnings.catch_warnings():
@@ -228,12 +198,8 @@ def test_sides_of_a_rig(
     assert np.allclose(np.load(folder / "out" / "Q.npy")[3, 2], 1.0 / -sum(place))
 
 
-def test_rays(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(sys, "argv", ["kcal", "rays", "left.camera.json", "-o", "rays.npz"])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    assert not stop.value.code
-    assert "rays 1 x 48 x 64 x 6, float32" in capsys.readouterr().out
+def test_rays(folder: Path, command: Command) -> None:
+    assert "rays 1 x 48 x 64 x 6, float32" in command("rays left.camera.json -o rays.npz").out
     stored = np.load(folder / "rays.npz")
     assert stored["rays"].shape == (1, 48, 64, 6)
     assert stored["rays"].dtype == np.float32

@@ -5,16 +5,16 @@ from __future__ import annotations
 import csv
 import json
 import math
-import sys
 from pathlib import Path
 
 import cv2
 import pytest
 import torch
+from command_line import Command
 from torch import Tensor
 from typer.testing import CliRunner
 
-from kcal.cli.main import app, main
+from kcal.cli.main import app
 from kcal.cli.rig_sources import Sources, read_sources
 from kcal.io.camera_file import camera_to_file, save_camera
 from kcal.io.images import write_png
@@ -107,23 +107,12 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["kcal", *arguments])
-    with pytest.raises(SystemExit) as stopped:
-        main()
-    code = stopped.value.code
-    return code if isinstance(code, int) else 0
+SOLVE = "rig left.json right.json --landmarks survey.csv --marks marks.csv --pixel-sigma 0.1"
 
 
-SOLVE = ["rig", "left.json", "right.json", "--landmarks", "survey.csv", "--marks", "marks.csv", "--pixel-sigma", "0.1"]
-
-
-def test_from_survey_to_positions(
-    site: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    more = ["--features", "far.csv", "--positions", "gnss.csv", "--baseline", "9.97+-0.05", "--picture", "rig.png"]
-    assert run(monkeypatch, *SOLVE, *more, "-o", "rig.json") == 0
-    printed = capsys.readouterr()
+def test_from_survey_to_positions(site: Path, command: Command) -> None:
+    more = "--features far.csv --positions gnss.csv --baseline 9.97+-0.05 --picture rig.png"
+    printed = command(SOLVE, more, "-o rig.json")
     assert "surveyed, but not marked: tree" in printed.err
     assert "left out: landmark post4: its marks are off the surveyed place by" in printed.err
     assert (site / "rig.png").read_bytes().startswith(b"\x89PNG")
@@ -144,12 +133,8 @@ def test_from_survey_to_positions(
     turn = vector_from_rotation(file.rig().right_from_left_rotation @ (ROTATION[1] @ ROTATION[0].T).T)
     assert bool((turn.abs() < 4.5 * joint.diagonal()[-6:-3].sqrt()).all())
 
-    outputs = ["-o", "out.geojson", "--map", "map.html", "--picture", "map.png"]
-    assert (
-        run(monkeypatch, "locate", "rig.json", "points.csv", "--truth", "truth.csv", "--pixel-sigma", "0.1", *outputs)
-        == 0
-    )
-    printed = capsys.readouterr()
+    outputs = "-o out.geojson --map map.html --picture map.png"
+    printed = command("locate rig.json points.csv --truth truth.csv --pixel-sigma 0.1", outputs)
     assert "95 % of the noise in the marks and of the errors in calibration and mounting" in printed.out
     rows = [line.split() for line in printed.out.splitlines() if line.startswith("t")]
     assert len(rows) == 5
@@ -160,9 +145,7 @@ def test_from_survey_to_positions(
     assert len(json.loads((site / "out.geojson").read_text())["features"]) == 12
 
 
-def test_landmarks_from_geojson_and_a_requirement(
-    site: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_landmarks_from_geojson_and_a_requirement(site: Path, command: Command) -> None:
     rows = list(csv.DictReader((site / "survey.csv").open()))
     features = [
         {
@@ -173,24 +156,20 @@ def test_landmarks_from_geojson_and_a_requirement(
         for row in rows
     ]
     (site / "survey.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": features}))
-    words = ["survey.geojson" if word == "survey.csv" else word for word in SOLVE]
-    assert run(monkeypatch, *words, "-o", "rig.json") == 1
-    assert "say how well the places are known" in capsys.readouterr().err
-    more = ["--survey-sigma", "0.02", "-o", "rig.json", "--report", "rig.html"]
-    assert run(monkeypatch, *words, *more, "--require", "1km:50%") == 0
+    words = SOLVE.replace("survey.csv", "survey.geojson")
+    assert "say how well the places are known" in command(words, "-o rig.json", code=1).err
+    more = "--survey-sigma 0.02 -o rig.json --report rig.html"
+    command(words, more, "--require 1km:50%")
     assert ">YES<" in (site / "rig.html").read_text()
-    assert run(monkeypatch, *words, *more, "--require", "4km:0.1%") == 3
+    assert "NO: at 4 km" in command(words, more, "--require 4km:0.1%", code=3).out
     assert ">NO<" in (site / "rig.html").read_text()
-    assert "NO: at 4 km" in capsys.readouterr().out
 
 
-def test_check_and_relock(site: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(monkeypatch, *SOLVE, "-o", "rig.json") == 0
+def test_check_and_relock(site: Path, command: Command) -> None:
+    command(SOLVE, "-o rig.json")
     before = (site / "rig.json").read_bytes()
-    capsys.readouterr()
-    check = ["rig", "check", "rig.json", "--reference", "then.csv", "--marks", "now.csv", "--pixel-sigma", "0.1"]
-    assert run(monkeypatch, *check) == 3
-    printed = capsys.readouterr()
+    check = "rig check rig.json --reference then.csv --marks now.csv --pixel-sigma 0.1"
+    printed = command(check, code=3)
     assert "left out: s3: it has moved by" in printed.err
     assert "has changed beyond chance" in printed.out
     line = next(line for line in printed.out.splitlines() if line.startswith("right from left"))
@@ -199,7 +178,7 @@ def test_check_and_relock(site: Path, monkeypatch: pytest.MonkeyPatch, capsys: p
     assert "a target at 5000 m is found at" in printed.out
     assert (site / "rig.json").read_bytes() == before
 
-    assert run(monkeypatch, *check, "--relock") == 3
+    command(check, "--relock", code=3)
     (kept,) = site.glob("rig.before-*.json")
     assert kept.read_bytes() == before
     old, new = RigFile.load(kept), RigFile.load(site / "rig.json")
@@ -214,15 +193,13 @@ def test_check_and_relock(site: Path, monkeypatch: pytest.MonkeyPatch, capsys: p
     assert float(spread[1][-5, -5]) > float(spread[0][-5, -5])
 
 
-def test_check_of_equal_marks(site: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_of_equal_marks(site: Path, command: Command) -> None:
     """Exactly no drift, no warning, exit code 0, and nothing written, though the rig itself is not exact."""
-    assert run(monkeypatch, *SOLVE, "-o", "rig.json") == 0
-    capsys.readouterr()
+    command(SOLVE, "-o rig.json")
     files = {path.name: path.read_bytes() for path in site.iterdir()}
-    check = ["rig", "check", "rig.json", "--reference", "then.csv", "--marks", "then.csv", "--relock"]
+    check = "rig check rig.json --reference then.csv --marks then.csv --relock"
     # With a hundredth of their true noise, errors of the rig would be seen.
-    assert run(monkeypatch, *check, "--pixel-sigma", "0.001") == 0
-    printed = capsys.readouterr()
+    printed = command(check, "--pixel-sigma 0.001")
     assert printed.err == ""
     for part in ("left camera", "right camera", "right from left"):
         (line,) = (line for line in printed.out.splitlines() if line.startswith(part))
@@ -233,26 +210,21 @@ def test_check_of_equal_marks(site: Path, monkeypatch: pytest.MonkeyPatch, capsy
     assert {path.name: path.read_bytes() for path in site.iterdir()} == files
 
 
-def test_check_without_a_drift(site: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_without_a_drift(site: Path, command: Command) -> None:
     """New marks with noise of their own, and the marks of the survey from which the rig was solved."""
-    assert run(monkeypatch, *SOLVE, "-o", "rig.json") == 0
+    command(SOLVE, "-o rig.json")
     before = (site / "rig.json").read_bytes()
     marks_table(site / "now.csv", "s", marked(points(25, 400.0, 6000.0, 33), 8))
-    capsys.readouterr()
     for *source, now in (("--reference", "then.csv", "now.csv"), ("--landmarks", "survey.csv", "marks.csv")):
-        check = ["rig", "check", "rig.json", *source, "--marks", now, "--pixel-sigma", "0.1", "--relock"]
-        assert run(monkeypatch, *check) == 0
-        printed = capsys.readouterr()
+        printed = command("rig check rig.json", *source, "--marks", now, "--pixel-sigma 0.1 --relock")
         assert "nothing was written" in printed.out
         assert "warning" not in printed.err
         assert (site / "rig.json").read_bytes() == before
         assert not list(site.glob("rig.before-*.json"))
 
 
-def test_check_of_a_rig_that_turned_as_a_whole(
-    site: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(monkeypatch, *SOLVE, "-o", "rig.json") == 0
+def test_check_of_a_rig_that_turned_as_a_whole(site: Path, command: Command) -> None:
+    command(SOLVE, "-o rig.json")
     heading = RigFile.load(site / "rig.json").mounting.heading_deg
     where = points(25, 400.0, 6000.0, 33)
     sine, cosine = math.sin(math.radians(0.05)), math.cos(math.radians(0.05))
@@ -262,31 +234,17 @@ def test_check_of_a_rig_that_turned_as_a_whole(
     now = torch.stack(sides, 1)
     noise = torch.Generator().manual_seed(8)
     marks_table(site / "now.csv", "s", now + 0.1 * torch.randn(now.shape, dtype=torch.float64, generator=noise))
-    check = ["rig", "check", "rig.json", "--reference", "then.csv", "--marks", "now.csv", "--pixel-sigma", "0.1"]
-    capsys.readouterr()
-    assert run(monkeypatch, *check, "--relock") == 3
-    printed = capsys.readouterr()
+    check = "rig check rig.json --reference then.csv --marks now.csv --pixel-sigma 0.1"
+    printed = command(check, "--relock", code=3)
     assert "no change of the relative attitude beyond chance" in printed.out
     assert "the left camera has turned beyond chance" in printed.out
     assert RigFile.load(site / "rig.json").mounting.heading_deg == pytest.approx(heading + 0.05, abs=0.005)
 
 
-def test_check_by_landmarks(site: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(monkeypatch, *SOLVE, "-o", "rig.json") == 0
-    capsys.readouterr()
-    arguments = [
-        "rig",
-        "check",
-        "rig.json",
-        "--landmarks",
-        "survey.csv",
-        "--marks",
-        "later.csv",
-        "--pixel-sigma",
-        "0.1",
-    ]
-    assert run(monkeypatch, *arguments, "--relock") == 3
-    printed = capsys.readouterr()
+def test_check_by_landmarks(site: Path, command: Command) -> None:
+    command(SOLVE, "-o rig.json")
+    arguments = "rig check rig.json --landmarks survey.csv --marks later.csv --pixel-sigma 0.1"
+    printed = command(arguments, "--relock", code=3)
     line = next(line for line in printed.out.splitlines() if line.startswith("right from left"))
     assert abs(float(line.split()[6]) - 0.02) < 4.5 * float(line.split()[8])
     new = RigFile.load(site / "rig.json")
@@ -297,35 +255,26 @@ def test_check_by_landmarks(site: Path, monkeypatch: pytest.MonkeyPatch, capsys:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--landmarks", "survey.csv"], "--landmarks and --marks belong together"),
-        (["--features", "far.csv", "--baseline", "10"], "write LENGTH±SIGMA in meters"),
-        (["--features", "far.csv"], "nothing tells where right stands"),
-        (["--landmarks", "survey.csv", "--marks", "then.csv"], "names must be the same in both files"),
-        (["--landmarks", "survey.csv", "--marks", "marks.csv", "--board-warp"], "cannot be estimated without boards"),
-        (["--landmarks", "survey.csv", "--marks", "marks.csv", "--picture", "a.jpg"], "end with .png"),
+        ("--landmarks survey.csv", "--landmarks and --marks belong together"),
+        ("--features far.csv --baseline 10", "write LENGTH±SIGMA in meters"),
+        ("--features far.csv", "nothing tells where right stands"),
+        ("--landmarks survey.csv --marks then.csv", "names must be the same in both files"),
+        ("--landmarks survey.csv --marks marks.csv --board-warp", "cannot be estimated without boards"),
+        ("--landmarks survey.csv --marks marks.csv --picture a.jpg", "end with .png"),
     ],
 )
-def test_refusals(
-    site: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    arguments: list[str],
-    message: str,
-) -> None:
-    assert run(monkeypatch, "rig", "left.json", "right.json", *arguments, "-o", "rig.json") == 1
-    assert message in capsys.readouterr().err
+def test_refusals(site: Path, command: Command, arguments: str, message: str) -> None:
+    assert message in command("rig left.json right.json", arguments, "-o rig.json", code=1).err
     assert not (site / "rig.json").exists()
 
 
-def test_usage(site: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(monkeypatch, *SOLVE, "-o", "rig.json") == 0
-    assert run(monkeypatch, "rig", "check", "rig.json", "--marks", "now.csv") == 1
-    assert "--reference" in capsys.readouterr().err
-    both = ["--reference", "then.csv", "--landmarks", "survey.csv"]
-    assert run(monkeypatch, "rig", "check", "rig.json", "--marks", "now.csv", *both) == 1
-    assert "not both" in capsys.readouterr().err
-    assert run(monkeypatch, "locate", "rig.json", "points.csv", "--origin", "1,2,3") == 2
-    assert run(monkeypatch, "locate", "rig.json", "points.csv", "--pitch", "1") == 2
+def test_usage(site: Path, command: Command) -> None:
+    command(SOLVE, "-o rig.json")
+    assert "--reference" in command("rig check rig.json --marks now.csv", code=1).err
+    both = "--reference then.csv --landmarks survey.csv"
+    assert "not both" in command("rig check rig.json --marks now.csv", both, code=1).err
+    command("locate rig.json points.csv --origin 1,2,3", code=2)
+    command("locate rig.json points.csv --pitch 1", code=2)
 
 
 def test_marks_count_with_their_own_noise(site: Path) -> None:
@@ -344,22 +293,20 @@ def test_marks_count_with_their_own_noise(site: Path) -> None:
     assert read.pixel_sigma == pytest.approx(math.sqrt((10 * 0.2**2 + 0.4**2 + 0.1**2) / 12))
 
 
-def test_the_rig_file_states_the_noise_of_its_marks(
-    site: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_rig_file_states_the_noise_of_its_marks(site: Path, command: Command) -> None:
     marks = read_marks(site / "marks.csv")
     write_marks(site / "own.csv", marks._replace(covariance=0.2**2 * torch.eye(4).double().expand(12, 4, 4)))
-    given = ["rig", "left.json", "right.json", "--landmarks", "survey.csv", "--marks"]
+    given = "rig left.json right.json --landmarks survey.csv --marks"
     for marked_in, more, stated, said in (
-        ("own.csv", [], 0.2, "noise of marks: 0.2 px, from the rig's file"),
-        ("own.csv", ["--pixel-sigma", "0.15"], 0.15, ""),
-        ("marks.csv", [], None, "noise of marks: 0.3 px, assumed"),
+        ("own.csv", "", 0.2, "noise of marks: 0.2 px, from the rig's file"),
+        ("own.csv", "--pixel-sigma 0.15", 0.15, ""),
+        ("marks.csv", "", None, "noise of marks: 0.3 px, assumed"),
     ):
-        assert run(monkeypatch, *given, marked_in, *more, "-o", "rig.json") == 0
+        printed = command(given, marked_in, more, "-o rig.json")
         calibration = RigFile.load(site / "rig.json").calibration
         assert calibration is not None
         assert calibration.pixel_sigma == (None if stated is None else pytest.approx(stated))
-        assert said in capsys.readouterr().out
+        assert said in printed.out
 
 
 # `kcal rig --tracks`: a rig from a drone's flight, and refusals.

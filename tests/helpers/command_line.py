@@ -1,0 +1,51 @@
+"""The command line, as a user types it; `command` of `tests/conftest.py` is one."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+
+class Said(NamedTuple):
+    """What a command printed."""
+
+    out: str
+    err: str
+
+
+class Command:
+    """Runs `kcal` in the working folder. Blanks in a text separate words; a path is one word."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+        self._monkeypatch, self._capsys = monkeypatch, capsys
+
+    def __call__(self, *words: object, code: int = 0) -> Said:
+        """What a command prints that must end with this exit code."""
+        from kcal.cli.main import main
+
+        given = [part for word in words for part in (word.split() if isinstance(word, str) else [str(word)])]
+        self._monkeypatch.setattr(sys, "argv", ["kcal", *given])
+        self._capsys.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            main()
+        said = Said(*self._capsys.readouterr())
+        assert (ended.value.code or 0) == code, said
+        return said
+
+    def refuses(self, *words: object) -> str:
+        """The one line that a command says which must fail. Nothing may appear or change in the folder."""
+        before = contents()
+        said = self(*words, code=1)
+        assert said.err.startswith("error: "), said.err
+        assert len(said.err.splitlines()) == 1, said.err
+        assert "Traceback" not in said.out + said.err
+        assert contents() == before
+        return said.err
+
+
+def contents() -> dict[Path, bytes]:
+    """All files and folders below the working folder."""
+    return {path: path.read_bytes() if path.is_file() else b"" for path in Path().rglob("*")}
