@@ -173,7 +173,7 @@ def test_images_become_a_source(nights: list[list[NamedStars]]) -> None:
     # A warmer air bends less: stars sink.
     shift = source.effects[2].shift
     assert shift is not None
-    assert bool((shift[source.named][:, 2] < 0).all())
+    assert bool((shift[source.named][..., 2] < 0).all())
 
 
 def test_moments_of_unlike_times(nights: list[list[NamedStars]]) -> None:
