@@ -169,7 +169,7 @@ def match_points(
 
 
 def joined(found: Sequence[PatchMatch]) -> Matches:
-    """The matches of patches, one after the other."""
+    """Join the matches of patches into one record."""
     numbers = torch.full((len(found), 8), math.nan, dtype=torch.float64)
     status = torch.tensor([int(match.status) for match in found], dtype=torch.int64)
     matches = Matches(numbers[:, :2], numbers[:, 2:6].unflatten(1, (2, 2)), status, numbers[:, 6], numbers[:, 7])
@@ -338,7 +338,7 @@ class Keypoints(NamedTuple):
     descriptors: Tensor
 
     def at(self, which: Tensor) -> Keypoints:
-        """Those at some places."""
+        """The keypoints at these indices."""
         return Keypoints(self.pixels[which], self.descriptors[which])
 
 

@@ -48,7 +48,7 @@ class View(Record):
     sha256: str | None = None
 
     def keeping(self, kept: Sequence[bool]) -> View:
-        """The same view without the corners that are not kept."""
+        """A copy of the view in which corners that are not kept are None."""
         pixels = tuple(value if own else None for value, own in zip(self.pixels, kept, strict=True))
         spread = self.covariance
         if spread is not None:

@@ -279,7 +279,7 @@ class _Patches(NamedTuple):
     grid: Tensor | None
 
     def at(self, which: Tensor) -> _Patches:
-        """The objects at some places."""
+        """The fits of the objects at these indices."""
         right = self.right.at(which)
         slopes, weight = self.slopes[which], self.weight[which]
         return _Patches(self.template[which], right, self.moved[which], slopes, weight, self.grid)
@@ -329,7 +329,7 @@ def _scale(residual: Tensor, weight: Tensor) -> Tensor:
 
 
 def _balance(patches: _Patches, theta: Tensor, scale: Tensor) -> Tensor:
-    """(N, 4 or 8) what is zero at the solution."""
+    """(N, 4 or 8) the estimating equations, which are zero at the solution."""
     residual, _, design = _residual(patches, theta)
     weight = patches.weight.flatten(1) * _biweight(residual, scale, patches)
     return ((weight * residual)[..., None] * design).sum(1)

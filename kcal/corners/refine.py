@@ -179,7 +179,7 @@ def _of_one_image(
     grid: tuple[int, int] | None,
     levels: tuple[float, float] | None,
 ) -> saddles.Refined:
-    """Of one image (H, W): the saddle's corners, or the erf fit from there.
+    """Refine the corners of one image (H, W): by the saddle alone, or by the erf fit from there.
 
     Where the saddle failed, its reason stays, unless it is saturation.
     """

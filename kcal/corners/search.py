@@ -264,7 +264,7 @@ def find_part(image: npt.NDArray[np.uint8], board: Board, seeds: Iterable[Tensor
 
 
 def _grown(image: npt.NDArray[np.uint8], seed: Tensor, board: Board) -> BoardPart:
-    """The part of the board that grows from a seed."""
+    """Grow a part of the board from a seed."""
     longer, shorter = max(board.columns, board.rows), min(board.columns, board.rows)
     grid = grown_grid(image, seed, longer + 1)
     known = torch.isfinite(grid).all(-1)

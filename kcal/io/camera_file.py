@@ -137,7 +137,7 @@ class CameraFile(NativeFile):
 
     @pydantic.field_serializer("calibration", mode="wrap")
     def _board_as_before(self, value: CalibrationRecord | None, plain: pydantic.SerializerFunctionWrapHandler):  # type: ignore[no-untyped-def]
-        """Leave out what checkerboards do not need, so that files of them stay as they were."""
+        """Leave out fields that checkerboards do not need, so that their files stay as they were."""
         content = plain(value)
         if content is not None and content["board"]["pattern"] == "checkerboard":
             del content["board"]["pattern"], content["board"]["gap"]
@@ -252,7 +252,7 @@ def camera_to_file(
 
 
 def named_camera_file(camera: Camera, otherwise: str) -> CameraFile:
-    """The same, under another name if the camera has none."""
+    """The file of a camera, with the name `otherwise` if the camera has none."""
     return camera_to_file(camera, name=(camera.calibration or CameraCalibration()).name or otherwise)
 
 

@@ -52,7 +52,7 @@ class CameraSummary(Record):
 
     @classmethod
     def derived(cls, camera: Camera, content: dict[str, Any]) -> Self:
-        """The same, with the error where something cannot be derived."""
+        """Derive the summary; an error is raised if something cannot be derived."""
         from kcal.lens.uncertainty import paraxial_focal
 
         record = camera.calibration.record if camera.calibration else None
@@ -79,7 +79,7 @@ def sigma_of(camera: Camera) -> dict[str, float | None]:
 
 
 def take_joint_errors(rig: Rig) -> None:
-    """Give the cameras the error bars that the rig has of them: those of each alone are of before it was solved."""
+    """Give the cameras the error bars of the solved rig, in place of those of their own calibrations."""
     if rig.covariance is None:
         return
     first = 0

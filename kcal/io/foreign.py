@@ -81,7 +81,7 @@ class ImportedCameras:
         return tuple(camera.calibration.name if camera.calibration else "" for camera in self.cameras)
 
     def is_rig(self) -> bool:
-        """Whether these are two cameras that do not stand in the same place."""
+        """Whether these are two cameras at different places."""
         return (
             len(self.cameras) == 2
             and len(self.poses) == 2
@@ -320,7 +320,7 @@ class Keys(Mapping[str, Any]):
 
 @contextmanager
 def reading(path: str | Path, what: str) -> Iterator[None]:
-    """Turn whatever goes wrong while a file is read into one `FileError` that names it.
+    """Turn any error while a file is read into one `FileError` that names the file.
 
     What is in a file must not end a program: parsers raise errors of a dozen kinds, and all mean that the file is bad.
     """

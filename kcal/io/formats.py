@@ -162,7 +162,7 @@ def format_named(name: str) -> CameraFormat:
 
 
 def held_exactly(camera: Camera, models: Sequence[str], skew: bool = False) -> Camera | None:
-    """The same camera in the first of the models that contains its lens; None if none does.
+    """The camera in the first of the models that represents its lens exactly; None if none does.
 
     Example:
         >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), coefficients=[-0.1, 0.01])

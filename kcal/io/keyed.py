@@ -81,7 +81,7 @@ _ZERO = re.compile(".*(?:inverse|modified)brownconrady")
 
 
 def _role(key: str, value: Any) -> tuple[str, str] | None:
-    """What a key of a camera means, and which side of a rig it says that it is of."""
+    """What a key of a camera means, and the side of the rig that it names."""
     name, found = bare(key), flat(value)
     count = len(found) if found is not None else -1
     many = isinstance(value, list | tuple | Mapping) or hasattr(value, "tolist")
@@ -96,7 +96,7 @@ def _role(key: str, value: Any) -> tuple[str, str] | None:
 
 
 class _Named:
-    """What is known of cameras: (role, side) to the key that says it."""
+    """Values of cameras by (role, side), with the key of each."""
 
     def __init__(self, content: Mapping[str, Any]) -> None:
         self.keys, self.at = Keys(content), dict[tuple[str, str], str]()
@@ -111,20 +111,20 @@ class _Named:
             self.at.setdefault((f"kind {key}", role[1]) if role[0] == "kind" else role, key)
 
     def sides(self) -> list[str]:
-        """Those of which there is a camera."""
+        """The sides that have a camera."""
         return sorted({side for role, side in self.at if role in ("matrix", "fx", "f")})
 
     def get(self, role: str, side: str = "") -> Any:
-        """What is said of a side, or of all; None if nothing is."""
+        """The value for a side, else the one for all sides; None if there is neither."""
         key = self.at.get((role, side)) or self.at.get((role, ""))
         return None if key is None else self.keys[key]
 
     def key(self, role: str, side: str) -> str:
-        """What that is called in the file."""
+        """The key of that value in the file."""
         return self.at.get((role, side)) or self.at.get((role, ""), role)
 
     def number(self, role: str, side: str, otherwise: float = 0.0) -> float:
-        """The same for a number."""
+        """The value as a number; `otherwise` if there is none."""
         found = self.get(role, side)
         return otherwise if found is None else numbers(found, 1, self.key(role, side))[0]
 
@@ -196,7 +196,7 @@ def speaks_of_camera(text: str) -> bool:
 
 
 def read_keyed(content: Mapping[str, Any], name: str, hints: Hints, title: str) -> ImportedCameras:
-    """The cameras of a mapping: one, several whose keys name a side, or those of mappings inside it.
+    """Read the cameras of a mapping: one, several whose keys name a side, or those of mappings inside it.
 
     Poses are those of each camera, or R and T of the second one of two.
 

@@ -57,7 +57,7 @@ _TABLES = {"project": "pixels_from_chart", "unproject": "chart_from_pixels"}
 
 
 def save_lookup(camera: LookupCamera, path: str | Path) -> Path:
-    """Write a lookup camera as .npz; see the module's first lines for what is in it.
+    """Write a lookup camera as .npz; the module's docstring lists the arrays.
 
     Raises:
         FileError: the file cannot be written.

@@ -110,7 +110,7 @@ class CovarianceRecord(Record):
 
 
 class InformationRecord(Record):
-    """A `CameraInformation` by the names of the parameters; whatever is not named is held.
+    """A `CameraInformation` by the names of the parameters; parameters without a name are held.
 
     The unknowns are groups of parameters that are equal, then the amplitudes of the board's modes. The likelihood of
     the data near the estimate is exp(-½ ‖R (x - estimate) + r‖²), the prior exp(-½ Σ ((x - mean) / sigma)²).
@@ -145,7 +145,7 @@ class InformationRecord(Record):
 
     @classmethod
     def of(cls, known: CameraInformation, names: tuple[str, ...]) -> InformationRecord:
-        """In the form in which it is stored; `names` are those of the camera's parameters."""
+        """Convert for storage; `names` are those of the camera's parameters."""
         groups: list[list[str]] = [[] for _ in range(known.lens_size)]
         for name, slot in zip(names, known.slots, strict=True):
             if slot >= 0:
@@ -161,7 +161,7 @@ class InformationRecord(Record):
         )
 
     def information(self, values: dict[str, float]) -> CameraInformation:
-        """What is known of a camera with these values of its parameters, by name, in their order."""
+        """The `CameraInformation` of a camera with these values of its parameters, by name, in their order."""
         slots = {name: slot for slot, group in enumerate(self.unknowns) for name in group}
         lens, count = [values[group[0]] for group in self.unknowns], len(self.mean)
         rows = _triangle_of(self.triangle.tensor(), count)

@@ -134,7 +134,7 @@ class ImageTransform:
         return tuple(made)
 
     def then(self, other: ImageTransform) -> ImageTransform:
-        """This and after it another one, as one.
+        """This transform followed by another one, as one transform.
 
         Raises:
             InputError: `other` begins with an image of another size.
@@ -194,7 +194,7 @@ OPENCV_MODELS = {
 
 
 class ConvertibleCamera(CameraParameters):
-    """What every camera can be made into; the parameters are those of `CameraParameters`."""
+    """Conversions of a camera: other image sizes, OpenCV and kornia."""
 
     calibration = UntilChanged[CameraCalibration](lambda camera, value: value.check(len(camera.names)))
 

@@ -52,7 +52,7 @@ class CameraLike(Protocol):
 
 
 class MissingParameterError(InputError, AttributeError):
-    """A camera that is known by its projection alone is asked for what only parameters tell."""
+    """A camera without parameters is asked for something that only parameters tell."""
 
 
 class AdaptedCamera(Float64Module):
@@ -144,7 +144,7 @@ class AdaptedCamera(Float64Module):
         return Projection(found, torch.stack(slopes, -3), empty, valid)
 
     def __getattr__(self, name: str) -> Any:
-        """What is missing."""
+        """Raise `MissingParameterError` for attributes that only cameras with parameters have."""
         try:
             return super().__getattr__(name)
         except AttributeError:

@@ -152,7 +152,7 @@ class LensParameters(Operations, StatedModule):
 
 
 def _with_new_region(module: Any, _: Any) -> None:
-    """After a state was loaded, that of a network in the lens too."""
+    """Measure the region anew after a state was loaded, also one of a network in the lens."""
     module.update_valid_region()
 
 

@@ -23,7 +23,7 @@ Key = Annotated[str, pydantic.Field(min_length=8, max_length=64)]
 
 
 def marking_app(desk: Desk, token: str, hosts: tuple[str, ...]) -> Starlette:
-    """The application: what is asked for is checked by the types of the answers' parameters.
+    """Make the application; requests are checked by the types of the handlers' parameters.
 
     Args:
         desk: what it serves.

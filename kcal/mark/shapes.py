@@ -191,7 +191,7 @@ def improve(
     whiten: Callable[[Floats], Floats],
     iterations: int = 15,
 ) -> ShapeFit | None:
-    """Least squares from one start (P,), `whiten` making the errors of columns (N, K) alike and independent."""
+    """Least squares from one start (P,); `whiten` makes the errors of columns (N, K) independent and of equal size."""
     residual = _whitened_residual(shape, where, levels, whiten)
     low, high = np.array([-6.0, -6.0, *shape.low]), np.array([6.0, 6.0, *shape.high])
     _, best = _minimized(residual, start, low, high, iterations)

@@ -62,7 +62,7 @@ _PARTNERS = 0.5
 
 
 def view_findings(result: CameraCalibrationResult, noise: float | None = None) -> list[Finding]:
-    """What the views themselves say, whatever was fitted to them.
+    """Findings about the views, which do not depend on what was fitted to them.
 
     Args:
         result: the calibration.
@@ -233,7 +233,7 @@ _LENS = 5.0
 def model_findings(
     result: CameraCalibrationResult, options: CalibrationOptions, found: Examination
 ) -> tuple[list[Finding], float]:
-    """What speaks against lens model, board and error bars, and by how many px RMS the camera is wrong beyond these.
+    """Findings about lens model, board and error bars, and the px RMS by which the camera errs beyond its error bars.
 
     A fault is what was measured: halves of the views, or a reference, that differ by more than the error bars state, or
     a plain lens that predicts other views better. Residuals that are not noise are a note: error bars allow for them.

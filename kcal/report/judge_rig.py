@@ -211,7 +211,7 @@ def named_cameras(rig: Rig) -> list[tuple[str, Camera]]:
 
 
 def _inherited(rig: Rig, cameras: Sequence[Verdict]) -> list[Finding]:
-    """Findings about the cameras, each named; what is the same of several is said once."""
+    """Findings about the cameras, with their names; a finding that several cameras share is listed once."""
     found: dict[Finding, list[str]] = {}
     if cameras:
         for verdict in cameras:

@@ -66,7 +66,7 @@ def verdict_page(
 
 
 def _from_template(name: str, **values: Any) -> str:
-    """Fill a template of this folder, with the style beside it; texts become texts, whatever is in them."""
+    """Fill a template of this folder and embed its style; markup in values is escaped."""
     import jinja2  # loaded here, like matplotlib above: answers without a page do without both
 
     environment = jinja2.Environment(

@@ -313,7 +313,7 @@ _MOST, _WIDTH = 6, 9.0
 
 
 def skyline_figure(images: Sequence[tuple[str, NDArray[Any]]], found: Sequence[SkylineAttitude]) -> Figure:
-    """Draw each image with the raster's skyline over it, and below what is left of it in the columns.
+    """Draw the raster's skyline over each image, and below it the residual of each column.
 
     Args:
         images: name and gray levels (H, W) of each.

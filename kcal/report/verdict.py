@@ -219,7 +219,7 @@ class Verdict:
 
     @property
     def next_step(self) -> str:
-        """The next picture to take, or what else to do, against the reason; empty where nothing is needed."""
+        """What to photograph or do next to mend the reason of the answer; empty if nothing is needed."""
         named, worst = self._forbidding, self._worst
         if named is not None and named.action:
             return named.action
@@ -247,7 +247,7 @@ class Verdict:
 
     @property
     def _forbidding(self) -> Finding | None:
-        """What forbids the use: error bars that nobody can believe, else what is behind the worst answer's error."""
+        """What forbids the use: error bars that cannot be believed, else the cause of the worst answer's error."""
         worst = self._worst
         without_worth = [finding for finding in self.stops if not finding.part]
         if without_worth or worst is None:

@@ -364,7 +364,7 @@ class BoardSize(NamedTuple):
 
 @dataclass(frozen=True)
 class PrintedBoard:
-    """A checkerboard as a printer and a wall leave it; poses and sizes are those of the board as it should be.
+    """A checkerboard whose print and paper have errors; its poses and sizes are those of the ordered board.
 
     It is stretched by 0.15 % along x, sheared by 0.02 %, bent by 0.7 mm about an oblique axis, and off by smooth errors
     of 0.03 mm.

@@ -226,7 +226,7 @@ class Cut(NamedTuple):
     slopes: tuple[Floats, Floats, Floats, Floats]
 
     def part(self, window: tuple[slice, ...]) -> Cut:
-        """The same in rows and columns of the window."""
+        """The part of this cut in some rows and columns of the window."""
         down, across, up_down, up_across = (each if each.size == 1 else each[window] for each in self.slopes)
         slopes = down, across, up_down, up_across
         return Cut(self.along[window], self.up[window], self.far[window], slopes)

@@ -453,7 +453,7 @@ def ships_at(site: PracticeSite, share: float) -> list[ShipAt]:
 
 
 def frames(site: PracticeSite, side: Side, count: int = RATE * SECONDS) -> Iterator[NDArray[np.uint8]]:
-    """Frames (H, W) of one camera, in gray; what does not move has the same noise in all of them, which films smaller.
+    """Gray frames (H, W) of one camera; still parts have the same noise in every frame, so that the video stays small.
 
     Args:
         site: the coast.
@@ -489,7 +489,7 @@ _Placed = tuple[shore.Facet, tuple[slice, slice]]
 def _with_ships(
     site: PracticeSite, side: Side, window: tuple[slice, slice], fixed: list[_Placed], moving: list[_Placed]
 ) -> Floats:
-    """Light (H, W, 3) in a window with all ships in it, and over them what is nearer than they are."""
+    """Light (H, W, 3) in a window with all ships in it, covered by what is nearer than they are."""
     camera, part = site.eyes[side], site.light(side)[window].copy()
     ships = [each for each in moving if _meet(each[1], window)]
     farthest = max(facet.distance for facet, _ in ships)

@@ -41,7 +41,7 @@ class Surface:
         return 0.0 if math.isinf(self.radius) else 1.0 / self.radius
 
     def scaled(self, scale: float) -> Self:
-        """The same with all lengths multiplied."""
+        """The surface with all its lengths multiplied."""
         return replace(self, radius=self.radius * scale, thickness=self.thickness * scale)
 
     def meet(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:

@@ -247,7 +247,7 @@ def render_light(
 
 
 def _in_light(options: RenderOptions) -> RenderOptions:
-    """The same levels as shares of light, times 255."""
+    """Options whose gray levels are converted to shares of light, times 255."""
     levels = {name: 255 * (getattr(options, name) / 255) ** options.gamma for name in ("black", "white", "background")}
     return options if options.gamma == 1 else replace(options, **levels)
 
@@ -345,7 +345,7 @@ def _on_print(a: Tensor, b: Tensor, sight: Tensor, board: PrintedBoard, margin: 
 
 
 def _linear(count: int, step: int) -> tuple[Tensor, Tensor]:
-    """Weights (count, nodes) of linear interpolation at 0, 1, ..., and the nodes: every so many, and the last."""
+    """Weights (count, nodes) of linear interpolation at 0, 1, ..., and the nodes: each `step`-th place and the last."""
     nodes = torch.cat([torch.arange(0, count - 1, step), torch.tensor([count - 1])])
     place = torch.arange(count)
     first = (place // step).clamp_max(max(len(nodes) - 2, 0))
