@@ -135,18 +135,12 @@ def near_epipolar_lines(
     first = _Rays(ray @ rotation.T, rotation @ by_pixel, own[2] - rotation @ by_error).split(len(whole))
     other = _Rays(*_turns(rig.right, right.reshape(-1, 2), own[1])).split(len(whole))
     shifts = shift, own[3]
-    errors, pairs = max(1, own[3].shape[1]), whole[0].numel()
+    pairs = whole[0].numel()
     for moments in torch.arange(len(whole), device=left.device).split(_AT_ONCE // (32 * pairs) + 1):
         seen = other.at(moments)
         for rows in torch.arange(left.shape[-2], device=left.device).split(_AT_ONCE // (32 * right.shape[-2]) + 1):
             part = first.at((moments[:, None], rows))
-            block = _possible(part, seen, shifts, sigma, _SLACK * gate, ranges)
-            if len(known):
-                # Exact where the bound on what the errors of the rig do leaves it open.
-                for at, some, columns in (which.T for which in block.nonzero().split(_AT_ONCE // (8 * errors) + 1)):
-                    certain = _certain(part.at((at, some)), seen.at((at, columns)), shifts, sigma, _SLACK * gate)
-                    block[at, some, columns] = certain
-            whole[moments[:, None], rows] = block
+            whole[moments[:, None], rows] = _possible(part, seen, shifts, sigma, _SLACK * gate, ranges)
     return near
 
 
@@ -158,7 +152,7 @@ def _possible(
     gate: float,
     ranges: tuple[float, float] | None,
 ) -> Tensor:
-    """(B, N, M) bool: each error of the rig as large as it can be beside the others."""
+    """(B, N, M) bool."""
     shift, by_shift = shifts
     turned, rays = first.ray[..., None, :], other.ray[:, None]
     across = torch.linalg.cross(rays, shift.expand_as(rays))
@@ -169,13 +163,19 @@ def _possible(
     by_other = torch.linalg.cross(*torch.broadcast_tensors(rays, torch.linalg.cross(shift.expand_as(turned), turned)))
     marks = (by_turn @ first.by_pixel).square().sum(-1)
     marks = marks + (by_other.transpose(1, 2) @ other.by_pixel).square().sum(-1).mT
-    moved = _length(by_turn, first.by_error) + _length(by_other.transpose(1, 2), other.by_error).mT
-    moved = moved + _length(shifted, by_shift)
+    # Squares of what the errors of the rig add together, by their products: no K for each pair.
+    left, right = first.by_error, other.by_error
+    back, cross = by_other.transpose(1, 2), left.flatten(1, 2) @ right.flatten(1, 2).mT
+    cross = cross.unflatten(2, (-1, 3)).unflatten(1, (-1, 3)).transpose(2, 3)  # (B, N, M, 3, 3)
+    moved = ((by_turn @ (left @ left.mT)) * by_turn).sum(-1) + ((back @ (right @ right.mT)) * back).sum(-1).mT
+    moved = moved - 2.0 * ((by_turn[..., None, :] @ cross)[..., 0, :] * by_other).sum(-1)
+    with_shift = 2.0 * (by_turn @ (left @ by_shift.T)) - 2.0 * (back @ (right @ by_shift.T)).transpose(1, 2)
+    moved = moved + ((with_shift + shifted @ (by_shift @ by_shift.T)) * shifted).sum(-1)
     # What products of two turns add at most.
     turns = first.by_pixel.square().sum((-2, -1))[..., None], other.by_pixel.square().sum((-2, -1))[:, None]
     second = (gate * sigma) ** 2 * (turns[0] + turns[1])
     baseline = torch.linalg.vector_norm(shift)
-    near = error.abs() <= gate * ((sigma**2 * marks).sqrt() + moved) + second * baseline
+    near = error.abs() <= gate * (sigma**2 * marks + moved.clamp_min(0.0)).sqrt() + second * baseline
     if ranges is None:
         return near
     # A point at the inverse distance q is seen where the cross product of its rays is q times that with the baseline.
@@ -189,26 +189,6 @@ def _possible(
     before = inverse - reach > _MIDDLE / ranges[0]
     # Near the baseline's own direction nothing is said of the distance.
     return near & ~((beyond | before) & (gate * stretch < 0.3))
-
-
-def _length(by: Tensor, errors: Tensor) -> Tensor:
-    """Of by (..., M, 3) times errors (..., 3, K), by the products of the errors with each other: no K for each pair."""
-    return ((by @ (errors @ errors.mT)) * by).sum(-1).clamp_min(0.0).sqrt()
-
-
-def _certain(first: _Rays, other: _Rays, shifts: tuple[Tensor, Tensor], sigma: float, gate: float) -> Tensor:
-    """(L,) bool: the same of L pairs, with the errors of the rig together."""
-    shift, by_shift = shifts
-    across = torch.linalg.cross(other.ray, shift.expand_as(other.ray))
-    by_turn = torch.linalg.cross(first.ray, across)[:, None]
-    by_other = torch.linalg.cross(other.ray, torch.linalg.cross(shift.expand_as(first.ray), first.ray))[:, None]
-    shifted = torch.linalg.cross(first.ray, other.ray)[:, None]
-    marks = torch.cat([by_turn @ first.by_pixel, by_other @ other.by_pixel], -1)
-    moved = by_turn @ first.by_error - by_other @ other.by_error + shifted @ by_shift
-    variance = sigma**2 * marks.square().sum((1, 2)) + moved.square().sum((1, 2))
-    turns = sum(ray.by_pixel.square().sum((1, 2)) for ray in (first, other))
-    second = (gate * sigma) ** 2 * turns * torch.linalg.vector_norm(shift)
-    return (first.ray * across).sum(-1).abs() <= gate * variance.sqrt() + second
 
 
 def _turns(camera: Camera, pixels: Tensor, half: Tensor) -> tuple[Tensor, Tensor, Tensor]:
