@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-from kcal.calibrate.rig.source import shifts_of
 from kcal.calibrate.rig.stars import StarSource, star_turns
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
@@ -165,7 +164,7 @@ def test_on_the_earth_the_clock_and_the_air_are_unknown() -> None:
     assert names[1:] == ["the clocks against UT1", "the air's temperature", "the air's pressure"]
     turns = turns_of_one(found)[1]
     assert turns.numpy() == pytest.approx(np.stack([0.3 * -EARTH_RATE * pole_in_enu(45.0)] * 2))
-    by_camera = shifts_of(found.effects, (*found.pixels.shape[:2], 3))
+    by_camera = found.shifts()
     shifts = by_camera[:, :, 0]
     assert torch.equal(by_camera[:, :, 1], shifts)
     assert bool((shifts[:2] == 0).all())

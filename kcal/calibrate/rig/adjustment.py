@@ -108,7 +108,9 @@ class Adjustment:
         if whole is not None and source.effects:
             begin = sum(len(one.effects) for one, place in self.sources if place.start < at.start)
             part = slice(begin, begin + len(source.effects))
-            effects = Effects(whole[part], None if unknowns.by_effects is None else unknowns.by_effects[part])
+            effects = Effects(
+                source.shifts(), whole[part], None if unknowns.by_effects is None else unknowns.by_effects[part]
+            )
         return Context(
             cameras=self.data.cameras,
             state=self.state._replace(items=self.state.items[at]),

@@ -16,13 +16,12 @@ from kcal.calibrate.rig.adjustment import Adjustment
 from kcal.calibrate.rig.features import FeatureBlock
 from kcal.calibrate.rig.initial_poses import InitialPoses
 from kcal.calibrate.rig.motion import moved_warnings, scatter_warnings
-from kcal.calibrate.rig.problem import RigProblem
+from kcal.calibrate.rig.problem import RigProblem, goodness_of_fit
 from kcal.calibrate.rig.resection import distinct_poses
 from kcal.calibrate.rig.result import Reasons, RigResult, places, records
 from kcal.calibrate.rig.source import RigState, as_items
 from kcal.calibrate.rig.uncertainty import (
     SharedCovariance,
-    goodness_of_fit,
     mounting_rows,
     parameter_rows,
     relative_rows,

@@ -134,7 +134,7 @@ class Boards(ItemSource):
 
     def begin(self, cameras: Sequence[Camera], start: Start) -> Tensor:
         """See `ItemSource.begin`."""
-        return as_items(start.board_rotation, start.board_translation)
+        return start.boards
 
     def block(self, mask: Tensor, given: Context) -> Block:
         """See `ItemSource.block`."""

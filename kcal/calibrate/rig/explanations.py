@@ -13,11 +13,11 @@ from torch import Tensor
 
 from kcal.calibrate.rig.adjustment import LOSS, MOST_WRONG, ROUGHLY, Adjustment, without_wrong
 from kcal.calibrate.rig.features import FeatureBlock
-from kcal.calibrate.rig.problem import RigProblem, least
+from kcal.calibrate.rig.problem import GoodnessOfFit, RigProblem, goodness_of_fit, least
 from kcal.calibrate.rig.resection import consensus_pose
 from kcal.calibrate.rig.source import RigState
 from kcal.calibrate.rig.sources import RigData
-from kcal.calibrate.rig.uncertainty import SharedCovariance, goodness_of_fit
+from kcal.calibrate.rig.uncertainty import SharedCovariance
 from kcal.checks import variance_factor
 from kcal.errors import DegenerateError, InputError
 from kcal.solve.lm import LMOptions
@@ -347,12 +347,26 @@ TRIAL = LMOptions(max_iterations=40, tolerance=1e-7, residual_floor=1e-8)
 
 
 class _Explanation(NamedTuple):
-    """What takes part, by a mask, what is left out by indices of terms, what is left out by its names, and χ²."""
+    """One way to explain a contradiction.
 
+    Attributes:
+        names: what is left out is called.
+        mask: the items that take part.
+        terms: numbers of the measurements that do not.
+        fit: of the rest.
+        size: how many things are left out.
+    """
+
+    names: tuple[str, ...]
     mask: Tensor
     terms: frozenset[int]
-    names: tuple[str, ...]
-    chi2: float
+    fit: GoodnessOfFit
+    size: int
+
+    @classmethod
+    def of(cls, work: Adjustment, mask: Tensor, names: tuple[str, ...], size: int) -> _Explanation:
+        """What an adjustment to the items in the mask says."""
+        return cls(names, mask, work.without, goodness_of_fit(work.problem(mask), work.part(mask)), size)
 
 
 def explained(work: Adjustment, mask: Tensor, solver: LMOptions) -> Tensor:
@@ -394,14 +408,10 @@ def explained(work: Adjustment, mask: Tensor, solver: LMOptions) -> Tensor:
             "coordinates and marks, and add landmarks"
         )
     if len(found) > 1:
-        ways = "; or ".join(f"{' and '.join(one.names)} (χ² {one.chi2:.3g})" for one in found[:3])
-        raise InputError(
-            f"something is wrong, and the data do not tell what: all the rest agrees without {ways}. Check these, or "
-            "add landmarks"
-        )
+        raise _several([f"{' and '.join(one.names)} (χ² {one.fit.chi2:.3g})" for one in found[:3]])
     (best,) = found
     if best.terms:
-        raise InputError(_blamed(best.names, best.chi2))
+        raise _blamed(best)
     work.state = robust
     work.solve(best.mask, solver)
     work.fit_corners(best.mask)
@@ -413,10 +423,23 @@ def _agree(work: Adjustment, mask: Tensor) -> bool:
     return goodness_of_fit(work.problem(mask), work.part(mask)).variance == 1.0
 
 
-def _blamed(names: tuple[str, ...], chi2: float) -> str:
-    return (
-        f"{' and '.join(names)} contradict{'s' if len(names) == 1 else ''} the rest, which agrees otherwise (χ² "
-        f"{chi2:.3g}): measure again, correct the value or its sigma, or leave it out"
+def _excess(found: _Explanation) -> float:
+    """By how much χ² is above what it should be."""
+    return found.fit.chi2 - found.fit.freedom
+
+
+def _blamed(found: _Explanation) -> InputError:
+    one = "s" if len(found.names) == 1 else ""
+    return InputError(
+        f"{' and '.join(found.names)} contradict{one} the rest, which agrees otherwise (χ² {found.fit.chi2:.3g}): "
+        "measure again, correct the value or its sigma, or leave it out"
+    )
+
+
+def _several(ways: Sequence[str]) -> InputError:
+    return InputError(
+        f"something is wrong, and the data do not tell what: all the rest agrees without {'; or '.join(ways)}. Check "
+        "these, or add landmarks"
     )
 
 
@@ -430,10 +453,10 @@ def _refuse_terms(work: Adjustment, mask: Tensor, kept: Tensor | None, robust: R
         robust: state to begin with.
         solver: options of the solver.
     """
-    ways: list[_Way] = []
+    ways: list[_Explanation] = []
     if kept is not None:
         names = tuple(_gone(work, mask & ~kept))
-        ways.append(_way(work, kept, names, len(names)))
+        ways.append(_Explanation.of(work, kept, names, len(names)))
     some = mask if kept is None else kept
     for term, determined in enumerate(still_determined(work.problem(some), work.part(some))):
         if not determined:
@@ -446,38 +469,18 @@ def _refuse_terms(work: Adjustment, mask: Tensor, kept: Tensor | None, robust: R
             others = without_wrong(trial, mask, solver)
         except InputError:
             continue
-        ways.append(_way(trial, others, (work.term_labels[term],), 1 + int((mask & ~others).sum())))
+        size = 1 + int((mask & ~others).sum())
+        ways.append(_Explanation.of(trial, others, (work.term_labels[term],), size))
     fewest = min((way.size for way in ways), default=0)
-    ways = sorted((way for way in ways if way.size == fewest), key=lambda way: way.chi2 - way.freedom)
-    if not ways:
-        return
-    ways = [way for way in ways if way.chi2 - way.freedom < ways[0].chi2 - ways[0].freedom + AS_GOOD]
-    stated = [way for way in ways if not way.items]
+    ways = sorted((way for way in ways if way.size == fewest), key=_excess)
+    ways = [way for way in ways if _excess(way) < _excess(ways[0]) + AS_GOOD]
+    stated = [way for way in ways if way.terms]
     if len(ways) == 1 and stated:
-        raise InputError(_blamed(stated[0].names, stated[0].chi2))
+        raise _blamed(stated[0])
     if stated:
-        told = "; or ".join(
-            f"{' and '.join(way.names)} (χ² {way.chi2:.3g}, {way.freedom} degrees of freedom)" for way in ways
-        )
-        raise InputError(
-            f"something is wrong, and the data do not tell what: all the rest agrees without {told}. Check these, or "
-            "add landmarks"
-        )
-
-
-class _Way(NamedTuple):
-    """An explanation: what is left out, how many things, whether they are items, and how well the rest agrees."""
-
-    names: tuple[str, ...]
-    size: int
-    items: bool
-    chi2: float
-    freedom: int
-
-
-def _way(work: Adjustment, kept: Tensor, names: tuple[str, ...], size: int) -> _Way:
-    fit = goodness_of_fit(work.problem(kept), work.part(kept))
-    return _Way(names, size, not work.without, fit.chi2, fit.freedom)
+        raise _several([
+            f"{' and '.join(way.names)} (χ² {way.fit.chi2:.3g}, {way.fit.freedom} degrees of freedom)" for way in ways
+        ])  # fmt: skip
 
 
 def _gone(work: Adjustment, mask: Tensor) -> list[str]:
@@ -525,19 +528,18 @@ def _explanations(work: Adjustment, mask: Tensor, kept: Tensor, robust: RigState
             some[[i for landmark, i in chosen if landmark]] = False
             if least_redundancy(trial.problem(some)) <= 0:
                 continue
-            fit = _solved(trial, some)
-            if fit is None:
+            if not _solved(trial, some):
                 continue
             names = tuple(work.labels[i] if landmark else labels[i] for landmark, i in chosen)
-            found.append(_Explanation(some, trial.without, names, fit))
+            found.append(_Explanation.of(trial, some, names, size))
         if found:
-            best = min(one.chi2 for one in found)
-            return sorted((one for one in found if one.chi2 < best + AS_GOOD), key=lambda one: one.chi2)
+            best = min(one.fit.chi2 for one in found)
+            return sorted((one for one in found if one.fit.chi2 < best + AS_GOOD), key=lambda one: one.fit.chi2)
     return []
 
 
-def _solved(trial: Adjustment, mask: Tensor) -> float | None:
-    """The χ² of the best solution from here, or from where landmarks alone put the cameras; None if it is too large."""
+def _solved(trial: Adjustment, mask: Tensor) -> bool:
+    """Whether χ² is small enough at the solution from here, or from where landmarks alone put the cameras."""
     for state in (trial.state, _resected(trial, mask)):
         if state is None:
             continue
@@ -545,8 +547,8 @@ def _solved(trial: Adjustment, mask: Tensor) -> float | None:
         problem, _ = trial.solve(mask, TRIAL)
         fit = goodness_of_fit(problem, trial.part(mask))
         if fit.freedom > 0 and fit.variance == 1.0:
-            return fit.chi2
-    return None
+            return True
+    return False
 
 
 def _resected(work: Adjustment, mask: Tensor) -> RigState | None:

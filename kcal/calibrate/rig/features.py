@@ -19,12 +19,8 @@ from kcal.calibrate.rig.source import (
     RigState,
     Start,
     as_items,
-    check_effects,
-    check_marks,
-    effects_of_both,
     first_rays,
     require_positive,
-    shifts_of,
 )
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
@@ -57,6 +53,7 @@ class Features(ItemSource):
     kind = "features"
     told_by: ClassVar[int] = 2
     turns: ClassVar[bool] = True
+    axes: ClassVar[int] = 2
 
     names: tuple[str, ...]
     pixels: Tensor
@@ -68,7 +65,7 @@ class Features(ItemSource):
 
     def __post_init__(self) -> None:
         count = len(self.names)
-        check_marks("features", self.names, self.pixels)
+        self.check_marks()
         if self.inverse_range.shape != (count,) or self.inverse_range_sigma.shape != (count,):
             raise InputError(f"features: inverse_range and its sigma ({count},) are needed")
         if not bool((torch.isfinite(self.inverse_range) & (self.inverse_range_sigma > 0)).all()):
@@ -78,7 +75,6 @@ class Features(ItemSource):
             raise InputError(
                 f"features: a covariance {(*self.pixels.shape, 2)} is needed, got {tuple(self.covariance.shape)}"
             )
-        check_effects("features", self.effects, self.pixels.shape, "(F, C, 2)")
 
     def __add__(self, other: Features) -> Features:
         """Both, with a covariance for each mark; effects shift only those whose they are."""
@@ -89,7 +85,7 @@ class Features(ItemSource):
             inverse_range=torch.cat([self.inverse_range, other.inverse_range]),
             inverse_range_sigma=torch.cat([self.inverse_range_sigma, other.inverse_range_sigma]),
             covariance=torch.cat(both),
-            effects=effects_of_both(self.effects, len(self.names), other.effects, len(other.names)),
+            effects=self.effects_with(other),
         )
 
     def _whole(self) -> Tensor:
@@ -111,8 +107,8 @@ class Features(ItemSource):
             known = self.covariance[mask].nan_to_num(1.0)
             white = torch.linalg.inv(torch.linalg.cholesky_ex(known)[0]) / given.times
         known_range = self.inverse_range[mask], given.times * self.inverse_range_sigma[mask]
-        shifts = shifts_of(self.effects, self.pixels.shape)[:, mask]
-        return FeatureBlock(self.pixels[mask], white, *known_range, given.anchor, given.effects, shifts)
+        effects = given.effects and given.effects.some(mask)
+        return FeatureBlock(self.pixels[mask], white, *known_range, given.anchor, effects)
 
     def doubt(self, off: str, sigmas: float, over: float) -> str:
         """See `ItemSource.doubt`."""
@@ -140,7 +136,7 @@ class FeatureBlock(Block):
     """Things of unknown position: a unit vector (V, 3) and an inverse range (V, 1), 1/m, from `anchor` each.
 
     Args:
-        pixels: (V, C, 2), see `Block`, as `whitening` (V, C, 2, 2), `effects` and `shifts`.
+        pixels: (V, C, 2), see `Block`, as `whitening` (V, C, 2, 2) and `effects`.
         inverse_range: (V,) as known beforehand, with `sigma`.
     """
 
@@ -156,9 +152,8 @@ class FeatureBlock(Block):
         sigma: Tensor,
         anchor: Tensor,
         effects: Effects | None = None,
-        shifts: Tensor | None = None,
     ) -> None:
-        super().__init__(pixels[:, :, None], whitening[:, :, None], effects, shifts)
+        super().__init__(pixels[:, :, None], whitening[:, :, None], effects)
         self._mean, self._weight = inverse_range, torch.where(torch.isfinite(sigma), 1.0 / sigma, 0.0)
         self._anchor = anchor
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from kcal.calibrate.rig.boards import Boards
 from kcal.calibrate.rig.pairs import Poses, SeenAlone, check_cameras, half_turn, pose_alone, refuse_wrong_pairs
 from kcal.calibrate.rig.resection import consensus_rotation, distinct_poses
-from kcal.calibrate.rig.source import Start
+from kcal.calibrate.rig.source import Start, as_items
 from kcal.calibrate.rig.sources import RigData
 from kcal.errors import DegenerateError
 from kcal.lens.turning import rotation_between
@@ -85,11 +85,9 @@ def first_poses(data: RigData, solver: LMOptions) -> InitialPoses:
                 )
         starts = _in_all_places(data, _starts(known, tried))
         if data.absolute and not placed:
-            for start in starts:
-                _into_frame(data, start)
+            starts = [_into_frame(data, start) for start in starts]
     views.turn_all()
-    for start in starts:
-        start.board_rotation, start.board_translation = views.world(start)
+    starts = [start._replace(boards=as_items(*views.world(start))) for start in starts]
     return InitialPoses(data=views.data, starts=starts, flipped=views.flipped, foreign=views.foreign)
 
 
@@ -177,7 +175,7 @@ def _starts(known: _Known, tried: list[int]) -> list[Start]:
         length = float(torch.linalg.vector_norm(center[camera] - center[other]))
         axes = torch.cat([rotation[other], -rotation[other]])
         starts = [
-            dataclasses.replace(start, center=start.center.index_copy(0, torch.tensor([camera]), place[None]))
+            start._replace(center=start.center.index_copy(0, torch.tensor([camera]), place[None]))
             for start in starts
             for place in start.center[other] + length * axes
         ]
@@ -196,12 +194,12 @@ def _in_all_places(data: RigData, starts: list[Start]) -> list[Start]:
             for rotation, center in distinct_poses(rays[valid], marks.points[valid], start.center[c], _AMBIGUOUS):
                 turned, moved = start.rotation.clone(), start.center.clone()
                 turned[c], moved[c] = rotation, center
-                starts.append(dataclasses.replace(start, rotation=turned, center=moved))
+                starts.append(start._replace(rotation=turned, center=moved))
     return starts
 
 
-def _into_frame(data: RigData, start: Start) -> None:
-    """Move a rig from its first camera's frame to where its cameras were measured."""
+def _into_frame(data: RigData, start: Start) -> Start:
+    """A rig moved from its first camera's frame to where its cameras were measured."""
     index = [p.camera for p in data.positions]
     there = torch.stack([p.point for p in data.positions])
     here = start.center[index]
@@ -210,8 +208,7 @@ def _into_frame(data: RigData, start: Start) -> None:
     moved = there - there.mean(0), here - here.mean(0)
     scale = max(float(torch.linalg.vector_norm(moved[1])), 1.0)
     turn = rotation_between(torch.cat([moved[1] / scale, _LEVEL * level]), torch.cat([moved[0] / scale, _LEVEL * up]))
-    start.center = (start.center - here.mean(0)) @ turn.T + there.mean(0)
-    start.rotation = start.rotation @ turn.T
+    return Start(start.rotation @ turn.T, (start.center - here.mean(0)) @ turn.T + there.mean(0))
 
 
 class _BoardViews:

@@ -20,11 +20,7 @@ from kcal.calibrate.rig.source import (
     RigState,
     Start,
     as_items,
-    check_effects,
-    check_marks,
-    effects_of_both,
     require_positive,
-    shifts_of,
 )
 from kcal.checks import as_points, require_finite
 from kcal.errors import InputError
@@ -64,11 +60,10 @@ class Landmarks(ItemSource):
                 f"landmarks: points and sigma ({count}, 3) are needed, got {tuple(self.points.shape)} and "
                 f"{tuple(self.sigma.shape)}"
             )
-        check_marks("landmarks", self.names, self.pixels)
+        self.check_marks()
         require_finite("landmarks: points", as_points("landmarks: points", self.points, 3))
         if not bool((torch.isfinite(self.sigma) & (self.sigma > 0)).all()):
             raise InputError("landmarks: every sigma must be a positive number of meters; nothing is surveyed exactly")
-        check_effects("landmarks", self.effects, (*self.pixels.shape[:2], 3), "(L, C, 3)")
         if not isinstance(self.pixel_sigma, Tensor):
             require_positive("landmarks: pixel_sigma", self.pixel_sigma)
             return
@@ -86,7 +81,7 @@ class Landmarks(ItemSource):
             sigma=torch.cat([self.sigma, other.sigma]),
             pixels=torch.cat([self.pixels, other.pixels]),
             pixel_sigma=torch.cat([self._each(), other._each()]),
-            effects=effects_of_both(self.effects, len(self.names), other.effects, len(other.names)),
+            effects=self.effects_with(other),
         )
 
     def _each(self) -> Tensor:
@@ -114,9 +109,9 @@ class Landmarks(ItemSource):
     def block(self, mask: Tensor, given: Context) -> Block:
         """See `ItemSource.block`."""
         white = torch.eye(2, dtype=torch.float64) / (given.times * self._each()[mask][..., None, None])
-        shifts = shifts_of(self.effects, (*self.pixels.shape[:2], 3))[:, mask]
         surveyed = self.points[mask], given.times * self.sigma[mask]
-        return LandmarkBlock(self.pixels[mask], white, *surveyed, given.unknowns.by_refraction, given.effects, shifts)
+        effects = given.effects and given.effects.some(mask)
+        return LandmarkBlock(self.pixels[mask], white, *surveyed, given.unknowns.by_refraction, effects)
 
     def doubt(self, off: str, sigmas: float, over: float) -> str:
         """See `ItemSource.doubt`."""
@@ -153,7 +148,6 @@ class LandmarkBlock(Block):
         sigma: (V, 3) meters.
         by_refraction: (K,) of the coefficient of refraction by the unknowns; None: it is held.
         effects: see `Block`.
-        shifts: see `Block`.
     """
 
     kind = "landmarks"
@@ -168,9 +162,8 @@ class LandmarkBlock(Block):
         sigma: Tensor,
         by_refraction: Tensor | None = None,
         effects: Effects | None = None,
-        shifts: Tensor | None = None,
     ) -> None:
-        super().__init__(pixels[:, :, None], whitening[:, :, None], effects, shifts)
+        super().__init__(pixels[:, :, None], whitening[:, :, None], effects)
         self._surveyed, self._sigma, self._by_refraction = points, sigma, by_refraction
 
     def _prior_count(self) -> Tensor:

@@ -166,27 +166,13 @@ def paired_boards(
     Raises:
         InputError: boards or image sizes that differ, a name that is not among the views, no pair.
     """
-    boards = [seen.board for seen in observations]
-    if boards[0] != boards[1]:
-        raise InputError(f"the cameras saw different boards: {boards[0]} and {boards[1]}")
-    for word, camera, seen in zip(("left", "right"), cameras, observations, strict=True):
-        if camera.size != tuple(seen.image_size):
-            raise InputError(
-                f"the {word} camera has images of {camera.size[0]}x{camera.size[1]}, its observations of "
-                f"{seen.image_size[0]}x{seen.image_size[1]}: are the files mixed up?"
-            )
     if not pairs:
         raise InputError("no pair of views")
+    moments = [(" ".join(dict.fromkeys(pair)), dict(enumerate(pair))) for pair in pairs]
+    found = _boards_at(cameras, ("left", "right"), dict(enumerate(observations)), moments)
     sides = [seen.subset([pair[side] for pair in pairs]) for side, seen in enumerate(observations)]
     known = [covariance for side in sides if (covariance := side.covariances()) is not None]
-    return Boards(
-        board=boards[0],
-        pixels=torch.stack([side.pixels() for side in sides], 1),
-        names=tuple(" ".join(dict.fromkeys(pair)) for pair in pairs),
-        deviation=_deviation(cameras, boards[0]),
-        views=tuple(tuple(pair[side] for pair in pairs) for side in (0, 1)),
-        covariance=torch.stack(known, 1) if len(known) == 2 else None,
-    )
+    return dataclasses.replace(found, covariance=torch.stack(known, 1) if len(known) == 2 else None)
 
 
 def boards_of_several(
@@ -204,32 +190,52 @@ def boards_of_several(
     Raises:
         InputError: boards or image sizes that differ, two views of one moment, no moment that two cameras saw.
     """
-    boards = {number: seen.board for number, seen in observations.items()}
-    first = next(iter(boards))
     moments: dict[str, dict[int, str]] = {}
     for number, seen in observations.items():
-        if seen.board != boards[first]:
-            raise InputError(f"{names[first]} and {names[number]} saw different boards: {boards[first]}, {seen.board}")
-        if cameras[number].size != tuple(seen.image_size):
-            raise InputError(f"{names[number]}: images of {cameras[number].size}, observations of {seen.image_size}")
         for name in seen.names:
             key = re.sub(r"[ _-]+", "_", _stem(name).replace(names[number], "")).strip("_")
             if number in moments.setdefault(key, {}):
                 raise InputError(f"{names[number]}: {moments[key][number]} and {name} are of one moment by their names")
             moments[key][number] = name
-    shared = {key: own for key, own in moments.items() if len(own) > 1}
+    shared = [(key, own) for key, own in moments.items() if len(own) > 1]
     if not shared:
         raise InputError("no moment at which two cameras saw the board: the names of views must be alike")
-    pixels = torch.full((len(shared), len(cameras), boards[first].corners, 2), math.nan, dtype=torch.float64)
+    return _boards_at(cameras, names, observations, [(key or str(i), own) for i, (key, own) in enumerate(shared)])
+
+
+def _boards_at(
+    cameras: Sequence[Camera],
+    names: Sequence[str],
+    observations: Mapping[int, Observations],
+    moments: Sequence[tuple[str, Mapping[int, str]]],
+) -> Boards:
+    """Boards at some moments.
+
+    Args:
+        cameras: of the rig.
+        names: of the cameras.
+        observations: of some of the cameras, by number.
+        moments: what each is called, and the view of each camera that saw the board then.
+    """
+    board = next(iter(observations.values())).board
+    pixels = torch.full((len(moments), len(cameras), board.corners, 2), math.nan, dtype=torch.float64)
     for number, seen in observations.items():
-        rows = [i for i, own in enumerate(shared.values()) if number in own]
-        pixels[rows, number] = seen.subset([own[number] for own in shared.values() if number in own]).pixels()
+        if seen.board != board:
+            raise InputError(f"the cameras saw different boards: {board} and {seen.board}")
+        if cameras[number].size != tuple(seen.image_size):
+            width, height = cameras[number].size
+            raise InputError(
+                f"the {names[number]} camera has images of {width}x{height}, its observations of "
+                f"{seen.image_size[0]}x{seen.image_size[1]}: are the files mixed up?"
+            )
+        rows = [i for i, (_, own) in enumerate(moments) if number in own]
+        pixels[rows, number] = seen.subset([moments[i][1][number] for i in rows]).pixels()
     return Boards(
-        board=boards[first],
+        board=board,
         pixels=pixels,
-        names=tuple(key or str(i) for i, key in enumerate(shared)),
-        deviation=_deviation([cameras[number] for number in observations], boards[first]),
-        views=tuple(tuple(own.get(c, "") for own in shared.values()) for c in range(len(cameras))),
+        names=tuple(name for name, _ in moments),
+        deviation=_deviation([cameras[number] for number in observations], board),
+        views=tuple(tuple(own.get(c, "") for _, own in moments) for c in range(len(cameras))),
     )
 
 

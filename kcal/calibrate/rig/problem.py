@@ -11,6 +11,7 @@ from torch import Tensor
 from kcal.calibrate.rig.motion import CameraRows, summed_products
 from kcal.calibrate.rig.source import LOCAL_SIZE, Block, Measurement, PosedCamera, RigState
 from kcal.calibrate.rig.unknowns import SharedUnknowns
+from kcal.checks import variance_factor
 from kcal.gaussian import inverse_root
 from kcal.lens.camera import Camera
 from kcal.lens.pose import nearest_rotation, rotation_from_vector
@@ -272,6 +273,33 @@ def _few_others_fall(total: Tensor, rows: Tensor) -> Tensor:
     return torch.where(testable, fall, 0.0)
 
 
+class GoodnessOfFit(NamedTuple):
+    """How residuals compare with their sigmas.
+
+    Attributes:
+        chi2: sum of squares of all residuals over their sigmas.
+        freedom: degrees of freedom.
+        variance: by which covariances are to be multiplied: χ² per degree of freedom where that is larger than chance
+            explains, otherwise 1.
+    """
+
+    chi2: float
+    freedom: int
+    variance: float
+
+    @classmethod
+    def of(cls, chi2: float, freedom: int) -> GoodnessOfFit:
+        """From χ² and its degrees of freedom."""
+        return cls(chi2, freedom, variance_factor(chi2, freedom))
+
+
+def goodness_of_fit(problem: RigProblem, state: RigState) -> GoodnessOfFit:
+    """Compare the residuals at a minimum with their sigmas."""
+    counted = sum(int((block.counts - block.size).sum()) for block in problem.blocks)
+    freedom = counted + problem.term_rows(state).shape[1] - problem.shared_size
+    return GoodnessOfFit.of(2.0 * float(problem.cost(state)), freedom)
+
+
 # How well each source of a rig fits itself: what its items leave over where nothing else is known of the cameras.
 #
 # Marks by hand are often worse than their sigmas say. Beside a thousand good matches that hardly shows in the χ² of
@@ -309,21 +337,14 @@ def least(gram: Tensor) -> Least:
     return Least(float(gram[-1, -1] - pull.square().sum()), root.shape[1], -root @ pull, root)
 
 
-class OwnFit(NamedTuple):
-    """The χ² of a source alone, and its degrees of freedom."""
-
-    chi2: float
-    freedom: int
-
-
-def own_fits(problem: RigProblem, state: RigState) -> dict[str, OwnFit]:
+def own_fits(problem: RigProblem, state: RigState) -> dict[str, GoodnessOfFit]:
     """The fit of each kind of items alone, with what is known beforehand, from their rows at a solution of all."""
-    prior, found = problem.prior_rows(state), dict[str, OwnFit]()
+    prior, found = problem.prior_rows(state), dict[str, GoodnessOfFit]()
     known = prior @ prior.T
     for block, gram in zip(problem.blocks, problem.block_grams(state), strict=True):
         # The noise of boards' corners is estimated as it is.
         if not block.many:
             alone = least(gram + known)
             rows = int((block.counts - block.size).sum()) + prior.shape[1]
-            found[block.kind] = OwnFit(alone.chi2, rows - alone.rank)
+            found[block.kind] = GoodnessOfFit.of(alone.chi2, rows - alone.rank)
     return found

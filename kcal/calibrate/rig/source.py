@@ -56,21 +56,18 @@ def as_items(*values: Tensor) -> Tensor:
     return torch.nn.functional.pad(flat, (0, OWN - flat.shape[1]))
 
 
-@dataclasses.dataclass(kw_only=True, eq=False)
-class Start:
+class Start(NamedTuple):
     """Poses to begin with.
 
-    Args:
+    Attributes:
         rotation: (C, 3, 3) cam_from_world.
         center: (C, 3) meters.
-        board_rotation: (V, 3, 3) world_from_board.
-        board_translation: (V, 3) meters.
+        boards: (V, 12) where boards are; see `kcal.calibrate.rig.boards.board_pose`.
     """
 
     rotation: Tensor
     center: Tensor
-    board_rotation: Tensor = dataclasses.field(default_factory=lambda: torch.empty(0, 3, 3, dtype=torch.float64))
-    board_translation: Tensor = dataclasses.field(default_factory=lambda: torch.empty(0, 3, dtype=torch.float64))
+    boards: Tensor = torch.zeros(0, OWN, dtype=torch.float64)
 
 
 def first_rays(cameras: Sequence[Camera], start: Start, pixels: Tensor, inverse: Tensor, anchor: Tensor) -> Tensor:
@@ -136,44 +133,22 @@ class Effect:
     factor: Tensor | None = None
 
 
-def shifts_of(effects: Sequence[Effect], shape: Sequence[int]) -> Tensor:
-    """(E, *shape) the shifts of all effects, each of this shape."""
-    zero = torch.zeros(*shape, dtype=torch.float64)
-    return torch.stack([zero, *(zero if effect.shift is None else effect.shift for effect in effects)])[1:]
-
-
-def check_effects(kind: str, effects: Sequence[Effect], shape: tuple[int, ...], axes: str) -> None:
-    """Refuse effects whose shifts have another shape, or that turn things that are no stars."""
-    for effect in effects:
-        shift, turn, factor = effect.shift, effect.turn, effect.factor
-        good = shift is None or (shift.shape == shape and bool(torch.isfinite(shift).all()))
-        if not good or (kind != "stars" and (turn is not None or shift is None)):
-            raise InputError(f"{kind}: the effect of {effect.name} needs finite shifts {axes}")
-        fits = (turn is None or turn.shape == (shape[1], 3)) and (factor is None or factor.shape == shape[:1])
-        if not fits:
-            raise InputError(f"{kind}: the effect of {effect.name} has another shape than stars and cameras")
-
-
-def effects_of_both(one: Sequence[Effect], count: int, other: Sequence[Effect], more: int) -> tuple[Effect, ...]:
-    """Effects of `count` items and of `more` others, for all of them: each shifts its own alone."""
-    around = [(effect, 0, more) for effect in one] + [(effect, count, 0) for effect in other]
-    return tuple(
-        dataclasses.replace(effect, shift=torch.nn.functional.pad(effect.shift, (0, 0, 0, 0, before, after)))
-        for effect, before, after in around
-        if effect.shift is not None
-    )
-
-
 class Effects(NamedTuple):
-    """Where the amounts of E effects are among the unknowns.
+    """What the E effects of a source do, and where their amounts are among the unknowns.
 
     Attributes:
+        shifts: (E, V, C, 3) by which one sigma of each shifts the items, or (E, V, C, 2) px the marks.
         of_state: (E, K) of the unknowns in the state.
         of_step: (E, K) of those in a step; None where the step changes none of them.
     """
 
+    shifts: Tensor
     of_state: Tensor
     of_step: Tensor | None
+
+    def some(self, mask: Tensor) -> Effects:
+        """Of the items in a mask alone."""
+        return self._replace(shifts=self.shifts[:, mask])
 
 
 # Checks of what a user gives.
@@ -183,14 +158,6 @@ def require_positive(name: str, value: float) -> None:
     """Refuse what is no positive number."""
     if not 0 < value < math.inf:
         raise InputError(f"{name}: a positive number is needed, got {value}")
-
-
-def check_marks(kind: str, names: tuple[str, ...], pixels: Tensor) -> None:
-    """Refuse marks that are not one in each camera for each name."""
-    count = len(names)
-    if pixels.ndim != 3 or pixels.shape[::2] != (count, 2):
-        raise InputError(f"{kind}: pixels ({count}, C, 2) are needed, got {tuple(pixels.shape)}")
-    check_names(kind, names, count)
 
 
 def check_names(kind: str, names: tuple[str, ...], count: int) -> None:
@@ -223,7 +190,7 @@ class Context(NamedTuple):
         shapes: (B, 3, N) by which the state's amplitudes displace a board's corners, meters.
         anchor: (3,) from where features are counted, meters.
         times: by which the source's sigmas are multiplied.
-        effects: where the amounts of its effects are; None without any.
+        effects: of the source; None without any.
         sigma_corner: of a board's corner along an axis, px.
         motion: how boards move while each camera reads its rows.
     """
@@ -294,6 +261,7 @@ class ItemSource(Source):
         told_by: marks in all cameras below which residuals of an item tell nothing.
         own_noise: whether the noise of its marks is estimated, instead of being multiplied where it is stated too low.
         turns: whether the items tell how cameras are turned against each other, but nothing of where these stand.
+        axes: of the shift by an effect: 3, or 2 where it shifts the marks.
     """
 
     names: tuple[str, ...]
@@ -305,11 +273,42 @@ class ItemSource(Source):
     told_by: ClassVar[int] = 1
     own_noise: ClassVar[bool] = False
     turns: ClassVar[bool] = False
+    axes: ClassVar[int] = 3
 
     def check(self, cameras: int, *, absolute: bool) -> None:
         """See `Source.check`."""
         if self.pixels.shape[1] != cameras:
             raise InputError(f"{self.kind}: pixels of {self.pixels.shape[1]} cameras, the rig has {cameras}")
+
+    def check_marks(self) -> None:
+        """Refuse marks that are not one in each camera for each name, and effects of another shape."""
+        shape, kind = self.pixels.shape, self.kind
+        if len(shape) != 3 or shape[::2] != (len(self.names), 2):
+            raise InputError(f"{kind}: pixels ({len(self.names)}, C, 2) are needed, got {tuple(shape)}")
+        check_names(kind, self.names, len(self.names))
+        for effect in self.effects:
+            shift, turn, factor = effect.shift, effect.turn, effect.factor
+            good = shift is None or (shift.shape == (*shape[:2], self.axes) and bool(torch.isfinite(shift).all()))
+            if not good or (kind != "stars" and (turn is not None or shift is None)):
+                axes = f"({kind[0].upper()}, C, {self.axes})"
+                raise InputError(f"{kind}: the effect of {effect.name} needs finite shifts {axes}")
+            if not ((turn is None or turn.shape == (shape[1], 3)) and (factor is None or factor.shape == shape[:1])):
+                raise InputError(f"{kind}: the effect of {effect.name} has another shape than stars and cameras")
+
+    def shifts(self) -> Tensor:
+        """(E, V, C, 3) shifts of the items by its effects, or (E, V, C, 2) px of the marks."""
+        zero = torch.zeros(*self.pixels.shape[:2], self.axes, dtype=torch.float64)
+        return torch.stack([zero, *(zero if effect.shift is None else effect.shift for effect in self.effects)])[1:]
+
+    def effects_with(self, other: ItemSource) -> tuple[Effect, ...]:
+        """Effects of its items and of others that follow them: each shifts its own alone."""
+        around = [(effect, (0, len(other.names))) for effect in self.effects]
+        around += [(effect, (len(self.names), 0)) for effect in other.effects]
+        return tuple(
+            dataclasses.replace(effect, shift=torch.nn.functional.pad(effect.shift, (0, 0, 0, 0, *more)))
+            for effect, more in around
+            if effect.shift is not None
+        )
 
     @property
     def marked(self) -> Tensor:
@@ -419,8 +418,7 @@ class Block(ABC):
     Args:
         pixels: (V, C, N, 2), NaN where not seen.
         whitening: (V, C, N, 2, 2) by which pixel residuals are multiplied.
-        effects: where the amounts of its effects are; None without any.
-        shifts: (E, V, C, 3) by which one sigma of each effect shifts the items, or (E, V, C, 2) px the marks.
+        effects: of the items; None without any.
 
     Attributes:
         kind: of the source.
@@ -437,10 +435,8 @@ class Block(ABC):
     many: ClassVar[bool] = False
     surveyed: ClassVar[bool] = False
 
-    def __init__(
-        self, pixels: Tensor, whitening: Tensor, effects: Effects | None = None, shifts: Tensor | None = None
-    ) -> None:
-        self._effects, self._shifts = effects, shifts
+    def __init__(self, pixels: Tensor, whitening: Tensor, effects: Effects | None = None) -> None:
+        self._effects = effects
         self.seen = torch.isfinite(pixels).all(-1)
         self._used = self.seen.any(-1).any(0).tolist()
         self.target = torch.where(self.seen[..., None], pixels, 0.0).transpose(-1, -2).contiguous()
@@ -490,10 +486,9 @@ class Block(ABC):
         """
         return None
 
-    def _shift(self, state: RigState, camera: int) -> Tensor:
+    def _shift(self, effects: Effects, state: RigState, camera: int) -> Tensor:
         """(E, V, 3) by which one sigma of each effect shifts the items for a camera, or (E, V, 2) px their marks."""
-        assert self._shifts is not None
-        return self._shifts[:, :, camera]
+        return effects.shifts[:, :, camera]
 
     def _bent(self, state: RigState, offset: Tensor) -> Tensor:
         """Where things are seen (V, 3, N) that stand at `offset` from the camera."""
@@ -521,7 +516,9 @@ class Block(ABC):
             offset = y - w * posed.center[:, None]
             beside = offset.new_zeros(())
             if self._effects is not None:
-                shift = torch.einsum("e,evk->vk", self._effects.of_state @ state.unknown, self._shift(state, c))
+                shift = torch.einsum(
+                    "e,evk->vk", self._effects.of_state @ state.unknown, self._shift(self._effects, state, c)
+                )
                 if shift.shape[1] == 2:
                     beside = shift[..., None]
                 else:
@@ -561,7 +558,7 @@ class Block(ABC):
             if (shared := self._by_shared(state, by_q, offset)) is not None:
                 changed.append(shared)
             if self._effects is not None and self._effects.of_step is not None:
-                shift = self._shift(state, c)
+                shift = self._shift(self._effects, state, c)
                 marks = shift[..., None] if shift.shape[2] == 2 else torch.einsum("vjun,evj->evun", by_offset, shift)
                 changed.append((marks.movedim(0, 1), self._effects.of_step))
             columns = torch.zeros(0, dtype=torch.long)

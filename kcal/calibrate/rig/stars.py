@@ -20,9 +20,7 @@ from kcal.calibrate.rig.source import (
     RigState,
     Start,
     as_items,
-    check_effects,
     first_rays,
-    shifts_of,
 )
 from kcal.checks import require_finite
 from kcal.errors import InputError
@@ -72,19 +70,17 @@ class StarSource(ItemSource):
 
     def __post_init__(self) -> None:
         count, shape = len(self.names), self.pixels.shape
-        if self.pixels.ndim != 3 or shape[::2] != (count, 2) or self.pixel_sigma.shape != shape[:2]:
+        self.check_marks()
+        if self.pixel_sigma.shape != shape[:2]:
             raise InputError(f"stars: pixels ({count}, C, 2) and a sigma for each are needed")
         if self.direction.shape != (count, 3) or self.direction_sigma.shape != (count,):
             raise InputError(f"stars: directions ({count}, 3) and a sigma ({count},) are needed")
-        if len(set(self.names)) != count:
-            raise InputError("stars: a name is there twice")
         seen = torch.isfinite(self.pixels).all(-1)
         if not bool((self.pixel_sigma[seen] > 0).all() & torch.isfinite(self.pixel_sigma[seen]).all()):
             raise InputError("stars: every pixel_sigma must be a positive number")
         if not bool((self.direction_sigma > 0).all()):
             raise InputError("stars: every direction_sigma must be positive; it is infinite without a name")
         require_finite("stars: directions", self.direction[self.named])
-        check_effects("stars", self.effects, (count, shape[1], 3), "(S, C, 3)")
 
     @property
     def named(self) -> Tensor:
@@ -123,8 +119,8 @@ class StarSource(ItemSource):
         count, cameras = self.pixels.shape[:2]
         white = torch.eye(2, dtype=torch.float64) / (given.times * self.pixel_sigma[mask][..., None, None])
         known = self.direction[mask], given.times * self.direction_sigma[mask]
-        moves = star_turns(self.effects, count, cameras)[:, :, mask], shifts_of(self.effects, (count, cameras, 3))
-        return StarBlock(self.pixels[mask], white, *known, moves[0], moves[1][:, mask], given.effects)
+        turns = star_turns(self.effects, count, cameras)[:, :, mask]
+        return StarBlock(self.pixels[mask], white, *known, turns, given.effects and given.effects.some(mask))
 
     def doubt(self, off: str, sigmas: float, over: float) -> str:
         """See `ItemSource.doubt`."""
@@ -143,7 +139,6 @@ class StarBlock(Block):
         direction: (V, 3) of the catalogue; anything for stars without a name.
         sigma: (V,) radians; infinite for these.
         turns: (E, C, V, 3) radians, see `star_turns`.
-        shifts: (E, V, C, 3), see `Block`.
         effects: see `Block`; its amounts are the u_e.
     """
 
@@ -157,10 +152,9 @@ class StarBlock(Block):
         direction: Tensor,
         sigma: Tensor,
         turns: Tensor,
-        shifts: Tensor,
         effects: Effects | None = None,
     ) -> None:
-        super().__init__(pixels[:, :, None], whitening[:, :, None], effects, shifts)
+        super().__init__(pixels[:, :, None], whitening[:, :, None], effects)
         named = torch.isfinite(sigma)
         self._weight = torch.where(named, 1.0 / sigma, 0.0)
         self._known = torch.where(named[:, None], direction, 0.0)
@@ -172,9 +166,9 @@ class StarBlock(Block):
     def _place(self, state: RigState) -> tuple[Tensor, Tensor]:
         return state.items[:, :3, None], state.items.new_zeros(len(self), 1, 1)
 
-    def _shift(self, state: RigState, camera: int) -> Tensor:
+    def _shift(self, effects: Effects, state: RigState, camera: int) -> Tensor:
         turned = torch.linalg.cross(self._turns[:, camera], state.items[:, :3].expand(len(self._turns), -1, -1))
-        return turned + super()._shift(state, camera)
+        return turned + super()._shift(effects, state, camera)
 
     def _by_own(self, state: RigState, by_q: Tensor, center: Tensor, by_w: Tensor | None) -> Tensor:
         return torch.einsum("vjun,vlj->vlun", by_q, torch.stack(side_axes(state.items[:, :3]), 1))

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from kcal.calibrate.rig.problem import RigProblem
 from kcal.calibrate.rig.source import RigState
-from kcal.checks import variance_factor
 from kcal.gaussian import inverse_root
 
 # Eigenvalues of the scaled information below this share of the largest are rounding, not information.
@@ -21,29 +19,6 @@ _LOST_SHARE = 1e-6
 # A motion gives an open direction its name if it lies in the open directions but for this share.
 _NAMED_SHARE = 0.02
 _IDENTITY = torch.eye(3, dtype=torch.float64)
-
-
-class GoodnessOfFit(NamedTuple):
-    """How residuals compare with their sigmas.
-
-    Attributes:
-        chi2: sum of squares of all residuals over their sigmas.
-        freedom: degrees of freedom.
-        variance: by which covariances are to be multiplied: χ² per degree of freedom where that is larger than chance
-            explains, otherwise 1.
-    """
-
-    chi2: float
-    freedom: int
-    variance: float
-
-
-def goodness_of_fit(problem: RigProblem, state: RigState) -> GoodnessOfFit:
-    """Compare the residuals at a minimum with their sigmas."""
-    chi2 = 2.0 * float(problem.cost(state))
-    counted = sum(int((block.counts - block.size).sum()) for block in problem.blocks)
-    freedom = counted + problem.term_rows(state).shape[1] - problem.shared_size
-    return GoodnessOfFit(chi2, freedom, variance_factor(chi2, freedom))
 
 
 class SharedCovariance:

@@ -63,46 +63,40 @@ class SharedUnknowns:
 
     def and_warp(self, board_points: Tensor) -> SharedUnknowns:
         """These, and two parabolas by which the board bends."""
-        shapes = warp_modes(board_points)
-        board = torch.cat([torch.zeros(2, len(self), dtype=torch.float64), torch.eye(2, dtype=torch.float64)], 1)
-        more = self._and("the board's warp along its rows", "the board's warp along its columns", known=False)
-        return dataclasses.replace(more, shapes=shapes, board=board)
+        labels = "the board's warp along its rows", "the board's warp along its columns"
+        more, added = self._and(*labels, known=False)
+        return dataclasses.replace(more, shapes=warp_modes(board_points), board=added)
 
     def and_refraction(self, refraction: float, sigma: float) -> SharedUnknowns:
         """These, and the coefficient of refraction with its standard deviation; with none, it is held."""
         check_refraction(refraction, sigma)
         if not sigma:
             return dataclasses.replace(self, refraction=refraction)
-        more = self._and("the coefficient of refraction", known=True)
-        slope = torch.zeros(len(more), dtype=torch.float64)
-        slope[-1] = sigma
-        return dataclasses.replace(more, refraction=refraction, by_refraction=slope)
+        more, added = self._and("the coefficient of refraction", known=True)
+        return dataclasses.replace(more, refraction=refraction, by_refraction=sigma * added[0])
 
     def and_effects(self, *names: str) -> SharedUnknowns:
-        """These, and amounts of what shifts stars, landmarks or features together, in standard deviations."""
-        more = self._and(*names, known=True)
-        count = len(names)
-        select = torch.zeros(count, len(more), dtype=torch.float64)
-        select[:, len(more) - count :] = torch.eye(count, dtype=torch.float64)
-        return dataclasses.replace(more, by_effects=select)
+        """These, and amounts of what shifts items together, in standard deviations."""
+        more, added = self._and(*names, known=True)
+        return dataclasses.replace(more, by_effects=added)
 
-    def _and(self, *labels: str, known: bool) -> SharedUnknowns:
-        """These, and more that change nothing yet."""
+    def _and(self, *labels: str, known: bool) -> tuple[SharedUnknowns, Tensor]:
+        """These, and M more that change nothing yet; and (M, K) the new ones by all."""
 
         def wider(part: Tensor) -> Tensor:
             return torch.nn.functional.pad(part, (0, len(labels)))
 
-        return SharedUnknowns(
+        more = dataclasses.replace(
+            self,
             cameras=tuple(map(wider, self.cameras)),
-            shapes=self.shapes,
             board=wider(self.board),
             begin=wider(self.begin),
             known=torch.cat([self.known, torch.full((len(labels),), known)]),
             labels=(*self.labels, *labels),
-            refraction=self.refraction,
             by_refraction=None if self.by_refraction is None else wider(self.by_refraction),
             by_effects=None if self.by_effects is None else wider(self.by_effects),
         )
+        return more, torch.eye(len(more), dtype=torch.float64)[len(self) :]
 
 
 def held(cameras: Sequence[Camera]) -> SharedUnknowns:

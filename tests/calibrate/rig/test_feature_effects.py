@@ -13,7 +13,7 @@ from kcal.calibrate.rig.landmarks import Landmarks
 from kcal.calibrate.rig.measured import Baseline
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.calibrate.rig.source import Effect, shifts_of
+from kcal.calibrate.rig.source import Effect
 from kcal.calibrate.rig.sources import RigData
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
@@ -113,7 +113,7 @@ def test_each_source_keeps_its_own_effects() -> None:
     )  # fmt: skip
     first, second = features(scattered(0.5), 1.0, 1, "first"), features(scattered(0.5), -1.0, 2, "second")
     both = first + second
-    shifts = shifts_of(both.effects, both.pixels.shape)
+    shifts = both.shifts()
     assert shifts.shape == (2, 2 * COUNT, 2, 2)
     assert not shifts[0, COUNT:].any()
     assert not shifts[1, :COUNT].any()

@@ -9,7 +9,7 @@ import torch
 
 from kcal.calibrate.rig.landmarks import Landmarks
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.calibrate.rig.source import Effect, shifts_of
+from kcal.calibrate.rig.source import Effect
 from kcal.calibrate.rig.sources import RigData
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
@@ -79,7 +79,7 @@ def test_sum_keeps_effects_with_their_landmarks() -> None:
     first, second = landmarks(0.5), landmarks(-0.5, seed=1)
     second = dataclasses.replace(second, names=tuple(f"q{i}" for i in range(COUNT)))
     both = first + second
-    shifts = shifts_of(both.effects, (*both.pixels.shape[:2], 3))
+    shifts = both.shifts()
     assert torch.equal(shifts[0, :COUNT], first.effects[0].shift)
     assert not shifts[0, COUNT:].any()
     assert torch.equal(shifts[1, COUNT:], second.effects[0].shift)
