@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from capture_frames import BOARD, images
+from command_line import Command
 from typer.testing import CliRunner
 
 from kcal.capture.session import FIRST_VIEWS, CaptureOptions, CaptureSession, Shot, follow, shots
@@ -128,15 +129,14 @@ def test_of_a_stream_the_newest_frame_is_looked_at(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.slow
-def test_command_line(tmp_path: Path) -> None:
+def test_command_line(tmp_path: Path, command: Command) -> None:
     folder = tmp_path / "in"
     folder.mkdir()
     for i, image in enumerate(images()):
         write_png(folder / f"{i}.png", image)
     what = ["--board", "6x5", "--square", "20mm", "--no-page"]
-    done = CliRunner().invoke(app, ["capture", str(folder), *what, "-o", str(tmp_path / "x.obs.json"), "--most", "5"])
-    assert done.exit_code == 0, done.output
-    assert "next: kcal calibrate" in done.output
+    done = command("capture", folder, *what, "-o", tmp_path / "x.obs.json", "--most 5")
+    assert "next: kcal calibrate" in done.out
     assert len(Observations.load(tmp_path / "x.obs.json").views) == 5
     assert len(list((tmp_path / "x.frames").iterdir())) == 5
     failed = CliRunner().invoke(app, ["capture", str(tmp_path / "no"), *what, "-o", str(tmp_path / "y.obs.json")])

@@ -17,6 +17,7 @@ import torch
 import typer
 from board_render import homography, render
 from calibrate_scenes import BOARD, camera, motions, observe, pixels_of
+from command_line import Command
 from locate_rigs import pinhole_rig
 from typer.main import get_command
 from typer.testing import CliRunner, Result
@@ -150,7 +151,7 @@ def test_a_pipe_is_an_error_at_once(tmp_path: Path) -> None:
     [(0, "interrupted; nothing was written"), (2, "written and kept: 0.png, 1.png"), (5, "kept: 2 other files, 2.png")],
 )
 def test_an_interruption_says_what_was_kept(
-    count: int, words: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    count: int, words: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, command: Command
 ) -> None:
     def detect(*_: object, **__: object) -> None:
         for number in range(count):
@@ -160,9 +161,8 @@ def test_an_interruption_says_what_was_kept(
     monkeypatch.chdir(tmp_path)
     Path("a.png").touch()
     monkeypatch.setattr("kcal.corners.images.expand_images", detect)
-    found = CliRunner().invoke(app, ["detect", "a.png", "--board", "9x6", "--square", "25mm", "-o", "a.obs.json"])
-    assert found.exit_code == 130
-    assert words in found.stderr.replace("\n", "")
+    found = command("detect a.png --board 9x6 --square 25mm -o a.obs.json", code=130)
+    assert words in found.err.replace("\n", "")
 
 
 @pytest.mark.parametrize("command", ["show none.json", "calibrate none.obs.json -o a.camera.json", "report none.json"])

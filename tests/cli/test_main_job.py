@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import torch
 from calibrate_scenes import camera, motions, observe, pixels_of
+from command_line import Command
 from typer.testing import CliRunner
 
 import kcal.sim.scene
@@ -388,14 +389,13 @@ def stored(folder: Path, focus: float) -> str:
     return str(save_camera(made, folder / f"f{focus:g}.camera.json"))
 
 
-def test_several_settings_in_one_call(tmp_path: Path) -> None:
+def test_several_settings_in_one_call(tmp_path: Path, command: Command) -> None:
     truth = camera("opencv4")
     seen = [tmp_path / name for name in ("near.obs.json", "far.obs.json")]
     for i, path in enumerate(seen):
         observe(pixels_of(truth, motions(truth, 6, i + 1), noise=0.1, seed=i + 1)).save(path)
     words = ["calibrate", *map(str, seen), "-o", str(tmp_path / "out"), "--model", "opencv4"]
-    done = RUNNER.invoke(app, [*words, "--setting", "focus=1,2.5", "--setting", "zoom=12"])
-    assert done.exit_code == 0, done.output
+    command(*words, "--setting focus=1,2.5 --setting zoom=12")
     found = [load_camera(tmp_path / "out" / f"{name}.camera.json").calibration for name in ("near", "far")]
     assert [one and one.setting and one.setting.values for one in found] == [
         {"focus": 1.0, "zoom": 12.0},
@@ -412,14 +412,13 @@ def test_several_settings_in_one_call(tmp_path: Path) -> None:
     assert "focus is stated twice" in str(twice.exception)
 
 
-def test_interpolate(tmp_path: Path) -> None:
+def test_interpolate(tmp_path: Path, command: Command) -> None:
     paths = [stored(tmp_path, focus) for focus in (0.0, 1.0, 2.0, 3.0)]
     made = tmp_path / "now.camera.json"
     words = ["interpolate", *paths, "--setting", "focus=1.5", "-o", str(made)]
-    done = RUNNER.invoke(app, [*words, "--setting-sigma", "focus=0.1"])
-    assert done.exit_code == 0, done.output
-    assert "focus=1.5, interpolated: far directions ± " in done.output
-    assert all(f" by {part}" in done.output for part in ("calibrations", "interpolation", "setting"))
+    done = command(*words, "--setting-sigma focus=0.1")
+    assert "focus=1.5, interpolated: far directions ± " in done.out
+    assert all(f" by {part}" in done.out for part in ("calibrations", "interpolation", "setting"))
     known = load_camera(made).calibration
     assert known is not None
     assert known.setting is not None

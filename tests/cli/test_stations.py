@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 from click.testing import Result
+from command_line import Command
 from typer.testing import CliRunner
 
 from kcal.cli.main import app
@@ -110,7 +111,7 @@ def test_one_station_alone(folder: Path) -> None:
     assert load_camera_rig(folder / "mill.json").names == ("mill",)
 
 
-def test_one_station_in_local_meters(folder: Path, tmp_path: Path) -> None:
+def test_one_station_in_local_meters(folder: Path, tmp_path: Path, command: Command) -> None:
     """Places and angles have their error bars there, too: those that an origin gives."""
     table = (folder / "survey.csv").read_text().splitlines()
     names, numbers = zip(
@@ -122,9 +123,8 @@ def test_one_station_in_local_meters(folder: Path, tmp_path: Path) -> None:
     rows = []
     for more in ([], ["--origin", f"{ORIGIN.lat},{ORIGIN.lon},{ORIGIN.height}"]):
         given = [str(folder / "mill.camera.json"), str(tmp_path / "local.csv"), "--marks", str(folder / "marks.csv")]
-        result = CliRunner().invoke(app, ["station", *given, "-o", str(tmp_path / "mill.rig.json"), *more, "--json"])
-        assert result.exit_code == 0, result.output
-        rows.append(json.loads(result.stdout)["cameras"]["mill"])
+        result = command("station", *given, "-o", tmp_path / "mill.rig.json", *more, "--json")
+        rows.append(json.loads(result.out)["cameras"]["mill"])
     assert rows[0].keys() >= {"east_m", "heading_deg", "sigma_m"}
     assert abs(rows[0]["sigma_m"] / rows[1]["sigma_m"] - 1.0) < 0.2
     # The camera's own vertical is a little different from the origin's.
@@ -316,7 +316,7 @@ def test_boards_seen_by_any_two_of_three_and_distances_of_named_pairs(tmp_path: 
         run(tmp_path, "rig", *three, "--pairs", "mill.obs.json", "mast.obs.json", "-o", "rig.json")
 
 
-def test_a_rig_of_four_is_judged(folder: Path) -> None:
+def test_a_rig_of_four_is_judged(folder: Path, command: Command) -> None:
     cameras = [f"{name}.camera.json" for name in NAMES]
     given = ["--landmarks", "survey.csv", "--marks", "marks.csv", "-o", "rig.json"]
     more = ["--report", "rig.html", "--picture", "rig.png"]
@@ -326,9 +326,8 @@ def test_a_rig_of_four_is_judged(folder: Path) -> None:
     assert "mill" in page
     assert "data:image/png" in page
     assert (folder / "rig.png").stat().st_size > 10_000
-    result = CliRunner().invoke(app, ["report", str(folder / "rig.json"), "--require", "5km:0.001%"])
-    assert result.exit_code == 3
-    assert "at 5 km the range is known to ±" in result.output
+    result = command("report", folder / "rig.json", "--require 5km:0.001%", code=3)
+    assert "at 5 km the range is known to ±" in result.out
     stated = ["--require", "5km:2%", "--pixel-sigma", "0.3", "--json"]
     told = json.loads(run(folder, "report", "rig.json", *stated))["verdict"]
     rig = load_camera_rig(folder / "rig.json")
@@ -340,6 +339,5 @@ def test_a_rig_of_four_is_judged(folder: Path) -> None:
     away = rig.rotation @ torch.diag(torch.tensor([-1.0, -1, 1], dtype=torch.float64))
     apart = Rig(rig.each, NAMES, away, center=rig.center, origin=rig.origin)
     save_camera_rig(apart, folder / "apart.json")
-    result = CliRunner().invoke(app, ["report", str(folder / "apart.json"), "--require", "1km:5%"])
-    assert result.exit_code == 3
-    assert "no two cameras see one" in result.output
+    result = command("report", folder / "apart.json", "--require 1km:5%", code=3)
+    assert "no two cameras see one" in result.out

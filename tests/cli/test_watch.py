@@ -11,6 +11,7 @@ from socketserver import StreamRequestHandler, TCPServer
 import orjson
 import pytest
 import torch
+from command_line import Command
 from PIL import Image
 from typer.testing import CliRunner
 from waiting import PATIENCE
@@ -41,12 +42,11 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_drift_is_found_told_and_drawn(site: Path) -> None:
+def test_a_drift_is_found_told_and_drawn(site: Path, command: Command) -> None:
     history, picture = site / "h.csv", site / "p.png"
     words = [str(site / name) for name in ("rig.json", "left", "right")]
-    found = RUNNER.invoke(app, ["watch", *words, "-o", str(history), "--picture", str(picture)])
-    assert found.exit_code == 3, found.output
-    assert "beyond the limit of 0.005°" in " ".join(found.output.split())
+    found = command("watch", *words, "-o", history, "--picture", picture, code=3)
+    assert "beyond the limit of 0.005°" in " ".join(found.err.split())
     assert picture.stat().st_size > 10_000
     with history.open() as file:
         rows = list(csv.DictReader(file))
@@ -56,9 +56,8 @@ def test_a_drift_is_found_told_and_drawn(site: Path) -> None:
     # Doubted at first: the interval contains both.
     assert float(rows[2]["relative_yaw_sigma_deg"]) > 0.015
     # Nothing new: nothing is looked at, no new alarm.
-    again = RUNNER.invoke(app, ["watch", *words, "-o", str(history), "--relock", str(site / "new.json")])
-    assert again.exit_code == 0, again.output
-    assert "not re-locked: a day of history is needed" in " ".join(again.output.split())
+    again = command("watch", *words, "-o", history, "--relock", site / "new.json")
+    assert "not re-locked: a day of history is needed" in " ".join(again.out.split())
     assert not (site / "new.json").exists()
 
 
@@ -90,25 +89,23 @@ def marks(folder: Path, times: list[str]) -> Path:
     return path
 
 
-def test_rows_are_located_by_the_rig_of_their_time(watched: Path) -> None:
+def test_rows_are_located_by_the_rig_of_their_time(watched: Path, command: Command) -> None:
     points = marks(watched, [f"{START + 1800.5}", "2026-05-01T12:30:00Z", f"{START + 36_000}"])
     words = ["locate", str(watched / "rig.json"), str(points), "--pixel-sigma", "0.02", "-o", str(watched / "out.csv")]
-    found = RUNNER.invoke(app, [*words, "--watch", str(watched / "h.csv")])
-    assert found.exit_code == 0, found.output
-    assert "errors in calibration and mounting are not included" not in " ".join(found.output.split())
+    found = command(*words, "--watch", watched / "h.csv")
+    assert "errors in calibration and mounting are not included" not in " ".join((found.out + found.err).split())
     with (watched / "out.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [float(row["range_m"]) for row in rows[:2]] == pytest.approx([2000.0] * 2, rel=0.01)
     wide = [float(row["range_high_m"]) - float(row["range_low_m"]) for row in rows]
     assert wide[2] > 1.4 * wide[0]
     assert float(rows[2]["range_low_m"]) < 2000.0 < float(rows[2]["range_high_m"])
-    plain = RUNNER.invoke(app, words)
-    assert plain.exit_code == 0
+    command(*words)
     with (watched / "out.csv").open() as file:
         assert abs(float(next(csv.DictReader(file))["range_m"]) - 2000.0) > 60.0
 
 
-def test_what_locate_needs_for_it(watched: Path) -> None:
+def test_what_locate_needs_for_it(watched: Path, command: Command) -> None:
     points = marks(watched, ["yesterday"])
     words = ["locate", str(watched / "rig.json"), str(points), "--watch", str(watched / "h.csv")]
     for text, message in (("yesterday", "p0: time 'yesterday'"), (f"{START - 60}", "tells nothing of that moment")):
@@ -116,13 +113,12 @@ def test_what_locate_needs_for_it(watched: Path) -> None:
         found = RUNNER.invoke(app, words)
         assert found.exit_code == 1
         assert message in " ".join(str(found.exception).split())
-    both = RUNNER.invoke(app, [*words, "--aged", "9h:0.0004"])
-    assert both.exit_code == 2
+    command(*words, "--aged 9h:0.0004", code=2)
     points.write_text("name,left_u,left_v,right_u,right_v\na,959.5,539.5,951.5,539.5\n")
     assert "needs a column time" in str(RUNNER.invoke(app, words).exception)
 
 
-def test_live_tracks_have_the_sigma_of_the_moment(watched: Path) -> None:
+def test_live_tracks_have_the_sigma_of_the_moment(watched: Path, command: Command) -> None:
     rig = planned_rig()
     sigmas = {}
     for name, start in (("day", START + 1800.0), ("dark", START + 36_000.0)):
@@ -136,8 +132,7 @@ def test_live_tracks_have_the_sigma_of_the_moment(watched: Path) -> None:
         source.write_bytes(b"\n".join(lines) + b"\n")
         output = watched / f"{name}.csv"
         words = ["live", str(watched / "rig.json"), "--detections", str(source), "-o", str(output)]
-        found = RUNNER.invoke(app, [*words, "--watch", str(watched / "h.csv")])
-        assert found.exit_code == 0, found.output
+        command(*words, "--watch", watched / "h.csv")
         with output.open() as file:
             last = list(csv.DictReader(file))[-1]
         assert float(last["range_low_m"]) < 1500.0 < float(last["range_high_m"])
@@ -204,7 +199,7 @@ def test_wrong_words(tmp_path: Path, words: list[str], message: str, monkeypatch
     assert message in " ".join((found.output + str(found.exception)).split())
 
 
-def test_videos_are_watched_too_and_continue(tmp_path: Path) -> None:
+def test_videos_are_watched_too_and_continue(tmp_path: Path, command: Command) -> None:
     pytest.importorskip("av")
     from tests.helpers.video_scenes import write_video
 
@@ -216,7 +211,6 @@ def test_videos_are_watched_too_and_continue(tmp_path: Path) -> None:
     words = ["watch", *(str(tmp_path / name) for name in ("rig.json", "left.mp4", "right.mp4"))]
     words += ["-o", str(tmp_path / "h.csv"), "--every", "2"]
     for _ in range(2):
-        found = RUNNER.invoke(app, words)
-        assert found.exit_code == 0, found.output
+        command(*words)
         with (tmp_path / "h.csv").open() as file:
             assert [float(row["time"]) for row in csv.DictReader(file)] == [0.0, 2.0]

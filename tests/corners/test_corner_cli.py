@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import torch
 from board_render import homography, render
+from command_line import Command
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
@@ -350,13 +351,10 @@ class TestVideo:
         with pytest.raises(InputError, match="no board in any frame"):
             detect_video(video[0], Board(columns=9, rows=8, square=0.02))
 
-    def test_command(self, video, tmp_path):
+    def test_command(self, video, tmp_path, command: Command):
         output = tmp_path / "v.obs.json"
-        result = CliRunner().invoke(
-            app, ["detect", str(video[0]), "--board", "6x5", "--square", "20mm", "-o", str(output)]
-        )
-        assert result.exit_code == 0
-        assert "board found in 3 of 4 sharp frames" in result.output
+        result = command("detect", video[0], "--board 6x5 --square 20mm -o", output)
+        assert "board found in 3 of 4 sharp frames" in result.out
         assert len(Observations.load(output).views) == 3
 
 
@@ -410,13 +408,12 @@ class TestStream:
         result = CliRunner().invoke(app, ["detect", stream, *base, "--keep", str(tmp_path / "none")])
         assert "no such folder" in str(result.exception) + result.output
 
-    def test_command(self, stream, tmp_path):
+    def test_command(self, stream, tmp_path, command: Command):
         path = tmp_path / "o.json"
         words = ["detect", stream, "--board", "6x5", "--square", "2cm", "-o", str(path), "--duration", "30"]
-        result = CliRunner().invoke(app, words)
-        assert result.exit_code == 0, result.output
+        result = command(*words)
         assert len(Observations.load(path).views) == 3
-        assert "secret" not in path.read_text() + result.output
+        assert "secret" not in path.read_text() + result.out + result.err
 
 
 def with_orientation(jpeg, value, order):
@@ -446,17 +443,14 @@ class TestOrientation:
         with pytest.raises(FileError, match="cannot read"):
             turned_images(["none.jpg"])
 
-    def test_is_reported_and_ignored(self, tmp_path):
+    def test_is_reported_and_ignored(self, tmp_path, command: Command):
         jpeg = cv2.imencode(".jpg", cv2.cvtColor(still((0, 0))[0], cv2.COLOR_GRAY2BGR))[1].tobytes()
         (tmp_path / "a.jpg").write_bytes(with_orientation(jpeg, 6, ">"))
         (tmp_path / "b.jpg").write_bytes(jpeg)
         output = tmp_path / "x.obs.json"
         pictures = ["--gallery", str(tmp_path / "g.png"), "--coverage", str(tmp_path / "c.png")]
-        result = CliRunner().invoke(
-            app, ["detect", str(tmp_path), "--board", "6x5", "--square", "20mm", "-o", str(output), *pictures]
-        )
-        assert result.exit_code == 0
-        assert "1 images have an EXIF rotation" in result.output
+        result = command("detect", tmp_path, "--board 6x5 --square 20mm -o", output, *pictures)
+        assert "1 images have an EXIF rotation" in result.out
         seen = Observations.load(output)
         assert seen.image_size == SIZE
         torch.testing.assert_close(seen.pixels()[0], seen.pixels()[1], rtol=0, atol=0)

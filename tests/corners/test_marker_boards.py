@@ -6,10 +6,9 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner
+from command_line import Command
 
 from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.cli.main import app
 from kcal.corners.board import Board
 from kcal.corners.detect import detect, detect_board, view_of
 from kcal.corners.images import read_gray
@@ -341,19 +340,16 @@ class TestDetection:
         assert float(side[0]) * 0.5 > 0.7 * 3.75 * np.sqrt(2)
 
 
-def test_commands(charuco_paper, tmp_path):
+def test_commands(charuco_paper, tmp_path, command: Command):
     import cv2
 
     image, _ = shoot(charuco_paper, CHARUCO_CAMERA, *charuco_pose([0.2, -0.15, 0.1], [0.0, 0.0], 0.4))
     cv2.imwrite(str(tmp_path / "a.png"), image)
-    run = CliRunner()
     output = tmp_path / "a.obs.json"
     what = ["--board", "charuco:9x6", "--square", "25mm", "-o"]
-    result = run.invoke(app, ["detect", str(tmp_path / "a.png"), *what, str(output)])
-    assert result.exit_code == 0
+    command("detect", tmp_path / "a.png", *what, output)
     assert Observations.load(output).board == CHARUCO
-    result = run.invoke(app, ["board", *what, str(tmp_path / "b.pdf"), "--page", "A4"])
-    assert result.exit_code == 0
+    command("board", *what, tmp_path / "b.pdf", "--page A4")
     assert b"charuco:9x6:4x4_50:17.5mm" in (tmp_path / "b.pdf").read_bytes()
 
 

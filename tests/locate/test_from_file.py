@@ -7,9 +7,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from typer.testing import CliRunner
+from command_line import Command
 
-from kcal.cli.main import app
 from kcal.errors import InputError
 from kcal.io.rig_file import load_rig
 from kcal.lens.rig import Mounting, Origin, RigCovariance
@@ -19,13 +18,12 @@ SAMPLE = Path(__file__).parents[2] / "assets" / "sample-rig.json"
 LEFT, RIGHT = torch.tensor([[960.0, 540.0], [700.0, 600.0]]), torch.tensor([[925.0, 535.0], [620.0, 592.0]])
 
 
-def test_the_same_intervals_as_the_command(tmp_path: Path) -> None:
+def test_the_same_intervals_as_the_command(tmp_path: Path, command: Command) -> None:
     marks = tmp_path / "points.csv"
     rows = [f"{left[0]},{left[1]},{right[0]},{right[1]}" for left, right in zip(LEFT, RIGHT, strict=True)]
     marks.write_text("\n".join(["left_u,left_v,right_u,right_v", *rows]) + "\n")
     out = tmp_path / "positions.csv"
-    done = CliRunner().invoke(app, ["locate", str(SAMPLE), str(marks), "--pixel-sigma", "0.1", "-o", str(out)])
-    assert done.exit_code == 0, done.output
+    command("locate", SAMPLE, marks, "--pixel-sigma 0.1 -o", out)
     for localize in (
         StereoLocalizer(load_rig(SAMPLE), pixel_sigma=0.1),
         StereoLocalizer.from_file(SAMPLE, pixel_sigma=0.1),

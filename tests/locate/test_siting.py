@@ -6,15 +6,14 @@ import dataclasses
 import itertools
 import math
 import re
-import sys
 from pathlib import Path
 
 import pytest
 import torch
+from command_line import Command
 from locate_rigs import real_rig, tensor
 from torch import Tensor
 
-from kcal.cli.main import main
 from kcal.errors import FileError, InputError
 from kcal.io.rig_file import save_rig
 from kcal.lens.rig import REFRACTION_SIGMA, Origin
@@ -326,38 +325,27 @@ def test_bad_arguments() -> None:
         range_errors(planned_rig(), [100.0], BudgetErrors(baseline_m=20.0))
 
 
-def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["kcal", "budget", *arguments])
-    with pytest.raises(SystemExit) as stopped:
-        main()
-    return int(stopped.value.code or 0)
-
-
-def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command) -> None:
     monkeypatch.chdir(tmp_path)
-    assert run(monkeypatch, "--pixel-sigma", "1.414213562373095", "--picture", "budget.png") == 0
-    printed = capsys.readouterr().out
+    printed = command("budget --pixel-sigma 1.414213562373095 --picture budget.png").out
     assert "f B 16000 px m" in printed
     line = next(line for line in printed.splitlines() if line.split()[:2] == ["5", "km"])
     assert line.split()[-6:] == ["-1920", "m", "+8330", "m", "+3120", "m"]
     assert Path("budget.png").read_bytes().startswith(b"\x89PNG")
     save_rig(real_rig(), "rig.json")
-    assert run(monkeypatch, "rig.json", "--distances", "500") == 0
-    assert "rig.json: baseline 10.0" in capsys.readouterr().out
-    assert run(monkeypatch, str(SAMPLE), "--distances", "1000,5000") == 0
-    table = capsys.readouterr().out.split("What the rig file knows, and 0.1 px of noise in each mark:")[1].splitlines()
+    assert "rig.json: baseline 10.0" in command("budget rig.json --distances 500").out
+    printed = command("budget", SAMPLE, "--distances 1000,5000").out
+    table = printed.split("What the rig file knows, and 0.1 px of noise in each mark:")[1].splitlines()
     assert table[3].startswith("5 km ")
     total, marks, lenses, pose, sideways = map(float, re.findall(r"(\S+) m", table[3].removeprefix("5 km")))
     assert marks == pytest.approx(math.sqrt(2) * 0.1 * 5000**2 / 16_000, rel=0.1)
     assert total == pytest.approx(math.hypot(marks, lenses, pose), rel=0.03)
     assert min(pose, sideways) > 0
-    assert run(monkeypatch, str(SAMPLE), "--pixel-sigma", "0") == 1
-    assert "a positive number of pixels" in capsys.readouterr().err
-    assert run(monkeypatch, "--baseline", "0.08") == 0
-    ranges = [line.strip().split("  ")[0] for line in capsys.readouterr().out.splitlines() if "disparity" in line]
+    assert "a positive number of pixels" in command("budget", SAMPLE, "--pixel-sigma 0", code=1).err
+    printed = command("budget --baseline 0.08").out
+    ranges = [line.strip().split("  ")[0] for line in printed.splitlines() if "disparity" in line]
     assert [float(text.removesuffix(" m")) for text in ranges] == [1, 2.5, 5, 10, 25, 50]
-    assert run(monkeypatch, "--distances", "near") == 1
-    assert "distances 'near'" in capsys.readouterr().err
+    assert "distances 'near'" in command("budget --distances near", code=1).err
 
 
 # The 95 % region on the map: its shape, its share and its sense.

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from command_line import Command
 from typer.testing import CliRunner
 
 from kcal.cli.main import app
@@ -113,7 +114,9 @@ def test_features_of_any_two_cameras(tmp_path: Path) -> None:
     assert found.pixel_sigma == 0.4
 
 
-def test_a_long_table_is_located_as_a_short_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_table_is_located_as_a_short_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command
+) -> None:
     """In parts as in one, and the sample remembers from where bearings count."""
     rig, generator = ring(3, 4000.0), torch.Generator().manual_seed(0)
     rig.root = rig.with_errors(attitude_deg=0.01)
@@ -130,8 +133,7 @@ def test_a_long_table_is_located_as_a_short_one(tmp_path: Path, monkeypatch: pyt
         if number:
             small_parts(monkeypatch, rows)
         out = [tmp_path / f"out{number}{suffix}" for suffix in (".csv", ".geojson")]
-        result = CliRunner().invoke(app, [*words, *(word for path in out for word in ("-o", str(path)))])
-        assert result.exit_code == 0, result.output
+        command(*words, *(word for path in out for word in ("-o", str(path))))
         outputs.append([cell for row in csv.reader(out[0].read_text().splitlines()) for cell in row])
         locate, sample = ViewsLocator(rig), PositionSample(most=20)
         for views, _ in read_mark_chunks(tmp_path / "marks.csv", rig.names):
@@ -147,7 +149,7 @@ def test_a_long_table_is_located_as_a_short_one(tmp_path: Path, monkeypatch: pyt
         torch.testing.assert_close(sample.feet, feet)
 
 
-def test_one_camera_and_a_terrain(tmp_path: Path) -> None:
+def test_one_camera_and_a_terrain(tmp_path: Path, command: Command) -> None:
     rig = ring(3, 4000.0)
     rig.root = rig.with_errors(attitude_deg=0.01)
     save_camera_rig(rig, tmp_path / "rig.json")
@@ -162,8 +164,7 @@ def test_one_camera_and_a_terrain(tmp_path: Path) -> None:
     words = ["locate", str(tmp_path / "rig.json"), str(tmp_path / "smoke.csv"), "-o", str(tmp_path / "out.csv")]
     assert CliRunner().invoke(app, words).exit_code != 0, "a bearing is no position"
     given = ["--terrain", str(tmp_path / "hills.asc"), "--terrain-sigma", "2"]
-    result = CliRunner().invoke(app, [*words, *given])
-    assert result.exit_code == 0, result.output
+    command(*words, *given)
     with (tmp_path / "out.csv").open() as file:
         (row,) = csv.DictReader(file)
     there = enu_to_geodetic(geodetic_to_enu(spot, ORIGIN), ORIGIN)
@@ -171,8 +172,7 @@ def test_one_camera_and_a_terrain(tmp_path: Path) -> None:
     assert float(row["height_ellipsoidal_m"]) == pytest.approx(631.0, abs=0.5)
     # A level error of two meters of height over the slope of the line of sight, 270 m over 4 km.
     assert 15 < math.sqrt(float(row["cov_ee_m2"]) + float(row["cov_nn_m2"])) < 60
-    both = CliRunner().invoke(app, [*words, *given, "--height", "631"])
-    assert both.exit_code == 2
+    command(*words, *given, "--height 631", code=2)
 
 
 def test_range_errors_of_many_cameras_are_those_of_a_pair() -> None:

@@ -8,12 +8,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from command_line import Command
 from locate_rigs import pinhole_rig
-from typer.testing import CliRunner
 
 from kcal import Board, Observations, View
 from kcal.cli import report
-from kcal.cli.main import app
 from kcal.cli.rig_sources import check_views_of
 from kcal.errors import InputError
 from kcal.io.rig_file import load_rig, save_rig
@@ -136,14 +135,13 @@ def test_faults_of_the_cameras_count_in_the_ranges() -> None:
     assert rig_verdict(solved(record(CLEAN)), NEED, mark_sigma=0.1, cameras=borne).usable
 
 
-def test_the_command_ends_with_3_and_names_the_camera(tmp_path: Path) -> None:
+def test_the_command_ends_with_3_and_names_the_camera(tmp_path: Path, command: Command) -> None:
     save_rig(solved(record(MIXED), warnings=("its geometry is weak",)), tmp_path / "rig.json")
     assert load_rig(tmp_path / "rig.json").left.calibration is not None
-    found = CliRunner().invoke(app, ["report", str(tmp_path / "rig.json")])
-    assert found.exit_code == 3
-    assert "NO: left: 20 of 20 views are named like pairs" in found.stdout
-    assert "its geometry is weak" in found.stdout
-    assert "the views were not looked at" in found.stdout
+    found = command("report", tmp_path / "rig.json", code=3)
+    assert "NO: left: 20 of 20 views are named like pairs" in found.out
+    assert "its geometry is weak" in found.out
+    assert "the views were not looked at" in found.out
 
 
 def test_images_named_alike_tell_neither_an_exchange_nor_a_moment(monkeypatch: pytest.MonkeyPatch) -> None:
