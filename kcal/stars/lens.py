@@ -13,9 +13,10 @@ from scipy import stats
 from torch import Tensor
 
 from kcal.calibrate.camera.result import CameraCalibrationResult
+from kcal.calibrate.hybrid.evidence import Amplitudes
 from kcal.calibrate.hybrid.families import PriorFamilies, typical_hyperprior
 from kcal.calibrate.hybrid.fit import HybridFit
-from kcal.calibrate.hybrid.fitted_views import NO_MOTION, Estimate, FittedViews, hybrid_unknowns, run_rounds
+from kcal.calibrate.hybrid.fitted_views import Estimate, FittedViews, hybrid_unknowns, run_rounds
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.parameters import FreeParameters, GaussianTerm
 from kcal.calibrate.problem.state import BoardState
@@ -201,10 +202,9 @@ def _by_evidence(
         stars = stars.near(hybrid.model, estimate.state, CUT)
         return dataclasses.replace(capture, weights=stars.weights / stars.noise)
 
-    estimate = Estimate(hybrid.model, families, state, hybrid.hyperparameters, NO_MOTION, 1.0, 1.0)
+    estimate = Estimate(hybrid.model, families, state, Amplitudes(hybrid.hyperparameters, 1.0))
     rounds = run_rounds(capture, estimate, cold=False, spent=0, rough=False, progress=lambda _: None, reweigh=near)
-    deviation = families.deviation(rounds.estimate.hyperparameters)[kept]
-    return deviation, stars, rounds.estimate.state
+    return rounds.estimate.deviation[kept], stars, rounds.estimate.state
 
 
 def _with_star_rows(known: CameraInformation, stars: Tensor, change: Tensor) -> CameraInformation:

@@ -12,8 +12,9 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from kcal.calibrate.hybrid.board_modes import BoardModes
+from kcal.calibrate.hybrid.evidence import Amplitudes
 from kcal.calibrate.hybrid.families import PUPIL, prior_families, typical_hyperprior
-from kcal.calibrate.hybrid.fitted_views import LAST, NO_MOTION, Estimate, FittedViews, run_rounds
+from kcal.calibrate.hybrid.fitted_views import LAST, Estimate, FittedViews, run_rounds
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.covariance import information_of
 from kcal.calibrate.problem.parameters import FreeParameters, Term
@@ -210,7 +211,8 @@ def fit_star_lens(
     stars = stars._replace(weights=rounds.capture.weights, variance=rounds.estimate.variance)
     _, estimate, _ = rounds.capture.solved(rounds.estimate, LAST, last_step=True)
     state = estimate.state
-    stated = rounds.capture.problem(estimate._replace(variance=stars.noise**2))
+    amplitudes = estimate.amplitudes._replace(variance=stars.noise**2)
+    stated = rounds.capture.problem(estimate._replace(amplitudes=amplitudes))
     information = information_of(stated, state, stars.noise)
     camera = Camera(state.parameters, size=size, model=model)
     return star_lens(stars, state, camera, information.rows, information)
@@ -223,7 +225,7 @@ def _typical_estimate(
     form = model.hybrid
     assert form is not None
     families = prior_families(form, focal, stars.fitted(size).board, size, 1.0)
-    return Estimate(model, families, state, typical_hyperprior().mean, NO_MOTION, stars.variance, 1.0)
+    return Estimate(model, families, state, Amplitudes(typical_hyperprior().mean, stars.variance))
 
 
 def require_stars(fields: Sequence[StarField]) -> None:

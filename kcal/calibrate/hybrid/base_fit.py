@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.hybrid.board_modes import KNOWN, STRETCH, BoardModes, board_modes
+from kcal.calibrate.hybrid.evidence import Amplitudes
 from kcal.calibrate.hybrid.families import BOARD, LensPrior, PriorFamilies, prior_families, typical_hyperprior
-from kcal.calibrate.hybrid.fitted_views import NO_MOTION, Estimate, FittedViews, hybrid_unknowns
+from kcal.calibrate.hybrid.fitted_views import Estimate, FittedViews, hybrid_unknowns
 from kcal.calibrate.problem.poses import homographies, poses_from_homographies
 from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.views import LEAST_NOISE
@@ -243,7 +244,7 @@ def fit_base(
         h = h.clone()
         h[BOARD + STRETCH] = (base.state.board.abs() / board.unit[first]).log()
     state = base.state._replace(parameters=params, board=amplitudes)
-    return Estimate(model, families, state, h, NO_MOTION, base.variance, 1.0), base.steps
+    return Estimate(model, families, state, Amplitudes(h, base.variance)), base.steps
 
 
 def _fit_known(capture: FittedViews, lens: LensPrior) -> tuple[Estimate, int]:
@@ -259,7 +260,7 @@ def _fit_known(capture: FittedViews, lens: LensPrior) -> tuple[Estimate, int]:
     still = dataclasses.replace(capture, readout=None, exact=True)
     h = capture.hyperprior.mean
     state, variance, steps = _solve_base(still, model, families, state, h, False)
-    return Estimate(model, families, state, h, NO_MOTION, variance, 1.0), steps
+    return Estimate(model, families, state, Amplitudes(h, variance)), steps
 
 
 def _with_constants(
@@ -292,7 +293,7 @@ def _solve_base(
         held[-1 - len(capture.board.unit)] = False
     if not capture.exact:
         held[len(held) - len(capture.board.unit) :] = False
-    problem = capture.problem(Estimate(model, families, state, h, NO_MOTION, 1.0, 1.0), held)
+    problem = capture.problem(Estimate(model, families, state, Amplitudes(h, 1.0)), held)
     found = minimize(problem, state, LMOptions(max_iterations=15, tolerance=1e-4, initial_damping=1e-6))
     return found.state, max(2.0 * float(found.cost) / capture.freedom, LEAST_NOISE**2), int(found.iterations)
 

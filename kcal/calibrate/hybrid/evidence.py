@@ -368,58 +368,57 @@ def _posterior(data: Quadratic, families: PriorFamilies, h: np.ndarray, log_vari
     return _Posterior(float(best.value), np.append(slope, noise), whole, best, Q, by_h)
 
 
-class Maximum(NamedTuple):
-    """Where the evidence is largest.
+# The logarithms of motions' standard deviations over the noise, of views that stand still.
+NO_MOTION = np.zeros(0)
+
+
+class Amplitudes(NamedTuple):
+    """What the evidence sets: how large each family of unknowns, the motions of views, and the noise are.
 
     Attributes:
         h: (H,) hyperparameters of the modes.
-        log_ratio: (4,) logarithms of the motions' standard deviations over the noise; () where views stand still.
-        variance: of the noise.
-        loss: the negative logarithm of the evidence.
+        variance: of the noise, px².
+        log_ratio: logarithms of standard deviations over the noise, of motions as in `MotionSigma`, and of bending; ()
+            where views stand still.
+        loss: the negative logarithm of the evidence; infinite before it is known.
     """
 
     h: Tensor
-    log_ratio: np.ndarray
     variance: float
-    loss: float
+    log_ratio: np.ndarray = NO_MOTION
+    loss: float = math.inf
 
 
 def maximize_evidence(
     data: ViewData,
     families: PriorFamilies,
-    h: Tensor,
-    variance: float,
+    start: Amplitudes,
     hyperprior: Hyperprior | None = None,
-    log_ratio: np.ndarray | None = None,
     tempering: float = 1.0,
     rough: bool = False,
     known_noise: bool = False,
-) -> Maximum:
-    """The hyperparameters and the noise variance of largest evidence.
+) -> Amplitudes:
+    """The amplitudes of largest evidence.
 
     Args:
         data: what the views say.
         families: the priors.
-        h: start.
-        variance: start.
+        start: of the search, with ratios for views that moved while they were read.
         hyperprior: of h; the typical one of the default field if not given.
-        log_ratio: start, for views that moved while they were read.
         tempering: by which the data count less.
         rough: end within some hundredths of a nat, for data that will change.
         known_noise: the variance of the noise stays as it is.
     """
-    prior = hyperprior or typical_hyperprior()
-    ratios = np.zeros(0) if log_ratio is None else log_ratio
+    prior, log_variance = hyperprior or typical_hyperprior(), math.log(start.variance)
     count = len(prior.mean)
-    log_variance = math.log(variance)
-    bounds = hyper_bounds(prior, len(ratios), log_variance)
+    bounds = hyper_bounds(prior, len(start.log_ratio), log_variance)
     if known_noise:
         bounds[-1] = log_variance, log_variance
-    start = np.concatenate([h.numpy(), ratios, [log_variance]])
+    begin = np.concatenate([start.h.numpy(), start.log_ratio, [log_variance]])
     at, value = _minimum(
-        EvidenceLoss(data, families, prior, tempering), start, bounds, *(_ROUGHLY if rough else _EXACTLY)
+        EvidenceLoss(data, families, prior, tempering), begin, bounds, *(_ROUGHLY if rough else _EXACTLY)
     )
-    return Maximum(torch.from_numpy(at[:count].copy()), at[count:-1].copy(), math.exp(at[-1]), float(value))
+    return Amplitudes(torch.from_numpy(at[:count].copy()), math.exp(at[-1]), at[count:-1].copy(), float(value))
 
 
 def _minimum(
@@ -549,7 +548,7 @@ def with_tempering(loss: float, data_freedom: float, variance: float, own: float
 
 
 def evidence_of_motion(
-    data: ViewData, best: Maximum, families: PriorFamilies, tempering: float, some: Sequence[int] | None = None
+    data: ViewData, best: Amplitudes, families: PriorFamilies, tempering: float, some: Sequence[int] | None = None
 ) -> float:
     """Gain of the log evidence (nats) by motions, with all other amplitudes unchanged.
 
@@ -576,7 +575,7 @@ _TAILS = 3.0
 _REPEATS = 30
 
 
-def relative_bends(data: ViewData, best: Maximum, families: PriorFamilies) -> Tensor:
+def relative_bends(data: ViewData, best: Amplitudes, families: PriorFamilies) -> Tensor:
     """(V,) the factors w of each view, at the best lens and board."""
     assert data.relative is not None
     step = _best(data.integrated(best.log_ratio).data, families, best.h.numpy(), math.log(best.variance)).step
@@ -606,8 +605,8 @@ _WIDEST = 2.0
 
 
 def expected_maximum(
-    data: ViewData, families: PriorFamilies, best: Maximum, hyperprior: Hyperprior, tempering: float = 1.0
-) -> Maximum:
+    data: ViewData, families: PriorFamilies, best: Amplitudes, hyperprior: Hyperprior, tempering: float = 1.0
+) -> Amplitudes:
     """The maximum of the evidence with all amplitudes in use, those of motions too, replaced by √<A²>.
 
     Args:

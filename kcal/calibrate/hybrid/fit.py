@@ -14,7 +14,7 @@ from torch import Tensor
 
 from kcal.calibrate.hybrid.base_fit import fit_base
 from kcal.calibrate.hybrid.board_modes import STRETCH, BoardModes, board_modes
-from kcal.calibrate.hybrid.evidence import WORTH, posterior_root
+from kcal.calibrate.hybrid.evidence import WORTH, Amplitudes, posterior_root
 from kcal.calibrate.hybrid.families import (
     BOARD,
     LEADING_UNKNOWNS,
@@ -73,10 +73,10 @@ def aspect_score(rounds: Rounds) -> float:
 def _standing(rounds: Rounds) -> float:
     """As `aspect_score`, at the amplitudes of the rounds, with a wide prior of the board's stretch."""
     estimate, data = rounds.estimate, rounds.data
-    families, h = estimate.families, estimate.hyperparameters.clone()
+    families, h = estimate.families, estimate.amplitudes.h.clone()
     h[BOARD + STRETCH] = h[BOARD + STRETCH].clamp_min(math.log(_PRINTED))
     deviation = torch.where(rounds.capture.held(estimate), 0.0, families.deviation(h))
-    still = data.integrated(estimate.log_ratio).data
+    still = data.integrated(estimate.amplitudes.log_ratio).data
     half = posterior_root(still.K, deviation, estimate.variance) * deviation
     x = half.T @ (half @ (still.g + still.K @ still.at)) / estimate.variance + families.mean
     columns, rows = 0, len(x) - len(rounds.capture.board.unit) - 1
@@ -215,13 +215,13 @@ def settle(
 
     if start is not None:
         estimate = start.estimate
-        state, h = estimate.state, estimate.hyperparameters
+        state, h = estimate.state, estimate.amplitudes.h
         if known is not None:
             state, h = state._replace(board=known.in_units(state.board)), h.clone()
             # Nothing depends on them any more, so that they are no reason for another round.
             h[BOARD:] = hyperprior.mean[BOARD:]
         families = estimate.families.with_board(shown)
-        estimate = estimate._replace(families=families, state=state, hyperparameters=h)
+        estimate = estimate._replace(families=families, state=state, amplitudes=estimate.amplitudes._replace(h=h))
         return run(capture, estimate, start.iterations)
     undecided = square is None and lens is None
     # Whether pixels are square is told well enough before amplitudes are entirely at rest.
@@ -433,16 +433,8 @@ class HybridFit:
     @property
     def as_start(self) -> FitStart:
         """A start for another fit."""
-        estimate = Estimate(
-            self.model,
-            self.families,
-            self.state,
-            self.hyperparameters,
-            self.log_ratio,
-            self.sigma**2,
-            self.tempering,
-            self.relative,
-        )
+        amplitudes = Amplitudes(self.hyperparameters, self.sigma**2 / self.tempering, self.log_ratio)
+        estimate = Estimate(self.model, self.families, self.state, amplitudes, self.tempering, self.relative)
         return FitStart(estimate, self.readout, self.square, self.residuals, self.iterations)
 
     @property
@@ -487,7 +479,8 @@ def fit_hybrid(
     capture, likely = rounds.capture, rounds.estimate
     # Error bars are for amplitudes as they are to be expected (`kcal.calibrate.hybrid.evidence`).
     estimate = likely if robust else expected_estimate(rounds)
-    model, families, state, h, _, variance, tempering, _ = estimate
+    model, families, state, (h, _, log_ratio, _), tempering, relative = estimate
+    variance = estimate.variance
     # Modes that the evidence holds so closely to zero that no pixel feels them are left out, error bars included.
     assert model.hybrid is not None
     peaks = torch.tensor(model.hybrid.modes.peaks, dtype=torch.float64)
@@ -526,14 +519,14 @@ def fit_hybrid(
         sigma=math.sqrt(variance),
         wider=wider,
         tempering=tempering,
-        hyperparameters=likely.hyperparameters,
+        hyperparameters=likely.amplitudes.h,
         expected=h,
         families=families,
         log_evidence=-rounds.loss,
         square=capture.square,
         readout=capture.readout,
-        log_ratio=estimate.log_ratio,
-        relative=estimate.relative,
+        log_ratio=log_ratio,
+        relative=relative,
         effective=len(deviation) - float(inverse.square().sum()),
         board_shapes=own,
         board_points=ordered + torch.einsum("b,bkn->nk", state.board, own.shapes),

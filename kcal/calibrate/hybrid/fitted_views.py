@@ -14,8 +14,9 @@ from torch import Tensor
 
 from kcal.calibrate.hybrid.board_modes import BoardModes
 from kcal.calibrate.hybrid.evidence import (
+    NO_MOTION,
     WORTH,
-    Maximum,
+    Amplitudes,
     ViewData,
     evidence_of_motion,
     expected_maximum,
@@ -104,9 +105,6 @@ def hybrid_prior(model: LensModel, shapes: int, mean: Tensor, precision: Tensor,
 
 # Views to which a hybrid camera is fitted, where a fit stands, and the least squares of both.
 
-# The logarithms of motions' standard deviations over the noise, of views that stand still.
-NO_MOTION = np.zeros(0)
-
 
 class Estimate(NamedTuple):
     """The present solution of a fit: its lens, the priors of all unknowns, their values and amplitudes.
@@ -115,9 +113,7 @@ class Estimate(NamedTuple):
         model: of the lens.
         families: which amplitudes set the prior of each unknown.
         state: values of camera, board, poses and motions.
-        hyperparameters: (H,) log amplitudes and decays.
-        log_ratio: logarithms of standard deviations of motions and bending over the noise; () where views stand still.
-        variance: of the noise, tempering included, px².
+        amplitudes: the hyperparameters of the priors, and the noise without tempering.
         tempering: factor by which the data count less, because residuals repeat within views.
         relative: (V,) how much the board bends in each view, relative to the others; None: alike in all.
     """
@@ -125,16 +121,24 @@ class Estimate(NamedTuple):
     model: LensModel
     families: PriorFamilies
     state: BoardState
-    hyperparameters: Tensor
-    log_ratio: np.ndarray
-    variance: float
-    tempering: float
+    amplitudes: Amplitudes
+    tempering: float = 1.0
     relative: Tensor | None = None
+
+    @property
+    def variance(self) -> float:
+        """Of the noise, tempering included, px²."""
+        return self.amplitudes.variance * self.tempering
+
+    @property
+    def deviation(self) -> Tensor:
+        """(S,) prior standard deviations of all unknowns."""
+        return self.families.deviation(self.amplitudes.h)
 
     @property
     def stillness(self) -> Tensor:
         """The squared noise over the variance of each number of a view."""
-        return stillness(self.log_ratio, self.relative)
+        return stillness(self.amplitudes.log_ratio, self.relative)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -225,8 +229,7 @@ class FittedViews:
     def problem(self, estimate: Estimate, held: Tensor | None = None) -> BoardProblem:
         """The least squares at amplitudes of an estimate, unknowns (S,) being held: those of `held` if not given."""
         never = self.held(estimate) if held is None else held
-        deviation = estimate.families.deviation(estimate.hyperparameters)
-        precision = torch.where(never, torch.inf, estimate.variance / deviation.square())
+        precision = torch.where(never, torch.inf, estimate.variance / estimate.deviation.square())
         fixed, still, kept = torch.isinf(precision), estimate.stillness, self._kept
         if kept and kept[0][0] is estimate.model and torch.equal(kept[0][1], fixed):
             # What corners say at the last state serves under other priors, too.
@@ -344,7 +347,7 @@ class Rounds(NamedTuple):
     def untempered_loss(self) -> float:
         """`loss` for data that count fully: only such losses of different rounds can be compared."""
         tempering = self.estimate.tempering
-        own, variance = 1.0 if self.data.moving else tempering, self.estimate.variance / tempering
+        own, variance = 1.0 if self.data.moving else tempering, self.estimate.amplitudes.variance
         return with_tempering(self.loss, self.data.still.freedom, variance, own, 1.0)
 
 
@@ -353,36 +356,32 @@ def begin_motion(capture: FittedViews, estimate: Estimate) -> Estimate:
 
     Values that the estimate has already are kept; new ones begin at zero, with the amplitude of a hand's motion.
     """
-    readout, old, ratios = capture.readout, estimate.state.motion, estimate.log_ratio
+    readout, old, ratios = capture.readout, estimate.state.motion, estimate.amplitudes.log_ratio
     has = (False, False) if readout is None else (readout.moves, readout.bends is not None)
     had = (len(ratios) >= AMPLITUDES, len(ratios) % AMPLITUDES > 0)
     count, again = len(capture.pixels), len(old) == len(capture.pixels)
     if has == had and again:
         return estimate
-    begin = math.log(_MOVING) - 0.5 * math.log(estimate.variance / estimate.tempering)
+    begin = math.log(_MOVING) - 0.5 * math.log(estimate.amplitudes.variance)
     motion, ratio = old.new_zeros(count, MOTION * has[0] + BENDS * has[1]), np.full(AMPLITUDES * has[0] + has[1], begin)
     # Motion comes first, bending last.
     numbers, parts = (slice(MOTION), slice(-BENDS, None)), (slice(AMPLITUDES), slice(-1, None))
     for kept in (k for k in (0, 1) if again and has[k] and had[k]):
         motion[:, numbers[kept]], ratio[parts[kept]] = old[:, numbers[kept]], ratios[parts[kept]]
     relative = (estimate.relative if again and had[1] else old.new_ones(count)) if has[1] else None
-    return estimate._replace(
-        state=estimate.state._replace(motion=motion), log_ratio=ratio if any(has) else NO_MOTION, relative=relative
-    )
+    amplitudes = estimate.amplitudes._replace(log_ratio=ratio if any(has) else NO_MOTION)
+    return estimate._replace(state=estimate.state._replace(motion=motion), amplitudes=amplitudes, relative=relative)
 
 
-def _least_gained(
-    readout: Readout, data: ViewData, best: Maximum, families: PriorFamilies, tempering: float
-) -> tuple[float, bool]:
+def _least_gained(readout: Readout, data: ViewData, estimate: Estimate) -> tuple[float, bool]:
     """The smaller gain of evidence (nats), of motion beside bending or of bending beside motion; whether of motion."""
+    _, families, _, best, tempering, _ = estimate
     parts = [(list(range(AMPLITUDES)), True)] * readout.moves
     parts += [([len(best.log_ratio) - 1], False)] * (readout.bends is not None)
     return min((evidence_of_motion(data, best, families, tempering, part), moves) for part, moves in parts)
 
 
-def _with_bending(
-    capture: FittedViews, estimate: Estimate, best: Maximum, tempering: float
-) -> tuple[FittedViews, Estimate] | None:
+def _with_bending(capture: FittedViews, estimate: Estimate) -> tuple[FittedViews, Estimate] | None:
     """Views and estimate with a board that bends by view; None where that explains the views no better.
 
     This is decided from one linearization at the estimate: nothing is fitted.
@@ -391,14 +390,14 @@ def _with_bending(
     if capture.heights is None or readout.bends is not None:
         return None
     wider = dataclasses.replace(capture, readout=dataclasses.replace(readout, bends=capture.heights))
-    bent = begin_motion(wider, estimate)
+    bent, best = begin_motion(wider, estimate), estimate.amplitudes
     data, trials = wider.data(wider.problem(bent), bent), []
     for sigma in _BENT:
         ratio = np.append(best.log_ratio, math.log(sigma) - 0.5 * math.log(best.variance))
         trial, number = best._replace(log_ratio=ratio), [len(ratio) - 1]
-        trials.append((evidence_of_motion(data, trial, estimate.families, tempering, number), sigma, ratio))
-    gained, _, ratio = max(trials)
-    return (wider, bent._replace(log_ratio=ratio, variance=best.variance, tempering=1.0)) if gained >= WORTH else None
+        trials.append((evidence_of_motion(data, trial, estimate.families, estimate.tempering, number), sigma, trial))
+    gained, _, trial = max(trials, key=lambda found: found[:2])
+    return (wider, bent._replace(amplitudes=trial, tempering=1.0)) if gained >= WORTH else None
 
 
 def run_rounds(
@@ -428,7 +427,7 @@ def run_rounds(
     estimate = begin_motion(capture, estimate)
     if capture.readout is not None:
         # That of an earlier fit, which was found after its rounds.
-        estimate = estimate._replace(variance=estimate.variance / estimate.tempering, tempering=1.0)
+        estimate = estimate._replace(tempering=1.0)
     for turn in range(_ROUNDS):
         first = turn == 0 and cold
         problem, estimate, steps = capture.solved(estimate, _FIRST if first else effort)
@@ -441,22 +440,20 @@ def run_rounds(
             # ends this where the new value alone swings forever (OpenCV's left camera, between 1 and 2).
             tempering = math.sqrt(tempering * found) if tempered else found
             tempered = True
-        best = Maximum(estimate.hyperparameters, estimate.log_ratio, estimate.variance / former, math.inf)
+        best = estimate.amplitudes
         # An earlier fit of still views, under another prior, is farther off than what a round leaves: by a step.
         most = 3 if turn == 0 and problem.readout is None else 2
         for roughly in (True,) if rough else (True, False):
             best = maximize_evidence(
                 data,
                 estimate.families,
-                best.h,
-                best.variance,
+                best,
                 capture.hyperprior,
-                best.log_ratio,
                 tempering,
                 roughly,
                 known_noise=capture.known is not None,
             )
-            change = max(_moved_by(estimate, best), abs(math.log(tempering / former)))
+            change = max(_moved_by(estimate.amplitudes, best), abs(math.log(tempering / former)))
             # The solver may try several steps where it finds nothing that the evidence feels.
             ended, bends = steps < effort[0], data.relative is not None
             still = steps <= most or abs(best.loss - last) < (_SCALE if ended and bends else _UNFELT)
@@ -469,13 +466,7 @@ def run_rounds(
             moved = float((relative / data.relative).log().abs().max())
             resting &= moved < (_NEAR_REST if rough else _AT_REST)
             data = data._replace(relative=relative)
-        estimate = estimate._replace(
-            hyperparameters=best.h,
-            relative=data.relative,
-            log_ratio=best.log_ratio,
-            variance=best.variance * tempering,
-            tempering=tempering,
-        )
+        estimate = estimate._replace(amplitudes=best, tempering=tempering, relative=data.relative)
         last = best.loss
         # Where its amplitudes rest and the solver does not, more rounds of a few steps would end as those before.
         effort = LAST if bends and change < _AT_REST and not ended else _LATER
@@ -485,14 +476,14 @@ def run_rounds(
             resting &= torch.equal(weighed.weights, capture.weights)
             capture = weighed
         if (first or resting) and turn < _ROUNDS // 2:
-            bent = _with_bending(capture, estimate, best, tempering)
+            bent = _with_bending(capture, estimate)
             if bent is not None:
                 (capture, estimate), top = bent, None
                 continue
         if data.moving and turn < _ROUNDS - 1:
             # The first round tells it as the second does, within .05 nats for 16 simulated captures of 6 to 200 views.
             assert capture.readout is not None
-            gained, moves = _least_gained(capture.readout, data, best, estimate.families, tempering)
+            gained, moves = _least_gained(capture.readout, data, estimate)
             if gained < WORTH:
                 less = dataclasses.replace(capture.readout, **({"moves": False} if moves else {"bends": None}))
                 # A stiff board is not tried again.
@@ -516,32 +507,26 @@ def run_rounds(
         # Once, at the end: amplitudes of motions that were set with it again would grow without bound where views are
         # few, as both explain the same residuals (measured on a webcam's seven views).
         tempering = _overdispersion(data, estimate, capture)
-        estimate = estimate._replace(variance=estimate.variance * tempering, tempering=tempering)
+        estimate = estimate._replace(tempering=tempering)
     return Rounds(capture, readout, estimate, data, best.loss, spent, converged, lost)
 
 
 def expected_estimate(rounds: Rounds) -> Estimate:
     """The estimate with expected amplitudes (`expected_maximum`) in place of the most likely ones."""
     estimate, data = rounds.estimate, rounds.data
-    variance = estimate.variance / estimate.tempering
-    best = Maximum(estimate.hyperparameters, estimate.log_ratio, variance, rounds.loss)
     # Views that move were tempered after their amplitudes were found.
     tempering = 1.0 if data.moving else estimate.tempering
-    found = expected_maximum(data, estimate.families, best, rounds.capture.hyperprior, tempering)
-    return estimate._replace(hyperparameters=found.h, log_ratio=found.log_ratio)
+    found = expected_maximum(data, estimate.families, estimate.amplitudes, rounds.capture.hyperprior, tempering)
+    return estimate._replace(amplitudes=found)
 
 
 def motion_is_worth(rounds: Rounds, readout: Readout) -> bool:
     """Whether views that were fitted as standing still are explained better by motion, to first order at the fit."""
     capture = dataclasses.replace(rounds.capture, readout=readout)
-    estimate = rounds.estimate
-    moving = begin_motion(capture, estimate)
+    moving = begin_motion(capture, rounds.estimate)
     data = capture.data(capture.problem(moving), moving)
-    variance, families = estimate.variance / estimate.tempering, estimate.families
-    best = maximize_evidence(
-        data, families, estimate.hyperparameters, variance, capture.hyperprior, moving.log_ratio, rough=True
-    )
-    return bool(evidence_of_motion(data, best, families, 1.0) >= WORTH)
+    best = maximize_evidence(data, moving.families, moving.amplitudes, capture.hyperprior, rough=True)
+    return bool(evidence_of_motion(data, best, moving.families, 1.0) >= WORTH)
 
 
 def columns_may_be_read(rounds: Rounds) -> bool:
@@ -552,7 +537,7 @@ def columns_may_be_read(rounds: Rounds) -> bool:
     readout, estimate = rounds.capture.readout, rounds.estimate
     if readout is None or not readout.moves:
         return False
-    found = motion_sigma(estimate.log_ratio, estimate.variance / estimate.tempering)
+    found = motion_sigma(estimate.amplitudes.log_ratio, estimate.amplitudes.variance)
     if not rounds.converged or max(found.turn, found.shift) > _TOO_MUCH:
         return True
     losses = []
@@ -560,31 +545,20 @@ def columns_may_be_read(rounds: Rounds) -> bool:
     for columns in (False, True):
         capture = dataclasses.replace(rounds.capture, readout=dataclasses.replace(readout, columns=columns))
         data = capture.data(capture.problem(estimate), still)
-        best = maximize_evidence(
-            data,
-            estimate.families,
-            estimate.hyperparameters,
-            estimate.variance / estimate.tempering,
-            capture.hyperprior,
-            estimate.log_ratio,
-            rough=True,
-        )
+        best = maximize_evidence(data, estimate.families, estimate.amplitudes, capture.hyperprior, rough=True)
         losses.append(best.loss)
     return losses[1] < losses[0]
 
 
-def _moved_by(estimate: Estimate, best: Maximum) -> float:
+def _moved_by(old: Amplitudes, new: Amplitudes) -> float:
     """The largest change of a hyperparameter or ratio."""
-    change = float((best.h - estimate.hyperparameters).abs().max())
-    if len(best.log_ratio):
-        change = max(change, float(np.abs(best.log_ratio - estimate.log_ratio).max()))
-    return change
+    return max(float((new.h - old.h).abs().max()), float(np.abs(new.log_ratio - old.log_ratio).max(initial=0.0)))
 
 
 def _overdispersion(data: ViewData, estimate: Estimate, capture: FittedViews) -> float:
-    deviation = torch.where(capture.held(estimate), 0.0, estimate.families.deviation(estimate.hyperparameters))
-    K = data.integrated(estimate.log_ratio).data.K
-    return overdispersion(data.scores(estimate.log_ratio), K, deviation, estimate.variance)
+    deviation, ratio = torch.where(capture.held(estimate), 0.0, estimate.deviation), estimate.amplitudes.log_ratio
+    K = data.integrated(ratio).data.K
+    return overdispersion(data.scores(ratio), K, deviation, estimate.variance)
 
 
 # Poses and motions of views that were held out, under a camera and a board that stay as they are.

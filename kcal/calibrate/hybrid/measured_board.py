@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.hybrid.board_modes import KNOWN, BoardModes, board_modes, undetermined_modes
-from kcal.calibrate.hybrid.evidence import maximize_evidence, still_data
+from kcal.calibrate.hybrid.evidence import Amplitudes, maximize_evidence, still_data
 from kcal.calibrate.hybrid.families import BOARD, Hyperprior, PriorFamilies, typical_hyperprior
 from kcal.corners.board import Board
 from kcal.errors import InputError
@@ -118,7 +118,7 @@ def printed_board(
     families = PriorFamilies(zero, unit.log(), modes.family, none, zero)
     data = still_data(stacked(messages).placed(numbered(BOARD_SLOT, len(unit)), zero).rows.T[None], zero, 0.0)
     # Messages are in standard deviations already.
-    found = maximize_evidence(data, families, prior.mean, 1.0, prior, known_noise=True)
+    found = maximize_evidence(data, families, Amplitudes(prior.mean, 1.0), prior, known_noise=True)
     return printed_prior(modes, found.h), -found.loss
 
 

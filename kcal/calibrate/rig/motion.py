@@ -12,6 +12,7 @@ from torch import Tensor
 
 from kcal.calibrate.hybrid.evidence import (
     WORTH,
+    Amplitudes,
     Quadratic,
     ViewData,
     evidence_of_motion,
@@ -121,7 +122,7 @@ def board_motion(columns: Tensor, whitening: Tensor, reach: float, rig: RigRows,
         return None
     data, families = rig.told(camera, white)
     begin = np.full(columns.shape[1] // AXES, math.log(MEDIAN) - 0.5 * math.log(variance))
-    best = maximize_evidence(data, families, _NONE, variance, _NO_PRIOR, begin)
+    best = maximize_evidence(data, families, Amplitudes(_NONE, variance, begin), _NO_PRIOR)
     if evidence_of_motion(data, best, families, 1.0) < WORTH:
         return None
     # What a single board tells of is wrong with that board.

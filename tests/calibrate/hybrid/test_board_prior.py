@@ -17,7 +17,7 @@ from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult
 from kcal.calibrate.hybrid.board_modes import board_modes, find_turns, mode_turn, turned, turned_corners
 from kcal.calibrate.hybrid.cameras_fit import fleet_priors, hyper_likelihood
-from kcal.calibrate.hybrid.evidence import maximize_evidence, negative_log_evidence
+from kcal.calibrate.hybrid.evidence import Amplitudes, maximize_evidence, negative_log_evidence
 from kcal.calibrate.hybrid.families import BOARD, Hyperprior, PriorFamilies, typical_hyperprior
 from kcal.calibrate.hybrid.measured_board import BoardPrior, evidence, printed_board, printed_prior
 from kcal.corners.board import Board
@@ -328,7 +328,7 @@ def test_likelihood_of_hyperparameters() -> None:
     data = quadratic(A, target, zero)
     h, variance = TYPICAL.mean, 0.02
     for _ in range(3):
-        h, _, variance, _ = maximize_evidence(standing(data), families, h, variance, TYPICAL)
+        h, variance, *_ = maximize_evidence(standing(data), families, Amplitudes(h, variance), TYPICAL)
     found = hyper_likelihood(data, families, h, variance)
     # Of a spread known from n draws the log has information 2 n.
     told = found.placed(found.slots, h).products

@@ -11,8 +11,8 @@ import torch
 from scipy import integrate, stats
 
 from kcal.calibrate.hybrid.evidence import (
+    Amplitudes,
     EvidenceLoss,
-    Maximum,
     ViewData,
     evidence_of_motion,
     expected_amplitudes,
@@ -134,7 +134,7 @@ def test_factors_of_views_are_the_most_likely() -> None:
     begun = view_data(products, x, motion, float(VIEWS * ROWS))._replace(relative=torch.ones(VIEWS, dtype=F64))
     # No prior lets lens and board move.
     held = FAMILIES._replace(log_unit=torch.full((UNKNOWNS,), -30.0, dtype=F64))
-    best = Maximum(torch.from_numpy(AT[:2]), np.array([0.4]), 0.5, math.inf)
+    best = Amplitudes(torch.from_numpy(AT[:2]), 0.5, np.array([0.4]))
     relative = relative_bends(begun, best, held)
     assert float(relative.std()) > 0.05
 
@@ -170,7 +170,7 @@ def test_maximum_is_found_from_afar(noise: float) -> None:
     """Where the gradient is zero and the Hessian positive."""
     at = data(True)
     start = torch.tensor([-4.0, 4.0], dtype=F64), math.exp(noise)
-    best = maximize_evidence(at, FAMILIES, *start, PRIOR, np.zeros(AMPLITUDES))
+    best = maximize_evidence(at, FAMILIES, Amplitudes(*start, np.zeros(AMPLITUDES)), PRIOR)
     v = np.concatenate([best.h.numpy(), best.log_ratio, [math.log(best.variance)]])
     value, slope, bend = EvidenceLoss(at, FAMILIES, PRIOR, 1.0)(v)
     bounds = hyper_bounds(PRIOR, AMPLITUDES, noise)
@@ -182,7 +182,7 @@ def test_maximum_is_found_from_afar(noise: float) -> None:
 
 def test_worth_of_motions() -> None:
     """The logarithm of the evidence with them less that without, all else the same."""
-    best = Maximum(torch.from_numpy(AT[:2]), AT[2:6], math.exp(AT[-1]), math.inf)
+    best = Amplitudes(torch.from_numpy(AT[:2]), math.exp(AT[-1]), AT[2:6])
     found = evidence_of_motion(data(True), best, FAMILIES, 1.0)
     assert found == pytest.approx(density(True, still=True) - density(True), rel=1e-9)
 

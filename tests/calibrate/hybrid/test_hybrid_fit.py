@@ -12,7 +12,13 @@ from standing_views import quadratic, standing
 from torch import Tensor
 
 from kcal.calibrate.hybrid.board_modes import BENDING, PRINT, STRETCH, TRAPEZOID, board_modes
-from kcal.calibrate.hybrid.evidence import Quadratic, maximize_evidence, negative_log_evidence, with_tempering
+from kcal.calibrate.hybrid.evidence import (
+    Amplitudes,
+    Quadratic,
+    maximize_evidence,
+    negative_log_evidence,
+    with_tempering,
+)
 from kcal.calibrate.hybrid.families import PriorFamilies, prior_families, typical_hyperprior
 from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid, rough_start
 from kcal.calibrate.hybrid.fitted_views import hybrid_problem
@@ -228,7 +234,7 @@ def test_evidence_is_that_of_the_linear_model() -> None:
     """-ln p of a Gaussian linear model, by the covariance of the data, up to a constant; and it is a maximum."""
     data, families = linear_case()
     K, g, c = data.K, data.g, data.c
-    h, _, variance, loss = maximize_evidence(standing(data), families, typical_hyperprior().mean, 0.09)
+    h, variance, _, loss = maximize_evidence(standing(data), families, Amplitudes(typical_hyperprior().mean, 0.09))
 
     def value(h: Tensor, variance: float) -> float:
         d = families.deviation(h)
@@ -271,7 +277,7 @@ def test_evidence_is_found_where_a_trial_cannot_be_factorized() -> None:
         return negative_log_evidence(data, families, v)[0] + 0.5 * float(z @ z)
 
     assert math.isinf(value(np.append(mean + 5 * sd, math.log(1e-6))))
-    found, _, variance, loss = maximize_evidence(standing(data), families, h, 100.0)
+    found, variance, _, loss = maximize_evidence(standing(data), families, Amplitudes(h, 100.0))
     best = np.append(found.numpy(), math.log(variance))
     # At a condition of 1e14, values at places that differ in their last digit differ by up to half a nat (measured).
     rounding = 0.5
@@ -281,7 +287,7 @@ def test_evidence_is_found_where_a_trial_cannot_be_factorized() -> None:
         assert value(best + step) > loss - rounding
     # Of 395 squares: 7 %.
     assert variance == pytest.approx(0.3**2, rel=0.2)
-    again = maximize_evidence(standing(data), families, found, variance).loss
+    again = maximize_evidence(standing(data), families, Amplitudes(found, variance)).loss
     assert loss == pytest.approx(again, abs=rounding)
 
 
@@ -296,7 +302,8 @@ def test_losses_of_unequal_tempering_are_brought_to_one(unit: float) -> None:
     truth = wide * torch.randn(len(wide), generator=generator, dtype=torch.float64)
     data = standing(quadratic(unit * rows, unit * noise, truth))
     one, other = (
-        maximize_evidence(data, families, h, (0.1 * unit) ** 2, tempering=tempering) for tempering in (1.1, 1.0)
+        maximize_evidence(data, families, Amplitudes(h, (0.1 * unit) ** 2), tempering=tempering)
+        for tempering in (1.1, 1.0)
     )
     found = with_tempering(one.loss, data.still.freedom, one.variance, 1.1, 1.0)
     assert abs(one.loss - other.loss) > 100.0

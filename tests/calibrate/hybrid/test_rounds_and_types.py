@@ -18,6 +18,7 @@ from torch import Tensor
 from kcal.calibrate.hybrid import cameras_fit, fitted_views
 from kcal.calibrate.hybrid.board_modes import board_modes
 from kcal.calibrate.hybrid.cameras_fit import CameraFit, _measured, fit_turned
+from kcal.calibrate.hybrid.evidence import Amplitudes
 from kcal.calibrate.hybrid.families import Hyperprior, typical_hyperprior
 from kcal.calibrate.hybrid.fit import FitOptions
 from kcal.calibrate.hybrid.fitted_views import Rounds, columns_may_be_read
@@ -54,8 +55,8 @@ class TestColumns:
     def asked(self, log_ratio: float, *, converged: bool = True, readout: Readout | None = READOUT) -> bool:
         state = SimpleNamespace(motion=torch.zeros(1, 12), _replace=lambda **_: None)
         estimate = SimpleNamespace(
-            log_ratio=np.full(4, log_ratio), variance=0.01, tempering=1.0, state=state, families=None,
-            hyperparameters=None, _replace=lambda **_: None,
+            amplitudes=Amplitudes(torch.zeros(0), 0.01, np.full(4, log_ratio)), state=state, families=None,
+            _replace=lambda **_: None,
         )  # fmt: skip
         rounds = cast(Rounds, SimpleNamespace(capture=Views(readout), estimate=estimate, converged=converged))
         return columns_may_be_read(rounds)

@@ -13,10 +13,10 @@ from torch import Tensor
 from kcal.calibrate.hybrid.base_fit import Base, _through_base, _with_constants
 from kcal.calibrate.hybrid.board_modes import KNOWN, board_modes, undetermined_modes
 from kcal.calibrate.hybrid.cameras_fit import _but_one, fleet_priors, typical_lens
-from kcal.calibrate.hybrid.evidence import Quadratic, overdispersion, posterior_root, still_data, view_data
+from kcal.calibrate.hybrid.evidence import Amplitudes, Quadratic, overdispersion, posterior_root, still_data, view_data
 from kcal.calibrate.hybrid.families import LensPrior, PriorFamilies, prior_families, typical_hyperprior
 from kcal.calibrate.hybrid.fit import pixels_are_square, with_square_pixels
-from kcal.calibrate.hybrid.fitted_views import NO_MOTION, Estimate
+from kcal.calibrate.hybrid.fitted_views import Estimate
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard, load_measured_board, save_measured_board
 from kcal.calibrate.problem.state import BoardState
 from kcal.corners.board import Board
@@ -147,7 +147,7 @@ class TestPixels:
             state = BoardState.still(
                 params, torch.zeros(28).double(), torch.eye(3)[None].double(), torch.zeros(1, 3).double()
             )
-            found = with_square_pixels(Estimate(model, families, state, h, NO_MOTION, 1.0, 1.0), board)
+            found = with_square_pixels(Estimate(model, families, state, Amplitudes(h, 1.0)), board)
             assert (found is not None) is near
             if found is not None:
                 middle = 400.0 * (1.0 + ratio)

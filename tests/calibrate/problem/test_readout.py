@@ -12,7 +12,7 @@ from torch import Tensor
 
 from kcal.calibrate.hybrid.base_fit import fit_base
 from kcal.calibrate.hybrid.board_modes import board_modes
-from kcal.calibrate.hybrid.evidence import Quadratic, ViewData, maximize_evidence, view_data
+from kcal.calibrate.hybrid.evidence import Amplitudes, Quadratic, ViewData, maximize_evidence, view_data
 from kcal.calibrate.hybrid.families import prior_families, typical_hyperprior
 from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.fitted_views import FittedViews, hybrid_problem, motion_is_worth, run_rounds
@@ -284,7 +284,7 @@ def test_deviations_of_motions_by_evidence() -> None:
     data, (families, modes) = linear_views()
     prior = typical_hyperprior(modes)
     start = np.full(AMPLITUDES, math.log(MEDIAN / 0.3))
-    best = maximize_evidence(data, families, prior.mean, 0.2, prior, start)
+    best = maximize_evidence(data, families, Amplitudes(prior.mean, 0.2, start), prior)
     found = np.exp(best.log_ratio) * math.sqrt(best.variance)
     # 90 numbers each know their deviation to 8 %.
     assert found == pytest.approx(MOVES, rel=0.3)
@@ -419,7 +419,9 @@ def test_limits_of_motions() -> None:
     data, (families, modes) = linear_views()
     prior = typical_hyperprior(modes)
     wild = ViewData(data.still, data.own * 1e-6, data.cross * 1e-3, data.score)
-    best = maximize_evidence(wild, families, prior.mean, 0.09, prior, np.full(AMPLITUDES, math.log(MEDIAN / 0.3)))
+    best = maximize_evidence(
+        wild, families, Amplitudes(prior.mean, 0.09, np.full(AMPLITUDES, math.log(MEDIAN / 0.3))), prior
+    )
     # Motions a thousand times as large come to the limit, which refers to the noise before.
     assert float((np.exp(best.log_ratio) * 0.3).max()) <= LARGEST * (1 + 1e-9)
     assert float((np.exp(best.log_ratio) * 0.3).min()) >= SMALLEST * (1 - 1e-9)
