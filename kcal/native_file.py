@@ -146,10 +146,8 @@ class NativeFile(Record):
         if kind != cls.KIND:
             raise FileError(f"{source}: this is a kcal {kind!s:.40} file; a kcal {cls.KIND} file is needed here")
         if type(version) is not int or version != cls.VERSION:
-            says = f"{source}: version {version!s:.40} of the {kind} format"
-            if type(version) is int and version == 1:
-                says += f", which kcal 0.1 wrote; kcal 1.0 converts it: save_{kind}(load_{kind}(path), path)"
-            raise FileError(f"{says}; this kcal reads version {cls.VERSION}")
+            says = f"version {version!s:.40} of the {kind} format; this kcal reads version {cls.VERSION}"
+            raise FileError(f"{source}: {says}")
         text = json.dumps(content)
         try:
             # As JSON, not as Python values: in strict mode only JSON's numbers are numbers, but arrays are tuples.

@@ -1,9 +1,10 @@
 """Write down what users may rely on: names, signatures, attributes, commands and their options.
 
     python -m scripts.make_promises            # adds what is new to tests/promises/python.txt and commands.txt
+    python -m scripts.make_promises --major    # before a new major version: drops what is gone, too
 
-It only adds. What is no longer there stays in the lists, and `tests/promises/test_surface.py` fails until it is there
-again, or its line is taken out by hand for a new major version.
+What is no longer there stays in the lists without `--major`, and `tests/promises/test_surface.py` fails until it is
+there again.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import inspect
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -105,13 +107,13 @@ def stored(name: str) -> list[str]:
     return (FOLDER / name).read_text(encoding="utf-8").splitlines()
 
 
-def main() -> None:
+def main(major: bool = False) -> None:
     for name, lines in (("python.txt", python_lines()), ("commands.txt", command_lines())):
         before = stored(name) if (FOLDER / name).exists() else []
-        after = sorted({*before, *lines})
+        after = sorted({*([] if major else before), *lines})
         (FOLDER / name).write_text("\n".join(after) + "\n", encoding="utf-8")
         print(f"{name}: {len(after)} lines, {len(set(after) - set(before))} new, {len(set(before) - set(lines))} gone")
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:] == ["--major"])
