@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import datetime
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -77,21 +78,26 @@ def star_source(
     catalog = catalog or StarCatalog.bundled()
     images = [image for moment in moments for image in moment.values()]
     on_earth = bool(images) and all(image.on_earth for image in images)
-    rows = _Rows(len(cameras))
-    for number, moment in enumerate(moments):
-        _add_named(rows, moment, catalog, number, on_earth=on_earth)
-        _add_nameless(rows, moment, cameras, number)
-    if not rows.names:
+    rows = [
+        row for number, moment in enumerate(moments)
+        for row in (*_with_names(moment, catalog, number, on_earth=on_earth), *_without_names(moment, cameras, number))
+    ]  # fmt: skip
+    if not rows:
         raise InputError("no stars were named in two cameras at the same moment")
-    direction = torch.from_numpy(np.array(rows.direction))
+    marks = np.full((len(rows), len(cameras), 3), np.nan)
+    for k, row in enumerate(rows):
+        for camera, place in row.places.items():
+            found = moments[row.moment][camera].detected
+            marks[k, camera] = *found.pixels[place], found.sigma[place]
+    direction = torch.from_numpy(np.array([row.direction for row in rows]))
     altitude = torch.arcsin(direction[:, 2].clamp(-1, 1)).numpy()
     sigma = torch.from_numpy(np.hypot(_CATALOG_SIGMA, refraction_sigma(np.nan_to_num(altitude, nan=1.0))))
     sigma[direction.isnan().any(-1)] = math.inf
     effects = _effects(moments, len(cameras), rows, clock_sigma, drift_sigma, origin, catalog, on_earth=on_earth)
     return StarSource(
-        names=tuple(rows.names),
-        pixels=torch.from_numpy(np.array(rows.pixels)),
-        pixel_sigma=torch.from_numpy(np.array(rows.sigma)),
+        names=tuple(row.name for row in rows),
+        pixels=torch.from_numpy(marks[..., :2].copy()),
+        pixel_sigma=torch.from_numpy(marks[..., 2].copy()),
         direction=direction,
         direction_sigma=sigma,
         effects=tuple(effects),
@@ -136,45 +142,29 @@ def moments_of(
     return [moment for moment in moments if on_earth or len(moment) > 1], alone
 
 
-class _Rows:
-    """Stars as they are gathered: one entry for each star of each moment."""
+class _Row(NamedTuple):
+    """A star of a moment; `places` are its numbers among the detected stars of the cameras that see it."""
 
-    def __init__(self, cameras: int) -> None:
-        self.names: list[str] = []
-        self.pixels: list[NDArray[np.float64]] = []
-        self.sigma: list[NDArray[np.float64]] = []
-        self.direction: list[NDArray[np.float64]] = []
-        self.moment: list[int] = []
-        self.star: list[int] = []
-        self._cameras = cameras
-
-    def add(self, name: str, moment: int, star: int, direction: NDArray[np.float64] | None) -> None:
-        self.names.append(name)
-        self.moment.append(moment)
-        self.star.append(star)
-        self.pixels.append(np.full((self._cameras, 2), np.nan))
-        self.sigma.append(np.full(self._cameras, np.nan))
-        self.direction.append(np.full(3, np.nan) if direction is None else direction)
+    name: str
+    moment: int
+    star: int
+    direction: NDArray[np.float64]
+    places: dict[int, int]
 
 
-def _add_named(rows: _Rows, moment: Moment, catalog: StarCatalog, number: int, *, on_earth: bool) -> None:
+def _with_names(moment: Moment, catalog: StarCatalog, number: int, *, on_earth: bool) -> Iterator[_Row]:
     seen: dict[int, dict[int, int]] = {}
     for camera, image in moment.items():
         for place, star in enumerate(image.attitude.star.tolist()):
             if star >= 0:
                 seen.setdefault(star, {})[camera] = place
     for star, places in seen.items():
-        if not on_earth and len(places) < 2:
-            continue
-        some = moment[next(iter(places))]
-        name = f"{catalog.name_of(int(catalog.number[star]))} at {number + 1}"
-        rows.add(name, number, star, some.directions[star] if on_earth else None)
-        for camera, place in places.items():
-            rows.pixels[-1][camera] = moment[camera].detected.pixels[place]
-            rows.sigma[-1][camera] = moment[camera].detected.sigma[place]
+        if on_earth or len(places) > 1:
+            direction = moment[next(iter(places))].directions[star] if on_earth else np.full(3, np.nan)
+            yield _Row(f"{catalog.name_of(catalog.number[star])} at {number + 1}", number, star, direction, places)
 
 
-def _add_nameless(rows: _Rows, moment: Moment, cameras: Sequence[Camera], number: int) -> None:
+def _without_names(moment: Moment, cameras: Sequence[Camera], number: int) -> Iterator[_Row]:
     """Stars that the catalogue does not have, seen by the first and another camera where the named ones put them."""
     first = min(moment)
     here = moment[first]
@@ -191,14 +181,12 @@ def _add_nameless(rows: _Rows, moment: Moment, cameras: Sequence[Camera], number
         distance, match = tree.query(expected.numpy(), distance_upper_bound=_MATCH)
         back = cKDTree(expected.numpy()).query(there.detected.pixels[others])[1]
         for k in np.flatnonzero(np.isfinite(distance)):
-            if back[match[k]] != k:
-                continue
-            rows.add(f"light {free[k]} at {number + 1}, {camera}", number, -1, None)
-            for c, image, place in ((first, here, free[k]), (camera, there, others[match[k]])):
-                rows.pixels[-1][c], rows.sigma[-1][c] = image.detected.pixels[place], image.detected.sigma[place]
+            if back[match[k]] == k:
+                places = {first: int(free[k]), camera: int(others[match[k]])}
+                yield _Row(f"light {free[k]} at {number + 1}, {camera}", number, -1, np.full(3, np.nan), places)
 
 
-def _nights(moments: Sequence[Moment], rows: _Rows) -> dict[int, Tensor]:
+def _nights(moments: Sequence[Moment], rows: Sequence[_Row]) -> dict[int, Tensor]:
     """By the number of each night of an hour or more: (S,) hours of each star since it began, 0 in other nights."""
     times = [next(iter(moment.values())).view.time for moment in moments]
     if None in times:
@@ -207,7 +195,7 @@ def _nights(moments: Sequence[Moment], rows: _Rows) -> dict[int, Tensor]:
     order = np.argsort(hours, kind="stable")
     night = np.empty(len(hours), np.int64)
     night[order] = np.cumsum(np.diff(hours[order], prepend=hours[order[0]]) > _DAY_BETWEEN)
-    of_row = np.array(rows.moment)
+    of_row = np.array([row.moment for row in rows])
     found = {}
     for number in range(night.max() + 1):
         own = night == number
@@ -220,7 +208,7 @@ def _nights(moments: Sequence[Moment], rows: _Rows) -> dict[int, Tensor]:
 def _effects(
     moments: Sequence[Moment],
     cameras: int,
-    rows: _Rows,
+    rows: Sequence[_Row],
     clock_sigma: float,
     drift_sigma: float,
     origin: Origin | None,
@@ -255,11 +243,11 @@ def _effects(
     found.append(Effect(name="the clocks against UT1", turn=turn))
     shifts: dict[str, Tensor] = {}
     for number, moment in enumerate(moments):
-        at = [k for k, (m, star) in enumerate(zip(rows.moment, rows.star, strict=True)) if m == number and star >= 0]
+        at = [k for k, row in enumerate(rows) if row.moment == number and row.star >= 0]
         if not at:
             continue
         view = next(iter(moment.values())).view
-        for name, shift in view.by_air(catalog, np.array([rows.star[k] for k in at])):
-            whole = shifts.setdefault(name, torch.zeros(len(rows.names), cameras, 3, dtype=torch.float64))
+        for name, shift in view.by_air(catalog, np.array([rows[k].star for k in at])):
+            whole = shifts.setdefault(name, torch.zeros(len(rows), cameras, 3, dtype=torch.float64))
             whole[at] = torch.from_numpy(shift)[:, None]
     return found + [Effect(name=name, shift=shift) for name, shift in shifts.items()]
