@@ -408,7 +408,7 @@ def explained(work: Adjustment, mask: Tensor, solver: LMOptions) -> Tensor:
             "coordinates and marks, and add landmarks"
         )
     if len(found) > 1:
-        raise _several([f"{' and '.join(one.names)} (χ² {one.fit.chi2:.3g})" for one in found[:3]])
+        raise _several_ways([f"{' and '.join(one.names)} (χ² {one.fit.chi2:.3g})" for one in found[:3]])
     (best,) = found
     if best.terms:
         raise _blamed(best)
@@ -436,7 +436,7 @@ def _blamed(found: _Explanation) -> InputError:
     )
 
 
-def _several(ways: Sequence[str]) -> InputError:
+def _several_ways(ways: Sequence[str]) -> InputError:
     return InputError(
         f"something is wrong, and the data do not tell what: all the rest agrees without {'; or '.join(ways)}. Check "
         "these, or add landmarks"
@@ -478,7 +478,7 @@ def _refuse_terms(work: Adjustment, mask: Tensor, kept: Tensor | None, robust: R
     if len(ways) == 1 and stated:
         raise _blamed(stated[0])
     if stated:
-        raise _several([
+        raise _several_ways([
             f"{' and '.join(way.names)} (χ² {way.fit.chi2:.3g}, {way.fit.freedom} degrees of freedom)" for way in ways
         ])  # fmt: skip
 
