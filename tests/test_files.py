@@ -148,7 +148,6 @@ class TestParts:
             stdout=subprocess.PIPE,
             env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
         )  # fmt: skip
-        assert child.stdout is not None
         assert child.stdout.readline() == b"ready\n"
         return child
 

@@ -57,7 +57,6 @@ def test_a_stretched_image_is_that_of_a_camera_with_long_pixels() -> None:
     assert seen.image_size == (640, 528)
     assert held_out(longer, BOARD.points, seen.pixels()).still < 1e-9
     found = seen.covariances()
-    assert found is not None
     assert torch.allclose(found[0, 0], torch.tensor([[0.01, 0.0022], [0.0022, 0.0484]]).double())
     assert found[0, 5].isnan().all()
 

@@ -93,7 +93,6 @@ def test_a_frame_without_a_board_gives_the_size_and_a_first_proposal(session: Ca
     assert np.ptp(outline[:, 0]) > 100
     assert ((outline > 0) & (outline < SIZE)).all()
     suggestion = session.suggestion
-    assert suggestion is not None
     upper = suggestion.pixels[: BOARD.columns] if "left" in suggestion.words else suggestion.pixels
     seen = suggestion.rotation @ BOARD.points.T + suggestion.translation[:, None]
     focal = (upper - upper.mean(0)).norm() / (seen[:2] / seen[2])[:, : len(upper)].sub(

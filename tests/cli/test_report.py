@@ -157,7 +157,6 @@ def test_a_browser_shows_the_page_without_errors_and_requests(folder: Path, widt
         page.goto(page_file.as_uri())
         # The answer, why, and what to do fit one screen; nothing is wider than it.
         header = page.locator("header").bounding_box()
-        assert header is not None
         assert header["height"] <= height
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         assert page.locator(".answer").inner_text() == "NO"

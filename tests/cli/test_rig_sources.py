@@ -117,19 +117,15 @@ def test_from_survey_to_positions(site: Path, command: Command) -> None:
     assert "left out: landmark post4: its marks are off the surveyed place by" in printed.err
     assert (site / "rig.png").read_bytes().startswith(b"\x89PNG")
     file = RigFile.load(site / "rig.json")
-    assert file.calibration is not None
     assert [entry.name for entry in file.calibration.excluded] == ["landmarks post4"]
     assert {source.name for source in file.calibration.sources} == {"landmarks", "features", "baselines", "positions"}
     # The mounting is the left camera's own, within its sigmas, on the other side of the antimeridian.
     stands = file.mounting
-    assert stands is not None
-    assert stands.covariance is not None
     true = enu_to_geodetic(CENTER[0], ORIGIN).tolist()
     assert [stands.lat, stands.lon] == pytest.approx(true[:2], abs=1e-6)
     assert stands.height == pytest.approx(true[2], abs=4.5 * stands.covariance[2][2] ** 0.5)
     assert stands.heading_deg == pytest.approx(16.0, abs=4.5 * math.degrees(stands.covariance[5][5] ** 0.5))
     joint = file.known().matrix
-    assert joint is not None
     turn = vector_from_rotation(file.rig().right_from_left_rotation @ (ROTATION[1] @ ROTATION[0].T).T)
     assert bool((turn.abs() < 4.5 * joint.diagonal()[-6:-3].sqrt()).all())
 
@@ -183,8 +179,6 @@ def test_check_and_relock(site: Path, command: Command) -> None:
     assert kept.read_bytes() == before
     old, new = RigFile.load(kept), RigFile.load(site / "rig.json")
     assert new.left == old.left
-    assert new.calibration is not None
-    assert new.calibration.relocked is not None
     assert new.calibration.relocked.endswith("from now.csv")
     turn = vector_from_rotation(new.rig().right_from_left_rotation @ old.rig().right_from_left_rotation.T)
     assert math.degrees(float(turn[1])) == pytest.approx(yaw, abs=1e-5)
@@ -248,7 +242,6 @@ def test_check_by_landmarks(site: Path, command: Command) -> None:
     line = next(line for line in printed.out.splitlines() if line.startswith("right from left"))
     assert abs(float(line.split()[6]) - 0.02) < 4.5 * float(line.split()[8])
     new = RigFile.load(site / "rig.json")
-    assert new.mounting is not None
     assert new.mounting.heading_deg == pytest.approx(16.0, abs=0.02)
 
 
@@ -285,7 +278,6 @@ def test_marks_count_with_their_own_noise(site: Path) -> None:
     sources = Sources(landmarks=site / "survey.csv", marks=site / "own.csv", mark_sigma=0.1)
     read = read_sources((CAMERAS[0], CAMERAS[1]), sources)
     found = read.data.landmarks
-    assert found is not None
     expected = torch.full((12, 2), 0.2, dtype=torch.float64)
     # Of one mark nothing is stated: it has the noise of the option.
     expected[3], expected[5] = 0.4, 0.1
@@ -304,7 +296,6 @@ def test_the_rig_file_states_the_noise_of_its_marks(site: Path, command: Command
     ):
         printed = command(given, marked_in, more, "-o rig.json")
         calibration = RigFile.load(site / "rig.json").calibration
-        assert calibration is not None
         assert calibration.pixel_sigma == (None if stated is None else pytest.approx(stated))
         assert said in printed.out
 
@@ -429,7 +420,6 @@ def test_a_station_from_its_skyline(files: Path) -> None:
     assert "next best heading" in text
     assert (files / "fit.png").stat().st_size > 10_000
     stands = station_mounting(load_camera_rig(files / "mast.rig.json"), 0)
-    assert stands.covariance is not None
     assert stands.heading_deg == pytest.approx(40.0, abs=3 * float(stands.covariance[5, 5].sqrt().rad2deg()))
 
 

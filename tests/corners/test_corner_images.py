@@ -228,8 +228,6 @@ def test_corners_of_a_smaller_image_are_those_of_the_whole_one(folder) -> None:
     ]
     alone = detect([folder / "c.png"], BOARD)
     small, large = alone.covariances(), seen.covariances()
-    assert small is not None
-    assert large is not None
     torch.testing.assert_close(large[2], 9.0 * small[0], rtol=1e-9, atol=0)
 
 
@@ -273,7 +271,6 @@ def test_sides_that_were_rounded_have_scales_of_their_own() -> None:
         View(name="b", pixels=((-0.5, -0.5), (639.5, 426.5)), covariance=((1, 0.5, 2),) * 2), found.scales[2]
     )
     assert view.pixels == ((-0.5, -0.5), (1499.5, 999.5))
-    assert view.covariance is not None
     assert view.covariance[0] is not None
     x, y = found.scales[2]
     assert view.covariance[0] == pytest.approx((x * x, 0.5 * x * y, 2.0 * y * y))
@@ -421,7 +418,6 @@ class TestOtherBoards:
         assert instead(twelve, self.BOARD, None) == told
         assert seen_circles(twelve, Board.parse("circles:4x3", "25mm")) == ""
         other = seen_circles(twelve, Board.parse("asymmetric:4x4", "25mm"))
-        assert other is not None
         assert other.startswith("some 12 circles were found, the board has 16")
         few = find_circles(twelve, Board.parse("circles:7x6", "25mm")).reason
         assert few == "no grid of 7x6 circles found (12 round blobs seen, 42 are needed, all in the image)"

@@ -83,9 +83,7 @@ def test_parameters_are_those_of_the_program(
     root = np.array(prior["sqrt_information"])
     assert np.array_equal(root, np.triu(root))
     assert bool((np.diag(root) > 0).all())
-    assert camera.calibration is not None
     covariance = camera.calibration.covariance
-    assert covariance is not None
     wanted = covariance[chosen][:, chosen].numpy() * np.outer(scale, scale)
     spread = np.sqrt(np.diag(wanted))
     free = spread > 0
@@ -114,8 +112,6 @@ def test_a_camera_comes_back(program: str, suffix: str, tmp_path: Path) -> None:
     assert found.notes == ("north: a fit to another lens, RMS 0.01 px",)
     for back, camera in zip(found.cameras, cameras, strict=True):
         assert back.size == camera.size
-        assert back.calibration is not None
-        assert camera.calibration is not None
         assert back.calibration.name == "north"
         torch.testing.assert_close(back.params, camera.params, rtol=1e-13, atol=1e-13)
         spread = camera.calibration.covariance.diagonal().sqrt() + 1e-30
@@ -154,7 +150,6 @@ def test_a_prior_without_information_is_a_camera(tmp_path: Path) -> None:
     (camera,) = read_prior(changed(tmp_path, sqrt_information=None), Hints()).cameras
     assert camera.calibration is None or camera.calibration.covariance is None
     (camera,) = read_prior(changed(tmp_path, held=["k1", "cx"]), Hints()).cameras
-    assert camera.calibration is not None
     variance = dict(zip(camera.names, camera.calibration.covariance.diagonal().tolist(), strict=True))
     assert {name for name, value in variance.items() if value == 0.0} == {"k1", "cx", "skew"}
 
@@ -166,15 +161,12 @@ def test_the_first_model_that_contains_a_lens() -> None:
     camera = camera.with_parameters(torch.cat([camera.params[:-1], torch.zeros(1).double()]))
     camera.calibration = CameraCalibration(name="north", covariance=torch.eye(10).double())
     found = held_exactly(camera, ("pinhole", "fisheye4", "opencv4", "opencv8"))
-    assert found is not None
     assert str(found.model) == "opencv4"
     assert torch.equal(found.params, camera.params[:-1])
-    assert found.calibration is not None
     assert (found.calibration.name, found.calibration.covariance) == ("north", None)
     camera.params.data[4] = 0.5
     assert held_exactly(camera, ("opencv8",)) is None
     skewed = held_exactly(camera, ("opencv8",), skew=True)
-    assert skewed is not None
     assert skewed.params[[4, 5]].tolist() == camera.params[[4, 5]].tolist()
     # A lens of a pinhole by its numbers is one, a fisheye's is none.
     fisheye = Camera.build(focal=(8, 8), center=(3, 2), size=(6, 4), coefficients=[0.0] * 4, model="fisheye4")
@@ -210,7 +202,6 @@ def camera() -> Camera:
 
 
 def stored_information(camera: Camera) -> CameraInformation:
-    assert camera.calibration is not None
     found = camera.calibration.known(camera.params)
     assert found is not None
     return found

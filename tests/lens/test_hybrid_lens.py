@@ -163,7 +163,6 @@ class TestPupil:
         camera = plain(0.5, pupil1=3e-3).free("pupil1", "pupil2")
         assert camera.free_names == ("pupil1", "pupil2")
         camera.ray_origins(directions(torch.tensor([0.5]).double(), 2))[:, 2].sum().backward()
-        assert camera.params.grad is not None
         named = dict(zip(camera.names, camera.params.grad.tolist(), strict=True))
         assert named["pupil1"] == pytest.approx(2 * 0.25)
         assert named["pupil2"] == pytest.approx(2 * 0.0625)
@@ -303,7 +302,6 @@ class TestModel:
     def test_free_by_name(self) -> None:
         camera = plain(0.5).free("z2+0", "pupil2")
         camera.project(torch.tensor([[0.3, 0.1, 1.0]]))[0].sum().backward()
-        assert camera.params.grad is not None
         moved = [name for name, g in zip(camera.names, camera.params.grad.tolist(), strict=True) if g]
         assert moved == ["pupil2", "z2+0"]
         with pytest.raises(InputError, match="unknown parameter 'z99'"):
@@ -422,7 +420,6 @@ class TestAgree:
         torch.testing.assert_close(rays.norm(dim=-1), torch.ones(COUNT).double(), rtol=0, atol=1e-15)
         assert distance(camera.project_rays(rays)[0], pixels) < 1e-9
         fitted = camera._fitted._backward
-        assert fitted is not None
         assert fitted(pixels, torch.empty(fitted.rows, COUNT).double())[1] is None
 
 

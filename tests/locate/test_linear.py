@@ -160,6 +160,5 @@ def test_what_cannot_be_located_is_flagged_and_finite(left: list[float], right: 
     assert valid.tolist() == [False, True], why
     assert found[0].tolist() == [5.0, 0.0, 0.0]
     found.sum().backward()
-    assert rays.grad is not None
     assert torch.isfinite(rays.grad).all()
     assert (rays.grad[0] == 0).all()

@@ -94,7 +94,6 @@ class TestCovariance:
         assert again.covariance is not None
         torch.testing.assert_close(again.covariance, covariance, equal_nan=True, atol=0, rtol=0)
         filled = again.covariance_or(0.5)
-        assert filled is not None
         assert torch.equal(filled[1], 0.25 * torch.eye(4).double())
 
     @pytest.mark.parametrize(

@@ -68,7 +68,6 @@ def test_lines_may_come_in_any_order(order: list[int]) -> None:
         path.write_text(HEAD + "".join(lines[i] for i in order))
         (found,), origin = read_tracks(path)
     assert found.times.tolist() == [0, 1, 2, 3, 4, 5]
-    assert origin is not None
     assert origin.lat == pytest.approx(54 + order[0] / 10)
     assert found.sigma[0].tolist() == [2, 2, 3]
     assert found.constant == (8, 8, 8)

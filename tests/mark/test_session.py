@@ -59,7 +59,6 @@ def test_the_files_are_those_that_rig_and_locate_read(tmp_path: Path, survey: Pa
     assert found.landmarks.pixels[1, 1].isnan().all()
     points = read_marks(session.files.points)
     assert points.names == ("truck",)
-    assert points.covariance is not None
     # The right mark was matched to the left one: it has its error too, and their difference has only the match's.
     expected = torch.block_diag(*[torch.eye(2) * 0.09] * 2).double()
     expected[:2, 2:] = expected[2:, :2] = torch.eye(2).double() * 0.09
@@ -147,12 +146,10 @@ def test_marks_that_were_changed_outside_are_taken_over(tmp_path: Path, survey: 
     write_marks(session.files.marks, Marks.of_pair(marks.names, marks.left + 1.0, marks.right, marks.covariance))
     again = Session(tmp_path / "marks.csv", survey)
     left = again.state.items["post"].left
-    assert left is not None
     assert left.u == pytest.approx(11.1)
     assert again.state.items["truck"].right is not None
     again.do(Step(do="undo"), "key-0009")
     left = again.state.items["post"].left
-    assert left is not None
     assert left.u == 10.1
 
 
@@ -340,7 +337,6 @@ def test_a_match_that_ends_keeps_its_whole_error(tmp_path: Path, survey: Path) -
     work(session)
     session.do(put("truck", "left", mark(50.0, 60.0, 0.02)), "key-0007")
     right = session.state.items["truck"].right
-    assert right is not None
     assert right.cov[0] == pytest.approx(0.3**2 + 0.05**2)
     assert float(pair_covariance(session.state.items["truck"])[0, 2]) == 0.0
 

@@ -127,8 +127,6 @@ def test_the_criterion_prefers_the_fewer_parameters() -> None:
     gray = shape.patterns(WHERE, p) @ np.array([60.0, 90.0]) + DRAW.normal(0, 2.0, len(WHERE))
     weight = np.ones(len(WHERE))
     own, richer = (fit_shape(s, WHERE, gray, weight, p[None]) for s in (WEDGE, CORNER))
-    assert own is not None
-    assert richer is not None
     count = len(WHERE)
     for fit, unknowns in ((own, 5 + 2 + 2), (richer, 5 + 4 + 2)):
         rss = fit.noise**2 * (count - unknowns)

@@ -96,7 +96,6 @@ class TestStars:
         assert offsets["Deneb"] == (-7, -3)
         # Turned over: stars are dark.
         shown = axes.images[0].get_array()
-        assert shown is not None
         assert shown[160, 240] < -40
         assert figure.get_figheight() == pytest.approx(9.0 * 320 / 480 + 0.9)
 

@@ -103,8 +103,6 @@ class TestViews:
         assert severity(0.36, 0.0) == "doubt"
         assert severity(0.1, 0.26) == "doubt"
         blurred, scattered = _blur_finding(0.1, 0.5), _blur_finding(0.8, 0.1)
-        assert blurred is not None
-        assert scattered is not None
         assert blurred.text.startswith("50 % of the views are blurred")
         assert scattered.text.startswith("corners scatter by 0.8 px")
 
@@ -126,7 +124,6 @@ class TestViews:
         others = [f"x{i}.png" for i in range(6)]
         assert _sides_finding([*pairs, *others], "stop") is None  # a half of them
         found = _sides_finding([*pairs, *others[:5]], "stop")
-        assert found is not None
         assert found.severity == "stop"
         assert found.text.startswith("6 of 11 views are named like pairs of two cameras, left00.png and right00.png")
 
@@ -306,7 +303,6 @@ class TestAnswers:
         rig = landmarks_rig().stereo()
         names = {one.name for one in rig_verdict(rig).findings}
         assert "left-out" not in names
-        assert rig.calibration is not None
         (source,) = rig.calibration.sources
         for out, severity in ((2, None), (3, "stop")):
             changed = dataclasses.replace(source, used=10 - out, left_out=out, sigmas=3.0)

@@ -56,7 +56,6 @@ def test_counted_features() -> None:
     assert every.features.pixels.shape == (5, 2, 2)
     assert every.features.inverse_range.tolist() == [0.0] * 5
     assert every.features.inverse_range_sigma.tolist() == [math.inf] * 5
-    assert every.features.covariance is not None
     assert every.features.covariance[:, 0].tolist() == every.features.covariance[:, 1].tolist()
     assert every.features.covariance[:, 1, 0, 0] == pytest.approx([0.5, 1.0, 1.5, 0.5, 1.0])
     # Three of two pairs: two of each.

@@ -108,7 +108,6 @@ def test_repeats_in_the_same_light_tell_less_than_they_count() -> None:
 
     def information(pairs: list[ImagePair], found: list[MatchedPair]) -> float:
         features = scene_of(CAMERAS, pairs, found).features
-        assert features.covariance is not None
         return float((0.5 / features.covariance[:, 0, 1, 1]).sum())
 
     # Noise enough, so that another pair tells anything at all.

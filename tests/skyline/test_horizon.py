@@ -31,7 +31,6 @@ def directions(raster: Raster, eye: Origin, refraction: float) -> tuple[np.ndarr
     column, row = np.meshgrid(middle, middle)
     cell = 1.0 / raster.to_cell[0]
     x, y = cell * (column - 0.5 * count), cell * (0.5 * count - row)
-    assert raster.into is not None
     lon, lat = raster.into.transform(x.ravel(), y.ravel(), direction="INVERSE")
     enu = geodetic_to_enu(torch.from_numpy(np.stack([lat, lon, raster.heights.ravel()], -1)), eye).numpy()
     level = np.hypot(enu[:, 0], enu[:, 1])

@@ -254,6 +254,5 @@ def test_narrow_and_wide_fields_have_names(field: float) -> None:
     ahead = seen[seen @ axis > np.cos(0.5 * field)][:25]
     turn = enu_from_cam(40.0, 10.0, 5.0).numpy()
     found = identify(ahead @ turn, 1e-4, field=field)
-    assert found is not None
     assert found.matches >= 0.8 * len(ahead)
     np.testing.assert_allclose(found.rotation, turn.T, atol=1e-4)

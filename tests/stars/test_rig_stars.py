@@ -89,7 +89,6 @@ def test_landmarks_tell_a_wrong_time(seconds: float, message: str) -> None:
         sigma=torch.full((12, 3), 0.02).double(), pixels=at + torch.from_numpy(draw.normal(0, 0.1, at.shape)),
         pixel_sigma=0.1,
     )  # fmt: skip
-    assert data.stars is not None
     turn = rotation_from_vector(torch.from_numpy(pole_in_enu(PLACE.lat)) * 7.292e-5 * seconds)
     stars = dataclasses.replace(data.stars, direction=data.stars.direction @ turn.T)
     wrong = dataclasses.replace(data, stars=stars, landmarks=marks)
@@ -134,7 +133,6 @@ def test_named_stars_need_a_frame_on_the_earth() -> None:
 
 def test_wrong_names_and_an_aircraft_are_left_out() -> None:
     data, truth, _ = star_rig(CAMERA, seed=3, named=True)
-    assert data.stars is not None
     names, direction, pixels = data.stars.names, data.stars.direction.clone(), data.stars.pixels.clone()
     direction[[4, 9]] = direction[[9, 4]]
     pixels[20, 1] += torch.tensor([3.0, -2.0])
@@ -168,11 +166,9 @@ def test_images_become_a_source(nights: list[list[NamedStars]]) -> None:
     names = [effect.name for effect in source.effects]
     assert names[1:] == ["the clocks against UT1", "the air's temperature", "the air's pressure"]
     one_second = source.effects[0].turn
-    assert one_second is not None
     assert float(one_second[1].norm()) == pytest.approx(0.1 * 7.292e-5, rel=1e-3)
     # A warmer air bends less: stars sink.
     shift = source.effects[2].shift
-    assert shift is not None
     assert bool((shift[source.named][..., 2] < 0).all())
 
 
@@ -218,13 +214,11 @@ def test_the_command(tmp_path: Path) -> None:
         assert done.exit_code == 0, done.output
         rig = load_rig(tmp_path / "rig.json")
         error = vector_from_rotation(rig.right_from_left_rotation @ (truth[1] @ truth[0].T).T)
-        assert rig.covariance is not None
         known = rig.covariance.matrix[-6:-3, -6:-3]
         assert float(error @ torch.linalg.solve(known, error)) < 16
         assert float(error.norm()) < 1e-4
         assert (rig.mounting is not None) == bool(more)
         if more:
-            assert rig.mounting is not None
             assert rig.mounting.heading_deg == pytest.approx(LOOKS[0][0], abs=0.004)
     done = CliRunner().invoke(app, [*common[:3], "--baseline", "10±0.002", *stars, "-o", str(tmp_path / "no.json")])
     assert "add matches of unknown range" in str(done.exception)

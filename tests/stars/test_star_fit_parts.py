@@ -132,7 +132,6 @@ class TestTurns:
         moved = pixels.numpy().copy()
         moved[5] += [1.5, -1.0]
         found = fit_attitude(moved, np.full(40, 0.1), directions.numpy(), np.full(40, 3.0), CAMERA, TURN.numpy())
-        assert found is not None
         assert found.star[5] == -1
         assert np.isnan(found.residual[5]).all()
         assert found.count == 39
@@ -160,7 +159,6 @@ class TestRefraction:
         assert self.doubt(1.0) is None
         for share, side in ((0.4, "higher"), (1.7, "lower")):
             text = self.doubt(share, 0.01)
-            assert text is not None
             # A little of it looks like a turn, which is not in the residuals here.
             assert float(text.split()[2]) == pytest.approx(share, abs=0.01)
             assert f"the stars stand {side} than" in text
@@ -430,7 +428,6 @@ class TestRoughLens:
     def test_names_by_a_camera(self) -> None:
         seen, index = self.seen()
         found = _by_camera(seen, CAMERA, CATALOG)
-        assert found is not None
         known = found.star >= 0
         assert known.sum() > 20
         assert found.star[known].tolist() == index[: len(known)][known].tolist()

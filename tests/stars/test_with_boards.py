@@ -54,12 +54,10 @@ def test_stars_refine_the_lens_of_boards(boards: CameraCalibrationResult, both: 
     camera, agreement = both.lens.camera, both.agreement
     before, after = (error_at_infinity(one, true_lens()).rms for one in (boards.camera, camera))
     assert after < 0.5 * before
-    assert agreement is not None
     assert agreement.contradiction is None
     assert agreement.freedom >= 4
     assert 0.1 < agreement.chi2 / agreement.freedom < 3
     joint = both.joint
-    assert joint is not None
     # Stars add information: no parameter is known less well than before, and the focal length far better.
     for name in ("fx", "cx", "cy"):
         old, new = boards.sigma[name], joint.sigma[name]
@@ -69,7 +67,6 @@ def test_stars_refine_the_lens_of_boards(boards: CameraCalibrationResult, both: 
     assert abs(float(camera.params[0] - true_lens().params[0])) < 4 * float(joint.covariance[0, 0].sqrt())
     # Boards are in it still: of the entrance pupil stars know nothing.
     known = joint.information
-    assert known is not None
     assert known.board_size == boards.information.board_size  # type: ignore[union-attr]
     pupil = [i for i, name in enumerate(camera.names) if name.startswith("pupil")]
     assert all(known.slots[i] >= 0 for i in pupil)
@@ -78,8 +75,6 @@ def test_stars_refine_the_lens_of_boards(boards: CameraCalibrationResult, both: 
 def test_the_posterior_is_at_its_minimum(both: StarCamera) -> None:
     """Rows and priors together have no slope at the estimate, in lens and board alike."""
     known = both.lens.camera.calibration
-    assert known is not None
-    assert known.information is not None
     rows = known.information.whole.rows
     slope = rows[:, :-1].T @ rows[:, -1]
     half = known.information.half()
@@ -92,8 +87,6 @@ def test_another_focus_contradicts(boards: CameraCalibrationResult, night: Night
     middle = torch.tensor([(SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2]).numpy()
     zoomed = [image._replace(pixels=middle + 1.01 * (image.pixels - middle)) for image in images]
     found = calibrate_by_stars(zoomed, views, SIZE, boards=boards)
-    assert found.joint is not None
-    assert found.agreement is not None
     assert found.agreement.by_chance < 1e-6
     assert any("boards and stars contradict each other" in text for text in found.joint.warnings)
 
@@ -171,7 +164,6 @@ def test_the_lens_is_found(found: StarCamera) -> None:
 
 def test_its_uncertainty(found: StarCamera) -> None:
     known = found.lens.camera.calibration
-    assert known is not None
     assert known.sigma is not None
     for name in ("fx", "cx", "cy"):
         place = found.lens.camera.names.index(name)
@@ -242,9 +234,7 @@ def test_a_lens_from_stars(focal: float | None) -> None:
     # The lens of an image without distortion would be off by 19 px in the corners.
     assert error.max() < 0.3
     known = found.lens.camera.calibration
-    assert known is not None
     assert known.information is not None
-    assert known.sigma is not None
     focal_sigma = known.sigma["fx"]
     assert focal_sigma is not None
     assert abs(float(found.lens.camera.params[0] - true_lens().params[0])) < 5 * focal_sigma

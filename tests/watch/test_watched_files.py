@@ -189,11 +189,9 @@ def test_relock_never_makes_a_good_rig_worse() -> None:
     assert good.rig is None
     assert "does not differ" in good.reason
     drifted = relock(day(0.03, 0.004))
-    assert drifted.rig is not None
     turn = drifted.rig.right_from_left_rotation @ RIG.right_from_left_rotation.T
     assert math.degrees(float(turn[0, 2])) == pytest.approx(0.03, abs=0.003)
     # Without the watch the swing is not known of a moment.
-    assert drifted.rig.covariance is not None
     assert math.degrees(float(drifted.rig.covariance.matrix[-5, -5].sqrt())) > 0.002
 
 
@@ -325,17 +323,13 @@ def test_the_rig_of_a_moment() -> None:
     assert torch.allclose(there.right_from_left_rotation, expected.rig.right_from_left_rotation)
     assert float(expected.relative[1]) == pytest.approx(2e-4, abs=3e-6)
     # The left camera looks elsewhere, too: a yaw to the left is a smaller heading.
-    assert there.mounting is not None
     assert abs(there.mounting.heading_deg - 35.0) == pytest.approx(math.degrees(1e-4), rel=0.05)
-    assert there.mounting.covariance is not None
     assert float(there.mounting.covariance[5, 5]) == pytest.approx(
         float(watched.turns_at(3000.0).covariance[1, 1]), rel=1e-6
     )
     assert rig.mounting.covariance is None
-    assert there.covariance is not None
     assert float(there.covariance.matrix[-5, -5]) == pytest.approx(float(expected.relative_covariance[1, 1]), rel=1e-6)
     later = watched.rig_at(9000.0)
-    assert later.covariance is not None
     assert later.covariance.half.shape == there.covariance.half.shape
     assert len(there.covariance.half) == MORE_ERRORS
     with pytest.raises(InputError, match="begins at 0"):

@@ -127,7 +127,6 @@ def test_a_sentence_about_pixels_needs_its_evidence() -> None:
     """That of the finished fit: 2.6 standard deviations are none."""
     seen = unequal(1.0, CHECKERBOARD, aspect=1.01)
     fit = calibrate_camera(seen).hybrid
-    assert fit is not None
     assert not fit.square
     aspect, sigma = measured_aspect(fit)
     assert aspect == pytest.approx(1.01, abs=5.0 * sigma)

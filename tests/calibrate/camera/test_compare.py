@@ -192,13 +192,11 @@ def test_all_that_is_known_is_in_the_file(tmp_path: Path) -> None:
     assert {name: file.standard_deviations[name] for name in result.sigma} == result.sigma
     stored = file.covariance_matrix()
     assert stored is not None
-    assert result.information is not None
     assert torch.equal(stored, result.information.covariance())
     # Once inverted from normal equations, once from their root.
     scale = result.covariance.diagonal().sqrt().clamp_min(1e-300)
     assert float(((stored - result.covariance) / scale / scale[:, None]).abs().max()) < 1e-6
     record = file.calibration
-    assert record is not None
     assert (record.rms, record.views, record.points) == (result.rms, 8, int(pixels.shape[0] * pixels.shape[1]) - 1)
     assert list(record.per_view_rms) == list(seen.names)
     assert record.excluded == result.excluded
@@ -209,10 +207,7 @@ def test_all_that_is_known_is_in_the_file(tmp_path: Path) -> None:
 
     # The camera itself carries all of it, until its parameters change.
     carried = load_camera(save_camera(result.camera, tmp_path / "again.camera.json")).calibration
-    assert carried is not None
-    assert carried.record is not None
     assert carried.record.excluded == result.excluded
-    assert carried.sigma is not None
     assert carried.sigma["fx"] == result.sigma["fx"]
 
 
@@ -225,7 +220,6 @@ def test_how_the_board_deviates_is_kept_where_it_was_solved(tmp_path: Path, opti
     result = calibrate_camera(seen, CalibrationOptions(**options))
     path = result.save(tmp_path / "a.camera.json")
     record = CameraFile.load(path).calibration
-    assert record is not None
     if options == {"model": "opencv5"}:
         assert record.board_deviation is None
         return

@@ -207,7 +207,6 @@ class TestPupil:
     def test_what_no_lens_does(self) -> None:
         lens = self.lens(0.1)
         found = corner_pupil(lens, self.spread(lens, 0.001))
-        assert found is not None
         assert found.depth == pytest.approx(0.1 * found.angle**2)
         assert found.sigma == pytest.approx(0.001 * found.angle**2)
         assert 70 < math.degrees(found.angle) < 76
@@ -232,7 +231,6 @@ class TestPupil:
         """A long lens is large: its pupil moves by more than the rule for angles says."""
         narrow = self.lens(0.024, "pinhole")
         found = corner_pupil(narrow, self.spread(narrow, 1e-4))
-        assert found is not None
         assert 0.03 * found.angle**2 < 0.01
         assert pupil_warnings(narrow, self.spread(narrow, 1e-4)) == []
         assert pupil_warnings(self.lens(0.06, "pinhole"), self.spread(narrow, 1e-4)) != []

@@ -204,7 +204,6 @@ def said(result: CameraCalibrationResult) -> list[str]:
 )
 def test_what_views_do_is_told_by_the_evidence(name: str, wanted: list[str]) -> None:
     fit = found(name).hybrid
-    assert fit is not None
     assert terms(fit) == wanted
     assert len(said(found(name))) == ("bending" in wanted)
     assert fit.sigma == pytest.approx(SIGMA, rel=0.1 if name != "both" else 0.6)
@@ -213,9 +212,7 @@ def test_what_views_do_is_told_by_the_evidence(name: str, wanted: list[str]) -> 
 def test_bending_is_taken_out() -> None:
     """The camera is nearer the truth than that of a board that is held to be stiff; heights are those of the views."""
     fit, stiff = found("bent").hybrid, found("bent", bending=False).hybrid
-    assert fit is not None
     assert fit.bends is not None
-    assert stiff is not None
     assert stiff.bends is None
     off, other = (error_at_infinity(one.camera, case("bent").lens).rms for one in (fit, stiff))
     assert off < 0.7 * other
@@ -235,8 +232,6 @@ def test_a_few_views_do_not_loosen_the_others() -> None:
     """They have large factors of their own, and are named."""
     result = found("few")
     fit = result.hybrid
-    assert fit is not None
-    assert fit.relative is not None
     bent = bends(20, 3e-3, 0.2, torch.Generator().manual_seed(9001)).abs().amax(1) > 0.0
     assert int(bent.sum()) == 4
     assert float(fit.relative[bent].min()) > 2.0
@@ -263,7 +258,6 @@ def real(name: str) -> Observations:
 def test_captures_of_strangers(name: str, wanted: list[str], noise: float) -> None:
     """Boards that bend, of a car's fisheye and on a wall: no second camera is blamed for it, nor a shutter alone."""
     result = calibrate_camera(real(name))
-    assert result.hybrid is not None
     assert terms(result.hybrid) == wanted
     assert result.hybrid.sigma < noise
     assert len(said(result)) == ("bending" in wanted)

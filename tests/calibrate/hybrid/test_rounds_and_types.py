@@ -45,7 +45,6 @@ class Views:
     def problem(self, *_: object) -> None: ...
 
     def data(self, *_: object) -> bool:
-        assert self.readout is not None
         return self.readout.columns
 
 
@@ -155,8 +154,6 @@ def test_what_a_camera_tells_of_its_lens(shape: Any, monkeypatch: pytest.MonkeyP
     options = FitOptions(modes=MODES, board=shape)
     found = fit_turned(observe(pixels, board=BOARD, size=SIZE), weights, options, one_type=True)
     assert freedoms == [pytest.approx(2 * (9 * 48 - 4) - 6 * 9)]
-    assert found.hyper is not None
-    assert found.lens is not None
     fit = found.fit
     deviation, count = fit.families.deviation(fit.expected), len(found.lens.slots)
     assert found.lens.slots == numbered(LENS_SLOT, count)

@@ -177,7 +177,6 @@ class TestPixels:
         base = Base(500.0, 0.3, None, state, 0.01, 3)
         assert base.distance == 0.5
         model, families = _with_constants(base, SIZE, MODES, board_modes(BOARD.points))
-        assert model.hybrid is not None
         assert model.hybrid.radius == pytest.approx(1.08 * 400.0 / 500.0)
         assert model.hybrid.shape == 0.3
         assert float(families.mean[0]) == 500.0
@@ -217,7 +216,6 @@ class TestBoards:
         said = [Gaussian.independent(("x",), tensor(float(k)), tensor(1.0)) for k in range(4)]
         found = _but_one(said)
         for k, one in enumerate(found):
-            assert one is not None
             assert float(one.mean) == pytest.approx((6.0 - k) / 3.0)
         assert _but_one(said[:1]) == [None]
 

@@ -383,7 +383,6 @@ def test_selected_elements_are_their_own_problem(own_pixels: bool) -> None:
     together = BoardProblem(BOARD.points, target, model, free_all(model), weights=weights, batch=(3,))
     chosen = torch.tensor([2, 0])
     part = together.select(chosen)
-    assert part is not None
     assert part.batch == (2,)
     some = map_state(lambda tensor: tensor[chosen], state)
     torch.testing.assert_close(part.rows(some), together.rows(state)[chosen], rtol=1e-13, atol=1e-14)

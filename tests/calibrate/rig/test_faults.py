@@ -203,7 +203,6 @@ class TestContradictions:
         assert "it may as well be the" in text
         assert text in found.warnings
         rig = found.stereo()
-        assert rig.calibration is not None
         assert rig.calibration.contradictions == found.contradictions
         assert not rig_verdict(rig).usable
         assert text in {finding.text for finding in rig_verdict(rig).stops}

@@ -50,7 +50,6 @@ def pairs(count: int) -> tuple[Observations, Observations]:
 
 
 def known(camera: Camera) -> CameraInformation:
-    assert camera.calibration is not None
     found = camera.calibration.known(camera.params)
     assert found is not None
     return found

@@ -102,14 +102,12 @@ class TestFewPoints:
         points = spread_points(6, 60.0, 900.0, 2)
         rays = rays_to(points)
         two = consensus_pose(rays[:2], points[:2], CENTER[0])
-        assert two is not None
         torch.testing.assert_close(two[0], ROTATION[0], rtol=0, atol=1e-9)
         assert torch.equal(two[1], CENTER[0])
         assert consensus_pose(rays[:2], points[:2]) is None
         assert consensus_pose(rays[:1], points[:1], CENTER[0]) is None
         # A place that is wrong by 10 m.
         moved = consensus_pose(rays, points, CENTER[0] + tensor(10.0, 0.0, 0.0))
-        assert moved is not None
         torch.testing.assert_close(moved[1], CENTER[0], rtol=0, atol=1e-6)
         assert moved[2] < 1e-12
 
