@@ -408,7 +408,7 @@ class RigReading:
 
     @property
     def positions(self) -> tuple[MeasuredPosition, ...]:
-        """Of the cameras, as far as they were measured."""
+        """Measured positions of the cameras."""
         return self.sources.get("positions", ())
 
     def add(self, field: str, source: Any) -> None:

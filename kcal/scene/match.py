@@ -256,7 +256,7 @@ def scene_features(cameras: tuple[Camera, Camera], pairs: Sequence[ImagePair], m
 def scene_of(
     cameras: tuple[Camera, Camera], pairs: Sequence[ImagePair], found: Sequence[MatchedPair], most: int = MOST
 ) -> SceneMatches:
-    """As `scene_features`, from matches of each pair (`match_scene`)."""
+    """Features from the matches of each pair (`match_scene`); see `scene_features`."""
     if not pairs:
         raise InputError("scene: no pair of images")
     _refuse_repeated(pairs)

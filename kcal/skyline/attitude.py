@@ -124,9 +124,9 @@ class SkylineAttitude:
 
     Args:
         rotation: (3, 3) the camera's axes from east, north, up at the camera.
-        heading_deg: as `Mounting`.
-        pitch_deg: likewise.
-        roll_deg: likewise.
+        heading_deg: see `Mounting`.
+        pitch_deg: see `Mounting`.
+        roll_deg: see `Mounting`.
         sigma_deg: (3,) of heading, pitch and roll.
         covariance: (3, 3) rad², of a small turn of the camera about the axes east, north, up.
         shares: of the variances of heading, pitch and roll (3,) by where they come from: image, raster, refraction,
@@ -205,7 +205,7 @@ def attitude_against(
     horizon_there: Callable[[], Horizon], image: NDArray[np.generic], camera: Camera, place: Origin, raster: Raster,
     place_sigma: tuple[float, float, float], error: RasterError, heading: tuple[float, float] | None = None,
 ) -> SkylineAttitude:  # fmt: skip
-    """As `skyline_attitude`, before a horizon that other images may share; it is called for if the image is clear."""
+    """Find the attitude like `skyline_attitude`, from a function that gives the horizon, which images may share."""
     shape = np.asarray(image).shape
     if shape != tuple(reversed(camera.size)):
         got = " x ".join(str(side) for side in reversed(shape))
@@ -432,7 +432,7 @@ def skyline_source(
     Raises:
         InputError: no images; what `skyline_attitude` refuses, with the image's name; images of one camera that
             contradict each other.
-        DegenerateError: likewise.
+        DegenerateError: see `skyline_attitude`.
 
     Example:
         >>> camera = Camera.build(focal=(300, 300), center=(159.5, 99.5), size=(320, 200), model="pinhole")

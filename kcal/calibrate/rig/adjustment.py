@@ -26,9 +26,9 @@ FALSE_ALARM = 1e-3
 
 # px, of a corner: noise-free corners would otherwise weigh infinitely much.
 _LEAST_SIGMA = 1e-3
-# Boards whose mean square is this many times the typical one do not tell how others move.
+# A board whose mean squared residual exceeds the typical one by this factor is wrong, and is not asked for motion.
 _WRONG = 9.0
-# How often each camera's motions are found, those of the others being known: the second time changes little.
+# How often the motions are estimated camera by camera; after the second round they hardly change.
 _TURNS = 2
 
 
@@ -41,7 +41,7 @@ class Adjustment:
         unknowns: what may change of lenses and board.
         sigma_corner: of a board's corner along an axis, px.
         turning: which cameras' rotations are unknown; left out: all, but the one that is the frame.
-        moving: likewise their centers.
+        moving: which cameras' centers are unknown; left out: all, but the one that is the frame.
 
     Attributes:
         sources: those with items, and the places of these among all items.
@@ -202,7 +202,8 @@ class Adjustment:
     def fit_motion(self, mask: Tensor) -> None:
         """Find how boards move while the cameras' rows are read, from residuals at the present state.
 
-        While rows are read, not before cameras of parametric models: what these cannot show would be taken for motion.
+        Motion while rows are read is not estimated for calibrated cameras of parametric models: errors of such a model
+        would be taken for motion.
         """
         self.motion, at = [None] * len(self.data.cameras), self.at("boards")
         if not bool(mask[at].any()):
@@ -217,7 +218,7 @@ class Adjustment:
         block, state = next((one, own) for one, own in parts if isinstance(one, BoardBlock))
         posed = problem.posed(state)
         rig = RigRows(block.camera_rows(posed, state), good, problem.shared_size)
-        # Rows of cameras whose motions are taken out, as they were before; what the others' motions were at that time.
+        # Rows of each camera before its own motions were integrated out, and the others' motions at that time.
         before: dict[int, Tensor] = {}
         others: dict[int, list[BoardMotion | None]] = {}
         for c in [*range(len(posed))] * _TURNS:
@@ -281,17 +282,17 @@ class Adjustment:
 
 
 def all_of(parts: Sequence[Tensor], none: Tensor) -> Tensor:
-    """The parts one after the other; `none` of them is given as an empty tensor."""
+    """Concatenate tensors; `none` is an empty tensor of their shape and type, for a list without any."""
     return torch.cat([none, *parts])
 
 
 # Find what contradicts the rest of a joint adjustment: worst first, and back in what does not after all.
 
-# Of the root of an item's mean square: an item three times worse than stated counts half.
+# Loss of the root mean squared residual of an item, in sigmas: at 3, an item has half its weight.
 LOSS = RobustLoss(kind="cauchy", scale=3.0)
-# Robust solutions only tell what is wrong; they need no digits.
+# A robust solution is only used to find what is wrong, so a rough one suffices.
 ROUGHLY = LMOptions(max_iterations=100, tolerance=1e-6, residual_floor=1e-8)
-# If more than this share of a source is wrong, it is not a few items that are.
+# If more than this share of its items is wrong, the source as a whole is.
 MOST_WRONG = 0.4
 # A source whose typical item is off by so many times its sigma is wrong as a whole.
 WRONG_AS_A_WHOLE = 20.0

@@ -239,7 +239,7 @@ def contradictions(work: Adjustment, problem: RigProblem, state: RigState) -> li
     suspects = suspects or [max(found, key=lambda group: found[group].sigmas)]
     suspects.sort(key=lambda group: (own[group], len(group), -found[group].sigmas))
     named = suspects[0]
-    # What supports itself no more, or no less, is as likely to be wrong.
+    # A source that is supported no better by its own data is as likely to be the wrong one.
     equal = [other for other in suspects[1:] if not set(other) & set(named) and (own[other] <= 0 or own[named] > 0)]
     rest = [part.name for i, part in enumerate(parts) if i not in named]
     text = _what_contradicts(parts, named, found[named], problem, state, known, rest)
@@ -370,10 +370,10 @@ class _Explanation(NamedTuple):
 
 
 def explained(work: Adjustment, mask: Tensor, solver: LMOptions) -> Tensor:
-    """As `kcal.calibrate.rig.adjustment.without_wrong`, but other explanations are compared.
+    """Leave out what is wrong (`kcal.calibrate.rig.adjustment.without_wrong`), and compare other explanations.
 
-    A measurement that is wrong can make good items look worse; so it is asked whether fewer are wrong without it. Where
-    few landmarks decide, all explanations are compared.
+    A wrong measurement can make good items look wrong. So each measurement is left out in turn, to see whether fewer
+    items are wrong without it. Where few landmarks decide, all explanations are compared.
 
     Raises:
         InputError: not a few items are wrong; several explanations are equally good, or none leaves anything to check
@@ -394,7 +394,7 @@ def explained(work: Adjustment, mask: Tensor, solver: LMOptions) -> Tensor:
     if not few or (failure is None and not gone and _agree(work, mask)):
         return kept
     marks = int(mask[work.at("landmarks")].sum())
-    # Nothing stands out, and yet it does not fit: one may be wrong that bends the others towards itself.
+    # Nothing stands out, yet χ² is too large: a wrong item may have bent the solution towards itself.
     most = max(1, int(MOST_WRONG * marks)) if failure is not None or gone else 1
     found = _explanations(work, mask, kept, robust, most)
     if not found:
@@ -463,7 +463,7 @@ def _refuse_terms(work: Adjustment, mask: Tensor, kept: Tensor | None, robust: R
             continue
         trial = copy.copy(work)
         trial.state, trial.without = robust, frozenset([term])
-        # What it bent towards itself is bent back.
+        # Without the measurement, the robust solution is found anew.
         trial.solve(mask, ROUGHLY, LOSS)
         try:
             others = without_wrong(trial, mask, solver)

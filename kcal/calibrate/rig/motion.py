@@ -69,12 +69,12 @@ def summed_products(parts: Sequence[CameraRows], size: int, shared_size: int) ->
 # under a normal prior, whitened residuals r have the covariance I + U Uᵀ, U being their derivatives by the motion times
 # its standard deviations, and (I + U Uᵀ)^-½ r takes the place of r.
 
-# Nats by which motions must raise the evidence without the board that tells most of them.
+# Nats by which motions must raise the evidence of the other boards, without the one that shows most motion.
 _WORTH_OF_OTHERS = 1.0
 # Mean square of residuals, in standard deviations, below which corners have no noise.
 _EXACT = 0.01
 _POSE = 6
-# How far what boards share may move their corners, in standard deviations of the noise: nothing is known beforehand.
+# Prior width of shared unknowns, as movement of corners in standard deviations of their noise: nearly no prior.
 _WIDE = 1e3
 # Readouts by which exposures must be apart to be called apart.
 _OTHER_MOMENT = 0.4
@@ -102,7 +102,7 @@ class BoardMotion(NamedTuple):
 
 
 def board_motion(columns: Tensor, whitening: Tensor, reach: float, rig: RigRows, camera: int) -> BoardMotion | None:
-    """How boards move while a camera reads its rows, and beforehand; None where they stand still.
+    """Estimate how boards move while a camera reads its rows, and between exposures; None where they stand still.
 
     Args:
         columns: (V, 18, 2, N) derivatives of its pixels by motions; (V, 6, 2, N) if they do not move while rows are
@@ -117,7 +117,7 @@ def board_motion(columns: Tensor, whitening: Tensor, reach: float, rig: RigRows,
         return None
     white = torch.einsum("vuwn,vpwn->vpun", whitening, columns).flatten(-2)
     variance = rig.variance
-    # Nothing is left to explain of corners without noise.
+    # Residuals without noise need no motion to explain them.
     if variance < _EXACT:
         return None
     data, families = rig.told(camera, white)
@@ -125,7 +125,7 @@ def board_motion(columns: Tensor, whitening: Tensor, reach: float, rig: RigRows,
     best = maximize_evidence(data, families, Amplitudes(_NONE, variance, begin), _NO_PRIOR)
     if evidence_of_motion(data, best, families, 1.0) < WORTH:
         return None
-    # What a single board tells of is wrong with that board.
+    # Motion that a single board shows is an error of that board.
     explained = data.integrated(best.log_ratio).half[..., -1].square().sum(-1)
     others = rig.without(int(good.nonzero()[explained.argmax(), 0]))
     rest, their_families = others.told(camera, white)
@@ -143,12 +143,12 @@ def board_motion(columns: Tensor, whitening: Tensor, reach: float, rig: RigRows,
 
 
 class RigRows:
-    """Rows of all cameras of a rig, from which what boards move before one camera is told after the other.
+    """Rows of all cameras of a rig, from which the motion of boards is estimated camera by camera.
 
     Args:
         parts: `CameraRows` of the cameras, whitened: derivatives of residuals by the boards' poses and by what boards
             share, and the residuals.
-        good: (V,) of which boards motions are told; of those, the ones whose rows are finite.
+        good: (V,) which boards are used to estimate motion; those without finite rows are left out.
         shared_size: number of the unknowns that boards share.
     """
 
@@ -164,7 +164,7 @@ class RigRows:
         self._whole = None
 
     def without(self, board: int) -> RigRows:
-        """The same, one board being no longer a good one."""
+        """These rows, with one board no longer among the good ones."""
         good = self.good.clone()
         good[board] = False
         return RigRows(self.parts.values(), good, self._size)
@@ -184,10 +184,10 @@ class RigRows:
         return self._whole
 
     def told(self, camera: int, white: Tensor) -> tuple[ViewData, PriorFamilies]:
-        """What good boards tell of their motions before a camera, whatever their poses and all that they share are.
+        """Evidence of the good boards on their motions before a camera, with poses and shared unknowns integrated out.
 
-        What they share comes in combinations in which it is independent and of unit weight, as if all boards stood
-        still. Of these, motions feel no more than there are motions: the others are taken out.
+        Shared unknowns enter as combinations that are independent and of unit weight where all boards stand still. At
+        most as many of these depend on motions as there are motions; the others are left out.
 
         Args:
             camera: its number.

@@ -313,7 +313,7 @@ class SeenAlone(NamedTuple):
 
     Attributes:
         poses: (V,) of all boards, NaN for others.
-        rms: (V,) px, likewise.
+        rms: (V,) px of each view; NaN for others.
     """
 
     poses: Poses

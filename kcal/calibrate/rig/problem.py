@@ -54,7 +54,7 @@ class RigProblem:
     ) -> None:
         self.cameras, self.blocks, self.unknowns, self.loss = tuple(cameras), tuple(blocks), unknowns, loss
         self.terms = tuple(terms)
-        # Of some marks, derivatives cost little more than the pixels themselves.
+        # Whether cost and derivatives are computed together: for few marks per item, derivatives cost little more.
         self.joint = not any(block.many for block in self.blocks)
         self.turn: list[slice | None] = []
         self.shift: list[slice | None] = []
@@ -244,7 +244,7 @@ class RigProblem:
 
 
 def _of_item(parts: Sequence[CameraRows], number: int) -> list[CameraRows]:
-    """Of one item."""
+    """The rows of one item."""
     return [part._replace(rows=part.rows[number : number + 1]) for part in parts]
 
 
@@ -259,7 +259,10 @@ def _others_fall(total: Tensor, part: Tensor) -> Tensor:
 
 
 def _few_others_fall(total: Tensor, rows: Tensor) -> Tensor:
-    """The same from an item's few rows (V, S + 1, k), e and B: eᵀ H (1 - H)⁻¹ e with H = Bᵀ N⁻¹ B (Woodbury 1950)."""
+    """(V,) what `_others_fall` gives for V items of few rows (V, S + 1, k), residuals e and derivatives B.
+
+    It is eᵀ H (1 - H)⁻¹ e with H = Bᵀ N⁻¹ B (Woodbury 1950).
+    """
     unit = total[:-1, :-1].diagonal().clamp_min(1e-300).rsqrt()
     root, info = torch.linalg.cholesky_ex(total[:-1, :-1] * unit[:, None] * unit)
     if int(info):

@@ -47,7 +47,7 @@ class RigResult:
         items: residuals by item, those left out included.
         flipped: boards that had been read from the other end and were turned.
         rms: sqrt(mean ‖r‖²) over the pixels of all cameras.
-        rms_px: likewise of each camera; NaN for a camera with none.
+        rms_px: sqrt(mean ‖r‖²) over the pixels of each camera; NaN for a camera with none.
         chi2: sum of squares of all residuals over their sigmas, as used: those of a source that fits itself worse than
             stated were multiplied (`kcal.calibrate.rig.problem`).
         freedom: degrees of freedom.
@@ -225,7 +225,7 @@ class RigResult:
         return self._covariance.of(relative_rows(self._problem, self._state, first, second))[0]
 
     def joint_covariance(self, first: int = 0, second: int = 1) -> Tensor:
-        """Of both cameras' parameters (zeros where held) and their relative pose, in the order of `RigCovariance`."""
+        """Covariance of both cameras' parameters (zeros where held) and relative pose, ordered as `RigCovariance`."""
         return self._covariance.of(self._joint_rows(first, second))[0]
 
     @property

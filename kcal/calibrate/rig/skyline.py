@@ -28,7 +28,7 @@ class SkylineSource(Measurement):
         cameras: number of the camera of each image.
         names: of the images.
         rotation: (C, 3, 3) cam_from_world by the skyline alone; NaN for cameras without one.
-        center: (C, 3) meters where the cameras were taken to be; NaN likewise.
+        center: (C, 3) meters where the cameras were taken to be; NaN for cameras without a skyline.
         parameters: (C) parameters of each camera's lens, as they were taken to be.
         rows: (Q, 6 C + P) whitened derivatives by turns of the cameras about their own axes, by their centers, and by
             the parameters of all lenses one after the other.

@@ -147,7 +147,7 @@ class Effects(NamedTuple):
     of_step: Tensor | None
 
     def some(self, mask: Tensor) -> Effects:
-        """Of the items in a mask alone."""
+        """The effects of the items in a mask alone."""
         return self._replace(shifts=self.shifts[:, mask])
 
 

@@ -100,7 +100,7 @@ class SharedUnknowns:
 
 
 def held(cameras: Sequence[Camera]) -> SharedUnknowns:
-    """Nothing: cameras and board are as they are, and light is straight."""
+    """No unknowns: cameras and board keep their values, and light is straight."""
     return SharedUnknowns(
         cameras=tuple(torch.zeros(camera.params.shape[-1], 0, dtype=torch.float64) for camera in cameras),
         shapes=torch.zeros(0, 3, 0, dtype=torch.float64),
@@ -165,8 +165,8 @@ def gathered(
         board: in the rig, if there is any; else that of the first camera that has one.
 
     Returns:
-        What is known: of cameras that saw another board, what is said of the camera alone; None: nothing, it is held.
-        And pairs of cameras whose boards have one name, and shapes that contradict each other.
+        For each camera what is known; of the camera alone if it saw another board; None if nothing is known and it is
+        held. And pairs of cameras whose boards have one name, and shapes that contradict each other.
     """
     out: list[CameraInformation | None] = []
     first: CameraInformation | None = None
@@ -198,7 +198,7 @@ def _agreeing(first: CameraInformation, other: CameraInformation, board: Board) 
 
 
 def _board_turned(known: CameraInformation, turns: int) -> CameraInformation:
-    """The same with the board's modes turned."""
+    """What is known of a camera and its board, with the modes of the board turned."""
     lens, turn = known.lens_size, mode_turn(turns)
     estimate = torch.cat([known.estimate[:lens], turn @ known.estimate[lens:]])
     out = dataclasses.replace(
@@ -265,14 +265,14 @@ def joint_unknowns(
             continue
         own = part.data + part.lens_prior
         if len(shared) == 1:
-            # What cameras told each other of their board counts once: of two in one rig, each brings its own rows.
+            # What other cameras told of the board counts only if none of the rig's brings rows of its own.
             own = own + part.told
         said.append(own.marginal(part.board))
         given.append(_given_board(part, own, prior.slots, amplitudes))
     told = stacked([one.placed(prior.slots, amplitudes) for one in said])
     shape = whitened(told.rows[:, :-1], told.rows[:, -1])
     given = [lens._replace(by_board=lens.by_board @ shape.change) for lens in given]
-    # Without a board in view, only what cameras say of theirs is left, and no corner moves.
+    # Without a board in view, its unknowns matter only through what calibrations know of it; no corner moves.
     shapes = torch.zeros(0, 3, 0, dtype=torch.float64) if modes is None else modes.shapes
     of_board = shape.change[:0] if modes is None else shape.change
     parts_begin, parts_known = ([getattr(one, name) for one in (*given, shape)] for name in ("begin", "known"))
@@ -312,7 +312,7 @@ class _GivenBoard(NamedTuple):
 
 
 def _given_board(part: CameraInformation, own: Gaussian, board: Slots, amplitudes: Tensor) -> _GivenBoard:
-    """What is known of a camera and its board, as if the board were known."""
+    """Write the parameters of a camera as functions of the board's unknowns and of unknowns independent of these."""
     size = part.lens_size
     rows = own.placed((*part.lens, *board), torch.cat([part.estimate[:size], amplitudes])).rows
     change, pull, known = whitened(rows[:, :size], rows[:, size:])
@@ -323,7 +323,7 @@ def _given_board(part: CameraInformation, own: Gaussian, board: Slots, amplitude
 def _board_beforehand(shared: Sequence[CameraInformation], modes: BoardModes | None) -> tuple[Gaussian, Tensor]:
     """The prior of a board's modes, and amplitudes to begin with; of no unknowns for no board."""
     if shared:
-        # Each camera's evidence set amplitudes of its own; what is in between is as good as either.
+        # Each camera's evidence set its own amplitudes; the geometric mean of their sigmas is used.
         sigma = torch.stack([part.sigma[part.lens_size :].log() for part in shared]).mean(0).exp()
         mean = torch.stack([part.mean[part.lens_size :] for part in shared]).mean(0)
         return Gaussian.independent(shared[0].board, mean, sigma), shared[0].estimate[shared[0].lens_size :]
@@ -337,9 +337,9 @@ def _board_beforehand(shared: Sequence[CameraInformation], modes: BoardModes | N
 def _felt(
     cameras: Sequence[Camera], lenses: Sequence[_GivenBoard], by_corners: Tensor, known: Sequence[Tensor]
 ) -> list[Tensor]:
-    """For each camera's unknowns, and last the board's, those directions (K, F) that matter, orthonormal.
+    """For the unknowns of each camera, and last of the board, orthonormal directions (K, F) that matter.
 
-    Of the known unknowns they are those that move anything seen by `_FELT` px; all others stay.
+    A direction of unknowns with a prior is kept if it moves anything seen by `_FELT` px; unknowns without one all stay.
 
     Args:
         cameras: of the rig.
@@ -362,10 +362,10 @@ def _felt(
 
 
 def _moving(effects: Tensor, known: Tensor) -> Tensor:
-    """(K, F): of the known ones of K unknowns those directions that move anything, by effects (K, N); all others."""
+    """(K, F) directions of K unknowns that move anything, by effects (K, N), and all unknowns without a prior."""
     moved = effects[known]
     _, vectors = torch.linalg.eigh(moved @ moved.T)
-    # The largest movement of any one place, not their sum.
+    # By the largest movement of any one place.
     felt = vectors[:, (vectors.T @ moved).abs().amax(1) > _FELT].flip(-1)
     unit = torch.eye(len(known), dtype=felt.dtype)
     return torch.cat([unit[:, known] @ felt, unit[:, ~known]], 1)
