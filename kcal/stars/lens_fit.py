@@ -16,9 +16,9 @@ from kcal.calibrate.hybrid.evidence import Amplitudes
 from kcal.calibrate.hybrid.families import PUPIL, prior_families, typical_hyperprior
 from kcal.calibrate.hybrid.fitted_views import LAST, Estimate, FittedViews, run_rounds
 from kcal.calibrate.problem.board_problem import BoardProblem
-from kcal.calibrate.problem.covariance import information_of
 from kcal.calibrate.problem.parameters import FreeParameters, Term
 from kcal.calibrate.problem.state import BoardState
+from kcal.calibrate.problem.views import information_of
 from kcal.errors import InputError
 from kcal.gaussian import triangular
 from kcal.lens.calibration import CameraCalibration

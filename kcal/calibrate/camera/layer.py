@@ -15,10 +15,9 @@ from kcal.calibrate.camera.solve import solve_corners
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard
 from kcal.calibrate.problem.board_problem import BoardProblem
-from kcal.calibrate.problem.covariance import uncertainty_of
 from kcal.calibrate.problem.parameters import CoefficientPrior, GaussianPrior, Term, is_overparameterized
 from kcal.calibrate.problem.state import BoardState
-from kcal.calibrate.problem.views import Views
+from kcal.calibrate.problem.views import Views, uncertainty_of
 from kcal.checks import StatedModule, as_points, require_finite
 from kcal.dispatch import is_differentiated
 from kcal.errors import DegenerateError, InputError

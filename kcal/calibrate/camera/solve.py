@@ -29,11 +29,18 @@ from kcal.calibrate.camera.warnings import (
 )
 from kcal.calibrate.hybrid.base_fit import fit_projection
 from kcal.calibrate.problem.board_problem import BoardProblem
-from kcal.calibrate.problem.covariance import Uncertainty, information_of, noise_variance, uncertainty_of
 from kcal.calibrate.problem.parameters import CoefficientPrior, FoldBarrier, GaussianPrior, Term, is_overparameterized
 from kcal.calibrate.problem.poses import poses_under, unflip
 from kcal.calibrate.problem.state import BoardState
-from kcal.calibrate.problem.views import LEAST_NOISE, CameraViews, whitening
+from kcal.calibrate.problem.views import (
+    LEAST_NOISE,
+    CameraViews,
+    Uncertainty,
+    information_of,
+    noise_variance,
+    uncertainty_of,
+    whitening,
+)
 from kcal.corners.observations import Observations
 from kcal.errors import InputError
 from kcal.lens.camera import Camera

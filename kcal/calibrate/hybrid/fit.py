@@ -37,9 +37,8 @@ from kcal.calibrate.hybrid.fitted_views import (
 from kcal.calibrate.hybrid.measured_board import BoardPrior, MeasuredBoard
 from kcal.calibrate.hybrid.network_fit import FieldTraining, train_network
 from kcal.calibrate.problem.board_problem import BoardProblem
-from kcal.calibrate.problem.covariance import information_of
 from kcal.calibrate.problem.state import BENDS, BoardState, MotionSigma, Readout, motion_sigma, stillness, widening
-from kcal.calibrate.problem.views import among
+from kcal.calibrate.problem.views import among, information_of
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.field_modes import FieldModes

@@ -12,9 +12,8 @@ from torch import Tensor
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
 from kcal.calibrate.problem.board_problem import BoardProblem
-from kcal.calibrate.problem.covariance import uncertainty_of
 from kcal.calibrate.problem.state import BoardState, warp_modes
-from kcal.calibrate.problem.views import free_parameters
+from kcal.calibrate.problem.views import free_parameters, uncertainty_of
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.solve.lm import LMOptions, minimize

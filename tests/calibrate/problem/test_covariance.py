@@ -13,9 +13,8 @@ from kcal.calibrate.camera import solve
 from kcal.calibrate.camera.advice import check_directions
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.problem.board_problem import BoardProblem
-from kcal.calibrate.problem.covariance import Uncertainty, information_of, noise_variance, uncertainty_of
 from kcal.calibrate.problem.state import BoardState
-from kcal.calibrate.problem.views import free_parameters
+from kcal.calibrate.problem.views import Uncertainty, free_parameters, information_of, noise_variance, uncertainty_of
 from kcal.errors import DegenerateError
 from kcal.lens.model import LensModel
 from kcal.lens.projection import project_components
