@@ -44,7 +44,7 @@ def observations(side: int, count: int, noise: float = 0.1) -> Observations:
         rotation = rotation_from_vector(tilt)
         center = torch.tensor([0.05 * math.cos(2 * angle), 0.06 * math.sin(3 * angle), 0.75], dtype=torch.float64)
         points = (BOARD.points - middle) @ rotation.T + center
-        pixels: Tensor = RIG(points)[side]
+        pixels: Tensor = RIG(points)[0][:, side]
         pixels = pixels + noise * torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
         views.append(View(name=f"{('left', 'right')[side]}{i:02}.png", pixels=tuple(map(tuple, pixels.tolist()))))
     return Observations(board=BOARD, image_size=SIZE, views=tuple(views))
