@@ -203,7 +203,7 @@ def _by_evidence(
         return dataclasses.replace(capture, weights=stars.weights / stars.noise)
 
     estimate = Estimate(hybrid.model, families, state, Amplitudes(hybrid.hyperparameters, 1.0))
-    rounds = run_rounds(capture, estimate, cold=False, spent=0, rough=False, progress=lambda _: None, reweigh=near)
+    rounds = run_rounds(capture, estimate, reweigh=near)
     return rounds.estimate.deviation[kept], stars, rounds.estimate.state
 
 

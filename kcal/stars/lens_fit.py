@@ -204,10 +204,7 @@ def fit_star_lens(
         weights = stars.near(model, estimate.state, CUT).weights
         return dataclasses.replace(capture, weights=weights)
 
-    capture = stars.fitted(size)
-    rounds = run_rounds(
-        capture, estimate, cold=False, spent=0, rough=False, progress=lambda _: None, reweigh=without_far
-    )
+    rounds = run_rounds(stars.fitted(size), estimate, reweigh=without_far)
     stars = stars._replace(weights=rounds.capture.weights, variance=rounds.estimate.variance)
     _, estimate, _ = rounds.capture.solved(rounds.estimate, LAST, last_step=True)
     state = estimate.state

@@ -404,10 +404,10 @@ def run_rounds(
     capture: FittedViews,
     estimate: Estimate,
     *,
-    cold: bool,
-    spent: int,
-    rough: bool,
-    progress: Callable[[str], object],
+    cold: bool = False,
+    spent: int = 0,
+    rough: bool = False,
+    progress: Callable[[str], object] = lambda _: None,
     reweigh: Callable[[FittedViews, Estimate], FittedViews] | None = None,
 ) -> Rounds:
     """Solve for all unknowns and set amplitudes by the evidence, in turn, until both come to rest.

@@ -110,9 +110,7 @@ def train_network(
         estimate, spent = step(turn, best.estimate)
         if estimate is best.estimate:
             break
-        found = run_rounds(
-            best.capture, estimate, cold=False, spent=best.steps + spent, rough=False, progress=lambda _: None,
-        )  # fmt: skip
+        found = run_rounds(best.capture, estimate, spent=best.steps + spent)
         value = found.untempered_loss + float(turn.pull(weights_of(_trunk(found.estimate))))
         progress(f"network, turn {number + 1}")
         if not value < loss - _WORTH:

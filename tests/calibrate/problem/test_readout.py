@@ -441,7 +441,7 @@ def test_motion_is_looked_for_beside_a_fit_of_views_that_stand_still(rate: float
         hyperprior=typical_hyperprior(MODES),
     )
     estimate, _ = fit_base(views, MODES)
-    rounds = run_rounds(views, estimate, cold=True, spent=0, rough=True, progress=lambda _: None)
+    rounds = run_rounds(views, estimate, cold=True, rough=True)
     distance = float(estimate.state.translation.norm(dim=-1).median())
     readout = Readout(center=points.mean(0), distance=distance, size=SIZE)
     assert motion_is_worth(rounds, readout) is worth
