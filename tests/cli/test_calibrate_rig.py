@@ -179,6 +179,7 @@ class TestCalibrate:
         [
             ("", "this is an empty file; a kcal observations file is needed here"),
             ("[1, 2]", "this is not a kcal file, but other JSON; a kcal observations file is needed here"),
+            ('{"kcal": "camera", "version": 1}', "a kcal camera file; a kcal observations file is needed here"),
             ('{"kcal": "observations", "version": 9}', "version 9 of the observations format"),
             ('{"kcal": "observations", "version": 1}', "bad observations file: board: "),
         ],
@@ -353,12 +354,6 @@ class TestRig:
     )
     def test_refusals(self, cameras: Path, command: Command, arguments: str, message: str) -> None:
         assert message in command.refuses("rig", arguments, "-o rig.json")
-
-    @pytest.mark.slow
-    def test_a_rig_file_is_no_camera_file(self, cameras: Path, command: Command) -> None:
-        command("rig left.camera.json right.camera.json", PAIRS, "-o rig.json")
-        text = command.refuses("rig rig.json right.camera.json", PAIRS, "-o b.json")
-        assert "rig.json: this is a kcal rig file; a kcal camera file is needed here" in text
 
     def test_views_that_cannot_be_paired(self, cameras: Path, command: Command) -> None:
         content = json.loads((cameras / "right.obs.json").read_text())

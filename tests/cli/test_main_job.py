@@ -245,17 +245,6 @@ class TestBadInput:
         write_png("a.png", np.zeros((240, 320), dtype=np.uint8))
         refused(run("detect", "a.png", "--board", "9x6", "--square", "25", "-o", "a.obs.json"), "unit", "25mm")
 
-    def test_one_view(self, run: Run) -> None:
-        observations(1, tilt=0.5).save("one.obs.json")
-        refused(run("calibrate", "one.obs.json", "-o", "c.json"), "1 view", "at least 3")
-        assert not Path("c.json").exists()
-
-    @pytest.mark.slow
-    def test_all_views_parallel_to_the_image(self, run: Run) -> None:
-        observations(8, tilt=0.0).save("flat.obs.json")
-        refused(run("calibrate", "flat.obs.json", "-o", "c.json"), "focal length", "tilted")
-        assert not Path("c.json").exists()
-
     def test_two_image_sizes(self, run: Run) -> None:
         generator = np.random.default_rng(0)
         for name, shape in (("a.png", (240, 320)), ("b.png", (480, 600))):
@@ -270,30 +259,11 @@ class TestBadInput:
         refused(answer, "rig.json", "rig file", "camera file is needed")
         assert not Path("out.json").exists()
 
-    def test_a_camera_file_where_observations_belong(self, run: Run) -> None:
-        Path("camera.json").write_text('{"kcal": "camera", "version": 1}')
-        refused(run("calibrate", "camera.json", "-o", "c.json"), "camera file", "observations file is needed")
-
-    def test_output_in_a_folder_that_does_not_exist(self, run: Run) -> None:
-        observations(5, tilt=0.5).save("a.obs.json")
-        refused(run("calibrate", "a.obs.json", "-o", "nowhere/c.json"), "nowhere", "does not exist")
-
     def test_output_over_an_input(self, run: Run) -> None:
         observations(5, tilt=0.5).save("a.obs.json")
         before = Path("a.obs.json").read_bytes()
         refused(run("calibrate", "a.obs.json", "-o", "a.obs.json"), "a.obs.json", "input")
         assert Path("a.obs.json").read_bytes() == before
-
-    def test_unknown_model(self, run: Run) -> None:
-        observations(5, tilt=0.5).save("a.obs.json")
-        refused(run("calibrate", "a.obs.json", "-o", "c.json", "--model", "opencv15"), "opencv15", "opencv14")
-
-    def test_an_old_file_survives_a_failure(self, run: Run) -> None:
-        Path("c.json").write_text("precious")
-        observations(1, tilt=0.5).save("one.obs.json")
-        assert run("calibrate", "one.obs.json", "-o", "c.json")[0] == 1
-        assert Path("c.json").read_text() == "precious"
-        assert sorted(path.name for path in Path().iterdir()) == ["c.json", "one.obs.json"]
 
 
 @pytest.mark.parametrize("command", ["demo", "board", "detect", "calibrate", "rig", "locate"])
