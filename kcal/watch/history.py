@@ -148,9 +148,9 @@ def _log_likelihood(series: AngleSeries, tried: NDArray[np.float64]) -> NDArray[
 # Of the state: slow turns, lasting errors of the looks, errors of the lenses between the cameras, turns per kelvin.
 _SLOW, _LASTING, _BIAS, _HEAT = slice(0, 6), slice(6, 12), slice(12, 17), slice(17, 23)
 SIZE = 23
-# Radians by which lenses may be wrong between the cameras: some tenths of a pixel.
+# Radians by which errors of the lenses turn what is measured between the cameras: some tenths of a pixel.
 _LENS_SIGMA = 3e-4
-# A look that chance makes so unlikely once in a million is doubted, until so many in a row say the same.
+# A look that chance explains less than once in a million is doubted, until so many in a row agree.
 _CHANCE, _AGREE = 1.0 - 1e-6, 3
 _GATES = torch.cat([torch.ones(1, dtype=torch.float64),
                     chi2_quantile(torch.arange(1.0, 12.0, dtype=torch.float64), _CHANCE)])  # fmt: skip

@@ -30,18 +30,18 @@ from kcal.watch.turned import camera_turns
 
 # What is looked for in each image of a watched rig: patches of fixed things, and where they were.
 #
-# Things that move, and patches that have changed, are learned out by time. When half of them are gone, new ones are
-# added where the present attitude puts them; how well that was known is kept.
+# Features that move, and patches that have changed, are dropped in time. When half of the features are gone, new ones are
+# added where the present attitude puts them; the covariance of that attitude is kept with them.
 
-# Pixels of a patch to each side: what least-squares matching reads of it.
+# Pixels from the middle of a stored patch to its sides, as many as least-squares matching needs.
 REACH = 15
 # Features of a camera, cells across and down among which they are spread, and pixels between them.
 _MOST, _CELLS, _APART = 400, (16, 9), 12.0
-# Below that many features a reference is of no use.
+# Fewest features of a reference.
 _FEWEST = 20
-# Looks of which a feature's record is a mean; before so many it is not judged.
+# Number of looks over which the record of a feature is averaged; a feature with fewer is not judged.
 MEMORY = 30
-# Learned out: found in fewer than this share of the looks that found others, or so many pixels off in the mean.
+# A feature is dropped if fewer than this share of the looks found it, or if it is so many pixels off on average.
 _SELDOM, _OFF = 0.3, 0.5
 _LARGEST = 2**26
 _FIELDS = ("pixels", "middle", "patches", "looks", "found", "off", "variance")
@@ -219,17 +219,17 @@ def load_references(path: str | Path, rig: Rig) -> tuple[FixedFeatures, FixedFea
 # Steps of a patch from its middle; px that a fit may go, and along the worst axis that it may be unsure.
 _HALF, _FARTHEST, _FAINTEST = 7, 1.5, 0.35
 _LEAST_SHARE = 0.55
-# Pixels that are searched when nearby too little is found: somebody has hit the mast.
+# Pixels that are searched where too few features are found nearby, as after somebody has hit the mast.
 _WIDE = 40
-# Features without which a camera tells nothing.
+# Fewest features from which the turn of a camera is computed.
 FEWEST = 8
-# px: light, shade and bilinear samples leave that much in the best patch.
+# px: smallest standard deviation of a patch, which light, shade and bilinear interpolation leave.
 _FLOOR = 0.03
-# A lens whose images are larger or smaller by this share, so surely, is another one: 20 K change them by 2e-4.
+# Images that are larger or smaller by this share, and by so many sigmas, are of another lens: 20 K change them by 2e-4.
 _OTHER_LENS, _SURELY = 1e-3, 8.0
 # Keypoints of an image that shows a scene, whatever scene that is.
 _SOME = 150
-# Share of the noise of a look that lasts, before it was measured.
+# Share of the noise of a look that is assumed to last until it is measured.
 _LASTING = 0.33
 
 
@@ -239,11 +239,11 @@ class Seen(NamedTuple):
     Attributes:
         turn: (3,) radians since the reference; zeros if nothing was found.
         covariance: (3, 3).
-        found: features that were found and stand still; 0 where they make no turn.
-        lasting: share of the covariance that lasts, None if it cannot be told yet.
+        found: number of features that were found and stand still; 0 where no turn could be computed.
+        lasting: share of the covariance that lasts; None where it is not known yet.
         reference: with the records of this look.
         note: what is wrong, if anything is.
-        lost: an image full of things that are not what was there.
+        lost: whether the image shows a scene, but nothing of the reference.
     """
 
     turn: Tensor

@@ -30,9 +30,9 @@ from kcal.watch.turned import Drift, drift_of_turns
 
 # `Watched`: a rig and the history of its attitude; the rig of any moment, with the errors of that moment.
 
-# Shared errors that a moment has beside those of the rig file.
+# Number of shared errors that a moment adds to those of the rig file.
 MORE_ERRORS = 6
-# Seconds of a history before and after the moments that are asked for: longer ago tells nothing more.
+# Seconds of a history that are read before and after the wanted moments; rows beyond change nothing.
 _BEFORE, _AFTER = 2 * 86400.0, 2 * 3600.0
 
 
@@ -56,7 +56,7 @@ class Watched:
     def __init__(self, rig: Rig, rows: Sequence[past.HistoryRow] = (), model: past.TurnModel | None = None) -> None:
         self.rig, self.model = rig, model or model_of(rows)
         self.between = past.between_rows(rig)
-        # Of which moments the rows tell all that the history does.
+        # The moments for which no further row of the history matters.
         self.since, self.until = -math.inf, math.inf
         self.times: list[float] = []
         self.states: list[past.TurnState] = []
@@ -172,7 +172,7 @@ def model_of(rows: Sequence[past.HistoryRow]) -> past.TurnModel:
 
 # A new rig file from a history, and only where the history proves that the old one is wrong for good.
 
-# Seconds of a history before a swing of the day is known, and looks at its end that were not used for the proof.
+# Seconds of history from which the swing of a day is known, and looks at its end that are held out for the proof.
 _DAY, _HELD_OUT = 86400.0, 20
 
 
