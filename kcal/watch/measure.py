@@ -30,8 +30,8 @@ from kcal.watch.turned import camera_turns
 
 # What is looked for in each image of a watched rig: patches of fixed things, and where they were.
 #
-# Features that move, and patches that have changed, are dropped in time. When half of the features are gone, new ones are
-# added where the present attitude puts them; the covariance of that attitude is kept with them.
+# Features that move, and patches that have changed, are dropped in time. When half of the features are gone, new ones
+# are added where the present attitude puts them; the covariance of that attitude is kept with them.
 
 # Pixels from the middle of a stored patch to its sides, as many as least-squares matching needs.
 REACH = 15
