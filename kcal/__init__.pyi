@@ -31,8 +31,8 @@ from kcal.calibrate.rig.measured import Baseline as Baseline
 from kcal.calibrate.rig.measured import MeasuredPosition as MeasuredPosition
 
 # Locate
-from kcal.locate.localizer import StereoLocalizer as StereoLocalizer
-from kcal.locate.positions import locate_points as locate_points
+from kcal.locate.localizer import Localizer as Localizer
+from kcal.locate.points import locate_points as locate_points
 from kcal.locate.stereo import PositionStatus as PositionStatus
 from kcal.lens.rig import Origin as Origin
 

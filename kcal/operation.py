@@ -62,10 +62,18 @@ class Operations(Float64Module):
         return list(_call(tensors, self._operation, method, given, asked))[:-1]
 
 
-def shapes_of(kind: type[tuple], **other: tuple[int, ...] | torch.dtype) -> dict[str, Any]:
+Shape = tuple[int, ...]
+
+
+def shapes_of(kind: type[tuple], **other: Shape | torch.dtype | tuple[Shape, torch.dtype]) -> dict[str, Any]:
     """`Operations.results` of a `forward` that returns a named tuple: float64 numbers, but for the `other` ones."""
-    found = [other.get(name, ()) for name in kind._fields]  # type: ignore[attr-defined]
-    both = [((), one) if isinstance(one, torch.dtype) else (one, torch.float64) for one in found]
+    both: list[Any] = []
+    for name in kind._fields:  # type: ignore[attr-defined]
+        one = other.get(name, ())
+        if isinstance(one, torch.dtype):
+            both.append(((), one))
+        else:
+            both.append(one if one and isinstance(one[-1], torch.dtype) else (one, torch.float64))
     return {"forward": tuple(both)}
 
 

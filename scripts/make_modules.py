@@ -38,9 +38,8 @@ from kcal.lens.rig import Origin, Rig, RigCovariance
 from kcal.lens.views import Cylinder
 from kcal.locate.disparity import DisparityRanges
 from kcal.locate.geodesy import enu_from_cam
-from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.localizer import Localizer
 from kcal.locate.mounting import mounting_covariance
-from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.locate.triangulate import Triangulate
 from kcal.nets.inverse import InverseNet
 from kcal.nets.joint import ResidualNet
@@ -120,8 +119,8 @@ def pairs() -> Values:
     """Marked pixels of three points in both images."""
     left, right = rig()(PLACES)[0].unbind(-2)
     return {
-        "pixels_left": left.detach() + 0.1 * noise(3, 2),
-        "pixels_right": right.detach() + 0.1 * noise(3, 2, seed=1),
+        "pixels": left.detach() + 0.1 * noise(3, 2),
+        "other": right.detach() + 0.1 * noise(3, 2, seed=1),
     }
 
 
@@ -131,12 +130,12 @@ def pair_cov() -> Tensor:
     return root @ root.mT + 0.1 * torch.eye(4, dtype=torch.float64)
 
 
-def stereo(number: int) -> StereoLocalizer:
+def stereo(number: int) -> Localizer:
     """With every kind of error."""
     own = rig(number)
     half = 1e-4 * noise(5, 26, seed=3)
     shared = 1e-3 * noise(5, 6, seed=4)
-    return StereoLocalizer(
+    return Localizer(
         own, origin=Origin(lat=19.07 + number, lon=72.87, height=14.0), heading_deg=30.0 + number, pitch_deg=1.0,
         pixel_sigma=0.3 + 0.1 * number, calibration=RigCovariance(half=half), refraction=0.13 + 0.01 * number,
         mounting=mounting_covariance(origin_m=(0.1, 0.1, 0.1), attitude_deg=(0.1, 0.1, 0.1)) + shared.T @ shared,
@@ -159,11 +158,11 @@ def seen_by_stations() -> Tensor:
     return pixels.detach() + 0.1 * noise(2, 3, 2)
 
 
-def several(number: int) -> MultiViewLocalizer:
+def several(number: int) -> Localizer:
     """Whose errors are shared."""
     own = stations(number)
     root = torch.cat([own.with_errors(position_m=0.1, attitude_deg=0.01, refraction=0.1), 1e-4 * noise(3, 49, seed=5)])
-    return MultiViewLocalizer(own, root=root, clock_sigma=0.01 + 0.01 * number, pixel_sigma=0.3 + 0.1 * number)
+    return Localizer(own, root=root, clock_sigma=0.01 + 0.01 * number, pixel_sigma=0.3 + 0.1 * number)
 
 
 SMALL = (32, 24)
@@ -296,13 +295,13 @@ CASES: dict[str, Case] = {
     ),
     "Triangulate": Case(
         make=lambda n: Triangulate(rig(n), 0.3 + 0.1 * n),
-        inputs=lambda: dict(zip(("pixels", "other"), pairs().values(), strict=True)),
-        batched=("pixels", "other"), otherwise=lambda: Triangulate(rig(0), method="linear"),
+        inputs=pairs, batched=("pixels", "other"), otherwise=lambda: Triangulate(rig(0), method="linear"),
     ),
-    "StereoLocalizer": Case(
-        make=stereo, inputs=lambda: {**pairs(), "cov": pair_cov()}, batched=("pixels_left", "pixels_right", "cov"),
+    "Localizer": Case(
+        make=stereo, inputs=lambda: {**pairs(), "cov": pair_cov()}, batched=("pixels", "other", "cov"),
+        detached=("misfit",),
     ),
-    "MultiViewLocalizer": Case(
+    "Localizer (several cameras)": Case(
         make=several, inputs=lambda: {"pixels": seen_by_stations(), "velocity": noise(2, 3, 2, seed=9)},
         batched=("pixels", "velocity"), detached=("misfit",), rtol=1e-4,
     ),

@@ -29,7 +29,7 @@ PUBLIC = {
     "kcal": """
         Baseline Board Boards CalibrationOptions Camera DegenerateError Features FileError InputError
         KcalError KcalWarning Landmarks MeasuredPosition Observations Origin PositionStatus RigData
-        RigOptions Rig StereoLocalizer View calibrate_camera calibrate_rig detect load_camera load_rig
+        RigOptions Rig Localizer View calibrate_camera calibrate_rig detect load_camera load_rig
         locate_points save_camera save_rig solve_rig
     """,
     "kcal.lens": """
@@ -53,9 +53,9 @@ PUBLIC = {
         read_tracks save_camera_rig scene_features skyline_attitude skyline_source
     """,
     "kcal.locate": """
-        BudgetErrors DisparityRanges Marks MultiViewLocalizer Site Triangulate
+        BudgetErrors DisparityRanges Marks Site Triangulate
         area_of enu_from_cam enu_to_geodetic find_geoid geodetic_to_enu level_ground locate_on_ground
-        locate_views range_errors rank_sites read_marks siting_map terrain write_positions
+        range_errors rank_sites read_marks siting_map terrain write_positions
     """,
     "kcal.track": """
         AssociationOptions ClockPrior Detections DisparityOptions Motion ObjectDisparity PairBoxes

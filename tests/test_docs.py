@@ -170,7 +170,7 @@ def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     index = (tmp_path / "site" / "search" / "search_index.js").read_text(encoding="utf-8")
-    assert "StereoLocalizer" in index
+    assert "Localizer" in index
     pages = [path.read_text(encoding="utf-8") for path in (tmp_path / "site").rglob("*.html")]
     assert [page for page in pages if re.search(r'<(script|link|img)[^>]*(src|href)="https?:', page)] == []
 

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 import kcal
 from kcal.lens.rig import Origin, RigCovariance
-from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.localizer import Localizer
 
 
 def named_tuples(kind: object) -> set[type[tuple]]:
@@ -56,7 +56,7 @@ class Returns(nn.Module):
 
 def test_every_result_is_saved_and_loaded() -> None:
     kinds = results_of_modules()
-    assert {"Localization", "Triangulation", "ViewsLocalization", "RangeImage"} <= {kind.__name__ for kind in kinds}
+    assert {"Localization", "Triangulation", "RangeImage"} <= {kind.__name__ for kind in kinds}
     for kind in kinds:
         file, x = io.BytesIO(), torch.ones(2)
         torch.export.save(torch.export.export(Returns(kind), (x,)), file)
@@ -72,7 +72,7 @@ def test_a_program_runs_in_another_process(tmp_path: Path) -> None:
     rig = pinhole_rig()
     rig.covariance = RigCovariance.of(rig, pose=1e-8 * torch.eye(6).double())
     origin = Origin(lat=19.0, lon=72.0, height=10.0)
-    module, path = StereoLocalizer(rig, origin=origin, heading_deg=20.0), tmp_path / "locate.pt2"
+    module, path = Localizer(rig, origin=origin, heading_deg=20.0), tmp_path / "locate.pt2"
     left = torch.tensor([[980.0, 540.0], [960.0, 540.0], [950.0, 530.0]], dtype=torch.float64)
     right = left - torch.tensor([9.0, 0.1], dtype=torch.float64)
     count = torch.export.Dim("count", min=2)

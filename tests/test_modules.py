@@ -48,7 +48,8 @@ def written(name: str) -> dict[str, str]:
 
 def test_each_module_has_a_case_and_a_row() -> None:
     """A module that is new fails here until it has a case in scripts/make_modules.py."""
-    assert set(modules()) - BASES == set(CASES) == set(table_rows(PAGE.read_text(encoding="utf-8")))
+    assert set(CASES) == set(table_rows(PAGE.read_text(encoding="utf-8")))
+    assert set(modules()) - BASES == {name.partition(" (")[0] for name in CASES}
 
 
 @each

@@ -18,7 +18,7 @@ from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.model import LensModel
 from kcal.lens.rig import Origin, Rig, RigCovariance
 from kcal.lens.zernike import ZernikeModes
-from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.localizer import Localizer
 from kcal.locate.triangulate import Triangulate
 
 pytestmark = traced_whole
@@ -41,11 +41,11 @@ def stereo(modes: ZernikeModes | NetworkModes | None = None) -> Rig:
     return Rig.pair(camera(modes), camera(modes), torch.eye(3), torch.tensor([-10.0, 0.1, 0.0]))
 
 
-def localizer() -> StereoLocalizer:
+def localizer() -> Localizer:
     rig = stereo()
     rig.covariance = RigCovariance.of(rig, pose=1e-8 * torch.eye(6).double())
     origin = Origin(lat=19.0, lon=72.0, height=10.0)
-    return StereoLocalizer(rig, origin=origin, heading_deg=20.0, mounting=1e-6 * torch.eye(6).double())
+    return Localizer(rig, origin=origin, heading_deg=20.0, mounting=1e-6 * torch.eye(6).double())
 
 
 def marks(rig: Rig, count: int = 5) -> tuple[Tensor, Tensor]:
@@ -79,7 +79,7 @@ def test_localizer_compiles_in_seconds_for_all_shapes() -> None:
     assert len(counter.graphs[-1].graph.nodes) < 100
 
 
-def gradients(call: torch.nn.Module, module: StereoLocalizer) -> list[Tensor]:
+def gradients(call: torch.nn.Module, module: Localizer) -> list[Tensor]:
     left, right = marks(module.rig)
     cov = (0.04 * torch.eye(4).double()).repeat(5, 1, 1)
     inputs = [value.requires_grad_() for value in (left, right, cov)]

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from locate_rigs import located_pairs
 
 import kcal
-from kcal import Board, Camera, Observations, Origin, Rig, StereoLocalizer, View
+from kcal import Board, Camera, Localizer, Observations, Origin, Rig, View
 from kcal.corners.detect import Detection
 from kcal.lens import rotation_from_vector
 from kcal.locate import Triangulate
@@ -58,7 +59,7 @@ def test_modules() -> None:
     stations = Rig([CAMERA] * 9, list("abcdefghi"), look.repeat(9, 1, 1), center=torch.eye(9)[:, :3] * 3000.0)
     check(stations, "a, b, c", "up to 4240 m apart", "9 x Camera", lines=6)
     origin = Origin(lat=19.07, lon=72.87, height=14.0)
-    localize = StereoLocalizer(RIG, origin=origin, heading_deg=35.0, pixel_sigma=0.1)
+    localize = Localizer(RIG, origin=origin, heading_deg=35.0, pixel_sigma=0.1)
     check(localize, "lat=19.07", "heading=35°", "pixel_sigma=0.1, errors of marks", "10.0 m", lines=9)
 
 
@@ -67,9 +68,9 @@ def test_results() -> None:
     right = left - torch.tensor([3.2, 0.0])
     right[5:] += 10.0
     check(Triangulate(RIG)(left, right), "Triangulation(5 OK, 2 PARALLEL, points=(7, 3), ", lines=2)
-    localize = StereoLocalizer(RIG, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=35.0)
+    localize = Localizer(RIG, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=35.0)
     check(localize(left, right), "Localization(5 OK, 2 PARALLEL, enu=(7, 3)")
-    located = kcal.locate_points(RIG, left[:1], right[:1], origin=Origin(lat=1.0, lon=2.0, height=3.0), heading_deg=0.0)
+    located = located_pairs(RIG, left[:1], right[:1], origin=Origin(lat=1.0, lon=2.0, height=3.0), heading_deg=0.0)
     check(located, "Located(")
     found = calibrated()
     check(found, f"CameraCalibrationResult(rms={found.rms:.6g}, ", "camera=Camera(model=opencv5", "per_view_rms=(5,)")

@@ -14,11 +14,11 @@ import pytest
 import torch
 
 import kcal
-from kcal import Board, Camera, InputError, KcalWarning, Observations, Origin, Rig, StereoLocalizer, View
+from kcal import Board, Camera, InputError, KcalWarning, Localizer, Observations, Origin, Rig, View
 from kcal.corners import refine_point
 from kcal.doors import _is_kind, _naming_slips
 from kcal.lens import camera_difference, pixel_covariance, rotation_from_vector, vector_from_rotation
-from kcal.locate import MultiViewLocalizer, Triangulate, enu_to_geodetic
+from kcal.locate import Marks, Triangulate, enu_to_geodetic
 
 CAMERA = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480))
 BOARD = Board(columns=3, rows=3, square=0.1)
@@ -28,7 +28,7 @@ BOARD = Board(columns=3, rows=3, square=0.1)
     ("call", "message"),
     [
         (lambda: camera_difference(CAMERA, None), "second: Camera is needed, got NoneType; .*load_camera"),
-        (lambda: StereoLocalizer(CAMERA), r"rig: Rig is needed, got Camera; .*solve_rig\(...\).ster"),
+        (lambda: Localizer(CAMERA), r"rig: Rig is needed, got Camera; .*solve_rig\(...\).ster"),
         (lambda: kcal.save_camera("a.json", CAMERA), "save_camera: camera: Camera is needed, got str"),
         (lambda: kcal.calibrate_camera("a.obs.json"), "observations: Observations is needed, got str; kcal.detect or"),
         (lambda: kcal.solve_rig([CAMERA, CAMERA]), "solve_rig: data: RigData is needed, got list of Camera"),
@@ -148,7 +148,7 @@ def test_what_shows_no_images(given: Any, message: str) -> None:
 RIG = Rig.pair(CAMERA, CAMERA, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
 LOOK = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]).repeat(2, 1, 1)
 STATIONS = Rig([CAMERA] * 2, ["a", "b"], LOOK, center=torch.tensor([[0.0, 0, 0], [1000.0, 0, 0]]))
-LOCALIZE = StereoLocalizer(RIG, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
+LOCALIZE = Localizer(RIG, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
 PIXELS = torch.full((4, 2), 200.0)
 NEXT = torch.tensor([[0.0, 0, 0, -1.0], [0, 0, 0, 0], [0, 0, 0, 0]])
 # Each with the last dimension that it needs.
@@ -166,9 +166,9 @@ DOORS: dict[str, tuple[Callable[[Any], Any], int]] = {
     "localize": (lambda bad: LOCALIZE(bad, PIXELS), 2),
     "localize cov": (lambda bad: LOCALIZE(PIXELS, PIXELS, bad), 4),
     "sensitivity": (lambda bad: LOCALIZE.sensitivity(PIXELS, bad), 2),
-    "locate_points": (lambda bad: kcal.locate_points(RIG, PIXELS, bad, origin=LOCALIZE.origin, heading_deg=0.0), 2),
+    "marks": (lambda bad: Marks.of_pair(("a",) * 4, PIXELS, bad), 2),
     "views": (Triangulate(STATIONS), 2),
-    "multi": (MultiViewLocalizer(STATIONS), 2),
+    "multi": (Localizer(STATIONS), 2),
     "geodetic": (lambda bad: enu_to_geodetic(bad, LOCALIZE.origin), 3),
     "camera": (lambda bad: Camera(bad, size=(640, 480)), 10),
     "rotation": (lambda bad: Rig.pair(CAMERA, CAMERA, bad, torch.tensor([-1.0, 0, 0])), 3),

@@ -10,6 +10,7 @@ import cv2
 import pytest
 import torch
 from board_render import render
+from locate_rigs import located_pairs
 from torch import Tensor
 
 import kcal
@@ -84,13 +85,13 @@ def test_from_images_to_positions(images: Path, tmp_path: Path) -> None:
 
     # A rig and pixels to positions, in a detector's graph and as a list.
     left, right = TRUTH(TARGETS)[0].unbind(-2)
-    localize = kcal.StereoLocalizer.from_file(file, pixel_sigma=0.1)
+    localize = kcal.Localizer.from_file(file, pixel_sigma=0.1)
     found = localize(left, right)
     assert localize.included == ("marks", "calibration", "mounting")
     assert [kcal.PositionStatus(int(code)).name for code in found.status] == ["OK", "OK"]
     true = torch.linalg.vector_norm(TARGETS, dim=-1)
     assert ((found.range_low < true) & (true < found.range_high)).all()
-    located = kcal.locate_points(kcal.load_rig(file), left, right, pixel_sigma=0.1, names=["gate", "mast"])
+    located = located_pairs(kcal.load_rig(file), left, right, pixel_sigma=0.1, names=["gate", "mast"])
     assert located.included == localize.included
     for position, low in zip(located.positions, found.range_low.tolist(), strict=True):
         assert position.range_low_m == pytest.approx(low, rel=1e-12)

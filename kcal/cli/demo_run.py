@@ -29,9 +29,10 @@ from kcal.io.images import write_png
 from kcal.io.rig_file import RigFile, load_rig
 from kcal.lens.rig import Rig
 from kcal.locate.geodesy import Origin
-from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.localizer import Localizer
 from kcal.locate.marks import Marks, read_marks, write_marks
-from kcal.locate.positions import interval_coverage, locate_points
+from kcal.locate.points import locate_points
+from kcal.locate.positions import interval_coverage
 from kcal.report.judge_rig import rig_verdict
 from kcal.report.pages import Part, save_summary
 from kcal.report.tables import chance_text, diagonal_rows, truth_rows
@@ -241,7 +242,7 @@ def real_pairs(
     command = locate_again(output, f"--origin={where.lat},{where.lon},{where.height}", f"--heading={heading}")
     marks = read_marks(output / "points.csv")
     rig = load_rig(output / "rig.json")
-    located = locate_points(rig, marks.left, marks.right, origin=where, heading_deg=heading, names=marks.names)
+    located = locate_points(Localizer(rig, origin=where, heading_deg=heading), marks)
     out.print("\nThe board's diagonal, true against estimated", markup=False)
     rows = diagonal_rows(located, board)
     print_table(rows)
@@ -325,7 +326,7 @@ def simulated_site(output: Path, seed: int) -> None:
     command = locate_again(output, "--pixel-sigma", scene.mark_sigma, "--truth", output / "truth.csv")
     rig = load_rig(output / "rig.json")
     located, exact = (
-        locate_points(rig, *pixels, pixel_sigma=scene.mark_sigma, names=targets.names)
+        locate_points(Localizer(rig, pixel_sigma=scene.mark_sigma), Marks.of_pair(targets.names, *pixels))
         for pixels in ((marks.left, marks.right), (marks.true_left, marks.true_right))
     )
     clock.lap("positions and maps")
@@ -349,7 +350,7 @@ def _more_draws(scene: DemoScene, rig: Rig) -> str:
     draws, targets = 200, scene.points_rig(scene.targets)
     marks = mark_points(scene.rig, targets.repeat(draws, 1), scene.mark_sigma, scene.generator(-30))
     ranges = targets.norm(dim=-1).repeat(draws)
-    localize = StereoLocalizer(rig, pixel_sigma=scene.mark_sigma)
+    localize = Localizer(rig, pixel_sigma=scene.mark_sigma)
     share = interval_coverage(localize, marks.left, marks.right, ranges)
     return f"With {draws} other draws of the noise in the marks, {100 * share:.0f} % of the intervals contain it."
 

@@ -21,8 +21,7 @@ from kcal.texts import measured_text
 
 if TYPE_CHECKING:
     from kcal.lens.rig import Rig
-    from kcal.locate.localizer import StereoLocalizer
-    from kcal.locate.multi_localizer import MultiViewLocalizer
+    from kcal.locate.localizer import Localizer
     from kcal.locate.positions import Located
     from kcal.locate.tables import PositionColumns
     from kcal.pipeline.association import AssociationOptions
@@ -135,7 +134,6 @@ def live_command(
 
     `detector | kcal live rig.json --detections - -o tracks.csv --to udp://239.2.3.1:6969`
     """
-    from kcal.locate.multi_localizer import MultiViewLocalizer
     from kcal.locate.stations import names_of_rig
     from kcal.pipeline.association import AssociationOptions
     from kcal.pipeline.grouping import read_moment
@@ -163,7 +161,7 @@ def live_command(
     clock = ClockPrior(offset_s=clock_offset, offset_sigma_s=clock_sigma, drift_sigma=clock_sigma / 3600.0)
     options = AssociationOptions(box_sigma=box_sigma)
     localize, run = _stations(rig, pixel_sigma) if many else _mast(rig, origin, heading, pixel_sigma)
-    solved = localize if isinstance(localize, MultiViewLocalizer) else localize.rig
+    solved = localize if many else localize.rig
 
     if compiled:
         err.print("compiling: some three minutes the first time")
@@ -220,14 +218,10 @@ def live_command(
             err.print(f"{whose} images are {late} later than their times say", markup=False)
 
 
-def _moments(
-    history: Path, localize: StereoLocalizer | MultiViewLocalizer
-) -> tuple[Callable[[float], StereoLocalizer], int]:
+def _moments(history: Path, localize: Localizer) -> tuple[Callable[[float], Localizer], int]:
     """The rig as it stands at each second, by a history that grows; and how many errors more that has."""
-    from kcal.locate.localizer import StereoLocalizer
     from kcal.watch.watcher import MORE_ERRORS, Followed
 
-    assert isinstance(localize, StereoLocalizer)
     return Followed(history, localize), MORE_ERRORS
 
 
@@ -246,28 +240,26 @@ def summary(counts: StreamCounts) -> str:
     return "; ".join(parts)
 
 
-def _mast(
-    rig: Path, origin: str | None, heading: float | None, pixel_sigma: float | None
-) -> tuple[StereoLocalizer, Located]:
+def _mast(rig: Path, origin: str | None, heading: float | None, pixel_sigma: float | None) -> tuple[Localizer, Located]:
     """Two cameras, and how positions of them are told."""
     from kcal.io.rig_file import load_rig
     from kcal.lens.rig import Origin
-    from kcal.locate.positions import located_by
-    from kcal.locate.tabulate import Locator
+    from kcal.locate.localizer import Localizer
+    from kcal.locate.points import PointLocator
 
     known, place = load_rig(rig), None if origin is None else Origin.parse(origin)
     if known.mounting is not None and {"origin", "heading"} <= taken:
         place = heading = None
         err.print("the position of the rig is that in its file, not that in kcal.toml")
     noise = pixel_sigma_of(pixel_sigma, known)
-    locate = Locator(known, origin=place, heading_deg=heading, pixel_sigma=noise)
-    return locate.localize, located_by(locate)
+    localize = Localizer(known, weights="marks", origin=place, heading_deg=heading, pixel_sigma=noise)
+    return localize, PointLocator(localize).located()
 
 
-def _stations(rig: Path, pixel_sigma: float | None) -> tuple[MultiViewLocalizer, Located]:
+def _stations(rig: Path, pixel_sigma: float | None) -> tuple[Localizer, Located]:
     """Many cameras, and how positions of them are told."""
-    from kcal.locate.multi_localizer import MultiViewLocalizer
-    from kcal.locate.station_positions import stations_head
+    from kcal.locate.localizer import Localizer
+    from kcal.locate.points import PointLocator
     from kcal.locate.stations import load_camera_rig
 
     known = load_camera_rig(rig)
@@ -275,14 +267,14 @@ def _stations(rig: Path, pixel_sigma: float | None) -> tuple[MultiViewLocalizer,
         raise InputError(
             f"{rig}: this rig has no place on the Earth; solve it with landmarks or positions with latitudes"
         )
-    localize = MultiViewLocalizer(known, pixel_sigma=pixel_sigma_of(pixel_sigma, known))
-    return localize, stations_head(localize)
+    localize = Localizer(known, weights="all", pixel_sigma=pixel_sigma_of(pixel_sigma, known))
+    return localize, PointLocator(localize).located()
 
 
 def _videos(
     videos: list[str],
     detector: str,
-    rig: Rig | MultiViewLocalizer,
+    rig: Rig | Localizer,
     tracker: Tracker,
     options: AssociationOptions,
     match_sigma: float,

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from kcal.cli.console import err, mark_again, out, print_table, print_wrote, steps, warn, with_command
-from kcal.cli.inputs import MARKS, RIG, SURVEY, PixelSigma, pixel_sigma_and_source, typed_with
+from kcal.cli.inputs import MARKS, RIG, SURVEY, PixelSigma, pixel_sigma_and_source
 from kcal.cli.settings import rarely, taken
 from kcal.cli.stations import parse_height
 from kcal.errors import DegenerateError, InputError
@@ -24,18 +24,18 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from kcal.lens.rig import Origin, Rig
+    from kcal.locate.marks import Marks
+    from kcal.locate.points import PointLocator, PositionSample
     from kcal.locate.positions import Located
-    from kcal.locate.station_positions import PositionSample, ViewsLocator
     from kcal.locate.tables import PositionColumns
-    from kcal.locate.tabulate import Locator
 
-    Locate = Callable[[Sequence[str], Tensor, Tensor | None, dict[str, list[str]] | None], PositionColumns]
+    Locate = Callable[[Marks], tuple[PositionColumns, Tensor | None]]
 
 
 # Rows of a table that are located by a watched rig, each as the rig stood at its time.
 
 
-def located_at(history: Path, rig: Rig, locator: Callable[[Rig], Locator]) -> Locate:
+def located_at(history: Path, rig: Rig, locator: Callable[[Rig], PointLocator]) -> Locate:
     """What locates rows with a column `time`: by the rig of that second.
 
     Args:
@@ -49,31 +49,27 @@ def located_at(history: Path, rig: Rig, locator: Callable[[Rig], Locator]) -> Lo
 
     watched: Watched | None = None
 
-    def locate(
-        names: Sequence[str], pixels: Tensor, cov: Tensor | None, extras: dict[str, list[str]] | None
-    ) -> PositionColumns:
+    def locate(marks: Marks) -> tuple[PositionColumns, Tensor | None]:
         nonlocal watched
-        texts = (extras or {}).get("time")
+        texts = marks.extras.get("time")
         if texts is None:
             raise InputError("--watch: the table needs a column time (Unix seconds, or like 2026-05-01T12:00:00Z)")
         times = []
-        for name, text in zip(names, texts, strict=True):
+        for name, text in zip(marks.names, texts, strict=True):
             try:
                 times.append(round(seconds_of(text)))
             except InputError as error:
                 raise InputError(f"{name}: {error}") from None
         if not times:
-            return locator(rig)(names, pixels, cov, extras)
+            return locator(rig)(marks)
         if watched is None or min(times) < watched.since or max(times) > watched.until:
             watched = Watched.read(history, rig, since=min(times), until=max(times))
         parts = []
         for time, group in itertools.groupby(range(len(times)), times.__getitem__):
             rows = list(group)
-            part = slice(rows[0], rows[-1] + 1)
-            own = {name: cells[part] for name, cells in (extras or {}).items()}
             standing = locator(watched.rig_at(float(time)))
-            parts.append(standing(names[part], pixels[part], None if cov is None else cov[part], own))
-        return PositionColumns.joined(parts)
+            parts.append(standing(marks.rows(slice(rows[0], rows[-1] + 1)))[0])
+        return PositionColumns.joined(parts), None
 
     return locate
 
@@ -121,6 +117,7 @@ def tell_located(
             "statuses": sample.statuses,
             "warnings": list(doubts),
             "pixel_sigma": located.pixel_sigma,
+            "frame": located.frame,
             "interval": located.interval_note,
             "geoid": located.geoid,
             "written": list(map(str, written)),
@@ -161,7 +158,10 @@ def _print_positions(located: Located, true: Tensor | None, statuses: dict[str, 
             out.print(f"* {one_line(position.name)}: {position.reason}", markup=False)
     noise = "the noise that the CSV states" if stated else f"{located.pixel_sigma:g} px of noise"
     out.print(f"Interval: {located.interval_note}; marks have {noise}.")
-    out.print(f"Heights are ellipsoidal; geoid: {located.geoid or 'none found'}.")
+    if located.origin is None:
+        out.print(f"This rig has no place on the Earth: positions are meters, {located.frame}.")
+    else:
+        out.print(f"Heights are ellipsoidal; geoid: {located.geoid or 'none found'}.")
 
 
 # What `kcal locate` does with a table, part by part: pairs of a rig of two cameras, or marks of any number of them.
@@ -212,14 +212,12 @@ class LocateRun(NamedTuple):
 
     Attributes:
         locate: by which it is.
-        empty: what is known of all positions, without any.
         parts: locates it, part by part.
         doubts: what the rig's file warns of.
         note: where the noise of marks is from, to be said if the table does not state it.
     """
 
-    locate: Locator | ViewsLocator
-    empty: Located
+    locate: PointLocator
     parts: Iterator[LocatedPart]
     doubts: Sequence[str]
     note: str
@@ -227,23 +225,42 @@ class LocateRun(NamedTuple):
 
 def locate_run(rig: Path, points: Path, options: LocateOptions) -> LocateRun:
     """Read a rig and begin a table: marks of several cameras, or of one with a height or a terrain, or pairs."""
-    from kcal.locate.marks import is_long
-    from kcal.locate.stations import names_of_rig
-
-    alone = options.height is not None or options.terrain is not None
-    if alone or is_long(points) or len(names_of_rig(rig)) != 2:
-        return _of_stations(rig, points, options)
-    return _of_pairs(rig, points, options)
-
-
-def _of_stations(rig: Path, points: Path, options: LocateOptions) -> LocateRun:
-    from kcal.locate.marks import read_mark_chunks
+    from kcal.io.rig_file import load_rig
+    from kcal.locate.localizer import Localizer
+    from kcal.locate.marks import is_long, read_mark_chunks
+    from kcal.locate.points import PointLocator
     from kcal.locate.raster import terrain
-    from kcal.locate.station_positions import ViewsLocator
-    from kcal.locate.stations import load_camera_rig
+    from kcal.locate.stations import load_camera_rig, names_of_rig
     from kcal.locate.tabulate import find_geoid
 
     own = options
+    many = own.height is not None or own.terrain is not None or is_long(points) or len(names_of_rig(rig)) != 2
+    if many:
+        _refuse_of_pairs(own)
+    elif own.aged and own.watch:
+        raise typer.BadParameter("--aged guesses what the history of --watch tells: give either")
+    solved = load_camera_rig(rig) if many else load_rig(rig)
+    noise, note = pixel_sigma_and_source(own.pixel_sigma, solved)
+    doubts = _warned(rig, solved.calibration.warnings if solved.calibration else ())
+    by_moments: Locate | None = None
+    if many:
+        ground = None if own.terrain is None else terrain(own.terrain, own.geoid_height)
+        locate = PointLocator(
+            Localizer(solved, weights="all", pixel_sigma=noise), geoid=find_geoid(own.geoid), ground=ground,
+            height=own.height if ground is None else (0.0, own.terrain_sigma),
+        )  # fmt: skip
+    else:
+        locate, by_moments = _of_pairs(solved, own, noise)
+
+    def parts() -> Iterator[LocatedPart]:
+        for marks, read in read_mark_chunks(points, solved.names, single=many):
+            columns, feet = (by_moments or locate)(marks)
+            yield LocatedPart(columns, feet, marks.covariance_or(noise) is not None, read)
+
+    return LocateRun(locate, parts(), doubts, note)
+
+
+def _refuse_of_pairs(own: LocateOptions) -> None:
     elsewhere = any(
         (
             own.place, own.yaw_sigma, own.heading_sigma, own.origin_sigma, own.refraction, own.refraction_sigma,
@@ -257,74 +274,42 @@ def _of_stations(rig: Path, points: Path, options: LocateOptions) -> LocateRun:
         )
     if own.height is not None and own.terrain is not None:
         raise typer.BadParameter("--height and --terrain both say where a thing that one camera saw stands: give one")
-    stations = load_camera_rig(rig)
-    noise, note = pixel_sigma_and_source(own.pixel_sigma, stations)
-    ground = None if own.terrain is None else terrain(own.terrain, own.geoid_height)
-    height = own.height if ground is None else (0.0, own.terrain_sigma)
-    locate = ViewsLocator(stations, pixel_sigma=noise, height=height, ground=ground, geoid=find_geoid(own.geoid))
-
-    def parts() -> Iterator[LocatedPart]:
-        for marks, read in read_mark_chunks(points, stations.names, single=True):
-            yield LocatedPart(*locate(marks), marks.covariance_or(noise) is not None, read)
-
-    doubts = _warned(rig, stations.calibration.warnings if stations.calibration else ())
-    return LocateRun(locate, locate.located(), parts(), doubts, note)
 
 
-def _of_pairs(rig: Path, points: Path, options: LocateOptions) -> LocateRun:
-    from kcal.io.rig_file import load_rig
+def _of_pairs(solved: Rig, own: LocateOptions, noise: float) -> tuple[PointLocator, Locate | None]:
+    """What locates pairs, and what does so by the history of a watched rig."""
     from kcal.lens.rig import RigCovariance
-    from kcal.locate.marks import read_mark_chunks
+    from kcal.locate.localizer import Localizer
     from kcal.locate.mounting import run_errors
-    from kcal.locate.positions import located_by
-    from kcal.locate.tabulate import Locator, find_geoid, true_from_grid
+    from kcal.locate.points import PointLocator
+    from kcal.locate.tabulate import find_geoid, true_from_grid
     from kcal.watch.turned import parse_aging
 
-    own = options
-    if own.aged and own.watch:
-        raise typer.BadParameter("--aged guesses what the history of --watch tells: give either")
     yaw_sigma = math.hypot(own.yaw_sigma, parse_aging(own.aged))
-    solved, place, heading = load_rig(rig), own.place, own.heading
-    noise, note = pixel_sigma_and_source(own.pixel_sigma, solved)
+    place, heading = own.place, own.heading
     if solved.mounting is not None and {"origin", "heading"} <= taken:
         # What the rig was solved with is better known.
         place = heading = None
         err.print("the position of the rig is that in its file, not that in kcal.toml")
-    doubts = _warned(rig, solved.calibration.warnings if solved.calibration else ())
-    if place is None or heading is None:
-        if solved.mounting is None:
-            raise InputError(
-                f"{rig}: the file has no position of the rig; give --origin and --heading. If you only need meters "
-                "from the left camera, the columns east_m, north_m and up_m: "
-                + typed_with({}, "--origin", "0,0,0", "--heading", "0")
-            )
-    elif own.grid is not None:
+    if place is not None and heading is not None and own.grid is not None:
         heading = true_from_grid(heading, place, own.grid)
 
-    def locator(standing: Rig) -> Locator:
+    def locator(standing: Rig) -> PointLocator:
         errors = run_errors(
             standing, yaw_deg=yaw_sigma, heading_deg=own.heading_sigma, origin_m=own.origin_sigma,
             elsewhere=place is not None,
         )  # fmt: skip
-        return Locator(
-            standing, geoid=find_geoid(own.geoid), origin=place, heading_deg=heading, pitch_deg=own.pitch,
-            roll_deg=own.roll, pixel_sigma=noise, calibration=errors.calibration, mounting=errors.mounting,
-            link=errors.link, refraction=own.refraction, refraction_sigma=own.refraction_sigma,
+        localize = Localizer(
+            standing, weights="marks", origin=place, heading_deg=heading, pitch_deg=own.pitch, roll_deg=own.roll,
+            pixel_sigma=noise, calibration=errors.calibration, mounting=errors.mounting, link=errors.link,
+            refraction=own.refraction, refraction_sigma=own.refraction_sigma,
         )  # fmt: skip
+        return PointLocator(localize, geoid=find_geoid(own.geoid))
 
     if own.watch is not None and solved.covariance is None:
         # Not exact: moments add what is not known of them.
         solved.covariance = RigCovariance.of(solved)
-    locate = locator(solved)
-    by_moments = None if own.watch is None else located_at(own.watch, solved, locator)
-
-    def parts() -> Iterator[LocatedPart]:
-        for marks, read in read_mark_chunks(points):
-            cov = marks.covariance_or(noise)
-            columns = (by_moments or locate)(marks.names, marks.pixels, cov, dict(marks.extras))
-            yield LocatedPart(columns, None, cov is not None, read)
-
-    return LocateRun(locate, located_by(locate), parts(), doubts, note)
+    return locator(solved), None if own.watch is None else located_at(own.watch, solved, locator)
 
 
 def _warned(rig: Path, doubts: Sequence[str]) -> Sequence[str]:
@@ -483,9 +468,9 @@ def locate_command(
     `kcal locate towers.rig.json smoke.csv --height 240±30 --map map.html`
     """
     from kcal.lens.rig import Origin
-    from kcal.locate.export import STREAM, check_format, open_writers
-    from kcal.locate.positions import read_truth
-    from kcal.locate.station_positions import PositionSample
+    from kcal.locate.export import STREAM, check_format, check_place, open_writers
+    from kcal.locate.points import PositionSample
+    from kcal.locate.positions import NOWHERE, read_truth
     from kcal.locate.survey import read_survey
 
     outputs = output or []
@@ -523,12 +508,19 @@ def locate_command(
             geoid_height=geoid_height, geoid=geoid,
         ),
     )  # fmt: skip
-    survey = None if truth is None else read_survey(truth, run.empty.origin, measured=False)
+    empty = run.locate.located()
+    for path in outputs:
+        check_place(f"positions{suffix}" if path == STREAM else path, empty)
+    if not empty.origin:
+        for option, given in (("--map", web_map), ("--picture", picture), ("--truth", truth)):
+            if given is not None:
+                raise InputError(f"{option}: {NOWHERE}")
+    survey = None if truth is None else read_survey(truth, empty.origin, measured=False)
     sample = PositionSample(frozenset(survey.names if survey else ()))
     with written_files() as written:
         try:
             size = points.stat().st_size if points.is_file() else None
-            with open_writers(outputs, run.empty, suffix) as writers, steps("locating", size) as advance:
+            with open_writers(outputs, empty, suffix) as writers, steps("locating", size) as advance:
                 read, stated = 0, False
                 for part in run.parts:
                     stated = stated or part.stated

@@ -122,7 +122,7 @@ class Mounting:
             the coefficient of refraction; (6, 6) where nothing was found of the last; None: exact.
         link: (P, 7) or (P, 6) covariance of the rig's P quantities, in the order of `RigCovariance`, with these; None:
             independent.
-        refraction: coefficient k, see `StereoLocalizer`; None: nothing was found of it.
+        refraction: coefficient k, see `Localizer`; None: nothing was found of it.
 
     Example:
         >>> Mounting(origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=35.0).pitch_deg
@@ -170,7 +170,7 @@ class Rig(Movable, StatedModule):
         translation: (V, 3) meters, likewise; or (3,).
         center: (V, 3) projection centers in the rig frame, meters, in place of the translation.
         origin: where the frame is anchored on the Earth.
-        refraction: coefficient k, see `StereoLocalizer`.
+        refraction: coefficient k, see `Localizer`.
 
     Raises:
         InputError: wrong shapes, values that are not finite, names that are there twice, or a matrix that is no
@@ -493,7 +493,7 @@ class Rig(Movable, StatedModule):
             refraction: of its coefficient.
 
         Returns:
-            (K, P): set it as `rig.root`, or give it to `MultiViewLocalizer`.
+            (K, P): set it as `rig.root`, or give it to `Localizer`.
 
         Example:
             >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")

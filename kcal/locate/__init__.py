@@ -1,4 +1,4 @@
-"""Positions, triangulation, the ground and geodesy; `StereoLocalizer` and `locate_points` are in `kcal`."""
+"""Positions, triangulation, the ground and geodesy; `Localizer` and `locate_points` are in `kcal`."""
 
 from kcal.doors import door
 

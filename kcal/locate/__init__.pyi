@@ -10,10 +10,6 @@ from kcal.locate.export import write_positions as write_positions
 from kcal.locate.triangulate import Triangulate as Triangulate
 from kcal.locate.disparity import DisparityRanges as DisparityRanges
 
-# Any number of cameras
-from kcal.locate.multi_localizer import MultiViewLocalizer as MultiViewLocalizer
-from kcal.locate.station_positions import locate_views as locate_views
-
 # Points on the ground
 from kcal.locate.ground import locate_on_ground as locate_on_ground
 from kcal.locate.ground import level_ground as level_ground

@@ -173,7 +173,7 @@ def triangulate_angular(cam_from_world: Tensor, rays: Tensor, seen: Tensor | Non
         ray, first = (one * directions).sum(-2), (one * centers[..., None, :, :]).sum(-2)
         sound = (usable[..., 0] | ~seen).all(-1) & (seen.sum(-1) > 1)
         ray = torch.where(sound[..., None], ray, ray.new_tensor([0.0, 0.0, 1.0]))
-    points, valid = _several(ray, directions.unbind(-2), first[..., None, :] - centers[..., None, :, :], seen)
+    points, valid = _several_rays(ray, directions.unbind(-2), first[..., None, :] - centers[..., None, :, :], seen)
     valid = valid & sound
     return Found(first + torch.where(valid[..., None], points, 0.0), valid)
 
@@ -201,7 +201,7 @@ def checked_rays(cam_from_world: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
     return cam_from_world, rays
 
 
-def _several(ray: Tensor, world: Sequence[Tensor], shifts: Tensor, seen: Tensor | None) -> tuple[Tensor, Tensor]:
+def _several_rays(ray: Tensor, world: Sequence[Tensor], shifts: Tensor, seen: Tensor | None) -> tuple[Tensor, Tensor]:
     """Points from the camera with the ray `ray`; `shifts` (..., 1 or N, C, 3) lead from each center to its own."""
     spread = torch.linalg.vector_norm(shifts, dim=-1).amax(-1)
     spread = torch.where(spread > 0, spread, 1.0)

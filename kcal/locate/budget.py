@@ -16,10 +16,10 @@ from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import Rig
 from kcal.locate.geodesy import enu_from_cam
+from kcal.locate.localizer import Localizer
 from kcal.locate.max_likelihood import calibration_effect
 from kcal.locate.mounting import by_mounting
-from kcal.locate.multi_localizer import MultiViewLocalizer, ViewsLocalization
-from kcal.locate.stereo import BEARING_SIGMAS, PositionStatus, checked_rig, sight_lines
+from kcal.locate.stereo import BEARING_SIGMAS, Localization, PositionStatus, checked_rig, sight_lines
 from kcal.locate.views import fit_pairs
 from kcal.threads import in_one_thread
 
@@ -367,7 +367,7 @@ def station_sigmas(rig: Rig, distance: float, *, pixel_sigma: float = 0.3) -> Ra
     # With exact lenses, what their errors have in common with the poses is known too.
     exact = root - within @ (within.T @ root)
     marks, without, total = (
-        _range_sigma(MultiViewLocalizer(rig, pixel_sigma=pixel_sigma, root=known)(pixels, seen), rays, distance)
+        _range_sigma(Localizer(rig, weights="all", pixel_sigma=pixel_sigma, root=known)(pixels, seen), rays, distance)
         for known in (torch.zeros_like(root), exact, root)
     )
     worst = total.nan_to_num(nan=torch.inf).argmax()
@@ -390,7 +390,7 @@ def _points_before(rig: Rig, distance: float) -> tuple[Tensor, Tensor]:
     return torch.cat(points), torch.cat(all_rays)
 
 
-def _range_sigma(found: ViewsLocalization, rays: Tensor, distance: float) -> Tensor:
+def _range_sigma(found: Localization, rays: Tensor, distance: float) -> Tensor:
     """(N,) meters along rays (N, 3); by the inverse range of what has a bearing only; infinite if unknown."""
     ok = found.status == int(PositionStatus.OK)
     along = (rays * (torch.where(ok[:, None, None], found.covariance, 0.0) @ rays[..., None])[..., 0]).sum(-1).sqrt()

@@ -11,8 +11,7 @@ from torch import Tensor
 from kcal.checks import Float64Module, as_tensor, exportable, scalar
 from kcal.errors import InputError
 from kcal.lens.images import StereoRectification
-from kcal.locate.geodesy import Origin
-from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.localizer import Localizer
 from kcal.texts import brief
 
 # Pixels for the derivatives of resampling, whose curvature is far below that of lenses over a pixel.
@@ -46,9 +45,9 @@ class RangeImage(NamedTuple):
 class DisparityRanges(Float64Module):
     """Map disparities of rectified images to ranges and their standard deviations.
 
-    Every pixel is located by `StereoLocalizer` in the images as they were taken, so that lenses, entrance pupils and
+    Every pixel is located by `Localizer` in the images as they were taken, so that lenses, entrance pupils and
     the joint covariance of the rig (`Rig.covariance`, exact if there is none) count in full. Results carry no
-    gradients; those of `StereoRectification.points` and `StereoLocalizer` do.
+    gradients; those of `StereoRectification.points` and `Localizer` do.
 
     Args:
         rectification: of the images.
@@ -76,12 +75,8 @@ class DisparityRanges(Float64Module):
             raise InputError(f"disparity_sigma {disparity_sigma}: positive pixels are needed")
         self.rectification = rectification
         self.register_buffer("disparity_sigma", scalar(disparity_sigma, rectification.rotation))
-        # Ranges do not depend on where the rig stands. Light is taken to be straight, which moves ranges by nothing
-        # that can be measured.
-        self.localize = StereoLocalizer(
-            rectification.rig, origin=Origin(lat=0.0, lon=0.0, height=0.0), heading_deg=0.0, refraction=0.0,
-            refraction_sigma=0.0,
-        )  # fmt: skip
+        # Ranges do not depend on where the rig stands, and light that bends moves them by nothing that can be measured.
+        self.localize = Localizer(rectification.rig, weights="marks")
 
     @torch.no_grad()
     def forward(self, disparity: Tensor) -> RangeImage:

@@ -20,7 +20,7 @@ import orjson
 
 from kcal.errors import InputError
 from kcal.files import open_atomic
-from kcal.locate.positions import CORNER_DECIMALS, REGION_SHARE, Located, cut_at_antimeridian, ring_blocks
+from kcal.locate.positions import CORNER_DECIMALS, NOWHERE, REGION_SHARE, Located, cut_at_antimeridian, ring_blocks
 from kcal.locate.stereo import PositionStatus
 from kcal.locate.tables import NUMBERS, TEXTS, PositionColumns, guarded, is_number, number_lines
 from kcal.texts import csv_line, one_line, visible
@@ -79,7 +79,7 @@ def kml_regions(columns: PositionColumns, run: Located) -> str:
     """A polygon for each row that has a position."""
     names = [columns.names[i] for i in np.flatnonzero(columns.located).tolist()]
     placemarks = []
-    rings = (ring for block in ring_blocks(columns, run.origin, plain=run.feet is not None) for ring in block)
+    rings = (ring for block in ring_blocks(columns, run.place, plain=run.feet is not None) for ring in block)
     for name, ring in zip(names, rings, strict=True):
         corners = np.stack([(ring[:, 1] + 180.0) % 360.0 - 180.0, ring[:, 0]], -1)
         places = number_lines(corners.round(CORNER_DECIMALS))
@@ -160,7 +160,7 @@ def point_features(columns: PositionColumns) -> Iterator[bytes]:
 def region_features(columns: PositionColumns, run: Located) -> Iterator[bytes]:
     """A polygon for each position: its 95 % region, a long and slightly skewed ellipse."""
     names = iter([columns.names[place] for place in np.flatnonzero(columns.located).tolist()])
-    for block in ring_blocks(columns, run.origin, plain=run.feet is not None):
+    for block in ring_blocks(columns, run.place, plain=run.feet is not None):
         corners = np.ascontiguousarray(block[..., ::-1]).round(CORNER_DECIMALS)
         beyond = (np.abs(block[..., 1]).max(-1) > 180.0).tolist()
         # Section 3.1.6: closed, counterclockwise; section 3.1.9: a polygon across the antimeridian is cut in two.
@@ -241,7 +241,7 @@ def cot_events(columns: PositionColumns, run: Located, *, time: datetime | None 
         raise InputError(f"stale_s {stale_s}: a positive number of seconds is needed")
     moment = moment.astimezone(UTC)
     start, stale = _stamp(moment), _stamp(moment + timedelta(seconds=stale_s))
-    station = f"{run.origin.lat!r} {run.origin.lon!r}"
+    station = f"{run.place.lat!r} {run.place.lon!r}"
     remark = escape(f"kcal: ce and le contain 95 %; {run.interval_note}")
     found = columns.rows(np.flatnonzero(columns.located))
     vertical = 1.96 * np.sqrt(np.maximum(found.column("cov_uu_m2"), 0.0))
@@ -283,6 +283,8 @@ _SPECIAL = re.compile(r"[^\w .:/\n-]|^[^\w.\n]", re.MULTILINE)
 # Names of properties and columns that further columns of a table must not have.
 _TAKEN = {"kind", *TEXTS, *NUMBERS}
 _STATUSES = {int(status): status.name.lower() for status in PositionStatus}
+_MOVED = {"east_m": "x_m", "north_m": "y_m", "up_m": "z_m"}
+_AXES = str.maketrans("enu", "xyz")
 
 
 class _Format(NamedTuple):
@@ -318,14 +320,28 @@ def _json_lines(run: Located, columns: PositionColumns, time: datetime) -> bytes
     return b"".join(line + b"\n" for line in lines)
 
 
+# The numbers of a rig that has no place on the Earth, by their names there: x, y and z for east, north and up.
+_OWN_FRAME = {
+    name: re.sub("cov_(..)", lambda found: f"cov_{found[1].translate(_AXES)}", _MOVED.get(name, name))
+    for name in NUMBERS
+    if not name.startswith(("lat", "lon", "height", "geoid", "cep", "azimuth", "elevation"))
+}
+_OWN_COLUMNS = [NUMBERS.index(name) for name in _OWN_FRAME]
+
+
 def _csv_start(run: Located, columns: PositionColumns) -> bytes:
-    return csv_line([*TEXTS, *NUMBERS, *columns.extras]).encode()
+    numbers = NUMBERS if run.origin else ("frame", *_OWN_FRAME.values())
+    return csv_line([*TEXTS, *numbers, *columns.extras]).encode()
 
 
 def _csv_rows(run: Located, columns: PositionColumns, time: datetime) -> bytes:
     statuses = [_STATUSES[code] for code in columns.status.tolist()]
     texts = [_csv_cells(columns.names), statuses, _csv_cells(columns.reasons)]
-    cells = [*texts, number_lines(columns.numbers), *map(_csv_cells, columns.extras.values())]
+    numbers = columns.numbers
+    if run.origin is None:
+        texts.append(_csv_cells([run.frame] * len(statuses)))
+        numbers = np.ascontiguousarray(numbers[:, _OWN_COLUMNS])
+    cells = [*texts, number_lines(numbers), *map(_csv_cells, columns.extras.values())]
     return "".join([",".join(row) + "\n" for row in zip(*cells, strict=True)]).encode()
 
 
@@ -365,6 +381,12 @@ _FORMATS = {
 
 # Rows of these can be appended one after another; a .cot file then lacks the end of its document.
 APPENDED = (".geojsonl", ".csv", ".cot")
+
+
+def check_place(path: str | Path, run: Located) -> None:
+    """Raise `InputError` for a file of latitudes where there are none."""
+    if run.origin is None and Path(path).suffix.lower() != ".csv":
+        raise InputError(f"{path}: {NOWHERE}; or write .csv")
 
 
 def check_format(path: str | Path) -> None:
@@ -408,6 +430,7 @@ class PositionWriter:
     """
 
     def __init__(self, file: BinaryIO, suffix: str, run: Located) -> None:
+        check_place(f"positions{suffix}", run)
         self._file, self._run, self._format = file, run, _FORMATS[suffix.lower()]
         self._later = tempfile.TemporaryFile() if self._format.later is not None else None  # noqa: SIM115
         self._started = False
@@ -445,6 +468,8 @@ def open_writers(paths: Sequence[Path], run: Located, stream_suffix: str = ".csv
         run: how the positions are located.
         stream_suffix: the format of `STREAM`.
     """
+    for path in paths:
+        check_place(f"positions{stream_suffix}" if path == STREAM else path, run)
     with ExitStack() as stack:
         writers = []
         for path in paths:
@@ -472,16 +497,17 @@ def write_positions(path: str | Path, located: Located) -> Path:
 
     Example:
         >>> import torch
-        >>> from kcal import Origin, locate_points
+        >>> from kcal import Localizer, Origin, locate_points
+        >>> from kcal.locate import Marks
         >>> from kcal.rig import planned_rig
-        >>> left, right = planned_rig()(torch.tensor([[0.0, 0.0, 1000.0]]))[0].unbind(-2)
-        >>> located = locate_points(planned_rig(), left, right, origin=Origin(lat=19.07, lon=72.87, height=14.0),
-        ...                         heading_deg=0.0)
+        >>> localize = Localizer(planned_rig(), origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
+        >>> located = locate_points(localize, Marks(("1",), planned_rig()(torch.tensor([[0.0, 0.0, 1000.0]]))[0]))
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     write_positions(Path(folder, "positions.csv"), located).read_text().splitlines()[1][:4]
         '1,ok'
     """
     check_format(path)
+    check_place(path, located)
     with open_atomic(path) as file:
         writer = PositionWriter(file, Path(path).suffix, located)
         writer.add(located.columns)

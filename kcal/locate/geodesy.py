@@ -144,7 +144,7 @@ def mean_radius(lat_deg: float) -> float:
 #   ellipsoid has fallen 1.96 m below the tangent plane, and the conversion here accounts for it.
 # * Heights are ellipsoidal (WGS84, what GNSS receivers call HAE), not above mean sea level; the two differ by up to
 #   100 m (`kcal.locate.tabulate` has the difference where a geoid grid is at hand).
-# * Refraction of light is part of `StereoLocalizer`, not of this module: 0.26 m of height at 5 km in standard air.
+# * Refraction of light is part of `Localizer`, not of this module: 0.26 m of height at 5 km in standard air.
 # * Headings count clockwise from true north, not from magnetic or grid north
 #   (`kcal.locate.tabulate` converts the latter).
 # * Order is latitude, longitude, height everywhere but in GeoJSON.

@@ -22,7 +22,7 @@ from kcal.texts import brief
 # One camera: pixels to places on the ground, a level surface or a terrain model, with their errors.
 #
 # A line of sight is followed outward until it is below the ground for the first time: what lies behind is hidden. Light
-# bends as for `StereoLocalizer`, and the ellipsoid falls away below the tangent plane.
+# bends as for `Localizer`, and the ellipsoid falls away below the tangent plane.
 
 # Height above the ellipsoid, meters, of latitudes and longitudes (degrees, of one shape); NaN where it is not known.
 Ground = Callable[[Tensor, Tensor], Tensor]

@@ -1,116 +1,115 @@
-"""`StereoLocalizer`: a module from a detector's pixels to positions on the Earth with their errors."""
+"""`Localizer`: a module from pixels to positions on the Earth, or in the rig's own frame, with their errors."""
 
 from __future__ import annotations
 
 import math
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, Literal, Self, TypeAlias, get_args
 
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
-from kcal.checks import as_covariance, expanded, exportable, scalar
-from kcal.dispatch import is_differentiated
+from kcal.checks import StatedModule, as_covariance, as_points, expanded, scalar
+from kcal.dispatch import is_differentiated, is_traced, known_true
 from kcal.errors import InputError
 from kcal.io.rig_file import load_rig
 from kcal.lens.pose import Movable, rotation_from_vector
-from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Origin, Rig, RigCovariance, check_refraction
-from kcal.locate.geodesy import anchor, enu_from_cam, mean_radius, place_enu
+from kcal.lens.rig import (
+    REFRACTION,
+    REFRACTION_SIGMA,
+    Mounting,
+    Origin,
+    Rig,
+    RigCovariance,
+    check_refraction,
+)
+from kcal.locate.geodesy import (
+    anchor,
+    ecef_from_enu_rotation,
+    enu_from_cam,
+    enu_to_geodetic,
+    mean_radius,
+    place_enu,
+)
+from kcal.locate.ground import EarthFrame, Ground, stated_ahead
 from kcal.locate.max_likelihood import by_pose, calibration_effect, inverse_variance, position_slope, symmetric
-from kcal.locate.mounting import attitude, by_mounting
+from kcal.locate.mounting import attitude, by_mounting, rig_errors, station_mounting, two_stations
 from kcal.locate.stereo import (
+    Localization,
     PositionStatus,
+    Sensitivity,
+    checked_mask,
     checked_pair_covariance,
     checked_pairs,
     checked_rig,
+    checked_sigma,
+    checked_views,
+    checked_views_covariance,
+    flag_positions,
+    joint_covariance,
     piece_by_piece,
-    range_where_ok,
     reprojection_errors,
-    status_counts,
 )
-from kcal.locate.views import ViewsFit, fit_pairs, reach_of
+from kcal.locate.views import (
+    CommonErrors,
+    PosedCameras,
+    ViewsFit,
+    errors_by_camera,
+    fit_pairs,
+    fit_views,
+    reach_of,
+)
 from kcal.operation import Operations, shapes_of
-from kcal.texts import brief
+
+Weights = Literal["marks", "all"]
+# How seldom good views are taken for bad ones.
+_BAD, _DOUBTFUL = 1e-4, 1e-2
+# Sigma of a height, whether there are derivatives, and the ground.
+_Options: TypeAlias = "tuple[float, bool, Ground | None]"
 
 
-@exportable
-class Localization(NamedTuple):
-    """Result of `StereoLocalizer`; nothing in it is NaN, whatever went in. Look at `status` before anything else.
+class Localizer(Operations, Movable, StatedModule):
+    """Locate what two or more cameras of a calibrated rig saw, with an error bar.
 
-    Attributes:
-        enu: (..., N, 3) meters east, north, up of the left camera; zeros unless the status is OK.
-        covariance: (..., N, 3, 3) of `enu`, to first order; an infinite diagonal unless OK. At long range a position
-            is skewed along the line of sight: quote the range interval.
-        geodetic: (..., N, 3) latitude, longitude (degrees), ellipsoidal WGS84 height (meters); the origin unless OK.
-        range_low: (..., N) meters from the left camera, lower end of the 95 % interval.
-        range_high: (..., N) upper end, infinite where the point may be at infinity. The interval is 0 to infinity
-            where nothing is known, infinite at both ends where the rays diverge by more than the noise explains.
-        status: (..., N) int8, codes of `PositionStatus`. BEARING_ONLY: the parallax is below three of its sigmas, so
-            that a range would be noise; PARALLEL: it is not positive. Both have a bearing and an interval.
-        bearing: (..., N, 3) unit vector east, north, up; zeros where nothing is known.
-        inverse_range: (..., N) one over meters; negative where the rays diverge. Unlike the range its errors are
-            Gaussian at any distance: the quantity for losses and filters.
-        inverse_range_sigma: (..., N) its standard deviation; zero where nothing is known.
-        reprojection: (..., N, 2) distance in px between mark and reprojected point, left and right.
-    """
+    A point is the most likely one (Gauss-Newton on reprojection errors). What weighs its pixels is an option:
 
-    enu: Tensor
-    covariance: Tensor
-    geodetic: Tensor
-    range_low: Tensor
-    range_high: Tensor
-    status: Tensor
-    bearing: Tensor
-    inverse_range: Tensor
-    inverse_range_sigma: Tensor
-    reprojection: Tensor
+    * `marks`, the default of two cameras on one mount: the pixels' covariances alone. Errors in the calibration
+      (`calibration`, a joint covariance of cameras and rig), in the mounting (`mounting`) and in refraction are added
+      to the covariance. A pair counts as a whole.
+    * `all`, the default of any other rig: also the errors that a camera's pixels share, which are lens, position,
+      attitude and refraction (`Rig.root`), and clocks. Any views of a point count: two give a position, one gives a
+      bearing, or a position where the height is stated. With three or more, one that contradicts the others is left
+      out and named.
 
-    def __repr__(self) -> str:
-        return brief(self, status=status_counts(self.status))
+    Only the noise differs from point to point; all other errors move neighboring points together, so that averaging
+    over frames does not reduce them.
 
-    @property
-    def range(self) -> Tensor:
-        """(..., N) meters from the left camera; infinite unless the status is OK."""
-        return range_where_ok(self.status, self.inverse_range)
-
-
-class Sensitivity(NamedTuple):
-    """Slopes of the range, infinite where there is no range; at long range they are valid for small errors only.
-
-    Attributes:
-        meters_per_pixel: (..., N) by a shift of one of the two marks in its worst direction.
-        meters_per_degree: (..., N) by a turn of the right camera about its worst axis: relative yaw, for a rig whose
-            cameras stand side by side.
-    """
-
-    meters_per_pixel: Tensor
-    meters_per_degree: Tensor
-
-
-class StereoLocalizer(Operations, Movable):
-    """Locate matched pixels of a calibrated rig on the Earth, with an error bar.
-
-    Pixels are triangulated in closed form, refined to the maximum-likelihood position (Gauss-Newton on reprojection
-    errors, weighed by the pixels' covariances), and carried with their covariance to east, north, up and to WGS84.
-    Geometry runs in float64 whatever the pipeline around it uses. There is no branch on values under `torch.compile`
-    and `torch.export`; gradients by pixels, covariances, cameras, poses and errors are exact and finite.
-    `free("origin")` and `free("attitude")` let them reach the mounting, as `Rig.free` the rig's pose.
-
-    The covariance of a position is the sum of four parts: noise in the marks, errors in the calibration
-    (`calibration`, a joint covariance of cameras and rig), errors in the mounting (`mounting`) and, upward, what is not
-    known of refraction, together with the mounting where both come from the same landmarks. All but the noise move
-    neighboring points together, so that averaging over frames does not reduce them.
+    A rig that says where it stands, or an `origin` and a heading, give positions on the Earth: east, north, up of the
+    origin, and WGS84. Otherwise they are in the rig's own frame, which is the left camera's for two cameras.
 
     Light bends downward: a point at the level distance d is k d² / 2R lower than a straight line of sight says, with R
-    the Earth's radius and k the coefficient of refraction: 0.26 ± 0.20 m at 5 km, 0.01 m at 1 km.
+    the Earth's radius and k the coefficient of refraction: 0.26 ± 0.20 m at 5 km, 0.01 m at 1 km. With all weights,
+    it bends at each camera about that one's vertical.
+
+    Geometry runs in float64 whatever the pipeline around it uses. There is no branch on values under `torch.compile`,
+    `torch.export` and `vmap`: bad views are then sought once, and one is found; otherwise again until two are left.
+    Gradients by pixels, covariances, velocities, heights, cameras, poses and errors are exact and finite; what one
+    camera and a stated height locate has error bars without a gradient. `free("origin")` and `free("attitude")` let
+    gradients reach the mounting of two cameras, as `Rig.free` the poses.
 
     Args:
-        rig: two cameras and their relative pose. What is not given below is taken from the rig where it knows it.
+        rig: cameras and their poses. What is not given below is taken from the rig where it knows it; all but the
+            sigmas of pixels and clocks is for two cameras in the left one's frame.
+        weights: see above.
+        pixel_sigma: standard deviation of a mark along each axis, px, where no covariance is given.
+        clock_sigma: standard deviation of each camera's clock, seconds; counts where `forward` is told velocities.
+        root: (K, P) like `rig.root`, in its place: for example `rig.with_errors(...)`.
         origin: position of the left camera's projection center; with `heading_deg`, or neither: `rig.mounting`.
         heading_deg: of the left camera's axis, clockwise from true north; see `enu_from_cam`.
         pitch_deg: of the same axis, positive up.
         roll_deg: of the left camera, positive clockwise as seen from behind.
-        pixel_sigma: standard deviation of a mark along each axis, px, where no covariance is given.
         calibration: how well the rig is known; `rig.covariance` if left out, and exact if that is None.
         mounting: (6, 6) of `mounting_covariance`, or (7, 7) of `Mounting`; if left out, that of `rig.mounting`, and
             exact for an `origin` that is given.
@@ -124,45 +123,65 @@ class StereoLocalizer(Operations, Movable):
             `refraction` or its sigma is given, as for another day, landmarks say nothing of it.
 
     Raises:
-        InputError: an angle, sigma or covariance that cannot be, or a rig that does not say where it stands.
-        DegenerateError: a rig without a baseline.
+        InputError: an angle, sigma or covariance that cannot be, what does not suit the rig.
+        DegenerateError: weights by marks alone of a rig without a baseline.
 
     Example:
         >>> from kcal import Camera
         >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
         >>> rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
-        >>> localize = StereoLocalizer(rig, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0,
-        ...                            pixel_sigma=0.1)
+        >>> localize = Localizer(rig, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0,
+        ...                      pixel_sigma=0.1)
         >>> left, right = torch.tensor([[960.0, 540.0]]), torch.tensor([[944.0, 540.0]])
         >>> found = localize(left, right)
         >>> [round(value, 2) for value in found.enu[0].tolist()], round(found.covariance[0, 1, 1].sqrt().item(), 2)
         ([0.0, 1000.0, -0.01], 8.84)
         >>> round(found.range_low.item(), 1), round(found.range_high.item(), 1), PositionStatus(int(found.status)).name
         (983.0, 1017.6, 'OK')
+        >>> [round(value, 2) for value in Localizer(rig)(left, right).enu[0].tolist()]  # in the left camera's frame
+        [0.0, 0.0, 1000.0]
+        >>> look = torch.stack([enu_from_cam(heading).T for heading in (0.0, 315.0, 45.0)])
+        >>> places = torch.tensor([[0.0, 0, 30], [5000.0, 0, 40], [-5000.0, 0, 35]])
+        >>> rig = Rig([camera] * 3, ["mill", "church", "mast"], look, center=places, refraction=0.0)
+        >>> rig.root = rig.with_errors(attitude_deg=0.01)
+        >>> pixels, seen = rig(torch.tensor([[0.0, 5000, 100]]))
+        >>> found = Localizer(rig)(pixels, seen)
+        >>> found.enu.round(decimals=3).abs().tolist(), round(float(found.covariance[0, 0, 0].sqrt()), 2)
+        ([[0.0, 5000.0, 100.0]], 1.05)
     """
 
     pixel_sigma: Tensor
-    refraction: Tensor
+    clock_sigma: Tensor
     half_curvature: Tensor
-    ecef_from_enu: Tensor
+    ecef_from_enu: Tensor | None
     ecef_of_origin: Tensor
     geodetic_of_origin: Tensor
-    results = shapes_of(
-        Localization, enu=(3,), covariance=(3, 3), geodetic=(3,), status=torch.int8, bearing=(3,), reprojection=(2,)
-    )
+    refraction: Tensor
     calibration_factor: Tensor | None
     mounting: Tensor | None
     link: Tensor | None
+    up: Tensor | None
+    heights: Tensor
+    errors: Tensor | None
+    bending_errors: Tensor
+    limits: Tensor
+    results = shapes_of(
+        Localization, enu=(3,), covariance=(3, 3), geodetic=(3,), status=torch.int8, bearing=(3,), reprojection=(2,),
+        anchor=torch.int64, used=((2,), torch.bool), bad=((2,), torch.bool), misfit=(2,),
+    )  # fmt: skip
 
     def __init__(
         self,
         rig: Rig,
         *,
+        weights: Weights | None = None,
+        pixel_sigma: float = 0.3,
+        clock_sigma: float = 0.0,
+        root: Tensor | None = None,
         origin: Origin | None = None,
         heading_deg: float | None = None,
         pitch_deg: float = 0.0,
         roll_deg: float = 0.0,
-        pixel_sigma: float = 0.3,
         calibration: RigCovariance | None = None,
         mounting: Tensor | None = None,
         link: Tensor | None = None,
@@ -170,44 +189,118 @@ class StereoLocalizer(Operations, Movable):
         refraction_sigma: float | None = None,
     ) -> None:
         super().__init__()
-        place = rig.right_from_left_translation
-        self.register_buffer("pixel_sigma", scalar(checked_rig(rig, pixel_sigma), place))
-        stored, own = rig.covariance, refraction is not None or refraction_sigma is not None
-        bending = (
-            REFRACTION if refraction is None else refraction,
-            REFRACTION_SIGMA if refraction_sigma is None else refraction_sigma,
+        if weights not in (None, *get_args(Weights)):
+            raise InputError(f"weights {weights!r}: marks or all is needed")
+        if not 0.0 <= clock_sigma < math.inf:
+            raise InputError(f"clock_sigma: seconds, not negative, are needed, got {clock_sigma}")
+        pair = len(rig) == 2 and rig.in_first_frame
+        known = root is not None or rig.root is not None
+        self.weights: Weights = weights or ("marks" if pair and not known else "all")
+        stated = {
+            "origin": origin, "heading_deg": heading_deg, "pitch_deg": pitch_deg or None, "roll_deg": roll_deg or None,
+            "calibration": calibration, "mounting": mounting, "link": link, "refraction": refraction,
+            "refraction_sigma": refraction_sigma,
+        }  # fmt: skip
+        more = {name: value for name, value in stated.items() if value is not None}
+        for name, value in (("pixel_sigma", checked_sigma(pixel_sigma)), ("clock_sigma", clock_sigma)):
+            self.register_buffer(name, scalar(value, rig.translation))
+        self.lens: tuple[tuple[int, ...], ...] = ()
+        if self.weights == "marks":
+            if not pair or known:
+                raise InputError('weights "marks": two cameras in the left one\'s frame are needed, without a root')
+            checked_rig(rig, pixel_sigma)
+            self._stand(rig, more)
+            self._weigh(rig, None)
+            return
+        if pair and not known:
+            rig = Localizer(rig, weights="marks", **more).apart()  # type: ignore[arg-type]
+        elif more:
+            raise InputError(f"{next(iter(more))}: where these cameras stand, and how well that is known, says the rig")
+        root = rig.root if root is None else root
+        if root is not None:
+            rig.check_root(root)
+        self.rig = rig
+        self.included: tuple[str, ...] = (
+            ("marks",) if root is None or not bool(root.any()) else ("marks", "calibration", "mounting")
         )
+        self._place(rig.origin, rig.translation)
+        for name in ("refraction", "calibration_factor", "mounting", "link"):
+            self.register_buffer(name, None)
+        self._weigh(rig, root)
+
+    def _place(self, origin: Origin | None, like: Tensor) -> None:
+        """Anchor the frame on the Earth, or nowhere."""
+        place = (None, None) if origin is None else anchor(origin, like.device)
+        self.register_buffer("ecef_from_enu", place[0])
+        self.register_buffer("ecef_of_origin", place[1])
+        zero = torch.zeros(3, dtype=torch.float64) if origin is None else origin.geodetic
+        self.register_buffer("geodetic_of_origin", zero.to(like.device))
+        self.register_buffer("half_curvature", scalar(0.5 / mean_radius(origin.lat) if origin else 0.0, like))
+
+    def _weigh(self, rig: Rig, root: Tensor | None) -> None:
+        """Prepare weights by all errors; nothing of it where marks alone weigh."""
+        names = ("up", "heights", "errors", "bending_errors", "limits")
+        if self.weights == "marks":
+            for name in names:
+                self.register_buffer(name, None)
+            return
+        # SciPy takes long to load.
+        from scipy.special import chdtri
+
+        up = heights = None
+        if rig.origin is not None:
+            assert self.ecef_from_enu is not None
+            geodetic = enu_to_geodetic(rig.center.detach(), rig.origin)
+            ups = [ecef_from_enu_rotation(lat, lon)[:, 2].to(geodetic) for lat, lon, _ in geodetic.tolist()]
+            up, heights = torch.stack(ups) @ self.ecef_from_enu, geodetic[:, 2]
+        errors, bending, self.lens = errors_by_camera(rig, root)
+        bending = None if bending is None else bending * self.half_curvature
+        freedom = 2.0 * torch.arange(len(rig) + 1, dtype=torch.float64) - 3.0
+        limits = [[float(chdtri(max(float(f), 1.0), p)) for f in freedom] for p in (_BAD, _DOUBTFUL)]
+        values = up, heights, errors, bending, torch.tensor(limits, dtype=torch.float64, device=rig.translation.device)
+        for name, value in zip(names, values, strict=True):
+            self.register_buffer(name, value)
+
+    def _stand(self, rig: Rig, given: dict[str, Any]) -> None:
+        """Where two cameras stand, and how well that and the rig are known."""
+        place = rig.translation
+        stored, own = rig.covariance, not given.keys().isdisjoint(("refraction", "refraction_sigma"))
+        calibration, mounting, link = (given.get(name) for name in ("calibration", "mounting", "link"))
+        bending = given.get("refraction", REFRACTION), given.get("refraction_sigma", REFRACTION_SIGMA)
         check_refraction(*bending)
-        if origin is None or heading_deg is None:
-            if origin is not None or heading_deg is not None or pitch_deg or roll_deg:
-                raise InputError("origin and heading_deg belong together, and pitch_deg and roll_deg to them")
-            stands = rig.mounting
-            if stands is None:
-                raise InputError("this rig does not say where it stands; give origin and heading_deg")
-            origin, heading_deg, pitch_deg, roll_deg = (
-                stands.origin, stands.heading_deg, stands.pitch_deg, stands.roll_deg,
-            )  # fmt: skip
+        stands: Mounting | None = rig.mounting
+        if ("origin" in given) != ("heading_deg" in given) or (
+            "origin" not in given and not given.keys().isdisjoint(("pitch_deg", "roll_deg"))
+        ):
+            raise InputError("origin and heading_deg belong together, and pitch_deg and roll_deg to them")
+        if "origin" in given:
+            stands = Mounting(
+                **{name: given[name] for name in ("origin", "heading_deg", "pitch_deg", "roll_deg") if name in given}
+            )
+        elif stands is not None:
             if not own and stands.refraction is not None:
                 bending = (stands.refraction, bending[1])
             if mounting is None:
                 mounting = stands.covariance
                 link = stands.link if link is None and calibration is None else link
+        elif mounting is not None or link is not None or own:
+            raise InputError("mounting, refraction: this rig does not say where it stands; give origin and heading_deg")
+        if stands is None:
+            bending = (0.0, 0.0)
         calibration = stored if calibration is None else calibration
         self.rig = rig
         errors = (("marks", True), ("calibration", calibration is not None), ("mounting", mounting is not None))
         self.included = tuple(name for name, there in errors if there)
-        device = place.device
+        self._place(None if stands is None else stands.origin, place)
         self.register_buffer("refraction", scalar(bending[0], place))
-        self.register_buffer("half_curvature", scalar(0.5 / mean_radius(origin.lat), place))
-        rotation, translation = anchor(origin, device)
-        self._keep("enu_from_rig", enu_from_cam(heading_deg, pitch_deg, roll_deg).to(device))
-        self.register_buffer("ecef_from_enu", rotation)
-        self.register_buffer("ecef_of_origin", translation)
-        self.register_buffer("geodetic_of_origin", origin.geodetic.to(device))
+        look = torch.eye(3, dtype=torch.float64)
+        if stands is not None:
+            look = enu_from_cam(stands.heading_deg, stands.pitch_deg, stands.roll_deg)
+        self._keep("enu_from_rig", look.to(place.device))
         factor = None
         if calibration is not None:
             calibration.check(rig)
-            factor = calibration.half.T.to(device) if bool(calibration.half.any()) else None
+            factor = calibration.half.T.to(place.device) if bool(calibration.half.any()) else None
         self.register_buffer("calibration_factor", factor)
         if link is not None:
             if calibration is None or mounting is None:
@@ -220,31 +313,48 @@ class StereoLocalizer(Operations, Movable):
             if own or len(mounting) == 6:
                 mounting = torch.block_diag(mounting[:6, :6], torch.tensor([[bending[1] ** 2]], dtype=torch.float64))
                 link = None if link is None else torch.nn.functional.pad(link[:, :6], (0, 1))
-            mounting = mounting.to(device)
+            mounting = mounting.to(place.device)
         self.register_buffer("mounting", mounting)
-        self.register_buffer("link", None if link is None else link.to(device))
+        self.register_buffer("link", None if link is None else link.to(place.device))
+
+    @property
+    def constants(self) -> object:
+        """By what it weighs, and by which parameters of each camera its marks have errors in common."""
+        return self.weights, self.lens
+
+    @property
+    def on_earth(self) -> bool:
+        """Whether positions are on the Earth; otherwise they are in the rig's own frame."""
+        return self.ecef_from_enu is not None
 
     @property
     def enu_from_rig(self) -> Tensor:
-        """(3, 3) how the left camera looks, with the step of `free`."""
+        """(3, 3) how the left of two cameras looks, with the step of `free`."""
         kept, step = self._kept("enu_from_rig"), self.freed_step
         return kept if step is None else rotation_from_vector(step[1]) @ kept
 
     @property
-    def origin(self) -> Origin:
-        """Position of the left camera's projection center."""
+    def origin(self) -> Origin | None:
+        """Where the frame is anchored on the Earth, which is the projection center of the left of two cameras."""
+        if self.ecef_from_enu is None:
+            return None
         step, place = self.freed_step, self.geodetic_of_origin
         return Origin.at(place if step is None else place_enu(step[0], self.ecef_from_enu, self.ecef_of_origin))
 
     @property
     def attitude_deg(self) -> tuple[float, float, float]:
-        """Heading, pitch and roll of the left camera."""
-        heading, pitch, roll = (round(angle, 11) for angle in attitude(self.enu_from_rig))
-        return heading, pitch, roll
+        """Heading, pitch and roll of the first camera, at its own vertical; in a frame of its own, about the axes."""
+        if self.weights == "all" and self.on_earth:
+            stands = station_mounting(self.rig, 0)
+            return stands.heading_deg, stands.pitch_deg, stands.roll_deg
+        look = self.enu_from_rig if self.weights == "marks" else self.rig.rotation[0].T
+        return tuple(round(angle, 11) for angle in attitude(look.detach()))  # type: ignore[return-value]
 
     @property
     def pose_slots(self) -> dict[str, Any]:
         """What `free` takes: `mounting`, or `origin` and `attitude`; the step is that of `Mounting.covariance`."""
+        if self.weights == "all" or not self.on_earth:
+            raise InputError("this localizer has no mounting to free; free the poses of its rig")
         return {"mounting": slice(0, 6), "origin": slice(0, 3), "attitude": slice(3, 6)}
 
     def _zero_step(self) -> Tensor:
@@ -260,56 +370,135 @@ class StereoLocalizer(Operations, Movable):
         Example:
             >>> import tempfile
             >>> from kcal import save_rig
-            >>> from kcal.rig import Mounting, planned_rig
+            >>> from kcal.rig import planned_rig
             >>> rig = planned_rig()
             >>> rig.mounting = Mounting(origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
             >>> with tempfile.TemporaryDirectory() as folder:
-            ...     localize = StereoLocalizer.from_file(save_rig(rig, Path(folder, "rig.json")), pixel_sigma=0.1)
-            >>> found = localize(torch.tensor([[959.5, 539.5]]), torch.tensor([[943.5, 539.5]]))
-            >>> [round(value, 2) for value in found.enu[0].tolist()]
-            [0.0, 1000.0, -0.01]
+            ...     localize = Localizer.from_file(save_rig(rig, Path(folder, "rig.json")), pixel_sigma=0.1)
+            >>> localize.origin
+            Origin(lat=19.07, lon=72.87, height=14.0)
         """
         return cls(load_rig(path), **options)
 
-    def forward(
-        self, pixels_left: Tensor, pixels_right: Tensor, cov: Tensor | None = None, mask: Tensor | None = None
-    ) -> Localization:
-        """Locate pixel pairs.
+    def apart(self, errors: int | None = None) -> Rig:
+        """Two cameras as a rig whose frame is that of the positions, with all that is known of it as its `root`.
 
         Args:
-            pixels_left: (..., N, 2), integer coordinates at pixel centers.
-            pixels_right: (..., N, 2), the same things in the right image.
-            cov: covariance of (u_left, v_left, u_right, v_right), (..., N, 4, 4) or broadcastable to it;
-                `pixel_sigma` squared times the identity if left out.
+            errors: how many shared errors the root has, some of them zero: a filter needs as many at every moment, and
+                those of the calibration in the same order.
+        """
+        size, look = sum(self.rig.sizes) + 6, self.enu_from_rig
+        half = rig_errors(size, self.calibration_factor, self.mounting, self.link, errors)
+        return two_stations(self.rig, look.T, self.origin, float(self.refraction), half)
+
+    def weighing_all(self, errors: int | None = None) -> Localizer:
+        """The same with weights by all errors; `errors` as for `apart`.
+
+        Example:
+            >>> from kcal.rig import planned_rig
+            >>> localize = Localizer(planned_rig()).weighing_all()
+            >>> localize.weights, localize.rig.names
+            ('all', ('left', 'right'))
+        """
+        if self.weights == "all":
+            return self
+        noise = float(self.pixel_sigma), float(self.clock_sigma)
+        return Localizer(self.apart(errors), weights="all", pixel_sigma=noise[0], clock_sigma=noise[1])
+
+    def forward(
+        self,
+        pixels: Tensor | ArrayLike,
+        other: Tensor | ArrayLike | None = None,
+        cov: Tensor | None = None,
+        mask: Tensor | None = None,
+        *,
+        velocity: Tensor | None = None,
+        height: Tensor | Ground | None = None,
+        height_sigma: float = 1.0,
+    ) -> Localization:
+        """Locate the pixels (..., N, 2) of two cameras, `forward(left, right)`, or rows (..., V, 2) of V cameras.
+
+        Args:
+            pixels: integer coordinates at pixel centers; where they are NaN, a camera did not see a point.
+            other: the same points in the right image, (..., N, 2); or (..., V) bool, what was seen: what is False is
+                neither read nor differentiated.
+            cov: covariance of each pixel, (..., V, 2, 2) or broadcastable to it; of left and right that of
+                (u_left, v_left, u_right, v_right), (..., N, 4, 4).
             mask: (..., N) bool; what is False is MASKED, and neither read nor differentiated.
+            velocity: (..., V, 2) motion in the images, px/s, with which errors of the clocks move the pixels.
+            height: (..., N) meters above the ellipsoid of what one camera alone saw, NaN where it is not known; or the
+                ground on which it stands, from `level_ground` or `terrain`: its line of sight is followed for 60 km
+                until it meets that for the first time, in steps of a raster's cells.
+            height_sigma: its standard deviation, meters.
 
         Raises:
-            InputError: not floating point, or shapes that are wrong or unlike.
+            InputError: not floating point, shapes that are wrong or unlike, a height where marks alone weigh or the rig
+                has no place on the Earth.
         """
-        left, right = checked_pairs(pixels_left, pixels_right, self.rig)
-        cov = checked_pair_covariance(cov, left)
+        count, like = len(self.rig), self.rig.translation
+        if other is not None and not (isinstance(other, Tensor) and other.dtype == torch.bool):
+            if count != 2:
+                raise InputError(
+                    f"seen: bool is needed; left and right are pixels of two cameras, and this rig has {count}"
+                )
+            left, right = checked_pairs(pixels, other, self.rig)
+            if self.weights == "marks" and velocity is None and height is None:
+                return self._of_pairs(left, right, checked_pair_covariance(cov, left), mask)
+            pixels, other = torch.stack([left, right], -2), None
+        pixels, seen = checked_views(pixels, other, count, like)
+        lead = pixels.shape[:-2]
         if mask is not None:
-            mask = torch.as_tensor(mask, device=left.device)
-            if mask.dtype != torch.bool:
-                raise InputError(f"mask: bool is needed, got {mask.dtype}")
-            mask = expanded("mask", mask, left.shape[:-1])
+            seen = seen & checked_mask(mask, lead, pixels.device)[..., None]
+        cov = checked_views_covariance(cov, pixels)
+        if velocity is not None:
+            moved = self.clock_sigma * expanded("velocity", as_points("velocity", velocity, 2, pixels), pixels.shape)
+            still = torch.eye(2, dtype=torch.float64, device=pixels.device)
+            cov = self.pixel_sigma**2 * still.expand(*moved.shape, 2) if cov is None else cov
+            cov = cov + moved[..., :, None] * moved[..., None, :]
+        if self.weights == "marks":
+            if height is not None:
+                raise InputError('height: a rig of two cameras uses it with weights="all"')
+            left, right = pixels.unbind(-2)
+            cov = None if cov is None else joint_covariance(cov)
+            return self._of_pairs(left, right, cov, None if known_true(seen) else seen.all(-1))
+        if height is not None:
+            if not self.on_earth:
+                raise InputError("height: this rig has no place on the Earth; give its origin")
+            if not 0.0 < height_sigma < math.inf:
+                raise InputError(f"height_sigma: a positive number of meters is needed, got {height_sigma}")
+            if isinstance(height, Tensor):
+                height = expanded("height", height.to(torch.float64), lead).reshape(-1)
+        pixels, seen = pixels.reshape(-1, count, 2), seen.reshape(-1, count)
+        cov = None if cov is None else cov.reshape(-1, count, 2, 2)
+        ground, heights = (None, height) if isinstance(height, Tensor) else (height, None)
+        differentiated = is_differentiated(pixels, cov, heights, self)
+
+        def locate(pixels: Tensor, seen: Tensor, cov: Tensor | None, height: Tensor | None) -> Localization:
+            return self._checked(pixels, seen, cov, height, (height_sigma, differentiated, ground))
+
+        share = 1 if self.errors is None else max(1, count * self.errors.shape[0] // 8)
+        found = piece_by_piece(locate, pixels, seen, cov, heights, differentiated=differentiated, axis=-3, share=share)
+        return Localization(*(value.reshape(*lead, *value.shape[1:]) for value in found))
+
+    def _of_pairs(self, left: Tensor, right: Tensor, cov: Tensor | None, mask: Tensor | None) -> Localization:
+        if mask is not None:
+            mask = checked_mask(mask, left.shape[:-1], left.device)
         if found := self.as_operation("forward", left, right, cov, mask):
             return Localization(*found)
         differentiated = is_differentiated(left, right, cov, self)
 
         def locate(left: Tensor, right: Tensor, cov: Tensor | None, mask: Tensor | None) -> Localization:
-            by_camera = self.calibration_factor is not None
-            return self._on_earth(
+            return self._by_marks(
                 fit_pairs(
-                    self.rig, left, right, cov, mask, noise=self.pixel_sigma, by_camera=by_camera,
-                    differentiated=differentiated,
+                    self.rig, left, right, cov, mask, noise=self.pixel_sigma,
+                    by_camera=self.calibration_factor is not None, differentiated=differentiated,
                 )
             )  # fmt: skip
 
         return piece_by_piece(locate, left, right, cov, mask, differentiated=differentiated)
 
-    def _on_earth(self, found: ViewsFit) -> Localization:
-        """Positions and all their errors."""
+    def _by_marks(self, found: ViewsFit) -> Localization:
+        """Positions of pairs and all their errors."""
         fit, scale, usable = found.fit, found.scale, found.fitted
         spread = [found.variance * entry for entry in fit.covariance]
         if self.calibration_factor is not None:
@@ -321,10 +510,11 @@ class StereoLocalizer(Operations, Movable):
         reach = reach_of(found, inverse_variance(fit, spread), PositionStatus.BEARING_ONLY)
         ok = reach.status == int(PositionStatus.OK)
         there = usable | (reach.status == int(PositionStatus.PARALLEL))
-        bearing = (fit.direction / found.length[..., None, :]).mT @ self.enu_from_rig.mT
+        look = self.enu_from_rig
+        bearing = (fit.direction / found.length[..., None, :]).mT @ look.mT
         depth = scale / torch.where(ok, fit.inverse, 1.0)
-        enu = torch.where(ok[..., None], depth[..., None] * (fit.direction.mT @ self.enu_from_rig.mT), 0.0)
-        slope = self.enu_from_rig @ position_slope(fit, scale, ok)
+        enu = torch.where(ok[..., None], depth[..., None] * (fit.direction.mT @ look.mT), 0.0)
+        slope = look @ position_slope(fit, scale, ok)
         covariance = slope @ symmetric(spread) @ slope.mT
         up = torch.stack([*torch.zeros_like(enu[..., :2]).unbind(-1), enu[..., :2].square().sum(-1)], -1)
         enu = enu - self.refraction * self.half_curvature * up
@@ -336,12 +526,10 @@ class StereoLocalizer(Operations, Movable):
                 covariance = covariance + mixed + mixed.mT
         covariance = torch.where(ok[..., None, None], covariance, torch.diag(covariance.new_full((3,), math.inf)))
         step = self.freed_step
-        shifted = enu if step is None else enu + step[0]
-        geodetic = place_enu(shifted, self.ecef_from_enu, self.ecef_of_origin)
         return Localization(
             enu=enu,
             covariance=covariance,
-            geodetic=torch.where(ok[..., None], geodetic, self.geodetic_of_origin),
+            geodetic=self._geodetic(enu if step is None else enu + step[0], ok),
             range_low=reach.interval.low,
             range_high=reach.interval.high,
             status=reach.status,
@@ -349,15 +537,130 @@ class StereoLocalizer(Operations, Movable):
             inverse_range=reach.value,
             inverse_range_sigma=reach.sigma,
             reprojection=reprojection_errors(fit.residual),
+            anchor=torch.zeros_like(reach.status, dtype=torch.int64),
+            used=found.used,
+            bad=torch.zeros_like(found.used),
+            misfit=found.pair_misfit,
         )
+
+    def _geodetic(self, enu: Tensor, ok: Tensor) -> Tensor:
+        if self.ecef_from_enu is None:
+            return self.geodetic_of_origin.expand(enu.shape)
+        there = place_enu(enu, self.ecef_from_enu, self.ecef_of_origin)
+        return torch.where(ok[..., None], there, self.geodetic_of_origin)
+
+    def _checked(
+        self, pixels: Tensor, seen: Tensor, cov: Tensor | None, height: Tensor | None, options: _Options
+    ) -> Localization:
+        """All rows, those with a bad view again without it."""
+        once, bad, torn = self._located(pixels, seen, cov, height, options)
+        again = bad.any(-1)
+        if not is_traced() and known_true(~again):
+            return self._contradicting(once, torn)
+        try:
+            rows = None if is_traced() else again.nonzero()[:, 0]
+        except RuntimeError:  # under vmap
+            rows = None
+        if rows is None:
+            left, worse, still = self._located(pixels, seen & ~bad, cov, height, options)
+            left = self._contradicting(left._replace(bad=bad), torn | still | worse.any(-1))
+            return left._replace(misfit=once.misfit)
+        part = [None if value is None else value[rows] for value in (cov, height)]
+        left = self._checked(pixels[rows], (seen & ~bad)[rows], part[0], part[1], options)
+        left = left._replace(bad=left.bad | bad[rows], misfit=once.misfit[rows])
+        whole = self._contradicting(once, torn)
+        return Localization(*(old.index_copy(0, rows, new) for old, new in zip(whole, left, strict=True)))
+
+    def _located(
+        self, pixels: Tensor, seen: Tensor, cov: Tensor | None, height: Tensor | None, options: _Options
+    ) -> tuple[Localization, Tensor, Tensor]:
+        """All rows; (N, V) the view that should be left out; (N,) rows whose views contradict each other for good."""
+        sigma, differentiated, ground = options
+        posed, shared = self.posed, self.common
+        reach = None
+        if self.up is not None and self.ecef_from_enu is not None:
+            bending = self.rig.refraction, self.half_curvature
+            frame = EarthFrame(self.up, self.heights, self.ecef_from_enu, self.ecef_of_origin, *bending)
+            stated = height if ground is None else ground
+            if stated is not None:
+                reach = partial(stated_ahead, frame, height=stated, sigma=sigma, differentiated=differentiated)
+        views = fit_views(
+            posed, pixels, seen, noise=self.pixel_sigma, cov=cov, shared=shared, height=reach,
+            differentiated=differentiated,
+        )  # fmt: skip
+        with torch.no_grad():
+            chi2, falls = (value.detach() for value in views.misfits())
+            count = views.used.sum(-1)
+            wrong = views.fitted & (chi2 > self.limits[0][count]) & (count > 1)
+            rest = chi2[..., None] - falls
+            best = torch.where(views.used, falls, -1.0).argmax(-1)
+            chosen = torch.arange(len(self.rig), device=pixels.device) == best[..., None]
+            # If others would do as well, nobody knows which it is.
+            others = (rest < self.limits[1][(count - 1).clamp_min(0)][..., None]) & views.used & ~chosen
+            torn = wrong & ((count < 3) | others.any(-1))
+            bad = chosen & (wrong & ~torn)[..., None]
+        return self._by_all(posed, views, falls), bad, torn
+
+    def _by_all(self, posed: PosedCameras, views: ViewsFit, falls: Tensor) -> Localization:
+        fit, variance = views.fit, views.variance * inverse_variance(views.fit, views.fit.covariance)
+        reach = reach_of(views, variance, PositionStatus.BEARING_ONLY, views.behind(posed.center))
+        ok = reach.status == int(PositionStatus.OK)
+        enu = torch.where(ok[..., None], views.points(ok), 0.0)
+        aimed = views.used.any(-1)
+        own = (fit.direction / views.length[..., None, :]).mT
+        sight = torch.where(views.fitted[..., None], own, (views.anchor[..., None] * views.rays).sum(-2))
+        return Localization(
+            enu=enu,
+            covariance=views.covariance(ok),
+            geodetic=self._geodetic(enu, ok),
+            status=reach.status,
+            anchor=views.anchor.to(torch.int64).argmax(-1),
+            bearing=torch.where(aimed[..., None], sight, 0.0),
+            inverse_range=reach.value,
+            inverse_range_sigma=reach.sigma,
+            range_low=reach.interval.low,
+            range_high=reach.interval.high,
+            used=views.used,
+            bad=torch.zeros_like(views.used),
+            misfit=(0.5 * falls.clamp_min(0.0)).sqrt(),
+            reprojection=torch.where((views.used & views.fitted[..., None]), reprojection_errors(fit.residual), 0.0),
+        )
+
+    def _contradicting(self, found: Localization, torn: Tensor) -> Localization:
+        """The same, without a position where `torn` (N,)."""
+        nowhere = torch.diag(found.covariance.new_full((3,), math.inf))
+        return found._replace(
+            enu=torch.where(torn[..., None], 0.0, found.enu),
+            covariance=torch.where(torn[..., None, None], nowhere, found.covariance),
+            geodetic=torch.where(torn[..., None], self.geodetic_of_origin, found.geodetic),
+            status=flag_positions(found.status, torn, PositionStatus.CONTRADICTION),
+        )
+
+    @property
+    def posed(self) -> PosedCameras:
+        """The cameras as they stand, where all errors weigh."""
+        rig = self.rig
+        return PosedCameras(rig.each, rig.rotation, rig.center, self.up, rig.refraction * self.half_curvature)
+
+    @property
+    def common(self) -> CommonErrors | None:
+        """What marks of a camera have in common; None where all is exact."""
+        return None if self.errors is None else CommonErrors(self.lens, self.errors, self.bending_errors)
+
+    @property
+    def _two(self) -> Rig:
+        """The rig, if marks alone weigh."""
+        if self.weights == "all":
+            raise InputError('sensitivity: it is known of two cameras with weights="marks"')
+        return self.rig
 
     def extra_repr(self) -> str:
         """Where it stands, and which errors its covariances contain, for `repr`."""
-        heading, pitch, roll = self.attitude_deg
-        return (
-            f"{self.origin}, heading={heading:.6g}°, pitch={pitch:.6g}°, roll={roll:.6g}°, "
-            f"pixel_sigma={self.pixel_sigma:g}, errors of {' and '.join(self.included)}"
-        )
+        stands = "in the frame of the rig"
+        if self.on_earth:
+            heading, pitch, roll = self.attitude_deg
+            stands = f"{self.origin}, heading={heading:.6g}°, pitch={pitch:.6g}°, roll={roll:.6g}°"
+        return f"{stands}, pixel_sigma={self.pixel_sigma:g}, errors of {' and '.join(self.included)}"
 
     @torch.no_grad()
     def sensitivity(self, pixels_left: Tensor, pixels_right: Tensor) -> Sensitivity:
@@ -367,7 +670,7 @@ class StereoLocalizer(Operations, Movable):
             pixels_left: (..., N, 2).
             pixels_right: (..., N, 2).
         """
-        return _sensitivity(fit_pairs(self.rig, *checked_pairs(pixels_left, pixels_right, self.rig)))
+        return _sensitivity(fit_pairs(self._two, *checked_pairs(pixels_left, pixels_right, self._two)))
 
     def with_sensitivity(self, pixels_left: Tensor, pixels_right: Tensor) -> tuple[Localization, Sensitivity]:
         """`forward` and `sensitivity` for the work of one; without covariances, masks and derivatives.
@@ -377,9 +680,9 @@ class StereoLocalizer(Operations, Movable):
             pixels_right: (..., N, 2).
         """
         by_camera = self.calibration_factor is not None
-        pairs = checked_pairs(pixels_left, pixels_right, self.rig)
+        pairs = checked_pairs(pixels_left, pixels_right, self._two)
         found = fit_pairs(self.rig, *pairs, noise=self.pixel_sigma, by_camera=by_camera)
-        return self._on_earth(found), _sensitivity(found)
+        return self._by_marks(found), _sensitivity(found)
 
 
 def _sensitivity(found: ViewsFit) -> Sensitivity:

@@ -13,7 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.errors import FileError
+from kcal.checks import as_points
+from kcal.errors import FileError, InputError
 from kcal.files import write_atomic
 from kcal.locate.tables import (
     CHUNK_ROWS,
@@ -64,8 +65,24 @@ class Marks(NamedTuple):
 
     @classmethod
     def of_pair(cls, names: Sequence[str], left: Tensor, right: Tensor, covariance: Tensor | None = None) -> Marks:
-        """Of pixels (N, 2) in the left and the right image."""
+        """Of pixels (N, 2) in the left and the right image.
+
+        Raises:
+            InputError: no floating point, or shapes that are wrong or unlike.
+        """
+        left = as_points("left", left, 2)
+        right = as_points("right", right, 2, left)
+        if left.ndim != 2 or left.shape != right.shape:
+            raise InputError(
+                f"left and right: the same shape (N, 2) is needed, got {tuple(left.shape)} and {tuple(right.shape)}"
+            )
         return cls(names, torch.stack([left, right], 1), covariance)
+
+    def rows(self, which: slice) -> Marks:
+        """Some consecutive rows."""
+        covariance, sigma = (None if value is None else value[which] for value in (self.covariance, self.sigma))
+        extras = {name: cells[which] for name, cells in self.extras.items()}
+        return Marks(self.names[which], self.pixels[which], covariance, sigma, extras)
 
     @property
     def left(self) -> Tensor:

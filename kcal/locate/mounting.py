@@ -11,9 +11,12 @@ from torch import Tensor
 
 from kcal.calibrate.rig.result import RigResult
 from kcal.errors import InputError
-from kcal.lens.rig import Mounting, Origin, Rig, RigCovariance
+from kcal.lens.rig import Mounting, Origin, Rig, RigCovariance, half_of_covariance
 from kcal.locate.geodesy import ecef_from_enu_rotation, enu_to_geodetic
 from kcal.threads import in_one_thread
+
+# Errors of where a rig stands at most: place, attitude, refraction.
+MOUNTING_ERRORS = 7
 
 
 def attitude(enu_from_cam: Tensor) -> tuple[float, float, float]:
@@ -129,7 +132,7 @@ def mounting_covariance(
 
 
 class RunErrors(NamedTuple):
-    """What `kcal.locate.tabulate.Locator` is told of a rig's errors.
+    """What a `Localizer` is told of a rig's errors.
 
     Attributes:
         calibration: of cameras and relative pose; None where nothing is known.
@@ -180,3 +183,106 @@ def by_mounting(enu: Tensor) -> Tensor:
     turns = torch.stack([zero, u, -n, -u, zero, e, n, -e, zero], -1).unflatten(-1, (3, 3))
     still = torch.eye(3, dtype=enu.dtype, device=enu.device).expand(turns.shape)
     return torch.cat([still, turns], -1)
+
+
+@torch.no_grad()
+def rig_errors(
+    size: int, factor: Tensor | None, mounting: Tensor | None, link: Tensor | None, errors: int | None = None
+) -> Tensor | None:
+    """(K, size + 7) root of what is known of two cameras, in the order of `RigCovariance`, and of their mounting.
+
+    Args:
+        size: quantities of the cameras.
+        factor: (size, L) of them; its errors come first in the result.
+        mounting: (7, 7).
+        link: (size, 7) of the two with each other.
+        errors: how many errors there are at least, some of them zero.
+    """
+    if factor is None and mounting is None:
+        return None
+    like = factor if mounting is None else mounting
+    assert like is not None
+    stands = like.new_zeros(MOUNTING_ERRORS, MOUNTING_ERRORS) if mounting is None else mounting
+    half, left_over = like.new_zeros(0, size + MOUNTING_ERRORS), stands
+    if factor is not None:
+        # What the mounting owes to the calibration's errors: factor · ofᵀ = link.
+        of = like.new_zeros(MOUNTING_ERRORS, factor.shape[1])
+        if link is not None:
+            scale = torch.linalg.vector_norm(factor, dim=1, keepdim=True)
+            unit = torch.where(scale > 0, scale, 1.0)
+            of = torch.linalg.lstsq(factor / unit, link / unit, driver="gelsd").solution.T
+        half, left_over = torch.cat([factor, of]).T, stands - of @ of.T
+    # What the calibration's errors explain is zero but for rounding.
+    kept = left_over.diagonal() > 1e-12 * stands.diagonal()
+    own = half_of_covariance(left_over * (kept[:, None] & kept))
+    half = torch.cat([half, torch.nn.functional.pad(own, (size, 0))])
+    return torch.nn.functional.pad(half, (0, 0, 0, max((errors or 0) - len(half), 0)))
+
+
+@torch.no_grad()
+def two_stations(rig: Rig, left: Tensor, origin: Origin | None, refraction: float, half: Tensor | None) -> Rig:
+    """Two cameras as a rig in another frame, from which the left one is turned by `left`.
+
+    halfᵀ half is the covariance of the quantities of `RigCovariance`, and of place, attitude and refraction.
+    """
+    shift = rig.right_from_left_translation
+    left = left.to(shift)
+    right = rig.right_from_left_rotation @ left
+    apart = -right.T @ shift
+    centers = torch.stack([torch.zeros_like(apart), apart])
+    stations = Rig(
+        [rig.left, rig.right], ("left", "right"), torch.stack([left, right]), center=centers, origin=origin,
+        refraction=refraction,
+    )  # fmt: skip
+    if half is None:
+        return stations
+    size = half.shape[1] - 7
+    half, by = half.to(shift), shift.new_zeros(stations.quantities, half.shape[1])
+    lenses = size - 6
+    by[:lenses, :lenses] = torch.eye(lenses).to(shift)
+    turn, move, center, attitude = (slice(size + at, size + at + 3) for at in (-6, -3, 0, 3))
+    still = torch.eye(3).to(shift)
+    first, second = stations.pose_columns(0).start, stations.pose_columns(1).start
+    by[first : first + 3, center], by[first + 3 : first + 6, attitude] = still, still
+    by[second : second + 3, center] = still
+    by[second : second + 3, attitude] = -_crossed(apart)
+    by[second : second + 3, turn] = -right.T @ _crossed(shift)
+    by[second : second + 3, move] = -right.T
+    by[second + 3 : second + 6, attitude], by[second + 3 : second + 6, turn] = still, -right.T
+    by[-1, -1] = 1.0
+    stations.root = half @ by.T
+    return stations
+
+
+def _crossed(vector: Tensor) -> Tensor:
+    """(3, 3) with `_crossed(v) @ w` = v × w."""
+    x, y, z = vector.tolist()
+    return vector.new_tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def station_mounting(rig: Rig, camera: int) -> Mounting:
+    """How a camera stands: place on the Earth, heading, pitch and roll at its own vertical, and how well that is known.
+
+    Raises:
+        InputError: a rig without an origin.
+
+    Example:
+        >>> from kcal import Camera, Origin
+        >>> from kcal.locate import enu_from_cam
+        >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
+        >>> there = torch.tensor([[0.0, 50_000.0, 0.0]])  # north of the origin, where the Earth has curved away
+        >>> rig = Rig([camera], ["tower"], enu_from_cam(90.0).T[None], center=there,
+        ...                 origin=Origin(lat=45.0, lon=6.0, height=0.0))
+        >>> stands = station_mounting(rig, 0)
+        >>> round(stands.origin.height), round(stands.heading_deg, 3), round(stands.roll_deg, 3)
+        (196, 90.0, 0.45)
+    """
+    if rig.origin is None:
+        raise InputError("this rig has no place on the Earth: give it an origin")
+    covariance = torch.zeros(7, 7, dtype=torch.float64)
+    if rig.root is not None:
+        own = torch.cat([rig.root[:, rig.pose_columns(camera)], rig.root[:, -1:]], 1)
+        covariance = own.T @ own
+    return mounting_of(
+        rig.rotation[camera], rig.center[camera], covariance, rig.origin, refraction=float(rig.refraction)
+    )

@@ -16,21 +16,25 @@ from torch import Tensor
 
 from kcal.checks import as_points
 from kcal.errors import InputError
-from kcal.lens.rig import Origin, Rig, RigCovariance
+from kcal.lens.rig import Origin
 from kcal.locate.geodesy import anchor, enu_to_geodetic, latitude_longitude
-from kcal.locate.localizer import StereoLocalizer
-from kcal.locate.stereo import PositionStatus, checked_pairs
+from kcal.locate.localizer import Localizer
+from kcal.locate.stereo import PositionStatus
 from kcal.locate.survey import read_survey
-from kcal.locate.tables import CHUNK_ROWS, NUMBERS, PositionColumns
-from kcal.locate.tabulate import Geoid, Locator, Viewpoint
+from kcal.locate.tables import NUMBERS, PositionColumns
+from kcal.locate.tabulate import Viewpoint
 from kcal.texts import brief
 
-# `locate_points`: pixel pairs to positions on the Earth, with everything that is told to a user.
+# Why there are neither maps nor latitudes, and the cure.
+NOWHERE = (
+    "this rig has no place on the Earth, so that its positions are meters in its own frame; solve it with landmarks or "
+    "positions that have latitudes, or give the origin and the heading of its left camera"
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Position:
-    """One pair of marks, located or not; what is not known is None.
+    """One row of marks, located or not; what is not known is None.
 
     Latitude, longitude (degrees) and the ellipsoidal WGS84 `height` (meters), `enu` and the best estimate `range_m`
     are there only if the status is `OK`. Azimuth and elevation in degrees and the range interval are also there if
@@ -69,7 +73,8 @@ class Position:
 class Located:
     """Result of `locate_points`: one position for each pair of marks, in order, and where the rig stood.
 
-    `columns` contains the positions as arrays, `positions` gives each row as a `Position`.
+    `columns` contains the positions as arrays, `positions` gives each row as a `Position`. `origin` is None, there are
+    no cameras, and heading, pitch and roll are NaN, where the rig has no place on the Earth.
 
     `feet` (N, 3) are the places, meters, from which bearings and ranges of the rows count; None: the left camera.
 
@@ -81,7 +86,7 @@ class Located:
 
     columns: PositionColumns
     cameras: tuple[Viewpoint, ...]
-    origin: Origin
+    origin: Origin | None
     heading_deg: float
     pitch_deg: float
     roll_deg: float
@@ -95,6 +100,24 @@ class Located:
     def positions(self) -> tuple[Position, ...]:
         """The rows, one object each."""
         return tuple(_positions_of(self.columns))
+
+    @property
+    def place(self) -> Origin:
+        """Where the rig stands.
+
+        Raises:
+            InputError: nowhere on the Earth.
+        """
+        if self.origin is None:
+            raise InputError(f"there are no latitudes: {NOWHERE}")
+        return self.origin
+
+    @property
+    def frame(self) -> str:
+        """Of which frame positions are the meters."""
+        if self.origin is not None:
+            return "east, north, up of the origin"
+        return "x right, y down, z forward of the left camera" if self.feet is None else "x, y, z of the rig"
 
     @property
     def count_note(self) -> str:
@@ -120,100 +143,6 @@ class Located:
         """East, north, up in meters, (N, 3) float64; NaN where there is no position."""
         first = NUMBERS.index("east_m")
         return torch.from_numpy(self.columns.numbers[:, first : first + 3].copy())
-
-
-def locate_points(
-    rig: Rig,
-    pixels_left: Tensor,
-    pixels_right: Tensor,
-    *,
-    origin: Origin | None = None,
-    heading_deg: float | None = None,
-    pitch_deg: float = 0.0,
-    roll_deg: float = 0.0,
-    pixel_sigma: float = 0.3,
-    names: Sequence[str] | None = None,
-    cov: Tensor | None = None,
-    calibration: RigCovariance | None = None,
-    mounting: Tensor | None = None,
-    link: Tensor | None = None,
-    refraction: float | None = None,
-    refraction_sigma: float | None = None,
-    geoid: Geoid | None = None,
-) -> Located:
-    """Positions on the Earth of things marked in both images of a stereo rig.
-
-    Args:
-        rig: the calibrated rig; origin, attitude and covariances that are left out are the rig's own, as for
-            `StereoLocalizer`.
-        pixels_left: (N, 2) marks in the left image, integer coordinates at pixel centers.
-        pixels_right: (N, 2) the same things in the right image.
-        origin: position of the left camera's projection center.
-        heading_deg: of the left camera's optical axis, clockwise from true north; see `enu_from_cam`.
-        pitch_deg: of the same axis, positive up.
-        roll_deg: of the left camera, positive clockwise as seen from behind.
-        pixel_sigma: standard deviation of a mark along each axis, px.
-        names: one for each pair; numbered from 1 if left out.
-        cov: (N, 4, 4) covariance of each pair's four coordinates, in place of `pixel_sigma`.
-        calibration: how well the rig is known.
-        mounting: how well origin and attitude are known, see `mounting_covariance`.
-        link: how calibration and mounting go together, see `StereoLocalizer`.
-        refraction: bending of light as a share of the Earth's curvature, see `StereoLocalizer`.
-        refraction_sigma: its standard deviation.
-        geoid: a grid from `kcal.locate.tabulate.find_geoid`.
-
-    Returns:
-        A position, or the reason why there is none, for each pair. A pair whose parallax is below three sigma is
-        `BEARING_ONLY`: its range would be noise.
-
-    Raises:
-        InputError: wrong shapes, dtypes or names, or an angle or sigma out of range.
-
-    Example:
-        >>> from kcal import Camera
-        >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
-        >>> rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
-        >>> located = locate_points(rig, torch.tensor([[960.0, 540.0]]), torch.tensor([[944.0, 540.0]]),
-        ...                  origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
-        >>> position = located.positions[0]
-        >>> round(position.range_m, 3), round(position.lat, 6), round(position.range_high_m, 1)
-        (1000.0, 19.079034, 1054.8)
-    """
-    pixels_left, pixels_right = checked_pairs(pixels_left, pixels_right, rig)
-    if pixels_left.ndim != 2:
-        raise InputError(f"pixels_left: shape (N, 2) is needed, got {tuple(pixels_left.shape)}")
-    if len(pixels_left) == 0:
-        raise InputError("pixels_left: no pair of marks; at least one is needed")
-    names = [str(i + 1) for i in range(len(pixels_left))] if names is None else list(names)
-    if len(names) != len(pixels_left):
-        raise InputError(f"names: {len(names)} for {len(pixels_left)} pairs of marks; one each is needed")
-    locate = Locator(
-        rig, geoid=geoid, origin=origin, heading_deg=heading_deg, pitch_deg=pitch_deg, roll_deg=roll_deg,
-        pixel_sigma=pixel_sigma, calibration=calibration, mounting=mounting, link=link, refraction=refraction,
-        refraction_sigma=refraction_sigma,
-    )  # fmt: skip
-    pixels = torch.stack([pixels_left, pixels_right], 1)
-    if cov is not None:
-        cov = cov.expand(len(pixels), 4, 4)
-    pieces = [slice(start, start + CHUNK_ROWS) for start in range(0, len(pixels), CHUNK_ROWS)]
-    found = [locate(names[piece], pixels[piece], None if cov is None else cov[piece]) for piece in pieces]
-    return located_by(locate, PositionColumns.joined(found))
-
-
-def located_by(locate: Locator, columns: PositionColumns | None = None) -> Located:
-    """Positions with what they were located by: where the rig stood, and which errors are covered."""
-    heading, pitch, roll = locate.localize.attitude_deg
-    return Located(
-        columns=columns or PositionColumns.joined([]),
-        cameras=locate.cameras,
-        origin=locate.localize.origin,
-        heading_deg=heading,
-        pitch_deg=pitch,
-        roll_deg=roll,
-        pixel_sigma=float(locate.localize.pixel_sigma),
-        included=locate.localize.included,
-        geoid=None if locate.geoid is None else locate.geoid.name,
-    )
 
 
 def _positions_of(columns: PositionColumns) -> Iterator[Position]:
@@ -302,7 +231,7 @@ def _covariance_root(matrix: Tensor) -> Tensor:
 
 def region_rings(located: Located) -> list[Ring]:
     """The ring of each position: (latitude, longitude), closed, counterclockwise, longitudes without a jump."""
-    blocks = ring_blocks(located.columns, located.origin, plain=located.feet is not None)
+    blocks = ring_blocks(located.columns, located.place, plain=located.feet is not None)
     return [[(lat, lon) for lat, lon in ring] for block in blocks for ring in block.tolist()]
 
 
@@ -420,17 +349,16 @@ def read_truth(path: str | Path, located: Located) -> Tensor:
     Example:
         >>> import tempfile
         >>> from kcal import locate_points
+        >>> from kcal.locate import Marks
         >>> from kcal.rig import planned_rig
-        >>> left, right = planned_rig()(torch.tensor([[0.0, 0.0, 1000.0]]))[0].unbind(-2)
-        >>> located = locate_points(planned_rig(), left, right, names=["mast"], heading_deg=0.0,
-        ...                         origin=Origin(lat=19.07, lon=72.87, height=14.0))
+        >>> localize = Localizer(planned_rig(), origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
+        >>> located = locate_points(localize, Marks(("mast",), planned_rig()(torch.tensor([[0.0, 0.0, 1000.0]]))[0]))
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     _ = Path(folder, "truth.csv").write_text("name,east,north,up\nmast,1,1000,0\n")
         ...     read_truth(Path(folder, "truth.csv"), located).tolist()
         [[1.0, 1000.0, 0.0]]
     """
-    here = Origin(lat=located.origin.lat, lon=located.origin.lon, height=located.origin.height)
-    survey = read_survey(path, here, measured=False)
+    survey = read_survey(path, located.place, measured=False)
     index = {name: i for i, name in enumerate(survey.names)}
     names = [position.name for position in located.positions]
     if not any(name in index for name in names):
@@ -448,10 +376,11 @@ def position_errors(located: Located, truth: Tensor) -> list[tuple[float, float,
 
     Example:
         >>> from kcal import Camera, Rig, locate_points
+        >>> from kcal.locate import Marks
         >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
         >>> rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
-        >>> found = locate_points(rig, torch.tensor([[960.0, 540.0]]), torch.tensor([[944.0, 540.0]]),
-        ...                origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
+        >>> localize = Localizer(rig, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
+        >>> found = locate_points(localize, Marks(("1",), torch.tensor([[[960.0, 540.0], [944.0, 540.0]]])))
         >>> [round(value, 6) for value in position_errors(found, torch.tensor([[3.0, 996.0, 0.0]]).double())[0][:1]]
         [5.0]
     """
@@ -471,7 +400,7 @@ def position_errors(located: Located, truth: Tensor) -> list[tuple[float, float,
 
 
 @torch.no_grad()
-def interval_coverage(localize: StereoLocalizer, left: Tensor, right: Tensor, ranges: Tensor) -> float:
+def interval_coverage(localize: Localizer, left: Tensor, right: Tensor, ranges: Tensor) -> float:
     """The share of pairs whose 95 % range interval contains the true range.
 
     Args:
@@ -483,7 +412,7 @@ def interval_coverage(localize: StereoLocalizer, left: Tensor, right: Tensor, ra
     Example:
         >>> from kcal.rig import planned_rig
         >>> points = torch.tensor([[0.0, 0.0, 500.0], [9.0, 0.0, 800.0], [0.0, 9.0, 900.0]]).double()
-        >>> localize = StereoLocalizer(planned_rig(), origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
+        >>> localize = Localizer(planned_rig(), origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
         >>> left, right = planned_rig()(points)[0].unbind(-2)
         >>> round(interval_coverage(localize, left, right, torch.tensor([500.0, 2000.0, 900.0])), 3)
         0.667

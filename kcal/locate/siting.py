@@ -16,10 +16,9 @@ from kcal.lens.camera import Camera
 from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Origin, Rig
 from kcal.locate.geodesy import anchor, ecef_from_enu_rotation, enu_from_cam, geodetic_to_enu, mean_radius, place_enu
 from kcal.locate.ground import Ground
-from kcal.locate.multi_localizer import errors_by_camera
-from kcal.locate.stations import station_mounting
+from kcal.locate.mounting import station_mounting
 from kcal.locate.tables import TableRow, read_rows
-from kcal.locate.views import CommonErrors, PosedCameras, shared_pixels
+from kcal.locate.views import CommonErrors, PosedCameras, errors_by_camera, shared_pixels
 
 # What the ground hides: lines of sight over a surface of heights, with the Earth's curve and bent light.
 
@@ -546,7 +545,7 @@ def _table_site(row: TableRow, ground: Ground | None) -> Site:
 def sites_of(rig: Rig, pixel_sigma: float = 0.3) -> list[Site]:
     """The cameras of a rig as sites, with what is known of lens and attitude together, half-way over the image.
 
-    What errors of several cameras have in common is not part of it: `MultiViewLocalizer` knows it.
+    What errors of several cameras have in common is not part of it: `Localizer` knows it.
 
     Args:
         rig: with an origin.

@@ -12,12 +12,13 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from kcal.checks import as_points, expanded
+from kcal.checks import as_points, expanded, exportable
 from kcal.dispatch import CHUNK, is_traced
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera_like import unproject_each
 from kcal.lens.rig import Rig
 from kcal.locate.angular import EPIPOLE, triangulate_pairs
+from kcal.texts import brief
 
 # The 95 % interval of a range, from one over the range and its standard deviation.
 #
@@ -73,7 +74,7 @@ _PARALLEL = 1e-9
 class PositionStatus(enum.IntEnum):
     """What became of a pixel pair. Only `OK` comes with a point; `PARALLEL` still has a bearing and a nearest range.
 
-    CONTRADICTION, of `MultiViewLocalizer`: the views are not of one point, and which is wrong cannot be told.
+    CONTRADICTION, where all errors weigh: the views are not of one point, and which is wrong cannot be told.
     """
 
     OK = 0
@@ -99,17 +100,23 @@ def flag_positions(code: Tensor, condition: Tensor, status: PositionStatus) -> T
     return torch.where(condition, code.new_full((), int(status)), code)
 
 
-def checked_rig(rig: Rig, pixel_sigma: float) -> float:
-    """The sigma of the marks as a float, after checking that it is positive and that the rig has a baseline."""
+def checked_sigma(pixel_sigma: float) -> float:
+    """The sigma of the marks as a float, after checking that it is positive."""
     if not 1e-6 <= pixel_sigma <= 1e6:
         # Beyond, squares of it leave the range of float64, or the accuracy of the arithmetic.
         raise InputError(f"pixel_sigma: a positive number of pixels, 1e-6 to 1e6, is needed, got {pixel_sigma}")
+    return float(pixel_sigma)
+
+
+def checked_rig(rig: Rig, pixel_sigma: float) -> float:
+    """The sigma of the marks as a float, after checking that it is positive and that the rig has a baseline."""
+    sigma = checked_sigma(pixel_sigma)
     if len(rig) < 2:
         raise InputError("a rig of two cameras or more is needed: one camera measures no range")
     apart = (rig.center - rig.center[0]).norm(dim=-1).amax()
     if not float(apart.detach()) > 0:
         raise DegenerateError("the rig's cameras stand in the same place: no range can be measured")
-    return float(pixel_sigma)
+    return sigma
 
 
 def checked_pairs(pixels_left: Tensor | ArrayLike, pixels_right: Tensor | ArrayLike, rig: Rig) -> tuple[Tensor, Tensor]:
@@ -132,6 +139,14 @@ def checked_pair_covariance(cov: Tensor | None, left: Tensor) -> Tensor | None:
     if cov.ndim < 2 or cov.shape[-2] != 4:
         raise InputError(f"cov: shape (..., N, 4, 4) is needed, got {tuple(cov.shape)}")
     return expanded("cov", cov, (*left.shape[:-1], 4, 4))
+
+
+def checked_mask(mask: Tensor, shape: tuple[int, ...], device: torch.device) -> Tensor:
+    """A mask of bool, broadcast to a shape."""
+    mask = torch.as_tensor(mask, device=device)
+    if mask.dtype != torch.bool:
+        raise InputError(f"mask: bool is needed, got {mask.dtype}")
+    return expanded("mask", mask, shape)
 
 
 class CheckedViews(NamedTuple):
@@ -273,3 +288,70 @@ def reprojection_errors(residual: Tensor) -> Tensor:
     squared = residual.unflatten(-2, (-1, 2)).square().sum(-2)
     some = squared > 0
     return torch.where(some, torch.sqrt(torch.where(some, squared, 1.0)), 0.0).mT
+
+
+@exportable
+class Localization(NamedTuple):
+    """Result of `Localizer` for N points and V cameras; nothing in it is NaN, whatever went in. Look at `status` first.
+
+    Attributes:
+        enu: (..., N, 3) meters east, north, up of the origin, which of two cameras is the left one; in the rig's frame
+            where it has no place on the Earth. Zeros unless the status is OK.
+        covariance: (..., N, 3, 3) of `enu`, to first order; an infinite diagonal unless OK. At long range a position
+            is skewed along the line of sight: quote the range interval.
+        geodetic: (..., N, 3) latitude, longitude (degrees), ellipsoidal WGS84 height (meters); the origin unless OK,
+            and zeros where the rig has no place on the Earth.
+        range_low: (..., N) meters from the camera `anchor`, lower end of the 95 % interval.
+        range_high: (..., N) upper end, infinite where the point may be at infinity. The interval is 0 to infinity
+            where nothing is known, infinite at both ends where the rays diverge by more than the noise explains.
+        status: (..., N) int8, codes of `PositionStatus`. BEARING_ONLY: the parallax is below three of its sigmas, so
+            that a range would be noise, or one camera alone saw the point and its height is not known; PARALLEL: the
+            lines of sight meet nowhere before the cameras. Both have a bearing and an interval. CONTRADICTION: the
+            views are not of one point, and which is wrong cannot be told.
+        bearing: (..., N, 3) unit vector in the frame of `enu`; zeros where nothing is known.
+        inverse_range: (..., N) one over meters; negative where the rays diverge. Unlike the range its errors are
+            Gaussian at any distance: the quantity for losses and filters.
+        inverse_range_sigma: (..., N) its standard deviation; zero where nothing is known.
+        reprojection: (..., N, V) distance in px between mark and reprojected point; zero where a view is not used.
+        anchor: (..., N) int64, the first camera that saw the point: from where bearing and ranges count.
+        used: (..., N, V) which views are part of the position.
+        bad: (..., N, V) views that were left out because they contradict the others.
+        misfit: (..., N, V) what leaving out each view changes, with all views: the root of the fall of χ² over two, in
+            sigmas; 1 is typical. Of two views, either takes it all. It has no gradient.
+    """
+
+    enu: Tensor
+    covariance: Tensor
+    geodetic: Tensor
+    range_low: Tensor
+    range_high: Tensor
+    status: Tensor
+    bearing: Tensor
+    inverse_range: Tensor
+    inverse_range_sigma: Tensor
+    reprojection: Tensor
+    anchor: Tensor
+    used: Tensor
+    bad: Tensor
+    misfit: Tensor
+
+    def __repr__(self) -> str:
+        return brief(self, status=status_counts(self.status))
+
+    @property
+    def range(self) -> Tensor:
+        """(..., N) meters from the camera `anchor`; infinite unless the status is OK."""
+        return range_where_ok(self.status, self.inverse_range)
+
+
+class Sensitivity(NamedTuple):
+    """Slopes of the range, infinite where there is no range; at long range they are valid for small errors only.
+
+    Attributes:
+        meters_per_pixel: (..., N) by a shift of one of the two marks in its worst direction.
+        meters_per_degree: (..., N) by a turn of the right camera about its worst axis: relative yaw, for a rig whose
+            cameras stand side by side.
+    """
+
+    meters_per_pixel: Tensor
+    meters_per_degree: Tensor

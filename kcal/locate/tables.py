@@ -94,7 +94,7 @@ class PositionColumns(NamedTuple):
     @property
     def located(self) -> NDArray[np.bool_]:
         """(N,) which pairs have a position."""
-        return np.isfinite(self.numbers[:, 0])
+        return np.isfinite(self.column("east_m"))
 
     def __repr__(self) -> str:
         return brief(self)

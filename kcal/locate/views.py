@@ -181,8 +181,17 @@ class ViewsFit(NamedTuple):
 
     @property
     def chi2(self) -> Tensor:
-        """χ² (N,) of the residuals."""
-        return (self.fit.residual * (self._weight * self.fit.residual).sum(-2)).sum(-2)
+        """χ² (..., N) of the residuals."""
+        residual = self.fit.residual
+        if self.weight is None:
+            return residual.square().sum(-2) / self.variance
+        return (residual * (self.weight * residual[..., None, :, :]).sum(-2)).sum(-2)
+
+    @property
+    def pair_misfit(self) -> Tensor:
+        """(..., N, 2) of two views: the root of half of χ², which either takes when it is left out; no gradient."""
+        misfit = torch.where(self.fitted, (0.5 * self.chi2.detach()).sqrt(), 0.0)
+        return misfit[..., None].expand(self.used.shape)
 
     @torch.no_grad()
     def misfits(self) -> tuple[Tensor, Tensor]:
@@ -479,3 +488,23 @@ def posed_pair(rig: Rig) -> PosedCameras:
     still = torch.eye(3, dtype=torch.float64, device=rotation.device)
     centers = torch.stack([torch.zeros_like(shift), -shift @ rotation])
     return PosedCameras([rig.left, rig.right], torch.stack([still, rotation]), centers)
+
+
+def errors_by_camera(rig: Rig, root: Tensor | None) -> tuple[Tensor | None, Tensor | None, tuple[tuple[int, ...], ...]]:
+    """What `CommonErrors` contains: `half`, `bending` per unit of k, and `lens`."""
+    if root is None or not bool(root.any()):
+        return None, None, ()
+    root = root.to(rig.center)
+    lenses = root[:, : sum(rig.sizes)].split(list(rig.sizes), 1)
+    wanted = [tuple(own.any(0).nonzero()[:, 0].tolist()) for own in lenses]
+    if len(set(rig.sizes)) == 1:
+        # Cameras of one kind are computed together, with the same parameters.
+        wanted = [tuple(sorted(set().union(*wanted)))] * len(rig)
+    most = max(map(len, wanted))
+    rows = [
+        torch.nn.functional.pad(
+            torch.cat([root[:, rig.pose_columns(c)], lenses[c][:, list(own)]], 1), (0, most - len(own))
+        )
+        for c, own in enumerate(wanted)
+    ]
+    return torch.stack(rows, 1), root[:, -1], tuple(wanted)

@@ -18,10 +18,12 @@ from kcal.lens.camera import Camera
 from kcal.lens.rig import Origin, Rig
 from kcal.locate.budget import range_sigmas
 from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic
+from kcal.locate.localizer import Localizer
 from kcal.locate.marks import Marks
 from kcal.locate.mirrored import solve_surveyed
 from kcal.locate.mounting import placed_rig
-from kcal.locate.positions import Located, Position, locate_points, near, region_rings
+from kcal.locate.points import locate_points
+from kcal.locate.positions import Located, Position, near, region_rings
 from kcal.locate.stereo import PositionStatus
 from kcal.locate.survey import Survey, match_landmarks, read_survey
 from kcal.mark.guide import Pictures, Proposal, Reference, RigBand, at_shape, propose, top_level
@@ -152,17 +154,8 @@ def verdict(promises: tuple[Promise, ...], count: int) -> tuple[str, bool]:
 
 def located(rig: Rig, marks: Marks, hand_sigma: float) -> Located:
     """Positions of targets; without a mounting, in a frame whose heading and place mean nothing."""
-    known = rig.mounting is not None
-    return locate_points(
-        rig,
-        marks.left,
-        marks.right,
-        names=marks.names,
-        pixel_sigma=hand_sigma,
-        cov=marks.covariance_or(hand_sigma),
-        origin=None if known else NOWHERE,
-        heading_deg=None if known else 0.0,
-    )
+    place, heading = (NOWHERE, 0.0) if rig.mounting is None else (None, None)
+    return locate_points(Localizer(rig, pixel_sigma=hand_sigma, origin=place, heading_deg=heading), marks)
 
 
 # The map of a marking session: cameras, landmarks and targets with their 95 % regions, as latitudes and longitudes.

@@ -18,8 +18,7 @@ from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.rig import Rig
 from kcal.lens.uncertainty import pixel_slopes
-from kcal.locate.multi_localizer import MultiViewLocalizer, common_errors, posed_cameras
-from kcal.locate.stations import stations_of
+from kcal.locate.localizer import Localizer
 from kcal.locate.views import CommonErrors, PosedCameras, ViewsFit, fit_views
 from kcal.pipeline.assignment import assign_groups
 from kcal.pipeline.detections import Anchor, Detections, box_anchors
@@ -222,9 +221,9 @@ class PairCosts(NamedTuple):
     sigma: Tensor
 
 
-def fit_some(localize: MultiViewLocalizer, cameras: list[int], pixels: Tensor, seen: Tensor, noise: float) -> ViewsFit:
+def fit_some(localize: Localizer, cameras: list[int], pixels: Tensor, seen: Tensor, noise: float) -> ViewsFit:
     """Points of pixels (N, C, 2) of some cameras, with all errors that each camera's marks share."""
-    posed, common = posed_cameras(localize), common_errors(localize)
+    posed, common = localize.posed, localize.common
     part = PosedCameras(
         [posed.cameras[c] for c in cameras], posed.rotation[cameras], posed.center[cameras],
         None if posed.up is None else posed.up[cameras], posed.bending,
@@ -235,7 +234,7 @@ def fit_some(localize: MultiViewLocalizer, cameras: list[int], pixels: Tensor, s
 
 
 def pair_costs(
-    localize: MultiViewLocalizer,
+    localize: Localizer,
     cameras: Tensor,
     pixels: Tensor,
     boxes: Tensor,
@@ -253,11 +252,11 @@ def pair_costs(
         nearest: smallest range, meters; None: any.
 
     Example:
-        >>> from kcal.locate.stations import stations_of
         >>> from kcal.rig import planned_rig
-        >>> rig, pixels = stations_of(planned_rig()), torch.tensor([[[960.0, 540.0], [944.0, 540.0]]]).double()
+        >>> localize = Localizer(planned_rig(), weights="all")
+        >>> pixels = torch.tensor([[[960.0, 540.0], [944.0, 540.0]]]).double()
         >>> boxes, both = torch.cat([pixels - 5.0, pixels + 5.0], -1), torch.tensor([[0, 1]])
-        >>> found = pair_costs(MultiViewLocalizer(rig), both, pixels, boxes, AssociationOptions(), 100.0)
+        >>> found = pair_costs(localize, both, pixels, boxes, AssociationOptions(), 100.0)
         >>> round(float(found.cost), 6), round(1.0 / float(found.inverse))
         (0.0, 1000)
     """
@@ -401,7 +400,7 @@ class BoxPairs(NamedTuple):
         mask: (B, K) bool, which left boxes have one.
         score: (B, K) exp(-cost / 2), the likelihood beside that of a perfect pair; 0 where there is none.
         ambiguous: (B, K) bool: another pairing is about as likely.
-        left: (B, K, 2) what stands for the left boxes, for `StereoLocalizer`; the image's middle where `mask` is False.
+        left: (B, K, 2) what stands for the left boxes, for `Localizer`; the image's middle where `mask` is False.
         right: (B, K, 2) likewise of their right boxes.
     """
 
@@ -572,7 +571,7 @@ def _costs(rig: Rig, pixels: Tensor, boxes: Tensor, options: AssociationOptions)
     # Where a mast stands does not matter.
     alone = Rig.pair(rig.left, rig.right, rig.right_from_left_rotation, rig.right_from_left_translation)
     alone.covariance = rig.covariance
-    localize, both = MultiViewLocalizer(stations_of(alone)), torch.tensor([0, 1]).expand(len(pixels), 2)
+    localize, both = Localizer(alone, weights="all"), torch.tensor([0, 1]).expand(len(pixels), 2)
     return pair_costs(localize, both, pixels, boxes, options, _nearest(rig, options)).cost
 
 

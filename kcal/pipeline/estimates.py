@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from kcal.locate.geodesy import place_enu
-from kcal.locate.multi_localizer import MultiViewLocalizer
+from kcal.locate.localizer import Localizer
 from kcal.locate.stereo import BEARING_SIGMAS, PositionStatus, flag_positions, range_interval, status_counts
 from kcal.pipeline.imm_filter import Summary
 from kcal.pipeline.measurements import product, rooted, squared
@@ -59,7 +59,7 @@ class TrackStates(NamedTuple):
 
 
 def track_states(
-    localize: MultiViewLocalizer, frame: Tensor, home: Tensor, beliefs: Summary, root: Tensor | None
+    localize: Localizer, frame: Tensor, home: Tensor, beliefs: Summary, root: Tensor | None
 ) -> TrackStates:
     """Place beliefs on the Earth.
 
@@ -186,7 +186,7 @@ class History:
         """A track got its number; several may share one, if motion recognized the target."""
         self.numbers[key] = number
 
-    def smoothed(self, localize: MultiViewLocalizer, clock: Tensor, root: Tensor | None) -> list[SmoothedTrack]:
+    def smoothed(self, localize: Localizer, clock: Tensor, root: Tensor | None) -> list[SmoothedTrack]:
         """All confirmed tracks, with the clock as now known and a root of the covariance of the shared errors."""
         by_number: dict[int, list[tuple[_Moment, Summary]]] = {}
         for key, number in self.numbers.items():

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from kcal.errors import InputError
 from kcal.lens.rig import Rig
-from kcal.locate.multi_localizer import MultiViewLocalizer, common_errors, posed_cameras
+from kcal.locate.localizer import Localizer
 from kcal.pipeline.assignment import assign_groups
 from kcal.pipeline.association import MOST_BOXES, AssociationOptions, fit_some, pair_costs
 from kcal.pipeline.detections import Detections
@@ -54,7 +54,7 @@ class _Group(NamedTuple):
 
 
 def group_objects(
-    localize: MultiViewLocalizer, seen: Sequence[Detections | None], options: AssociationOptions | None = None
+    localize: Localizer, seen: Sequence[Detections | None], options: AssociationOptions | None = None
 ) -> ObjectViews:
     """Group the detections that the cameras of a rig have at one moment.
 
@@ -83,7 +83,7 @@ def group_objects(
         >>> pixels, _ = rig(torch.tensor([[0.0, 5000, 100], [400.0, 5500, 100]]))
         >>> boxes = [torch.cat([p - 5, p + 5], -1) for p in pixels.unbind(1)]
         >>> seen = [Detections.read(b, size=(1920, 1080), time=7.0) for b in (boxes[0], boxes[1].flip(0), boxes[2][:1])]
-        >>> views = group_objects(MultiViewLocalizer(rig), seen)
+        >>> views = group_objects(Localizer(rig), seen)
         >>> views.seen.tolist(), views.ambiguous.tolist()
         ([[True, True, True], [True, True, False]], [False, False])
     """
@@ -136,10 +136,8 @@ def group_objects(
 class _Scene:
     """Detections of all cameras, counted through."""
 
-    def __init__(
-        self, localize: MultiViewLocalizer, seen: Sequence[Detections | None], options: AssociationOptions
-    ) -> None:
-        self.localize, self.options, self.posed = localize, options, posed_cameras(localize)
+    def __init__(self, localize: Localizer, seen: Sequence[Detections | None], options: AssociationOptions) -> None:
+        self.localize, self.options, self.posed = localize, options, localize.posed
         self.nearest = options.nearest or _NEAREST_M
         there = [(c, each) for c, each in enumerate(seen) if each is not None]
         none = torch.zeros(0, dtype=torch.float64)
@@ -212,7 +210,7 @@ class _Scene:
 
     def _lines(self) -> StationSights:
         """Lines of sight of all detections."""
-        posed, common = self.posed, common_errors(self.localize)
+        posed, common = self.posed, self.localize.common
         moved, turned, air = torch.zeros(len(self.own)).double(), torch.zeros(len(self.own)).double(), 0.0
         if common is not None:
             moved, turned = common.half[..., :6].square().sum(0).sqrt().unflatten(-1, (2, 3)).amax(-1).unbind(-1)
@@ -375,9 +373,7 @@ class Moment(NamedTuple):
     pairs: ObjectViews
 
 
-def read_moment(
-    line: str | bytes, rig: Rig | MultiViewLocalizer, options: AssociationOptions, pixel_sigma: float
-) -> Moment:
+def read_moment(line: str | bytes, rig: Rig | Localizer, options: AssociationOptions, pixel_sigma: float) -> Moment:
     """Read one line.
 
     Args:
@@ -399,7 +395,7 @@ def read_moment(
         content = orjson.loads(line)
     except orjson.JSONDecodeError as error:
         raise InputError(f"not a line of JSON ({error})") from error
-    if isinstance(rig, MultiViewLocalizer):
+    if isinstance(rig, Localizer):
         return _named_cameras(content, rig, options)
     if not isinstance(content, dict) or not {"left", "right"} <= set(content):
         raise InputError("a JSON object with left and right is needed")
@@ -416,7 +412,7 @@ def read_moment(
     return _pairs_of_line(content, pixel_sigma)
 
 
-def _named_cameras(content: Any, localize: MultiViewLocalizer, options: AssociationOptions) -> Moment:
+def _named_cameras(content: Any, localize: Localizer, options: AssociationOptions) -> Moment:
     names = localize.rig.names
     each = content.get("cameras") if isinstance(content, dict) else None
     if not isinstance(each, dict) or set(content) != {"cameras"} or not each or not set(each) <= set(names):

@@ -14,7 +14,7 @@ from kcal.errors import InputError
 from kcal.lens.camera_like import CameraStack, camera_stack, project_stack, unproject_each
 from kcal.lens.pose import side_axes
 from kcal.locate.angular import LIGHT_HORIZON, Found, baseline_axes, first_seen, meeting_points, triangulate_angular
-from kcal.locate.multi_localizer import MultiViewLocalizer, common_errors, posed_cameras
+from kcal.locate.localizer import Localizer
 from kcal.locate.views import CommonErrors, PosedCameras, sound_covariances
 
 # Pixels of any subset of cameras as rows that are linear around where their lines of sight meet.
@@ -350,9 +350,9 @@ class Sightings(NamedTuple):
         return type(self)(*(value.index_select(-1, which) for value in self))
 
 
-def known_sightings(localize: MultiViewLocalizer) -> KnownViews:
+def known_sightings(localize: Localizer) -> KnownViews:
     """What `sightings` needs of a rig; the calibration's errors are those that `localize` includes."""
-    return known_views(posed_cameras(localize), common_errors(localize))
+    return known_views(localize.posed, localize.common)
 
 
 @torch.no_grad()

@@ -225,7 +225,7 @@ def mark_numbers(pixels: Tensor, seen: Tensor) -> NDArray[np.int64]:
 
 
 class PixelPairs(NamedTuple):
-    """Matches of a batch of B pairs of images, padded to K each, for `StereoLocalizer(left, right, mask=mask)`.
+    """Matches of a batch of B pairs of images, padded to K each, for `Localizer(left, right, mask=mask)`.
 
     Attributes:
         left: (B, K, 2) pixels of the left images; 0 where `mask` is False.
@@ -373,7 +373,7 @@ class ObjectDisparities(NamedTuple):
 
 
 class ObjectDisparity(StatedModule):
-    """Match the image inside boxes: the module between a detector's boxes and `StereoLocalizer`.
+    """Match the image inside boxes: the module between a detector's boxes and `Localizer`.
 
     Gradients of `pixels` reach both images by the implicit function theorem; the scale of the biweight, the rig and the
     boxes count as constants. The other results carry none.

@@ -228,8 +228,8 @@ class LiveMap:
         cameras = [
             {
                 "name": camera.name if run.feet is not None else f"{camera.name} camera",
-                "place": camera_place(camera, run.origin),
-                "field": field_of_view(camera, run.origin, _FIELD_REACH_M),
+                "place": camera_place(camera, run.place),
+                "field": field_of_view(camera, run.place, _FIELD_REACH_M),
             }
             for camera in run.cameras
         ]
@@ -299,7 +299,7 @@ class LiveMap:
 
 def _tracks_text(columns: PositionColumns, sequence: int, run: Located) -> bytes:
     """The tracks with a position: name, place, 95 % region, and what is said of each."""
-    origin = run.origin
+    origin = run.place
     located = np.flatnonzero(columns.located)
     rings = itertools.chain.from_iterable(ring_blocks(columns, origin, plain=run.feet is not None))
     distances = columns.column("range_m")

@@ -23,10 +23,9 @@ from kcal.errors import FileError, InputError
 from kcal.files import FileLock, read_bytes, write_atomic
 from kcal.lens.rig import Rig
 from kcal.locate.export import APPENDED, appended
-from kcal.locate.localizer import Localization
+from kcal.locate.points import own_axes
 from kcal.locate.positions import Located
-from kcal.locate.station_positions import own_axes
-from kcal.locate.stereo import PositionStatus
+from kcal.locate.stereo import Localization, PositionStatus
 from kcal.locate.tables import PositionColumns
 from kcal.locate.tabulate import number_table
 from kcal.pipeline.estimates import TrackStates
@@ -346,7 +345,8 @@ def track_columns(tracks: Tracks, sequence: int, stations: Rig | None = None) ->
     if stations is not None:
         state = state._replace(bearing=(own_axes(stations).cpu()[state.anchor] @ state.bearing[..., None])[..., 0])
     shared = {name: value for name, value in state._asdict().items() if name in Localization._fields}
-    numbers = number_table(Localization(**shared, reprojection=torch.zeros(count, 2)))
+    views = dict.fromkeys(("reprojection", "used", "bad", "misfit"), torch.zeros(count, 2))
+    numbers = number_table(Localization(**views | shared))
     sigma = state.velocity_covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
     extras = {
         "sequence": [str(sequence)] * count,

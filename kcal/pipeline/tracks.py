@@ -17,9 +17,8 @@ import kcal.pipeline.imm_filter as imm
 from kcal.dispatch import known_true
 from kcal.errors import InputError
 from kcal.lens.pose import side_axes
-from kcal.locate.localizer import StereoLocalizer
-from kcal.locate.multi_localizer import MultiViewLocalizer
-from kcal.locate.stations import MOUNTING_ERRORS, stations_at
+from kcal.locate.localizer import Localizer
+from kcal.locate.mounting import MOUNTING_ERRORS
 from kcal.pipeline.assignment import Candidates, Looks, Scores, SeenFrom, assigned, looks_of, nearby, within
 from kcal.pipeline.estimates import History, SmoothedTrack, TrackStates, track_states
 from kcal.pipeline.measurements import (
@@ -177,7 +176,7 @@ def taken_in(beliefs: imm.Beliefs, seen: Anchored, timing: imm.Timing, root: Ten
     return imm.updated(beliefs, found, root)
 
 
-def track_steps(localize: MultiViewLocalizer, lasting_px: float) -> TrackSteps:
+def track_steps(localize: Localizer, lasting_px: float) -> TrackSteps:
     """The steps as they are."""
     centers, errors, bending = localize.rig.center, localize.errors, localize.bending_errors
     turned = None if errors is None else errors[:, :, 3:6].movedim(-1, 0)
@@ -315,7 +314,7 @@ class Tracker:
     in the marks lasts: frames reduce the noise of the marks, and never what these contribute.
 
     Args:
-        localize: the rig, where it stands, and how well both are known; `StereoLocalizer` for two cameras of one mast.
+        localize: the rig, where it stands, and how well both are known.
         options: when tracks begin and end.
         clock: what is known of the clock of each camera but the first, or one for all of them; with sigmas above zero
             they are estimated from the tracks.
@@ -328,7 +327,7 @@ class Tracker:
         >>> from kcal import Origin
         >>> from kcal.rig import planned_rig
         >>> rig = planned_rig()
-        >>> tracker = Tracker(StereoLocalizer(rig, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0))
+        >>> tracker = Tracker(Localizer(rig, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0))
         >>> for time in torch.arange(10).double() / 10:
         ...     place = torch.tensor([[0.0, 0.0, 500.0]]) + time * torch.tensor([8.0, 0.0, 0.0])
         ...     left, right = rig(place)[0].unbind(-2)
@@ -341,13 +340,13 @@ class Tracker:
 
     def __init__(
         self,
-        localize: MultiViewLocalizer | StereoLocalizer,
+        localize: Localizer,
         options: TrackOptions | None = None,
         *,
         clock: ClockPrior | Sequence[ClockPrior] | None = None,
         record: bool = False,
         compiled: bool = False,
-        moments: Callable[[float], StereoLocalizer] | None = None,
+        moments: Callable[[float], Localizer] | None = None,
         moving: int = 0,
     ) -> None:
         if moments is not None and (compiled or record):
@@ -355,12 +354,15 @@ class Tracker:
         # SciPy takes long to load.
         from scipy.special import chdtrc, chdtri
 
-        self.localize = localize if isinstance(localize, MultiViewLocalizer) else stations_at(localize)
+        self.localize = localize.weighing_all()
         self.solved, self.moments, self.options = self.localize, moments, options or TrackOptions()
         rig, errors = self.localize.rig, self.localize.errors
         others = len(rig) - 1
         if rig.origin is None or not others:
-            raise InputError("tracks: a rig of two cameras or more with a place on the Earth is needed")
+            raise InputError(
+                "tracks: two cameras or more with a place on the Earth are needed; solve the rig with landmarks, or "
+                "give origin and heading_deg"
+            )
         priors = [clock or ClockPrior()] * others if clock is None or isinstance(clock, ClockPrior) else list(clock)
         if len(priors) != others:
             raise InputError(f"clock: one, or one for each of {others} cameras beside the first, is needed")
@@ -374,7 +376,7 @@ class Tracker:
         loss = chdtrc(4, self.options.gate)
         limits = [float(chdtri(2 * max(count, 1), loss)) for count in range(len(rig) + 1)]
         self.gates = torch.tensor(limits, dtype=torch.float64, device=device)
-        self._stands: StereoLocalizer | None = None
+        self._stands: Localizer | None = None
         self.time = -math.inf
         self.records: list[TrackRecord] = []
         self.history: History | None = History() if record else None
@@ -413,7 +415,7 @@ class Tracker:
         if self.shared.start is None:
             self.shared.start = time
         if self.moments is not None and (stands := self.moments(time)) is not self._stands:
-            self._stands, self.localize = stands, stations_at(stands, errors=self.errors)
+            self._stands, self.localize = stands, stands.weighing_all(self.errors)
             self.steps = track_steps(self.localize, self.options.lasting_px)
         self._predict(time)
         self.seen_now = {}

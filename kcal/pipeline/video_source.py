@@ -24,7 +24,7 @@ from torch import Tensor
 from kcal.errors import FileError, InputError
 from kcal.files import is_stream, source_name
 from kcal.lens.rig import Rig
-from kcal.locate.multi_localizer import MultiViewLocalizer
+from kcal.locate.localizer import Localizer
 from kcal.pipeline.association import AssociationOptions
 from kcal.pipeline.detections import Detections, Detector, detect_in
 from kcal.pipeline.grouping import Moment, group_objects
@@ -518,7 +518,7 @@ class Videos:
     def __init__(
         self,
         videos: Sequence[str],
-        rig: Rig | MultiViewLocalizer,
+        rig: Rig | Localizer,
         detector: Detector,
         options: AssociationOptions,
         *,

@@ -249,7 +249,7 @@ def map_page(
     allowed = "data: https://tile.openstreetmap.org" if online else "data:"
     title = located.count_note
     note = (
-        f"From {located.origin.lat:.6f}°, {located.origin.lon:.6f}°, heading {located.heading_deg:g}° from true north. "
+        f"From {located.place.lat:.6f}°, {located.place.lon:.6f}°, heading {located.heading_deg:g}° from true north. "
         f"Regions and intervals: {located.interval_note}. Geoid: {located.geoid or 'none found'}."
     )
     key = "White dots: estimated; click one for its numbers. Black outlines: 95 % regions."
@@ -301,19 +301,19 @@ def _content(located: Located, truth: Tensor | None) -> dict[str, Any]:
         sweep = field_azimuths(view)
         if sweep is not None:
             edges += [(float(a) - located.heading_deg + 180) % 360 - 180 for a in sweep[[0, -1]]]
-        outline, place = field_of_view(view, located.origin, reach), camera_place(view, located.origin)
+        outline, place = field_of_view(view, located.place, reach), camera_place(view, located.place)
         cameras.append({"name": view.name, "place": place, "field": outline})
     low, high = (min(edges), max(edges)) if edges else (-180.0, 180.0)
     sweep = torch.linspace(low, high, 90, dtype=torch.float64) + located.heading_deg
     arcs = [
-        {"name": range_text(arc), "line": map_places(level_rim((0, 0, 0), sweep, arc), located.origin)}
+        {"name": range_text(arc), "line": map_places(level_rim((0, 0, 0), sweep, arc), located.place)}
         for arc in (arcs_within(reach) if located.feet is None else [])
     ]
     feet = torch.zeros(len(located.positions), 3, dtype=torch.float64) if located.feet is None else located.feet
     bearings = [
         map_places(
             foot + level_rim((0.0, 0.0, 0.0), torch.full((2,), p.azimuth_deg, dtype=torch.float64), 1.0) * ends,
-            located.origin,
+            located.place,
         )
         for p, foot in zip(located.positions, feet, strict=True)
         if p.azimuth_deg is not None and p.status != PositionStatus.OK
@@ -323,19 +323,19 @@ def _content(located: Located, truth: Tensor | None) -> dict[str, Any]:
     for position, row in zip(located.positions, [] if truth is None else truth, strict=truth is not None):
         if not bool(torch.isfinite(row).all()):
             continue
-        (spot,) = map_places(row[None], located.origin)
+        (spot,) = map_places(row[None], located.place)
         true.append(spot)
         if position.enu is not None and position.lat is not None and position.lon is not None:
             miss = torch.tensor(position.enu, dtype=torch.float64) - row.detach().cpu().double()
             azimuth = math.degrees(math.atan2(float(miss[0]), float(miss[1])))
-            arrows.append({"line": [spot, (position.lat, near(position.lon, located.origin.lon))], "azimuth": azimuth})
+            arrows.append({"line": [spot, (position.lat, near(position.lon, located.place.lon))], "azimuth": azimuth})
     unit = range_unit(located)
     points = [
-        {"name": p.name, "place": (p.lat, near(p.lon, located.origin.lon)), "rows": _popup_rows(p, unit)}
+        {"name": p.name, "place": (p.lat, near(p.lon, located.place.lon)), "rows": _popup_rows(p, unit)}
         for p in located.positions
         if p.lat is not None and p.lon is not None
     ]
-    rings = [[(lat, near(lon, located.origin.lon)) for lat, lon in ring] for ring in region_rings(located)]
+    rings = [[(lat, near(lon, located.place.lon)) for lat, lon in ring] for ring in region_rings(located)]
     return {
         "cameras": cameras, "arcs": arcs, "regions": rings, "bearings": bearings, "arrows": arrows, "truth": true,
         "points": points,

@@ -68,11 +68,13 @@ def positions_figure(located: Located, truth: Tensor | None = None) -> Figure:
 
     Example:
         >>> import torch
-        >>> from kcal import Camera, Origin, Rig, locate_points
+        >>> from kcal import Camera, Localizer, Origin, Rig, locate_points
+        >>> from kcal.locate import Marks
         >>> camera = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
         >>> rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
-        >>> left, right = rig(torch.tensor([[50.0, 0.0, 900.0]]))[0].unbind(-2)
-        >>> located = locate_points(rig, left, right, origin=Origin(lat=19.0, lon=72.9, height=0.0), heading_deg=35.0)
+        >>> marks = Marks(("mast",), rig(torch.tensor([[50.0, 0.0, 900.0]]))[0])
+        >>> localize = Localizer(rig, origin=Origin(lat=19.0, lon=72.9, height=0.0), heading_deg=35.0)
+        >>> located = locate_points(localize, marks)
         >>> len(positions_figure(located).axes)
         2
     """
@@ -87,7 +89,7 @@ def positions_figure(located: Located, truth: Tensor | None = None) -> Figure:
     _draw_ranges(ranges, located, true_enu, shown)
     figure.suptitle(
         f"{located.count_note}, from "
-        f"{located.origin.lat:.6f}°, {located.origin.lon:.6f}°, heading {located.heading_deg:g}°",
+        f"{located.place.lat:.6f}°, {located.place.lon:.6f}°, heading {located.heading_deg:g}°",
         x=0.015,
         ha="left",
         fontsize=14,
@@ -334,7 +336,7 @@ def stations_figure(located: Located, truth: Tensor | None = None) -> Figure:
     """Draw a plan, kilometers east and north of the origin.
 
     Args:
-        located: from `kcal.locate.station_positions.locate_views`.
+        located: from `kcal.locate_points`.
         truth: (N, 3) true east, north, up in meters, NaN where unknown.
     """
     figure = figures.new_figure(8.0, 7.0)

@@ -23,7 +23,7 @@ from kcal.lens.rig import Origin, Rig
 from kcal.lens.turning import rotation_between
 from kcal.locate.budget import range_sigmas
 from kcal.locate.geodesy import geodetic_to_enu
-from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.localizer import Localizer
 
 Floats = NDArray[np.float64]
 _FAR = 5000.0  # meters, at which errors of lenses are told
@@ -109,7 +109,7 @@ class RangeScore(NamedTuple):
 def score_rig(rig: Rig, truth: dict[str, Any]) -> list[RangeScore]:
     """Compare ranges of exact marks with the true ones, over the image."""
     placed = rig.mounting is not None
-    localize = StereoLocalizer(
+    localize = Localizer(
         rig,
         pixel_sigma=_EXACT,
         origin=None if placed else Origin(lat=0.0, lon=0.0, height=0.0),

@@ -23,7 +23,8 @@ def position_rows(located: Located, off: list[tuple[float, float, bool] | None] 
         off: from `kcal.locate.positions.position_errors`, for three more columns.
     """
     unit = range_unit(located)
-    rows = [["name", "lat °", "lon °", "height m", f"range {unit.name}", f"interval {unit.name}", "status"]]
+    where = ["lat °", "lon °", "height m"] if located.origin else ["x m", "y m", "z m"]
+    rows = [["name", *where, f"range {unit.name}", f"interval {unit.name}", "status"]]
     rows += [_position_row(position, unit) for position in located.positions]
     if off is not None:
         rows[0][-1:-1] = [f"off level {unit.name}", f"off in range {unit.name}", "in interval"]
@@ -68,6 +69,10 @@ def _position_row(position: Position, unit: Unit) -> list[str]:
         degrees = 9 if unit.meters < M.meters else 7
         up = None if position.covariance is None else math.sqrt(position.covariance[2][2])
         place = [f"{position.lat:.{degrees}f}", f"{position.lon:.{degrees}f}", number_text(position.height, up)]
+        numbers = [*place, unit.number(position.range_m or 0.0, range_sigma(position))]
+    elif position.enu is not None and position.covariance is not None:
+        sigmas = [math.sqrt(row[axis]) for axis, row in enumerate(position.covariance)]
+        place = [number_text(value, sigma) for value, sigma in zip(position.enu, sigmas, strict=True)]
         numbers = [*place, unit.number(position.range_m or 0.0, range_sigma(position))]
     status = position.status.name.lower().replace("_", " ")
     return [position.name, *numbers, interval_text(position, unit), f"{status} *" if position.reason else status]
@@ -119,13 +124,13 @@ def chance_text(located: Located, truth: Tensor) -> str:
     """How many 95 % intervals contain the true range, and how many misses chance explains.
 
     Example:
-        >>> from kcal import Origin, locate_points
+        >>> from kcal import Localizer, Origin, locate_points
+        >>> from kcal.locate import Marks
         >>> from kcal.rig import planned_rig
         >>> import torch
         >>> points = torch.tensor([[0.0, 0.0, 1000.0]] * 7, dtype=torch.float64)
-        >>> left, right = planned_rig()(points)[0].unbind(-2)
-        >>> found = locate_points(planned_rig(), left, right, origin=Origin(lat=19.0, lon=72.9, height=0.0),
-        ...                       heading_deg=0.0)
+        >>> localize = Localizer(planned_rig(), origin=Origin(lat=19.0, lon=72.9, height=0.0), heading_deg=0.0)
+        >>> found = locate_points(localize, Marks(tuple("abcdefg"), planned_rig()(points)[0]))
         >>> chance_text(found, points[:, [0, 2, 1]])
         'The true range is inside 7 of 7 intervals. Of 7 intervals of 95 %, one or more miss in 30 % of all runs.'
     """

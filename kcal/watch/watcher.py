@@ -24,7 +24,7 @@ from kcal.corners.images import Gray
 from kcal.errors import FileError, InputError
 from kcal.lens.rig import Rig, RigCovariance
 from kcal.locate.geodesy import enu_from_cam
-from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.localizer import Localizer
 from kcal.pipeline.stream import Ledger
 from kcal.watch.turned import Drift, drift_of_turns
 
@@ -232,12 +232,12 @@ class Followed:
         FileError: no history, or one of another rig.
     """
 
-    def __init__(self, history: Path, localize: StereoLocalizer) -> None:
+    def __init__(self, history: Path, localize: Localizer) -> None:
         self._tail, self._solved = past.HistoryTail(history, localize.rig.fingerprint), localize
         self._watched = Watched(localize.rig, self._tail.rows())
         self._now, self._until = localize, -math.inf
 
-    def __call__(self, time: float) -> StereoLocalizer:
+    def __call__(self, time: float) -> Localizer:
         """The localizer of a moment.
 
         Raises:
@@ -254,13 +254,13 @@ class Followed:
         return self._now
 
 
-def standing(solved: StereoLocalizer, watched: Watched, time: float) -> StereoLocalizer:
+def standing(solved: Localizer, watched: Watched, time: float) -> Localizer:
     """A localizer as the rig stands at a moment; its place stays where it was given."""
     rig = watched.rig_at(time)
     if solved.rig.mounting is not None and solved.origin == solved.rig.mounting.origin:
-        return StereoLocalizer(rig, pixel_sigma=float(solved.pixel_sigma))
+        return Localizer(rig, pixel_sigma=float(solved.pixel_sigma))
     heading, pitch, roll = solved.attitude_deg
-    return StereoLocalizer(
+    return Localizer(
         rig,
         origin=solved.origin,
         heading_deg=heading,

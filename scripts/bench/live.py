@@ -23,7 +23,7 @@ import torch
 from kcal.io.rig_file import save_rig
 from kcal.lens.rig import Mounting, Origin, Rig, RigCovariance
 from kcal.locate.budget import planned_rig
-from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.localizer import Localizer
 from kcal.pipeline.pairing import ObjectViews
 from kcal.pipeline.tracks import Tracker
 from scripts.shared.page import table, write_section
@@ -52,7 +52,7 @@ def marks(rig: Rig, targets: int, second: float, generator: torch.Generator) -> 
 def cost_of_tracks(targets: int = 50, moments: int = 60, compiled: bool = False) -> float:
     """Processor milliseconds of one moment of the tracker."""
     rig, generator = site_rig(), torch.Generator().manual_seed(0)
-    tracker = Tracker(StereoLocalizer(rig), compiled=compiled)
+    tracker = Tracker(Localizer(rig), compiled=compiled)
     spent = 0.0
     for moment in range(moments):
         left, right = marks(rig, targets, moment / 30.0, generator)

@@ -24,7 +24,7 @@ from kcal.lens.projection import project_components
 from kcal.lens.rig import Origin, Rig, RigCovariance
 from kcal.locate.angular import triangulate_linear, triangulate_pairs
 from kcal.locate.geodesy import enu_to_geodetic
-from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.localizer import Localizer
 from kcal.locate.tabulate import circular_error
 from scripts.shared.long_range import ORIGIN, RANGES, rig
 from scripts.shared.page import write_section
@@ -134,8 +134,8 @@ def localizer(rounds: int, counts: tuple[int, ...]) -> list[str]:
             "|---|---|---|---|",
         ]
     )
-    plain = StereoLocalizer(rig(), origin=ORIGIN, heading_deg=35.0, pixel_sigma=0.1)
-    known = StereoLocalizer(rig(), origin=ORIGIN, heading_deg=35.0, pixel_sigma=0.1, calibration=known_to())
+    plain = Localizer(rig(), origin=ORIGIN, heading_deg=35.0, pixel_sigma=0.1)
+    known = Localizer(rig(), origin=ORIGIN, heading_deg=35.0, pixel_sigma=0.1, calibration=known_to())
     for count in counts:
         left, right = rig()(some_points(count))[0].unbind(-2)
         cov = (0.01 * torch.eye(4, dtype=torch.float64)).expand(count, 4, 4)
@@ -159,8 +159,8 @@ def coverage(draws: int) -> list[str]:
         ]
     )
     there, known = rig(), known_to()
-    plain = StereoLocalizer(there, origin=ORIGIN, heading_deg=35.0, pixel_sigma=0.1)
-    wide = StereoLocalizer(there, origin=ORIGIN, heading_deg=35.0, pixel_sigma=0.1, calibration=known)
+    plain = Localizer(there, origin=ORIGIN, heading_deg=35.0, pixel_sigma=0.1)
+    wide = Localizer(there, origin=ORIGIN, heading_deg=35.0, pixel_sigma=0.1, calibration=known)
     factor, generator = known.half.T, torch.Generator().manual_seed(7)
     for i, distance in enumerate(RANGES):
         angle = -0.3 + 0.1 * i

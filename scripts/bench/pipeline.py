@@ -4,7 +4,7 @@
     python -m scripts.bench.pipeline --calls 20 --no-compile
     python -m scripts.bench.pipeline --gradients --write   section gradients: compiling, and derivatives
 
-One thread. `localize` is `StereoLocalizer` alone, with a covariance for each pair, compiled step by step
+One thread. `localize` is `Localizer` alone, with a covariance for each pair, compiled step by step
 (`whole_graph`) with `cpp_wrapper`;
 `associate` pairs as many detections of both images; `match` is `ObjectDisparity` on boxes of 12 px, all of which have
 their image in both. One graph is compiled for any number of pairs from two; a single pair goes twice.
@@ -27,7 +27,7 @@ from kcal.io.rig_file import load_rig
 from kcal.lens.camera import Camera
 from kcal.lens.rig import Origin, Rig, RigCovariance
 from kcal.locate.budget import planned_rig
-from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.localizer import Localizer
 from kcal.locate.triangulate import Triangulate
 from kcal.pipeline.association import associate
 from kcal.pipeline.detections import Detections
@@ -73,7 +73,7 @@ def spent(calls: list[Callable[[], object]], rounds: int = 9) -> list[str]:
     ]
 
 
-def localizer(lens: str) -> tuple[StereoLocalizer, Tensor, Tensor]:
+def localizer(lens: str) -> tuple[Localizer, Tensor, Tensor]:
     """The sample rig or one with other lenses, with a covariance of the cameras, and marks of points from 100 m on."""
     rig = load_rig("assets/sample-rig.json")
     values = LENSES[lens]
@@ -83,7 +83,7 @@ def localizer(lens: str) -> tuple[StereoLocalizer, Tensor, Tensor]:
         own = torch.diag(torch.tensor([0.1, 0.1, 0.1, 0.1, 1e-3, *([1e-4] * len(values))], dtype=torch.float64) ** 2)
         whole.covariance = RigCovariance.of(whole, left=own, right=own, pose=1e-9 * torch.eye(6).double())
         rig = whole
-    localize = StereoLocalizer(rig, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=35.0)
+    localize = Localizer(rig, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=35.0)
     random = torch.Generator().manual_seed(0)
     depth = 10 ** (2.0 + 1.5 * torch.rand(PAIRS, 1, generator=random).double())
     place = (torch.rand(PAIRS, 2, generator=random).double() - 0.5) * torch.tensor([0.9, 0.5])
@@ -122,7 +122,7 @@ def gradients() -> str:
     heads += [
         f"{what}, {how}, ms" for what in ("100", PAIRS, f"{PAIRS} with gradients") for how in ("eager", "compiled")
     ]
-    text = "Processor time of `StereoLocalizer`, one thread. Made by `scripts/bench/pipeline.py --gradients`.\n\n"
+    text = "Processor time of `Localizer`, one thread. Made by `scripts/bench/pipeline.py --gradients`.\n\n"
     text += "\n".join(table(heads, rows))
     camera = made["opencv5"][0].rig.left
     pixels, K, d = made["opencv5"][1], camera.matrix, camera.coefficients
@@ -177,7 +177,7 @@ def main() -> None:
             write_section("pairing.md", "gradients", text)
         return
     rig = site_rig()
-    localize = StereoLocalizer(rig, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=35.0)
+    localize = Localizer(rig, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=35.0)
     compiled = None
     if not options.no_compile:
         localize.whole_graph = True

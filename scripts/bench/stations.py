@@ -3,7 +3,7 @@
     python -m scripts.bench.stations sites              # 200 x 200 points, 5 towers, 10 candidates; sites.png
     python -m scripts.bench.stations frame [ROUNDS]     # 1,000 detections in 8 cameras
     python -m scripts.bench.stations table [ROWS ...]   # kcal locate of long tables: CPU seconds and peak memory
-    python -m scripts.bench.stations two [PAIRS]        # StereoLocalizer beside MultiViewLocalizer
+    python -m scripts.bench.stations two [PAIRS]        # Localizer beside Localizer
     python -m scripts.bench.stations many [CAMERAS VIEWS ...]  # calibrated together: 8 and 24, 16 and 60
 
 `--write` puts a part into docs/measured/stations.md. CPU seconds on one core
@@ -42,11 +42,9 @@ from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import Mounting, Origin, Rig, RigCovariance
 from kcal.locate.budget import planned_rig
-from kcal.locate.localizer import StereoLocalizer
-from kcal.locate.multi_localizer import MultiViewLocalizer
+from kcal.locate.localizer import Localizer
 from kcal.locate.raster import terrain
 from kcal.locate.siting import Site, area_of, rank_sites, siting_map
-from kcal.locate.stations import stations_of
 from scripts.shared.memory import peak_megabytes
 from scripts.shared.page import table, write_section
 from scripts.shared.station_scenes import drawn_errors, hills, marks, ring, targets
@@ -117,7 +115,7 @@ def frame(rounds: int) -> list[str]:
     rows = []
     for name, pixels in (("all seen, none wrong", seen), ("10 % missing, 5 % wrong", spoiled)):
         for errors, known in (("marks alone", torch.zeros(1, rig.quantities).double()), ("all errors", root)):
-            localize = MultiViewLocalizer(rig, root=known, pixel_sigma=0.3)
+            localize = Localizer(rig, root=known, pixel_sigma=0.3)
             spent = []
             with torch.no_grad():
                 for _ in range(rounds + 1):
@@ -129,7 +127,7 @@ def frame(rounds: int) -> list[str]:
 
 
 def two(count: int) -> list[str]:
-    """`StereoLocalizer` beside `MultiViewLocalizer` on the same pairs of marks."""
+    """`Localizer` beside `Localizer` on the same pairs of marks."""
     rows, generator = [], torch.Generator().manual_seed(0)
     for name, pose in (("marks alone", None), ("and lenses and pose", 1e-10 * torch.eye(6).double())):
         rig = planned_rig()
@@ -143,8 +141,8 @@ def two(count: int) -> list[str]:
         marked = torch.stack([left, right], 1) + 0.2 * torch.randn(count, 2, 2, generator=generator).double()
         with torch.no_grad():
             (ours, by_pair), (theirs, by_views) = (
-                _timed(StereoLocalizer(rig, pixel_sigma=0.2, refraction_sigma=0.0), marked[:, 0], marked[:, 1]),
-                _timed(MultiViewLocalizer(stations_of(rig), pixel_sigma=0.2), marked),
+                _timed(Localizer(rig, pixel_sigma=0.2, refraction_sigma=0.0), marked[:, 0], marked[:, 1]),
+                _timed(Localizer(rig, weights="all", pixel_sigma=0.2), marked),
             )
         both = (ours.status == 0) & (theirs.status == 0)
         sigma = ours.covariance[both].diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
@@ -155,7 +153,7 @@ def two(count: int) -> list[str]:
             f"{float(off.median()):.1e}",
         ])  # fmt: skip
     return table(
-        ["errors", "`StereoLocalizer`, CPU s per million", "`MultiViewLocalizer`", "times", "median difference in σ"],
+        ["errors", "`Localizer`, CPU s per million", "`Localizer`", "times", "median difference in σ"],
         rows,
     )
 

@@ -17,7 +17,7 @@ from kcal.calibrate.rig.sources import RigData
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera
 from kcal.locate.geodesy import enu_from_cam
-from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.localizer import Localizer
 from kcal.locate.mounting import placed_rig
 from kcal.sim.captures import TrueRig, drawn_rig
 from kcal.sim.raytrace import SURVEILLANCE
@@ -104,7 +104,7 @@ def landmarks(rig: TrueRig, generator: torch.Generator) -> tuple[Landmarks, Land
     return dataclasses.replace(exact, points=points + survey, pixels=marks + noise), exact
 
 
-def localizer(cameras: tuple[Camera, Camera], seen: Landmarks, how: How) -> StereoLocalizer:
+def localizer(cameras: tuple[Camera, Camera], seen: Landmarks, how: How) -> Localizer:
     """The rig solved from landmarks, with what it knows of itself.
 
     Args:
@@ -121,7 +121,7 @@ def localizer(cameras: tuple[Camera, Camera], seen: Landmarks, how: How) -> Ster
     rig = placed_rig(solve_rig(data, options), ORIGIN)
     if rig.covariance is None or rig.mounting is None:
         raise KcalError("the solved rig has no covariance or no mounting")
-    return StereoLocalizer(rig, pixel_sigma=MARK)
+    return Localizer(rig, pixel_sigma=MARK)
 
 
 def judge(

@@ -33,7 +33,7 @@ from kcal.io.camera_file import load_camera
 from kcal.lens.difference import camera_difference
 from kcal.lens.rig import RigCovariance
 from kcal.lens.uncertainty import projection_sigma
-from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.localizer import Localizer
 from kcal.solve.problem import SolverStatus
 from scripts.check import rig as site
 from scripts.shared.views import observed, simulate
@@ -92,7 +92,7 @@ def positions(found: RigResult, pixels: Tensor) -> dict[str, Any]:
     """Points of marks (N, 2, 2) with their covariance, and the rig that located them."""
     pair = found.stereo()
     known = RigCovariance.of(pair, joint=found.joint_covariance())
-    localize = StereoLocalizer(pair, origin=site.ORIGIN, heading_deg=0.0, pixel_sigma=_SIGMA, calibration=known)
+    localize = Localizer(pair, origin=site.ORIGIN, heading_deg=0.0, pixel_sigma=_SIGMA, calibration=known)
     answer = localize(pixels[:, 0], pixels[:, 1])
     return {
         "points": answer.enu.tolist(),

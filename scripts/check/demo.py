@@ -23,7 +23,10 @@ import torch
 
 from kcal.cli.demo_run import simulated_site
 from kcal.io.rig_file import load_rig
-from kcal.locate.positions import locate_points, position_errors
+from kcal.locate.localizer import Localizer
+from kcal.locate.marks import Marks
+from kcal.locate.points import locate_points
+from kcal.locate.positions import position_errors
 from kcal.sim.scene import DemoScene
 from scripts.shared.page import table, tell
 
@@ -35,7 +38,9 @@ def outcome(seed: int) -> dict[str, Any]:
         simulated_site(Path(folder), seed)
         rig = load_rig(Path(folder, "rig.json"))
     marks, targets = scene.target_marks, scene.targets
-    located = locate_points(rig, marks.left, marks.right, pixel_sigma=scene.mark_sigma, names=targets.names)
+    located = locate_points(
+        Localizer(rig, pixel_sigma=scene.mark_sigma), Marks.of_pair(targets.names, marks.left, marks.right)
+    )
     ranges = targets.enu.norm(dim=-1).tolist()
     found = []
     for name, true, miss in zip(targets.names, ranges, position_errors(located, targets.enu), strict=True):

@@ -26,7 +26,7 @@ from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.model import LensModel
 from kcal.lens.rig import Origin, Rig, RigCovariance
 from kcal.lens.zernike import ZernikeModes
-from kcal.locate.localizer import Localization, StereoLocalizer
+from kcal.locate.localizer import Localization, Localizer
 from scripts.shared.page import table, write_section
 from scripts.shared.timing import row, show
 
@@ -35,7 +35,7 @@ WAYS = ("trace", "inductor", "export", "onnx")
 ALLOWED = 1e-9
 
 
-def localizer(lens: str) -> StereoLocalizer:
+def localizer(lens: str) -> Localizer:
     """Of two cameras with mild lenses, with all error terms."""
     modes = ZernikeModes(radial=5, decentered=4, astigmatic=3, other=3)
     model = LensModel(hybrid=HybridForm(shape=0.7, radius=1.4, modes=modes)) if lens == "hybrid" else lens
@@ -48,10 +48,10 @@ def localizer(lens: str) -> StereoLocalizer:
     rig.covariance = RigCovariance.of(rig, pose=1e-8 * torch.eye(6, dtype=torch.float64))
     mounting = 1e-6 * torch.eye(6, dtype=torch.float64)
     origin = Origin(lat=19.07, lon=72.87, height=14.0)
-    return StereoLocalizer(rig, origin=origin, heading_deg=35.0, pixel_sigma=0.1, mounting=mounting)
+    return Localizer(rig, origin=origin, heading_deg=35.0, pixel_sigma=0.1, mounting=mounting)
 
 
-def marks(module: StereoLocalizer, repeats: int) -> tuple[Tensor, Tensor]:
+def marks(module: Localizer, repeats: int) -> tuple[Tensor, Tensor]:
     points = torch.tensor([[30.0, 10, 800], [-100, 40, 900], [5, 5, 100], [200, -30, 5000]], dtype=torch.float64)
     left, right = module.rig(points)[0].unbind(-2)
     bad = torch.tensor([[torch.nan, 3.0], [5000.0, 5.0]], dtype=torch.float64)
@@ -77,7 +77,7 @@ def difference(found: Sequence[Tensor], wanted: Localization, origin: Tensor) ->
 
 
 @torch.no_grad()
-def result(way: str, module: StereoLocalizer, few: tuple[Tensor, Tensor], many: tuple[Tensor, Tensor]) -> list[Tensor]:
+def result(way: str, module: Localizer, few: tuple[Tensor, Tensor], many: tuple[Tensor, Tensor]) -> list[Tensor]:
     """What a way of deployment that has seen `few` pairs gives for `many`."""
     if way in {"trace", "inductor"}:
         compiled = torch.compile(module, fullgraph=True, dynamic=True, backend="eager" if way == "trace" else way)

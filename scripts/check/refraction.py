@@ -23,7 +23,7 @@ from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.sources import RigData
 from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA
 from kcal.locate.geodesy import enu_from_cam, mean_radius
-from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.localizer import Localizer
 from kcal.locate.mounting import placed_rig
 from scripts.shared.long_range import ORIGIN, rig
 from scripts.shared.page import table, write_section
@@ -87,7 +87,7 @@ def heights(place: Site, generator: torch.Generator, noise: float, learned: bool
     options = RigOptions(intrinsics="fixed", refraction_sigma=REFRACTION_SIGMA if learned else 0.0)
     solved = solve_rig(data, options)
     k, sigma = (None, None) if learned else (REFRACTION, REFRACTION_SIGMA)
-    localize = StereoLocalizer(placed_rig(solved, ORIGIN), pixel_sigma=MARK, refraction=k, refraction_sigma=sigma)
+    localize = Localizer(placed_rig(solved, ORIGIN), pixel_sigma=MARK, refraction=k, refraction_sigma=sigma)
     marks = place.target_marks + MARK * normal(place.target_marks)
     found = localize(marks[:, 0], marks[:, 1])
     # Across the line of sight, upward: errors of the range are not those of light.

@@ -27,7 +27,7 @@ from kcal.calibrate.rig.sources import RigData
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.lens.rig import Rig, RigCovariance
 from kcal.locate.geodesy import enu_from_cam
-from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.localizer import Localizer
 from kcal.report.figures import save_picture
 from kcal.report.rig import rig_figure
 from kcal.watch.turned import drift_of_turns, measure_drift
@@ -137,7 +137,7 @@ def coverage(draws: int, marks: int) -> list[str]:
     ahead = torch.stack([angles.sin(), 0.02 * torch.arange(len(RANGES)) - 0.06, angles.cos()], -1)
     targets = far[:, None] * ahead / torch.linalg.vector_norm(ahead, dim=-1, keepdim=True) @ LOOK
     exact = seen(targets)
-    best = StereoLocalizer(TRUTH, origin=ORIGIN, heading_deg=HEADING, pixel_sigma=MARK)(exact[:, 0], exact[:, 1])
+    best = Localizer(TRUTH, origin=ORIGIN, heading_deg=HEADING, pixel_sigma=MARK)(exact[:, 0], exact[:, 1])
     bound = best.inverse_range_sigma
     lines = show(
         [
@@ -159,7 +159,7 @@ def coverage(draws: int, marks: int) -> list[str]:
             found = solve_rig(data(kind.replace("20 summits", "summits"), draw), STRAIGHT)
             pair = found.stereo()
             known = RigCovariance.of(pair, joint=found.joint_covariance())
-            localize = StereoLocalizer(
+            localize = Localizer(
                 pair, origin=ORIGIN, heading_deg=HEADING, pixel_sigma=MARK, calibration=known
             )  # fmt: skip
             noisy = exact + MARK * normal((marks, *exact.shape), draw)

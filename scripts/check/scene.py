@@ -42,7 +42,7 @@ from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import vector_from_rotation
 from kcal.lens.rig import Rig
-from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.localizer import Localizer
 from kcal.scene.common_errors import line_errors, with_common_errors
 from kcal.scene.match import ImagePair, MatchedPair, counted, match_scene, scene_of, still_matches
 from kcal.scene.match import _posed as posed
@@ -400,7 +400,7 @@ def at_five_km(found: RigResult, draw: torch.Generator) -> tuple[Tensor, Tensor]
     ray = 5000.0 * ray / ray.norm(dim=-1, keepdim=True)
     left, right = RIG(ray)[0].unbind(-2)
     noise = MARK * torch.randn(2, 9, 2, dtype=torch.float64, generator=draw)
-    where = StereoLocalizer(found.stereo(), origin=ORIGIN, heading_deg=0.0, pixel_sigma=MARK)(
+    where = Localizer(found.stereo(), origin=ORIGIN, heading_deg=0.0, pixel_sigma=MARK)(
         left + noise[0], right + noise[1]
     )
     return 5000.0 * where.inverse_range - 1.0, 5000.0 * where.inverse_range_sigma

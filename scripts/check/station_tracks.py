@@ -26,7 +26,7 @@ from torch import Tensor
 from kcal.lens.camera import Camera
 from kcal.lens.rig import Rig
 from kcal.locate.geodesy import anchor, ecef_from_enu_rotation, enu_from_cam, enu_to_geodetic, geodetic_to_enu
-from kcal.locate.multi_localizer import MultiViewLocalizer
+from kcal.locate.localizer import Localizer
 from kcal.pipeline.association import AssociationOptions
 from kcal.pipeline.detections import Detections
 from kcal.pipeline.grouping import group_objects
@@ -137,7 +137,7 @@ class Sums:
 
 def run_seed(seed: int, count: int, seconds: float, sums: Sums) -> None:
     site, g = drawn_site(seed, count), torch.Generator().manual_seed(1000 + seed)
-    localize = MultiViewLocalizer(site.rig)
+    localize = Localizer(site.rig)
     tracker = Tracker(localize, OPTIONS, clock=ClockPrior(offset_sigma_s=OFFSET_S, drift_sigma=RATE))
     options, names = AssociationOptions(box_sigma=BOX_PX), dict[int, int]()
     for second in np.arange(0.0, seconds):
@@ -247,7 +247,7 @@ def crowd(things: int, missed: float, false: int, seed: int) -> list[str]:
     errors = drawn_errors(rig.root, 1, g).expand(things, -1)
     spread = torch.tensor([2500.0, 2500.0, 400.0]).double()
     points = (torch.rand(things, 3, generator=g).double() - 0.5) * 2 * spread + torch.tensor([0.0, 0.0, 700.0])
-    localize, sums = MultiViewLocalizer(rig), Sums()
+    localize, sums = Localizer(rig), Sums()
     tracker = Tracker(localize, OPTIONS)
     spent, marked, kept = [], 0, 0
     # Tracks of a thousand things are not what is measured.

@@ -39,8 +39,8 @@ from torch import Tensor
 
 from kcal.lens.camera import Camera
 from kcal.lens.rig import Rig
-from kcal.locate.multi_localizer import MultiViewLocalizer, ViewsLocalization
-from kcal.locate.stereo import PositionStatus
+from kcal.locate.localizer import Localizer
+from kcal.locate.stereo import Localization, PositionStatus
 from kcal.locate.triangulate import Triangulate
 from scripts.shared.page import table, write_section
 from scripts.shared.station_scenes import drawn_errors, marks, ring, targets
@@ -92,17 +92,17 @@ def peers_of(rig: Rig) -> dict[str, tuple[Solve, int]]:
     matrices, found = projections(rig), dict[str, tuple[Solve, int]]()
     shift = -(rig.rotation @ rig.center[..., None])
     plain = Triangulate(rig, pixel_sigma=1.0)
-    checked = MultiViewLocalizer(rig, pixel_sigma=1.0)
+    checked = Localizer(rig, pixel_sigma=1.0)
 
     def ours(pixels: np.ndarray) -> np.ndarray:
-        result: ViewsLocalization = checked(torch.from_numpy(pixels))
+        result: Localization = checked(torch.from_numpy(pixels))
         return np.where((result.status == OK).numpy()[:, None], result.enu.numpy(), np.nan)
 
     def views(pixels: np.ndarray) -> np.ndarray:
         result = plain(torch.from_numpy(pixels))
         return np.where((result.status == OK).numpy()[:, None], result.points.numpy(), np.nan)
 
-    found["kcal `MultiViewLocalizer`"], found["kcal `Triangulate`"] = (ours, 1), (views, 1)
+    found["kcal `Localizer`"], found["kcal `Triangulate`"] = (ours, 1), (views, 1)
     try:
         import cv2
         from aniposelib.cameras import Camera as OtherCamera  # type: ignore[import-not-found]
@@ -198,7 +198,7 @@ def coverage(draws: int) -> list[str]:
             velocity = 10.0 * torch.randn(seen.shape, generator=generator, dtype=torch.float64)
             late = 0.05 * torch.randn(draws, views, 1, generator=generator, dtype=torch.float64)
             seen = seen + velocity * late + 0.3 * torch.randn(seen.shape, generator=generator, dtype=torch.float64)
-            found = MultiViewLocalizer(rig, pixel_sigma=0.3, root=root, clock_sigma=0.05)(seen, velocity=velocity)
+            found = Localizer(rig, pixel_sigma=0.3, root=root, clock_sigma=0.05)(seen, velocity=velocity)
             ok = found.status == OK
             error = (found.enu - points)[ok]
             squares = (error * torch.linalg.solve(found.covariance[ok], error)).sum(-1)
@@ -247,7 +247,7 @@ def smoke(draws: int) -> list[str]:
         )
         across = (2 * half * shift).square() + edge**2 / 2
         cov = torch.diag_embed(torch.stack([across, torch.full_like(across, edge**2)], -1))
-        found = MultiViewLocalizer(rig, root=root)(box, cov=cov)
+        found = Localizer(rig, root=root)(box, cov=cov)
         ok = found.status == OK
         spread = found.covariance[:, :2, :2]
         error = (found.enu - points)[:, :2]
@@ -317,7 +317,7 @@ def real() -> list[str]:
     rows = []
     alone = [(f"without {name}", torch.arange(4) != c) for c, name in enumerate(rig.names)]
     for name, using in [("all four", torch.ones(4, dtype=torch.bool)), *alone]:
-        found = MultiViewLocalizer(rig, pixel_sigma=sigma)(pixels, seen & using)
+        found = Localizer(rig, pixel_sigma=sigma)(pixels, seen & using)
         ok = found.status == OK
         misses = (rig(found.enu)[0] - pixels).norm(dim=-1)
         own, torn = misses[found.used & ok[:, None]], found.status == int(PositionStatus.CONTRADICTION)
@@ -338,7 +338,7 @@ def real() -> list[str]:
 def picture() -> None:
     """Towers and smoke, for the how-to page."""
     from kcal.locate.marks import Marks
-    from kcal.locate.station_positions import locate_views
+    from kcal.locate.points import locate_points
     from kcal.report.figures import save_picture
     from kcal.report.positions import stations_figure
 
@@ -357,7 +357,7 @@ def picture() -> None:
     seen = seen + 10.0 * torch.randn(seen.shape, generator=generator, dtype=torch.float64)
     seen[2, 1], seen[3, :2] = math.nan, math.nan
     views = Marks(("smoke 1", "smoke 2", "smoke 3", "smoke 4"), seen, sigma=torch.full((4, 3), 10.0).double())
-    located = locate_views(rig, views)
+    located = locate_points(rig, views)
     path = Path(__file__).parents[2] / "docs" / "howto" / "stations.png"
     show([str(save_picture(path, stations_figure(located, points)))])
 

@@ -19,7 +19,7 @@ from stonesoup.types.state import GaussianState
 from stonesoup.updater.kalman import KalmanUpdater, UnscentedKalmanUpdater
 from torch import Tensor
 
-from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.localizer import Localizer
 from kcal.pipeline.pairing import ObjectViews
 
 START = datetime.datetime(2026, 1, 1)
@@ -85,7 +85,7 @@ class Pixels(MeasurementModel):
     covariance: Any = Property(doc="Of the pixels.")
 
     @classmethod
-    def of(cls, localize: StereoLocalizer, delay: float, covariance: Tensor) -> Pixels:
+    def of(cls, localize: Localizer, delay: float, covariance: Tensor) -> Pixels:
         """The model of a rig that stands somewhere."""
         rig, turn = localize.rig, localize.enu_from_rig.T
         cameras = [
@@ -144,9 +144,7 @@ class Pixels(MeasurementModel):
 class OfPixels(CartesianFilters):
     """Takes in the pairs themselves, unscented: the same information as kcal's tracker, in other coordinates."""
 
-    def take(
-        self, targets: Tensor, pairs: ObjectViews, places: Tensor, localize: StereoLocalizer, offset: float
-    ) -> None:
+    def take(self, targets: Tensor, pairs: ObjectViews, places: Tensor, localize: Localizer, offset: float) -> None:
         """Take in the pairs of a moment.
 
         Args:

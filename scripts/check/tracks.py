@@ -20,7 +20,7 @@ from torch import Tensor
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import Origin, Rig, RigCovariance
 from kcal.locate.budget import planned_rig
-from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.localizer import Localizer
 from kcal.pipeline.imm_filter import Motion
 from kcal.pipeline.measurements import ClockPrior
 from kcal.pipeline.pairing import ObjectViews
@@ -42,7 +42,7 @@ TARGETS = 30
 class Site(NamedTuple):
     """One draw: places and velocities (F, T, 3) at each tenth of a second, the true rig and the believed one."""
 
-    localize: StereoLocalizer
+    localize: Localizer
     true: Rig
     path: Tensor
     pace: Tensor
@@ -54,7 +54,7 @@ def drawn_site(seed: int, frames: int) -> Site:
     rig = planned_rig()
     pose = torch.zeros(6, 6, dtype=torch.float64)
     pose[1, 1] = math.radians(YAW_SIGMA) ** 2
-    localize = StereoLocalizer(
+    localize = Localizer(
         rig, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0, refraction=0.0, refraction_sigma=0.0,
         calibration=RigCovariance.of(rig, pose=pose),
     )  # fmt: skip
@@ -159,9 +159,7 @@ def run_seed(seed: int, seconds: float, figures: Figures, *, oracle: bool) -> No
     # The same without clock errors in the estimate of what is expected: knows the offset exactly.
     informed = Tracker(site.localize, options, clock=ClockPrior(offset_s=OFFSET))
     # Filter against filter: both know the rig and the clock, and get the same pairs.
-    plain = StereoLocalizer(
-        site.true, origin=site.localize.origin, heading_deg=0.0, refraction=0.0, refraction_sigma=0.0
-    )
+    plain = Localizer(site.true, origin=site.localize.origin, heading_deg=0.0, refraction=0.0, refraction_sigma=0.0)
     # The rival knows no errors that last, and the marks have none.
     equal = Tracker(plain, dataclasses.replace(options, lasting_px=0.0), clock=ClockPrior(offset_s=OFFSET))
     positions, pixels = OfPositions(ACCELERATION, options.speed_mps), OfPixels(ACCELERATION, options.speed_mps)

@@ -25,7 +25,7 @@ from torch import Tensor
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import Mounting, Origin, Rig, RigCovariance
 from kcal.locate.budget import planned_rig
-from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.localizer import Localizer
 from kcal.watch.history import AngleSeries, Look, TurnModel, between_rows, first_state, learned, passed, taken, turns_of
 from kcal.watch.turned import drift_of_turns
 from kcal.watch.watcher import LIMIT, exceeded
@@ -187,7 +187,7 @@ def in_interval(watched: Rig, standing: Rig, seed: int) -> bool:
         2.0 * torch.rand(1, 3, generator=random) - 1.0)  # fmt: skip
     left, right = standing(place.double())[0].unbind(-2)
     marks = [pixels + MARK * torch.randn(1, 2, generator=random, dtype=torch.float64) for pixels in (left, right)]
-    found = StereoLocalizer(watched, pixel_sigma=MARK)(*marks)
+    found = Localizer(watched, pixel_sigma=MARK)(*marks)
     return bool(found.range_low[0] <= place.norm() <= found.range_high[0])
 
 

@@ -29,7 +29,7 @@ from kcal.calibrate.rig.sources import RigData
 from kcal.errors import KcalError
 from kcal.lens.rig import Rig, RigCovariance
 from kcal.locate.geodesy import enu_from_cam
-from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.localizer import Localizer
 from scripts.shared.long_range import ORIGIN, RANGES, rig
 from scripts.shared.page import table, write_section
 from scripts.shared.timing import show
@@ -151,7 +151,7 @@ def judged(truth: Rig, found: RigResult, draw: Draw, widen: float = 1.0) -> tupl
     solved = found.stereo()
     assert solved.covariance is not None
     known = RigCovariance(half=widen * solved.covariance.half)
-    localize = StereoLocalizer(solved, origin=ORIGIN, heading_deg=35.0, pixel_sigma=MARK, calibration=known)
+    localize = Localizer(solved, origin=ORIGIN, heading_deg=35.0, pixel_sigma=MARK, calibration=known)
     answer = localize(left + noise[0], right + noise[1])
     inside = (answer.range_low <= far) & (far <= answer.range_high) & seen
     error = torch.where(seen, answer.inverse_range * far - 1.0, 0.0).square().sum(1) / seen.sum(1)

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from kcal.lens.camera import Camera
 from kcal.lens.rig import Origin, Rig
-from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.localizer import Localizer
 from kcal.locate.stereo import PositionStatus
 
 
@@ -89,7 +89,7 @@ def require_status(value: Any) -> None:
             place: dict[str, Any] = (
                 {} if value.mounting else {"origin": Origin(lat=0.0, lon=0.0, height=0.0), "heading_deg": 0.0}
             )
-            found = StereoLocalizer(value, pixel_sigma=0.3, **place)(left, right)
+            found = Localizer(value, pixel_sigma=0.3, **place)(left, right)
             good = found.status == PositionStatus.OK
             assert bool(found.enu[good].isfinite().all()), "a good position is not finite"
             assert bool(found.range_low[good].isfinite().all()), "the interval of a good position is not finite"

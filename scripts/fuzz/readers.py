@@ -29,8 +29,8 @@ from kcal.io.rig_file import load_rig, save_camera_rig, save_rig
 from kcal.lens.baking import bake
 from kcal.lens.rig import Mounting, Origin, Rig
 from kcal.locate.export import write_positions
-from kcal.locate.marks import COVARIANCE, read_marks, write_marks
-from kcal.locate.positions import locate_points
+from kcal.locate.marks import COVARIANCE, Marks, read_marks, write_marks
+from kcal.locate.points import locate_points
 from kcal.locate.raster import terrain
 from kcal.locate.stations import load_camera_rig
 from kcal.locate.survey import import_survey, read_features, read_survey
@@ -120,8 +120,8 @@ def _whole_journal(path: Path) -> None:
 
 
 def _positions(path: Path) -> None:
-    left, right = RIG(torch.tensor([[0.0, 0.0, 50.0], [5.0, 1.0, 100.0]], dtype=torch.float64))[0].unbind(-2)
-    write_positions(path, locate_points(placed_rig(), left, right, names=["a", "b"]))
+    pixels = RIG(torch.tensor([[0.0, 0.0, 50.0], [5.0, 1.0, 100.0]], dtype=torch.float64))[0]
+    write_positions(path, locate_points(placed_rig(), Marks(("a", "b"), pixels)))
 
 
 def _fits(path: Path) -> None:

@@ -26,9 +26,9 @@ from starlette.applications import Starlette
 
 from kcal.capture.session import CaptureOptions, CaptureSession, capture_app
 from kcal.io.images import write_png
+from kcal.locate.localizer import Localizer
 from kcal.locate.marks import read_marks
-from kcal.locate.positions import located_by
-from kcal.locate.tabulate import Locator
+from kcal.locate.points import PointLocator
 from kcal.mark.guide import Pictures, open_pictures
 from kcal.mark.marking_service import Desk
 from kcal.mark.server import marking_app
@@ -227,7 +227,7 @@ class _Errors(logging.Handler):
 
 def live_map(folder: Path) -> Prepared:
     """Raw bytes to the socket of a live map."""
-    live = LiveMap(located_by(Locator(placed_rig())), 0)
+    live = LiveMap(PointLocator(Localizer(placed_rig())).located(), 0)
     parts = urlsplit(live.address)
     errors = _Errors()
     logging.getLogger("uvicorn.error").addHandler(errors)

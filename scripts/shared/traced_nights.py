@@ -21,7 +21,7 @@ from kcal.calibrate.rig.sources import RigData
 from kcal.calibrate.rig.stars import StarSource
 from kcal.lens.camera import Camera
 from kcal.lens.projection import FAR
-from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.localizer import Localizer
 from kcal.sim.captures import TrueRig
 from kcal.stars.detect import DetectedStars
 from kcal.stars.lens import calibrate_by_stars
@@ -213,7 +213,7 @@ def judged(found: RigResult, there: Targets, seed: int) -> np.ndarray:
         marks = there.pixels
         if sigma == MARK:
             marks = marks + MARK * torch.randn(marks.shape, dtype=torch.float64, generator=generator)
-        answer = StereoLocalizer(pair, origin=ORIGIN, heading_deg=35.0, pixel_sigma=sigma)(*marks)
+        answer = Localizer(pair, origin=ORIGIN, heading_deg=35.0, pixel_sigma=sigma)(*marks)
         inside = (answer.range_low <= 1 / there.inverse) & (1 / there.inverse <= answer.range_high)
         if sigma != MARK:
             columns += [

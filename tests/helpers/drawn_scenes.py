@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from calibrate_scenes import BOARD, camera, motions
-from locate_rigs import pinhole_rig, tensor
+from locate_rigs import located_pairs, pinhole_rig, tensor
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -32,7 +32,7 @@ from kcal.lens.rig import Origin
 from kcal.locate.budget import RangeError
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.ground import level_ground
-from kcal.locate.positions import Located, locate_points
+from kcal.locate.positions import Located
 from kcal.locate.siting import Area, RankedSite, Site, area_of, rank_sites
 from kcal.report.calibration import (
     board_figure,
@@ -54,7 +54,7 @@ def located(heading: float = 300.0) -> tuple[Located, torch.Tensor]:
     """Four things, the last too far for a range, and their true places."""
     left, right = pinhole_rig()(PLACES)[0].unbind(-2)
     names = ["gate", "mast", "ship", "cloud"]
-    found = locate_points(
+    found = located_pairs(
         pinhole_rig(), left, right + tensor([0.3, 0.0]), origin=PLACE, heading_deg=heading, names=names
     )
     return found, PLACES @ enu_from_cam(heading).T
@@ -101,7 +101,7 @@ def stations() -> Located:
     """Things seen by three towers, one of them by one tower alone."""
     from kcal.lens.rig import Rig
     from kcal.locate.marks import Marks
-    from kcal.locate.station_positions import locate_views
+    from kcal.locate.points import locate_points
 
     lens = Camera.build(focal=(900, 900), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
     centers = tensor([0.0, 0.0, 30.0], [3000.0, 200.0, 40.0], [1500.0, -900.0, 35.0])
@@ -110,7 +110,7 @@ def stations() -> Located:
     things = tensor([1200.0, 4000.0, 10.0], [2000.0, 3000.0, 10.0], [-800.0, 2500.0, 10.0])
     pixels = torch.stack([lens.project((things - c) @ turn.T)[0] for c, turn in zip(centers, turns, strict=True)], 1)
     pixels[2, 1:] = math.nan
-    return locate_views(rig, Marks(("fire", "smoke", "light"), pixels))
+    return locate_points(rig, Marks(("fire", "smoke", "light"), pixels))
 
 
 @functools.cache

@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from kcal.lens.camera import Camera
 from kcal.lens.rig import Rig
+from kcal.locate.localizer import Localizer
+from kcal.locate.marks import Marks
+from kcal.locate.points import locate_points
+from kcal.locate.positions import Located
+from kcal.locate.tabulate import Geoid
 
 SIZE = (1920, 1080)
 
@@ -47,3 +54,13 @@ def spread_points(ranges: Tensor) -> Tensor:
     """Points at the given ranges, spread over the common view."""
     angle = torch.linspace(-0.35, 0.35, len(ranges), dtype=torch.float64)
     return torch.stack([ranges * angle.sin(), 0.1 * ranges * (7 * angle).sin(), ranges * angle.cos()], -1)
+
+
+def located_pairs(
+    rig: Rig, left: Tensor, right: Tensor, *, names: Sequence[str] | None = None, cov: Tensor | None = None,
+    geoid: Geoid | None = None, **options: Any,
+) -> Located:  # fmt: skip
+    """Positions of pixels in the left and the right image; `options` are those of `Localizer`."""
+    names = [str(i + 1) for i in range(len(left))] if names is None else names
+    cov = None if cov is None else cov.expand(len(left), 4, 4)
+    return locate_points(Localizer(rig, **options), Marks.of_pair(names, left, right, cov), geoid=geoid)

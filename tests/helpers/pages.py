@@ -14,7 +14,7 @@ import torch
 from calibrate_scenes import BOARD, camera, motions
 from capture_frames import BOARD as PHOTOGRAPHED
 from capture_frames import images
-from locate_rigs import pinhole_rig
+from locate_rigs import located_pairs, pinhole_rig
 from starlette.applications import Starlette
 from track_scenes import pairs_of, tracked_site
 from typer.testing import CliRunner
@@ -24,8 +24,8 @@ from kcal.cli.main import app
 from kcal.corners.observations import Observations, View
 from kcal.io.images import write_png
 from kcal.lens.rig import Origin
-from kcal.locate.positions import locate_points, located_by
-from kcal.locate.tabulate import Locator
+from kcal.locate.localizer import Localizer
+from kcal.locate.points import PointLocator
 from kcal.mark.guide import open_pictures
 from kcal.mark.items import Add, Mark, Put
 from kcal.mark.marking_service import Desk
@@ -111,7 +111,7 @@ def capturing(folder: Path) -> Iterator[Opened]:
 def crowded_map(targets: int) -> Iterator[LiveMap]:
     """A live map of targets at 100 m to 3 km, many of them side by side."""
     site = tracked_site(0.01)
-    page = LiveMap(located_by(Locator(site.rig, origin=site.origin, heading_deg=0.0)), 0)
+    page = LiveMap(PointLocator(Localizer(site.rig, origin=site.origin, heading_deg=0.0)).located(), 0)
     reach = 100.0 * 30.0 ** torch.linspace(0, 1, targets).double()
     side = 0.3 * reach * torch.sin(2.4 * torch.arange(targets).double())
     left, right = site.rig(torch.stack([side, 0 * side, reach], -1))[0].unbind(-2)
@@ -150,7 +150,7 @@ def written_map(folder: Path) -> Iterator[Opened]:
     truth = torch.tensor([[20, 0, 100], [26, 0, 104], [-300, 5, 1000], [900, 0, 5000]]).double()
     rig = pinhole_rig()
     left, right = rig(truth)[0].unbind(-2)
-    located = locate_points(
+    located = located_pairs(
         rig, left, right + torch.tensor([0.6, 0.0]), origin=ORIGIN, heading_deg=0.0,
         names=["gate", "a second gate beside it", "mast", "ship"],
     )  # fmt: skip

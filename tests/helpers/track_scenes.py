@@ -11,7 +11,7 @@ from torch import Tensor
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import Origin, Rig, RigCovariance
 from kcal.locate.budget import planned_rig
-from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.localizer import Localizer
 from kcal.pipeline.pairing import ObjectViews
 
 ORIGIN = Origin(lat=19.07, lon=72.87, height=14.0)
@@ -23,13 +23,13 @@ def yawed_rig(rig: Rig, yaw: float) -> Rig:
     return Rig.pair(rig.left, rig.right, turn @ rig.right_from_left_rotation, rig.right_from_left_translation)
 
 
-def tracked_site(yaw_deg: float = 0.0, **options: object) -> StereoLocalizer:
+def tracked_site(yaw_deg: float = 0.0, **options: object) -> Localizer:
     """The planned rig, f = 1600 px and 10 m of baseline, whose relative yaw is known to a sigma; straight light."""
     rig = planned_rig()
     pose = torch.zeros(6, 6, dtype=torch.float64)
     pose[1, 1] = math.radians(yaw_deg) ** 2
     known = {"origin": ORIGIN, "heading_deg": 0.0, "refraction": 0.0, "refraction_sigma": 0.0} | options
-    return StereoLocalizer(rig, calibration=RigCovariance.of(rig, pose=pose), **known)  # type: ignore[arg-type]
+    return Localizer(rig, calibration=RigCovariance.of(rig, pose=pose), **known)  # type: ignore[arg-type]
 
 
 def pairs_of(

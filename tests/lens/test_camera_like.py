@@ -16,8 +16,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.camera_like import CameraLike
 from kcal.lens.images import Undistort, undistort_maps
 from kcal.lens.rig import Origin, Rig
-from kcal.locate.localizer import StereoLocalizer
-from kcal.locate.multi_localizer import MultiViewLocalizer
+from kcal.locate.localizer import Localizer
 from kcal.locate.triangulate import Triangulate
 
 MODEL = Camera.build(focal=(900, 900), center=(322, 238), size=(640, 480), coefficients=[-0.1, 0.02, 1e-3, -5e-4, 0.0])
@@ -65,7 +64,7 @@ def test_positions_are_those_of_the_camera_that_it_stands_for(kind: str) -> None
     origin = Origin(lat=50.0, lon=8.0, height=100.0)
     for pair in ((make(), make()), (make(), camera), (camera, make())):
         localize = [
-            StereoLocalizer(rig(*cameras), origin=origin, heading_deg=30.0, pixel_sigma=0.1)
+            Localizer(rig(*cameras), origin=origin, heading_deg=30.0, pixel_sigma=0.1)
             for cameras in (pair, (camera, camera))
         ]
         found, wanted = (one(*pixels) for one in localize)
@@ -76,7 +75,7 @@ def test_positions_are_those_of_the_camera_that_it_stands_for(kind: str) -> None
     many = Rig([make(), camera, make()], ["a", "b", "c"], torch.eye(3).repeat(3, 1, 1), center=4.0 * torch.eye(3))
     seen, visible = many(POINTS)
     assert bool(visible.all())
-    located = MultiViewLocalizer(many, pixel_sigma=0.1)(seen)
+    located = Localizer(many, pixel_sigma=0.1)(seen)
     torch.testing.assert_close(located.enu, POINTS, rtol=1e-4, atol=1e-4)
 
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from kcal import Camera, Rig, StereoLocalizer, load_rig, save_rig
+from kcal import Camera, Localizer, Rig, load_rig, save_rig
 from kcal.errors import InputError
 from kcal.lens import rotation_from_vector
 from kcal.lens.rig import Mounting, Origin
@@ -104,7 +104,7 @@ def test_one_station_of_several_and_a_mounting() -> None:
     moved = several.pose_step.grad.abs().sum(-1) > 0  # type: ignore[union-attr]
     assert moved.tolist() == [False, True, False]
     localize = stereo(0).free("attitude")
-    assert isinstance(localize, StereoLocalizer)
+    assert isinstance(localize, Localizer)
     found = localize(*pairs().values())
     found.enu.sum().backward()
     by_origin, by_turn = localize.pose_step.grad.split(3)  # type: ignore[union-attr]
@@ -128,5 +128,5 @@ def test_ranges_and_covariance_without_the_earth() -> None:
     # Z = f b / d: its sigma is Z² / (f b) times that of a disparity, √2 of a mark's.
     assert float(found.covariance[0, 2, 2].sqrt()) == pytest.approx(1000.0**2 / 16000 * 0.1 * 2**0.5, rel=1e-3)
     assert found.covariance[1].diagonal().tolist() == [float("inf")] * 3
-    located = StereoLocalizer(own, origin=Origin(lat=0, lon=0, height=0), heading_deg=0.0)(left, right)
+    located = Localizer(own, origin=Origin(lat=0, lon=0, height=0), heading_deg=0.0)(left, right)
     assert located.range.tolist() == pytest.approx([1000.0, float("inf"), float("inf")])

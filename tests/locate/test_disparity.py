@@ -8,15 +8,15 @@ import math
 
 import pytest
 import torch
-from locate_rigs import pinhole_rig, real_rig, spread_points, tensor
+from locate_rigs import located_pairs, pinhole_rig, real_rig, spread_points, tensor
 
 from kcal.errors import InputError
 from kcal.lens.images import StereoRectification
 from kcal.lens.rig import Origin
 from kcal.locate.disparity import DisparityRanges
 from kcal.locate.export import APPENDED, appended
-from kcal.locate.localizer import StereoLocalizer
-from kcal.locate.positions import interval_coverage, locate_points, position_errors
+from kcal.locate.localizer import Localizer
+from kcal.locate.positions import interval_coverage, position_errors
 from kcal.locate.stereo import PositionStatus
 from kcal.locate.views import fit_pairs
 
@@ -82,7 +82,7 @@ def test_errors_against_a_truth() -> None:
     points = tensor([0.0, 0.0, 500.0], [9.0, 0.0, 800.0], [0.0, 0.0, 900.0])
     left, right = RIG(points)[0].unbind(-2)
     left[2] = math.nan
-    located = locate_points(RIG, left, right, origin=ORIGIN, heading_deg=0.0, **STRAIGHT)
+    located = located_pairs(RIG, left, right, origin=ORIGIN, heading_deg=0.0, **STRAIGHT)
     # The second is said to be 3 m to the east, 4 m to the south and 200 m farther than it is.
     wrong = tensor([0.0, 500.0, 0.0], [6.0, 604.0, 0.0], [0.0, 900.0, 0.0])
     found = position_errors(located, wrong)
@@ -94,7 +94,7 @@ def test_errors_against_a_truth() -> None:
     assert not inside
     assert found[2] is None
     assert position_errors(located, tensor([math.nan, 0, 0], [0, 0, 0], [0, 0, 0]))[0] is None
-    localize = StereoLocalizer(RIG, origin=ORIGIN, heading_deg=0.0, **STRAIGHT)
+    localize = Localizer(RIG, origin=ORIGIN, heading_deg=0.0, **STRAIGHT)
     true = points.norm(dim=-1)
     assert interval_coverage(localize, left[:2], right[:2], true[:2]) == 1.0
     assert interval_coverage(localize, left[:2], right[:2], tensor(500.0, 1200.0)) == 0.5
@@ -106,7 +106,7 @@ def test_rows_of_a_file_that_grows(suffix: str) -> None:
     """What begins the file stands before the first rows only; each thing has rows of its own."""
     points = tensor([0.0, 0.0, 500.0], [9.0, 0.0, 800.0])
     left, right = RIG(points)[0].unbind(-2)
-    run = locate_points(RIG, left, right, origin=ORIGIN, heading_deg=0.0, names=["mast", "mill"], **STRAIGHT)
+    run = located_pairs(RIG, left, right, origin=ORIGIN, heading_deg=0.0, names=["mast", "mill"], **STRAIGHT)
     time = datetime.datetime(2026, 1, 2, 3, 4, 5, tzinfo=datetime.UTC)
     first, later = (appended(suffix, run, run.columns, time, first=one).decode() for one in (True, False))
     assert first.endswith(later)

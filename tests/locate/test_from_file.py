@@ -12,7 +12,7 @@ from command_line import Command
 from kcal.errors import InputError
 from kcal.io.rig_file import load_rig
 from kcal.lens.rig import Mounting, Origin, RigCovariance
-from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.localizer import Localizer
 
 SAMPLE = Path(__file__).parents[2] / "assets" / "sample-rig.json"
 LEFT, RIGHT = torch.tensor([[960.0, 540.0], [700.0, 600.0]]), torch.tensor([[925.0, 535.0], [620.0, 592.0]])
@@ -25,8 +25,8 @@ def test_the_same_intervals_as_the_command(tmp_path: Path, command: Command) -> 
     out = tmp_path / "positions.csv"
     command("locate", SAMPLE, marks, "--pixel-sigma 0.1 -o", out)
     for localize in (
-        StereoLocalizer(load_rig(SAMPLE), pixel_sigma=0.1),
-        StereoLocalizer.from_file(SAMPLE, pixel_sigma=0.1),
+        Localizer(load_rig(SAMPLE), pixel_sigma=0.1),
+        Localizer.from_file(SAMPLE, pixel_sigma=0.1),
     ):
         assert localize.included == ("marks", "calibration", "mounting")
         found = localize(LEFT, RIGHT)
@@ -40,15 +40,15 @@ def test_the_same_intervals_as_the_command(tmp_path: Path, command: Command) -> 
 def test_what_is_given_replaces_what_the_rig_knows() -> None:
     rig = load_rig(SAMPLE)
     assert rig.mounting is not None
-    own = StereoLocalizer(rig)(LEFT, RIGHT)
+    own = Localizer(rig)(LEFT, RIGHT)
     exact = RigCovariance.of(rig)
-    narrow = StereoLocalizer(rig, calibration=exact)(LEFT, RIGHT)
+    narrow = Localizer(rig, calibration=exact)(LEFT, RIGHT)
     assert (narrow.inverse_range_sigma < own.inverse_range_sigma).all()
-    elsewhere = StereoLocalizer(rig, origin=Origin(lat=0.0, lon=0.0, height=0.0), heading_deg=0.0)
+    elsewhere = Localizer(rig, origin=Origin(lat=0.0, lon=0.0, height=0.0), heading_deg=0.0)
     assert elsewhere.included == ("marks", "calibration")
     assert torch.equal(elsewhere(LEFT, RIGHT).inverse_range_sigma, own.inverse_range_sigma)
     # Without the link, errors of calibration and mounting are taken as independent: another covariance.
-    loose = StereoLocalizer(rig, mounting=rig.mounting.covariance)
+    loose = Localizer(rig, mounting=rig.mounting.covariance)
     assert not torch.allclose(loose(LEFT, RIGHT).covariance, own.covariance, rtol=1e-5)
 
 
@@ -57,9 +57,11 @@ def test_half_a_mounting_is_refused() -> None:
     origin = Origin(lat=0.0, lon=0.0, height=0.0)
     for options in ({"origin": origin}, {"heading_deg": 10.0}, {"pitch_deg": 1.0}):
         with pytest.raises(InputError, match="belong together"):
-            StereoLocalizer(rig, **options)
+            Localizer(rig, **options)
     rig.mounting = None
-    with pytest.raises(InputError, match="does not say where it stands"):
-        StereoLocalizer(rig)
+    assert not Localizer(rig).on_earth
+    for options in ({"mounting": torch.eye(6)}, {"refraction": 0.1}):
+        with pytest.raises(InputError, match="does not say where it stands"):
+            Localizer(rig, **options)
     rig.mounting = Mounting(origin=origin, heading_deg=10.0)
-    assert StereoLocalizer(rig).attitude_deg == (10.0, 0.0, 0.0)
+    assert Localizer(rig).attitude_deg == (10.0, 0.0, 0.0)

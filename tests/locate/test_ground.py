@@ -15,8 +15,8 @@ from kcal.lens.camera import Camera
 from kcal.lens.rig import Mounting, Origin, Rig
 from kcal.locate.geodesy import enu_from_cam, geodetic_to_enu
 from kcal.locate.ground import level_ground, locate_on_ground
+from kcal.locate.localizer import Localizer
 from kcal.locate.mounting import mounting_covariance
-from kcal.locate.multi_localizer import MultiViewLocalizer
 from kcal.locate.raster import terrain
 
 CAMERA = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
@@ -184,7 +184,7 @@ def test_a_file_that_is_no_raster(tmp_path: Path) -> None:
 
 
 def test_one_camera_of_a_rig_meets_the_ground_as_a_camera_alone_does(tmp_path: Path) -> None:
-    """`MultiViewLocalizer` with the terrain, beside `locate_on_ground`; what two cameras see needs no ground."""
+    """`Localizer` with the terrain, beside `locate_on_ground`; what two cameras see needs no ground."""
     ground = terrain(raster_file(tmp_path))
     known = mounting_covariance(origin_m=(0.5, 0.5, 0.3), attitude_deg=(0.01, 0.01, 0.02))
     known = torch.block_diag(known, torch.full((1, 1), 0.01).double())
@@ -200,11 +200,11 @@ def test_one_camera_of_a_rig_meets_the_ground_as_a_camera_alone_does(tmp_path: P
     marks = torch.full((6, 2, 2), math.nan, dtype=torch.float64)
     marks[:5, 0] = pixels
     marks[5] = rig(torch.tensor([[20.0, 900.0, -10.0]]))[0][0]
-    found = MultiViewLocalizer(rig, pixel_sigma=0.3)(marks, height=ground, height_sigma=2.0)
+    found = Localizer(rig, pixel_sigma=0.3)(marks, height=ground, height_sigma=2.0)
     assert alone.status.tolist() == [0, 0, 0, 6, 6]
     assert found.status.tolist() == [0, 0, 0, 6, 6, 0]
     torch.testing.assert_close(found.enu[:3], alone.enu[:3], rtol=0, atol=1e-3)
     torch.testing.assert_close(found.covariance[:3], alone.covariance[:3], rtol=1e-2, atol=1e-3)
-    without = MultiViewLocalizer(rig, pixel_sigma=0.3)(marks)
+    without = Localizer(rig, pixel_sigma=0.3)(marks)
     assert without.status.tolist() == [6, 6, 6, 6, 6, 0]
     torch.testing.assert_close(found.enu[5], without.enu[5])

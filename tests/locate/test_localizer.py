@@ -14,7 +14,7 @@ from kcal.lens.pose import rotation_from_vector
 from kcal.lens.projection import project_components
 from kcal.lens.rig import Origin, Rig, RigCovariance
 from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic
-from kcal.locate.localizer import Localization, StereoLocalizer
+from kcal.locate.localizer import Localization, Localizer
 from kcal.locate.mounting import mounting_covariance
 from kcal.locate.stereo import PositionStatus
 from kcal.locate.triangulate import Triangulate
@@ -25,10 +25,10 @@ ATTITUDE = {"heading_deg": 200.0, "pitch_deg": 3.0, "roll_deg": -2.0}
 N = 8000
 
 
-def localizer(rig: Rig = RIG, **options: object) -> StereoLocalizer:
+def localizer(rig: Rig = RIG, **options: object) -> Localizer:
     """Of a rig that sees along straight lines."""
     straight = {"refraction": 0.0, "refraction_sigma": 0.0}
-    return StereoLocalizer(rig, **{"origin": ORIGIN, **ATTITUDE, **straight, **options})
+    return Localizer(rig, **{"origin": ORIGIN, **ATTITUDE, **straight, **options})
 
 
 def noise(sigma: float, *shape: int, seed: int = 3) -> torch.Tensor:
@@ -109,12 +109,12 @@ def test_errors_of_the_calibration_are_in_the_interval(z: float) -> None:
         for points, part in ((point.expand(count, 1, 3), draws[:, :9]), (in_right, draws[:, 9:18]))
     ]
     marks = torch.cat(seen, -1) + noise(0.1, count, 4, seed=9)
-    found = StereoLocalizer(rig, origin=ORIGIN, heading_deg=0.0, pixel_sigma=0.1, calibration=known)(
+    found = Localizer(rig, origin=ORIGIN, heading_deg=0.0, pixel_sigma=0.1, calibration=known)(
         marks[:, :2], marks[:, 2:]
     )
     # 4000 draws know 95 % to 0.34 %; three of those.
     assert 0.94 < covered(found, point.norm()) < 0.96
-    blind = StereoLocalizer(rig, origin=ORIGIN, heading_deg=0.0, pixel_sigma=0.1)(marks[:, :2], marks[:, 2:])
+    blind = Localizer(rig, origin=ORIGIN, heading_deg=0.0, pixel_sigma=0.1)(marks[:, :2], marks[:, 2:])
     assert covered(blind, point.norm()) < 0.85
 
 
@@ -160,7 +160,7 @@ def test_refraction_lowers_the_point() -> None:
 def test_refraction_of_standard_air_is_the_default() -> None:
     """k = 0.13 ± 0.1: the up component alone moves, and what is not known of k is added to its variance."""
     left, right = RIG(spread_points(tensor(300.0, 1000.0, 5000.0)))[0].unbind(-2)
-    straight, found = localizer()(left, right), StereoLocalizer(RIG, origin=ORIGIN, **ATTITUDE)(left, right)
+    straight, found = localizer()(left, right), Localizer(RIG, origin=ORIGIN, **ATTITUDE)(left, right)
     bend = straight.enu[:, :2].square().sum(-1) / (2 * 6.371e6)
     torch.testing.assert_close(found.enu[:, :2], straight.enu[:, :2], rtol=0, atol=0)
     torch.testing.assert_close(straight.enu[:, 2] - found.enu[:, 2], 0.13 * bend, rtol=5e-3, atol=0)
@@ -184,7 +184,7 @@ def test_heights_are_inside_their_intervals_where_light_bends() -> None:
     k = 0.13 + 0.1 * torch.randn(len(enu), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     seen = enu + torch.stack([0 * k, 0 * k, k * enu[:, :2].square().sum(-1) / (2 * 6.371e6)], -1)
     left, right = RIG(seen @ enu_from_cam(*ATTITUDE.values()))[0].unbind(-2)
-    found = StereoLocalizer(RIG, origin=ORIGIN, **ATTITUDE, pixel_sigma=0.05)(
+    found = Localizer(RIG, origin=ORIGIN, **ATTITUDE, pixel_sigma=0.05)(
         left + noise(0.05, 400, 2), right + noise(0.05, 400, 2, seed=4)
     )
     error = (found.enu - enu)[:, 2] / found.covariance[:, 2, 2].sqrt()
@@ -211,7 +211,7 @@ def test_rounded_covariances_are_accepted() -> None:
     """A matrix may be symmetric to rounding only, and have zeros."""
     cov = torch.diag(tensor(0.09, 0.04, 0.09, 0.04))
     cov[0, 2], cov[2, 0] = 0.01, 0.01 * (1 + 1e-12)
-    localize = StereoLocalizer(pinhole_rig(), origin=ORIGIN, heading_deg=0.0)
+    localize = Localizer(pinhole_rig(), origin=ORIGIN, heading_deg=0.0)
     left, right = tensor([980.0, 540.0], [980.0, 540.0]), tensor([970.0, 540.0], [970.0, 540.0])
     crooked = cov.clone()
     crooked[2, 0] = 0.02
@@ -227,7 +227,7 @@ def test_statuses_and_no_nan_in_values_or_gradients() -> None:
     cov.requires_grad_()
     mask = torch.ones(len(BAD), dtype=torch.bool)
     mask[7] = False
-    found = StereoLocalizer(pinhole_rig(), origin=ORIGIN, heading_deg=0.0)(left, right, cov, mask)
+    found = Localizer(pinhole_rig(), origin=ORIGIN, heading_deg=0.0)(left, right, cov, mask)
     assert [PositionStatus(s).name for s in found.status.tolist()] == [row[2].name for row in BAD]
     for name, value in found._asdict().items():
         assert not torch.isnan(value).any(), name
@@ -323,20 +323,20 @@ def test_agrees_with_triangulate() -> None:
 def test_sensitivities() -> None:
     rig = pinhole_rig(1600.0, 10.0)
     left, right = rig(tensor([0.0, 0.0, 5000.0], [0.0, 0.0, 1000.0]))[0].unbind(-2)
-    slopes = StereoLocalizer(rig, origin=ORIGIN, heading_deg=0.0).sensitivity(left, right)
+    slopes = Localizer(rig, origin=ORIGIN, heading_deg=0.0).sensitivity(left, right)
     # Z² / (f b) m/px, and Z² / b m/rad: 436 m for 0.01° at 5 km.
     assert slopes.meters_per_pixel.tolist() == pytest.approx([1562.5, 62.5], rel=1e-3)
     assert slopes.meters_per_degree.tolist() == pytest.approx([43_633, 1745.3], rel=1e-3)
     # By turning the rig and locating again.
     turned_rig = Rig.pair(rig.left, rig.right, turned(1e-4), rig.right_from_left_translation)
-    module = StereoLocalizer(turned_rig, origin=ORIGIN, heading_deg=0.0)
+    module = Localizer(turned_rig, origin=ORIGIN, heading_deg=0.0)
     moved = module(left, right).enu.norm(dim=-1) - tensor(5000.0, 1000.0)
     assert moved.abs().tolist() == pytest.approx([4.3633, 0.17453], rel=2e-3)
 
 
 @traced_whole
 def test_compiles_as_one_graph_with_its_gradients() -> None:
-    module = StereoLocalizer(pinhole_rig(), origin=ORIGIN, heading_deg=0.0)
+    module = Localizer(pinhole_rig(), origin=ORIGIN, heading_deg=0.0)
     left, right = tensor([980.0, 540.0], [960.0, 540.0], [1.0, 1.0]), tensor([970.0, 540.2], [970.0, 540.0], [1.0, 1.0])
     cov, mask = 0.04 * torch.eye(4, dtype=torch.float64).repeat(3, 1, 1), torch.tensor([True, True, False])
     compiled = torch.compile(module, fullgraph=True, backend="eager")
@@ -366,7 +366,7 @@ def test_a_detector_is_trained_through_it() -> None:
         crops.append(torch.exp(-((grid - u) ** 2 + (grid[:, None] - v) ** 2) / 8.0))
     images = torch.stack(crops, 1).reshape(32, 1, 33, 33) + 0.02 * torch.rand(32, 1, 33, 33)
     net = torch.nn.Sequential(torch.nn.Conv2d(1, 4, 5, padding=2), torch.nn.ReLU(), torch.nn.Conv2d(4, 1, 5, padding=2))
-    module = StereoLocalizer(rig, origin=ORIGIN, heading_deg=0.0)
+    module = Localizer(rig, origin=ORIGIN, heading_deg=0.0)
     aim = truth @ enu_from_cam(0.0).T
 
     def located() -> Localization:

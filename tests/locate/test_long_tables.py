@@ -13,22 +13,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from locate_rigs import real_rig, spread_points
+from locate_rigs import located_pairs, real_rig, spread_points
 
 from kcal.cli.main import main
 from kcal.errors import FileError, InputError
 from kcal.io.rig_file import save_rig
 from kcal.lens.rig import Origin, RigCovariance
-from kcal.locate import marks, stereo, tables, tabulate
+from kcal.locate import marks, points, stereo, tables
 from kcal.locate.export import PositionWriter, write_positions
 from kcal.locate.geodesy import azimuth_elevation
-from kcal.locate.marks import read_mark_chunks, read_marks
+from kcal.locate.localizer import Localizer
+from kcal.locate.marks import Marks, read_mark_chunks, read_marks
 from kcal.locate.mounting import mounting_covariance
-from kcal.locate.positions import locate_points, located_by
-from kcal.locate.station_positions import PositionSample
+from kcal.locate.points import PointLocator, PositionSample
 from kcal.locate.stereo import PositionStatus
 from kcal.locate.tables import NUMBERS, number_lines
-from kcal.locate.tabulate import Locator, circular_error
+from kcal.locate.tabulate import circular_error
 
 ORIGIN = Origin(lat=-33.9, lon=151.2, height=40.0)
 ROWS = 250
@@ -44,13 +44,13 @@ def pixels() -> torch.Tensor:
     return both
 
 
-def locator_of_everything() -> Locator:
+def locator_of_everything() -> PointLocator:
     rig = real_rig()
     pose = torch.diag(torch.tensor([1e-5, 2e-5, 1e-5, 1e-3, 1e-3, 1e-3], dtype=torch.float64) ** 2)
-    return Locator(
+    return PointLocator(Localizer(
         rig, origin=ORIGIN, heading_deg=200.0, pitch_deg=3.0, calibration=RigCovariance.of(rig, pose=pose),
         mounting=mounting_covariance(origin_m=[0.1] * 3, attitude_deg=(0.01, 0.01, 0.02)),
-    )  # fmt: skip
+    ))  # fmt: skip
 
 
 def table(path: Path, extra: bool = False) -> Path:
@@ -64,11 +64,11 @@ def table(path: Path, extra: bool = False) -> Path:
 
 def written(suffix: str, path: Path, at_once: int, piece: int = 10_000) -> bytes:
     locate, file = locator_of_everything(), io.BytesIO()
-    writer = PositionWriter(file, suffix, located_by(locate))
+    writer = PositionWriter(file, suffix, locate.located())
     # The moment of Cursor-on-Target.
     writer._time = writer._time.replace(year=2026, month=5, day=4, hour=12, minute=0, second=0, microsecond=0)
     for chunk, _ in read_mark_chunks(path, at_once=at_once):
-        for columns in locate(chunk.names, chunk.pixels, extras=chunk.extras).pieces(piece):
+        for columns in locate(chunk)[0].pieces(piece):
             writer.add(columns)
     writer.close()
     return file.getvalue()
@@ -99,7 +99,7 @@ def test_a_streamed_table_is_that_of_one_call_to_the_last_bit(tmp_path: Path, mo
 
 def test_numbers_are_those_of_the_localizer_to_the_last_bit() -> None:
     locate, both = locator_of_everything(), pixels()
-    columns = locate([str(i) for i in range(ROWS)], both)
+    columns, _ = locate(Marks([str(i) for i in range(ROWS)], both))
     found = locate.localize(both[:, 0], both[:, 1])
     slopes = locate.localize.sensitivity(both[:, 0], both[:, 1])
     assert np.array_equal(columns.status, found.status.numpy())
@@ -124,8 +124,8 @@ def test_numbers_are_those_of_the_localizer_to_the_last_bit() -> None:
 
 
 def test_positions_and_columns_are_the_same() -> None:
-    columns = locator_of_everything()([str(i) for i in range(ROWS)], pixels())
-    located = located_by(locator_of_everything(), columns)
+    columns = locator_of_everything()(Marks([str(i) for i in range(ROWS)], pixels()))[0]
+    located = locator_of_everything().located(columns)
     fields = {
         "lat": "lat", "lon": "lon", "height": "height_ellipsoidal_m", "geoid_height": "geoid_height_m",
         "range_m": "range_m", "range_low_m": "range_low_m", "range_high_m": "range_high_m", "cep50_m": "cep50_m",
@@ -155,9 +155,9 @@ def test_a_long_list_of_points_is_located_in_pieces(monkeypatch: pytest.MonkeyPa
     both = pixels()
     cov = (torch.rand(ROWS, 1, 1, dtype=torch.float64) + 0.1) * torch.eye(4, dtype=torch.float64)
     for options in ({}, {"cov": cov}, {"cov": cov[:1]}):
-        whole = locate_points(real_rig(), both[:, 0], both[:, 1], origin=ORIGIN, heading_deg=0.0, **options)
-        monkeypatch.setattr("kcal.locate.positions.CHUNK_ROWS", 50)
-        pieces = locate_points(real_rig(), both[:, 0], both[:, 1], origin=ORIGIN, heading_deg=0.0, **options)
+        whole = located_pairs(real_rig(), both[:, 0], both[:, 1], origin=ORIGIN, heading_deg=0.0, **options)
+        monkeypatch.setattr("kcal.locate.points.CHUNK_ROWS", 50)
+        pieces = located_pairs(real_rig(), both[:, 0], both[:, 1], origin=ORIGIN, heading_deg=0.0, **options)
         monkeypatch.undo()
         one, other = whole.columns, pieces.columns
         assert (one.names, one.status.tolist()) == (other.names, other.status.tolist())
@@ -216,7 +216,7 @@ def test_names_that_would_act_are_texts_and_come_back(tmp_path: Path) -> None:
         out.writerows([name, 960, 540, 950, 540] for name in column)
     assert [name for chunk, _ in read_mark_chunks(again) for name in chunk.names] == names
     # A name that begins as if it had been guarded is guarded once more.
-    located = locate_points(real_rig(), *pixels()[:1].unbind(1), names=["'=1"], origin=ORIGIN, heading_deg=0.0)
+    located = located_pairs(real_rig(), *pixels()[:1].unbind(1), names=["'=1"], origin=ORIGIN, heading_deg=0.0)
     text = write_positions(tmp_path / "guarded.csv", located).read_text(encoding="utf-8")
     assert text.splitlines()[1].startswith("''=1,")
 
@@ -301,7 +301,7 @@ def test_number_lines_keep_every_digit() -> None:
 def test_a_sample_is_even_and_does_not_depend_on_chunks() -> None:
     def sampled(size: int) -> PositionSample:
         sample = PositionSample(frozenset({"7", "247"}), most=20)
-        columns = locator_of_everything()([str(i) for i in range(ROWS)], pixels())
+        columns = locator_of_everything()(Marks([str(i) for i in range(ROWS)], pixels()))[0]
         for piece in columns.pieces(size):
             sample.add(piece)
         return sample
@@ -343,14 +343,14 @@ def test_what_is_interrupted_leaves_old_files_as_they_were(
     (folder / "out.csv").write_text("old")
     before = sorted(folder.iterdir())
     calls: Iterator[int] = iter(range(10))
-    explain = tabulate._explanation
+    explain = points._pair_reason
 
     def stops(*arguments: object) -> str:
         if next(calls) == 3:
             raise KeyboardInterrupt
         return explain(*arguments)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(tabulate, "_explanation", stops)
+    monkeypatch.setattr(points, "_pair_reason", stops)
     assert run(monkeypatch, "-o", "out.csv", "-o", "out.geojson") == 130
     assert (folder / "out.csv").read_text() == "old"
     assert sorted(folder.iterdir()) == before

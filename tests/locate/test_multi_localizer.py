@@ -9,7 +9,7 @@ from torch import Tensor
 from kcal.errors import InputError
 from kcal.lens.rig import Rig
 from kcal.locate.geodesy import enu_to_geodetic
-from kcal.locate.multi_localizer import MultiViewLocalizer
+from kcal.locate.localizer import Localizer
 from kcal.locate.stereo import PositionStatus
 from scripts.shared import station_scenes as scenes
 from scripts.shared.station_scenes import ORIGIN, drawn_errors, marks, ring
@@ -29,7 +29,7 @@ def noise(shape: tuple[int, ...], sigma: float, seed: int = 1) -> Tensor:
 def test_exact_marks_through_bent_light_give_the_point_back(radius: float) -> None:
     rig, points = ring(4, radius), targets(6)
     rig.root = rig.with_errors(attitude_deg=0.01)
-    found = MultiViewLocalizer(rig)(marks(rig, points))
+    found = Localizer(rig)(marks(rig, points))
     assert (found.status == OK).all()
     # Without refraction, points 40 km away would be 16 m too high; one radius serves for all verticals.
     assert (found.enu - points).norm(dim=-1).max() < 1e-3
@@ -43,7 +43,7 @@ def test_ellipses_contain_the_truth_as_often_as_they_say(count: int) -> None:
     root = rig.with_errors(position_m=0.3, attitude_deg=(0.004, 0.004, 0.02), refraction=0.1)
     generator, points = torch.Generator().manual_seed(7), targets(2000)
     seen = marks(rig, points, drawn_errors(root, 2000, generator)) + noise((2000, count, 2), 0.3)
-    found = MultiViewLocalizer(rig, pixel_sigma=0.3, root=root)(seen)
+    found = Localizer(rig, pixel_sigma=0.3, root=root)(seen)
     ok = found.status == OK
     error = (found.enu - points)[ok]
     assert ok.sum() > 1990
@@ -56,8 +56,8 @@ def test_a_camera_with_a_poor_attitude_counts_less() -> None:
     rig = ring(3, 5000.0)
     root = rig.with_errors(attitude_deg=0.002)
     root[:, rig.pose_columns(1)] *= 50.0
-    found = MultiViewLocalizer(rig, root=root)(marks(rig, targets(1)) + noise((1, 3, 2), 0.1))
-    alike = MultiViewLocalizer(rig, root=rig.with_errors(attitude_deg=0.1))(marks(rig, targets(1)))
+    found = Localizer(rig, root=root)(marks(rig, targets(1)) + noise((1, 3, 2), 0.1))
+    alike = Localizer(rig, root=rig.with_errors(attitude_deg=0.1))(marks(rig, targets(1)))
     assert found.covariance[0].diagonal().sum() < 0.05 * alike.covariance[0].diagonal().sum()
 
 
@@ -68,14 +68,14 @@ def test_any_subset_of_cameras_is_as_if_the_others_were_not_there() -> None:
     for chosen in ([0, 1], [1, 3], [0, 2, 4]):
         seen = torch.zeros(3, 5, dtype=torch.bool)
         seen[:, chosen] = True
-        found = MultiViewLocalizer(rig, root=root)(torch.where(seen[..., None], pixels, math.nan), seen)
+        found = Localizer(rig, root=root)(torch.where(seen[..., None], pixels, math.nan), seen)
         few = Rig(
             [rig.each[c] for c in chosen], [rig.names[c] for c in chosen], rig.rotation[chosen],
             center=rig.center[chosen],
             origin=ORIGIN,
         )  # fmt: skip
         less = few.with_errors(position_m=0.1, attitude_deg=0.01, refraction=0.1)
-        alone = MultiViewLocalizer(few, root=less)(pixels[:, chosen])
+        alone = Localizer(few, root=less)(pixels[:, chosen])
         assert torch.allclose(found.enu, alone.enu, atol=1e-5)
         assert torch.allclose(found.covariance, alone.covariance, rtol=1e-6)
         assert torch.equal(found.used, seen)
@@ -85,7 +85,7 @@ def test_any_subset_of_cameras_is_as_if_the_others_were_not_there() -> None:
 def test_every_row_is_alone() -> None:
     rig, points = ring(4, 5000.0), targets(6)
     pixels = marks(rig, points) + noise((6, 4, 2), 0.3)
-    good = MultiViewLocalizer(rig, root=rig.with_errors(attitude_deg=0.01))
+    good = Localizer(rig, root=rig.with_errors(attitude_deg=0.01))
     whole = good(pixels)
     spoiled = pixels.clone()
     spoiled[1] = math.nan
@@ -114,7 +114,7 @@ def test_a_wrong_view_is_named_and_left_out(count: int) -> None:
     wrong = torch.arange(40) % count
     off = torch.tensor([[120.0, 90.0], [-20.0, 30.0]])[torch.arange(40) % 2]
     pixels[torch.arange(40), wrong] += off
-    found = MultiViewLocalizer(rig, root=root)(pixels)
+    found = Localizer(rig, root=root)(pixels)
     named = found.bad & (found.status == OK)[:, None]
     # Of three views, an error along a line that the others allow may be anyone's; such rows say so.
     assert named.any(-1).sum() >= (20 if count == 3 else 40)
@@ -131,17 +131,17 @@ def test_good_views_are_left_alone() -> None:
     root = rig.with_errors(attitude_deg=0.02)
     errors = drawn_errors(root, 2000, torch.Generator().manual_seed(3))
     pixels = marks(rig, targets(2000), errors) + noise((2000, 6, 2), 0.3)
-    found = MultiViewLocalizer(rig, root=root)(pixels)
+    found = Localizer(rig, root=root)(pixels)
     # One in ten thousand; without the errors that pixels share, nearly all.
     assert (found.bad.any(-1) | (found.status != OK)).sum() <= 2
-    assert MultiViewLocalizer(rig)(pixels).bad.any(-1).sum() > 1000
+    assert Localizer(rig)(pixels).bad.any(-1).sum() > 1000
 
 
 def test_two_views_that_contradict_each_other_are_told() -> None:
     rig = ring(2, 3000.0)
     pixels = marks(rig, targets(2))
     pixels[1, 0, 1] += 60.0
-    found = MultiViewLocalizer(rig)(pixels)
+    found = Localizer(rig)(pixels)
     assert found.status.tolist() == [OK, int(PositionStatus.CONTRADICTION)]
     assert (found.enu[1] == 0).all()
     assert torch.isinf(found.covariance[1].diagonal()).all()
@@ -149,7 +149,7 @@ def test_two_views_that_contradict_each_other_are_told() -> None:
 
 def test_gradients_are_exact() -> None:
     rig = ring(3, 5000.0)
-    locate = MultiViewLocalizer(rig, root=rig.with_errors(attitude_deg=0.01, refraction=0.1))
+    locate = Localizer(rig, root=rig.with_errors(attitude_deg=0.01, refraction=0.1))
     pixels = (marks(rig, targets(2)) + noise((2, 3, 2), 0.3)).requires_grad_()
     cov = (0.1 * torch.eye(2, dtype=torch.float64)).repeat(2, 3, 1, 1).requires_grad_()
 
@@ -159,13 +159,13 @@ def test_gradients_are_exact() -> None:
     assert torch.autograd.gradcheck(places, (pixels, cov), eps=1e-4, rtol=1e-4, atol=1e-3)
 
 
-def mixed_rows() -> tuple[MultiViewLocalizer, Tensor, Tensor]:
+def mixed_rows() -> tuple[Localizer, Tensor, Tensor]:
     rig = ring(3, 5000.0)
     pixels = marks(rig, targets(8)) + noise((8, 3, 2), 0.3)
     pixels[3, 2, 1] += 80.0
     seen = torch.ones(8, 3, dtype=torch.bool)
     seen[0, 1] = False
-    return MultiViewLocalizer(rig, root=rig.with_errors(attitude_deg=0.01)), pixels, seen
+    return Localizer(rig, root=rig.with_errors(attitude_deg=0.01)), pixels, seen
 
 
 def test_vmap() -> None:
@@ -194,7 +194,7 @@ def test_one_camera_with_a_stated_height() -> None:
     points = points - torch.tensor([0.0, 0.0, 300.0])
     height = enu_to_geodetic(points, ORIGIN)[:, 2]
     root = rig.with_errors(attitude_deg=0.02, refraction=0.1)
-    locate = MultiViewLocalizer(rig, root=root)
+    locate = Localizer(rig, root=root)
     seen = torch.tensor([False, True, False]).expand(5, 3)
     pixels = marks(rig, points)
     found = locate(pixels, seen, height=height, height_sigma=2.0)
@@ -218,7 +218,7 @@ def test_one_camera_alone_is_as_one_of_several(count: int) -> None:
     pixels = marks(rig, points)[:, :count]
     seen = torch.arange(count).expand(4, count) == 0
     height = enu_to_geodetic(points, ORIGIN)[:, 2]
-    found = MultiViewLocalizer(few, root=few.with_errors(attitude_deg=0.01))(pixels, seen, height=height)
+    found = Localizer(few, root=few.with_errors(attitude_deg=0.01))(pixels, seen, height=height)
     assert (found.status == OK).all()
     assert (found.enu - points).norm(dim=-1).max() < 0.1
 
@@ -226,8 +226,8 @@ def test_one_camera_alone_is_as_one_of_several(count: int) -> None:
 def test_errors_of_clocks_widen_along_the_motion() -> None:
     rig = ring(3, 3000.0)
     pixels, velocity = marks(rig, targets(1)), torch.tensor([[[50.0, 0.0]] * 3], dtype=torch.float64)
-    still = MultiViewLocalizer(rig, clock_sigma=0.1)(pixels)
-    moving = MultiViewLocalizer(rig, clock_sigma=0.1)(pixels, velocity=velocity)
+    still = Localizer(rig, clock_sigma=0.1)(pixels)
+    moving = Localizer(rig, clock_sigma=0.1)(pixels, velocity=velocity)
     assert moving.covariance[0, 0, 0] > 50 * still.covariance[0, 0, 0]
     assert moving.covariance[0, 2, 2] < 1.5 * still.covariance[0, 2, 2]
 
@@ -235,10 +235,10 @@ def test_errors_of_clocks_widen_along_the_motion() -> None:
 def test_bad_arguments() -> None:
     rig = ring(3, 3000.0)
     with pytest.raises(InputError, match=r"shape \(\.\.\., 3, 2\)"):
-        MultiViewLocalizer(rig)(torch.zeros(4, 2, 2))
+        Localizer(rig)(torch.zeros(4, 2, 2))
     with pytest.raises(InputError, match="seen: bool"):
-        MultiViewLocalizer(rig)(torch.zeros(4, 3, 2), torch.ones(4, 3))
+        Localizer(rig)(torch.zeros(4, 3, 2), torch.ones(4, 3))
     with pytest.raises(InputError, match="a root"):
-        MultiViewLocalizer(rig, root=torch.ones(2, 5))
+        Localizer(rig, root=torch.ones(2, 5))
     with pytest.raises(InputError, match="unlike names"):
         Rig(rig.each, ["a", "a", "b"], rig.rotation, center=rig.center)

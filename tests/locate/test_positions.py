@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from locate_rigs import pinhole_rig, real_rig, spread_points, tensor
+from locate_rigs import located_pairs, pinhole_rig, real_rig, spread_points, tensor
 
 from kcal.errors import FileError, InputError
 from kcal.lens.rig import Origin, RigCovariance
 from kcal.locate.export import cot_events, write_positions
 from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic, geodetic_to_enu
-from kcal.locate.positions import Located, Position, locate_points
+from kcal.locate.positions import Located, Position
 from kcal.locate.stereo import PositionStatus
 from kcal.locate.tabulate import find_geoid
 
@@ -30,7 +30,7 @@ STRAIGHT = {"refraction": 0.0, "refraction_sigma": 0.0}
 
 
 def one(left: tuple[float, float], right: tuple[float, float], **options: float) -> Position:
-    return locate_points(RIG, tensor(left), tensor(right), origin=ORIGIN, heading_deg=0.0, **options).positions[0]
+    return located_pairs(RIG, tensor(left), tensor(right), origin=ORIGIN, heading_deg=0.0, **options).positions[0]
 
 
 def mixed() -> Located:
@@ -38,13 +38,13 @@ def mixed() -> Located:
     left = tensor([975.5, 539.5], [960.0, 500.0], [955.0, 500.0], [900.0, 500.0], [-5.0, 3.0], [math.nan, 3.0])
     right = tensor([959.5, 539.5], [959.5, 500.0], [955.0, 500.0], [905.0, 500.0], [1.0, 3.0], [1.0, 3.0])
     names = ["mast", "far", "parallel", "mismatch", "outside", "nothing"]
-    return locate_points(RIG, left, right, origin=ORIGIN, heading_deg=90.0, names=names, **STRAIGHT)
+    return located_pairs(RIG, left, right, origin=ORIGIN, heading_deg=90.0, names=names, **STRAIGHT)
 
 
 def test_end_to_end_with_real_lenses() -> None:
     rig, truth = real_rig(), spread_points(torch.logspace(2, 3.7, 9, dtype=torch.float64))
     left, right = rig(truth)[0].unbind(-2)
-    located = locate_points(
+    located = located_pairs(
         rig, left, right, origin=ORIGIN, heading_deg=200.0, pitch_deg=3.0, roll_deg=-2.0, **STRAIGHT
     )
     enu = truth @ enu_from_cam(200.0, 3.0, -2.0).T
@@ -127,11 +127,11 @@ def test_bad_input_is_refused() -> None:
         (("marks", marks), "tensor or array"),
     ):
         with pytest.raises(InputError, match=message):
-            locate_points(RIG, *arguments, origin=ORIGIN, heading_deg=0.0)
+            located_pairs(RIG, *arguments, origin=ORIGIN, heading_deg=0.0)
     with pytest.raises(InputError, match="names"):
-        locate_points(RIG, marks, marks, origin=ORIGIN, heading_deg=0.0, names=["a", "b"])
+        located_pairs(RIG, marks, marks, origin=ORIGIN, heading_deg=0.0, names=["a", "b"])
     with pytest.raises(InputError, match="heading"):
-        locate_points(RIG, marks, marks, origin=ORIGIN, heading_deg=math.nan)
+        located_pairs(RIG, marks, marks, origin=ORIGIN, heading_deg=math.nan)
 
 
 def test_cameras_stand_and_look_where_they_should() -> None:
@@ -209,7 +209,7 @@ def test_covariances_circles_and_slopes_of_a_position() -> None:
     assert along == pytest.approx(62.5 * 0.1 * math.sqrt(2), rel=1e-3)
     assert position.cep50_m == pytest.approx(0.6745 * along, rel=0.01)
     assert position.cep95_m == pytest.approx(1.96 * along, rel=0.01)
-    wide = locate_points(
+    wide = located_pairs(
         RIG, tensor([975.5, 539.5]), tensor([959.5, 539.5]), origin=ORIGIN, heading_deg=0.0, pixel_sigma=0.1,
         calibration=RigCovariance.of(RIG, pose=torch.diag(tensor(0, 1e-4, 0, 0, 0, 0) ** 2)),
     )  # fmt: skip
@@ -222,7 +222,7 @@ def test_geoid_heights_are_stated(tmp_path: Path) -> None:
     path = tmp_path / "flat.gtx"
     path.write_bytes(struct.pack(">4d2i9f", -35.0, 150.0, 1.0, 1.0, 3, 3, *[22.5] * 9))
     marks = tensor([975.5, 539.5]), tensor([959.5, 539.5])
-    located = locate_points(RIG, *marks, origin=ORIGIN, heading_deg=0.0, geoid=find_geoid(path))
+    located = located_pairs(RIG, *marks, origin=ORIGIN, heading_deg=0.0, geoid=find_geoid(path))
     assert (located.geoid, located.positions[0].geoid_height) == ("flat", pytest.approx(22.5))
     document = ET.fromstring(write_positions(tmp_path / "points.kml", located).read_bytes())
     coordinates = [element.text.split(",") for element in document.iter("{http://www.opengis.net/kml/2.2}coordinates")]
@@ -291,7 +291,7 @@ def test_cursor_on_target() -> None:
 def test_regions_across_the_antimeridian_are_cut(tmp_path: Path) -> None:
     origin = Origin(lat=10.0, lon=179.9921, height=0.0)
     rig = pinhole_rig()
-    located = locate_points(rig, tensor([975.5, 539.5]), tensor([959.5, 539.5]), origin=origin, heading_deg=60.0)
+    located = located_pairs(rig, tensor([975.5, 539.5]), tensor([959.5, 539.5]), origin=origin, heading_deg=60.0)
     content = json.loads(write_positions(tmp_path / "points.geojson", located).read_bytes())
     region = content["features"][-1]["geometry"]
     assert region["type"] == "MultiPolygon"

@@ -11,7 +11,7 @@ from locate_rigs import real_rig, tensor
 from kcal.errors import InputError
 from kcal.lens.rig import Mounting, Origin, Rig, RigCovariance
 from kcal.locate.budget import planned_rig, range_sigmas, usual_ranges
-from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.localizer import Localizer
 from kcal.locate.mounting import mounting_covariance
 from kcal.report.tables import range_sigma_rows
 
@@ -74,7 +74,7 @@ def test_parts_sum_to_what_the_localizer_says_and_pose_is_conditional() -> None:
     torch.testing.assert_close(squares, found.total.square())
     both = rig.right_from_left_rotation[2] + tensor(0.0, 0.0, 1.0)
     left, right = rig(found.distance[:, None] * both / both.norm())[0].unbind(-2)
-    located = StereoLocalizer(rig, pixel_sigma=0.1)(left, right)
+    located = Localizer(rig, pixel_sigma=0.1)(left, right)
     torch.testing.assert_close(found.total, located.inverse_range_sigma * found.distance**2, rtol=1e-6, atol=0)
     # With exact lenses: the covariance of the pose is its Schur complement, and that of the lenses is zero.
     matrix = rig.covariance.matrix

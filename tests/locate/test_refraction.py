@@ -18,7 +18,7 @@ from kcal.errors import InputError
 from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.rig import Mounting, Origin
 from kcal.locate.geodesy import enu_to_geodetic
-from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.localizer import Localizer
 from kcal.locate.mounting import placed_rig
 from kcal.watch.turned import check_rig
 
@@ -92,7 +92,7 @@ def test_heights_have_the_errors_that_are_stated() -> None:
                 covariance = torch.block_diag(mounting.covariance[:6, :6], mounting.covariance[6:, 6:])
                 rig.mounting = dataclasses.replace(mounting, covariance=covariance)
             # Marks without noise: what is left is the rig's and the light's.
-            localize = StereoLocalizer(rig, pixel_sigma=1e-3)
+            localize = Localizer(rig, pixel_sigma=1e-3)
             found = localize(*pixels)
             there = enu_to_geodetic(target, ORIGIN)
             error = float((found.geodetic - there)[0, 2])
@@ -119,16 +119,16 @@ def test_a_file_keeps_it_and_the_localizer_takes_it(tmp_path: Path) -> None:
     assert torch.equal(again.mounting.covariance, rig.mounting.covariance)
     target = spread_points(1, 5000.0, 5000.0, 12)
     pixels = [bent(target, c, 0.31) for c in (0, 1)]
-    own, loaded = (StereoLocalizer(one, pixel_sigma=0.1)(*pixels) for one in (rig, again))
+    own, loaded = (Localizer(one, pixel_sigma=0.1)(*pixels) for one in (rig, again))
     assert torch.equal(own.enu, loaded.enu)
     assert torch.equal(own.covariance, loaded.covariance)
     # Given anew, it replaces the rig's: here with the usual sigma, which is larger than what the landmarks left.
-    same = StereoLocalizer(rig, pixel_sigma=0.1, refraction=rig.mounting.refraction)(*pixels)
+    same = Localizer(rig, pixel_sigma=0.1, refraction=rig.mounting.refraction)(*pixels)
     assert torch.equal(same.enu, own.enu)
     assert float(same.covariance[0, 2, 2]) > float(own.covariance[0, 2, 2])
     # Nothing found of it: the usual one.
     rig.mounting = Mounting(origin=ORIGIN, heading_deg=16.0)
-    usual, stated = StereoLocalizer(rig), StereoLocalizer(rig, refraction=0.13, refraction_sigma=0.1)
+    usual, stated = Localizer(rig), Localizer(rig, refraction=0.13, refraction_sigma=0.1)
     assert torch.equal(usual(*pixels).enu, stated(*pixels).enu)
     assert torch.equal(usual(*pixels).covariance, stated(*pixels).covariance)
 

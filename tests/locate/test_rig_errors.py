@@ -1,4 +1,4 @@
-"""Errors of rig and mounting together: what `StereoLocalizer` adds up is what moving rig and mounting does."""
+"""Errors of rig and mounting together: what `Localizer` adds up is what moving rig and mounting does."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from kcal.errors import InputError
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import Mounting, Origin, Rig, RigCovariance
 from kcal.locate.geodesy import enu_from_cam
-from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.localizer import Localizer
 from kcal.locate.mounting import run_errors
 
 ORIGIN = Origin(lat=19.07, lon=72.87, height=14.0)
@@ -30,7 +30,7 @@ def located(link: bool) -> tuple[torch.Tensor, torch.Tensor]:
     rig, whole = real_rig(), joint()
     known = RigCovariance.of(rig, pose=whole[:6, :6])
     cross = torch.cat([torch.zeros(len(known.matrix) - 6, 6, dtype=torch.float64), whole[:6, 6:]])
-    localize = StereoLocalizer(
+    localize = Localizer(
         rig, origin=ORIGIN, heading_deg=35.0, pitch_deg=-1.0, roll_deg=0.5, pixel_sigma=0.1, calibration=known,
         mounting=whole[6:, 6:], link=cross if link else None,
     )  # fmt: skip
@@ -41,7 +41,7 @@ def located(link: bool) -> tuple[torch.Tensor, torch.Tensor]:
 def test_covariance_is_that_of_moving_rig_and_mounting() -> None:
     rig = real_rig()
     left, right = rig(POINTS)[0].unbind(-2)
-    plain = StereoLocalizer(rig, origin=ORIGIN, heading_deg=35.0, pitch_deg=-1.0, roll_deg=0.5, pixel_sigma=0.1)
+    plain = Localizer(rig, origin=ORIGIN, heading_deg=35.0, pitch_deg=-1.0, roll_deg=0.5, pixel_sigma=0.1)
     start = plain(left, right)
     expected = start.covariance.clone()
     values, vectors = torch.linalg.eigh(joint())
@@ -50,7 +50,7 @@ def test_covariance_is_that_of_moving_rig_and_mounting() -> None:
         for sign in (-1e-3, 1e-3):
             turn = rotation_from_vector(sign * step[:3])
             pose = turn @ rig.right_from_left_rotation, rig.right_from_left_translation + sign * step[3:6]
-            moved = StereoLocalizer(Rig.pair(rig.left, rig.right, *pose), origin=ORIGIN, heading_deg=35.0)
+            moved = Localizer(Rig.pair(rig.left, rig.right, *pose), origin=ORIGIN, heading_deg=35.0)
             in_rig = moved(left, right).enu @ enu_from_cam(35.0)
             turned = rotation_from_vector(sign * step[9:]) @ enu_from_cam(35.0, -1.0, 0.5)
             ends.append(in_rig @ turned.T + sign * step[6:9])
@@ -71,9 +71,7 @@ def test_a_link_must_fit() -> None:
         (torch.ones(size, 6), whole[6:, 6:], "not a covariance"),
     ):
         with pytest.raises(InputError, match=message):
-            StereoLocalizer(
-                rig, origin=ORIGIN, heading_deg=0.0, calibration=known, mounting=mounting, link=link.double()
-            )
+            Localizer(rig, origin=ORIGIN, heading_deg=0.0, calibration=known, mounting=mounting, link=link.double())
 
 
 def test_stated_errors_are_added_to_what_the_rig_knows() -> None:

@@ -20,13 +20,13 @@ from kcal.lens.rig import REFRACTION_SIGMA, Origin
 from kcal.locate.budget import BudgetErrors, planned_rig, range_errors
 from kcal.locate.geodesy import anchor, enu_to_geodetic, geodetic_to_enu, mean_radius, place_enu
 from kcal.locate.ground import level_ground
-from kcal.locate.multi_localizer import MultiViewLocalizer
+from kcal.locate.localizer import Localizer
 from kcal.locate.positions import region_outline
 from kcal.locate.raster import terrain
 from kcal.locate.siting import Area, Site, area_of, rank_sites, read_sites, seen_over, sites_of, siting_map, surface_of
 from scripts.shared.station_scenes import ORIGIN, marks, ring
 
-# Siting: hidden ground, the map of errors beside `MultiViewLocalizer`, and the order of candidates.
+# Siting: hidden ground, the map of errors beside `Localizer`, and the order of candidates.
 
 
 BOUNDS = (44.96, 5.95, 45.04, 6.05)
@@ -85,7 +85,7 @@ def test_errors_are_those_of_the_localizer() -> None:
     found = siting_map(area, sites)
     geodetic = torch.stack([*torch.meshgrid(area.lat, area.lon, indexing="ij"), area.ground], -1)
     points = geodetic_to_enu(geodetic, ORIGIN).reshape(-1, 3)
-    located = MultiViewLocalizer(rig, pixel_sigma=1.0)(marks(rig, points))
+    located = Localizer(rig, pixel_sigma=1.0)(marks(rig, points))
     assert bool((located.status == 0).all())
     # Standard refraction is common to all in the localizer, and moves heights alone.
     there = located.covariance[:, :2, :2].diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()

@@ -16,10 +16,9 @@ from kcal.calibrate.rig.sources import RigData
 from kcal.errors import DegenerateError, FileError
 from kcal.io.rig_file import load_rig, save_camera_rig, save_rig
 from kcal.lens.rig import Mounting, Rig, RigCovariance
-from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.localizer import Localizer
 from kcal.locate.mounting import placed_rig
-from kcal.locate.multi_localizer import MultiViewLocalizer
-from kcal.locate.stations import load_camera_rig, station_mounting, stations_of
+from kcal.locate.stations import load_camera_rig, station_mounting
 from scripts.shared.station_scenes import ORIGIN, marks, ring, targets
 
 RIG = Path(__file__).parents[1] / "io" / "rig.json"
@@ -75,7 +74,7 @@ def test_positions_from_solved_stations_are_inside_their_ellipses() -> None:
         found = solve_rig(data).stations(ORIGIN)
         points = targets(50, torch.Generator().manual_seed(100 + seed))
         noise = 0.3 * torch.randn(50, len(truth), 2, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-        located = MultiViewLocalizer(found)(marks(truth, points) + noise)
+        located = Localizer(found)(marks(truth, points) + noise)
         error = located.enu - points
         squares.append((error * torch.linalg.solve(located.covariance, error)).sum(-1))
     inside = float((torch.cat(squares) < 7.815).double().mean())
@@ -146,16 +145,16 @@ def test_a_stereo_rig_gives_the_same_positions_and_covariances(tmp_path: Path, m
     points = spread_points(torch.linspace(80.0, 400.0, 5, dtype=torch.float64))
     left, right = rig(points)[0].unbind(-2)
     right = right + tensor(0.05, 0.0)
-    many = MultiViewLocalizer(load_camera_rig(save_rig(rig, tmp_path / "rig.json")))
+    many = Localizer(load_camera_rig(save_rig(rig, tmp_path / "rig.json")))
     found = many(torch.stack([left, right], 1))
     if mounted:
-        other = StereoLocalizer(rig)(left, right)
+        other = Localizer(rig)(left, right)
         assert torch.allclose(found.geodetic, other.geodetic, atol=1e-6)
         # Here ranges count from where the left camera is said to stand, 0.1 to 0.2 m off.
         assert torch.allclose(found.range_high, other.range_high, atol=0.3)
     else:
         # Without a place on the Earth there are straight lines, in the left camera's frame.
-        other = StereoLocalizer(rig, origin=ORIGIN, heading_deg=0.0, refraction=0.0, refraction_sigma=0.0)(left, right)
+        other = Localizer(rig, origin=ORIGIN, heading_deg=0.0, refraction=0.0, refraction_sigma=0.0)(left, right)
         turned = other.enu @ tensor([1, 0, 0], [0, 0, 1], [0, -1, 0])
         assert torch.allclose(found.enu, turned, atol=0.01)
     assert (found.enu.norm(dim=-1) - other.enu.norm(dim=-1)).abs().max() < 0.01
@@ -164,8 +163,8 @@ def test_a_stereo_rig_gives_the_same_positions_and_covariances(tmp_path: Path, m
         gained = torch.linalg.eigvalsh(other.covariance - found.covariance)
         assert (gained[:, 0] > -1e-3 * torch.linalg.eigvalsh(other.covariance)[:, -1]).all()
         rig.covariance, rig.mounting = None, dataclasses.replace(rig.mounting, link=None)
-        found = MultiViewLocalizer(stations_of(rig))(torch.stack([left, right], 1))
-        other = StereoLocalizer(rig)(left, right)
+        found = Localizer(rig, weights="all")(torch.stack([left, right], 1))
+        other = Localizer(rig)(left, right)
         scale = other.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
         off = (found.covariance - other.covariance) / scale[:, :, None] / scale[:, None]
         assert off.abs().max() < 1e-3

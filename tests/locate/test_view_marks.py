@@ -19,8 +19,9 @@ from kcal.io.rig_file import save_camera_rig
 from kcal.locate import marks as tables
 from kcal.locate.budget import range_sigmas, station_sigmas
 from kcal.locate.geodesy import enu_to_geodetic, geodetic_to_enu
+from kcal.locate.localizer import Localizer
 from kcal.locate.marks import Marks, read_mark_chunks, read_marks
-from kcal.locate.station_positions import PositionSample, ViewsLocator
+from kcal.locate.points import PointLocator, PositionSample
 from kcal.locate.stations import stations_of
 from kcal.locate.survey import read_features
 from kcal.locate.tables import read_chunks
@@ -135,7 +136,7 @@ def test_a_long_table_is_located_as_a_short_one(
         out = [tmp_path / f"out{number}{suffix}" for suffix in (".csv", ".geojson")]
         command(*words, *(word for path in out for word in ("-o", str(path))))
         outputs.append([cell for row in csv.reader(out[0].read_text().splitlines()) for cell in row])
-        locate, sample = ViewsLocator(rig), PositionSample(most=20)
+        locate, sample = PointLocator(Localizer(rig, weights="all")), PositionSample(most=20)
         for views, _ in read_mark_chunks(tmp_path / "marks.csv", rig.names):
             sample.add(*locate(views))
         samples.append(sample.located(locate))

@@ -7,7 +7,7 @@ import torch
 from kcal.lens.camera import Camera
 from kcal.lens.rig import Origin, Rig
 from kcal.locate.geodesy import enu_from_cam
-from kcal.locate.multi_localizer import MultiViewLocalizer, common_errors, posed_cameras
+from kcal.locate.localizer import Localizer
 from kcal.locate.views import shared_pixels
 from kcal.pipeline.measurements import ALONE_M, known_views, view_rows
 
@@ -28,14 +28,14 @@ def mixed_stations() -> Rig:
 
 def test_rows_are_those_of_the_rig() -> None:
     rig = mixed_stations()
-    localize = MultiViewLocalizer(rig)
+    localize = Localizer(rig)
     points = torch.tensor([[0.0, 5000.0, 100.0], [300.0, 4000.0, 50.0], [-200.0, 6000.0, 80.0]], dtype=torch.float64)
     pixels, seen = rig(points)
     assert bool(seen.all())
     seen[1, 0], seen[2, :2] = False, False
     mix = torch.randn(6, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     covariance = (mix @ mix.T + torch.eye(6)).expand(3, 6, 6)
-    posed, common = posed_cameras(localize), common_errors(localize)
+    posed, common = localize.posed, localize.common
     marks = torch.where(seen[..., None], pixels + torch.tensor([0.3, 0.0]), torch.nan)
     found = view_rows(known_views(posed, common), marks, seen, covariance)
     assert found.anchor.tolist() == [0, 1, 2]

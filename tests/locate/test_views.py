@@ -11,9 +11,11 @@ from locate_rigs import tensor
 
 from kcal.errors import FileError, InputError
 from kcal.lens.rig import Rig
+from kcal.locate.export import write_positions
 from kcal.locate.geodesy import enu_to_geodetic
+from kcal.locate.localizer import Localizer
 from kcal.locate.marks import Marks, is_long, read_marks
-from kcal.locate.station_positions import locate_views
+from kcal.locate.points import locate_points
 from kcal.locate.stereo import PositionStatus
 from kcal.locate.survey import Survey, match_landmarks, read_features
 from kcal.watch.turned import seen_again
@@ -125,7 +127,7 @@ class TestPositions:
 
     def test_positions_and_what_is_said_of_them(self) -> None:
         points, views = self.views()
-        found = locate_views(self.RIG, views)
+        found = locate_points(self.RIG, views)
         status = [position.status for position in found.positions]
         assert status == [
             PositionStatus.OK, PositionStatus.OK, PositionStatus.BEARING_ONLY, PositionStatus.OK,
@@ -155,7 +157,7 @@ class TestPositions:
 
     def test_ranges_and_bearings_are_from_the_first_camera_at_its_own_vertical(self) -> None:
         points, views = self.views()
-        position = locate_views(self.RIG, views).positions[1]
+        position = locate_points(self.RIG, views).positions[1]
         center = self.RIG.center[0]
         assert position.range_m == pytest.approx(float((points[1] - center).norm()), rel=1e-4)
         # Azimuths at the station and here differ by the convergence of meridians, 5 km · tan 45° / 6371 km.
@@ -166,10 +168,10 @@ class TestPositions:
 
     def test_noise_of_marks_by_table_and_by_default(self) -> None:
         _, views = self.views()
-        plain = locate_views(self.RIG, views, pixel_sigma=0.3)
-        twice = locate_views(self.RIG, views, pixel_sigma=0.6)
+        plain = locate_points(Localizer(self.RIG, pixel_sigma=0.3), views)
+        twice = locate_points(Localizer(self.RIG, pixel_sigma=0.6), views)
         stated = views._replace(sigma=torch.full((5, 4), 0.6).double())
-        tabled = locate_views(self.RIG, stated, pixel_sigma=0.3)
+        tabled = locate_points(Localizer(self.RIG, pixel_sigma=0.3), stated)
         sigma = [found.positions[0].cep50_m for found in (plain, twice, tabled)]
         assert sigma[1] == pytest.approx(2.0 * sigma[0], rel=1e-3)  # type: ignore[operator]
         assert sigma[2] == pytest.approx(sigma[1], rel=1e-6)
@@ -177,19 +179,36 @@ class TestPositions:
     def test_a_height_places_what_one_camera_saw(self) -> None:
         points, views = self.views()
         height = float(enu_to_geodetic(points[2], ORIGIN)[2])
-        found = locate_views(self.RIG, views, height=(height, 0.5)).positions[2]
+        found = locate_points(self.RIG, views, height=(height, 0.5)).positions[2]
         assert found.status == PositionStatus.OK
         assert found.enu is not None
         assert float((torch.tensor(found.enu).double() - points[2]).norm()) < 1.0
-        wider = locate_views(self.RIG, views, height=(height, 5.0)).positions[2]
+        wider = locate_points(self.RIG, views, height=(height, 5.0)).positions[2]
         assert wider.cep95_m is not None
         assert found.cep95_m is not None
         assert wider.cep95_m > 2.0 * found.cep95_m
 
-    def test_a_rig_without_a_place_is_refused(self) -> None:
-        bare = Rig(list(self.RIG.each), self.RIG.names, self.RIG.rotation, center=self.RIG.center)
+    def test_a_rig_without_a_place_has_positions_in_its_own_frame(self, tmp_path: Path) -> None:
+        straight = [Rig(list(self.RIG.each), self.RIG.names, self.RIG.rotation, center=self.RIG.center,
+                        origin=origin, refraction=0.0) for origin in (None, ORIGIN)]  # fmt: skip
+        bare, placed = (locate_points(rig, self.views()[1]) for rig in straight)
+        assert bare.origin is None
+        torch.testing.assert_close(bare.enu, placed.enu, equal_nan=True)
+        ranges = [[position.range_m for position in found.positions] for found in (bare, placed)]
+        assert ranges[0] == pytest.approx(ranges[1], nan_ok=True)
+        one = bare.positions[0]
+        assert (one.status, one.lat, one.height, one.azimuth_deg, one.cep95_m) == (PositionStatus.OK, *[None] * 4)
+        assert one.covariance == placed.positions[0].covariance
+        head, first, *_ = write_positions(tmp_path / "own.csv", bare).read_text().splitlines()
+        assert head.startswith("name,status,reason,frame,x_m,y_m,z_m,range_m,")
+        assert "cov_xz_m2" in head
+        assert ',"x, y, z of the rig",' in first
+        for name in ("own.geojson", "own.kml", "own.cot", "own.geojsonl"):
+            with pytest.raises(InputError, match=rf"{name}: this rig has no place on the Earth.* or write .csv"):
+                write_positions(tmp_path / name, bare)
+        assert [path.name for path in tmp_path.iterdir()] == ["own.csv"]
         with pytest.raises(InputError, match="no place on the Earth"):
-            locate_views(bare, self.views()[1])
+            locate_points(straight[0], self.views()[1], height=(3.0, 1.0))
 
 
 def test_things_that_are_marked_again() -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from lenses import FEW_MODES, hybrid_camera
+from locate_rigs import located_pairs
 from waiting import wait_for
 
 from kcal.corners.match import Matches, MatchStatus, find_again
@@ -17,7 +18,6 @@ from kcal.io.images import write_png
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import Origin, Rig, RigCovariance
 from kcal.locate.marks import Marks, write_marks
-from kcal.locate.positions import locate_points
 from kcal.locate.survey import Survey
 from kcal.mark.guide import Reference, RigBand, at_shape, open_pictures, propose
 from kcal.mark.items import Add, Mark, MarkingState, Place, Put, Side, SurveyPlace
@@ -346,7 +346,7 @@ def test_the_map_shows_each_region_at_its_target(site: MarkingSite) -> None:
     left = torch.cat([far, left])
     right = torch.cat([site.rig(torch.tensor([[0.0, 0.0, 1e7]]).double())[0][:, 1], right])
     names = ["far", *site.pixels]
-    located = locate_points(site.rig, left, right, names=names, origin=Origin(lat=0, lon=0, height=0), heading_deg=0.0)
+    located = located_pairs(site.rig, left, right, names=names, origin=Origin(lat=0, lon=0, height=0), heading_deg=0.0)
     shown = {target["name"]: target for target in map_content(site.rig, located, None, anchored=False)["targets"]}
     assert shown["far"]["ring"] is None
     assert sum(target["ring"] is not None for target in shown.values()) == located.count > 3

@@ -10,9 +10,7 @@ from torch import Tensor
 from kcal.errors import InputError
 from kcal.lens.rig import Mounting, Origin, Rig, RigCovariance
 from kcal.locate.budget import planned_rig
-from kcal.locate.localizer import StereoLocalizer
-from kcal.locate.multi_localizer import MultiViewLocalizer
-from kcal.locate.stations import stations_of
+from kcal.locate.localizer import Localizer
 from kcal.pipeline.association import AssociationOptions, PairBoxes, associate
 from kcal.pipeline.detections import Detections
 from kcal.pipeline.grouping import group_objects
@@ -69,7 +67,7 @@ def test_a_batch_is_paired_as_each_of_its_moments() -> None:
     at = found.match.clamp_min(0)[..., None].expand(-1, -1, 2)
     assert torch.equal(found.right[found.mask], middles.gather(1, at)[found.mask])
     # What has no partner is harmless to a localizer.
-    where = StereoLocalizer(rig)(found.left, found.right, mask=found.mask)
+    where = Localizer(rig)(found.left, found.right, mask=found.mask)
     assert bool(torch.isfinite(where.enu).all())
 
 
@@ -103,12 +101,12 @@ def test_a_position_is_differentiable_by_the_boxes_of_a_detector() -> None:
     rig, left, right, here, there = moments(1)
     raw = left[0][here[0]].float().requires_grad_(True)
     pairs = pair_objects(rig, detections(raw), detections(right[0][there[0]]), options=OPTIONS)
-    StereoLocalizer(rig)(pairs.left, pairs.right, pairs.covariance).inverse_range.sum().backward()
+    Localizer(rig)(pairs.left, pairs.right, pairs.covariance).inverse_range.sum().backward()
     assert raw.grad is not None
     # A step to the right of a left box raises the disparity: 1 / (focal length × baseline) each.
     moved = raw.grad.double().reshape(-1, 2, 2)[..., 0].sum(-1)
     assert torch.allclose(moved[moved != 0], torch.tensor(1.0 / 16000.0).double(), rtol=0.1)
-    views = group_objects(MultiViewLocalizer(stations_of(rig)), [detections(raw), detections(right[0])], OPTIONS)
+    views = group_objects(Localizer(rig, weights="all"), [detections(raw), detections(right[0])], OPTIONS)
     assert views.pixels.requires_grad
 
 
@@ -151,7 +149,7 @@ def test_all_of_it_on_another_device() -> None:
         found.score.sum().backward()
         seen = detections(moved[0][0]), detections(moved[1][0])
         pairs = pair_objects(rig, *seen, (moved[4][0, 0], moved[4][0, 0]), options=OPTIONS)
-        views = group_objects(MultiViewLocalizer(stations_of(rig)), seen, OPTIONS)
+        views = group_objects(Localizer(rig, weights="all"), seen, OPTIONS)
         matches = {"keypoints0": pairs.left, "keypoints1": pairs.right, "confidence": pairs.score}
         again = type(pairs).from_matches(matches)
         for value in (*found, pairs.covariance, pairs.time, views.pixels, views.time, views.score, again.covariance):

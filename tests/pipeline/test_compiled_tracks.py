@@ -7,14 +7,13 @@ import torch
 from track_scenes import pairs_of, seen_by, tracked_site
 
 from kcal.errors import InputError
-from kcal.locate.localizer import StereoLocalizer
-from kcal.locate.stations import stations_at
+from kcal.locate.localizer import Localizer
 from kcal.pipeline.imm_filter import no_beliefs
 from kcal.pipeline.measurements import ClockPrior
 from kcal.pipeline.tracks import Tracker, compiled_steps, track_steps
 
 
-def scene(localize: StereoLocalizer, frame: int) -> tuple[torch.Tensor, torch.Tensor]:
+def scene(localize: Localizer, frame: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Targets on lines, one of which sweeps by closely; first one, then four, then nine, three of which pause."""
     count = 1 if frame < 4 else 4 if frame < 8 else 9
     number = torch.arange(count, dtype=torch.float64)
@@ -56,7 +55,7 @@ def test_steps_that_cannot_be_compiled_are_an_error(monkeypatch: pytest.MonkeyPa
         return call
 
     monkeypatch.setattr(torch, "compile", fails)
-    localize = stations_at(tracked_site())
+    localize = tracked_site().weighing_all()
     nothing = no_beliefs(1, 0, 4, torch.device("cpu"))
     with pytest.raises(InputError, match="no compiler"):
         compiled_steps(track_steps(localize, 0.01), 2, nothing, None)

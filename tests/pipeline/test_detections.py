@@ -17,8 +17,7 @@ from track_scenes import tracked_site
 
 from kcal.errors import InputError
 from kcal.lens.camera_conversions import ImageTransform
-from kcal.locate.multi_localizer import MultiViewLocalizer
-from kcal.locate.stations import stations_of
+from kcal.locate.localizer import Localizer
 from kcal.pipeline.association import AssociationOptions
 from kcal.pipeline.detections import Detections, detect_in, load_detector
 from kcal.pipeline.grouping import Moment, read_moment
@@ -308,7 +307,7 @@ def test_malformed(content: object, message: str) -> None:
 
 def test_cameras_by_their_names() -> None:
     """The time is that of the first camera that has an image; only names of the rig's cameras are possible."""
-    localize = MultiViewLocalizer(stations_of(RIG))
+    localize = Localizer(RIG, weights="all")
     first, second = localize.rig.names
     options = AssociationOptions()
 

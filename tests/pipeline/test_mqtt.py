@@ -14,9 +14,9 @@ from track_scenes import tracked_site
 
 pytest.importorskip("paho.mqtt.client")
 from kcal.errors import InputError
-from kcal.locate.positions import located_by
+from kcal.locate.localizer import Localizer
+from kcal.locate.points import PointLocator
 from kcal.locate.tables import NUMBERS, PositionColumns
-from kcal.locate.tabulate import Locator
 from kcal.pipeline.senders import Sender, sender_to
 
 
@@ -59,7 +59,7 @@ def sent_to(broker: Broker) -> Sender:
     numbers = np.full((2, len(NUMBERS)), np.nan)
     numbers[:, :3] = 19.0, 72.0, 5.0
     columns = PositionColumns(["track 1", "track 2"], np.zeros(2, np.int8), ["", ""], numbers, {"sequence": ["9", "9"]})
-    run = located_by(Locator(site.rig, origin=site.origin, heading_deg=0.0))
+    run = PointLocator(Localizer(site.rig, origin=site.origin, heading_deg=0.0)).located()
     sender.send(columns, run, datetime.datetime.now(datetime.UTC))
     sender.close()
     broker.join()

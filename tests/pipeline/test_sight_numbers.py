@@ -10,7 +10,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from kcal.locate.multi_localizer import MultiViewLocalizer
+from kcal.locate.localizer import Localizer
 from kcal.pipeline.assignment import Candidates, Scores, assigned
 from kcal.pipeline.association import AssociationOptions
 from kcal.pipeline.detections import Detections
@@ -385,7 +385,7 @@ def test_a_crowd_is_grouped_as_it_is(missed: float, false: int) -> None:
         numbers = [*there.tolist(), *[-1] * false]
         assert seen[-1] is not None
         owners.append({tuple(p): number for p, number in zip(seen[-1].anchors().tolist(), numbers, strict=True)})
-    found = group_objects(MultiViewLocalizer(rig), seen, AssociationOptions(box_sigma=1.0))
+    found = group_objects(Localizer(rig), seen, AssociationOptions(box_sigma=1.0))
     right = wrong_ones = 0
     complete = set()
     for p, s, doubt in zip(found.pixels.tolist(), found.seen.tolist(), found.ambiguous.tolist(), strict=True):

@@ -16,10 +16,10 @@ from kcal.io.lookup_file import save_onnx
 from kcal.lens.camera import Camera
 from kcal.lens.model import PRESETS
 from kcal.lens.rig import Origin, Rig, RigCovariance
-from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.localizer import Localizer
 
 
-def localizer(lens: str, scale: float, heading: float) -> StereoLocalizer:
+def localizer(lens: str, scale: float, heading: float) -> Localizer:
     model = HYBRID if lens == "hybrid" else PRESETS[lens]
     values = torch.tensor([0.02, -0.01, 0.003, -0.0005]) if model.fisheye else 0.3 * strong(model)
     focal = torch.tensor([1600.0, 1610.0, 955.0, 541.0, 0.0])
@@ -27,7 +27,7 @@ def localizer(lens: str, scale: float, heading: float) -> StereoLocalizer:
     rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-10.0 * scale, 0.1, 0.2]))
     rig.covariance = RigCovariance.of(rig, pose=scale * 1e-8 * torch.eye(6, dtype=torch.float64))
     mounting = scale * 1e-6 * torch.eye(6, dtype=torch.float64)
-    return StereoLocalizer(rig, origin=Origin(lat=19.0, lon=72.0, height=14.0), heading_deg=heading, mounting=mounting)
+    return Localizer(rig, origin=Origin(lat=19.0, lon=72.0, height=14.0), heading_deg=heading, mounting=mounting)
 
 
 @pytest.mark.parametrize("lens", ["opencv5", "ext24", "fisheye4", "hybrid"])

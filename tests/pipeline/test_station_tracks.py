@@ -12,8 +12,7 @@ from torch import Tensor
 from kcal.errors import InputError
 from kcal.lens.rig import Mounting, Rig
 from kcal.locate.budget import planned_rig
-from kcal.locate.multi_localizer import MultiViewLocalizer
-from kcal.locate.stations import stations_of
+from kcal.locate.localizer import Localizer
 from kcal.pipeline.association import AssociationOptions, associate
 from kcal.pipeline.detections import Detections
 from kcal.pipeline.grouping import group_objects
@@ -67,7 +66,7 @@ def test_two_cameras_of_one_mast_are_paired_as_ever() -> None:
     # The nearest range is a default of masts.
     options = AssociationOptions(box_sigma=1.0, nearest=100.0)
     expected = associate(rig, *seen, options)
-    found = group_objects(MultiViewLocalizer(stations_of(rig)), seen, options)
+    found = group_objects(Localizer(rig, weights="all"), seen, options)
     both = found.seen.all(1)
     pairs = {
         tuple(p.flatten().tolist()): bool(a) for p, a in zip(found.pixels[both], found.ambiguous[both], strict=True)
@@ -89,7 +88,7 @@ def test_detections_of_one_thing_come_together(count: int) -> None:
             {tuple(p.tolist()): int(i) for p, i in zip(boxes(pixels[order, c]).anchors(), order, strict=True)}
         )
         seen.append(boxes(pixels[order, c]))
-    found = group_objects(MultiViewLocalizer(rig), seen, AssociationOptions(box_sigma=1.0))
+    found = group_objects(Localizer(rig), seen, AssociationOptions(box_sigma=1.0))
     right = 0
     for p, s, doubt in zip(found.pixels, found.seen.tolist(), found.ambiguous.tolist(), strict=True):
         whose = {owners[c][tuple(p[c].tolist())] for c in range(count) if s[c]}
@@ -109,7 +108,7 @@ def test_errors_of_tracks_are_as_large_as_stated() -> None:
     start, velocity = scene(count, 5)
     g = torch.Generator().manual_seed(6)
     errors = drawn_errors(rig.root, count, g)
-    tracker = Tracker(MultiViewLocalizer(rig), STEADY)
+    tracker = Tracker(Localizer(rig), STEADY)
     for second in range(8):
         places = start + second * velocity
         pixels = marks(rig, places, errors) + torch.randn(count, 4, 2, generator=g).double()
@@ -136,7 +135,7 @@ def test_a_name_lives_through_bearings_and_a_hand_over() -> None:
     rig.root = torch.cat([rig.root, lens])
     g = torch.Generator().manual_seed(7)
     start, velocity = torch.tensor([[-400.0, 300.0, 200.0]]).double(), torch.tensor([[12.0, -5.0, 0.0]]).double()
-    tracker = Tracker(MultiViewLocalizer(rig), STEADY)
+    tracker = Tracker(Localizer(rig), STEADY)
     shown, sigmas, seen_by = set(), [], []
     for second in range(40):
         who = [[0, 1], [1], [1, 2], [2]][second // 10]
@@ -161,7 +160,7 @@ def test_a_name_lives_through_bearings_and_a_hand_over() -> None:
 
 def test_one_camera_begins_no_track() -> None:
     rig = stations()
-    tracker = Tracker(MultiViewLocalizer(rig), STEADY)
+    tracker = Tracker(Localizer(rig), STEADY)
     pixels, seen = marks(rig, torch.tensor([[0.0, 0.0, 200.0]]).double()), torch.tensor([[False, True, False]])
     for second in range(6):
         assert tracker(views_of(pixels, seen, float(second)), float(second)).number == ()
@@ -176,7 +175,7 @@ def test_a_row_that_is_not_finite_loses_no_other() -> None:
     broken[2, 0] = math.nan
     found = []
     for given, there in ((broken, seen), (pixels, seen & torch.isfinite(broken).all(-1))):
-        tracker = Tracker(MultiViewLocalizer(rig), STEADY)
+        tracker = Tracker(Localizer(rig), STEADY)
         for second in range(6):
             tracks = tracker(views_of(given, there, float(second)), float(second))
         found.append(tracks)
@@ -194,7 +193,7 @@ def test_the_clock_of_each_camera_is_found() -> None:
     velocity = torch.tensor([[25.0, 5.0, 0.0], [-10.0, -20.0, 0.0], [5.0, 25.0, -3.0], [-22.0, 8.0, 2.0]]).double()
     late = torch.tensor([0.0, 0.3, -0.2]).double()
     clock = [ClockPrior(offset_sigma_s=0.5, drift_sigma=1e-4), ClockPrior(offset_s=-0.1, offset_sigma_s=0.5)]
-    tracker = Tracker(MultiViewLocalizer(rig), STEADY, clock=clock)
+    tracker = Tracker(Localizer(rig), STEADY, clock=clock)
     for frame in range(30):
         time = frame / 3.0
         pixels = torch.stack([marks(rig, start + (time + float(d)) * velocity)[:, c] for c, d in enumerate(late)], 1)
@@ -210,7 +209,7 @@ def test_the_clock_of_each_camera_is_found() -> None:
 
 def test_refusals() -> None:
     rig = stations()
-    localize = MultiViewLocalizer(rig)
+    localize = Localizer(rig)
     with pytest.raises(InputError, match="tower 2 need a time"):
         group_objects(localize, [None, dataclasses.replace(boxes(torch.zeros(1, 2)), time=None), None])
     with pytest.raises(InputError, match="of 3 cameras"):

@@ -12,8 +12,7 @@ from track_scenes import ORIGIN, pairs_of, seen_by, tracked_site, yawed_rig
 
 from kcal.errors import InputError
 from kcal.lens.rig import RigCovariance
-from kcal.locate.localizer import StereoLocalizer
-from kcal.locate.stations import stations_at
+from kcal.locate.localizer import Localizer
 from kcal.pipeline.estimates import track_states
 from kcal.pipeline.imm_filter import Motion, Timing, born
 from kcal.pipeline.measurements import anchored, known_sightings, sightings
@@ -23,20 +22,20 @@ STEADY = TrackOptions(motions=(Motion(acceleration=1e-4),), speed_mps=10.0, conf
 
 
 def test_one_sighting_is_what_the_localizer_says() -> None:
-    """A real lens, correlated errors of calibration and mounting, refraction: all as `StereoLocalizer` has them."""
+    """A real lens, correlated errors of calibration and mounting, refraction: all as `Localizer` has them."""
     rig = real_rig()
     mix = torch.randn(12, 12, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
     scale = tensor(*[2e-5] * 3, *[5e-3] * 3, *[0.02] * 3, *[3e-5] * 3)
     whole = (scale[:, None] * mix) @ (scale[:, None] * mix).T / 12.0
     known = RigCovariance.of(rig, pose=whole[:6, :6])
     link = torch.cat([torch.zeros(len(known.matrix) - 6, 6, dtype=torch.float64), whole[:6, 6:]])
-    localize = StereoLocalizer(rig, origin=ORIGIN, heading_deg=35.0, pitch_deg=-1.0, roll_deg=0.5, calibration=known,
+    localize = Localizer(rig, origin=ORIGIN, heading_deg=35.0, pitch_deg=-1.0, roll_deg=0.5, calibration=known,
                                mounting=whole[6:, 6:], link=link)  # fmt: skip
     points = tensor([10.0, -3.0, 120.0], [-150.0, 20.0, 900.0], [300.0, 60.0, 2500.0], [0.0, 40.0, 90_000.0])
     left, right = rig(points)[0].unbind(-2)
     pairs = pairs_of(left, right + tensor([0.0, 0.4]), 7.0)
     expected = localize(pairs.left, pairs.right, pairs.covariance)
-    stations = stations_at(localize)
+    stations = localize.weighing_all()
     seen = sightings(known_sightings(stations), pairs.pixels, pairs.seen, pairs.covariance, pairs.time)
     turned = torch.linalg.qr(torch.eye(3).double() + 0.2 * mix[:3, :3])[0]
     frame = ((turned * torch.sign(turned.diagonal())).T @ localize.enu_from_rig.T).expand(4, 3, 3)
@@ -160,7 +159,7 @@ def test_the_effect_of_a_calibration_error_is_that_of_making_it() -> None:
     rig = tracked_site().rig
     covariance = torch.zeros(5, 5, dtype=torch.float64)
     covariance[0, 0] = 1.0
-    localize = StereoLocalizer(rig, origin=ORIGIN, heading_deg=0.0, calibration=RigCovariance.of(rig, right=covariance))
+    localize = Localizer(rig, origin=ORIGIN, heading_deg=0.0, calibration=RigCovariance.of(rig, right=covariance))
     found = []
     for error in (0.0, 0.05):
         tracker = Tracker(localize, TrackOptions(motions=(Motion(acceleration=3.0),), confirm_hits=1))

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from drawn_scenes import calibrated, located
-from locate_rigs import pinhole_rig, tensor
+from locate_rigs import located_pairs, pinhole_rig, tensor
 from matplotlib.colors import to_hex
 
 from kcal.corners.observations import Failure, Observations, View
@@ -20,7 +20,6 @@ from kcal.errors import FileError
 from kcal.io.images import write_png
 from kcal.lens.rig import Origin
 from kcal.locate.geodesy import enu_to_geodetic
-from kcal.locate.positions import locate_points
 from kcal.report import positions
 from kcal.report.calibration import FailedImage, _predicted_sigma, _thumbnail, coverage_figure, gallery_figure
 from kcal.report.figures import ACCENT, WARN, round_levels
@@ -212,7 +211,7 @@ class TestTables:
         true = tensor([0.0, 60_000.0, 0.0])
         left, right = pinhole_rig()(tensor([0.0, 0.0, 60_000.0]))[0].unbind(-2)
         origin = Origin(lat=10.0, lon=20.0, height=0.0)
-        far = locate_points(pinhole_rig(), left, right, origin=origin, heading_deg=0.0, names=["cloud"])
+        far = located_pairs(pinhole_rig(), left, right, origin=origin, heading_deg=0.0, names=["cloud"])
         heads, row = truth_rows(far, far, true)
         assert len(row) == len(heads)
         assert row[0] == "cloud"

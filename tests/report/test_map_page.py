@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 import torch
 from browser import at_rest, chromium_page, needs_browser
-from locate_rigs import pinhole_rig, tensor
+from locate_rigs import located_pairs, pinhole_rig, tensor
 from PIL import Image, TiffImagePlugin
 from waiting import wait_for
 
 from kcal.errors import FileError, InputError
 from kcal.lens.rig import Origin
 from kcal.locate.geodesy import enu_from_cam, geodetic_to_enu
-from kcal.locate.positions import Located, locate_points
+from kcal.locate.positions import Located
 from kcal.report.map_page import local_image, local_tiles, map_page, save_map
 
 ORIGIN = Origin(lat=19.07, lon=72.87, height=14.0)
@@ -29,7 +29,7 @@ TRUTH = tensor([20.0, 0.0, 100.0], [-300.0, 5.0, 1000.0], [900.0, 0.0, 5000.0], 
 def scene(origin: Origin = ORIGIN) -> tuple[Located, torch.Tensor]:
     left, right = pinhole_rig()(TRUTH)[0].unbind(-2)
     names = ["gate", "</script><b>mast", "ship", "cloud"]
-    located = locate_points(
+    located = located_pairs(
         pinhole_rig(), left, right + tensor([0.3, 0.0]), origin=origin, heading_deg=300.0, names=names
     )
     return located, TRUTH @ enu_from_cam(300.0).T
@@ -104,7 +104,7 @@ HOSTILE = (
 @needs_browser
 def test_names_are_texts_in_a_browser(tmp_path: Path) -> None:
     left, right = pinhole_rig()(TRUTH)[0].unbind(-2)
-    located = locate_points(pinhole_rig(), left, right, origin=ORIGIN, heading_deg=300.0, names=list(HOSTILE))
+    located = located_pairs(pinhole_rig(), left, right, origin=ORIGIN, heading_deg=300.0, names=list(HOSTILE))
     tiles = tmp_path / HOSTILE[1]
     (tiles / "13" / "5754").mkdir(parents=True)
     Image.new("RGB", (256, 256), "green").save(tiles / "13" / "5754" / "3654.png")

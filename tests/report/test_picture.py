@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from locate_rigs import pinhole_rig, tensor
+from locate_rigs import located_pairs, pinhole_rig, tensor
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
@@ -14,7 +14,7 @@ from kcal.errors import InputError
 from kcal.lens.rig import Origin
 from kcal.locate.budget import RangeError
 from kcal.locate.geodesy import enu_from_cam
-from kcal.locate.positions import Located, locate_points
+from kcal.locate.positions import Located
 from kcal.report.figures import new_figure, save_picture
 from kcal.report.positions import budget_figure, positions_figure
 
@@ -28,7 +28,7 @@ def scene() -> tuple[Located, torch.Tensor]:
     # One pair more, outside the image, of which the truth is not known.
     left, right = torch.cat([left, tensor([5000.0, 1.0])]), torch.cat([right, tensor([1.0, 1.0])])
     right = right + tensor([0.3, 0.0])
-    located = locate_points(
+    located = located_pairs(
         rig,
         left,
         right,
@@ -100,7 +100,7 @@ def test_no_more_than_forty_points_have_names(count: int, named: bool) -> None:
     left, right = pinhole_rig()(points)[0].unbind(-2)
     names = [f"p{i}" for i in range(count)]
     origin = Origin(lat=10.0, lon=20.0, height=0.0)
-    figure = positions_figure(locate_points(pinhole_rig(), left, right, origin=origin, heading_deg=0.0, names=names))
+    figure = positions_figure(located_pairs(pinhole_rig(), left, right, origin=origin, heading_deg=0.0, names=names))
     assert ("p7" in [text.get_text() for text in figure.axes[0].texts]) is named
     rows = [text.get_text().split()[0] for text in figure.axes[1].get_yticklabels()]
     assert rows == (names if named else [])
@@ -111,7 +111,7 @@ def test_one_point_and_many_points(tmp_path: Path, count: int) -> None:
     rig = pinhole_rig()
     points = torch.linspace(80, 6000, count, dtype=torch.float64)[:, None] * tensor([0.1, 0.0, 1.0])
     left, right = rig(points)[0].unbind(-2)
-    located = locate_points(rig, left, right, origin=Origin(lat=10.0, lon=20.0, height=0.0), heading_deg=0.0)
+    located = located_pairs(rig, left, right, origin=Origin(lat=10.0, lon=20.0, height=0.0), heading_deg=0.0)
     path = save_picture(tmp_path / "map.png", positions_figure(located))
     assert path.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
     assert list(tmp_path.iterdir()) == [path]
@@ -119,7 +119,7 @@ def test_one_point_and_many_points(tmp_path: Path, count: int) -> None:
 
 def test_nothing_to_draw_is_drawn_all_the_same(tmp_path: Path) -> None:
     rig, marks = pinhole_rig(), tensor([5000.0, 1.0])
-    located = locate_points(rig, marks, marks, origin=Origin(lat=10.0, lon=20.0, height=0.0), heading_deg=0.0)
+    located = located_pairs(rig, marks, marks, origin=Origin(lat=10.0, lon=20.0, height=0.0), heading_deg=0.0)
     assert save_picture(tmp_path / "map.png", positions_figure(located)).stat().st_size > 10_000
 
 
@@ -148,7 +148,7 @@ def test_names_are_drawn_as_they_are(tmp_path: Path) -> None:
     points = torch.linspace(80, 6000, len(HOSTILE), dtype=torch.float64)[:, None] * tensor([0.1, 0.0, 1.0])
     left, right = pinhole_rig()(points)[0].unbind(-2)
     origin = Origin(lat=10.0, lon=20.0, height=0.0)
-    located = locate_points(pinhole_rig(), left, right, origin=origin, heading_deg=0.0, names=list(HOSTILE))
+    located = located_pairs(pinhole_rig(), left, right, origin=origin, heading_deg=0.0, names=list(HOSTILE))
     save_picture(tmp_path / "map.png", positions_figure(located))
     figure = positions_figure(located)
     figure.canvas.draw()

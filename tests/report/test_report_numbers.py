@@ -8,6 +8,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import pytest
 import torch
+from locate_rigs import located_pairs
 
 from kcal.errors import InputError
 from kcal.lens.calibration import CameraCalibration
@@ -15,7 +16,6 @@ from kcal.lens.camera import Camera
 from kcal.lens.difference import camera_difference, difference_text
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import Origin, Rig
-from kcal.locate.positions import locate_points
 from kcal.report.calibration import difference_figure
 from kcal.report.pages import _correlations, _percent, _sentence, range_rows
 from kcal.report.positions import plotted_ranges
@@ -80,7 +80,7 @@ class TestSentences:
         """By the binomial distribution of 20 intervals of 95 %."""
         points = torch.tensor([[0.0, 0.0, 500.0]] * 20, dtype=torch.float64)
         left, right = rig()(points)[0].unbind(-2)
-        found = locate_points(rig(), left, right, origin=Origin(lat=19.0, lon=72.0, height=0.0), heading_deg=0.0)
+        found = located_pairs(rig(), left, right, origin=Origin(lat=19.0, lon=72.0, height=0.0), heading_deg=0.0)
         true = points[:, [0, 2, 1]]
         true[:wrong] *= 2.0
         text = chance_text(found, true)

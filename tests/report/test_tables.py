@@ -6,13 +6,13 @@ import math
 
 import pytest
 import torch
-from locate_rigs import pinhole_rig, tensor
+from locate_rigs import located_pairs, pinhole_rig, tensor
 
 from kcal.corners.board import Board
 from kcal.lens.rig import Rig
 from kcal.locate.budget import range_sigmas
 from kcal.locate.geodesy import Origin
-from kcal.locate.positions import locate_points, position_errors
+from kcal.locate.positions import position_errors
 from kcal.report.tables import diagonal_rows, position_rows, range_sigma_rows, truth_rows
 
 ORIGIN = Origin(lat=10.0, lon=20.0, height=0.0)
@@ -21,7 +21,7 @@ ORIGIN = Origin(lat=10.0, lon=20.0, height=0.0)
 def test_positions_and_what_they_miss() -> None:
     left, right = pinhole_rig()(tensor([0.0, 0.0, 100.0]))[0].unbind(-2)
     left, right = torch.cat([left, tensor([5000.0, 1.0])]), torch.cat([right, tensor([1.0, 1.0])])
-    located = locate_points(pinhole_rig(), left, right, origin=ORIGIN, heading_deg=0.0, names=["gate", "lost"])
+    located = located_pairs(pinhole_rig(), left, right, origin=ORIGIN, heading_deg=0.0, names=["gate", "lost"])
     truth = tensor([3.0, 96.0, 0.0], [math.nan] * 3)
     heads, gate, lost = position_rows(located, position_errors(located, truth))
     assert gate[:1] + gate[4:5] == ["gate", "100.00"]
@@ -37,7 +37,7 @@ def test_errors_along_and_across_the_line_of_sight() -> None:
     left, right = pinhole_rig()(tensor([2.0, 0.0, 101.0]))[0].unbind(-2)
     exact = pinhole_rig()(tensor([0.0, 0.0, 100.0]))[0].unbind(-2)
     located, noiseless = (
-        locate_points(pinhole_rig(), *pair, origin=ORIGIN, heading_deg=0.0, names=["gate"])
+        located_pairs(pinhole_rig(), *pair, origin=ORIGIN, heading_deg=0.0, names=["gate"])
         for pair in ((left, right), exact)
     )
     row = dict(zip(*truth_rows(located, noiseless, true), strict=True))
@@ -60,7 +60,7 @@ def test_units_fit_the_range_and_numbers_their_sigma(
     rig = pinhole_rig()
     rig = Rig.pair(rig.left, rig.right, rig.right_from_left_rotation, scale * rig.right_from_left_translation)
     pixels = rig(tensor([0.0, 0.0, distance]))[0].unbind(-2)
-    located = locate_points(rig, *pixels, origin=ORIGIN, heading_deg=0.0)
+    located = located_pairs(rig, *pixels, origin=ORIGIN, heading_deg=0.0)
     head, row = position_rows(located)
     assert head[4:6] == heads
     assert row[4:6] == cells
@@ -77,7 +77,7 @@ def test_diagonals_of_pairs_whose_ends_were_both_located() -> None:
     board = Board(columns=5, rows=4, square=1.0)
     points = tensor([0.0, 0.0, 100.0], [4.0, 3.01, 100.0], [0.0, 0.0, 50.0])
     left, right = pinhole_rig()(points)[0].unbind(-2)
-    located = locate_points(
+    located = located_pairs(
         pinhole_rig(), left, right, origin=ORIGIN, heading_deg=0.0, names=["a first", "a last", "b first"]
     )
     _, row = diagonal_rows(located, board)

@@ -22,7 +22,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.lens.rig import Origin, RigCovariance
 from kcal.locate.geodesy import enu_from_cam
-from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.localizer import Localizer
 
 HELD = RigOptions(intrinsics="fixed")
 ORIGIN = Origin(lat=19.07, lon=72.87, height=14.0)
@@ -110,7 +110,7 @@ class TestWidened:
             inside = []
             for widen in (1.0, 1.0 / math.sqrt(found.variance)):
                 known = RigCovariance(half=widen * rig.covariance.half)
-                localize = StereoLocalizer(rig, origin=ORIGIN, heading_deg=0.0, pixel_sigma=0.1, calibration=known)
+                localize = Localizer(rig, origin=ORIGIN, heading_deg=0.0, pixel_sigma=0.1, calibration=known)
                 answer = localize(*(value[both] for value in pixels))
                 good = (answer.range_low <= far[both]) & (far[both] <= answer.range_high)
                 inside.append(float(good.double().mean()))
@@ -149,7 +149,7 @@ class TestOrdinary:
         rig = found.stereo()
         targets = _targets(found._problem, found._state, found._covariance, (0, 1), 1.0 / 200.0)
         assert targets is not None
-        localize = StereoLocalizer(rig, origin=ORIGIN, heading_deg=0.0, pixel_sigma=0.1)
+        localize = Localizer(rig, origin=ORIGIN, heading_deg=0.0, pixel_sigma=0.1)
         for far in (200.0, 370.0, 900.0, 5000.0):
             pixels, good = rig(far * targets.rays)
             (left, right), good = pixels.unbind(-2), good.all(-1)
