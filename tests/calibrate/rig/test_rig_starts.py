@@ -235,7 +235,7 @@ class TestPlaces:
         some = data(positions=positions(*range(count)))
         own = ROTATION @ ROTATION[0].T, (CENTER - CENTER[0]) @ ROTATION[0].T
         start = Start(rotation=own[0].clone(), center=own[1].clone())
-        _into_frame(some, start)
+        start = _into_frame(some, start)
         torch.testing.assert_close(start.center[:count], CENTER[:count], rtol=0, atol=1e-6)
         down = start.rotation[:, 1].mean(0)
         if count == 3:
