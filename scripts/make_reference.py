@@ -23,6 +23,12 @@ DOORS = (
 
 
 RETURNED = "Results and parts of them"
+# Types of attributes and of private steps in which only those look who work on kcal.
+INSIDE = {
+    "Border", "BoardPrior", "BoardState", "CameraFile", "FieldModes", "FitOptions", "Fixes",
+    "GroundSurface", "HistoryRow", "HybridFit", "LearnedStart", "LensPrior", "PosedCameras", "Spline",
+    "Surroundings", "TurnModel", "WeightPrior",
+}  # fmt: skip
 
 
 def groups(door: str) -> dict[str, list[tuple[str, str]]]:
@@ -86,7 +92,7 @@ def _returns(module: str, name: str) -> set[tuple[str, str]]:
         (kind, home)
         for kind, home in homes
         # How a problem is solved is no result.
-        if home.startswith("kcal.") and not kind.startswith("_")
+        if home.startswith("kcal.") and kind not in INSIDE and not kind.startswith("_")
         if not home.startswith(("kcal.calibrate.problem.", "kcal.calibrate.rig.source"))
         if any(isinstance(node, ast.ClassDef) and node.name == kind for node in _tree(home).body)
     }

@@ -22,7 +22,7 @@ import torch
 import kcal
 from kcal.lens.information import CameraInformation
 from kcal.locate.max_likelihood import PointFit
-from scripts.make_reference import returned_by
+from scripts.make_reference import INSIDE, returned_by
 
 # Taking a name away breaks users; adding one is a promise. Either is a line here and one in CHANGELOG.md.
 PUBLIC = {
@@ -79,8 +79,6 @@ PUBLIC = {
 }
 NAMES = [(door, name) for door, names in PUBLIC.items() for name in names.split()]
 NAMESPACES = {door.removeprefix("kcal.") for door in PUBLIC} - {"kcal"}
-# Types of attributes in which only those look who work on kcal.
-INSIDE = {"HistoryRow", "LearnedStart", "TurnModel"}
 # What functions return, and blocks of files: examples are those of the functions.
 RECORDS = {
     "cylinder_view",
@@ -176,7 +174,8 @@ def test_every_type_in_a_public_signature_is_public_or_a_result() -> None:
     results = {getattr(importlib.import_module(module), name) for name, module in RESULTS}
     values = [value for value in public if not (inspect.isclass(value) and issubclass(value, Exception))]
     others = {value.__qualname__: signature_types(value) - public - results for value in values}
-    assert {kind.__qualname__ for kinds in others.values() for kind in kinds} == INSIDE, others
+    assert {kind.__qualname__ for kinds in others.values() for kind in kinds} <= INSIDE, others
+    assert not INSIDE & {kind.__qualname__ for kind in public}
 
 
 def test_a_type_that_is_not_public_is_seen() -> None:
