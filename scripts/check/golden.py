@@ -66,7 +66,13 @@ def table_numbers(file: Path) -> Numbers:
     """Each number of a table by its row and column."""
     with file.open() as text:
         rows = list(csv.DictReader(text))
-    return {f"{row['name']} {key}": [value] for row in rows for key, cell in row.items() if (value := number(cell))}
+    # Where marks are exact their reprojection is rounding.
+    return {
+        f"{row['name']} {key}": [value]
+        for row in rows
+        for key, cell in row.items()
+        if (value := number(cell)) and not key.startswith("reprojection")
+    }
 
 
 def number(cell: Any) -> float:
@@ -100,12 +106,13 @@ def rig_numbers(rig: Path, folder: Path, *place: str) -> Numbers:
     return found | table_numbers(table)
 
 
-def json_numbers(value: Any, name: str = "") -> Iterator[tuple[str, list[float]]]:
-    if isinstance(value, dict | list):
-        for key, inside in value.items() if isinstance(value, dict) else enumerate(value):
-            yield from json_numbers(inside, f"{name}/{key}")
-    elif (found := number(value)) and not isinstance(value, str | bool):
-        yield name, [found]
+def star_numbers(images: list[Path]) -> Numbers:
+    found: Numbers = {}
+    for i, image in enumerate(json.loads(run("stars", *images, "--json"))["images"]):
+        sigma = max(image["sigma_deg"])
+        found |= {f"{i} {key}": [image[key], sigma] for key in ("right_ascension_deg", "declination_deg")}
+        found |= {f"{i} sigma": [sigma], f"{i} stars": [image["identified"]]}
+    return found
 
 
 def stations(folder: Path) -> Numbers:
@@ -149,7 +156,7 @@ def measure(data: Path, folder: Path, words: list[str]) -> Iterator[tuple[str, N
             yield f"rig {pair}", rig_numbers(rig, folder, *PLACE)
     if wanted("stars"):
         images = sorted((data / "stars").glob("*.png"))
-        yield "stars", dict(json_numbers(json.loads(run("stars", *images[:3], "--json"))))
+        yield "stars", star_numbers(images[:3])
     if wanted("demo"):
         run("demo", "-o", folder / "demo")
         yield "demo", rig_numbers(folder / "demo" / "rig.json", folder)
