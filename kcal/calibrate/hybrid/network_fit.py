@@ -166,10 +166,10 @@ class _Moved:
         assert model.hybrid is not None
         assert isinstance(model.hybrid.modes, NetworkModes)
         self.vector, self.trunk = model.hybrid.modes.vector, model.hybrid.modes.trunk
-        points = problem.points(state).transpose(-1, -2)
+        points = problem.shown(problem.points(state)).transpose(-1, -2)
         plane = project_components(points, state.parameters[None], model, (0,)).plane
         assert plane is not None
-        self.factor = torch.where(turn.capture.seen, turn.capture.weights, 0.0)
+        self.factor = problem.shown(torch.where(turn.capture.seen, turn.capture.weights, 0.0))
         self.places = torch.where(self.factor[..., None] > 0, plane.transpose(-1, -2) / model.hybrid.radius, 0.0)
         self.coefficients = state.parameters[len(INTRINSICS) + len(LEADING) :]
         self.focal = state.parameters[:2]
@@ -184,7 +184,7 @@ class _Moved:
         return (self.focal * (features @ both.T)).view(places.shape)
 
     def rows(self, weights: Tensor, views: slice) -> Tensor:
-        """(V, T, 2 N) weighted derivatives of pixels of some views by the weights."""
+        """(V, T, 2 K) weighted derivatives of pixels of some views by the weights, of the corners in `problem`'s rows."""
         places = self.places[views]
         try:
             found = vmap(jacrev(self.pixels), in_dims=(None, 0))(weights, places.reshape(-1, 2))
@@ -256,7 +256,7 @@ def _adam(turn: _Turn, estimate: Estimate) -> tuple[Estimate, int]:
     cost = turn.cost(problem, estimate)
     for _ in range(_STEPS):
         moved, weights = _Moved(turn, problem, estimate), weights_of(_trunk(estimate)).requires_grad_()
-        errors = problem.pixel_errors(estimate.state).transpose(-1, -2)
+        errors = problem.shown(problem.pixel_errors(estimate.state).transpose(-1, -2))
         with torch.no_grad():
             rest = torch.where(moved.factor[..., None] > 0, errors, 0.0) - moved.pixels(weights, moved.places)
         optimizer = torch.optim.Adam([weights], lr=_RATE)

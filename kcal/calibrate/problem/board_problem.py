@@ -78,9 +78,11 @@ POSE, TURN = 6, 3
 class BoardImages:
     """Corners of boards in the views of one camera; see `BoardProblem`.
 
+    Where views show few of the board's N corners, work is done on K corners of each view: those that it shows come
+    first, and K is the largest number of them. Otherwise K = N.
+
     Attributes:
-        seen: (..., V, N) corners that count.
-        weights: (..., V, N) or (..., V, 2, 2, N).
+        weights: (..., V, K) or (..., V, 2, 2, K).
         pose: unknowns of each view's pose, the first of its local ones.
         local_size: unknowns of each view: of its pose, and of its motion.
         unknown_count: of camera and board, those that are held among them.
@@ -103,18 +105,24 @@ class BoardImages:
     ) -> None:
         self.model, self.loss, self.batch = model, loss, batch
         self.free, self.free_board = FreeParameters.of(free), free_board
-        self.board_points, self._board = board_points, board_points.mT.contiguous()
-        self.shapes = warp_modes(board_points) if shapes is None else shapes
-        self.seen = torch.isfinite(pixels).all(-1)
-        if weights is not None and weights.ndim == self.seen.ndim:
-            self.seen = self.seen & (weights > 0)
-        self._target = torch.where(self.seen[..., None], pixels, 0.0).transpose(-1, -2).contiguous()
+        self.board_points, self.shapes = board_points, warp_modes(board_points) if shapes is None else shapes
+        seen = torch.isfinite(pixels).all(-1)
+        if weights is not None and weights.ndim == seen.ndim:
+            seen = seen & (weights > 0)
+        self._numbers = _shown_corners(seen)
+        self._seen, pixels = self.shown(seen), self.shown(pixels)
+        self._target = torch.where(self._seen[..., None], pixels, 0.0).transpose(-1, -2).contiguous()
         self._weigh(weights)
         self.readout = readout
         self.pose = TURN if turning else POSE
         self.local_size = self.pose + (readout.numbers if readout else 0)
         if readout is not None:
             self._time = readout.time(pixels)
+            if self._numbers is not None and readout.bends is not None:
+                self.readout = dataclasses.replace(readout, bends=self._of_board(readout.bends))
+        own = board_points.ndim > 2
+        self._board = self.shown(board_points).mT.contiguous() if own else self._of_board(board_points.mT)
+        self._shapes = self._of_board(self.shapes)
         self.unknown_count = len(self.free) + len(self.shapes) * free_board
         self.joint = not model.hybrid
         self._shown: list[tuple[BoardState, _Imaged]] = []
@@ -123,13 +131,36 @@ class BoardImages:
         self._leading = [index for index in self.free.indices if index < first]
         self._field = self._field_slots(first, weights) if model.hybrid and not batch else None
 
+    def shown(self, values: Tensor) -> Tensor:
+        """(..., V, K, ...) of values (..., V, N, ...) of all corners, in the order in which work is done."""
+        if self._numbers is None:
+            return values
+        return values[torch.arange(len(self._numbers))[:, None], self._numbers]
+
+    def _of_board(self, values: Tensor) -> Tensor:
+        """(V, ..., K) of values (..., N) that all views share; (1, ..., N) where all views have all corners."""
+        return (values[None] if self._numbers is None else values[..., self._numbers].movedim(-2, 0)).contiguous()
+
+    def _of_all(self, values: Tensor, fill: float | bool) -> Tensor:
+        """(..., V, C, N) of values (..., V, C, K)."""
+        if self._numbers is None:
+            return values
+        numbers = self._numbers[:, None].expand_as(values)
+        return values.new_full((*values.shape[:-1], self.board_points.shape[-2]), fill).scatter(-1, numbers, values)
+
+    @property
+    def seen(self) -> Tensor:
+        """(..., V, N) corners that count."""
+        return self._of_all(self._seen[..., None, :], False)[..., 0, :]
+
     def _weigh(self, weights: Tensor | None) -> None:
-        self.weights: Tensor | None = None  # (..., V, N) or (..., V, 2, 2, N)
-        self._counts = self.seen
-        if weights is not None and weights.ndim > self.seen.ndim:
-            self.weights = torch.where(self.seen[..., None, None], weights, 0.0).movedim(-3, -1).contiguous()
-        elif weights is not None and not bool((weights[self.seen] == 1.0).all()):
-            self.weights = torch.where(self.seen, weights, 0.0)
+        self.weights: Tensor | None = None
+        self._counts, seen = self._seen, self._seen
+        weights = None if weights is None else self.shown(weights)
+        if weights is not None and weights.ndim > seen.ndim:
+            self.weights = torch.where(seen[..., None, None], weights, 0.0).movedim(-3, -1).contiguous()
+        elif weights is not None and not bool((weights[seen] == 1.0).all()):
+            self.weights = torch.where(seen, weights, 0.0)
             self._counts = self.weights > 0
         self._all_count = bool(self._counts.all())
 
@@ -146,21 +177,17 @@ class BoardImages:
     @property
     def pixels(self) -> Tensor:
         """(..., V, N, 2) observed corners; NaN where not seen."""
-        return torch.where(self.seen[..., None], self._target.transpose(-1, -2), torch.nan)
-
-    def _points_of(self, views: slice) -> Tensor:
-        """(..., 3, N) the points of some views, of one board or of each view its own."""
-        return self._board if self._board.ndim == 2 else self._board[views]
+        target = torch.where(self._seen[..., None, :], self._target, torch.nan)
+        return self._of_all(target, torch.nan).transpose(-1, -2)
 
     def _placed(self, state: BoardState, views: slice = ALL) -> _Placed:
-        flat = self._points_of(views)
+        flat = _of_views(self._board, views)
         if len(self.shapes) and (self.free_board or bool(state.board.any())):
-            flat = flat + torch.einsum("...b,bkn->...kn", state.board, self.shapes)[..., None, :, :]
+            flat = flat + torch.einsum("...b,vbkn->...vkn", state.board, _of_views(self._shapes, views))
         if self.readout is None:
             rotated = state.rotation @ flat
             return _Placed(flat, rotated, rotated + state.translation[..., None], None)
-        flat = flat.squeeze(0)
-        moved = self.readout.moved(state.motion, self._time[views], flat)
+        moved = self.readout.of_views(views).moved(state.motion, self._time[views], flat)
         rotated = state.rotation @ moved.points
         return _Placed(flat, rotated, rotated + state.translation[..., None] + moved.shift, moved.turn)
 
@@ -186,34 +213,38 @@ class BoardImages:
         return float(state.parameters[INTRINSICS.index("skew")]) == 0.0
 
     def points(self, state: BoardState) -> Tensor:
-        """(..., V, N, 3) the board's corners in the camera's frame, meters."""
-        return self._placed(state).points.transpose(-1, -2)
+        """(..., V, N, 3) the board's corners in the camera's frame, meters; NaN for those that no work is done on."""
+        return self._of_all(self._placed(state).points, torch.nan).transpose(-1, -2)
 
     def pixel_errors(self, state: BoardState) -> Tensor:
         """Projected minus observed, (..., V, 2, N) pixels, not weighted; 0 where not seen.
 
         NaN where a seen corner lies behind the camera, or beyond a pole or a fold of the lens.
         """
+        return self._of_all(self._errors(state), 0.0)
+
+    def _errors(self, state: BoardState) -> Tensor:
+        """(..., V, 2, K) the same of the corners that work is done on."""
         if self._by_field(state):
             projected = self._imaged(state).seen
         else:
             points = self._placed(state).points
             projected = project_components(points, state.parameters[..., None, :], self.model)
         bad = torch.where(projected.regular, 0.0, torch.nan)[..., None, :]
-        return torch.where(self.seen[..., None, :], projected.pixels - self._target + bad, 0.0)
+        return torch.where(self._seen[..., None, :], projected.pixels - self._target + bad, 0.0)
 
     def corner_residuals(self, state: BoardState, *, weighted: bool = False) -> Tensor:
         """(..., V, N, 2) residuals by corner; NaN where not seen."""
-        errors = self.pixel_errors(state)
+        errors = self._errors(state)
         if weighted:
             errors = self._weighted(errors[..., None, :, :])[..., 0, :, :]
-        return torch.where(self.seen[..., None], errors.transpose(-1, -2), torch.nan)
+        return self._of_all(torch.where(self._seen[..., None, :], errors, torch.nan), torch.nan).transpose(-1, -2)
 
     def _weighted(self, vectors: Tensor, views: slice = ALL) -> Tensor:
-        """Vectors (..., V, Q, 2, N) of pixels, multiplied by the corners' weights; 0 where these are zero."""
+        """Vectors (..., V, Q, 2, K) of pixels, multiplied by the corners' weights; 0 where these are zero."""
         if self.weights is None:
             return vectors
-        if self.weights.ndim > self.seen.ndim:
+        if self.weights.ndim > self._seen.ndim:
             return torch.einsum("...uwn,...qwn->...qun", self.weights[..., views, :, :, :], vectors)
         weights = self.weights[..., views, None, None, :]
         # Without an image a corner of weight zero is NaN.
@@ -226,7 +257,7 @@ class BoardImages:
         return self._weighted(vectors, views)
 
     def corner_rows(self, state: BoardState, views: slice = ALL, memory: list[Tensor] | None = None) -> Tensor:
-        """(..., V, L + S + 1, 2 N) as `rows`, of the corners alone, and as if no unknown were held.
+        """(..., V, L + S + 1, 2 K) as `rows`, of the corners alone, and as if no unknown were held.
 
         With `memory` given, an empty list at first, the next call may overwrite what this one returns: new memory costs
         as much time as what is written there.
@@ -243,7 +274,8 @@ class BoardImages:
         rows = self._memory(by_point, L + self.unknown_count + 1, memory)
         rows[..., : self.pose, :, :] = step_rows(by_point, placed.rotated)[..., : self.pose, :, :]
         if self.readout is not None:
-            rows[..., self.pose : L, :, :] = self.readout.columns_of(by_point, rotation, self._time[views], placed.flat)
+            readout, time = self.readout.of_views(views), self._time[views]
+            rows[..., self.pose : L, :, :] = readout.columns_of(by_point, rotation, time, placed.flat)
         shared = rows[..., L:-1, :, :]
         slots = self._slots[: by_camera.shape[-3]]
         shared.index_fill_(-3, slots, 0.0).index_add_(-3, slots, by_camera)
@@ -254,7 +286,8 @@ class BoardImages:
             if placed.turn is not None:
                 # What displaces a corner of the board turns with it.
                 by_board = by_board + torch.linalg.cross(by_board, placed.turn[:, :, None].expand_as(by_board), dim=1)
-            along = zip(by_board.split(1, -3), self.shapes[:, :, None].unbind(1), strict=True)
+            shapes = _of_views(self._shapes, views)[..., None, :]
+            along = zip(by_board.split(1, -3), shapes.unbind(-3), strict=True)
             shared[..., count:, :, :] = sum(slope * shape for slope, shape in along)
         rows[..., -1:, :, :] = error
         if self.loss is not None:
@@ -262,7 +295,7 @@ class BoardImages:
         return rows.flatten(-2)
 
     def _memory(self, like: Tensor, count: int, memory: list[Tensor] | None) -> Tensor:
-        """(..., V, count, 2, N), of one camera such that each column is in one piece."""
+        """(..., V, count, 2, K), of one camera such that each column is in one piece."""
         *views, _, axes, corners = like.shape
         if len(views) > 1:
             return like.new_empty(*views, count, axes, corners)
@@ -280,15 +313,28 @@ class BoardImages:
         x, y = seen.plane.unbind(-2)
         scale = state.parameters[:2, None]
         if not self._all_count:
+            # The field itself is not zero in the middle of the disc, where corners that do not count are put.
             counts = self._counts[views]
-            x, y = torch.where(counts, x, 0.0), torch.where(counts, y, 0.0)
+            x, y, scale = torch.where(counts, x, 0.0), torch.where(counts, y, 0.0), scale * counts[:, None]
         if self.weights is not None:
             scale = scale * self.weights[views, None]
         fill_field_columns(shared[:, self._field].transpose(0, 1), x, y, scale, self.model.hybrid)
 
 
+def _shown_corners(seen: Tensor) -> Tensor | None:
+    """(V, K) numbers of the corners that each view shows, then of others; None where most are seen, or in batches."""
+    if seen.ndim > 2 or 2 * int(seen.sum()) > seen.numel():
+        return None
+    return (~seen).byte().argsort(dim=-1, stable=True)[:, : max(1, int(seen.sum(-1).max()))]
+
+
+def _of_views(values: Tensor, views: slice) -> Tensor:
+    """Some of values (V, ...) by view; all of values (1, ...) that all views share."""
+    return values if len(values) == 1 else values[views]
+
+
 class _Placed(NamedTuple):
-    """The board (..., 3, N) in its frame; in each view rotated, and in the camera's frame; turns while it is read."""
+    """The board (..., 3, K) in its frame; in each view rotated, and in the camera's frame; turns while it is read."""
 
     flat: Tensor
     rotated: Tensor
@@ -298,7 +344,7 @@ class _Placed(NamedTuple):
     def of(self, views: slice) -> _Placed:
         """The same of some of all views of one camera."""
         turn = None if self.turn is None else self.turn[views]
-        return self._replace(rotated=self.rotated[views], points=self.points[views], turn=turn)
+        return _Placed(_of_views(self.flat, views), self.rotated[views], self.points[views], turn)
 
 
 class _Imaged(NamedTuple):
@@ -388,7 +434,7 @@ class BoardProblem(BoardImages, SchurProblem[BoardState]):
     ) -> None:
         super().__init__(board_points, pixels, model, free, shapes, free_board, weights, loss, readout, batch, turning)
         self.terms = tuple(terms)
-        self.residual_count = 2 * int(self.seen.sum((-2, -1)).max())
+        self.residual_count = 2 * int(self._seen.sum((-2, -1)).max())
         if readout is not None:
             self._still = torch.zeros(readout.numbers, dtype=pixels.dtype) if stillness is None else stillness
         self.moving = torch.arange(self.unknown_count) if held is None else (~held).nonzero()[:, 0]
@@ -433,8 +479,9 @@ class BoardProblem(BoardImages, SchurProblem[BoardState]):
         part = copy.copy(self)
         part._kept, part._shown = [], []
         part.batch = (len(elements),)
-        if self.seen.ndim > 2:
-            part.seen, part._target, part._counts = self.seen[elements], self._target[elements], self._counts[elements]
+        if self._seen.ndim > 2:
+            part._seen, part._target = self._seen[elements], self._target[elements]
+            part._counts = self._counts[elements]
             part._all_count = bool(part._counts.all())
             if self.weights is not None:
                 part.weights = self.weights[elements]
@@ -451,7 +498,7 @@ class BoardProblem(BoardImages, SchurProblem[BoardState]):
 
     def residuals(self, state: BoardState) -> Tensor:
         """See `SchurProblem.residuals`: weighted `pixel_errors`, u of all corners, then v; last those of motions."""
-        errors = self._weighted(self.pixel_errors(state)[..., None, :, :])[..., 0, :, :].flatten(-2)
+        errors = self._weighted(self._errors(state)[..., None, :, :])[..., 0, :, :].flatten(-2)
         return errors if self.readout is None else torch.cat([errors, self._still.sqrt() * state.motion], -1)
 
     def view_cost(self, state: BoardState) -> Tensor:
@@ -484,24 +531,24 @@ class BoardProblem(BoardImages, SchurProblem[BoardState]):
         yield from (slice(start, start + size) for start in range(0, count, size)) if size < count else (ALL,)
 
     def _parts(self, state: BoardState) -> Iterator[tuple[BoardProblem, BoardState, slice]]:
-        """A few views at a time, of a large board without corners that none of these shows."""
+        """A few views at a time, without corners where these show less than half as many as others."""
         for views in self._chunks(state):
-            shown = self.seen[views].any(0) if self.seen.ndim == 2 and not self.batch else self.seen
-            if shown.ndim > 1 or 2 * int(shown.sum()) > len(shown):
+            most = 0 if self._numbers is None else max(1, int(self._seen[views].sum(-1).max()))
+            if self._numbers is None or 2 * most > self._numbers.shape[-1]:
                 yield self, state, views
                 continue
             part = copy.copy(self)
             part._kept, part._shown = [], []
-            part.seen, part._target, part._counts = (
-                each[views][..., shown] for each in (self.seen, self._target, self._counts)
+            part._numbers, part._seen, part._target, part._counts, part._board, part._shapes = (
+                each[views][..., :most]
+                for each in (self._numbers, self._seen, self._target, self._counts, self._board, self._shapes)
             )
             part._all_count = bool(part._counts.all())
-            part.weights = None if self.weights is None else self.weights[views][..., shown]
+            part.weights = None if self.weights is None else self.weights[views][..., :most]
             if self.readout is not None:
-                bends = None if self.readout.bends is None else self.readout.bends[:, shown]
-                part.readout, part._time = dataclasses.replace(self.readout, bends=bends), self._time[views][:, shown]
+                bends = None if self.readout.bends is None else self.readout.bends[views][..., :most]
+                part.readout, part._time = dataclasses.replace(self.readout, bends=bends), self._time[views][..., :most]
                 part._still = self._still.expand_as(state.motion)[views]
-            part._board, part.shapes = self._points_of(views)[..., shown], self.shapes[..., shown]
             yield part, state.views(views), ALL
 
     def products(self, state: BoardState) -> Products:

@@ -71,7 +71,8 @@ class Readout:
         size: of the image.
         columns: whether columns are read one after the other instead of rows, as in a picture that was turned.
         moves: whether views move.
-        bends: (12, N) heights of the corners by modes of bending (`BoardModes.heights`), meters; None: it is stiff.
+        bends: (12, N), or (V, 12, N) of each view, heights of the corners by modes of bending (`BoardModes.heights`),
+            meters; None: it is stiff.
 
     Example:
         >>> readout = Readout(center=torch.zeros(3), distance=1.0, size=(640, 480))
@@ -96,6 +97,12 @@ class Readout:
         axis = 0 if self.columns else 1
         return ((pixels[..., axis] + 0.5) / self.size[axis] - 0.5).nan_to_num(0.0)
 
+    def of_views(self, views: slice) -> Readout:
+        """The same of some views, where each has heights of its own."""
+        if self.bends is None or self.bends.ndim == 2:
+            return self
+        return dataclasses.replace(self, bends=self.bends[views])
+
     def reach(self, points: Tensor) -> float:
         """How far corners (N, 3) of the board, meters, are from its middle at most, in distances of the board."""
         return float((points - self.center).norm(dim=-1).max()) / self.distance
@@ -106,16 +113,16 @@ class Readout:
         Args:
             motion: (V, M) of each view: ω₁, s₁, ω₂, s₂ where views move, and heights of bending where the board bends.
             time: (V, N) of each corner.
-            points: (3, N) the board, meters.
+            points: (3, N), or (V, 3, N) of each view, the board, meters.
         """
-        points = points.expand(len(motion), *points.shape)
+        points = points.expand(len(motion), *points.shape[-2:])
         turn = shift = torch.zeros_like(points)
         if self.moves:
             powers = torch.stack([time, time * time], -1)
             turn, shift = torch.einsum("vno,vokj->kvjn", powers, motion[:, :MOTION].unflatten(1, (ORDERS, 2, 3)))
             points = points + torch.linalg.cross(turn, points - self.center[:, None], dim=1)
         if self.bends is not None:
-            points = points + torch.nn.functional.pad((motion[:, -BENDS:] @ self.bends)[:, None], (0, 0, 2, 0))
+            points = points + torch.nn.functional.pad(motion[:, None, -BENDS:] @ self.bends, (0, 0, 2, 0))
         return MovedBoard(points, self.distance * shift, turn)
 
     def columns_of(
@@ -127,17 +134,17 @@ class Readout:
             by_point: (V, 3, 2, N) of pixels by points in the camera's frame.
             rotation: (V, 3, 3) cam_from_board.
             time: (V, N).
-            points: (3, N) the board, meters.
+            points: (3, N), or (V, 3, N) of each view, the board, meters.
             apart: last, a motion during `APART` readouts, which all corners share.
         """
         by_board = torch.einsum("vkun,vkl->vlun", by_point, rotation)
         found = []
         if self.moves:
-            about = (points - self.center[:, None])[None, :, None].expand_as(by_board)
+            about = (points - self.center[:, None]).unsqueeze(-2).expand_as(by_board)
             both = torch.cat([torch.linalg.cross(about, by_board, dim=1), self.distance * by_point], 1)
             g = time[:, None, None]
             found = [g * both, g * g * both, *([APART * both] if apart else [])]
-        return torch.cat(found if self.bends is None else [*found, by_board[:, 2:] * self.bends[:, None]], 1)
+        return torch.cat(found if self.bends is None else [*found, by_board[:, 2:] * self.bends[..., None, :]], 1)
 
 
 def amplitudes_of(count: int) -> np.ndarray:
