@@ -227,6 +227,47 @@ def test_rows_in_one_piece_of_memory(square: bool) -> None:
     torch.testing.assert_close(problem.rows(state, some), wanted[some], rtol=1e-11, atol=1e-12 * size)
 
 
+@pytest.mark.parametrize("hidden", [0.0, 0.2, 0.8, "uneven"])
+@pytest.mark.parametrize("bends", [False, True])
+def test_corners_that_are_not_seen_say_nothing(
+    hidden: float | str, bends: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rows of the others are those of a board that is seen entirely; where few are seen, work is done on these."""
+    whole, state = moving_problem(True, bends)
+    share = 0.6 if hidden == "uneven" else hidden
+    seen = torch.rand(4, BOARD.corners, generator=torch.Generator().manual_seed(8)) >= share
+    seen[0, 10:] &= hidden != "uneven"
+    weights = torch.ones(4, BOARD.corners, dtype=F64)
+    readout = Readout(
+        center=BOARD.points.mean(0),
+        distance=0.6,
+        size=SIZE,
+        bends=board_modes(BOARD.points).heights if bends else None,
+    )
+    problem = BoardProblem(
+        BOARD.points, torch.where(seen[..., None], whole.pixels, torch.nan), whole.model, whole.free,
+        shapes=whole.shapes, free_board=True, weights=weights, readout=readout, stillness=whole._still,
+    )  # fmt: skip
+    monkeypatch.setattr("kcal.calibrate.problem.board_problem._CHUNK", 1)
+    most = int(seen.sum(1).max()) if 2 * int(seen.sum()) <= seen.numel() else BOARD.corners
+    assert problem.corner_rows(state).shape[-1] == 2 * most
+    assert torch.equal(problem.seen, seen)
+    assert torch.equal(problem.shown(problem.pixels)[..., 0].isfinite(), problem.shown(seen))
+    rows = whole.corner_rows(state) * seen.repeat(1, 2)[:, None]
+    for found, wanted in zip(problem.products(state), Products.of_rows(rows, problem.local_size), strict=True):
+        torch.testing.assert_close(found, wanted, rtol=1e-9, atol=1e-12 * float(wanted.abs().max()))
+    reduced, off = problem.reduced_rows(state), without_local(problem.rows(state), problem.local_size)
+    flat = off.transpose(0, 1).flatten(1)
+    torch.testing.assert_close(reduced.T @ reduced, flat @ flat.T, rtol=1e-8, atol=1e-12 * float(flat.square().sum()))
+    errors = torch.where(seen[:, None], whole.pixel_errors(state), 0.0)
+    torch.testing.assert_close(problem.pixel_errors(state), errors, rtol=1e-12, atol=1e-12)
+    found = problem.corner_residuals(state)
+    assert torch.equal(found[..., 0].isfinite(), seen)
+    torch.testing.assert_close(found.nan_to_num(0.0), errors.mT, rtol=1e-12, atol=1e-12)
+    less = torch.where(seen, 0.5, 0.0).double()
+    torch.testing.assert_close(problem.with_weights(less).products(state).total, 0.25 * problem.products(state).total)
+
+
 def test_products_of_few_views_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """They use one piece of memory in turn; of three views, then of one."""
     problem, state = weighed_problem(True)
