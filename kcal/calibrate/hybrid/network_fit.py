@@ -184,7 +184,7 @@ class _Moved:
         return (self.focal * (features @ both.T)).view(places.shape)
 
     def rows(self, weights: Tensor, views: slice) -> Tensor:
-        """(V, T, 2 K) weighted derivatives of pixels of some views by the weights; corners as in rows of the problem."""
+        """(V, T, 2 K) weighted derivatives of pixels of some views by the weights; corners as in the problem."""
         places = self.places[views]
         try:
             found = vmap(jacrev(self.pixels), in_dims=(None, 0))(weights, places.reshape(-1, 2))
