@@ -238,7 +238,7 @@ class FittedViews:
             problem = hybrid_problem(
                 self.points, self.board.shapes, self.pixels, self.weights, estimate.model, estimate.families.mean,
                 precision, self.readout, still, self.square, self.turning,
-            )  # fmt: skip
+            ).read_as_shown(estimate.state)  # fmt: skip
             kept[:] = [(estimate.model, fixed, problem)]
         prior = hybrid_prior(estimate.model, len(self.board.shapes), estimate.families.mean, precision, self.square)
         problem = problem.with_priors([prior, *self._told(estimate.model)], still)

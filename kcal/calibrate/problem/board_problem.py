@@ -461,6 +461,21 @@ class BoardProblem(BoardImages, SchurProblem[BoardState]):
         changed._kept = []
         return changed
 
+    def read_as_shown(self, state: BoardState) -> BoardProblem:
+        """The same problem with each corner read at the time of the pixel where a state shows it.
+
+        At the time of the observed pixel, motions would reduce the noise of the corners that set their times: thousands
+        of corners would have motions where nothing moves.
+        """
+        if self.readout is None:
+            return self
+        errors = self._errors(state)
+        known = errors.isfinite().all(-2)
+        changed = copy.copy(self)
+        changed._time = torch.where(known, self.readout.time((self._target + errors).mT), self._time)
+        changed._kept, changed._shown = [], []
+        return changed
+
     def with_priors(self, terms: Sequence[Term], stillness: Tensor) -> BoardProblem:
         """The same corners and unknowns under other priors of these; both keep what corners say."""
         changed = copy.copy(self)
