@@ -288,6 +288,8 @@ def _readout(points: Tensor, size: tuple[int, int]) -> Readout:
 
 # Pixels that a mode can move any point by, below which it is left out.
 _UNFELT = 1e-6
+# Times that corners are put when they are shown, of views that move: each time the rest falls to a hundredth.
+_READ_AGAIN = 3
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -401,13 +403,23 @@ class HybridFit:
 
     def residuals_of(self, pixels: Tensor) -> Tensor:
         """(V, N, 2) as `residuals`, of any corners of the same views; infinite where the lens has no image of one."""
-        state, points = self.state, self.board_points.T.expand(len(pixels), 3, -1)
+        if self.readout is None:
+            return self._shown(pixels) - pixels
+        at = pixels
+        for _ in range(_READ_AGAIN):
+            shown = self._shown(at)
+            at = torch.where(shown.isfinite(), shown, at)
+        return self._shown(at) - pixels
+
+    def _shown(self, read: Tensor) -> Tensor:
+        """(V, N, 2) pixels of all corners that are read when pixels (V, N, 2) are; infinite without an image."""
+        state, points = self.state, self.board_points.T.expand(len(read), 3, -1)
         shift: Tensor | float = 0.0
         if self.readout is not None:
-            points, shift, _ = self.readout.moved(state.motion, self.readout.time(pixels), self.board_points.T)
+            points, shift, _ = self.readout.moved(state.motion, self.readout.time(read), self.board_points.T)
         placed = state.rotation @ points + state.translation[..., None] + shift
         found, valid = self.camera.project(placed.transpose(-1, -2))
-        return torch.where(valid[..., None], found, torch.inf) - pixels
+        return torch.where(valid[..., None], found, torch.inf)
 
     def only(self, views: Sequence[int]) -> HybridFit:
         """This fit with some of its views, where the others had no weight in it."""
@@ -500,7 +512,6 @@ def fit_hybrid(
     errors = problem.pixel_errors(state)
     if not robust:
         check_shown(errors)
-    residuals = capture.by_corner(errors)
     wider = widening(len(pixels)) if capture.readout is not None else 1.0
     half = math.sqrt(wider) * inverse * deviation
     information = information_of(problem, state, math.sqrt(wider * variance), reduced)
@@ -509,7 +520,7 @@ def fit_hybrid(
         state = state._replace(board=mean + state.board @ root)
         information = known.in_modes(information, state.board)
         half = torch.cat([half[:, : -len(mean)], half[:, -len(mean) :] @ root], 1)
-    return HybridFit(
+    fit = HybridFit(
         model=model,
         size=size,
         state=state,
@@ -529,9 +540,16 @@ def fit_hybrid(
         effective=len(deviation) - float(inverse.square().sum()),
         board_shapes=own,
         board_points=ordered + torch.einsum("b,bkn->nk", state.board, own.shapes),
-        residuals=residuals,
+        residuals=capture.by_corner(errors),
         weights=weights,
-        weighted_rms=math.sqrt(float((weights[..., None] * residuals).square().nansum()) / int(capture.seen.sum())),
+        weighted_rms=math.nan,
         iterations=rounds.steps + steps,
         converged=rounds.converged,
     )
+    residuals = fit.residuals
+    if capture.readout is not None:
+        # With each corner read exactly when it is shown.
+        again = fit.residuals_of(pixels)
+        residuals = torch.where(again.isfinite() & capture.seen[..., None], again, residuals)
+    weighted = float((weights[..., None] * residuals).square().nansum()) / int(capture.seen.sum())
+    return dataclasses.replace(fit, residuals=residuals, weighted_rms=math.sqrt(weighted))
