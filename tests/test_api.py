@@ -28,46 +28,45 @@ from scripts.make_reference import INSIDE, returned_by
 PUBLIC = {
     "kcal": """
         Baseline Board Boards CalibrationOptions Camera DegenerateError Features FileError InputError
-        KcalError KcalWarning Landmarks MeasuredPosition Observations Origin PositionStatus RigData
-        RigOptions Rig Localizer View calibrate_camera calibrate_rig detect load_camera load_rig
-        locate_points save_camera save_rig solve_rig
+        KcalError KcalWarning Landmarks Localizer MeasuredPosition Observations Origin PositionStatus Rig
+        RigData RigOptions View calibrate_camera calibrate_rig detect load_camera load_rig locate_points
+        save_camera save_rig solve_rig
     """,
     "kcal.lens": """
         CameraCalibration CameraLike CameraRays ExtendedDistortion ImageTransform LensModel LensSetting
-        StereoRectification Undistort UndistortImage Unproject bake camera_difference cylinder_view export_cameras
-        import_cameras load_lookup looking new_pinhole pinhole_view pixel_covariance projection_sigma
-        refit_camera rotation_from_vector save_lookup save_onnx undistort_maps vector_from_rotation
+        StereoRectification Undistort UndistortImage Unproject bake camera_difference cylinder_view
+        export_cameras import_cameras load_lookup looking pinhole_view pixel_covariance refit_camera
+        rotation_from_vector save_lookup save_onnx undistort_maps vector_from_rotation
     """,
     "kcal.corners": """
-        CornerStatus MatchOptions MatchStatus RefineCorners detect_board detect_video import_corners
-        match_points refine_point save_board
+        CornerStatus MatchOptions MatchStatus RefineCorners detect_board detect_video match_points
+        refine_point save_board
     """,
     "kcal.calibrate": """
-        CalibrationLayer OutlierRejection calibrate_cameras calibrate_views camera_at_setting compare_models
-        examine load_measured_board measure_board save_measured_board
+        CalibrationLayer OutlierRejection calibrate_cameras calibrate_views compare_models examine
+        load_measured_board measure_board save_measured_board
     """,
     "kcal.rig": """
         Effect ImagePair Mounting MovingOptions RasterError RigCovariance SkylineImage Survey Watched
         check_rig import_survey load_camera_rig match_landmarks match_moving mounting_covariance
-        pair_by_name paired_boards placed_rig planned_rig read_features read_pairs read_sightings
-        read_tracks save_camera_rig scene_features skyline_attitude skyline_source
+        pair_by_name paired_boards placed_rig planned_rig read_features read_sightings read_tracks
+        save_camera_rig scene_features skyline_attitude skyline_source
     """,
     "kcal.locate": """
-        BudgetErrors DisparityRanges Marks Site Triangulate
-        area_of enu_from_cam enu_to_geodetic find_geoid geodetic_to_enu level_ground locate_on_ground
-        range_errors rank_sites read_marks siting_map terrain write_positions
+        BudgetErrors DisparityRanges Marks Site Triangulate area_of enu_from_cam enu_to_geodetic find_geoid
+        geodetic_to_enu level_ground locate_on_ground range_errors rank_sites read_marks terrain
+        write_positions
     """,
     "kcal.track": """
         AssociationOptions ClockPrior Detections DisparityOptions Motion ObjectDisparity PairBoxes
         TrackOptions Tracker group_objects matched_pixels pair_objects
     """,
     "kcal.report": """
-        Requirement calibration_figure camera_verdict positions_figure rig_figure rig_verdict save_map save_picture
-        save_verdict_page
+        Requirement calibration_figure camera_verdict positions_figure rig_figure rig_verdict save_map
+        save_picture
     """,
     "kcal.stars": """
-        Air NightPlan SkyView StarCatalog calibrate_by_stars detect_stars name_stars planned_stars
-        star_source
+        Air SkyView StarCatalog calibrate_by_stars detect_stars name_stars star_source
     """,
     "kcal.solve": """
         LMOptions LevenbergMarquardt RobustLoss SolverStatus
@@ -108,7 +107,6 @@ WITHOUT_EXAMPLE = {
     "terrain",
     "detect_video",
     "paired_boards",
-    "read_pairs",
     "save_map",
 }
 

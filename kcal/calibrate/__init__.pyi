@@ -5,9 +5,6 @@
 from kcal.calibrate.camera.calibrate import calibrate_cameras as calibrate_cameras
 from kcal.calibrate.camera.at_setting import compare_models as compare_models
 
-# Zoom and focus
-from kcal.calibrate.camera.at_setting import camera_at_setting as camera_at_setting
-
 # Outliers
 from kcal.calibrate.camera.result import OutlierRejection as OutlierRejection
 

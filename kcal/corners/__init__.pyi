@@ -4,7 +4,6 @@
 # Find boards
 from kcal.corners.detect import detect_board as detect_board
 from kcal.corners.video import detect_video as detect_video
-from kcal.corners.foreign_corners import import_corners as import_corners
 from kcal.corners.print_board import save_board as save_board
 
 # Refine and match points

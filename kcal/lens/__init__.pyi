@@ -4,7 +4,6 @@
 # Lens models
 from kcal.lens.model import LensModel as LensModel
 from kcal.lens.camera_parameters import ExtendedDistortion as ExtendedDistortion
-from kcal.lens.views import new_pinhole as new_pinhole
 from kcal.calibrate.camera.export import refit_camera as refit_camera
 from kcal.lens.difference import camera_difference as camera_difference
 
@@ -20,7 +19,6 @@ from kcal.lens.camera_like import CameraRays as CameraRays
 from kcal.lens.camera_conversions import ImageTransform as ImageTransform
 
 # Error bars
-from kcal.lens.uncertainty import projection_sigma as projection_sigma
 from kcal.lens.uncertainty import pixel_covariance as pixel_covariance
 
 # Calibration records

@@ -18,7 +18,6 @@ from kcal.locate.raster import terrain as terrain
 # Where to put the next camera
 from kcal.locate.siting import area_of as area_of
 from kcal.locate.siting import Site as Site
-from kcal.locate.siting import siting_map as siting_map
 from kcal.locate.siting import rank_sites as rank_sites
 
 # Geodesy

@@ -5,7 +5,6 @@
 from kcal.report.judge_camera import camera_verdict as camera_verdict
 from kcal.report.judge_rig import rig_verdict as rig_verdict
 from kcal.report.verdict import Requirement as Requirement
-from kcal.report.pages import save_verdict_page as save_verdict_page
 
 # Pictures
 from kcal.report.figures import save_picture as save_picture

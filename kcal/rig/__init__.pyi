@@ -3,7 +3,6 @@
 
 # Read and match data
 from kcal.calibrate.rig.pairs import pair_by_name as pair_by_name
-from kcal.calibrate.rig.pairs import read_pairs as read_pairs
 from kcal.calibrate.rig.pairs import paired_boards as paired_boards
 from kcal.locate.survey import import_survey as import_survey
 from kcal.locate.survey import Survey as Survey

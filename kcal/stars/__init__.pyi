@@ -15,5 +15,3 @@ from kcal.stars.rig_stars import star_source as star_source
 
 # Lenses, and what to expect
 from kcal.stars.lens import calibrate_by_stars as calibrate_by_stars
-from kcal.stars.detect import planned_stars as planned_stars
-from kcal.stars.detect import NightPlan as NightPlan
