@@ -440,7 +440,8 @@ def locate_command(
     is not known of K is part of the height's error, but not of the range's.
 
     The rig file of a rig that was solved with landmarks contains its position: `--origin` and `--heading` are then not
-    needed.
+    needed. Without any position, points are meters in the rig's own frame, which is the left camera's (x right, y down,
+    z forward); they can be written as CSV.
 
     Of several cameras (one line for each mark: name,camera,u,v) any may have seen a thing; with three or more, a mark
     that contradicts the others is left out and named. One camera alone gives a bearing, or a position at --height or

@@ -128,7 +128,9 @@ class Located:
     @property
     def interval_note(self) -> str:
         """Which errors the intervals cover and which they do not, as a sentence without a full stop."""
-        missing = [name for name in ("calibration", "mounting") if name not in self.included]
+        # What stands nowhere has no errors of where it stands.
+        relevant = ("calibration", "mounting") if self.origin else ("calibration",)
+        missing = [name for name in relevant if name not in self.included]
         known = [name for name in self.included if name != "marks"]
         note = "95 % of the noise in the marks" + (f" and of the errors in {' and '.join(known)}" if known else "")
         return note + (f"; errors in {' and '.join(missing)} are not included" if missing else "")

@@ -49,6 +49,31 @@ def test_writes_files_and_a_table(folder: Path, command: Command, origin: str) -
     assert (folder / "map.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_a_rig_without_a_place_gives_meters_in_its_own_frame(folder: Path, command: Command) -> None:
+    shown = command("locate rig.json points.csv -o out.csv").out
+    row = next(line for line in shown.splitlines() if line.startswith("[b]mast")).split()
+    assert [float(cell) for cell in row[1:5]] == pytest.approx([10.0, 0.0, 1000.0, 1000.0], abs=0.06)
+    assert "no place on the Earth: positions are meters, x right," in " ".join(shown.split())
+    with (folder / "out.csv").open() as file:
+        mast, lost = csv.DictReader(file)
+    assert mast["frame"] == "x right, y down, z forward of the left camera"
+    assert [float(mast[name]) for name in ("x_m", "y_m", "z_m")] == pytest.approx([10.0, 0.0, 1000.0], abs=1e-6)
+    assert float(mast["cov_zz_m2"]) > 100 * float(mast["cov_xx_m2"]) > 0
+    assert float(mast["range_low_m"]) < 1000.0 < float(mast["range_high_m"])
+    assert (lost["status"], lost["x_m"], lost["range_m"]) == ("outside_image", "", "")
+    assert "lat" not in mast
+    (folder / "true.csv").write_text("name,lat,lon,height,sigma\nmast,1,2,3,1\n")
+    told = json.loads(command("locate rig.json points.csv --json").out)
+    assert told["frame"] == mast["frame"]
+    assert "mounting" not in told["interval"]
+    for option in ("-o new.geojson", "-o new.kml", "-o - --format cot", "--map new.html", "--picture new.png",
+                   "--truth true.csv"):  # fmt: skip
+        failed = command("locate rig.json points.csv", option, code=1)
+        assert "this rig has no place on the Earth" in failed.err
+        assert "give the origin and the heading" in " ".join(failed.err.split())
+    assert not list(folder.glob("new.*"))
+
+
 def test_what_is_doubted_of_a_rig_travels_with_it(folder: Path, command: Command) -> None:
     rig, doubt = load_rig(folder / "rig.json"), "the [landmarks] lie nearly in one line"
     rig.calibration = RigCalibration(
