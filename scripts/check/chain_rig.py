@@ -11,9 +11,8 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.landmarks import Landmarks
+from kcal import Landmarks, RigData
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.calibrate.rig.sources import RigData
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera
 from kcal.locate.geodesy import enu_from_cam

@@ -22,12 +22,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kcal import Baseline, Landmarks, RigData
 from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.calibrate.rig.landmarks import Landmarks
-from kcal.calibrate.rig.measured import Baseline
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import solve_rig
-from kcal.calibrate.rig.sources import RigData
 from kcal.corners.observations import Observations
 from kcal.errors import KcalError
 from kcal.lens.pose import vector_from_rotation

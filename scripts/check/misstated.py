@@ -15,11 +15,9 @@ import math
 
 import torch
 
-from kcal.calibrate.rig.features import Features
-from kcal.calibrate.rig.measured import Baseline
+from kcal import Baseline, Features, RigData
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import solve_rig
-from kcal.calibrate.rig.sources import RigData
 from kcal.calibrate.rig.uncertainty import turn_rows
 from kcal.errors import InputError
 from kcal.lens.pose import vector_from_rotation

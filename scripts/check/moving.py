@@ -22,9 +22,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.measured import Baseline, MeasuredPosition
+from kcal import Baseline, MeasuredPosition, RigData
 from kcal.calibrate.rig.solve import solve_rig
-from kcal.calibrate.rig.sources import RigData
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation

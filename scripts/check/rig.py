@@ -18,12 +18,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.features import Features
-from kcal.calibrate.rig.landmarks import Landmarks
-from kcal.calibrate.rig.measured import Baseline, MeasuredPosition
+from kcal import Baseline, Features, Landmarks, MeasuredPosition, RigData
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.calibrate.rig.sources import RigData
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.lens.rig import Rig, RigCovariance
 from kcal.locate.geodesy import enu_from_cam

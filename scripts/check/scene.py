@@ -30,13 +30,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kcal import Baseline, Features, Landmarks, RigData
 from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.calibrate.rig.features import Features
-from kcal.calibrate.rig.landmarks import Landmarks
-from kcal.calibrate.rig.measured import Baseline
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.calibrate.rig.sources import RigData
 from kcal.corners.match import keypoints
 from kcal.errors import InputError
 from kcal.lens.camera import Camera

@@ -20,11 +20,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from kcal import MeasuredPosition, RigData
 from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.calibrate.rig.measured import MeasuredPosition
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import solve_rig
-from kcal.calibrate.rig.sources import RigData
 from kcal.calibrate.rig.uncertainty import SharedCovariance
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera

@@ -22,10 +22,9 @@ from unittest import mock
 import torch
 from torch import Tensor
 
+from kcal import Landmarks, RigData
 from kcal.calibrate.rig import assess, solve
-from kcal.calibrate.rig.landmarks import Landmarks
 from kcal.calibrate.rig.result import RigResult
-from kcal.calibrate.rig.sources import RigData
 from kcal.errors import KcalError
 from kcal.lens.rig import Rig, RigCovariance
 from kcal.locate.geodesy import enu_from_cam

@@ -16,9 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.landmarks import Landmarks
+from kcal import Landmarks, RigData
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.calibrate.rig.sources import RigData
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera
 from kcal.locate.triangulate import Triangulate

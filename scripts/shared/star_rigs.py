@@ -9,10 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.features import Features
-from kcal.calibrate.rig.measured import Baseline, MeasuredPosition
+from kcal import Baseline, Features, MeasuredPosition, RigData
 from kcal.calibrate.rig.source import Effect
-from kcal.calibrate.rig.sources import RigData
 from kcal.calibrate.rig.stars import StarSource
 from kcal.lens.camera import Camera
 from kcal.lens.projection import FAR

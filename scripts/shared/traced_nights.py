@@ -12,12 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kcal import Baseline, Features, MeasuredPosition, RigData
 from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.calibrate.rig.features import Features
-from kcal.calibrate.rig.measured import Baseline, MeasuredPosition
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.calibrate.rig.sources import RigData
 from kcal.calibrate.rig.stars import StarSource
 from kcal.lens.camera import Camera
 from kcal.lens.projection import FAR

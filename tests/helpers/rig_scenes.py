@@ -7,9 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.boards import Boards
-from kcal.calibrate.rig.features import Features
-from kcal.calibrate.rig.landmarks import Landmarks
+from kcal import Boards, Features, Landmarks
 from kcal.corners.board import Board
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector

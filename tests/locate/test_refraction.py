@@ -10,10 +10,9 @@ import torch
 from rig_scenes import CAMERAS, CENTER, NAMES, ROTATION, normal, spread_points
 from torch import Tensor
 
-from kcal.calibrate.rig.landmarks import Landmarks
+from kcal import Landmarks, RigData
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.calibrate.rig.sources import RigData
 from kcal.errors import InputError
 from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.rig import Mounting, Origin

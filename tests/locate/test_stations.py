@@ -9,10 +9,8 @@ import torch
 from locate_rigs import real_rig, spread_points, tensor
 from torch import Tensor
 
-from kcal.calibrate.rig.landmarks import Landmarks
-from kcal.calibrate.rig.measured import MeasuredPosition
+from kcal import Landmarks, MeasuredPosition, RigData
 from kcal.calibrate.rig.solve import solve_rig
-from kcal.calibrate.rig.sources import RigData
 from kcal.errors import DegenerateError, FileError
 from kcal.io.rig_file import load_rig, save_camera_rig, save_rig
 from kcal.lens.rig import Mounting, Rig, RigCovariance

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from kcal.calibrate.rig.measured import Baseline
+from kcal import Baseline, RigData
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.calibrate.rig.sources import RigData
 from kcal.errors import InputError
 from kcal.lens.pose import vector_from_rotation
 from kcal.scene.match import ImagePair, MatchedPair, match_scene, scene_features, scene_of

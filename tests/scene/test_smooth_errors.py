@@ -5,11 +5,9 @@ import dataclasses
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.features import Features
-from kcal.calibrate.rig.measured import Baseline
+from kcal import Baseline, Features, RigData
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.source import Effect
-from kcal.calibrate.rig.sources import RigData
 from kcal.lens.pose import rotation_from_vector, side_axes
 from kcal.lens.rig import Rig
 from kcal.scene import common_errors

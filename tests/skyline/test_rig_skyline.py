@@ -10,12 +10,11 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from kcal.calibrate.rig.measured import MeasuredPosition
+from kcal import MeasuredPosition, RigData
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.skyline import SkylineSource
 from kcal.calibrate.rig.solve import solve_rig
 from kcal.calibrate.rig.source import PosedCamera
-from kcal.calibrate.rig.sources import RigData
 from kcal.errors import InputError
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.lens.rig import Origin

@@ -10,8 +10,7 @@ import torch
 from rig_scenes import CAMERAS, CENTER, ROTATION, landmarks, normal, see, spread_points, tensor
 from torch import Tensor
 
-from kcal.calibrate.rig.features import Features
-from kcal.calibrate.rig.landmarks import Landmarks
+from kcal import Features, Landmarks
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.lens.rig import Rig

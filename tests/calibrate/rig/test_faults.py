@@ -10,15 +10,13 @@ import torch
 from rig_scenes import CAMERAS, CENTER, NAMES, boards, features, landmarks, normal, tensor
 from torch import Tensor
 
+from kcal import Baseline, Landmarks, MeasuredPosition, RigData
 from kcal.calibrate.rig import assess
 from kcal.calibrate.rig.adjustment import Adjustment
 from kcal.calibrate.rig.explanations import contradictions, redundancy
 from kcal.calibrate.rig.initial_poses import first_poses
-from kcal.calibrate.rig.landmarks import Landmarks
-from kcal.calibrate.rig.measured import Baseline, MeasuredPosition
 from kcal.calibrate.rig.resection import distinct_poses, poses_from_three
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.calibrate.rig.sources import RigData
 from kcal.calibrate.rig.unknowns import held
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.pose import rotation_from_vector

@@ -8,13 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.features import Features
-from kcal.calibrate.rig.landmarks import Landmarks
-from kcal.calibrate.rig.measured import Baseline
+from kcal import Baseline, Features, Landmarks, RigData
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.source import Effect
-from kcal.calibrate.rig.sources import RigData
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import vector_from_rotation

@@ -7,10 +7,9 @@ import dataclasses
 import pytest
 import torch
 
-from kcal.calibrate.rig.landmarks import Landmarks
+from kcal import Landmarks, RigData
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.source import Effect
-from kcal.calibrate.rig.sources import RigData
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 

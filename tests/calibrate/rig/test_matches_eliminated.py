@@ -7,13 +7,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from kcal import Baseline, Features, Landmarks, RigData
 from kcal.calibrate.rig.adjustment import Adjustment
-from kcal.calibrate.rig.features import Features
-from kcal.calibrate.rig.landmarks import Landmarks
-from kcal.calibrate.rig.measured import Baseline
 from kcal.calibrate.rig.problem import RigProblem, _few_others_fall, _others_fall
 from kcal.calibrate.rig.source import LOCAL_SIZE, Start
-from kcal.calibrate.rig.sources import RigData
 from kcal.calibrate.rig.unknowns import held
 from kcal.errors import InputError
 from kcal.lens.camera import Camera

@@ -10,10 +10,8 @@ import pytest
 import torch
 from rig_scenes import CAMERAS, CENTER, boards, features, landmarks, normal, see, spread_points, tensor
 
-from kcal.calibrate.rig.features import Features
-from kcal.calibrate.rig.measured import Baseline, MeasuredPosition
+from kcal import Baseline, Features, MeasuredPosition, RigData
 from kcal.calibrate.rig.solve import solve_rig
-from kcal.calibrate.rig.sources import RigData
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 

@@ -10,12 +10,10 @@ import torch
 from rig_scenes import CAMERAS, CENTER, NAMES, ROTATION, features, landmarks
 from torch import Tensor
 
-from kcal.calibrate.rig.landmarks import Landmarks
-from kcal.calibrate.rig.measured import Baseline
+from kcal import Baseline, Landmarks, RigData
 from kcal.calibrate.rig.problem import own_fits
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.calibrate.rig.sources import RigData
 from kcal.calibrate.rig.uncertainty import turn_rows
 from kcal.errors import InputError
 from kcal.lens.pose import vector_from_rotation

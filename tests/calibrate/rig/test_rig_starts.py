@@ -22,8 +22,8 @@ from rig_scenes import (
 )
 from torch import Tensor
 
+from kcal import Baseline, MeasuredPosition, RigData
 from kcal.calibrate.rig.initial_poses import _baseline, _in_all_places, _into_frame, _level_starts, _starts
-from kcal.calibrate.rig.measured import Baseline, MeasuredPosition
 from kcal.calibrate.rig.pairs import Poses, _median_rms, _view_rms, consensus, evenly, half_turn
 from kcal.calibrate.rig.resection import (
     _real_roots,
@@ -35,7 +35,6 @@ from kcal.calibrate.rig.resection import (
     poses_from_three,
 )
 from kcal.calibrate.rig.source import Start
-from kcal.calibrate.rig.sources import RigData
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import Rig

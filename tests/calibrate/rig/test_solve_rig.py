@@ -26,18 +26,17 @@ from rig_scenes import (
 )
 from torch import Tensor
 
+from kcal import Baseline, MeasuredPosition, RigData
 from kcal.calibrate.rig import boards as board_limits
 from kcal.calibrate.rig import initial_poses, solve
 from kcal.calibrate.rig.boards import BoardBlock
 from kcal.calibrate.rig.features import FeatureBlock, inverse_range_beyond
 from kcal.calibrate.rig.landmarks import LandmarkBlock
-from kcal.calibrate.rig.measured import Baseline, MeasuredPosition
 from kcal.calibrate.rig.problem import RigProblem
 from kcal.calibrate.rig.resection import consensus_pose, poses_from_three
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.source import PosedCamera, RigState, Start, as_items
-from kcal.calibrate.rig.sources import RigData
 from kcal.calibrate.rig.unknowns import SharedUnknowns, joint_unknowns
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.calibration import CameraCalibration

@@ -10,12 +10,10 @@ import torch
 from rig_scenes import CAMERAS, CENTER, NAMES, ROTATION, generator, landmarks, normal, see, tensor
 from torch import Tensor
 
+from kcal import Landmarks, MeasuredPosition, RigData
 from kcal.calibrate.rig.assess import OpenPlace, _first_order, _targets, open_place
-from kcal.calibrate.rig.landmarks import Landmarks
-from kcal.calibrate.rig.measured import MeasuredPosition
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.calibrate.rig.sources import RigData
 from kcal.errors import DegenerateError
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
