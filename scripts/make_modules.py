@@ -408,6 +408,9 @@ def derivatives(case: Case, *, seed: int = 1) -> tuple[set[str], list[str]]:
     for name, value in values.items():
         largest = float(value.abs().max())
         step = 0.05 * noise(*value.shape, seed=seed) * value.abs().clamp(min(0.3 * largest or 1e-3, 1e3), 1e3)
+        if name.endswith("pose_step"):
+            # What is not freed is held, whatever its step.
+            step = step * module.get_buffer(name.replace("pose_step", "pose_mask"))
         along[name] = 0.5 * (step + step.mT) if name.endswith("cov") else step
     live = {name: value.clone().requires_grad_() for name, value in values.items()}
     out = summed(live)
