@@ -22,7 +22,7 @@ from kcal.calibrate.camera.result import (
     CalibrationOptions,
     CameraCalibrationResult,
     Progress,
-    RejectedView,
+    Rejected,
     SharedBoard,
 )
 from kcal.calibrate.camera.solve import calibrate_parametric
@@ -244,7 +244,7 @@ def _complete(
     warnings = (*result.warnings, *copy_warnings(names, copied), *pose_warnings(result.observations.pixels()))
     kept = [i for i in range(len(names)) if i not in copied]
     left_out = tuple(
-        RejectedView(
+        Rejected(
             view=names[i],
             corners=int(torch.isfinite(pixels[i]).all(-1).sum()),
             residual=float(result.per_view_rms[kept.index(first)]),

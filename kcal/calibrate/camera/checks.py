@@ -14,8 +14,7 @@ from kcal.calibrate.camera.result import (
     CameraCalibrationResult,
     OutlierRejection,
     Progress,
-    RejectedCorner,
-    RejectedView,
+    Rejected,
 )
 from kcal.calibrate.problem.poses import homographies, spread_out
 from kcal.calibrate.problem.views import LEAST_NOISE
@@ -282,7 +281,7 @@ class Kept(Generic[F]):
     fit: F
     views: list[int]
     rejected: Tensor
-    rejected_views: tuple[RejectedView, ...]
+    rejected_views: tuple[Rejected, ...]
 
     def complete(
         self, result: CameraCalibrationResult, observations: Observations, plain: Tensor, weighted: Tensor
@@ -297,7 +296,7 @@ class Kept(Generic[F]):
         """
         limits = corner_limits(torch.where(self.rejected[..., None], torch.nan, weighted))
         corners = tuple(
-            RejectedCorner(
+            Rejected(
                 view=observations.names[self.views[i]],
                 corner=n,
                 residual=float(plain[i, n].norm()),
@@ -335,7 +334,7 @@ def leave_out_outliers(
     pixels, names = observations.pixels(), observations.names
     seen = torch.isfinite(pixels).all(-1)
     left, rejected = list(range(len(pixels))), torch.zeros_like(seen)
-    gone: list[RejectedView] = []
+    gone: list[Rejected] = []
     found: F | None = None
     residuals = robust
     for _ in range(_ROUNDS):
@@ -346,7 +345,7 @@ def leave_out_outliers(
         rms = view_rms(residuals, beyond)
         for i, reason in views.items():
             count = int(seen[left[i]].sum())
-            gone.append(RejectedView(view=names[left[i]], corners=count, residual=float(rms[i]), reason=reason))
+            gone.append(Rejected(view=names[left[i]], corners=count, residual=float(rms[i]), reason=reason))
         kept = [i for i in range(len(left)) if i not in views]
         left, rejected = [left[i] for i in kept], beyond[kept]
         lost = int(rejected.sum()) + sum(view.corners for view in gone)
@@ -428,7 +427,7 @@ def without(observations: Observations, views: Sequence[int], rejected: Tensor) 
     return observations.model_copy(update={"views": kept})
 
 
-def check_share(gone: int, total: int, views: Sequence[RejectedView], limit: float) -> None:
+def check_share(gone: int, total: int, views: Sequence[Rejected], limit: float) -> None:
     """Raise `InputError` where more than the limit would be left out."""
     if gone <= limit * total:
         return

@@ -31,7 +31,7 @@ from kcal.calibrate.camera.result import (
     CameraCalibrationResult,
     OutlierRejection,
     Progress,
-    RejectedView,
+    Rejected,
 )
 from kcal.calibrate.camera.warnings import (
     bending_warnings,
@@ -343,7 +343,7 @@ def without_views(
     kept = [i for i in range(len(observations.views)) if i not in wrong]
     counts = torch.isfinite(observations.pixels()).all(-1).sum(-1).tolist()
     left_out = tuple(
-        RejectedView(view=observations.names[i], corners=counts[i], residual=float("nan"), reason=why)
+        Rejected(view=observations.names[i], corners=counts[i], residual=float("nan"), reason=why)
         for i, why in wrong.items()
     )
     note = (

@@ -233,37 +233,29 @@ class CalibrationOptions:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class RejectedCorner:
-    """A corner that was left out.
+class Rejected:
+    """A view, or a corner of one, that was left out.
 
     Args:
-        view: name of its view.
-        corner: its index on the board.
-        residual: pixels between it and its projection by the camera that was calibrated without it.
+        view: name of the view.
+        corner: index of the corner on the board; None: the whole view.
+        corners: how many corners were left out.
+        residual: of a corner, pixels between it and its projection by the camera that was calibrated without it; of a
+            view, its RMS in pixels when it was last part of the calibration, without corners left out before.
         reason: one sentence.
     """
 
     view: str
-    corner: int
+    corner: int | None = None
+    corners: int = 1
     residual: float
     reason: str
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class RejectedView:
-    """A view that was left out.
-
-    Args:
-        view: its name.
-        corners: how many corners it had.
-        residual: its RMS in pixels when it was last part of the calibration, without corners left out before.
-        reason: one sentence.
-    """
-
-    view: str
-    corners: int
-    residual: float
-    reason: str
+    @property
+    def exclusion(self) -> Exclusion:
+        """Its line in a file's history."""
+        name = self.view if self.corner is None else f"{self.view} corner {self.corner}"
+        return Exclusion(name=name, reason=self.reason)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -339,8 +331,8 @@ class CameraCalibrationResult:
     advice: tuple[str, ...] = ()
     fixed: tuple[str, ...] = ()
     led_by_prior: tuple[str, ...] = ()
-    rejected_corners: tuple[RejectedCorner, ...] = ()
-    rejected_views: tuple[RejectedView, ...] = ()
+    rejected_corners: tuple[Rejected, ...] = ()
+    rejected_views: tuple[Rejected, ...] = ()
     by_view: Tensor | None = None
     shared_board: SharedBoard | None = None
 
@@ -439,10 +431,7 @@ class CameraCalibrationResult:
     @property
     def excluded(self) -> tuple[Exclusion, ...]:
         """Views, then single corners, that were left out, each with its reason."""
-        return (
-            *(Exclusion(name=view.view, reason=view.reason) for view in self.rejected_views),
-            *(Exclusion(name=f"{c.view} corner {c.corner}", reason=c.reason) for c in self.rejected_corners),
-        )
+        return tuple(one.exclusion for one in (*self.rejected_views, *self.rejected_corners))
 
     def file(
         self,

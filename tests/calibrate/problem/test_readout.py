@@ -368,6 +368,24 @@ def test_motion_is_found_and_taken_out() -> None:
     torch.testing.assert_close(found.residuals_of(capture(2e-3)), found.residuals, rtol=0, atol=1e-9)
 
 
+def test_motions_do_not_take_up_the_noise_of_many_corners() -> None:
+    """20 still views of 961 corners: no motion, the noise as it is, and the focal length within its error bar."""
+    board = Board(columns=31, rows=31, square=0.03)
+    camera = Camera.build(focal=(1500, 1500), center=(965, 545), size=(1920, 1080), model="pinhole")
+    generator = torch.Generator().manual_seed(1)
+    u = torch.rand(20, 6, generator=generator, dtype=F64) - 0.5
+    shift = torch.cat([0.3 * u[:, 3:5], torch.full_like(u[:, 5:], 2.5)], 1)
+    placed = (board.points - board.points.mean(0)) @ rotation_from_vector(1.2 * u[:, :3]).mT + shift[:, None]
+    pixels = camera.project(placed)[0]
+    pixels = pixels + 0.1 * torch.randn(pixels.shape, generator=generator, dtype=F64)
+    found = fit_hybrid(board.points, pixels, (1920, 1080))
+    assert found.motion_sigma is None
+    assert found.rms == pytest.approx(0.1 * math.sqrt(2.0), rel=0.01)
+    sigma = float(found.covariance[0, 0].sqrt())
+    assert sigma < 10.0
+    assert abs(float(found.camera.focal[0]) - 1500.0) < 2.0 * sigma
+
+
 def test_few_views_that_moved_are_less_sure(monkeypatch: pytest.MonkeyPatch) -> None:
     """All variances alike, in the covariance and in what other fits take of the camera."""
     found = fitted(2e-3)
