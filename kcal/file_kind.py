@@ -19,8 +19,6 @@ from kcal.strict_json import MOST_BYTES, read_json
 _HEAD = 65536
 _NATIVE = re.compile(rb'\A\s*\{\s*"kcal"\s*:\s*"(\w{1,40})"')
 _VIDEO = ((4, b"ftyp"), (0, b"\x1aE\xdf\xa3"), (8, b"AVI "), (0, b"\0\0\1\xba"), (0, b"FLV"), (0, b"G@"))
-# Version of rig files of any number of cameras; those of two have a lower one.
-CAMERA_RIG_VERSION = 3
 # In words, for messages.
 WORDS = {
     "missing": "missing",

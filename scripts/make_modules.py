@@ -109,7 +109,7 @@ def rig(number: int = 0, size: tuple[int, int] = (640, 480), *, free: bool = Tru
     """Two cameras some meters apart, the right one turned."""
     turn = rotation_from_vector(torch.tensor([[0.01, 0.02 - 0.002 * number, -0.01]], dtype=torch.float64))[0]
     made = Rig.pair(camera(number, size), camera(1 - number, size), turn, torch.tensor([-5.0 - number, 0.1, 0.2]))
-    return made.free() if free else made
+    return made.free("left", "right") if free else made
 
 
 PLACES = torch.tensor([[4.0, -8.0, 160.0], [-30.0, 14.0, 120.0], [2.0, 2.0, 40.0]], dtype=torch.float64)

@@ -48,9 +48,9 @@ PUBLIC = {
     """,
     "kcal.rig": """
         Effect ImagePair Mounting MovingOptions RasterError RigCovariance SkylineImage Survey Watched
-        check_rig import_survey load_camera_rig match_landmarks match_moving mounting_covariance
+        check_rig import_survey match_landmarks match_moving mounting_covariance
         pair_by_name paired_boards placed_rig planned_rig read_features read_sightings read_tracks
-        save_camera_rig scene_features skyline_attitude skyline_source
+        scene_features skyline_attitude skyline_source
     """,
     "kcal.locate": """
         BudgetErrors DisparityRanges Marks Site Triangulate area_of enu_from_cam enu_to_geodetic find_geoid

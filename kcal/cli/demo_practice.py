@@ -21,7 +21,7 @@ from kcal.errors import FileError
 from kcal.files import dump_json, make_folder, read_bytes, write_atomic
 from kcal.io.camera_file import load_camera
 from kcal.io.images import write_png, write_video
-from kcal.io.rig_file import load_rig
+from kcal.io.rig_file import load_pair
 from kcal.lens.rig import Origin, Rig
 from kcal.locate.geodesy import enu_to_geodetic
 from kcal.report.positions import save_site_sketch
@@ -332,7 +332,7 @@ def _score_rig(folder: Path, truth: dict[str, Any]) -> Rig | None:
     if not path.exists():
         out.print("not done yet")
         return None
-    rig = load_rig(path)
+    rig = load_pair(path)
     rows = [["at", "mean m", "RMS m", "one sigma as stated m"]]
     for found in score_rig(rig, truth):
         stated = "none" if found.stated is None else _short_meters(found.stated)

@@ -26,7 +26,7 @@ from kcal.corners.observations import Observations
 from kcal.errors import FileError
 from kcal.files import make_folder, write_atomic
 from kcal.io.images import write_png
-from kcal.io.rig_file import RigFile, load_rig
+from kcal.io.rig_file import RigFile, load_pair
 from kcal.lens.rig import Rig
 from kcal.locate.geodesy import Origin
 from kcal.locate.localizer import Localizer
@@ -147,7 +147,7 @@ def save_pairs_summary(output: Path, table: Sequence[Sequence[str]], command: st
 
 
 def _residuals_text(file: RigFile) -> str:
-    cameras = zip(("left", "right"), (file.left.calibration, file.right.calibration), strict=True)
+    cameras = zip(("left", "right"), [camera.calibration for camera in file.cameras], strict=True)
     rms = ", ".join(f"{side} {record.rms:.3f} px" for side, record in cameras if record is not None)
     return f"RMS of the residuals: {rms}."
 
@@ -241,7 +241,7 @@ def real_pairs(
     where = origin or Origin(lat=0.0, lon=0.0, height=0.0)
     command = locate_again(output, f"--origin={where.lat},{where.lon},{where.height}", f"--heading={heading}")
     marks = read_marks(output / "points.csv")
-    rig = load_rig(output / "rig.json")
+    rig = load_pair(output / "rig.json")
     located = locate_points(Localizer(rig, origin=where, heading_deg=heading), marks)
     out.print("\nThe board's diagonal, true against estimated", markup=False)
     rows = diagonal_rows(located, board)
@@ -324,7 +324,7 @@ def simulated_site(output: Path, seed: int) -> None:
     write_marks(output / "points.csv", Marks.of_pair(targets.names, marks.left, marks.right))
     _write_places(output / "truth.csv", targets)
     command = locate_again(output, "--pixel-sigma", scene.mark_sigma, "--truth", output / "truth.csv")
-    rig = load_rig(output / "rig.json")
+    rig = load_pair(output / "rig.json")
     located, exact = (
         locate_points(Localizer(rig, pixel_sigma=scene.mark_sigma), Marks.of_pair(targets.names, *pixels))
         for pixels in ((marks.left, marks.right), (marks.true_left, marks.true_right))

@@ -173,7 +173,7 @@ def import_command(
 
     from kcal.io.camera_file import save_camera
     from kcal.io.formats import import_cameras
-    from kcal.io.rig_file import save_camera_rig, save_rig
+    from kcal.io.rig_file import save_rig
 
     found = import_cameras(
         *sources, format=format, size=parse_size(size), fisheye=fisheye, meters=_UNITS[unit] if unit else None
@@ -181,7 +181,7 @@ def import_command(
     for note in found.notes:
         warn(note)
     if camera is None and len(found.poses) > 2 and not found.unread:
-        save_camera_rig(found.camera_rig(), output)
+        save_rig(found.camera_rig(), output)
         out.print(f"rig from {found.format}: {', '.join(found.names)}", markup=False)
     elif camera is None and found.is_rig() and not found.unread:
         rig = found.rig()
@@ -243,8 +243,7 @@ def _import_survey(sources: list[Path], output: Path, sigma: float | None, geoid
 # Kind, class, and which command writes it.
 FILES = {
     "camera": ("kcal.io.camera_file", "CameraFile", "kcal calibrate"),
-    "rig": ("kcal.io.rig_file", "RigFile", "kcal rig"),
-    "camera-rig": ("kcal.io.rig_file", "CameraRigFile", "kcal rig of three cameras and more, kcal station"),
+    "rig": ("kcal.io.rig_file", "RigFile", "kcal rig, kcal station"),
     "observations": ("kcal.corners.observations", "Observations", "kcal detect"),
     "board": ("kcal.calibrate.hybrid.measured_board", "BoardFile", "kcal board measure"),
 }
@@ -278,9 +277,7 @@ def file_schema(kind: str) -> dict[str, Any]:
 def schema_command(
     kind: Annotated[
         str | None,
-        typer.Argument(
-            metavar="KIND", help="camera, rig, camera-rig, observations or board; a list of them if not given."
-        ),
+        typer.Argument(metavar="KIND", help="camera, rig, observations or board; a list of them if not given."),
     ] = None,
 ) -> None:
     """Print the JSON schema of a kind of file, for programs that read or check kcal's files.

@@ -60,13 +60,13 @@ def picked(found: ImportedCameras, name: str | None, source: str) -> Camera:
 def cameras_and_rig(path: Path) -> tuple[ImportedCameras, Rig | None]:
     """The cameras of a file of any program, and the rig that they are, if they are one."""
     from kcal.io.formats import import_cameras, recognized
-    from kcal.io.rig_file import load_rig
+    from kcal.io.rig_file import load_pair
 
     found = _notes_said(import_cameras(path))
     if len(found.cameras) == 1:
         return found, None
     if recognized(path) == "kcal":
-        return found, load_rig(path)
+        return found, load_pair(path)
     return found, found.rig() if found.is_rig() else None
 
 
@@ -102,9 +102,9 @@ def calibrated_camera(source: str | Path) -> Camera:
         return load_camera(path)
     if name not in ("left", "right"):
         raise InputError(f"{source}: a rig has the cameras left and right, and none named {name!r}")
-    from kcal.io.rig_file import load_rig
+    from kcal.io.rig_file import load_pair
 
-    rig = load_rig(path)
+    rig = load_pair(path)
     return rig.left if name == "left" else rig.right
 
 

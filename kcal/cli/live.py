@@ -242,12 +242,12 @@ def summary(counts: StreamCounts) -> str:
 
 def _mast(rig: Path, origin: str | None, heading: float | None, pixel_sigma: float | None) -> tuple[Localizer, Located]:
     """Two cameras, and how positions of them are told."""
-    from kcal.io.rig_file import load_rig
+    from kcal.io.rig_file import load_pair
     from kcal.lens.rig import Origin
     from kcal.locate.localizer import Localizer
     from kcal.locate.points import PointLocator
 
-    known, place = load_rig(rig), None if origin is None else Origin.parse(origin)
+    known, place = load_pair(rig), None if origin is None else Origin.parse(origin)
     if known.mounting is not None and {"origin", "heading"} <= taken:
         place = heading = None
         err.print("the position of the rig is that in its file, not that in kcal.toml")
@@ -258,11 +258,12 @@ def _mast(rig: Path, origin: str | None, heading: float | None, pixel_sigma: flo
 
 def _stations(rig: Path, pixel_sigma: float | None) -> tuple[Localizer, Located]:
     """Many cameras, and how positions of them are told."""
+    from kcal.io.rig_file import load_rig
     from kcal.locate.localizer import Localizer
     from kcal.locate.points import PointLocator
-    from kcal.locate.stations import load_camera_rig
+    from kcal.locate.stations import stations_of
 
-    known = load_camera_rig(rig)
+    known = stations_of(load_rig(rig))
     if known.origin is None:
         raise InputError(
             f"{rig}: this rig has no place on the Earth; solve it with landmarks or positions with latitudes"

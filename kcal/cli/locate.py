@@ -230,7 +230,7 @@ def locate_run(rig: Path, points: Path, options: LocateOptions) -> LocateRun:
     from kcal.locate.marks import is_long, read_mark_chunks
     from kcal.locate.points import PointLocator
     from kcal.locate.raster import terrain
-    from kcal.locate.stations import load_camera_rig, names_of_rig
+    from kcal.locate.stations import names_of_rig
     from kcal.locate.tabulate import find_geoid
 
     own = options
@@ -239,7 +239,7 @@ def locate_run(rig: Path, points: Path, options: LocateOptions) -> LocateRun:
         _refuse_of_pairs(own)
     elif own.aged and own.watch:
         raise typer.BadParameter("--aged guesses what the history of --watch tells: give either")
-    solved = load_camera_rig(rig) if many else load_rig(rig)
+    solved = load_rig(rig)
     noise, note = pixel_sigma_and_source(own.pixel_sigma, solved)
     doubts = _warned(rig, solved.calibration.warnings if solved.calibration else ())
     by_moments: Locate | None = None

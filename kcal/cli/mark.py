@@ -66,7 +66,7 @@ def mark_command(
         from kcal.web.serving import LocalServer
 
     from kcal.io.camera_file import load_camera
-    from kcal.io.rig_file import load_rig
+    from kcal.io.rig_file import load_pair
     from kcal.mark.guide import Reference, open_pictures
     from kcal.mark.marking_service import Desk
     from kcal.mark.session import Session
@@ -76,7 +76,7 @@ def mark_command(
     if (reference is None) != (reference_images is None):
         raise InputError("--reference and --reference-images belong together: old marks, and the images they are in")
     pictures = open_pictures(left, right)
-    known = None if rig is None else load_rig(rig)
+    known = None if rig is None else load_pair(rig)
     own = None if cameras is None else (load_camera(cameras[0]), load_camera(cameras[1]))
     old = None if reference is None or reference_images is None else Reference(reference, *reference_images)
     session = Session(output, landmarks, pixel_sigma_of(pixel_sigma, known))

@@ -384,7 +384,7 @@ def check(
 
     `kcal rig check rig.json --landmarks survey.csv --marks now.csv --relock`
     """
-    from kcal.io.rig_file import load_rig
+    from kcal.io.rig_file import load_pair
     from kcal.locate.marks import read_marks
     from kcal.watch.turned import check_rig, seen_again
 
@@ -394,7 +394,7 @@ def check(
         raise InputError("give --reference or --landmarks, not both: with old marks no survey is needed")
     if relock:
         check_writable(rig, marks, *(path for path in (reference, landmarks) if path is not None))
-    old = load_rig(rig)
+    old = load_pair(rig)
     noise = pixel_sigma_of(pixel_sigma, old)
     now = read_marks(marks, single=True)
     features = None if reference is None else seen_again(read_marks(reference, single=True), now, noise)

@@ -18,7 +18,7 @@ from kcal.cli.console import out, print_table
 from kcal.cli.inputs import SHOWN
 from kcal.cli.stations import station_rows
 from kcal.errors import FileError
-from kcal.file_kind import CAMERA_RIG_VERSION, file_kind
+from kcal.file_kind import file_kind
 from kcal.files import read_bytes
 from kcal.native_file import digest
 from kcal.strict_json import MOST_BYTES, read_json
@@ -56,7 +56,7 @@ def show_command(
     if content["kcal"] == "observations":
         _show_observations(file)
         return
-    if content["kcal"] == "rig" and content.get("version") == CAMERA_RIG_VERSION:
+    if content["kcal"] == "rig" and (content.get("origin") or len(content.get("names") or "12") != 2):
         _show_stations(file)
         return
     cameras, rig = _as_written(content) or _computed_anew(file, content["kcal"])
@@ -92,18 +92,19 @@ def _as_written(content: dict[str, Any]) -> tuple[list[_Camera], _Rig | None] | 
             rig = None
         else:
             rig = content, _checked_summary(RigSummary, content["summary"])
-            if rig[1].of != digest({key: value for key, value in content.items() if key not in ("left", "right")}):
+            if rig[1].of != digest({key: value for key, value in content.items() if key != "cameras"}):
                 return None
             # The rig knows more of its cameras than each of them knew before it was solved.
             cameras = [
-                (content[side], _checked_summary(CameraSummary, content["summary"][side])) for side in ("left", "right")
+                (block, _checked_summary(CameraSummary, known))
+                for block, known in zip(content["cameras"], content["summary"]["cameras"], strict=True)
             ]
         fresh = all(
             known.of == digest(block) and (known.board is None) == (block["calibration"] is None)
             for block, known in cameras
         )
         return (cameras, rig) if fresh else None
-    except (KeyError, TypeError, AttributeError, pydantic.ValidationError):
+    except (KeyError, TypeError, AttributeError, ValueError):
         # No such file was written by kcal: its reader says what is wrong.
         return None
 
@@ -182,7 +183,7 @@ def _show_camera(content: Mapping[str, Any], known: CameraSummary) -> None:
 
 
 def _show_pose(content: Mapping[str, Any], known: RigSummary) -> None:
-    x, y, z = content["right_from_left"]["translation"]
+    x, y, z = content["poses"][1]["translation"]
     turn = known.rotation_vector_deg
     out.print(f"\nbaseline {known.baseline_m:.6g} m, translation {x:.6g}, {y:.6g}, {z:.6g} m")
     out.print(f"rotation vector of the right camera {turn[0]:.6g}, {turn[1]:.6g}, {turn[2]:.6g}°")
@@ -204,9 +205,9 @@ def _show_pose(content: Mapping[str, Any], known: RigSummary) -> None:
 
 
 def _show_stations(file: Path) -> None:
-    from kcal.io.rig_file import CameraRigFile
+    from kcal.io.rig_file import load_rig
 
-    rig = CameraRigFile.load(file).rig()
+    rig = load_rig(file)
     for camera in rig.each:
         _show_camera(*_derived_camera(camera))
     out.print("")

@@ -75,10 +75,11 @@ def sites_command(
 
     `kcal sites towers.rig.json --area 44.8,5.8,45.2,6.3 --ground 240 --above 50 -o map.csv`
     """
+    from kcal.io.rig_file import load_rig
     from kcal.locate.ground import level_ground
     from kcal.locate.raster import terrain as raster_of
     from kcal.locate.siting import area_of, rank_sites, read_sites, sites_of, siting_map
-    from kcal.locate.stations import load_camera_rig
+    from kcal.locate.stations import stations_of
 
     inputs = [path for path in (towers, candidates, terrain) if path is not None]
     if output is not None:
@@ -90,7 +91,7 @@ def sites_command(
         raise InputError("give --terrain, or --ground with the height of level ground above the ellipsoid; one of them")
     surface = level_ground(ground) if terrain is None and ground is not None else raster_of(terrain or "", geoid_height)
     if file_kind(towers) == "rig":
-        rig = load_camera_rig(towers)
+        rig = stations_of(load_rig(towers))
         standing = sites_of(rig, pixel_sigma_of(pixel_sigma, rig))
         if rig.root is None:
             warn(f"{towers}: the rig has no error bars: bearings count as exact but for the noise of marks")
@@ -240,13 +241,13 @@ def budget_command(
     """
     import math
 
-    from kcal.io.rig_file import load_rig
+    from kcal.io.rig_file import load_pair
     from kcal.locate.budget import BudgetErrors, planned_rig, range_errors, range_sigmas, usual_ranges
     from kcal.report.tables import range_sigma_rows
 
     if picture is not None:
         check_picture(picture)
-    chosen = planned_rig(focal_px=focal, baseline_m=baseline) if rig is None else load_rig(rig)
+    chosen = planned_rig(focal_px=focal, baseline_m=baseline) if rig is None else load_pair(rig)
     noise = pixel_sigma_of(pixel_sigma, None if rig is None else chosen)
     disparity = math.sqrt(2.0) * noise
     errors = BudgetErrors(

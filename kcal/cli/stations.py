@@ -140,7 +140,7 @@ def solve_stations(
 ) -> None:  # fmt: skip
     """Solve one camera, or three and more, write the rig, print how each stands and whether it may be used."""
     from kcal.io.camera_file import load_camera
-    from kcal.io.rig_file import save_camera_rig
+    from kcal.io.rig_file import save_rig
     from kcal.locate.mirrored import solve_surveyed
 
     names = camera_names(paths)
@@ -163,7 +163,7 @@ def solve_stations(
         rms_px=result.rms, cameras=_stands(rig), warnings=list(result.warnings), undetermined=list(result.undetermined),
         left_out={item.label: item.reason for item in result.left_out},
     )  # fmt: skip
-    save_camera_rig(rig, output)
+    save_rig(rig, output)
     if picture is not None:
         from kcal.report.figures import save_picture
         from kcal.report.rig import rig_figure

@@ -83,7 +83,7 @@ def watch_command(
     `kcal watch rig.json rtsp://10.0.0.7/main rtsp://10.0.0.8/main -o history.csv --alarm https://example.org/rig`
     """
     from kcal.corners.images import read_gray
-    from kcal.io.rig_file import load_rig, save_rig
+    from kcal.io.rig_file import load_pair, save_rig
     from kcal.watch.history import Temperatures
     from kcal.watch.watcher import Watched, Watcher, Webhook
     from kcal.watch.watcher import relock as relocked_by
@@ -98,7 +98,7 @@ def watch_command(
     if relock is not None:
         check_writable(relock, rig, history)
     hooks = [Webhook(address) for address in alarm or [] if address != _EXIT]
-    known = load_rig(rig)
+    known = load_pair(rig)
     raised = 0
     if images:
         air = None if temperature is None else Temperatures(temperature)

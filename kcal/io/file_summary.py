@@ -108,12 +108,11 @@ def _rounded(value: Any) -> float:
 
 
 class RigSummary(Record):
-    """Of the relative pose of a rig.
+    """Of the relative pose of a rig of two cameras.
 
     Args:
         of: digest of the rest of the file, without its cameras.
-        left: of the first camera, with the error bars that the rig has of it.
-        right: likewise of the second one.
+        cameras: of each camera, with the error bars that the rig has of it.
         baseline_m: distance between the cameras.
         rotation_vector_deg: of the right camera.
         sigma_m: of the translation along x, y, z; None without error bars.
@@ -121,8 +120,7 @@ class RigSummary(Record):
     """
 
     of: str
-    left: CameraSummary | None
-    right: CameraSummary | None
+    cameras: tuple[CameraSummary | None, ...]
     baseline_m: float
     rotation_vector_deg: tuple[float, float, float]
     sigma_m: tuple[float, float, float] | None
@@ -139,14 +137,10 @@ class RigSummary(Record):
             errors = rig.covariance.matrix.diagonal()[-6:].clamp_min(0.0).sqrt().tolist()
         both = copy.deepcopy(rig)
         take_joint_errors(both)
-        left, right = (
-            CameraSummary.made(camera, content.get(side, {}))
-            for side, camera in (("left", both.left), ("right", both.right))
-        )
+        files = content.get("cameras") or [{}] * len(rig)
         return cls(
-            left=left,
-            right=right,
-            of=digest({key: value for key, value in content.items() if key not in ("left", "right")}),
+            cameras=tuple(CameraSummary.made(*both) for both in zip(both.each, files, strict=True)),
+            of=digest({key: value for key, value in content.items() if key != "cameras"}),
             baseline_m=_rounded(rig.baseline),
             rotation_vector_deg=_triple(turn),
             sigma_m=None if errors is None else _triple(errors[3:]),

@@ -1,8 +1,8 @@
 """kcal's own rig files: whole cameras, where they stand, and how that was found.
 
-JSON, `"kcal": "rig"`. Two cameras are version 2, which maps of pairs read too; any other number is version 3. The
-cameras are embedded, not referred to: relative yaw of 0.01° is 436 m at 5 km, so a rig must never be combined with
-cameras that were solved again after it.
+JSON, `"kcal": "rig"`, version 4. kcal 1.0 wrote version 2 for two cameras and version 3 for any other number; both are
+read. The cameras are embedded, not referred to: relative yaw of 0.01° is 436 m at 5 km, so a rig must never be combined
+with cameras that were solved again after it.
 """
 
 from __future__ import annotations
@@ -16,39 +16,34 @@ import pydantic
 import torch
 from torch import Tensor, nn
 
-from kcal.checks import as_covariance, require_root
+from kcal.checks import as_covariance
 from kcal.dispatch import still
-from kcal.errors import FileError
-from kcal.file_kind import CAMERA_RIG_VERSION
+from kcal.errors import FileError, InputError
 from kcal.io.camera_file import CameraFile, named_camera_file
 from kcal.io.file_summary import RigSummary
 from kcal.io.record import Packed
 from kcal.lens.calibration import RigCalibration
 from kcal.lens.projection import INTRINSICS
-from kcal.lens.rig import CameraRigCalibration, Mounting, Origin, Rig, RigCovariance
+from kcal.lens.rig import REFRACTION, Mounting, Origin, Rig, RigCovariance, pose_doubt
 from kcal.native_file import NativeFile, Record, storing
 
 Triple = tuple[float, float, float]
 
 
 class RigPose(Record):
-    """`points_right = rotation @ points_left + translation`, meters."""
+    """`points_cam = rotation @ points_rig + translation`, meters."""
 
     rotation: tuple[Triple, Triple, Triple]
     translation: Triple
 
     @pydantic.model_validator(mode="after")
     def _rigid(self) -> RigPose:
-        rotation = self.matrix()
+        rotation = torch.tensor(self.rotation, dtype=torch.float64)
         # As in Rig; checked here so that the error names the file.
         error = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max()
         if not float(error) <= 1e-6 or float(torch.linalg.det(rotation)) < 0:
             raise ValueError("rotation is no rotation matrix (R Rᵀ must be 1 and det R = +1)")
         return self
-
-    def matrix(self) -> Tensor:
-        """The rotation, (3, 3) float64."""
-        return torch.tensor(self.rotation, dtype=torch.float64)
 
 
 Matrix = tuple[tuple[float, ...], ...]
@@ -80,7 +75,7 @@ class RigMounting(FrameOrigin):
         roll_deg: clockwise as seen from behind.
         covariance: (6, 6) of east, north, up of the center (meters) and of turns about these axes (radians), or (7, 7)
             with the coefficient of refraction.
-        link: (P, 6) or (P, 7) covariance of the rig's P quantities (`RigFile.covariance`) with these.
+        link: (P, 6) or (P, 7) covariance of the rig's P quantities (`RigFile.half`) with these.
         refraction: the coefficient, if anything was found of it.
     """
 
@@ -119,18 +114,19 @@ class RigMounting(FrameOrigin):
 
 
 class RigFile(NativeFile):
-    """A stereo rig (file kind `rig`, version 2).
+    """A rig of any number of cameras (file kind `rig`, version 4).
 
     Args:
-        left: the first camera, whole; its frame is the rig's.
-        right: the second camera, whole.
-        right_from_left: where the right camera stands.
-        covariance: always None; files of version 1 had the matrix.
-        half: (K, P) root of the covariance of both cameras' parameters and the relative pose together, in the order of
-            `RigCovariance`: halfᵀ half is the covariance; what was held has zeros.
-        mounting: where the rig stands on the Earth, if that was solved.
+        names: of the cameras.
+        cameras: whole.
+        poses: where they stand in the rig's frame.
+        origin: where this frame is anchored on the Earth, east, north, up; None: it is a camera's or any other one.
+        refraction: coefficient.
+        root: (K, P) as `Rig.root`.
+        half: (K, P) as in `RigCovariance`, of two cameras: what was held has zeros.
+        mounting: where two cameras stand on the Earth, if that was solved.
         calibration: how the rig was solved, if it was.
-        summary: what `kcal show` prints of the relative pose without computing.
+        summary: what `kcal show` prints of two cameras without computing.
 
     Example:
         >>> from kcal import Camera
@@ -141,64 +137,125 @@ class RigFile(NativeFile):
     """
 
     KIND: ClassVar[str] = "rig"
-    VERSION: ClassVar[int] = 2
+    VERSION: ClassVar[int] = 4
 
-    left: CameraFile
-    right: CameraFile
-    right_from_left: RigPose
-    covariance: None = None
+    names: tuple[str, ...]
+    cameras: tuple[CameraFile, ...]
+    poses: tuple[RigPose, ...]
+    origin: FrameOrigin | None = None
+    refraction: float = pydantic.Field(default=REFRACTION, ge=-2, le=2)
+    root: Packed | None = None
     half: Packed | None = None
     mounting: RigMounting | None = None
     calibration: RigCalibration | None = None
     summary: RigSummary | None = None
 
     @pydantic.model_validator(mode="after")
-    def _measured(self) -> RigFile:
-        link = None if self.mounting is None else self.mounting.link
-        size = len(self.left.coefficients) + len(self.right.coefficients) + 2 * len(INTRINSICS) + 6
-        if self.half is not None:
-            require_root("half", self.half.tensor(), size)
-        known = self.known()
+    def _fitting(self) -> RigFile:
+        if not len(self.names) == len(self.cameras) == len(self.poses):
+            raise ValueError(f"{len(self.names)} names, {len(self.cameras)} cameras and {len(self.poses)} poses")
+        if len(set(self.names)) != len(self.names) or not all(self.names):
+            raise ValueError(f"unlike names are needed, got {', '.join(self.names)}")
+        if len(self.names) != 2 and not (self.half is None and self.mounting is None):
+            raise ValueError(f"half and mounting are those of two cameras; there are {len(self.names)}")
+        lenses = sum(len(camera.coefficients) + len(INTRINSICS) for camera in self.cameras)
+        sizes = {"half": (self.half, lenses + 6), "root": (self.root, lenses + 6 * len(self.names) + 1)}
+        for word, (value, size) in sizes.items():
+            if value is not None and (len(value.shape) != 2 or value.shape[1] != size):
+                raise ValueError(f"{word}: a root (K, {size}) is needed, got the shape {list(value.shape)}")
+        known, link = self.known(), None if self.mounting is None else self.mounting.link
         if link is not None:
             if known is None:
                 raise ValueError("the mounting's link needs the rig's covariance")
             if self.mounting is None or self.mounting.covariance is None:
                 raise ValueError("the mounting's link needs the mounting's covariance")
             mounted = torch.tensor(self.mounting.covariance, dtype=torch.float64)
-            known.checked_link(mounted, _tensor(link, size, len(mounted), "the mounting's link"))
-        length = math.hypot(*self.right_from_left.translation)
-        # A thousandth of a millimeter in a meter: more is not rounding but another rig.
-        if self.calibration and not math.isclose(self.calibration.baseline_m, length, rel_tol=1e-6):
-            raise ValueError(f"baseline_m is {self.calibration.baseline_m:g}, but the translation is {length:g} m long")
+            known.checked_link(mounted, _tensor(link, lenses + 6, len(mounted), "the mounting's link"))
+        if (len(self.names) != 2 or self.origin is not None) and all(file.model.complete for file in self.cameras):
+            self.rig()
         return self
 
     @classmethod
     def parse(cls, content: Any, source: str) -> Self:
         """See `NativeFile.parse`."""
-        head = (content.get("kcal"), content.get("version")) if isinstance(content, dict) else None
-        if head == (cls.KIND, CAMERA_RIG_VERSION):
-            many = len(content["names"]) if isinstance(content.get("names"), list) else "many"
-            raise FileError(
-                f"{source}: a rig of {many} cameras; a rig of two is needed here (kcal locate and kcal show take both)"
-            )
+        if isinstance(content, dict) and content.get("kcal") == cls.KIND and content.get("version") in _EARLIER:
+            try:
+                content = _EARLIER[content["version"]](content)
+            except InputError as error:
+                raise FileError(f"{source}: bad rig file: {error}") from error
         return super().parse(content, source)
 
     def known(self) -> RigCovariance | None:
-        """The stored covariance."""
+        """The stored covariance of two cameras."""
         return None if self.half is None else RigCovariance(half=self.half.tensor())
 
     def rig(self, field: nn.Module | None = None) -> Rig:
-        """The rig, equal to the stored one to the last bit, with its covariance, mounting and calibration.
-
-        `field` as for `load_rig`.
-        """
-        pose = self.right_from_left
-        translation = torch.tensor(pose.translation, dtype=torch.float64)
-        rig = Rig.pair(self.left.camera(field), self.right.camera(field), pose.matrix(), translation)
+        """The rig, equal to the stored one to the last bit, with all that is known of it; `field` as for `load_rig`."""
+        cameras = [file.camera(field) for file in self.cameras]
+        rotation, translation = (
+            torch.tensor([getattr(pose, part) for pose in self.poses], dtype=torch.float64).reshape(-1, *shape)
+            for part, shape in (("rotation", (3, 3)), ("translation", (3,)))
+        )
+        origin = None if self.origin is None else Origin(**dict(self.origin))
+        rig = Rig(cameras, self.names, rotation, translation, origin=origin, refraction=self.refraction)
+        rig.root = None if self.root is None else self.root.tensor()
         rig.covariance = self.known()
         rig.mounting = None if self.mounting is None else self.mounting.mounting()
         rig.calibration = self.calibration
+        if len(rig) == 2 and rig.in_first_frame:
+            pose_doubt(rig.right_from_left_rotation, rig.right_from_left_translation)
         return rig
+
+
+def _of_two(content: dict[str, Any]) -> dict[str, Any]:
+    """A file of version 2, of two cameras, as one of version 4."""
+    pose: Any = content.get("right_from_left")
+    solved: Any = content.get("calibration")
+    if isinstance(solved, dict):
+        solved = dict(solved)
+        length, frame = solved.pop("baseline_m", None), solved.pop("frame", "left camera")
+        if frame != "left camera":
+            raise InputError(f"calibration.frame: left camera is needed, got {frame!s:.40}")
+        shift: Any = pose.get("translation") if isinstance(pose, dict) else None
+        if isinstance(shift, list) and all(isinstance(value, int | float) for value in [*shift, length]):
+            apart = math.hypot(*shift)
+            # A thousandth of a millimeter in a meter: more is not rounding but another rig.
+            if not math.isclose(length, apart, rel_tol=1e-6):
+                raise InputError(f"baseline_m is {length:g}, but the translation is {apart:g} m long")
+        solved["rms_px"] = [solved.pop("rms_left", None), solved.pop("rms_right", None)]
+    known = ("version", "left", "right", "right_from_left", "calibration", "summary")
+    more = {name: value for name, value in content.items() if name not in known}
+    if more.get("covariance") is None:
+        more.pop("covariance", None)
+    still = {"rotation": torch.eye(3).tolist(), "translation": [0.0, 0.0, 0.0]}
+    cameras = [content.get("left"), content.get("right")]
+    return {
+        "version": RigFile.VERSION, "names": ["left", "right"], "cameras": cameras, "poses": [still, pose],
+        "calibration": solved, **more,
+    }  # fmt: skip
+
+
+def _of_many(content: dict[str, Any]) -> dict[str, Any]:
+    """A file of version 3, whose poses have centers in place of translations, as one of version 4."""
+
+    def moved(pose: Any) -> Any:
+        try:
+            rotation, center = (torch.tensor(pose[part], dtype=torch.float64) for part in ("rotation", "center"))
+            shift = -(rotation @ center)
+        except (KeyError, TypeError, ValueError, RuntimeError):
+            # What is wrong with it is told by the checks of the fields.
+            return pose
+        rest = {part: value for part, value in pose.items() if part != "center"}
+        return rest | {"translation": shift.tolist()}
+
+    poses = content.get("poses")
+    there = {"poses": list(map(moved, poses))} if isinstance(poses, list) else {}
+    # 1.0 had another default.
+    return {"refraction": 0.0, **content, **there, "version": RigFile.VERSION}
+
+
+# Versions of kcal 1.0, and how each becomes the present one.
+_EARLIER = {2: _of_two, 3: _of_many}
 
 
 def rig_to_file(rig: Rig) -> RigFile:
@@ -211,26 +268,33 @@ def rig_to_file(rig: Rig) -> RigFile:
         >>> from kcal import Camera
         >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
         >>> rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
-        >>> rig_to_file(rig).right_from_left.translation
+        >>> rig_to_file(rig).poses[1].translation
         (-1.0, 0.0, 0.0)
     """
     rig = still(rig)
-    covariance, mounting = rig.covariance, rig.mounting
-    pose: Any = {"rotation": rig.right_from_left_rotation, "translation": rig.right_from_left_translation}
+    root, covariance, mounting, origin = rig.root, rig.covariance, rig.mounting, rig.origin
     with storing("rig"):
         file = RigFile(
-            left=named_camera_file(rig.left, "left"),
-            right=named_camera_file(rig.right, "right"),
-            right_from_left=RigPose(**pose),
+            names=rig.names,
+            cameras=tuple(named_camera_file(camera, name) for camera, name in zip(rig.each, rig.names, strict=True)),
+            poses=tuple(
+                RigPose(rotation=turn, translation=shift)
+                for turn, shift in zip(rig.rotation, rig.translation, strict=True)
+            ),
+            origin=None if origin is None else FrameOrigin(**dataclasses.asdict(origin)),
+            refraction=float(rig.refraction),
+            root=None if root is None else Packed.of(root),
             half=None if covariance is None else Packed.of(covariance.half),
             mounting=None if mounting is None else RigMounting.of(mounting),
             calibration=rig.calibration,
         )
+    if len(rig) != 2 or origin is not None:
+        return file
     return file.model_copy(update={"summary": RigSummary.made(rig, file.model_dump(mode="json"))})
 
 
 def save_rig(rig: Rig, path: str | Path) -> Path:
-    """Write a rig with both cameras and all that is known of them: covariances, mounting and how they were calibrated.
+    """Write a rig with its cameras and all that is known of them: covariances, mounting and how they were calibrated.
 
     Raises:
         InputError: see `rig_to_file`.
@@ -249,9 +313,9 @@ def save_rig(rig: Rig, path: str | Path) -> Path:
 
 
 def load_rig(path: str | Path, *, field: nn.Module | None = None) -> Rig:
-    """Read the rig of a kcal rig file, with its covariance, mounting and calibration, and those of its cameras.
+    """Read the rig of a kcal rig file, with all that is known of it and of its cameras.
 
-    `field` as for `kcal.load_camera`, for both cameras: each gets a copy with its own weights.
+    `field` as for `kcal.load_camera`, for all cameras: each gets a copy with its own weights.
 
     Raises:
         FileError: missing, not JSON, another kind of file (a camera, say), or a field that is wrong; it names the path.
@@ -264,106 +328,16 @@ def load_rig(path: str | Path, *, field: nn.Module | None = None) -> Rig:
     return RigFile.load(path).rig(field)
 
 
-# Any number of cameras.
-
-
-class StationPose(Record):
-    """`points_cam = rotation @ (points - center)`, meters, in the rig's frame."""
-
-    rotation: tuple[Triple, Triple, Triple]
-    center: Triple
-
-
-class CameraRigFile(NativeFile):
-    """A rig of any number of cameras (file kind `rig`, version 3).
-
-    Args:
-        names: of the cameras.
-        cameras: whole.
-        poses: where they stand.
-        origin: of the frame, east, north, up; None: the first camera's frame.
-        refraction: coefficient.
-        root: (K, P) as `Rig.root`.
-        calibration: how the rig was solved, if it was.
-
-    Example:
-        >>> from kcal import Camera
-        >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
-        >>> rig = Rig([camera] * 3, ["a", "b", "c"], torch.eye(3).repeat(3, 1, 1), center=torch.eye(3))
-        >>> camera_rig_to_file(rig).rig().names
-        ('a', 'b', 'c')
-    """
-
-    KIND: ClassVar[str] = "rig"
-    VERSION: ClassVar[int] = CAMERA_RIG_VERSION
-
-    names: tuple[str, ...]
-    cameras: tuple[CameraFile, ...]
-    poses: tuple[StationPose, ...]
-    origin: FrameOrigin | None = None
-    refraction: float = pydantic.Field(default=0.0, ge=-2, le=2)
-    root: Packed | None = None
-    calibration: CameraRigCalibration | None = None
-
-    @pydantic.model_validator(mode="after")
-    def _fitting(self) -> CameraRigFile:
-        if not len(self.names) == len(self.cameras) == len(self.poses):
-            raise ValueError(f"{len(self.names)} names, {len(self.cameras)} cameras and {len(self.poses)} poses")
-        if all(file.model.complete for file in self.cameras):
-            self.rig()
-        return self
-
-    def rig(self, field: nn.Module | None = None) -> Rig:
-        """The rig, equal to the stored one to the last bit; `field` as for `kcal.load_rig`."""
-        rig = Rig(
-            [file.camera(field) for file in self.cameras],
-            self.names,
-            torch.tensor([pose.rotation for pose in self.poses], dtype=torch.float64).reshape(-1, 3, 3),
-            center=torch.tensor([pose.center for pose in self.poses], dtype=torch.float64).reshape(-1, 3),
-            origin=None if self.origin is None else Origin(**dict(self.origin)),
-            refraction=self.refraction,
-        )
-        rig.root = None if self.root is None else self.root.tensor()
-        rig.calibration = self.calibration
-        return rig
-
-
-def camera_rig_to_file(rig: Rig) -> CameraRigFile:
-    """Put a rig, with all that is known of it and of its cameras, in the form in which it is stored.
+def load_pair(path: str | Path) -> Rig:
+    """Read a rig of two cameras, as `load_rig` does.
 
     Raises:
-        InputError: values that do not fit together.
+        FileError: also a rig of any other number.
     """
-    rig = still(rig)
-    root, origin = rig.root, rig.origin
-    with storing("rig"):
-        return CameraRigFile(
-            names=rig.names,
-            cameras=tuple(named_camera_file(camera, name) for camera, name in zip(rig.each, rig.names, strict=True)),
-            poses=tuple(
-                StationPose(rotation=turn, center=at) for turn, at in zip(rig.rotation, rig.center, strict=True)
-            ),
-            origin=None if origin is None else FrameOrigin(**dataclasses.asdict(origin)),
-            refraction=float(rig.refraction),
-            root=None if root is None else Packed.of(root),
-            calibration=rig.calibration,
+    file = RigFile.load(path)
+    if len(file.names) != 2:
+        raise FileError(
+            f"{path}: a rig of {len(file.names)} cameras; a rig of two is needed here (kcal locate and kcal show take "
+            "both)"
         )
-
-
-def save_camera_rig(rig: Rig, path: str | Path) -> Path:
-    """Write a rig of any number of cameras with all that is known of it.
-
-    Raises:
-        InputError: see `camera_rig_to_file`.
-        FileError: the file cannot be written.
-
-    Example:
-        >>> import tempfile
-        >>> from kcal import Camera
-        >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
-        >>> rig = Rig([camera], ["tower"], torch.eye(3)[None], center=torch.zeros(1, 3))
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     CameraRigFile.load(save_camera_rig(rig, Path(folder, "rig.json"))).names
-        ('tower',)
-    """
-    return camera_rig_to_file(rig).save(path)
+    return file.rig()

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 def _refuse_negative(where: object, names: Iterable[str]) -> None:
     for name in names:
         value = getattr(where, name)
-        for number in value.values() if isinstance(value, dict) else (value,):
+        for number in value.values() if isinstance(value, dict) else value if isinstance(value, tuple) else (value,):
             if number is not None and not 0 <= number < math.inf:
                 raise InputError(f"{name} is {number}; it must not be negative")
 
@@ -279,20 +279,18 @@ class RigCalibration:
     """How a rig was solved.
 
     Args:
-        rms: sqrt(mean ‖r‖²) over the points of both cameras, pixels.
-        rms_left: of the left camera alone.
-        rms_right: of the right camera alone.
+        rms: sqrt(mean ‖r‖²) over the points of all cameras, pixels.
+        rms_px: likewise of each camera; None for a camera with none.
         pairs: how many pairs of views were used.
         per_pair_rms: pair name -> RMS in pixels, for the pairs used.
         flipped: pairs in which one camera's corner order had to be turned by 180°.
         excluded: pairs, landmarks and matches left out, with the reason.
         sources: what the rig was solved from, where that is more than boards.
+        undetermined: what the data leave open, camera by camera.
         warnings: what should be doubted of it, a sentence each, for example that its geometry is weak.
         pixel_sigma: noise of marks along each axis, pixels, as stated when the rig was solved; None if nobody did.
         contradictions: which source contradicts the others beyond reasonable doubt, a sentence each.
         relocked: when only the cameras' attitudes were solved again, and from what.
-        baseline_m: distance between the cameras' centers, meters; must be the length of the translation.
-        frame: what the rig's frame is.
         kcal_version: the version that calibrated; see `kcal.io.camera_file.provenance`.
         created: when, with its time zone.
     """
@@ -300,29 +298,25 @@ class RigCalibration:
     __repr__ = brief
 
     rms: float
-    rms_left: float
-    rms_right: float
-    pairs: int
-    per_pair_rms: dict[str, float]
+    rms_px: tuple[float | None, ...]
+    pairs: int = 0
+    per_pair_rms: dict[str, float] = dataclasses.field(default_factory=dict)
     flipped: tuple[str, ...] = ()
     excluded: tuple[Exclusion, ...] = ()
     sources: tuple[RigSource, ...] = ()
+    undetermined: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     pixel_sigma: float | None = None
     contradictions: tuple[str, ...] = ()
     relocked: str | None = None
-    baseline_m: float
-    frame: Literal["left camera"] = "left camera"
     kcal_version: str
     created: datetime.datetime
 
     def __post_init__(self) -> None:
-        _refuse_negative(self, ("rms", "rms_left", "rms_right", "per_pair_rms"))
+        _refuse_negative(self, ("rms", "rms_px", "per_pair_rms"))
         _refuse_local_time(self.created)
         if self.pairs != len(self.per_pair_rms):
             raise InputError(f"pairs is {self.pairs}, but per_pair_rms has {len(self.per_pair_rms)}")
-        if not self.baseline_m > 0:
-            raise InputError(f"baseline_m is {self.baseline_m}; it must be positive")
 
 
 Attribute = TypeVar("Attribute")

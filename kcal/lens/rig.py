@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import datetime
 import hashlib
 import math
 from collections.abc import Sequence
@@ -16,7 +15,7 @@ from torch import Tensor, nn
 from kcal.checks import StatedModule, as_covariance, as_points, as_tensor, require_root, scalar
 from kcal.dispatch import is_differentiated
 from kcal.errors import InputError, warn_user
-from kcal.lens.calibration import Exclusion, RigSource, UntilChanged
+from kcal.lens.calibration import RigCalibration, UntilChanged
 from kcal.lens.camera import Camera
 from kcal.lens.camera_like import CameraLike, as_camera
 from kcal.lens.pose import Movable, check_motion, rotation_from_vector
@@ -160,7 +159,7 @@ class Rig(Movable, StatedModule):
     * `root`, of any number: (K, P) with rootᵀ root the covariance of P quantities: all parameters of each camera in
       turn (`Camera.names`); then for each camera its center (3, meters) and a small turn of it (3, radians), both along
       and about the rig frame's axes; last the coefficient of refraction. None: cameras and poses count as exact;
-    * `calibration`: how the rig was solved.
+    * `calibration` (a `RigCalibration`): how the rig was solved.
 
     Args:
         cameras: V of them, or `CameraLike`s; one or more.
@@ -196,7 +195,7 @@ class Rig(Movable, StatedModule):
     covariance = UntilChanged["RigCovariance"](lambda rig, value: value.check(rig))
     mounting = UntilChanged[Mounting]()
     root = UntilChanged[Tensor](lambda rig, value: rig.check_root(value))
-    calibration = UntilChanged[Any]()
+    calibration = UntilChanged[RigCalibration]()
 
     def __init__(
         self,
@@ -279,8 +278,7 @@ class Rig(Movable, StatedModule):
             raise InputError("right_from_left_translation: as a parameter it must be float64 of shape (3,)")
         if isinstance(right_from_left_rotation, nn.Parameter):
             rotation = right_from_left_rotation
-        if doubt := _pose_doubt(rotation.detach(), translation.detach()):
-            warn_user(doubt)
+        pose_doubt(rotation.detach(), translation.detach())
         return cls([left, right], ("left", "right"), rotation, translation)
 
     @property
@@ -620,23 +618,22 @@ class RigCovariance:
         return as_covariance("covariance of calibration and mounting", whole, size + more)[:size, size:]
 
 
-def _pose_doubt(rotation: Tensor, translation: Tensor) -> str:
-    """Why a relative pose is more likely a slip; empty where there is no reason to doubt it."""
+def pose_doubt(rotation: Tensor, translation: Tensor) -> None:
+    """Warn of a relative pose that is more likely a slip."""
     x, y, z = (-translation @ rotation).tolist()
     baseline = math.hypot(x, y, z)
     # Endoscopes have 4 mm. Masts are 10 to 500 m apart; beyond, cameras are stations.
     if baseline and not 1e-3 <= baseline <= 1e3:
-        return (
+        warn_user(
             f"Rig: the baseline is {length_text(baseline)}; the translation must be in meters (T of "
             "cv2.stereoCalibrate has the unit of the board's points)"
         )
     # Side by side, and looking to the same side. One above the other, or facing each other, neither is on the left.
-    if x < -0.9 * baseline and float(rotation[2, 2]) > 0:
-        return (
+    elif x < -0.9 * baseline and float(rotation[2, 2]) > 0:
+        warn_user(
             f"Rig: the right camera stands {length_text(-x)} to the left of the left one: exchanged images, or a "
             "pose left_from_right? points_right = rotation @ points_left + translation is needed"
         )
-    return ""
 
 
 def half_of_covariance(matrix: Tensor) -> Tensor:
@@ -648,34 +645,3 @@ def half_of_covariance(matrix: Tensor) -> Tensor:
     values, vectors = torch.linalg.eigh(matrix / safe[:, None] / safe[None, :])
     kept = values > 1e-14 * values[-1:].sum().clamp_min(1e-300)
     return (scale[:, None] * vectors[:, kept] * values[kept].sqrt()).T
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class CameraRigCalibration:
-    """How a rig of any number of cameras was solved.
-
-    Args:
-        rms: sqrt(mean ‖r‖²) over the pixels of all cameras.
-        rms_px: likewise of each camera; None for a camera with none.
-        sources: what the rig was solved from.
-        excluded: what was left out, with the reason.
-        undetermined: what the data leave open, camera by camera.
-        warnings: what should be doubted, a sentence each.
-        contradictions: which source contradicts the others, a sentence each; such a rig should not be used.
-        pixel_sigma: noise of marks along each axis, px, as stated; None if nobody did.
-        kcal_version: the version that solved.
-        created: when, with its time zone.
-    """
-
-    __repr__ = brief
-
-    rms: float
-    rms_px: tuple[float | None, ...]
-    sources: tuple[RigSource, ...] = ()
-    excluded: tuple[Exclusion, ...] = ()
-    undetermined: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
-    contradictions: tuple[str, ...] = ()
-    pixel_sigma: float | None = None
-    kcal_version: str
-    created: datetime.datetime

@@ -7,32 +7,10 @@ from pathlib import Path
 from torch import Tensor
 
 from kcal.files import read_bytes
-from kcal.io.rig_file import CameraRigFile, RigFile
 from kcal.lens.rig import Rig
 from kcal.locate.localizer import Localizer
 from kcal.locate.mounting import attitude, station_mounting
 from kcal.strict_json import MOST_BYTES, read_json
-
-
-def load_camera_rig(path: str | Path) -> Rig:
-    """Read any rig file: one of many cameras, or one of two, named left and right.
-
-    Raises:
-        FileError: missing, not JSON, another kind of file, or a field that is wrong; it names the path.
-
-    Example:
-        >>> import tempfile
-        >>> from kcal import save_rig
-        >>> from kcal.rig import planned_rig
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     load_camera_rig(save_rig(planned_rig(), Path(folder, "rig.json"))).names
-        ('left', 'right')
-    """
-    path = Path(path)
-    content = read_json(read_bytes(path, MOST_BYTES), str(path))
-    if isinstance(content, dict) and content.get("version") == CameraRigFile.VERSION:
-        return CameraRigFile.parse(content, str(path)).rig()
-    return stations_of(RigFile.parse(content, str(path)).rig())
 
 
 def names_of_rig(path: str | Path) -> tuple[str, ...]:
@@ -44,9 +22,10 @@ def names_of_rig(path: str | Path) -> tuple[str, ...]:
 
 
 def stations_of(rig: Rig) -> Rig:
-    """A stereo rig as a rig of two cameras, with all that is known of it.
+    """A rig whose errors are those of each camera's pose (`Rig.root`): one of two cameras is changed into that.
 
-    The frame is east, north, up of the left camera if the rig says where it stands, and the left camera's otherwise.
+    The frame is then east, north, up of the left camera if the rig says where it stands, and the left camera's
+    otherwise.
 
     Example:
         >>> from kcal.rig import planned_rig

@@ -19,7 +19,7 @@ from kcal.lens.calibration import RigCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.pose import step_rows, vector_from_rotation
 from kcal.lens.projection import project_components
-from kcal.lens.rig import CameraRigCalibration, Rig
+from kcal.lens.rig import Rig
 from kcal.locate.budget import RangeSigmas, range_sigmas, station_sigmas
 from kcal.locate.stereo import PositionStatus
 from kcal.locate.triangulate import Triangulate
@@ -348,7 +348,7 @@ def _exact_lenses(rig: Rig, result: RigResult | None) -> tuple[str, ...]:
     return tuple(name for (name, _), part in parts if not bool(part.any()))
 
 
-def _largest_variance(solved: RigResult | RigCalibration | CameraRigCalibration | None) -> float:
+def _largest_variance(solved: RigResult | RigCalibration | None) -> float:
     """Largest mean square of a source's residuals in their sigmas."""
     sources = () if solved is None else solved.sources
     known = [source.sigmas for source in sources if source.sigmas is not None]

@@ -32,8 +32,6 @@ from kcal.locate.mounting import mounting_covariance as mounting_covariance
 from kcal.locate.budget import planned_rig as planned_rig
 
 # Any number of cameras
-from kcal.locate.stations import load_camera_rig as load_camera_rig
-from kcal.io.rig_file import save_camera_rig as save_camera_rig
 
 # Drift
 from kcal.watch.watcher import Watched as Watched

@@ -322,7 +322,7 @@ class Drift:
                 rig.mounting, heading_deg=heading, pitch_deg=pitch, roll_deg=roll, covariance=covariance
             )
         if rig.calibration is not None:
-            new.calibration = dataclasses.replace(rig.calibration, relocked=note, baseline_m=float(new.baseline))
+            new.calibration = dataclasses.replace(rig.calibration, relocked=note)
         return new
 
 

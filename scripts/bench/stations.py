@@ -37,7 +37,7 @@ from kcal.calibrate.rig.solve import solve_rig
 from kcal.calibrate.rig.sources import RigData
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
-from kcal.io.rig_file import save_camera_rig
+from kcal.io.rig_file import save_rig
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import Mounting, Origin, Rig, RigCovariance
@@ -171,7 +171,7 @@ def long_tables(sizes: Sequence[int]) -> list[str]:
     rig.root = rig.with_errors(attitude_deg=0.01)
     for size in sizes:
         with tempfile.TemporaryDirectory() as folder:
-            save_camera_rig(rig, Path(folder, "rig.json"))
+            save_rig(rig, Path(folder, "rig.json"))
             generator, things = torch.Generator().manual_seed(0), size // 3
             with Path(folder, "marks.csv").open("w") as file:
                 file.write("name,camera,u,v\n")

@@ -25,14 +25,13 @@ from kcal.file_kind import file_kind
 from kcal.files import read_bytes
 from kcal.io.camera_file import load_camera, save_camera
 from kcal.io.lookup_file import load_lookup, save_lookup
-from kcal.io.rig_file import load_rig, save_camera_rig, save_rig
+from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.baking import bake
 from kcal.lens.rig import Mounting, Origin, Rig
 from kcal.locate.export import write_positions
 from kcal.locate.marks import COVARIANCE, Marks, read_marks, write_marks
 from kcal.locate.points import locate_points
 from kcal.locate.raster import terrain
-from kcal.locate.stations import load_camera_rig
 from kcal.locate.survey import import_survey, read_features, read_survey
 from kcal.mark.session import Journal
 from kcal.pipeline.association import AssociationOptions
@@ -155,7 +154,7 @@ READERS: dict[str, Reader] = {
     "rig": Reader(load_rig, ".json", lambda path: save_rig(placed_rig(), path), save_rig,
                   infinite=_PRIOR, more="*/rig.json"),
     # A file has centers and a rig translations: each is computed from the other.
-    "camera rig": Reader(load_camera_rig, ".json", _promised("1.0/camera-rig.json"), save_camera_rig, 1e-9,
+    "camera rig": Reader(load_rig, ".json", _promised("1.0/camera-rig.json"), save_rig, 1e-9,
                          infinite=_PRIOR, kept=lambda found: (
                              found.names, *found.each, found.rotation, found.center, found.root, found.origin,
                              float(found.refraction), found.calibration)),

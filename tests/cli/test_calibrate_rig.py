@@ -224,9 +224,9 @@ class TestRig:
         file = RigFile.load(cameras / "rig.json")
         assert file.calibration is not None
         assert file.calibration.pairs == 6
-        assert file.calibration.baseline_m == pytest.approx(float(RIG.baseline), rel=0.02)
+        assert float(file.rig().baseline) == pytest.approx(float(RIG.baseline), rel=0.02)
         stated = float(re.search(r"baseline ([\d.]+) ± [\d.]+ mm", printed.out).group(1))  # type: ignore[union-attr]
-        assert stated == pytest.approx(1e3 * file.calibration.baseline_m, abs=0.1)
+        assert stated == pytest.approx(1e3 * float(file.rig().baseline), abs=0.1)
         assert "the board's are 50.00 mm" in printed.out
         side = float(next(line for line in printed.out.splitlines() if "triangulated" in line).split()[2])
         assert side == pytest.approx(50.0, rel=2e-3)
@@ -247,7 +247,7 @@ class TestRig:
         file = RigFile.load(cameras / "joint.json")
         assert file.calibration is not None
         assert file.calibration.pairs == 6
-        assert file.calibration.baseline_m == pytest.approx(float(RIG.baseline), abs=0.001)
+        assert float(file.rig().baseline) == pytest.approx(float(RIG.baseline), abs=0.001)
         assert file.mounting is None
         assert file.known() is not None
 
@@ -325,11 +325,12 @@ class TestRig:
         printed = command("rig left.camera.json right.camera.json", PAIRS, "-o rig.json")
         assert "turned by 180°: left01.png right01.png (right; the board" in printed.out
         assert "left out: board left04.png right04.png: " in printed.err
-        record = RigFile.load(cameras / "rig.json").calibration
+        file = RigFile.load(cameras / "rig.json")
+        record = file.calibration
         assert record is not None
         assert record.flipped == ("left01.png right01.png",)
         assert [entry.name for entry in record.excluded] == ["left04.png right04.png"]
-        assert record.baseline_m == pytest.approx(float(RIG.baseline), rel=0.02)
+        assert float(file.rig().baseline) == pytest.approx(float(RIG.baseline), rel=0.02)
 
     @pytest.mark.slow
     @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from kcal.cli.main import app
 from kcal.errors import FileError, InputError
-from kcal.io.rig_file import save_camera_rig, save_rig
+from kcal.io.rig_file import save_rig
 from kcal.lens.rig import Mounting
 from kcal.pipeline.stream import Stream
 from kcal.pipeline.tracks import TrackOptions
@@ -174,7 +174,7 @@ def test_stations_into_files(tmp_path: Path) -> None:
     """Three towers, one of which is blind for a while: one line names the cameras that have an image."""
     rig = ring(3, 6000.0)
     rig.root = rig.with_errors(position_m=0.3, attitude_deg=0.004)
-    save_camera_rig(rig, tmp_path / "towers.json")
+    save_rig(rig, tmp_path / "towers.json")
     generator = torch.Generator().manual_seed(0)
     start = torch.tensor([[-400.0, 300.0, 200.0], [700.0, -500.0, 150.0]]).double()
     velocity = torch.tensor([[12.0, -5.0, 0.0], [0.0, 9.0, 0.0]]).double()

@@ -23,7 +23,7 @@ from waiting import wait_for
 
 from kcal.cli.main import app
 from kcal.errors import FileError, InputError
-from kcal.io.rig_file import save_camera_rig, save_rig
+from kcal.io.rig_file import save_rig
 from kcal.lens.rig import Origin, Rig
 from kcal.pipeline.stream import Stream
 from kcal.threads import Handover
@@ -122,7 +122,7 @@ def test_three_videos_of_three_cameras(tmp_path: Path, monkeypatch: pytest.Monke
         origin=Origin(lat=19.07, lon=72.87, height=14.0),
     )
     rig.root = rig.with_errors(position_m=0.001, attitude_deg=0.001)
-    save_camera_rig(rig, tmp_path / "rig.json")
+    save_rig(rig, tmp_path / "rig.json")
     west = Rig.pair(camera, camera, torch.eye(3), torch.tensor([2.0, 0.0, 0.0]))
     times = [number / 15 for number in range(FRAMES)]
     for name, scene, side, count in (("left", pair, 0, FRAMES), ("right", pair, 1, FRAMES), ("third", west, 1, 8)):

@@ -77,7 +77,7 @@ def test_a_rig_without_a_place_gives_meters_in_its_own_frame(folder: Path, comma
 def test_what_is_doubted_of_a_rig_travels_with_it(folder: Path, command: Command) -> None:
     rig, doubt = load_rig(folder / "rig.json"), "the [landmarks] lie nearly in one line"
     rig.calibration = RigCalibration(
-        rms=0.1, rms_left=0.1, rms_right=0.1, pairs=0, per_pair_rms={}, baseline_m=10.0, warnings=(doubt,),
+        rms=0.1, rms_px=(0.1, 0.1), pairs=0, per_pair_rms={}, warnings=(doubt,),
         **provenance(),
     )  # fmt: skip
     save_rig(rig, folder / "rig.json")

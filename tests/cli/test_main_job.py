@@ -117,7 +117,7 @@ class TestRealImages:
         rig = RigFile.load("r.json")
         assert rig.calibration is not None
         # stereoCalibrate finds 3.345 squares of 25 mm with less accurate corners.
-        assert math.isclose(rig.calibration.baseline_m, 3.345 * 0.025, rel_tol=0.01)
+        assert math.isclose(float(rig.rig().baseline), 3.345 * 0.025, rel_tol=0.01)
 
         # The board's first and last corner of one pair, whose distance is known.
         left, right = (Observations.load(f"{side}.obs.json").views[0].pixels for side in ("left", "right"))

@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 from kcal.cli.main import app
 from kcal.corners.observations import Observations, View
 from kcal.errors import InputError, KcalError
-from kcal.io.rig_file import save_camera_rig, save_rig
+from kcal.io.rig_file import save_rig
 from kcal.lens.rig import RigCovariance
 from scripts.shared.station_scenes import ring
 
@@ -211,14 +211,14 @@ def test_the_site_on_the_ridge_is_better(site_folder: Path) -> None:
 def test_a_rig_of_stations_on_level_ground(site_folder: Path) -> None:
     rig = ring(3, 3000.0)
     rig.root = rig.with_errors(position_m=0.1, attitude_deg=0.01)
-    save_camera_rig(rig, site_folder / "towers.json")
+    save_rig(rig, site_folder / "towers.json")
     told = json.loads(
         run(site_folder, "towers.json", "--area", AREA, "--ground", "790", "--pixel-sigma", "1", "--json")
     )
     assert told["covered"] > 0.3
     assert "candidates" in told
     rig.root = None
-    save_camera_rig(rig, site_folder / "towers.json")
+    save_rig(rig, site_folder / "towers.json")
     assert "no error bars" in run(site_folder, "towers.json", "--area", AREA, "--ground", "790")
 
 

@@ -24,7 +24,7 @@ from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.lens.rig import Origin
 from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic
 from kcal.locate.marks import read_marks, write_marks
-from kcal.locate.stations import load_camera_rig, station_mounting
+from kcal.locate.stations import station_mounting
 from scripts.check.moving import CAMERA, CENTERS, LATE, NAMES, simulated
 from tests.helpers.scene_pairs import pair, small_rig
 from tests.helpers.skyline_site import camera, heights, small_site, write_raster
@@ -419,7 +419,7 @@ def test_a_station_from_its_skyline(files: Path) -> None:
     assert "variance of its heading: " in text
     assert "next best heading" in text
     assert (files / "fit.png").stat().st_size > 10_000
-    stands = station_mounting(load_camera_rig(files / "mast.rig.json"), 0)
+    stands = station_mounting(load_rig(files / "mast.rig.json"), 0)
     assert stands.heading_deg == pytest.approx(40.0, abs=3 * float(stands.covariance[5, 5].sqrt().rad2deg()))
 
 

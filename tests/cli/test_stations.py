@@ -18,13 +18,12 @@ from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.errors import DegenerateError, FileError, InputError
 from kcal.io.camera_file import save_camera
-from kcal.io.rig_file import save_camera_rig
+from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import Origin, Rig
 from kcal.locate.budget import station_sigmas
 from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic, geodetic_to_enu
-from kcal.locate.stations import load_camera_rig
 from scripts.shared.station_scenes import ORIGIN, marks, ring, targets
 
 NAMES = ("mill", "mast", "church", "hill")
@@ -76,7 +75,7 @@ def solve(folder: Path) -> None:
 
 def test_four_cameras_are_solved_and_locate_what_some_of_them_saw(folder: Path) -> None:
     solve(folder)
-    rig, truth = load_camera_rig(folder / "rig.json"), ring(4, 5000.0)
+    rig, truth = load_rig(folder / "rig.json"), ring(4, 5000.0)
     assert rig.names == NAMES
     assert rig.root is not None
     assert rig.origin is not None
@@ -108,7 +107,7 @@ def test_four_cameras_are_solved_and_locate_what_some_of_them_saw(folder: Path) 
 def test_one_station_alone(folder: Path) -> None:
     text = run(folder, "station", "mill.camera.json", "survey.csv", "--marks", "marks.csv", "-o", "mill.json")
     assert "mill" in text
-    assert load_camera_rig(folder / "mill.json").names == ("mill",)
+    assert load_rig(folder / "mill.json").names == ("mill",)
 
 
 def test_one_station_in_local_meters(folder: Path, tmp_path: Path, command: Command) -> None:
@@ -254,7 +253,7 @@ def test_show_says_how_each_camera_stands() -> None:
     text = CliRunner().invoke(app, ["show", str(stored)]).stdout
     assert text.count("\ncamera ") == 4  # three cameras and the head of the table
     (line,) = [line for line in text.splitlines() if line.startswith("fisheye4 ")]
-    rig = load_camera_rig(stored)
+    rig = load_rig(stored)
     lat, lon = (float(word) for word in line.split()[1:3])
     there = enu_to_geodetic(rig.center[1], rig.origin).tolist()
     assert (lat, lon) == pytest.approx(there[:2], abs=1e-7)
@@ -296,7 +295,7 @@ def test_boards_seen_by_any_two_of_three_and_distances_of_named_pairs(tmp_path: 
     three = [f"{name}.camera.json" for name in NAMES[:3]]
     boards = [word for name in boards_of(rig, tmp_path) for word in ("--observations", name)]
     run(tmp_path, "rig", *three, *boards, "-o", "rig.json")
-    found = load_camera_rig(tmp_path / "rig.json")
+    found = load_rig(tmp_path / "rig.json")
     assert float((found.center - centers).norm(dim=-1).max()) < 0.01
     assert found.root is not None
     # A distance that is known better than by boards moves the cameras to it, and only those two by all of it.
@@ -304,7 +303,7 @@ def test_boards_seen_by_any_two_of_three_and_distances_of_named_pairs(tmp_path: 
     run(
         tmp_path, "rig", *three, *boards, "--baseline", f"mill:church={far:.5f}±0.00001", "--keep-all", "-o", "rig.json"
     )
-    held = load_camera_rig(tmp_path / "rig.json")
+    held = load_rig(tmp_path / "rig.json")
     assert float((held.center[0] - held.center[2]).norm()) == pytest.approx(far, abs=1e-4)
     with pytest.raises(InputError, match="of 3 cameras write FIRST:SECOND=LENGTH±SIGMA, the names being mill, mast"):
         run(tmp_path, "rig", *three, *boards, "--baseline", "3.0±0.1", "-o", "rig.json")
@@ -330,7 +329,7 @@ def test_a_rig_of_four_is_judged(folder: Path, command: Command) -> None:
     assert "at 5 km the range is known to ±" in result.out
     stated = ["--require", "5km:2%", "--pixel-sigma", "0.3", "--json"]
     told = json.loads(run(folder, "report", "rig.json", *stated))["verdict"]
-    rig = load_camera_rig(folder / "rig.json")
+    rig = load_rig(folder / "rig.json")
     answer = told["ranges"][0]
     worst = station_sigmas(rig, 5000.0)
     assert worst is not None
@@ -338,6 +337,6 @@ def test_a_rig_of_four_is_judged(folder: Path, command: Command) -> None:
     # Turned away from each other, no two see the same.
     away = rig.rotation @ torch.diag(torch.tensor([-1.0, -1, 1], dtype=torch.float64))
     apart = Rig(rig.each, NAMES, away, center=rig.center, origin=rig.origin)
-    save_camera_rig(apart, folder / "apart.json")
+    save_rig(apart, folder / "apart.json")
     result = command("report", folder / "apart.json", "--require 1km:5%", code=3)
     assert "no two cameras see one" in result.out

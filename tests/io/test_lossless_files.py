@@ -19,7 +19,6 @@ from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.rig import Rig, RigCovariance
-from kcal.locate.stations import load_camera_rig
 
 # Cameras, covariances, mounting with link, sources, records.
 SAMPLE = Path(__file__).parent / "rig.json"
@@ -47,7 +46,7 @@ def test_rig_file(tmp_path: Path) -> None:
     assert save_rig(load_rig(again), tmp_path / "third.json").read_bytes() == again.read_bytes()
 
 
-@pytest.mark.parametrize(("kind", "load"), [("rig", load_rig), ("rig", load_camera_rig), ("camera", load_camera)])
+@pytest.mark.parametrize(("kind", "load"), [("rig", load_rig), ("camera", load_camera)])
 def test_files_of_0_1_are_refused_with_what_to_do(kind: str, load: Callable[[Path], object], tmp_path: Path) -> None:
     path = tmp_path / "old.json"
     path.write_text(json.dumps({"kcal": kind, "version": 1}))

@@ -23,7 +23,7 @@ from typer.testing import CliRunner
 from kcal.cli.main import app
 from kcal.errors import FileError, KcalError
 from kcal.io.formats import import_cameras
-from kcal.io.rig_file import CameraRigFile
+from kcal.io.rig_file import RigFile
 
 K = np.array([[500.0, 0, 330], [0, 505, 236], [0, 0, 1]])
 D = [-0.2, 0.05, 0.001, -0.002, 0.01]
@@ -522,7 +522,7 @@ def test_three_cameras_are_a_rig(tmp_path: Path) -> None:
                    .replace("cam0", f"cam{i}") for i in range(3))  # fmt: skip
     code, words = run("import", written(tmp_path, "c.yaml", text), "-o", tmp_path / "rig.json")
     assert (code, "cam0, cam1, cam2" in words) == (0, True)
-    rig = CameraRigFile.load(tmp_path / "rig.json").rig()
+    rig = RigFile.load(tmp_path / "rig.json").rig()
     assert np.abs(rig.center.numpy() - np.outer([0, 1, 2], [0.1, 0, -0.02])).max() < 1e-12
 
 

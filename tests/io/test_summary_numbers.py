@@ -83,12 +83,13 @@ def rig(covariance: bool) -> Rig:
 
 def test_a_rig_at_a_glance() -> None:
     made = rig(True)
-    content = {"left": {"x": 1}, "right": {"x": 2}, "more": 3}
+    content = {"cameras": [{"x": 1}, {"x": 2}], "more": 3}
     found = RigSummary.made(made, content)
     assert found.of == digest({"more": 3})
-    assert found.left is not None
-    assert found.right is not None
-    assert (found.left.of, found.right.of) == (digest({"x": 1}), digest({"x": 2}))
+    left, right = found.cameras
+    assert left is not None
+    assert right is not None
+    assert (left.of, right.of) == (digest({"x": 1}), digest({"x": 2}))
     assert found.baseline_m == pytest.approx(math.sqrt(100.05), rel=1e-5)
     assert found.rotation_vector_deg == pytest.approx([math.degrees(v) for v in (0.01, -0.02, 0.03)], rel=1e-5)
     assert made.covariance is not None
@@ -96,8 +97,8 @@ def test_a_rig_at_a_glance() -> None:
     assert found.sigma_deg == pytest.approx([math.degrees(v) for v in sigma[-6:-3].tolist()], rel=1e-5)
     assert found.sigma_m == pytest.approx(sigma[-3:].tolist(), rel=1e-5)
     # Each camera has the error bars that the rig has of it; the rig itself keeps its own.
-    assert list(found.left.sigma.values()) == pytest.approx(sigma[:10].tolist(), rel=1e-5)
-    assert list(found.right.sigma.values()) == pytest.approx(sigma[10:20].tolist(), rel=1e-5)
+    assert list(left.sigma.values()) == pytest.approx(sigma[:10].tolist(), rel=1e-5)
+    assert list(right.sigma.values()) == pytest.approx(sigma[10:20].tolist(), rel=1e-5)
     assert made.left.calibration is not None
     assert made.left.calibration.covariance is None
 

@@ -15,7 +15,7 @@ from torch.func import functional_call, stack_module_state, vmap
 
 from kcal.errors import InputError
 from kcal.io.camera_file import load_camera, save_camera
-from kcal.io.rig_file import CameraRigFile, load_rig, save_camera_rig, save_rig
+from kcal.io.rig_file import RigFile, load_rig, save_rig
 from kcal.lens.baking import bake
 from kcal.lens.camera import Camera
 from kcal.lens.camera_like import CameraRays
@@ -269,8 +269,8 @@ def test_files(kind: str, tmp_path: Path) -> None:
     rig = Rig.pair(own, own, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
     assert load_rig(save_rig(rig, tmp_path / "rig.json"), field=field).fingerprint == rig.fingerprint
     many = Rig([own] * 3, ["a", "b", "c"], torch.eye(3).repeat(3, 1, 1), center=torch.eye(3))
-    saved = save_camera_rig(many, tmp_path / "many.json")
-    assert CameraRigFile.load(saved).rig(field).fingerprint == many.fingerprint
+    saved = save_rig(many, tmp_path / "many.json")
+    assert RigFile.load(saved).rig(field).fingerprint == many.fingerprint
     if kind != "chain":
         with pytest.raises(InputError, match=rf"{type(network(kind)).__name__}, which is not kcal's: give such"):
             load_camera(path)

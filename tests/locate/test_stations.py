@@ -12,11 +12,11 @@ from torch import Tensor
 from kcal import Landmarks, MeasuredPosition, RigData
 from kcal.calibrate.rig.solve import solve_rig
 from kcal.errors import DegenerateError, FileError
-from kcal.io.rig_file import load_rig, save_camera_rig, save_rig
+from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.rig import Mounting, Rig, RigCovariance
 from kcal.locate.localizer import Localizer
 from kcal.locate.mounting import placed_rig
-from kcal.locate.stations import load_camera_rig, station_mounting
+from kcal.locate.stations import station_mounting
 from scripts.shared.station_scenes import ORIGIN, marks, ring, targets
 
 RIG = Path(__file__).parents[1] / "io" / "rig.json"
@@ -103,8 +103,8 @@ def test_one_camera_alone() -> None:
 def test_file_of_many_cameras(tmp_path: Path) -> None:
     _, data, _ = survey()
     rig = solve_rig(data).stations(ORIGIN)
-    path = save_camera_rig(rig, tmp_path / "rig.json")
-    again = load_camera_rig(path)
+    path = save_rig(rig, tmp_path / "rig.json")
+    again = load_rig(path)
     assert again.names == rig.names
     assert again.origin == ORIGIN
     assert torch.equal(again.rotation, rig.rotation)
@@ -117,11 +117,11 @@ def test_file_of_many_cameras(tmp_path: Path) -> None:
     content["poses"].pop()
     path.write_text(json.dumps(content))
     with pytest.raises(FileError, match="4 names, 4 cameras and 3 poses"):
-        load_camera_rig(path)
+        load_rig(path)
 
 
 def test_rigs_of_two_load() -> None:
-    two = load_camera_rig(RIG)
+    two = load_rig(RIG)
     assert two.names == ("left", "right")
     assert float((two.center[1] - two.center[0]).norm()) == pytest.approx(float(load_rig(RIG).baseline))
 
@@ -143,7 +143,7 @@ def test_a_stereo_rig_gives_the_same_positions_and_covariances(tmp_path: Path, m
     points = spread_points(torch.linspace(80.0, 400.0, 5, dtype=torch.float64))
     left, right = rig(points)[0].unbind(-2)
     right = right + tensor(0.05, 0.0)
-    many = Localizer(load_camera_rig(save_rig(rig, tmp_path / "rig.json")))
+    many = Localizer(load_rig(save_rig(rig, tmp_path / "rig.json")))
     found = many(torch.stack([left, right], 1))
     if mounted:
         other = Localizer(rig)(left, right)

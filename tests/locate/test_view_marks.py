@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from kcal.cli.main import app
 from kcal.cli.stars import images_of_nights
 from kcal.errors import FileError, InputError
-from kcal.io.rig_file import save_camera_rig
+from kcal.io.rig_file import save_rig
 from kcal.locate import marks as tables
 from kcal.locate.budget import range_sigmas, station_sigmas
 from kcal.locate.geodesy import enu_to_geodetic, geodetic_to_enu
@@ -121,7 +121,7 @@ def test_a_long_table_is_located_as_a_short_one(
     """In parts as in one, and the sample remembers from where bearings count."""
     rig, generator = ring(3, 4000.0), torch.Generator().manual_seed(0)
     rig.root = rig.with_errors(attitude_deg=0.01)
-    save_camera_rig(rig, tmp_path / "rig.json")
+    save_rig(rig, tmp_path / "rig.json")
     pixels = marks(rig, targets(60, generator))
     lines = [
         f"t{i},{name},{pixels[i, c, 0]:.3f},{pixels[i, c, 1]:.3f}"
@@ -153,7 +153,7 @@ def test_a_long_table_is_located_as_a_short_one(
 def test_one_camera_and_a_terrain(tmp_path: Path, command: Command) -> None:
     rig = ring(3, 4000.0)
     rig.root = rig.with_errors(attitude_deg=0.01)
-    save_camera_rig(rig, tmp_path / "rig.json")
+    save_rig(rig, tmp_path / "rig.json")
     # A plain that rises to the north, far below the towers.
     rows = [" ".join(f"{600 + i}" for _ in range(90)) for i in range(60, 0, -1)]
     head = "ncols 90\nnrows 60\nxllcorner 5.955\nyllcorner 44.97\ncellsize 0.001\n"

@@ -24,7 +24,7 @@ from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.io.camera_file import load_camera, save_camera
 from kcal.io.lookup_file import load_lookup, save_lookup
-from kcal.io.rig_file import load_rig, save_camera_rig, save_rig
+from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.baking import bake
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
@@ -76,7 +76,7 @@ def camera_rig(folder: Path, out: dict[str, object]) -> None:
     site = Origin(lat=19.07, lon=72.87, height=14.0)
     rig = Rig(cameras, [*lens], turns @ north, center=centers, origin=site, refraction=0.14)
     rig.root = rig.with_errors(position_m=(0.02, 0.02, 0.05), attitude_deg=0.01, refraction=0.05)
-    save_camera_rig(rig, folder / "camera-rig.json")
+    save_rig(rig, folder / "camera-rig.json")
     out["camera-rig.json"] = {
         "rotation": rig.rotation.tolist(),
         "center": rig.center.tolist(),

@@ -49,11 +49,9 @@ def solved(left: CalibrationRecord, right: CalibrationRecord | None = None, **ch
     rig.covariance = RigCovariance.of(rig, joint=torch.diag(spread.square()))
     rig.calibration = RigCalibration(
         rms=0.1,
-        rms_left=0.1,
-        rms_right=0.1,
+        rms_px=(0.1, 0.1),
         pairs=0,
         per_pair_rms={},
-        baseline_m=10.0,
         kcal_version="1",
         created=NOW,
         **changes,  # type: ignore[arg-type]

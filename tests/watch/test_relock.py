@@ -45,9 +45,7 @@ def standing_rig(covariance: Tensor | None = STANDING) -> Rig:
     rig = pinhole_rig()
     rig.covariance = RigCovariance.of(rig, pose=torch.diag(tensor(1e-6, 2e-6, 3e-6, 1e-2, 2e-2, 3e-2) ** 2))
     rig.mounting = Mounting(origin=ORIGIN, heading_deg=90.0, covariance=covariance, refraction=0.0)
-    rig.calibration = RigCalibration(
-        rms=0.1, rms_left=0.1, rms_right=0.1, pairs=0, per_pair_rms={}, baseline_m=10.0, **provenance()
-    )
+    rig.calibration = RigCalibration(rms=0.1, rms_px=(0.1, 0.1), pairs=0, per_pair_rms={}, **provenance())
     return rig
 
 
@@ -77,7 +75,7 @@ def test_a_relocked_rig_stands_as_it_was_found() -> None:
     assert angles == pytest.approx((90.02, 0.01, 0.0), abs=1e-5)
     assert new.mounting.origin == rig.mounting.origin
     assert (new.calibration.relocked, rig.calibration.relocked) == ("Monday", None)
-    assert new.calibration.baseline_m == pytest.approx(10.0, abs=1e-9)
+    assert float(new.baseline) == pytest.approx(10.0, abs=1e-9)
     x, y, z = found.left_covariance.diagonal().tolist()
     more = (new.mounting.covariance - STANDING).diagonal()
     # The camera is turned by 0.02° against east and north.

@@ -20,7 +20,7 @@ from kcal.calibrate.rig.uncertainty import SharedCovariance, mounting_rows, para
 from kcal.io.rig_file import save_rig
 from kcal.lens.calibration import Exclusion, ItemResidual, RigCalibration, RigSource
 from kcal.lens.camera import Camera
-from kcal.lens.rig import CameraRigCalibration, Origin, Rig, RigCovariance
+from kcal.lens.rig import Origin, Rig, RigCovariance
 from kcal.solve.lm import LMOptions
 from kcal.solve.problem import SolverStatus
 from kcal.texts import brief
@@ -161,17 +161,7 @@ class RigResult:
         half = self._covariance.half_of(self._joint_rows(first, second))
         if half is not None:
             rig.covariance = RigCovariance(half=half)
-        rms = [0.0 if math.isnan(self.rms_px[camera]) else self.rms_px[camera] for camera in (first, second)]
-        rig.calibration = RigCalibration(
-            rms=self.rms,
-            rms_left=rms[0],
-            rms_right=rms[1],
-            pairs=len(self.pairs),
-            per_pair_rms=dict(zip(self.pairs, self.pair_rms.tolist(), strict=True)),
-            flipped=tuple(dict.fromkeys(turned.board for turned in self.flipped)),
-            baseline_m=float(rig.baseline),
-            **self._history(),
-        )
+        rig.calibration = self._calibration(first, second)
         return rig
 
     def stations(self, origin: Origin | None = None) -> Rig:
@@ -188,26 +178,27 @@ class RigResult:
         poses = [mounting_rows(self._problem, self._state, camera) for camera in each]
         lenses = [parameter_rows(self._problem, camera) for camera in each]
         rig.root = self._covariance.half_of(torch.cat([*lenses, *(pose[:6] for pose in poses), poses[0][6:]]))
-        rig.calibration = CameraRigCalibration(
-            rms=self.rms,
-            rms_px=tuple(None if math.isnan(rms) else rms for rms in self.rms_px),
-            undetermined=self.undetermined,
-            **self._history(),
-        )
+        rig.calibration = self._calibration(*each)
         return rig
 
-    def _history(self) -> dict[str, Any]:
-        """What `stereo` and `stations` tell alike of how a rig was solved."""
-        return {
+    def _calibration(self, *cameras: int) -> RigCalibration:
+        """How a rig of these cameras was solved."""
+        return RigCalibration(
+            rms=self.rms,
+            rms_px=tuple(None if math.isnan(self.rms_px[camera]) else self.rms_px[camera] for camera in cameras),
+            pairs=len(self.pairs),
+            per_pair_rms=dict(zip(self.pairs, self.pair_rms.tolist(), strict=True)),
+            flipped=tuple(dict.fromkeys(turned.board for turned in self.flipped)),
             # Boards by their names alone, as in `per_pair_rms`.
-            "excluded": tuple(
+            excluded=tuple(
                 Exclusion(f"{item.source} {item.name}".removeprefix("boards "), item.reason) for item in self.left_out
             ),
-            "sources": self.sources,
-            "warnings": self.warnings,
-            "contradictions": self.contradictions,
+            sources=self.sources,
+            undetermined=self.undetermined,
+            warnings=self.warnings,
+            contradictions=self.contradictions,
             **self._provenance,
-        }
+        )
 
     def save(self, path: str | Path) -> Path:
         """Write the rig of the first two cameras as `stereo` gives it; see `kcal.save_rig`."""
