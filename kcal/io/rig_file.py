@@ -207,7 +207,7 @@ class RigFile(NativeFile):
         return rig
 
 
-def _of_two(content: dict[str, Any]) -> dict[str, Any]:
+def _from_two(content: dict[str, Any]) -> dict[str, Any]:
     """A file of version 2, of two cameras, as one of version 4."""
     pose: Any = content.get("right_from_left")
     solved: Any = content.get("calibration")
@@ -217,7 +217,7 @@ def _of_two(content: dict[str, Any]) -> dict[str, Any]:
         if frame != "left camera":
             raise InputError(f"calibration.frame: left camera is needed, got {frame!s:.40}")
         shift: Any = pose.get("translation") if isinstance(pose, dict) else None
-        if isinstance(shift, list) and all(isinstance(value, int | float) for value in [*shift, length]):
+        if isinstance(shift, list) and len(shift) == 3 and all(isinstance(x, int | float) for x in [*shift, length]):
             apart = math.hypot(*shift)
             # A thousandth of a millimeter in a meter: more is not rounding but another rig.
             if not math.isclose(length, apart, rel_tol=1e-6):
@@ -235,7 +235,7 @@ def _of_two(content: dict[str, Any]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _of_many(content: dict[str, Any]) -> dict[str, Any]:
+def _from_many(content: dict[str, Any]) -> dict[str, Any]:
     """A file of version 3, whose poses have centers in place of translations, as one of version 4."""
 
     def moved(pose: Any) -> Any:
@@ -255,7 +255,7 @@ def _of_many(content: dict[str, Any]) -> dict[str, Any]:
 
 
 # Versions of kcal 1.0, and how each becomes the present one.
-_EARLIER = {2: _of_two, 3: _of_many}
+_EARLIER = {2: _from_two, 3: _from_many}
 
 
 def rig_to_file(rig: Rig) -> RigFile:

@@ -245,7 +245,7 @@ def test_two_cameras_take_the_long_table_too(folder: Path) -> None:
     save_camera(other, folder / "mast.camera.json")
     given = ["--landmarks", "survey.csv", "--marks", "two.csv", "-o", "two.json"]
     run(folder, "rig", "mill.camera.json", "mast.camera.json", *given)
-    assert json.loads((folder / "two.json").read_text())["version"] == 2
+    assert json.loads((folder / "two.json").read_text())["names"] == ["left", "right"]
 
 
 def test_show_says_how_each_camera_stands() -> None:

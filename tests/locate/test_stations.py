@@ -12,7 +12,7 @@ from torch import Tensor
 from kcal import Landmarks, MeasuredPosition, RigData
 from kcal.calibrate.rig.solve import solve_rig
 from kcal.errors import DegenerateError, FileError
-from kcal.io.rig_file import load_rig, save_rig
+from kcal.io.rig_file import load_pair, load_rig, save_rig
 from kcal.lens.rig import Mounting, Rig, RigCovariance
 from kcal.locate.localizer import Localizer
 from kcal.locate.mounting import placed_rig
@@ -112,7 +112,7 @@ def test_file_of_many_cameras(tmp_path: Path) -> None:
     assert torch.equal(again.root, rig.root)
     assert again.calibration == rig.calibration
     with pytest.raises(FileError, match="a rig of 4 cameras; a rig of two is needed here"):
-        load_rig(path)
+        load_pair(path)
     content = json.loads(path.read_text())
     content["poses"].pop()
     path.write_text(json.dumps(content))
