@@ -153,11 +153,7 @@ READERS: dict[str, Reader] = {
                      infinite=_PRIOR, more="*/*.camera.json"),
     "rig": Reader(load_rig, ".json", lambda path: save_rig(placed_rig(), path), save_rig,
                   infinite=_PRIOR, more="*/rig.json"),
-    # A file has centers and a rig translations: each is computed from the other.
-    "camera rig": Reader(load_rig, ".json", _promised("1.0/camera-rig.json"), save_rig, 1e-9,
-                         infinite=_PRIOR, kept=lambda found: (
-                             found.names, *found.each, found.rotation, found.center, found.root, found.origin,
-                             float(found.refraction), found.calibration)),
+    "camera rig": Reader(load_rig, ".json", _promised("1.0/camera-rig.json"), save_rig, infinite=_PRIOR),
     "board": Reader(load_measured_board, ".json", _promised("1.0/board.json"), save_measured_board),
     "lookup": Reader(load_lookup, ".npz", lambda path: save_lookup(bake(CAMERA, 0.1), path), save_lookup),
     "observations": Reader(Observations.load, ".json", _observations, lambda found, path: found.save(path),
