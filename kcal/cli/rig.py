@@ -207,6 +207,10 @@ def solve_command(
     Three cameras and more may stand kilometers apart and see different things: each needs four landmarks or more, of
     its own or in common, and measured positions (--positions, by the cameras' names) help.
 
+    For one camera that is moved from place to place, give its file once for each place. Its lens is then the same
+    unknown at all of them. What several places see must stand still in between. Two places are left and right; tables
+    with a column `camera` name them by the file, as in mast-1 and mast-2.
+
     **Examples**
 
     `kcal rig left.camera.json right.camera.json --pairs left.obs.json right.obs.json -o rig.json`
@@ -218,7 +222,6 @@ def solve_command(
     """
     from kcal.calibrate.rig.solve import RigOptions
     from kcal.corners.observations import Observations
-    from kcal.io.camera_file import load_camera
     from kcal.io.rig_file import save_rig
     from kcal.locate.budget import range_sigmas
     from kcal.locate.mirrored import solve_surveyed
@@ -240,7 +243,7 @@ def solve_command(
         skyline=rig_sources.skyline_options(
             skyline, skyline_images or (), scene, geoid, skyline_sigma, (refraction, refraction_sigma), skyline_picture
         ),
-        names=tuple(path.name.split(".")[0] for path in (left, right)),
+        names=rig_sources.place_names((left, right)),
     )  # fmt: skip
     check_writable(output, left, right, *sources.files)
     needs = required(require)
@@ -263,7 +266,7 @@ def solve_command(
         raise typer.BadParameter("--night is for three cameras and more; give --stars LEFT RIGHT")
     if observations:
         raise typer.BadParameter("--observations is for three cameras and more; give --pairs LEFT RIGHT")
-    calibrated = load_camera(left), load_camera(right)
+    calibrated = rig_sources.load_cameras((left, right))
     rig_sources.check_sides(calibrated, (left, right))
 
     def cure(error: object) -> str:

@@ -416,6 +416,16 @@ class RigReading:
         before = self.sources.get(field)
         self.sources[field] = source if before is None else before + source
 
+    @property
+    def one_camera(self) -> list[str]:
+        """What to say of a camera that was given at several places."""
+        lenses = self.data.lenses
+        return [
+            f"{' and '.join(same)} are one camera that stood at {len(same)} places: its lens is the same unknown"
+            for lens in dict.fromkeys(lenses)
+            if len(same := [name for name, own in zip(self.cameras, lenses, strict=True) if own == lens]) > 1
+        ]
+
     @functools.cached_property
     def data(self) -> RigData:
         """Everything in one frame."""
@@ -425,7 +435,7 @@ class RigReading:
 
     def told(self, result: RigResult) -> list[str]:
         """What there is to say once the rig is solved."""
-        return [*self.notes, *(line for tell in self.tellers for line in tell(result))]
+        return [*self.one_camera, *self.notes, *(line for tell in self.tellers for line in tell(result))]
 
 
 def parse_baselines(text: str, names: Sequence[str] = CAMERAS) -> tuple[Baseline, ...]:
@@ -552,19 +562,30 @@ def read_sources(cameras: Sequence[Camera], sources: Sources) -> RigReading:
 
     if (sources.landmarks is None) != (sources.marks is None):
         raise InputError("--landmarks and --marks belong together: places by name, and where they are in the images")
-    pair = len(cameras) == 2
-    if pair and cameras[0].fingerprint == cameras[1].fingerprint:
-        raise InputError(
-            "both files contain one camera: this is the same camera twice; give two. To calibrate both: "
-            "kcal calibrate left.obs.json right.obs.json -o cameras"
-        )
-    names = CAMERAS if pair else sources.names
+    names = CAMERAS if len(cameras) == 2 else sources.names
     origin = None if sources.origin is None else Origin.parse(sources.origin)
     read = RigReading(cameras=dict(zip(names, cameras, strict=True)), given=sources, origin=origin)
     for option, reader in READERS.items():
         if value := getattr(sources, option):
             reader(read, value)
     return read
+
+
+def load_cameras(paths: Sequence[Path]) -> tuple[Camera, ...]:
+    """Cameras from files; a file given at several places is one `Camera`, whose lens is the same at all of them."""
+    from kcal.io.camera_file import load_camera
+
+    found = {path: load_camera(path) for path in dict.fromkeys(paths)}
+    return tuple(found[path] for path in paths)
+
+
+def place_names(paths: Sequence[Path]) -> tuple[str, ...]:
+    """Names of camera files up to their first dots; NAME-1, NAME-2 ... for a file given at several places."""
+    names = []
+    for number, path in enumerate(paths):
+        name, turn = path.name.split(".")[0], paths[: number + 1].count(path)
+        names.append(f"{name}-{turn}" if paths.count(path) > 1 else name)
+    return tuple(names)
 
 
 def cameras_of_files(paths: Sequence[Path], names: Sequence[str]) -> list[int]:

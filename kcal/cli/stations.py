@@ -122,12 +122,12 @@ def print_rig(result: RigResult, lines: list[str]) -> None:
 
 
 def camera_names(paths: Sequence[Path]) -> tuple[str, ...]:
-    """Names of camera files up to their first dots.
+    """Names of camera files up to their first dots; NAME-1, NAME-2 ... for one file at several places.
 
     Raises:
-        InputError: two of one name.
+        InputError: two files of one name.
     """
-    names = tuple(path.name.split(".")[0] for path in paths)
+    names = rig_sources.place_names(paths)
     for path, name in zip(paths, names, strict=True):
         if names.count(name) > 1:
             raise InputError(f"{path}: two cameras are named {name!r}; rename a file: marks are told apart by them")
@@ -139,7 +139,6 @@ def solve_stations(
     needs: tuple[Requirement, ...] = (), report: Path | None = None, picture: Path | None = None,
 ) -> None:  # fmt: skip
     """Solve one camera, or three and more, write the rig, print how each stands and whether it may be used."""
-    from kcal.io.camera_file import load_camera
     from kcal.io.rig_file import save_rig
     from kcal.locate.mirrored import solve_surveyed
 
@@ -153,7 +152,7 @@ def solve_stations(
             raise InputError(f"{option} is for rigs of two cameras; {instead}")
     check_writable(output, *paths, *sources.files)
     sources = dataclasses.replace(sources, names=names)
-    read = rig_sources.read_sources(tuple(map(load_camera, paths)), sources)
+    read = rig_sources.read_sources(rig_sources.load_cameras(paths), sources)
     with steps("solving the stations", None) as advance:
         result = solve_surveyed(read.data, read.origin, options, advance)
     rig = result.stations(read.origin)

@@ -348,7 +348,7 @@ class TestRig:
                 "they are exchanged",
             ),
             (f"left.camera.json right.camera.json {PAIRS} --match none.csv", "none.csv: cannot read"),
-            (f"left.camera.json left.camera.json {PAIRS}", "the same camera twice"),
+            (f"left.camera.json left.camera.json {PAIRS}", "or these are views of two cameras"),
             ("left.camera.json left.camera.json --pairs left.obs.json left.obs.json", "camera twice"),
             ("left.camera.json right.camera.json --pairs left.obs.json left.obs.json", "camera twice"),
         ],

@@ -15,11 +15,12 @@ from typer.testing import CliRunner, Result
 
 from kcal.cli.demo_practice import _first, _short_meters, _signed
 from kcal.cli.main import app
-from kcal.cli.rig_sources import Sources, parse_baselines, read_sources
+from kcal.cli.rig_sources import Sources, parse_baselines, place_names, read_sources
 from kcal.errors import InputError
 from kcal.io.camera_file import save_camera
 from kcal.io.images import write_png
 from kcal.io.rig_file import save_rig
+from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.rig import Origin, Rig
 
@@ -118,8 +119,15 @@ class TestSources:
         for some in (Sources(landmarks=Path("a")), Sources(marks=Path("a"))):
             with pytest.raises(InputError, match="belong together"):
                 read_sources(CAMERAS, some)
-        with pytest.raises(InputError, match="the same camera twice"):
-            read_sources(CAMERAS[:1] * 2, Sources())
+
+    def test_names_of_places(self) -> None:
+        """A file given several times is one camera at several places."""
+        paths = [Path(f"{name}.camera.json") for name in ("mill", "mast", "mill")]
+        assert place_names(paths) == ("mill-1", "mast", "mill-2")
+        mill = CAMERAS[0].with_parameters(CAMERAS[0].params)
+        mill.calibration = CameraCalibration(name="mill")
+        told = read_sources((mill, CAMERAS[1], mill), Sources(names=place_names(paths))).one_camera
+        assert told == ["mill-1 and mill-2 are one camera that stood at 2 places: its lens is the same unknown"]
 
     def test_baselines(self) -> None:
         (one,) = parse_baselines(" 10.02+-0.005")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -221,11 +222,13 @@ def test_surveys_of_strangers(kcal_data: Path, tmp_path: Path, folder: str, came
 def test_messages(folder: Path) -> None:
     solve(folder)
     three = [f"{name}.camera.json" for name in NAMES[:3]]
+    (folder / "another").mkdir()
+    shutil.copy(folder / "mill.camera.json", folder / "another")
     given = ["--landmarks", "survey.csv", "--marks", "marks.csv", "-o", "x.json"]
     with pytest.raises(FileError, match="no camera is named 'hill'"):
         run(folder, "rig", *three, *given)
     with pytest.raises(InputError, match="two cameras are named 'mill'"):
-        run(folder, "rig", *three, three[0], *given)
+        run(folder, "rig", *three, "another/mill.camera.json", *given)
     with pytest.raises(FileError, match="a rig of 4 cameras; a rig of two is needed"):
         run(folder, "budget", "rig.json")
     text = run(folder, "locate", "rig.json", "smoke.csv", "--yaw-sigma", "0.1").replace("│", " ")

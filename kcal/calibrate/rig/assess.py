@@ -511,6 +511,7 @@ def rig_result(
                 f"anything; {cure}"
             )
     explanations.refuse_exact(problem, data.names, fit.freedom)
+    explanations.refuse_one_place(data, problem, state, covariance)
     widen, doubts = check_places(problem, state, covariance, data.names, refuse=refuse)
     if widen > 1.0:
         covariance = SharedCovariance(problem, state, widen**2 * fit.variance)
@@ -538,7 +539,14 @@ def rig_result(
     if only_boards and (count := int(mask.sum())) < _FEW_BOARDS:
         warnings.append(f"{count} pair(s) only: a wrong one could not be noticed; 5 or more are good")
     focal = [float(camera.params[0]) for camera in data.cameras]
-    warnings = scatter_warnings(focal, work.motion, work.sigma_corner) + warnings
+    scattered = scatter_warnings(focal, work.motion, work.sigma_corner)
+    if refuse and scattered and explanations.one_camera_doubts(data):
+        raise InputError(
+            f"{scattered[0].split(':')[0]}, and one camera saw the boards from two places: boards moved while the "
+            "camera was moved, or these are views of two cameras. Use boards that stand still, leave --pairs out, or "
+            "give the file of each camera"
+        )
+    warnings = scattered + warnings
     if only_boards and rms > _HIGH_RMS and not any(work.motion):
         warnings.append(f"RMS {rms:.2f} px is high: were both views of each pair taken at the same moment?")
     if status not in (SolverStatus.CONVERGED, SolverStatus.EXACT):

@@ -17,10 +17,11 @@ from kcal.calibrate.rig.problem import GoodnessOfFit, RigProblem, goodness_of_fi
 from kcal.calibrate.rig.resection import consensus_pose
 from kcal.calibrate.rig.source import RigState
 from kcal.calibrate.rig.sources import RigData
-from kcal.calibrate.rig.uncertainty import SharedCovariance
+from kcal.calibrate.rig.uncertainty import SharedCovariance, relative_rows
 from kcal.checks import variance_factor
 from kcal.errors import DegenerateError, InputError
 from kcal.solve.lm import LMOptions
+from kcal.texts import measured_length
 
 # Recognize cameras that were mixed up: the same one given twice, or left and right swapped throughout.
 #
@@ -36,6 +37,8 @@ _BEHIND_SIGMAS = 4.0
 _MOST_BEHIND = 9.0
 # Fewer equal pixels may be equal by chance.
 _EQUAL_PIXELS = 4
+# χ² of three degrees of freedom that chance exceeds once in 1000 times.
+_AT_ONE_PLACE = 16.27
 
 
 def refuse_same_camera(data: RigData) -> None:
@@ -50,8 +53,37 @@ def refuse_same_camera(data: RigData) -> None:
             if len(both) >= _EQUAL_PIXELS and torch.equal(both[:, 0], both[:, 1]):
                 raise InputError(
                     f"{data.names[other]} and {data.names[one]} have the same pixels everywhere: this is the same "
-                    "camera twice; give the observations and marks of two cameras"
+                    "camera twice; give the observations and marks of two cameras, or of one camera at two places"
                 )
+
+
+def refuse_one_place(data: RigData, problem: RigProblem, state: RigState, covariance: SharedCovariance) -> None:
+    """Raise `InputError` if one camera was given at two places, and its images come from one and the same."""
+    for second, lens in enumerate(data.lenses):
+        for first in (c for c in range(second) if data.lenses[c] == lens):
+            rows = relative_rows(problem, state, first, second)[3:]
+            shift = state.rotation[second] @ (state.center[first] - state.center[second])
+            known, determined = covariance.of(rows)
+            if bool(determined.all()) and float(shift @ torch.linalg.pinv(known) @ shift) < _AT_ONE_PLACE:
+                apart, sigma = float(shift.norm()), float(known.diagonal().sum().sqrt())
+                raise InputError(
+                    f"{data.names[first]} and {data.names[second]} are one camera at one place: they stand "
+                    f"{measured_length(apart, sigma)} apart, which is no baseline. The images show the same view, or "
+                    "the camera was only turned; give images from two places, or the files of two cameras"
+                )
+
+
+def one_camera_doubts(data: RigData) -> list[str]:
+    """Warn of boards seen by one camera from two places, which it cannot have seen at the same moment."""
+    assert data.boards is not None
+    seen = torch.isfinite(data.boards.pixels).all(-1).any(-1)
+    return [
+        f"{data.names[first]} and {data.names[second]} are one camera at two places, and {count} boards were seen from "
+        "both: this is right only if no board moved while the camera was moved; otherwise leave --pairs out"
+        for second, lens in enumerate(data.lenses)
+        for first in range(second)
+        if data.lenses[first] == lens and (count := int(seen[:, [first, second]].all(-1).sum()))
+    ]
 
 
 def swap_warnings(data: RigData, problem: RigProblem, state: RigState, covariance: SharedCovariance) -> list[str]:

@@ -20,7 +20,12 @@ from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.rig.adjustment import LOSS, ROUGHLY, Adjustment, all_of, possible
 from kcal.calibrate.rig.assess import rig_result
 from kcal.calibrate.rig.boards import MINIMUM_CORNERS, Boards
-from kcal.calibrate.rig.explanations import cost_of_features_behind, explained, refuse_same_camera
+from kcal.calibrate.rig.explanations import (
+    cost_of_features_behind,
+    explained,
+    one_camera_doubts,
+    refuse_same_camera,
+)
 from kcal.calibrate.rig.initial_poses import InitialPoses, first_poses
 from kcal.calibrate.rig.pairs import Pair, evenly, paired_boards, pose_alone
 from kcal.calibrate.rig.result import Reasons, RigResult, records
@@ -117,7 +122,7 @@ _SAME_RMS = 0.25
 
 
 def without_repeated(
-    known: CameraInformation, camera: Camera, boards: Boards, number: int, solver: LMOptions
+    known: CameraInformation, camera: Camera, boards: Boards, places: Sequence[int], solver: LMOptions
 ) -> CameraInformation:
     """What a calibration knows from other views than the rig's.
 
@@ -127,18 +132,23 @@ def without_repeated(
         known: what the calibration knows from all its views.
         camera: the camera, with its calibration.
         boards: of the rig, as they were read.
-        number: of the camera in the rig.
+        places: numbers in the rig of this camera, one for each place where it stood.
         solver: options for poses.
     """
     record = None if camera.calibration is None else camera.calibration.record
-    names = () if boards.views is None else boards.views[number]
-    if record is None or record.noise is None or not names:
+    if record is None or record.noise is None or boards.views is None:
         return known
-    named = torch.tensor([name in record.per_view_rms for name in names])
-    named &= torch.isfinite(boards.pixels[:, number]).all(-1).sum(-1) >= MINIMUM_CORNERS
-    if not bool(named.any()):
+    enough = torch.isfinite(boards.pixels).all(-1).sum(-1) >= MINIMUM_CORNERS
+    used = [
+        (board, place)
+        for place in places
+        for board, name in enumerate(boards.views[place])
+        if name in record.per_view_rms and bool(enough[board, place])
+    ]
+    if not used:
         return known
-    pixels, parameters = boards.pixels[named, number], camera.params.detach()
+    at = tuple(torch.tensor(used).T)
+    pixels, parameters = boards.pixels[at], camera.params.detach()
     sigma = record.noise * math.sqrt(record.tempering or 1.0)
     free = [i for i, slot in enumerate(known.slots) if slot >= 0]
     with_board = known.board_size > 0
@@ -150,14 +160,14 @@ def without_repeated(
         FreeParameters(tuple(free), tuple(known.slots[i] for i in free)),
         shapes=board_modes(boards.board.points).shapes if with_board else pixels.new_zeros(0, 3, pixels.shape[1]),
         free_board=with_board,
-        weights=boards.whitening(sigma)[named, number],
+        weights=boards.whitening(sigma)[at],
     )
     amplitudes = known.estimate[known.lens_size :]
     seen = problem.board_points + torch.einsum("b,bcn->nc", amplitudes, problem.shapes)
     poses, _ = pose_alone(seen, pixels, camera, solver)
     state = BoardState.still(parameters, amplitudes, poses.rotation, poses.translation)
     rms = problem.corner_residuals(state).square().sum(-1).nanmean(-1).sqrt()
-    then = torch.tensor([record.per_view_rms[name] for name, used in zip(names, named.tolist(), strict=True) if used])
+    then = torch.tensor([record.per_view_rms[boards.views[place][board]] for board, place in used])
     same = (rms - then).abs() <= _SAME_RMS * then
     if int(same.sum()) == record.views:
         # Only what was assumed is left.
@@ -218,6 +228,9 @@ def solve_rig(
     and are eliminated. A robust loss finds the solution that most of the data agree on; what contradicts it is left
     out and named; the rest is solved by plain least squares.
 
+    One camera that is moved from place to place is a rig too: give it once for each place. Its lens is then the same
+    unknown at all of them (`RigData.lenses`), and all that several places see must stand still in between.
+
     Args:
         data: see `RigData`.
         options: see `RigOptions`.
@@ -225,7 +238,7 @@ def solve_rig(
 
     Raises:
         InputError: data that contradict each other as a whole, or that have several explanations; a measured baseline
-            or position that contradicts the rest; cameras that are swapped or given twice.
+            or position that contradicts the rest; cameras that are swapped; the same view given as two places.
         DegenerateError: a camera that nothing connects with the others, or relative poses that the data do not
             determine, or determine exactly, so that nothing is left over to check them with, or that may as well be
             others; what could be anything, and what is missing, is named.
@@ -304,30 +317,38 @@ def _first_mask(initial: InitialPoses, *, reject: bool) -> tuple[Tensor, Reasons
 
 def _what_may_change(data: RigData, options: RigOptions) -> tuple[RigData, SharedUnknowns, list[str]]:
     """What may change of cameras, board and air, the data with the board as it is expected, and warnings of it."""
-    boards, doubts = data.boards, []
+    boards, doubts = data.boards, list[str]()
+    # One camera at several places has one lens.
+    places = {lens: [c for c, own in enumerate(data.lenses) if own == lens] for lens in data.lenses}
+    cameras = tuple(data.cameras[lens] for lens in places)
     if options.intrinsics == "prior":
         known = []
-        for number, camera in enumerate(data.cameras):
+        for camera, at in zip(cameras, places.values(), strict=True):
             own = None if camera.calibration is None else camera.calibration.known(camera.params.detach())
             if own is not None and boards is not None:
-                own = without_repeated(own, camera, boards, number, options.solver)
+                own = without_repeated(own, camera, boards, at, options.solver)
             known.append(own)
         if boards is None:
-            unknowns = _lens_unknowns(data.cameras, tuple(camera.fingerprint for camera in data.cameras), tuple(known))
+            unknowns = _lens_unknowns(cameras, tuple(camera.fingerprint for camera in cameras), tuple(known))
         else:
-            parts, apart = gathered(data.cameras, known, boards.board)
+            parts, apart = gathered(cameras, known, boards.board)
+            lenses = list(places)
             measured = boards.deviation is not None
             doubts = [
-                f"the calibrations of {data.names[one]} and {data.names[other]} contradict each other about their "
-                f"board ({boards.board}): two prints, or one that bent in between; calibrate both cameras from views "
-                "of the board in the pairs"
+                f"the calibrations of {data.names[lenses[one]]} and {data.names[lenses[other]]} contradict each other "
+                f"about their board ({boards.board}): two prints, or one that bent in between; calibrate both cameras "
+                "from views of the board in the pairs"
                 for one, other in apart
             ]
-            unknowns, deviation = joint_unknowns(data.cameras, parts, boards.board, measured=measured)
+            unknowns, deviation = joint_unknowns(cameras, parts, boards.board, measured=measured)
             if deviation is not None:
                 data = dataclasses.replace(data, boards=dataclasses.replace(boards, deviation=deviation))
     else:
-        unknowns = held(data.cameras) if options.intrinsics == "fixed" else free(data.cameras, data.names)
+        names = [" and ".join(data.names[c] for c in at) for at in places.values()]
+        unknowns = held(cameras) if options.intrinsics == "fixed" else free(cameras, names)
+    unknowns = unknowns.at_places([list(places).index(lens) for lens in data.lenses])
+    if boards is not None:
+        doubts += one_camera_doubts(data)
     if options.board_warp and boards is not None and not len(unknowns.shapes):
         unknowns = unknowns.and_warp(boards.points)
     if data.absolute:

@@ -25,7 +25,8 @@ class RigData:
     through `sources`; a new one needs a field here and nothing else.
 
     Args:
-        cameras: calibrated, two or more, or one with landmarks; unlike sizes and models are welcome.
+        cameras: calibrated, two or more, or one with landmarks; unlike sizes and models are welcome. One camera that
+            was moved from place to place is given once for each place (`lenses`).
         names: of the cameras.
         boards: see `Boards`.
         landmarks: see `Landmarks`.
@@ -67,6 +68,19 @@ class RigData:
             source.check(count, absolute=self.absolute)
 
     @property
+    def lenses(self) -> tuple[int, ...]:
+        """For each camera, the number of the first one that has the same lens.
+
+        Cameras have the same lens if they are one `Camera` with a calibration, or if their parameters are equal and
+        come from a calibration, as its record says. Two cameras of one type have equal nominal parameters, and two
+        lenses. A lens is one block of unknowns: its data count once, and its errors are the same at all places.
+        """
+        return tuple(
+            next((first for first in range(c) if _same_lens(self.cameras[first], camera)), c)
+            for c, camera in enumerate(self.cameras)
+        )
+
+    @property
     def sources(self) -> tuple[Source, ...]:
         """All that there are, in the order of their fields."""
         values = (getattr(self, field.name) for field in dataclasses.fields(self)[2:])
@@ -92,3 +106,10 @@ class RigData:
     def absolute(self) -> bool:
         """Whether anything places the rig in the local frame; otherwise that is the first camera's."""
         return any(source.absolute for source in self.sources)
+
+
+def _same_lens(one: Camera, other: Camera) -> bool:
+    if one.calibration is None or other.calibration is None:
+        return False
+    measured = one.calibration.record is not None and other.calibration.record is not None
+    return one is other or (measured and one.fingerprint == other.fingerprint)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import math
 from pathlib import Path
@@ -57,7 +58,8 @@ def captured(by_hand: bool, seed: int) -> tuple[Observations, Observations]:
 def solve(by_hand: bool, seed: int, camera: Camera = CAMERA, *, motion: bool = True) -> RigResult:
     left, right = captured(by_hand, seed)
     pairs = [(name, name) for name in left.names]
-    return calibrate_rig(camera, camera, left, right, pairs, RigOptions(motion=motion))
+    # Two cameras of one type, and not one at two places.
+    return calibrate_rig(camera, copy.deepcopy(camera), left, right, pairs, RigOptions(motion=motion))
 
 
 def error(result: RigResult) -> Tensor:
