@@ -16,7 +16,7 @@ import pydantic
 import torch
 from torch import Tensor, nn
 
-from kcal.checks import as_covariance
+from kcal.checks import as_covariance, require_root
 from kcal.dispatch import still
 from kcal.errors import FileError, InputError
 from kcal.io.camera_file import CameraFile, named_camera_file
@@ -24,7 +24,7 @@ from kcal.io.file_summary import RigSummary
 from kcal.io.record import Packed
 from kcal.lens.calibration import RigCalibration
 from kcal.lens.projection import INTRINSICS
-from kcal.lens.rig import REFRACTION, Mounting, Origin, Rig, RigCovariance, pose_doubt
+from kcal.lens.rig import REFRACTION, Mounting, Origin, Rig, RigCovariance
 from kcal.native_file import NativeFile, Record, storing
 
 Triple = tuple[float, float, float]
@@ -161,8 +161,8 @@ class RigFile(NativeFile):
         lenses = sum(len(camera.coefficients) + len(INTRINSICS) for camera in self.cameras)
         sizes = {"half": (self.half, lenses + 6), "root": (self.root, lenses + 6 * len(self.names) + 1)}
         for word, (value, size) in sizes.items():
-            if value is not None and (len(value.shape) != 2 or value.shape[1] != size):
-                raise ValueError(f"{word}: a root (K, {size}) is needed, got the shape {list(value.shape)}")
+            if value is not None:
+                require_root(word, value.tensor(), size)
         known, link = self.known(), None if self.mounting is None else self.mounting.link
         if link is not None:
             if known is None:
@@ -202,8 +202,6 @@ class RigFile(NativeFile):
         rig.covariance = self.known()
         rig.mounting = None if self.mounting is None else self.mounting.mounting()
         rig.calibration = self.calibration
-        if len(rig) == 2 and rig.in_first_frame:
-            pose_doubt(rig.right_from_left_rotation, rig.right_from_left_translation)
         return rig
 
 

@@ -278,7 +278,8 @@ class Rig(Movable, StatedModule):
             raise InputError("right_from_left_translation: as a parameter it must be float64 of shape (3,)")
         if isinstance(right_from_left_rotation, nn.Parameter):
             rotation = right_from_left_rotation
-        pose_doubt(rotation.detach(), translation.detach())
+        if doubt := _pose_doubt(rotation.detach(), translation.detach()):
+            warn_user(doubt)
         return cls([left, right], ("left", "right"), rotation, translation)
 
     @property
@@ -618,22 +619,23 @@ class RigCovariance:
         return as_covariance("covariance of calibration and mounting", whole, size + more)[:size, size:]
 
 
-def pose_doubt(rotation: Tensor, translation: Tensor) -> None:
-    """Warn of a relative pose that is more likely a slip."""
+def _pose_doubt(rotation: Tensor, translation: Tensor) -> str:
+    """Why a relative pose is more likely a slip, or ""."""
     x, y, z = (-translation @ rotation).tolist()
     baseline = math.hypot(x, y, z)
     # Endoscopes have 4 mm. Masts are 10 to 500 m apart; beyond, cameras are stations.
     if baseline and not 1e-3 <= baseline <= 1e3:
-        warn_user(
+        return (
             f"Rig: the baseline is {length_text(baseline)}; the translation must be in meters (T of "
             "cv2.stereoCalibrate has the unit of the board's points)"
         )
     # Side by side, and looking to the same side. One above the other, or facing each other, neither is on the left.
-    elif x < -0.9 * baseline and float(rotation[2, 2]) > 0:
-        warn_user(
+    if x < -0.9 * baseline and float(rotation[2, 2]) > 0:
+        return (
             f"Rig: the right camera stands {length_text(-x)} to the left of the left one: exchanged images, or a "
             "pose left_from_right? points_right = rotation @ points_left + translation is needed"
         )
+    return ""
 
 
 def half_of_covariance(matrix: Tensor) -> Tensor:

@@ -268,7 +268,7 @@ class TestRig:
         assert drawn.err == printed.err
         assert drawn.out.replace("drawn", "plain").replace("wrote rig.png\n", "") == printed.out
         plain, picture = (RigFile.load(cameras / name) for name in ("plain.json", "drawn.json"))
-        assert plain.right_from_left == picture.right_from_left
+        assert plain.poses == picture.poses
         assert plain.calibration is not None
         assert plain.calibration.pairs == (6 if keep_all else 5)
         assert ("warning: board left04.png right04.png: " in printed.err) == keep_all
