@@ -153,9 +153,12 @@ def by_kcal(scene: DemoScene, cameras: tuple[Camera, Camera]) -> Orient:
             return torch.where((found.status == 0)[..., None], enu, torch.nan)
 
         def project(enu: Tensor) -> tuple[Tensor, Tensor]:
-            pixels, valid = rig((enu - solved.center[0]) @ solved.rotation[0].T)
-            (left, right), valid = pixels.unbind(-2), valid.all(-1)
-            return torch.where(valid[:, None], left, torch.nan), torch.where(valid[:, None], right, torch.nan)
+            # By the lenses, not the rig: a pixel outside the image is one too.
+            points = (enu - solved.center[0]) @ solved.rotation[0].T
+            left, known = rig.left.project(points)
+            right, also = rig.right.project(rig.right_from_left(points))
+            valid = (known & also)[:, None]
+            return torch.where(valid, left, torch.nan), torch.where(valid, right, torch.nan)
 
         return place, project
 
@@ -169,6 +172,11 @@ lost: Rig = (
 )
 
 
+def dense(pixels: Tensor) -> Any:
+    """As OpenCV takes points: it refuses one camera's pixels as a view of those of all cameras."""
+    return np.ascontiguousarray(pixels.numpy())
+
+
 def by_opencv(cameras: dict[str, tuple[Any, Any]]) -> Orient:
     """`solvePnP` on the landmarks, `undistortPoints` and `triangulatePoints`, as a user of OpenCV would.
 
@@ -179,14 +187,14 @@ def by_opencv(cameras: dict[str, tuple[Any, Any]]) -> Orient:
     def orient(points: Tensor, left: Tensor, right: Tensor) -> Rig:
         surveyed, poses = points.numpy(), {}
         for side, pixels in zip(SIDES, (left, right), strict=True):
-            matrix, lens = cameras[side]
-            _, turn, shift = cv2.solvePnP(surveyed, pixels.numpy(), matrix, lens, flags=cv2.SOLVEPNP_SQPNP)
-            poses[side] = cv2.solvePnPRefineLM(surveyed, pixels.numpy(), matrix, lens, turn, shift)
+            (matrix, lens), marks = cameras[side], dense(pixels)
+            _, turn, shift = cv2.solvePnP(surveyed, marks, matrix, lens, flags=cv2.SOLVEPNP_SQPNP)
+            poses[side] = cv2.solvePnPRefineLM(surveyed, marks, matrix, lens, turn, shift)
         projections = [np.hstack([cv2.Rodrigues(turn)[0], shift]) for turn, shift in poses.values()]
 
         def place(left: Tensor, right: Tensor) -> Tensor:
             plane = [
-                cv2.undistortPoints(pixels.reshape(-1, 1, 2).numpy(), *cameras[side])[:, 0].T
+                cv2.undistortPoints(dense(pixels.reshape(-1, 1, 2)), *cameras[side])[:, 0].T
                 for side, pixels in zip(SIDES, (left, right), strict=True)
             ]
             homogeneous = cv2.triangulatePoints(projections[0], projections[1], plane[0], plane[1])
