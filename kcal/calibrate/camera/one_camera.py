@@ -11,8 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kcal.calibrate.camera.checks import corners_beyond
 from kcal.calibrate.camera.hybrid import few_views, fit_by_options, hybrid_result, lasting_warnings
 from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult, Progress
+from kcal.calibrate.camera.warnings import outlier_warnings
 from kcal.calibrate.hybrid.evidence import WORTH, with_tempering
 from kcal.calibrate.hybrid.fit import HybridFit
 from kcal.calibrate.hybrid.fitted_views import hybrid_unknowns
@@ -263,6 +265,13 @@ def lenses_by_view(
             own = CalibrationOptions(board=options.board, motion=options.motion, bending=options.bending)
             fit = fit_by_options(seen, pixels, None, None, own, progress)
         found = own_lenses(fit, seen, pixels, own, progress)
+        wrong = [] if found is None else outlier_warnings(seen.names, fit.residuals)
+        if wrong:
+            # One wrong corner would make two cameras of the views.
+            progress("again without corners that noise cannot explain")
+            strays = corners_beyond(fit.residuals)
+            pixels, weights = pixels.masked_fill(strays[..., None], torch.nan), fit.weights.masked_fill(strays, 0.0)
+            found = own_lenses(fit_by_options(seen, pixels, weights, fit, own, progress), seen, pixels, own, progress)
     except (InputError, DegenerateError, ArithmeticError, torch.linalg.LinAlgError):
         return result
     if found is None:
@@ -285,7 +294,7 @@ def lenses_by_view(
     return dataclasses.replace(
         after,
         by_view=among(found.theta, used, len(result.observations.views)),
-        warnings=(*lasting_warnings(result), text, *after.warnings),
+        warnings=(*lasting_warnings(result), text, *wrong, *after.warnings),
         rejected_corners=result.rejected_corners,
         rejected_views=result.rejected_views,
     )
@@ -425,11 +434,13 @@ def _grouped(views: _ByView, mean: Tensor, size: tuple[int, int]) -> Tensor:
 
 def _two_cameras(refits: _Refits, views: _ByView, second: Tensor, nats: float) -> OwnLenses | None:
     """Two groups of views, if two values of θ are likelier than normal ones, which are by so many nats."""
-    refits.step = math.inf
+    refits.step, before = math.inf, second
     for _ in range(_ROUNDS):
         if not _FEWEST_OTHERS <= int(second.sum()) <= len(second) - _FEWEST_OTHERS:
             return None
-        views = refits.with_own(views.best(second)[second.long()], _AHEAD).lens()
+        # Ahead of a view that changed its group it would be in neither one, and change again.
+        ahead = _AHEAD if torch.equal(second, before) else 0.0
+        views, before = refits.with_own(views.best(second)[second.long()], ahead).lens(), second
         changes = views.change(views.best(second)[:, None])
         moved = changes[1] < changes[0]
         if refits.rest and torch.equal(moved, second):
@@ -520,7 +531,7 @@ def _problem(fit: HybridFit, pixels: Tensor, free: FreeParameters | Sequence[int
     return BoardProblem(
         fit.board_points, pixels, fit.model, free, shapes=shapes, free_board=True, weights=fit.weights,
         readout=fit.readout, stillness=None if fit.readout is None else fit.stillness,
-    )  # fmt: skip
+    ).read_as_shown(fit.state._replace(board=shapes.new_zeros(len(shapes))))  # fmt: skip
 
 
 def _evidence_at(fit: HybridFit, tempering: float) -> float:

@@ -232,14 +232,15 @@ class FittedViews:
         precision = torch.where(never, torch.inf, estimate.variance / estimate.deviation.square())
         fixed, still, kept = torch.isinf(precision), estimate.stillness, self._kept
         if kept and kept[0][0] is estimate.model and torch.equal(kept[0][1], fixed):
-            # What corners say at the last state serves under other priors, too.
-            problem = kept[0][2]
+            # What corners say at the last state serves under other priors, too. The first state may show corners many
+            # pixels from where they were read.
+            problem = kept[0][2].read_as_shown(estimate.state, math.sqrt(estimate.amplitudes.variance))
         else:
             problem = hybrid_problem(
                 self.points, self.board.shapes, self.pixels, self.weights, estimate.model, estimate.families.mean,
                 precision, self.readout, still, self.square, self.turning,
             ).read_as_shown(estimate.state)  # fmt: skip
-            kept[:] = [(estimate.model, fixed, problem)]
+        kept[:] = [(estimate.model, fixed, problem)]
         prior = hybrid_prior(estimate.model, len(self.board.shapes), estimate.families.mean, precision, self.square)
         problem = problem.with_priors([prior, *self._told(estimate.model)], still)
         if self.robust:

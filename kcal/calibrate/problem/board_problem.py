@@ -461,8 +461,10 @@ class BoardProblem(BoardImages, SchurProblem[BoardState]):
         changed._kept = []
         return changed
 
-    def read_as_shown(self, state: BoardState) -> BoardProblem:
+    def read_as_shown(self, state: BoardState, beyond: float = 0.0) -> BoardProblem:
         """The same problem with each corner read at the time of the pixel where a state shows it.
+
+        This very problem if no view's times would change by more pixels than `beyond` (RMS).
 
         At the time of the observed pixel, motions would reduce the noise of the corners that set their times: thousands
         of corners would have motions where nothing moves.
@@ -471,8 +473,13 @@ class BoardProblem(BoardImages, SchurProblem[BoardState]):
             return self
         errors = self._errors(state)
         known = errors.isfinite().all(-2)
+        time = torch.where(known, self.readout.time((self._target + errors).mT), self._time)
+        off = torch.where(self._seen, time - self._time, 0.0).square().sum(-1)
+        least = beyond * self.readout.per_pixel
+        if beyond and bool((off <= least * least * self._seen.sum(-1)).all()):
+            return self
         changed = copy.copy(self)
-        changed._time = torch.where(known, self.readout.time((self._target + errors).mT), self._time)
+        changed._time = time
         changed._kept, changed._shown = [], []
         return changed
 

@@ -92,6 +92,11 @@ class Readout:
         """How many numbers a view has beside its pose."""
         return MOTION * self.moves + BENDS * (self.bends is not None)
 
+    @property
+    def per_pixel(self) -> float:
+        """Time in which one row, or column, is read."""
+        return 1.0 / self.size[0 if self.columns else 1]
+
     def time(self, pixels: Tensor) -> Tensor:
         """(...) when pixels (..., 2) were read: -½ at the first edge of the image, ½ at the last; 0 where NaN."""
         axis = 0 if self.columns else 1

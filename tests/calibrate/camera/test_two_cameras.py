@@ -117,6 +117,16 @@ class TestGroups:
         good = calibrate_camera(capture(second=()))
         assert float(result.camera.focal[0]) == pytest.approx(float(good.camera.focal[0]), rel=2e-3)
 
+    def test_one_wrong_corner_makes_no_other_camera(self) -> None:
+        seen = capture(second=())
+        views = list(seen.views)
+        pixels = torch.tensor(views[4].pixels, dtype=torch.float64)
+        pixels[7, 0] += 9.0
+        views[4] = View(name=views[4].name, pixels=tuple(map(tuple, pixels.tolist())))
+        result = calibrate_camera(seen.model_copy(update={"views": tuple(views)}))
+        assert result.rejected_views == ()
+        assert any("corner 7 of view 04 by" in text for text in result.warnings)
+
     def test_parametric_lenses_too(self) -> None:
         with pytest.raises(InputError, match="the views are not of one camera"):
             calibrate_camera(capture(zoomed(1.05)), CalibrationOptions(model="opencv5"))

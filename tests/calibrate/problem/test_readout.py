@@ -504,3 +504,24 @@ def test_motion_is_looked_for_beside_a_fit_of_views_that_stand_still(rate: float
     distance = float(estimate.state.translation.norm(dim=-1).median())
     readout = Readout(center=points.mean(0), distance=distance, size=SIZE)
     assert motion_is_worth(rounds, readout) is worth
+
+
+@pytest.mark.parametrize("columns", [False, True])
+def test_corners_are_read_again_where_a_state_shows_them_elsewhere(columns: bool) -> None:
+    """Not for less than asked for: what is known of a problem would be lost."""
+    camera, points = truth(), BOARD.points - BOARD.points.mean(0)
+    shift = torch.tensor([0.0, 0.0, 0.7], dtype=F64).expand(3, 3)
+    state = BoardState.flat(camera.params.detach(), torch.eye(3, dtype=F64).expand(3, 3, 3), shift)
+    state = state._replace(motion=torch.zeros(3, MOTION, dtype=F64))
+    shown = camera.project(points + shift[:, None])[0].detach()
+    readout = Readout(center=torch.zeros(3, dtype=F64), distance=0.7, size=SIZE, columns=columns)
+    # Of one view alone.
+    problem = BoardProblem(
+        points, shown + torch.tensor([[[0.0]], [[3.0]], [[0.0]]]), camera.model, [0], readout=readout
+    )
+    assert problem.read_as_shown(state, 3.1) is problem
+    for beyond in (0.0, 2.9):
+        again = problem.read_as_shown(state, beyond)
+        assert again is not problem
+        torch.testing.assert_close(again._time, readout.time(shown))
+        assert again.read_as_shown(state, 1e-6) is again
