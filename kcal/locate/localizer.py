@@ -365,7 +365,7 @@ class Localizer(Operations, Movable, StatedModule):
         """Read a rig file; `options` are those of the class, and replace what the file says.
 
         Raises:
-            FileError: see `kcal.load_pair`.
+            FileError: see `kcal.load_rig`; also a file of any other number of cameras than two.
 
         Example:
             >>> import tempfile

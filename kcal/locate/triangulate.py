@@ -176,7 +176,7 @@ class Triangulate(Operations, StatedModule):
         found = fit_views(posed, pixels, seen, noise=self.pixel_sigma, cov=cov, differentiated=differentiated)
         finite = seen & torch.isfinite(pixels).all(-1)
         with torch.no_grad():
-            inside = torch.stack([camera.inside(pixels[..., c, :]) for c, camera in enumerate(posed.cameras)], -1)
+            inside = posed.inside(pixels)
         flags = (
             (found.status == int(PositionStatus.BEARING_ONLY), PositionStatus.NOT_FINITE),
             ((finite & ~found.used).any(-1), PositionStatus.OUTSIDE_LENS),

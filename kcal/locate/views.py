@@ -72,6 +72,10 @@ class PosedCameras(NamedTuple):
         moved = self.rotation @ (self.center[0] - self.center)[..., None]
         return torch.cat([self.rotation, moved], -1)
 
+    def inside(self, pixels: Tensor) -> Tensor:
+        """Which pixels (..., C, 2), one of each camera, are in its image: (..., C) bool."""
+        return torch.stack([camera.inside(pixels[..., c, :]) for c, camera in enumerate(self.cameras)], -1)
+
     @property
     def around(self) -> Surroundings:
         """How light bends, in the cameras' axes."""
@@ -258,7 +262,7 @@ def fit_views(
     in_frame = (rays[..., None, :] @ posed.rotation)[..., 0, :]
     # Weights follow the place where a point is sought first, and derivatives follow them.
     with torch.set_grad_enabled(differentiated and shared is not None):
-        inside = torch.stack([camera.inside(pixels[..., c, :]) for c, camera in enumerate(posed.cameras)], -1)
+        inside = posed.inside(pixels)
         used = wanted & valid & inside & sound
         code = torch.full(used.shape[:-1], int(PositionStatus.OK), dtype=torch.int8, device=used.device)
         count = used.sum(-1)

@@ -52,9 +52,9 @@ def seen_landmarks(rig: Rig, count: int, random: np.random.Generator) -> Iterato
         at = torch.tensor([[random.uniform(0.1, 0.9) * width, random.uniform(0.2, 0.8) * height]], dtype=torch.float64)
         rays, _ = rig.left.unproject(at)
         point = 10 ** random.uniform(1.8, 3.3) * rays
-        pixels, valid = rig(point)
-        (left, right), valid = pixels.unbind(-2), valid.all(-1)
-        if bool(valid) and bool(rig.left.inside(left).all() & rig.right.inside(right).all()):
+        pixels, seen = rig(point)
+        left, right = pixels.unbind(-2)
+        if bool(seen.all()):
             found += 1
             yield torch.stack([point[0, 0], point[0, 2], -point[0, 1]]), torch.cat([left, right])
 

@@ -145,7 +145,7 @@ def measure(data: Path, folder: Path, words: list[str]) -> Iterator[tuple[str, N
         yield "stations", stations(folder)
     for observations in sorted((data / "captures").glob("*.obs.json")):
         name = f"camera {observations.name.removesuffix('.obs.json')}"
-        # These are refused: there is no camera to compare.
+        # This one is refused: there is no camera to compare.
         if wanted(name) and name != "camera lanhp_l":
             yield name, camera_numbers(calibrated(observations, folder))
     for pair in ("st1", "gavin"):

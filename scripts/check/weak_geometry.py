@@ -115,7 +115,7 @@ def drawn(kind: str, seed: int) -> tuple[Rig, Landmarks, dict[str, Any]]:
     truth = Rig.pair(TRUTH.left, TRUTH.right, TRUTH.right_from_left_rotation, scale * TRUTH.right_from_left_translation)
     pixels, seen = truth(points)
     (left, right), seen = pixels.unbind(-2), seen.all(-1)
-    seen &= truth.left.inside(left) & truth.right.inside(right) & (points[:, 2] > 30.0)
+    seen &= points[:, 2] > 30.0
     kept = seen.nonzero()[:count, 0]
     exact = Landmarks(
         names=tuple(f"post {i}" for i in range(len(kept))),
@@ -144,7 +144,6 @@ def judged(truth: Rig, found: RigResult, draw: Draw, widen: float = 1.0) -> tupl
     far = torch.tensor(RANGES, dtype=torch.float64)[:, None]
     pixels, seen = truth(far[..., None] * rays)
     (left, right), seen = pixels.unbind(-2), seen.all(-1)
-    seen &= truth.left.inside(left) & truth.right.inside(right)
     # Neither that of the landmarks nor another with each call.
     noise = MARK * Draw(draw.seed + 500).normal(2, *left.shape)
     solved = found.stereo()
