@@ -14,7 +14,7 @@ import typer
 
 from kcal.cli.console import err, on_signals, steps
 from kcal.cli.inputs import RIG, VIDEO, PixelSigma, pixel_sigma_of
-from kcal.cli.settings import rarely, taken
+from kcal.cli.settings import rarely, settings_file, taken
 from kcal.errors import InputError, with_extra
 from kcal.files import check_writable
 from kcal.texts import measured_text
@@ -250,7 +250,7 @@ def _mast(rig: Path, origin: str | None, heading: float | None, pixel_sigma: flo
     known, place = load_pair(rig), None if origin is None else Origin.parse(origin)
     if known.mounting is not None and {"origin", "heading"} <= taken:
         place = heading = None
-        err.print("the position of the rig is that in its file, not that in kcal.toml")
+        err.print(f"the position of the rig is that in its file, not that in {settings_file()}", markup=False)
     noise = pixel_sigma_of(pixel_sigma, known)
     localize = Localizer(known, weights="marks", origin=place, heading_deg=heading, pixel_sigma=noise)
     return localize, PointLocator(localize).located()

@@ -14,7 +14,7 @@ import typer
 
 from kcal.cli.console import err, mark_again, out, print_table, print_wrote, steps, warn, with_command
 from kcal.cli.inputs import MARKS, RIG, SURVEY, PixelSigma, pixel_sigma_and_source
-from kcal.cli.settings import rarely, taken
+from kcal.cli.settings import rarely, settings_file, taken
 from kcal.cli.stations import parse_height
 from kcal.errors import DegenerateError, InputError
 from kcal.files import check_picture, check_writable, written_files
@@ -290,7 +290,7 @@ def _of_pairs(solved: Rig, own: LocateOptions, noise: float) -> tuple[PointLocat
     if solved.mounting is not None and {"origin", "heading"} <= taken:
         # What the rig was solved with is better known.
         place = heading = None
-        err.print("the position of the rig is that in its file, not that in kcal.toml")
+        err.print(f"the position of the rig is that in its file, not that in {settings_file()}", markup=False)
     if place is not None and heading is not None and own.grid is not None:
         heading = true_from_grid(heading, place, own.grid)
 

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import difflib
 import inspect
+import os
+import shlex
 import sys
 import tomllib
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -15,7 +18,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from kcal.cli.console import err, print_wrote
 from kcal.errors import FileError, InputError
-from kcal.files import check_writable, read_bytes, write_atomic
+from kcal.files import check_writable, is_stream, read_bytes, write_atomic
 
 # Commands that have subcommands and do their main work without one.
 
@@ -32,7 +35,7 @@ def group_with_default(command: str) -> type[TyperGroup]:
     return DefaultGroup
 
 
-# Settings of a folder: `kcal.toml`, written by `kcal init`, gives options of the commands that are run there.
+# Settings of a folder: `kcal.toml`, written by `kcal init`, gives options of the commands that are run there or below.
 
 NAME = "kcal.toml"
 _MOST_BYTES = 2**20
@@ -86,32 +89,52 @@ SETTINGS = {
 }
 
 
+def settings_file(folder: str | Path = ".") -> Path:
+    """The nearest kcal.toml: that of the folder or of one that it lies in, up to the root of its file system.
+
+    Where there is none, it is the one that `kcal init` would write.
+    """
+    shown = Path(folder)
+    with suppress(OSError):  # where the folder itself was removed meanwhile
+        for place in (shown.resolve(), *shown.resolve().parents):
+            if os.path.isfile(shown / NAME):
+                return shown / NAME
+            if os.path.ismount(place):
+                break
+            shown /= ".."
+    return Path(folder, NAME)
+
+
 def read_settings(folder: str | Path = ".") -> dict[str, Any]:
-    """The settings of a folder by name; none if it has no kcal.toml.
+    """The settings of a folder by name; none if neither it nor a folder that it lies in has a kcal.toml.
 
     Raises:
         FileError: not TOML, an unknown key, or a value of another type.
     """
-    path = Path(folder, NAME)
+    path = settings_file(folder)
     if not path.is_file():
         return {}
     try:
         content = tomllib.loads(read_bytes(path, _MOST_BYTES).decode("utf-8-sig"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise FileError(f"{NAME}: not TOML: {error}. To write a new one: kcal init --force") from error
-    return {key: _checked_setting(key, value) for key, value in content.items()}
+        again = shlex.join(["kcal", "init", *([] if path.parent == Path() else [str(path.parent)]), "--force"])
+        raise FileError(f"{path}: not TOML: {error}. To write a new one: {again}") from error
+    found = {key: _checked_setting(key, value, path) for key, value in content.items()}
+    if not is_stream(found.get("camera", "camera:0")):  # a folder of images, which is named from where the file is
+        found["camera"] = os.path.join(os.path.relpath(path.parent, folder), found["camera"]).removeprefix("./")
+    return found
 
 
-def _checked_setting(key: str, value: Any) -> Any:
+def _checked_setting(key: str, value: Any, path: Path) -> Any:
     if key not in SETTINGS:
         near = difflib.get_close_matches(key, SETTINGS, 1, 0.0)[0]
-        raise FileError(f"{NAME}: unknown key {key[:40]!r}; did you mean {near}? Known are {', '.join(SETTINGS)}")
+        raise FileError(f"{path}: unknown key {key[:40]!r}; did you mean {near}? Known are {', '.join(SETTINGS)}")
     wanted = SETTINGS[key].kind
     # An integer of TOML may be larger than any float.
     number = wanted is float and type(value) in (int, float) and abs(value) <= sys.float_info.max
     if not number and (wanted is float or not isinstance(value, str)):
         what = "a number" if wanted is float else "a text in quotation marks"
-        raise FileError(f"{NAME}: {key} must be {what}, for example {key} = {SETTINGS[key].example}")
+        raise FileError(f"{path}: {key} must be {what}, for example {key} = {SETTINGS[key].example}")
     return wanted(value)
 
 
@@ -127,20 +150,20 @@ def defaults_of(settings: dict[str, Any]) -> dict[str, Any]:
     return found
 
 
-def settings_text(values: dict[str, Any]) -> str:
+def settings_text(values: dict[str, Any], path: Path) -> str:
     """What was taken from the file, in one line.
 
     Example:
-        >>> settings_text({"size": "9x6", "pixel_sigma": 0.1})
-        'from kcal.toml: board 9x6, pixel_sigma 0.1'
+        >>> settings_text({"size": "9x6", "pixel_sigma": 0.1}, Path("../kcal.toml"))
+        'from ../kcal.toml: board 9x6, pixel_sigma 0.1'
     """
     keys = {parameter: key for key, setting in SETTINGS.items() for _, parameter in setting.takers}
-    return f"from {NAME}: {', '.join(f'{keys[name]} {value}' for name, value in values.items())}"
+    return f"from {path}: {', '.join(f'{keys[name]} {value}' for name, value in values.items())}"
 
 
 def toml_text(given: dict[str, Any]) -> str:
     """A kcal.toml with these settings; all others stand in it as comments."""
-    lines = ["# Options of kcal's commands in this folder; what is typed goes first.", ""]
+    lines = ["# Options of kcal's commands in this folder and those below; what is typed goes first.", ""]
     for key, setting in SETTINGS.items():
         value = given.get(key)
         lines.append(f"# {setting.about}")
@@ -200,7 +223,7 @@ class Command(TyperCommand):
         taken.clear()
         taken.update(names)
         if names:
-            err.print(settings_text({name: ctx.params[name] for name in names}), markup=False)
+            err.print(settings_text({name: ctx.params[name] for name in names}, settings_file()), markup=False)
         return super().invoke(ctx)
 
 
@@ -225,10 +248,11 @@ def init_command(
     force: Annotated[bool, typer.Option("--force", help="Write anew a file that is there.")] = False,
     **given: Any,
 ) -> None:
-    """Write a kcal.toml: board, camera and site, which the commands that are run in this folder then know.
+    """Write a kcal.toml: board, camera and site, which the commands that are run in this folder or below then know.
 
     What is typed on a command line goes before what the file says, and each command says in one line what it took from
-    it. Without options all lines are comments, to be filled in by hand.
+    it. A folder's own file replaces that of a folder above. Without options all lines are comments, to be filled in by
+    hand.
 
     **Examples**
 

@@ -253,6 +253,28 @@ def test_commands_take_what_is_not_typed_and_say_so(folder: Path) -> None:
     assert defaults_of({"pixel_sigma": 0.25})["rig"]["check"] == {"pixel_sigma": 0.25}
 
 
+def test_the_file_of_a_folder_above_is_used_and_named(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    Path("kcal.toml").write_text(toml_text({"board": "9x6", "square": "25mm", "camera": "frames"}))
+    Path("shots", "left").mkdir(parents=True)
+    monkeypatch.chdir("shots/left")
+    printed = kcal("board", "-o", "board.svg")
+    assert "board.svg: 9x6 inner corners, 25 mm squares" in printed.stdout
+    assert "from ../../kcal.toml: board 9x6, square 25mm\n" in printed.stderr
+    # Folders are named from where the file is.
+    assert read_settings()["camera"] == "../../frames"
+    assert read_settings(folder)["camera"] == "frames"
+    # The nearest file alone counts.
+    Path("../kcal.toml").write_text("bord = 1")
+    with pytest.raises(FileError, match=r"^\.\./kcal\.toml: unknown key"):
+        read_settings()
+    Path("../kcal.toml").write_text("bord")
+    with pytest.raises(FileError, match=r"kcal init \.\. --force"):
+        read_settings()
+    # What lies beyond the root of a file system belongs to others.
+    monkeypatch.setattr("os.path.ismount", lambda path: path == folder / "shots" / "left")
+    assert read_settings() == {}
+
+
 def test_the_position_of_a_rig_goes_before_that_of_the_folder(folder: Path) -> None:
     plain = kcal("locate", "rig.json", "points.csv").stdout
     Path("kcal.toml").write_text(toml_text({"origin": "1,2,3", "heading": 4.0}))
