@@ -9,6 +9,7 @@ import shlex
 import signal
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
+from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,7 +17,7 @@ import orjson
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Task, TextColumn
 from rich.text import Text
 
 from kcal.errors import DegenerateError, InputError, KcalError
@@ -36,6 +37,16 @@ class _PlainConsole(Console):
     def render_str(self, text: str, **options: Any) -> Text:
         """Called by `print` for every text."""
         return super().render_str(visible(text), **options)
+
+    def print(self, *texts: Any, **options: Any) -> None:
+        """Print, above the line that shows the progress if there is one."""
+        shown = self is out and _line.live.is_started  # that of the error stream does so by itself
+        if shown:
+            _line.stop()
+        super().print(*texts, **options)
+        # A pager that reads the output has the terminal from now on.
+        if shown and self.is_terminal:
+            _line.start()
 
 
 out = _PlainConsole(soft_wrap=True, highlight=False, emoji=False)
@@ -73,6 +84,7 @@ def with_json(command: Callable[..., None]) -> Callable[..., None]:
                 command(*arguments, **options)
             except typer.Exit as stopped:
                 code = stopped.exit_code
+        end_line()
         print(orjson.dumps({"exit_code": code, **_told, "text": captured.get().splitlines()}).decode())
         raise typer.Exit(code)
 
@@ -119,12 +131,12 @@ def print_table(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> 
 
 def print_answer(yes: bool, text: str) -> None:
     """Print a yes or no, and why."""
-    out.print(f"[bold]{'YES' if yes else 'NO'}[/]:", end=" ")
-    out.print(text, markup=False)
+    out.print(f"[bold]{'YES' if yes else 'NO'}[/]: {escape(text)}")
 
 
 def show_page(address: str, what: str, *, browser: bool) -> None:
     """Print the address of a local page, and open it in the browser if that is wanted."""
+    _line.stop()
     out.print(f"{what}: {address}", markup=False, soft_wrap=True)
     if browser:
         import webbrowser
@@ -143,29 +155,80 @@ def on_signals(stop: Callable[..., object]) -> Iterator[None]:
             signal.signal(number, handler)
 
 
+class _Left(ProgressColumn):
+    """How many steps are done of how many, and the time that is left; of unknown many, the time that has passed."""
+
+    def render(self, task: Task) -> Text:
+        """The text at the end of the line."""
+        if task.total is None:
+            return Text(str(timedelta(seconds=int(task.elapsed or 0.0))))
+        left = "" if task.time_remaining is None else f", {timedelta(seconds=int(task.time_remaining))} left"
+        return Text(f"{task.completed:.0f}/{task.total:.0f}{left}")
+
+
+class _Bar(BarColumn):
+    def render(self, task: Task) -> Any:
+        return "" if task.total is None else super().render(task)
+
+
+# At the foot of a terminal: what the command does now, how much of it is done, and what is left.
+_line = Progress(
+    SpinnerColumn(),
+    TextColumn("{task.description}"),
+    _Bar(),
+    _Left(),
+    console=err,
+    transient=True,
+    redirect_stdout=False,
+    redirect_stderr=False,
+    refresh_per_second=5,
+)
+
+
+def end_line() -> None:
+    """Take the line of the progress away for good, where the output is a terminal to which something else writes."""
+    if out.is_terminal:
+        _line.stop()
+        for task in _line.tasks:
+            _line.update(task.id, visible=False)
+
+
+@contextmanager
+def working(command: str) -> Iterator[None]:
+    """Show on a terminal, from the first moment, that a command works, and what it does (`steps`); "" for none."""
+    if not (command and err.is_terminal and err.is_interactive):
+        yield
+        return
+    task = _line.add_task(f"kcal {command}", total=None)
+    _line.start()
+    try:
+        yield
+    finally:
+        _line.stop()
+        _line.remove_task(task)
+
+
 @contextmanager
 def steps(description: str, total: int | None) -> Iterator[Callable[..., None]]:
     """Show a progress bar on the error stream: call the value with a text, and how many if not one, after each step."""
-    bar = Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        console=err,
-        transient=True,
-        disable=not err.is_terminal,
-    )
+    before = [task.id for task in _line.tasks if task.visible]
     # Long work: meanwhile the garbage collector need not search the imported libraries, which takes 50 ms each time.
     gc.freeze()
+    for other in before:
+        _line.update(other, visible=False)
+    task = _line.add_task(description, total=total)
+    if before:
+        _line.start()
     try:
-        with bar:
-            task = bar.add_task(description, total=total)
 
-            def advance(text: str, by: int = 1) -> None:
-                bar.update(task, advance=by, description=f"{description}: {escape(one_line(text))}")
+        def advance(text: str, by: float = 1) -> None:
+            _line.update(task, advance=by, description=f"{description}: {escape(one_line(text))}")
 
-            yield advance
+        yield advance
     finally:
+        _line.remove_task(task)
+        for other in before:
+            _line.update(other, visible=True)
         gc.unfreeze()
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from kcal.cli.console import board_words, ending_with, err, out, steps, tell, warn
+from kcal.cli.console import board_words, ending_with, out, steps, tell, warn
 from kcal.cli.inputs import IMAGES, BoardSize, Refine, RefineMethod, SquareSide, typed, typed_with
 from kcal.errors import FileError, InputError
 from kcal.files import check_picture, check_writable, is_stream, source_name
@@ -100,7 +100,7 @@ def detect_command(
             nonlocal searched
             searched += 1
 
-        with err.status(f"watching {streams[0]} for {duration:g} s" if streams else "searching the video"):
+        with steps(f"watching {streams[0]} for {duration:g} s" if streams else "searching the video", None):
             observations = detect_video(
                 images[0], board, refine.value, progress=count, time_limit=time_limit, duration=duration, keep=keep
             )

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from kcal.cli.console import err, mark_again, out, print_table, print_wrote, steps, warn, with_command
+from kcal.cli.console import end_line, err, mark_again, out, print_table, print_wrote, steps, warn, with_command
 from kcal.cli.inputs import MARKS, RIG, SURVEY, PixelSigma, pixel_sigma_and_source
 from kcal.cli.settings import rarely, settings_file, taken
 from kcal.cli.stations import parse_height
@@ -122,6 +122,7 @@ def tell_located(
             "geoid": located.geoid,
             "written": list(map(str, written)),
         }
+        end_line()
         print(json.dumps(summary, indent=1))
     elif streamed:
         err.print(counts_text(sample.count, sample.statuses), markup=False)
@@ -479,6 +480,8 @@ def locate_command(
     suffix = f".{stream_format}"
     if streamed and (as_json or outputs.count(STREAM) > 1):
         raise typer.BadParameter("-o - takes the standard output for itself; leave out --json and a second -o -")
+    if streamed:
+        end_line()
     for path in outputs:
         if path == STREAM:
             check_format(f"positions{suffix}")

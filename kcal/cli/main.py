@@ -20,7 +20,7 @@ from kcal.cli.calibrate import calibrate_command
 from kcal.cli.capture import capture_command
 from kcal.cli.check import check_command
 from kcal.cli.compare import bake_command, compare_command, diff_command, interpolate_command
-from kcal.cli.console import err, option_for_each, with_json
+from kcal.cli.console import err, option_for_each, with_json, working
 from kcal.cli.demo import demo_command
 from kcal.cli.detect import detect_command
 from kcal.cli.exchange import export_command, import_command, schema_command
@@ -67,8 +67,10 @@ class _Commands(TyperGroup):
             return super().make_context(name, words, *rest, **options)
 
     def invoke(self, ctx: Any) -> Any:
+        # Help and the version come at once.
+        name = " ".join(word for word in inputs.typed[:1] if not {"--help", "--help-all"} & set(inputs.typed))
         # Typer ends an interrupted command without a word.
-        with usage_errors_shown(), written_files() as written:
+        with usage_errors_shown(), written_files() as written, working(name):
             try:
                 return super().invoke(ctx)
             except KeyboardInterrupt:

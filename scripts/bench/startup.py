@@ -1,16 +1,22 @@
-"""CPU seconds and large libraries of each command: `python -m scripts.bench.startup`.
+"""CPU seconds and large libraries of each command: `python -m scripts.bench.startup [FOLDER COMMAND...]`.
 
 `--help` of every command, and commands on small files that compute little. Seconds are those of user and system of the
 child process, because wall time depends on what else the machine does.
+
+With a folder and commands, each in quotation marks: how long each is silent on a terminal, at first and at most.
 """
 
 from __future__ import annotations
 
+import contextlib
+import os
 import resource
+import shlex
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import NamedTuple
 
 import kcal
 from kcal.cli.main import app
@@ -31,6 +37,38 @@ def measure(arguments: list[str], folder: Path, code: str = "try: main()") -> tu
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     return seconds, done.returncode, sorted(done.stderr.splitlines()[-1].split())
+
+
+class Terminal(NamedTuple):
+    """What a command wrote on a terminal; CPU seconds to the first character, between two of them, and in all."""
+
+    code: int
+    text: str
+    first: float
+    silent: float
+    seconds: float
+
+
+def on_terminal(words: list[str], folder: Path) -> Terminal:
+    """Run a command on a terminal of its own (Linux)."""
+    import pty
+
+    child, terminal = pty.fork()
+    if not child:
+        os.chdir(folder)
+        own = {"TERM": "xterm", "COLUMNS": "120", "LINES": "40"}
+        os.execve(sys.executable, [sys.executable, "-m", "kcal", *words], os.environ | own)
+    times, text = [0.0], b""
+    with contextlib.suppress(OSError):  # the terminal of a process that has ended
+        while data := os.read(terminal, 2**16):
+            used = Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()
+            times.append(sum(map(int, used[11:15])) / os.sysconf("SC_CLK_TCK"))
+            text += data
+    os.close(terminal)
+    _, status, used_in_all = os.wait4(child, 0)
+    seconds = used_in_all.ru_utime + used_in_all.ru_stime
+    gaps = [after - before for before, after in zip(times, [*times[1:], seconds], strict=True)]
+    return Terminal(os.waitstatus_to_exitcode(status), text.decode(errors="replace"), gaps[0], max(gaps), seconds)
 
 
 def helps() -> list[list[str]]:
@@ -73,6 +111,12 @@ def commands(folder: Path) -> list[list[str]]:
 
 def main() -> None:
     """Print the table."""
+    if len(sys.argv) > 2:
+        print("first character, longest silence, end: CPU s  exit  command")
+        for line in sys.argv[2:]:
+            found = on_terminal(shlex.split(line), Path(sys.argv[1]))
+            print(f"{found.first:5.2f}  {found.silent:5.2f}  {found.seconds:6.2f}  {found.code:4}  {line}", flush=True)
+        return
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         print("CPU s  exit  command  (large libraries that it loaded)")

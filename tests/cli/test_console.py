@@ -30,7 +30,7 @@ from kcal.cli.settings import SETTINGS, defaults_of, read_settings, toml_text
 from kcal.errors import FileError
 from kcal.files import write_atomic
 from kcal.io.rig_file import save_rig
-from scripts.bench.startup import helps, measure
+from scripts.bench.startup import helps, measure, on_terminal
 
 # What reaches the terminal is shown and does nothing else; errors are one line.
 
@@ -369,6 +369,30 @@ def test_a_command_loads_what_it_computes_with_and_no_more(line: str, libraries:
     _, code, loaded = measure(line.split(), start_folder)
     assert code in (0, 3)
     assert loaded == libraries.split()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_a_terminal_shows_that_a_command_works_and_then_no_more_of_it(start_folder: Path) -> None:
+    shown = on_terminal(["diff", "left.json", "left.json"], start_folder)
+    assert shown.code == 0
+    # Long before what it computes with is loaded.
+    assert shown.first < 0.5 * shown.seconds
+    before, _, after = shown.text.partition("difference at infinity")
+    assert "kcal diff" in before
+    assert "kcal diff" not in after.rpartition("\x1b[2K")[2]
+    # JSON is not written beside it, nor help below it.
+    shown = on_terminal(["budget", "--json"], start_folder)
+    assert json.loads(shown.text.rpartition("\x1b[2K")[2])["exit_code"] == 0
+    assert "kcal budget  0:" not in on_terminal(["budget", "--help"], start_folder).text
+    # Nor is any of it in what others capture.
+    done = subprocess.run(
+        [sys.executable, "-m", "kcal", "diff", "left.json", "left.json"],
+        cwd=start_folder,
+        capture_output=True,
+        text=True,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "\x1b" not in done.stdout
 
 
 @pytest.mark.parametrize(
