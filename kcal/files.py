@@ -258,11 +258,11 @@ def check_picture(path: str | Path) -> None:
     """Raise an error now if `path` could not be written as a picture later.
 
     Raises:
-        InputError: a suffix other than .png and .svg.
+        InputError: a suffix other than .png, .svg and .pdf.
         FileError: the file cannot be written.
     """
-    if Path(path).suffix.lower() not in (".png", ".svg"):
-        raise InputError(f"{path}: the name of a picture must end with .png or .svg")
+    if Path(path).suffix.lower() not in (".png", ".svg", ".pdf"):
+        raise InputError(f"{path}: the name of a picture must end with .png, .svg or .pdf")
     check_writable(path)
 
 

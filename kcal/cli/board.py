@@ -10,9 +10,9 @@ import typer
 
 from kcal.cli.console import out, print_wrote, steps, warn, with_json
 from kcal.cli.inputs import OBSERVATIONS, BoardSize, SquareSide, with_inputs
-from kcal.cli.settings import Command, group_with_default
+from kcal.cli.settings import Command, group_with_default, picture_option
 from kcal.errors import InputError
-from kcal.files import check_picture, check_writable, write_atomic
+from kcal.files import check_writable, write_atomic
 
 app = typer.Typer(
     cls=group_with_default("print"), rich_markup_mode="markdown", help="Draw a board to print, and measure it later."
@@ -83,9 +83,7 @@ def measure_command(
         list[Path], typer.Argument(metavar="OBS...", help="Observations files of one or several cameras."), OBSERVATIONS
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="Board file to write.")],
-    picture: Annotated[
-        Path | None, typer.Option(help="PNG file to write: heights as colors, print errors as arrows.")
-    ] = None,
+    picture: Annotated[Path | None, picture_option("heights as colors, print errors as arrows.")] = None,
 ) -> None:
     """Measure a printed board: how it bends, and how its print errs, each with its σ.
 
@@ -104,8 +102,6 @@ def measure_command(
     from kcal.report.figures import save_picture
 
     check_writable(output, *observations)
-    if picture is not None:
-        check_picture(picture)
     sets = [Observations.load(path) for path in observations]
     names = [path.name.split(".")[0] for path in observations]
     if len(set(names)) < len(names):

@@ -174,8 +174,9 @@ def calibrate_command(
     picture: Annotated[
         Path | None,
         typer.Option(
-            help="PNG file to write: coverage, where the camera is uncertain, residuals, RMS of each view; of several "
-            "cameras, NAME.png in this folder."
+            metavar="FILE",
+            help="Picture to write (.png, .svg or .pdf): coverage, where the camera is uncertain, residuals, RMS of "
+            "each view. Of several cameras: a folder, for a NAME.png of each.",
         ),
     ] = None,
     verbose: Annotated[bool, rarely("", "Print every parameter with its σ.", "--verbose")] = False,

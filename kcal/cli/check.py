@@ -14,8 +14,9 @@ from kcal.cli.console import err, out, print_answer, print_table, print_wrote, s
 from kcal.cli.inputs import CALIBRATED, OBSERVATIONS
 from kcal.cli.report import NO
 from kcal.cli.rig_sources import check_views_of
+from kcal.cli.settings import picture_option
 from kcal.errors import FileError, InputError
-from kcal.files import check_picture, check_writable, read_bytes, write_atomic
+from kcal.files import check_writable, read_bytes, write_atomic
 
 if TYPE_CHECKING:
     from kcal.calibrate.camera.interval_check import IntervalCheck, Refit
@@ -47,7 +48,7 @@ def check_command(
         OBSERVATIONS,
     ] = None,
     refits: Annotated[int, typer.Option(min=10, max=100_000, help="Captures to simulate.")] = 100,
-    picture: Annotated[Path | None, typer.Option(metavar="PNG", help="Map of where the intervals hold.")] = None,
+    picture: Annotated[Path | None, picture_option("how often the intervals contain the truth.")] = None,
     output: Annotated[
         Path | None,
         typer.Option("-o", "--output", metavar="NPZ", help="Refits that are done; CAMERA.check.npz if not given."),
@@ -76,8 +77,6 @@ def check_command(
     """
     name = camera.name.removesuffix(".json").removesuffix(".camera")
     kept = check_writable(output or camera.with_name(f"{name}.check.npz"), camera)
-    if picture is not None:
-        check_picture(picture)
 
     from kcal.calibrate.camera.interval_check import FEWEST, interval_check
 

@@ -11,9 +11,10 @@ import typer
 from kcal.cli.calibrate import named_numbers, stated_settings
 from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
 from kcal.cli.inputs import ANY_CAMERA, CALIBRATED, CAMERA, OBSERVATIONS, calibrated_camera, single_camera
+from kcal.cli.settings import picture_option
 from kcal.errors import InputError
-from kcal.files import check_picture, check_writable
-from kcal.texts import number_text
+from kcal.files import check_writable, write_atomic
+from kcal.texts import csv_line, number_text
 
 if TYPE_CHECKING:
     from kcal.lens.camera import Camera
@@ -32,6 +33,10 @@ def compare_command(
         str, typer.Option(metavar="KIND", help="Hold out blocks of views together, or views one by one.")
     ] = "blocks",
     parts: Annotated[int, typer.Option(min=2, help="Number of times that a part of the groups is held out.")] = 5,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="CSV", help="The same numbers, to write.")
+    ] = None,
+    picture: Annotated[Path | None, picture_option("held-out RMS of each model with its standard error.")] = None,
 ) -> None:
     """Compare lens models on views that were held out. A tool for research: calibrating needs no model to choose.
 
@@ -41,12 +46,19 @@ def compare_command(
     **Example**
 
     `kcal compare left.obs.json --model hybrid opencv5 opencv14`
+
+    `kcal compare left.obs.json --model hybrid opencv14 -o models.csv --picture models.png`
     """
     if groups not in ("blocks", "views"):
         raise InputError(f"--groups {groups}: write blocks or views")
     names = [*(model or []), *(models or [])]
     if not names:
         raise InputError("name the models to compare, for example --model hybrid opencv5 opencv14")
+
+    if output is not None:
+        if output.suffix.lower() != ".csv":
+            raise InputError(f"{output}: the name of a table must end with .csv")
+        check_writable(output, observations)
 
     from kcal.calibrate.camera.at_setting import compare_models
     from kcal.corners.observations import Observations
@@ -58,14 +70,21 @@ def compare_command(
         )
     count = len(result.corners)
     out.print(f"{len(seen.views)} views; held out in {count} groups, {parts} parts; RMS per corner")
-    ranking = sorted(result.rms.items(), key=lambda entry: entry[1])
-    best = ranking[0][0]
     rows = [["model", "held-out RMS, px", "more than the best, px", "± standard error"]]
-    for name, rms in ranking:
-        more, error = result.difference(name, best)
-        cells = ["", ""] if name == best else [number_text(more, error), number_text(error, error)]
+    lines = [csv_line(["model", "held_out_rms_px", "more_than_best_px", "standard_error_px"])]
+    for place, (name, rms, more, error) in enumerate(result.ranking):
+        cells = [number_text(more, error), number_text(error, error)] if place else ["", ""]
         rows.append([name, number_text(rms, digits=4), *cells])
+        lines.append(csv_line([name, rms, *((more, error) if place else (None, None))]))
     print_table(rows)
+    if output is not None:
+        write_atomic(output, "".join(lines))
+    if picture is not None:
+        from kcal.report.calibration import models_figure
+        from kcal.report.figures import save_picture
+
+        save_picture(picture, models_figure(result, observations.name))
+    print_wrote(output, picture)
     for name, reason in result.failures.items():
         warn(f"{name} could not be fitted to some of the views: {reason}")
 
@@ -86,7 +105,7 @@ def diff_command(
     turn: Annotated[
         bool, typer.Option("--turn/--no-turn", help="Turn the second camera until it agrees best with the first.")
     ] = True,
-    picture: Annotated[Path | None, typer.Option(metavar="PNG", help="Map of the difference and of its sigma.")] = None,
+    picture: Annotated[Path | None, picture_option("maps of the difference and of its σ.")] = None,
 ) -> None:
     """Compare two calibrations of a camera: are they the same within their uncertainty?
 
@@ -103,8 +122,6 @@ def diff_command(
 
     from kcal.lens.difference import camera_difference, difference_text
 
-    if picture is not None:
-        check_picture(picture)
     cameras = [single_camera(source) for source in (first, second)]
     for source, camera in zip((first, second), cameras, strict=True):
         out.print(f"{source}: {_history(camera)}", markup=False)

@@ -12,8 +12,9 @@ from rich.markup import escape
 
 from kcal.cli.console import board_words, ending_with, out, steps, tell, warn
 from kcal.cli.inputs import IMAGES, BoardSize, Refine, RefineMethod, SquareSide, typed, typed_with
+from kcal.cli.settings import picture_option
 from kcal.errors import FileError, InputError
-from kcal.files import check_picture, check_writable, is_stream, source_name
+from kcal.files import check_writable, is_stream, source_name
 
 if TYPE_CHECKING:
     from kcal.corners.board import Board
@@ -36,13 +37,9 @@ def detect_command(
     refine: RefineMethod = Refine.erf,
     gallery: Annotated[
         Path | None,
-        typer.Option(
-            help="PNG file to write: images that failed and why, then the views with their corners, worst first."
-        ),
+        picture_option("images that failed and why, then the views with their corners, worst first.", "--gallery"),
     ] = None,
-    coverage: Annotated[
-        Path | None, typer.Option(help="PNG file to write: where in the image corners were seen.")
-    ] = None,
+    coverage: Annotated[Path | None, picture_option("where in the image corners were seen.", "--coverage")] = None,
     time_limit: Annotated[
         float,
         typer.Option(
@@ -73,10 +70,6 @@ def detect_command(
     """
     from kcal.corners.board import Board
 
-    pictures = [path for path in (gallery, coverage) if path is not None]
-    if pictures:
-        for path in pictures:
-            check_picture(path)
     check_writable(output)
     board = Board.parse(size, square)
 
@@ -124,7 +117,7 @@ def detect_command(
         turned = turned_images([path for path in paths if os.path.isfile(path)])
         source = f"of {len(paths)} images"
     observations.save(output)
-    if pictures:
+    if gallery is not None or coverage is not None:
         from kcal.report.calibration import FailedImage, coverage_figure, gallery_figure
         from kcal.report.figures import save_picture
 

@@ -11,8 +11,9 @@ import typer
 
 from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
 from kcal.cli.inputs import CAMERA_OR_RIG, FOREIGN, cameras_and_rig, named_source, parse_size, picked
+from kcal.cli.settings import picture_option
 from kcal.errors import InputError
-from kcal.files import check_picture, check_writable, write_atomic
+from kcal.files import check_writable, write_atomic
 
 if TYPE_CHECKING:
     from kcal.lens.camera import Camera
@@ -41,9 +42,7 @@ def export_command(
     model: Annotated[
         str | None, typer.Option(metavar="NAME", help="Lens model of the format to fit, for example opencv5.")
     ] = None,
-    picture: Annotated[
-        Path | None, typer.Option(metavar="PNG", help="Picture of the error of a refitted lens over the image.")
-    ] = None,
+    picture: Annotated[Path | None, picture_option("error of a refitted lens over the image.")] = None,
 ) -> None:
     """Write a camera or a rig for another program.
 
@@ -70,8 +69,6 @@ def export_command(
 
     from kcal.calibrate.camera.export import export_cameras
 
-    if picture is not None:
-        check_picture(picture)
     found, rig = cameras_and_rig(path)
     alone = name is not None or len(found.cameras) == 1
     chosen = picked(found, name, source) if alone else rig or found.cameras

@@ -14,10 +14,10 @@ import typer
 
 from kcal.cli.console import end_line, err, mark_again, out, print_table, print_wrote, steps, warn, with_command
 from kcal.cli.inputs import MARKS, RIG, SURVEY, PixelSigma, pixel_sigma_and_source
-from kcal.cli.settings import rarely, settings_file, taken
+from kcal.cli.settings import picture_option, rarely, settings_file, taken
 from kcal.cli.stations import parse_height
 from kcal.errors import DegenerateError, InputError
-from kcal.files import check_picture, check_writable, written_files
+from kcal.files import check_writable, written_files
 from kcal.texts import one_line
 
 if TYPE_CHECKING:
@@ -422,7 +422,7 @@ def locate_command(
         str, rarely("NAME", "Format of `-o -`: csv, geojson, geojsonl, kml or cot.", "--format")
     ] = "csv",
     as_json: Annotated[bool, typer.Option("--json", help="Print a summary as JSON in place of the table.")] = False,
-    picture: Annotated[Path | None, typer.Option(help="PNG file to write: the map and the intervals.")] = None,
+    picture: Annotated[Path | None, picture_option("a plan and the intervals.")] = None,
     web_map: Annotated[
         Path | None, typer.Option("--map", help="HTML file to write: an interactive map that needs no network.")
     ] = None,
@@ -488,8 +488,6 @@ def locate_command(
             continue
         check_format(path)
         check_writable(path, rig, points, *([truth] if truth else []))
-    if picture is not None:
-        check_picture(picture)
     if web_map is not None:
         from kcal.report.map_page import check_map_format
 

@@ -14,11 +14,11 @@ import kcal.cli.rig_sources as rig_sources
 from kcal.cli.console import err, out, print_table, print_wrote, warn
 from kcal.cli.inputs import MARKS, RIG, SURVEY, PixelSigma, pixel_sigma_of
 from kcal.cli.report import NO, REQUIRE_HELP, judged_sides, required, side_pictures, stored_tables, told_usable
-from kcal.cli.settings import Command, group_with_default, rarely
+from kcal.cli.settings import Command, group_with_default, picture_option, rarely
 from kcal.cli.stars import TIME_HELP, NightOptions, images_of_nights
 from kcal.cli.stations import print_rig, rig_lines, solve_stations
 from kcal.errors import InputError
-from kcal.files import check_picture, check_writable, write_atomic
+from kcal.files import check_writable, write_atomic
 
 if TYPE_CHECKING:
     from kcal.calibrate.rig.landmarks import Landmarks
@@ -127,7 +127,9 @@ def solve_command(
         list[str] | None, rarely("NAME=IMAGES", rig_sources.IMAGES_HELP, "--skyline-images")
     ] = None,
     skyline_sigma: Annotated[float | None, rarely("M", rig_sources.SIGMA_HELP, "--skyline-sigma", min=0)] = None,
-    skyline_picture: Annotated[Path | None, rarely("", rig_sources.PICTURE_HELP, "--skyline-picture")] = None,
+    skyline_picture: Annotated[
+        Path | None, picture_option(rig_sources.PICTURE_HELP, "--skyline-picture", hidden=True)
+    ] = None,
     night: Annotated[
         list[str] | None,
         rarely(
@@ -182,7 +184,7 @@ def solve_command(
     refraction_sigma: Annotated[float, rarely("K", "Its standard deviation; 0 holds it.", min=0)] = 0.1,
     keep_all: Annotated[bool, rarely("", "Leave nothing out; only warn.", "--keep-all")] = False,
     board_warp: Annotated[bool, rarely("", "Also estimate how the board bends.", "--board-warp")] = False,
-    picture: Annotated[Path | None, rarely("", "A .png or .svg file: a plan, and residuals.")] = None,
+    picture: Annotated[Path | None, picture_option("a plan, and residuals.", hidden=True)] = None,
 ) -> None:
     """Solve a rig: where the right camera stands from the left, and where both, or any number, stand on the Earth.
 
@@ -249,8 +251,6 @@ def solve_command(
     needs = required(require)
     if report is not None:
         check_writable(report, left, right, *sources.files)
-    if picture is not None:
-        check_picture(picture)
     if not any(
         (pairs, landmarks, marks, features, positions, baseline, stars, scene, tracks, observations, night, skyline)
     ):
@@ -309,9 +309,9 @@ def solve_command(
         console.warn(f"range errors are not split: {error}")
     console.print_wrote(output, picture)
     if needs or report is not None:
+        from kcal.report.figures import picture_bytes
         from kcal.report.judge_rig import named_cameras, rig_verdict
         from kcal.report.rig import rig_figure
-        from kcal.report.verdict_pictures import png_bytes
 
         sides = pairs if pairs is not None and _calibrated_from(rig, pairs) else ()
         cameras = judged_sides(named_cameras(rig), sides, noise)
@@ -323,7 +323,7 @@ def solve_command(
         console.tell(verdict=verdict.to_dict())
 
         def drawn() -> dict[str, bytes]:
-            return {"rig": png_bytes(rig_figure(result)), **side_pictures(cameras)}
+            return {"rig": picture_bytes(rig_figure(result)), **side_pictures(cameras)}
 
         if not told_usable(verdict, drawn, tables, report):
             raise typer.Exit(NO)

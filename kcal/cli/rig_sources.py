@@ -14,7 +14,6 @@ from kcal.cli.console import err, steps, warn
 from kcal.cli.inputs import typed_with
 from kcal.cli.stars import NightOptions, read_stars
 from kcal.errors import InputError
-from kcal.files import check_picture
 from kcal.texts import measured_text
 
 if TYPE_CHECKING:
@@ -139,7 +138,7 @@ SKYLINE_HELP = (
 )
 IMAGES_HELP = "Images of the skyline by a camera: file, folder or quoted wildcard; once for each camera."
 SIGMA_HELP = "Of a height of the --skyline raster; 2 is a 30 m raster from satellites, 0.3 one from lidar."
-PICTURE_HELP = "A .png or .svg file: the raster's skyline over each image, and what is left."
+PICTURE_HELP = "the raster's skyline over each image, and the residuals."
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -188,8 +187,6 @@ def skyline_options(
         found = dict(zip(("left", "right"), scene, strict=True))
     if not found:
         raise InputError("--skyline needs images: --skyline-images IMAGES, or NAME=IMAGES once for each camera")
-    if picture is not None:
-        check_picture(picture)
     known = {} if sigma is None else {"sigma": sigma, "offset": 0.5 * sigma}
     error = RasterError(refraction=refraction[0], refraction_sigma=refraction[1], **known)
     return SkylineOptions(raster=raster, images=found, geoid=geoid or 0.0, error=error, picture=picture)

@@ -18,7 +18,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from kcal.cli.console import err, print_wrote
 from kcal.errors import FileError, InputError
-from kcal.files import check_writable, is_stream, read_bytes, write_atomic
+from kcal.files import check_picture, check_writable, is_stream, read_bytes, write_atomic
 
 # Commands that have subcommands and do their main work without one.
 
@@ -184,6 +184,18 @@ def _toml(value: Any) -> str:
 def rarely(metavar: str, about: str, *flags: str, panel: str | None = None, **more: Any) -> Any:
     """An option that few people need: `--help-all` shows it."""
     return typer.Option(*flags, metavar=metavar or None, help=about, hidden=True, rich_help_panel=panel, **more)
+
+
+def picture_option(about: str, *flags: str, hidden: bool = False) -> Any:
+    """An option for a picture to write; a name that no picture can have is refused before anything is computed."""
+
+    def checked(path: Path | None) -> Path | None:
+        if path is not None:
+            check_picture(path)
+        return path
+
+    about = f"Picture to write (.png, .svg or .pdf): {about}"
+    return typer.Option(*flags, metavar="FILE", help=about, hidden=hidden, callback=checked)
 
 
 class Command(TyperCommand):

@@ -10,10 +10,11 @@ import typer
 
 from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
 from kcal.cli.inputs import RIG, SITES, PixelSigma, pixel_sigma_of
+from kcal.cli.settings import picture_option
 from kcal.cli.stars import print_star_budget
 from kcal.errors import InputError
 from kcal.file_kind import file_kind
-from kcal.files import check_picture, check_writable, write_atomic
+from kcal.files import check_writable, write_atomic
 from kcal.texts import length_text, range_text
 
 if TYPE_CHECKING:
@@ -60,7 +61,7 @@ def sites_command(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="CSV file to write: the map, one line for each point.")
     ] = None,
-    picture: Annotated[Path | None, typer.Option(help="A .png or .svg file: the map.")] = None,
+    picture: Annotated[Path | None, picture_option("the map.")] = None,
 ) -> None:
     """Where to put the next camera: a map of what towers see and how well they locate it, and candidates in order.
 
@@ -85,7 +86,6 @@ def sites_command(
     if output is not None:
         check_writable(output, *inputs)
     if picture is not None:
-        check_picture(picture)
         check_writable(picture, *inputs)
     if (terrain is None) == (ground is None):
         raise InputError("give --terrain, or --ground with the height of level ground above the ellipsoid; one of them")
@@ -209,7 +209,7 @@ def budget_command(
     speed: Annotated[
         float, typer.Option(metavar="M/S", help="Speed of the target along the baseline, meters a second.", min=0)
     ] = 20.0,
-    picture: Annotated[Path | None, typer.Option(help="PNG file to write: a plot of the errors.")] = None,
+    picture: Annotated[Path | None, picture_option("a plot of the errors.")] = None,
     stars: Annotated[bool, typer.Option("--stars", help="Also: how many stars, and what they give.")] = False,
     aperture: Annotated[
         float, typer.Option(metavar="MM", help="Of --stars: diameter of the lens's opening, focal length / f-number.")
@@ -245,8 +245,6 @@ def budget_command(
     from kcal.locate.budget import BudgetErrors, planned_rig, range_errors, range_sigmas, usual_ranges
     from kcal.report.tables import range_sigma_rows
 
-    if picture is not None:
-        check_picture(picture)
     chosen = planned_rig(focal_px=focal, baseline_m=baseline) if rig is None else load_pair(rig)
     noise = pixel_sigma_of(pixel_sigma, None if rig is None else chosen)
     disparity = math.sqrt(2.0) * noise

@@ -12,6 +12,7 @@ import typer
 
 from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
 from kcal.cli.inputs import IMAGES, single_camera
+from kcal.cli.settings import picture_option
 from kcal.errors import InputError, KcalError
 from kcal.files import check_writable
 
@@ -437,9 +438,7 @@ def stars_command(
     hectopascal: Annotated[
         float | None, typer.Option(metavar="HPA", help="Pressure at the camera; standard air if not given.")
     ] = None,
-    picture: Annotated[
-        Path | None, typer.Option(help="A .png or .svg file: the first image that has names, with them.")
-    ] = None,
+    picture: Annotated[Path | None, picture_option("the first image that has names, with them.")] = None,
 ) -> None:
     """Name the stars of night images, and find how the camera looks.
 
@@ -458,10 +457,6 @@ def stars_command(
     from kcal.stars.night import clock_doubts, name_stars
     from kcal.stars.sky import StarCatalog
 
-    if picture is not None:
-        from kcal.report.figures import check_picture
-
-        check_picture(picture)
     files = expand_nights(images)
     if picture is not None:
         check_writable(picture, *files)

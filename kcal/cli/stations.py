@@ -14,6 +14,7 @@ import kcal.cli.rig_sources as rig_sources
 from kcal.cli.console import err, out, print_table, print_wrote, steps, tell
 from kcal.cli.inputs import ASSUMED, CALIBRATED, MARKS, SURVEY, PixelSigma
 from kcal.cli.report import NO, stored_tables, told_usable
+from kcal.cli.settings import picture_option
 from kcal.errors import InputError
 from kcal.files import check_writable
 from kcal.texts import length_text, measured_length, measured_text, number_text
@@ -171,14 +172,14 @@ def solve_stations(
     _print_stations(result, rig, read.told(result))
     print_wrote(output, picture)
     if needs or report is not None:
+        from kcal.report.figures import picture_bytes
         from kcal.report.judge_rig import rig_verdict
         from kcal.report.rig import rig_figure
-        from kcal.report.verdict_pictures import png_bytes
 
         subject = output.name.split(".")[0]
         verdict = rig_verdict(rig, needs, mark_sigma=sources.mark_sigma, result=result, subject=subject)
         tell(verdict=verdict.to_dict())
-        if not told_usable(verdict, lambda: {"rig": png_bytes(rig_figure(result))}, stored_tables(rig), report):
+        if not told_usable(verdict, lambda: {"rig": picture_bytes(rig_figure(result))}, stored_tables(rig), report):
             raise typer.Exit(NO)
 
 
@@ -268,7 +269,7 @@ def station_command(
     skyline_sigma: Annotated[
         float | None, typer.Option("--skyline-sigma", metavar="M", help=rig_sources.SIGMA_HELP, min=0)
     ] = None,
-    skyline_picture: Annotated[Path | None, typer.Option("--skyline-picture", help=rig_sources.PICTURE_HELP)] = None,
+    skyline_picture: Annotated[Path | None, picture_option(rig_sources.PICTURE_HELP, "--skyline-picture")] = None,
     geoid: Annotated[
         float | None, typer.Option(metavar="M", help="Height of the geoid above the WGS84 ellipsoid, for --skyline.")
     ] = None,

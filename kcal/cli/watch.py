@@ -13,8 +13,9 @@ import typer
 from kcal.cli.console import err, on_signals, out, print_wrote, warn
 from kcal.cli.inputs import RIG
 from kcal.cli.rig import DRIFTED, print_turns
+from kcal.cli.settings import picture_option
 from kcal.errors import InputError, with_extra
-from kcal.files import check_picture, check_writable
+from kcal.files import check_writable
 from kcal.texts import measured_text
 
 if TYPE_CHECKING:
@@ -59,7 +60,9 @@ def watch_command(
         Path | None,
         typer.Option(metavar="JSON", help="Rig file to write at the end, if the history proves the old one wrong."),
     ] = None,
-    picture: Annotated[Path | None, typer.Option(help="PNG file to write at the end: attitudes with bands.")] = None,
+    picture: Annotated[
+        Path | None, picture_option("the attitude over time and its 95 % intervals, at the end.")
+    ] = None,
 ) -> None:
     """Watch how the cameras of a rig turn, from what they see, and keep a history with the sigma of every moment.
 
@@ -93,8 +96,6 @@ def watch_command(
     if history.suffix.lower() != ".csv":
         raise typer.BadParameter(f"--history {history}: a name that ends with .csv is needed")
     check_writable(history, rig)
-    if picture is not None:
-        check_picture(picture)
     if relock is not None:
         check_writable(relock, rig, history)
     hooks = [Webhook(address) for address in alarm or [] if address != _EXIT]

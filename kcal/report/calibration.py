@@ -21,6 +21,7 @@ from torch import Tensor
 
 import kcal.report.figures as figures
 from kcal.calibrate.camera.advice import reached, unreached_share
+from kcal.calibrate.camera.at_setting import ComparisonResult
 from kcal.calibrate.camera.calibrate import CameraCalibrationResult
 from kcal.calibrate.camera.export import Misfit
 from kcal.calibrate.camera.interval_check import IntervalCheck
@@ -245,6 +246,24 @@ def board_figure(board: MeasuredBoard) -> Figure:
     axes.spines[["top", "right"]].set_visible(False)
     head = [f"{board.name}: {board.board}", *board_text(board), f"arrows: displacement in the plane x {scale:g}"]
     figure.text(0.08, 1.0 - 0.12 / figure.get_figheight(), "\n".join(head), va="top", fontsize=9, color=figures.INK)
+    return figure
+
+
+def models_figure(compared: ComparisonResult, title: str = "") -> Figure:
+    """Draw the held-out RMS of each model, the best first, with the standard error of its difference from the best."""
+    ranked = [entry for entry in compared.ranking if math.isfinite(entry[1])]
+    names, rms, _, error = zip(*ranked, strict=True)
+    figure = figures.new_figure(7.6, 1.5 + 0.45 * len(ranked), layout="constrained")
+    axes = figure.add_subplot()
+    axes.axvline(rms[0], color=figures.FAINT, linewidth=0.8)
+    axes.errorbar(rms, range(len(ranked)), xerr=error, fmt="o", color=figures.ACCENT, capsize=4)
+    axes.set_yticks(range(len(ranked)), names)
+    axes.set(
+        ylim=(len(ranked) - 0.5, -0.5),
+        xlabel="held-out RMS, px (bars: ± standard error of the difference from the best)",
+    )
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.set_title(title, fontsize=11, loc="left")
     return figure
 
 

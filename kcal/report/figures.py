@@ -1,4 +1,4 @@
-"""Shared parts of all pictures: colors, axes of an image, magnified arrows, and PNG or SVG files written whole."""
+"""Shared parts of all pictures: colors, axes of an image, magnified arrows, and files written whole."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ INK, GRAY, FAINT, ACCENT, WARN = "#111827", "#4b5563", "#9aa3af", "#2b6cb0", "#c
 CAMERA_COLORS = ("#2b6cb0", "#dd7a1f", "#0f766e", "#7c3aed")
 
 
-# Shared parts of all pictures: colors, axes of an image, magnified arrows, and PNG or SVG files written whole.
+# Shared parts of all pictures: colors, axes of an image, magnified arrows, and files written whole.
 
 # White around text that lies on lines.
 HALO = [patheffects.withStroke(linewidth=2.5, foreground="white")]
@@ -68,9 +68,9 @@ def _shown(text: str) -> str:
     return visible(text)[:2000]
 
 
-def new_figure(width: float, height: float, dpi: int = 130) -> PlainFigure:
+def new_figure(width: float, height: float, dpi: int = 130, layout: Any = None) -> PlainFigure:
     """Make a figure of that many inches that belongs to no window and no global state."""
-    figure = PlainFigure(figsize=(width, height), dpi=dpi, facecolor="white")
+    figure = PlainFigure(figsize=(width, height), dpi=dpi, facecolor="white", layout=layout)
     FigureCanvasAgg(figure)
     return figure
 
@@ -158,10 +158,10 @@ def draw_north(axes: Axes, x: float) -> None:
 
 
 def save_picture(path: str | Path, figure: Figure) -> Path:
-    """Write a figure as PNG or SVG, as the suffix says, atomically.
+    """Write a figure as PNG, SVG or PDF, as the suffix says, atomically.
 
     Raises:
-        InputError: a suffix other than .png and .svg.
+        InputError: a suffix other than .png, .svg and .pdf.
         FileError: the file cannot be written.
 
     Example:
@@ -171,9 +171,13 @@ def save_picture(path: str | Path, figure: Figure) -> Path:
         'empty.svg'
     """
     check_picture(path)
+    return write_atomic(path, picture_bytes(figure, Path(path).suffix.lower()[1:]))
+
+
+def picture_bytes(figure: Figure, kind: str = "png") -> bytes:
+    """A figure as PNG, SVG or PDF."""
     data = io.BytesIO()
-    # The same figure makes the same bytes: an SVG has neither a date nor random names.
+    # The same figure makes the same bytes: no file has a date, and an SVG no random names.
     with rc_context({"svg.hashsalt": "kcal"}):
-        kind = Path(path).suffix.lower()[1:]
-        figure.savefig(data, format=kind, metadata={"Date": None} if kind == "svg" else None)
-    return write_atomic(path, data.getvalue())
+        figure.savefig(data, format=kind, metadata={"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind))
+    return data.getvalue()

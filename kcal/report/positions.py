@@ -607,7 +607,7 @@ def save_site_sketch(path: str | Path, image: NDArray[np.uint8], landmarks: Name
     """Write a picture with named landmarks and targets.
 
     Args:
-        path: of the .png or .svg file.
+        path: of the .png, .svg or .pdf file.
         image: (H, W, 3) of the site.
         landmarks: names, and pixels (N, 2).
         targets: the same of what is to be located.

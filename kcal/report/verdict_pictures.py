@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from kcal.calibrate.camera.advice import board_tilts
 from kcal.calibrate.camera.result import CameraCalibrationResult
@@ -22,18 +20,11 @@ from kcal.report.calibration import (
     draw_uncertainty,
     draw_view_rms,
 )
-from kcal.report.figures import ACCENT, FAINT, INK, WARN, new_figure
+from kcal.report.figures import ACCENT, FAINT, INK, WARN, new_figure, picture_bytes
 from kcal.report.verdict import FAULTS, RangeAnswer
 from kcal.texts import range_text
 
 _PART_COLORS = {"marks": ACCENT, "lenses": "#dd7a1f", "relative pose": "#0f766e", FAULTS: WARN}
-
-
-def png_bytes(figure: Figure) -> bytes:
-    """A figure as PNG."""
-    data = io.BytesIO()
-    figure.savefig(data, format="png")
-    return data.getvalue()
 
 
 def camera_pictures(result: CameraCalibrationResult, examination: Examination | None = None) -> dict[str, bytes]:
@@ -51,14 +42,14 @@ def camera_pictures(result: CameraCalibrationResult, examination: Examination | 
     if examination is not None:
         for half in examination.halves:
             title = f"Difference of cameras from halves: {half.label}"
-            found.setdefault("halves", png_bytes(difference_figure(half.difference, title)))
+            found.setdefault("halves", picture_bytes(difference_figure(half.difference, title)))
             if not half.alike and (half.difference.probability or 0.0) < 1e-3:
-                found["halves"] = png_bytes(difference_figure(half.difference, title))
+                found["halves"] = picture_bytes(difference_figure(half.difference, title))
         if examination.model is not None:
-            found["model"] = png_bytes(difference_figure(examination.model, "Difference from the hybrid lens"))
+            found["model"] = picture_bytes(difference_figure(examination.model, "Difference from the hybrid lens"))
     board = ((examination and examination.reference) or result).measured_board
     if board is not None and bool(board.amplitudes.any()):
-        found["board"] = png_bytes(board_figure(board))
+        found["board"] = picture_bytes(board_figure(board))
     return found
 
 
@@ -94,14 +85,14 @@ def range_picture(answers: Sequence[RangeAnswer]) -> bytes:
         frameon=False, fontsize=8.5, loc="upper center", bbox_to_anchor=(0.5, 1.0 + 0.35 / len(answers)), ncols=4
     )
     figure.tight_layout()
-    return png_bytes(figure)
+    return picture_bytes(figure)
 
 
 def _drawn(draw: Callable[[Axes], None], height: float) -> bytes:
     figure = new_figure(6.4, height, dpi=110)
     draw(figure.add_subplot())
     figure.tight_layout()
-    return png_bytes(figure)
+    return picture_bytes(figure)
 
 
 def _draw_poses(axes: Axes, result: CameraCalibrationResult) -> None:

@@ -206,8 +206,22 @@ class TestCompare:
         assert held_out - table[lowest][0] == pytest.approx(more, abs=2e-4)
         assert sigma > 0
 
+    def test_table_and_picture(self, run: Run) -> None:
+        observations(8, tilt=0.5).save("a.obs.json")
+        command = "compare a.obs.json --model pinhole opencv4 --groups views --parts 2 -o m.csv --picture m.svg"
+        code, shown, error = run(*command.split())
+        assert (code, error) == (0, "")
+        first, other = csv.DictReader(Path("m.csv").read_text().splitlines())
+        assert [first["model"], other["model"]] == [line.split()[0] for line in shown.splitlines()[2:4]]
+        assert first["more_than_best_px"] == first["standard_error_px"] == ""
+        more, error_px = float(other["more_than_best_px"]), float(other["standard_error_px"])
+        assert float(other["held_out_rms_px"]) - float(first["held_out_rms_px"]) == pytest.approx(more, rel=1e-12)
+        assert more > 0 < error_px
+        assert Path("m.svg").read_bytes().startswith(b"<?xml")
+
     def test_bad_input(self, run: Run) -> None:
         observations(5, tilt=0.5).save("a.obs.json")
+        refused(run("compare", "a.obs.json", "--model", "opencv5", "-o", "m.txt"), "must end with .csv")
         refused(run("compare", "a.obs.json"), "name the models", "--model")
         refused(run("compare", "a.obs.json", "--model", "opencv5", "--groups", "days"), "blocks or views")
         refused(run("compare", "a.obs.json", "--model", "opencv6"), "unknown lens model 'opencv6'")

@@ -496,7 +496,7 @@ class TestVerdictPictures:
     @pytest.fixture(autouse=True)
     def _figures(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Figures in place of their PNG."""
-        monkeypatch.setattr("kcal.report.verdict_pictures.png_bytes", lambda figure: figure)
+        monkeypatch.setattr("kcal.report.verdict_pictures.picture_bytes", lambda figure: figure)
 
     def test_bars_are_shares_of_the_variance(self) -> None:
         needs = (Requirement(distance=1000.0, meters=50.0), Requirement(distance=5000.0, meters=500.0))

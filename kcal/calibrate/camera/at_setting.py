@@ -526,6 +526,12 @@ class ComparisonResult:
         values = (self.costs.sum(-1) / self.corners.sum()).sqrt()
         return dict(zip(self.models, values.tolist(), strict=True))
 
+    @property
+    def ranking(self) -> list[tuple[str, float, float, float]]:
+        """The best first: name, RMS, how much more that is than the best, and the standard error of the difference."""
+        order = sorted(self.rms.items(), key=lambda entry: entry[1])
+        return [(name, rms, *self.difference(name, order[0][0])) for name, rms in order]
+
     def difference(self, one: str, other: str) -> tuple[float, float]:
         """RMS of one model minus that of another, and its standard error over groups, pixels.
 
