@@ -154,6 +154,8 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
         page.meta["hide"] = ["navigation", "toc"]  # the picture gets their place
     if page.file.src_uri in PYTHON or page.file.src_uri.startswith("reference/changelog"):
         page.meta["search"] = {"boost": 0.3}  # what explains is found before what lists
+    if page.file.src_uri == "howto/opencv.md":
+        page.meta["search"] = {"boost": 2}  # K and D are OpenCV's before they are the beginning of a word
     if page.file.src_uri in PYTHON:
         return with_descriptions(PYTHON[page.file.src_uri], markdown)
     if page.file.src_uri in {f"reference/{name.lower()}" for name in OUTSIDE}:

@@ -213,3 +213,21 @@ def test_a_script_writes_each_table(page: Path) -> None:
     folders = {path.parent for path, script in scripts.items() if f'"{page.name}"' in script}
     own = [script for path, script in scripts.items() if path.parent in folders]
     assert [name for name in sections if not any(f'"{name}"' in script for script in own)] == []
+
+
+def test_how_often_intervals_are_right_is_one_figure_of_the_whole_chain() -> None:
+    """The table of `scripts.check.chain` gives it; the other pages link to it and state no other one."""
+    text = (ROOT / "docs" / "measured" / "chain.md").read_text(encoding="utf-8")
+    cells = [line.split(" | ")[7] for line in text.splitlines() if " | default-prior | " in line]
+    ends = [cell.split(" to ") for cell in cells]
+    figure = f"{min(low for low, _ in ends)} to {max(high for _, high in ends)} %"
+    assert f"{figure} of the intervals contain the true range" in text
+    stated = {
+        page: re.findall(r"\[(\d[\d.]* to \d[\d.]* %)\]\([./a-z]*chain\.md", page.read_text("utf-8")) for page in PAGES
+    }
+    assert {found for each in stated.values() for found in each} == {figure}
+    assert {"README.md", "guide.md", "survey.md", "paper.md"} <= {page.name for page, found in stated.items() if found}
+    other = [page for page in PAGES if page.parent.name != "measured" and page.name != "CHANGELOG.md"]
+    assert [
+        page for page in other if re.search(r"9\d[\d.]* to 9\d[\d.]* % of (the|cases)", page.read_text("utf-8"))
+    ] == []

@@ -265,7 +265,7 @@ def several_rigs(counts: Sequence[int]) -> list[str]:
     """Rigs of CAMERAS VIEWS, CAMERAS VIEWS...; the smallest first, as memory is told by its peak."""
     rows = [row for pair in zip(counts[::2], counts[1::2], strict=True) for row in many(*pair)]
     heads = ["cameras x views", "program", "CPU s", "of it one by one", "peak MB", "RMS error of centers mm"]
-    return table([*heads, "after the best turn of all", "of attitudes °"], rows)
+    return table([*heads, "after the best-fit rotation of all", "of attitudes °"], rows)
 
 
 def _errors(rig: Rig, rotation: Tensor, center: Tensor) -> list[str]:

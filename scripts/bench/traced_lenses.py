@@ -8,7 +8,7 @@
 Truth: three lenses of `kcal.sim.raytrace`, decentered by their tolerances, whose entrance pupil moves as in life
 (`wander` 1); views of the paper's board (6 x 7 corners, 5 cm), exact or printed (stretch 0.15 %, shear 0.02 %,
 bent along an oblique axis by 0.7 mm, smooth errors of 0.03 mm), with Gaussian corner noise. Measure: how far from the
-truth each camera sees infinitely distant points, all over the image, after the best turn; RMS in pixels. Coverage: how
+truth each camera sees infinitely distant points, over the image, after the best-fit rotation; RMS, px. Coverage: how
 often the truth lies in the hybrid's 95 % ellipses, on a grid of the image, where boards reached and beyond; and the RMS
 error that its covariance predicts, over the true one. Parametric models are fitted as `calibrate_camera` does by
 default, with the board's warp.

@@ -9,8 +9,8 @@ rendered, with noise and a little blur, and corners are detected in them. *Rando
 views and each next one as `kcal capture` asks for them, held by a person: off by 5 % of the distance across and by 10 %
 along, by 8 degrees of tilt and 10 degrees of roll. A view that is not seen whole is held again.
 
-Guided capture goes on until its σ is that of the 20 random views (far directions, RMS over the image; both as kcal
-predicts it), or to 20 views. True errors are those of far directions after the best turn.
+Guided capture goes on until its σ is that of the 20 random views (points at infinity, RMS over the image; both as kcal
+predicts it), or to 20 views. True errors are those of points at infinity after the best-fit rotation.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def held(wanted: NextView, generator: torch.Generator) -> BoardPose:
 
 
 def true_error(found: Camera, truth: Camera) -> float:
-    """RMS of far directions over the image along an axis, after the best turn, pixels."""
+    """RMS error of points at infinity over the image along an axis, after the best-fit rotation, pixels."""
     pixels = truth.grid(33, 19).reshape(-1, 2)
     there, here = truth.unproject(pixels)[0], found.unproject(pixels)[0]
     u, _, vh = torch.linalg.svd(there.T @ here)

@@ -1,4 +1,4 @@
-"""Rigs from things that tell where they are: a drone with RTK, ships with AIS, aircraft with ADS-B.
+"""Rigs from targets that report their position: a drone with RTK, ships with AIS, aircraft with ADS-B.
 
     python -m scripts.check.moving [drone ships aircraft] [--seeds 30] [--write]
 

@@ -219,11 +219,11 @@ def found_at_5_km(old: Rig, new: Rig) -> float:
 
 
 def drift(draws: int) -> list[str]:
-    """The right camera turns by 0.01°; static things then and now, or landmarks."""
+    """The right camera turns by 0.01°; points that do not move, then and now, or landmarks."""
     lines = show(
         [
             "| seen | RMS error of the yaw | mean σ | within 0.001° | called significant | the same without drift "
-            "| 5 km with the old rig | RMS at 5 km after relock |",
+            "| 5 km with the old rig | RMS at 5 km, corrected |",
             "|---|---|---|---|---|---|---|---|",
         ]
     )

@@ -6,7 +6,7 @@ The lens is `machine-vision` with errors of assembly, 1920 x 1080. *zoom*: a gap
 has 1340 to 1980 px of focal length and another distortion everywhere, and the sensor follows its focus. *focus*: the
 same lens at 25 mm moves away from the sensor by up to 2.7 % of its focal length. At five settings it sees 8 views of
 one printed board each, with corners of 0.1 px. At a setting between them, drawn at random, cameras are compared with
-the truth on 9 x 7 places of the image: far directions, after the best turn of the camera. Interpolated from all
+the truth on 9 x 7 places of the image: points at infinity, after the best-fit rotation. Interpolated from all
 five, and from the first, the middle and the last one; beside them the nearest calibration, and what is done elsewhere:
 `cv2.calibrateCamera` with five coefficients at each setting, of which each parameter is interpolated linearly.
 The last rows are cameras that were calibrated at their setting. With --write the table of docs/measured/settings.md is

@@ -1,7 +1,7 @@
 """Tracks over stations: five of them 11 to 60 km apart on the round Earth, smokes, ships and drones, unlike clocks.
 
     python -m scripts.check.station_tracks --seeds 24 --seconds 60 --write
-    python -m scripts.check.station_tracks --speed --write    # 100 and 1,000 things in 8 cameras: grouping, tracks
+    python -m scripts.check.station_tracks --speed --write    # 100 and 1,000 targets in 8 cameras: grouping, tracks
 
 Each seed draws position, attitude and refraction errors, clocks (offset and rate) and targets anew, from what is
 stated. Marks are rendered in each station's own east, north, up (`scripts/shared/station_scenes.py`), not as kcal
@@ -240,20 +240,20 @@ def report(counts: list[int], all_sums: list[Sums], seeds: int, seconds: float) 
     ])  # fmt: skip
 
 
-def crowd(things: int, missed: float, false: int, seed: int) -> list[str]:
-    """Things in 8 cameras 8 km away, in one draw of the cameras' errors: a row of the table."""
+def crowd(targets: int, missed: float, false: int, seed: int) -> list[str]:
+    """Targets in 8 cameras 8 km away, in one draw of the cameras' errors: a row of the table."""
     rig, g = ring(8, 8000.0), torch.Generator().manual_seed(seed)
     rig.root = rig.with_errors(position_m=POSITION_M, attitude_deg=ATTITUDE_DEG, refraction=REFRACTION)
-    errors = drawn_errors(rig.root, 1, g).expand(things, -1)
+    errors = drawn_errors(rig.root, 1, g).expand(targets, -1)
     spread = torch.tensor([2500.0, 2500.0, 400.0]).double()
-    points = (torch.rand(things, 3, generator=g).double() - 0.5) * 2 * spread + torch.tensor([0.0, 0.0, 700.0])
+    points = (torch.rand(targets, 3, generator=g).double() - 0.5) * 2 * spread + torch.tensor([0.0, 0.0, 700.0])
     localize, sums = Localizer(rig), Sums()
     tracker = Tracker(localize, OPTIONS)
     spent, marked, kept = [], 0, 0
-    # Tracks of a thousand things are not what is measured.
-    moments = 2 if things <= 100 else 1
+    # Tracks of a thousand targets are not what is measured.
+    moments = 2 if targets <= 100 else 1
     for number in range(moments):
-        pixels = marks(rig, points, errors) + BOX_PX * torch.randn(things, 8, 2, generator=g).double()
+        pixels = marks(rig, points, errors) + BOX_PX * torch.randn(targets, 8, 2, generator=g).double()
         inside = torch.stack([camera.inside(pixels[:, c]) for c, camera in enumerate(rig.each)], 1)
         inside &= torch.rand(inside.shape, generator=g) >= missed
         seen: list[Detections | None] = []
@@ -277,22 +277,22 @@ def crowd(things: int, missed: float, false: int, seed: int) -> list[str]:
             several = (views.seen.sum(1) > 1) & ~views.ambiguous
             marked, kept = int(inside.sum()), int(views.seen[several].sum())
     return [
-        f"{things:,}", f"{marked:,}; {100 * missed:g} % missed, {false} false an image", f"{spent[-1][0]:,.0f} ms",
+        f"{targets:,}", f"{marked:,}; {100 * missed:g} % missed, {false} false an image", f"{spent[-1][0]:,.0f} ms",
         f"{sums.right:,}", f"{sums.groups - sums.right:,}", f"{sums.doubtful:,}", f"{kept:,}",
         f"{spent[-1][1]:,.0f} ms" if moments > 1 else "",
     ]  # fmt: skip
 
 
-def speed(things: list[int]) -> str:
-    """Things in 8 cameras: CPU of grouping and of tracking them, and how many groups are right."""
+def speed(targets: list[int]) -> str:
+    """Targets in 8 cameras: CPU of grouping and of tracking them, and how many groups are right."""
     crowd(20, 0.0, 0, 0)
-    rows = [crowd(count, *rest, 0) for count in things for rest in ((0.0, 0), (0.15, 0), (0.15, count // 30))]
+    rows = [crowd(count, *rest, 0) for count in targets for rest in ((0.0, 0), (0.15, 0), (0.15, count // 30))]
     heads = [
-        "things", "marks of them in 8 cameras", "CPU of grouping", "right groups", "wrong groups", "doubtful groups",
+        "targets", "marks of them in 8 cameras", "CPU of grouping", "right groups", "wrong groups", "doubtful groups",
         "marks in groups that are not doubtful", "CPU of the tracker",
     ]  # fmt: skip
     return "\n".join([
-        "Things in 5 by 5 km, .8 km high, 8 cameras around them in 8 km; one thread, one draw of the cameras' "
+        "Targets in 5 by 5 km, .8 km high, 8 cameras around them in 8 km; one thread, one draw of the cameras' "
         "errors. A group is right if all its marks are of one thing. Made by "
         "`scripts/check/station_tracks.py --speed`.",
         "",
@@ -306,12 +306,12 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--counts", type=int, nargs="+", default=[2, 3, 5])
     parser.add_argument("--speed", action="store_true")
-    parser.add_argument("--things", type=int, nargs="+", default=[100, 1000], help="of --speed")
+    parser.add_argument("--targets", type=int, nargs="+", default=[100, 1000], help="of --speed")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     torch.set_num_threads(1)
     if options.speed:
-        text = speed(options.things)
+        text = speed(options.targets)
         print(text)
     else:
         sums = [Sums() for _ in options.counts]

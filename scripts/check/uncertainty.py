@@ -36,7 +36,7 @@ LENS = (-0.25, 0.08, 5e-4, -3e-4, -0.02, 0.03, -0.01, 0.003, 4e-4, -2e-4, -3e-4,
 
 
 class Fit(NamedTuple):
-    """One capture: errors of fx, cx, of the places and of the places after the best turn, with their covariances.
+    """One capture: errors of fx, cx, of the places and of the places after the best rotation, with covariances.
 
     Args:
         parameters: (2,) fx and cx.

@@ -60,7 +60,7 @@ CLEAN = ("clean", "clean", "clean", "clean pair")
 
 
 def true_error(lens: TruthLens, camera: Camera) -> float:
-    """RMS over the image, after the best turn, between where the lens and the camera see far things, px."""
+    """Difference of lens and camera at infinity after the best-fit rotation, RMS over the image, px."""
     grid = camera.grid(33, 25).reshape(-1, 2)
     rays, _ = lens.unproject(grid)
     own, valid = camera.unproject(grid)

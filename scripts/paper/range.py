@@ -68,8 +68,8 @@ def choice(results: Results) -> list[str]:
     return [
         *table(heads, rows),
         "",
-        "The third column can only look better than the others, on these seven points: what it gains over the first, "
-        f"{middle(gains, 2)} points of a percent over all draws, is what the leak pretends.",
+        "The third column chooses by the seven points on which it is scored, so its score is the lowest possible. "
+        f"It is {middle(gains, 2)} percentage points below the first column: this is the bias of the paper's choice.",
     ]
 
 

@@ -90,7 +90,7 @@ class LensTrial(NamedTuple):
     """A calibrated lens against the traced one, at infinity over the whole image.
 
     Attributes:
-        rms: px, after the best turn.
+        rms: px, after the best-fit rotation.
         largest: px.
         inside: share of the image in which the truth lies in the stated 95 % ellipse.
         chi2: of the agreement of boards and stars over its freedom; NaN where only one of them was used.
