@@ -50,7 +50,7 @@ PUBLIC = {
         Effect ImagePair Mounting MovingOptions RasterError RigCovariance SkylineImage Survey Watched
         check_rig import_survey match_landmarks match_moving mounting_covariance
         pair_by_name paired_boards placed_rig planned_rig read_features read_sightings read_tracks
-        scene_features skyline_attitude skyline_source
+        scene_features skyline_attitude skyline_source stated_mounting station_rig
     """,
     "kcal.locate": """
         BudgetErrors DisparityRanges Marks Site Triangulate area_of enu_from_cam enu_to_geodetic find_geoid

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import torch
 from torch import Tensor
 
+from kcal.errors import InputError
 from kcal.files import read_bytes
-from kcal.lens.rig import Rig
+from kcal.lens.camera import Camera
+from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Mounting, Origin, Rig, half_of_covariance
+from kcal.locate.geodesy import ecef_from_enu_rotation, enu_from_cam, geodetic_to_enu
 from kcal.locate.localizer import Localizer
 from kcal.locate.mounting import attitude, station_mounting
 from kcal.strict_json import MOST_BYTES, read_json
@@ -49,3 +55,111 @@ def station_stands(rig: Rig, camera: int) -> tuple[tuple[float, ...], tuple[floa
     half = None if rig.root is None else rig.root[:, rig.pose_columns(camera)]
     covariance = None if half is None else half.T @ half
     return tuple(rig.center[camera].tolist()), attitude(rig.rotation[camera].T), covariance
+
+
+# Stations of which the pose is known beforehand: no landmarks are needed.
+
+
+def stated_mounting(
+    origin: Origin,
+    *,
+    heading_deg: tuple[float, float],
+    pitch_deg: tuple[float, float],
+    roll_deg: tuple[float, float] = (0.0, 0.0),
+    sigma_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> Mounting:
+    """How a camera stands, of which position and angles were measured, each with its standard deviation.
+
+    Args:
+        origin: its place.
+        heading_deg: azimuth of the optical axis from true north at the camera, and its sigma, degrees.
+        pitch_deg: elevation of the optical axis above the horizon there, likewise.
+        roll_deg: likewise; positive clockwise as seen from behind the camera.
+        sigma_m: of the place, east, north and up.
+
+    Raises:
+        InputError: an angle out of range, or a sigma that is negative or not finite.
+
+    Example:
+        >>> place = Origin(lat=46.0, lon=7.0, height=2100.0)
+        >>> drone = stated_mounting(place, heading_deg=(90.0, 1.0), pitch_deg=(-30.0, 0.5))
+        >>> drone.covariance[3:, 3:].diagonal().sqrt().rad2deg().round(decimals=6).tolist()
+        [0.0, 0.5, 1.0]
+    """
+    sigma = torch.tensor([*sigma_m, *(math.radians(one[1]) for one in (heading_deg, pitch_deg, roll_deg))])
+    if not bool((sigma.isfinite() & (sigma >= 0)).all()):
+        raise InputError("a station: sigmas must be finite and not negative")
+    level = enu_from_cam(heading_deg[0])
+    forward = enu_from_cam(heading_deg[0], pitch_deg[0], roll_deg[0])[:, 2]
+    # About these axes the angles turn the camera: up, to its right, and ahead.
+    axes = torch.stack([-level[:, 1], level[:, 0], forward], 1)
+    by = torch.block_diag(torch.eye(3).double(), axes) * sigma
+    return Mounting(
+        origin=origin, heading_deg=heading_deg[0], pitch_deg=pitch_deg[0], roll_deg=roll_deg[0], covariance=by @ by.T
+    )
+
+
+def station_rig(
+    cameras: Mapping[str, Camera],
+    stands: Sequence[Mounting],
+    *,
+    refraction: float = REFRACTION,
+    refraction_sigma: float = REFRACTION_SIGMA,
+) -> Rig:
+    """The rig of cameras of which it is known how each stands: the inverse of `station_mounting`.
+
+    North and up are those at each camera: 60 km apart they differ by half a degree, which is 500 m at that distance.
+    Errors of the cameras' poses are independent of each other. Errors of one lens at several places are the same at
+    each.
+
+    Args:
+        cameras: each with its name; one or more.
+        stands: how each stands, with errors as `stated_mounting` gives them; the rig's frame is east, north, up at the
+            first one.
+        refraction: coefficient of refraction of light.
+        refraction_sigma: its standard deviation.
+
+    Raises:
+        InputError: no camera, or not one stand for each.
+
+    Example:
+        >>> from kcal import Localizer
+        >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
+        >>> place = Origin(lat=46.0, lon=7.0, height=1600.0)
+        >>> above = stated_mounting(place, heading_deg=(0.0, 1.0), pitch_deg=(-45.0, 1.0))
+        >>> seen = Localizer(station_rig({"drone": camera}, [above]))(
+        ...     torch.tensor([[[960.0, 540.0]]]), height=torch.tensor([600.0])
+        ... )
+        >>> round(float(seen.range[0]), 1)
+        1414.3
+    """
+    if not cameras or len(cameras) != len(stands):
+        raise InputError(f"{len(cameras)} cameras and {len(stands)} places of cameras: one for each is needed")
+    origin = stands[0].origin
+    ecef_from_frame = ecef_from_enu_rotation(origin.lat, origin.lon)
+    local_from_frame = [ecef_from_enu_rotation(one.origin.lat, one.origin.lon).T @ ecef_from_frame for one in stands]
+    rotation = [
+        enu_from_cam(one.heading_deg, one.pitch_deg, one.roll_deg).T @ turn
+        for one, turn in zip(stands, local_from_frame, strict=True)
+    ]
+    center = geodetic_to_enu(torch.stack([one.origin.geodetic for one in stands]), origin)
+    rig = Rig(
+        [*cameras.values()], [*cameras], torch.stack(rotation), center=center, origin=origin, refraction=refraction
+    )
+    rows = [rig.with_errors(refraction=refraction_sigma)]
+    for camera, (own, stand, turn) in enumerate(zip(cameras.values(), stands, local_from_frame, strict=True)):
+        if stand.covariance is not None:
+            both = torch.block_diag(turn, turn)
+            half = half_of_covariance(both.T @ stand.covariance[:6, :6] @ both)
+            rows.append(half.new_zeros(len(half), rig.quantities))
+            rows[-1][:, rig.pose_columns(camera)] = half
+        everywhere = [number for number, other in enumerate(cameras.values()) if other is own]
+        known = None if own.calibration is None else own.calibration.covariance
+        if known is not None and everywhere[0] == camera:
+            half = half_of_covariance(known)
+            rows.append(half.new_zeros(len(half), rig.quantities))
+            for number in everywhere:
+                first = sum(rig.sizes[:number])
+                rows[-1][:, first : first + len(known)] = half
+    rig.root = torch.cat(rows)
+    return rig

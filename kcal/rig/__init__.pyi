@@ -32,6 +32,8 @@ from kcal.locate.mounting import mounting_covariance as mounting_covariance
 from kcal.locate.budget import planned_rig as planned_rig
 
 # Any number of cameras
+from kcal.locate.stations import station_rig as station_rig
+from kcal.locate.stations import stated_mounting as stated_mounting
 
 # Drift
 from kcal.watch.watcher import Watched as Watched

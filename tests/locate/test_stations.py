@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import copy
 import dataclasses
 import json
 from pathlib import Path
@@ -11,12 +12,15 @@ from torch import Tensor
 
 from kcal import Landmarks, MeasuredPosition, RigData
 from kcal.calibrate.rig.solve import solve_rig
-from kcal.errors import DegenerateError, FileError
+from kcal.errors import DegenerateError, FileError, InputError
 from kcal.io.rig_file import load_pair, load_rig, save_rig
-from kcal.lens.rig import Mounting, Rig, RigCovariance
+from kcal.lens.calibration import CameraCalibration
+from kcal.lens.camera import Camera
+from kcal.lens.rig import Mounting, Origin, Rig, RigCovariance
+from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic, geodetic_to_enu
 from kcal.locate.localizer import Localizer
-from kcal.locate.mounting import placed_rig
-from kcal.locate.stations import station_mounting
+from kcal.locate.mounting import placed_rig, station_mounting
+from kcal.locate.stations import stated_mounting, station_rig
 from scripts.shared.station_scenes import ORIGIN, marks, ring, targets
 
 RIG = Path(__file__).parents[1] / "io" / "rig.json"
@@ -176,3 +180,106 @@ def test_a_placed_rig_and_its_stations_stand_alike() -> None:
     assert theirs is not None
     assert ours.heading_deg == pytest.approx(theirs.heading_deg, abs=1e-9)
     assert torch.allclose(ours.covariance, theirs.covariance, rtol=1e-9, atol=1e-18)
+
+
+# Stations of which the pose is known beforehand.
+
+APART = (Origin(lat=46.0, lon=7.0, height=1500.0), Origin(lat=46.4, lon=7.5, height=900.0))
+
+
+def placed(lens: Camera, sigma: float = 0.0) -> Rig:
+    """One lens at two places some 60 km apart, each of which looks at what is between them from its own vertical."""
+    stands = [
+        stated_mounting(APART[0], heading_deg=(62.0, sigma), pitch_deg=(5.0, sigma), roll_deg=(2.0, sigma),
+                        sigma_m=(100.0 * sigma, 100.0 * sigma, 200.0 * sigma)),
+        stated_mounting(APART[1], heading_deg=(200.0, 2 * sigma), pitch_deg=(12.0, sigma), roll_deg=(-3.0, 3 * sigma)),
+    ]  # fmt: skip
+    return station_rig({"west": lens, "east": lens}, stands, refraction=0.0, refraction_sigma=0.0)
+
+
+def seen_from_each(lens: Camera, point: Tensor, stands: list[Mounting]) -> Tensor:
+    """Pixels (V, 2) of a geodetic place, by the attitude of each camera at its own vertical alone."""
+    pixels = []
+    for stand in stands:
+        enu = geodetic_to_enu(point, stand.origin)
+        ray = enu @ enu_from_cam(stand.heading_deg, stand.pitch_deg, stand.roll_deg)
+        pixels.append(lens.project(ray[None])[0][0])
+    return torch.stack(pixels)
+
+
+def test_known_poses_have_each_its_own_vertical() -> None:
+    lens = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080), coefficients=[-0.1, 0.01, 0, 0])
+    rig = placed(lens)
+    assert 55_000.0 < float((rig.center[1] - rig.center[0]).norm()) < 65_000.0
+    stands = [station_mounting(rig, camera) for camera in range(2)]
+    assert stands[1].origin.lat == pytest.approx(46.4, abs=1e-9)
+    assert (stands[1].heading_deg, stands[1].pitch_deg, stands[1].roll_deg) == pytest.approx(
+        (200.0, 12.0, -3.0), abs=1e-9
+    )
+    airplane = tensor(46.15, 7.4, 9000.0)
+    pixels = seen_from_each(lens, airplane, stands)
+    assert all(bool(lens.inside(pixel)) for pixel in pixels)
+    located = Localizer(rig)(pixels[None])
+    here = geodetic_to_enu(airplane, APART[0])
+    assert float((located.enu[0] - here).norm()) < 1e-3
+    # With the west's vertical in the east, the airplane would be hundreds of meters higher or lower.
+    level = enu_from_cam(200.0, 12.0, -3.0).T
+    wrong = Rig(rig.each, rig.names, torch.stack([rig.rotation[0], level]), center=rig.center, origin=rig.origin)
+    assert float((Localizer(wrong)(pixels[None]).enu[0] - here).norm()) > 100.0
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_errors_of_known_poses_are_those_of_positions(count: int) -> None:
+    """Of an airplane that two cameras see, and of a place whose height is known and one: scatter is as it is told."""
+    lens = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080), coefficients=[-0.1, 0.01, 0, 0])
+    nominal = [tensor(62.0, 5.0, 2.0), tensor(200.0, 12.0, -3.0)] if count == 2 else [tensor(62.0, -20.0, 2.0)]
+    angle = 0.05 * tensor([1.0, 1.0, 1.0], [2.0, 1.0, 3.0])[:count]
+    spread = tensor([5.0, 5.0, 10.0], [0.0, 0.0, 0.0])[:count]
+    thing = tensor(46.15, 7.4, 9000.0) if count == 2 else tensor(46.008, 7.02, 600.0)
+
+    def stands(angles: list[Tensor], places: list[Origin], sigma: Tensor) -> list[Mounting]:
+        return [
+            stated_mounting(place, heading_deg=(h, s[0]), pitch_deg=(p, s[1]), roll_deg=(r, s[2]), sigma_m=tuple(m))
+            for (h, p, r), place, s, m in zip(
+                map(Tensor.tolist, angles), places, sigma.tolist(), spread.tolist(), strict=True
+            )
+        ]
+
+    lenses = dict.fromkeys(("west", "east")[:count], lens)
+    rig = station_rig(lenses, stands(nominal, [*APART[:count]], angle), refraction=0.0, refraction_sigma=0.0)
+    drawn, generator = [], torch.Generator().manual_seed(0)
+    for _ in range(300):
+        turned, moved = torch.randn(2, count, 3, dtype=torch.float64, generator=generator)
+        places = [Origin.at(enu_to_geodetic(m * by, at)) for m, by, at in zip(moved, spread, APART, strict=False)]
+        truth = stands([one + t * s for one, t, s in zip(nominal, turned, angle, strict=True)], places, angle)
+        drawn.append(seen_from_each(lens, thing, truth))
+    height = torch.full((300,), float(thing[2])).double() if count == 1 else None
+    located = Localizer(rig, pixel_sigma=1e-3)(torch.stack(drawn), height=height, height_sigma=1e-3)
+    assert not located.status.any()
+    free = 3 if count == 2 else 2
+    error, covariance = located.enu - geodetic_to_enu(thing, APART[0]), located.covariance[:, :free, :free]
+    squares = (error[:, :free] * torch.linalg.solve(covariance, error[:, :free])).sum(-1)
+    # The mean of 300 chi-squares, ± 0.14 or 0.12.
+    assert float(squares.mean()) == pytest.approx(free, abs=0.4)
+
+
+def test_a_lens_at_two_places_errs_alike() -> None:
+    lens = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
+    variance = torch.diag(tensor(4.0, 4.0, 1.0, 1.0, 0.0))
+    lens.calibration = CameraCalibration(covariance=variance)
+    rig = placed(lens)
+    assert rig.root is not None
+    covariance = rig.root.T @ rig.root
+    assert torch.allclose(covariance[:5, :5], variance)
+    assert torch.allclose(covariance[:5, 5:10], variance)
+    other = copy.deepcopy(lens)
+    rig = station_rig({"a": lens, "b": other}, [stated_mounting(place, heading_deg=(0.0, 1.0), pitch_deg=(0.0, 1.0))
+                                                for place in APART])  # fmt: skip
+    assert rig.root is not None
+    covariance = rig.root.T @ rig.root
+    assert torch.allclose(covariance[5:10, 5:10], variance)
+    assert not covariance[:5, 5:10].any()
+    with pytest.raises(InputError, match="one for each"):
+        station_rig({"a": lens}, [])
+    with pytest.raises(InputError, match="sigmas"):
+        stated_mounting(APART[0], heading_deg=(0.0, -1.0), pitch_deg=(0.0, 1.0))
