@@ -10,7 +10,8 @@ import typer
 
 from kcal.cli.console import out, print_wrote, steps, warn, with_json
 from kcal.cli.inputs import OBSERVATIONS, BoardSize, SquareSide, with_inputs
-from kcal.cli.settings import Command, group_with_default, picture_option
+from kcal.cli.options import Command, group_with_default
+from kcal.cli.settings import picture_option
 from kcal.errors import InputError
 from kcal.files import check_writable, write_atomic
 

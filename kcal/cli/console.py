@@ -62,6 +62,16 @@ def tell(**content: Any) -> None:
     _told.update(content)
 
 
+def tell_anew() -> None:
+    """Forget what was told before: a command begins."""
+    _told.clear()
+
+
+def told() -> dict[str, Any]:
+    """What was told since the command began."""
+    return _told
+
+
 def _tell_more(name: str, *items: Any) -> None:
     _told.setdefault(name, []).extend(items)
 

@@ -270,26 +270,34 @@ def with_inputs(command: Callable[..., None]) -> Callable[..., None]:
     def run(*arguments: Any, **options: Any) -> None:
         given = signature.bind(*arguments, **options).arguments
         outputs = given.get("output") or []
-        outputs = outputs if isinstance(outputs, list) else [outputs]
-        # Where nothing can be written, the command says so first.
-        if all(Path(path).parent.is_dir() for path in outputs):
-            found = [
-                _Given(label, text, wanted)
-                for name, (label, wanted) in files.items()
-                for text in _checked_inputs(wanted, given.get(name))
-            ]
-            # Beside a stream no files are allowed at all, which the command says.
-            if not any(is_stream(one.text) for one in found if not one.label.startswith("-")):
-                for one in found:
-                    if file_kind(one.path) == "missing" and not _unseen(one.text):
-                        images = one.wanted is IMAGES
-                        what = "no such file or folder" if images else "cannot read: No such file or directory"
-                        raise FileError(f"{one.text}: {what}")
-                check_kinds(found)
+        check_given(
+            [(label, wanted, given.get(name)) for name, (label, wanted) in files.items()],
+            outputs if isinstance(outputs, list) else [outputs],
+        )
         return command(*arguments, **options)
 
     run.__signature__ = signature  # type: ignore[attr-defined]
     return run
+
+
+def check_given(files: Sequence[tuple[str, Wanted, Any]], outputs: Sequence[Any]) -> None:
+    """Refuse files that are missing, or not what is wanted, before anything is loaded.
+
+    Args:
+        files: what each option is called, what it must be, and what was given.
+        outputs: files to write. Where nothing can be written, the command says so first.
+    """
+    if not all(Path(path).parent.is_dir() for path in outputs):
+        return
+    found = [_Given(label, text, wanted) for label, wanted, given in files for text in _checked_inputs(wanted, given)]
+    # Beside a stream no files are allowed at all, which the command says.
+    if any(is_stream(one.text) for one in found if not one.label.startswith("-")):
+        return
+    for one in found:
+        if file_kind(one.path) == "missing" and not _unseen(one.text):
+            what = "no such file or folder" if one.wanted is IMAGES else "cannot read: No such file or directory"
+            raise FileError(f"{one.text}: {what}")
+    check_kinds(found)
 
 
 def check_file(label: str, text: str, wanted: Wanted) -> None:

@@ -28,10 +28,11 @@ from kcal.cli.inputs import with_inputs
 from kcal.cli.live import live_command
 from kcal.cli.locate import locate_command
 from kcal.cli.mark import mark_command
+from kcal.cli.options import Command, declared
 from kcal.cli.rectify import rays_command, rectify_command
 from kcal.cli.report import report_command
 from kcal.cli.rig import app as rig
-from kcal.cli.settings import Command, defaults_of, init_command, read_settings
+from kcal.cli.settings import defaults_of, init_command, read_settings
 from kcal.cli.show import show_command
 from kcal.cli.sites import budget_command, sites_command
 from kcal.cli.stars import stars_command
@@ -128,8 +129,8 @@ app.command("stars", cls=Command)(with_json(with_inputs(stars_command)))
 app.command("locate", cls=Command)(with_inputs(locate_command))
 app.command("live", cls=Command)(with_inputs(live_command))
 app.command("watch", cls=Command)(with_inputs(watch_command))
-app.command("budget", cls=Command)(with_json(with_inputs(budget_command)))
-app.command("sites", cls=Command)(with_json(with_inputs(sites_command)))
+app.command("budget", cls=Command)(declared(budget_command))
+app.command("sites", cls=Command)(declared(sites_command))
 app.command("rectify", cls=Command)(with_json(with_inputs(rectify_command)))
 app.command("rays", cls=Command)(with_json(with_inputs(rays_command)))
 app.command("bake", cls=Command)(with_json(with_inputs(bake_command)))

@@ -11,10 +11,12 @@ import typer
 import kcal.cli.console as console
 import kcal.cli.inputs as inputs
 import kcal.cli.rig_sources as rig_sources
+from kcal.cli import kinds
 from kcal.cli.console import err, out, print_table, print_wrote, warn
-from kcal.cli.inputs import MARKS, RIG, SURVEY, PixelSigma, pixel_sigma_of
+from kcal.cli.inputs import pixel_sigma_of
+from kcal.cli.options import Command, declared, group_with_default
 from kcal.cli.report import NO, REQUIRE_HELP, judged_sides, required, side_pictures, stored_tables, told_usable
-from kcal.cli.settings import Command, group_with_default, picture_option, rarely
+from kcal.cli.settings import picture_option, rarely
 from kcal.cli.stars import TIME_HELP, NightOptions, images_of_nights
 from kcal.cli.stations import print_rig, rig_lines, solve_stations
 from kcal.errors import InputError
@@ -350,23 +352,13 @@ DRIFTED = 3
 
 
 def check(
-    rig: Annotated[Path, typer.Argument(help="Rig file from `kcal rig`."), RIG],
-    marks: Annotated[
-        Path, typer.Option(metavar="CSV", help="Marks in new images: name,left_u,left_v,right_u,right_v."), MARKS
-    ],
-    reference: Annotated[
-        Path | None,
-        typer.Option(metavar="CSV", help="The same static things, marked in images from when the rig was solved."),
-        MARKS,
-    ] = None,
-    landmarks: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="Surveyed places among the marks, as for `kcal rig`."), SURVEY
-    ] = None,
-    pixel_sigma: PixelSigma = None,
-    relock: Annotated[
-        bool,
-        typer.Option("--relock", help="If it has turned, write the corrected rig in its place; the old one is kept."),
-    ] = False,
+    rig: kinds.RigFile,
+    *,
+    marks: kinds.Marks,
+    reference: kinds.Marks | None = None,
+    landmarks: kinds.Survey | None = None,
+    pixel_sigma: kinds.PixelSigma | None = None,
+    relock: Path | None = None,
 ) -> None:
     """Check whether the cameras have turned since the rig was solved, and what that does to ranges.
 
@@ -375,8 +367,8 @@ def check(
     the rig must have been solved with some). Forty features marked to 0.1 px determine the yaw to a thousandth of a
     degree. Things that moved are left out and named.
 
-    With `--relock` the rig file is replaced by one with the present attitudes, if these have changed beyond chance; the
-    old one is kept beside it.
+    With `--relock rig.json` a rig with the present attitudes is written, if these have changed beyond chance. It may be
+    the same file: the old one is kept beside it.
 
     The exit code is 3 if a camera has turned beyond chance, relocked or not; 0 if none has; 1 if that could not be
     measured.
@@ -385,7 +377,14 @@ def check(
 
     `kcal rig check rig.json --reference then.csv --marks now.csv`
 
-    `kcal rig check rig.json --landmarks survey.csv --marks now.csv --relock`
+    `kcal rig check rig.json --landmarks survey.csv --marks now.csv --relock rig.json`
+
+    Args:
+        rig: Rig file from `kcal rig`.
+        marks: Marks in new images: name,left_u,left_v,right_u,right_v.
+        reference: The same static things, marked in images from when the rig was solved.
+        landmarks: Surveyed places among the marks, as for `kcal rig`.
+        relock: Rig file to write if it has turned; an old one of that name is kept.
     """
     from kcal.io.rig_file import load_pair
     from kcal.locate.marks import read_marks
@@ -395,8 +394,8 @@ def check(
         raise InputError("give --reference (marks of the same things in old images) or --landmarks (a survey)")
     if reference is not None and landmarks is not None:
         raise InputError("give --reference or --landmarks, not both: with old marks no survey is needed")
-    if relock:
-        check_writable(rig, marks, *(path for path in (reference, landmarks) if path is not None))
+    if relock is not None:
+        check_writable(relock, marks, *(path for path in (reference, landmarks) if path is not None))
     old = load_pair(rig)
     noise = pixel_sigma_of(pixel_sigma, old)
     now = read_marks(marks, single=True)
@@ -417,13 +416,11 @@ def check(
     if drift.left_significant:
         out.print("the left camera has [bold]turned[/] beyond chance: directions by the old rig are wrong")
     if not (drift.significant or drift.left_significant):
-        if relock:
+        if relock is not None:
             out.print("nothing was written")
         return
-    if relock:
-        kept = _relock(rig, drift, marks)
-        out.print(f"kept the old rig as {kept}", markup=False)
-        print_wrote(rig)
+    if relock is not None:
+        _relock(relock, drift, marks)
     raise typer.Exit(DRIFTED)
 
 
@@ -455,23 +452,25 @@ def _print_effect(drift: Drift) -> None:
         out.print(f"with the old rig a target at {distance:g} m is found at {shift}")
 
 
-def _relock(path: Path, drift: Drift, marks: Path) -> Path:
-    """Replace the rig file; returns where the old one is kept."""
+def _relock(path: Path, drift: Drift, marks: Path) -> None:
+    """Write the rig as it stands now; a file of that name is kept beside it."""
     import datetime
 
     from kcal.io.rig_file import save_rig
 
     stamp = datetime.datetime.now(datetime.UTC).strftime("%Y%m%dT%H%M%SZ")
-    kept = path.with_name(f"{path.stem}.before-{stamp}{path.suffix}")
-    number = 1
-    while kept.exists():
-        number += 1
-        kept = path.with_name(f"{path.stem}.before-{stamp}-{number}{path.suffix}")
     new = drift.relocked(f"{stamp}, from {marks.name}")
     # The old one first: whatever happens in between, there is a good rig.
-    write_atomic(kept, path.read_bytes())
+    if path.exists():
+        kept = path.with_name(f"{path.stem}.before-{stamp}{path.suffix}")
+        number = 1
+        while kept.exists():
+            number += 1
+            kept = path.with_name(f"{path.stem}.before-{stamp}-{number}{path.suffix}")
+        write_atomic(kept, path.read_bytes())
+        out.print(f"kept the old rig as {kept}", markup=False)
     save_rig(new, path)
-    return kept
+    print_wrote(path)
 
 
-app.command("check", cls=Command)(console.with_json(inputs.with_inputs(check)))
+app.command("check", cls=Command)(declared(check))

@@ -14,26 +14,10 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import typer
-from typer.core import TyperCommand, TyperGroup
 
-from kcal.cli.console import err, print_wrote
+from kcal.cli.console import print_wrote
 from kcal.errors import FileError, InputError
 from kcal.files import check_picture, check_writable, is_stream, read_bytes, write_atomic
-
-# Commands that have subcommands and do their main work without one.
-
-
-def group_with_default(command: str) -> type[TyperGroup]:
-    """A group whose arguments go to `command` unless they begin with the name of another one."""
-
-    class DefaultGroup(TyperGroup):
-        def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-            if not args or args[0] not in self.commands:
-                args = [command, *args]
-            return super().parse_args(ctx, args)
-
-    return DefaultGroup
-
 
 # Settings of a folder: `kcal.toml`, written by `kcal init`, gives options of the commands that are run there or below.
 
@@ -196,47 +180,6 @@ def picture_option(about: str, *flags: str, hidden: bool = False) -> Any:
 
     about = f"Picture to write (.png, .svg or .pdf): {about}"
     return typer.Option(*flags, metavar="FILE", help=about, hidden=hidden, callback=checked)
-
-
-class Command(TyperCommand):
-    """A command whose rare options are shown by `--help-all`, and that says what it took from kcal.toml."""
-
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **options)
-        self.more = [param for param in self.params if getattr(param, "hidden", False)]
-        if self.more:
-            hint = f"`--help-all` shows {len(self.more)} more options."
-            self.epilog = f"{self.epilog}\n\n{hint}" if self.epilog else hint
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Show all options and stop, if that was asked for."""
-        if "--help-all" in args and self.more:
-            shown, self.epilog = self.epilog, None
-            try:
-                for param in self.more:
-                    param.hidden = False  # type: ignore[attr-defined]
-                text = self.get_help(ctx)
-            finally:
-                for param in self.more:
-                    param.hidden = True  # type: ignore[attr-defined]
-                self.epilog = shown
-            if text:
-                print(text)
-            ctx.exit()
-        return super().parse_args(ctx, ["--help" if word == "--help-all" else word for word in args])
-
-    def invoke(self, ctx: Any) -> Any:
-        """Run the command; what it takes from kcal.toml is said first, in one line."""
-        names = [
-            param.name
-            for param in self.params
-            if getattr(ctx.get_parameter_source(param.name), "name", "") == "DEFAULT_MAP"
-        ]
-        taken.clear()
-        taken.update(names)
-        if names:
-            err.print(settings_text({name: ctx.params[name] for name in names}, settings_file()), markup=False)
-        return super().invoke(ctx)
 
 
 # `kcal init`: a kcal.toml for a folder, so that the commands that are run there are short.

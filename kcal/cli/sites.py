@@ -3,65 +3,37 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
+from kcal.cli import kinds
 from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
-from kcal.cli.inputs import RIG, SITES, PixelSigma, pixel_sigma_of
-from kcal.cli.settings import picture_option
+from kcal.cli.inputs import pixel_sigma_of
+from kcal.cli.options import Kind
 from kcal.cli.stars import print_star_budget
 from kcal.errors import InputError
 from kcal.file_kind import file_kind
 from kcal.files import check_writable, write_atomic
 from kcal.texts import length_text, range_text
+from kcal.values import WithSigma
 
 if TYPE_CHECKING:
     from kcal.locate.siting import Area, RankedSite, SitingMap
 
 
 def sites_command(
-    towers: Annotated[
-        Path,
-        typer.Argument(
-            help="Towers that stand: CSV with name,lat,lon and height or mast (meters above the ground), and heading, "
-            "field, sigma, elevation_sigma (degrees), position_sigma, reach (meters); or a rig file."
-        ),
-        SITES,
-    ],
-    area: Annotated[
-        str, typer.Option(metavar="S,W,N,E", help="What they should see: south, west, north, east, in degrees.")
-    ],
-    candidates: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="Sites for the next tower, in such a table."), SITES
-    ] = None,
-    build: Annotated[
-        int, typer.Option(metavar="N", help="How many of them are to be built, one after the other.", min=1)
-    ] = 1,
-    terrain: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="RASTER",
-            help="Heights of the ground that hides things: an ESRI ASCII grid (.asc), or a GeoTIFF (needs "
-            "'kcal\\[terrain]'). Level ground if not given.",
-        ),
-    ] = None,
-    geoid_height: Annotated[
-        float, typer.Option(metavar="M", help="Added to the terrain's heights if they are above the sea.")
-    ] = 0.0,
-    ground: Annotated[
-        float | None, typer.Option(metavar="M", help="Without a terrain: height of the ground above the ellipsoid.")
-    ] = None,
-    above: Annotated[
-        float, typer.Option(metavar="M", help="Height above the ground of what should be seen: smoke, drones.")
-    ] = 0.0,
-    cells: Annotated[int, typer.Option(metavar="N", help="Points of the map along its longer side.", min=10)] = 200,
-    pixel_sigma: PixelSigma = None,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="CSV file to write: the map, one line for each point.")
-    ] = None,
-    picture: Annotated[Path | None, picture_option("the map.")] = None,
+    towers: kinds.Sites,
+    *,
+    area: kinds.Area,
+    candidates: kinds.Sites | None = None,
+    build: kinds.Count = 1,
+    terrain: kinds.Raster | None = None,
+    geoid: kinds.Meters = 0.0,
+    ground: kinds.Meters | None = None,
+    above: kinds.Meters = 0.0,
+    cells: Annotated[int, Kind(metavar="N", least=10)] = 200,
+    pixel_sigma: kinds.PixelSigma | None = None,
+    output: kinds.Output | None = None,
+    picture: kinds.Picture | None = None,
 ) -> None:
     """Where to put the next camera: a map of what towers see and how well they locate it, and candidates in order.
 
@@ -75,6 +47,21 @@ def sites_command(
     `kcal sites towers.csv --area 44.8,5.8,45.2,6.3 --terrain hills.tif --candidates hilltops.csv --picture sites.png`
 
     `kcal sites towers.rig.json --area 44.8,5.8,45.2,6.3 --ground 240 --above 50 -o map.csv`
+
+    Args:
+        towers: Towers that stand: CSV with name,lat,lon and height or mast (meters above the ground), and heading,
+            field, sigma, elevation_sigma (degrees), position_sigma, reach (meters); or a rig file.
+        area: What they should see: south, west, north, east, in degrees.
+        candidates: Sites for the next tower, in such a table.
+        build: How many of them are to be built, one after the other.
+        terrain: Heights of the ground that hides things: an ESRI ASCII grid (.asc), or a GeoTIFF (needs
+            'kcal[terrain]'). Level ground if not given.
+        geoid: Height of the geoid above the WGS84 ellipsoid, added to the terrain's heights if these are above the sea.
+        ground: Without a terrain: height of the ground above the ellipsoid.
+        above: Height above the ground of what should be seen: smoke, drones.
+        cells: Points of the map along its longer side.
+        output: CSV file to write: the map, one line for each point.
+        picture: The map.
     """
     from kcal.io.rig_file import load_rig
     from kcal.locate.ground import level_ground
@@ -89,7 +76,7 @@ def sites_command(
         check_writable(picture, *inputs)
     if (terrain is None) == (ground is None):
         raise InputError("give --terrain, or --ground with the height of level ground above the ellipsoid; one of them")
-    surface = level_ground(ground) if terrain is None and ground is not None else raster_of(terrain or "", geoid_height)
+    surface = level_ground(ground) if terrain is None and ground is not None else raster_of(terrain or "", geoid)
     if file_kind(towers) == "rig":
         rig = stations_of(load_rig(towers))
         standing = sites_of(rig, pixel_sigma_of(pixel_sigma, rig))
@@ -102,7 +89,7 @@ def sites_command(
     if twice := {name for name in names if names.count(name) > 1}:
         raise InputError(f"{candidates}: {min(twice)!r} is a tower and a candidate; names must differ")
     with steps("looking from each site", None):
-        field = area_of(_bounds(area), surface, (*standing, *proposed), cells=cells, above=above)
+        field = area_of(list(area), surface, (*standing, *proposed), cells=cells, above=above)
         now = siting_map(field, standing)
         ranked = rank_sites(field, standing, proposed, build=build)
         later = siting_map(field, [*standing, *(one.site for one in ranked if one.order)]) if ranked else None
@@ -132,16 +119,6 @@ def sites_command(
 
         save_picture(picture, siting_figure(field, standing, ranked))
     print_wrote(output, picture)
-
-
-def _bounds(text: str) -> list[float]:
-    try:
-        values = [float(part) for part in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) != 4:
-        raise InputError(f"area {text!r}: write SOUTH,WEST,NORTH,EAST in degrees, for example 44.8,5.8,45.2,6.3")
-    return values
 
 
 def _print_towers(now: SitingMap) -> None:
@@ -191,35 +168,19 @@ _BASELINES = (10.0, 25.0, 50.0, 100.0, 250.0, 500.0)
 
 
 def budget_command(
-    rig: Annotated[
-        Path | None, typer.Argument(help="Rig file; the planned rig of --focal and --baseline if not given."), RIG
-    ] = None,
-    focal: Annotated[float, typer.Option(metavar="PX", help="Focal length of the planned rig, pixels.")] = 1600.0,
-    baseline: Annotated[
-        float, typer.Option(metavar="M", help="Distance between the cameras of the planned rig, meters.")
-    ] = 10.0,
-    distances: Annotated[
-        str | None,
-        typer.Option(metavar="M,M,...", help="Ranges in the table, meters; 10 to 500 baselines if not given."),
-    ] = None,
-    pixel_sigma: PixelSigma = None,
-    yaw: Annotated[float, typer.Option(metavar="DEG", help="Relative yaw error, degrees.", min=0)] = 0.01,
-    baseline_error: Annotated[float, typer.Option(metavar="M", help="Baseline error, meters.", min=0)] = 0.001,
-    timing: Annotated[float, typer.Option(metavar="S", help="Time between the two images, seconds.", min=0)] = 0.01,
-    speed: Annotated[
-        float, typer.Option(metavar="M/S", help="Speed of the target along the baseline, meters a second.", min=0)
-    ] = 20.0,
-    picture: Annotated[Path | None, picture_option("a plot of the errors.")] = None,
-    stars: Annotated[bool, typer.Option("--stars", help="Also: how many stars, and what they give.")] = False,
-    aperture: Annotated[
-        float, typer.Option(metavar="MM", help="Of --stars: diameter of the lens's opening, focal length / f-number.")
-    ] = 2.9,
-    altitude: Annotated[
-        float, typer.Option(metavar="DEG", help="Of --stars: of the middle of the image; 0 for a level camera.")
-    ] = 0.0,
-    clock_sigma: Annotated[
-        float, typer.Option(metavar="S", help="Of --stars: of the offset between the cameras' clocks.", min=0)
-    ] = 0.01,
+    rig: kinds.RigFile | None = None,
+    *,
+    focal: kinds.Pixels = 1600.0,
+    baseline: kinds.MeasuredMeters = WithSigma(10.0, 0.001),
+    distances: kinds.Distances | None = None,
+    pixel_sigma: kinds.PixelSigma | None = None,
+    yaw_sigma: kinds.DegreesSigma = 0.01,
+    timing: kinds.Seconds = 0.01,
+    speed: Annotated[float, Kind(metavar="M/S", least=0)] = 20.0,
+    picture: kinds.Picture | None = None,
+    aperture: kinds.Millimeters | None = None,
+    pitch: kinds.Degrees = 0.0,
+    clock_sigma: kinds.Seconds = 0.01,
 ) -> None:
     """Print range errors from disparity, relative yaw, baseline and timing, each alone, at several ranges.
 
@@ -235,9 +196,23 @@ def budget_command(
 
     `kcal budget`
 
-    `kcal budget --focal 2400 --baseline 4 --pixel-sigma 0.2 --picture budget.png`
+    `kcal budget --focal 2400 --baseline 4±0.002 --pixel-sigma 0.2 --picture budget.png`
 
     `kcal budget rig.json --distances 500,1000,2000`
+
+    Args:
+        rig: Rig file; the planned rig of --focal and --baseline if not given.
+        focal: Focal length of the planned rig.
+        baseline: Distance between the cameras of the planned rig, and its error; without ±, 1 mm.
+        distances: Ranges in the table, meters; 10 to 500 baselines if not given.
+        yaw_sigma: Error of the relative yaw.
+        timing: Time between the two images.
+        speed: Speed of the target along the baseline, meters a second.
+        picture: A plot of the errors.
+        aperture: Also print how many stars a camera sees, and what they give: diameter of the lens's opening, focal
+            length / f-number; 2.9 is common.
+        pitch: With --aperture: elevation of the cameras' axes.
+        clock_sigma: With --aperture: standard deviation of the offset between the cameras' clocks.
     """
     import math
 
@@ -245,39 +220,35 @@ def budget_command(
     from kcal.locate.budget import BudgetErrors, planned_rig, range_errors, range_sigmas, usual_ranges
     from kcal.report.tables import range_sigma_rows
 
-    chosen = planned_rig(focal_px=focal, baseline_m=baseline) if rig is None else load_pair(rig)
+    chosen = planned_rig(focal_px=focal, baseline_m=baseline.value) if rig is None else load_pair(rig)
     noise = pixel_sigma_of(pixel_sigma, None if rig is None else chosen)
     disparity = math.sqrt(2.0) * noise
-    errors = BudgetErrors(
-        disparity_px=disparity, yaw_deg=yaw, baseline_m=baseline_error, timing_s=timing, speed_mps=speed
-    )
-    try:
-        far = [float(value) for value in distances.split(",")] if distances else usual_ranges(chosen, _BASELINES)
-    except ValueError:
-        raise InputError(f"distances {distances!r}: write numbers of meters, for example 250,1000,5000") from None
+    error = 0.001 if baseline.sigma is None else baseline.sigma
+    errors = BudgetErrors(disparity_px=disparity, yaw_deg=yaw_sigma, baseline_m=error, timing_s=timing, speed_mps=speed)
+    far = list(distances or usual_ranges(chosen, _BASELINES))
     labels = {
         "disparity": f"disparity {disparity:.3g} px",
-        "yaw": f"relative yaw {yaw:g}°",
-        "baseline": f"baseline {range_text(baseline_error)}",
+        "yaw": f"relative yaw {yaw_sigma:g}°",
+        "baseline": f"baseline {range_text(error)}",
         "timing": f"{1000 * timing:g} ms apart at {speed:g} m/s",
     }
     found = range_errors(chosen, far, errors)
     if rig is None:
-        out.print(f"planned rig: f {focal:g} px, baseline {baseline:g} m, f B {focal * baseline:g} px m")
+        out.print(f"planned rig: f {focal:g} px, baseline {baseline.value:g} m, f B {focal * baseline.value:g} px m")
     else:
         out.print(f"{rig}: baseline {length_text(float(chosen.baseline), digits=6)}", markup=False)
     rows = [["range", "error", "nearer", "farther", "first order"]]
     for i, distance in enumerate(far):
-        for name, error in found.items():
-            cells = (length_text(float(value[i]), sign=True) for value in error)
+        for name, sides in found.items():
+            cells = (length_text(float(value[i]), sign=True) for value in sides)
             rows.append([range_text(distance), labels[name], *cells])
     print_table(rows, left=(1,))
     if chosen.covariance is not None:
         out.print(f"\nWhat the rig file knows, and {noise:g} px of noise in each mark:")
         print_table(range_sigma_rows(range_sigmas(chosen, far, pixel_sigma=noise)))
-    if stars:
+    if aperture is not None:
         print_star_budget(
-            float(chosen.left.params[0]), chosen.left.size, float(chosen.baseline), 5000.0, aperture, altitude,
+            float(chosen.left.params[0]), chosen.left.size, float(chosen.baseline), 5000.0, aperture, pitch,
             clock_sigma,
         )  # fmt: skip
     if picture is not None:

@@ -14,6 +14,7 @@ from kcal.files import read_text
 from kcal.lens.calibration import BoardRecord
 from kcal.native_file import Record
 from kcal.strict_formats import MOST_YAML, read_yaml
+from kcal.values import length
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -33,7 +34,6 @@ DICTIONARIES = {
 }  # fmt: skip
 _DEFAULT_DICTIONARY, _MARKER_SHARE = "4x4_50", 0.7
 _SPACING = 0.3  # of the tag's side: that of the boards that Kalibr offers for download
-_UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
 MOST = 500  # points in a row or a column
 _FORMS = {
     "": "COLUMNSxROWS",
@@ -69,7 +69,7 @@ def board_fields(text: str, square: str) -> dict[str, Any]:
     if not (2 <= each * columns <= MOST and 2 <= each * rows <= MOST):
         what = "tags" if kind == "aprilgrid" else "circles" if kind in ("circles", "asymmetric") else "inner corners"
         raise InputError(f"board {text!r}: {2 // each} to {MOST // each} {what} each way are needed")
-    side = parse_length("square", square)
+    side = length(square, "square")
     fields: dict[str, Any] = {"columns": each * columns, "rows": each * rows, "square": side}
     if kind == "":
         if more:
@@ -81,7 +81,7 @@ def board_fields(text: str, square: str) -> dict[str, Any]:
     else:
         if len(more) > 1:
             raise InputError(form)
-        fields |= {"pattern": kind} | ({"diameter": parse_length("diameter", more[0])} if more else {})
+        fields |= {"pattern": kind} | ({"diameter": length(more[0], "diameter")} if more else {})
     return fields
 
 
@@ -96,7 +96,7 @@ def _charuco_fields(parts: list[str], side: float, form: str) -> dict[str, Any]:
         elif "marker" in fields:
             raise InputError(form)
         else:
-            new = {"marker": parse_length("marker", part)}
+            new = {"marker": length(part, "marker")}
         if new.keys() & fields.keys():
             raise InputError(form)
         fields |= new
@@ -111,7 +111,7 @@ def _april_fields(parts: list[str], side: float, form: str) -> dict[str, Any]:
         elif re.fullmatch(r"\s*\d*\.?\d+\s*", part):
             new = {"gap": float(part) * side}
         else:
-            new = {"gap": parse_length("spacing", part)}
+            new = {"gap": length(part, "spacing")}
         if new.keys() & fields.keys():
             raise InputError(form)
         fields |= new
@@ -121,28 +121,6 @@ def _april_fields(parts: list[str], side: float, form: str) -> dict[str, Any]:
 def _first_id(text: str) -> int | None:
     match = re.fullmatch(r"\s*id(\d{1,6})\s*", text, re.IGNORECASE)
     return int(match.group(1)) if match else None
-
-
-def parse_length(name: str, text: str) -> float:
-    """A text such as `25mm` in meters.
-
-    Raises:
-        InputError: no positive number with a unit.
-
-    Example:
-        >>> parse_length("square", "2.5cm")
-        0.025
-    """
-    length = re.fullmatch(r"\s*([0-9.]+(?:[eE][-+]?\d+)?)\s*([a-z]*)\s*", text)
-    try:
-        value = float(length.group(1)) if length else float("nan")
-    except ValueError:
-        value = float("nan")
-    if length is None or not value > 0 or length.group(2) not in _UNITS:
-        raise InputError(f"{name} {text!r}: write a length with its unit (mm, cm, m, in), for example 25mm")
-    # Division by the exact inverse keeps 25 mm at 0.025 to the last bit.
-    unit = _UNITS[length.group(2)]
-    return value / round(1 / unit) if unit in (1e-3, 1e-2) else value * unit
 
 
 # Read the target files of Kalibr (https://github.com/ethz-asl/kalibr, wiki page "Calibration targets").

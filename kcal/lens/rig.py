@@ -20,6 +20,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.camera_like import CameraLike, as_camera
 from kcal.lens.pose import Movable, check_motion, rotation_from_vector
 from kcal.texts import brief, length_text
+from kcal.values import number_list
 
 # `Origin` and `Mounting`: where a camera stands on the Earth and where it looks, as plain numbers.
 
@@ -73,14 +74,8 @@ class Origin:
         Raises:
             InputError: not three numbers, or a value out of range.
         """
-        fields = text.split(",")
-        try:
-            values = [float(field) for field in fields]
-        except ValueError:
-            values = []
-        if len(values) != 3:
-            raise InputError(f"origin {text!r}: write three numbers LAT,LON,HEIGHT, for example 19.07,72.87,14")
-        return cls(lat=values[0], lon=values[1], height=values[2])
+        lat, lon, height = number_list(text, "origin", 3, "three numbers LAT,LON,HEIGHT, for example 19.07,72.87,14")
+        return cls(lat=lat, lon=lon, height=height)
 
     @classmethod
     def at(cls, geodetic: Tensor) -> Origin:

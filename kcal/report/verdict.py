@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import re
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
-from kcal.errors import InputError
 from kcal.locate.stereo import BEARING_SIGMAS
 from kcal.texts import range_text
+from kcal.values import ranges_and_errors
 
 Severity = Literal["stop", "doubt", "note", "fine"]
 # The source of what a camera is wrong by beyond its error bars.
@@ -64,22 +63,7 @@ class Requirement:
         Raises:
             InputError: something else, or a number that is not positive.
         """
-        found = []
-        for part in text.split(","):
-            match = re.fullmatch(r"\s*([0-9.]+)\s*(km|m)\s*:\s*([0-9.]+)\s*(%|km|m)\s*", part)
-            try:
-                distance, allowed = (float(match.group(i)) for i in (1, 3)) if match else (0.0, 0.0)
-            except ValueError:
-                distance = allowed = 0.0
-            if match is None or not (0 < distance < math.inf and 0 < allowed < math.inf):
-                raise InputError(
-                    f"requirement {part.strip()!r}: write RANGE:ERROR, for example 5km:10% or 800m:20m, several with "
-                    "commas"
-                )
-            distance *= 1000.0 if match.group(2) == "km" else 1.0
-            scale = {"%": 0.01 * distance, "km": 1000.0, "m": 1.0}[match.group(4)]
-            found.append(cls(distance=distance, meters=allowed * scale))
-        return tuple(found)
+        return tuple(cls(distance=far, meters=most) for far, most in ranges_and_errors(text, "requirement"))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

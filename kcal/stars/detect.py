@@ -17,7 +17,8 @@ from kcal.corners.images import DATE_IN_NAME, VIDEO_SUFFIXES, expand_images, rea
 from kcal.corners.video import read_frames
 from kcal.errors import FileError, InputError
 from kcal.files import read_bytes
-from kcal.stars.sky import EARTH_RATE, StarCatalog, parse_time
+from kcal.stars.sky import EARTH_RATE, StarCatalog
+from kcal.values import instant
 
 # Find stars in an image to a small part of a pixel, each with its own standard deviation.
 #
@@ -270,14 +271,14 @@ def time_of(text: str | None, path: Path) -> datetime.datetime | None:
         return None
     kind, _, zone = text.partition(":")
     if kind != "name":
-        return parse_time(text)
+        return instant(text, "time")
     if not zone:
         raise InputError("--time name: say the zone of the times in the names, name:Z for UTC or name:+02:00")
     found = DATE_IN_NAME.search(path.name)
     if found is None:
         raise InputError(f"{path.name}: no time in this name; it should be like 2026-11-24T204726")
     year, month, day, hour, minute, second = found.groups()[:6]
-    return parse_time(f"{year}-{month}-{day}T{hour}:{minute}:{second}{zone}")
+    return instant(f"{year}-{month}-{day}T{hour}:{minute}:{second}{zone}", "time")
 
 
 # How many stars a camera will see, how well, and what range error follows: before anyone climbs the mast.

@@ -212,27 +212,6 @@ def require_erfa() -> Any:
     return erfa
 
 
-def parse_time(text: str) -> datetime.datetime:
-    """Read a time with its zone, as UTC.
-
-    Raises:
-        InputError: no time, or one without a zone: an hour is 15° of heading.
-
-    Example:
-        >>> parse_time("2019-07-29T22:47:26+02:00").isoformat()
-        '2019-07-29T20:47:26+00:00'
-    """
-    try:
-        time = datetime.datetime.fromisoformat(text.strip())
-    except ValueError:
-        raise InputError(f"time {text!r}: write it like 2026-11-24T20:47:26Z") from None
-    if time.tzinfo is None:
-        raise InputError(
-            f"time {text!r} has no zone, and an hour is 15° of heading; end it with Z for UTC, or with +02:00"
-        )
-    return time.astimezone(datetime.UTC)
-
-
 def year_of(time: datetime.datetime) -> float:
     """The year with its fraction.
 
@@ -287,7 +266,8 @@ def observed_directions(
 
     Example:
         >>> place = Origin(lat=52.0, lon=4.4, height=0.0)
-        >>> seen = observed_directions(StarCatalog.bundled(), parse_time("2019-07-29T20:47:26Z"), place)
+        >>> time = datetime.datetime(2019, 7, 29, 20, 47, 26, tzinfo=datetime.UTC)
+        >>> seen = observed_directions(StarCatalog.bundled(), time, place)
         >>> polaris = seen[StarCatalog.bundled().number == 424][0]
         >>> round(float(np.degrees(np.arcsin(polaris[2]))), 1)
         51.5

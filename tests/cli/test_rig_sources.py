@@ -174,7 +174,7 @@ def test_check_and_relock(site: Path, command: Command) -> None:
     assert "a target at 5000 m is found at" in printed.out
     assert (site / "rig.json").read_bytes() == before
 
-    command(check, "--relock", code=3)
+    command(check, "--relock rig.json", code=3)
     (kept,) = site.glob("rig.before-*.json")
     assert kept.read_bytes() == before
     old, new = RigFile.load(kept), RigFile.load(site / "rig.json")
@@ -191,7 +191,7 @@ def test_check_of_equal_marks(site: Path, command: Command) -> None:
     """Exactly no drift, no warning, exit code 0, and nothing written, though the rig itself is not exact."""
     command(SOLVE, "-o rig.json")
     files = {path.name: path.read_bytes() for path in site.iterdir()}
-    check = "rig check rig.json --reference then.csv --marks then.csv --relock"
+    check = "rig check rig.json --reference then.csv --marks then.csv --relock rig.json"
     # With a hundredth of their true noise, errors of the rig would be seen.
     printed = command(check, "--pixel-sigma 0.001")
     assert printed.err == ""
@@ -210,7 +210,7 @@ def test_check_without_a_drift(site: Path, command: Command) -> None:
     before = (site / "rig.json").read_bytes()
     marks_table(site / "now.csv", "s", marked(points(25, 400.0, 6000.0, 33), 8))
     for *source, now in (("--reference", "then.csv", "now.csv"), ("--landmarks", "survey.csv", "marks.csv")):
-        printed = command("rig check rig.json", *source, "--marks", now, "--pixel-sigma 0.1 --relock")
+        printed = command("rig check rig.json", *source, "--marks", now, "--pixel-sigma 0.1 --relock rig.json")
         assert "nothing was written" in printed.out
         assert "warning" not in printed.err
         assert (site / "rig.json").read_bytes() == before
@@ -229,7 +229,7 @@ def test_check_of_a_rig_that_turned_as_a_whole(site: Path, command: Command) -> 
     noise = torch.Generator().manual_seed(8)
     marks_table(site / "now.csv", "s", now + 0.1 * torch.randn(now.shape, dtype=torch.float64, generator=noise))
     check = "rig check rig.json --reference then.csv --marks now.csv --pixel-sigma 0.1"
-    printed = command(check, "--relock", code=3)
+    printed = command(check, "--relock rig.json", code=3)
     assert "no change of the relative attitude beyond chance" in printed.out
     assert "the left camera has turned beyond chance" in printed.out
     assert RigFile.load(site / "rig.json").mounting.heading_deg == pytest.approx(heading + 0.05, abs=0.005)
@@ -238,7 +238,7 @@ def test_check_of_a_rig_that_turned_as_a_whole(site: Path, command: Command) -> 
 def test_check_by_landmarks(site: Path, command: Command) -> None:
     command(SOLVE, "-o rig.json")
     arguments = "rig check rig.json --landmarks survey.csv --marks later.csv --pixel-sigma 0.1"
-    printed = command(arguments, "--relock", code=3)
+    printed = command(arguments, "--relock rig.json", code=3)
     line = next(line for line in printed.out.splitlines() if line.startswith("right from left"))
     assert abs(float(line.split()[6]) - 0.02) < 4.5 * float(line.split()[8])
     new = RigFile.load(site / "rig.json")

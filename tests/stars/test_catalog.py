@@ -9,7 +9,8 @@ import pytest
 
 from kcal.errors import InputError
 from kcal.lens.rig import Origin
-from kcal.stars.sky import _NAMES, Air, StarCatalog, _by_chance, celestial_directions, observed_directions, parse_time
+from kcal.stars.sky import _NAMES, Air, StarCatalog, _by_chance, celestial_directions, observed_directions
+from kcal.values import instant
 
 # The catalogue in the package, and where its stars are seen.
 
@@ -53,7 +54,7 @@ def test_out_of_range() -> None:
 @pytest.mark.parametrize("text", ["2026-11-24T20:47:26", "yesterday", ""])
 def test_a_time_has_a_zone(text: str) -> None:
     with pytest.raises(InputError, match=r"no zone|write it like"):
-        parse_time(text)
+        instant(text, "time")
 
 
 def test_aberration_is_twenty_seconds_of_arc() -> None:

@@ -32,7 +32,6 @@ from kcal.stars.sky import (
     _table_on_disk,
     identify,
     pair_table,
-    parse_time,
     pole_in_enu,
     refraction_sigma,
     require_erfa,
@@ -40,6 +39,7 @@ from kcal.stars.sky import (
     unit_vectors,
     year_of,
 )
+from kcal.values import instant
 
 WIDTH = 1.3  # px, of the window
 AROUND = np.arange(-7, 8)
@@ -272,12 +272,12 @@ class TestTables:
 
 class TestSky:
     def test_years_with_their_fraction(self) -> None:
-        assert year_of(parse_time("2021-01-01T00:00:00Z")) == 2021.0
-        assert year_of(parse_time("2021-07-02T15:00:00Z")) == pytest.approx(2021.5)
+        assert year_of(instant("2021-01-01T00:00:00Z", "time")) == 2021.0
+        assert year_of(instant("2021-07-02T15:00:00Z", "time")) == pytest.approx(2021.5)
         for wrong in ("1971-12-31T23:59:59Z", "2100-01-01T00:00:00Z"):
             with pytest.raises(InputError, match="outside 1972 to 2100"):
-                year_of(parse_time(wrong))
-        assert year_of(parse_time("1972-01-01T00:00:00Z")) == 1972.0
+                year_of(instant(wrong, "time"))
+        assert year_of(instant("1972-01-01T00:00:00Z", "time")) == 1972.0
 
     def test_julian_dates_are_those_of_utc(self) -> None:
         erfa = require_erfa()

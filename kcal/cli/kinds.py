@@ -1,0 +1,94 @@
+"""Kinds of values on the command line: metavar, unit and reader of each, declared once for all commands."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NamedTuple
+
+from kcal import values
+from kcal.cli import inputs
+from kcal.cli.options import Kind
+from kcal.files import check_picture
+from kcal.values import WithSigma
+
+if TYPE_CHECKING:
+    from kcal.lens.rig import Origin
+
+# Numbers with their unit. `Positive...` and `Least...` refuse others as wrong usage.
+Meters = Annotated[float, Kind(metavar="M")]
+Sigma = Annotated[float, Kind(metavar="M", least=0)]
+Degrees = Annotated[float, Kind(metavar="DEG")]
+DegreesSigma = Annotated[float, Kind(metavar="DEG", least=0)]
+Pixels = Annotated[float, Kind(metavar="PX")]
+Seconds = Annotated[float, Kind(metavar="S", least=0)]
+Celsius = Annotated[float, Kind(metavar="°C")]
+Hectopascal = Annotated[float, Kind(metavar="HPA")]
+Millimeters = Annotated[float, Kind(metavar="MM")]
+Count = Annotated[int, Kind(metavar="N", least=1)]
+PixelSigma = Annotated[
+    float,
+    Kind(metavar="PX", about="Noise of marks along each axis; that in the rig's file, or 0.3, if not given."),
+]
+
+# Numbers with what is known of them, VALUE±SIGMA.
+MeasuredMeters = Annotated[WithSigma, Kind(metavar="M±SIGMA", read=values.with_sigma, usage=True)]
+MeasuredDegrees = Annotated[WithSigma, Kind(metavar="DEG±SIGMA", read=values.with_sigma, usage=True)]
+MeasuredRefraction = Annotated[WithSigma, Kind(metavar="K±SIGMA", read=values.with_sigma, usage=True)]
+
+# Texts that stand for more than one number.
+Distance = Annotated[float, Kind(metavar="DISTANCE", read=values.distance)]
+Distances = Annotated[tuple[float, ...], Kind(metavar="M,M,...", read=values.number_list)]
+Size = Annotated[tuple[int, int], Kind(metavar="WIDTHxHEIGHT", read=values.size)]
+
+
+def _area(text: str, name: str) -> tuple[float, ...]:
+    return values.number_list(text, name, 4, "SOUTH,WEST,NORTH,EAST in degrees, for example 44.8,5.8,45.2,6.3")
+
+
+Area = Annotated[tuple[float, ...], Kind(metavar="S,W,N,E", read=_area)]
+
+
+class KnownPlace(NamedTuple):
+    """Where a camera stands on the Earth.
+
+    Args:
+        origin: the place.
+        sigma: of each axis, meters; None where that was not stated.
+    """
+
+    origin: Origin
+    sigma: float | None = None
+
+
+def read_site(text: str, name: str) -> KnownPlace:
+    """`LAT,LON,HEIGHT`, or `LAT,LON,HEIGHT±SIGMA`."""
+    from kcal.lens.rig import Origin
+
+    lat, lon, height, sigma = values.place_on_earth(text, name)
+    return KnownPlace(Origin(lat=lat, lon=lon, height=height), sigma)
+
+
+Place = Annotated[KnownPlace, Kind(metavar="LAT,LON,HEIGHT[±M]", read=read_site)]
+
+# Files that are read: what they must be.
+RigFile = Annotated[Path, inputs.RIG]
+CameraFile = Annotated[Path, inputs.CAMERA]
+CalibratedCamera = Annotated[Path, inputs.CALIBRATED]
+Observed = Annotated[Path, Kind(metavar="OBS.json"), inputs.OBSERVATIONS]
+Marks = Annotated[Path, Kind(metavar="CSV"), inputs.MARKS]
+Survey = Annotated[Path, Kind(metavar="CSV"), inputs.SURVEY]
+Table = Annotated[Path, Kind(metavar="CSV"), inputs.TABLE]
+Sites = Annotated[Path, Kind(metavar="CSV"), inputs.SITES]
+Images = Annotated[str, Kind(metavar="IMAGES"), inputs.IMAGES]
+Raster = Annotated[Path, Kind(metavar="RASTER")]
+
+# Files that are written. A name that no picture can have is refused before anything is computed.
+
+
+def _picture(text: str, name: str) -> Path:
+    check_picture(text)
+    return Path(text)
+
+
+Output = Annotated[Path, Kind(flags=("-o", "--output"))]
+Picture = Annotated[Path, Kind(metavar="FILE", read=_picture, about="Picture to write (.png, .svg or .pdf): {}")]

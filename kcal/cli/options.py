@@ -1,0 +1,347 @@
+"""Commands from plain functions: options from annotations and defaults, their help from the docstring's `Args:`.
+
+    def show_command(file: RigFile, *, pitch: Rare[Degrees] = 0.0, output: Output | None = None) -> None:
+
+Parameters before the `*` are arguments, those after it are options. A `Kind` in the annotation tells the metavar, how
+the text is read, and the flags if they are not the parameter's name. A parameter whose type is a dataclass stands for
+the options that are its fields.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import inspect
+import re
+import types
+from collections.abc import Callable, Iterator, Sequence
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
+
+import orjson
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+from kcal.cli import console
+from kcal.cli.inputs import Wanted, check_given
+from kcal.cli.settings import settings_file, settings_text, taken
+from kcal.errors import InputError
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Kind:
+    """How an option is typed.
+
+    Args:
+        metavar: what stands for the value in the help.
+        read: makes the value of the text, and is told the option's name; None: the annotation's type does.
+        usage: whether a text that cannot be read is wrong usage, exit code 2, as a word for a number is.
+        least: the smallest number allowed.
+        flags: of the option, where they are not its name.
+        several: whether all words up to the next option are values of this one, as in `--stars a.png b.png`.
+        rare: whether only `--help-all` shows it.
+        panel: title of the box in the help.
+        about: what it is; `{}` stands for what `Args:` say of the one option.
+    """
+
+    metavar: str | None = None
+    read: Callable[[str, str], Any] | None = None
+    usage: bool = False
+    least: float | None = None
+    flags: tuple[str, ...] = ()
+    several: bool = False
+    rare: bool = False
+    panel: str | None = None
+    about: str = "{}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Only:
+    """Fields of a dataclass that are options; the others keep their defaults."""
+
+    names: tuple[str, ...]
+
+
+_T = TypeVar("_T")
+Rare = Annotated[_T, Kind(rare=True)]
+Several = Annotated[list[_T], Kind(several=True)]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Option:
+    """A parameter of the command line, taken apart."""
+
+    name: str
+    type: Any
+    kind: Kind
+    wanted: Wanted | None
+    default: Any
+    about: str
+    argument: bool
+    group: str | None
+
+    @property
+    def label(self) -> str:
+        """What it is called in messages."""
+        if self.argument:
+            return _words(self.name).upper()
+        return next((flag for flag in self.kind.flags if flag.startswith("--")), f"--{_words(self.name)}")
+
+    @property
+    def parameter(self) -> inspect.Parameter:
+        """As typer takes it."""
+        text, default = self.type, self.default
+        if self.kind.read is not None:
+            text, default = _of_text(text), default if default in (None, inspect.Parameter.empty) else str(default)
+        shared: dict[str, Any] = {"help": self.about.replace("[", r"\[")}
+        shared |= {"min": self.kind.least, "rich_help_panel": self.kind.panel, "show_default": bool(str(default))}
+        if self.argument:
+            info: Any = typer.Argument(**shared)
+        else:
+            only = self.type is bool and self.default is False
+            flags = self.kind.flags or ((self.label,) if only or self.name != _words(self.name) else ())
+            info = typer.Option(*flags, hidden=self.kind.rare, metavar=self.kind.metavar, **shared)
+        return inspect.Parameter(
+            self.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[text, info]
+        )
+
+    def value(self, given: Any) -> Any:
+        """What the command gets."""
+        if self.kind.read is None or given is None:
+            return given
+        if isinstance(given, list | tuple):
+            return type(given)(map(self._read, given))
+        return self._read(str(given))
+
+    def _read(self, text: str) -> Any:
+        assert self.kind.read is not None
+        try:
+            return self.kind.read(text, self.label)
+        except InputError as error:
+            if self.kind.usage:
+                raise typer.BadParameter(str(error)) from None
+            raise
+
+
+def _words(name: str) -> str:
+    return name.strip("_").replace("_", "-")
+
+
+def _taken_apart(annotation: Any) -> tuple[Any, tuple[Any, ...]]:
+    """The plain type, and what `Annotated` says of it or of its parts."""
+    origin, parts = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        inner, more = _taken_apart(parts[0])
+        return inner, (*more, *parts[1:])
+    if origin in (Union, types.UnionType, list, tuple):
+        apart = [_taken_apart(part) for part in parts]
+        metadata = tuple(dict.fromkeys(one for _, more in apart for one in more))
+        plain = tuple(inner for inner, _ in apart)
+        return (Union[plain] if origin in (Union, types.UnionType) else origin[plain]), metadata  # noqa: UP007
+    return annotation, ()
+
+
+def _of_text(plain: Any) -> Any:
+    """The same type with texts in it, before these are read."""
+    if plain is types.NoneType:
+        return plain
+    origin, parts = get_origin(plain), tuple(map(_of_text, get_args(plain)))
+    if origin in (Union, types.UnionType):
+        return Union[parts]  # noqa: UP007
+    return list[str] if origin is list else str
+
+
+def described(docstring: str | None) -> tuple[str, dict[str, str]]:
+    """A docstring without its `Args:`, and what these say of each name.
+
+    Example:
+        >>> described("Show a file.\\n\\nArgs:\\n    file: Camera file,\\n        or rig file.\\n\\nMore.")
+        ('Show a file.\\n\\nMore.', {'file': 'Camera file, or rig file.'})
+    """
+    text = inspect.cleandoc(docstring or "")
+    found = re.search(r"^Args:\n((?:    .*\n|\n)*)", f"{text}\n", re.MULTILINE)
+    if found is None:
+        return text, {}
+    names = re.findall(r"^    (\w+): ((?:.*\n(?:     .*\n)*))", found.group(1), re.MULTILINE)
+    rest = f"{text[: found.start()].rstrip()}\n\n{text[found.end() :].strip()}".strip()
+    return rest, {name: " ".join(about.split()) for name, about in names}
+
+
+def _declared_options(
+    parameters: Sequence[inspect.Parameter | dataclasses.Field[Any]], about: dict[str, str], group: str | None = None
+) -> Iterator[_Option]:
+    for each in parameters:
+        plain, more = _taken_apart(each.annotation if isinstance(each, inspect.Parameter) else each.type)
+        default = each.default
+        if isinstance(each, dataclasses.Field) and each.default_factory is not dataclasses.MISSING:
+            default = each.default_factory()
+        if dataclasses.is_dataclass(plain) and group is None:
+            only = next((one.names for one in more if isinstance(one, Only)), None)
+            fields = [field for field in _typed_fields(plain) if only is None or field.name in only]
+            yield from _declared_options(fields, about | described(plain.__doc__)[1], each.name)
+            continue
+        kinds = [one for one in more if isinstance(one, Kind)]
+        told = {
+            field.name: value
+            for kind in kinds
+            for field in dataclasses.fields(Kind)
+            if (value := getattr(kind, field.name)) != field.default
+        }
+        kind = Kind(**told)
+        yield _Option(
+            name=each.name, type=plain, kind=kind, group=group,
+            about=kind.about.format(about[each.name]) if "{}" in kind.about else kind.about,
+            wanted=next((one for one in more if isinstance(one, Wanted)), None),
+            default=inspect.Parameter.empty if default is dataclasses.MISSING else default,
+            argument=isinstance(each, inspect.Parameter) and each.kind is not each.KEYWORD_ONLY,
+        )  # fmt: skip
+
+
+def _typed_fields(cls: Any) -> Iterator[dataclasses.Field[Any]]:
+    hints = inspect.get_annotations(cls, eval_str=True)
+    for field in dataclasses.fields(cls):
+        field.type = hints[field.name]
+        yield field
+
+
+def declared(function: Callable[..., None], *, json: bool = True) -> Callable[..., None]:
+    """The function as typer takes it: files are checked first, then values are read, then it is called.
+
+    Args:
+        function: a command, see above.
+        json: whether it has an option `--json`: one JSON object on the standard output, in place of what it prints.
+            It has `exit_code`, what the command tells (`console.tell`), and the lines that a person would read as
+            `text`. Errors go to the error stream, and the exit code is the same, with it and without.
+    """
+    signature = inspect.signature(function, eval_str=True)
+    text, about = described(function.__doc__)
+    options = list(_declared_options([*signature.parameters.values()], about))
+    names = [name for name in signature.parameters if name in {one.group for one in options}]
+    groups = {name: _taken_apart(signature.parameters[name].annotation)[0] for name in names}
+
+    @functools.wraps(function)
+    def run(*, as_json: bool = False, **given: Any) -> None:
+        console.tell_anew()
+        outputs = given.get("output") or []
+        check_given(
+            [(one.label, one.wanted, given[one.name]) for one in options if one.wanted is not None],
+            outputs if isinstance(outputs, list) else [outputs],
+        )
+        values: dict[str | None, dict[str, Any]] = {None: {}, **{name: {} for name in groups}}
+        for one in options:
+            values[one.group][one.name] = one.value(given[one.name])
+        own = values[None] | {name: cls(**values[name]) for name, cls in groups.items()}
+        bound = signature.bind_partial()
+        bound.arguments.update({name: own[name] for name in signature.parameters})
+        if not as_json:
+            return function(*bound.args, **bound.kwargs)
+        code = 0
+        with console.out.capture() as captured:
+            try:
+                function(*bound.args, **bound.kwargs)
+            except typer.Exit as stopped:
+                code = stopped.exit_code
+        told = {"exit_code": code, **console.told(), "text": captured.get().splitlines()}
+        print(orjson.dumps(told).decode())
+        raise typer.Exit(code)
+
+    parameters = [one.parameter for one in options]
+    if json:
+        option = Annotated[bool, typer.Option("--json", help="Print one JSON object for programs in place of text.")]
+        parameters.append(
+            inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=option)
+        )
+    run.__doc__ = text
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    run.several = {one.name for one in options if one.kind.several}  # type: ignore[attr-defined]
+    return run
+
+
+class Command(TyperCommand):
+    """A command whose rare options are shown by `--help-all`, and that says what it took from kcal.toml."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.more = [param for param in self.params if getattr(param, "hidden", False)]
+        if self.more:
+            hint = f"`--help-all` shows {len(self.more)} more options."
+            self.epilog = f"{self.epilog}\n\n{hint}" if self.epilog else hint
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Show all options and stop, if that was asked for."""
+        if "--help-all" in args and self.more:
+            shown, self.epilog = self.epilog, None
+            try:
+                for param in self.more:
+                    param.hidden = False  # type: ignore[attr-defined]
+                text = self.get_help(ctx)
+            finally:
+                for param in self.more:
+                    param.hidden = True  # type: ignore[attr-defined]
+                self.epilog = shown
+            if text:
+                print(text)
+            ctx.exit()
+        words = ["--help" if word == "--help-all" else word for word in args]
+        return super().parse_args(ctx, self._spread(words))
+
+    def _spread(self, words: list[str]) -> list[str]:
+        """Each value of an option that takes several with the flag before it, as typer wants them.
+
+        The values end at the next option. Words that arguments of the command still need are the last of them.
+        """
+        several: set[str] = getattr(self.callback, "several", set())
+        takes = {flag: param for param in self.params for flag in (*param.opts, *param.secondary_opts)}
+        spread: list[list[str]] = []
+        alone, i = 0, 0
+        while i < len(words):
+            flag, equals, _ = words[i].partition("=")
+            param = takes.get(flag) if flag.startswith("-") else None
+            if words[i] == "--":
+                alone += len(words) - i - 1
+                spread.append(words[i:])
+                break
+            count = 0 if param is None or equals or getattr(param, "is_flag", False) else param.nargs
+            if param is not None and param.name in several and not equals:
+                count = next((n for n, word in enumerate(words[i + 1 :]) if word.startswith("-")), len(words) - i - 1)
+            alone += not words[i].startswith("-")
+            spread.append(words[i : i + 1 + count])
+            i += 1 + count
+        needed = (param.nargs for param in self.params if param.required and not param.opts[0].startswith("-"))
+        missing = sum(needed) - alone
+        found: list[str] = []
+        for group in reversed(spread):
+            param = takes.get(group[0])
+            if param is None or param.name not in several or len(group) < 2 or "=" in group[0]:
+                found = [*group, *found]
+                continue
+            back = max(0, min(missing, len(group) - 2))
+            missing -= back
+            values = group[1 : len(group) - back]
+            found = [*(word for value in values for word in (group[0], value)), *group[len(group) - back :], *found]
+        return found
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command; what it takes from kcal.toml is said first, in one line."""
+        names = [
+            param.name
+            for param in self.params
+            if getattr(ctx.get_parameter_source(param.name), "name", "") == "DEFAULT_MAP"
+        ]
+        taken.clear()
+        taken.update(names)
+        if names:
+            console.err.print(settings_text({name: ctx.params[name] for name in names}, settings_file()), markup=False)
+        return super().invoke(ctx)
+
+
+def group_with_default(command: str) -> type[TyperGroup]:
+    """A group whose arguments go to `command` unless they begin with the name of another one."""
+
+    class DefaultGroup(TyperGroup):
+        def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+            if not args or args[0] not in self.commands:
+                args = [command, *args]
+            return super().parse_args(ctx, args)
+
+    return DefaultGroup
