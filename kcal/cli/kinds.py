@@ -41,11 +41,11 @@ Distances = Annotated[tuple[float, ...], Kind(metavar="M,M,...", read=values.num
 Size = Annotated[tuple[int, int], Kind(metavar="WIDTHxHEIGHT", read=values.size)]
 
 
-def _area(text: str, name: str) -> tuple[float, ...]:
+def _read_area(text: str, name: str) -> tuple[float, ...]:
     return values.number_list(text, name, 4, "SOUTH,WEST,NORTH,EAST in degrees, for example 44.8,5.8,45.2,6.3")
 
 
-Area = Annotated[tuple[float, ...], Kind(metavar="S,W,N,E", read=_area)]
+Area = Annotated[tuple[float, ...], Kind(metavar="S,W,N,E", read=_read_area)]
 
 
 class KnownPlace(NamedTuple):
@@ -85,10 +85,10 @@ Raster = Annotated[Path, Kind(metavar="RASTER")]
 # Files that are written. A name that no picture can have is refused before anything is computed.
 
 
-def _picture(text: str, name: str) -> Path:
+def _read_picture(text: str, name: str) -> Path:
     check_picture(text)
     return Path(text)
 
 
 Output = Annotated[Path, Kind(flags=("-o", "--output"))]
-Picture = Annotated[Path, Kind(metavar="FILE", read=_picture, about="Picture to write (.png, .svg or .pdf): {}")]
+Picture = Annotated[Path, Kind(metavar="FILE", read=_read_picture, about="Picture to write (.png, .svg or .pdf): {}")]
