@@ -143,7 +143,7 @@ def main() -> None:
     early, late = max(settled[: 2 * quarter]), max(settled[-quarter:])
     text = "\n".join([
         f"{options.hours:g} h of {options.rate:g} moments a second with {options.targets} targets, replayed as fast as "
-        "it goes. Made by `scripts/bench/live.py`.",
+        "it goes. Made by `python -m scripts.bench.live --write`.",
         "",
         *table(["", "found"], [
             ["moments, positions", f"{moments:,}, {sum(seen.values()):,}"],

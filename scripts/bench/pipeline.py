@@ -122,7 +122,7 @@ def gradients() -> str:
     heads += [
         f"{what}, {how}, ms" for what in ("100", PAIRS, f"{PAIRS} with gradients") for how in ("eager", "compiled")
     ]
-    text = "Processor time of `Localizer`, one thread. Made by `scripts/bench/pipeline.py --gradients`.\n\n"
+    text = "Processor time of `Localizer`, one thread: `python -m scripts.bench.pipeline --gradients --write`.\n\n"
     text += "\n".join(table(heads, rows))
     camera = made["opencv5"][0].rig.left
     pixels, K, d = made["opencv5"][1], camera.matrix, camera.coefficients
@@ -222,8 +222,8 @@ def main() -> None:
         "match",
     ]
     text = (
-        "Milliseconds a call: median / 99th percentile (processor time, mean). Made by `scripts/bench/pipeline.py`.\n\n"
-        + "\n".join(table(heads, rows))
+        "Milliseconds a call: median / 99th percentile (processor time, mean). Made by "
+        "`python -m scripts.bench.pipeline --write`.\n\n" + "\n".join(table(heads, rows))
     )
     if options.write:
         write_section("pairing.md", "latency", text)

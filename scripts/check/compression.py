@@ -130,7 +130,7 @@ def main() -> None:
     lines = [
         f"Ten plates of 16 by 12 px in {FRAMES} frames, H.264 by x264. *Pace*: 1 is some 0.4 px a frame, 0 stands "
         "still. *Lasts*: the part of each plate's error that is the same in all frames. Made by "
-        "`scripts/check/compression.py`.",
+        "`python -m scripts.check.compression --write`.",
         "",
         *table(heads, rows),
     ]

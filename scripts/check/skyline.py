@@ -8,9 +8,9 @@ Trials that are done are kept in skyline-alone.jsonl and skyline-rigs.jsonl in K
 
 from __future__ import annotations
 
+import argparse
 import math
 import os
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -32,8 +32,8 @@ from kcal.lens.projection import project_components
 from kcal.lens.rig import Origin
 from kcal.skyline.attitude import SkylineImage, skyline_attitude, skyline_source
 from kcal.skyline.horizon import RasterError
-from scripts.check.stars import kept
 from scripts.shared.page import table, write_section
+from scripts.shared.records import kept
 from scripts.shared.skyline_trials import (
     HERE,
     Ground,
@@ -204,10 +204,14 @@ WHAT: dict[
 }
 
 if __name__ == "__main__":
-    what, count = sys.argv[1], int(sys.argv[2])
-    run, names, told = WHAT[what]
-    lines = told(kept(TRIALS / f"skyline-{what}.jsonl", list(names), range(count), run))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=WHAT)
+    parser.add_argument("count", type=int, help="draws of each kind")
+    parser.add_argument("--write", action="store_true", help="put the table into docs/measured/skyline.md")
+    options = parser.parse_args()
+    run, names, told = WHAT[options.what]
+    lines = told(kept(TRIALS / f"skyline-{options.what}.jsonl", list(names), range(options.count), run))
     print("\n".join(lines))
-    if "--write" in sys.argv:
-        made = f"Made by `python -m scripts.check.skyline {what} {count} --write`."
-        write_section("skyline.md", what, "\n".join([*lines, "", made]))
+    if options.write:
+        made = f"Made by `python -m scripts.check.skyline {options.what} {options.count} --write`."
+        write_section("skyline.md", options.what, "\n".join([*lines, "", made]))

@@ -1,6 +1,6 @@
 """Stars: real images, identification of random points, and simulated rigs, as `docs/howto/stars.md` states them.
 
-    python -m scripts.check.stars real
+    python -m scripts.check.stars real --write
     python -m scripts.check.stars random 10000
     python -m scripts.check.stars rigs 30
     python -m scripts.check.stars lens 3
@@ -11,12 +11,10 @@ where one of them is installed.
 
 from __future__ import annotations
 
-import json
+import argparse
 import math
 import os
-import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +27,7 @@ from kcal.stars.lens import StarCamera, calibrate_by_stars
 from kcal.stars.night import SkyView, fit_attitude, name_stars
 from kcal.stars.sky import StarCatalog, identify
 from scripts.shared.page import write_section
+from scripts.shared.records import kept
 
 # Trials that are done already, one a line; a run continues where another one ended.
 RIGS, LENSES = (Path(os.environ.get("KCAL_TRIALS", "."), f"stars-{what}.jsonl") for what in ("rigs", "lens"))
@@ -162,18 +161,6 @@ def random_points(count: int) -> None:
     say(f"{count} fields of 4 to 20 random points: {wrong} with names; {spent:.2f} CPU s each")
 
 
-def kept(path: Path, names: list[str], seeds: range, run: Callable[[int], dict[str, Any]]) -> dict[str, list[Any]]:
-    """Trials of all seeds by name, those that the file has already left as they are."""
-    lines = [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
-    done = {line["seed"]: line["found"] for line in lines}
-    for seed in seeds:
-        if seed not in done:
-            done[seed] = run(seed)
-            with path.open("a") as file:
-                file.write(json.dumps({"seed": seed, "found": done[seed]}) + "\n")
-    return {name: [done[seed][name] for seed in seeds] for name in names}
-
-
 def rigs(count: int) -> None:
     """Ranges of rigs behind traced lenses that boards calibrated: errors, and coverage of their 95 % intervals."""
     from scripts.shared.traced_nights import CASES, PAIRS_OF_LENSES, trial
@@ -214,10 +201,17 @@ def lens(count: int) -> None:
 
 
 if __name__ == "__main__":
-    what, number = sys.argv[1], int(sys.argv[2]) if len(sys.argv) > 2 else 30
-    {"real": real, "random": lambda: random_points(number), "rigs": lambda: rigs(number), "lens": lambda: lens(number)}[
-        what
-    ]()
-    about = _ABOUT.get(what, "").format(count=number)
-    made = f"Made by `python -m scripts.check.stars {' '.join(sys.argv[1:])}`{about}."
-    write_section("stars.md", what, made + "\n\n" + "\n".join(_said))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("real", "random", "rigs", "lens"))
+    parser.add_argument("count", type=int, nargs="?", default=30, help="points, rigs or lenses; real images are six")
+    parser.add_argument("--write", action="store_true", help="put the result into docs/measured/stars.md")
+    options = parser.parse_args()
+    what, count = options.what, options.count
+    if what == "real":
+        real()
+    else:
+        {"random": random_points, "rigs": rigs, "lens": lens}[what](count)
+    if options.write:
+        words = f"{what} --write" if what == "real" else f"{what} {count} --write"
+        made = f"Made by `python -m scripts.check.stars {words}`{_ABOUT.get(what, '').format(count=count)}."
+        write_section("stars.md", what, made + "\n\n" + "\n".join(_said))

@@ -234,7 +234,7 @@ def report(counts: list[int], all_sums: list[Sums], seeds: int, seconds: float) 
         "12 targets (smokes, ships at 8 m/s, drones at 25 m/s) in 12 by 16 km, all of one category, once a second for "
         f"{seconds:g} s, {seeds} draws; boxes {BOX_PX:g} px, {100 * MISSED:g} % missed, {FALSE:g} false an image; "
         f"attitude known to {ATTITUDE_DEG[0]}° and heading to {ATTITUDE_DEG[2]}°, clocks to {OFFSET_S} s and "
-        f"{1e6 * RATE:g} ppm. Made by `scripts/check/station_tracks.py`.",
+        f"{1e6 * RATE:g} ppm. Made by `python -m scripts.check.station_tracks --write`.",
         "",
         *table(heads, rows),
     ])  # fmt: skip
@@ -294,7 +294,7 @@ def speed(targets: list[int]) -> str:
     return "\n".join([
         "Targets in 5 by 5 km, .8 km high, 8 cameras around them in 8 km; one thread, one draw of the cameras' "
         "errors. A group is right if all its marks are of one thing. Made by "
-        "`scripts/check/station_tracks.py --speed`.",
+        "`python -m scripts.check.station_tracks --speed --write`.",
         "",
         *table(heads, rows),
     ])  # fmt: skip

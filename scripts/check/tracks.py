@@ -290,7 +290,7 @@ def report(figures: Figures, seeds: int, seconds: float) -> str:
     lines = [
         f"{TARGETS} targets from 100 m to 5 km, six of them at 5 km and 30 m/s; cameras of 10 and 25 frames a second; "
         f"boxes {BEARING_PX} px, matching {MATCH_PX} px; relative yaw known to {YAW_SIGMA}°; {seconds:g} s, {seeds} "
-        "draws of rig, targets and noise. Made by `scripts/check/tracks.py`.",
+        "draws of rig, targets and noise. Made by `python -m scripts.check.tracks --write`.",
         "",
         *table(
             ["range at 5 km", "RMS of error (of the inverse range, times 5 km squared)", "over its stated sigma"], rows

@@ -51,3 +51,9 @@ def finish(
             file.write(json.dumps(record) + "\n")
         print(*key, show(record), flush=True)
     return read([path])
+
+
+def kept(path: Path, names: Iterable[str], seeds: Iterable[int], run: Callable[[int], Record]) -> dict[str, list[Any]]:
+    """Trials of all seeds by name; `finish` makes those that the file does not have."""
+    found = {record["key"][0]: record for record in finish(path, [(seed,) for seed in seeds], run, lambda _: "done")}
+    return {name: [found[seed][name] for seed in seeds] for name in names}

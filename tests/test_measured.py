@@ -1,0 +1,123 @@
+"""Commands on the measured pages exist as they are written there, and each page says what they need."""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import functools
+import re
+import runpy
+import shlex
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted((ROOT / "docs" / "measured").glob("*.md"))
+COMMAND = re.compile(r"`((?:[A-Z_]+=\S+\s+)*python\s+-m\s+scripts\.[^`]+)`")
+
+
+def commands(page: Path) -> list[str]:
+    return [" ".join(found.split()) for found in COMMAND.findall(page.read_text(encoding="utf-8"))]
+
+
+ALL = sorted({(page.stem, command) for page in PAGES for command in commands(page)})
+
+
+class ParsedError(Exception):
+    """The arguments are what the script takes; nothing has run."""
+
+
+def parse(command: str, patch: pytest.MonkeyPatch) -> None:
+    """Start the script of a command, and stop it when it has read its arguments."""
+    words = [word for word in shlex.split(command) if not re.match(r"[A-Z_]+=", word)]
+    source = (ROOT / f"{words[2].replace('.', '/')}.py").read_text(encoding="utf-8")
+    assert "argparse.ArgumentParser(" in source, "without a parser the script would run"
+    patch.setattr(sys, "argv", words[2:])
+    read = argparse.ArgumentParser.parse_args
+
+    def stop(self: argparse.ArgumentParser, *given: object) -> None:
+        read(self, *given)  # type: ignore[call-overload]
+        raise ParsedError
+
+    patch.setattr(argparse.ArgumentParser, "parse_args", stop)
+    runpy.run_module(words[2], run_name="__main__", alter_sys=True)
+
+
+@pytest.mark.filterwarnings("ignore:'scripts:RuntimeWarning")
+@pytest.mark.parametrize(("page", "command"), ALL)
+def test_a_command_exists_with_its_options(page: str, command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ParsedError):
+        parse(command, monkeypatch)
+
+
+@pytest.mark.filterwarnings("ignore:'scripts:RuntimeWarning")
+@pytest.mark.parametrize("wrong", ["python -m scripts.bench.corners --wrote", "python -m scripts.check.stars reel"])
+def test_a_wrong_option_is_seen(wrong: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(SystemExit):
+        parse(wrong, monkeypatch)
+
+
+@functools.cache
+def extra_packages() -> frozenset[str]:
+    """Names by which Python imports what `pip install kcal[bench]` installs."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    waiting, names = [*project["dependencies"], "kcal[bench]"], set()
+    while waiting:
+        line = waiting.pop()
+        if line.startswith("kcal["):
+            for extra in line[5:].rstrip("]").split(","):
+                waiting += project["optional-dependencies"][extra]
+        names.add(re.split(r"[^\w.-]", line)[0].lower())
+    other = {
+        "cv2": "opencv-contrib-python-headless",
+        "PIL": "pillow",
+        "skimage": "scikit-image",
+        "erfa": "pyerfa",
+        "yaml": "pyyaml",
+    }
+    return frozenset({*names, *(name for name, package in other.items() if package in names)})
+
+
+@functools.cache
+def read(module: str) -> tuple[frozenset[str], frozenset[str]]:
+    """Scripts that a script imports or starts, and what it asks for: packages and folders or programs by variable."""
+    path = ROOT / f"{module.replace('.', '/')}.py"
+    if not path.exists():  # a name in a module
+        return frozenset(), frozenset()
+    text = path.read_text(encoding="utf-8")
+    asked = set(re.findall(r"KCAL_(?:DATA|MRCAL|PEERS)", text))
+    scripts = {f"{module.rpartition('.')[0]}.{name}" for name in re.findall(r'with_name\("(\w+)\.py"\)', text)}
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Import):
+            asked |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            asked.add(node.module.split(".")[0])
+            scripts |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    own = {"kcal", "scripts", *sys.stdlib_module_names, *extra_packages()}
+    return frozenset(name for name in scripts if name.startswith("scripts.")), frozenset(asked - own)
+
+
+def needs(module: str) -> set[str]:
+    """What a script and those that it uses ask for beyond a checkout and the extra `bench`."""
+    seen, waiting, found = set(), [module], set()
+    while waiting:
+        each = waiting.pop()
+        if each not in seen:
+            seen.add(each)
+            more, asked = read(each)
+            waiting += more
+            found |= asked
+    return found
+
+
+@pytest.mark.parametrize("page", PAGES, ids=[page.stem for page in PAGES])
+def test_a_page_says_what_its_commands_need(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    told = text[text.rindex("\n**To repeat**") :]
+    assert "`pip install -e '.[bench]'`" in told
+    asked = {name for command in commands(page) for name in needs(command.split("-m ")[1].split()[0])}
+    assert commands(page)
+    assert {name for name in asked if f"`{name}`" not in told} == set()
