@@ -117,7 +117,8 @@ def _option_row(option: Any) -> str:
 
 def conclusions_page() -> str:
     """What to conclude from each measured page."""
-    lines = ["# Measured", "", "Each page is written by scripts of the repository, and ends with what they need. This is what each concludes.", ""]
+    about = "Each page is written by scripts of the repository, and ends with what they need. What each concludes:"
+    lines = ["# Measured", "", about, ""]
     _, folder, order = SECTIONS[-1]
     for name in ordered([page.stem for page in (DOCS / folder).glob("*.md")], order):
         title, opening = (DOCS / folder / f"{name}.md").read_text(encoding="utf-8").split("\n\n")[:2]
