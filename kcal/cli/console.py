@@ -165,6 +165,10 @@ def on_signals(stop: Callable[..., object]) -> Iterator[None]:
             signal.signal(number, handler)
 
 
+# From so many steps on their share is told.
+_MANY = 10_000
+
+
 class _Left(ProgressColumn):
     """How many steps are done of how many, and the time that is left; of unknown many, the time that has passed."""
 
@@ -173,7 +177,8 @@ class _Left(ProgressColumn):
         if task.total is None:
             return Text(str(timedelta(seconds=int(task.elapsed or 0.0))))
         left = "" if task.time_remaining is None else f", {timedelta(seconds=int(task.time_remaining))} left"
-        return Text(f"{task.completed:.0f}/{task.total:.0f}{left}")
+        many = task.total >= _MANY  # bytes
+        return Text((f"{task.percentage:.0f} %" if many else f"{task.completed:.0f}/{task.total:.0f}") + left)
 
 
 class _Bar(BarColumn):
@@ -220,19 +225,25 @@ def working(command: str) -> Iterator[None]:
 
 @contextmanager
 def steps(description: str, total: int | None) -> Iterator[Callable[..., None]]:
-    """Show a progress bar on the error stream: call the value with a text, and how many if not one, after each step."""
-    before = [task.id for task in _line.tasks if task.visible]
+    """Show a bar on the terminal: call the value with a text, and how many if not one, after each step.
+
+    Blocks may be nested. Of unknown many steps (None), the last text and the time that has passed are shown.
+    """
+    shown = any(task.visible for task in _line.tasks)
+    # What has no end in sight makes room for what it consists of.
+    before = [task.id for task in _line.tasks if task.visible and task.total is None]
     # Long work: meanwhile the garbage collector need not search the imported libraries, which takes 50 ms each time.
     gc.freeze()
     for other in before:
         _line.update(other, visible=False)
     task = _line.add_task(description, total=total)
-    if before:
+    if shown:
         _line.start()
     try:
 
         def advance(text: str, by: float = 1) -> None:
-            _line.update(task, advance=by, description=f"{description}: {escape(one_line(text))}")
+            about = f"{description}: {escape(one_line(text))}" if text else description
+            _line.update(task, advance=by, description=about)
 
         yield advance
     finally:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from kcal.locate.tables import PositionColumns
     from kcal.pipeline.association import AssociationOptions
     from kcal.pipeline.senders import LiveMap
-    from kcal.pipeline.stream import StreamCounts
+    from kcal.pipeline.stream import Stream, StreamCounts
     from kcal.pipeline.tracks import Tracker, Tracks
     from kcal.pipeline.video_source import Videos
 
@@ -177,7 +177,7 @@ def live_command(
             senders=[sender_to(address) for address in to or []], start=moment_zero, shown=None,
         )  # fmt: skip
         page = None if port is None else _live_map(stream.run, port)
-        stream.shown = _progress(advance, stream.counts, page)
+        stream.shown = _progress(advance, stream, page)
         if stream.ledger.place.sequence:
             err.print(f"continuing after {stream.ledger.place.sequence:,} moments of {log}", markup=False)
         ending = "finished"
@@ -306,18 +306,18 @@ def _live_map(run: Located, port: int) -> LiveMap:
 
 
 def _progress(
-    advance: Callable[..., None], counts: StreamCounts, page: LiveMap | None
+    advance: Callable[..., None], stream: Stream, page: LiveMap | None
 ) -> Callable[[PositionColumns, Tracks], None]:
     """Show the tracks on the map, and how it goes, twice a second."""
-    next_time = 0.0
+    next_time, read = 0.0, 0
 
     def show(columns: PositionColumns, tracks: Tracks) -> None:
-        nonlocal next_time
+        nonlocal next_time, read
         if page is not None:
-            page.show(columns, counts.moments)
+            page.show(columns, stream.counts.moments)
         if clocks.monotonic() >= next_time:
-            next_time = clocks.monotonic() + 0.5
-            advance(f"{len(tracks.number)} tracks; {summary(counts)}", 0)
+            next_time, before, read = clocks.monotonic() + 0.5, read, stream.ledger.place.offset
+            advance(f"{len(tracks.number)} tracks; {summary(stream.counts)}", read - before)
 
     return show
 

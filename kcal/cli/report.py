@@ -110,7 +110,9 @@ def told_usable(
     print_verdict(verdict, warned)
     if page is not None:
         ranges = [range_rows(verdict)] if verdict.answers else []
-        print_wrote(save_verdict_page(page, verdict, pictures(), [*ranges, *tables]))
+        with steps("drawing", None):
+            drawn = pictures()
+        print_wrote(save_verdict_page(page, verdict, drawn, [*ranges, *tables]))
     return verdict.usable
 
 
@@ -232,10 +234,12 @@ def judged_sides(
     cameras: Sequence[tuple[str, Camera]], observations: Sequence[Path], mark_sigma: float
 ) -> list[Judged]:
     """The verdicts on cameras of a rig, calibrated again from their observations; none without these."""
-    return [
-        _judged_again(camera, file, (), mark_sigma=mark_sigma, name=side)
-        for (side, camera), file in zip(cameras, observations, strict=False)
-    ]
+    found = []
+    with steps("cameras", len(observations)) as advance:
+        for (side, camera), file in zip(cameras, observations, strict=False):
+            found.append(_judged_again(camera, file, (), mark_sigma=mark_sigma, name=side))
+            advance("")
+    return found
 
 
 def stored_tables(rig: Rig) -> list[list[list[str]]]:

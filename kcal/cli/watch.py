@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kcal.cli.console import err, on_signals, out, print_wrote, warn
+from kcal.cli.console import err, on_signals, out, print_wrote, steps, warn
 from kcal.cli.inputs import RIG
 from kcal.cli.rig import DRIFTED, print_turns
 from kcal.cli.settings import picture_option
@@ -119,7 +119,8 @@ def watch_command(
         err.print(_summary(watcher, hooks), markup=False)
         if not watcher.last_time > -math.inf:
             raise InputError("no pair of images was looked at")
-    watched = Watched.read(history, known)
+    with steps("fitting how it turns", None):
+        watched = Watched.read(history, known)
     _tell_turns(watched, limit)
     if picture is not None:
         _draw_turns(watched, picture, limit, history.name)
@@ -172,10 +173,12 @@ def _frame_pairs(rig: Rig, sources: tuple[str, str]) -> FramesTogether:
 
 
 def _of_frames(watcher: Watcher, frames: FramesTogether) -> Iterator[tuple[float, Gray, Gray]]:
-    for _, (_, group) in frames(0 if frames.live else watcher.offset):
-        one, other = group
-        if one is not None and other is not None and watcher.due(one.time):
-            yield one.time, one.gray().numpy(), other.gray().numpy()
+    with steps("watching", None) as advance:
+        for _, (_, group) in frames(0 if frames.live else watcher.offset):
+            one, other = group
+            if one is not None and other is not None and watcher.due(one.time):
+                advance(f"{one.time:.0f} s")
+                yield one.time, one.gray().numpy(), other.gray().numpy()
 
 
 def _folder_pairs(watcher: Watcher, folders: tuple[str, str]) -> Iterator[tuple[float, Gray, Gray]]:
@@ -187,9 +190,11 @@ def _folder_pairs(watcher: Watcher, folders: tuple[str, str]) -> Iterator[tuple[
     if not pairs:
         raise InputError(f"no image of {folders[0]} belongs to one of {folders[1]}; name pairs alike")
     timed = sorted((image_time(files[0][left]), left, right) for left, right in pairs)
-    for time, left, right in timed:
-        if watcher.due(time):
-            yield time, read_gray(files[0][left]), read_gray(files[1][right])
+    with steps("watching", len(timed)) as advance:
+        for time, left, right in timed:
+            if watcher.due(time):
+                yield time, read_gray(files[0][left]), read_gray(files[1][right])
+            advance(left)
 
 
 def _turn_text(noticed: Noticed) -> str:
@@ -243,7 +248,11 @@ def _draw_turns(watched: Watched, picture: Path, limit: float, title: str) -> No
 
     step = -(-len(watched.times) // _DRAWN)
     times = watched.times[::step]
-    drifts = [watched.drift_at(time) for time in times]
+    drifts = []
+    with steps("drawing", len(times)) as advance:
+        for time in times:
+            drifts.append(watched.drift_at(time))
+            advance("")
     angle = np.degrees(np.stack([drift.relative.numpy() for drift in drifts]))
     sigma = np.degrees(np.stack([drift.relative_covariance.diagonal().sqrt().numpy() for drift in drifts]))
     seen = np.array(watched.seen[::step], bool)
