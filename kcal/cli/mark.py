@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from kcal.cli.console import err, out, show_page, warn
-from kcal.cli.inputs import CALIBRATED, IMAGES, MARKS, RIG, SURVEY, PixelSigma, pixel_sigma_of
+from kcal.cli.inputs import CALIBRATED, IMAGES, MARKS, RIG, SURVEY, TABLE, PixelSigma, pixel_sigma_of
 from kcal.errors import InputError, with_extra
 
 _PORT = 8347
@@ -32,6 +32,9 @@ def mark_command(
         Path | None,
         typer.Option(metavar="CSV", help="Surveyed places: name,lat,lon,height,sigma or east,north,up."),
         SURVEY,
+    ] = None,
+    targets: Annotated[
+        Path | None, typer.Option(metavar="CSV", help="What will be located: its column name fills the list."), TABLE
     ] = None,
     reference: Annotated[
         Path | None, typer.Option(metavar="CSV", help="Marks in old images, to be found again in these."), MARKS
@@ -79,7 +82,7 @@ def mark_command(
     known = None if rig is None else load_pair(rig)
     own = None if cameras is None else (load_camera(cameras[0]), load_camera(cameras[1]))
     old = None if reference is None or reference_images is None else Reference(reference, *reference_images)
-    session = Session(output, landmarks, pixel_sigma_of(pixel_sigma, known))
+    session = Session(output, landmarks, pixel_sigma_of(pixel_sigma, known), targets)
     desk = Desk(pictures, session, own, known, old)
     try:
         desk.check_sizes()

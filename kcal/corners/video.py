@@ -94,13 +94,22 @@ class VideoFrames:
         self._next = 0
 
     def __getitem__(self, number: int) -> npt.NDArray[np.uint8]:
+        frame = self._frame(number)
+        return np.asarray(frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), np.uint8)
+
+    def stored(self, number: int) -> npt.NDArray[np.uint8]:
+        """A frame in color (H, W, 3), red first; (H, W) if the video has none."""
+        frame = self._frame(number)
+        return frame if frame.ndim == 2 else frame[..., ::-1]
+
+    def _frame(self, number: int) -> npt.NDArray[np.uint8]:
         if self._next != number:
             self._video.set(cv2.CAP_PROP_POS_FRAMES, number)
         done, frame = self._video.read()
         self._next = number + 1
         if not done:
             raise FileError(f"{self.source}: frame {number} cannot be decoded")
-        return np.asarray(frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), np.uint8)
+        return np.asarray(frame, np.uint8)
 
 
 def _open(stream: str) -> cv2.VideoCapture:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import threading
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -16,10 +17,11 @@ from PIL import Image
 from torch import Tensor
 
 from kcal.calibrate.rig.pairs import pair_by_name
-from kcal.corners.images import VIDEO_SUFFIXES, Gray, expand_images, read_gray
+from kcal.corners.images import VIDEO_SUFFIXES, Gray, decode_image, expand_images, read_gray
 from kcal.corners.match import MatchOptions, MatchStatus, find_again, match_points
 from kcal.corners.video import VideoFrames
 from kcal.errors import InputError
+from kcal.files import read_bytes
 from kcal.lens.pose import side_axes, step_rows
 from kcal.lens.projection import FAR, project_components
 from kcal.lens.rig import Rig
@@ -222,45 +224,57 @@ def at_shape(found: Proposal, image: Gray, how: str) -> Proposal:
 # Images of both cameras, frame by frame, as tiles at every scale: what is not looked at is not prepared.
 
 TILE = 512  # pixels along a side of a tile
-_KEPT_FRAMES = 4  # per camera
+_KEPT_FRAMES = 2  # per camera: in color, one of 24 megapixels takes 130 MB
 
 
 class FrameSource(Protocol):
-    """Frames by number."""
+    """Frames by number: gray (H, W), which is measured, and as stored, which is shown."""
 
     def __getitem__(self, number: int) -> Gray: ...
 
+    def stored(self, number: int) -> Gray:
+        """As decoded: gray (H, W), or (H, W, 3) and more in color."""
 
-class _Files(NamedTuple):
-    paths: tuple[Path, ...]
 
-    def __getitem__(self, number: Any) -> Any:
-        return read_gray(self.paths[number])
+class _Files:
+    def __init__(self, paths: tuple[Path, ...]) -> None:
+        self._paths = paths
+
+    def __getitem__(self, number: int) -> Gray:
+        return read_gray(self._paths[number])
+
+    def stored(self, number: int) -> Gray:
+        return decode_image(read_bytes(self._paths[number]), self._paths[number])
 
 
 class Pyramid:
-    """An image at halved sizes, each made when it is first asked for."""
+    """An image at halved sizes, each made when it is first asked for.
 
-    def __init__(self, image: Gray) -> None:
-        self._levels: list[Gray] = [np.ascontiguousarray(image)]
+    Args:
+        image: (H, W), which is measured.
+        stored: gives it as it is shown: (H, W), or (H, W, 3) and more in color; the image itself if not given.
+    """
+
+    def __init__(self, image: Gray, stored: Callable[[], Gray] | None = None) -> None:
+        self.image = np.ascontiguousarray(image)
+        self._stored = stored
+        self._levels: list[Gray] = []
         self._lock = threading.Lock()
         low, high = (float(v) for v in np.percentile(image[::16, ::16] if image.size > 1 << 20 else image, (0.1, 99.9)))
         self.span = (low, high if high > low else low + 1.0)
 
-    @property
-    def image(self) -> Gray:
-        """The image as it was read."""
-        return self._levels[0]
-
     def level(self, number: int) -> Gray:
-        """The image, each pixel being the mean of 2^number x 2^number; incomplete blocks at the end are left out."""
+        """What is shown, each pixel the mean of 2^number x 2^number; incomplete blocks at the end are left out."""
         with self._lock:
+            if not self._levels:
+                colors = self.image if self._stored is None else self._stored()[..., :3]
+                self._levels.append(self.image if _is_gray(colors) else np.ascontiguousarray(colors))
             while len(self._levels) <= number:
                 self._levels.append(_halved(self._levels[-1]))
             return self._levels[number]
 
     def tile(self, number: int, column: int, row: int, span: tuple[float, float] | None = None) -> NDArray[np.uint8]:
-        """A tile as 8 bits: the gray levels themselves, or `span` stretched to 0 to 255.
+        """A tile (H, W) or (H, W, 3) as 8 bits: the levels themselves, or `span` stretched to 0 to 255.
 
         Raises:
             InputError: no such tile.
@@ -286,8 +300,12 @@ def top_level(shape: tuple[int, ...]) -> int:
     return level
 
 
+def _is_gray(image: Gray) -> bool:
+    return image.ndim < 3 or image.shape[2] < 3 or bool((image == image[..., :1]).all())
+
+
 def _halved(image: Gray) -> Gray:
-    height, width = (size // 2 * 2 for size in image.shape)
+    height, width = (size // 2 * 2 for size in image.shape[:2])
     even = image[:height, :width]
     if image.dtype == np.uint8:
         return np.asarray(Image.fromarray(np.ascontiguousarray(even)).reduce(2))
@@ -313,7 +331,7 @@ class Pictures:
         self._locks = {"left": threading.Lock(), "right": threading.Lock()}
 
     def pyramid(self, side: Side, frame: int) -> Pyramid:
-        """A frame with its smaller sizes; the last four of each camera are kept.
+        """A frame with its smaller sizes; the last two of each camera are kept.
 
         Raises:
             InputError: no such frame.
@@ -324,7 +342,8 @@ class Pictures:
         with self._locks[side]:
             kept = self._kept[side]
             if frame not in kept:
-                kept[frame] = Pyramid(self._sources[side][frame])
+                source = self._sources[side]
+                kept[frame] = Pyramid(source[frame], functools.partial(source.stored, frame))
             kept.move_to_end(frame)
             while len(kept) > _KEPT_FRAMES:
                 kept.popitem(last=False)

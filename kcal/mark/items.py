@@ -13,6 +13,7 @@ from typing import Annotated, Literal
 import pydantic
 
 from kcal.errors import InputError
+from kcal.mark.shapes import REACH
 
 Kind = Literal["landmark", "feature", "target"]
 Side = Literal["left", "right"]
@@ -112,13 +113,23 @@ class Add(_Strict):
 
 
 class Put(_Strict):
-    """Set a mark; `matched` says that it was matched to the other side's mark and shares its error."""
+    """Set a mark.
+
+    Args:
+        name: of the thing.
+        side: of the image.
+        mark: as it was clicked, dragged, matched or found.
+        matched: it was matched to the other side's mark and shares its error.
+        zoom: screen pixels per pixel of the image when it was clicked or dragged. A click is known to one screen pixel
+            at best.
+    """
 
     do: Literal["put"]
     name: _Name
     side: Side
     mark: Mark
     matched: bool = False
+    zoom: Annotated[float, pydantic.Field(gt=0, le=1e4)] | None = None
 
 
 class Take(_Strict):
@@ -154,10 +165,11 @@ class SurveyPlace(_Strict):
 
 
 class Places(_Strict):
-    """Take over a file of surveyed places. It is no work of the operator's, so it cannot be undone."""
+    """Take over files of surveyed places and of targets' names. It is no work of the operator's: nothing to undo."""
 
     do: Literal["places"]
     places: dict[str, Place]
+    targets: tuple[_Name, ...] = ()
 
 
 class Load(_Strict):
@@ -201,6 +213,8 @@ def applied(state: MarkingState, action: Change) -> MarkingState:
         survey |= places
         for name in places:
             items.setdefault(name, Item(kind="landmark"))
+        for name in action.targets if isinstance(action, Places) else ():
+            items.setdefault(name, Item(kind="target"))
     elif isinstance(action, Add):
         if action.name in items:
             raise InputError(f"the name {action.name!r} is used already; names must differ")
@@ -243,7 +257,16 @@ def _with_mark(action: Put, item: Item) -> Item:
     if action.matched and far is None:
         raise InputError(f"{action.name} has no mark in the other image to be matched with")
     cross = other_side(action.side) if action.matched else None
-    return dataclasses.replace(_item_with(_unmatched(item), action.side, action.mark), cross=cross)
+    return dataclasses.replace(_item_with(_unmatched(item), action.side, _known_to(action)), cross=cross)
+
+
+def _known_to(action: Put) -> Mark:
+    """The mark with the sigma that its zoom allows: from afar, a shape within reach may be another thing."""
+    least = 0.0 if action.zoom is None else 1.0 / action.zoom
+    exact = action.mark.how != "hand" and 2.0 * least <= REACH
+    if exact or action.mark.sigma >= least:
+        return action.mark
+    return action.mark.model_copy(update={"cov": (least**2, 0.0, least**2)})
 
 
 def _item_with(item: Item, side: Side, mark: Mark | None) -> Item:

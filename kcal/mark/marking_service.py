@@ -63,7 +63,7 @@ class LiveRig(NamedTuple):
         items: how well each landmark agrees with the others.
         promises: at the usual ranges; of a baseline of 10 m, 250 m, 1 km and 5 km.
         marked: landmarks marked in both images.
-        sigma: px, typical of the marks.
+        sigma: px, typical of marks that are made from near.
         text: what the operator should know, in one sentence.
         enough: whether more landmarks would still matter: errors of the rig are below those of marks at the farthest.
         warnings: of the solution.
@@ -92,13 +92,14 @@ def solve_live(cameras: tuple[Camera, Camera], survey: Survey | None, marks: Mar
     both = torch.isfinite(marks.pixels).all(-1).all(-1)
     names = {name for name, seen in zip(marks.names, both.tolist(), strict=True) if seen}
     count = len(names & set(survey.names)) if survey is not None else 0
-    sigma = marks.typical_sigma(hand_sigma)
+    sigmas = marks.sigmas(hand_sigma)
+    sigma = near_sigma(marks, hand_sigma)
     nothing = LiveRig(None, None if survey is None else survey.origin, (), (), count, sigma, "")
     if survey is None or count < LEAST_LANDMARKS:
         missing = LEAST_LANDMARKS - count
         return nothing._replace(text=f"{missing} more landmark{'s' if missing > 1 else ''} in both images for a rig")
     try:
-        landmarks = match_landmarks(survey, marks, marks.sigmas(hand_sigma)).landmarks
+        landmarks = match_landmarks(survey, marks, sigmas).landmarks
         data = RigData(cameras=cameras, names=("left", "right"), landmarks=landmarks)
         result = solve_surveyed(data, survey.origin, RigOptions())
         rig = placed_rig(result, survey.origin or NOWHERE)
@@ -107,6 +108,9 @@ def solve_live(cameras: tuple[Camera, Camera], survey: Survey | None, marks: Mar
     items = tuple(item for item in result.items if item.source == "landmarks")
     promises = promised(rig, sigma)
     text, enough = verdict(promises, count)
+    coarse = int((sigmas > 2 * hand_sigma).sum())
+    if coarse and not enough:
+        text += f"; {coarse} marks have a σ above {2 * hand_sigma:g} px: zoom in at each and press S"
     if result.exact:
         text += "; errors of the lenses are not in it"
     wrong = [item.name for item in items if not item.used]
@@ -114,6 +118,13 @@ def solve_live(cameras: tuple[Camera, Camera], survey: Survey | None, marks: Mar
         enough = False
         text = f"{', '.join(wrong)} contradict{'s' if len(wrong) == 1 else ''} the other landmarks; {text}"
     return LiveRig(rig, survey.origin, items, promises, count, sigma, text, enough, result.warnings)
+
+
+def near_sigma(marks: Marks, hand_sigma: float) -> float:
+    """The typical sigma of marks that are made from near, px: none of them is worse than one by hand."""
+    return marks._replace(covariance=None, sigma=marks.sigmas(hand_sigma).clamp_max(hand_sigma)).typical_sigma(
+        hand_sigma
+    )
 
 
 def promised(rig: Rig, sigma: float) -> tuple[Promise, ...]:
@@ -371,7 +382,7 @@ class Desk:
     def curve(self, side: Side, u: float, v: float) -> Json:
         """The epipolar curve of a pixel in the other image with its band of two sigmas, or why there is none."""
         if self._band is None:
-            return {"refusal": "no relative pose yet: mark four landmarks, or give a rig"}
+            return {"refusal": self._no_rig(), "solved": False}
         try:
             found = self._band.curve(side, u, v)
         except InputError as error:
@@ -382,7 +393,7 @@ class Desk:
         """The match of a pixel in the other image, at the shape that is there if the mark is at such a shape."""
         rig, band = self.rig, self._band
         if rig is None or band is None:
-            return {"refusal": "no relative pose yet: mark four landmarks, or give a rig"}
+            return {"refusal": self._no_rig(), "solved": False}
         try:
             sigma = float(band.curve(side, u, v).sigma.max())
         except InputError as error:
@@ -390,6 +401,12 @@ class Desk:
         images = self.pictures.image("left", frame), self.pictures.image("right", frame)
         found = propose(rig, images, side, u, v, sigma)
         return _proposal(at_shape(found, images[SIDES.index(other_side(side))], how))
+
+    def _no_rig(self) -> str:
+        if self._cameras is None:
+            return "no cameras were given, so nothing tells where this is in the other image; start with --cameras"
+        solving = self._solved < self.session.version
+        return "no relative pose yet: " + ("the rig is being solved" if solving else self._live.text)
 
     def again(self, name: str, side: Side, frame: Number, reach: Reach = 40) -> Json:
         """Where a thing of the reference is now."""
@@ -438,7 +455,7 @@ class Desk:
         if self._cameras is not None:
             live = solve_live(self._cameras, self._survey(), marks, self.session.hand_sigma)
             if live.rig is None and self._given is not None:
-                live = live._replace(promises=promised(self._given, marks.typical_sigma(self.session.hand_sigma)))
+                live = live._replace(promises=promised(self._given, near_sigma(marks, self.session.hand_sigma)))
             if live.rig is not None:
                 entry = {"count": live.marked, "promises": [p._asdict() for p in live.promises]}
                 self._history = [old for old in self._history if old["count"] < live.marked] + [entry]

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable
 from typing import Annotated, Any
 
+import numpy as np
 import pydantic
+from numpy.typing import NDArray
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
@@ -49,23 +51,30 @@ def marking_app(desk: Desk, token: str, hosts: tuple[str, ...]) -> Starlette:
         """A tile; `low` and `high` stretch deep images."""
         span = None if low is None or high is None else (low, high)
         part = desk.pictures.pyramid(side, frame).tile(level, x, y, span)
-        return Response(part.tobytes(), media_type="application/octet-stream",
-                        headers={"X-Width": str(part.shape[1]), "X-Height": str(part.shape[0])})  # fmt: skip
+        return pixels(part)
+
+    def pixels(levels: NDArray[np.uint8], **more: int) -> Response:
+        """Levels of 8 bits, (H, W) or (H, W, 3), row by row."""
+        height, width, *channels = levels.shape
+        told = {"width": width, "height": height, "channels": channels[0] if channels else 1, **more}
+        headers = {f"X-{name.capitalize()}": str(value) for name, value in told.items()}
+        return Response(levels.tobytes(), media_type="application/octet-stream", headers=headers)
 
     def enlarged(side: Side, frame: Number, u: Coordinate, v: Coordinate) -> Response:
         import torch
 
-        image = desk.pictures.image(side, frame)
-        height, width = image.shape
+        pyramid = desk.pictures.pyramid(side, frame)
+        image = pyramid.level(0)
+        height, width = image.shape[:2]
         column, row = min(max(round(u), 0), width - 1), min(max(round(v), 0), height - 1)
         top, left = max(row - 32, 0), max(column - 32, 0)
         crop = torch.from_numpy(image[top : row + 33, left : column + 33].astype("float64"))
-        view = enlarge(crop, torch.tensor([float(column - left), float(row - top)]), half=24)
-        low, high = desk.pictures.pyramid(side, frame).span if image.dtype.itemsize > 1 else (0.0, 255.0)
-        patch = ((view.patch - low) * (255.0 / (high - low))).clamp(0, 255).round().to(torch.uint8).numpy()
-        where = {"X-Left": str(left + view.left), "X-Top": str(top + view.top), "X-Factor": str(view.factor)}
-        size = {"X-Width": str(patch.shape[1]), "X-Height": str(patch.shape[0])}
-        return Response(patch.tobytes(), media_type="application/octet-stream", headers={**size, **where})
+        middle = torch.tensor([float(column - left), float(row - top)])
+        views = [enlarge(plane, middle, half=24) for plane in torch.atleast_3d(crop).unbind(-1)]
+        low, high = pyramid.span if image.dtype.itemsize > 1 else (0.0, 255.0)
+        levels = (torch.stack([view.patch for view in views], -1) - low) * (255.0 / (high - low))
+        patch = levels.clamp(0, 255).round().to(torch.uint8).numpy().squeeze(-1 if len(views) == 1 else ())
+        return pixels(patch, left=left + views[0].left, top=top + views[0].top, factor=views[0].factor)
 
     def act(key: Key, action: dict[str, Any]) -> Json:
         return desk.act(ACTION.validate_python(action), key)

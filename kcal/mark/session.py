@@ -22,7 +22,7 @@ from kcal.files import check_writable, try_lock, write_atomic
 from kcal.lens.rig import Origin
 from kcal.locate.marks import Marks, marks_text, read_marks
 from kcal.locate.survey import EARTH, LOCAL, PLACE_COLUMNS, places_csv, read_survey
-from kcal.locate.tables import TableRow, read_rows
+from kcal.locate.tables import TableRow, header_of, read_rows
 
 # The undo log: every action is one line of a file, written through to the disk before it is answered.
 #
@@ -232,8 +232,6 @@ def read_places(path: Path) -> SurveyedPlaces:
     """
     read_survey(path)  # its checks name the line
     rows, columns = _place_rows(path)
-    if any(not row.name.isprintable() or len(row.name) > 60 for row in rows):
-        raise FileError(f"{path}: a name has more than 60 characters; give it a shorter one")
     places = {}
     for row in rows:
         first, second, third = (row.number(column) for column in columns)
@@ -243,9 +241,25 @@ def read_places(path: Path) -> SurveyedPlaces:
     return SurveyedPlaces(columns, places)
 
 
+def read_names(path: Path) -> tuple[str, ...]:
+    """The column `name` of a table; its other columns are not read.
+
+    Raises:
+        FileError: a file that cannot be read, or without that column; a name twice, or longer than 60 characters.
+    """
+    return tuple(row.name for row in _named_rows(path, "name,mark", header_of(path), "name"))
+
+
 def _place_rows(path: Path) -> tuple[Sequence[TableRow], tuple[str, str, str]]:
-    rows = read_rows(path, "name,lat,lon,height,sigma", PLACE_COLUMNS, ("sigma",))
+    rows = _named_rows(path, "name,lat,lon,height,sigma", PLACE_COLUMNS, "sigma")
     return rows, EARTH if EARTH[0] in rows[0].cells else LOCAL
+
+
+def _named_rows(path: Path, header: str, columns: Sequence[str], required: str) -> Sequence[TableRow]:
+    rows = read_rows(path, header, columns, (required,))
+    if any(not row.name.isprintable() or len(row.name) > 60 for row in rows):
+        raise FileError(f"{path}: a name has more than 60 characters; give it a shorter one")
+    return rows
 
 
 def places_text(survey: SurveyedPlaces) -> str:
@@ -291,6 +305,7 @@ class Session:
     Args:
         marks: the file of marks.
         survey: a file of surveyed places; those are the landmarks.
+        targets: a file whose column `name` lists what will be located.
         hand_sigma: of a mark that was placed by hand or read without covariance, px.
 
     Attributes:
@@ -301,18 +316,21 @@ class Session:
         FileError: a file that cannot be read or written, or that another session has open.
     """
 
-    def __init__(self, marks: Path, survey: Path | None = None, hand_sigma: float = 0.3) -> None:
+    def __init__(
+        self, marks: Path, survey: Path | None = None, hand_sigma: float = 0.3, targets: Path | None = None
+    ) -> None:
         self.files = MarkingFiles.beside(marks)
         self.hand_sigma = hand_sigma
         self._lock = threading.Lock()
         self.trouble = ""
         for path in (self.files.marks, self.files.points, self.files.landmarks, self.files.log):
-            check_writable(path, *([survey] if survey else []))
+            check_writable(path, *filter(None, (survey, targets)))
         places = NO_PLACES if survey is None else read_places(survey)
+        named = () if targets is None else read_names(targets)
         self._journal = Journal(self.files.log)
         self.notes = self._journal.notes
         try:
-            self.columns = self._take_over_places(places)
+            self.columns = self._take_over_places(places, named)
             self._take_over_changes()
             self._write()
         except BaseException:
@@ -382,15 +400,16 @@ class Session:
         # Once: it is read meanwhile.
         self.trouble = trouble
 
-    def _take_over_places(self, places: SurveyedPlaces) -> tuple[str, str, str]:
-        """Log the places that are new or have changed, and return the columns of coordinates."""
+    def _take_over_places(self, places: SurveyedPlaces, targets: tuple[str, ...]) -> tuple[str, str, str]:
+        """Log the places that are new or have changed and the targets that are new; return the coordinates' columns."""
         columns = places.columns
         if not places.places and self.files.landmarks.exists():
             # Its places are in the log, too: one that cannot be right is mended on the page.
             columns = _place_rows(self.files.landmarks)[1]
         new = {name: place for name, place in places.places.items() if self.state.survey.get(name) != place}
-        if new:
-            self._journal.do(marking.Places(do="places", places=new), f"{_LOADED} {self.version}")
+        names = tuple(name for name in targets if name not in self.state.items and name not in new)
+        if new or names:
+            self._journal.do(marking.Places(do="places", places=new, targets=names), f"{_LOADED} {self.version}")
         return columns
 
     def _take_over_changes(self) -> None:

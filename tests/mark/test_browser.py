@@ -84,12 +84,9 @@ def test_a_whole_site_while_the_server_is_killed(site: tuple[Path, MarkingSite],
                     # Others may still be on their way to the server: a new target is selected all the same.
                     page.evaluate("kcal.nudge(0.1, 0), kcal.nudge(-0.1, 0)")
                     page.keyboard.press("n")
-                    page.wait_for_function("() => (kcal.selected || '').startsWith('target ')")
-                    settled(page)
-                    page.fill("#edit-name", name)
-                    page.press("#edit-name", "Enter")
+                    page.keyboard.type(name)
+                    page.keyboard.press("Enter")
                     page.wait_for_function("name => kcal.selected === name", arg=name)
-                    page.evaluate("document.activeElement.blur()")
                 mark_both(page, scene, name, random)
                 if number in kills:
                     before = page.evaluate("kcal.items.filter(i => i.left).length")

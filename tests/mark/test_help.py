@@ -20,9 +20,9 @@ from kcal.lens.rig import Origin, Rig, RigCovariance
 from kcal.locate.marks import Marks, write_marks
 from kcal.locate.survey import Survey
 from kcal.mark.guide import Reference, RigBand, at_shape, open_pictures, propose
-from kcal.mark.items import Add, Mark, MarkingState, Place, Put, Side, SurveyPlace
+from kcal.mark.items import SIDES, Add, Mark, MarkingState, Place, Put, Side, SurveyPlace, applied
 from kcal.mark.marking_service import Desk, Promise, map_content, solve_live, verdict
-from kcal.mark.session import Session
+from kcal.mark.session import Session, marks_of
 from kcal.mark.shapes import snap
 from kcal.watch.turned import check_rig, seen_again
 from scripts.shared.marking_scene import (
@@ -275,6 +275,28 @@ class TestLiveRig:
         found = solve_live((site.rig.left, site.rig.right), survey_of(site, names), marks, 0.3)
         assert [item.name for item in found.items if not item.used] == ["post 5"]
         assert found.text.startswith("post 5 contradicts the other landmarks")
+
+    @pytest.mark.parametrize(("zoom", "blamed"), [(None, True), (0.24, False)])
+    def test_marks_from_afar_are_not_blamed(self, site: MarkingSite, zoom: float | None, blamed: bool) -> None:
+        """Clicked at 0.24 times, three marks are up to 6 px off: right ones, as far as anyone could see."""
+        names, random = [point.name for point in LANDMARKS[:10]], np.random.default_rng(5)
+        state = MarkingState()
+        for number, name in enumerate(names):
+            state = applied(state, Add(do="add", name=name, kind="landmark"))
+            for side, at in zip(SIDES, site.pixels[name], strict=True):
+                afar = number < 3
+                u, v = at + (random.uniform(-1, 1, 2) / 0.24 if afar else random.normal(0, 0.1, 2))
+                clicked = Mark(u=u, v=v, cov=(0.09, 0.0, 0.09) if afar else (0.01, 0.0, 0.01))
+                put = Put(do="put", name=name, side=side, mark=clicked, zoom=zoom if afar else 12.0)
+                state = applied(state, put)
+        found = solve_live((site.rig.left, site.rig.right), survey_of(site, names), marks_of(state, ("landmark",)), 0.3)
+        assert [item.name for item in found.items if not item.used] == (names[:3] if blamed else [])
+        assert ("contradict" in found.text) == blamed
+        # What is promised of a target that is marked from near does not grow with them.
+        assert found.sigma <= 0.3
+        far = solve_live((site.rig.left, site.rig.right), survey_of(site, names), marks_at(site, names, 4.0), 0.3)
+        assert not far.enough
+        assert "; 20 marks have a σ above 0.6 px: zoom in at each and press S" in far.text
 
     def test_enough_has_a_number(self) -> None:
         assert verdict((Promise(5000.0, 150.0, 100.0, 180.0),), 8) == (

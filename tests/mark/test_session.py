@@ -390,3 +390,57 @@ def test_what_was_answered_survives_a_kill_at_any_moment(tmp_path: Path) -> None
             name: [[float(name.partition("-")[2]), 1.0], [float(name.partition("-")[2]), 2.0]] for name in answered
         }
     assert len(answered) >= 10
+
+
+@pytest.mark.parametrize(
+    ("how", "zoom", "sigma"),
+    [
+        ("hand", None, 0.3),
+        ("hand", 6.0, 0.3),
+        ("hand", 0.24, 1 / 0.24),
+        # Closer than half of what a click reaches, a shape is the one that was meant.
+        ("corner", 1.0, 0.3),
+        ("corner", 0.24, 1 / 0.24),
+    ],
+)
+def test_a_click_is_known_to_one_pixel_of_the_screen(
+    tmp_path: Path, how: str, zoom: float | None, sigma: float
+) -> None:
+    session = Session(tmp_path / "marks.csv")
+    session.do(Add(do="add", name="a", kind="feature"), "key-0001")
+    clicked = mark(10.0, 20.0, 0.3).model_copy(update={"how": how})
+    session.do(Put(do="put", name="a", side="left", mark=clicked, zoom=zoom), "key-0002")
+    session.do(put("a", "right", mark(9.0, 20.0)), "key-0003")
+    left = session.state.items["a"].left
+    assert left is not None
+    assert left.sigma == pytest.approx(sigma)
+    assert (left.u, left.v, left.how) == (10.0, 20.0, how)
+    assert float(read_marks(session.files.marks).sigmas(0.3)[0, 0]) == pytest.approx(sigma)
+    session.close()
+    again = Session(tmp_path / "marks.csv")
+    assert again.state == session.state
+    again.close()
+
+
+def test_names_of_targets_fill_the_list(tmp_path: Path, survey: Path) -> None:
+    targets = tmp_path / "targets.csv"
+    targets.write_text("name,mark\nbuoy,the top\ngate,left post\npost,a landmark already\n")
+    session = Session(tmp_path / "marks.csv", survey, targets=targets)
+    kinds = {name: item.kind for name, item in session.state.items.items()}
+    assert kinds == {"post": "landmark", "roof": "landmark", "buoy": "target", "gate": "target"}
+    assert session.undoable == (False, False)
+    session.do(put("buoy", "left", mark(1.0, 2.0)), "key-0001")
+    state = session.state
+    session.close()
+    # What is marked stays; only new names are added, and undoing does not take them back.
+    targets.write_text("name\nbuoy\nyawl\n")
+    again = Session(tmp_path / "marks.csv", survey, targets=targets)
+    assert list(again.state.items) == [*state.items, "yawl"]
+    assert again.state.items["buoy"] == state.items["buoy"]
+    again.do(Step(do="undo"), "key-0002")
+    assert list(again.state.items) == [*state.items, "yawl"]
+    assert again.state.items["buoy"].left is None
+    again.close()
+    targets.write_text("buoy\nyawl\n")
+    with pytest.raises(FileError, match=r"targets\.csv.*name"):
+        Session(tmp_path / "other.csv", targets=targets)

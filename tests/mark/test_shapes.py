@@ -11,6 +11,7 @@ import pytest
 from scipy import stats
 from scipy.special import ndtr
 
+from kcal.corners.images import read_gray
 from kcal.errors import FileError, InputError
 from kcal.io.images import write_png
 from kcal.mark.guide import TILE, Pyramid, open_pictures, top_level
@@ -179,6 +180,23 @@ def test_tiles_are_the_image_and_its_means(dtype: type) -> None:
             pyramid.tile(*bad)
 
 
+def test_colors_are_shown_and_gray_levels_measured(tmp_path: Path) -> None:
+    colors = np.random.default_rng(1).integers(0, 255, (64, 96, 3), dtype=np.uint8)
+    write_png(tmp_path / "left.png", colors)
+    write_png(tmp_path / "right.png", np.repeat(colors[..., :1], 3, axis=2))
+    pictures = open_pictures(tmp_path / "left.png", tmp_path / "right.png")
+    left, right = pictures.pyramid("left", 0), pictures.pyramid("right", 0)
+    np.testing.assert_array_equal(left.tile(0, 0, 0), colors)
+    np.testing.assert_array_equal(left.image, read_gray(tmp_path / "left.png"))
+    # Colors that are none are sent as gray levels, in a third of the bytes.
+    np.testing.assert_array_equal(right.tile(0, 0, 0), colors[..., 0])
+    deep = Pyramid(left.image, lambda: colors.astype(np.uint16) * 257)
+    np.testing.assert_array_equal(deep.tile(0, 0, 0, (0.0, 65535.0)), colors)
+    means = colors.reshape(32, 2, 48, 2, 3).mean((1, 3))
+    assert np.abs(deep.level(1) / 257 - means).max() < 0.51
+    assert np.abs(left.level(1).astype(float) - means).max() <= 0.75
+
+
 def test_folders_are_paired_by_name(tmp_path: Path) -> None:
     for side, numbers in (("left", (1, 2, 3)), ("right", (2, 3, 4))):
         (tmp_path / side).mkdir()
@@ -198,12 +216,16 @@ def test_videos_are_paired_by_frame(tmp_path: Path) -> None:
     for side, count in (("left", 5), ("right", 4)):
         video = cv2.VideoWriter(str(tmp_path / f"{side}.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
         for number in range(count):
-            video.write(np.full((48, 64, 3), 40 * number + 20, np.uint8))
+            # Blue, green, red.
+            video.write(np.full((48, 64, 3), np.array([30, 0, 13]) + 40 * number + 10, np.uint8))
         video.release()
     pictures = open_pictures(tmp_path / "left.avi", tmp_path / "right.avi")
     assert len(pictures.names) == 4
     for number in (2, 0, 3, 1):
-        assert abs(float(pictures.image("left", number).mean()) - (40 * number + 20)) < 3
+        assert abs(float(pictures.image("left", number).mean()) - (40 * number + 17)) < 3
+        red, _, blue = pictures.pyramid("left", number).tile(0, 0, 0).mean((0, 1))
+        assert abs(red - (40 * number + 23)) < 5
+        assert abs(blue - (40 * number + 40)) < 5
     write_png(tmp_path / "one.png", noise(20, 30))
     with pytest.raises(InputError, match="two images, two folders or two videos"):
         open_pictures(tmp_path / "left.avi", tmp_path / "one.png")

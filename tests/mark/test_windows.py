@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from typing import Any
 
@@ -112,10 +113,129 @@ def test_a_refusal_ends_with_its_reason(site: tuple[Desk, MarkingSite, str]) -> 
         assert NO_POSE not in page.evaluate(STATUS)
         mark(page, scene, LANDMARKS[4].name, 0)
         page.wait_for_function("() => document.documentElement.dataset.proposal === 'there'")
-        assert page.is_visible("#accept")
+        assert page.is_enabled("#accept")
         page.click("#accept")
         page.wait_for_function("name => kcal.item(name).right", arg=LANDMARKS[4].name)
-        assert not page.is_visible("#accept")
+        assert not page.is_enabled("#accept")
+
+
+SIZES = [(1280, 800), (390, 800)]
+BOXES = (
+    "() => [...document.querySelectorAll('header button, header label')].filter((e) => !e.hidden)"
+    ".map((e) => [e.id, ...Object.values(e.getBoundingClientRect().toJSON())])"
+)
+
+
+def test_letters_of_a_name_are_no_keys(site: tuple[Desk, MarkingSite, str]) -> None:
+    desk, scene, address = site
+    with chromium_page() as page:
+        opened(page, address)
+        mark(page, scene, "post 10", 0)
+        settled(page)
+        before = desk.session.version
+        page.keyboard.press("n")
+        page.keyboard.type("buoy")  # U would undo, and N begin another
+        assert desk.session.version == before
+        assert page.evaluate("document.activeElement.id") == "new-name"
+        assert violations(page) == []
+        page.keyboard.press("Enter")
+        page.wait_for_function("() => kcal.selected === 'buoy'")
+        settled(page)
+        assert page.evaluate("kcal.item('post 10').left") is not None
+        # A name that is there already is chosen; without a name it gets a number; Escape adds nothing.
+        for typed, chosen in (("post 11", "post 11"), ("", "target 1")):
+            page.keyboard.press("n")
+            page.keyboard.type(typed)
+            page.keyboard.press("Enter")
+            page.wait_for_function("name => kcal.selected === name", arg=chosen)
+        page.keyboard.press("n")
+        page.keyboard.press("Escape")
+        settled(page)
+        assert desk.session.version == before + 2
+        for action in ("{do: 'drop', name: 'buoy'}", "{do: 'drop', name: 'target 1'}"):
+            page.evaluate(f"kcal.act({action})")
+        settled(page)
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_nothing_moves_and_nothing_is_covered(site: tuple[Desk, MarkingSite, str], width: int, height: int) -> None:
+    """Buttons stay where they are when a proposal comes; the foot is below all; landscape pictures fill their pane."""
+    _, _, address = site
+    with chromium_page(width, height) as page:
+        opened(page, address)
+        before = page.evaluate(BOXES)
+        page.evaluate(
+            "kcal.proposed('right', {refusal: '', u: 90, v: 90, cov: [1, 0, 1], how: 'match', sigma: 1, score: 1})"
+        )
+        page.wait_for_function("() => !document.getElementById('accept').disabled")
+        assert page.evaluate(BOXES) == before
+        page.evaluate("kcal.reject()")
+        main, foot = (page.locator(name).bounding_box() for name in ("main", "#foot"))
+        assert main["y"] + main["height"] <= foot["y"] + 0.5
+        assert foot["y"] + foot["height"] <= height
+        page.evaluate("kcal.views.left.fit()")
+        shown, (wide, _) = page.evaluate("[kcal.zoomed('left'), kcal.about.images.left.size]")
+        # Side by side on the wide screen, they would be 469 px wide.
+        assert shown * wide >= (width - 20 if width < 800 else 600)
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+
+
+def test_marks_of_landmarks_are_removed_by_a_button(site: tuple[Desk, MarkingSite, str]) -> None:
+    _, scene, address = site
+    with chromium_page() as page:
+        opened(page, address)
+        mark(page, scene, "post 12", 0, 1)
+        settled(page)
+        page.click("#take-right")
+        page.wait_for_function("() => !kcal.item('post 12').right && kcal.item('post 12').left")
+        assert not page.is_enabled("#take-right")
+        page.click("#take-left")
+        page.wait_for_function("() => !kcal.item('post 12').left")
+        assert not page.is_enabled("#take-left")
+
+
+def test_a_click_from_afar_says_what_it_is_worth(site: tuple[Desk, MarkingSite, str]) -> None:
+    _, scene, address = site
+    u, v = map(float, scene.pixels["post 12"][0])
+    with chromium_page() as page:
+        opened(page, address)
+        choose(page, "post 12")
+        look_at(page, "left", u, v, 0.25)
+        click_at(page, "left", u, v)
+        page.wait_for_function("() => kcal.item('post 12').left")
+        assert page.evaluate("kcal.item('post 12').left.sigma") == pytest.approx(4.0)
+        page.wait_for_function(f"() => {STATUS}.includes('σ 4.0 px, one pixel of the screen at 0.25×')")
+        page.keyboard.press("z")
+        page.keyboard.press("s")
+        page.wait_for_function("() => kcal.item('post 12').left.sigma < 0.3")
+        page.click("#take-left")
+        page.wait_for_function("() => !kcal.item('post 12').left")
+
+
+SPREAD = """() => {
+  const left = (i) => ({u: 400 + 40 * (i % 6), v: 300 + 25 * Math.floor(i / 6), cov: [1, 0, 1], how: 'hand', sigma: 1});
+  kcal.items = Array.from({length: 30}, (_, i) => ({name: 'thing ' + i, kind: 'feature', left: left(i)}));
+  kcal.selected = null;
+  const view = kcal.views.left, c = view.context, fill = c.fillText, names = [];
+  c.fillText = function (words, x, y) {
+    names.push([x, y - 11, x + c.measureText(words).width, y + 3]);
+    fill.apply(c, arguments);
+  };
+  view.paint();
+  const marks = kcal.items.map((item) => view.screen(item.left.u, item.left.v));
+  return [names, marks.map(([x, y]) => [x - 7, y - 7, x + 7, y + 7])];
+}"""
+
+
+def test_names_stand_beside_marks(site: tuple[Desk, MarkingSite, str]) -> None:
+    """As drawn: no name on a mark, none on another name."""
+    _, _, address = site
+    with chromium_page() as page:
+        opened(page, address)
+        names, marks = page.evaluate(SPREAD)
+    assert 5 <= len(names) < 30
+    for a, b in [*itertools.combinations(names, 2), *itertools.product(names, marks)]:
+        assert min(a[2], b[2]) - max(a[0], b[0]) <= 0.5 or min(a[3], b[3]) - max(a[1], b[1]) <= 0.5
 
 
 def test_a_full_disk_is_on_the_page(site: tuple[Desk, MarkingSite, str], monkeypatch: pytest.MonkeyPatch) -> None:

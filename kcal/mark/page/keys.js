@@ -2,7 +2,7 @@
 import {stretchContrast} from "/page/tiles.js";
 
 const KEYS = [
-  ["N", "new target"], ["F", "new static feature"], ["[ ]", "previous, next thing"], ["Space", "mark at the middle of the image in focus"],
+  ["N", "new target: type its name"], ["F", "new static feature"], ["[ ]", "previous, next thing"], ["Space", "mark at the middle of the image in focus"],
   ["Arrows", "move the mark by 0.1 px"], ["Shift+arrows", "move it by 1 px"], ["Alt+arrows", "move the image"],
   ["S", "snap the mark again"], ["Enter", "accept the proposal"], ["R", "reject it"], ["Delete", "remove the mark in this image"],
   ["X", "other image"], ["+ −", "zoom"], ["0", "whole image"], ["Z", "20× at the selected thing"], ["I", "×10 interpolated or raw pixels"],
@@ -16,11 +16,20 @@ export function listen(app) {
   const step = (event) => (event.shiftKey ? 1 : 0.1);
   const moves = {ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1]};
   const again = () => { const name = app.about.reference.find((n) => { const item = app.item(n); return !item || !item.left || !item.right; }); if (name) app.again(name); else app.say("all points of the reference are marked"); };
-  const remove = () => { const item = app.item(); if (item && item[app.side]) app.act({do: "take", name: item.name, side: app.side}); };
+  const remove = (side = app.side) => { const item = app.item(); if (item && item[side]) app.act({do: "take", name: item.name, side}); };
   const fit = () => { app.views.left.fit(); app.views.right.fit(); };
+  let kind = "target";
+  const ask = (what) => {
+    kind = what;
+    byId("naming-title").textContent = "New " + (kind === "target" ? "target" : "static feature");
+    byId("new-name").value = "";
+    byId("new-name").placeholder = app.freeName(kind);
+    byId("naming").showModal();
+    byId("new-name").focus();
+  };
   const commands = {
-    n: () => app.add("target"), f: () => app.add("feature"), "[": () => app.next(-1), "]": () => app.next(1),
-    s: () => app.snapAgain(), Enter: () => app.accept(), r: () => app.reject(), Delete: remove, Backspace: remove,
+    n: () => ask("target"), f: () => ask("feature"), "[": () => app.next(-1), "]": () => app.next(1),
+    s: () => app.snapAgain(), Enter: () => app.accept(), r: () => app.reject(), Delete: () => remove(), Backspace: () => remove(),
     x: () => app.views[app.side === "left" ? "right" : "left"].canvas.focus(), "+": () => app.zoom(view(), 1.5), "=": () => app.zoom(view(), 1.5),
     "-": () => app.zoom(view(), 1 / 1.5), 0: fit, z: () => app.closer(), i: () => app.toggle("interpolated"), c: () => stretchContrast(app),
     k: () => app.toggle("linked"), u: () => app.act({do: "undo"}), ",": () => app.show(app.frame - 1), ".": () => app.show(app.frame + 1),
@@ -43,9 +52,14 @@ export function listen(app) {
   });
   document.addEventListener("pointerdown", () => { app.byKeyboard = false; });
   const press = {"new-target": commands.n, "new-feature": commands.f, undo: commands.u, redo: () => app.act({do: "redo"}), fit, nearer: commands["+"], farther: commands["-"], accept: commands.Enter, reject: commands.r, interpolate: commands.i,
-    contrast: commands.c, link: commands.k, again, "show-keys": commands["?"], drop: () => app.selected && app.act({do: "drop", name: app.selected})};
+    contrast: commands.c, link: commands.k, again, "take-left": () => remove("left"), "take-right": () => remove("right"), "no-name": () => byId("naming").close(), "show-keys": commands["?"], drop: () => app.selected && app.act({do: "drop", name: app.selected})};
   for (const [id, run] of Object.entries(press)) byId(id).addEventListener("click", run);
   byId("frame").addEventListener("input", (event) => app.show(Number(event.target.value)));
+  byId("name-form").addEventListener("submit", (event) => {
+    event.preventDefault();
+    byId("naming").close();
+    app.add(kind, byId("new-name").value.trim());
+  });
   byId("edit").addEventListener("submit", async (event) => {
     event.preventDefault();
     const item = app.item(), to = byId("edit-name").value.trim();

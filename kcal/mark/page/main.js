@@ -10,6 +10,14 @@ const SIDES = ["left", "right"];
 const other = (side) => (side === "left" ? "right" : "left");
 const byId = (id) => document.getElementById(id);
 
+// Pictures stand side by side or above each other, whichever shows them larger.
+function arrange([width, height]) {
+  const main = document.querySelector("main");
+  main.style.setProperty("--aspect", Math.min(width / height, 2));
+  const across = main.clientWidth - document.querySelector("aside").clientWidth, down = main.clientHeight;
+  main.classList.toggle("stacked", Math.min(across / width, down / 2 / height) > 1.1 * Math.min(across / 2 / width, down / height));
+}
+
 class App {
   constructor(about) {
     this.about = about;
@@ -27,6 +35,9 @@ class App {
     this.dragged = null;
     this.version = -1;
     this.views = {};
+    const fitting = () => arrange(about.images.left.size);
+    fitting();
+    addEventListener("resize", fitting);
     for (const side of SIDES) this.views[side] = new View(side, about.images[side], this);
     followOthers(this);
     this.actions = new Actions(about.files.log, (state) => this.answered(state), (text, kept) => this.failed(text, kept));
@@ -34,7 +45,7 @@ class App {
       const found = await post("curve", {side, frame: this.frame, u, v});
       if (key !== this.key()) return;
       this.curves = found.refusal ? {} : {[other(side)]: found};
-      if (found.refusal) this.refuse(found.refusal);
+      if (found.refusal) this.refuse(found.refusal, found.solved);
       this.draw();
     });
     this.askPosition = latest(async (left, right, matched) => {
@@ -60,7 +71,7 @@ class App {
     byId("status").classList.toggle("bad", bad);
   }
   // Why something cannot be had now, which may change with the next landmark.
-  refuse(text) { this.say(text); this.said = "refusal"; }
+  refuse(text, solved = true) { this.say(text); this.said = solved ? "refusal" : "no rig"; }
   // What was said of an earlier thing or rig no longer holds.
   settle(...kinds) { if (kinds.includes(this.said)) this.say(""); }
 
@@ -89,6 +100,7 @@ class App {
     this.last = text;
     this.moved = false;
     const rigChanged = state.rig.known !== this.rig.known || JSON.stringify(state.rig.promises) !== JSON.stringify(this.rig.promises);
+    if (state.rig.text !== this.rig.text || (this.pending && !state.pending)) this.settle("no rig");
     this.version = state.version;
     this.items = state.items;
     this.survey = state.survey;
@@ -119,13 +131,13 @@ class App {
   }
   draw() {
     const proposed = SIDES.some((side) => this.proposals[side] && !this.proposals[side].refusal);
-    for (const id of ["accept", "reject"]) byId(id).hidden = !proposed;
+    for (const id of ["accept", "reject"]) byId(id).disabled = !proposed;
     for (const side of SIDES) this.views[side].draw();
   }
   act(action) { return this.actions.push(action); }
 
   select(name, look = true) {
-    if (name !== this.selected) this.settle("refusal", "bad");
+    if (name !== this.selected) this.settle("refusal", "no rig", "bad");
     this.selected = name;
     this.curves = {};
     this.proposals = {};
@@ -177,7 +189,7 @@ class App {
   proposed(side, found) {
     this.proposals[side] = found;
     document.documentElement.dataset.proposal = found.refusal ? "refused" : "there";
-    if (found.refusal) this.refuse(`${side}: ${found.refusal}`);
+    if (found.refusal) this.refuse(`${side}: ${found.refusal}`, found.solved);
     else {
       this.say(`${side}: proposal (${found.how}) with σ ${found.sigma.toFixed(3)} px, correlation ${found.score.toFixed(2)}. Enter accepts it, R rejects it.`);
       const view = this.views[side];
@@ -219,14 +231,16 @@ class App {
     this.select(name);
   }
 
-  async add(kind) {
-    const names = new Set(this.items.map((item) => item.name));
+  freeName(kind) {
     let number = 1;
-    while (names.has(kind + " " + number)) number += 1;
-    const name = kind + " " + number;
-    await this.act({do: "add", name, kind});
+    while (this.item(kind + " " + number)) number += 1;
+    return kind + " " + number;
+  }
+  async add(kind, given = "") {
+    const name = given || this.freeName(kind), there = this.item(name);
+    if (!there) await this.act({do: "add", name, kind});
     this.select(name);
-    this.say(`${name}: click it in either image`);
+    this.say(`${name}${there ? " is in the list already" : ""}: click it in either image`);
   }
   next(step) {
     if (!this.items.length) return;
@@ -240,33 +254,42 @@ class App {
     if (!this.item()) await this.add("target");
     const item = this.item();
     if (!item) return;
-    const hand = this.about.hand_sigma ** 2;
-    let mark = {u, v, cov: [hand, 0, hand], how: "hand", frame: this.frameName()};
+    const zoom = this.zoomed(side), frame = this.frameName();
+    let {sigma, ...mark} = this.byHand(side, {u, v, frame}), words = "";
     if (snapping) {
       let found;
       try { found = await post("snap", {side, frame: this.frame, u, v}); } catch (error) {
         found = {refusal: error instanceof Refused ? error.message : AWAY};
       }
-      if (found.refusal) this.say(`${found.refusal} (kept as clicked, σ ${this.about.hand_sigma} px)`);
+      if (found.refusal) words = `${found.refusal} (kept as clicked, σ ${sigma.toFixed(1)} px)`;
       else {
         mark = {...mark, u: found.u, v: found.v, cov: found.cov, how: found.how};
-        this.say(`${item.name}, ${side}: ${found.how}, σ ${found.sigma.toFixed(3)} px`);
+        sigma = found.sigma;
+        words = `${item.name}, ${side}: ${found.how}, σ ${found.sigma.toFixed(3)} px`;
       }
+      this.say(words);
     }
     this.side = side;
     this.proposals[side] = undefined;
-    await this.act({do: "put", name: item.name, side, mark});
+    await this.act({do: "put", name: item.name, side, mark, zoom});
+    const kept = this.item(item.name)?.[side];
+    if (kept && 1 / zoom > this.about.hand_sigma && kept.sigma > 0.99 / zoom) this.say(`${item.name}, ${side}: σ ${kept.sigma.toFixed(1)} px, one pixel of the screen at ${zoom.toFixed(2)}×. Press Z to see it closer, then S to snap it.`);
     this.guide();
+  }
+  // Screen pixels per pixel of the image, and what a mark by hand is worth there: the server sees to the same.
+  zoomed(side) { return this.views[side].scale / this.views[side].ratio; }
+  byHand(side, at) {
+    const sigma = Math.max(this.about.hand_sigma, 1 / this.zoomed(side));
+    return {...at, cov: [sigma ** 2, 0, sigma ** 2], how: "hand", sigma};
   }
   nudge(du, dv) {
     const item = this.item(), mark = this.markOf(this.side);
     if (!item || !mark) { this.say("nothing is marked in this image to be moved"); return; }
-    const hand = this.about.hand_sigma ** 2;
-    const moved = {u: mark.u + du, v: mark.v + dv, cov: [hand, 0, hand], how: "hand", frame: mark.frame};
+    const {sigma, ...moved} = this.byHand(this.side, {u: mark.u + du, v: mark.v + dv, frame: mark.frame});
     if (!this.inside(this.side, moved.u, moved.v)) return;
     this.moved = true;
-    item[this.side] = {...moved, sigma: this.about.hand_sigma};
-    this.act({do: "put", name: item.name, side: this.side, mark: moved});
+    item[this.side] = {...moved, sigma};
+    this.act({do: "put", name: item.name, side: this.side, mark: moved, zoom: this.zoomed(this.side)});
     this.askCurve(this.side, moved.u, moved.v, this.key());
     this.draw();
   }
@@ -357,8 +380,8 @@ class App {
     }
   }
   drag(side, from, du, dv) {
-    const item = this.item(), hand = this.about.hand_sigma ** 2;
-    this.dragged = {side, item, mark: {...from, u: from.u + du, v: from.v + dv, cov: [hand, 0, hand], how: "hand", sigma: this.about.hand_sigma}};
+    const item = this.item();
+    this.dragged = {side, item, mark: this.byHand(side, {u: from.u + du, v: from.v + dv, frame: this.frameName()})};
     const far = item[other(side)];
     if (far) this.askPosition(...(side === "left" ? [this.dragged.mark, far] : [far, this.dragged.mark]), null);
     this.askCurve(side, this.dragged.mark.u, this.dragged.mark.v, this.key());
@@ -370,7 +393,8 @@ class App {
     if (!this.inside(side, mark.u, mark.v)) { this.draw(); drawPanel(this); return; }
     item[side] = mark;
     this.moved = true;
-    this.act({do: "put", name: item.name, side, mark: {u: mark.u, v: mark.v, cov: mark.cov, how: "hand", frame: this.frameName()}});
+    const {sigma, ...put} = mark;
+    this.act({do: "put", name: item.name, side, mark: put, zoom: this.zoomed(side)});
     this.guide();
   }
 

@@ -19,8 +19,9 @@ function symbol(c, kind, x, y, r) {
   else { c.moveTo(x, y - r); c.lineTo(x + r, y); c.lineTo(x, y + r); c.lineTo(x - r, y); c.closePath(); }
 }
 
+const font = (ratio) => `600 ${12 * ratio}px system-ui, "DejaVu Sans", sans-serif`;
 function text(c, words, x, y, ratio) {
-  c.font = `600 ${12 * ratio}px system-ui, "DejaVu Sans", sans-serif`;
+  c.font = font(ratio);
   c.lineWidth = 4;
   c.strokeStyle = "rgba(0, 0, 0, 0.8)";
   c.strokeText(words, x, y);
@@ -55,6 +56,9 @@ export function drawOverlay(view, c) {
     const [x, y] = view.screen(...curve.pixels[0]);
     text(c, "∞", x + 4 * ratio, y - 4 * ratio, ratio);
   }
+  // Names stand beside their marks: on no mark, on no other name, and not below the loupe.
+  const taken = takenRoom(view.canvas.width, view.canvas.height), named = [], loupe = view.loupe.canvas;
+  if (!loupe.hidden) taken.take([loupe.offsetLeft, loupe.offsetTop, loupe.offsetLeft + loupe.offsetWidth, loupe.offsetTop + loupe.offsetHeight].map((v) => v * ratio));
   for (const item of app.items) {
     const mark = app.markOf(view.side, item);
     if (!mark || (item.kind === "target" && mark.frame !== app.frameName())) continue;
@@ -70,7 +74,22 @@ export function drawOverlay(view, c) {
     if (wrong) outlined(c, () => { c.moveTo(x - r, y - r); c.lineTo(x + r, y + r); c.moveTo(x + r, y - r); c.lineTo(x - r, y + r); }, color, 2);
     let words = item.name + (wrong ? " – wrong?" : "");
     if (chosen && item.position && item.position.text) words += "  " + item.position.text;
-    text(c, words, x + r + 3 * ratio, y - r, ratio);
+    taken.take([x - r, y - r, x + r, y + r]);
+    if (chosen) { taken.take([x - 26 * ratio, y - 2, x + 26 * ratio, y + 2]); taken.take([x - 2, y - 26 * ratio, x + 2, y + 26 * ratio]); }
+    named.push({key: item.name, words, x, y, r, rank: chosen ? 0 : wrong ? 1 : 2});
+  }
+  c.font = font(ratio);
+  for (const {key, words, x, y, r, rank} of named.sort((a, b) => a.rank - b.rank)) {
+    const width = c.measureText(words).width, height = 14 * ratio, offsets = aroundDot(r + 3 * ratio, width, height);
+    const box = ([dx, dy]) => [x + dx - width / 2, y + dy - height / 2, x + dx + width / 2, y + dy + height / 2];
+    // Where it was before, if there still is room.
+    const found = [view.names.get(key) ?? 0, ...offsets.keys()].find((k) => taken.free(box(offsets[k])));
+    // Others wait until there is room; what is selected or wrong is named all the same.
+    if (found === undefined && rank === 2) continue;
+    view.names.set(key, found ?? 0);
+    taken.take(box(offsets[found ?? 0]));
+    const [left, top] = box(offsets[found ?? 0]);
+    text(c, words, left, top + 11 * ratio, ratio);
   }
   const found = app.proposals[view.side];
   if (found && !found.refusal) {

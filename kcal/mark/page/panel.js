@@ -35,7 +35,11 @@ export function drawTable(app) {
     cell(row, sigma(item.right));
     cell(row, worth(item));
     row.addEventListener("click", () => app.select(item.name));
-    if (chosen) { row.scrollIntoView({block: "nearest"}); if (focused) row.focus(); }
+    if (!chosen) continue;
+    // Only the list scrolls: the pictures stay where they are.
+    const list = byId("things"), head = body.parentElement.tHead.offsetHeight;
+    list.scrollTop = Math.min(row.offsetTop - head, Math.max(list.scrollTop, row.offsetTop + row.offsetHeight - list.clientHeight));
+    if (focused) row.focus({preventScroll: true});
   }
 }
 
@@ -43,6 +47,8 @@ export function drawPanel(app) {
   const item = app.item(), out = byId("worth");
   byId("edit").hidden = !item || (item.surveyed && item.kind === "landmark");
   byId("survey").hidden = !item || item.surveyed || item.kind === "target";
+  byId("marks").hidden = !item;
+  for (const side of ["left", "right"]) byId("take-" + side).disabled = !item || !item[side];
   out.textContent = "";
   const line = (text) => { const p = document.createElement("div"); p.textContent = text; out.append(p); };
   if (!item) line("Nothing is selected.");

@@ -1,4 +1,4 @@
-// Tiles of one camera's images: gray levels from the server, made visible with the present contrast.
+// Tiles of one camera's images: levels from the server, gray or in color, made visible with the present contrast.
 import {raw} from "/page/api.js";
 
 export const TILE = 512;
@@ -23,7 +23,7 @@ export class Tiles {
     const key = frame + "/" + level + "/" + x + "/" + y;
     let tile = this.kept.get(key);
     if (!tile) {
-      tile = {gray: null, canvas: null, version: -1};
+      tile = {levels: null, canvas: null, version: -1};
       this.kept.set(key, tile);
       this.fetch(tile, key, frame, level, x, y);
       if (this.kept.size > KEPT) this.kept.delete(this.kept.keys().next().value);
@@ -31,7 +31,7 @@ export class Tiles {
       this.kept.delete(key);
       this.kept.set(key, tile);
     }
-    if (!tile.gray) return null;
+    if (!tile.levels) return null;
     if (tile.version !== this.version) this.paint(tile);
     return tile.canvas;
   }
@@ -42,26 +42,25 @@ export class Tiles {
       const answer = await raw("tile", query);
       tile.width = Number(answer.headers.get("X-Width"));
       tile.height = Number(answer.headers.get("X-Height"));
-      tile.gray = new Uint8Array(await answer.arrayBuffer());
+      tile.channels = Number(answer.headers.get("X-Channels"));
+      tile.levels = new Uint8Array(await answer.arrayBuffer());
       this.loaded();
     } catch (error) {
       this.kept.delete(key);
     }
   }
   paint(tile) {
-    const table = new Uint32Array(256);
+    const table = new Uint8ClampedArray(256);
     const [low, high] = this.contrast && !this.image.deep ? this.contrast : [0, 255];
-    for (let i = 0; i < 256; i++) {
-      const v = Math.max(0, Math.min(255, Math.round((i - low) * 255 / Math.max(high - low, 1))));
-      table[i] = 0xff000000 | (v << 16) | (v << 8) | v;
-    }
-    const colors = new Uint32Array(tile.gray.length);
-    for (let i = 0; i < colors.length; i++) colors[i] = table[tile.gray[i]];
+    for (let i = 0; i < 256; i++) table[i] = (i - low) * 255 / Math.max(high - low, 1);
+    const {levels, channels} = tile, green = channels === 3 ? 1 : 0, blue = channels === 3 ? 2 : 0;
+    const colors = new Uint32Array(tile.width * tile.height);
+    for (let i = 0, k = 0; i < colors.length; i++, k += channels) colors[i] = 0xff000000 | (table[levels[k + blue]] << 16) | (table[levels[k + green]] << 8) | table[levels[k]];
     tile.canvas = tile.canvas || new OffscreenCanvas(tile.width, tile.height);
     tile.canvas.getContext("2d").putImageData(new ImageData(new Uint8ClampedArray(colors.buffer), tile.width, tile.height), 0, 0);
     tile.version = this.version;
   }
-  // Gray levels between which 98 % of the loaded pixels of a part of the image lie.
+  // Levels between which 98 % of the loaded pixels of a part of the image lie; of colors, those of the green.
   span(frame, level, left, top, right, bottom) {
     const counts = new Uint32Array(256);
     let total = 0;
@@ -69,10 +68,11 @@ export class Tiles {
     for (let y = Math.max(0, Math.floor(top / size)); y * size < bottom; y++) {
       for (let x = Math.max(0, Math.floor(left / size)); x * size < right; x++) {
         const tile = this.kept.get(frame + "/" + level + "/" + x + "/" + y);
-        if (!tile || !tile.gray) continue;
+        if (!tile || !tile.levels) continue;
+        const {levels, channels} = tile, green = channels === 3 ? 1 : 0;
         const u0 = Math.max(0, Math.floor((left - x * size) >> level)), u1 = Math.min(tile.width, Math.ceil((right - x * size) / (1 << level)));
         const v0 = Math.max(0, Math.floor((top - y * size) >> level)), v1 = Math.min(tile.height, Math.ceil((bottom - y * size) / (1 << level)));
-        for (let v = v0; v < v1; v++) for (let u = u0; u < u1; u++) { counts[tile.gray[v * tile.width + u]] += 1; total += 1; }
+        for (let v = v0; v < v1; v++) for (let u = u0; u < u1; u++) { counts[levels[(v * tile.width + u) * channels + green]] += 1; total += 1; }
       }
     }
     if (!total) return null;

@@ -15,6 +15,8 @@ export class View {
     this.tiles = new Tiles(side, image, () => this.draw());
     this.center = [this.width / 2, this.height / 2];
     this.scale = 0;
+    this.whole = true;
+    this.names = new Map();
     this.pointer = null;
     this.enlarged = null;
     this.frames = [];
@@ -26,10 +28,11 @@ export class View {
     this.ratio = window.devicePixelRatio || 1;
     this.canvas.width = Math.max(1, Math.round(box.width * this.ratio));
     this.canvas.height = Math.max(1, Math.round(box.height * this.ratio));
-    if (!this.scale) this.fit();
+    if (this.whole) this.fit();
     this.draw();
   }
   fit() {
+    this.whole = true;
     this.scale = Math.min(this.canvas.width / this.width, this.canvas.height / this.height);
     this.center = [(this.width - 1) / 2, (this.height - 1) / 2];
     this.draw();
@@ -42,6 +45,7 @@ export class View {
     return [(event.clientX - box.left) * this.ratio, (event.clientY - box.top) * this.ratio];
   }
   zoom(factor, x = this.canvas.width / 2, y = this.canvas.height / 2) {
+    this.whole = false;
     const [u, v] = this.image(x, y);
     const least = 0.5 * Math.min(this.canvas.width / this.width, this.canvas.height / this.height);
     this.scale = Math.max(least, Math.min(this.scale * factor, 120));
@@ -49,6 +53,7 @@ export class View {
     this.draw();
   }
   look(u, v, scale) {
+    this.whole = false;
     this.center = [u, v];
     if (scale) this.scale = scale;
     this.draw();
@@ -113,17 +118,17 @@ export class View {
   async fetchEnlarged(key, u, v) {
     const frame = this.app.frame;
     this.enlarged = {...(this.enlarged || {}), key};
-    let answer, gray;
+    let answer, levels;
     try {
       answer = await raw("enlarged", {side: this.side, frame, u: Math.max(u, 0), v: Math.max(v, 0)});
-      gray = new Uint8Array(await answer.arrayBuffer());
+      levels = new Uint8Array(await answer.arrayBuffer());
     } catch (error) {
       // Asked for again when the view is drawn next.
       if (this.enlarged.key === key) this.enlarged.key = null;
       return;
     }
     const size = (name) => Number(answer.headers.get(name));
-    const tile = {width: size("X-Width"), height: size("X-Height"), gray, canvas: null};
+    const tile = {width: size("X-Width"), height: size("X-Height"), channels: size("X-Channels"), levels, canvas: null};
     this.tiles.paint(tile);
     if (this.enlarged.key === key) this.enlarged = {key, frame, canvas: tile.canvas, left: size("X-Left"), top: size("X-Top"), factor: size("X-Factor")};
     this.draw();
@@ -131,7 +136,12 @@ export class View {
   paintLoupe() {
     const c = this.loupe, across = 14, size = c.canvas.width, scale = size / across;
     const selected = this.app.markOf(this.side);
-    const [u, v] = this.pointer ? this.image(...this.pointer) : selected ? [selected.u, selected.v] : this.center;
+    c.canvas.hidden = !this.pointer && !selected;
+    if (c.canvas.hidden) return;
+    const [u, v] = this.pointer ? this.image(...this.pointer) : [selected.u, selected.v];
+    // It does not stand on what it shows.
+    const [x0, y0] = this.screen(u, v), room = c.canvas.clientWidth + 26;
+    c.canvas.classList.toggle("aside", x0 > this.canvas.width - room * this.ratio && y0 > this.canvas.height - room * this.ratio);
     c.fillStyle = "#3a3f47";
     c.fillRect(0, 0, size, size);
     c.imageSmoothingEnabled = this.app.interpolated;

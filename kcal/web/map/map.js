@@ -1,13 +1,10 @@
 "use strict";
 // What every map draws alike: names of dots, and cameras with their fields of view.
 
-// Names beside the dots of a Leaflet map: none covers another name, a dot or a control. A name that finds no room waits
-// until the map is zoomed in, or until its dot is pointed at or reached with the Tab key.
-function mapLabels(map) {
-  const CELL = 4, MOST = 300; // px of a cell of what is taken; names at once
-  const dots = new Set(), labels = [];
-  let cells = new Uint8Array(0), columns = 0, rows = 0;
-
+// What is taken of a picture of some pixels, so that names find room: boxes are [left, top, right, bottom].
+function takenRoom(width, height) {
+  const CELL = 4, columns = Math.ceil(width / CELL) + 1, rows = Math.ceil(height / CELL) + 1;
+  const cells = new Uint8Array(columns * rows);
   const each = (box, told) => {
     for (let y = Math.max(0, Math.floor(box[1] / CELL)); y <= Math.min(rows - 1, Math.floor(box[3] / CELL)); y++) {
       for (let x = Math.max(0, Math.floor(box[0] / CELL)); x <= Math.min(columns - 1, Math.floor(box[2] / CELL)); x++) {
@@ -16,15 +13,23 @@ function mapLabels(map) {
     }
     return true;
   };
-  const take = (box) => each(box, (cell) => { cells[cell] = 1; });
-  const free = (box, size) =>
-    box[0] >= 0 && box[1] >= 0 && box[2] <= size.x && box[3] <= size.y && each(box, (cell) => cells[cell]);
-
-  // The places around a dot in order, as offsets of the name's middle: right, left, above, below, and between.
-  const around = (reach, width, height) => {
-    const x = reach + width / 2, y = reach + height / 2, half = width / 2;
-    return [[x, 0], [-x, 0], [0, -y], [0, y], [half, -y], [half, y], [-half, -y], [-half, y]];
+  return {
+    take: (box) => each(box, (cell) => { cells[cell] = 1; }),
+    free: (box) => box[0] >= 0 && box[1] >= 0 && box[2] <= width && box[3] <= height && each(box, (cell) => cells[cell]),
   };
+}
+
+// The places around a dot in order, as offsets of the name's middle: right, left, above, below, and between.
+function aroundDot(reach, width, height) {
+  const x = reach + width / 2, y = reach + height / 2, half = width / 2;
+  return [[x, 0], [-x, 0], [0, -y], [0, y], [half, -y], [half, y], [-half, -y], [-half, y]];
+}
+
+// Names beside the dots of a Leaflet map: none covers another name, a dot or a control. A name that finds no room waits
+// until the map is zoomed in, or until its dot is pointed at or reached with the Tab key.
+function mapLabels(map) {
+  const MOST = 300; // names at once
+  const dots = new Set(), labels = [];
   const radius = (shape) => shape.getRadius() + (shape.options.weight || 0) / 2;
 
   const reachable = (label) => {
@@ -82,9 +87,7 @@ function mapLabels(map) {
 
   function place() {
     const size = map.getSize(), ground = map.getContainer().getBoundingClientRect();
-    columns = Math.ceil(size.x / CELL) + 1;
-    rows = Math.ceil(size.y / CELL) + 1;
-    cells = new Uint8Array(columns * rows);
+    const {take, free} = takenRoom(size.x, size.y);
     for (const control of map.getContainer().querySelectorAll(".leaflet-control")) {
       const box = control.getBoundingClientRect();
       take([box.left - ground.left, box.top - ground.top, box.right - ground.left, box.bottom - ground.top]);
@@ -105,11 +108,11 @@ function mapLabels(map) {
       const element = elements[i];
       if (!element || element.style.display === "none") return;
       const spot = map.latLngToContainerPoint(label.shape.getLatLng()), [width, height] = label.size;
-      const offsets = around(radius(label.shape) + CELL + 1, width, height);
+      const offsets = aroundDot(radius(label.shape) + 5, width, height);
       const box = ([x, y]) => [spot.x + x - width / 2, spot.y + y - height / 2, spot.x + x + width / 2, spot.y + y + height / 2];
       // Where it was before, if there still is room: names do not jump.
       const order = [label.at, ...offsets.keys()];
-      const found = named < MOST ? order.find((k) => free(box(offsets[k]), size)) : undefined;
+      const found = named < MOST ? order.find((k) => free(box(offsets[k]))) : undefined;
       label.room = found !== undefined;
       if (label.room) { named++; label.at = found; take(box(offsets[found])); }
       const tooltip = label.shape.getTooltip(), [x, y] = offsets[label.at];
