@@ -57,7 +57,7 @@ STEPS = (
         f"kcal calibrate {side}.obs.json -o {side}.camera.json" for side in ("left", "right"))),
     Exercise("mark", ("marks.csv",), (
         "kcal mark site/left.png site/right.png --cameras left.camera.json right.camera.json --landmarks survey.csv "
-        "-o marks.csv",), True),
+        "--targets targets.csv -o marks.csv",), True),
     Exercise("solve the rig", ("rig.json",), (
         "kcal rig left.camera.json right.camera.json --landmarks survey.csv --marks marks.csv -o rig.json",)),
     Exercise("locate", ("positions.geojson",), (

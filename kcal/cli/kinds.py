@@ -24,6 +24,7 @@ Seconds = Annotated[float, Kind(metavar="S", least=0)]
 Celsius = Annotated[float, Kind(metavar="°C")]
 Hectopascal = Annotated[float, Kind(metavar="HPA")]
 Millimeters = Annotated[float, Kind(metavar="MM")]
+Port = Annotated[int, Kind(metavar="PORT", least=0, about="Of the local address; 0 for any that is free.")]
 Count = Annotated[int, Kind(metavar="N", least=1)]
 PixelSigma = Annotated[
     float,

@@ -5,52 +5,38 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
+from kcal.cli import kinds
 from kcal.cli.console import err, out, show_page, warn
-from kcal.cli.inputs import CALIBRATED, IMAGES, MARKS, RIG, SURVEY, TABLE, PixelSigma, pixel_sigma_of
+from kcal.cli.inputs import IMAGES, pixel_sigma_of
+from kcal.cli.options import Kind
 from kcal.errors import InputError, with_extra
 
 _PORT = 8347
+_Pictures = Annotated[Path, Kind(metavar="IMAGES"), IMAGES]
+_Both = Kind(metavar="LEFT RIGHT")
 
 
 def mark_command(
-    left: Annotated[Path, typer.Argument(help="Image of the left camera, a folder of them, or a video."), IMAGES],
-    right: Annotated[Path, typer.Argument(help="The same of the right camera."), IMAGES],
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="CSV", help="Marks of landmarks; the other files lie beside it.")
-    ],
-    rig: Annotated[
-        Path | None, typer.Option(help="Rig file: cameras, and the relative pose as known so far."), RIG
-    ] = None,
-    cameras: Annotated[
-        tuple[Path, Path] | None,
-        typer.Option(metavar="LEFT RIGHT", help="Camera files, if there is no rig yet: landmarks will give one."),
-        CALIBRATED,
-    ] = None,
-    landmarks: Annotated[
-        Path | None,
-        typer.Option(metavar="CSV", help="Surveyed places: name,lat,lon,height,sigma or east,north,up."),
-        SURVEY,
-    ] = None,
-    targets: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="What will be located: its column name fills the list."), TABLE
-    ] = None,
-    reference: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="Marks in old images, to be found again in these."), MARKS
-    ] = None,
-    reference_images: Annotated[
-        tuple[Path, Path] | None, typer.Option(metavar="LEFT RIGHT", help="With --reference: the old images."), IMAGES
-    ] = None,
-    pixel_sigma: PixelSigma = None,
-    port: Annotated[int, typer.Option(help="Of the local address; 0 for any that is free.", min=0, max=65535)] = _PORT,
-    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
+    left: _Pictures,
+    right: _Pictures,
+    *,
+    output: Annotated[kinds.Output, Kind(metavar="CSV")],
+    rig: kinds.RigFile | None = None,
+    cameras: Annotated[tuple[kinds.CalibratedCamera, kinds.CalibratedCamera] | None, _Both] = None,
+    landmarks: kinds.Survey | None = None,
+    targets: kinds.Table | None = None,
+    reference: kinds.Marks | None = None,
+    reference_images: Annotated[tuple[_Pictures, _Pictures] | None, _Both] = None,
+    pixel_sigma: kinds.PixelSigma | None = None,
+    port: kinds.Port = _PORT,
+    browser: bool = True,
 ) -> None:
     """Mark landmarks and targets on a local web page, and see at once what each mark is worth.
 
-    A click snaps to the corner, cross, blob or pole end that is there and shows its σ. In the other image the epipolar
-    curve appears with a band of two σ of the rig, and on it a proposal with its covariance, or the reason why there is
-    none. From four landmarks on the rig is solved as you mark; a wrong landmark is named.
+    A click snaps to the corner, cross, blob or pole end that is there and shows its σ, at least one pixel of the screen
+    where the image is shown small. In the other image the epipolar curve appears with a band of two σ of the rig, and
+    on it a proposal with its covariance, or the reason why there is none. From four landmarks on the rig is solved as
+    you mark; a wrong landmark is named.
 
     Every action is on the disk before it is answered: `marks.csv` (for `kcal rig --marks`), `marks.points.csv` (for
     `kcal locate`), `marks.landmarks.csv` (for `kcal rig --landmarks`) and `marks.log` (for undo, and to continue).
@@ -60,9 +46,21 @@ def mark_command(
 
     **Examples**
 
-    `kcal mark left.png right.png --rig rig.json --landmarks survey.csv -o marks.csv`
+    `kcal mark left.png right.png --rig rig.json --landmarks survey.csv --targets targets.csv -o marks.csv`
 
     `kcal mark new-left.png new-right.png --reference then.csv --reference-images left.png right.png -o now.csv`
+
+    Args:
+        left: Image of the left camera, a folder of them, or a video.
+        right: The same of the right camera.
+        output: Marks of landmarks; the other files are written beside it.
+        rig: Rig file: cameras, and the relative pose as known so far.
+        cameras: Camera files, if there is no rig yet: landmarks will give one.
+        landmarks: Surveyed places: name,lat,lon,height,sigma or east,north,up.
+        targets: What will be located: the names in its column `name` fill the list.
+        reference: Marks in old images, to be found again in these.
+        reference_images: With --reference: the old images.
+        browser: Open the page in the browser.
     """
     with with_extra("mark", "kcal mark needs"):
         from kcal.mark.server import marking_app

@@ -42,11 +42,13 @@ def listening_socket(port: int, *, fallback: bool) -> socket.socket:
         listener.bind(("127.0.0.1", port))
         # Whoever opens the address as soon as it is printed waits for the server, and is not refused.
         listener.listen()
-    except OSError as error:
+    except (OSError, OverflowError) as error:
         listener.close()
         if fallback:
             return listening_socket(0, fallback=False)
-        raise InputError(f"port {port} cannot be used: {error.strerror or error}; give another --port") from error
+        raise InputError(
+            f"port {port} cannot be used: {getattr(error, 'strerror', None) or error}; give another --port"
+        ) from error
     return listener
 
 

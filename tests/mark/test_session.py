@@ -441,6 +441,7 @@ def test_names_of_targets_fill_the_list(tmp_path: Path, survey: Path) -> None:
     assert list(again.state.items) == [*state.items, "yawl"]
     assert again.state.items["buoy"].left is None
     again.close()
+    # A name is a name, not a header.
     targets.write_text("buoy\nyawl\n")
     with pytest.raises(FileError, match=r"targets\.csv.*name"):
         Session(tmp_path / "other.csv", targets=targets)

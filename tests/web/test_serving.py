@@ -26,6 +26,8 @@ def test_a_port_in_use_is_refused_or_replaced() -> None:
             pass
         with pytest.raises(InputError, match=f"port {port} cannot be used: .*; give another --port"):
             listening_socket(port, fallback=False)
+        with pytest.raises(InputError, match=r"port 70000 cannot be used: .*0-65535.*; give another --port"):
+            listening_socket(70000, fallback=False)
         with listening_socket(port, fallback=True) as other:
             assert other.getsockname()[0] == "127.0.0.1"
             assert other.getsockname()[1] not in (0, port)
