@@ -72,10 +72,10 @@ def file_kind(path: str | Path) -> str:
 
 
 def _foreign_kind(path: Path, head: bytes, size: int) -> str:
-    if any(head[place:].startswith(mark) for place, mark in _VIDEO):
-        return "video"
     if is_image(head):
         return "image"
+    if any(head[place:].startswith(mark) for place, mark in _VIDEO):
+        return "video"
     text = head.decode("utf-8-sig", errors="replace").lstrip()
     if "\0" in text:
         return "foreign" if path.suffix.lower() in (".mat", ".bin", ".npz", ".pb") else "unknown"
@@ -170,6 +170,8 @@ def check_image_header(data: bytes, source: str | Path) -> Size:
 
 def is_image(data: bytes) -> bool:
     """Whether bytes begin like an image of a known format."""
+    if is_heif(data):
+        return True
     start, size_of = next(((start, of) for start, of in _FORMATS.items() if data.startswith(start)), (b"", None))
     if size_of is None:
         return False
@@ -180,6 +182,17 @@ def is_image(data: bytes) -> bool:
         return all(0 < side < 2**20 for side in size_of(data))
     except (struct.error, IndexError, TypeError, ValueError):
         return False
+
+
+def is_heif(data: bytes) -> bool:
+    r"""Whether bytes begin like HEIC, HEIF or AVIF, as phones write them.
+
+    Example:
+        >>> is_heif(bytes(3) + b"\x18ftypheic"), is_heif(bytes(3) + b"\x18ftypisom")
+        (True, False)
+    """
+    brands = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1", b"avif", b"avis")
+    return data[4:8] == b"ftyp" and data[8:12] in brands
 
 
 def _png(data: bytes) -> Size:

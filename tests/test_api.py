@@ -40,7 +40,7 @@ PUBLIC = {
     """,
     "kcal.corners": """
         CornerStatus MatchOptions MatchStatus RefineCorners detect_board detect_video match_points
-        refine_point save_board
+        recognize_board refine_point save_board
     """,
     "kcal.calibrate": """
         CalibrationLayer OutlierRejection calibrate_cameras calibrate_views compare_models examine

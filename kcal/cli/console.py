@@ -5,8 +5,10 @@ from __future__ import annotations
 import functools
 import gc
 import inspect
+import re
 import shlex
 import signal
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
@@ -21,6 +23,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Ta
 from rich.text import Text
 
 from kcal.errors import DegenerateError, InputError, KcalError
+from kcal.files import write_atomic
 from kcal.texts import one_line, visible
 
 if TYPE_CHECKING:
@@ -119,6 +122,24 @@ def print_wrote(*paths: Path | None) -> None:
         if path is not None:
             _tell_more("wrote", str(path))
             out.print(f"wrote {path}", markup=False)
+
+
+_MOST_LINES = 12  # of a list on the screen
+
+
+def print_left_out(lines: Sequence[str], beside: Path, head: str) -> None:
+    """Print what was left out, a line each; of more than a screen of them one line and the file with all of them."""
+    if len(lines) <= _MOST_LINES:
+        for line in lines:
+            out.print(f"  {line}", markup=False)
+        return
+    kinds = Counter(re.sub(r"[\d.]+", "N", line.partition(": ")[2]) for line in lines)
+    text, count = kinds.most_common(1)[0]
+    first = next(line.partition(": ")[2] for line in lines if re.sub(r"[\d.]+", "N", line.partition(": ")[2]) == text)
+    path = beside.with_name(f"{beside.name.split('.')[0]}.left-out.txt")
+    write_atomic(path, "".join(f"{line}\n" for line in lines))
+    _tell_more("wrote", str(path))
+    out.print(f"{head}, {count} of them: {first}; all of them: {path}", markup=False)
 
 
 def print_table(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> None:

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
 
-from kcal.cli.console import board_words, ending_with, out, steps, tell, warn
-from kcal.cli.inputs import IMAGES, BoardSize, Refine, RefineMethod, SquareSide, typed, typed_with
+from kcal.cli.console import board_words, ending_with, err, out, print_left_out, steps, tell, warn
+from kcal.cli.inputs import IMAGES, BoardOrAuto, Refine, RefineMethod, SquareSide, typed, typed_with
 from kcal.cli.settings import picture_option
-from kcal.errors import FileError, InputError
-from kcal.files import check_writable, is_stream, source_name
+from kcal.errors import InputError
+from kcal.files import check_writable, is_stream, make_folder, source_name
 
 if TYPE_CHECKING:
     from kcal.corners.board import Board
@@ -31,8 +32,8 @@ def detect_command(
         ),
         IMAGES,
     ],
-    size: BoardSize,
     output: Annotated[Path, typer.Option("-o", "--output", help="Observations file to write.")],
+    size: BoardOrAuto = "auto",
     square: SquareSide = None,
     refine: RefineMethod = Refine.erf,
     gallery: Annotated[
@@ -55,10 +56,13 @@ def detect_command(
 ) -> None:
     """Find the board in the images of one camera.
 
-    Writes the corners of each view, and the reason for each image in which no board was found. EXIF orientation is
-    ignored: pixels are used as the sensor wrote them. Nothing is written if no image shows the board.
+    The images tell which board it is; --square tells its size. Writes the corners of each view, and the reason for each
+    image in which no board was found. EXIF orientation is ignored: pixels are used as the sensor wrote them. Nothing is
+    written if no image shows the board, or if more images show another one.
 
     **Examples**
+
+    `kcal detect left/ --square 25mm -o left.obs.json`
 
     `kcal detect left/ --board 9x6 --square 25mm -o left.obs.json`
 
@@ -68,10 +72,8 @@ def detect_command(
 
     `kcal detect "shots/left*.png" --board 9x6 --square 25mm -o left.obs.json --refine opencv`
     """
-    from kcal.corners.board import Board
-
     check_writable(output)
-    board = Board.parse(size, square)
+    given = given_board(size, square)
 
     from kcal.corners.detect import Detection, detect
     from kcal.corners.images import VIDEO_SUFFIXES, expand_images, turned_images
@@ -84,8 +86,8 @@ def detect_command(
     streams = [source_name(image) for image in images if is_stream(image)]
     if streams and len(images) > 1:
         raise InputError(f"{streams[0]}: a stream is searched alone, without other images")
-    if keep is not None and not os.path.isdir(keep):
-        raise FileError(f"{keep}: no such folder")
+    if keep is not None:
+        make_folder(keep)
     if streams or (len(images) == 1 and Path(images[0]).suffix.lower() in VIDEO_SUFFIXES):
         searched = 0
 
@@ -93,6 +95,7 @@ def detect_command(
             nonlocal searched
             searched += 1
 
+        board = given or board_in_images(images, square, time_limit)
         with steps(f"watching {streams[0]} for {duration:g} s" if streams else "searching the video", None):
             observations = detect_video(
                 images[0], board, refine.value, progress=count, time_limit=time_limit, duration=duration, keep=keep
@@ -101,8 +104,9 @@ def detect_command(
     else:
         paths = expand_images(images)
         check_writable(output, *paths)
+        board = given or board_in_images(paths, square, time_limit)
         with (
-            ending_with(lambda error: _right_board(str(error), size, board)),
+            ending_with(lambda error: _right_board(str(error), size, board, paths)),
             steps("detecting", len(paths)) as advance,
         ):
             observations = detect(
@@ -136,17 +140,58 @@ def detect_command(
     for text in notes:
         warn(text)
     if turned:
-        out.print(f"note: {len(turned)} images have an EXIF rotation, which kcal ignores")
+        out.print(
+            f"note: {len(turned)} images have an EXIF rotation, of {len(paths)}, which kcal ignores: corners are in "
+            "pixels of the sensor"
+        )
     if unseen:
         out.print(f"corners left out as uncertain: {unseen} of {found * board.corners}")
-    for failure in observations.failures:
-        out.print(f"  [yellow]failed[/] {escape(failure.name)}: {escape(failure.reason)}")
+    print_left_out(
+        [f"failed {failure.name}: {failure.reason}" for failure in observations.failures],
+        output,
+        f"{len(observations.failures)} images failed",
+    )
     if not board.unambiguous:
         out.print(f"note: this board looks the same turned by 180°; for stereo {board.stereo_advice}")
 
 
-def _right_board(refusal: str, size: str, board: Board) -> str:
+def given_board(size: str, square: str | None) -> Board | None:
+    """The board that `--board` and `--square` say; None where the images have to tell it."""
+    from kcal.corners.board import Board
+
+    return None if size == "auto" else Board.parse(size, square)
+
+
+def board_in_images(images: Sequence[str | Path], square: str | None, time_limit: float | None = None) -> Board:
+    """The board that images, a video or a stream show; it is said."""
+    from kcal.corners.detect import recognize_board
+    from kcal.corners.images import VIDEO_SUFFIXES
+    from kcal.corners.recognize import Recognized
+    from kcal.corners.video import spread_frames
+
+    def say(found: Recognized) -> None:
+        if found.seen is not None:
+            tell(board=found.seen.text)
+            err.print(f"board {found.seen.text}, seen in {found.votes} of {found.looked} images that were looked at")
+
+    first = images[0]
+    frames = is_stream(str(first)) or Path(first).suffix.lower() in VIDEO_SUFFIXES
+    with steps("looking for a board", None):
+        return recognize_board(spread_frames(first) if frames else images, square, time_limit=time_limit, note=say)
+
+
+_CURED = 6  # images that are looked at to name the board of a refusal
+
+
+def _right_board(refusal: str, size: str, board: Board, paths: Sequence[Path]) -> str:
     """The command with the board that was found instead, or one that draws the board that was asked for."""
-    if (found := re.search(r"a board of (\d+x\d+)", refusal)) and size in typed:
-        return f"Perhaps: {typed_with({size: found[1]})}"
+    found = re.search(r"a board of (\d+x\d+)", refusal) or re.search(r"give --board ((?:\w+:)?\d+x\d\S*)$", refusal)
+    text = found[1] if found else ""
+    if "COLUMNSxROWS" in refusal:
+        from kcal.corners.detect import recognize_images
+
+        seen = recognize_images(paths, _CURED).seen
+        text = seen.text if seen is not None else ""
+    if text and size in typed:
+        return f"Perhaps: {typed_with({size: text})}"
     return f"To see what this board looks like: kcal board {board_words(board)} -o board.svg"

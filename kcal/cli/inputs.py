@@ -447,6 +447,16 @@ BoardSize: TypeAlias = Annotated[
         "asymmetric:4x11; aprilgrid:6x6[:SPACING]; or a target file of Kalibr, april.yaml.",
     ),
 ]
+BoardOrAuto: TypeAlias = Annotated[
+    str,
+    typer.Option(
+        "--board",
+        metavar="BOARD",
+        help="auto: the images tell. Otherwise inner corners, columns by rows: 9x6 has 10x7 squares; "
+        "charuco:9x6[:DICTIONARY][:MARKER]; circles:7x6; asymmetric:4x11; aprilgrid:6x6[:SPACING]; or a target file of "
+        "Kalibr, april.yaml.",
+    ),
+]
 SquareSide: TypeAlias = Annotated[
     str | None,
     typer.Option(

@@ -3,6 +3,7 @@
 
 # Find boards
 from kcal.corners.detect import detect_board as detect_board
+from kcal.corners.detect import recognize_board as recognize_board
 from kcal.corners.video import detect_video as detect_video
 from kcal.corners.print_board import save_board as save_board
 

@@ -4,34 +4,41 @@ from __future__ import annotations
 
 import glob
 import hashlib
+import itertools
 import os
 import re
 import warnings
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from kcal.corners.board import DICTIONARIES, TAGS, Board
-from kcal.corners.circles import find_circles, refine_circles, round_blobs, wrong_size
-from kcal.corners.grid import MIN_SHARPNESS, local_side, sharpness, without_false_sides
-from kcal.corners.images import VIDEO_SUFFIXES, Gray, decode_gray, expand_images, to_8bit, unique_names
-from kcal.corners.marker_boards import BORDERS, MIN_CORNERS, enough, find_aprilgrid, find_charuco, free_side
-from kcal.corners.markers import opencv_dictionary
+from kcal.corners.board import Board
+from kcal.corners.circles import find_circles, refine_circles, wrong_size
+from kcal.corners.grid import MIN_SHARPNESS, local_side, sharpness
+from kcal.corners.images import VIDEO_SUFFIXES, Gray, decode_gray, expand_images, image_header, to_8bit, unique_names
+from kcal.corners.marker_boards import MIN_CORNERS, enough, find_aprilgrid, find_charuco, free_side
 from kcal.corners.observations import Failure, Observations, View, common_size, rescaled
+from kcal.corners.recognize import (
+    Recognized,
+    Votes,
+    clear_circles,
+    seen_board,
+    seen_instead,
+    size_advice,
+    spread_order,
+)
 from kcal.corners.refine import Refinement, refine_corners
 from kcal.corners.saddle import CornerStatus, Refined
-from kcal.corners.search import SEARCH_SIDES, find_board, largest_grid, reduced, refine_through_sizes
+from kcal.corners.search import SEARCH_SIDES, find_board, reduced, refine_through_sizes
 from kcal.corners.time_limit import Limited, TookTooLongError
 from kcal.errors import FileError, InputError
-from kcal.file_kind import check_image_header
 from kcal.files import is_stream, read_bytes, source_name
 from kcal.texts import brief
 
@@ -149,57 +156,14 @@ def _detect_circles(image: Gray, board: Board, refine: Refinement) -> Detection:
     return Detection(refined.pixels, covariance=refined.covariance)
 
 
-# Say which other board an image shows, where the one that was asked for is not found.
-
-# Larger dictionaries contain the smaller ones of their family, and take seconds to search.
-_FAMILIES = (
-    TAGS, "4x4_250", "5x5_250", "6x6_250", "7x7_250", "aruco_original", "aruco_mip_36h12", "apriltag_25h9",
-    "apriltag_16h5",
-)  # fmt: skip
-_ENOUGH = 8  # markers of one dictionary, after which no other is searched
-_MIN_MARKERS = 4  # fewer are found in pictures without any: markers of 16 cells have few errors to correct
-_MIN_CIRCLES = 12
-_ROUND = 0.83  # 4 pi area / perimeter²: squares have 0.79, circles seen from 45 degrees 0.94
-_ROUNDER = 0.88  # 58 % and more of the spots in blurred checkerboards are less round
-_SIZES = (0.6, 1.6)  # of the median: sizes of circles of one grid, seen from aside
-
-
-def seen_instead(image: npt.NDArray[np.uint8], board: Board) -> str:
-    """Which board an image shows that is not the one asked for; empty if it shows none.
-
-    Args:
-        image: (H, W).
-        board: that was asked for.
-    """
-    if markers := seen_markers(image, board):
-        return markers
-    if has_own_markers(image, board):
-        return ""
-    plain = board.pattern == "checkerboard" and board.dictionary is None
-    found = seen_size(image) if plain else None
-    if (circles := _clear_circles(image, board) if found else seen_circles(image, board)) is not None:
-        return circles
-    found = found or seen_size(image)
-    own = (max(board.columns, board.rows), min(board.columns, board.rows))
-    return "" if found is None or (found == own and plain) else _size_advice(found, board)
-
-
-def _clear_circles(image: npt.NDArray[np.uint8], board: Board) -> str | None:
-    """As `seen_circles`, where blurred squares do not pass for circles: most of the spots are rounder."""
-    return seen_circles(image, board) if _like_sized(image, _ROUNDER) > 0.6 * _like_sized(image) else None
-
-
-def _size_advice(found: tuple[int, int], board: Board) -> str:
-    own = (max(board.columns, board.rows), min(board.columns, board.rows))
-    squares = found == (own[0] - 1, own[1] - 1) and board.pattern == "checkerboard"
-    advice = "count inner corners, not squares" if squares else f"give --board {found[0]}x{found[1]}"
-    return f"a board of {found[0]}x{found[1]} was found: {advice}"
-
+# Refuse images that show another board than the one that was asked for.
 
 # What a detection says that has found all corners of another board, or more than this one has.
 _OTHER = re.compile(r"a (?:board|grid) of (\d+)x(\d+) inner corners was found")
 _LOOKS = 3  # images without the board in which another one is sought
 _STOPS = 3, 8  # images without the board, and none with it, after which the search may end
+_CHECKED = 6  # images without the board, where less than half have it, in which another one is sought
+_LOOKED_AT = 24  # images that tell which board they show
 _FEW = 0.2  # views, as a share of the images that show one other board: the board was named wrongly
 
 
@@ -213,13 +177,13 @@ def seen_by_most(failed: Sequence[tuple[Any, str]], board: Board) -> tuple[str, 
     votes: dict[str, list[str]] = {}
     for number, (file, reason) in enumerate(failed):
         said = _OTHER.search(reason)
-        text = _size_advice((int(said[1]), int(said[2])), board) if said else ""
+        text = size_advice((int(said[1]), int(said[2])), board) if said else ""
         if number < _LOOKS:
             with suppress(FileError):
-                image = to_8bit(_image_and_hash(file)[0])
+                image = to_8bit(image_and_hash(file)[0])
                 small = to_8bit(reduced(image, max(1.0, max(image.shape) / SEARCH_SIDES[0]), _size(image))[0])
                 # Corners may also be seen between circles.
-                text = (_clear_circles(small, board) or text) if said else seen_instead(small, board)
+                text = (clear_circles(small, board) or text) if said else seen_instead(small, board)
         if text:
             votes.setdefault(text.rpartition(": ")[2], []).append(text)
     most = max(votes.values(), key=len, default=[""])
@@ -249,94 +213,77 @@ def refuse_other_board(views: int, failed: Sequence[tuple[Any, str]], count: int
         text, shown = seen_by_most(failed, board)
         if views <= _FEW * shown:
             raise InputError(f"the board is in {views} of {count} images only; in {shown} of them {text}")
+    if 2 * views < count:
+        found = recognize_images([failed[number][0] for number in spread_order(len(failed))], _CHECKED)
+        others = found.votes * len(failed) / max(found.looked, 1)
+        # A part of the board does not end in one image and have the same size in others.
+        if (
+            found.seen is not None
+            and found.seen.other_than(board)
+            and found.sure
+            and found.votes > 1
+            and others > views
+        ):
+            raise InputError(
+                f"the board is in {views} of {count} images only; in {found.votes} of {found.looked} others that were "
+                f"looked at another one is seen: give --board {found.seen.text}"
+            )
 
 
-def seen_markers(image: npt.NDArray[np.uint8], board: Board) -> str:
-    """Which markers an image shows that are not the board's; empty if it shows none.
+def recognize_images(images: Iterable[Any], most: int, time_limit: float | None = None) -> Recognized:
+    """Which board images show, by those that are looked at, the first ones.
+
+    Args:
+        images: images, or files; those that cannot be read are passed over.
+        most: images to look at.
+        time_limit: seconds of processor time for each.
+    """
+    votes = Votes()
+    with Limited(time_limit) as limited:
+        for image in itertools.islice(images, most):
+            with suppress(FileError, TookTooLongError):
+                votes.add(limited(seen_board, to_8bit(image_and_hash(image)[0]), votes.without_markers))
+            if votes.agreed:
+                break
+    return votes.result
+
+
+def recognize_board(
+    paths: str | Path | Sequence[str | Path | Gray | Tensor] | Gray | Tensor | Iterator[Gray],
+    square: str | None = None,
+    *,
+    time_limit: float | None = None,
+    note: Callable[[Recognized], object] | None = None,
+) -> Board:
+    """Recognize which board images show: checkerboard, ChArUco board, AprilGrid or circles, and its columns and rows.
+
+    Up to 24 images are looked at, far apart from each other, until they agree.
+
+    Args:
+        paths: as in `detect`; or an iterator of images, which are looked at in turn.
+        square: side of its squares or tags with the unit, such as `25mm`: images do not tell it. Markers and gaps are
+            measured in terms of it.
+        time_limit: seconds of processor time for each image; no limit by default.
+        note: called with what was recognized, and in how many images.
+
+    Raises:
+        InputError: the images show no board, or not one board; or its square is missing.
 
     Example:
-        >>> page = np.full((200, 200), 255, np.uint8)
-        >>> for k in range(4):
-        ...     x, y = 20 + 90 * (k % 2), 20 + 90 * (k // 2)
-        ...     page[y : y + 70, x : x + 70] = opencv_dictionary("5x5_50").generateImageMarker(k, 70)
-        >>> seen_markers(page, Board(columns=9, rows=6, square=0.025))
-        'markers 0 to 3 of dictionary 5x5_50 were found: give --board charuco:COLUMNSxROWS:5x5_50'
+        >>> y, x = np.mgrid[:120, :160]
+        >>> on = (x >= 20) & (x < 140) & (y >= 20) & (y < 100)
+        >>> image = np.where(on & ((x // 20 + y // 20) % 2 == 0), 40, 220).astype(np.uint8)
+        >>> str(recognize_board(image, "25mm"))
+        '5x3 inner corners, 25 mm squares'
     """
-    name, border, numbers = _most_markers(image)
-    if numbers:
-        own = (name == board.dictionary and border == 1) or (name == TAGS and board.pattern == "aprilgrid")
-        if own and any(board.first <= number < board.first + board.markers for number in numbers):
-            return ""  # it may be this board, and the image's own reason says what is wrong
-        found = f"markers {numbers[0]} to {numbers[-1]} of dictionary {name} were found"
-        if name == TAGS and border == BORDERS[0]:
-            return f"{found}: give --board aprilgrid:COLUMNSxROWS"
-        return f"{found}: give --board charuco:COLUMNSxROWS:{name}"
-    return ""
-
-
-def seen_circles(image: npt.NDArray[np.uint8], board: Board) -> str | None:
-    """What to say of a grid of circles in an image; None if there is none, empty if it may be the board's own."""
-    count = _like_sized(image)
-    if count < _MIN_CIRCLES:
-        return None
-    if board.pattern not in ("circles", "asymmetric"):
-        return f"some {count} circles were found: give --board circles:COLUMNSxROWS or asymmetric:COLUMNSxROWS"
-    if count == board.corners:
-        return ""
-    return (
-        f"some {count} circles were found, the board has {board.corners}: check its columns and rows, and whether they "
-        "are asymmetric"
-    )
-
-
-def has_own_markers(image: npt.NDArray[np.uint8], board: Board) -> bool:
-    """Whether an image shows any marker of a ChArUco board or tag of an AprilGrid."""
-    name = TAGS if board.pattern == "aprilgrid" else board.dictionary
-    own = {*range(board.first, board.first + board.markers)}
-    borders = BORDERS if board.pattern == "aprilgrid" else (1,)
-    return name is not None and any(own & set(_read(image, name, border)) for border in borders)
-
-
-def _most_markers(image: npt.NDArray[np.uint8]) -> tuple[str, int, list[int]]:
-    """The dictionary of which most markers are seen, their border in cells, and their numbers."""
-    best: tuple[str, int, list[int]] = ("", 1, [])
-    for family in _FAMILIES:
-        for border in BORDERS if family == TAGS else (1,):
-            numbers = _read(image, family, border)
-            if len(numbers) >= max(_MIN_MARKERS, len(best[2]) + 1):
-                best = _smallest(family, numbers[-1]), border, numbers
-            if len(numbers) >= _ENOUGH:
-                return best
-    return best
-
-
-def _read(image: npt.NDArray[np.uint8], name: str, border: int) -> list[int]:
-    options = cv2.aruco.DetectorParameters()
-    options.markerBorderBits = border
-    _, numbers, _ = cv2.aruco.ArucoDetector(opencv_dictionary(name), options).detectMarkers(image)
-    return [] if numbers is None else sorted({int(number) for number in numbers.reshape(-1).tolist()})
-
-
-def _smallest(family: str, highest: int) -> str:
-    """The smallest dictionary of a family that contains a number."""
-    stem = family.removesuffix("_250")
-    sizes = [name for name in DICTIONARIES if name.startswith(f"{stem}_") and name[3:4] == "_"]
-    return min((name for name in sizes if DICTIONARIES[name] > highest), key=DICTIONARIES.__getitem__, default=family)
-
-
-def _like_sized(image: npt.NDArray[np.uint8], least: float = _ROUND) -> int:
-    """How many round spots of like size are seen, dark or light; a checkerboard has as many of both."""
-    counts = []
-    for picture in (image, 255 - image):
-        sizes = np.array([blob.size for blob in round_blobs(picture, least)])
-        middle = float(np.median(sizes)) if len(sizes) else 0.0
-        counts.append(int(((sizes > _SIZES[0] * middle) & (sizes < _SIZES[1] * middle)).sum()))
-    return max(counts) if min(counts) < max(counts) / 3 else 0
+    if not isinstance(paths, Iterator):
+        files = _files_and_images(paths)
+        paths = (files[number] for number in spread_order(len(files)))
+    return recognize_images(paths, _LOOKED_AT, time_limit).board(square, note)
 
 
 # Find a board in one image, or in all images of a camera.
 
-_THOROUGH = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
 MIN_GOOD = 0.5  # share of the corners that must be refined successfully
 
 
@@ -502,7 +449,7 @@ def detect(
             try:
                 if i in common.left_out:
                     raise FileError(common.left_out[i])
-                image, digest = _image_and_hash(file)
+                image, digest = image_and_hash(file)
             except FileError as error:
                 failures.append(Failure(name=name, reason=str(error).removeprefix(f"{file}: ")))
                 if i not in common.left_out:
@@ -562,7 +509,7 @@ def _files_and_images(paths: Any) -> list[Any]:
     return found
 
 
-def _image_and_hash(source: Any) -> tuple[Any, str | None]:
+def image_and_hash(source: Any) -> tuple[Any, str | None]:
     """An image, and the hash of its file's bytes if it comes from one."""
     if not isinstance(source, Path):
         return as_image(source), None
@@ -590,7 +537,7 @@ def _renumbered(
     unclear, out = set(numberings.get(None, ())), []
     for view in views:
         if view.name in unclear:
-            found = detect_charuco(_image_and_hash(sources[view.name])[0], board, refine, legacy=True)
+            found = detect_charuco(image_and_hash(sources[view.name])[0], board, refine, legacy=True)
             if found.pixels is not None:
                 out.append(view_of(found, view.name, image=view.image, sha256=view.sha256))
             continue
@@ -629,22 +576,7 @@ def _size_of(file: Any) -> tuple[int, int] | None:
     if not isinstance(file, Path):
         return _size(file)
     try:
-        width, height = check_image_header(read_bytes(file), file)
-        return (width, height) if width else _size(_image_and_hash(file)[0])
+        width, height = image_header(read_bytes(file), file)
+        return (width, height) if width else _size(image_and_hash(file)[0])
     except FileError:
         return None
-
-
-def seen_size(image: Gray) -> tuple[int, int] | None:
-    """Inner corners, the larger number first, of the largest checkerboard grid in an image; None if there is none.
-
-    Example:
-        >>> y, x = np.mgrid[:240, :320]
-        >>> on = (x >= 40) & (x < 280) & (y >= 40) & (y < 200)
-        >>> seen_size(np.where(on & ((x // 40 + y // 40) % 2 == 0), 40, 220).astype(np.uint8))
-        (5, 3)
-    """
-    grid = largest_grid(image, _THOROUGH)
-    if grid is not None:
-        grid = without_false_sides(image, grid)
-    return None if grid is None else (max(grid.shape[:2]), min(grid.shape[:2]))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import datetime
 import glob
+import importlib
 import io
 import os
 import re
@@ -15,6 +16,7 @@ import tempfile
 import threading
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +27,15 @@ from PIL import ExifTags, Image, UnidentifiedImageError
 from PIL.JpegImagePlugin import JpegImageFile
 
 from kcal.errors import FileError, InputError
-from kcal.file_kind import check_image_header
+from kcal.file_kind import check_image_header, check_pixel_count, is_heif
 from kcal.files import read_bytes, read_head
 
 Gray = npt.NDArray[np.uint8 | np.uint16]
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".pnm", ".jp2"})
+# Those that need Pillow's plug-in, and those that must be developed first.
+HEIF_SUFFIXES = frozenset({".heic", ".heif", ".avif"})
+RAW_SUFFIXES = frozenset({".cr2", ".cr3", ".nef", ".arw", ".dng", ".orf", ".rw2", ".raf", ".pef", ".srw"})
 VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg"})
 MIN_IMAGE_SIDE = 16
 
@@ -117,7 +122,8 @@ def expand_images(inputs: str | Path | Sequence[str | Path]) -> list[Path]:
     """List the image files that files, folders and wildcards stand for, each file once.
 
     A folder stands for the images directly inside it (by suffix), a wildcard for the files it matches; both in natural
-    order (`2.jpg` before `10.jpg`).
+    order (`2.jpg` before `10.jpg`). HEIC and raw images of cameras are among them unless the folder has the same image
+    in another format: what cannot be read is told with what to do.
 
     Raises:
         InputError: no input at all.
@@ -161,8 +167,11 @@ def unique_names(paths: Sequence[Path]) -> list[str]:
 def _expand_one(path: Path) -> list[Path]:
     # Unlike Path's, these say no where a name is too long.
     if os.path.isdir(path):
-        inside = [file for file in path.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES and file.is_file()]
-        images = _natural(file for file in inside if not file.name.startswith("."))
+        inside = [file for file in path.iterdir() if not file.name.startswith(".") and file.is_file()]
+        usual = [file for file in inside if file.suffix.lower() in IMAGE_SUFFIXES]
+        twins = {file.stem for file in usual}
+        others = [file for file in inside if file.suffix.lower() in HEIF_SUFFIXES | RAW_SUFFIXES]
+        images = _natural([*usual, *(file for file in others if file.stem not in twins)])
         if not images:
             raise FileError(f"{path}: no image in this folder (looked for {', '.join(sorted(IMAGE_SUFFIXES))})")
         return images
@@ -185,7 +194,13 @@ def _natural(paths: Iterable[Path]) -> list[Path]:
 
 
 def _decoded(data: bytes, source: str | Path, flags: int) -> npt.NDArray[Any]:
-    check_image_header(data, source)
+    image_header(data, source)
+    if is_heif(data):
+        picture = _opened_heif(data, source)
+        stored = picture.transpose(_UNDONE[turns]) if (turns := _heif_turns(data)) else picture
+        if flags != cv2.IMREAD_UNCHANGED:
+            return np.asarray(stored.convert("L"))
+        return np.ascontiguousarray(np.asarray(stored.convert("RGB"))[..., ::-1])
     image, complaints = _imdecode(data, flags)
     broken = _BROKEN_JPEG.search(complaints)
     if image is None:
@@ -195,6 +210,47 @@ def _decoded(data: bytes, source: str | Path, flags: int) -> npt.NDArray[Any]:
     if image.dtype not in (np.uint8, np.uint16):
         raise FileError(f"{source}: pixels are {image.dtype}; store the image with 8 or 16 bits unsigned")
     return image
+
+
+def image_header(data: bytes, source: str | Path) -> tuple[int, int]:
+    """(width, height) as stored, or (0, 0) where only the decoder tells; see `check_image_header`.
+
+    Raises:
+        FileError: no image that can be read, with what to do.
+    """
+    if Path(source).suffix.lower() in RAW_SUFFIXES:
+        raise FileError(
+            f"{source}: a raw image, which has to be developed first: take the JPEG that the camera stored with it, or "
+            "save it as TIFF without corrections of the lens (darktable-cli, dcraw -T)"
+        )
+    if not is_heif(data):
+        return check_image_header(data, source)
+    picture = _opened_heif(data, source)
+    width, height = check_pixel_count(picture.size)
+    return (height, width) if _heif_turns(data) % 2 else (width, height)
+
+
+# Quarter turns to the left that a decoder of HEIC carries out, as the file's box `irot` says, and how to undo them.
+_IROT = re.compile(rb"\0\0\0\x09irot(.)", re.DOTALL)
+_UNDONE = {1: Image.Transpose.ROTATE_270, 2: Image.Transpose.ROTATE_180, 3: Image.Transpose.ROTATE_90}
+
+
+def _opened_heif(data: bytes, source: str | Path) -> Image.Image:
+    """A HEIC, HEIF or AVIF image, by Pillow or its plug-in."""
+    with suppress(ImportError):
+        importlib.import_module("pillow_heif").register_heif_opener()
+    try:
+        return Image.open(io.BytesIO(data))
+    except UnidentifiedImageError:
+        raise FileError(
+            f"{source}: a HEIC image, which needs one more package: pip install pillow-heif; or convert it to PNG"
+        ) from None
+
+
+def _heif_turns(data: bytes) -> int:
+    # Decoders of AVIF leave pixels as they are stored.
+    found = None if data[8:12] in (b"avif", b"avis") else _IROT.search(data, 0, _EXIF_HEAD)
+    return found[1][0] & 3 if found else 0
 
 
 def _imdecode(data: bytes, flags: int) -> tuple[npt.NDArray[Any] | None, bytes]:
@@ -273,7 +329,7 @@ _EXIF_HEAD = 1 << 17  # bytes: the EXIF block is among the first 64 KiB, another
 
 
 def exif_orientation(data: bytes) -> int:
-    """The orientation (1 to 8) that a JPEG's EXIF block asks viewers for; 1 (as stored) where there is none.
+    """The orientation (1 to 8) that a JPEG's EXIF block, or a HEIC file, asks viewers for; 1 where there is none.
 
     3 is turned by 180°, 6 and 8 by 90°; 2, 4, 5 and 7 are mirrored as well. Pixels in kcal are always as stored.
     Source: JEITA CP-3451 (Exif 2.3), tag 0x0112.
@@ -285,6 +341,8 @@ def exif_orientation(data: bytes) -> int:
         >>> exif_orientation(b"no JPEG")
         1
     """
+    if is_heif(data):
+        return (1, 8, 3, 6)[_heif_turns(data)]
     try:
         orientation = JpegImageFile(io.BytesIO(data)).getexif().get(ExifTags.Base.Orientation, 1)
     except (SyntaxError, OSError, ValueError):  # no JPEG, or a damaged one: `decode_gray` reports it

@@ -392,7 +392,7 @@ def find_aprilgrid(image: npt.NDArray[np.uint8], board: Board) -> FoundTags:
     for number, corners in _with_unread(image, placed, board, turn, share).items():
         places = _tag_places(number, board, turn)
         edge = float(np.linalg.norm(corners - np.roll(corners, 1, 0), axis=1).min())
-        moved = torch.from_numpy(_nearer(image, corners, edge))
+        moved = torch.from_numpy(nearer(image, corners, edge))
         # Corners whose window leaves the image would spoil what the others tell of the light.
         inside = inside_image(moved, torch.full((4,), SHARE * share * edge), image.shape[1], image.shape[0])
         pixels[places] = torch.where(inside[:, None], moved, torch.nan)
@@ -421,7 +421,7 @@ def _most_tags(
     return border, tags, others
 
 
-def _nearer(image: npt.NDArray[np.uint8], corners: npt.NDArray[np.float64], edge: float) -> npt.NDArray[np.float64]:
+def nearer(image: npt.NDArray[np.uint8], corners: npt.NDArray[np.float64], edge: float) -> npt.NDArray[np.float64]:
     """Corners moved near enough for kcal's refinement, in windows that reach no cell inside the tag; NaN outside."""
     limit = np.array(image.shape[::-1]) - 1.0
     inside = ((corners >= 0) & (corners <= limit)).all(1, keepdims=True)

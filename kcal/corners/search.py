@@ -439,7 +439,7 @@ def find_board(image: npt.NDArray[np.uint8], board: Board) -> FoundBoard:
             if missing.rejected is None:
                 missing = FoundBoard(None, reason=trouble, rejected=to_full_size(corners, scale))
     factor, small, scale = sizes[0]
-    part = find_part(small, board, _seeds(small))
+    part = find_part(small, board, seeds(small))
     if part.pixels is not None:
         return FoundBoard(to_full_size(part.pixels, scale), factor)
     if part.rejected is not None and (part.other or missing.rejected is None):
@@ -498,7 +498,7 @@ def largest_grid(image: Gray, flags: int = cv2.CALIB_CB_EXHAUSTIVE) -> Tensor | 
     return torch.from_numpy(corners.reshape(*meta.shape[:2], 2).astype(np.float64))
 
 
-def _seeds(image: npt.NDArray[np.uint8]) -> Iterator[Tensor]:
+def seeds(image: npt.NDArray[np.uint8]) -> Iterator[Tensor]:
     """Grids of corners, of which some are right where others have glare or an edge of paper among them."""
     equalized = _equalized(image)
     thorough = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE

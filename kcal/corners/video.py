@@ -17,6 +17,7 @@ from torch import Tensor
 from kcal.corners.board import Board
 from kcal.corners.detect import Detection, detect_board, view_of
 from kcal.corners.observations import Failure, Observations, View
+from kcal.corners.recognize import spread_order
 from kcal.corners.refine import Refinement
 from kcal.corners.time_limit import Limited, TookTooLongError
 from kcal.errors import FileError, InputError
@@ -110,6 +111,15 @@ class VideoFrames:
         if not done:
             raise FileError(f"{self.source}: frame {number} cannot be decoded")
         return np.asarray(frame, np.uint8)
+
+
+def spread_frames(source: str | Path) -> Iterator[npt.NDArray[np.uint8]]:
+    """Frames of a video from all over it, the first few of them far apart; those of a live stream as they come."""
+    if is_stream(source):
+        yield from (frame.image for frame in sharpest(read_frames(source)))
+        return
+    frames = VideoFrames(source)
+    yield from (frames[number] for number in spread_order(frames.count))
 
 
 def _open(stream: str) -> cv2.VideoCapture:

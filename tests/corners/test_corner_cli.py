@@ -405,14 +405,14 @@ class TestStream:
         result = CliRunner().invoke(app, ["detect", stream, "a.png", *base])
         assert result.exit_code == 1
         assert "searched alone" in str(result.exception) + result.output
-        result = CliRunner().invoke(app, ["detect", stream, *base, "--keep", str(tmp_path / "none")])
-        assert "no such folder" in str(result.exception) + result.output
 
     def test_command(self, stream, tmp_path, command: Command):
         path = tmp_path / "o.json"
         words = ["detect", stream, "--board", "6x5", "--square", "2cm", "-o", str(path), "--duration", "30"]
-        result = command(*words)
+        result = command(*words, "--keep", str(tmp_path / "new" / "frames"))
         assert len(Observations.load(path).views) == 3
+        # The folder is made.
+        assert len(list((tmp_path / "new" / "frames").iterdir())) == 3
         assert "secret" not in path.read_text() + result.out + result.err
 
 

@@ -18,18 +18,14 @@ from kcal.corners.board import Board
 from kcal.corners.circles import find_circles
 from kcal.corners.detect import (
     detect,
-    has_own_markers,
     refuse_other_board,
     seen_by_most,
-    seen_circles,
-    seen_instead,
-    seen_markers,
-    seen_size,
     too_few,
 )
 from kcal.corners.images import decode_gray, expand_images, image_time, read_gray, to_8bit, unique_names
 from kcal.corners.markers import opencv_dictionary
 from kcal.corners.observations import View, common_size, rescaled, resized_alike
+from kcal.corners.recognize import has_own_markers, seen_circles, seen_instead, seen_markers, seen_size
 from kcal.corners.refine import refine_corners
 from kcal.corners.saddle import CornerStatus, Refined
 from kcal.corners.video import VideoFrames
@@ -341,7 +337,7 @@ BLANK = np.full((200, 240), 230, np.uint8)
 def instead(image: np.ndarray, board: Board, size: tuple[int, int] | None) -> str:
     """What is told where the largest grid of the image has a size."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("kcal.corners.detect.seen_size", lambda _: size)
+        patch.setattr("kcal.corners.recognize.seen_size", lambda _: size)
         return seen_instead(image, board)
 
 

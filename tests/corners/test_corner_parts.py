@@ -13,7 +13,6 @@ from torch import Tensor
 
 from kcal.corners.board import Board
 from kcal.corners.circles import _goes_on, _symmetric, wrong_size
-from kcal.corners.detect import _like_sized, _smallest
 from kcal.corners.erf import _bounded, _odd, _pixel_pairs
 from kcal.corners.erf_board import (
     RAMP_WEIGHT,
@@ -48,6 +47,7 @@ from kcal.corners.grid import (
 )
 from kcal.corners.marker_boards import in_place, inliers
 from kcal.corners.patches import highest_peak, is_textured, weighted_correlation
+from kcal.corners.recognize import like_sized, smallest
 from kcal.corners.search import (
     _factors,
     _predicted,
@@ -453,19 +453,19 @@ class TestSizes:
         assert _goes_on(torch.cat([grid, last]), grid, board)
 
     def test_the_smallest_dictionary_with_a_number(self) -> None:
-        assert _smallest("5x5_250", 49) == "5x5_50"
-        assert _smallest("5x5_250", 50) == "5x5_100"
-        assert _smallest("5x5_250", 249) == "5x5_250"
-        assert _smallest("apriltag_16h5", 3) == "apriltag_16h5"
+        assert smallest("5x5_250", 49) == "5x5_50"
+        assert smallest("5x5_250", 50) == "5x5_100"
+        assert smallest("5x5_250", 249) == "5x5_250"
+        assert smallest("apriltag_16h5", 3) == "apriltag_16h5"
 
     def test_spots_of_like_size(self) -> None:
         image = np.full((400, 400), 230, np.uint8)
         for k in range(15):
             cv2.circle(image, (50 + 70 * (k % 5), 60 + 90 * (k // 5)), 14, 20, -1)
         cv2.circle(image, (350, 350), 40, 20, -1)
-        assert _like_sized(image) == 15
-        assert _like_sized(255 - image) == 15
-        assert _like_sized(np.full((100, 100), 200, np.uint8)) == 0
+        assert len(like_sized(image)) == 15
+        assert len(like_sized(255 - image)) == 15
+        assert like_sized(np.full((100, 100), 200, np.uint8)) == []
 
     def test_markers_in_their_places(self) -> None:
         square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])

@@ -1,0 +1,130 @@
+"""Which board images show: its kind, columns, rows and markers; images that do not agree; a board named wrongly."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import Command
+from numpy.typing import NDArray
+
+from kcal.corners.board import Board
+from kcal.corners.detect import detect, detect_board, recognize_board
+from kcal.corners.recognize import Recognized, circle_board, marker_board, most_markers, seen_board, spread_order
+from kcal.errors import InputError
+from kcal.lens.camera import Camera
+from scripts.shared.printed_board import Paper, pose
+
+CAMERA = Camera.build(focal=(700, 700), center=(379.5, 279.5), size=(760, 560))
+TILTS = ([0.1, 0.1, 0.1], [0.7, 0.1, 1.4], [-0.2, 0.6, -0.4])
+
+
+def shots(board: Board, distance: float, *tilts: list[float]) -> list[NDArray[np.uint8]]:
+    paper = Paper(board, cell_mm=0.5)
+    return [paper.shoot(CAMERA, *pose(board, tilt, distance), supersample=1)[0] for tilt in tilts or TILTS]
+
+
+@pytest.mark.parametrize(("text", "square", "distance"), [
+    ("9x6", "25mm", 0.4), ("7x7", "25mm", 0.4), ("charuco:9x6:5x5_100:19mm", "25mm", 0.4),
+    ("charuco:7x4:4x4_50:id20", "25mm", 0.4), ("aprilgrid:6x5:0.3", "30mm", 0.5),
+    ("aprilgrid:5x4:0.2:id20", "30mm", 0.5), ("circles:8x6", "22mm", 0.35), ("asymmetric:4x11", "20mm", 0.45),
+])  # fmt: skip
+def test_boards_are_recognized(text: str, square: str, distance: float) -> None:
+    board = Board.parse(text, square)
+    found = recognize_board(shots(board, distance), square)
+    assert (found.pattern, found.columns, found.rows, found.first) == (
+        board.pattern, board.columns, board.rows, board.first,
+    )  # fmt: skip
+    # The smallest dictionary that has its markers.
+    assert (found.dictionary or "").split("_")[0] == (board.dictionary or "").split("_")[0]
+    for own, true in ((found.marker, board.marker), (found.gap, board.gap)):
+        assert own == (None if true is None else pytest.approx(true, rel=0.04))
+
+
+def test_rows_that_one_image_cuts_another_shows() -> None:
+    """A part of a board with markers votes as well; it does not make the board smaller."""
+    board = Board.parse("charuco:9x6:5x5_100", "25mm")
+    upper = shots(board, 0.4, TILTS[0])[0]
+    lower, middle = upper.copy(), upper.shape[0] // 2
+    upper[middle + 40 :] = 200
+    lower[: middle - 40] = 200
+    for image in (upper, lower):
+        seen = seen_board(image)
+        assert seen is not None
+        assert seen.rows[1] - seen.rows[0] < 6
+    found = recognize_board([upper, lower], "25mm")
+    assert (found.columns, found.rows, found.first) == (9, 6, 0)
+
+
+def test_nothing_and_no_agreement() -> None:
+    one, two = (shots(Board.parse(text, "25mm"), 0.4, *TILTS[:2]) for text in ("9x6", "8x5"))
+    with pytest.raises(InputError, match=r"cannot be told from 4 images .*: 9x6 in 2, 8x5 in 2; give --board"):
+        recognize_board([*one, *two], "25mm")
+    with pytest.raises(InputError, match="1 images that were looked at: they show none; give --board"):
+        recognize_board(np.full((200, 240), 230, np.uint8), "25mm")
+
+
+def test_the_square_is_asked_for_with_what_was_found() -> None:
+    noted: list[Recognized] = []
+    with pytest.raises(InputError, match=r"the board is 9x6, seen in 1 of 1 images .* for example --square 25mm"):
+        recognize_board(shots(Board.parse("9x6", "25mm"), 0.4, TILTS[0]), note=noted.append)
+    assert [(found.votes, found.looked) for found in noted] == [(1, 1)]
+
+
+def test_it_ends_as_soon_as_images_agree() -> None:
+    images = shots(Board.parse("9x6", "25mm"), 0.4, TILTS[0]) * 20
+    noted: list[Recognized] = []
+    recognize_board(images, "25mm", note=noted.append)
+    assert noted[0].looked == 3
+    assert sorted(spread_order(13)) == list(range(13))
+
+
+def test_markers_and_spots_that_are_no_board() -> None:
+    random = np.random.default_rng(0)
+    (image,) = shots(Board.parse("charuco:9x6:5x5_100", "25mm"), 0.4, TILTS[0])
+    seen = most_markers(image)
+    assert marker_board(image, seen) is not None
+    shuffled = dict(zip(seen.corners, random.permutation(list(seen.corners.values())), strict=True))
+    assert marker_board(image, seen._replace(corners=shuffled)) is None
+    assert circle_board([tuple(place) for place in random.uniform(0, 500, (40, 2)).tolist()]) is None
+    grid = [(30.0 * i, 30.0 * j) for i in range(6) for j in range(5)]
+    assert circle_board(grid) is not None
+    assert circle_board(grid[1:]) is None
+
+
+@pytest.mark.parametrize(("images", "text"), [
+    ("opencv_stereo/left*.jpg", "9x6"), ("captures/pi640", "7x7"), ("captures/gloworm960", "8x6"),
+    ("captures/carnd", "9x6"), ("captures/single/fisheye_8x6.jpg", "8x6"),
+    ("captures/single/inverted_charuco.png", "charuco:3x4:4x4_50"), ("field/charuco/v2.png", "charuco:16x10:5x5_100"),
+])  # fmt: skip
+def test_boards_of_strangers(images: str, text: str, kcal_data: Path) -> None:
+    noted: list[Recognized] = []
+    recognize_board(str(kcal_data / images), "25mm", note=noted.append)
+    assert noted[0].seen is not None
+    assert noted[0].seen.text == text
+
+
+def test_a_false_hit_does_not_make_another_board(kcal_data: Path, tmp_path: Path, command: Command) -> None:
+    """OpenCV finds 8x8 corners in one image of a board of 7x7."""
+    files = [kcal_data / "captures" / "pi640" / f"img{number}.jpg" for number in (9, 1, 5, 7)]
+    wrong = Board.parse("8x8", "25mm")
+    assert detect_board(shots(Board.parse("9x6", "25mm"), 0.4, TILTS[0])[0], wrong).pixels is None
+    with pytest.raises(InputError, match=r"the board is in 1 of 4 images only; .* give --board 7x7"):
+        detect(files, wrong)
+    output = tmp_path / "x.obs.json"
+    result = command("detect", *files, "--square 25mm -o", output)
+    assert "board 7x7, seen in " in result.err
+    assert "board found in 4 of 4 images" in result.out
+
+
+def test_a_board_that_is_often_covered_is_no_other_one() -> None:
+    """Few images with the whole board, and more that show a part of it: the board stays."""
+    image = shots(Board.parse("9x6", "25mm"), 0.4, TILTS[0])[0]
+    covered = [image.copy() for _ in range(4)]
+    for number, one in enumerate(covered):
+        one[:, : 300 + 50 * number] = 128
+    seen = detect([image, *covered], Board.parse("9x6", "25mm"))
+    assert seen.names[0] == "image 0"
+    # Fewer than half, so that others were looked at.
+    assert 2 * len(seen.views) < 5
