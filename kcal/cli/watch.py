@@ -31,7 +31,7 @@ _DRAWN = 2000
 
 def watch_command(
     rig: Annotated[Path, typer.Argument(help="Rig file from `kcal rig`."), RIG],
-    history: Annotated[Path, typer.Option("-o", "--history", help="CSV file that grows, a row for each look.")],
+    history: Annotated[Path, typer.Option("-o", "--history", help="CSV file that grows, a row for each measurement.")],
     images: Annotated[
         list[str] | None,
         typer.Argument(
@@ -39,7 +39,7 @@ def watch_command(
             help="Two folders of images, videos or addresses (rtsp://...); without them the history is shown.",
         ),
     ] = None,
-    every: Annotated[float, typer.Option(metavar="S", help="Seconds between looks.", min=1.0)] = 60.0,
+    every: Annotated[float, typer.Option(metavar="S", help="Seconds between measurements.", min=1.0)] = 60.0,
     reference: Annotated[
         tuple[Path, Path] | None,
         typer.Option(metavar="LEFT RIGHT", help="Images of when the rig was solved; else the first ones count."),
@@ -215,9 +215,9 @@ def _message(noticed: Noticed, watcher: Watcher) -> dict[str, object]:
 
 
 def _summary(watcher: Watcher, hooks: list[Webhook]) -> str:
-    parts = [f"{watcher.looks:,} looks, {watcher.alarms:,} alarms"]
+    parts = [f"{watcher.looks:,} measurements, {watcher.alarms:,} alarms"]
     if watcher.skipped:
-        parts.append(f"{watcher.skipped:,} images not after the last look, left out")
+        parts.append(f"{watcher.skipped:,} images not after the last measurement, left out")
     failed = sum(hook.failed for hook in hooks)
     if failed:
         parts.append(f"{failed:,} times a webhook did not answer")
@@ -234,7 +234,7 @@ def _tell_turns(watched: Watched, limit: float) -> None:
     swing = degrees * math.hypot(float(model.swing[1]), float(model.swing[4]))
     gust = degrees * math.hypot(float(model.gust[1]), float(model.gust[4]))
     out.print(
-        f"relative yaw swings by {swing:.5f}° and moves by {gust:.5f}° in the wind; without looks an hour costs "
+        f"relative yaw swings by {swing:.5f}° and moves by {gust:.5f}° in the wind; without images an hour costs "
         f"{degrees * math.sqrt(sum(hour)):.5f}°: `kcal locate --aged` needs that number where there is no history",
         markup=False,
     )

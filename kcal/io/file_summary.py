@@ -31,7 +31,7 @@ class CameraSummary(Record):
         focal_length: on the optical axis, with its σ.
         covers_image: whether every pixel has a ray.
         sigma: of each parameter by name; None where it was held, or nothing is known.
-        sigma_px: median and largest σ of where the camera sees far things, over the image; None without error bars.
+        sigma_px: median and largest σ of where the camera sees far points, over the image; None without error bars.
     """
 
     of: str
@@ -92,7 +92,7 @@ def take_joint_errors(rig: Rig) -> None:
 
 
 def sigma_over_image(camera: Camera) -> tuple[float, float] | None:
-    """Median and largest σ of where the camera sees far things, px; None without error bars."""
+    """Median and largest σ of where the camera sees far points, px; None without error bars."""
     if camera.calibration is None or camera.calibration.covariance is None:
         return None
     from kcal.lens.uncertainty import image_sigma

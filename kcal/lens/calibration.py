@@ -243,7 +243,7 @@ class RigSource:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ItemResidual:
-    """One thing that was seen or measured, and how well it agrees with the rest.
+    """One point that was seen or measured, and how well it agrees with the rest.
 
     Args:
         source: which kind it is: boards, landmarks, features, stars, skyline, baselines or positions.

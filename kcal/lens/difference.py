@@ -1,4 +1,4 @@
-"""How differently two cameras see the same things, over the image, against what is known of both."""
+"""How differently two cameras see the same points, over the image, against what is known of both."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class PixelShift:
         return float(self.length[self.length.isfinite()].max())
 
 
-# How differently two cameras see the same things, after the turn that best undoes it, against what is known of both.
+# How differently two cameras see the same points after the best-fit rotation, against what is known of both.
 #
 # No calibration determines how a camera's frame is turned in its housing. So the second camera is turned until it sees
 # what the first one sees as well as it can (mrcal: the implied rotation), with weights from the error bars of both.
@@ -60,7 +60,7 @@ _SETTLED = 1e-13
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class CameraDifference(PixelShift):
-    """Where a second camera sees things that a first camera sees at `pixels`.
+    """Where a second camera sees points that a first camera sees at `pixels`.
 
     Args:
         pixels: (rows, columns, 2) of the first camera.
@@ -70,7 +70,7 @@ class CameraDifference(PixelShift):
         known: whether the error bars of the first, and of the second camera count in it.
         rotation: (3, 3) from the first camera's frame to the second's.
         translation: (3,) likewise, meters; zero at infinity.
-        at: distance of the things, meters.
+        at: distance of the points, meters.
         ratio: RMS of the shift over what the error bars predict, 1 if they explain it; None without error bars.
         probability: that cameras which agree differ by at least as much; None without error bars.
 
@@ -116,13 +116,13 @@ def camera_difference(
     """Compare what two cameras see, after the turn of the second that fits best.
 
     The turn minimizes the squared shifts over a grid of the image, weighted by the inverse variances of both cameras
-    where their calibration has them, else equally. For things at a distance the second camera may also stand elsewhere.
+    where their calibration has them, else equally. For points at a distance the second camera may also stand elsewhere.
     Error bars of the cameras are taken as independent.
 
     Args:
         first: a single camera, with its `calibration` if it has error bars.
         second: a single camera of the same image size.
-        at: distance of the things from the first camera, meters.
+        at: distance of the points from the first camera, meters.
         rotation: (3, 3) from the first camera's frame to the second's, if it is known: the identity where the frames
             are the same by construction. Nothing is fitted then.
         grid: columns and rows.

@@ -307,7 +307,7 @@ def _source_positions(
 #
 # The new x axis lies along the baseline, the new z axis between both cameras' axes (A. Fusiello, E. Trucco and A.
 # Verri, "A compact algorithm for rectification of stereo pairs", 2000). Both pinholes have one focal length and one
-# principal point, so that far things have no disparity and depth is f b / disparity. Images stay upright, as those of
+# principal point, so that far points have no disparity and depth is f b / disparity. Images stay upright, as those of
 # cv2.stereoRectify: x or y lies along the baseline, in either direction, whichever turns the cameras least.
 
 # Degrees between the baseline and a camera's axis below which the rectified images are stretched beyond use, and
@@ -490,7 +490,7 @@ def _common_pinhole(cameras: tuple[TurnedCamera, TurnedCamera], alpha: float, si
         low, high = (lows.amax(0), highs.amin(0)) if inner else (lows.amin(0), highs.amax(0))
         if not bool((high > low).all()):
             raise DegenerateError(
-                "rectification: far away the cameras have no directions in common; for near things give a field of "
+                "rectification: far away the cameras have no directions in common; for near points give a field of "
                 "view (--fov)"
             )
         scale = last / (high - low)

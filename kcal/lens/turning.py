@@ -1,4 +1,4 @@
-"""Turn a camera until it sees things where they were seen: the one Gauss-Newton iteration on rotations."""
+"""Rotate a camera until its projections agree with what was seen: Gauss-Newton on rotations."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ def pixel_covariance(
     at: float = math.inf,
     grid: tuple[int, int] = (25, 17),
 ) -> Tensor:
-    """Covariance of where the camera sees things, after the best turn of the whole camera.
+    """Covariance of where the camera sees points, after the best-fit rotation of the camera.
 
     No board determines how the camera's frame is turned in its housing, and a rig solves its cameras' attitudes anew.
     So the change of the image that a turn undoes does not count: the turn for which the squared change at infinity is
@@ -39,7 +39,7 @@ def pixel_covariance(
         camera: a single camera.
         places: (..., N, 2) pixels, or (..., N, 3) rays in the camera's frame.
         covariance: (5 + P, 5 + P) of its parameters; None: that of its calibration.
-        at: distance of the things, meters; lenses whose entrance pupil moves differ near and far.
+        at: distance of the points, meters; lenses whose entrance pupil moves differ near and far.
         grid: columns and rows.
 
     Returns:
@@ -85,7 +85,7 @@ def pixel_covariance(
 def pixel_errors(
     camera: Camera, truth: Camera, places: Tensor, *, at: float = math.inf, grid: tuple[int, int] = (25, 17)
 ) -> Tensor:
-    """Where a camera sees things minus where the true camera sees them: the errors that `pixel_covariance` predicts.
+    """Where a camera sees points minus where the true camera sees them: the errors that `pixel_covariance` predicts.
 
     The turn that no board determines is taken out in the same way.
 
@@ -93,7 +93,7 @@ def pixel_errors(
         camera: a single camera.
         truth: a single camera of the same image size.
         places: (N, 2) pixels of the camera.
-        at: distance of the things, meters.
+        at: distance of the points, meters.
         grid: columns and rows over which the turn is fitted.
 
     Returns:
@@ -123,14 +123,14 @@ def pixel_errors(
 
 
 def projection_sigma(camera: Camera, places: Tensor, *, at: float = math.inf) -> Tensor:
-    """Standard deviation in pixels of where the camera sees things, in the direction in which it is largest.
+    """Standard deviation in pixels of where the camera sees points, in the direction in which it is largest.
 
-    After the best turn of the camera (`pixel_covariance`); it grows where no board was.
+    After the best-fit rotation of the camera (`pixel_covariance`); it grows where no board was.
 
     Args:
         camera: a single camera, with its calibration.
         places: (..., N, 2) pixels, or (..., N, 3) rays in the camera's frame.
-        at: distance of the things, meters.
+        at: distance of the points, meters.
 
     Returns:
         (..., N); NaN where the camera has no ray.

@@ -456,7 +456,7 @@ def shown_by(camera: Camera, view: Camera | Cylinder, rotation: Tensor, mask: Te
 
 @torch.no_grad()
 def pupil_shift(camera: Camera, at: float) -> float:
-    """Largest distance in pixels between images of things at that range and far away, in one direction.
+    """Largest distance in pixels between images of points at that range and far away, in one direction.
 
     The entrance pupil of a hybrid lens moves with the angle. No map can be right for all ranges then: one that is right
     far away errs by so much at that range, and by half of it at twice the range. 0 for other lenses.

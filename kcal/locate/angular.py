@@ -398,7 +398,7 @@ def length_of_one(scale: Tensor, inverse: Tensor) -> Tensor:
 
 
 def lifted(seen: Tensor, around: Surroundings, unit: Tensor | float) -> Tensor:
-    """By how much (..., C, 3, N) things are seen higher than `seen` in each camera's axes; one of it is `unit` m."""
+    """By how much (..., C, 3, N) points are seen higher than `seen` in each camera's axes; one of it is `unit` m."""
     assert around.up is not None
     up = around.up[..., None]
     along = (seen * up).sum(-2, keepdim=True)

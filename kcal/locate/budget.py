@@ -328,7 +328,7 @@ _PLACES = (0.2, 0.35, 0.5, 0.65, 0.8)
 def station_sigmas(rig: Rig, distance: float, *, pixel_sigma: float = 0.3) -> RangeSigmas | None:
     """Split the standard deviation of ranges from each camera by its sources, where it is worst.
 
-    Looked at are things at a distance from each camera, along the middle row of its image, that another camera sees
+    Looked at are points at a distance from each camera, along the middle row of its image, that another camera sees
     too. Marks, lenses and poses are told apart as by `range_sigmas`; the poses are those of all
     cameras, and `sideways` is zero.
 

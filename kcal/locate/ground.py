@@ -153,7 +153,7 @@ def locate_on_ground(
     Args:
         camera: calibrated.
         mounting: where it stands and looks, with its covariance, and the refraction if it was found.
-        pixels: (N, 2), for example the bottom of a box, where a thing stands.
+        pixels: (N, 2), for example the bottom of a box, where a point stands.
         ground: from `level_ground` or `terrain`.
         pixel_sigma: standard deviation of a pixel along each axis, px.
         ground_sigma: standard deviation of the ground's height, meters.

@@ -384,7 +384,7 @@ class Localizer(Operations, Movable, StatedModule):
         """Two cameras as a rig whose frame is that of the positions, with all that is known of it as its `root`.
 
         Args:
-            errors: how many shared errors the root has, some of them zero: a filter needs as many at every moment, and
+            errors: how many shared errors the root has, some of them zero: a filter needs as many at every time, and
                 those of the calibration in the same order.
         """
         size, look = sum(self.rig.sizes) + 6, self.enu_from_rig

@@ -1,4 +1,4 @@
-"""Tables of marks: what each camera saw of a thing, one line for each thing or for each mark."""
+"""Tables of marks: what each camera saw of a point, one line for each point or for each mark."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from kcal.locate.tables import (
 )
 from kcal.texts import brief, csv_line
 
-# The wide table has one line for each thing that two cameras saw, the long one a line for each mark.
+# The wide table has one line for each point that two cameras saw, the long one a line for each mark.
 PIXELS = ("left_u", "left_v", "right_u", "right_v")
 PAIR = ("left", "right")
 # The ten entries of a pair's covariance (left_u, left_v, right_u, right_v) on and above its diagonal, row by row.
@@ -45,16 +45,16 @@ _WHOLE = 1 << 24
 
 
 class Marks(NamedTuple):
-    """What the cameras of a rig saw, a row for each thing.
+    """What the cameras of a rig saw, a row for each point.
 
     Attributes:
-        names: one for each row, unique; its number where a wide table has no names, and with the moment where a long
-            one has a thing at several.
+        names: one for each row, unique; its number where a wide table has no names, and with the time where a long
+            one has a point at several.
         pixels: (N, V, 2) float64, integer coordinates at pixel centers; NaN where a camera has no mark.
         covariance: (N, 2 V, 2 V) px² of a row's coordinates, as a wide table states it: NaN where a row has none; None
             if it states none at all.
         sigma: (N, V) px along each axis, as a long table states it: NaN where it does not; None likewise.
-        extras: the cells of other columns, as they are written: of a long table as in the first line of each thing.
+        extras: the cells of other columns, as they are written: of a long table as in the first line of each point.
     """
 
     names: Sequence[str]
@@ -170,7 +170,7 @@ def read_marks(
     Args:
         path: of the file.
         cameras: their names, in the order of the result.
-        single: allow a thing of two cameras to be marked in one image only; the other's two cells are then empty.
+        single: allow a point of two cameras to be marked in one image only; the other's two cells are then empty.
         others: skip marks of other cameras, where they are otherwise an error.
         more: the other columns that a long table may have; any if left out.
 
@@ -209,10 +209,10 @@ def read_marks(
 def read_mark_chunks(
     path: str | Path, cameras: Sequence[str] = PAIR, *, single: bool = False, at_once: int = CHUNK_ROWS
 ) -> Iterator[tuple[Marks, int]]:
-    """The same for a table that may be longer than memory: some things at a time, and how many bytes were read.
+    """The same for a table that may be longer than memory: some points at a time, and how many bytes were read.
 
     Other columns are kept, also of a wide table. Long tables of up to 16 MB are read whole, in any order of their
-    lines. In longer ones the lines of one thing, and one time, stand together; names come with their time, if there is
+    lines. In longer ones the lines of one point, and one time, stand together; names come with their time, if there is
     one.
 
     Args:
@@ -222,7 +222,7 @@ def read_mark_chunks(
         at_once: most rows of a part of a wide table.
 
     Raises:
-        FileError: as `read_marks`; a thing whose lines do not stand together.
+        FileError: as `read_marks`; a point whose lines do not stand together.
     """
     path = Path(path)
     if not is_long(path):
@@ -242,7 +242,7 @@ def read_mark_chunks(
                     raise FileError(_not_together(row.where, row.name))
                 reader.add(row)
                 open_key = key
-            # The last thing may go on.
+            # The last point may go on.
             done, reader = reader, _Gather(cameras)
             if open_key is not None:
                 done.move(open_key, reader)
@@ -295,7 +295,7 @@ def _not_together(where: str, name: str) -> str:
 
 
 def _things(path: Path) -> Iterator[tuple[tuple[str, str], int]]:
-    """Name and time of each thing, and the first of its lines that stand together."""
+    """Name and time of each point, and the first of its lines that stand together."""
     last = None
     for chunk in _long_chunks(path):
         times = chunk.columns.get("time", [""] * len(chunk.names))
@@ -311,7 +311,7 @@ def _long_chunks(path: str | Path, more: Sequence[str] | None = None) -> Iterato
 
 
 class _Gather:
-    """Lines of one thing at one time, put together into rows."""
+    """Lines of one point at one time, put together into rows."""
 
     def __init__(self, cameras: Sequence[str], others: bool = False) -> None:
         self.number: Mapping[str, int] = {name: c for c, name in enumerate(cameras)}
@@ -336,7 +336,7 @@ class _Gather:
         self.placed[place] = row.number("u", _PIXEL), row.number("v", _PIXEL), sigma
 
     def move(self, key: tuple[str, str], other: _Gather) -> None:
-        """Take the last thing away, and give it to another."""
+        """Take the last point away, and give it to another."""
         last = self.rows.pop(key)
         other.rows[key], other.first = 0, [self.first.pop()]
         for camera in range(len(self.cameras)):

@@ -1,4 +1,4 @@
-"""Things that move and tell where they are: their tracks and sightings, and how both are matched."""
+"""Targets that move and report where they are: their tracks and sightings, and how both are matched."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from kcal.locate.survey import EARTH, LOCAL, place_sigma, places_of
 from kcal.locate.tables import TableRow, read_chunks
 from kcal.texts import unix_seconds
 
-# Tracks of things whose positions are known while they move: a drone with RTK, ships with AIS, aircraft with ADS-B.
+# Tracks of targets whose positions are known while they move: a drone with RTK, ships with AIS, aircraft with ADS-B.
 #
-# They are control as surveyed landmarks are, only that a position belongs to a moment. Between two fixes it is
+# They are control as surveyed landmarks are, only that a position belongs to a time. Between two fixes it is
 # interpolated, and how well is learned from the track itself: from fixes that are predicted without being used.
 
 _TRACK = "name,time,lat,lon,height,sigma"
@@ -62,14 +62,14 @@ class Fixes(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class MovingTrack:
-    """What a receiver tells of one thing that moves.
+    """What a receiver tells of one target that moves.
 
     Args:
-        name: of the thing.
+        name: of the target.
         times: (M,) seconds, rising; the clock that all tracks share.
         points: (M, 3) meters in the local frame.
         sigma: (M, 3) meters, of each fix by itself.
-        constant: (3,) meters, of what is the same in all fixes: where the antenna is on the thing that is seen.
+        constant: (3,) meters, of what is the same in all fixes: where the antenna is on the target that is seen.
         latency: seconds by which all its times may be late or early, one sigma.
 
     Raises:
@@ -99,7 +99,7 @@ class MovingTrack:
         if not bool(torch.isfinite(self.points).all() & torch.isfinite(self.times).all()):
             raise InputError(f"track {self.name}: every time and position must be finite")
         if not bool((self.times.diff() > 0).all()):
-            raise InputError(f"track {self.name}: times must rise, with no moment twice")
+            raise InputError(f"track {self.name}: times must rise, with no time twice")
         if not bool((self.sigma > 0).all() & torch.isfinite(self.sigma).all()):
             raise InputError(f"track {self.name}: every sigma must be a positive number of meters")
         if not all(0 <= value < math.inf for value in (*self.constant, self.latency)):
@@ -180,8 +180,8 @@ def read_tracks(path: str | Path, origin: Origin | None = None) -> tuple[tuple[M
     r"""Read tracks: `name,time,lat,lon,height,sigma` or with `east,north,up`; one line for each fix, in any order.
 
     `sigma` (and `sigma_up` where it differs) is of each fix by itself, meters. `constant_sigma` (`constant_sigma_up`)
-    is of what is the same in all fixes of a thing, as where the antenna is on it, and `latency_sigma`, seconds, of how
-    late its times are; both from the first line of each thing.
+    is of what is the same in all fixes of a target, as where the antenna is on it, and `latency_sigma`, seconds, of how
+    late its times are; both from the first line of each target.
 
     Args:
         path: of the file.
@@ -191,7 +191,7 @@ def read_tracks(path: str | Path, origin: Origin | None = None) -> tuple[tuple[M
         the tracks, and the origin; None for local meters without one.
 
     Raises:
-        FileError: see `kcal.locate.tables.read_rows`; a thing with a fix twice, or with fewer than four.
+        FileError: see `kcal.locate.tables.read_rows`; a target with a fix twice, or with fewer than four.
 
     Example:
         >>> import tempfile
@@ -267,15 +267,15 @@ class Sighting:
 def read_sightings(path: str | Path, cameras: Sequence[str]) -> tuple[Sighting, ...]:
     r"""Read `name,camera,time,u,v` and, if they are there, `sigma` (px) and `note`: what each camera followed.
 
-    Lines with one name and one camera are one thing. The name is that of a track, where somebody says so; any other
-    name is a thing that nobody named.
+    Lines with one name and one camera are one target. The name is that of a track, where somebody says so; any other
+    name is a target that nobody named.
 
     Args:
         path: of the file.
         cameras: their names, in the order of the rig.
 
     Raises:
-        FileError: see `kcal.locate.tables.read_rows`; a camera that is not there; a thing seen twice at one moment.
+        FileError: see `kcal.locate.tables.read_rows`; a camera that is not there; a target seen twice at one time.
 
     Example:
         >>> import tempfile
@@ -315,7 +315,7 @@ def read_sightings(path: str | Path, cameras: Sequence[str]) -> tuple[Sighting, 
 
 # The name of the effect.
 CLOCK = "the clock of the cameras"
-# Moments of a sighting that take part in the search, and sightings whose pairing with every track is tried where names
+# Times of a sighting that take part in the search, and sightings whose pairing with every track is tried where names
 # do not tell.
 _MOMENTS, _TRIED = 12, 3
 # Radians by which a pose from the search may be off; how many sigmas a sighting may be from its track, and how many
@@ -323,7 +323,7 @@ _MOMENTS, _TRIED = 12, 3
 _ROUGH, _NEAR, _CLEARLY = 3e-3, 3.0, 2.0
 # Steps of the clock's search on each side, at most, and by what it is refined, twice.
 _STEPS, _FINER = 60, 5
-# Seconds: sightings by several cameras are of one moment.
+# Seconds: sightings by several cameras are of one time.
 _SAME = 1e-3
 
 
@@ -367,7 +367,7 @@ class Identity(NamedTuple):
 
 
 class MovingControl(NamedTuple):
-    """Sightings as landmarks, one for each moment of a track.
+    """Sightings as landmarks, one for each time of a track.
 
     Attributes:
         landmarks: with clocks, latencies and constant offsets as effects.
@@ -458,7 +458,7 @@ def _searched(sighting: Sighting, camera: Camera) -> _Seen:
 
 
 def _in_common(track: MovingTrack, seen: _Seen, clock: float) -> tuple[Tensor, Tensor]:
-    """Rays (M, 3) and points (M, 3) at the moments that the track knows."""
+    """Rays (M, 3) and points (M, 3) at the times that the track knows."""
     points = track.at(seen.times + clock).points
     known = torch.isfinite(points).all(-1)
     return seen.rays[known], points[known]
@@ -520,7 +520,7 @@ def _clock(tracks: Sequence[MovingTrack], seen: Sequence[_Seen], near: dict[int,
         step /= _FINER
         offsets = [best + step * i for i in range(1 - _FINER, _FINER)]
     if math.isinf(score(best)):
-        raise InputError("tracks and sightings have too few moments in common: check clocks and time zones")
+        raise InputError("tracks and sightings have too few times in common: check clocks and time zones")
     return best
 
 
@@ -567,7 +567,7 @@ def _identities(
 
 
 def _sigmas(track: MovingTrack, one: _Seen, pose: tuple[Tensor, Tensor, float], clock: float) -> float:
-    """RMS distance of a sighting from a track in sigmas of both; infinite with fewer than two moments in common."""
+    """RMS distance of a sighting from a track in sigmas of both; infinite with fewer than two times in common."""
     rotation, center, _ = pose
     fixes = track.at(one.times + clock)
     known = torch.isfinite(fixes.points).all(-1)
@@ -601,7 +601,7 @@ def _moving_landmarks(
     clock: float,
     options: MovingOptions,
 ) -> Landmarks:
-    """One landmark for each fix: at the moment nearest to it, preferably one that several cameras saw."""
+    """One landmark for each fix: at the time nearest to it, preferably one that several cameras saw."""
     labels, points, sigma, velocity, pixels, noise = [], [], [], [], [], []
     of: list[int] = []
     for k, track in enumerate(tracks):

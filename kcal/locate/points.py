@@ -23,9 +23,9 @@ from kcal.locate.stereo import PositionStatus
 from kcal.locate.tables import CHUNK_ROWS, PositionColumns
 from kcal.locate.tabulate import Geoid, Group, Viewpoint, geoid_column, number_table, viewpoint
 
-# A reprojection error of this many sigma is not noise: two different things were marked, or the rig has moved.
+# A reprojection error of this many sigma is not noise: two different points were marked, or the rig has moved.
 _MISMATCH_SIGMAS = 10.0
-_ELSEWHERE = "are the marks the same thing?"
+_ELSEWHERE = "are the marks the same point?"
 _TEXTS = {
     PositionStatus.OUTSIDE_LENS: "the lens model has no ray for a mark",
     PositionStatus.BEHIND: f"the lines of sight cross behind a camera: {_ELSEWHERE}",
@@ -39,7 +39,7 @@ _VIEW_TEXTS = _TEXTS | {
     PositionStatus.BEARING_ONLY: "only the bearing is known: one camera, or a parallax below three sigma",
     PositionStatus.PARALLEL: f"the lines of sight do not meet before the cameras: {_ELSEWHERE}",
     PositionStatus.NOT_FINITE: "no camera has a mark",
-    PositionStatus.CONTRADICTION: "the marks are not of one thing, and which is wrong cannot be told",
+    PositionStatus.CONTRADICTION: "the marks are not of one point, and which is wrong cannot be told",
 }
 
 
@@ -51,7 +51,7 @@ def locate_points(
     ground: Ground | None = None,
     geoid: Geoid | None = None,
 ) -> Located:
-    """Positions of things that are marked in the images of a rig.
+    """Positions of points that are marked in the images of a rig.
 
     Where all errors weigh, further columns tell which cameras a position is from (`cameras`), which was left out
     because it contradicts the others (`left_out`), and what leaving out each changes (`misfit_sigmas`). Ranges,
@@ -62,7 +62,7 @@ def locate_points(
         marks: in the order of its cameras, such as those of `read_marks`.
         height: meters above the ellipsoid, and its sigma, of what one camera alone saw; with `ground` the first is not
             read, and the second is the ground's.
-        ground: on which such things stand, from `level_ground` or `terrain`.
+        ground: on which such points stand, from `level_ground` or `terrain`.
         geoid: a grid from `find_geoid`.
 
     Returns:
@@ -244,7 +244,7 @@ def _pair_reason(status: PositionStatus, found: Localization, i: int, baseline: 
     low = float(found.range_low[i])
     if status == PositionStatus.PARALLEL and math.isinf(low):
         angle = math.degrees(math.atan(-baseline * float(found.inverse_range[i])))
-        return f"the lines of sight diverge by {angle:.3g}°, more than noise: not the same thing, or the rig has turned"
+        return f"the lines of sight diverge by {angle:.3g}°, more than noise: not the same point, or the rig has turned"
     if status == PositionStatus.PARALLEL and low == 0:
         return "a mark lies in the direction of the other camera: no range can be measured along that line"
     if status in (PositionStatus.PARALLEL, PositionStatus.BEARING_ONLY):

@@ -131,7 +131,7 @@ def eye_height(surface: GroundSurface, name: str, eye: Tensor) -> None:
 
 # Where to put the next camera: a map of errors and coverage over an area, and the best of candidate sites.
 #
-# A camera knows the direction to a thing, off by its marks, its attitude, its position and by refraction. Directions of
+# A camera knows the direction to a point, off by its marks, its attitude, its position and by refraction. Directions of
 # several cameras are added as information; what no camera knows is the size of the area. The measure of a set of sites
 # is the mean variance of level positions over the area (A-optimality), which covers hidden parts before it refines
 # others.
@@ -153,7 +153,7 @@ class Site:
         sigma_deg: standard deviation of a bearing: marks and heading together.
         elevation_sigma_deg: of an elevation; as of a bearing if left out.
         position_m: of the camera's position along each axis, meters.
-        reach_m: farthest distance at which things are still seen, meters.
+        reach_m: farthest distance at which points are still seen, meters.
         camera: lens and size of the image: what it sees then depends on heights too.
         pitch_deg: of such a camera.
         roll_deg: of such a camera.
@@ -200,7 +200,7 @@ class Area(NamedTuple):
         origin: of east, north and up, in the middle.
         lat: (rows,) degrees.
         lon: (columns,) degrees.
-        points: (rows, columns, 3) things of which positions are wanted, meters; NaN where the ground is not known.
+        points: (rows, columns, 3) points of which positions are wanted, meters; NaN where the ground is not known.
         ground: (rows, columns) height of the ground above the ellipsoid, meters.
         surface: what hides them.
     """
@@ -219,7 +219,7 @@ class Area(NamedTuple):
 
     @property
     def prior(self) -> float:
-        """Variance along each axis of a thing that is somewhere in the area, m²."""
+        """Variance along each axis of a point that is somewhere in the area, m²."""
         flat = self.points[self.known][:, :2]
         return float((flat.amax(0) - flat.amin(0)).square().sum() / 24.0)
 
@@ -230,7 +230,7 @@ class SitingMap(NamedTuple):
     Attributes:
         sees: (S, rows, columns) which site sees what.
         sigma: (rows, columns) root of the variance of the level position, east and north together, meters: where one
-            site or none sees a thing, nearly the size of the area.
+            site or none sees a point, nearly the size of the area.
         mean_sigma: root of the mean variance over the area, weighted: what is made small.
         covered: share of the area, weighted, that two sites or more see.
     """
@@ -275,7 +275,7 @@ def area_of(
         ground: from `level_ground` or `terrain`.
         sites: that stand, and candidates.
         cells: points along the longer side.
-        above: height of things above the ground, meters: smoke, say.
+        above: height of points above the ground, meters: smoke, say.
         step: of the ground that hides, meters; the cell of a raster, or of the map, if left out.
 
     Raises:
@@ -600,7 +600,7 @@ def sites_of(rig: Rig, pixel_sigma: float = 0.3) -> list[Site]:
 
 
 def _common_variance(alone: Rig, common: CommonErrors, rays: Tensor) -> Tensor:
-    """(N, 2) variance that common errors of one camera give its pixels of things far away, in px²."""
+    """(N, 2) variance that common errors of one camera give its pixels of points far away, in px²."""
     posed = PosedCameras(alone.each, alone.rotation, alone.center)
     used = torch.ones(len(rays), 1, dtype=torch.bool)
     place, inverse = alone.center.expand(len(rays), 3), torch.full((len(rays),), 1.0 / _FAR, dtype=torch.float64)

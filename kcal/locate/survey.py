@@ -165,7 +165,7 @@ def match_landmarks(survey: Survey, marks: Marks, pixel_sigma: float | Tensor) -
 
     Args:
         survey: the places.
-        marks: with at least one mark of each thing.
+        marks: with at least one mark of each point.
         pixel_sigma: of a mark along an axis, px; one number, or (N, V) such as `marks.sigmas(0.3)`.
 
     Raises:

@@ -157,7 +157,7 @@ class JointOptions:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class JointFit:
-    """Two nets that were trained together, and what they are worth.
+    """Two nets that were trained together, and how well they fit.
 
     Args:
         residual: the residual net.

@@ -93,7 +93,7 @@ class _Rays(NamedTuple):
         return _Rays(*(value[which] for value in self))
 
     def split(self, moments: int) -> _Rays:
-        """Those of so many moments: (B, N / B, ...)."""
+        """Those of so many time steps: (B, N / B, ...)."""
         return _Rays(*(value.unflatten(0, (moments, -1)) for value in self))
 
 
@@ -110,7 +110,7 @@ def near_epipolar_lines(
     Args:
         rig: the calibrated cameras; errors of its `covariance` widen the band.
         left: (..., N, 2) float64 pixels.
-        right: (..., M, 2), with the same leading dimensions: moments, whose pixels are not compared with each other's.
+        right: (..., M, 2), with the same leading dimensions: time steps, which are not compared with each other.
         sigma: standard deviation of every pixel along each axis.
         gate: standard deviations.
         ranges: nearest and farthest, meters: pairs beyond them by as many standard deviations are left out, too.
@@ -393,7 +393,7 @@ def associate(
 
 @exportable
 class BoxPairs(NamedTuple):
-    """Pairs of boxes of B moments; nothing in it is NaN.
+    """Pairs of boxes of B time steps; nothing in it is NaN.
 
     Attributes:
         match: (B, K) int64, number of the right box of each left one, -1 where it has none.
@@ -416,9 +416,9 @@ class BoxPairs(NamedTuple):
 
 
 class PairBoxes(StatedModule):
-    """Pair the boxes of both images, for a batch of moments: `associate` as a module between detector and localizer.
+    """Pair the boxes of both images, for a batch of time steps: `associate` as a module between detector and localizer.
 
-    Matches are those of `associate`, moment by moment. Pixels and scores are differentiable by the boxes, with the
+    Matches are those of `associate`, each time step alone. Pixels and scores are differentiable by the boxes, with the
     pairing and the rig held as they are. The assignment itself runs on the CPU, whatever the device; inside
     `torch.compile` this module runs eagerly, and its batch stands for `vmap`.
 
@@ -520,7 +520,7 @@ def _sound_boxes(name: str, boxes: Tensor, mask: Tensor | None, size: tuple[int,
 
 
 class _Paired(NamedTuple):
-    """Of B moments: right boxes (B, N) or -1, doubts (B, N), costs (B, N, M), and which pairs were possible."""
+    """Of B time steps: right boxes (B, N) or -1, doubts (B, N), costs (B, N, M), and which pairs were possible."""
 
     match: Tensor
     ambiguous: Tensor
@@ -548,7 +548,7 @@ def _paired(
     if images is not None:
         shapes = [some.shape for some in images]
         if shapes != [(len(near), *camera.size[::-1]) for camera in (rig.left, rig.right)]:
-            raise InputError("association: images of the cameras' sizes are needed, one of each for each moment")
+            raise InputError("association: images of the cameras' sizes are needed, one of each for each time step")
         for one, first, second, left, right in zip(cost, *boxes, *images, strict=True):
             gray = as_gray("left image", left), as_gray("right image", right)
             looks = torch.cat([appearance(gray[0], first, gray[1], some) for some in second.split(64)], 1)

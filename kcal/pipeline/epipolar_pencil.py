@@ -173,10 +173,10 @@ def _ranges(u: Floats, v: Floats, base: Floats, length: float) -> tuple[Floats, 
     return length * (along * bb - back * ab) / area, length * (along * ab - back * aa) / area
 
 
-# Detections of things that most cameras see: found where lines of sight of two meet and those of others pass by.
+# Detections of targets that most cameras see: found where lines of sight of two meet and those of others pass by.
 #
 # Each meeting of two lines of sight is looked up in trees of the other cameras' lines of sight. Those that enough
-# cameras confirm are groups. Where r cameras may miss a thing, r + 1 pairs of cameras, no two of which share a camera,
+# cameras confirm are groups. Where r cameras may miss a target, r + 1 pairs of cameras, no two of which share a camera,
 # find all: one of these pairs sees it. At last, the marks of each camera are assigned to all groups together, one to
 # one.
 
@@ -260,7 +260,7 @@ class Confirming:
 
         Args:
             pair: of cameras.
-            misses: how many cameras may miss a thing.
+            misses: how many cameras may miss a target.
             free: (N,) which marks may be taken.
         """
         own, trees = self._trees(free)
@@ -452,7 +452,7 @@ def _sideways(ray: Floats) -> Floats:
 
 
 def separate_pairs(center: Floats, axis: Floats, there: list[int]) -> list[tuple[int, int]]:
-    """Pairs of cameras, no two with a camera in common, that see things from directions as different as possible.
+    """Pairs of cameras, no two with a camera in common, that see targets from directions as different as possible.
 
     Example:
         >>> axis = np.array([[1.0, 0, 0], [0.8, 0.6, 0], [0, 1, 0], [0, 1, 0]])

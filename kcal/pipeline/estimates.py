@@ -1,4 +1,4 @@
-"""From what is believed of tracks to places and velocities on the Earth, at each moment and smoothed afterwards."""
+"""From what is believed of tracks to places and velocities on the Earth, at each time step and smoothed afterwards."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from kcal.texts import brief
 
 
 class TrackStates(NamedTuple):
-    """Places of T tracks at one moment; nothing is NaN. Look at `status` before anything else.
+    """Places of T tracks at one time; nothing is NaN. Look at `status` before anything else.
 
     Attributes:
         enu: (T, 3) meters east, north, up in the rig's frame (of two cameras: from the left one); zeros unless the
@@ -118,14 +118,14 @@ def track_states(
     )
 
 
-# Smoothing afterwards: what later sightings say of earlier moments (Rauch, Tung, Striebel).
+# Smoothing afterwards: what later sightings say of earlier time steps (Rauch, Tung, Striebel).
 #
 # The pass back follows the noise alone, like the filter's gain. The effect of the shared errors is carried through it,
 # so that it stays in the smoothed covariance as it was.
 
 
 class SmoothedTrack(NamedTuple):
-    """One track at the M moments of its life.
+    """One track at the M time steps of its life.
 
     Attributes:
         number: as in `Tracks`.
@@ -139,7 +139,7 @@ class SmoothedTrack(NamedTuple):
 
 
 class _Moment(NamedTuple):
-    """A track at one moment, each (1, ...); `prior` and `cross` tell how it was predicted, None at birth.
+    """A track at one time, each (1, ...); `prior` and `cross` tell how it was predicted, None at birth.
 
     `clock` are the values of the clock's errors with which both were made.
     """
@@ -154,7 +154,7 @@ class _Moment(NamedTuple):
 
 
 class History:
-    """What smoothing needs of each track, by its key: it grows by some kilobytes for each track and moment."""
+    """What smoothing needs of each track, by its key: it grows by some kilobytes for each track and time step."""
 
     def __init__(self) -> None:
         self._moments: dict[int, list[_Moment]] = {}
@@ -163,7 +163,7 @@ class History:
         self.numbers: dict[int, int] = {}
 
     def predicted(self, keys: Sequence[int], prior: Summary, cross: Tensor, clock: Tensor) -> None:
-        """Note what is believed before the sightings of a moment."""
+        """Note what is believed before the sightings of a time step."""
         places = [torch.tensor([i], device=cross.device) for i in range(len(keys))]
         self._clock = clock
         self._priors = {key: (prior.at(i), cross[i]) for key, i in zip(keys, places, strict=True)}
@@ -176,7 +176,7 @@ class History:
             which = torch.tensor([place], device=frame.device)
             prior, cross = self._priors.get(key, (None, None))
             if prior is not None:
-                # The sightings of this moment told something of the clock.
+                # The sightings of this time step told something of the clock.
                 prior = _moved(prior, clock - self._clock)
             moment = _Moment(time, frame[which], home[which], beliefs.at(which), prior, cross, clock)
             self._moments.setdefault(key, []).append(moment)

@@ -1,4 +1,4 @@
-"""`group_objects`: which detections of any number of cameras are of one thing; and lines of JSON to such objects."""
+"""`group_objects`: which detections of any number of cameras are of one target; and lines of JSON to such objects."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from kcal.pipeline.detections import Detections
 from kcal.pipeline.epipolar_pencil import FEWEST_VIEWS, Confirming, StationSights, near_in_angle, separate_pairs
 from kcal.pipeline.pairing import ObjectViews, pair_objects
 
-# `group_objects`: which detections of any number of cameras are of one thing, by where their lines of sight meet.
+# `group_objects`: which detections of any number of cameras are of one target, by where their lines of sight meet.
 #
 # Two lines of sight that come close are a possible pair, with an inverse range from the first of them. Pairs of one
 # detection with others whose inverse ranges agree are a possible group; all its views are then fitted together, with
@@ -56,7 +56,7 @@ class _Group(NamedTuple):
 def group_objects(
     localize: Localizer, seen: Sequence[Detections | None], options: AssociationOptions | None = None
 ) -> ObjectViews:
-    """Group the detections that the cameras of a rig have at one moment.
+    """Group the detections that the cameras of a rig have at one time.
 
     Works on the CPU; pixels come back on the device and in the graph of the detections.
 
@@ -158,7 +158,7 @@ class _Scene:
         return groups + self._remaining()
 
     def _clear(self) -> tuple[list[_Group], NDArray[np.bool_]]:
-        """Groups that most cameras see, and which marks are of none of these things."""
+        """Groups that most cameras see, and which marks are of none of these targets."""
         posed, options = self.posed, self.options
         there = [c for c, own in enumerate(self.own) if len(own)]
         groups: list[_Group] = []
@@ -183,7 +183,7 @@ class _Scene:
         if not len(all_found):
             return groups, free
         settled = confirming.settled(all_found, every)
-        # Without the marks that could as well be of another thing, if views enough are left.
+        # Without the marks that could as well be of another target, if views enough are left.
         sure = np.where(settled.rival, -1, settled.marks)
         doubtful = (sure >= 0).sum(1) < FEWEST_VIEWS
         rows = np.where(doubtful[:, None], settled.marks, sure)
@@ -348,7 +348,7 @@ def _with_one_range(edges: _Edges, camera: NDArray[np.int64], cameras: int, gate
     return sorted(found)
 
 
-# Lines of JSON to pairs: one line for each moment, as a detector's program writes them.
+# Lines of JSON to pairs: one line for each time step, as a detector's program writes them.
 #
 # A line has the detections of both images, or pairs that are matched already:
 #
@@ -367,7 +367,7 @@ _PAIR_KEYS = {"time", "left", "right", "sigma", "covariance", "scores", "categor
 
 
 class Moment(NamedTuple):
-    """What cameras saw at one moment: seconds of the first camera's image, and pairs or views, possibly none."""
+    """What cameras saw at one time: seconds of the first camera's image, and pairs or views, possibly none."""
 
     time: float
     pairs: ObjectViews

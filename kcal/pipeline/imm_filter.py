@@ -329,7 +329,7 @@ def predicted(beliefs: Beliefs, step: Transition, turn: Tensor | None = None, sh
     both = torch.cat([noise, columns[:, 6:width]], 1)
     if exact:
         return Beliefs(found.state, both, beliefs.late, beliefs.weight)
-    # Velocities of earlier moments are today's, turned back; a memory that fades would let them grow without end. The
+    # Velocities of earlier time steps are today's, turned back; a fading memory would let them grow without end. The
     # velocity in the state is divided by z, and z has changed by `ahead`.
     keep = step.keep if turn is None else product(turn[:, :, None], step.keep)
     back = keep.transpose(0, 1) * (found.ahead / step.left)

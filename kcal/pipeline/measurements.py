@@ -21,7 +21,7 @@ from kcal.locate.views import CommonErrors, PosedCameras, sound_covariances
 #
 # A filter takes these in as they are: it needs no optimum, and neither a status nor a covariance of each point. A point
 # is told from its anchor, the first camera that saw it, by a direction and an inverse distance, as in
-# `kcal.locate.views`. What does not change from one moment to the next is prepared once (`known_views`).
+# `kcal.locate.views`. What does not change from one time step to the next is prepared once (`known_views`).
 
 # Meters at which a bearing of one camera is taken; what light bends elsewhere follows from it.
 ALONE_M = 20_000.0
@@ -299,7 +299,7 @@ def mahalanobis(covariance: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
     return (done.columns[:, 0].square() / done.pivots).sum(0), done.pivots.log().sum(0)
 
 
-# Turn pixels of one moment into what a filter measures: rows of unit noise, with every error's effect on them.
+# Turn pixels of one time step into what a filter measures: rows of unit noise, with every error's effect on them.
 #
 # Where the lines of sight of the cameras that saw an object meet (`kcal.locate.views`) is told by three numbers: two
 # across the line of sight of the first of them, and the inverse range from it. The pixels are nearly linear in them at
@@ -308,7 +308,7 @@ def mahalanobis(covariance: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class Sightings(NamedTuple):
-    """N objects of one moment, seen by some of V cameras; the last axis of all counts them. M = 2 V rows of unit noise.
+    """N objects of one time step, seen by some of V cameras; the last axis counts them. M = 2 V rows of unit noise.
 
     The point is place + direction / inverse, in the rig's frame.
 
@@ -364,7 +364,7 @@ def sightings(
     time: Tensor,
     lasting_px: float = 0.0,
 ) -> Sightings:
-    """Measure objects of one moment.
+    """Measure objects of one time step.
 
     Args:
         known: from `known_sightings`.

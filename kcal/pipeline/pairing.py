@@ -1,4 +1,4 @@
-"""Objects that cameras see at one moment, and how detections and all their pixels become pairs."""
+"""Objects that cameras see at one time, and how detections and all their pixels become pairs."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from kcal.pipeline.association import AssociationOptions, associate
 from kcal.pipeline.detections import Detections
 from kcal.texts import brief
 
-# `ObjectViews`: objects of one moment, each with its pixels in those of a rig's cameras that saw it.
+# `ObjectViews`: objects of one time step, each with its pixels in those of a rig's cameras that saw it.
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ObjectViews:
-    """Objects of one moment, seen by any of V cameras: what a tracker takes in.
+    """Objects of one time step, seen by any of V cameras: what a tracker takes in.
 
     Several rows may have the same mark: the tracker then settles whose it is. A row with one camera alone is a bearing:
     it continues a track and begins none.

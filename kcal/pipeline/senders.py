@@ -32,8 +32,8 @@ from kcal.web.serving import LocalServer, local_app, page_files
 
 # Where positions go besides files: Cursor-on-Target by UDP or TCP, and MQTT.
 #
-# A sender never holds up the stream: what cannot be sent is counted. After a restart the last moments may be sent
-# again; events and messages carry the number of their moment, so that a receiver can tell.
+# A sender never holds up the stream: what cannot be sent is counted. After a restart the last time steps may be sent
+# again; events and messages carry the number of their time step, so that a receiver can tell.
 
 _EVENT = re.compile(r" <event.*?</event>\n", re.DOTALL)
 # Seconds: a receiver that does not answer must not stop the stream, and is tried again after a while; a broker has some
@@ -42,12 +42,12 @@ _PATIENCE, _AGAIN, _FAREWELL = 1.0, 5.0, 5.0
 
 
 class Sender(Protocol):
-    """Somewhere that positions go; `failed` counts moments that did not get there."""
+    """Somewhere that positions go; `failed` counts time steps that did not get there."""
 
     failed: int
 
     def send(self, columns: PositionColumns, run: Located, moment: datetime.datetime) -> None:
-        """Send the positions of a moment."""
+        """Send the positions of a time step."""
 
     def close(self) -> None:
         """Send nothing more."""
@@ -133,7 +133,7 @@ class MqttSender:
         except OSError as error:
             raise InputError(f"{_without_password(address)}: the broker does not answer ({error})") from error
         self._client.loop_start()
-        # The messages of each moment, from the first that the broker has not acknowledged.
+        # The messages of each time step, from the first that the broker has not acknowledged.
         self._sent: deque[list[Any]] = deque()
         self.failed = 0
 
@@ -204,7 +204,7 @@ def sender_to(address: str) -> Sender:
 
 # The map of a stream in the browser: served to this machine only, and it loads nothing from elsewhere.
 #
-# A page gets the newest tracks as server-sent events. A page that is slow misses moments; nothing waits for it, except
+# A page gets the newest tracks as server-sent events. A slow page misses time steps; nothing waits for it, except
 # that the end is told to each page before the server stops.
 
 # Seconds between looks for news, between signs of life while there is none, and for which the end waits for pages.
@@ -235,7 +235,7 @@ class LiveMap:
         ]
         self.run, self.readers = run, 0
         self._site = orjson.dumps({"cameras": cameras})
-        # Number of the news, its columns and its moment; the last that was written for pages.
+        # Number of the news, its columns and its time step; the last that was written for pages.
         self._news: tuple[int, PositionColumns | None, int] = (0, None, 0)
         self._written = (0, b"")
         self._ending = b""
@@ -246,7 +246,7 @@ class LiveMap:
         self._thread.start()
 
     def show(self, columns: PositionColumns, sequence: int) -> None:
-        """Show the tracks of a moment. It is written out only if a page asks for it."""
+        """Show the tracks of a time step. It is written out only if a page asks for it."""
         self._news = (self._news[0] + 1, columns, sequence)
 
     def close(self, words: str = "finished") -> None:

@@ -1,4 +1,4 @@
-"""The stream, in bounded memory and with its journal: lines or frames in, tracks out, moment by moment."""
+"""The stream, in bounded memory and with its journal: lines or frames in, tracks out, time step by time step."""
 
 from __future__ import annotations
 
@@ -35,18 +35,18 @@ from kcal.pipeline.senders import Sender
 from kcal.pipeline.tracks import Tracker, TrackRecord, Tracks
 from kcal.threads import Handover
 
-# The journal of a stream: which moments are in the outputs, so that a restart neither loses nor doubles any.
+# The journal of a stream: which time steps are in the outputs, so that a restart neither loses nor doubles any.
 #
-# The first line is a checkpoint with the state of the tracker; each further line is a moment whose positions are in the
-# outputs. A moment is written to the outputs first. What a crash left of a moment that is not in the journal is cut off
-# the outputs at the next start, and the moment is done again.
+# The first line is a checkpoint with the state of the tracker. Each further line is a time step whose positions are in
+# the outputs. A time step is written to the outputs first, then to the journal. What a crash left of one that is
+# not in the journal is cut off the outputs at the next start, and the time step is done again.
 
 
 class StreamPlace(NamedTuple):
     """How far a stream has come.
 
     Attributes:
-        sequence: how many moments are in the outputs.
+        sequence: how many time steps are in the outputs.
         time: seconds of the last one; None before the first.
         offset: bytes of the input that were read.
         sizes: bytes of each output.
@@ -89,7 +89,7 @@ class Ledger:
             raise
 
     def append(self, parts: Sequence[bytes], time: float, offset: int) -> None:
-        """Write a moment's bytes to the outputs, and then to the journal."""
+        """Write a time step's bytes to the outputs, and then to the journal."""
         if self._log is None:
             raise FileError(f"{self.path}: no checkpoint was written yet")
         for file, part in zip(self._files, parts, strict=True):
@@ -101,7 +101,7 @@ class Ledger:
         self._log.flush()
 
     def checkpoint(self, state: dict[str, Any]) -> None:
-        """Begin the journal again with the state after the last moment."""
+        """Begin the journal again with the state after the last time step."""
         for file in self._files:
             os.fsync(file.fileno())
         names = [str(path.resolve()) for path in self.outputs]
@@ -164,15 +164,15 @@ def _stored_place(values: Any, outputs: int) -> StreamPlace:
     return StreamPlace(sequence, time, offset, tuple(sizes))
 
 
-# The stream: lines or frames in, tracks out, moment by moment, in bounded memory, and stopped at any time.
+# The stream: lines or frames in, tracks out, time step by time step, in bounded memory, and stopped at any time.
 
 # Times of a stream in their order: one that its neighbors contradict is left out, a clock that was set is followed.
 
 # Seconds: a step ahead beyond it, and beyond ten times the last step, waits until later times bear it out.
 _AHEAD_S, _STEPS = 1.0, 10.0
-# Seconds: times that go back by less are of moments that came before, once more or out of order; less ahead is a gap.
+# Seconds: times that go back by less are of earlier time steps, repeated or out of order; less ahead is a gap.
 _BACK_S = 15.0
-# Moments in their order that make a jump true.
+# Time steps in their order that make a jump true.
 _RUN = 3
 # Seconds, the year 5138: a larger number is no time in seconds.
 MOST_SECONDS = 1e11
@@ -180,13 +180,13 @@ T = TypeVar("T")
 
 
 class Released(NamedTuple, Generic[T]):
-    """What is to be done after one more moment.
+    """What is to be done after one more time step.
 
     Attributes:
         moments: to be taken in now, in the order in which they came.
         jump_s: by how many seconds the clock was set before the first of them; 0 if it was not, or by a short gap.
         contradicted: how many that waited are left out.
-        repeated: whether this moment is left out, because its time is not after the last one.
+        repeated: whether this time step is left out, because its time is not after the last one.
     """
 
     moments: list[T]
@@ -196,13 +196,13 @@ class Released(NamedTuple, Generic[T]):
 
 
 class MomentOrder(Generic[T]):
-    """Decide moment by moment which are taken in.
+    """Decide time step by time step which are taken in.
 
     A time that jumps, ahead or back, waits. If the next ones go on from where the clock was, it is left out. If they go
     on from it, the clock was set (or nothing was seen for a while), and they are taken in.
 
     Args:
-        time: seconds of the last moment; -inf before the first.
+        time: seconds of the last time step; -inf before the first.
         step: seconds between the last two.
         until: times up to this one are repeated, until one is later: a source that begins somewhat earlier again.
 
@@ -220,11 +220,11 @@ class MomentOrder(Generic[T]):
 
     @property
     def waiting(self) -> int:
-        """Moments whose times nothing has borne out yet."""
+        """Time steps whose times nothing has borne out yet."""
         return len(self._waiting)
 
     def put(self, moment: T, time: float) -> Released[T]:
-        """Take one more moment."""
+        """Take one more time step."""
         ahead = time - self.time
         if 0.0 < ahead <= max(_AHEAD_S, _STEPS * self.step) or self.time == -math.inf:
             return self._release([(moment, time)], contradicted=len(self._waiting))
@@ -334,8 +334,8 @@ def track_columns(tracks: Tracks, sequence: int, stations: Rig | None = None) ->
     """One row for each track; velocities, hits and times are further columns.
 
     Args:
-        tracks: of one moment.
-        sequence: number of the moment, which together with the name is never used twice.
+        tracks: of one time step.
+        sequence: number of the time step, which together with the name is never used twice.
         stations: cameras far apart: bearings are then those at the anchor's own vertical, and two more columns tell
             from which camera a track is told, and which see it now.
     """
@@ -371,12 +371,12 @@ def _texts(values: torch.Tensor, ok: torch.Tensor) -> list[str]:
     return [repr(value) if there else "" for value, there in zip(values.tolist(), ok.tolist(), strict=True)]
 
 
-# The stream: lines or frames in, tracks out, moment by moment, in bounded memory, and stopped at any time.
+# The stream: lines or frames in, tracks out, time step by time step, in bounded memory, and stopped at any time.
 #
-# One thread reads and puts moments into a short queue; when it is full, reading waits (a file or pipe), or the oldest
-# moment is dropped and counted (a camera, which does not wait).
+# One thread reads and puts time steps into a short queue. When it is full, reading waits (a file or pipe), or the
+# oldest time step is dropped and counted (a camera, which does not wait).
 
-# Moments that wait, and moments between checkpoints: about ten seconds of video.
+# Time steps that wait, and time steps between checkpoints: about ten seconds of video.
 _WAITING, _CHECKPOINT = 32, 250
 # Bytes; a longer line is malformed, so that memory stays bounded.
 _LONGEST = 1 << 22
@@ -385,7 +385,7 @@ CALENDAR = 1e9
 
 
 class SourceItem(NamedTuple):
-    """What a source gives: a moment, or why there is none; `offset` bytes of the source have been read by then."""
+    """What a source gives: a time step, or why there is none; `offset` bytes of the source have been read by then."""
 
     moment: Moment | InputError
     offset: int
@@ -398,14 +398,14 @@ class StreamCounts:
     Attributes:
         moments: written to the outputs in this run.
         repeated: skipped, because their time is not after that of the last one.
-        contradicted: left out, because the moments before and after agree that their time is wrong.
-        waiting: at the end, moments whose time jumped and that no later one bears out; the next run reads them again.
+        contradicted: left out, because the time steps before and after agree that their time is wrong.
+        waiting: at the end, time steps whose time jumped and that no later one confirms; the next run reads them again.
         jumps: how often the clock was set, or nothing came for a while, and what came was followed.
         last_jump_s: by how many seconds the clock was set last.
         malformed: lines that could not be read.
-        dropped: moments of a camera for which there was no time.
+        dropped: time steps of a camera for which there was no time.
         positions: written.
-        unsent: moments that a receiver did not get.
+        unsent: time steps that a receiver did not get.
         last_error: of the last malformed line.
     """
 
@@ -432,7 +432,7 @@ class Stream:
         journal: the file that remembers what was written.
         senders: where positions go besides.
         start: calendar time of second zero, for sources that count from elsewhere than 1970.
-        shown: called with the columns and tracks of each moment, for a map.
+        shown: called with the columns and tracks of each time step, for a map.
 
     Raises:
         InputError: an output of another kind.
@@ -467,23 +467,23 @@ class Stream:
                 raise
 
     def stop(self) -> None:
-        """End after the present moment; may be called from another thread or a signal's handler."""
+        """End after the present time step; may be called from another thread or a signal's handler."""
         self._stop.set()
 
     def follow(self, source: Callable[[int], Iterator[SourceItem]], *, waits: bool, resumes: bool) -> StreamCounts:
         """Follow a source until it ends or `stop` is called.
 
-        A time that jumps is followed once two later moments go on from it; tracks then
+        A time that jumps is followed once two later time steps go on from it; tracks then
         begin anew.
 
         Args:
             source: gives items from an offset on; if it can be closed, it is closed at the end.
-            waits: whether the source waits when there is no time for more; else the oldest moments are dropped.
+            waits: whether the source waits when there is no time for more; else the oldest time steps are dropped.
             resumes: whether it can begin at an offset; else it gives what comes now.
         """
         place, checkpoint = self.ledger.place, self.ledger.checkpoint_at
         begin = checkpoint.offset if resumes else 0
-        # Moments after the checkpoint that are in the outputs already bring only the tracker to where it was.
+        # Time steps after the checkpoint that are in the outputs already bring only the tracker to where it was.
         self._behind = resumes and self.ledger.state is not None and checkpoint.sequence < place.sequence
         self._order = self._new_order(waits=waits, resumes=resumes)
         if not self._behind:
@@ -534,7 +534,7 @@ class Stream:
         self.ledger.checkpoint(snapshot(self.tracker) | {"step_s": self._order.step})
 
     def _take_in(self, released: Released[SourceItem], new: bool) -> None:
-        """Take in the moments that are in order now; `new`: they are counted."""
+        """Take in the time steps that are in order now; `new`: they are counted."""
         if new:
             self.counts.repeated += released.repeated
             self.counts.contradicted += released.contradicted
@@ -587,7 +587,7 @@ class Stream:
         self.counts.moments += 1
         self.counts.positions += len(columns.names)
         self.counts.unsent = sum(sender.failed for sender in self.senders)
-        # Last: what is told counts this moment, too.
+        # Last: what is told counts this time step, too.
         if self.shown is not None:
             self.shown(columns, tracks)
 
@@ -608,7 +608,7 @@ def lines_of(path: Path | None, read: Callable[[bytes], Moment]) -> Callable[[in
 
     Args:
         path: of the file.
-        read: turns a line into a moment, or raises `InputError`.
+        read: turns a line into a time step, or raises `InputError`.
     """
 
     def items(offset: int) -> Iterator[SourceItem]:

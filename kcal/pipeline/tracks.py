@@ -1,4 +1,4 @@
-"""`Tracker`: objects of one moment after another become tracks with places, velocities and honest errors."""
+"""`Tracker`: objects of one time step after another become tracks with places, velocities and honest errors."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ class TrackRecord:
 
 
 class Tracks(NamedTuple):
-    """The confirmed tracks at one moment.
+    """The confirmed tracks at one time.
 
     Attributes:
         time: seconds.
@@ -120,7 +120,7 @@ class Tracks(NamedTuple):
         unseen_s: (T,) seconds since the last one; zero if seen now.
         state: places and velocities.
         models: (T, J) probabilities of `TrackOptions.motions`.
-        seen: (T, V) bool: which cameras see it at this moment.
+        seen: (T, V) bool: which cameras see it at this time step.
     """
 
     time: float
@@ -133,7 +133,7 @@ class Tracks(NamedTuple):
     seen: Tensor
 
 
-# What a tracker computes at each moment, as functions of tensors alone: as they are, or compiled.
+# What a tracker computes at each time step, as functions of tensors alone: as they are, or compiled.
 #
 # Sizes are T tracks under J models, N pairs, L possible matches.
 
@@ -147,9 +147,9 @@ class TrackSteps(NamedTuple):
     """The steps, in their order.
 
     Attributes:
-        measure: pixels, which are seen, covariances and times of a moment as sightings; see `sightings`.
+        measure: pixels, which are seen, covariances and times of a time step as sightings; see `sightings`.
         move: beliefs to another time; see `moved_on`.
-        look: see `looked_at`, with beliefs that have come to the same moment.
+        look: see `looked_at`, with beliefs that have come to the same time step.
         near: see `nearby`.
         score: see `scored`.
         take: see `taken_in`.
@@ -295,7 +295,7 @@ def _contiguous(value: Any) -> Any:
     return type(value)(*(part.contiguous() for part in value))
 
 
-# `Tracker`: objects of one moment after another become tracks with places, velocities and honest errors.
+# `Tracker`: objects of one time step after another become tracks with places, velocities and honest errors.
 
 # Of the gate: nearer sightings tell of the clocks. One in a hundred is left out where the gate loses one in 10,000.
 _SURE = 13.3 / 23.5
@@ -305,7 +305,7 @@ _TURN = 0.3
 
 
 class Tracker:
-    """Follow targets through marks of two cameras or more; call it with the objects of each moment in turn.
+    """Follow targets through marks of two cameras or more; call it with the objects of each time step in turn.
 
     Two cameras that see a target begin a track. It keeps its number while any camera sees it: one alone tells its
     bearing, and other cameras may take over. A target is told from the camera that saw it first.
@@ -320,7 +320,7 @@ class Tracker:
             they are estimated from the tracks.
         record: keep what `smoothed` needs; memory then grows with time.
         compiled: translate the filter to C++ first, which takes three minutes, or one where torch remembers;
-            each moment of many tracks then takes about half the time.
+            each time step of many tracks then takes about half the time.
         moments: `localize` as it stands at a time, with `moving` more errors; neither compiled nor recorded.
 
     Example:
@@ -393,7 +393,7 @@ class Tracker:
 
     @torch.no_grad()
     def __call__(self, views: ObjectViews, time: float | None = None) -> Tracks:
-        """Take in the objects of one moment; moments must not go back in time.
+        """Take in the objects of one time step; time steps must not go back in time.
 
         Args:
             views: may be empty if `time` is given.
@@ -470,7 +470,7 @@ class Tracker:
         return self.shared.clock_estimate(camera)
 
     def smoothed(self) -> list[SmoothedTrack]:
-        """Every confirmed track with the knowledge of all moments, if `record` was set; it may be called at any time.
+        """Every confirmed track with the knowledge of all time steps, if `record` was set. Call it at any time.
 
         Raises:
             InputError: nothing was recorded.
@@ -596,7 +596,7 @@ class Tracker:
         columns = track.tolist(), scores.log_density[rows].tolist(), categories, score.tolist(), count.tolist()
         for t, density, name, weight, cameras in zip(*columns, strict=True):
             record = self.records[t]
-            # One camera alone confirms nothing, and no moment counts twice.
+            # One camera alone confirms nothing, and no time step counts twice.
             if record.last < self.time and (cameras > 1 or record.number):
                 record.hits += 1
             record.last = self.time

@@ -489,13 +489,13 @@ class FramesTogether:
             yield frame
 
 
-# `Videos`: moments of a rig's videos: a detector in frames that belong together, and matched objects.
+# `Videos`: time steps of a rig's videos: a detector in frames that belong together, and matched objects.
 
 
 class Videos:
     """Detect in frames that belong together; of two cameras of one mast, match the images inside the boxes too.
 
-    Call it with the offset of the last moment that is not wanted any more: it is a source for `Stream.follow`. Files
+    Call it with the offset of the last time step that is not wanted any more: it is a source for `Stream.follow`. Files
     wait until there is time for the next frames; of live streams the newest ones are taken, the others counted.
 
     Args:
@@ -542,7 +542,7 @@ class Videos:
         self._rig, self._detector, self._options = rig, detector, options
 
     def __call__(self, offset: int) -> Iterator[SourceItem]:
-        """The moments after an offset: microseconds of the first frame, from 1."""
+        """The time steps after an offset: microseconds of the first frame, from 1."""
         for place, (moment, group) in self._frames(offset):
             yield SourceItem(self._moment(moment, group), place)
 

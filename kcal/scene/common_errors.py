@@ -59,7 +59,7 @@ def line_errors(rig: Rig, pixels: Tensor) -> LineErrors:
     return LineErrors((right * normal).sum(-1) / per_px[:, 0], slope / per_px, slopes)
 
 
-# What errors of matches have in common: overlapping patches, and one thing in several pairs.
+# What errors of matches have in common: overlapping patches, and one point in several pairs.
 #
 # The fit of a match tells what noise does to it. What remains shows in how far matches lie off their epipolar lines,
 # and most of it is the same whenever the same thing is seen in the same light: it is no smaller after a hundred pairs.
@@ -67,11 +67,11 @@ def line_errors(rig: Rig, pixels: Tensor) -> LineErrors:
 # learned from the matches themselves, for classes of how much of a patch fits.
 
 PATCH = 2.0 * HALF + 1.0  # pixels across
-# Pixels of sway of a mast between pairs, of disparity and of place within which two matches are of one thing.
+# Pixels of sway of a mast between pairs, of disparity and of place within which two matches are of one point.
 _SWAY, _SAME_DISPARITY, _SAME_PLACE = 8.0, 1.5, 1.5
 # Errors off the epipolar lines beyond so many standard deviations are wrong matches, and tell nothing of the others.
 WRONG = 5.0
-# Pairs of matches of one thing without which nothing is learned: then all that is not noise counts as common.
+# Pairs of matches of one point without which nothing is learned: then all that is not noise counts as common.
 _FEWEST = 50
 # Classes of how much of a patch fits. By quarters, errors beyond noise are 0.11, 0.09, 0.02 and 0.03 px (two terrains).
 _CLASSES = 4
@@ -120,7 +120,7 @@ def with_common_errors(
     same_time = pair[near[:, 0]] == pair[near[:, 1]]
     apart = (still[near[:, 0]] - still[near[:, 1]]).abs()
     overlap = (1.0 - apart / PATCH).clamp_min(0.0).prod(1)
-    # Only things at one distance are the same.
+    # Only points at one distance are the same.
     disparity = places[:, 1] - places[:, 0]
     alike = (disparity[near[:, 0]] - disparity[near[:, 1]]).abs().amax(1) < _SAME_DISPARITY
     same = ~same_time & alike & (apart < _SAME_PLACE).all(1) & good[near].all(1)
@@ -185,7 +185,7 @@ def _shifts(places: Tensor, pair: Tensor) -> Tensor:
     count = int(pair[-1]) + 1
     found = torch.zeros(count, 2, dtype=torch.float64)
     first = places[pair == 0]
-    # Disparity is a coordinate in which matches of one thing are as near as that.
+    # Disparity is a coordinate in which matches of one point are as near as that.
     as_far = _SWAY / _SAME_DISPARITY
     tree = cKDTree(torch.cat([first[:, 0], as_far * (first[:, 1] - first[:, 0])], 1).numpy())
     for k in range(1, count):
@@ -203,7 +203,7 @@ def _shifts(places: Tensor, pair: Tensor) -> Tensor:
 
 
 def _common_share(error: Tensor, variance: Tensor, same: Tensor, overlap: Tensor) -> float:
-    """Share of the variance that matches of one thing at two times have in common, from their errors' products."""
+    """Share of the variance that matches of one point at two times have in common, from their errors' products."""
     if len(same) < _FEWEST:
         return 1.0
     product = error[same].prod(1) / variance[same].prod(1).sqrt()

@@ -33,7 +33,7 @@ from kcal.scene.refine import Stillness, refine_matches, still_there
 _FREE_RATIO, _GUIDED_RATIO = 0.75, 0.9
 # Pixels that a keypoint may be off its epipolar line, before the pose is refined and while it is guessed.
 BAND, _FIRST_BAND = 3.0, 2.0
-# Baselines of the nearest things that are matched.
+# Baselines of the nearest points that are matched.
 _NEAREST = 3.0
 # Matches without which a guessed pose is chance.
 _NEEDED = 20
@@ -60,7 +60,7 @@ def rough_rig(cameras: tuple[Camera, Camera], points: tuple[Keypoints, Keypoints
     if count < _NEEDED:
         raise InputError(
             f"{name}: both images have only {count} features in common; {_NEEDED} are needed. Are they of the same "
-            "scene and moment, and is left left?"
+            "scene and time, and is left left?"
         )
     return Rig.pair(cameras[0], cameras[1], rotation, shift)
 
@@ -156,7 +156,7 @@ _UNIT_SIGMA = 1e-3
 
 
 class ImagePair(NamedTuple):
-    """Two images of one moment.
+    """Two images of one time.
 
     Attributes:
         name: of the pair, in messages and of its matches.
@@ -176,7 +176,7 @@ class PairCounts:
     Args:
         name: of the pair.
         matched: keypoints that are each other's best along the epipolar line.
-        untextured: left out: no sub-pixel match, too little texture, or only a part of a patch is the same thing.
+        untextured: left out: no sub-pixel match, too little texture, or only a part of a patch is the same point.
         off_line: left out: off the epipolar line by more than noise explains.
         moved: left out: not there in the other pairs, or at another range.
         thinned: left out: others in the same part of the image are better.
@@ -234,7 +234,7 @@ def scene_features(cameras: tuple[Camera, Camera], pairs: Sequence[ImagePair], m
 
     Args:
         cameras: left and right, calibrated.
-        pairs: images of one moment each; days apart is good.
+        pairs: images of one time each; days apart is good.
         most: matches of all pairs together, evenly spread over the image.
 
     Raises:
@@ -292,7 +292,7 @@ def _refuse_repeated(pairs: Sequence[ImagePair]) -> None:
             first = names.setdefault(hashlib.sha256(picture).digest(), pair.name)
             if first != pair.name:
                 raise InputError(
-                    f"{pair.name}: the {side} image is that of {first}; each pair must be of another moment: remove one"
+                    f"{pair.name}: the {side} image is that of {first}; each pair must be of another time: remove one"
                 )
 
 

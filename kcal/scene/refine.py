@@ -149,9 +149,9 @@ def _patch(
 
 # Steps of a patch from its middle, and pixels by which masts may have swayed.
 _HALF, SWAY = 7, 6
-# Correlation of the same thing in other light; of waves and of what came or went it is below.
+# Correlation of the same point in other light; of waves and of what came or went it is below.
 SAME = 0.6
-# Standard deviations, and px, by which the disparity of one thing may differ between two times.
+# Standard deviations, and px, by which the disparity of one point may differ between two times.
 _SIGMAS, _SLACK = 5.0, 0.15
 
 

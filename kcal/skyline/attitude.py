@@ -219,7 +219,7 @@ def attitude_against(
     if len(columns.pixel) < max(_CLEAR * camera.size[0], 30):
         raise InputError(
             f"the border of sky and ground is clear in {len(columns.pixel)} of {camera.size[0]} columns only: the "
-            "skyline must be in the image, by day, without fog, and without things close by in front of it"
+            "skyline must be in the image, by day, without fog, and without objects close by in front of it"
         )
     around = horizon_there()
     errors = SkylineErrors(error, np.array(place_sigma), fits.lens_errors(camera), mean_radius(place.lat))

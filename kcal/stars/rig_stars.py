@@ -27,12 +27,12 @@ from kcal.threads import in_one_thread
 _CATALOG_SIGMA = math.radians(1.0 / 3600)
 # px: stars without a name are matched within this distance of where the named ones put them.
 _MATCH = 2.0
-# s: images of one moment.
+# s: images of one time.
 _SAME_TIME = 1e-3
 # h: a gap that is longer is a day; and the shortest night in which clocks drift by something.
 _DAY_BETWEEN, _LEAST_NIGHT = 6.0, 1.0
 
-# Images of one moment: NamedStars by the number of the camera.
+# Images of one time: NamedStars by the number of the camera.
 Moment = Mapping[int, NamedStars]
 
 
@@ -70,7 +70,7 @@ def star_source(
         >>> camera = Camera.build(focal=(900, 900), center=(479.5, 299.5), size=(960, 600), model="pinhole")
         >>> star_source([], (camera, camera))
         Traceback (most recent call last):
-        kcal.errors.InputError: no stars were named in two cameras at the same moment
+        kcal.errors.InputError: no stars were named in two cameras at the same time
     """
     for name, value in (("clock_sigma", clock_sigma), ("drift_sigma", drift_sigma)):
         if not 0 <= value < math.inf:
@@ -83,7 +83,7 @@ def star_source(
         for row in (*_with_names(moment, catalog, number, on_earth=on_earth), *_without_names(moment, cameras, number))
     ]  # fmt: skip
     if not rows:
-        raise InputError("no stars were named in two cameras at the same moment")
+        raise InputError("no stars were named in two cameras at the same time")
     marks = np.full((len(rows), len(cameras), 3), np.nan)
     for k, row in enumerate(rows):
         for camera, place in row.places.items():
@@ -114,7 +114,7 @@ def moments_of(
         tolerance: seconds.
 
     Returns:
-        the moments, and how many images have no partner. On the Earth these are moments of their own.
+        the times, and how many images have no partner. On the Earth these are times of their own.
 
     Raises:
         InputError: images without times that are not as many for each camera.
@@ -143,7 +143,7 @@ def moments_of(
 
 
 class _Row(NamedTuple):
-    """A star of a moment; `places` are its numbers among the detected stars of the cameras that see it."""
+    """A star of a time; `places` are its numbers among the detected stars of the cameras that see it."""
 
     name: str
     moment: int

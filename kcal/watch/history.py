@@ -24,10 +24,10 @@ from kcal.texts import csv_line, unix_seconds
 # How the cameras of a rig turn over time, and how that is learned from what was measured (maximum likelihood).
 #
 # Each camera turns by three angles, left before right: pitch, yaw, roll, in radians about its own axes, counted from
-# the moment of the reference. Each angle is a random walk that returns to its mean (an Ornstein-Uhlenbeck process:
+# the time of the reference. Each angle is a random walk that returns to its mean (an Ornstein-Uhlenbeck process:
 # masts bend with the sun and go back), plus a turn for each kelvin where temperatures are known, plus a part that has
-# another value at every look (wind). Beyond the noise of a look, patches change with light and shade: that error lasts
-# for hours.
+# another value at every measurement (wind). Beyond the noise of a measurement, patches change with light and shade:
+# that error lasts for hours.
 
 # Seconds that light and shade last.
 LASTING_S = 7200.0
@@ -39,7 +39,7 @@ _FACTOR = math.log(5.0)
 _LEAST, _MOST = (1e-7, 300.0, 1e-8), (0.05, 3e7, 0.01)
 # Rows that are enough to learn from, and the most that are read.
 FEWEST, MOST_LEARNT = 60, 1500
-# Standard deviations beyond which a look is left out of the likelihood.
+# Standard deviations beyond which a measurement is left out of the likelihood.
 _OUTLIER = 5.0
 
 
@@ -50,7 +50,7 @@ class TurnModel:
     Args:
         swing: (..., 6) radians, standard deviation of the part that changes slowly.
         return_s: (..., 6) seconds in which it goes back by 1 - 1/e; a random walk where that is long.
-        gust: (..., 6) radians, standard deviation of what has another value at every look.
+        gust: (..., 6) radians, standard deviation of what has another value at every measurement.
     """
 
     swing: Tensor
@@ -65,12 +65,12 @@ class TurnModel:
 
 
 class AngleSeries(NamedTuple):
-    """One angle at T looks, for K angles: what `learned` reads.
+    """One angle at T measurements, for K angles: what `learned` reads.
 
     Attributes:
         time: (T,) seconds.
         angle: (T, K) radians, NaN where it was not measured.
-        variance: (T, K) of its noise that is new at each look.
+        variance: (T, K) of its noise that is new at each measurement.
         lasting: (T, K) variance of what lasts.
         kelvin: (T, K) of warming since the reference; zeros where nobody measured it.
     """
@@ -83,9 +83,9 @@ class AngleSeries(NamedTuple):
 
 
 def learned(series: AngleSeries) -> TurnModel:
-    """The most likely model of K angles; what is usual counts where the looks tell little.
+    """The most likely model of K angles; what is usual counts where the measurements tell little.
 
-    Looks are thinned to some thousand, evenly; a compass search goes over the logarithms of the three numbers.
+    Measurements are thinned to some thousand, evenly; a compass search goes over the logarithms of the three numbers.
     """
     known = np.isfinite(series.angle).any(1)
     rows = np.flatnonzero(known)
@@ -143,25 +143,25 @@ def _log_likelihood(series: AngleSeries, tried: NDArray[np.float64]) -> NDArray[
     return total
 
 
-# Kalman filter and smoother of the attitude of both cameras: from looks at the scene to the turn of any moment.
+# Kalman filter and smoother of the attitude of both cameras: from looks at the scene to the turn of any time.
 
-# Of the state: slow turns, lasting errors of the looks, errors of the lenses between the cameras, turns per kelvin.
+# Of the state: slow turns, lasting errors of measurements, errors of lenses between the cameras, turns per kelvin.
 _SLOW, _LASTING, _BIAS, _HEAT = slice(0, 6), slice(6, 12), slice(12, 17), slice(17, 23)
 SIZE = 23
 # Radians by which errors of the lenses turn what is measured between the cameras: some tenths of a pixel.
 _LENS_SIGMA = 3e-4
-# A look that chance explains less than once in a million is doubted, until so many in a row agree.
+# A measurement that chance explains less than once in a million is doubted, until so many in a row agree.
 _CHANCE, _AGREE = 1.0 - 1e-6, 3
 _GATES = torch.cat([torch.ones(1, dtype=torch.float64),
                     chi2_quantile(torch.arange(1.0, 12.0, dtype=torch.float64), _CHANCE)])  # fmt: skip
 
 
 class Look(NamedTuple):
-    """What the images of one moment tell; leading dimensions (...) are separate rigs.
+    """What the images of one time tell; leading dimensions (...) are separate rigs.
 
     Attributes:
         turn: (..., 6) radians of the left and right camera since the reference; what is not seen is not read.
-        covariance: (..., 6, 6) of it, as one look tells.
+        covariance: (..., 6, 6) of it, as one measurement tells.
         lasting: (...) share of that covariance that lasts (light and shade).
         seen: (..., 2) whether there is a turn of each camera.
         between: (..., 5) of `between_rows`, from matches between the cameras.
@@ -181,15 +181,15 @@ class Look(NamedTuple):
 
 
 class TurnState(NamedTuple):
-    """What is known at a moment.
+    """What is known at a time.
 
     Attributes:
         mean: (..., 23).
         covariance: (..., 23, 23).
-        doubt: (..., 6) radians by which the last looks contradict the state, if they do.
+        doubt: (..., 6) radians by which the last measurements contradict the state, if they do.
         strikes: (...) how many in a row did.
-        kelvin: (...) of the last look.
-        lasting: (..., 6) variance of lasting errors, of the last look.
+        kelvin: (...) of the last measurement.
+        lasting: (..., 6) variance of lasting errors, of the last measurement.
     """
 
     mean: Tensor
@@ -201,7 +201,7 @@ class TurnState(NamedTuple):
 
 
 class Turns(NamedTuple):
-    """Turn of both cameras at a moment: (..., 6) radians, and (..., 6, 6)."""
+    """Turn of both cameras at a time: (..., 6) radians, and (..., 6, 6)."""
 
     mean: Tensor
     covariance: Tensor
@@ -222,7 +222,7 @@ def between_rows(rig: Rig) -> Tensor:
 
 
 def first_state(model: TurnModel, lead: tuple[int, ...] = ()) -> TurnState:
-    """Before the first look."""
+    """Before the first measurement."""
     variance = torch.zeros(*lead, SIZE, dtype=torch.float64)
     variance[..., _SLOW], variance[..., _BIAS], variance[..., _HEAT] = model.swing**2, _LENS_SIGMA**2, HEAT_SIGMA**2
     zero = torch.zeros(*lead, 6, dtype=torch.float64)
@@ -247,16 +247,16 @@ def passed(state: TurnState, seconds: Tensor, model: TurnModel) -> tuple[TurnSta
 
 
 def taken(state: TurnState, look: Look, model: TurnModel, rows: Tensor) -> TurnState:
-    """The state after a look of the same moment; `rows` are those of `between_rows`.
+    """The state after a measurement of the same time; `rows` are those of `between_rows`.
 
-    A look that contradicts the state is doubted and widens what is told of that moment. Three in a row that do are
+    A measurement that contradicts the state is doubted and widens what is told of that time. Three in a row that do are
     believed: somebody has hit the mast.
     """
     share = look.lasting[..., None]
     own = look.covariance.diagonal(dim1=-2, dim2=-1)
     first = (state.lasting == 0).all(-1, keepdim=True)
     variance = state.covariance.diagonal(dim1=-2, dim2=-1).clone()
-    # The first look tells how much may last.
+    # The first measurement tells how much may last.
     variance[..., _LASTING] = torch.where(first, share * own, variance[..., _LASTING])
     spread = (
         state.covariance - torch.diag_embed(state.covariance.diagonal(dim1=-2, dim2=-1)) + torch.diag_embed(variance)
@@ -298,7 +298,7 @@ def _rows_of(look: Look, model: TurnModel, rows: Tensor) -> tuple[Tensor, Tensor
     design[..., :6, _LASTING] = torch.eye(6, dtype=torch.float64)
     design[..., 6:, _BIAS] = torch.eye(5, dtype=torch.float64)
     design[..., _HEAT] = look.kelvin[..., None, None] * by_turn
-    # Wind turns both measurements of a moment alike.
+    # Wind turns both measurements of a time alike.
     noise = (by_turn * model.gust[..., None, :] ** 2) @ by_turn.mT
     noise = noise.expand(*there.shape, 11).clone()
     noise[..., :6, :6] += (1.0 - look.lasting)[..., None, None] * look.covariance
@@ -310,7 +310,7 @@ def _rows_of(look: Look, model: TurnModel, rows: Tensor) -> tuple[Tensor, Tensor
 
 
 def turns_of(state: TurnState, model: TurnModel, *, gusts: bool = True) -> Turns:
-    """The turn of both cameras; with the wind of the moment, or only what lasts beyond it (for alarms)."""
+    """The turn of both cameras; with the wind of the time, or only what lasts beyond it (for alarms)."""
     whole = torch.zeros(*state.mean.shape[:-1], 6, SIZE, dtype=torch.float64)
     whole[..., _SLOW] = torch.eye(6, dtype=torch.float64)
     whole[..., _HEAT] = state.kelvin[..., None, None] * torch.eye(6, dtype=torch.float64)
@@ -320,10 +320,10 @@ def turns_of(state: TurnState, model: TurnModel, *, gusts: bool = True) -> Turns
 
 
 def smoothed(states: list[TurnState], times: list[float], model: TurnModel) -> list[TurnState]:
-    """What is known of each moment from all looks, those after it too (H. Rauch, F. Tung and C. Striebel 1965).
+    """What is known of each time from all measurements, those after it too (H. Rauch, F. Tung and C. Striebel 1965).
 
     Args:
-        states: after each look, in turn.
+        states: after each measurement, in turn.
         times: seconds of these.
         model: of the turns.
     """
@@ -398,7 +398,7 @@ class GrowingTable:
             raise FileError(f"{self.path}: cannot read: {error.strerror or error}") from error
 
 
-# The history of a watched rig as a growing CSV file: what each look measured, and what it made of it.
+# The history of a watched rig as a growing CSV file: what each measurement measured, and what it made of it.
 
 _ANGLES = ("pitch", "yaw", "roll")
 _SIDES = ("left", "right")
@@ -421,12 +421,12 @@ _TELLS = torch.tensor([0] * 3 + [1] * 3 + [0] * 6 + [1] * 6 + [2] * 20)
 COLUMNS = (
     "time", "rig", *_TOLD, "left_features", "right_features", "matches", "lasting", "temperature_c", *_LOOK, "note",
 )  # fmt: skip
-# Rows that are kept of a file: two weeks of a look a minute.
+# Rows that are kept of a file: two weeks of a measurement a minute.
 MOST_ROWS = 20_000
 
 
 class HistoryRow(NamedTuple):
-    """One look.
+    """One measurement.
 
     Attributes:
         time: seconds, of the left image.
@@ -456,7 +456,7 @@ def no_look() -> Look:
 
 
 def history_line(row: HistoryRow, fingerprint: str, told: tuple[Tensor, Tensor]) -> str:
-    """A line of the file; `told` is the relative turn (3,) of the moment and its sigma (3,), radians."""
+    """A line of the file; `told` is the relative turn (3,) of the time and its sigma (3,), radians."""
     look, air = row.look, None if math.isnan(row.temperature) else row.temperature
     blocks = look.covariance[:3, :3], look.covariance[3:, 3:]
     parts = [look.turn, *(block[_upper(3)] for block in blocks), look.between, look.between_covariance[_upper(5)]]
@@ -566,7 +566,7 @@ def _from_upper(upper: Tensor, size: int, there: Tensor) -> Tensor:
 
 # Temperatures from a table (time,temperature) that may grow while it is read.
 
-# Seconds beyond which the nearest temperature is not that of a moment.
+# Seconds beyond which the nearest temperature is not that of a time.
 _NEAR = 3600.0
 _KEPT = 100_000
 
@@ -607,7 +607,7 @@ class Temperatures:
             raise FileError(f"{path}: {needed}")
 
     def at(self, time: float) -> float:
-        """°C at a moment, between the two nearest; NaN where the nearest is more than an hour away.
+        """°C at a time, between the two nearest; NaN where the nearest is more than an hour away.
 
         Raises:
             FileError: a damaged line.

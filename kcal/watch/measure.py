@@ -28,7 +28,7 @@ from kcal.strict_formats import read_npz
 from kcal.watch.history import Look, between_rows, no_look
 from kcal.watch.turned import camera_turns
 
-# What is looked for in each image of a watched rig: patches of fixed things, and where they were.
+# What is looked for in each image of a watched rig: patches of fixed points, and where they were.
 #
 # Features that move, and patches that have changed, are dropped in time. When half of the features are gone, new ones
 # are added where the present attitude puts them; the covariance of that attitude is kept with them.
@@ -39,9 +39,9 @@ REACH = 15
 _MOST, _CELLS, _APART = 400, (16, 9), 12.0
 # Fewest features of a reference.
 _FEWEST = 20
-# Number of looks over which the record of a feature is averaged; a feature with fewer is not judged.
+# Number of measurements over which the record of a feature is averaged; a feature with fewer is not judged.
 MEMORY = 30
-# A feature is dropped if fewer than this share of the looks found it, or if it is so many pixels off on average.
+# A feature is dropped if fewer than this share of the measurements found it, or if it is so many pixels off on average.
 _SELDOM, _OFF = 0.3, 0.5
 _LARGEST = 2**26
 _FIELDS = ("pixels", "middle", "patches", "looks", "found", "off", "variance")
@@ -131,7 +131,7 @@ def _spread_features(image: Gray, taken: Tensor, most: int) -> FixedFeatures:
 
 
 def with_look(reference: FixedFeatures, seen: Tensor, off: Tensor) -> FixedFeatures:
-    """The reference after a look.
+    """The reference after a measurement.
 
     Args:
         reference: before it.
@@ -214,7 +214,7 @@ def load_references(path: str | Path, rig: Rig) -> tuple[FixedFeatures, FixedFea
     return sides[0], sides[1]
 
 
-# What the images of one moment tell of the attitude of both cameras, with covariance.
+# What the images of one time tell of the attitude of both cameras, with covariance.
 
 # Steps of a patch from its middle; px that a fit may go, and along the worst axis that it may be unsure.
 _HALF, _FARTHEST, _FAINTEST = 7, 1.5, 0.35
@@ -229,19 +229,19 @@ _FLOOR = 0.03
 _OTHER_LENS, _SURELY = 1e-3, 8.0
 # Keypoints of an image that shows a scene, whatever scene that is.
 _SOME = 150
-# Share of the noise of a look that is assumed to last until it is measured.
+# Share of the noise of a measurement that is assumed to last until it is measured.
 _LASTING = 0.33
 
 
 class Seen(NamedTuple):
-    """One camera at one moment.
+    """One camera at one time.
 
     Attributes:
         turn: (3,) radians since the reference; zeros if nothing was found.
         covariance: (3, 3).
         found: number of features that were found and stand still; 0 where no turn could be computed.
         lasting: share of the covariance that lasts; None where it is not known yet.
-        reference: with the records of this look.
+        reference: with the records of this measurement.
         note: what is wrong, if anything is.
         lost: whether the image shows a scene, but nothing of the reference.
     """
@@ -412,7 +412,7 @@ def between_turn(rig: Rig, matched: MatchedPair) -> tuple[Tensor, Tensor]:
 
 
 class TwoViews(NamedTuple):
-    """A look, both cameras, and the number of matches between them."""
+    """A measurement, both cameras, and the number of matches between them."""
 
     look: Look
     sides: tuple[Seen, Seen]
@@ -429,7 +429,7 @@ def measured(
     *,
     between: bool,
 ) -> TwoViews:
-    """Look at both images of a moment.
+    """Look at both images of a time.
 
     Args:
         rig: as it was solved.

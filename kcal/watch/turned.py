@@ -37,9 +37,9 @@ from kcal.solve.lm import LMOptions
 from kcal.texts import brief
 from kcal.threads import in_one_thread
 
-# Find how cameras have turned, from marks of the same static things then and now.
+# Find how cameras have turned, from marks of the same static points then and now.
 #
-# A camera that turns about its center moves the images of things by amounts that do not depend on their distance. So
+# A camera that turns about its center moves the images of points by amounts that do not depend on their distance. So
 # each camera is solved alone, from the differences between its marks now and then. What is the same in both cancels:
 # errors of the lens and of the rig. Equal marks give exactly no turn.
 
@@ -184,7 +184,7 @@ def _over_limit(turn: CameraTurn, known: Tensor) -> Tensor:
     return turn.squares / (max(1.0, _typical(turn)) * chi2_quantile(2.0, level))
 
 
-# Measure how the cameras of a rig have turned since it was solved, from things that do not move (`kcal rig check`).
+# Measure how the cameras of a rig have turned since it was solved, from points that do not move (`kcal rig check`).
 #
 # Masts bend in the sun and mounts settle: the cameras stay where they are and turn by thousandths of a degree, which at
 # long range is all that matters (0.01° of relative yaw is 436 m at 5 km with 10 m of baseline). Only rotations are
@@ -211,7 +211,7 @@ class Drift:
         rig: the rig as it stands now: the same cameras in the same places, turned.
         pose_covariance: (6, 6) what the measurement adds to the covariance of the rig's relative pose.
         cam_from_local: (3, 3) of the left camera now, where a pose was given.
-        items: residuals by item, those left out included: what moved, or is not the same thing.
+        items: residuals by item, those left out included: what moved, or is not the same point.
         variance: by which covariances were multiplied, because residuals were larger than stated.
     """
 
@@ -327,7 +327,7 @@ class Drift:
 
 
 class DriftEffect(NamedTuple):
-    """What an old rig makes of things that a turned one sees, (D,) meters for D distances.
+    """Errors of the old rig's positions after a turn, (D,) meters for D distances.
 
     Attributes:
         distance: true range from the left camera.
@@ -609,7 +609,7 @@ def check_rig(rig: Rig, *, features: Features | None = None, landmarks: Landmark
 
 
 def seen_again(then: Marks, now: Marks, sigma: float) -> Features:
-    """Things of unknown range that are marked in old and new images, for `check_rig`; `sigma` of a mark, pixels.
+    """Points of unknown range that are marked in old and new images, for `check_rig`; `sigma` of a mark, pixels.
 
     Raises:
         InputError: no name is in both.
@@ -623,7 +623,7 @@ def seen_again(then: Marks, now: Marks, sigma: float) -> Features:
     """
     common = tuple(name for name in then.names if name in now.names)
     if not common:
-        raise InputError("no name is in both files of marks; give the same things the same names")
+        raise InputError("no name is in both files of marks; give the same points the same names")
     pixels = [marks.pixels[[marks.names.index(name) for name in common]] for marks in (then, now)]
     unknown = torch.zeros(len(common), dtype=torch.float64)
     return Features(

@@ -1,4 +1,4 @@
-"""A rig and the history of its attitude: looks at images as they come, drift, and the rig of any moment."""
+"""A rig and the history of its attitude: looks at images as they come, drift, and the rig of any time."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from kcal.locate.localizer import Localizer
 from kcal.pipeline.stream import Ledger
 from kcal.watch.turned import Drift, drift_of_turns
 
-# `Watched`: a rig and the history of its attitude; the rig of any moment, with the errors of that moment.
+# `Watched`: a rig and the history of its attitude; the rig of any time, with the errors of that time.
 
-# Number of shared errors that a moment adds to those of the rig file.
+# Number of shared errors that a time adds to those of the rig file.
 MORE_ERRORS = 6
-# Seconds of a history that are read before and after the wanted moments; rows beyond change nothing.
+# Seconds of a history that are read before and after the wanted times; rows beyond change nothing.
 _BEFORE, _AFTER = 2 * 86400.0, 2 * 3600.0
 
 
@@ -56,7 +56,7 @@ class Watched:
     def __init__(self, rig: Rig, rows: Sequence[past.HistoryRow] = (), model: past.TurnModel | None = None) -> None:
         self.rig, self.model = rig, model or model_of(rows)
         self.between = past.between_rows(rig)
-        # The moments for which no further row of the history matters.
+        # The times for which no further row of the history matters.
         self.since, self.until = -math.inf, math.inf
         self.times: list[float] = []
         self.states: list[past.TurnState] = []
@@ -67,7 +67,7 @@ class Watched:
 
     @classmethod
     def read(cls, path: str | Path, rig: Rig, *, since: float = -math.inf, until: float = math.inf) -> Self:
-        """Read the history that `kcal watch` wrote, as far as it tells of moments between two times.
+        """Read the history that `kcal watch` wrote, as far as it tells of times between two times.
 
         Raises:
             FileError: no history, or one of another rig.
@@ -77,13 +77,13 @@ class Watched:
         return found
 
     def take(self, row: past.HistoryRow, most: int | None = None) -> None:
-        """Take in a further look; of more than `most` the oldest are forgotten.
+        """Take in a further measurement; of more than `most` the oldest are forgotten.
 
         Raises:
             InputError: it is not later than the last one.
         """
         if self.times and not row.time > self.times[-1]:
-            raise InputError(f"time {row.time:g}: not after that of the last look, {self.times[-1]:g}")
+            raise InputError(f"time {row.time:g}: not after that of the last measurement, {self.times[-1]:g}")
         if self.times:
             state, _ = past.passed(self.states[-1], torch.tensor(row.time - self.times[-1]).double(), self.model)
         else:
@@ -102,15 +102,15 @@ class Watched:
         return None if stands is None else enu_from_cam(stands.heading_deg, stands.pitch_deg, stands.roll_deg).T
 
     def turns_at(self, time: float, *, gusts: bool = True) -> past.Turns:
-        """The turn of both cameras at a moment, from the looks before and after it.
+        """The turn of both cameras at a time, from the measurements before and after it.
 
         Raises:
-            InputError: before the first look.
+            InputError: before the first measurement.
         """
         k = bisect.bisect_right(self.times, time) - 1
         if k < 0:
             begin = f"it begins at {self.times[0]:.0f}" if self.times else "it has no rows"
-            raise InputError(f"time {time:.0f} s: the history of the rig tells nothing of that moment; {begin}")
+            raise InputError(f"time {time:.0f} s: the history of the rig tells nothing of that time; {begin}")
         if self._smooth is None and k + 1 < len(self.times):
             self._smooth = past.smoothed(self.states, self.times, self.model)
         state, _ = past.passed(self.states[k], torch.tensor(time - self.times[k]).double(), self.model)
@@ -123,17 +123,17 @@ class Watched:
         return drift_of_turns(self.rig, *self.turns_at(time, gusts=gusts), self.cam_from_local)
 
     def rig_at(self, time: float) -> Rig:
-        """The rig as it stood at a moment: attitudes corrected, with the covariance of that moment on top.
+        """The rig as it stood at a time: attitudes corrected, with the covariance of that time on top.
 
         Args:
             time: seconds, as in the history.
 
         Raises:
-            InputError: before the first look.
+            InputError: before the first measurement.
         """
         drift = dataclasses.replace(self.drift_at(time), old=_uncertain(self.rig))
         rig = drift.relocked(f"at {time:.3f} s, from the history of the watched rig")
-        # The same number of shared errors at every moment, for filters.
+        # The same number of shared errors at every time, for filters.
         known = rig.covariance
         if known is not None:
             more = len(self.rig.covariance.half if self.rig.covariance else []) + MORE_ERRORS - len(known.half)
@@ -142,7 +142,7 @@ class Watched:
 
 
 def _uncertain(rig: Rig) -> Rig:
-    """The rig, with an exact mounting as one whose covariance is zero: a moment adds to it."""
+    """The rig, with an exact mounting as one whose covariance is zero: a time adds to it."""
     stands = rig.mounting
     if stands is None or stands.covariance is not None:
         return rig
@@ -186,8 +186,8 @@ class Relock(NamedTuple):
 def relock(watched: Watched) -> Relock:
     """The rig with the mean attitude of the last day, if that differs from the rig file's beyond the swing of a day.
 
-    A new file is used without the watch: its covariance contains the swing. It must explain the last looks, which take
-    no part in the mean, better than the old one.
+    A new file is used without the watch: its covariance contains the swing. It must explain the last
+    measurements, which take no part in the mean, better than the old one.
     """
     if not watched.times or watched.times[-1] - watched.times[0] < _DAY:
         return Relock(None, "a day of history is needed, so that a swing is not taken for a drift")
@@ -210,19 +210,19 @@ def relock(watched: Watched) -> Relock:
         old += float(now.relative @ weight @ now.relative)
         new += float(off @ weight @ off)
     if new >= old:
-        return Relock(None, f"the last {_HELD_OUT} looks fit the old rig file better")
+        return Relock(None, f"the last {_HELD_OUT} measurements fit the old rig file better")
     better = drift.relocked(f"mean of the day before {end:.0f} s")
-    return Relock(better, f"χ² {drift.chi2:.0f} of the turn; the last looks: {old:.0f} before, {new:.0f} after")
+    return Relock(better, f"χ² {drift.chi2:.0f} of the turn; the last measurements: {old:.0f} before, {new:.0f} after")
 
 
-# A watched rig in a stream: the localizer of each moment, from a history that another process writes.
+# A watched rig in a stream: the localizer of each time, from a history that another process writes.
 
 # Seconds for which an attitude counts, and rows that are kept.
 _STEP_S, _KEPT = 10.0, past.MOST_ROWS // 4
 
 
 class Followed:
-    """Call it with a time: the localizer of that moment; the same one for ten seconds.
+    """Call it with a time: the localizer of that time; the same one for ten seconds.
 
     Args:
         history: of `kcal watch`, which may grow.
@@ -238,10 +238,10 @@ class Followed:
         self._now, self._until = localize, -math.inf
 
     def __call__(self, time: float) -> Localizer:
-        """The localizer of a moment.
+        """The localizer of a time.
 
         Raises:
-            InputError: a moment before the history begins.
+            InputError: a time before the history begins.
         """
         if self._until - _STEP_S <= time < self._until:
             return self._now
@@ -255,7 +255,7 @@ class Followed:
 
 
 def standing(solved: Localizer, watched: Watched, time: float) -> Localizer:
-    """A localizer as the rig stands at a moment; its place stays where it was given."""
+    """A localizer as the rig stands at a time; its place stays where it was given."""
     rig = watched.rig_at(time)
     if solved.rig.mounting is not None and solved.origin == solved.rig.mounting.origin:
         return Localizer(rig, pixel_sigma=float(solved.pixel_sigma))
@@ -277,14 +277,14 @@ def standing(solved: Localizer, watched: Watched, time: float) -> Localizer:
 # Degrees of the relative attitude: 0.005° of yaw is 4 % of the range at 5 km with a baseline of 10 m.
 LIMIT = 0.005
 _MONTH = 30 * 86400.0
-# Seconds for an answer; what was not delivered is tried again at the next look.
+# Seconds for an answer; what was not delivered is tried again at the next measurement.
 _PATIENCE = 5.0
 
 
 def alarm_sigmas(every_s: float) -> float:
     """Standard deviations by which a limit must be exceeded, for less than one false alarm a month.
 
-    Three angles and two signs are looked at every so many seconds; that looks agree with each other makes it rarer.
+    Three angles and two signs are measured every so many seconds; agreement of measurements makes it rarer.
 
     Example:
         >>> round(alarm_sigmas(60.0), 2)
@@ -345,21 +345,21 @@ class Webhook:
 
 # Seconds between looks at the matches between the cameras, which take seconds; between times at which it is learned.
 _BETWEEN_S, _LEARN_S = 3600.0, 86400.0
-# Looks between checkpoints, at which references are renewed and saved; rows in memory: three days of a look a minute.
+# Measurements between checkpoints, at which references are renewed and saved; rows in memory: three days, one a minute.
 _CHECKPOINT, _KEPT_ROWS = 60, 4320
-# Looks in a row at images full of things of which none is what was there: another camera, or another view.
+# Measurements in a row at images full of points of which none is what was there: another camera, or another view.
 _LOST = 30
 
 
 class Noticed(NamedTuple):
-    """What a look has told.
+    """What a measurement has told.
 
     Attributes:
         row: of the history.
         turn: (3,) radians, relative, without wind.
         sigma: (3,) of it.
         alarm: whether it is beyond the limit surely.
-        begins: whether it was not at the look before.
+        begins: whether it was not at the measurement before.
     """
 
     row: past.HistoryRow
@@ -378,7 +378,7 @@ class Watcher:
     Args:
         rig: as it was solved.
         history: CSV file that grows.
-        every_s: seconds between looks.
+        every_s: seconds between measurements.
         limit_deg: relative turn beyond which there is an alarm.
         temperatures: of the air at the rig, if they are known.
         tell: called with what happens.
@@ -430,23 +430,23 @@ class Watcher:
 
     @property
     def last_time(self) -> float:
-        """Seconds of the last look; -inf before the first."""
+        """Seconds of the last measurement; -inf before the first."""
         return self._rows[-1].time if self._rows else -math.inf
 
     @property
     def offset(self) -> int:
-        """Microseconds of the last look's frame, from 1; 0 before the first."""
+        """Microseconds of the last measurement's frame, from 1; 0 before the first."""
         return self._ledger.place.offset
 
     def due(self, time: float) -> bool:
-        """Whether the next look may be at that time; images of an earlier one are counted and left out."""
+        """Whether the next measurement may be at that time; images of an earlier one are counted and left out."""
         if time <= self.last_time:
             self.skipped += 1
             return False
         return time >= self.last_time + self.every_s
 
     def refer_to(self, left: Gray, right: Gray) -> None:
-        """Take images of when the rig was solved as the reference, before the first look.
+        """Take images of when the rig was solved as the reference, before the first measurement.
 
         Raises:
             FileError: there is a reference already.
@@ -459,7 +459,7 @@ class Watcher:
         self._sides = sides
 
     def look(self, time: float, left: Gray, right: Gray) -> Noticed:
-        """Look at images of a moment, and write a row.
+        """Look at images of a time, and write a row.
 
         Raises:
             InputError: too few features for a reference, or another lens (`AnotherCameraError`).

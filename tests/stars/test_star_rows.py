@@ -84,7 +84,7 @@ def test_named_stars_of_two_cameras() -> None:
     assert on_earth.pixels[1, 1].isnan().all()
     altitude = np.arcsin(CATALOG.directions()[[7, 11], 2])
     assert on_earth.direction_sigma.numpy() == pytest.approx(np.hypot(SECOND_OF_ARC, refraction_sigma(altitude)))
-    with pytest.raises(InputError, match="two cameras at the same moment"):
+    with pytest.raises(InputError, match="two cameras at the same time"):
         source([{0: left, 1: image([[1, 1]], [30])}])
 
 
