@@ -108,7 +108,7 @@ def test_rows_are_located_by_the_rig_of_their_time(watched: Path, command: Comma
 def test_what_locate_needs_for_it(watched: Path, command: Command) -> None:
     points = marks(watched, ["yesterday"])
     words = ["locate", str(watched / "rig.json"), str(points), "--watch", str(watched / "h.csv")]
-    for text, message in (("yesterday", "p0: time 'yesterday'"), (f"{START - 60}", "tells nothing of that moment")):
+    for text, message in (("yesterday", "p0: time 'yesterday'"), (f"{START - 60}", "tells nothing of that time")):
         marks(watched, [text])
         found = RUNNER.invoke(app, words)
         assert found.exit_code == 1
