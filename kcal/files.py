@@ -210,6 +210,8 @@ def _regular_file(path: str | Path) -> Iterator[BinaryIO]:
         with open(path, "rb", opener=_open_at_once) as file:
             if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
                 raise FileError(f"{path}: not a regular file; a pipe or a device cannot be read here")
+            if _watching:
+                _read.add(os.path.realpath(path))
             yield file
     except (OSError, ValueError) as error:
         raise FileError(f"{path}: cannot read: {_reason(error)}") from error
@@ -280,18 +282,29 @@ def make_folder(path: str | Path) -> Path:
     return path
 
 
-# Lists to which the paths of files are added as they are written.
-_watching: list[list[Path]] = []
+# The paths of files as they are written, and whether each replaced one that was not read before.
+_watching: list[dict[Path, bool]] = []
+_read: set[str] = set()
 
 
 @contextmanager
-def written_files() -> Iterator[list[Path]]:
-    """Collect the paths of all files that are written meanwhile, for messages after an interruption."""
-    _watching.append([])
+def written_files() -> Iterator[dict[Path, bool]]:
+    """Collect the paths of all files that are written meanwhile, and whether each replaced another one.
+
+    What goes on from a file that was read meanwhile, as journals do, replaces nothing.
+    """
+    if not _watching:
+        _read.clear()
+    _watching.append({})
     try:
         yield _watching[-1]
     finally:
         _watching.pop()
+
+
+def replaced(path: str | Path) -> bool:
+    """Whether a file that was just written took the place of another one (`written_files`)."""
+    return any(written.get(Path(path), False) for written in _watching)
 
 
 @contextmanager
@@ -338,8 +351,8 @@ def open_atomic(path: str | Path, *, told: bool = True) -> Iterator[BinaryIO]:
                 temporary.unlink()
             else:
                 # In place, also where an interruption came right after that.
-                for paths in _watching if told else ():
-                    paths.append(path)
+                for written in _watching if told else ():
+                    written.setdefault(path, mode is not None and str(target) not in _read)
     except OSError as error:
         raise FileError(f"{path}: cannot write: {error.strerror or error}") from error
 

@@ -9,7 +9,7 @@ import re
 import shlex
 import signal
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
 from pathlib import Path
@@ -23,7 +23,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Ta
 from rich.text import Text
 
 from kcal.errors import DegenerateError, InputError, KcalError
-from kcal.files import write_atomic
+from kcal.files import replaced, write_atomic
 from kcal.texts import one_line, visible
 
 if TYPE_CHECKING:
@@ -117,11 +117,20 @@ def warn(text: str) -> None:
 
 
 def print_wrote(*paths: Path | None) -> None:
-    """Print which files were written; None stands for a file that was not asked for."""
+    """Print which files were written or replaced; None stands for a file that was not asked for."""
     for path in paths:
         if path is not None:
             _tell_more("wrote", str(path))
-            out.print(f"wrote {path}", markup=False)
+            out.print(f"{'replaced' if replaced(path) else 'wrote'} {path}", markup=False)
+
+
+def print_replaced(written: Mapping[Path, bool]) -> None:
+    """Name on the error stream the files that were replaced and of which nothing was said."""
+    said = _told.get("wrote", ())
+    names = [str(path) for path, anew in written.items() if anew and str(path) not in said]
+    if names:
+        others = [f"{len(names) - 3} other files"] if len(names) > 3 else []
+        err.print(f"replaced {', '.join([*names[:3], *others])}", markup=False)
 
 
 _MOST_LINES = 12  # of a list on the screen

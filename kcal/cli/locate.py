@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 import json
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -98,7 +98,7 @@ def tell_located(
     located: Located,
     true: Tensor | None,
     sample: PositionSample,
-    written: Sequence[Path],
+    written: Iterable[Path],
     *,
     as_json: bool,
     streamed: bool,

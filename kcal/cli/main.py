@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
@@ -20,7 +20,7 @@ from kcal.cli.calibrate import calibrate_command
 from kcal.cli.capture import capture_command
 from kcal.cli.check import check_command
 from kcal.cli.compare import bake_command, compare_command, diff_command, interpolate_command
-from kcal.cli.console import err, option_for_each, with_json, working
+from kcal.cli.console import err, option_for_each, print_replaced, with_json, working
 from kcal.cli.demo import demo_command
 from kcal.cli.detect import detect_command
 from kcal.cli.exchange import export_command, import_command, schema_command
@@ -73,15 +73,18 @@ class _Commands(TyperGroup):
         # Typer ends an interrupted command without a word.
         with usage_errors_shown(), written_files() as written, working(name):
             try:
-                return super().invoke(ctx)
+                try:
+                    return super().invoke(ctx)
+                finally:
+                    print_replaced(written)
             except KeyboardInterrupt:
                 err.print(kept_text(written), markup=False)
                 raise typer.Exit(130) from None
 
 
-def kept_text(written: Sequence[Path]) -> str:
+def kept_text(written: Iterable[Path]) -> str:
     """What is said after an interruption: the last files that were written, and how many others."""
-    names = list(dict.fromkeys(map(str, written)))
+    names = list(map(str, written))
     if not names:
         return "interrupted; nothing was written"
     more = f"{len(names) - 3} other files, " if len(names) > 3 else ""

@@ -241,6 +241,7 @@ def declared(function: Callable[..., None], *, json: bool = True) -> Callable[..
             except typer.Exit as stopped:
                 code = stopped.exit_code
         told = {"exit_code": code, **console.told(), "text": captured.get().splitlines()}
+        console.end_line()
         print(orjson.dumps(told).decode())
         raise typer.Exit(code)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 import shlex
@@ -28,7 +29,7 @@ from kcal.cli.console import err, out, print_table, print_wrote, steps, warn
 from kcal.cli.main import app, main, usage_errors_shown
 from kcal.cli.settings import SETTINGS, defaults_of, read_settings, toml_text
 from kcal.errors import FileError
-from kcal.files import write_atomic
+from kcal.files import read_bytes, replaced, write_atomic, written_files
 from kcal.io.rig_file import save_rig
 from scripts.bench.startup import helps, measure, on_terminal
 
@@ -163,6 +164,41 @@ def test_an_interruption_says_what_was_kept(
     monkeypatch.setattr("kcal.corners.images.expand_images", detect)
     found = command("detect a.png --board 9x6 --square 25mm -o a.obs.json", code=130)
     assert words in found.err.replace("\n", "")
+
+
+@pytest.mark.parametrize(
+    ("line", "name"),
+    [
+        ("export plain.json -o out.yaml", "out.yaml"),
+        ("import plain.json -o out.json", "out.json"),
+        ("diff left.json left.json --picture out.png", "out.png"),
+        ("board --board 9x6 --square 25mm -o out.svg", "out.svg"),
+        ("budget --picture out.png", "out.png"),
+    ],
+)
+def test_a_file_is_replaced_with_a_word(line: str, name: str, start_folder: Path, command: Command) -> None:
+    with contextlib.chdir(start_folder):
+        Path(name).unlink(missing_ok=True)
+        found = command(line)
+        assert "replaced" not in found.out + found.err
+        found = command(line)
+        assert (found.out + found.err).count("replaced") == 1
+        assert name in next(row for row in (found.out + found.err).splitlines() if "replaced" in row)
+
+
+def test_what_goes_on_from_a_file_replaces_nothing(tmp_path: Path) -> None:
+    for name in ("a", "b", "c"):
+        write_atomic(tmp_path / name, name)
+    with written_files() as written:
+        read_bytes(tmp_path / "a")
+        for name in ("a", "b", "b", "d", "d"):
+            write_atomic(tmp_path / name, "new")
+        assert [replaced(tmp_path / name) for name in "abcd"] == [False, True, False, False]
+    assert {path.name: anew for path, anew in written.items()} == {"a": False, "b": True, "d": False}
+    # What one command has read, the next one may replace.
+    with written_files() as written:
+        write_atomic(tmp_path / "a", "new")
+    assert list(written.values()) == [True]
 
 
 @pytest.mark.parametrize("command", ["show none.json", "calibrate none.obs.json -o a.camera.json", "report none.json"])

@@ -134,7 +134,7 @@ def test_nothing_located_is_a_failure_with_its_reasons(folder: Path, command: Co
         ("mast.camera.json points.csv", "To make one: kcal rig mast.camera.json right.camera.json"),
         (f"{POINTS} --heading 0 -o a.shp", "a.shp: unknown format"),
         (f"{POINTS} --heading 0 -o no/a.csv", "does not exist"),
-        (f"{POINTS} --heading 0 --picture a.pdf", "end with .png"),
+        (f"{POINTS} --heading 0 --picture a.gif", "end with .png"),
     ],
 )
 def test_refusals_are_one_line_and_write_nothing(folder: Path, command: Command, arguments: str, message: str) -> None:
