@@ -309,6 +309,16 @@ def measured_length(meters: float, sigma: float | None) -> str:
     return measured_text(meters / unit.meters, None if sigma is None else sigma / unit.meters, unit.name)
 
 
+def counted_text(count: int, what: str) -> str:
+    """So many of something.
+
+    Example:
+        >>> counted_text(1, "view"), counted_text(12, "view")
+        ('1 view', '12 views')
+    """
+    return f"{count} {what}{'' if count == 1 else 's'}"
+
+
 def percent_text(share: float) -> str:
     """A share in percent, without a sign; what is not zero is not written as zero.
 

@@ -399,7 +399,7 @@ def calibrate_command(
                 result, options, needs, baseline=baseline, mark_sigma=pixel_sigma_of(pixel_sigma), name=place.name
             )
             figures[place.name]["verdict"] = found[0].to_dict()
-            usable = told_usable(*found, place.report) and usable
+            usable = told_usable(*found, place.report, warned=result.findings) and usable
     tell(cameras=figures)
     if failed:
         raise DegenerateError(f"{len(failed)} of {len(places)} cameras failed: {', '.join(failed)}")

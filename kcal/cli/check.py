@@ -125,7 +125,7 @@ def _calibration_of(path: Path, observations: Path | None) -> tuple[CameraCalibr
         result = calibrate_camera(seen, options, advance)
     others, _ = other_views(camera, result)
     if others:
-        raise InputError(f"{file}: {others[0].text}; {others[0].action}")
+        raise InputError(f"{file}: {others[0].sentence}")
     return result, options, camera.fingerprint
 
 
@@ -260,7 +260,7 @@ def _told_views(result: CameraCalibrationResult, options: CalibrationOptions) ->
     if fault is None:
         print_answer(True, "its own views say nothing against lens model and board")
     else:
-        print_answer(False, f"its own views contradict the stated intervals: {fault.text}; {fault.action}")
+        print_answer(False, f"its own views contradict the stated intervals: {fault.sentence}")
     tell(fault=None if fault is None else fault.text)
     return fault is None
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult
+    from kcal.calibrate.rig.result import RigResult
+    from kcal.finding import Finding
     from kcal.lens.camera import Camera
     from kcal.lens.rig import Rig
     from kcal.report.verdict import Requirement, Verdict
@@ -75,7 +77,7 @@ def report_command(
         else _of_camera(subject, given, needs, baseline, pixel_sigma_of(pixel_sigma))
     )
     tell(verdict=found[0].to_dict())
-    if not told_usable(*found, output, warned=()):
+    if not told_usable(*found, output):
         raise typer.Exit(NO)
 
 
@@ -94,7 +96,7 @@ def told_usable(
     tables: list[list[list[str]]],
     page: Path | None,
     *,
-    warned: tuple[str, ...] = ("calibration", "rig"),
+    warned: Iterable[Finding] = (),
 ) -> bool:
     """Print a verdict and write its page; returns whether it is a yes.
 
@@ -103,7 +105,7 @@ def told_usable(
         pictures: draws those of the page.
         tables: of the page.
         page: to write.
-        warned: names of findings of which the command has warned already.
+        warned: findings of which the command has warned already.
     """
     from kcal.report.pages import range_rows, save_verdict_page
 
@@ -116,7 +118,7 @@ def told_usable(
     return verdict.usable
 
 
-def print_verdict(verdict: Verdict, warned: tuple[str, ...] = ()) -> None:
+def print_verdict(verdict: Verdict, warned: Iterable[Finding] = ()) -> None:
     """Print answers, reason, next step and findings but those that were told already."""
     # A single answer is the reason, and said once.
     single = [answer.text for answer in verdict.answers] == [verdict.reason]
@@ -125,10 +127,17 @@ def print_verdict(verdict: Verdict, warned: tuple[str, ...] = ()) -> None:
     print_answer(verdict.usable, verdict.reason)
     if not verdict.usable:
         out.print(f"next: {verdict.next_step}", markup=False)
+    told = {finding.text for finding in warned}
     for finding in verdict.findings:
-        if finding.severity == "fine" or finding.name in warned:
+        if finding.severity == "fine" or finding.text in told:
             continue
-        out.print(f"  {finding.title}: {finding.text}{f'; {finding.action}' if finding.action else ''}", markup=False)
+        out.print(f"  {finding.title}: {finding.sentence}", markup=False)
+
+
+def warned_of(result: RigResult) -> list[Finding]:
+    """Findings of which was warned when a rig was solved, and when its cameras were calibrated."""
+    known = [camera.calibration.record for camera in result.data.cameras if camera.calibration]
+    return [*result.findings, *(finding for record in known if record for finding in record.findings)]
 
 
 def _of_camera(

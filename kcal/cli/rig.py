@@ -15,7 +15,16 @@ from kcal.cli import kinds
 from kcal.cli.console import err, out, print_table, print_wrote, warn
 from kcal.cli.inputs import pixel_sigma_of
 from kcal.cli.options import Command, declared, group_with_default
-from kcal.cli.report import NO, REQUIRE_HELP, judged_sides, required, side_pictures, stored_tables, told_usable
+from kcal.cli.report import (
+    NO,
+    REQUIRE_HELP,
+    judged_sides,
+    required,
+    side_pictures,
+    stored_tables,
+    told_usable,
+    warned_of,
+)
 from kcal.cli.settings import picture_option, rarely
 from kcal.cli.stars import TIME_HELP, NightOptions, images_of_nights
 from kcal.cli.stations import print_rig, rig_lines, solve_stations
@@ -327,7 +336,7 @@ def solve_command(
         def drawn() -> dict[str, bytes]:
             return {"rig": picture_bytes(rig_figure(result)), **side_pictures(cameras)}
 
-        if not told_usable(verdict, drawn, tables, report):
+        if not told_usable(verdict, drawn, tables, report, warned=warned_of(result)):
             raise typer.Exit(NO)
 
 

@@ -13,7 +13,7 @@ import typer
 import kcal.cli.rig_sources as rig_sources
 from kcal.cli.console import err, out, print_table, print_wrote, steps, tell
 from kcal.cli.inputs import ASSUMED, CALIBRATED, MARKS, SURVEY, PixelSigma
-from kcal.cli.report import NO, stored_tables, told_usable
+from kcal.cli.report import NO, stored_tables, told_usable, warned_of
 from kcal.cli.settings import picture_option
 from kcal.errors import InputError
 from kcal.files import check_writable
@@ -179,7 +179,11 @@ def solve_stations(
         subject = output.name.split(".")[0]
         verdict = rig_verdict(rig, needs, mark_sigma=sources.mark_sigma, result=result, subject=subject)
         tell(verdict=verdict.to_dict())
-        if not told_usable(verdict, lambda: {"rig": picture_bytes(rig_figure(result))}, stored_tables(rig), report):
+
+        def drawn() -> dict[str, bytes]:
+            return {"rig": picture_bytes(rig_figure(result))}
+
+        if not told_usable(verdict, drawn, stored_tables(rig), report, warned=warned_of(result)):
             raise typer.Exit(NO)
 
 

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 from kcal.errors import InputError
+from kcal.finding import Finding
 from kcal.texts import brief, setting_text
 
 if TYPE_CHECKING:
@@ -134,6 +135,11 @@ class CalibrationRecord:
             raise InputError(f"views is {self.views} and points is {self.points}; both must be positive")
         if self.views != len(self.per_view_rms):
             raise InputError(f"views is {self.views}, but per_view_rms has {len(self.per_view_rms)}")
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """The warnings as findings."""
+        return tuple(Finding("calibration", "doubt", text) for text in self.warnings)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -317,6 +323,12 @@ class RigCalibration:
         _refuse_local_time(self.created)
         if self.pairs != len(self.per_pair_rms):
             raise InputError(f"pairs is {self.pairs}, but per_pair_rms has {len(self.per_pair_rms)}")
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Contradictions and warnings as findings."""
+        stops = [Finding("contradiction", "stop", text) for text in self.contradictions]
+        return (*stops, *(Finding("rig", "doubt", text) for text in self.warnings if text not in self.contradictions))
 
 
 Attribute = TypeVar("Attribute")

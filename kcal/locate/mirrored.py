@@ -15,6 +15,7 @@ from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.sources import RigData
 from kcal.errors import InputError, KcalError
+from kcal.finding import Finding
 from kcal.lens.rig import Origin
 from kcal.locate.geodesy import enu_to_geodetic, geodetic_to_enu
 from kcal.locate.mounting import attitude
@@ -57,7 +58,7 @@ def solve_surveyed(
     told, text = _like_mirrored(data, origin, found)
     if told:
         raise InputError(text)
-    return dataclasses.replace(found, warnings=(*found.warnings, text)) if text else found
+    return dataclasses.replace(found, findings=(*found.findings, Finding("swapped", "doubt", text))) if text else found
 
 
 def _like_mirrored(data: RigData, origin: Origin | None, found: RigResult | None) -> tuple[bool, str]:

@@ -25,20 +25,12 @@ from kcal.calibrate.camera.trust import (
 )
 from kcal.calibrate.rig.pairs import names_by_side
 from kcal.corners.observations import Observations
+from kcal.finding import FAULTS, Finding, Severity, sorted_findings
 from kcal.lens.calibration import CalibrationRecord
 from kcal.lens.camera import Camera
 from kcal.lens.difference import camera_difference
 from kcal.lens.uncertainty import image_sigma, paraxial_focal
-from kcal.report.verdict import (
-    FAULTS,
-    Finding,
-    RangeAnswer,
-    Requirement,
-    Severity,
-    Verdict,
-    sorted_findings,
-    weighed_findings,
-)
+from kcal.report.verdict import RangeAnswer, Requirement, Verdict, weighed_findings
 from kcal.texts import percent_text
 from kcal.threads import in_one_thread
 
@@ -92,7 +84,7 @@ def record_findings(record: CalibrationRecord) -> list[Finding]:
         found.append(_blur_finding(record.noise, 0.0))
     if record.views < _FEW_VIEWS:
         found.append(_few_finding(record.views))
-    found += [Finding.of("calibration", "doubt", text) for text in record.warnings]
+    found += record.findings
     return [finding for finding in found if finding is not None]
 
 
@@ -113,13 +105,13 @@ def _sides_finding(names: Sequence[str], severity: Severity) -> Finding | None:
                 f"calibrate each camera from its own images, {one} and {other}; if they are of one camera, its "
                 "observations tell (kcal report --observations)"
             )
-            return Finding.of("names", severity, text, action)
+            return Finding("names", severity, text, action)
     return None
 
 
 def _few_finding(views: int) -> Finding:
     text = f"{views} views are few: a wrong one among them could not be noticed"
-    return Finding.of("views", "doubt", text, "take 20 to 40 views")
+    return Finding("views", "doubt", text, "take 20 to 40 views")
 
 
 def _order_finding(pixels: Tensor, observations: Observations) -> Finding | None:
@@ -132,7 +124,7 @@ def _order_finding(pixels: Tensor, observations: Observations) -> Finding | None
         "another order than the board's"
     )
     action = "switch the mirroring off, or correct the order of the corners, and detect again"
-    return Finding.of("mirrored", "stop", text, action)
+    return Finding("mirrored", "stop", text, action)
 
 
 def _pose_findings(camera: Camera, rotation: Tensor, middle: Tensor) -> list[Finding]:
@@ -149,25 +141,25 @@ def _pose_findings(camera: Camera, rotation: Tensor, middle: Tensor) -> list[Fin
             f"{float(tilts.max()):.0f}° at most: the focal length is known only to "
             + (f"±{100 * focal_error:.2g} %" if math.isfinite(focal_error) else "an error that nobody can tell")
         )
-        found.append(Finding.of("tilt", "stop", text, "tilt the board by 30 to 45 degrees in different directions"))
+        found.append(Finding("tilt", "stop", text, "tilt the board by 30 to 45 degrees in different directions"))
     if (span := roll_span(rotation)) < ROLL_SPAN:
         text = (
             f"the board was always held the same way up (rolls within {span:.0f}°): its print and the "
             "principal point cannot be told apart"
         )
-        found.append(Finding.of("roll", "doubt", text, "turn the board by 90 degrees in some views"))
+        found.append(Finding("roll", "doubt", text, "turn the board by 90 degrees in some views"))
     distance = middle.norm(dim=-1)
     if float(distance.max()) < _DEPTH * float(distance.min()):
         text = (
             f"the board was always at the same distance ({float(distance.min()):.2g} to {float(distance.max()):.2g} m)"
         )
-        found.append(Finding.of("depth", "doubt", text, "show the board near and far"))
+        found.append(Finding("depth", "doubt", text, "show the board near and far"))
     if not found:
         text = (
             f"tilts up to {float(tilts.max()):.0f}°, rolls within {span:.0f}°, distances "
             f"{float(distance.min()):.2g} to {float(distance.max()):.2g} m"
         )
-        found.append(Finding.of("poses", "fine", text))
+        found.append(Finding("poses", "fine", text))
     return found
 
 
@@ -179,8 +171,8 @@ def _coverage_finding(observations: Observations) -> Finding:
     border = 1.0 - float(seen[ring].double().mean())
     text = f"no board reached {percent_text(share)} of the image, and {percent_text(border)} of its border"
     if share <= _UNREACHED and border <= _BORDER:
-        return Finding.of("coverage", "fine", text)
-    return Finding.of(
+        return Finding("coverage", "fine", text)
+    return Finding(
         "coverage",
         "doubt",
         f"{text}: there the camera rests on its lens model alone",
@@ -203,7 +195,7 @@ def _blur_finding(noise: float, share: float) -> Finding | None:
     what = f"{100 * share:.0f} % of the views are blurred" if share > _MANY else f"corners scatter by {noise:.2g} px"
     text = f"{what}: blurred corners are shifted by what lies next to them, which no error bar knows"
     action = "hold board and camera still, focus, use more light or a shorter exposure, and take the views again"
-    return Finding.of("blur", "doubt", text, action)
+    return Finding("blur", "doubt", text, action)
 
 
 # Findings about lens model, board and error bars, from what a calibration says against itself.
@@ -255,7 +247,7 @@ def model_findings(
                 f"the lens model {result.camera.model} does not fit this lens: it differs by "
                 f"{found.model.rms:.2g} px from one that does"
             )
-            named = Finding.of("model", "doubt", text, "calibrate with the default lens (--model hybrid)")
+            named = Finding("model", "doubt", text, "calibrate with the default lens (--model hybrid)", FAULTS)
         against = against if against is not None and against.name == "changed" else named or against
     findings = [] if against is None else [against]
     if patterns and against is None:
@@ -264,14 +256,14 @@ def model_findings(
         findings.append(_prediction_finding(alike[0], found.plain))
     if found.failures or not found.halves:
         text = f"the error bars could not be checked by halves of the views: {'; '.join(found.failures)}"
-        findings.append(Finding.of("halves", "doubt", text, "take more views"))
+        findings.append(Finding("halves", "doubt", text, "take more views"))
     elif against is None:
         agree = _halves_agree(found.halves)
         text = (
             f"cameras from halves of the views {'agree: they ' if agree else ''}differ by "
             f"{_ratios(found.halves)} what the error bars predict{'' if agree else ': these may be too small'}"
         )
-        findings.append(Finding.of("halves", "fine" if agree else "doubt", text, "" if agree else "take more views"))
+        findings.append(Finding("halves", "fine" if agree else "doubt", text, "" if agree else "take more views"))
     return findings, beyond
 
 
@@ -310,7 +302,7 @@ def _patterns_finding(found: Examination) -> Finding:
         if agree
         else "halves of the views do not show that the error bars allow for it"
     )
-    return Finding.of(
+    return Finding(
         "patterns",
         "note" if agree else "doubt",
         f"residuals are not only noise: {what}; {checked}",
@@ -326,7 +318,7 @@ def _prediction_finding(half: HalvesDifference, plain: PlainLens | None) -> Find
         f"{ratio:.2f} times what is left where they are fitted"
     )
     if ratio <= PREDICTED:
-        return Finding.of("prediction", "fine", text)
+        return Finding("prediction", "fine", text)
     better = plain is not None and plain.own > _PLAIN * plain.held_out
     if plain is not None:
         text += (
@@ -335,9 +327,9 @@ def _prediction_finding(half: HalvesDifference, plain: PlainLens | None) -> Find
         )
     if plain is None or not better:
         action = "take more views, all over the image and at several distances, with one flat, stiff board"
-        return Finding.of("prediction", "doubt" if plain is None else "note", text, action)
+        return Finding("prediction", "doubt" if plain is None else "note", text, action)
     action = f"use --model {plain.model}, or take more views all over the image and at several distances"
-    return Finding.of("prediction", "stop", text, action, part=FAULTS)
+    return Finding("prediction", "stop", text, action, part=FAULTS)
 
 
 def _far_halves(halves: Sequence[HalvesDifference], patterns: bool) -> list[HalvesDifference]:
@@ -378,7 +370,7 @@ def _apart_finding(
             f"{how}, and each fits better alone (RMS {half.own:.2g} px, together {result.rms:.2g} px): images of "
             "two cameras in one file, or focus, zoom or image stabilization changed in between"
         )
-        return Finding.of("changed", "stop", text, "calibrate from the images of one camera with fixed focus and zoom")
+        return Finding("changed", "stop", text, "calibrate from the images of one camera with fixed focus and zoom")
     if alike is not None and not half.alike and not unexplained(alike.difference, _CHANCE):
         cause = (
             f". With {alike.label} it is {alike.difference.ratio:.1f} times, and the halves fit hardly better alone "
@@ -389,7 +381,7 @@ def _apart_finding(
         cause = f", and residuals are not noise (correlation {structure.neighbors:.2f}): lens model or board do not fit"
     else:
         cause = ": lens model or board do not fit"
-    return Finding.of(
+    return Finding(
         "halves",
         "doubt",
         f"{how}{cause}. The error bars are too small",
@@ -406,11 +398,11 @@ def _against_reference(
     if plain and (bends := _board_fault(result, options, found.reference)):
         text = f"{bends}, but was taken as flat and exact: far directions are wrong by {far:.2g} px"
         action = "calibrate with the default lens and --board printed, which measures the board, or use a stiffer board"
-        return Finding.of("board", "doubt", text, action)
+        return Finding("board", "doubt", text, action, FAULTS)
     if plain and (pupil := _pupil_fault(result, found.reference)):
         text = f"{pupil}, which {result.camera.model} does not have: far directions are off by {far:.2g} px"
         action = "calibrate with the default lens (--model hybrid), or show the board from farther away"
-        return Finding.of("pupil", "doubt", text, action)
+        return Finding("pupil", "doubt", text, action, FAULTS)
     if (
         plain
         and result.hybrid is None
@@ -423,7 +415,7 @@ def _against_reference(
             "most where no board was"
         )
         action = "calibrate with the default lens (--model hybrid), and show the board at the borders of the image"
-        return Finding.of("model", "doubt", text, action)
+        return Finding("model", "doubt", text, action, FAULTS)
     return None
 
 
@@ -511,9 +503,9 @@ def camera_verdict(
     # Faults of the views come first: without tilts or with blur the model looks wrong too.
     reference = examination.reference or result
     found = [*view_findings(result, min(result.noise, reference.noise)), *against]
-    found += [Finding.of("calibration", "doubt", text) for text in result.warnings]
-    if any("upright" in text for text in result.warnings):
-        found = [finding for finding in found if finding.name != "roll"]
+    # That views show the board upright says more than that they roll it little.
+    told = {finding.name for finding in result.findings} & {"roll"}
+    found = [*(finding for finding in found if finding.name not in told), *result.findings]
     if stored is not None:
         other, apart = other_views(stored, result)
         found, beyond = [*other, *found], max(beyond, apart)
@@ -563,7 +555,7 @@ def stored_verdict(
     sigma = _image_rms(camera)
     if math.isinf(sigma):
         text = "the camera has no error bars: nobody can say how wrong its directions are"
-        found.append(Finding.of("error-bars", "stop", text, "calibrate it with kcal calibrate"))
+        found.append(Finding("error-bars", "stop", text, "calibrate it with kcal calibrate"))
     return Verdict(
         subject=subject,
         answers=tuple(
@@ -579,7 +571,7 @@ def stored_findings(camera: Camera) -> list[Finding]:
     record = camera.calibration.record if camera.calibration else None
     text = "the views were not looked at, and a camera file alone cannot show that its lens model or board is wrong"
     action = "give the observations too (--observations FILE, for a rig twice: left, then right)"
-    unseen = Finding.of("halves", "doubt", text, action)
+    unseen = Finding("halves", "doubt", text, action)
     return [unseen, *([] if record is None else record_findings(record))]
 
 
@@ -598,7 +590,7 @@ def other_views(stored: Camera, result: CameraCalibrationResult) -> tuple[list[F
     text += f": they give one that differs by {found.rms:.2g} px (RMS)"
     if found.ratio is not None:
         text += f", {found.ratio:.1f} times what the error bars predict"
-    other = Finding.of(
+    other = Finding(
         "other-views",
         "doubt" if found.same else "stop",
         text,

@@ -15,6 +15,7 @@ from kcal.calibrate.problem.views import Views
 from kcal.calibrate.rig.result import RigResult
 from kcal.checks import as_points
 from kcal.errors import DegenerateError, InputError
+from kcal.finding import FAULTS, Finding
 from kcal.lens.calibration import RigCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.pose import step_rows, vector_from_rotation
@@ -24,7 +25,7 @@ from kcal.locate.budget import RangeSigmas, range_sigmas, station_sigmas
 from kcal.locate.stereo import PositionStatus
 from kcal.locate.triangulate import Triangulate
 from kcal.report.judge_camera import stored_findings
-from kcal.report.verdict import FAULTS, Finding, RangeAnswer, Requirement, Verdict, weighed_findings
+from kcal.report.verdict import RangeAnswer, Requirement, Verdict, weighed_findings
 from kcal.solve.lm import LMOptions
 from kcal.texts import range_text
 from kcal.threads import in_one_thread
@@ -138,6 +139,7 @@ _MOST_LEFT_OUT = 0.2
 _LOOK = {False: "both cameras look", True: "two cameras or more look"}
 # Residuals of a whole rig in their sigmas: more, and something does not fit.
 _MOST_VARIANCE = 9.0
+_MEASURE_AGAIN = "measure again what contradicts, correct it or its sigma, and solve the rig again"
 
 
 @in_one_thread
@@ -222,12 +224,7 @@ def _inherited(rig: Rig, cameras: Sequence[Verdict]) -> list[Finding]:
             for finding in stored_findings(camera):
                 found.setdefault(finding, []).append(word)
     return [
-        dataclasses.replace(
-            finding,
-            text=f"{' and '.join(names)}: {finding.text}",
-            action=finding.action and f"{finding.action}, for {' and '.join(names)}",
-            picture=finding.picture and f"{names[0]}-{finding.picture}",
-        )
+        dataclasses.replace(finding, cameras=tuple(names))
         for finding, names in found.items()
         if finding.severity != "fine"
     ]
@@ -290,9 +287,10 @@ def _own_findings(rig: Rig, result: RigResult | None) -> list[Finding]:
     record = rig.calibration
     if record is None and result is None:
         text = "the rig's file does not tell how it was solved: residuals and what was left out could not be checked"
-        found.append(Finding.of("record", "doubt", text))
-    warnings = result.warnings if result is not None else record.warnings if record is not None else ()
-    found += [Finding.of("rig", "doubt", text) for text in warnings]
+        found.append(Finding("record", "doubt", text))
+    for one in result.findings if result is not None else record.findings if record is not None else ():
+        # It is more than a warning that was printed.
+        found.append(dataclasses.replace(one, action=_MEASURE_AGAIN) if one.severity == "stop" else one)
     return found
 
 
@@ -300,7 +298,7 @@ def _doubts(rig: Rig, result: RigResult | None) -> list[Finding]:
     found = []
     if rig.root is None and rig.covariance is None:
         text = "the rig has no error bars: nobody can say how wrong its ranges are"
-        found.append(Finding.of("error-bars", "stop", text, "solve it with kcal rig from cameras that kcal calibrated"))
+        found.append(Finding("error-bars", "stop", text, "solve it with kcal rig from cameras that kcal calibrated"))
     record = rig.calibration
     if record is not None:
         out = sum(source.left_out for source in record.sources)
@@ -311,27 +309,18 @@ def _doubts(rig: Rig, result: RigResult | None) -> list[Finding]:
                 "of it nobody can tell which part is right"
             )
             action = "check that both images of each pair were taken at the same moment, and the survey"
-            found.append(Finding.of("left-out", "stop", text, action))
-        found += [
-            Finding.of(
-                "contradiction",
-                "stop",
-                text,
-                "measure again what contradicts, correct it or its sigma, and solve the rig again",
-            )
-            for text in record.contradictions
-        ]
+            found.append(Finding("left-out", "stop", text, action))
     if exact := _exact_lenses(rig, result):
         text = f"the lenses of {' and '.join(exact)} were taken as exact: their errors are in no error bar"
         action = "solve the rig from cameras with error bars, with --intrinsics prior"
-        found.append(Finding.of("exact-lenses", "doubt", text, action))
+        found.append(Finding("exact-lenses", "doubt", text, action))
     variance = max(1.0 if result is None else result.variance, _largest_variance(record if result is None else result))
     if variance > _MOST_VARIANCE:
         text = (
             f"residuals are {math.sqrt(variance):.1f} times as large as their sigmas say: cameras, "
             "survey and marks do not fit each other"
         )
-        found.append(Finding.of("misfit", "stop", text, "look at the residuals by item, and correct what stands out"))
+        found.append(Finding("misfit", "stop", text, "look at the residuals by item, and correct what stands out"))
     return found
 
 
@@ -372,13 +361,13 @@ def _unseen_finding(distance: float) -> Finding:
         "thing: no range can be told"
     )
     action = "turn the cameras so that their views overlap, or add one (kcal sites says where)"
-    return Finding.of("view", "stop", text, action)
+    return Finding("view", "stop", text, action)
 
 
 def _unpaired_finding(why: str) -> Finding:
     text = f"whether both cameras saw the board at the same moments could not be checked: {why}"
     action = "give the observations of the pairs (--observations twice: left, then right)"
-    return Finding.of("synchronization", "doubt", text, action)
+    return Finding("synchronization", "doubt", text, action)
 
 
 def _synchrony_finding(found: Synchrony) -> Finding:
@@ -392,7 +381,7 @@ def _synchrony_finding(found: Synchrony) -> Finding:
             f"both cameras saw the board in the same place in {found.pairs} pairs "
             f"({found.ratio:.1f} times what noise explains)"
         )
-        return Finding.of("synchronization", "fine", text)
+        return Finding("synchronization", "fine", text)
     how = ""
     if late and found.delay is not None and found.delay_sigma is not None:
         which = "after" if found.delay > 0 else "before"
@@ -405,7 +394,7 @@ def _synchrony_finding(found: Synchrony) -> Finding:
         f"the right camera, {found.ratio:.1f} times what noise explains{how}"
     )
     action = "trigger both cameras together, or hold the board still in each pose (a tripod), and take pairs again"
-    return Finding.of("synchronization", "stop" if found.ratio > _APART else "doubt", text, action)
+    return Finding("synchronization", "stop" if found.ratio > _APART else "doubt", text, action)
 
 
 # A check anyone can understand: do the squares of the board come out as large as they are?

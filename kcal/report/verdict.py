@@ -5,15 +5,13 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Any
 
+from kcal.finding import FAULTS, Finding, sorted_findings
 from kcal.locate.stereo import BEARING_SIGMAS
 from kcal.texts import range_text
 from kcal.values import ranges_and_errors
 
-Severity = Literal["stop", "doubt", "note", "fine"]
-# The source of what a camera is wrong by beyond its error bars.
-FAULTS = "faults of the calibration"
 # What lessens each source, where no finding tells more.
 _NEXT = {
     "marks": "mark targets more accurately, or use a longer baseline or focal length: no calibration mends this",
@@ -21,23 +19,6 @@ _NEXT = {
     "relative pose": "mark more far features or surveyed landmarks in both images: they determine the relative yaw",
     FAULTS: "look at the doubts below, and calibrate again without them",
 }
-# Of each finding: what people read as its name, the picture that shows it, and the part of errors that it enlarges.
-_KINDS = {
-    "views": ("number of views", "views", "lenses"), "mirrored": ("mirrored board", "coverage", ""),
-    "coverage": ("coverage", "coverage", "lenses"), "blur": ("blur", "residuals", "lenses"),
-    "patterns": ("patterns in residuals", "residuals", "lenses"), "poses": ("poses", "poses", "lenses"),
-    "prediction": ("prediction of other views", "halves", "lenses"), "tilt": ("tilts", "poses", "lenses"),
-    "halves": ("check by halves of the views", "halves", "lenses"), "roll": ("rolls", "poses", "lenses"),
-    "other-views": ("other views", "", FAULTS), "depth": ("distances", "poses", "lenses"),
-    "calibration": ("warning when it was calibrated", "residuals", "lenses"), "board": ("board", "board", FAULTS),
-    "changed": ("two cameras", "halves", FAULTS), "names": ("two cameras", "", "lenses"),
-    "pupil": ("entrance pupil", "model", FAULTS), "model": ("lens model", "model", FAULTS),
-    "error-bars": ("error bars", "", ""), "view": ("common view", "", ""),
-    "misfit": ("residuals", "rig", "relative pose"), "record": ("no record", "", "relative pose"),
-    "synchronization": ("same moment", "rig", "relative pose"), "exact-lenses": ("exact lenses", "", "lenses"),
-    "rig": ("warning when it was solved", "", "relative pose"),
-    "contradiction": ("contradiction", "rig", "relative pose"), "left-out": ("left out", "", "relative pose"),
-}  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -117,41 +98,6 @@ class RangeAnswer:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Finding:
-    """Something that was found about a calibration.
-
-    Args:
-        name: short and fixed, for programs: "model", "pupil", "board", "tilt", "coverage", ...
-        severity: "stop": the answer is no whatever the error bars say; "doubt": read it; "note": it does no harm that
-            was measured; "fine": nothing found.
-        text: what was found, and why it matters; one sentence.
-        action: what to do; empty where nothing is needed.
-        picture: name of the picture on the page that shows it.
-        part: the source of range errors that it makes larger, one of `RangeAnswer.parts`; empty: with it, no error bar
-            can be believed.
-    """
-
-    name: str
-    severity: Severity
-    text: str
-    action: str = ""
-    picture: str = ""
-    part: str = ""
-
-    @property
-    def title(self) -> str:
-        """What it is about, in words."""
-        return _KINDS.get(self.name, (self.name,))[0]
-
-    @classmethod
-    def of(cls, name: str, severity: Severity, text: str, action: str = "", *, part: str | None = None) -> Finding:
-        """A finding of a known kind, with its picture, and its part unless another one is given."""
-        _, picture, own = _KINDS[name]
-        return cls(name=name, severity=severity, text=text, action=action, picture=picture,
-                   part=own if part is None else part)  # fmt: skip
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Verdict:
     """May this camera or rig be used, and why not.
 
@@ -192,9 +138,9 @@ class Verdict:
         """The one reason: the largest contribution to what misses a requirement, else what forbids the use."""
         named, worst = self._forbidding, self._worst
         if named is not None and (worst is None or named.part in ("", FAULTS)):
-            return named.text
+            return named.told
         if worst is not None:
-            return f"{worst.text}; most of it is from {worst.most}" + (f": {named.text}" if named else "")
+            return f"{worst.text}; most of it is from {worst.most}" + (f": {named.told}" if named else "")
         if self.answers:
             return max(self.answers, key=lambda answer: answer.sigma / answer.requirement.meters).text
         doubts = sum(finding.severity == "doubt" for finding in self.findings)
@@ -206,7 +152,7 @@ class Verdict:
         """What to photograph or do next to mend the reason of the answer; empty if nothing is needed."""
         named, worst = self._forbidding, self._worst
         if named is not None and named.action:
-            return named.action
+            return named.step
         if worst is None:
             return "nothing is needed" if self.usable else _NEXT["lenses"]
         return self._against(worst.most)
@@ -255,16 +201,11 @@ class Verdict:
                 }
                 for answer in self.answers
             ],
-            "findings": [dataclasses.asdict(finding) for finding in self.findings],
+            "findings": [finding.content() for finding in self.findings],
             "advice": list(self.advice),
             "basis": self.basis,
             "unexplained_px": self.unexplained,
         }
-
-
-def sorted_findings(findings: Sequence[Finding]) -> tuple[Finding, ...]:
-    """The most severe first, otherwise in their order."""
-    return tuple(sorted(findings, key=lambda finding: ("stop", "doubt", "note", "fine").index(finding.severity)))
 
 
 def weighed_findings(

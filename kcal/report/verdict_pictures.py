@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from kcal.calibrate.camera.advice import board_tilts
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.camera.trust import Examination
+from kcal.finding import FAULTS
 from kcal.report.calibration import (
     board_figure,
     difference_figure,
@@ -21,7 +22,7 @@ from kcal.report.calibration import (
     draw_view_rms,
 )
 from kcal.report.figures import ACCENT, FAINT, INK, WARN, new_figure, picture_bytes
-from kcal.report.verdict import FAULTS, RangeAnswer
+from kcal.report.verdict import RangeAnswer
 from kcal.texts import range_text
 
 _PART_COLORS = {"marks": ACCENT, "lenses": "#dd7a1f", "relative pose": "#0f766e", FAULTS: WARN}

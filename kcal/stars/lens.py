@@ -21,6 +21,7 @@ from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.parameters import FreeParameters, GaussianTerm
 from kcal.calibrate.problem.state import BoardState
 from kcal.errors import InputError
+from kcal.finding import Finding
 from kcal.gaussian import Gaussian, numbered
 from kcal.lens.camera import Camera
 from kcal.lens.information import LENS_SLOT, CameraInformation
@@ -139,7 +140,7 @@ def refine_by_stars(
 def joint_calibration(
     boards: CameraCalibrationResult, found: StarLens, agreement: Agreement
 ) -> CameraCalibrationResult:
-    """The calibration by boards with camera, error bars and warnings of both; residuals stay those of boards alone.
+    """The calibration by boards with camera, error bars and doubts of both; residuals stay those of boards alone.
 
     Args:
         boards: before.
@@ -150,14 +151,14 @@ def joint_calibration(
     assert known is not None
     assert known.information is not None
     assert known.sigma is not None
-    contradiction = agreement.contradiction
+    doubts = [] if agreement.contradiction is None else [Finding("stars", "doubt", agreement.contradiction)]
     return dataclasses.replace(
         boards,
         camera=found.camera,
         sigma={name: known.sigma[name] for name in boards.sigma},
         covariance=known.information.covariance(),
         information=known.information,
-        warnings=boards.warnings + (() if contradiction is None else (contradiction,)),
+        findings=(*boards.findings, *doubts),
     )
 
 

@@ -26,6 +26,7 @@ from kcal import Landmarks, RigData
 from kcal.calibrate.rig import assess, solve
 from kcal.calibrate.rig.result import RigResult
 from kcal.errors import KcalError
+from kcal.finding import sentences
 from kcal.lens.rig import Rig, RigCovariance
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.localizer import Localizer
@@ -218,7 +219,11 @@ def checked(truth: Rig, found: RigResult, draw: Draw) -> dict[str, Any]:
     except KcalError as error:
         return record | {"outcome": "refused", "said": str(error)}
     outcome = "warned" if said else "accepted"
-    return record | {"outcome": outcome, "said": "; ".join(said), "contained": judged(truth, found, draw, widen)[0]}
+    return record | {
+        "outcome": outcome,
+        "said": "; ".join(sentences(said)),
+        "contained": judged(truth, found, draw, widen)[0],
+    }
 
 
 def by_kind(records: list[dict[str, Any]]) -> list[str]:

@@ -23,7 +23,7 @@ from kcal.io.rig_file import RigFile
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import Rig
-from kcal.texts import number_text
+from kcal.texts import counted_text, number_text
 
 BOARD = Board(columns=7, rows=6, square=0.05)
 SIZE = (640, 480)
@@ -194,7 +194,9 @@ class TestCalibrate:
     def test_too_few_views(self, folder: Path, command: Command, count: int) -> None:
         observations(0, count).save(folder / "few.obs.json")
         text = command.refuses("calibrate few.obs.json -o a.json")
-        assert ("no view with a board" if count == 0 else f"{count} view(s) of the board: at least 3") in text
+        assert (
+            "no view with a board" if count == 0 else f"{counted_text(count, 'view')} of the board: at least 3"
+        ) in text
 
     def test_an_old_file_survives_a_failure(self, folder: Path, command: Command) -> None:
         (folder / "old.json").write_text("precious")

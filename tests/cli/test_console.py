@@ -518,7 +518,7 @@ def refusal_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     ("line", "named", "cure"),
     [
-        ("calibrate few.obs.json -o x.json", "2 view(s)", f"{FEW} few.obs.json"),
+        ("calibrate few.obs.json -o x.json", "2 views", f"{FEW} few.obs.json"),
         ("calibrate flat.obs.json -o x.json", "tilted", f"{FEW} flat.obs.json"),
         ("calibrate wild.obs.json -o x.json --model opencv5", "v0", f"{SEEN} wild.obs.json"),
         ("calibrate a/left.obs.json b/left.obs.json -o x", "both named left", "mv b/left.obs.json b/b-left.obs.json"),

@@ -305,7 +305,7 @@ def test_too_few_views_end_with_the_command_that_adds_some(tmp_path: Path) -> No
     result = RUNNER.invoke(app, ["calibrate", str(path), "-o", str(tmp_path / "left.camera.json")])
     assert isinstance(result.exception, DegenerateError)
     text = str(result.exception)
-    assert text.startswith("2 view(s) of the board: at least 3")
+    assert text.startswith("2 views of the board: at least 3")
     command = shlex.split(text.split("To add views: ")[1])
     assert command[:2] == ["kcal", "capture"]
     options = dict(zip(command[3::2], command[4::2], strict=True))

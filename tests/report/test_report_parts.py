@@ -21,6 +21,7 @@ from kcal.calibrate.camera.trust import Examination, HalvesDifference, PlainLens
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.errors import InputError
+from kcal.finding import FAULTS, Finding
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.difference import camera_difference
@@ -51,7 +52,7 @@ from kcal.report.judge_rig import (
 )
 from kcal.report.map_page import _box, _content, _placing, _tile, _warp, arcs_within, local_image
 from kcal.report.pages import _caption, _correlations, camera_tables
-from kcal.report.verdict import FAULTS, Finding, RangeAnswer, Requirement, weighed_findings
+from kcal.report.verdict import RangeAnswer, Requirement, weighed_findings
 from kcal.report.verdict_pictures import _PART_COLORS
 
 CAMERA = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480), model="pinhole")

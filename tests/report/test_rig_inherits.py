@@ -15,12 +15,13 @@ from kcal import Board, Observations, View
 from kcal.cli import report
 from kcal.cli.rig_sources import check_views_of
 from kcal.errors import InputError
+from kcal.finding import FAULTS, Finding
 from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.calibration import BoardRecord, CalibrationRecord, CameraCalibration, RigCalibration, RigSource
 from kcal.lens.rig import Rig, RigCovariance
 from kcal.report.judge_camera import record_findings
 from kcal.report.judge_rig import rig_verdict
-from kcal.report.verdict import FAULTS, Finding, Requirement, Verdict
+from kcal.report.verdict import Requirement, Verdict
 
 NEED = Requirement.parse("1km:5%")
 NOW = datetime.datetime(2026, 1, 1, tzinfo=datetime.UTC)
@@ -67,7 +68,7 @@ def test_a_clean_rig_is_allowed_and_says_what_was_not_checked() -> None:
     verdict = rig_verdict(solved(record(CLEAN)), NEED, mark_sigma=0.1)
     assert verdict.usable
     assert severities(verdict) == {"halves": "doubt"}
-    assert verdict.findings[0].text.startswith("left and right: the views were not looked at")
+    assert verdict.findings[0].told.startswith("left and right: the views were not looked at")
 
 
 def test_images_of_two_cameras_in_one_are_told_by_their_names() -> None:

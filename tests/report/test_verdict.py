@@ -17,6 +17,7 @@ from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibratio
 from kcal.calibrate.camera.trust import Examination, HalvesDifference, examine, residual_structure
 from kcal.corners.observations import Observations, View
 from kcal.errors import InputError
+from kcal.finding import Finding
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import Rig
@@ -24,7 +25,7 @@ from kcal.lens.uncertainty import image_sigma
 from kcal.report.judge_camera import camera_verdict, stored_verdict, view_findings
 from kcal.report.judge_rig import rig_verdict, synchrony
 from kcal.report.pages import range_rows, verdict_page
-from kcal.report.verdict import Finding, RangeAnswer, Requirement, Verdict
+from kcal.report.verdict import RangeAnswer, Requirement, Verdict
 
 VIEWS, NOISE = 14, 0.08
 # Fast: an opencv5 truth, fitted with opencv5 unless a test plants another model.

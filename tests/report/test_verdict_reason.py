@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import kcal.report
+import kcal
 from kcal.errors import FileError, InputError
+from kcal.finding import FAULTS, KINDS, Finding
 from kcal.io.images import write_png
 from kcal.report.pages import Part, save_summary, summary_page, verdict_page
-from kcal.report.verdict import FAULTS, Finding, RangeAnswer, Requirement, Verdict, weighed_findings
+from kcal.report.verdict import RangeAnswer, Requirement, Verdict, weighed_findings
 
 # The one reason of a verdict, and the next step: those of the largest contribution to what misses a requirement.
 
@@ -107,14 +108,13 @@ def test_what_would_improve_a_yes_is_against_most_of_its_error() -> None:
 
 def test_findings_are_called_by_words() -> None:
     """Names are for programs: people read what a finding is about, on the screen and on the page."""
-    folder = Path(kcal.report.__file__).parent
     names = {
         name
-        for module in folder.glob("judge_*.py")
-        for name in re.findall(r'Finding.of\(\s*"([\w-]+)"', module.read_text(encoding="utf-8"))
+        for module in Path(kcal.__file__).parent.rglob("*.py")
+        for name in re.findall(r'(?:Finding|doubt)\(\s*"([\w-]+)"', module.read_text(encoding="utf-8"))
     }
-    assert {"halves", "tilt", "patterns", "coverage"} <= names
-    names |= {"other-views", "left-out", "exact-lenses", "error-bars", "misfit", "synchronization"}
+    assert {"halves", "tilt", "patterns", "coverage", "roll", "bending", "place", "swapped", "stars"} <= names
+    assert names <= set(KINDS)
     titles = {name: Finding(name=name, severity="fine", text="").title for name in names}
     assert not any("-" in title for title in titles.values())
     assert titles["halves"] == "check by halves of the views"

@@ -17,6 +17,7 @@ from kcal.calibrate.problem.views import Views
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError
+from kcal.finding import Finding
 from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
 from kcal.lens.model import LensModel
@@ -139,8 +140,8 @@ def roll_span(rotation: Tensor) -> float:
     return 360.0 - float(gaps.max()) if len(gaps) else 0.0
 
 
-def roll_warnings(rotation: Tensor) -> list[str]:
-    """A warning where every view shows the board the same way up, or upside down.
+def roll_findings(rotation: Tensor) -> list[Finding]:
+    """A doubt where every view shows the board the same way up, or upside down.
 
     The height of the image's pixels over their width, the same ratio of the board's squares, and the principal point
     then do nearly the same to all views.
@@ -149,18 +150,18 @@ def roll_warnings(rotation: Tensor) -> list[str]:
         rotation: (V, 3, 3) cam_from_board; NaN for views that were left out.
 
     Example:
-        >>> roll_warnings(torch.eye(3).expand(12, 3, 3))[0][:57]
+        >>> roll_findings(torch.eye(3).expand(12, 3, 3))[0].text[:57]
         'all 12 views show the board upright (rolled by at most 0°'
     """
     rolls = board_rolls(rotation[rotation.isfinite().all(-1).all(-1)])
     for middle, held in ((0.0, "upright"), (90.0, "on its side")):
         away = ((rolls - middle + 90.0) % 180.0 - 90.0).abs()
         if len(away) and float(away.max()) <= _UPRIGHT:
-            return [
+            text = (
                 f"all {len(rolls)} views show the board {held} (rolled by at most {float(away.max()):.0f}°): pixels "
-                "that are not square, a stretched print and a shifted principal point look alike in such views; turn "
-                "the board or the camera by 90° for a third of the views"
-            ]
+                "that are not square, a stretched print and a shifted principal point look alike in such views"
+            )
+            return [Finding("roll", "doubt", text, "turn the board or the camera by 90° for a third of the views")]
     return []
 
 

@@ -8,12 +8,12 @@ from collections.abc import Callable, Mapping, Sequence
 import torch
 from torch import Tensor
 
-from kcal.calibrate.camera.checks import MINIMUM_VIEWS, copied_views, copy_warnings, pose_warnings, unusable_views
+from kcal.calibrate.camera.checks import MINIMUM_VIEWS, copied_views, copy_findings, pose_findings, unusable_views
 from kcal.calibrate.camera.hybrid import (
     calibrate_hybrid,
     calibrate_what_fits,
     hybrid_result,
-    lasting_warnings,
+    lasting_findings,
     listed_views,
     without_views,
 )
@@ -26,7 +26,7 @@ from kcal.calibrate.camera.result import (
     SharedBoard,
 )
 from kcal.calibrate.camera.solve import calibrate_parametric
-from kcal.calibrate.camera.warnings import spacing_warnings
+from kcal.calibrate.camera.warnings import spacing_findings
 from kcal.calibrate.hybrid.base_fit import may_be_unequal
 from kcal.calibrate.hybrid.board_modes import turned_corners
 from kcal.calibrate.hybrid.cameras_fit import LEAST_CAMERAS, Run, fit_cameras
@@ -34,6 +34,7 @@ from kcal.calibrate.hybrid.fit import HybridFit
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError, KcalError
+from kcal.finding import Finding
 from kcal.threads import in_one_thread
 
 # Cameras that are calibrated together: they share the boards that they saw, and what lenses of one type have alike.
@@ -99,10 +100,10 @@ def sharing(
         after = hybrid_result(seen, camera.fit.among(used[i], len(seen.views)), options)
         pixels = before.observations.pixels()
         copied = {k: of for k, of in copied_views(pixels, before.noise).items() if k not in used[i]}
-        repeats = (*copy_warnings(before.observations.names, copied), *pose_warnings(pixels[used[i]]))
+        repeats = (*copy_findings(before.observations.names, copied), *pose_findings(pixels[used[i]]))
         found[i] = dataclasses.replace(
             after,
-            warnings=(*lasting_warnings(before), *after.warnings, *repeats),
+            findings=(*lasting_findings(before), *after.findings, *repeats),
             rejected_corners=before.rejected_corners,
             rejected_views=before.rejected_views,
             shared_board=shared,
@@ -222,12 +223,12 @@ def _check_spacing(observations: Observations, options: CalibrationOptions, prog
     try:
         if not may_be_unequal(observations.board.points, observations.pixels(), observations.image_size):
             return
-        found = spacing_warnings(calibrate_hybrid(observations, CalibrationOptions(), progress), refused=True)
+        found = spacing_findings(calibrate_hybrid(observations, CalibrationOptions(), progress), refused=True)
     except (KcalError, ArithmeticError):
         # What is wrong with the views is said when they are calibrated.
         return
     if found:
-        raise InputError(found[0])
+        raise InputError(found[0].sentence)
 
 
 def _without_copies(observations: Observations, copied: Mapping[int, int]) -> Observations:
@@ -239,9 +240,9 @@ def _without_copies(observations: Observations, copied: Mapping[int, int]) -> Ob
 def _complete(
     result: CameraCalibrationResult, observations: Observations, copied: Mapping[int, int]
 ) -> CameraCalibrationResult:
-    """A result without copies as one for all observations, with warnings about views that add nothing."""
+    """A result without copies as one for all observations, with doubts about views that add nothing."""
     pixels, names = observations.pixels(), observations.names
-    warnings = (*result.warnings, *copy_warnings(names, copied), *pose_warnings(result.observations.pixels()))
+    findings = (*result.findings, *copy_findings(names, copied), *pose_findings(result.observations.pixels()))
     kept = [i for i in range(len(names)) if i not in copied]
     left_out = tuple(
         Rejected(
@@ -254,7 +255,7 @@ def _complete(
     )
     if left_out:
         result = result.among(kept, observations)
-    return dataclasses.replace(result, warnings=warnings, rejected_views=(*result.rejected_views, *left_out))
+    return dataclasses.replace(result, findings=findings, rejected_views=(*result.rejected_views, *left_out))
 
 
 def _calibrate(observations: Observations, options: CalibrationOptions, progress: Progress) -> CameraCalibrationResult:
@@ -295,7 +296,7 @@ def calibrate_cameras(
         >>> board = Board(columns=3, rows=3, square=0.1)
         >>> view = View(name="a", pixels=[(100.0 * x, 100.0 * y) for y in range(1, 4) for x in range(1, 4)])
         >>> calibrate_cameras([Observations(board=board, image_size=(640, 480), views=[view])])
-        [DegenerateError('1 view(s) of the board: at least 3 at different tilts are needed, 10 to 40 are good')]
+        [DegenerateError('1 view of the board: at least 3 at different tilts are needed, 10 to 40 are good')]
     """
     options = options or CalibrationOptions()
     if one_type and not options.hybrid:
@@ -314,8 +315,8 @@ def calibrate_cameras(
             alone, options, one_type=one_type, advance=lambda name: progress(f"camera {name} with the others")
         )
     except KcalError as error:
-        note = f"{ALONE}: {error}"
+        note = Finding("alone", "doubt", f"{ALONE}: {error}")
         return [
-            found if isinstance(found, KcalError) else dataclasses.replace(found, warnings=(*found.warnings, note))
+            found if isinstance(found, KcalError) else dataclasses.replace(found, findings=(*found.findings, note))
             for found in alone
         ]

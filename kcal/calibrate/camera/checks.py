@@ -20,7 +20,8 @@ from kcal.calibrate.problem.poses import homographies, spread_out
 from kcal.calibrate.problem.views import LEAST_NOISE
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError
-from kcal.texts import percent_text
+from kcal.finding import Finding
+from kcal.texts import counted_text, percent_text
 
 # Find views of one camera that add nothing: copies of other views, and frames of a board that stands still.
 #
@@ -105,27 +106,28 @@ def _nearby(pixels: Tensor, seen: Tensor, limit: Tensor) -> Iterator[list[int]]:
             yield row[:i].nonzero()[:, 0].tolist()
 
 
-def copy_warnings(names: Sequence[str], copied: Mapping[int, int]) -> list[str]:
-    """A warning that names the copies."""
+def copy_findings(names: Sequence[str], copied: Mapping[int, int]) -> list[Finding]:
+    """A doubt that names the copies."""
     if not copied:
         return []
     pairs = ", ".join(f"{names[i]} of {names[k]}" for i, k in list(copied.items())[:5])
-    return [
+    text = (
         f"{len(copied)} of {len(names)} views are copies of others ({pairs}{', ...' if len(copied) > 5 else ''}) and "
-        "were left out: they add nothing, and σ would be too small with them; remove them"
-    ]
+        "were left out: they add nothing, and σ would be too small with them"
+    )
+    return [Finding("copies", "doubt", text, "remove them")]
 
 
-def pose_warnings(pixels: Tensor) -> list[str]:
-    """A warning where most views show the board in the pose of another view."""
+def pose_findings(pixels: Tensor) -> list[Finding]:
+    """A doubt where most views show the board in the pose of another view."""
     views, repeated = len(pixels), len(repeated_poses(pixels))
     if 2 * repeated <= views:
         return []
-    return [
+    text = (
         f"{views} views show the board in {views - repeated} poses only: frames of one pose average noise, but errors "
-        "of the lens model and the board are the same in all of them, and σ does not contain these; move and tilt the "
-        "board between views"
-    ]
+        "of the lens model and the board are the same in all of them, and σ does not contain these"
+    )
+    return [Finding("repeated", "doubt", text, "move and tilt the board between views")]
 
 
 # Check the views of one camera before it is calibrated.
@@ -229,15 +231,16 @@ def check_views(board_points: Tensor, pixels: Tensor, names: Sequence[str], para
     """
     if len(pixels) < fewest:
         raise DegenerateError(
-            f"{len(pixels)} view(s) of the board: at least {fewest} at different tilts are needed, 10 to 40 are good"
+            f"{counted_text(len(pixels), 'view')} of the board: at least {fewest} at different tilts are needed, 10 to "
+            "40 are good"
         )
     repeated = repeated_poses(pixels)
     if (poses := len(pixels) - len(repeated)) < fewest:
         pairs = ", ".join(f"{names[i]} like {names[k]}" for i, k in list(repeated.items())[:5])
         raise DegenerateError(
-            f"{len(pixels)} views show the board in {poses} pose(s) only, the others are too similar ({pairs}"
-            f"{', ...' if len(repeated) > 5 else ''}): at least {fewest} at different tilts are needed, 10 to 40 are "
-            "good; move and tilt the board between views"
+            f"{len(pixels)} views show the board in {counted_text(poses, 'pose')} only, the others are too similar "
+            f"({pairs}{', ...' if len(repeated) > 5 else ''}): at least {fewest} at different tilts are needed, 10 to "
+            "40 are good; move and tilt the board between views"
         )
     for i, why in unusable_views(board_points, pixels).items():
         raise InputError(f"view {names[i]!r}: {why}; remove the view")
@@ -258,6 +261,8 @@ _FALSE_CORNERS = 0.01
 _MAD = 1.4826
 # An outlying view has this many times the typical RMS, and is this many robust standard deviations above it.
 _TIMES_TYPICAL, _VIEW_DEVIATIONS = 3.0, 5.0
+# Corners are reported if one of them is this many times farther off than noise explains.
+_GROSS = 2.0
 # A view is left out whole if fewer of its corners are kept, as a number or as a share.
 _FEWEST_KEPT, _MINIMUM_KEPT = 6, 0.5
 # Largest number of fits; one or two are the rule.
@@ -384,6 +389,15 @@ def corner_limits(residuals: Tensor) -> Tensor:
 def corners_beyond(residuals: Tensor, times: float = 1.0) -> Tensor:
     """Which corners (V, N) of residuals (V, N, 2), NaN where not seen, are beyond `times` the limit."""
     return torch.linalg.vector_norm(residuals.nan_to_num(0.0), dim=-1) > times * corner_limits(residuals)[:, None]
+
+
+def stray_corners(residuals: Tensor) -> Tensor:
+    """Which corners (V, N) are beyond the limit, if one of them is by twice; none otherwise.
+
+    Smaller deviations are as often the lens model's fault.
+    """
+    beyond = corners_beyond(residuals)
+    return beyond & corners_beyond(residuals, _GROSS).any() if bool(beyond.any()) else beyond
 
 
 def views_beyond(board_points: Tensor, residuals: Tensor, pixels: Tensor, rejected: Tensor) -> dict[int, str]:

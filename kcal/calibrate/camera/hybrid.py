@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from kcal.calibrate.camera.advice import check_directions, roll_warnings, what_to_photograph
+from kcal.calibrate.camera.advice import check_directions, roll_findings, what_to_photograph
 from kcal.calibrate.camera.checks import (
     MINIMUM_VIEWS,
     check_views,
@@ -24,6 +24,7 @@ from kcal.calibrate.camera.checks import (
     least_planar,
     leave_out_outliers,
     noise_scale,
+    stray_corners,
     views_beyond,
 )
 from kcal.calibrate.camera.result import (
@@ -34,19 +35,20 @@ from kcal.calibrate.camera.result import (
     Rejected,
 )
 from kcal.calibrate.camera.warnings import (
-    bending_warnings,
+    bending_findings,
     check_end,
-    general_warnings,
-    hybrid_warnings,
-    motion_warnings,
-    outlier_warnings,
-    pixel_warnings,
-    pupil_warnings,
-    spacing_warnings,
+    general_findings,
+    hybrid_findings,
+    motion_findings,
+    outlier_findings,
+    pixel_findings,
+    pupil_findings,
+    spacing_findings,
 )
 from kcal.calibrate.hybrid.fit import FitOptions, FitStart, HybridFit, fit_hybrid, rough_start
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError
+from kcal.finding import Finding
 from kcal.solve.problem import SolverStatus
 
 # The unknowns that the views alone must determine: focal length, principal point, shape of the base projection.
@@ -127,7 +129,7 @@ def _hybrid_without_outliers(
 
 
 def hybrid_result(observations: Observations, fit: HybridFit, options: CalibrationOptions) -> CameraCalibrationResult:
-    """The result of a fit, with its warnings.
+    """The result of a fit, with what to doubt of it.
 
     Raises:
         DegenerateError: the views hardly determine where the camera sees what they show.
@@ -170,20 +172,20 @@ def hybrid_result(observations: Observations, fit: HybridFit, options: Calibrati
         iterations=fit.iterations,
         hybrid=fit,
         advice=what_to_photograph(observations, camera, fit.state.rotation),
-        warnings=(
-            *general_warnings([names[i] for i in used], camera, fit.rms, per_view[used], (), status, stated),
-            *hybrid_warnings(fit),
-            *motion_warnings(fit),
-            *bending_warnings(names, fit),
-            *pixel_warnings(fit),
-            *pupil_warnings(camera, covariance),
-            *(roll_warnings(fit.state.rotation) if options.board == "printed" else ()),
-            *outlier_warnings(names, fit.residuals),
+        findings=(
+            *general_findings([names[i] for i in used], camera, fit.rms, per_view[used], (), status, stated),
+            *hybrid_findings(fit),
+            *motion_findings(fit),
+            *bending_findings(names, fit),
+            *pixel_findings(fit),
+            *pupil_findings(camera, covariance),
+            *(roll_findings(fit.state.rotation) if options.board == "printed" else ()),
+            *outlier_findings(names, fit.residuals, stray_corners(fit.residuals)),
         ),
     )
-    unequal = spacing_warnings(result) if options.board == "printed" else ()
+    unequal = spacing_findings(result) if options.board == "printed" else ()
     # It explains what else may be said.
-    return dataclasses.replace(result, warnings=(*unequal, *result.warnings)) if unequal else result
+    return dataclasses.replace(result, findings=(*unequal, *result.findings)) if unequal else result
 
 
 # Calibrate without views that no lens fits, before refusing all of them; and name them.
@@ -198,8 +200,8 @@ _FAILED = (InputError, ArithmeticError, torch.linalg.LinAlgError)
 _FEW = 0.2
 # How many times larger or smaller a focal length is that was given wrongly.
 _FAR = 1.5
-# In warnings about what was not used: they concern the views, not the fit, and stay with another fit of the same views.
-_LEFT_OUT, _START = "views were left out:", "was given for the start"
+# What was not used concerns the views, not the fit, and stays with another fit of the same views.
+_LASTING = ("excluded", "start")
 # Names and reasons in one message, at most.
 _SHOWN = 5
 
@@ -277,11 +279,12 @@ def _with_start(result: CameraCalibrationResult, given: float | None) -> CameraC
     found = float(result.camera.focal[0])
     if given is None or 1.0 / _FAR < found / given < _FAR:
         return result
-    note = (
-        f"the focal length that {_START} ({given:.4g} px) is far from the camera's ({found:.4g} px): it was not used; "
-        "leave it out, or correct it"
+    text = (
+        f"the focal length that was given for the start ({given:.4g} px) is far from the camera's ({found:.4g} px): it "
+        "was not used"
     )
-    return dataclasses.replace(result, warnings=(note, *result.warnings))
+    note = Finding("start", "doubt", text, "leave it out, or correct it")
+    return dataclasses.replace(result, findings=(note, *result.findings))
 
 
 def _without_start(
@@ -295,11 +298,12 @@ def _without_start(
         )
     except InputError:
         raise failure from None
-    note = (
-        f"no lens with the focal length that {_START} ({given:.4g} px) shows the corners: it was not "
-        "used; leave it out, or correct it"
+    text = (
+        f"no lens with the focal length that was given for the start ({given:.4g} px) shows the corners: it was not "
+        "used"
     )
-    return dataclasses.replace(result, warnings=(note, *result.warnings))
+    note = Finding("start", "doubt", text, "leave it out, or correct it")
+    return dataclasses.replace(result, findings=(note, *result.findings))
 
 
 def _wrong_views(observations: Observations, options: CalibrationOptions) -> dict[int, str]:
@@ -319,9 +323,9 @@ def _wrong_views(observations: Observations, options: CalibrationOptions) -> dic
     return dict(sorted(found.items()))
 
 
-def lasting_warnings(result: CameraCalibrationResult) -> tuple[str, ...]:
-    """Those of a result's warnings that hold for another fit of the same views, too: of these, or what was not used."""
-    return tuple(text for text in result.warnings if any(part in text for part in (_LEFT_OUT, _START)))
+def lasting_findings(result: CameraCalibrationResult) -> tuple[Finding, ...]:
+    """Those of a result's findings that hold for another fit of the same views, too: of these, or what was not used."""
+    return tuple(one for one in result.findings if one.name in _LASTING)
 
 
 def _few_names(names: Sequence[str]) -> str:
@@ -337,7 +341,7 @@ def listed_views(observations: Observations, wrong: Mapping[int, str]) -> str:
 def without_views(
     result: CameraCalibrationResult, observations: Observations, wrong: Mapping[int, str]
 ) -> CameraCalibrationResult:
-    """A result without some views as one for all `observations`, with a warning that names them."""
+    """A result without some views as one for all `observations`, with a doubt that names them."""
     if not wrong:
         return result
     kept = [i for i in range(len(observations.views)) if i not in wrong]
@@ -346,12 +350,10 @@ def without_views(
         Rejected(view=observations.names[i], corners=counts[i], residual=float("nan"), reason=why)
         for i, why in wrong.items()
     )
-    note = (
-        f"{len(wrong)} of {len(observations.views)} {_LEFT_OUT} {listed_views(observations, wrong)}; look at "
-        "these images, and remove or retake them"
-    )
+    text = f"{len(wrong)} of {len(observations.views)} views were left out: {listed_views(observations, wrong)}"
+    note = Finding("excluded", "doubt", text, "look at these images, and remove or retake them")
     return dataclasses.replace(
         result.among(kept, observations),
-        warnings=(note, *result.warnings),
+        findings=(note, *result.findings),
         rejected_views=(*result.rejected_views, *left_out),
     )

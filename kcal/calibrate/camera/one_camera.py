@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.camera.checks import corners_beyond
-from kcal.calibrate.camera.hybrid import few_views, fit_by_options, hybrid_result, lasting_warnings
+from kcal.calibrate.camera.checks import stray_corners
+from kcal.calibrate.camera.hybrid import few_views, fit_by_options, hybrid_result, lasting_findings
 from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult, Progress
-from kcal.calibrate.camera.warnings import outlier_warnings
+from kcal.calibrate.camera.warnings import outlier_findings
 from kcal.calibrate.hybrid.evidence import WORTH, with_tempering
 from kcal.calibrate.hybrid.fit import HybridFit
 from kcal.calibrate.hybrid.fitted_views import hybrid_unknowns
@@ -24,6 +24,7 @@ from kcal.calibrate.problem.state import BoardState, by_number
 from kcal.calibrate.problem.views import LEAST_NOISE, among
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError
+from kcal.finding import Finding
 from kcal.gaussian import triangular
 from kcal.solve.schur import without_local
 from kcal.texts import number_text
@@ -265,11 +266,11 @@ def lenses_by_view(
             own = CalibrationOptions(board=options.board, motion=options.motion, bending=options.bending)
             fit = fit_by_options(seen, pixels, None, None, own, progress)
         found = own_lenses(fit, seen, pixels, own, progress)
-        wrong = [] if found is None else outlier_warnings(seen.names, fit.residuals)
-        if wrong:
+        strays, wrong = stray_corners(fit.residuals), list[Finding]()
+        if found is not None and bool(strays.any()):
+            wrong = outlier_findings(seen.names, fit.residuals, strays)
             # One wrong corner would make two cameras of the views.
             progress("again without corners that noise cannot explain")
-            strays = corners_beyond(fit.residuals)
             pixels, weights = pixels.masked_fill(strays[..., None], torch.nan), fit.weights.masked_fill(strays, 0.0)
             found = own_lenses(fit_by_options(seen, pixels, weights, fit, own, progress), seen, pixels, own, progress)
     except (InputError, DegenerateError, ArithmeticError, torch.linalg.LinAlgError):
@@ -290,11 +291,12 @@ def lenses_by_view(
         after = hybrid_result(result.observations, found.fit.among(used, len(result.observations.views)), options)
     except DegenerateError as error:
         raise DegenerateError(f"{text}, which leaves no focal length for all of them: {_STILL}") from error
-    text += f": the camera is their mean, and its error bars contain the movement; for smaller ones {_STILL}"
+    text += ": the camera is their mean, and its error bars contain the movement"
+    moving = Finding("moving-lens", "doubt", text, f"for smaller ones {_STILL}")
     return dataclasses.replace(
         after,
         by_view=among(found.theta, used, len(result.observations.views)),
-        warnings=(*lasting_warnings(result), text, *wrong, *after.warnings),
+        findings=(*lasting_findings(result), moving, *wrong, *after.findings),
         rejected_corners=result.rejected_corners,
         rejected_views=result.rejected_views,
     )

@@ -19,6 +19,7 @@ from kcal.calibrate.problem.state import warp_modes
 from kcal.calibrate.problem.views import among
 from kcal.corners.observations import Observations
 from kcal.errors import InputError
+from kcal.finding import Finding, sentences
 from kcal.io.camera_file import CameraFile, camera_to_file, provenance
 from kcal.lens.calibration import CalibrationRecord, CameraCalibration, Exclusion, LensSetting
 from kcal.lens.camera import Camera
@@ -295,7 +296,7 @@ class CameraCalibrationResult:
             computed and where nothing was estimated.
         status: why the solver stopped.
         iterations: trial steps of the solver, all starts and models together.
-        warnings: what the user should doubt, and what to do about it.
+        findings: what the user should doubt, and what to do about it.
         observations: what was calibrated from.
         hybrid: how the hybrid lens and the board were fitted: noise, tempering, board; None for parametric models.
         advice: what to photograph next, the most useful first.
@@ -324,7 +325,7 @@ class CameraCalibrationResult:
     covariance: Tensor
     status: SolverStatus
     iterations: int
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]
     observations: Observations
     information: CameraInformation | None = None
     hybrid: HybridFit | None = None
@@ -376,6 +377,11 @@ class CameraCalibrationResult:
             warnings=self.warnings,
             **provenance(),
         )
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The findings as sentences."""
+        return sentences(self.findings)
 
     def _board_deviation(self) -> tuple[tuple[float, float, float], ...] | None:
         """As `CalibrationRecord.board_deviation`."""

@@ -17,15 +17,16 @@ from kcal.calibrate.camera.checks import (
     least_planar,
     leave_out_outliers,
     noise_scale,
+    stray_corners,
     without,
 )
 from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult, OutlierRejection, Progress
 from kcal.calibrate.camera.warnings import (
     NO_ERROR_BARS,
-    general_warnings,
-    outlier_warnings,
-    prior_warnings,
-    rival_warnings,
+    general_findings,
+    outlier_findings,
+    prior_findings,
+    rival_findings,
 )
 from kcal.calibrate.hybrid.base_fit import fit_projection
 from kcal.calibrate.problem.board_problem import BoardProblem
@@ -396,7 +397,7 @@ def _reweight_priors(
     return views, result, spent
 
 
-# Assess a camera's solution: σ, covariance, residuals and warnings, as the result of its calibration.
+# Assess a camera's solution: σ, covariance, residuals and doubts, as the result of its calibration.
 
 
 def assess(observations: Observations, solution: Solution, options: CalibrationOptions) -> CameraCalibrationResult:
@@ -459,12 +460,14 @@ def assess(observations: Observations, solution: Solution, options: CalibrationO
         iterations=solution.spent,
         covariance=spread,
         information=information,
-        warnings=(
-            *general_warnings(observations.names, camera, rms, per_view, lost, status),
+        findings=(
+            *general_findings(observations.names, camera, rms, per_view, lost, status),
             *doubts,
-            *rival_warnings(camera, sigma, solution.rivals, solution.plain_cost, problem.residual_count),
-            *prior_warnings(solution.terms, solved.state, solution.views.prior_noise),
-            *outlier_warnings(observations.names, weighted, "; this lens may need a richer model"),
+            *rival_findings(camera, sigma, solution.rivals, solution.plain_cost, problem.residual_count),
+            *prior_findings(solution.terms, solved.state, solution.views.prior_noise),
+            *outlier_findings(
+                observations.names, weighted, stray_corners(weighted), "; this lens may need a richer model"
+            ),
         ),
     )
 

@@ -1,4 +1,4 @@
-"""Checks and warnings for a finished calibration."""
+"""What to doubt of a finished calibration."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.calibrate.camera.advice import roll_warnings
-from kcal.calibrate.camera.checks import corners_beyond
+from kcal.calibrate.camera.advice import roll_findings
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.hybrid.fit import HybridFit, pixels_are_square
 from kcal.calibrate.problem.parameters import GaussianPrior, Term
 from kcal.calibrate.problem.state import FELT, LARGEST, BoardState
 from kcal.errors import InputError
+from kcal.finding import Finding
 from kcal.lens.camera import Camera
 from kcal.lens.projection import pupil_depth
 from kcal.solve.problem import SolverStatus
@@ -31,36 +31,34 @@ _BENT, _SOME, _NAMED = 2.0, 0.5, 5
 _LIMIT = 0.9
 
 
-def motion_warnings(fit: HybridFit) -> list[str]:
-    """A warning where the camera or the board moved while an image was read, with how much that moved corners."""
+def motion_findings(fit: HybridFit) -> list[Finding]:
+    """A doubt where the camera or the board moved while an image was read, with how much that moved corners."""
     if fit.motion_sigma is None or fit.readout is None:
         return []
     if max(fit.motion_sigma) > _LIMIT * LARGEST:
-        return [
+        text = (
             "while an image is read, views move by more than any hand does: these motions stand for something else "
-            "(wrong corners, a cropped or stabilized video); look at the views that fit worst, and photograph a board "
-            "on a stand"
-        ]
+            "(wrong corners, a cropped or stabilized video)"
+        )
+        return [Finding("motion", "doubt", text, "look at the views that fit worst, and photograph a board on a stand")]
     lines = "column" if fit.readout.columns else "row"
     moved = fit.motion_sigma.moved(float(fit.state.parameters[0]), fit.readout.reach(fit.board_points))
     if moved < FELT * fit.sigma:
         return []
-    views, few = len(fit.state.motion), []
+    views, found = len(fit.state.motion), []
     if views < _FEW:
-        few = [
-            f"{views} views that moved are few: error bars are wide, and may still be too small; use a stand, or "
-            f"{_FEW} views or more"
-        ]
-    return [
-        *few,
+        text = f"{views} views that moved are few: error bars are wide, and may still be too small"
+        found.append(Finding("motion", "doubt", text, f"use a stand, or {_FEW} views or more"))
+    text = (
         f"the camera or the board moved while {lines}s were read (rolling shutter), by some {moved:.1f} px from the "
-        f"first {lines} to the last: this is taken out, and error bars allow for it; put both on a stand, or take the "
-        "still moments of a video, for smaller error bars",
-    ]
+        f"first {lines} to the last: this is taken out, and error bars allow for it"
+    )
+    action = "put both on a stand, or take the still moments of a video, for smaller error bars"
+    return [*found, Finding("motion", "doubt", text, action)]
 
 
-def bending_warnings(names: Sequence[str], fit: HybridFit) -> list[str]:
-    """A warning where the board bends from view to view, with how much, and in which views most."""
+def bending_findings(names: Sequence[str], fit: HybridFit) -> list[Finding]:
+    """A doubt where the board bends from view to view, with how much, and in which views most."""
     if fit.bends is None or fit.relative is None:
         return []
     # RMS of the corners in each view, millimeters; NaN where a view was left out.
@@ -68,11 +66,12 @@ def bending_warnings(names: Sequence[str], fit: HybridFit) -> list[str]:
     clear = [i for i in height.nan_to_num(0.0).argsort(descending=True).tolist() if float(fit.relative[i]) > _BENT]
     named = ", ".join(names[i] for i in clear[:_NAMED]) + (", ..." if len(clear) > _NAMED else "")
     where = f", most in {len(clear)} of {count} views ({named})" if 0 < len(clear) <= _SOME * count else ""
-    return [
+    text = (
         f"the board bends from view to view, by {float(height.nanmedian()):.2g} mm (RMS of its corners) in a typical "
         f"view and by up to {float(height.nan_to_num(0.0).max()):.2g} mm{where}: this is taken out, and error bars "
-        "allow for it; mount the board on a stiff plate for smaller error bars"
-    ]
+        "allow for it"
+    )
+    return [Finding("bending", "doubt", text, "mount the board on a stiff plate for smaller error bars")]
 
 
 def measured_aspect(fit: HybridFit) -> tuple[float, float]:
@@ -83,19 +82,19 @@ def measured_aspect(fit: HybridFit) -> tuple[float, float]:
     return fy / fx, float(slope @ fit.covariance @ slope) ** 0.5
 
 
-def pixel_warnings(fit: HybridFit) -> list[str]:
-    """A warning where pixels are not square."""
+def pixel_findings(fit: HybridFit) -> list[Finding]:
+    """A doubt where pixels are not square."""
     if fit.square:
         return []
     aspect, sigma = measured_aspect(fit)
     if pixels_are_square((aspect - 1.0) / sigma):
         # The rounds said so, and error bars with amplitudes as they are to be expected do not.
         return []
-    return [
-        f"pixels are not square: f_y / f_x = {aspect:.4f} ± {sigma:.4f}; was the image or video resized, or taken in "
-        "an anamorphic mode? The camera is right for images of this size and shape only: photograph boards and targets "
-        "in the same mode"
-    ]
+    action = (
+        "was the image or video resized, or taken in an anamorphic mode? The camera is right for images of this size "
+        "and shape only: photograph boards and targets in the same mode"
+    )
+    return [Finding("pixels", "doubt", f"pixels are not square: f_y / f_x = {aspect:.4f} ± {sigma:.4f}", action)]
 
 
 # Share beyond which columns of a board that are farther apart than its rows are no error of the print, and in standard
@@ -103,8 +102,8 @@ def pixel_warnings(fit: HybridFit) -> list[str]:
 _NO_PRINT, _UNEQUAL = 0.02, 5.0
 
 
-def spacing_warnings(result: CameraCalibrationResult, refused: bool = False) -> list[str]:
-    """A warning where columns of the board are not as far apart as its rows; or why a lens is refused for it."""
+def spacing_findings(result: CameraCalibrationResult, refused: bool = False) -> list[Finding]:
+    """A doubt where columns of the board are not as far apart as its rows; or why a lens is refused for it."""
     board, measured = result.observations.board, result.measured_board
     if measured is None:
         return []
@@ -121,17 +120,18 @@ def spacing_warnings(result: CameraCalibrationResult, refused: bool = False) -> 
         allows = "only the default lens with a printed board allows for this"
     unsure = (
         ""
-        if not roll_warnings(result.cam_from_board_rotation)
+        if not roll_findings(result.cam_from_board_rotation)
         else (
             "; or else pixels are not square, which views that show the board upright hardly tell: turn it by 90° "
             "for a third of the views"
         )
     )
-    return [
-        f"{apart} ({100 * value:+.2f} ± {100 * sigma:.2g} %), but one length was given for both: {allows}; measure "
-        "both with a ruler, give the distance of the rows as --square, and print at 100 %, not fitted to the page"
-        + unsure
-    ]
+    text = f"{apart} ({100 * value:+.2f} ± {100 * sigma:.2g} %), but one length was given for both: {allows}"
+    action = (
+        "measure both with a ruler, give the distance of the rows as --square, and print at 100 %, not fitted to the "
+        f"page{unsure}"
+    )
+    return [Finding("board", "doubt", text, action)]
 
 
 # Say what a fitted movement of the entrance pupil stands for, where it is larger than any lens has.
@@ -183,8 +183,8 @@ def corner_pupil(camera: Camera, covariance: Tensor) -> CornerPupil | None:
     return CornerPupil(float(depth[0]), math.sqrt(max(float(variance), 0.0)), float(angle))
 
 
-def pupil_warnings(camera: Camera, covariance: Tensor) -> list[str]:
-    """A warning where the entrance pupil moves by more than ten times what glass does, and by more than chance.
+def pupil_findings(camera: Camera, covariance: Tensor) -> list[Finding]:
+    """A doubt where the entrance pupil moves by more than ten times what glass does, and by more than chance.
 
     Args:
         camera: the camera.
@@ -196,23 +196,22 @@ def pupil_warnings(camera: Camera, covariance: Tensor) -> list[str]:
     most = max(_LEAST, _GLASS * pupil.angle**2)
     if not abs(pupil.depth) > max(most, _SURE * pupil.sigma):
         return []
-    return [
+    text = (
         f"the fitted entrance pupil moves by {1e3 * abs(pupil.depth):.0f} ± {1e3 * pupil.sigma:.0f} mm, which no lens "
         f"does ({1e3 * most:.0f} mm at most, {math.degrees(pupil.angle):.0f}° off the axis): it stands for an error "
         "that changes with the board's distance: a wrong size of the squares, a board that flexes, motion, or a focal "
-        "length that too few tilts tell; measure the squares, and photograph a stiff board at rest, tilted by 30 to 45 "
-        "degrees in all directions"
-    ]
+        "length that too few tilts tell"
+    )
+    action = "measure the squares, and photograph a stiff board at rest, tilted by 30 to 45 degrees in all directions"
+    return [Finding("pupil", "doubt", text, action)]
 
 
-# Checks and warnings for a finished calibration.
+# Checks of a finished calibration.
 
 # Another solution with a χ² higher by less than this cannot be excluded: 14 parameters more gain as much by chance.
 _CLOSE_RIVAL = 25.0
 # Mean square of the differences from priors, in their standard deviations, beyond which the data contradict them.
 _CONTRADICTION = 3.0
-# A corner is reported if it is this many times farther off than noise explains.
-_GROSS = 2.0
 # Tempering that chance and rounding do not explain: it is 1 on simulated captures, 2.2 on the wide lens's.
 REPEATING = 2.0
 # Times the noise of its corners beyond which the RMS of a fit shows that it did not end: it is 0.93 to 1.0 on captures.
@@ -222,13 +221,14 @@ _ENDED = 2.0
 _NOT_OF_CORNERS = 30.0
 # Of the principal point, in standard deviations of its prior.
 _FAR_CENTER = 3.0
-NO_ERROR_BARS = (
-    "no error bars: σ cannot be computed, because a corner lies where the lens model folds; choose a smaller model"
-)
+NO_ERROR_BARS = Finding(
+    "open", "doubt", "no error bars: σ cannot be computed, because a corner lies where the lens model folds",
+    "choose a smaller model",
+)  # fmt: skip
 
 
-def prior_warnings(terms: Sequence[Term], state: BoardState, noise: float) -> list[str]:
-    """A warning where parameters differ from their priors by much more than the priors allow.
+def prior_findings(terms: Sequence[Term], state: BoardState, noise: float) -> list[Finding]:
+    """A doubt where parameters differ from their priors by much more than the priors allow.
 
     Args:
         terms: the priors among them are checked.
@@ -241,20 +241,19 @@ def prior_warnings(terms: Sequence[Term], state: BoardState, noise: float) -> li
     count = sum(len(row) for row in rows)
     if squared <= _CONTRADICTION * count:
         return []
-    return [
-        f"the views contradict the priors: the parameters differ from them by {(squared / count) ** 0.5:.1f} standard "
-        "deviations; give wider priors, for a strong lens a larger weak prior or none"
-    ]
+    away = (squared / count) ** 0.5
+    text = f"the views contradict the priors: the parameters differ from them by {away:.1f} standard deviations"
+    return [Finding("priors", "doubt", text, "give wider priors, for a strong lens a larger weak prior or none")]
 
 
-def rival_warnings(
+def rival_findings(
     camera: Camera,
     sigma: Mapping[str, float | None],
     rivals: Sequence[tuple[float, BoardState]],
     cost: float,
     residual_count: int,
-) -> list[str]:
-    """A warning where another solution, of (cost, state), fits almost as well and lies outside the error bars."""
+) -> list[Finding]:
+    """A doubt where another solution, of (cost, state), fits almost as well and lies outside the error bars."""
     variance = max(2.0 * cost / residual_count, 1e-300)
     here = dict(zip(camera.names, camera.params.tolist(), strict=True))
     for other, state in rivals:
@@ -269,10 +268,9 @@ def rival_warnings(
         if apart:
             rms = (2.0 * variance * other / cost) ** 0.5
             where = ", ".join(f"{name} {shift:+.1f} px" for name, shift in apart.items())
-            return [
-                f"another solution fits almost as well (RMS {rms:.4f} px) with {where}: do not trust this model's "
-                "parameters; choose a smaller model or add views"
-            ]
+            text = f"another solution fits almost as well (RMS {rms:.4f} px) with {where}"
+            action = "choose a smaller model or add views"
+            return [Finding("model", "doubt", f"{text}: do not trust this model's parameters", action)]
     return []
 
 
@@ -287,44 +285,46 @@ def check_end(fit: HybridFit) -> None:
         )
 
 
-def hybrid_warnings(fit: HybridFit) -> list[str]:
-    """Warnings about the evidence: residuals that repeat within views, a principal point far from the middle."""
+def hybrid_findings(fit: HybridFit) -> list[Finding]:
+    """Doubts about the evidence: residuals that repeat within views, a principal point far from the middle."""
     found = []
     if fit.tempering > REPEATING:
-        found.append(
+        text = (
             f"residuals repeat within views (tempering {fit.tempering:.1f}, where noise alone gives 1): blur, or what "
-            "neither motion nor bending of the board explains; error bars are widened for it; use a stand and a short "
-            "exposure"
+            "neither motion nor bending of the board explains; error bars are widened for it"
         )
+        found.append(Finding("patterns", "doubt", text, "use a stand and a short exposure"))
     off = (fit.state.parameters[2:4] - fit.families.mean[1:3]).norm() / fit.families.log_unit[1].exp()
     if float(off) > _FAR_CENTER:
         cx, cy = (float(value) for value in fit.state.parameters[2:4])
-        found.append(
-            f"the principal point ({cx:.0f}, {cy:.0f}) is far from the middle of the image: give images that are not "
-            "cropped, and turn the board by 90 degrees in a third of the views"
-        )
+        text = f"the principal point ({cx:.0f}, {cy:.0f}) is far from the middle of the image"
+        action = "give images that are not cropped, and turn the board by 90 degrees in a third of the views"
+        found.append(Finding("center", "doubt", text, action))
     return found
 
 
-def outlier_warnings(names: Sequence[str], residuals: Tensor, more: str = "") -> list[str]:
-    """A warning where a corner is off by twice what noise explains; residuals (V, N, 2), NaN where not seen.
+def outlier_findings(names: Sequence[str], residuals: Tensor, strays: Tensor, more: str = "") -> list[Finding]:
+    """A doubt that names the worst of corners that are off.
 
-    Smaller deviations are as often the lens model's fault. `more` is said where the lens may be to blame.
+    Args:
+        names: of the views.
+        residuals: (V, N, 2), NaN where not seen.
+        strays: (V, N) as of `kcal.calibrate.camera.checks.stray_corners`.
+        more: what is said where the lens may be to blame.
     """
-    beyond = corners_beyond(residuals)
-    if not bool(corners_beyond(residuals, _GROSS).any()):
+    if not bool(strays.any()):
         return []
-    count = int(beyond.sum())
+    count = int(strays.sum())
     length = residuals.nan_to_num(0.0).norm(dim=-1)
     view, corner = divmod(int(length.argmax()), length.shape[1])
-    return [
+    text = (
         f"{count} of {int(residuals.isfinite().all(-1).sum())} corners are farther off than noise explains, corner "
-        f"{corner} of view {names[view]} by {float(length.max()):.2f} px: look at them, and leave wrong ones out "
-        f"(--reject){more}"
-    ]
+        f"{corner} of view {names[view]} by {float(length.max()):.2f} px"
+    )
+    return [Finding("corners", "doubt", text, f"look at them, and leave wrong ones out (--reject){more}")]
 
 
-def general_warnings(
+def general_findings(
     names: Sequence[str],
     camera: Camera,
     rms: float,
@@ -332,8 +332,8 @@ def general_warnings(
     lost: Sequence[str],
     status: SolverStatus,
     stated: Tensor | None = None,
-) -> list[str]:
-    """Warnings about the solver, the RMS, parameters that are not determined, and folds of the lens.
+) -> list[Finding]:
+    """Doubts about the solver, the RMS, parameters that are not determined, and folds of the lens.
 
     Args:
         names: of the views.
@@ -344,40 +344,48 @@ def general_warnings(
         status: of the solver.
         stated: (..., 2, 2) covariances of the corners, as they came with them, in views that were used.
     """
-    found = []
+    found = list[Finding]()
+
+    def doubt(name: str, text: str, action: str = "") -> None:
+        found.append(Finding(name, "doubt", text, action))
+
     noise = math.nan if stated is None else float(stated.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt().nanmedian())
     hybrid = camera.model.hybrid is not None
     if status not in (SolverStatus.CONVERGED, SolverStatus.EXACT):
-        rest = ": the camera may be farther off than its error bars say; add views, and see which of them fit worst"
-        found.append(f"the solver {status.message}{rest if hybrid else ''}")
+        rest = ": the camera may be farther off than its error bars say" if hybrid else ""
+        action = "add views, and see which of them fit worst" if hybrid else ""
+        doubt("solver", f"the solver {status.message}{rest}", action)
     if rms > 1.0:
-        found.append(
-            f"RMS {rms:.2f} px is high: corners, board and lens model do not fit each other; check the board's size, "
-            "and look at the views that fit worst"
-        )
+        doubt(
+            "residuals", f"RMS {rms:.2f} px is high: corners, board and lens model do not fit each other",
+            "check the board's size, and look at the views that fit worst",
+        )  # fmt: skip
     elif rms > _NOT_OF_CORNERS * noise:
-        found.append(
+        doubt(
+            "residuals",
             f"RMS {rms:.2g} px is {rms / noise:.0f} times what the corners' own covariances say ({noise:.2g} px): "
             "either these are far too small, or most of it is no noise; look whether the board is as ordered (numbers "
             "of squares, print), whether all images are of one camera at one zoom and focus, and whether they were "
-            "resized or stabilized"
+            "resized or stabilized",
         )
     typical = float(per_view.median())
     for i in (per_view > max(3.0 * typical, 0.1)).nonzero()[:, 0].tolist():
-        found.append(f"view {names[i]}: RMS {float(per_view[i]):.2f} px is high, {typical:.2f} px is typical; check it")
+        text = f"view {names[i]}: RMS {float(per_view[i]):.2f} px is high, {typical:.2f} px is typical"
+        doubt("residuals", text, "check it")
     if lost:
-        found.append(f"the views do not determine {', '.join(lost)}: choose a smaller model or add views")
+        doubt("open", f"the views do not determine {', '.join(lost)}", "choose a smaller model or add views")
     if not bool(camera.covers_image()):
         _, valid = camera.unproject(camera.grid(33, 25))
         share = percent_text(float((~valid).double().mean()))
         if hybrid:
-            found.append(
-                f"{share} of the image has no ray: no board was there, and the lens found from the rest ends "
-                "before; if the lens shows anything there, add views with the board in these parts"
+            doubt(
+                "no-ray",
+                f"{share} of the image has no ray: no board was there, and the lens found from the rest ends before",
+                "if the lens shows anything there, add views with the board in these parts",
             )
         else:
-            found.append(
-                f"the lens model folds inside the image: {share} of it has no ray; choose a smaller model, or "
-                "add views with corners there"
-            )
+            doubt(
+                "no-ray", f"the lens model folds inside the image: {share} of it has no ray",
+                "choose a smaller model, or add views with corners there",
+            )  # fmt: skip
     return found

@@ -15,7 +15,7 @@ import kcal.calibrate.rig.explanations as explanations
 from kcal.calibrate.rig.adjustment import Adjustment
 from kcal.calibrate.rig.features import FeatureBlock
 from kcal.calibrate.rig.initial_poses import InitialPoses
-from kcal.calibrate.rig.motion import moved_warnings, scatter_warnings
+from kcal.calibrate.rig.motion import moved_findings, scatter_findings
 from kcal.calibrate.rig.problem import RigProblem, goodness_of_fit
 from kcal.calibrate.rig.resection import distinct_poses
 from kcal.calibrate.rig.result import Reasons, RigResult, places, records
@@ -28,13 +28,14 @@ from kcal.calibrate.rig.uncertainty import (
 )
 from kcal.calibrate.rig.unknowns import held
 from kcal.errors import DegenerateError, InputError
+from kcal.finding import Finding
 from kcal.io.camera_file import provenance
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.pose import vector_from_rotation
 from kcal.solve.lm import LMOptions
 from kcal.solve.problem import Result, SolverStatus
-from kcal.texts import length_text
+from kcal.texts import counted_text, length_text
 
 # Refuse rigs whose baseline is so open that intervals of ranges are wrong; widen intervals where that helps.
 #
@@ -64,20 +65,20 @@ _DIRECTIONS = torch.nn.functional.normalize(
 
 def check_places(
     problem: RigProblem, state: RigState, covariance: SharedCovariance, names: Sequence[str], *, refuse: bool = True
-) -> tuple[float, list[str]]:
-    """By how much the standard deviations of a rig must be multiplied for its intervals to be right, and warnings.
+) -> tuple[float, list[Finding]]:
+    """By how much the standard deviations of a rig must be multiplied for its intervals to be right, and doubts.
 
     Args:
         problem: the problem.
         state: its solution.
         covariance: of the solution.
         names: of the cameras.
-        refuse: raise an error where no range is known; otherwise a warning tells.
+        refuse: raise an error where no range is known; otherwise a doubt tells.
 
     Raises:
         DegenerateError: a camera whose place is so open that no range is known; what to add is told.
     """
-    widen, warnings = 1.0, list[str]()
+    widen, doubts = 1.0, list[Finding]()
     for second in range(1, len(names)):
         found = open_place(problem, state, covariance, 0, second)
         if found is None or (found.ratio <= _LINEAR and found.share <= _OPEN):
@@ -95,8 +96,8 @@ def check_places(
         factor = min(max(found.ratio, 1.0) ** 2, _WIDEST)
         widen = max(widen, factor)
         effect = "ranges could be anything" if hopeless else f"intervals were widened {factor:.1f} times for that"
-        warnings.append(f"{text}{effect}. {advice}")
-    return widen, warnings
+        doubts.append(Finding("place", "doubt", f"{text}{effect}", advice))
+    return widen, doubts
 
 
 # What landmarks tell of a camera is linear in its pose only nearby. So the pose is moved by two standard deviations in
@@ -108,23 +109,23 @@ _MOST_BENT, _DIRECTIONS_TRIED = 1.0, 2
 
 def check_poses(
     problem: RigProblem, state: RigState, covariance: SharedCovariance, names: Sequence[str], *, refuse: bool = True
-) -> list[str]:
-    """Widen the covariance where landmarks leave a camera's pose so open that it is not linear; return warnings.
+) -> list[Finding]:
+    """Widen the covariance where landmarks leave a camera's pose so open that it is not linear; return doubts.
 
     Args:
         problem: the problem.
         state: its solution.
         covariance: of the solution; its root grows.
         names: of the cameras.
-        refuse: raise an error where the pose could be anything; otherwise a warning tells.
+        refuse: raise an error where the pose could be anything; otherwise a doubt tells.
 
     Raises:
         DegenerateError: a camera whose pose is so open; what to add is told.
     """
-    warnings, missing = list[str](), list[Tensor]()
+    doubts, missing = list[Finding](), list[Tensor]()
     points = _surveyed(problem, state)
     if points is None or not covariance.complete:
-        return warnings
+        return doubts
     still, at_rest = problem.linearize(state).step(_UNDAMPED)[0]
     for c, name in enumerate(names):
         pose = mounting_rows(problem, state, c)[:6]
@@ -147,13 +148,13 @@ def check_poses(
         if bent > _MOST_BENT:
             place, turn = length_text(float(sigma[:3].max()), digits=2), min(float(sigma[3:].max()), math.pi)
             text = f"the landmarks do not determine where {name} stands: ± {place}, ± {math.degrees(turn):.0f}° turned"
-            text = f"{text}. {_advice(problem, state)}"
+            doubt = Finding("place", "doubt", text, _advice(problem, state))
             if refuse:
-                raise DegenerateError(text)
-            warnings.append(text)
-    if missing and not warnings:
+                raise DegenerateError(doubt.sentence)
+            doubts.append(doubt)
+    if missing and not doubts:
         covariance.root = torch.cat([covariance.root, torch.stack(missing, 1)], 1)
-    return warnings
+    return doubts
 
 
 def _advice(problem: RigProblem, state: RigState) -> str:
@@ -471,7 +472,7 @@ def rig_result(
     mask: Tensor,
     reasons: Reasons,
     initial: InitialPoses,
-    warnings: list[str],
+    findings: list[Finding],
     *,
     refuse: bool,
 ) -> RigResult:
@@ -483,8 +484,8 @@ def rig_result(
         mask: what took part.
         reasons: why the rest did not.
         initial: from where it began.
-        warnings: that there are already.
-        refuse: raise errors where measurements contradict each other or leave ranges open; otherwise warnings tell.
+        findings: that there are already.
+        refuse: raise errors where measurements contradict each other or leave ranges open; otherwise doubts tell.
 
     Raises:
         InputError: a measured baseline or position that contradicts the rest, or several explanations.
@@ -525,42 +526,46 @@ def rig_result(
     told = records(work, mask, reasons)
     rms = math.sqrt(float(told.squared.sum() / told.counts.sum()))
     status = SolverStatus(int(found.status))
-    warnings += [
-        f"the {kind} differ from each other by {times:.1f} times what their sigmas say: their sigmas were multiplied "
-        f"by {times:.1f}"
-        for kind, times in work.widened.items()
-        if times > 1.0
-    ]
+
+    def doubt(name: str, text: str, action: str = "") -> None:
+        findings.append(Finding(name, "doubt", text, action))
+
+    for kind, times in work.widened.items():
+        if times > 1.0:
+            text = f"the {kind} differ from each other by {times:.1f} times what their sigmas say"
+            doubt("sigmas", f"{text}: their sigmas were multiplied by {times:.1f}")
     if fit.variance > 1.0:
         times = math.sqrt(fit.variance)
-        warnings.append(f"residuals are {times:.1f} times as large as their sigmas say; the covariance was widened")
-    warnings += [one.text for one in against]
+        doubt("sigmas", f"residuals are {times:.1f} times as large as their sigmas say; the covariance was widened")
+    findings += [Finding("contradiction", "stop" if one in certain else "doubt", one.text) for one in against]
     only_boards = len(problem.blocks) == 1 and problem.blocks[0].many
     if only_boards and (count := int(mask.sum())) < _FEW_BOARDS:
-        warnings.append(f"{count} pair(s) only: a wrong one could not be noticed; 5 or more are good")
+        doubt("pairs", f"{counted_text(count, 'pair')} only: a wrong one could not be noticed", "5 or more are good")
     focal = [float(camera.params[0]) for camera in data.cameras]
-    scattered = scatter_warnings(focal, work.motion, work.sigma_corner)
+    scattered = scatter_findings(focal, work.motion, work.sigma_corner)
     if refuse and scattered and explanations.one_camera_doubts(data):
         raise InputError(
-            f"{scattered[0].split(':')[0]}, and one camera saw the boards from two places: boards moved while the "
+            f"{scattered[0].text.split(':')[0]}, and one camera saw the boards from two places: boards moved while the "
             "camera was moved, or these are views of two cameras. Use boards that stand still, leave --pairs out, or "
             "give the file of each camera"
         )
-    warnings = scattered + warnings
+    findings[:0] = scattered
     if only_boards and rms > _HIGH_RMS and not any(work.motion):
-        warnings.append(f"RMS {rms:.2f} px is high: were both views of each pair taken at the same moment?")
+        doubt("synchronization", f"RMS {rms:.2f} px is high: were both views of each pair taken at the same moment?")
     if status not in (SolverStatus.CONVERGED, SolverStatus.EXACT):
-        warnings.append(f"the solver {status.message}")
-    warnings += moved_warnings(data.names, focal, work.motion, work.sigma_corner)
-    warnings += doubts
-    warnings += [f"not determined by the data: {text}" for text in undetermined]
+        doubt("solver", f"the solver {status.message}")
+    findings += moved_findings(data.names, focal, work.motion, work.sigma_corner)
+    findings += doubts
+    for text in undetermined:
+        doubt("place", f"not determined by the data: {text}")
     whole = [parameter_rows(problem, c) for c in range(len(data.cameras))]
     if not bool(covariance.of(torch.cat(whole))[1].all()):
-        warnings.append(
+        doubt(
+            "place",
             "the data do not determine all parameters of the cameras: the rig has no covariance, and intervals know "
-            "errors of the marks alone"
+            "errors of the marks alone",
         )
-    warnings += explanations.swap_warnings(data, problem, state, covariance)
+    findings += explanations.swap_findings(data, problem, state, covariance)
     cameras = data.cameras
     if any(bool(part.any()) for part in problem.unknowns.cameras):
         cameras = tuple(
@@ -583,9 +588,8 @@ def rig_result(
         variance=widen**2 * fit.variance,
         sigma_corner=None if data.boards is None else work.sigma_corner,
         undetermined=undetermined,
-        contradictions=tuple(one.text for one in certain),
         status=status,
-        warnings=tuple(warnings),
+        findings=tuple(findings),
         _problem=problem,
         _state=state,
         _covariance=covariance,

@@ -20,6 +20,7 @@ from kcal.calibrate.rig.sources import RigData
 from kcal.calibrate.rig.uncertainty import SharedCovariance, relative_rows
 from kcal.checks import variance_factor
 from kcal.errors import DegenerateError, InputError
+from kcal.finding import Finding
 from kcal.solve.lm import LMOptions
 from kcal.texts import measured_length
 
@@ -73,21 +74,26 @@ def refuse_one_place(data: RigData, problem: RigProblem, state: RigState, covari
                 )
 
 
-def one_camera_doubts(data: RigData) -> list[str]:
-    """Warn of boards seen by one camera from two places, which it cannot have seen at the same moment."""
+def one_camera_doubts(data: RigData) -> list[Finding]:
+    """Doubt boards seen by one camera from two places, which it cannot have seen at the same moment."""
     assert data.boards is not None
     seen = torch.isfinite(data.boards.pixels).all(-1).any(-1)
     return [
-        f"{data.names[first]} and {data.names[second]} are one camera at two places, and {count} boards were seen from "
-        "both: this is right only if no board moved while the camera was moved; otherwise leave --pairs out"
+        Finding(
+            "synchronization",
+            "doubt",
+            f"{data.names[first]} and {data.names[second]} are one camera at two places, and {count} boards were seen "
+            "from both: this is right only if no board moved while the camera was moved",
+            "otherwise leave --pairs out",
+        )
         for second, lens in enumerate(data.lenses)
         for first in range(second)
         if data.lenses[first] == lens and (count := int(seen[:, [first, second]].all(-1).sum()))
     ]
 
 
-def swap_warnings(data: RigData, problem: RigProblem, state: RigState, covariance: SharedCovariance) -> list[str]:
-    """Warn if left and right are swapped: by the side on which the right camera is, and by features behind both.
+def swap_findings(data: RigData, problem: RigProblem, state: RigState, covariance: SharedCovariance) -> list[Finding]:
+    """Tell if left and right are swapped: by the side on which the right camera is, and by features behind both.
 
     Args:
         data: only cameras named `left` and `right` have sides.
@@ -104,16 +110,16 @@ def swap_warnings(data: RigData, problem: RigProblem, state: RigState, covarianc
         if side < -_SIDEWAYS * length:
             # Without a vertical, right is where the left camera has it.
             otherwise = "" if data.absolute else " (or both cameras hang upside down)"
-            found.append(
-                f"the right camera is {-side:.3g} m to the left of the left camera: left and right are swapped"
-                f"{otherwise}; exchange their cameras, observations and marks"
-            )
+            text = f"the right camera is {-side:.3g} m to the left of the left camera: left and right are swapped"
+            action = "exchange their cameras, observations and marks"
+            found.append(Finding("swapped", "doubt", f"{text}{otherwise}", action))
     behind, seen = _features_behind(problem, state, covariance)
     if behind > seen / 2:
-        found.append(
+        text = (
             f"{behind} of {seen} features have negative parallax, as if they were behind the cameras: left and right "
             "marks are swapped, or are not of the same things"
         )
+        found.append(Finding("swapped", "doubt", text))
     return found
 
 

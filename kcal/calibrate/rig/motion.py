@@ -21,6 +21,7 @@ from kcal.calibrate.hybrid.evidence import (
 )
 from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies
 from kcal.calibrate.problem.state import AMPLITUDES, APART, AXES, FELT, MEDIAN, MotionSigma
+from kcal.finding import Finding
 from kcal.solve.schur import Products, column_scale
 
 # Rows of each camera of a rig, and their products, without the many columns that are zero for it.
@@ -299,24 +300,25 @@ class WithoutMotion:
         return rows + along @ self._inner @ self._columns
 
 
-def moved_warnings(
+def moved_findings(
     names: Sequence[str], focal: Sequence[float], motions: Sequence[BoardMotion | None], noise: float
-) -> list[str]:
-    """One warning for each camera before which boards moved by much more than the noise of a corner, in pixels."""
+) -> list[Finding]:
+    """One doubt for each camera before which boards moved by much more than the noise of a corner, in pixels."""
     found = []
     for name, length, motion in zip(names, focal, motions, strict=True):
         moved = 0.0 if motion is None else motion.sigma.moved(length, motion.reach)
         if moved > FELT * noise:
-            found.append(
+            text = (
                 f"the boards or the {name} camera moved while rows were read (rolling shutter), by some {moved:.1f} px "
-                "from the first row to the last: this is taken out, and the covariance allows for it; stands make it "
-                "smaller (if nothing moved, pairs are mixed up or a camera is wrong)"
+                "from the first row to the last: this is taken out, and the covariance allows for it"
             )
+            action = "stands make it smaller (if nothing moved, pairs are mixed up or a camera is wrong)"
+            found.append(Finding("moved", "doubt", text, action))
     return found
 
 
-def scatter_warnings(focal: Sequence[float], motions: Sequence[BoardMotion | None], noise: float) -> list[str]:
-    """A warning where the cameras' relative pose differs from pair to pair by much more than the noise, in pixels."""
+def scatter_findings(focal: Sequence[float], motions: Sequence[BoardMotion | None], noise: float) -> list[Finding]:
+    """A doubt where the cameras' relative pose differs from pair to pair by much more than the noise, in pixels."""
     moving = [(length, motion) for length, motion in zip(focal, motions, strict=True) if motion is not None]
     off = math.hypot(*(length * math.hypot(one.apart[1], one.reach * one.apart[0]) for length, one in moving))
     # What rolling shutters leave open of boards that move during one exposure is no matter of another moment.
@@ -324,9 +326,10 @@ def scatter_warnings(focal: Sequence[float], motions: Sequence[BoardMotion | Non
         FELT * noise, _OTHER_MOMENT * math.hypot(*(one.sigma.moved(length, one.reach) for length, one in moving))
     ):
         return []
-    return [
+    text = (
         f"the cameras' relative pose differs from pair to pair by some {off:.1f} px, {off / noise:.0f} times the noise "
         "of a corner: were both views of each pair taken at the same moment, of a board at rest? Each pair counts with "
-        "such an error, and the covariance allows for it; trigger the cameras together, or put the board on a stand "
-        "(if nothing moved, a camera is wrong)"
-    ]
+        "such an error, and the covariance allows for it"
+    )
+    action = "trigger the cameras together, or put the board on a stand (if nothing moved, a camera is wrong)"
+    return [Finding("synchronization", "doubt", text, action)]

@@ -17,6 +17,7 @@ from kcal.calibrate.rig.problem import RigProblem
 from kcal.calibrate.rig.source import RigState
 from kcal.calibrate.rig.sources import RigData
 from kcal.calibrate.rig.uncertainty import SharedCovariance, mounting_rows, parameter_rows, relative_rows
+from kcal.finding import Finding, sentences
 from kcal.io.rig_file import save_rig
 from kcal.lens.calibration import Exclusion, ItemResidual, RigCalibration, RigSource
 from kcal.lens.camera import Camera
@@ -55,10 +56,9 @@ class RigResult:
             ranges are not linear in errors of the baseline (`kcal.calibrate.rig.assess`); 1 if neither.
         sigma_corner: of a board's corner along an axis, px, as used; None without boards.
         undetermined: what the data leave open, in words; none of it concerns the cameras' relative poses.
-        contradictions: which source contradicts the others beyond reasonable doubt
-            (`kcal.calibrate.rig.explanations`), a sentence each; such a rig should not be used.
         status: why the solver stopped.
-        warnings: one sentence for each thing that the user should doubt.
+        findings: what the user should doubt; a source that contradicts the others beyond reasonable doubt
+            (`kcal.calibrate.rig.explanations`) is a "stop": such a rig should not be used.
     """
 
     __repr__ = brief
@@ -78,9 +78,8 @@ class RigResult:
     variance: float
     sigma_corner: float | None
     undetermined: tuple[str, ...]
-    contradictions: tuple[str, ...]
     status: SolverStatus
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]
     _problem: RigProblem
     _state: RigState
     _covariance: SharedCovariance
@@ -102,6 +101,16 @@ class RigResult:
         """Names of the cameras that were taken as exact: errors of their lenses are in no covariance."""
         maps = self._problem.unknowns.cameras
         return tuple(name for name, by_unknown in zip(self.names, maps, strict=True) if not bool(by_unknown.any()))
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The findings as sentences."""
+        return sentences(self.findings)
+
+    @property
+    def contradictions(self) -> tuple[str, ...]:
+        """Those of the findings that forbid the use."""
+        return sentences(one for one in self.findings if one.severity == "stop")
 
     @property
     def left_out(self) -> tuple[ItemResidual, ...]:

@@ -33,6 +33,7 @@ from kcal.calibrate.rig.sources import RigData
 from kcal.calibrate.rig.unknowns import SharedUnknowns, free, gathered, held, joint_unknowns, less
 from kcal.corners.observations import Observations
 from kcal.errors import InputError
+from kcal.finding import Finding
 from kcal.gaussian import triangular
 from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
@@ -43,13 +44,13 @@ from kcal.threads import in_one_thread
 # Leave out marks and corners at which a lens model has no ray.
 
 
-def without_rayless(data: RigData) -> tuple[RigData, list[str]]:
-    """The data with pixels at which a lens model has no ray taken as unseen, and warnings that count them.
+def without_rayless(data: RigData) -> tuple[RigData, list[Finding]]:
+    """The data with pixels at which a lens model has no ray taken as unseen, and doubts that count them.
 
     Raises:
         InputError: most corners of a board are such pixels.
     """
-    warnings, changed = list[str](), dict[str, Any]()
+    doubts, changed = list[Finding](), dict[str, Any]()
     for source in data.seen:
         kind = source.kind
         pixels = source.pixels.clone()
@@ -67,10 +68,11 @@ def without_rayless(data: RigData) -> tuple[RigData, list[str]]:
                         "ray at most of its corners: it folds inside the image; calibrate with views nearer the "
                         "image's border or with a smaller model"
                     )
-            warnings.append(f"{int(lost.sum())} pixels of {kind} left out where {data.names[c]}'s lens has no ray")
+            text = f"{int(lost.sum())} pixels of {kind} left out where {data.names[c]}'s lens has no ray"
+            doubts.append(Finding("excluded", "doubt", text))
             pixels[:, c] = torch.where(lost[..., None], torch.nan, pixels[:, c])
         changed[kind] = dataclasses.replace(source, pixels=pixels)  # type: ignore[type-var]
-    return dataclasses.replace(data, **changed), warnings
+    return dataclasses.replace(data, **changed), doubts
 
 
 # The best robust solution of a rig from several initial poses.
@@ -196,7 +198,7 @@ class RigOptions:
         weighted: let corners count by their covariances where all views have them.
         motion: boards may move while the rows of an image are read, if they or the cameras are held by hand; how much
             the boards tell. False: they stand still.
-        reject: leave out what contradicts the rest; otherwise warnings name it. Left out or not, it is listed.
+        reject: leave out what contradicts the rest; otherwise findings name it. Left out or not, it is listed.
         refraction: of light towards landmarks, as a share of the Earth's curvature; estimated from here. For
             simulations and other straight lines it and its sigma are 0.
         refraction_sigma: its standard deviation beforehand; 0 holds it.
@@ -265,10 +267,10 @@ def solve_rig(
     refuse_same_camera(data)
     if not options.weighted and data.boards is not None:
         data = dataclasses.replace(data, boards=dataclasses.replace(data.boards, covariance=None))
-    data, warnings = without_rayless(data)
+    data, findings = without_rayless(data)
     progress("what is known of cameras and board")
     data, unknowns, doubts = _what_may_change(data, options)
-    warnings += doubts
+    findings += doubts
     progress("first poses")
     initial = first_poses(data, options.solver)
     mask, reasons = _first_mask(initial, reject=options.reject)
@@ -284,7 +286,7 @@ def solve_rig(
     else:
         mask = possible(work, mask)
         kept, doubts = _suspicions(work, mask, reasons, looking)
-        warnings += doubts
+        findings += doubts
     if options.motion:
         work.fit_motion(kept)
     progress("solution")
@@ -298,7 +300,7 @@ def solve_rig(
         if change < 1e-3:
             break
     progress("uncertainty")
-    return rig_result(work, found, mask, reasons, initial, warnings, refuse=options.reject)
+    return rig_result(work, found, mask, reasons, initial, findings, refuse=options.reject)
 
 
 def _first_mask(initial: InitialPoses, *, reject: bool) -> tuple[Tensor, Reasons]:
@@ -315,9 +317,9 @@ def _first_mask(initial: InitialPoses, *, reject: bool) -> tuple[Tensor, Reasons
     return all_of(masks, torch.zeros(0, dtype=torch.bool)), reasons
 
 
-def _what_may_change(data: RigData, options: RigOptions) -> tuple[RigData, SharedUnknowns, list[str]]:
-    """What may change of cameras, board and air, the data with the board as it is expected, and warnings of it."""
-    boards, doubts = data.boards, list[str]()
+def _what_may_change(data: RigData, options: RigOptions) -> tuple[RigData, SharedUnknowns, list[Finding]]:
+    """What may change of cameras, board and air, the data with the board as it is expected, and doubts of it."""
+    boards, doubts = data.boards, list[Finding]()
     # One camera at several places has one lens.
     places = {lens: [c for c, own in enumerate(data.lenses) if own == lens] for lens in data.lenses}
     cameras = tuple(data.cameras[lens] for lens in places)
@@ -335,9 +337,13 @@ def _what_may_change(data: RigData, options: RigOptions) -> tuple[RigData, Share
             lenses = list(places)
             measured = boards.deviation is not None
             doubts = [
-                f"the calibrations of {data.names[lenses[one]]} and {data.names[lenses[other]]} contradict each other "
-                f"about their board ({boards.board}): two prints, or one that bent in between; calibrate both cameras "
-                "from views of the board in the pairs"
+                Finding(
+                    "board",
+                    "doubt",
+                    f"the calibrations of {data.names[lenses[one]]} and {data.names[lenses[other]]} contradict each "
+                    f"other about their board ({boards.board}): two prints, or one that bent in between",
+                    "calibrate both cameras from views of the board in the pairs",
+                )
                 for one, other in apart
             ]
             unknowns, deviation = joint_unknowns(cameras, parts, boards.board, measured=measured)
@@ -366,16 +372,16 @@ def _lens_unknowns(
     return joint_unknowns(cameras, gathered(cameras, known, None)[0], None)[0]
 
 
-def _suspicions(work: Adjustment, mask: Tensor, reasons: Reasons, solver: LMOptions) -> tuple[Tensor, list[str]]:
-    """What agrees, and warnings that name what would be left out, were it not to be kept."""
+def _suspicions(work: Adjustment, mask: Tensor, reasons: Reasons, solver: LMOptions) -> tuple[Tensor, list[Finding]]:
+    """What agrees, and doubts that name what would be left out, were it not to be kept."""
     trial = copy.copy(work)
     try:
         kept = explained(trial, mask, solver)
     except InputError as error:
-        return mask, [str(error)]
+        return mask, [Finding("excluded", "doubt", str(error))]
     named = {work.labels[i] for i in reasons}
     return kept, [
-        f"{item.label}: {item.reason}; it was kept"
+        Finding("excluded", "doubt", f"{item.label}: {item.reason}; it was kept")
         for item in records(trial, kept, reasons).items
         if not item.used and item.label not in named
     ]

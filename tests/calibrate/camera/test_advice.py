@@ -13,14 +13,15 @@ from kcal.calibrate.camera.advice import (
     board_rolls,
     board_tilts,
     reached,
+    roll_findings,
     roll_span,
-    roll_warnings,
     unreached_share,
     what_to_photograph,
 )
-from kcal.calibrate.camera.warnings import corner_pupil, pupil_warnings
+from kcal.calibrate.camera.warnings import corner_pupil, pupil_findings
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
+from kcal.finding import sentences
 from kcal.lens.camera import Camera
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.model import LensModel
@@ -101,14 +102,14 @@ def test_rolls() -> None:
 
 def test_boards_all_the_same_way_up() -> None:
     left_out = torch.full((1, 3, 3), torch.nan).double()
-    (text,) = roll_warnings(torch.cat([turned(rolls=[-10.0, 15.0, 179.0]), left_out]))
+    (text,) = sentences(roll_findings(torch.cat([turned(rolls=[-10.0, 15.0, 179.0]), left_out])))
     assert text.startswith("all 3 views show the board upright (rolled by at most 15°)")
-    (text,) = roll_warnings(turned(rolls=[80.0, -90.0, 105.0]))
+    (text,) = sentences(roll_findings(turned(rolls=[80.0, -90.0, 105.0])))
     assert text.startswith("all 3 views show the board on its side (rolled by at most 15°)")
-    assert roll_warnings(turned(rolls=[0.0, 21.0])) == []
-    assert len(roll_warnings(turned(rolls=[0.0, 19.0]))) == 1
-    assert roll_warnings(turned(rolls=[0.0, 90.0])) == []
-    assert roll_warnings(left_out) == []
+    assert roll_findings(turned(rolls=[0.0, 21.0])) == []
+    assert len(roll_findings(turned(rolls=[0.0, 19.0]))) == 1
+    assert roll_findings(turned(rolls=[0.0, 90.0])) == []
+    assert roll_findings(left_out) == []
 
 
 @pytest.mark.parametrize(
@@ -147,19 +148,19 @@ def hybrid(pupil1: float) -> tuple[Camera, Tensor]:
 
 def test_an_entrance_pupil_that_no_lens_has() -> None:
     assert corner_pupil(camera(), torch.eye(5)) is None
-    assert pupil_warnings(camera(), torch.eye(5)) == []
+    assert pupil_findings(camera(), torch.eye(5)) == []
     corner = math.atan(math.hypot(149.5, 149.5) / 300)
     for slope in (0.1, -0.1):
         found = corner_pupil(*hybrid(slope))
         assert found.angle == pytest.approx(corner, rel=1e-6)
         assert found.depth == pytest.approx(slope * corner**2, rel=1e-6)
         assert found.sigma == pytest.approx(0.01 * corner**2, rel=1e-6)
-        (text,) = pupil_warnings(*hybrid(slope))
+        (text,) = sentences(pupil_findings(*hybrid(slope)))
         told = f"moves by {100 * corner**2:.0f} ± {found.sigma * 1e3:.0f} mm, which no lens does"
         assert f"{told} (11 mm at most, 35° off the axis)" in text
     # Ten times what glass does, and two sigmas.
-    assert pupil_warnings(*hybrid(0.029)) == []
-    assert len(pupil_warnings(*hybrid(0.031))) == 1
+    assert pupil_findings(*hybrid(0.029)) == []
+    assert len(pupil_findings(*hybrid(0.031))) == 1
     lens, covariance = hybrid(0.1)
-    assert pupil_warnings(lens, 26 * covariance) == []
-    assert len(pupil_warnings(lens, 24 * covariance)) == 1
+    assert pupil_findings(lens, 26 * covariance) == []
+    assert len(pupil_findings(lens, 24 * covariance)) == 1

@@ -10,11 +10,12 @@ import pytest
 import torch
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.calibrate.camera.warnings import check_end, measured_aspect, motion_warnings, pixel_warnings
+from kcal.calibrate.camera.warnings import check_end, measured_aspect, motion_findings, pixel_findings
 from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.errors import InputError
+from kcal.finding import sentences
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.uncertainty import paraxial_focal
@@ -37,15 +38,15 @@ def fitted(views: int, hands: Hands | None) -> HybridFit:
 
 
 def test_motion_is_told_in_pixels() -> None:
-    many = motion_warnings(fitted(12, HANDS))
+    many = sentences(motion_findings(fitted(12, HANDS)))
     assert len(many) == 1
     assert "moved while rows were read" in many[0]
-    assert motion_warnings(fitted(12, None)) == []
+    assert motion_findings(fitted(12, None)) == []
 
 
 def test_few_views_that_moved() -> None:
     """Their error bars are wide, and may still be too small, which no other warning says."""
-    few = motion_warnings(fitted(5, HANDS))
+    few = sentences(motion_findings(fitted(5, HANDS)))
     assert [text.startswith("5 views that moved are few") for text in few] == [True, False]
 
 
@@ -130,6 +131,6 @@ def test_a_sentence_about_pixels_needs_its_evidence() -> None:
     assert not fit.square
     aspect, sigma = measured_aspect(fit)
     assert aspect == pytest.approx(1.01, abs=5.0 * sigma)
-    assert "f_y / f_x = 1.01" in pixel_warnings(fit)[0]
+    assert "f_y / f_x = 1.01" in sentences(pixel_findings(fit))[0]
     wider = dataclasses.replace(fit, half=(aspect - 1.0) / sigma / 2.6 * fit.half)
-    assert pixel_warnings(wider) == []
+    assert pixel_findings(wider) == []

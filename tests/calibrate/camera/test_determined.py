@@ -11,13 +11,15 @@ from calibrate_scenes import BOARD, SIZE, camera, motions, observe, pixels_of
 from lenses import FEW_MODES, hybrid_camera
 from torch import Tensor
 
-from kcal.calibrate.camera.advice import check_directions, direction_share, reached, roll_warnings, what_to_photograph
+from kcal.calibrate.camera.advice import check_directions, direction_share, reached, roll_findings, what_to_photograph
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.calibrate.camera.warnings import corner_pupil, general_warnings, outlier_warnings, pupil_warnings
+from kcal.calibrate.camera.checks import stray_corners
+from kcal.calibrate.camera.warnings import corner_pupil, general_findings, outlier_findings, pupil_findings
 from kcal.corners.board import Board
 from kcal.corners.detect import detect
 from kcal.corners.observations import Observations, View
 from kcal.errors import DegenerateError
+from kcal.finding import sentences
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.lens.pose import rotation_from_vector
@@ -153,22 +155,25 @@ def rolled(*degrees: float) -> Tensor:
 
 class TestRolls:
     def test_a_board_upright_in_all_views(self) -> None:
-        (text,) = roll_warnings(rolled(3.0, -7.2, 1.0, 178.0))
+        (text,) = sentences(roll_findings(rolled(3.0, -7.2, 1.0, 178.0)))
         assert text.startswith("all 4 views show the board upright (rolled by at most 7°): ")
         assert text.endswith("turn the board or the camera by 90° for a third of the views")
 
     def test_on_its_side(self) -> None:
-        assert "all 3 views show the board on its side (rolled by at most 5°)" in roll_warnings(rolled(90, -85, 270))[0]
+        assert (
+            "all 3 views show the board on its side (rolled by at most 5°)"
+            in sentences(roll_findings(rolled(90, -85, 270)))[0]
+        )
 
     def test_one_view_of_another_roll_is_enough(self) -> None:
-        assert roll_warnings(rolled(0.0, 5.0, -5.0, 45.0)) == []
-        assert roll_warnings(rolled(0.0, 90.0)) == []
+        assert roll_findings(rolled(0.0, 5.0, -5.0, 45.0)) == []
+        assert roll_findings(rolled(0.0, 90.0)) == []
 
     def test_views_left_out_and_none_at_all(self) -> None:
         rotation = rolled(0.0, 90.0, 2.0)
         rotation[1] = torch.nan
-        assert "all 2 views" in roll_warnings(rotation)[0]
-        assert roll_warnings(rotation[1:2]) == []
+        assert "all 2 views" in sentences(roll_findings(rotation))[0]
+        assert roll_findings(rotation[1:2]) == []
 
     def test_only_where_the_board_is_estimated(self) -> None:
         """A plate that is as ordered has no print to confound with anything."""
@@ -183,13 +188,13 @@ class TestRolls:
         if name == "ch1280":
             seen = Observations.load(kcal_data / "captures" / "ch1280.obs.json")
             rotation = calibrate_camera(seen, CalibrationOptions(model="opencv4")).cam_from_board_rotation
-            assert roll_warnings(rotation) == []
+            assert roll_findings(rotation) == []
             return
 
         images = sorted((kcal_data / "captures" / "pi640").glob("*.jpg"))
         seen = detect(images[5:16], Board(columns=7, rows=7, square=0.0254), "none")
         rotation = calibrate_camera(seen, CalibrationOptions(model="opencv4")).cam_from_board_rotation
-        assert re.search(r"upright \(rolled by at most [1-5]°\)", roll_warnings(rotation)[0])
+        assert re.search(r"upright \(rolled by at most [1-5]°\)", sentences(roll_findings(rotation))[0])
 
 
 class TestPupil:
@@ -210,7 +215,7 @@ class TestPupil:
         assert found.depth == pytest.approx(0.1 * found.angle**2)
         assert found.sigma == pytest.approx(0.001 * found.angle**2)
         assert 70 < math.degrees(found.angle) < 76
-        (text,) = pupil_warnings(lens, self.spread(lens, 0.001))
+        (text,) = sentences(pupil_findings(lens, self.spread(lens, 0.001)))
         moved = f"moves by {1e3 * found.depth:.0f} ± {1e3 * found.sigma:.0f} mm, which no lens does"
         assert f"{moved} ({30 * found.angle**2:.0f} mm at most" in text
         assert "measure the squares" in text
@@ -219,29 +224,29 @@ class TestPupil:
     def test_what_a_lens_may_do_or_chance(self, first: float, sigma: float) -> None:
         """Glass moves some 3 mm per square radian, the wide lens of the tests' data 6."""
         lens = self.lens(first)
-        assert pupil_warnings(lens, self.spread(lens, sigma)) == []
+        assert pupil_findings(lens, self.spread(lens, sigma)) == []
 
     def test_either_way(self) -> None:
         lens = self.lens(-0.04)
-        assert "moves by" in pupil_warnings(lens, self.spread(lens, 1e-4))[0]
+        assert "moves by" in sentences(pupil_findings(lens, self.spread(lens, 1e-4)))[0]
         # As of 88 thermal views: 43 ± 18 mm.
-        assert "moves by" in pupil_warnings(lens, self.spread(lens, 0.04 * 18 / 43))[0]
+        assert "moves by" in sentences(pupil_findings(lens, self.spread(lens, 0.04 * 18 / 43)))[0]
 
     def test_at_small_angles_a_centimeter_is_allowed(self) -> None:
         """A long lens is large: its pupil moves by more than the rule for angles says."""
         narrow = self.lens(0.024, "pinhole")
         found = corner_pupil(narrow, self.spread(narrow, 1e-4))
         assert 0.03 * found.angle**2 < 0.01
-        assert pupil_warnings(narrow, self.spread(narrow, 1e-4)) == []
-        assert pupil_warnings(self.lens(0.06, "pinhole"), self.spread(narrow, 1e-4)) != []
+        assert pupil_findings(narrow, self.spread(narrow, 1e-4)) == []
+        assert pupil_findings(self.lens(0.06, "pinhole"), self.spread(narrow, 1e-4)) != []
 
     def test_parametric_lenses_have_none(self) -> None:
-        assert pupil_warnings(camera(), torch.zeros(10, 10).double()) == []
+        assert pupil_findings(camera(), torch.zeros(10, 10).double()) == []
 
 
 class TestGeneral:
     def warned(self, lens: Camera, status: SolverStatus = SolverStatus.CONVERGED, rms: float = 0.1) -> list[str]:
-        return general_warnings(["a"], lens, rms, torch.tensor([rms]).double(), (), status)
+        return sentences(general_findings(["a"], lens, rms, torch.tensor([rms]).double(), (), status))
 
     def test_a_hybrid_lens_has_no_smaller_model(self) -> None:
         lens = hybrid_camera("wide", modes=FEW_MODES)
@@ -276,9 +281,13 @@ class TestGeneral:
 
 def test_a_far_corner_blames_the_lens_only_where_it_may_be_too_simple() -> None:
     residuals = 0.1 * torch.randn(4, 40, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    assert outlier_warnings("abcd", residuals) == []
+    assert not bool(stray_corners(residuals).any())
+    assert outlier_findings("abcd", residuals, stray_corners(residuals)) == []
     residuals[1, 3] = 5.0
-    (plain,), (model,) = outlier_warnings("abcd", residuals), outlier_warnings("abcd", residuals, "; a richer model")
+    strays = stray_corners(residuals)
+    (plain,), (model,) = (
+        sentences(outlier_findings("abcd", residuals, strays, more)) for more in ("", "; a richer model")
+    )
     assert plain.startswith("1 of 160 corners are farther off than noise explains, corner 3 of view b by 7.07 px")
     assert plain.endswith("(--reject)")
     assert model == plain + "; a richer model"

@@ -17,11 +17,11 @@ from kcal.calibrate.camera.interval_check import interval_check, simulated_refit
 from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult
 from kcal.cli.main import main
 from kcal.corners.observations import Observations
+from kcal.finding import Finding
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.uncertainty import pixel_covariance, pixel_errors
 from kcal.report.judge_camera import fault_of_views
-from kcal.report.verdict import Finding
 from scripts.shared.views import observed, simulate
 
 OPTIONS = CalibrationOptions(model="opencv5", weak_prior=None)

@@ -27,6 +27,7 @@ from kcal.cli.main import app
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError, KcalError
+from kcal.finding import Finding
 from kcal.io.camera_file import load_camera, save_camera
 from kcal.lens.camera import Camera
 
@@ -95,11 +96,11 @@ def test_a_shared_board_is_better_known() -> None:
 
 def test_what_was_said_of_the_views_stays() -> None:
     """Warnings of a fit alone are found anew; those of its views are not, and must not be lost."""
-    doubts = ("2 of 5 views were left out: c, d", "1 of 5 views were left out: e")
-    one = dataclasses.replace(alone(1), warnings=("of this fit alone", *doubts))
+    doubts = tuple(Finding("excluded", "doubt", f"{which} left out") for which in ("2 of 5 views were", "1 of 5 was"))
+    one = dataclasses.replace(alone(1), findings=(Finding("model", "doubt", "of this fit alone"), *doubts))
     found = result_of(sharing([one, alone(2)], CalibrationOptions())[0])
     assert found.shared_board is not None
-    assert found.warnings[:2] == doubts
+    assert found.findings[:2] == doubts
     assert "of this fit alone" not in found.warnings
 
 

@@ -24,6 +24,7 @@ from kcal.io.rig_file import load_rig
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.solve.problem import SolverStatus
+from kcal.texts import counted_text
 
 # 8 x 6 corners: the colors are the same after half a turn, so that a detector cannot know the first corner.
 AMBIGUOUS = Board(columns=8, rows=6, square=0.04)
@@ -92,7 +93,9 @@ class TestTruth:
     def test_few_pairs_are_warned_of(self) -> None:
         assert solve(views(3, 1)).warnings == ()
         for count in (1, 2):
-            assert [text[:15] for text in solve(views(count, 1)).warnings] == [f"{count} pair(s) only:"]
+            assert [text.split(":")[0] for text in solve(views(count, 1)).warnings] == [
+                f"{counted_text(count, 'pair')} only"
+            ]
 
     def test_corners_that_one_camera_did_not_see(self) -> None:
         pixels = views(5, 1)
