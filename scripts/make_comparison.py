@@ -27,10 +27,7 @@ import torch
 from matplotlib.axes import Axes
 from torch import Tensor
 
-from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.calibrate.rig.landmarks import Landmarks
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations, View
+from kcal import Board, Landmarks, Observations, View, calibrate_camera
 from kcal.report.figures import ACCENT, FAINT, GRAY, INK, WARN, new_figure, save_picture
 from kcal.sim.captures import PrintedBoard, drawn_rig
 from kcal.sim.raytrace import SURVEILLANCE

@@ -25,27 +25,18 @@ from torch import Tensor, nn
 from torch.func import functional_call, jvp, stack_module_state, vjp, vmap
 
 import kcal
-from kcal import Board, Camera
-from kcal.calibrate.camera.layer import CalibrationLayer
-from kcal.calibrate.camera.result import CalibrationOptions
-from kcal.corners.refine import RefineCorners
-from kcal.lens import rotation_from_vector
+from kcal import Board, CalibrationOptions, Camera, Localizer, Origin, Rig
+from kcal.calibrate import CalibrationLayer
+from kcal.corners import RefineCorners
+from kcal.lens import CameraRays, StereoRectification, Undistort, UndistortImage, Unproject, rotation_from_vector
 from kcal.lens.baking import LookupCamera, bake
-from kcal.lens.camera_like import CameraRays, Unproject
 from kcal.lens.camera_parameters import CameraDistortion, ExtendedDistortion
-from kcal.lens.images import StereoRectification, Undistort, UndistortImage
-from kcal.lens.rig import Origin, Rig, RigCovariance
 from kcal.lens.views import Cylinder
-from kcal.locate.disparity import DisparityRanges
-from kcal.locate.geodesy import enu_from_cam
-from kcal.locate.localizer import Localizer
-from kcal.locate.mounting import mounting_covariance
-from kcal.locate.triangulate import Triangulate
-from kcal.nets.inverse import InverseNet
-from kcal.nets.joint import ResidualNet
-from kcal.pipeline.association import PairBoxes
-from kcal.pipeline.pairing import ObjectDisparity
-from kcal.solve.lm import LevenbergMarquardt
+from kcal.locate import DisparityRanges, Triangulate, enu_from_cam
+from kcal.nets import InverseNet, ResidualNet
+from kcal.rig import RigCovariance, mounting_covariance
+from kcal.solve import LevenbergMarquardt
+from kcal.track import ObjectDisparity, PairBoxes
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "reference" / "modules.md"
 # What only others are made of.

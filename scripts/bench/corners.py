@@ -26,15 +26,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kcal import Board, Camera, detect
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.corners.board import Board
-from kcal.corners.detect import detect
 from kcal.corners.grid import local_side
 from kcal.corners.images import expand_images
 from kcal.corners.refine import Refinement, refine_corners
 from kcal.corners.saddle import saddle
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
+from kcal.lens import rotation_from_vector
 from kcal.sim.captures import BoardSize, project_board
 from kcal.sim.scene import RenderOptions, render_light
 from scripts.shared.page import table, write_section

@@ -28,12 +28,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from kcal.corners.board import Board
+from kcal import Board, Camera
 from kcal.corners.detect import detect_board, limit_threads
 from kcal.corners.grid import local_side
 from kcal.corners.images import expand_images, read_gray
 from kcal.corners.refine import refine_corners
-from kcal.lens.camera import Camera
 from kcal.sim.captures import BoardSize, sample_board_poses
 from kcal.sim.scene import render_board
 from scripts.shared.page import table, write_section

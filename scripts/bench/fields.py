@@ -20,14 +20,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kcal import Board, Observations, detect
 from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid
-from kcal.calibrate.hybrid.network_fit import FieldTraining
-from kcal.corners.board import Board
-from kcal.corners.detect import detect
 from kcal.corners.images import expand_images
-from kcal.corners.observations import Observations
 from kcal.lens.field_modes import FieldModes, GaussianModes, NetworkModes
 from kcal.lens.zernike import ZernikeModes
+from kcal.nets import FieldTraining
 from scripts.shared.page import table, write_section
 from scripts.shared.timing import show
 from scripts.shared.wide_lens import folds, held_out, load

@@ -10,9 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcal.corners.board import Board
+from kcal import Board, Camera
 from kcal.corners.print_board import pattern_shapes
-from kcal.lens.camera import Camera
 from kcal.sim.captures import BoardPose, BoardSize, PoseOptions, sample_board_poses
 from kcal.sim.scene import RenderOptions, render_light
 from scripts.shared.printed_board import Paper, light_of, points_of, through_lens

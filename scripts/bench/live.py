@@ -20,12 +20,10 @@ import numpy as np
 import orjson
 import torch
 
-from kcal.io.rig_file import save_rig
-from kcal.lens.rig import Mounting, Origin, Rig, RigCovariance
-from kcal.locate.budget import planned_rig
-from kcal.locate.localizer import Localizer
+from kcal import Localizer, Origin, Rig, save_rig
 from kcal.pipeline.pairing import ObjectViews
-from kcal.pipeline.tracks import Tracker
+from kcal.rig import Mounting, RigCovariance, planned_rig
+from kcal.track import Tracker
 from scripts.shared.page import table, write_section
 
 

@@ -19,9 +19,8 @@ from pathlib import Path
 import torch
 
 import kcal
-from kcal.io.rig_file import save_rig
-from kcal.lens.rig import Mounting
-from kcal.locate.mounting import mounting_covariance
+from kcal import save_rig
+from kcal.rig import Mounting, mounting_covariance
 from scripts.bench.locate import known_to, some_points
 from scripts.shared.long_range import ORIGIN, rig
 from scripts.shared.page import table, write_section

@@ -24,18 +24,15 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.io.camera_file import load_camera, save_camera
+from kcal import Rig, calibrate_camera, load_camera, load_rig, save_camera, save_rig
 from kcal.io.images import write_png
-from kcal.io.rig_file import load_rig, save_rig
-from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Rig
-from kcal.locate.marks import Marks
-from kcal.locate.survey import Survey
+from kcal.lens import rotation_from_vector
+from kcal.locate import Marks
 from kcal.mark.guide import open_pictures
 from kcal.mark.items import SIDES, Mark, Put
 from kcal.mark.marking_service import Desk, solve_live
 from kcal.mark.session import Session
+from kcal.rig import Survey
 from scripts.shared.simulated import simulated
 
 # Of captures by a machine-vision lens.

@@ -21,10 +21,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from kcal.io.camera_file import save_camera
-from kcal.io.rig_file import load_rig, save_rig
-from kcal.lens.camera import Camera
-from kcal.lens.rig import Mounting
+from kcal import Camera, load_rig, save_camera, save_rig
+from kcal.rig import Mounting
 from scripts.bench.locate_table import write_table
 from scripts.shared.long_range import ORIGIN, rig
 from scripts.shared.page import table, write_section

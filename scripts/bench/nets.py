@@ -22,14 +22,13 @@ import torch
 from torch import Tensor
 
 import kcal.lens.inverse
-from kcal.lens.baking import bake
-from kcal.lens.camera import Camera
+from kcal import Camera
+from kcal.lens import LensModel, bake
 from kcal.lens.distortion import distort_components
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.inverse import InverseStart
-from kcal.lens.model import LensModel
 from kcal.lens.zernike import ZernikeModes
-from kcal.nets.inverse import InverseNetOptions, train_inverse
+from kcal.nets import InverseNetOptions, train_inverse
 from scripts.bench.lens import LENS, SIZE
 from scripts.bench.lens import build as build_hd
 from scripts.shared.page import write_section

@@ -16,12 +16,9 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from kcal.calibrate.camera.at_setting import compare_models
-from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.calibrate.camera.result import CalibrationOptions
-from kcal.calibrate.hybrid.network_fit import FieldTraining
-from kcal.corners.observations import Observations
-from kcal.errors import KcalError
+from kcal import CalibrationOptions, KcalError, Observations, calibrate_camera
+from kcal.calibrate import compare_models
+from kcal.nets import FieldTraining
 from scripts.shared.dented_lens import capture, network, off
 from scripts.shared.page import table, write_row
 

@@ -28,15 +28,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kcal import Board, Camera, Observations, Rig, RigOptions, calibrate_rig, detect
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.hybrid.fit import fit_hybrid
-from kcal.calibrate.rig.solve import RigOptions, calibrate_rig
-from kcal.corners.board import Board
-from kcal.corners.detect import detect
 from kcal.corners.images import expand_images
-from kcal.corners.observations import Observations
-from kcal.lens.camera import Camera
-from kcal.lens.rig import Rig
 from scripts.shared.mrcal_spline import splined
 from scripts.shared.page import write_row
 from scripts.shared.timing import row, show

@@ -23,14 +23,10 @@ import cv2
 import numpy as np
 import torch
 
+from kcal import Board, Camera, Observations, RigOptions, calibrate_rig, detect
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.calibrate.rig.pairs import pair_by_name
-from kcal.calibrate.rig.solve import RigOptions, calibrate_rig
-from kcal.corners.board import Board
-from kcal.corners.detect import detect
-from kcal.corners.observations import Observations
-from kcal.lens.camera import Camera
 from kcal.report.judge_rig import triangulated_sides
+from kcal.rig import pair_by_name
 from scripts.shared.page import write_section
 
 BOARD = Board(columns=9, rows=6, square=0.025)

@@ -23,15 +23,11 @@ from kornia.geometry.calibration import distort_points, undistort_points
 from kornia.geometry.epipolar import triangulate_points
 from torch import Tensor
 
-from kcal.io.rig_file import load_rig
-from kcal.lens.camera import Camera
-from kcal.lens.rig import Origin, Rig, RigCovariance
-from kcal.locate.budget import planned_rig
-from kcal.locate.localizer import Localizer
-from kcal.locate.triangulate import Triangulate
+from kcal import Camera, Localizer, Origin, Rig, load_rig
+from kcal.locate import Triangulate
 from kcal.pipeline.association import associate
-from kcal.pipeline.detections import Detections
-from kcal.pipeline.pairing import ObjectDisparity
+from kcal.rig import RigCovariance, planned_rig
+from kcal.track import Detections, ObjectDisparity
 from scripts.check.pairing import OPTIONS, SIZE, site_rig
 from scripts.shared.page import table, write_section
 

@@ -31,20 +31,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.camera.calibrate import calibrate_camera
+from kcal import Board, Camera, Localizer, Observations, RigData, View, calibrate_camera, save_rig, solve_rig
 from kcal.calibrate.rig.pairs import boards_of_several
-from kcal.calibrate.rig.solve import solve_rig
-from kcal.calibrate.rig.sources import RigData
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations, View
-from kcal.io.rig_file import save_rig
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
+from kcal.lens import rotation_from_vector
 from kcal.lens.rig import Mounting, Origin, Rig, RigCovariance
-from kcal.locate.budget import planned_rig
-from kcal.locate.localizer import Localizer
-from kcal.locate.raster import terrain
+from kcal.locate import terrain
 from kcal.locate.siting import Site, area_of, rank_sites, siting_map
+from kcal.rig import planned_rig
 from scripts.shared.memory import peak_megabytes
 from scripts.shared.page import table, write_section
 from scripts.shared.station_scenes import drawn_errors, hills, marks, ring, targets

@@ -30,11 +30,10 @@ from typing import Any
 
 import torch
 
+from kcal import KcalError, Observations
 from kcal.calibrate.camera.advice import reached
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.corners.observations import Observations
-from kcal.errors import KcalError
-from kcal.lens.uncertainty import pixel_covariance
+from kcal.lens import pixel_covariance
 from kcal.sim.captures import drawn_lens
 from kcal.sim.truth import TruthLens
 from scripts.shared.infinity import error_at_infinity

@@ -22,10 +22,9 @@ import numpy as np
 import torch
 from kornia.geometry.calibration import undistort_image
 
-from kcal.lens.camera import Camera
+from kcal import Camera, Rig
+from kcal.lens import cylinder_view, looking, pinhole_view
 from kcal.lens.images import StereoRectification, Undistort, UndistortMaps, undistort_maps
-from kcal.lens.rig import Rig
-from kcal.lens.views import cylinder_view, looking, pinhole_view
 from scripts.shared.page import write_section
 from scripts.shared.timing import median, ratio, row, show, times
 

@@ -19,8 +19,7 @@ from pathlib import Path
 
 import torch
 
-from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.errors import KcalError
+from kcal import KcalError, calibrate_camera
 from scripts.shared.page import table, tell
 from scripts.shared.records import Record, finish, read, seeds
 from scripts.shared.simulated import simulated

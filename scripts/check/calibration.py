@@ -20,16 +20,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kcal import Board, KcalError, Observations, View, detect
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.views import free_parameters
-from kcal.corners.board import Board
-from kcal.corners.detect import detect
-from kcal.corners.observations import Observations, View
-from kcal.errors import KcalError
-from kcal.lens.model import LensModel
-from kcal.lens.pose import rotation_from_vector
+from kcal.lens import LensModel, rotation_from_vector
 from kcal.lens.projection import INTRINSICS
 from kcal.solve.lm import minimize
 from kcal.solve.problem import SolverStatus, State

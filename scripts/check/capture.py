@@ -27,14 +27,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kcal import Board, Camera, Observations, View, calibrate_camera
 from kcal.calibrate.camera.advice import NextView, far_sigma
-from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.capture.session import CaptureOptions, CaptureSession
-from kcal.corners.board import Board
 from kcal.corners.detect import detect_board, view_of
-from kcal.corners.observations import Observations, View
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
+from kcal.lens import rotation_from_vector
 from kcal.sim.captures import BoardPose, BoardSize, sample_board_poses
 from kcal.sim.scene import RenderOptions, render_board
 from scripts.shared.page import table, tell

@@ -39,10 +39,8 @@ import cv2
 import numpy as np
 import torch
 
+from kcal import Camera, KcalError, Observations
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.corners.observations import Observations
-from kcal.errors import KcalError
-from kcal.lens.camera import Camera
 from kcal.sim.captures import TrueRig
 from scripts.check.chain_page import conclude, failures, tables
 from scripts.check.chain_rig import How, judge, targets, true_rig

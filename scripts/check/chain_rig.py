@@ -11,13 +11,9 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from kcal import Landmarks, RigData
-from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.errors import KcalError
-from kcal.lens.camera import Camera
-from kcal.locate.geodesy import enu_from_cam
-from kcal.locate.localizer import Localizer
-from kcal.locate.mounting import placed_rig
+from kcal import Camera, KcalError, Landmarks, Localizer, RigData, RigOptions, solve_rig
+from kcal.locate import enu_from_cam
+from kcal.rig import placed_rig
 from kcal.sim.captures import TrueRig, drawn_rig
 from kcal.sim.raytrace import SURVEILLANCE
 from scripts.shared.long_range import ORIGIN, RANGES, range_sigma

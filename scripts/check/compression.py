@@ -22,10 +22,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.lens.camera import Camera
-from kcal.lens.rig import Rig
-from kcal.pipeline.association import AssociationOptions
+from kcal import Camera, Rig
 from kcal.pipeline.video_source import Videos
+from kcal.track import AssociationOptions
 from scripts.shared.object_scene import Floats, exposed, paint_plate, plate, true_box
 from scripts.shared.page import table, write_section
 

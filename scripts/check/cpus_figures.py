@@ -20,21 +20,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kcal import Board, DegenerateError, InputError, Localizer, Observations, detect, load_camera
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.calibrate.rig.pairs import pair_by_name
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, calibrate_rig, solve_rig
-from kcal.corners.board import Board
-from kcal.corners.detect import detect
-from kcal.corners.observations import Observations
-from kcal.errors import DegenerateError, InputError
 from kcal.files import make_folder
-from kcal.io.camera_file import load_camera
-from kcal.lens.difference import camera_difference
-from kcal.lens.rig import RigCovariance
+from kcal.lens import camera_difference
 from kcal.lens.uncertainty import projection_sigma
-from kcal.locate.localizer import Localizer
-from kcal.solve.problem import SolverStatus
+from kcal.rig import RigCovariance, pair_by_name
+from kcal.solve import SolverStatus
 from scripts.check import rig as site
 from scripts.shared.views import observed, simulate
 

@@ -21,11 +21,9 @@ from typing import Any
 
 import torch
 
+from kcal import Localizer, load_rig, locate_points
 from kcal.cli.demo_run import simulated_site
-from kcal.io.rig_file import load_rig
-from kcal.locate.localizer import Localizer
-from kcal.locate.marks import Marks
-from kcal.locate.points import locate_points
+from kcal.locate import Marks
 from kcal.locate.positions import position_errors
 from kcal.sim.scene import DemoScene
 from scripts.shared.page import table, tell

@@ -20,13 +20,12 @@ import onnxruntime
 import torch
 from torch import Tensor
 
-from kcal.io.lookup_file import save_onnx
-from kcal.lens.camera import Camera
+from kcal import Camera, Origin, Rig
+from kcal.lens import LensModel, save_onnx
 from kcal.lens.hybrid_terms import HybridForm
-from kcal.lens.model import LensModel
-from kcal.lens.rig import Origin, Rig, RigCovariance
 from kcal.lens.zernike import ZernikeModes
 from kcal.locate.localizer import Localization, Localizer
+from kcal.rig import RigCovariance
 from scripts.shared.page import table, write_section
 from scripts.shared.timing import row, show
 

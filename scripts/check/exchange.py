@@ -24,10 +24,8 @@ import yaml
 from scipy.io import loadmat
 
 from kcal import Camera, Rig
-from kcal.lens import camera_difference, export_cameras, import_cameras
+from kcal.lens import LensModel, camera_difference, export_cameras, import_cameras, rotation_from_vector
 from kcal.lens.hybrid_terms import HybridForm, radius_over_angle
-from kcal.lens.model import LensModel
-from kcal.lens.pose import rotation_from_vector
 from kcal.lens.zernike import ZernikeModes
 from scripts.shared.page import table, write_section
 from scripts.shared.timing import show

@@ -22,13 +22,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal import Baseline, Landmarks, RigData
-from kcal.calibrate.camera.calibrate import calibrate_camera
+from kcal import Baseline, KcalError, Landmarks, Observations, RigData, calibrate_camera, solve_rig
 from kcal.calibrate.rig.result import RigResult
-from kcal.calibrate.rig.solve import solve_rig
-from kcal.corners.observations import Observations
-from kcal.errors import KcalError
-from kcal.lens.pose import vector_from_rotation
+from kcal.lens import vector_from_rotation
 from scripts.check.rig import BASELINE, NAMES, STRAIGHT, TRUTH, data, generator, landmarks
 from scripts.shared.real_captures import data_folder, load, names
 from scripts.shared.simulated import simulated

@@ -26,14 +26,12 @@ import torch
 from numpy.polynomial import Polynomial
 from torch import Tensor
 
+from kcal import Board, Camera, detect
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.corners.board import Board
-from kcal.corners.detect import detect
 from kcal.corners.images import expand_images
-from kcal.lens.camera import Camera
+from kcal.lens import LensModel
 from kcal.lens.distortion import distort_components
 from kcal.lens.inverse import inverse_jacobian, newton_step, prepare_inverse, undistort
-from kcal.lens.model import LensModel
 from kcal.lens.projection import from_pixels
 from kcal.lens.region import DIRECTIONS, Region, direction_limits, in_region, sampled_region, valid_region
 from scripts.check.uncertainty import LENS

@@ -19,12 +19,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.solve import RigOptions, calibrate_rig
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations
-from kcal.errors import KcalError
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector, vector_from_rotation
+from kcal import Board, Camera, KcalError, Observations, RigOptions, calibrate_rig
+from kcal.lens import rotation_from_vector, vector_from_rotation
 from kcal.sim.captures import BoardPose, BoardSize, sample_board_poses
 from scripts.shared.moving_captures import Hands, MovingCapture, moving_capture
 from scripts.shared.page import table, tell

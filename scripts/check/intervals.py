@@ -24,15 +24,8 @@ import statistics
 import time
 from pathlib import Path
 
-from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.calibrate.camera.interval_check import (
-    against_capture,
-    interval_check,
-    simulated_capture,
-    simulated_refits,
-)
-from kcal.calibrate.camera.result import CalibrationOptions
-from kcal.errors import KcalError
+from kcal import CalibrationOptions, KcalError, calibrate_camera
+from kcal.calibrate.camera.interval_check import against_capture, interval_check, simulated_capture, simulated_refits
 from kcal.lens.uncertainty import pixel_covariance, pixel_errors
 from kcal.report.judge_camera import fault_of_views
 from scripts.shared.infinity import error_at_infinity

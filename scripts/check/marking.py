@@ -18,8 +18,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from kcal.errors import InputError
-from kcal.lens.rig import Rig
+from kcal import InputError, Rig
 from kcal.mark.guide import at_shape, propose
 from kcal.mark.shapes import snap
 from scripts.shared.marking_scene import KINDS, Floats, background, finished, inside_of, paint, seen, site_rig

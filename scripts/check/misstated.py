@@ -15,12 +15,10 @@ import math
 
 import torch
 
-from kcal import Baseline, Features, RigData
+from kcal import Baseline, Features, InputError, RigData, solve_rig
 from kcal.calibrate.rig.result import RigResult
-from kcal.calibrate.rig.solve import solve_rig
 from kcal.calibrate.rig.uncertainty import turn_rows
-from kcal.errors import InputError
-from kcal.lens.pose import vector_from_rotation
+from kcal.lens import vector_from_rotation
 from scripts.check.rig import (
     BASELINE,
     MARK,

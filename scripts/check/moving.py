@@ -22,11 +22,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal import Baseline, MeasuredPosition, RigData
-from kcal.calibrate.rig.solve import solve_rig
-from kcal.errors import KcalError
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector, vector_from_rotation
+from kcal import Baseline, Camera, KcalError, MeasuredPosition, RigData, solve_rig
+from kcal.lens import rotation_from_vector, vector_from_rotation
 from kcal.locate.moving import CLOCK, MovingOptions, MovingTrack, Sighting, match_moving
 from scripts.shared.page import table, write_section
 

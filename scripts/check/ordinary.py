@@ -28,11 +28,10 @@ from pathlib import Path
 import cv2
 import torch
 
+from kcal import Camera, KcalError
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.errors import KcalError
-from kcal.lens.camera import Camera
-from kcal.lens.difference import camera_difference
-from kcal.report.judge_camera import camera_verdict
+from kcal.lens import camera_difference
+from kcal.report import camera_verdict
 from scripts.shared.held_out import Projection, held_out
 from scripts.shared.mrcal_camera import splined_camera
 from scripts.shared.page import table, tell

@@ -17,13 +17,12 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from kcal.corners.match import MatchStatus
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Rig, RigCovariance
+from kcal import Camera, Rig
+from kcal.corners import MatchStatus
+from kcal.lens import rotation_from_vector
 from kcal.pipeline.association import AssociationOptions, associate
-from kcal.pipeline.detections import Detections
-from kcal.pipeline.pairing import ObjectDisparity
+from kcal.rig import RigCovariance
+from kcal.track import Detections, ObjectDisparity
 from scripts.shared.marking_scene import Floats, background
 from scripts.shared.object_scene import Plate, exposed, paint_plate, plate, texture_gradient, true_box
 from scripts.shared.page import table, write_section

@@ -24,19 +24,10 @@ import torch
 from mpmath import mpf
 from torch import Tensor
 
-from kcal.errors import InputError
-from kcal.io.camera_file import load_camera, save_camera
-from kcal.io.lookup_file import save_onnx
-from kcal.io.rig_file import load_rig
-from kcal.lens.baking import bake
-from kcal.lens.camera import Camera
-from kcal.lens.images import undistort_maps
-from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Origin, Rig
+from kcal import Camera, InputError, Origin, PositionStatus, Rig, load_camera, load_rig, save_camera
+from kcal.lens import bake, rotation_from_vector, save_onnx, undistort_maps
 from kcal.lens.views import new_pinhole
-from kcal.locate.geodesy import enu_to_geodetic, geodetic_to_enu
-from kcal.locate.stereo import PositionStatus
-from kcal.locate.triangulate import Triangulate
+from kcal.locate import Triangulate, enu_to_geodetic, geodetic_to_enu
 from kcal.stars.sky import Air, StarCatalog, observed_directions
 from scripts.shared.page import table, write_section
 from scripts.shared.timing import show

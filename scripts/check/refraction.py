@@ -18,12 +18,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal import Landmarks, RigData
-from kcal.calibrate.rig.solve import RigOptions, solve_rig
+from kcal import Landmarks, Localizer, RigData, RigOptions, solve_rig
 from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA
 from kcal.locate.geodesy import enu_from_cam, mean_radius
-from kcal.locate.localizer import Localizer
-from kcal.locate.mounting import placed_rig
+from kcal.rig import placed_rig
 from scripts.shared.long_range import ORIGIN, rig
 from scripts.shared.page import table, write_section
 from scripts.shared.timing import show

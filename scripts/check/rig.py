@@ -18,15 +18,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from kcal import Baseline, Features, Landmarks, MeasuredPosition, RigData
+from kcal import Baseline, Features, Landmarks, Localizer, MeasuredPosition, Rig, RigData, RigOptions, solve_rig
 from kcal.calibrate.rig.result import RigResult
-from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.lens.pose import rotation_from_vector, vector_from_rotation
-from kcal.lens.rig import Rig, RigCovariance
-from kcal.locate.geodesy import enu_from_cam
-from kcal.locate.localizer import Localizer
-from kcal.report.figures import save_picture
-from kcal.report.rig import rig_figure
+from kcal.lens import rotation_from_vector, vector_from_rotation
+from kcal.locate import enu_from_cam
+from kcal.report import rig_figure, save_picture
+from kcal.rig import RigCovariance
 from kcal.watch.turned import drift_of_turns, measure_drift
 from scripts.shared.long_range import ORIGIN, RANGES, rig
 from scripts.shared.page import DOCS, write_section

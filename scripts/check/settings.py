@@ -28,11 +28,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kcal import Camera, Observations, calibrate_camera
 from kcal.calibrate.camera.at_setting import InterpolatedCamera, camera_at_setting
-from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.corners.observations import Observations
-from kcal.lens.calibration import LensSetting
-from kcal.lens.camera import Camera
+from kcal.lens import LensSetting
 from kcal.lens.uncertainty import pixel_covariance, pixel_errors
 from kcal.sim.raytrace import Misalignment, focal_length, system_matrix
 from kcal.sim.truth import TruthLens

@@ -20,18 +20,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from kcal import MeasuredPosition, RigData
-from kcal.calibrate.camera.calibrate import calibrate_camera
+from kcal import Camera, KcalError, MeasuredPosition, Origin, RigData, calibrate_camera, solve_rig
 from kcal.calibrate.rig.result import RigResult
-from kcal.calibrate.rig.solve import solve_rig
 from kcal.calibrate.rig.uncertainty import SharedCovariance
-from kcal.errors import KcalError
-from kcal.lens.camera import Camera
 from kcal.lens.pose import step_rows
 from kcal.lens.projection import project_components
-from kcal.lens.rig import Origin
-from kcal.skyline.attitude import SkylineImage, skyline_attitude, skyline_source
-from kcal.skyline.horizon import RasterError
+from kcal.rig import RasterError, SkylineImage, skyline_attitude, skyline_source
 from scripts.shared.page import table, write_section
 from scripts.shared.records import kept
 from scripts.shared.skyline_trials import (

@@ -23,17 +23,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.lens.camera import Camera
-from kcal.lens.rig import Rig
+from kcal import Camera, Localizer, Rig
 from kcal.locate.geodesy import anchor, ecef_from_enu_rotation, enu_from_cam, enu_to_geodetic, geodetic_to_enu
-from kcal.locate.localizer import Localizer
-from kcal.pipeline.association import AssociationOptions
-from kcal.pipeline.detections import Detections
-from kcal.pipeline.grouping import group_objects
-from kcal.pipeline.imm_filter import Motion
-from kcal.pipeline.measurements import ClockPrior
 from kcal.pipeline.pairing import ObjectViews
-from kcal.pipeline.tracks import Tracker, TrackOptions
+from kcal.track import AssociationOptions, ClockPrior, Detections, Motion, Tracker, TrackOptions, group_objects
 from scripts.shared.page import table, write_section
 from scripts.shared.station_scenes import ORIGIN, drawn_errors, marks, ring
 

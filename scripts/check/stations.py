@@ -37,11 +37,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.lens.camera import Camera
-from kcal.lens.rig import Rig
-from kcal.locate.localizer import Localizer
+from kcal import Camera, Localizer, Rig
+from kcal.locate import Triangulate
 from kcal.locate.stereo import Localization, PositionStatus
-from kcal.locate.triangulate import Triangulate
 from scripts.shared.page import table, write_section
 from scripts.shared.station_scenes import drawn_errors, marks, ring, targets
 from scripts.shared.timing import show

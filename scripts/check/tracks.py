@@ -17,14 +17,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Origin, Rig, RigCovariance
-from kcal.locate.budget import planned_rig
-from kcal.locate.localizer import Localizer
-from kcal.pipeline.imm_filter import Motion
-from kcal.pipeline.measurements import ClockPrior
+from kcal import Localizer, Origin, Rig
+from kcal.lens import rotation_from_vector
 from kcal.pipeline.pairing import ObjectViews
 from kcal.pipeline.tracks import Tracker, TrackOptions, Tracks
+from kcal.rig import RigCovariance, planned_rig
+from kcal.track import ClockPrior, Motion
 from scripts.check.track_rivals import CartesianFilters, OfPixels, OfPositions
 from scripts.shared.page import table, write_section
 

@@ -19,18 +19,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kcal import Camera, KcalError, RigData, solve_rig
+from kcal.calibrate import examine
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.calibrate.camera.trust import examine
-from kcal.calibrate.rig.pairs import pair_by_name, paired_boards
-from kcal.calibrate.rig.solve import solve_rig
-from kcal.calibrate.rig.sources import RigData
-from kcal.errors import KcalError
-from kcal.lens.camera import Camera
 from kcal.lens.turning import rotation_between
 from kcal.lens.uncertainty import image_sigma
-from kcal.report.judge_camera import camera_verdict
-from kcal.report.judge_rig import rig_verdict
+from kcal.report import camera_verdict, rig_verdict
 from kcal.report.verdict import Requirement, Verdict
+from kcal.rig import pair_by_name, paired_boards
 from kcal.sim.truth import TruthLens
 from scripts.check.verdict_captures import FAULTS, Planted, PlantedPair, drawn
 from scripts.shared.page import table, write_section

@@ -10,10 +10,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from kcal.calibrate.camera.result import CalibrationOptions
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations, View
-from kcal.lens.pose import rotation_from_vector
+from kcal import Board, CalibrationOptions, Observations, View
+from kcal.lens import rotation_from_vector
 from kcal.sim.captures import BoardPose, PoseOptions, TrueRig, drawn_lens, drawn_rig, sample_board_poses
 from kcal.sim.truth import TruthLens
 from scripts.shared.pair_poses import sample_pair_poses

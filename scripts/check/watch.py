@@ -22,10 +22,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Mounting, Origin, Rig, RigCovariance
-from kcal.locate.budget import planned_rig
-from kcal.locate.localizer import Localizer
+from kcal import Localizer, Origin, Rig
+from kcal.lens import rotation_from_vector
+from kcal.rig import Mounting, RigCovariance, planned_rig
 from kcal.watch.history import AngleSeries, Look, TurnModel, between_rows, first_state, learned, passed, taken, turns_of
 from kcal.watch.turned import drift_of_turns
 from kcal.watch.watcher import LIMIT, exceeded

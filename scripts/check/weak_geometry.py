@@ -22,14 +22,12 @@ from unittest import mock
 import torch
 from torch import Tensor
 
-from kcal import Landmarks, RigData
+from kcal import KcalError, Landmarks, Localizer, Rig, RigData
 from kcal.calibrate.rig import assess, solve
 from kcal.calibrate.rig.result import RigResult
-from kcal.errors import KcalError
 from kcal.finding import sentences
-from kcal.lens.rig import Rig, RigCovariance
-from kcal.locate.geodesy import enu_from_cam
-from kcal.locate.localizer import Localizer
+from kcal.locate import enu_from_cam
+from kcal.rig import RigCovariance
 from scripts.shared.long_range import ORIGIN, RANGES, rig
 from scripts.shared.page import table, write_section
 from scripts.shared.timing import show

@@ -12,17 +12,14 @@ import numpy as np
 import torch
 from scipy.io import savemat
 
-from kcal.calibrate.camera.export import export_cameras
+from kcal import Camera, InputError, Observations
 from kcal.corners.board import Board, target_fields
 from kcal.corners.foreign_corners import import_corners
-from kcal.corners.observations import Observations
-from kcal.errors import InputError
 from kcal.files import read_bytes
 from kcal.io.foreign import ImportedCameras
 from kcal.io.format_prior import prior_of, write_priors
 from kcal.io.formats import FORMATS, import_cameras
-from kcal.lens.calibration import CameraCalibration
-from kcal.lens.camera import Camera
+from kcal.lens import CameraCalibration, export_cameras
 from scripts.fuzz.reader import Reader, whole_text
 
 BOARD = Board(columns=3, rows=2, square=0.1)

@@ -12,10 +12,7 @@ import torch
 from pydantic import BaseModel
 from torch import Tensor, nn
 
-from kcal.lens.camera import Camera
-from kcal.lens.rig import Rig
-from kcal.locate.localizer import Localizer
-from kcal.locate.stereo import PositionStatus
+from kcal import Camera, Localizer, PositionStatus, Rig
 
 
 def leaves(value: Any, place: str = "", depth: int = 12) -> Iterator[tuple[str, Any]]:

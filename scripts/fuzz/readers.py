@@ -14,33 +14,27 @@ import cv2
 import numpy as np
 import torch
 
+from kcal import Observations, Origin, Rig, View, load_camera, load_rig, locate_points, save_camera, save_rig
+from kcal.calibrate import load_measured_board, save_measured_board
 from kcal.calibrate.batch.jobs import read_jobs
-from kcal.calibrate.hybrid.measured_board import load_measured_board, save_measured_board
 from kcal.calibrate.rig.pairs import read_pairs
 from kcal.cli.settings import read_settings, toml_text
 from kcal.corners.images import read_gray, turned_images
-from kcal.corners.observations import Observations, View
 from kcal.corners.video import VideoFrames, read_frames
 from kcal.file_kind import file_kind
 from kcal.files import read_bytes
-from kcal.io.camera_file import load_camera, save_camera
-from kcal.io.lookup_file import load_lookup, save_lookup
-from kcal.io.rig_file import load_rig, save_rig
-from kcal.lens.baking import bake
-from kcal.lens.rig import Mounting, Origin, Rig
-from kcal.locate.export import write_positions
+from kcal.lens import bake, load_lookup, save_lookup
+from kcal.locate import terrain, write_positions
 from kcal.locate.marks import COVARIANCE, Marks, read_marks, write_marks
-from kcal.locate.points import locate_points
-from kcal.locate.raster import terrain
 from kcal.locate.survey import import_survey, read_features, read_survey
 from kcal.mark.session import Journal
-from kcal.pipeline.association import AssociationOptions
-from kcal.pipeline.detections import Detections
 from kcal.pipeline.grouping import read_moment
 from kcal.pipeline.stream import Ledger
 from kcal.report.map_page import local_image
 from kcal.report.practice_score import located_rows
+from kcal.rig import Mounting
 from kcal.stars.detect import read_night
+from kcal.track import AssociationOptions, Detections
 from scripts.fuzz import foreign_readers
 from scripts.fuzz.foreign_readers import BOARD, CAMERA, board_points
 from scripts.fuzz.reader import PROMISED, Reader, whole_text

@@ -22,11 +22,9 @@ from pathlib import Path
 import cv2
 import torch
 
+from kcal import Camera, KcalError, Observations
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.corners.observations import Observations
-from kcal.errors import KcalError
-from kcal.lens.camera import Camera
-from kcal.lens.difference import camera_difference
+from kcal.lens import camera_difference
 from scripts.paper.site import KINDS, observe, paper_scene
 from scripts.paper.train_eq12 import by_least_squares
 from scripts.shared.held_out import held_out

@@ -16,11 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal import Landmarks, RigData
-from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.errors import KcalError
-from kcal.lens.camera import Camera
-from kcal.locate.triangulate import Triangulate
+from kcal import Camera, KcalError, Landmarks, RigData, RigOptions, solve_rig
+from kcal.locate import Triangulate
 from kcal.sim.scene import DemoScene
 from scripts.paper.site import MARK_SIGMA, SURVEY_SIGMA, PaperScene
 from scripts.shared.long_range import range_sigma

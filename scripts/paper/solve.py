@@ -12,11 +12,9 @@ from typing import Any
 
 import cv2
 
-from kcal.calibrate.camera.at_setting import compare_models
+from kcal import Camera, KcalError, Observations
+from kcal.calibrate import compare_models
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.corners.observations import Observations
-from kcal.errors import KcalError
-from kcal.lens.camera import Camera
 from kcal.sim.truth import TruthLens
 from scripts.paper.locate import bound, by_kcal, by_opencv, judge, nowhere
 from scripts.paper.site import KINDS, observe, paper_scene

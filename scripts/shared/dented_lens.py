@@ -8,13 +8,10 @@ import math
 import torch
 from torch import nn
 
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations, View
-from kcal.lens.camera import Camera
+from kcal import Board, Camera, Observations, View
+from kcal.lens import LensModel, rotation_from_vector
 from kcal.lens.field_modes import GaussianModes
 from kcal.lens.hybrid_terms import HybridForm
-from kcal.lens.model import LensModel
-from kcal.lens.pose import rotation_from_vector
 
 BOARD = Board(columns=9, rows=7, square=0.04)
 SIZE, NOISE = (800, 600), 0.05

@@ -7,9 +7,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Origin, Rig
+from kcal import Camera, Origin, Rig
+from kcal.lens import rotation_from_vector
 
 RANGES = (100.0, 250.0, 500.0, 1000.0, 2000.0, 3500.0, 5000.0)
 ORIGIN = Origin(lat=19.07, lon=72.87, height=14.0)

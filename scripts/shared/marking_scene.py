@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Rig
+from kcal import Camera, Rig
+from kcal.lens import rotation_from_vector
 
 Floats = NDArray[np.float64]
 Inside = Callable[[Floats, Floats], NDArray[np.bool_]]

@@ -8,10 +8,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from kcal.lens.camera import Camera
+from kcal import Camera, Origin
 from kcal.lens.projection import FAR
-from kcal.lens.rig import Origin
-from kcal.locate.geodesy import enu_from_cam
+from kcal.locate import enu_from_cam
 from kcal.stars.sky import StarCatalog, observed_directions
 
 TIME = datetime.datetime(2026, 11, 24, 4, 0, tzinfo=datetime.UTC)

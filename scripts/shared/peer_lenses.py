@@ -7,8 +7,7 @@ import math
 import cv2
 import numpy as np
 
-from kcal.corners.observations import Observations
-from kcal.lens.camera import Camera
+from kcal import Camera, Observations
 
 _END = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 1000, 1e-12)
 

@@ -11,10 +11,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcal.corners.board import Board
+from kcal import Board, Camera
 from kcal.corners.print_board import board_sheet
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
+from kcal.lens import rotation_from_vector
 
 DARK, LIGHT = 40.0, 210.0
 WALL = 0.3  # share of white

@@ -11,10 +11,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.corners.board import Board
-from kcal.corners.detect import detect
+from kcal import Board, Observations, detect
 from kcal.corners.images import expand_images
-from kcal.corners.observations import Observations
 from scripts.shared import wide_lens
 
 # Folders of images, and their boards. The squares of gloworm960 are not known; no figure depends on them.

@@ -9,15 +9,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kcal import Board, Camera, KcalError, Observations, View
 from kcal.calibrate.camera.advice import reached
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.hybrid.fit import HybridFit
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations, View
-from kcal.errors import KcalError
-from kcal.lens.camera import Camera
-from kcal.lens.uncertainty import pixel_covariance
+from kcal.lens import pixel_covariance
 from kcal.sim.captures import PoseOptions, PrintedBoard, drawn_lens, sample_board_poses
 from kcal.sim.truth import TruthLens
 from scripts.shared.infinity import error_at_infinity

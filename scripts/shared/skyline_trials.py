@@ -12,14 +12,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcal.lens.camera import Camera
-from kcal.lens.rig import Origin
-from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic
+from kcal import Camera, Origin
+from kcal.locate import enu_from_cam, enu_to_geodetic
 from kcal.locate.raster import Raster
+from kcal.rig import RasterError
 from kcal.sim.captures import drawn_lens
 from kcal.sim.raytrace import SURVEILLANCE
 from kcal.sim.truth import TruthLens
-from kcal.skyline.horizon import RasterError
 from scripts.shared.skyline_scenes import Hills, HillWeather, Skyline, skyline_image
 from scripts.shared.traced import as_camera
 

@@ -9,16 +9,15 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.lens.camera import Camera
+from kcal import Camera, calibrate_camera
+from kcal.lens import pixel_covariance
 from kcal.lens.projection import FAR
-from kcal.lens.uncertainty import pixel_covariance
-from kcal.locate.geodesy import enu_from_cam
+from kcal.locate import enu_from_cam
 from kcal.sim.captures import LensLike, drawn_lens
 from kcal.sim.truth import TruthLens
+from kcal.stars import SkyView
 from kcal.stars.detect import DetectedStars
 from kcal.stars.lens import Agreement, StarCamera, calibrate_by_stars
-from kcal.stars.night import SkyView
 from kcal.stars.sky import StarCatalog, observed_directions
 from scripts.shared.infinity import error_at_infinity
 from scripts.shared.night_scenes import PLACE, TIME

@@ -9,12 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal import Baseline, Features, MeasuredPosition, RigData
-from kcal.calibrate.rig.source import Effect
+from kcal import Baseline, Camera, Features, MeasuredPosition, RigData
 from kcal.calibrate.rig.stars import StarSource
-from kcal.lens.camera import Camera
 from kcal.lens.projection import FAR
-from kcal.locate.geodesy import enu_from_cam
+from kcal.locate import enu_from_cam
+from kcal.rig import Effect
 from kcal.stars.sky import EARTH_RATE, StarCatalog, observed_directions, pole_in_enu
 from scripts.shared.night_scenes import PLACE, TIME
 

@@ -7,9 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Origin, Rig
+from kcal import Camera, Origin, Rig
+from kcal.lens import rotation_from_vector
 from kcal.locate.geodesy import (
     anchor,
     ecef_from_enu_rotation,

@@ -8,11 +8,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations, View
-from kcal.lens.camera import Camera
+from kcal import Board, Camera, Observations, View
+from kcal.lens import LensModel
 from kcal.lens.hybrid_terms import HybridForm, radius_over_angle
-from kcal.lens.model import LensModel
 from kcal.lens.projection import project_components
 from kcal.lens.zernike import ZernikeModes
 from kcal.sim.captures import LensLike, PrintedBoard

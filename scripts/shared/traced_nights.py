@@ -12,19 +12,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal import Baseline, Features, MeasuredPosition, RigData
-from kcal.calibrate.camera.calibrate import calibrate_camera
+from kcal import Baseline, Camera, Features, Localizer, MeasuredPosition, RigData, calibrate_camera
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.stars import StarSource
-from kcal.lens.camera import Camera
 from kcal.lens.projection import FAR
-from kcal.locate.localizer import Localizer
 from kcal.sim.captures import TrueRig
+from kcal.stars import calibrate_by_stars, star_source
 from kcal.stars.detect import DetectedStars
-from kcal.stars.lens import calibrate_by_stars
 from kcal.stars.night import Attitude, NamedStars, SkyView
-from kcal.stars.rig_stars import star_source
 from kcal.stars.sky import Air, StarCatalog, celestial_directions, observed_directions
 from scripts.check.chain_rig import ENU_FROM_RIG, Targets, landmarks, targets, true_rig
 from scripts.shared.long_range import ORIGIN, RANGES

@@ -9,13 +9,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from kcal import Board, Camera, Observations, View
 from kcal.calibrate.problem.poses import poses_under
 from kcal.calibrate.problem.state import warp_modes
 from kcal.calibrate.problem.views import Views
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations, View
-from kcal.lens.camera import Camera
-from kcal.solve.lm import LMOptions
+from kcal.solve import LMOptions
 
 EXACT = LMOptions(max_iterations=60, tolerance=1e-12)
 

@@ -10,12 +10,10 @@ from typing import Any
 import pytest
 import torch
 
-from kcal.errors import FileError
+from kcal import Camera, FileError
 from kcal.io.record import Packed
 from kcal.io.rig_file import RigFile, rig_to_file, save_rig
-from kcal.lens.calibration import CameraCalibration
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
+from kcal.lens import CameraCalibration, rotation_from_vector
 from kcal.lens.rig import Origin, Rig, RigCalibration
 
 

@@ -16,12 +16,11 @@ import torch
 from scipy.interpolate import BSpline
 from scipy.io import savemat
 
-from kcal.errors import FileError, InputError
+from kcal import Camera, FileError, InputError
 from kcal.io.format_kalibr import project_omni
 from kcal.io.format_mrcal import SplineGrid, fit_spline, project_spline, stereographic
 from kcal.io.formats import import_cameras, recognized
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
+from kcal.lens import rotation_from_vector
 
 # Cameras of other programs with what these know of them, and lenses that no model of kcal is.
 

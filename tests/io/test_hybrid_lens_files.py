@@ -11,12 +11,9 @@ import torch
 from lenses import FEW_MODES, hybrid_camera
 from wrong_files import assert_refused
 
-from kcal.errors import FileError
+from kcal import Camera, FileError, Rig, load_rig, save_rig
 from kcal.io.camera_file import CameraFile, camera_to_file, load_camera, save_camera
-from kcal.io.rig_file import load_rig, save_rig
-from kcal.lens.calibration import CameraCalibration
-from kcal.lens.camera import Camera
-from kcal.lens.rig import Rig
+from kcal.lens import CameraCalibration
 
 
 @pytest.mark.parametrize("kind", ["webcam", "wide"])

@@ -10,15 +10,11 @@ import pytest
 import torch
 from scipy.io import loadmat, savemat
 
-from kcal.errors import FileError
+from kcal import Camera, FileError, Rig
 from kcal.io import lookup_file
 from kcal.io.foreign import rig_poses
 from kcal.io.format_opencv import write_matlab
-from kcal.io.formats import import_cameras
-from kcal.io.lookup_file import load_lookup, save_lookup
-from kcal.lens.baking import bake
-from kcal.lens.camera import Camera
-from kcal.lens.rig import Rig
+from kcal.lens import bake, import_cameras, load_lookup, save_lookup
 
 
 @pytest.fixture(scope="module")

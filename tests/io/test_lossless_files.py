@@ -11,13 +11,11 @@ from typing import Any
 import pytest
 import torch
 
-from kcal.errors import FileError, InputError
+from kcal import Camera, FileError, InputError, Rig, load_rig, save_rig
 from kcal.io.camera_file import CameraFile, load_camera, save_camera
 from kcal.io.record import Packed
-from kcal.io.rig_file import load_rig, save_rig
-from kcal.lens.calibration import CameraCalibration
-from kcal.lens.camera import Camera
-from kcal.lens.rig import Rig, RigCovariance
+from kcal.lens import CameraCalibration
+from kcal.rig import RigCovariance
 
 # Cameras, covariances, mounting with link, sources, records.
 SAMPLE = Path(__file__).parent / "rig.json"

@@ -13,20 +13,12 @@ import torch
 from typer.testing import CliRunner
 from wrong_files import assert_refused
 
+from kcal import Camera, FileError, InputError, Rig
 from kcal.cli.main import app
-from kcal.errors import FileError, InputError
-from kcal.io.camera_file import (
-    CameraFile,
-    camera_to_file,
-    load_camera,
-    provenance,
-    save_camera,
-)
+from kcal.io.camera_file import CameraFile, camera_to_file, load_camera, provenance, save_camera
 from kcal.io.rig_file import RigFile, load_rig, rig_to_file, save_rig
 from kcal.lens.calibration import BoardRecord, CalibrationRecord, CameraCalibration, Exclusion, RigCalibration
-from kcal.lens.camera import Camera
 from kcal.lens.model import PRESETS, LensModel
-from kcal.lens.rig import Rig
 from kcal.native_file import digest
 
 

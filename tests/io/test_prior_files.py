@@ -11,17 +11,14 @@ import numpy as np
 import pytest
 import torch
 
+from kcal import Board, Camera, FileError, InputError, load_camera, save_camera
 from kcal.calibrate.hybrid.board_modes import BENDING, board_modes
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard, load_measured_board, save_measured_board
-from kcal.corners.board import Board
-from kcal.errors import FileError, InputError
-from kcal.io.camera_file import load_camera, save_camera
 from kcal.io.foreign import Hints
 from kcal.io.format_prior import Parameter, arranged, prior_of, read_prior, write_priors
 from kcal.io.formats import FORMATS, held_exactly, import_cameras
 from kcal.io.record import Packed
-from kcal.lens.calibration import CameraCalibration
-from kcal.lens.camera import Camera
+from kcal.lens import CameraCalibration
 from kcal.lens.information import CameraInformation
 
 # Priors for other programs: parameters as each program counts them, and the information about exactly these.

@@ -8,13 +8,12 @@ import math
 import pytest
 import torch
 
+from kcal import Camera, Rig
 from kcal.io.file_summary import CameraSummary, RigSummary, sigma_of, sigma_over_image, take_joint_errors
-from kcal.lens.calibration import CameraCalibration
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Rig, RigCovariance
+from kcal.lens import CameraCalibration, rotation_from_vector
 from kcal.lens.uncertainty import image_sigma
 from kcal.native_file import digest
+from kcal.rig import RigCovariance
 
 
 def camera(covariance: torch.Tensor | None = None, **known: object) -> Camera:

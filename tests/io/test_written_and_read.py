@@ -8,12 +8,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from kcal import Camera, Rig
 from kcal.io.foreign import CameraPose, rig_poses
 from kcal.io.formats import FORMATS, import_cameras
-from kcal.lens.camera import Camera
-from kcal.lens.model import LensModel
-from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Rig
+from kcal.lens import LensModel, rotation_from_vector
 
 LENS = (-0.21, 0.052, 1.1e-3, -2.3e-3, 0.013, 0.021, -0.032, 0.0041, 5e-4, -6e-4, 7e-4, -8e-4)
 SUFFIXES = {

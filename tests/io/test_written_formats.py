@@ -10,13 +10,12 @@ import torch
 import yaml
 from scipy.io import loadmat
 
+from kcal import Camera, Rig
 from kcal.io.foreign import rig_poses
 from kcal.io.format_kalibr import fit_omni, project_omni, write_omni
 from kcal.io.format_mrcal import fit_spline, project_spline
 from kcal.io.format_opencv import write_matlab
-from kcal.io.formats import import_cameras
-from kcal.lens.camera import Camera
-from kcal.lens.rig import Rig
+from kcal.lens import import_cameras
 
 
 def lens(center: tuple[float, float] = (319.5, 239.5)) -> Camera:

@@ -9,15 +9,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from kcal.errors import InputError
-from kcal.io.rig_file import save_rig
-from kcal.lens.baking import bake
-from kcal.lens.camera import Camera
-from kcal.lens.camera_like import CameraLike
-from kcal.lens.images import Undistort, undistort_maps
-from kcal.lens.rig import Origin, Rig
-from kcal.locate.localizer import Localizer
-from kcal.locate.triangulate import Triangulate
+from kcal import Camera, InputError, Localizer, Origin, Rig, save_rig
+from kcal.lens import CameraLike, Undistort, bake, undistort_maps
+from kcal.locate import Triangulate
 
 MODEL = Camera.build(focal=(900, 900), center=(322, 238), size=(640, 480), coefficients=[-0.1, 0.02, 1e-3, -5e-4, 0.0])
 

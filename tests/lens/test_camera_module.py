@@ -10,11 +10,8 @@ import torch
 from lenses import HYBRID, parameters, strong
 from torch import nn
 
-from kcal.errors import InputError
-from kcal.lens.baking import bake
-from kcal.lens.camera import Camera
-from kcal.lens.model import LensModel
-from kcal.lens.rig import Rig
+from kcal import Camera, InputError, Rig
+from kcal.lens import LensModel, bake
 
 POINTS = torch.tensor([[0.1, -0.2, 1.1], [-0.6, 0.5, 1.3], [1.2, 0.9, 2.5]], dtype=torch.float64)
 

@@ -12,12 +12,9 @@ from lenses import HYBRID, strong
 from torch import Tensor, nn
 from whole_graphs import traced_whole
 
-from kcal.errors import FileError, InputError
-from kcal.io.lookup_file import save_onnx
-from kcal.lens.camera import Camera
-from kcal.lens.camera_like import Unproject
+from kcal import Camera, FileError, InputError, Rig
+from kcal.lens import Unproject, save_onnx
 from kcal.lens.model import PRESETS
-from kcal.lens.rig import Rig
 
 # In front, beside the axis, off the image but in the lens, behind, and not a number.
 POINTS = torch.tensor(

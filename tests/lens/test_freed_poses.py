@@ -8,11 +8,10 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from kcal import Camera, Localizer, Rig, load_rig, save_rig
-from kcal.errors import InputError
+from kcal import Camera, InputError, Localizer, Origin, Rig, load_rig, save_rig
 from kcal.lens import rotation_from_vector
-from kcal.lens.rig import Mounting, Origin
 from kcal.locate import Triangulate
+from kcal.rig import Mounting
 from scripts.make_modules import PLACES, pairs, rig, stations, stereo
 
 

@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from kcal.errors import InputError, KcalWarning
-from kcal.lens.camera import Camera
-from kcal.lens.rig import Rig
+from kcal import Camera, InputError, KcalWarning, Rig
 
 K = np.array([[800.0, 0, 322], [0, 820, 238], [0, 0, 1]])
 D = np.array([-0.2, 0.05, 1e-3, -2e-3, 0.01, 0.02, -0.01, 2e-3, 1e-3, -5e-4, 4e-4, 1e-4, 0.01, -0.02])

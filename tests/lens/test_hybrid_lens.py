@@ -14,13 +14,11 @@ from torch.autograd import gradgradcheck
 from torch.func import functional_call
 from whole_graphs import traced_whole
 
-from kcal.errors import InputError
-from kcal.lens.baking import bake
-from kcal.lens.camera import Camera
+from kcal import Camera, InputError
+from kcal.lens import LensModel, bake
 from kcal.lens.distortion import distort_components
 from kcal.lens.hybrid_points import FEWEST, PIECE, Forward, fit_plane_map, polynomials_of, trim
 from kcal.lens.hybrid_terms import HybridForm, growth_by_shape, largest_base_radius
-from kcal.lens.model import LensModel
 from kcal.lens.projection import plane_from_points, project_components, rays_from_plane
 from kcal.lens.views import source_pixels
 from kcal.lens.zernike import ZernikeModes

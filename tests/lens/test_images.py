@@ -15,12 +15,9 @@ from kornia.geometry.transform import remap
 from lenses import HYBRID, strong
 from torch import Tensor
 
-from kcal.errors import InputError
-from kcal.lens.calibration import CameraCalibration
-from kcal.lens.camera import Camera
-from kcal.lens.camera_conversions import ImageTransform
+from kcal import Camera, InputError
+from kcal.lens import CameraCalibration, ImageTransform, Undistort, undistort_maps
 from kcal.lens.camera_like import project_each, stackable, unproject_each
-from kcal.lens.images import Undistort, undistort_maps
 from kcal.lens.model import PRESETS
 from kcal.lens.projection import project_components
 from kcal.lens.views import new_pinhole, source_pixels

@@ -11,10 +11,9 @@ from hypothesis import strategies as st
 from lenses import HYBRID, MODELS, distort_with_jacobian, parameters, strong
 from torch import Tensor
 
-from kcal.errors import InputError
-from kcal.lens.camera import Camera
+from kcal import Camera, InputError
+from kcal.lens import LensModel
 from kcal.lens.inverse import undistort
-from kcal.lens.model import LensModel
 from kcal.lens.projection import largest_radius
 from kcal.lens.region import valid_region
 from scripts.shared.distorted import distort

@@ -23,12 +23,8 @@ from kornia.image import ImageSize
 from kornia.sensors.camera import CameraModel, CameraModelType
 from lenses import HYBRID, strong
 
-from kcal.errors import InputError
-from kcal.lens.camera import Camera
-from kcal.lens.camera_conversions import ImageTransform
-from kcal.lens.images import Undistort, UndistortImage
-from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Rig
+from kcal import Camera, InputError, Rig
+from kcal.lens import ImageTransform, Undistort, UndistortImage, rotation_from_vector
 from scripts.make_kornia_vectors import PATH, vectors
 
 POINTS = torch.tensor([[0.1, -0.2, 1.1], [-0.3, 0.2, 1.3], [0.4, 0.3, 2.5], [0.0, 0.0, 1.0]], dtype=torch.float64)

@@ -8,11 +8,9 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from kcal.errors import InputError
-from kcal.lens.camera import Camera
+from kcal import Camera, InputError, Rig
 from kcal.lens.model import PRESETS, LensModel
 from kcal.lens.projection import INTRINSICS, parameter_names
-from kcal.lens.rig import Rig
 from scripts.shared.distorted import distort
 
 OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")

@@ -15,8 +15,8 @@ import torch
 from lenses import hybrid_camera
 from torch import Tensor
 
-from kcal.errors import DegenerateError, FileError, InputError
-from kcal.io.lookup_file import load_lookup, save_lookup, save_onnx
+from kcal import Camera, DegenerateError, FileError, InputError
+from kcal.lens import load_lookup, save_lookup, save_onnx
 from kcal.lens.baking import (
     RINGS,
     LookupCamera,
@@ -28,7 +28,6 @@ from kcal.lens.baking import (
     filter_nodes,
     rays_from_chart,
 )
-from kcal.lens.camera import Camera
 
 _BARREL = [-0.28, 0.1, 5e-4, -3e-4, 0.02, 0.05, 0.02, 0.01, 4e-4, -2e-4, -3e-4, 1e-4, 0.004, -0.006]
 _HD: dict[str, Any] = {"focal": (1600, 1605), "center": (957, 541), "size": (1920, 1080)}

@@ -13,19 +13,12 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call, stack_module_state, vmap
 
-from kcal.errors import InputError
-from kcal.io.camera_file import load_camera, save_camera
+from kcal import Camera, InputError, Localizer, Origin, Rig, load_camera, save_camera
 from kcal.io.rig_file import RigFile, load_rig, save_rig
-from kcal.lens.baking import bake
-from kcal.lens.camera import Camera
-from kcal.lens.camera_like import CameraRays
-from kcal.lens.field_modes import NetworkModes
+from kcal.lens import CameraRays, LensModel, Undistort, bake
 from kcal.lens.hybrid_terms import HybridForm
-from kcal.lens.images import Undistort
-from kcal.lens.model import LensModel
-from kcal.lens.rig import Origin, Rig
-from kcal.locate.localizer import Localizer
-from kcal.locate.triangulate import Triangulate
+from kcal.locate import Triangulate
+from kcal.nets import NetworkModes
 
 
 class Waves(nn.Module):

@@ -16,9 +16,8 @@ from torch import Tensor, nn
 from torch.autograd import gradcheck, gradgradcheck
 from torch.func import functional_call, jacrev
 
-from kcal.errors import DegenerateError, InputError
-from kcal.lens.calibration import CameraCalibration
-from kcal.lens.camera import Camera
+from kcal import Camera, DegenerateError, InputError
+from kcal.lens import CameraCalibration
 from kcal.lens.images import NOWHERE, undistort_maps
 from kcal.lens.information import CameraInformation
 from kcal.lens.inverse import undistort

@@ -9,12 +9,9 @@ import pytest
 import torch
 from lenses import HYBRID, strong
 
-from kcal.errors import InputError
-from kcal.lens.calibration import CameraCalibration
-from kcal.lens.camera import Camera
-from kcal.lens.difference import camera_difference
+from kcal import Camera, InputError
+from kcal.lens import CameraCalibration, camera_difference, rotation_from_vector
 from kcal.lens.information import CameraInformation
-from kcal.lens.pose import rotation_from_vector
 from kcal.lens.uncertainty import image_sigma, pixel_covariance, projection_sigma
 from scripts.shared.infinity import error_at_infinity
 

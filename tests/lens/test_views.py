@@ -11,14 +11,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal.errors import DegenerateError, InputError
-from kcal.lens.camera import Camera
+from kcal import Camera, DegenerateError, InputError, Rig
+from kcal.lens import StereoRectification, Undistort, rotation_from_vector, undistort_maps
 from kcal.lens.camera_like import CameraRays, ray_error
-from kcal.lens.images import StereoRectification, Undistort, undistort_maps
-from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Rig, RigCovariance
 from kcal.lens.views import Cylinder, cylinder_view, looking, pinhole_view, pupil_shift, shown_by
-from kcal.locate.disparity import DisparityRanges
+from kcal.locate import DisparityRanges
+from kcal.rig import RigCovariance
 from tests.helpers.lenses import HYBRID
 
 F64 = torch.float64

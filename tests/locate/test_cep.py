@@ -6,9 +6,7 @@ import pytest
 import torch
 from locate_rigs import pinhole_rig, tensor
 
-from kcal.errors import InputError
-from kcal.lens.rig import Origin
-from kcal.locate.localizer import Localizer
+from kcal import InputError, Localizer, Origin
 from kcal.locate.tabulate import circular_error
 
 

@@ -10,14 +10,11 @@ import pytest
 import torch
 from locate_rigs import located_pairs, pinhole_rig, real_rig, spread_points, tensor
 
-from kcal.errors import InputError
-from kcal.lens.images import StereoRectification
-from kcal.lens.rig import Origin
-from kcal.locate.disparity import DisparityRanges
+from kcal import InputError, Localizer, Origin, PositionStatus
+from kcal.lens import StereoRectification
+from kcal.locate import DisparityRanges
 from kcal.locate.export import APPENDED, appended
-from kcal.locate.localizer import Localizer
 from kcal.locate.positions import interval_coverage, position_errors
-from kcal.locate.stereo import PositionStatus
 from kcal.locate.views import fit_pairs
 
 ORIGIN = Origin(lat=19.0, lon=72.0, height=10.0)

@@ -11,9 +11,8 @@ import pytest
 from locate_rigs import real_rig
 from typer.testing import CliRunner
 
+from kcal import FileError, save_rig
 from kcal.cli.main import app
-from kcal.errors import FileError
-from kcal.io.rig_file import save_rig
 from kcal.locate import marks, tables
 from kcal.locate.marks import read_mark_chunks
 from kcal.locate.tables import DistinctKeys, Doubled, read_chunks

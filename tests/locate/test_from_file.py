@@ -9,10 +9,8 @@ import pytest
 import torch
 from command_line import Command
 
-from kcal.errors import InputError
-from kcal.io.rig_file import load_rig
-from kcal.lens.rig import Mounting, Origin, RigCovariance
-from kcal.locate.localizer import Localizer
+from kcal import InputError, Localizer, Origin, load_rig
+from kcal.rig import Mounting, RigCovariance
 
 SAMPLE = Path(__file__).parents[2] / "assets" / "sample-rig.json"
 LEFT, RIGHT = torch.tensor([[960.0, 540.0], [700.0, 600.0]]), torch.tensor([[925.0, 535.0], [620.0, 592.0]])

@@ -15,9 +15,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from locate_rigs import tensor
 
-from kcal.errors import FileError, InputError
-from kcal.io.lookup_file import save_onnx
-from kcal.lens.rig import Origin
+from kcal import FileError, InputError, Origin
+from kcal.lens import save_onnx
 from kcal.locate.geodesy import (
     anchor,
     arc_tangent,

@@ -10,14 +10,9 @@ import pyproj
 import pytest
 import torch
 
-from kcal.errors import FileError, InputError
-from kcal.lens.camera import Camera
-from kcal.lens.rig import Mounting, Origin, Rig
-from kcal.locate.geodesy import enu_from_cam, geodetic_to_enu
-from kcal.locate.ground import level_ground, locate_on_ground
-from kcal.locate.localizer import Localizer
-from kcal.locate.mounting import mounting_covariance
-from kcal.locate.raster import terrain
+from kcal import Camera, FileError, InputError, Localizer, Origin, Rig
+from kcal.locate import enu_from_cam, geodetic_to_enu, level_ground, locate_on_ground, terrain
+from kcal.rig import Mounting, mounting_covariance
 
 CAMERA = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
 ORIGIN = Origin(lat=19.07, lon=72.87, height=60.0)

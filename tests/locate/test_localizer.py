@@ -8,16 +8,12 @@ from kornia.geometry.subpix import spatial_soft_argmax2d
 from locate_rigs import SIZE, pinhole_rig, real_rig, spread_points, tensor, turned
 from whole_graphs import traced_whole
 
-from kcal.errors import DegenerateError, InputError
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
+from kcal import Camera, DegenerateError, InputError, Origin, PositionStatus, Rig
+from kcal.lens import rotation_from_vector
 from kcal.lens.projection import project_components
-from kcal.lens.rig import Origin, Rig, RigCovariance
-from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic
+from kcal.locate import Triangulate, enu_from_cam, enu_to_geodetic
 from kcal.locate.localizer import Localization, Localizer
-from kcal.locate.mounting import mounting_covariance
-from kcal.locate.stereo import PositionStatus
-from kcal.locate.triangulate import Triangulate
+from kcal.rig import RigCovariance, mounting_covariance
 
 ORIGIN = Origin(lat=-33.9, lon=151.2, height=40.0)
 RIG = real_rig()

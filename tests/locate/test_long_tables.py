@@ -15,20 +15,16 @@ import pytest
 import torch
 from locate_rigs import located_pairs, real_rig, spread_points
 
+from kcal import FileError, InputError, Localizer, Origin, PositionStatus, save_rig
 from kcal.cli.main import main
-from kcal.errors import FileError, InputError
-from kcal.io.rig_file import save_rig
-from kcal.lens.rig import Origin, RigCovariance
 from kcal.locate import marks, points, stereo, tables
 from kcal.locate.export import PositionWriter, write_positions
 from kcal.locate.geodesy import azimuth_elevation
-from kcal.locate.localizer import Localizer
 from kcal.locate.marks import Marks, read_mark_chunks, read_marks
-from kcal.locate.mounting import mounting_covariance
 from kcal.locate.points import PointLocator, PositionSample
-from kcal.locate.stereo import PositionStatus
 from kcal.locate.tables import NUMBERS, number_lines
 from kcal.locate.tabulate import circular_error
+from kcal.rig import RigCovariance, mounting_covariance
 
 ORIGIN = Origin(lat=-33.9, lon=151.2, height=40.0)
 ROWS = 250

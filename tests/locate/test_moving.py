@@ -10,8 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kcal.calibrate.rig.measured import MeasuredPosition
-from kcal.errors import FileError, InputError
+from kcal import FileError, InputError, MeasuredPosition
 from kcal.locate.moving import MovingOptions, MovingTrack, Sighting, match_moving, read_sightings, read_tracks
 from scripts.check.moving import CAMERA, CENTERS, LATE, NAMES, one_draw, path_of
 

@@ -6,11 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal.errors import InputError
-from kcal.lens.rig import Rig
-from kcal.locate.geodesy import enu_to_geodetic
-from kcal.locate.localizer import Localizer
-from kcal.locate.stereo import PositionStatus
+from kcal import InputError, Localizer, PositionStatus, Rig
+from kcal.locate import enu_to_geodetic
 from scripts.shared import station_scenes as scenes
 from scripts.shared.station_scenes import ORIGIN, drawn_errors, marks, ring
 

@@ -6,10 +6,7 @@ import pytest
 import torch
 from locate_rigs import SIZE, tensor, turned
 
-from kcal.errors import DegenerateError, InputError
-from kcal.lens.camera import Camera
-from kcal.lens.rig import Rig
-from kcal.locate.stereo import PositionStatus
+from kcal import Camera, DegenerateError, InputError, PositionStatus, Rig
 from kcal.locate.triangulate import Method, Triangulate
 
 METHODS: tuple[Method, ...] = ("linear", "angular", "likelihood")

@@ -15,13 +15,11 @@ import pytest
 import torch
 from locate_rigs import located_pairs, pinhole_rig, real_rig, spread_points, tensor
 
-from kcal.errors import FileError, InputError
-from kcal.lens.rig import Origin, RigCovariance
+from kcal import FileError, InputError, Origin, PositionStatus
+from kcal.locate import enu_from_cam, enu_to_geodetic, find_geoid, geodetic_to_enu
 from kcal.locate.export import cot_events, write_positions
-from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic, geodetic_to_enu
 from kcal.locate.positions import Located, Position
-from kcal.locate.stereo import PositionStatus
-from kcal.locate.tabulate import find_geoid
+from kcal.rig import RigCovariance
 
 ORIGIN = Origin(lat=-33.9, lon=151.2, height=40.0)
 RIG = pinhole_rig()  # f b = 16 000 px m, center (959.5, 539.5)

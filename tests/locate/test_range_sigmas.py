@@ -8,12 +8,10 @@ import pytest
 import torch
 from locate_rigs import real_rig, tensor
 
-from kcal.errors import InputError
-from kcal.lens.rig import Mounting, Origin, Rig, RigCovariance
+from kcal import InputError, Localizer, Origin, Rig
 from kcal.locate.budget import planned_rig, range_sigmas, usual_ranges
-from kcal.locate.localizer import Localizer
-from kcal.locate.mounting import mounting_covariance
 from kcal.report.tables import range_sigma_rows
+from kcal.rig import Mounting, RigCovariance, mounting_covariance
 
 ORIGIN = Origin(lat=-33.9, lon=151.2, height=40.0)
 SIZE = len(planned_rig().left.names)

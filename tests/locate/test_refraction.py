@@ -10,16 +10,10 @@ import torch
 from rig_scenes import CAMERAS, CENTER, NAMES, ROTATION, normal, spread_points
 from torch import Tensor
 
-from kcal import Landmarks, RigData
+from kcal import InputError, Landmarks, Localizer, Origin, RigData, RigOptions, load_rig, save_rig, solve_rig
 from kcal.calibrate.rig.result import RigResult
-from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.errors import InputError
-from kcal.io.rig_file import load_rig, save_rig
-from kcal.lens.rig import Mounting, Origin
-from kcal.locate.geodesy import enu_to_geodetic
-from kcal.locate.localizer import Localizer
-from kcal.locate.mounting import placed_rig
-from kcal.watch.turned import check_rig
+from kcal.locate import enu_to_geodetic
+from kcal.rig import Mounting, check_rig, placed_rig
 
 ORIGIN = Origin(lat=19.07, lon=72.87, height=14.0)
 EARTH = 6_371_008.8  # meters, mean radius

@@ -8,12 +8,11 @@ import pytest
 import torch
 from locate_rigs import real_rig, tensor
 
-from kcal.errors import InputError
-from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Mounting, Origin, Rig, RigCovariance
-from kcal.locate.geodesy import enu_from_cam
-from kcal.locate.localizer import Localizer
+from kcal import InputError, Localizer, Origin, Rig
+from kcal.lens import rotation_from_vector
+from kcal.locate import enu_from_cam
 from kcal.locate.mounting import run_errors
+from kcal.rig import Mounting, RigCovariance
 
 ORIGIN = Origin(lat=19.07, lon=72.87, height=14.0)
 POINTS = tensor([10.0, -3.0, 120.0], [-150.0, 20.0, 900.0], [300.0, 60.0, 2500.0])

@@ -14,16 +14,13 @@ from command_line import Command
 from locate_rigs import real_rig, tensor
 from torch import Tensor
 
-from kcal.errors import FileError, InputError
-from kcal.io.rig_file import save_rig
+from kcal import FileError, InputError, Localizer, save_rig
 from kcal.lens.rig import REFRACTION_SIGMA, Origin
-from kcal.locate.budget import BudgetErrors, planned_rig, range_errors
+from kcal.locate import BudgetErrors, level_ground, range_errors, terrain
 from kcal.locate.geodesy import anchor, enu_to_geodetic, geodetic_to_enu, mean_radius, place_enu
-from kcal.locate.ground import level_ground
-from kcal.locate.localizer import Localizer
 from kcal.locate.positions import region_outline
-from kcal.locate.raster import terrain
 from kcal.locate.siting import Area, Site, area_of, rank_sites, read_sites, seen_over, sites_of, siting_map, surface_of
+from kcal.rig import planned_rig
 from scripts.shared.station_scenes import ORIGIN, marks, ring
 
 # Siting: hidden ground, the map of errors beside `Localizer`, and the order of candidates.

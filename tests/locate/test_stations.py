@@ -10,17 +10,13 @@ import torch
 from locate_rigs import real_rig, spread_points, tensor
 from torch import Tensor
 
-from kcal import Landmarks, MeasuredPosition, RigData
-from kcal.calibrate.rig.solve import solve_rig
+from kcal import Camera, Landmarks, Localizer, MeasuredPosition, Origin, Rig, RigData, solve_rig
 from kcal.errors import DegenerateError, FileError, InputError
 from kcal.io.rig_file import load_pair, load_rig, save_rig
-from kcal.lens.calibration import CameraCalibration
-from kcal.lens.camera import Camera
-from kcal.lens.rig import Mounting, Origin, Rig, RigCovariance
-from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic, geodetic_to_enu
-from kcal.locate.localizer import Localizer
+from kcal.lens import CameraCalibration
+from kcal.locate import enu_from_cam, enu_to_geodetic, geodetic_to_enu
 from kcal.locate.mounting import placed_rig, station_mounting
-from kcal.locate.stations import stated_mounting, station_rig
+from kcal.rig import Mounting, RigCovariance, stated_mounting, station_rig
 from scripts.shared.station_scenes import ORIGIN, marks, ring, targets
 
 RIG = Path(__file__).parents[1] / "io" / "rig.json"

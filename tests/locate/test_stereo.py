@@ -10,11 +10,8 @@ from lenses import hybrid_camera
 from locate_rigs import SIZE, pinhole_rig, real_rig, spread_points, tensor, turned
 from whole_graphs import traced_whole
 
-from kcal.errors import DegenerateError, InputError
-from kcal.lens.camera import Camera
-from kcal.lens.rig import Rig
-from kcal.locate.stereo import PositionStatus
-from kcal.locate.triangulate import Triangulate
+from kcal import Camera, DegenerateError, InputError, PositionStatus, Rig
+from kcal.locate import Triangulate
 from kcal.locate.views import fit_pairs
 
 RIG = real_rig()

@@ -10,11 +10,9 @@ import pyproj
 import pytest
 import torch
 
-from kcal.errors import FileError, InputError
-from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Origin
-from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic
-from kcal.locate.marks import read_marks
+from kcal import FileError, InputError, Origin
+from kcal.lens import rotation_from_vector
+from kcal.locate import enu_from_cam, enu_to_geodetic, read_marks
 from kcal.locate.mounting import attitude, mounting_of
 from kcal.locate.survey import camera_positions, import_survey, match_landmarks, read_features, read_survey
 

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from kcal.lens.camera import Camera
-from kcal.lens.rig import Origin, Rig
-from kcal.locate.geodesy import enu_from_cam
-from kcal.locate.localizer import Localizer
+from kcal import Camera, Localizer, Origin, Rig
+from kcal.locate import enu_from_cam
 from kcal.locate.views import shared_pixels
 from kcal.pipeline.measurements import ALONE_M, known_views, view_rows
 

@@ -9,15 +9,10 @@ import pytest
 import torch
 from locate_rigs import tensor
 
-from kcal.errors import FileError, InputError
-from kcal.lens.rig import Rig
-from kcal.locate.export import write_positions
-from kcal.locate.geodesy import enu_to_geodetic
-from kcal.locate.localizer import Localizer
+from kcal import FileError, InputError, Localizer, PositionStatus, Rig, locate_points
+from kcal.locate import enu_to_geodetic, write_positions
 from kcal.locate.marks import Marks, is_long, read_marks
-from kcal.locate.points import locate_points
-from kcal.locate.stereo import PositionStatus
-from kcal.locate.survey import Survey, match_landmarks, read_features
+from kcal.rig import Survey, match_landmarks, read_features
 from kcal.watch.turned import seen_again
 from scripts.shared.station_scenes import ORIGIN, marks, ring, targets
 

@@ -15,10 +15,8 @@ from lenses import hybrid_camera
 from torch import Tensor
 
 import kcal.lens.inverse
-from kcal.errors import DegenerateError, InputError
-from kcal.io.lookup_file import save_onnx
-from kcal.lens.camera import Camera
-from kcal.lens.camera_like import Unproject
+from kcal import Camera, DegenerateError, InputError
+from kcal.lens import Unproject, save_onnx
 from kcal.nets.inverse import (
     InverseFit,
     InverseNet,

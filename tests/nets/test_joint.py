@@ -10,13 +10,12 @@ from calibrate_scenes import BOARD, SIZE, camera, motions, pixels_of
 from lenses import hybrid_camera
 from torch import Tensor
 
-from kcal.errors import DegenerateError, InputError
-from kcal.lens.camera import Camera
+from kcal import Camera, DegenerateError, InputError
 from kcal.lens.projection import from_pixels, plane_from_points
 from kcal.nets.inverse import InverseNet, initial_weights, train_inverse
 from kcal.nets.joint import JointFit, JointOptions, ResidualNet, _JointProblem, train_jointly
+from kcal.solve import SolverStatus
 from kcal.solve.lm import LMOptions, minimize
-from kcal.solve.problem import SolverStatus
 from scripts.paper.pure_lens import PureLensNet, PureLensProblem, train_pure_lens
 
 # Eq. 12: both terms of the loss, its derivatives, and which method ends lower.

@@ -9,14 +9,13 @@ import torch
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
-from kcal.errors import InputError
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Rig, RigCovariance
+from kcal import Camera, InputError, Rig
+from kcal.lens import rotation_from_vector
 from kcal.locate.views import PosedCameras, fit_views
 from kcal.pipeline.assignment import assign_groups, best_assignment
 from kcal.pipeline.association import Association, AssociationOptions, associate, association_costs, near_epipolar_lines
-from kcal.pipeline.detections import Detections
+from kcal.rig import RigCovariance
+from kcal.track import Detections
 
 SIZE = (1920, 1080)
 

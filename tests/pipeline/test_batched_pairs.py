@@ -7,14 +7,10 @@ import torch
 from elsewhere import DEVICE, Elsewhere
 from torch import Tensor
 
-from kcal.errors import InputError
-from kcal.lens.rig import Mounting, Origin, Rig, RigCovariance
-from kcal.locate.budget import planned_rig
-from kcal.locate.localizer import Localizer
+from kcal import InputError, Localizer, Origin, Rig
 from kcal.pipeline.association import AssociationOptions, PairBoxes, associate
-from kcal.pipeline.detections import Detections
-from kcal.pipeline.grouping import group_objects
-from kcal.pipeline.pairing import pair_objects
+from kcal.rig import Mounting, RigCovariance, planned_rig
+from kcal.track import Detections, group_objects, pair_objects
 
 SIZE = (1920, 1080)
 OPTIONS = AssociationOptions(box_sigma=1.0)

@@ -11,12 +11,10 @@ import pytest
 import torch
 from track_scenes import pairs_of, seen_by, tracked_site
 
-from kcal.errors import FileError, InputError
+from kcal import FileError, InputError
 from kcal.pipeline import video_source
-from kcal.pipeline.imm_filter import Motion
-from kcal.pipeline.measurements import ClockPrior
-from kcal.pipeline.tracks import Tracker, TrackOptions
 from kcal.pipeline.video_source import FramesTogether, VideoCounts, frames_together
+from kcal.track import ClockPrior, Motion, Tracker, TrackOptions
 
 # Clocks: offset, drift and slope from targets that move, covered by their sigmas; frames at different times.
 

@@ -6,11 +6,10 @@ import pytest
 import torch
 from track_scenes import pairs_of, seen_by, tracked_site
 
-from kcal.errors import InputError
-from kcal.locate.localizer import Localizer
+from kcal import InputError, Localizer
 from kcal.pipeline.imm_filter import no_beliefs
-from kcal.pipeline.measurements import ClockPrior
 from kcal.pipeline.tracks import Tracker, compiled_steps, track_steps
+from kcal.track import ClockPrior
 
 
 def scene(localize: Localizer, frame: int) -> tuple[torch.Tensor, torch.Tensor]:

@@ -15,12 +15,11 @@ import supervision
 import torch
 from track_scenes import tracked_site
 
-from kcal.errors import InputError
-from kcal.lens.camera_conversions import ImageTransform
-from kcal.locate.localizer import Localizer
-from kcal.pipeline.association import AssociationOptions
+from kcal import InputError, Localizer
+from kcal.lens import ImageTransform
 from kcal.pipeline.detections import Detections, detect_in, load_detector
 from kcal.pipeline.grouping import Moment, read_moment
+from kcal.track import AssociationOptions
 
 EDGES = [[100.0, 50.0, 112.0, 62.0], [10.0, 20.0, 40.5, 60.0]]
 

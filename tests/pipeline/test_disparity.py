@@ -10,13 +10,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal.corners import patches
-from kcal.corners.match import MatchStatus
-from kcal.errors import InputError
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Rig
-from kcal.locate.triangulate import Triangulate
+from kcal import Camera, InputError, Rig
+from kcal.corners import MatchStatus, patches
+from kcal.lens import rotation_from_vector
+from kcal.locate import Triangulate
 from kcal.pipeline.pairing import DisparityOptions, ObjectDisparities, ObjectDisparity, _brightest, _flagged, _Objects
 from scripts.shared.marking_scene import background
 from scripts.shared.object_scene import exposed, paint_plate, plate, texture_gradient, true_box

@@ -21,14 +21,13 @@ from waiting import PATIENCE, wait_for
 pytest.importorskip("uvicorn")
 from pages import crowded_map
 
-from kcal.lens.rig import Origin
-from kcal.locate.geodesy import geodetic_to_enu
-from kcal.locate.localizer import Localizer
+from kcal import Localizer, Origin
+from kcal.locate import geodetic_to_enu
 from kcal.locate.points import PointLocator
 from kcal.locate.tables import PositionColumns
 from kcal.pipeline.senders import LiveMap
 from kcal.pipeline.stream import track_columns
-from kcal.pipeline.tracks import Tracker, TrackOptions
+from kcal.track import Tracker, TrackOptions
 from scripts.shared.children import children
 
 SITE = tracked_site()

@@ -13,8 +13,7 @@ from ports import deaf_port
 from track_scenes import tracked_site
 
 pytest.importorskip("paho.mqtt.client")
-from kcal.errors import InputError
-from kcal.locate.localizer import Localizer
+from kcal import InputError, Localizer
 from kcal.locate.points import PointLocator
 from kcal.locate.tables import NUMBERS, PositionColumns
 from kcal.pipeline.senders import Sender, sender_to

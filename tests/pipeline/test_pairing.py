@@ -7,13 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal.errors import InputError
-from kcal.lens.rig import Origin, Rig
-from kcal.locate.budget import planned_rig
-from kcal.locate.localizer import Localizer
-from kcal.pipeline.association import AssociationOptions
-from kcal.pipeline.detections import Detections
-from kcal.pipeline.pairing import pair_objects
+from kcal import InputError, Localizer, Origin, Rig
+from kcal.rig import planned_rig
+from kcal.track import AssociationOptions, Detections, pair_objects
 from scripts.shared.object_scene import exposed, paint_plate, plate, true_box
 
 SIZE = (1920, 1080)

@@ -10,10 +10,8 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from kcal.locate.localizer import Localizer
+from kcal import Localizer
 from kcal.pipeline.assignment import Candidates, Scores, assigned
-from kcal.pipeline.association import AssociationOptions
-from kcal.pipeline.detections import Detections
 from kcal.pipeline.epipolar_pencil import (
     FARTHEST_BEND_M,
     Confirming,
@@ -25,6 +23,7 @@ from kcal.pipeline.epipolar_pencil import (
 )
 from kcal.pipeline.grouping import _Edges, _with_one_range, group_objects
 from kcal.pipeline.measurements import Anchored
+from kcal.track import AssociationOptions, Detections
 from scripts.shared.station_scenes import drawn_errors, marks, ring
 
 # Lines of sight of several cameras: pencils, points, who is nearest and which groups hold, against plain NumPy.

@@ -11,12 +11,10 @@ import torch
 from lenses import HYBRID, strong
 from torch import Tensor, nn
 
-from kcal.errors import InputError
-from kcal.io.lookup_file import save_onnx
-from kcal.lens.camera import Camera
+from kcal import Camera, InputError, Localizer, Origin, Rig
+from kcal.lens import save_onnx
 from kcal.lens.model import PRESETS
-from kcal.lens.rig import Origin, Rig, RigCovariance
-from kcal.locate.localizer import Localizer
+from kcal.rig import RigCovariance
 
 
 def localizer(lens: str, scale: float, heading: float) -> Localizer:

@@ -9,17 +9,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal.errors import InputError
-from kcal.lens.rig import Mounting, Rig
-from kcal.locate.budget import planned_rig
-from kcal.locate.localizer import Localizer
+from kcal import InputError, Localizer, Rig
 from kcal.pipeline.association import AssociationOptions, associate
-from kcal.pipeline.detections import Detections
-from kcal.pipeline.grouping import group_objects
-from kcal.pipeline.imm_filter import Motion
-from kcal.pipeline.measurements import ClockPrior
 from kcal.pipeline.pairing import ObjectViews
-from kcal.pipeline.tracks import Tracker, TrackOptions
+from kcal.rig import Mounting, planned_rig
+from kcal.track import ClockPrior, Detections, Motion, Tracker, TrackOptions, group_objects
 from scripts.shared.station_scenes import ORIGIN, drawn_errors, marks, ring
 
 SIZE = (1920, 1080)

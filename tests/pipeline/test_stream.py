@@ -27,15 +27,12 @@ from track_scenes import seen_by, tracked_site
 from waiting import PATIENCE
 
 import kcal.pipeline.stream
-from kcal.errors import FileError, InputError
-from kcal.locate.localizer import Localizer
+from kcal import FileError, InputError, Localizer
 from kcal.locate.points import PointLocator
-from kcal.pipeline.association import AssociationOptions
 from kcal.pipeline.grouping import Moment, read_moment
-from kcal.pipeline.measurements import ClockPrior
 from kcal.pipeline.senders import CotSender, sender_to
 from kcal.pipeline.stream import Ledger, MomentOrder, SourceItem, Stream, StreamCounts, lines_of
-from kcal.pipeline.tracks import Tracker
+from kcal.track import AssociationOptions, ClockPrior, Tracker
 from scripts.shared.children import children
 
 # Streams: the same bytes whether killed or not, malformed lines counted, nothing read or written twice.

@@ -12,13 +12,12 @@ from scipy.special import chdtrc
 from torch import Tensor
 from track_scenes import pairs_of, tracked_site
 
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Rig
+from kcal import Camera, Rig
+from kcal.lens import rotation_from_vector
 from kcal.pipeline.association import _patches, appearance, near_epipolar_lines
-from kcal.pipeline.imm_filter import Motion
 from kcal.pipeline.pairing import ObjectViews
 from kcal.pipeline.tracks import Tracker, TrackOptions, TrackRecord, _toward
+from kcal.track import Motion
 
 SLOW = TrackOptions(motions=(Motion(acceleration=0.05),), confirm_hits=3, lose_after_s=1.0, forget_after_s=4.0)
 HERE = (0.0, 0.0, 400.0)

@@ -10,13 +10,12 @@ import torch
 from locate_rigs import real_rig, tensor
 from track_scenes import ORIGIN, pairs_of, seen_by, tracked_site, yawed_rig
 
-from kcal.errors import InputError
-from kcal.lens.rig import RigCovariance
-from kcal.locate.localizer import Localizer
+from kcal import InputError, Localizer
 from kcal.pipeline.estimates import track_states
 from kcal.pipeline.imm_filter import Motion, Timing, born
 from kcal.pipeline.measurements import anchored, known_sightings, sightings
 from kcal.pipeline.tracks import Tracker, TrackOptions, Tracks
+from kcal.rig import RigCovariance
 
 STEADY = TrackOptions(motions=(Motion(acceleration=1e-4),), speed_mps=10.0, confirm_hits=2)
 

@@ -9,8 +9,7 @@ import pytest
 import torch
 from track_scenes import pairs_of, seen_by, tracked_site
 
-from kcal.pipeline.imm_filter import Motion
-from kcal.pipeline.tracks import Tracker, TrackOptions
+from kcal.track import Motion, Tracker, TrackOptions
 
 pytest.importorskip("stonesoup", reason="an oracle of the tests only")
 from stonesoup.models.measurement.linear import LinearGaussian

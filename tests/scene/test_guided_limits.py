@@ -7,10 +7,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from kcal import Camera, InputError, Rig
 from kcal.corners.match import Keypoints
-from kcal.errors import InputError
-from kcal.lens.camera import Camera
-from kcal.lens.rig import Rig
 from kcal.scene import refine
 from kcal.scene.match import ImagePair, _both_ways, guided_matches, match_scene
 from tests.helpers.scene_pairs import small_rig

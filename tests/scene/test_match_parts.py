@@ -8,9 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from kcal import Camera, Rig
 from kcal.corners.patches import object_planes, plane_pixels
-from kcal.lens.camera import Camera
-from kcal.lens.rig import Rig
 from kcal.scene import match, refine
 from kcal.scene.match import ImagePair, MatchedPair, PairCounts
 from kcal.scene.refine import HALF, SWAY, RefinedMatches, Stillness, _patch, refine_matches, still_there, whole_shifts

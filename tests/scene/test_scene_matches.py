@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from kcal import Baseline, RigData
-from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.errors import InputError
-from kcal.lens.pose import vector_from_rotation
+from kcal import Baseline, InputError, RigData, RigOptions, solve_rig
+from kcal.lens import vector_from_rotation
 from kcal.scene.match import ImagePair, MatchedPair, match_scene, scene_features, scene_of
 from kcal.scene.refine import Stillness, still_there
 from tests.helpers.scene_pairs import pair, small_rig, true_right

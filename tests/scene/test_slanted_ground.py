@@ -8,9 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from kcal import Camera, Rig
 from kcal.corners.patches import image_windows, sample, warped_blur_windows
-from kcal.lens.camera import Camera
-from kcal.lens.rig import Rig
 from kcal.scene import refine
 from kcal.scene.refine import refine_matches
 

@@ -5,11 +5,9 @@ import dataclasses
 import torch
 from torch import Tensor
 
-from kcal import Baseline, Features, RigData
-from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.calibrate.rig.source import Effect
+from kcal import Baseline, Features, Rig, RigData, RigOptions, solve_rig
 from kcal.lens.pose import rotation_from_vector, side_axes
-from kcal.lens.rig import Rig
+from kcal.rig import Effect
 from kcal.scene import common_errors
 from kcal.scene.common_errors import line_errors, smooth_effects
 from kcal.scene.match import MatchedPair, PairCounts, counted

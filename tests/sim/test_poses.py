@@ -5,9 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kcal.errors import InputError
-from kcal.lens.camera import Camera
-from kcal.lens.rig import Rig
+from kcal import Camera, InputError, Rig
 from kcal.sim.captures import BoardSize, PoseOptions, board_points, project_board, sample_board_poses
 from kcal.sim.scene import demo_rig
 from scripts.shared.pair_poses import rig_pose, sample_pair_poses

@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from kcal.corners.board import Board
-from kcal.errors import InputError
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
+from kcal import Board, Camera, InputError
+from kcal.lens import rotation_from_vector
 from kcal.sim import coast
 from kcal.sim.captures import (
     BoardPose,

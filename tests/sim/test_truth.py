@@ -9,9 +9,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kcal.errors import InputError
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
+from kcal import Camera, InputError
+from kcal.lens import rotation_from_vector
 from kcal.sim.captures import drawn_lens
 from kcal.sim.raytrace import (
     SURVEILLANCE,

@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kcal.errors import DegenerateError, InputError
-from kcal.lens.rig import Origin
-from kcal.locate.geodesy import enu_from_cam
+from kcal import DegenerateError, InputError, Origin
+from kcal.locate import enu_from_cam
+from kcal.rig import RasterError
 from kcal.skyline import attitude
 from kcal.skyline.attitude import SkylineAttitude, skyline_attitude
 from kcal.skyline.fit import Candidate
-from kcal.skyline.horizon import RasterError
 from scripts.shared.skyline_scenes import Hills, HillWeather, skyline_image
 from tests.helpers.skyline_site import (
     ANGLES,

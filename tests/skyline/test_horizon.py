@@ -10,9 +10,8 @@ import torch
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from kcal.errors import InputError
-from kcal.lens.rig import Origin
-from kcal.locate.geodesy import geodetic_to_enu
+from kcal import InputError, Origin
+from kcal.locate import geodetic_to_enu
 from kcal.locate.raster import Raster
 from kcal.skyline.attitude import raised_horizon
 from kcal.skyline.horizon import RasterError, sky_border, terrain_horizon

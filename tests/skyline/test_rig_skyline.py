@@ -10,19 +10,16 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from kcal import MeasuredPosition, RigData
+from kcal import InputError, MeasuredPosition, Origin, RigData, solve_rig
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.skyline import SkylineSource
-from kcal.calibrate.rig.solve import solve_rig
 from kcal.calibrate.rig.source import PosedCamera
-from kcal.errors import InputError
-from kcal.lens.pose import rotation_from_vector, vector_from_rotation
-from kcal.lens.rig import Origin
-from kcal.locate.geodesy import enu_from_cam
+from kcal.lens import rotation_from_vector, vector_from_rotation
+from kcal.locate import enu_from_cam
 from kcal.locate.raster import Raster
 from kcal.locate.stations import station_mounting
+from kcal.rig import SkylineImage, skyline_source
 from kcal.skyline import attitude
-from kcal.skyline.attitude import SkylineImage, skyline_source
 from kcal.skyline.horizon import Horizon, terrain_horizon
 from scripts.shared.skyline_scenes import HillWeather
 from tests.helpers.skyline_site import ANGLES, ERROR, camera, image, small_site

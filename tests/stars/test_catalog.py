@@ -7,8 +7,7 @@ import datetime
 import numpy as np
 import pytest
 
-from kcal.errors import InputError
-from kcal.lens.rig import Origin
+from kcal import InputError, Origin
 from kcal.stars.sky import _NAMES, Air, StarCatalog, _by_chance, celestial_directions, observed_directions
 from kcal.values import instant
 

@@ -11,10 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-from kcal.errors import FileError, InputError
-from kcal.lens.camera import Camera
-from kcal.lens.rig import Origin
-from kcal.locate.geodesy import enu_from_cam
+from kcal import Camera, FileError, InputError, Origin
+from kcal.locate import enu_from_cam
 from kcal.stars.detect import detect_stars, read_night
 from kcal.stars.night import SkyView, clock_doubts, field_angle, name_stars
 from kcal.stars.sky import StarCatalog, _table_of, cache_folder, identify, observed_directions, pair_table

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-from kcal.errors import InputError
+from kcal import Camera, InputError
 from kcal.io.images import write_png, write_video
-from kcal.lens.camera import Camera
 from kcal.stars.detect import (
     NightPlan,
     PlannedStars,

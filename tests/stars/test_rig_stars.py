@@ -13,15 +13,11 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from kcal.calibrate.rig.landmarks import Landmarks
-from kcal.calibrate.rig.solve import RigOptions, solve_rig
+from kcal import DegenerateError, InputError, Landmarks, RigOptions, load_rig, save_camera, solve_rig
 from kcal.cli.main import app
-from kcal.errors import DegenerateError, InputError
-from kcal.io.camera_file import save_camera
 from kcal.io.images import write_png
-from kcal.io.rig_file import load_rig
-from kcal.lens.pose import rotation_from_vector, vector_from_rotation
-from kcal.locate.geodesy import enu_from_cam
+from kcal.lens import rotation_from_vector, vector_from_rotation
+from kcal.locate import enu_from_cam
 from kcal.stars.night import NamedStars, SkyView, name_stars
 from kcal.stars.rig_stars import moments_of, star_source
 from kcal.stars.sky import StarCatalog, pole_in_enu

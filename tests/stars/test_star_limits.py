@@ -13,10 +13,8 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from kcal.errors import InputError
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Origin
+from kcal import Camera, InputError, Origin
+from kcal.lens import rotation_from_vector
 from kcal.stars.detect import _reasons, _windowed, detect_stars
 from kcal.stars.lens import _near_middle
 from kcal.stars.night import SkyView, _names_at, fit_attitude

@@ -11,11 +11,9 @@ import numpy as np
 import pytest
 import torch
 
+from kcal import Camera, InputError, Origin
 from kcal.calibrate.rig.stars import StarSource, star_turns
-from kcal.errors import InputError
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Origin
+from kcal.lens import rotation_from_vector
 from kcal.stars.detect import DetectedStars
 from kcal.stars.night import Attitude, NamedStars, SkyView
 from kcal.stars.rig_stars import Moment, moments_of, star_source

@@ -12,17 +12,15 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
+from kcal import Camera, InputError, load_camera
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.cli.main import app
-from kcal.errors import InputError
-from kcal.io.camera_file import load_camera
 from kcal.io.images import write_png
-from kcal.lens.camera import Camera
+from kcal.stars import SkyView
 from kcal.stars.detect import DetectedStars, NightPlan, planned_stars
 from kcal.stars.lens import StarCamera, calibrate_by_stars, refine_by_stars
 from kcal.stars.lens_fit import StarField, fit_star_lens
-from kcal.stars.night import SkyView
 from kcal.stars.sky import StarCatalog, cache_folder, pair_table
 from scripts.shared.infinity import error_at_infinity
 from scripts.shared.night_scenes import PLACE, rendered

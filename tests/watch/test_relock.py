@@ -10,13 +10,12 @@ import torch
 from locate_rigs import pinhole_rig, real_rig, tensor
 from torch import Tensor
 
-from kcal.calibrate.rig.landmarks import Landmarks
-from kcal.errors import InputError
+from kcal import InputError, Landmarks, Origin, Rig
 from kcal.io.camera_file import provenance
+from kcal.lens import rotation_from_vector
 from kcal.lens.calibration import RigCalibration
-from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Mounting, Origin, Rig, RigCovariance
-from kcal.locate.geodesy import enu_from_cam
+from kcal.locate import enu_from_cam
+from kcal.rig import Mounting, RigCovariance
 from kcal.watch.turned import DriftEffect, check_rig, drift_of_turns, measure_drift
 
 # Sigmas of the origin (east, north, up) and of turns about these axes, all unlike; simulated light goes straight.

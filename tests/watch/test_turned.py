@@ -10,10 +10,8 @@ import torch
 from rig_scenes import CAMERAS, CENTER, ROTATION, landmarks, normal, see, spread_points, tensor
 from torch import Tensor
 
-from kcal import Features, Landmarks
-from kcal.errors import DegenerateError, InputError
-from kcal.lens.pose import rotation_from_vector, vector_from_rotation
-from kcal.lens.rig import Rig
+from kcal import DegenerateError, Features, InputError, Landmarks, Rig
+from kcal.lens import rotation_from_vector, vector_from_rotation
 from kcal.watch.turned import measure_drift
 
 RELATIVE = ROTATION[1] @ ROTATION[0].T

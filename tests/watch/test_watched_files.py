@@ -12,10 +12,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from kcal import FileError, InputError, Origin
 from kcal.corners.images import image_time
-from kcal.errors import FileError, InputError
-from kcal.lens.rig import Mounting, Origin
-from kcal.locate.budget import planned_rig
+from kcal.rig import Mounting, planned_rig
 from kcal.watch.history import (
     AngleSeries,
     HistoryRow,
