@@ -176,13 +176,16 @@ RIG = Wanted(
     "a kcal rig file",
     frozenset({"rig"}),
     _SOLVE,
-    (("camera", "kcal rig {given} right.camera.json --landmarks survey.csv --marks marks.csv -o rig.json"),
+    (("camera", "kcal rig {given} right.camera.json --landmarks survey.csv --marks marks.csv -o rig.json; of one "
+      "camera whose pose you know: kcal place {given} --site LAT,LON,HEIGHT --heading DEG±SIGMA --pitch DEG±SIGMA -o "
+      "{name}.rig.json"),
      ("observations", "kcal calibrate left.obs.json right.obs.json -o cameras"),
      ("foreign", "kcal import {given} -o rig.json"), ("json", "kcal import {given} -o rig.json")),
 )  # fmt: skip
 # Where marks are of any number of cameras, `name,camera,u,v`.
 _STATION = (
-    "kcal station {given} survey.csv --marks marks.csv -o {name}.rig.json (several cameras: kcal rig), then "
+    "kcal station {given} survey.csv --marks marks.csv -o {name}.rig.json (several cameras: kcal rig; a pose that you "
+    "know: kcal place), then "
     "kcal locate {name}.rig.json {marks}, with --height 12±3 or --terrain dem.tif for positions"
 )
 CAMERA_OR_RIG = dataclasses.replace(

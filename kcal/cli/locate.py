@@ -231,16 +231,16 @@ def locate_run(rig: Path, points: Path, options: LocateOptions) -> LocateRun:
     from kcal.locate.marks import is_long, read_mark_chunks
     from kcal.locate.points import PointLocator
     from kcal.locate.raster import terrain
-    from kcal.locate.stations import names_of_rig
     from kcal.locate.tabulate import find_geoid
 
     own = options
-    many = own.height is not None or own.terrain is not None or is_long(points) or len(names_of_rig(rig)) != 2
+    solved = load_rig(rig)
+    stated = own.height is not None or own.terrain is not None
+    many = stated or is_long(points) or len(solved) != 2 or not solved.in_first_frame
     if many:
         _refuse_of_pairs(own)
     elif own.aged and own.watch:
         raise typer.BadParameter("--aged guesses what the history of --watch tells: give either")
-    solved = load_rig(rig)
     noise, note = pixel_sigma_and_source(own.pixel_sigma, solved)
     doubts = _warned(rig, solved.calibration.warnings if solved.calibration else ())
     by_moments: Locate | None = None

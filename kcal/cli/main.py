@@ -29,6 +29,7 @@ from kcal.cli.live import live_command
 from kcal.cli.locate import locate_command
 from kcal.cli.mark import mark_command
 from kcal.cli.options import Command, declared
+from kcal.cli.place import place_command
 from kcal.cli.rectify import rays_command, rectify_command
 from kcal.cli.report import report_command
 from kcal.cli.rig import app as rig
@@ -128,6 +129,7 @@ app.command("batch", cls=Command)(with_json(with_inputs(batch_command)))
 app.command("mark", cls=Command)(declared(mark_command, json=False))
 app.add_typer(rig, name="rig")
 app.command("station", cls=Command)(with_json(with_inputs(station_command)))
+app.command("place", cls=Command)(declared(place_command))
 app.command("stars", cls=Command)(with_json(with_inputs(stars_command)))
 app.command("locate", cls=Command)(with_inputs(locate_command))
 app.command("live", cls=Command)(with_inputs(live_command))

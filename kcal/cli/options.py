@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
+import itertools
 import re
 import types
 from collections.abc import Callable, Iterator, Sequence
@@ -304,7 +305,7 @@ class Command(TyperCommand):
                 break
             count = 0 if param is None or equals or getattr(param, "is_flag", False) else param.nargs
             if param is not None and param.name in several and not equals:
-                count = next((n for n, word in enumerate(words[i + 1 :]) if word.startswith("-")), len(words) - i - 1)
+                count = len([*itertools.takewhile(lambda word: not re.match(r"-(?![.\d])", word), words[i + 1 :])])
             alone += not words[i].startswith("-")
             spread.append(words[i : i + 1 + count])
             i += 1 + count

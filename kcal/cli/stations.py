@@ -160,8 +160,8 @@ def solve_stations(
     assert rig.calibration is not None
     rig.calibration = dataclasses.replace(rig.calibration, pixel_sigma=sources.mark_sigma)
     tell(
-        rms_px=result.rms, cameras=_stands(rig), warnings=list(result.warnings), undetermined=list(result.undetermined),
-        left_out={item.label: item.reason for item in result.left_out},
+        rms_px=result.rms, cameras=told_stands(rig), warnings=list(result.warnings),
+        undetermined=list(result.undetermined), left_out={item.label: item.reason for item in result.left_out},
     )  # fmt: skip
     save_rig(rig, output)
     if picture is not None:
@@ -233,7 +233,7 @@ def station_rows(rig: Rig) -> list[list[str]]:
     return rows
 
 
-def _stands(rig: Rig) -> dict[str, dict[str, float]]:
+def told_stands(rig: Rig) -> dict[str, dict[str, float]]:
     """How each camera stands, for --json."""
     from kcal.locate.stations import station_stands
 

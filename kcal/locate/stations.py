@@ -9,13 +9,15 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from kcal.errors import InputError
+from kcal.errors import FileError, InputError
 from kcal.files import read_bytes
 from kcal.lens.camera import Camera
 from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Mounting, Origin, Rig, half_of_covariance
 from kcal.locate.geodesy import ecef_from_enu_rotation, enu_from_cam, geodetic_to_enu
 from kcal.locate.localizer import Localizer
 from kcal.locate.mounting import attitude, station_mounting
+from kcal.locate.survey import EARTH, place_sigma
+from kcal.locate.tables import TableRow, read_rows
 from kcal.strict_json import MOST_BYTES, read_json
 
 
@@ -97,6 +99,52 @@ def stated_mounting(
     return Mounting(
         origin=origin, heading_deg=heading_deg[0], pitch_deg=pitch_deg[0], roll_deg=roll_deg[0], covariance=by @ by.T
     )
+
+
+# Columns of a table of known poses.
+_STAND_COLUMNS = ("name", *EARTH, "sigma", "sigma_up", "heading", "heading_sigma", "pitch", "pitch_sigma", "roll",
+                  "roll_sigma")  # fmt: skip
+_STAND_HEADER = "name,lat,lon,height,sigma,heading,heading_sigma,pitch,pitch_sigma"
+
+
+def read_stands(path: str | Path, names: Sequence[str] | None = None) -> dict[str, Mounting]:
+    """How cameras stand, from a table `name,lat,lon,height,sigma,heading,heading_sigma,pitch,pitch_sigma`.
+
+    Degrees, meters above the WGS84 ellipsoid, meters; `sigma_up` is that of the height where it differs. Without `roll`
+    a camera is level, known as well as its pitch.
+
+    Args:
+        path: CSV.
+        names: of the cameras; None: all lines of the table.
+
+    Raises:
+        FileError: see `kcal.locate.tables.read_rows`; a value out of range, no sigma, or a camera without a line.
+    """
+    rows = {row.name: row for row in read_rows(path, _STAND_HEADER, _STAND_COLUMNS, _STAND_HEADER.split(",")[1:])}
+    found = {}
+    for name in rows if names is None else names:
+        if name not in rows:
+            raise FileError(f"{path}: no line is named {name!r}; a line for each camera is needed, named as its file")
+        row = rows[name]
+        lat, lon = (row.number(column, "decimal degrees") for column in EARTH[:2])
+        pitch = _stated_angle(row, "pitch")
+        roll = _stated_angle(row, "roll") if row.cells.get("roll") else (0.0, pitch[1])
+        try:
+            place = Origin(lat=lat, lon=lon, height=row.number("height", "a number in meters"))
+            found[name] = stated_mounting(
+                place, heading_deg=_stated_angle(row, "heading"), pitch_deg=pitch, roll_deg=roll,
+                sigma_m=place_sigma(row, "place"),
+            )  # fmt: skip
+        except InputError as error:
+            raise FileError(f"{row.where}: {error}") from None
+    return found
+
+
+def _stated_angle(row: TableRow, name: str) -> tuple[float, float]:
+    sigma = row.positive(f"{name}_sigma")
+    if sigma is None:
+        raise FileError(f"{row.where}: {name}_sigma is empty; write how well it is known, degrees")
+    return row.number(name, "a number in degrees"), sigma
 
 
 def station_rig(

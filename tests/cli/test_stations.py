@@ -343,3 +343,92 @@ def test_a_rig_of_four_is_judged(folder: Path, command: Command) -> None:
     save_rig(apart, folder / "apart.json")
     result = command("report", folder / "apart.json", "--require 1km:5%", code=3)
     assert "no two cameras see one" in result.out
+
+
+# `kcal place`: stations whose pose is known.
+
+POSES = """name,lat,lon,height,sigma,sigma_up,heading,heading_sigma,pitch,pitch_sigma,roll,roll_sigma
+west,46.0,7.0,1500,5,10,62,0.1,5,0.05,2,0.2
+east,46.4,7.5,900,5,10,200,0.2,12,0.05,,
+"""
+
+
+@pytest.fixture
+def known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    for name in ("west", "east", "left", "right"):
+        lens = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
+        save_camera(lens, f"{name}.camera.json")
+    Path("poses.csv").write_text(POSES)
+    return tmp_path
+
+
+def test_known_poses_as_typed_and_in_a_table(known: Path, command: Command) -> None:
+    said = command(
+        "place west.camera.json east.camera.json --site 46.0,7.0,1500±5 46.4,7.5,900+-5 --heading 62±0.1 200±0.2 "
+        "--pitch 5±0.05 12±0.05 --roll 2±0.2 0±0.05 -o typed.json"
+    )
+    assert "wrote typed.json" in said.out
+    command("place west.camera.json east.camera.json --places poses.csv -o read.json")
+    typed, read = load_rig("typed.json"), load_rig("read.json")
+    assert typed.names == read.names == ("west", "east")
+    assert torch.equal(typed.rotation, read.rotation)
+    told = json.loads(command("place west.camera.json east.camera.json --places poses.csv -o read.json --json").out)
+    east = told["cameras"]["east"]
+    assert (east["lat"], east["heading_deg"], east["pitch_deg"]) == pytest.approx((46.4, 200.0, 12.0), abs=1e-9)
+    assert east["sigma_m"] == pytest.approx(10.0, rel=1e-3)
+    # One file at several places is one lens, named by the table; without --roll it is level, and that is said.
+    command("place west.camera.json --places poses.csv -o one.json")
+    assert load_rig("one.json").names == ("west", "east")
+    said = command("place west.camera.json --site -33.9,151.2,10 --heading 0±1 --pitch -30±0.5 -o down.json")
+    assert "roll: 0, known as well as the pitch" in said.err
+    assert load_rig("down.json").root is not None
+
+
+@pytest.mark.parametrize("names", [("west", "east"), ("left", "right")])
+def test_one_pixel_and_two_are_located(names: tuple[str, str], known: Path, command: Command) -> None:
+    Path("poses.csv").write_text(POSES.replace("west", names[0]).replace("east", names[1]))
+    command(f"place {names[0]}.camera.json {names[1]}.camera.json --places poses.csv -o rig.json")
+    rig, airplane = load_rig("rig.json"), torch.tensor([46.15, 7.4, 9000.0]).double()
+    assert rig.origin is not None
+    # Straight lines of sight: light bends in `kcal locate`, by what the airplane is lower than it seems.
+    left, right = rig(geodetic_to_enu(airplane, rig.origin)[None])[0][0].tolist()
+    wide = f"a,{left[0]},{left[1]},{right[0]},{right[1]}"
+    Path("wide.csv").write_text(f"name,left_u,left_v,right_u,right_v\n{wide}\n")
+    Path("long.csv").write_text(
+        f"name,camera,u,v\na,{names[0]},{left[0]},{left[1]}\na,{names[1]},{right[0]},{right[1]}\n"
+    )
+    for table in ("wide.csv", "long.csv"):
+        command(f"locate rig.json {table} -o found.csv")
+        found = next(csv.DictReader(Path("found.csv").read_text().splitlines()))
+        place = [float(found[name]) for name in ("lat", "lon", "height_ellipsoidal_m")]
+        assert place[:2] == pytest.approx((46.15, 7.4), abs=1e-4)
+        assert place[2] == pytest.approx(9000.0, abs=60.0)
+    command("place west.camera.json --site 46,7,1500±5 --heading 62±0.1 --pitch -20±0.1 -o drone.json")
+    Path("one.csv").write_text("name,camera,u,v\nhut,west,1200,700\n")
+    assert "ok" in command("locate drone.json one.csv --height 600±2").out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--site 46,7,1500 --heading 62 --pitch 5±1", "--heading 62: say how well it is known, for example 62±1"),
+        (
+            "--site 46,7,1500 46,7,1 --heading 62±1 --pitch 5±1",
+            "--site: one value for each of 1 cameras is needed, got 2",
+        ),
+        ("--site 46,7,1500 --heading 62±1 --pitch 95±1", "pitch 95"),
+        ("east.camera.json --places short.csv", "no line is named 'east'"),
+        ("--places bare.csv", "pitch_sigma is empty; write how well it is known, degrees"),
+    ],
+)
+def test_what_is_missing_of_a_pose_is_asked_for(words: str, message: str, known: Path, command: Command) -> None:
+    Path("short.csv").write_text("".join(POSES.splitlines(keepends=True)[:2]))
+    Path("bare.csv").write_text(POSES.replace("5,0.05,2", "5,,2"))
+    assert message in command(f"place west.camera.json {words} -o rig.json", code=1).err.replace("\n", " ")
+    assert not Path("rig.json").exists()
+
+
+def test_one_camera_in_place_of_a_rig_is_told_of_known_poses(known: Path, command: Command) -> None:
+    Path("one.csv").write_text("name,left_u,left_v,right_u,right_v\nhut,1,2,3,4\n")
+    assert "kcal place west.camera.json --site" in command("locate west.camera.json one.csv", code=1).err

@@ -1,0 +1,110 @@
+"""`kcal place`: stations whose pose is known, from a drone's log or by a compass: no landmarks are needed."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import typer
+
+from kcal.cli import kinds
+from kcal.cli.console import err, out, print_table, print_wrote, tell
+from kcal.cli.options import Several
+from kcal.cli.stations import camera_names, station_rows, told_stands
+from kcal.errors import InputError
+from kcal.files import check_writable
+from kcal.values import WithSigma
+
+if TYPE_CHECKING:
+    from kcal.lens.rig import Mounting
+
+
+def place_command(
+    cameras: list[kinds.CalibratedCamera],
+    *,
+    output: kinds.Output,
+    site: Several[kinds.Place] | None = None,
+    heading: Several[kinds.MeasuredDegrees] | None = None,
+    pitch: Several[kinds.MeasuredDegrees] | None = None,
+    roll: Several[kinds.MeasuredDegrees] | None = None,
+    places: kinds.Table | None = None,
+) -> None:
+    """Make a station, or a rig of several, from positions and angles that are known: no landmarks are needed.
+
+    North, up and the horizon are those at each camera. `kcal locate` then gives the position of what one camera sees at
+    a known height (`--height`, `--terrain`), and of what several see. State how well you know each value: ±1 or more
+    for the compass of a drone or a phone. Where there are landmarks, `kcal station` finds the pose far better.
+
+    **Examples**
+
+    `kcal place drone.camera.json --site 46.02,7.75,1720±3 --heading 212±2 --pitch -30±0.5 -o drone.rig.json`
+
+    `kcal place west.camera.json east.camera.json --places places.csv -o towers.rig.json`
+
+    Args:
+        cameras: Camera file of each; of one file and a table, each line of the table is a place of that camera.
+        output: Rig file to write.
+        site: Place of each camera; heights are above the WGS84 ellipsoid, ± along each axis, 1 m if not given.
+        heading: Azimuth of each camera's axis from true north.
+        pitch: Elevation of each camera's axis above the horizon.
+        roll: Of each camera, clockwise as seen from behind it; level within the pitch's ± if not given.
+        places: In place of these a table: name (of the camera), lat, lon, height, sigma, heading, heading_sigma, pitch,
+            pitch_sigma, and if need be sigma_up, roll, roll_sigma.
+    """
+    check_writable(output, *cameras, *([] if places is None else [places]))
+    typed = {"--site": site, "--heading": heading, "--pitch": pitch}
+    if (places is None) == any(value is None for value in typed.values()) or (places and (roll or any(typed.values()))):
+        raise typer.BadParameter("give --site, --heading and --pitch of each camera, or all of them in --places")
+    from kcal.io.camera_file import load_camera
+    from kcal.io.rig_file import save_rig
+    from kcal.locate.stations import read_stands, station_rig
+
+    names = camera_names(cameras)
+    if places is None:
+        stands = dict(zip(names, _typed_stands(len(names), site or [], heading or [], pitch or [], roll), strict=True))
+    else:
+        stands = read_stands(places, None if len(names) == 1 else names)
+    lenses = {path: load_camera(path) for path in dict.fromkeys(cameras)}
+    paths = cameras * len(stands) if len(cameras) == 1 else cameras
+    rig = station_rig({name: lenses[path] for name, path in zip(stands, paths, strict=True)}, [*stands.values()])
+    save_rig(rig, output)
+    tell(cameras=told_stands(rig))
+    print_table(station_rows(rig))
+    print_wrote(output)
+    out.print(
+        f"next: kcal locate {output} marks.csv, with lines of name,camera,u,v; --height or --terrain where one camera "
+        "alone sees a thing",
+        markup=False,
+    )
+
+
+def _typed_stands(
+    count: int,
+    site: list[kinds.KnownPlace],
+    heading: list[WithSigma],
+    pitch: list[WithSigma],
+    roll: list[WithSigma] | None,
+) -> list[Mounting]:
+    """How each camera stands, as it was typed."""
+    from kcal.locate.stations import stated_mounting
+
+    if roll is None:
+        roll = [WithSigma(0.0, one.sigma) for one in pitch]
+        err.print("roll: 0, known as well as the pitch; --roll states it")
+    angles = {"--heading": heading, "--pitch": pitch, "--roll": roll}
+    for option, many in (("--site", len(site)), *((option, len(given)) for option, given in angles.items())):
+        if many != count:
+            raise InputError(f"{option}: one value for each of {count} cameras is needed, got {many}")
+    for option, given in angles.items():
+        for one in given:
+            if one.sigma is None:
+                raise InputError(f"{option} {one}: say how well it is known, for example {one}±1")
+    return [
+        stated_mounting(
+            place.origin,
+            heading_deg=(turn.value, turn.sigma or 0.0),
+            pitch_deg=(rise.value, rise.sigma or 0.0),
+            roll_deg=(tip.value, tip.sigma or 0.0),
+            sigma_m=(1.0 if place.sigma is None else place.sigma,) * 3,
+        )
+        for place, turn, rise, tip in zip(site, heading, pitch, roll, strict=True)
+    ]
