@@ -35,7 +35,7 @@ from kcal.corners.saddle import saddle
 from kcal.lens import rotation_from_vector
 from kcal.sim.captures import BoardSize, project_board
 from kcal.sim.scene import RenderOptions, render_light
-from scripts.shared.page import table, write_section
+from scripts.shared.page import table, tell
 
 BOARD = Board(columns=9, rows=6, square=0.025)
 SQUARES, BLURS, NOISES = (8, 10, 20, 40), (0.5, 1.0, 2.0), (0, 2, 5)
@@ -212,9 +212,7 @@ def main() -> None:
     squares, count = (SQUARES[1:], 2) if arguments.quick else (SQUARES, 20)
     cells = {(s, b, n): run_cell(s, b, n, count) for s, b, n in itertools.product(squares, BLURS, NOISES)}
     lines = [*rms_table(cells), "", summary(cells)]
-    print(*lines, sep="\n")
-    if arguments.write:
-        write_section("corners.md", "refinement", "\n".join(lines))
+    tell("corners.md", "refinement", lines, write=arguments.write)
     if arguments.real:
         folder = os.environ.get("KCAL_DATA")
         if not folder:

@@ -214,8 +214,7 @@ def main() -> None:
         "",
     ]
     text += batches(images, arguments.images)
-    if arguments.write:
-        write_section("corners.md", "speed", "\n".join(text))
+    write_section("corners.md", "speed", text, write=arguments.write)
 
 
 if __name__ == "__main__":

@@ -110,7 +110,7 @@ def main() -> None:
         show([" | ".join(rows[-1])])
     if arguments.write:
         heads = ["field", *(case.name for case in cases), "CPU s, wide lens"]
-        write_section("one-camera.md", "fields", "\n".join(table(heads, rows)))
+        write_section("one-camera.md", "fields", table(heads, rows))
 
 
 if __name__ == "__main__":

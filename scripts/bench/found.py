@@ -142,8 +142,7 @@ def main() -> None:
             real_rows.append([f"{folder}, {board.columns}x{board.rows}", *cells])
             show([row(*real_rows[-1])])
         text += ["", *table(heads, real_rows)]
-    if arguments.write:
-        write_section("corners.md", "found", "\n".join(text))
+    write_section("corners.md", "found", text, write=arguments.write)
 
 
 if __name__ == "__main__":

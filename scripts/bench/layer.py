@@ -1,7 +1,7 @@
 """Gradients through a calibration: time, and what Gauss and Newton's matrix would get wrong; docs/measured/solver.md.
 
 python -m scripts.bench.layer          prints and writes the section
-python -m scripts.bench.layer --dry    prints only
+python -m scripts.bench.layer --write    puts the table into the page
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def study(views: int, lens: str) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--dry", action="store_true", help="print only")
+    parser.add_argument("--write", action="store_true", help="write the table into the page")
     arguments = parser.parse_args()
     lines = [
         row("views", "lens", "from nothing, s", "again, s", "gradient, s", "error", "Gauss-Newton"),
@@ -97,8 +97,7 @@ def main() -> None:
         for lens in LENSES:
             if lens != "default" or views <= MOST_DEFAULT:
                 lines += show([study(views, lens)])
-    if not arguments.dry:
-        write_section("solver.md", "gradients", "\n".join(lines))
+    write_section("solver.md", "gradients", lines, write=arguments.write)
 
 
 if __name__ == "__main__":

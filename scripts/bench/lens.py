@@ -235,8 +235,7 @@ def main() -> None:
     }
     for name, made in parts.items():
         lines = made()
-        if arguments.write:
-            write_section("lens.md", name, "\n".join(lines))
+        write_section("lens.md", name, lines, write=arguments.write)
 
 
 if __name__ == "__main__":

@@ -155,8 +155,7 @@ def main() -> None:
         ]),
     ])  # fmt: skip
     print(text)
-    if options.write:
-        write_section("tracks.md", "live", text)
+    write_section("tracks.md", "live", text, write=options.write)
 
 
 if __name__ == "__main__":

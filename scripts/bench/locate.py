@@ -252,8 +252,7 @@ def main() -> None:
     }
     for name, made in parts.items():
         lines = made()
-        if arguments.write:
-            write_section("locate.md", name, "\n".join(lines))
+        write_section("locate.md", name, lines, write=arguments.write)
 
 
 if __name__ == "__main__":

@@ -23,8 +23,7 @@ from kcal import save_rig
 from kcal.rig import Mounting, mounting_covariance
 from scripts.bench.locate import known_to, some_points
 from scripts.shared.long_range import ORIGIN, rig
-from scripts.shared.page import table, write_section
-from scripts.shared.timing import show
+from scripts.shared.page import table, tell
 
 COUNTS = (1_000, 1_000_000)
 SUFFIXES = ("csv", "geojson", "geojsonl", "kml", "cot")
@@ -107,9 +106,7 @@ def main() -> None:
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         lines = measure(arguments.source, Path(name), tuple(arguments.formats), arguments.rows, arguments.repeat)
-    show(lines)
-    if arguments.write:
-        write_section("locate.md", "tables", "\n".join(lines))
+    tell("locate.md", "tables", lines, write=arguments.write)
 
 
 if __name__ == "__main__":

@@ -115,8 +115,7 @@ def main() -> None:
             rows.append([kind.__name__, *(score(find, some, board) for find in detectors.values())])
             print(name, *rows[-1], sep=" | ", flush=True)
         text += ["", f"`{name}`:", "", *table(["", *detectors], rows)]
-    if arguments.write:
-        write_section("corners.md", "marked boards", "\n".join(text))
+    write_section("corners.md", "marked boards", text, write=arguments.write)
 
 
 if __name__ == "__main__":

@@ -251,8 +251,7 @@ def main() -> None:
             for size in given.sizes or (*step.sizes, *(step.largest if given.largest else ())):
                 rows.append(measured(step, size))
                 show([str(rows[-1])])
-        if given.write:
-            write_section("precision.md", "fleet memory" if name == "fleet" else name, "\n".join(table(head, rows)))
+        write_section("precision.md", "fleet memory" if name == "fleet" else name, table(head, rows), write=given.write)
 
 
 if __name__ == "__main__":

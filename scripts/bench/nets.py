@@ -209,8 +209,8 @@ def main() -> None:
     show(alone(arguments.seeds))
     nets, lookup = as_start(arguments.rounds), tables(arguments.rounds)
     if arguments.write:
-        write_section(PAGE, "inverse nets", "\n".join(nets))
-        write_section(PAGE, "lookup tables", "\n".join(lookup))
+        write_section(PAGE, "inverse nets", nets)
+        write_section(PAGE, "lookup tables", lookup)
 
 
 if __name__ == "__main__":

@@ -58,8 +58,7 @@ def main() -> None:
     }
     for name, made in parts.items():
         lines = made()
-        if arguments.write:
-            write_section("other-programs.md", name, "\n".join(lines))
+        write_section("other-programs.md", name, lines, write=arguments.write)
 
 
 def _show(lines: list[str]) -> list[str]:

@@ -169,8 +169,7 @@ def main() -> None:
     torch.set_num_threads(1)
     if options.gradients:
         text = gradients()
-        if options.write:
-            write_section("pairing.md", "gradients", text)
+        write_section("pairing.md", "gradients", text, write=options.write)
         return
     rig = site_rig()
     localize = Localizer(rig, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=35.0)
@@ -221,8 +220,7 @@ def main() -> None:
         "Milliseconds a call: median / 99th percentile (processor time, mean). Made by "
         "`python -m scripts.bench.pipeline --write`.\n\n" + "\n".join(table(heads, rows))
     )
-    if options.write:
-        write_section("pairing.md", "latency", text)
+    write_section("pairing.md", "latency", text, write=options.write)
 
 
 if __name__ == "__main__":

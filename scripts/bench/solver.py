@@ -315,7 +315,7 @@ def main() -> None:
     parser.add_argument("--coefficients", type=int, nargs="*", default=list(MODELS), choices=list(MODELS))
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--timeout", type=float, default=60.0)
-    parser.add_argument("--dry", action="store_true", help="print only")
+    parser.add_argument("--write", action="store_true", help="write the table into the page")
     arguments = parser.parse_args()
     arguments.solvers = [name for name in SOLVERS if name not in PYTHON or os.environ.get(PYTHON[name])]
     os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -326,8 +326,8 @@ def main() -> None:
         for views in arguments.views:
             found, seconds[views, coefficients] = compare(views, coefficients, arguments)
             lines += show([row(*cells) for cells in found])
-        if coefficients in SECTIONS and not arguments.dry:
-            write_section("solver.md", SECTIONS[coefficients], "\n".join(lines))
+        if coefficients in SECTIONS and arguments.write:
+            write_section("solver.md", SECTIONS[coefficients], lines)
     show(growth(seconds))
 
 

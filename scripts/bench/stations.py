@@ -39,7 +39,7 @@ from kcal.locate import terrain
 from kcal.locate.siting import Site, area_of, rank_sites, siting_map
 from kcal.rig import planned_rig
 from scripts.shared.memory import peak_megabytes
-from scripts.shared.page import table, write_section
+from scripts.shared.page import table, tell
 from scripts.shared.station_scenes import drawn_errors, hills, marks, ring, targets
 from scripts.shared.timing import show
 
@@ -291,9 +291,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "many": lambda: several_rigs(given.counts or [8, 24, 16, 60]),
     }
     lines = parts[given.part]()
-    show(lines)
-    if given.write:
-        write_section("stations.md", given.part, "\n".join(lines))
+    tell("stations.md", given.part, lines, write=given.write)
 
 
 if __name__ == "__main__":

@@ -173,7 +173,7 @@ def main() -> None:
     records = [json.loads(line) for path in arguments.out if path.exists() for line in path.read_text().splitlines()]
     if arguments.write or arguments.write_sigmas:
         section, lines = ("traced", tables(records)) if arguments.write else ("sigmas", sigma_tables(records))
-        write_section(PAGE, section, "\n".join(lines))
+        write_section(PAGE, section, lines)
         return
     done = {(r["lens"], r["board"], r["views"], r["sigma"], r["seed"]) for r in records}
     names = (arguments.lens,) if arguments.lens else LENSES

@@ -50,8 +50,7 @@ def main() -> None:
         tables(rounds)
         return
     lines = views(rounds)
-    if arguments.write:
-        write_section("lens.md", "rectification", "\n".join(lines))
+    write_section("lens.md", "rectification", lines, write=arguments.write)
 
 
 def views(rounds: int) -> list[str]:

@@ -1,7 +1,7 @@
 """Whether calibration ends where it should, on real views; writes a table of docs/measured/solver.md.
 
     KCAL_DATA=folder python -m scripts.check.calibration            both checks, 20 starts
-    KCAL_DATA=folder python -m scripts.check.calibration --starts 5 --sets left --dry
+    KCAL_DATA=folder python -m scripts.check.calibration --starts 5 --sets left
 
 Richer models must not end above poorer ones (5 to 24 coefficients), and neither the start nor the units of the
 parameters may matter. Corners count alike (`weighted=False`), so that the RMS is what is minimized.
@@ -195,7 +195,7 @@ def main() -> None:
     parser.add_argument("--sets", nargs="*", default=["left", "right", "wide"], choices=["left", "right", "wide"])
     parser.add_argument("--starts", type=int, default=20)
     parser.add_argument("--only", choices=["ladder", "starts"], help="one of the two checks")
-    parser.add_argument("--dry", action="store_true", help="print only")
+    parser.add_argument("--write", action="store_true", help="write the table into the page")
     arguments = parser.parse_args()
     folder = os.environ.get("KCAL_DATA")
     if not folder:
@@ -203,8 +203,7 @@ def main() -> None:
     sets = real_sets(Path(folder), arguments.sets)
     if arguments.only != "starts":
         text = ladder(sets)
-        if not arguments.dry:
-            write_section("solver.md", "richer models", "\n".join(text))
+        write_section("solver.md", "richer models", text, write=arguments.write)
     if arguments.only != "ladder":
         starts(sets, arguments.starts)
 

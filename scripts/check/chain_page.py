@@ -91,7 +91,7 @@ def failures(records: Records) -> list[str]:
 
 def conclude(records: Records) -> None:
     """Write the table of the page."""
-    write_section("chain.md", "chain", "\n".join(tables(records)))
+    write_section("chain.md", "chain", tables(records))
 
 
 def _values(records: Records, key: str, *, sort: bool = True) -> list[Any]:

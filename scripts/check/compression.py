@@ -133,8 +133,7 @@ def main() -> None:
         "",
         *table(heads, rows),
     ]
-    if options.write:
-        write_section("pairing.md", "compression", "\n".join(lines))
+    write_section("pairing.md", "compression", lines, write=options.write)
 
 
 if __name__ == "__main__":

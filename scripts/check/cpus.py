@@ -166,7 +166,7 @@ def main() -> None:
             lines, different = tests_table(found), differing(found)
     show(lines)
     if arguments.write and arguments.figures:
-        write_section("other-programs.md", "cpus", "\n".join(lines))
+        write_section("other-programs.md", "cpus", lines)
     if different:
         sys.exit(1)
 

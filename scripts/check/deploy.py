@@ -118,8 +118,7 @@ def main() -> None:
         worst = max(worst, *(apart for apart, _ in found))
         rows.append([lens, *(f"{apart:.0e} ({seconds:.0f} s)" for apart, seconds in found)])
         show([row(*rows[-1])])
-    if options.write:
-        write_section("other-programs.md", "deploy", "\n".join(table(["lens", *options.ways], rows)))
+    write_section("other-programs.md", "deploy", table(["lens", *options.ways], rows), write=options.write)
     if not worst < ALLOWED:
         raise SystemExit(f"largest difference {worst:.1e}: more than {ALLOWED:.0e}")
 

@@ -27,7 +27,7 @@ from kcal import Camera, Rig
 from kcal.lens import LensModel, camera_difference, export_cameras, import_cameras, rotation_from_vector
 from kcal.lens.hybrid_terms import HybridForm, radius_over_angle
 from kcal.lens.zernike import ZernikeModes
-from scripts.shared.page import table, write_section
+from scripts.shared.page import table, tell
 from scripts.shared.timing import show
 
 POINTS = 10_000
@@ -300,9 +300,7 @@ def main() -> None:
                    rig_rows(folder, args.ros, args.mrcal)))  # fmt: skip
         show(table(["written by", "largest error, px", ""], back_rows(folder, args.mrcal, args.colmap)))
     for section, lines in parts.items():
-        show(lines)
-        if args.write:
-            write_section("other-programs.md", section, "\n".join(lines))
+        tell("other-programs.md", section, lines, write=args.write)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Gradient descent and Adam on a calibration problem, beside Levenberg-Marquardt; a section of docs/measured/solver.md.
 
     python -m scripts.check.first_order
-    python -m scripts.check.first_order --steps 500 --dry
+    python -m scripts.check.first_order --steps 500
 
 The paper (Section 4.3.1) found that first-order optimizers fail on camera calibration. Here all three get the same
 residuals, the same start (base projection, no distortion) and exact gradients. The first-order methods run twice: on
@@ -146,7 +146,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=1500)
     parser.add_argument("--coefficients", type=int, nargs="*", default=[5, 14], choices=list(MODELS))
     parser.add_argument("--picture", type=Path, help="draw RMS over steps and time into this file")
-    parser.add_argument("--dry", action="store_true", help="print only")
+    parser.add_argument("--write", action="store_true", help="write the table into the page")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     lines = [
@@ -167,8 +167,7 @@ def main() -> None:
         lines += rows_of(coefficients, of)
     if arguments.picture:
         draw(runs, arguments.picture)
-    if not arguments.dry:
-        write_section("solver.md", "first-order methods", "\n".join(lines))
+    write_section("solver.md", "first-order methods", lines, write=arguments.write)
 
 
 if __name__ == "__main__":

@@ -270,7 +270,7 @@ def main() -> None:
         sizes = f"--cameras {given.cameras} --views {given.views} --every {given.every}"
         how = f"`python -m scripts.check.fleet {sizes} --write`: {size}, {given.workers} workers of one thread,"
         lines = [*table(HEAD, rows), "", f"{how} a kill after every {given.every} pieces of work."]
-        write_section("precision.md", "fleet", "\n".join(lines))
+        write_section("precision.md", "fleet", lines)
     sys.exit(failed)
 
 

@@ -1,7 +1,7 @@
 """Whether a pixel has two valid rays, on lenses that are built to fold where it is hard to see.
 
     python -m scripts.check.folds                  the table of docs/measured/lens.md
-    python -m scripts.check.folds --lenses 500 --dry
+    python -m scripts.check.folds --lenses 500
 
 The numerator and the denominator of a radial factor that nearly cancel, denominators and derivatives with nearly double
 roots, the same with tangential, prism and tilt terms, and coefficients at random. Two rays are looked for without what
@@ -299,15 +299,14 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=math.inf, help="most time for constructed lenses")
     parser.add_argument("--ordinary", type=int, default=400, help="drawn at random; 0 leaves all ordinary ones out")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--dry", action="store_true", help="print only")
+    parser.add_argument("--write", action="store_true", help="write the table into the page")
     arguments = parser.parse_args()
     text = constructed(arguments.lenses, arguments.seed, arguments.compared, arguments.minutes)
     if arguments.ordinary:
         text += ["", *ordinary(arguments.ordinary, arguments.seed)]
     show(text)
     show(build_times(15))
-    if not arguments.dry:
-        write_section("lens.md", "folds", "\n".join(text))
+    write_section("lens.md", "folds", text, write=arguments.write)
 
 
 if __name__ == "__main__":

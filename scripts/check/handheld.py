@@ -129,7 +129,7 @@ def main() -> None:
         own = [record for record in records if (KINDS[record["key"][0]][1] > 0.0) is bent]
         text = show(lines(own)) if own else []
         if arguments.write and own:
-            write_section(PAGE, section, "\n".join(text))
+            write_section(PAGE, section, text)
 
 
 if __name__ == "__main__":

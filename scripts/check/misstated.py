@@ -32,8 +32,7 @@ from scripts.check.rig import (
     seen,
     spread,
 )
-from scripts.shared.page import table, write_section
-from scripts.shared.timing import show
+from scripts.shared.page import table, tell
 
 MATCHES, TAPE = 300, 0.005
 
@@ -100,9 +99,8 @@ def main() -> None:
         "error of attitude / σ", "inside 95 %",
     ]  # fmt: skip
     cases = [(1.0, 1.0), (2.0, 1.0), (3.0, 1.0), (5.0, 1.0), (1.0, 1.02), (3.0, 1.02), (3.0, 1.1)]
-    lines = show(table(heads, [judged(times, tape, options.draws) for times, tape in cases]))
-    if options.write:
-        write_section("rig.md", "misstated", "\n".join(lines))
+    rows = [judged(times, tape, options.draws) for times, tape in cases]
+    tell("rig.md", "misstated", table(heads, rows), write=options.write)
 
 
 if __name__ == "__main__":

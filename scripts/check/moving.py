@@ -25,7 +25,7 @@ from torch import Tensor
 from kcal import Baseline, Camera, KcalError, MeasuredPosition, RigData, solve_rig
 from kcal.lens import rotation_from_vector, vector_from_rotation
 from kcal.locate.moving import CLOCK, MovingOptions, MovingTrack, Sighting, match_moving
-from scripts.shared.page import table, write_section
+from scripts.shared.page import table, tell
 
 CAMERA = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
 CENTERS = torch.tensor([[0.0, 0, 0], [10.0, 0, 0]], dtype=torch.float64)
@@ -230,9 +230,7 @@ def main() -> None:
         rows.append(row_of(name, given.seeds))
         print(rows[-1], flush=True)
     lines = table(HEADS, rows)
-    print("\n".join(lines))
-    if given.write:
-        write_section("moving.md", "moving", "\n".join(lines))
+    tell("moving.md", "moving", lines, write=given.write)
 
 
 if __name__ == "__main__":

@@ -335,8 +335,7 @@ def main() -> None:
                 judge(files, path, number, site, arguments.budget, arguments.seed)
     rooms, lines = report()
     print(f"{rooms}\n\n{lines}")
-    if arguments.write:
-        write_section("mutants.md", "mutants", rooms)
+    write_section("mutants.md", "mutants", rooms, write=arguments.write)
 
 
 if __name__ == "__main__":

@@ -29,8 +29,7 @@ from kcal.lens import bake, rotation_from_vector, save_onnx, undistort_maps
 from kcal.lens.views import new_pinhole
 from kcal.locate import Triangulate, enu_to_geodetic, geodetic_to_enu
 from kcal.stars.sky import Air, StarCatalog, observed_directions
-from scripts.shared.page import table, write_section
-from scripts.shared.timing import show
+from scripts.shared.page import table, tell
 
 Numbers = Sequence[mpf]
 SIZE = (1920, 1080)
@@ -350,9 +349,7 @@ def main() -> None:
         "limits": lambda: table(["what is asked", "answer"], limit_rows()),
     }
     for name, make in sections.items():
-        lines = show(make())
-        if given.write:
-            write_section("precision.md", name, "\n".join(lines))
+        tell("precision.md", name, make(), write=given.write)
 
 
 if __name__ == "__main__":

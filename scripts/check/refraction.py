@@ -23,8 +23,7 @@ from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA
 from kcal.locate.geodesy import enu_from_cam, mean_radius
 from kcal.rig import placed_rig
 from scripts.shared.long_range import ORIGIN, rig
-from scripts.shared.page import table, write_section
-from scripts.shared.timing import show
+from scripts.shared.page import table, tell
 
 COUNT, SURVEY, MARK = 12, 0.02, 0.07  # landmarks; meters, px
 TARGET_RANGE = 5000.0
@@ -139,9 +138,7 @@ def main() -> None:
     torch.set_num_threads(1)
     head, *body = rows(arguments.draws)
     lines = table(head, body)
-    show(lines)
-    if arguments.write:
-        write_section("rig.md", "refraction", "\n".join(lines))
+    tell("rig.md", "refraction", lines, write=arguments.write)
 
 
 if __name__ == "__main__":

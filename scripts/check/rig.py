@@ -308,8 +308,7 @@ def main() -> None:
     }
     for name, made in parts.items():
         lines = made()
-        if arguments.write:
-            write_section("rig.md", name, "\n".join(lines))
+        write_section("rig.md", name, lines, write=arguments.write)
     if arguments.write:
         example(DOCS / "rig.png")
 

@@ -47,7 +47,7 @@ from kcal.sim.captures import TrueRig, drawn_rig
 from kcal.sim.raytrace import SURVEILLANCE
 from kcal.sim.scene import FOCAL_MM
 from scripts.shared.long_range import ORIGIN
-from scripts.shared.page import DOCS, table, write_row, write_section
+from scripts.shared.page import DOCS, table, tell, write_row
 from scripts.shared.records import Record, finish, read, seeds
 from scripts.shared.terrain import Terrain, Weather
 from scripts.shared.timing import show
@@ -534,9 +534,7 @@ def main() -> None:
                 if part in ("matches", "common")
                 else repeated(part, given)
             )
-            show(lines)
-            if given.write:
-                write_section("scene.md", part, "\n".join(lines))
+            tell("scene.md", part, lines, write=given.write)
 
 
 if __name__ == "__main__":

@@ -24,10 +24,9 @@ from kcal.scene.common_errors import line_errors
 from kcal.scene.match import guided_matches
 from kcal.scene.refine import refine_matches
 from scripts.check.scene import HALF, WRONG, exact, rig_of
-from scripts.shared.page import table, write_section
+from scripts.shared.page import table, tell
 from scripts.shared.records import seeds
 from scripts.shared.terrain import Terrain, Weather
-from scripts.shared.timing import show
 
 KINDS = ("level ground", "hills and walls", "edges before something farther")
 BESIDE = 0.08  # px, added to the σ of each match in weights
@@ -114,9 +113,7 @@ def main() -> None:
     given = parser.parse_args()
     torch.set_num_threads(1)
     found = [errors_of(seed) for seed in seeds(given.seeds)]
-    lines = show(table(HEADS, rows(found)))
-    if given.write:
-        write_section("scene.md", "repeats", "\n".join(lines))
+    tell("scene.md", "repeats", table(HEADS, rows(found)), write=given.write)
 
 
 if __name__ == "__main__":

@@ -208,4 +208,4 @@ if __name__ == "__main__":
     print("\n".join(lines))
     if options.write:
         made = f"Made by `python -m scripts.check.skyline {options.what} {options.count} --write`."
-        write_section("skyline.md", options.what, "\n".join([*lines, "", made]))
+        write_section("skyline.md", options.what, [*lines, "", made])

@@ -313,8 +313,7 @@ def main() -> None:
                 run_seed(seed, count, options.seconds, each)
             text = report(options.counts, sums, seed + 1, options.seconds)
             print(f"after {seed + 1} seeds\n{text}", flush=True)
-    if options.write:
-        write_section("tracks.md", "station speed" if options.speed else "station tracks", text)
+    write_section("tracks.md", "station speed" if options.speed else "station tracks", text, write=options.write)
 
 
 if __name__ == "__main__":

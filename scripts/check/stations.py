@@ -40,7 +40,7 @@ from torch import Tensor
 from kcal import Camera, Localizer, Rig
 from kcal.locate import Triangulate
 from kcal.locate.stereo import Localization, PositionStatus
-from scripts.shared.page import table, write_section
+from scripts.shared.page import table, tell
 from scripts.shared.station_scenes import drawn_errors, marks, ring, targets
 from scripts.shared.timing import show
 
@@ -378,9 +378,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             "smoke": lambda: smoke(given.count or 2000),
             "real": real,
         }[given.part]()
-    show(lines)
-    if given.write:
-        write_section("stations.md", given.part, "\n".join(lines))
+    tell("stations.md", given.part, lines, write=given.write)
 
 
 if __name__ == "__main__":

@@ -266,8 +266,7 @@ def main() -> None:
         print(f"clock, after {seed + 1} seeds\n{clock_report(figures, options.clock_seconds)}", flush=True)
     if options.clock_seconds and options.clock_seeds:
         text += "\n\n" + clock_report(figures, options.clock_seconds)
-    if options.write:
-        write_section("tracks.md", "tracks", text)
+    write_section("tracks.md", "tracks", text, write=options.write)
 
 
 def report(figures: Figures, seeds: int, seconds: float) -> str:

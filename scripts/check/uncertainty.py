@@ -1,7 +1,7 @@
 """Whether predicted standard deviations are those of repeated captures; writes a section of docs/measured/solver.md.
 
     python -m scripts.check.uncertainty                  300 captures with 5, 8, 14 coefficients
-    python -m scripts.check.uncertainty --refits 50 --coefficients 5 --dry
+    python -m scripts.check.uncertainty --refits 50 --coefficients 5
 
 One camera, one set of poses, fresh normal noise for each capture; every capture is calibrated from nothing.
 """
@@ -137,7 +137,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--refits", type=int, default=300)
     parser.add_argument("--coefficients", type=int, nargs="*", default=[5, 8, 14], choices=[5, 8, 14])
-    parser.add_argument("--dry", action="store_true", help="print only")
+    parser.add_argument("--write", action="store_true", help="write the table into the page")
     arguments = parser.parse_args()
     lines = table(
         ["coefficients", "cx: error, px", "cx: σ / error", "fx: σ / error",
@@ -148,8 +148,7 @@ def main() -> None:
     for coefficients in arguments.coefficients:
         for weak in (None,) if coefficients == 5 else (None, WEAK):
             lines += study(coefficients, weak, arguments.refits)
-    if not arguments.dry:
-        write_section("solver.md", "predicted and repeated", "\n".join(lines))
+    write_section("solver.md", "predicted and repeated", lines, write=arguments.write)
 
 
 if __name__ == "__main__":

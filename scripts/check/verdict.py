@@ -181,7 +181,7 @@ def main() -> None:
     if arguments.out.exists():
         lines = [json.loads(text) for text in arguments.out.read_text().splitlines()]
     if arguments.write:
-        write_section("ordinary.md", "verdict", "\n".join(table_of(lines)))
+        write_section("ordinary.md", "verdict", table_of(lines))
         return
     done = {(line["kind"], line["seed"]) for line in lines}
     wanted = [(FAULTS[i % len(FAULTS)], arguments.first + i // len(FAULTS)) for i in range(arguments.planted)]

@@ -1,7 +1,7 @@
 """Install kcal into empty environments, from wheel and sdist, with the oldest and newest dependencies, and use it.
 
-    python -m scripts.check.versions                          # all that can be had; writes the page other-programs.md
-    python -m scripts.check.versions --only oldest --no-page  # quicker, for CI
+    python -m scripts.check.versions --write         # all that can be had, into the page other-programs.md
+    python -m scripts.check.versions --only oldest   # quicker, for CI
 
 Each cell is an environment of its own in a temporary folder: an interpreter, what it is installed from, and its
 dependencies. *Oldest* are the lowest versions that pyproject.toml allows, *newest* what pip chooses. In it, outside the
@@ -191,7 +191,7 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=1, help="that run the tests")
     parser.add_argument("--newest-torch", default="", metavar="REQUIREMENT", help="in place of what pip chooses")
     parser.add_argument("--out", type=Path, help="JSON lines of rows; those in it are kept and shown")
-    parser.add_argument("--no-page", action="store_true")
+    parser.add_argument("--write", action="store_true", help="write the table into the page")
     arguments = parser.parse_args()
     lower = [lowest(line) for line in tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]]
     kept = arguments.out.read_text().splitlines() if arguments.out and arguments.out.exists() else []
@@ -219,8 +219,7 @@ def main() -> None:
                     if arguments.out:
                         with arguments.out.open("a") as file:
                             file.write(json.dumps(rows[-1]) + "\n")
-        if not arguments.no_page:
-            write_section("other-programs.md", "versions", "\n".join(filled(rows, missing)))
+        write_section("other-programs.md", "versions", filled(rows, missing), write=arguments.write)
     if not rows or any(not row[-1].startswith("passed") for row in rows):
         sys.exit(1)
 

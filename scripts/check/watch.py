@@ -296,8 +296,8 @@ def main() -> None:
     drift = table(["drift of 0.01°", "rigs", "found in 10 minutes of its end", "median", "in an hour"], found)
     print(*swing, *drift, sep="\n")
     if given.write:
-        write_section("watch.md", "swing", "\n".join(swing))
-        write_section("watch.md", "drift", "\n".join(drift))
+        write_section("watch.md", "swing", swing)
+        write_section("watch.md", "drift", drift)
 
 
 if __name__ == "__main__":

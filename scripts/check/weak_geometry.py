@@ -281,8 +281,7 @@ def main() -> None:
                 file.write(json.dumps(records[-1]) + "\n")
     lines = show(by_kind(records))
     show(by_ratio(records))
-    if arguments.write:
-        write_section("rig.md", "weak geometry", "\n".join(lines))
+    write_section("rig.md", "weak geometry", lines, write=arguments.write)
 
 
 if __name__ == "__main__":

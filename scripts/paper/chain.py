@@ -152,8 +152,7 @@ def main() -> None:
         lambda r: " | ".join(cells(r)),
     )
     show(lines(records))
-    if arguments.write:
-        write_section(PAGE, "chain", "\n".join(lines(records)))
+    write_section(PAGE, "chain", lines(records), write=arguments.write)
 
 
 if __name__ == "__main__":

@@ -50,8 +50,7 @@ def main() -> None:
             print(f"{name}, seed {seed}: {time.perf_counter() - start:.0f} s", flush=True)
     for name, lines in sections(results).items():
         show(["", *lines])
-        if arguments.write:
-            write_section("paper.md", name, "\n".join(lines))
+        write_section("paper.md", name, lines, write=arguments.write)
     if arguments.write:
         write_figures(results)
 

@@ -194,8 +194,7 @@ def main() -> None:
             )
     if arguments.picture:
         draw(runs, arguments.picture)
-    if arguments.write:
-        write_section(PAGE, "net lens", "\n".join(lines))
+    write_section(PAGE, "net lens", lines, write=arguments.write)
 
 
 if __name__ == "__main__":

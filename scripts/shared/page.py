@@ -14,8 +14,11 @@ from scripts.shared.timing import row, show
 DOCS = Path(__file__).parents[2] / "docs" / "measured"
 
 
-def write_section(page: str, name: str, text: str) -> None:
-    """Put a section between its markers in a page, at the page's end if it is not there yet."""
+def write_section(page: str, name: str, text: str | list[str], *, write: bool = True) -> None:
+    """Put text or lines between their markers in a page, at its end if they are not there yet; not without `write`."""
+    if not write:
+        return
+    text = text if isinstance(text, str) else "\n".join(text)
     path = DOCS / page
     begin, end = f"<!-- begin: {name} -->", f"<!-- end: {name} -->"
     whole = path.read_text(encoding="utf-8")
@@ -30,9 +33,7 @@ def write_section(page: str, name: str, text: str) -> None:
 
 def tell(page: str, name: str, lines: list[str], *, write: bool) -> None:
     """Print a section, and put it into its page if `write`."""
-    show(lines)
-    if write:
-        write_section(page, name, "\n".join(lines))
+    write_section(page, name, show(lines), write=write)
 
 
 def read_section(page: str, name: str) -> str:
@@ -52,7 +53,7 @@ def write_row(page: str, name: str, heads: Sequence[object], cells: Sequence[obj
     place = next((i for i, old in enumerate(rows) if old[0] == cells[0]), len(rows))
     before = [*rows[place], *[""] * len(heads)] if place < len(rows) else [""] * len(heads)
     rows[place : place + 1] = [[old if new is None else str(new) for old, new in zip(before, cells, strict=False)]]
-    write_section(page, name, "\n".join(table(heads, rows)))
+    write_section(page, name, table(heads, rows))
 
 
 def table(heads: Sequence[object], rows: Iterable[Sequence[object]]) -> list[str]:
