@@ -320,9 +320,8 @@ def solve_command(
         console.warn(f"range errors are not split: {error}")
     console.print_wrote(output, picture)
     if needs or report is not None:
-        from kcal.report.figures import picture_bytes
         from kcal.report.judge_rig import named_cameras, rig_verdict
-        from kcal.report.rig import rig_figure
+        from kcal.report.verdict_pictures import rig_pictures
 
         sides = pairs if pairs is not None and _calibrated_from(rig, pairs) else ()
         cameras = judged_sides(named_cameras(rig), sides, noise)
@@ -334,7 +333,7 @@ def solve_command(
         console.tell(verdict=verdict.to_dict())
 
         def drawn() -> dict[str, bytes]:
-            return {"rig": picture_bytes(rig_figure(result)), **side_pictures(cameras)}
+            return {**rig_pictures(result), **side_pictures(cameras)}
 
         if not told_usable(verdict, drawn, tables, report, warned=warned_of(result)):
             raise typer.Exit(NO)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -172,18 +173,14 @@ def solve_stations(
     _print_stations(result, rig, read.told(result))
     print_wrote(output, picture)
     if needs or report is not None:
-        from kcal.report.figures import picture_bytes
         from kcal.report.judge_rig import rig_verdict
-        from kcal.report.rig import rig_figure
+        from kcal.report.verdict_pictures import rig_pictures
 
         subject = output.name.split(".")[0]
         verdict = rig_verdict(rig, needs, mark_sigma=sources.mark_sigma, result=result, subject=subject)
         tell(verdict=verdict.to_dict())
-
-        def drawn() -> dict[str, bytes]:
-            return {"rig": picture_bytes(rig_figure(result))}
-
-        if not told_usable(verdict, drawn, stored_tables(rig), report, warned=warned_of(result)):
+        pictures = functools.partial(rig_pictures, result)
+        if not told_usable(verdict, pictures, stored_tables(rig), report, warned=warned_of(result)):
             raise typer.Exit(NO)
 
 

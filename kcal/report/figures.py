@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import math
 import textwrap
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib import patheffects, rc_context
 from matplotlib.axes import Axes
 from matplotlib.backend_bases import RendererBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import BoundaryNorm, Colormap
+from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter
@@ -26,9 +29,6 @@ from kcal.texts import visible
 
 INK, GRAY, FAINT, ACCENT, WARN = "#111827", "#4b5563", "#9aa3af", "#2b6cb0", "#c02a6b"
 CAMERA_COLORS = ("#2b6cb0", "#dd7a1f", "#0f766e", "#7c3aed")
-
-
-# Shared parts of all pictures: colors, axes of an image, magnified arrows, and files written whole.
 
 # White around text that lies on lines.
 HALO = [patheffects.withStroke(linewidth=2.5, foreground="white")]
@@ -68,11 +68,58 @@ def _shown(text: str) -> str:
     return visible(text)[:2000]
 
 
-def new_figure(width: float, height: float, dpi: int = 130, layout: Any = None) -> PlainFigure:
+def new_figure(width: float, height: float, dpi: int = 130) -> PlainFigure:
     """Make a figure of that many inches that belongs to no window and no global state."""
-    figure = PlainFigure(figsize=(width, height), dpi=dpi, facecolor="white", layout=layout)
+    figure = PlainFigure(figsize=(width, height), dpi=dpi, facecolor="white")
     FigureCanvasAgg(figure)
     return figure
+
+
+def framed_figure(
+    width: float, height: float, title: str = "", notes: Sequence[str] = (), dpi: int = 130
+) -> PlainFigure:
+    """Make a figure with a title above and notes below, whose axes, labels and color bars share the room between.
+
+    Args:
+        width: inches.
+        height: inches of the axes with their labels; title and notes add to it.
+        title: broken into lines where it is too long.
+        notes: sentences, likewise.
+        dpi: pixels of an inch.
+    """
+    head = wrapped(title, width - 0.3, 13.0) if title else []
+    foot = [line for note in notes for line in wrapped(note, width - 0.3, 9.0)]
+    figure = new_figure(width, height + 0.26 * len(head) + 0.18 * len(foot), dpi)
+    figure.set_layout_engine("constrained", w_pad=0.08, h_pad=0.08)
+    if head:
+        figure.suptitle("\n".join(head), x=0.1 / width, ha="left", fontsize=13, color=INK)
+    if foot:
+        figure.supxlabel("\n".join(foot), x=0.1 / width, ha="left", fontsize=9, color=GRAY)
+    return figure
+
+
+def image_figure(
+    size: tuple[int, int], count: int = 1, title: str = "", notes: Sequence[str] = (), narrow: bool = False
+) -> tuple[PlainFigure, list[Axes]]:
+    """Make a figure with axes of the shape of an image, side by side.
+
+    Args:
+        size: width and height of the image, pixels.
+        count: of axes.
+        title: above all.
+        notes: below all.
+        narrow: for a phone; axes stand one below the other, and letters are larger.
+    """
+    wide = 2.9 if narrow else 5.2 if count > 1 else 7.4
+    tall = min(wide * size[1] / size[0], 8.0)
+    wide = tall * size[0] / size[1]
+    across, down = (1, count) if narrow else (count, 1)
+    least = max(wide, 2.6 if narrow else 4.2)
+    figure = framed_figure((least + 0.75) * across + 0.75, (tall + 0.9) * down, title, notes, 160 if narrow else 130)
+    panels = list(figure.subplots(down, across, squeeze=False).flat)
+    for axes in panels:
+        frame_image(axes, size)
+    return figure, panels
 
 
 def shortened(text: str, most: int) -> str:
@@ -112,16 +159,53 @@ def draw_arrows(
     axes: Axes,
     places: NDArray[np.float64],
     arrows: NDArray[np.float64],
-    wanted: float,
+    scale: float,
+    unit: str = "px",
     *colors: ArrayLike,
     **style: Any,
-) -> float:
-    """Draw arrows (..., 2) at pixels (..., 2), magnified by the round factor at or below `wanted`; return it."""
-    power = 10.0 ** math.floor(math.log10(wanted))
-    scale = power * max(step for step in (1, 2, 5) if step * power <= wanted)
-    across, down = np.moveaxis(scale * arrows, -1, 0)
-    axes.quiver(places[..., 0], places[..., 1], across, down, *colors, angles="xy", scale_units="xy", scale=1, **style)
-    return scale
+) -> None:
+    """Draw magnified arrows (..., 2) at places (..., 2), and a scale bar above the axes, whose ends must be set."""
+    style = style if colors else {"color": INK} | style
+    moved = (scale * arrows).reshape(-1, 2).T
+    drawn = axes.quiver(*places.reshape(-1, 2).T, *moved, *colors, angles="xy", scale_units="xy", scale=1, **style)
+    left, right = axes.get_xlim()
+    room = 0.12 * abs(right - left) / scale
+    length = max(step for step in round_levels(1e-7, room) if step <= max(room, 1e-7))
+    key = {"labelpos": "W", "color": INK, "labelcolor": INK, "fontproperties": {"size": 9}}
+    axes.quiverkey(drawn, 0.87, 1.04, scale * length, f"{length:g} {unit}", **key)
+
+
+def draw_values(
+    axes: Axes,
+    places: NDArray[np.float64],
+    values: NDArray[np.float64],
+    levels: Sequence[float],
+    cmap: str | Colormap = "viridis_r",
+    extend: Literal["neither", "both", "min", "max"] = "neither",
+) -> ContourSet:
+    """Draw values (R, C) at places (R, C, 2) as steps of color that are told apart alike, whatever the levels."""
+    norm = BoundaryNorm(levels, 256, extend=extend)
+    return axes.contourf(places[..., 0], places[..., 1], values, levels=levels, cmap=cmap, norm=norm, extend=extend)
+
+
+def add_color_bar(drawn: Any, axes: Axes, label: str, **style: Any) -> None:
+    """Add what colors mean, with its unit, to the right of axes and as high as they are."""
+    beside = axes.inset_axes((1.02, 0.0, 0.03, 1.0))
+    axes.figure.colorbar(drawn, cax=beside, **{"format": "%g", **style}).set_label(label, color=INK)
+
+
+def name_point(axes: Axes, place: ArrayLike, name: str, beside: tuple[float, float] = (6, 0), **style: Any) -> None:
+    """Write a name beside a point, so many typographic points to the right and up, where lines do not hide it."""
+    side = "left" if beside[0] >= 0 else "right"
+    style = {"fontsize": 9, "va": "center", "ha": side, "path_effects": HALO, **style}
+    x, y = np.asarray(place, float).tolist()
+    axes.annotate(shortened(name, 40), (x, y), beside, textcoords="offset points", **style)
+
+
+def draw_way(axes: Axes, start: ArrayLike, end: ArrayLike, color: str, head: str = "-|>", **style: Any) -> None:
+    """Draw an arrow from one point to another."""
+    way = {"arrowstyle": head, "color": color, "shrinkA": 0, "shrinkB": 0, **style}
+    axes.annotate("", np.asarray(end, float).tolist(), np.asarray(start, float).tolist(), arrowprops=way, zorder=8)
 
 
 def round_levels(low: float, high: float, least: int = 1) -> list[float]:
@@ -135,6 +219,41 @@ def round_levels(low: float, high: float, least: int = 1) -> list[float]:
     first = max((i for i, step in enumerate(steps) if step <= low), default=0)
     last = next((i for i, step in enumerate(steps) if step >= high), len(steps) - 1)
     return steps[first : max(last, first + least) + 1]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RangeScale:
+    """A plan on which directions are true, and ranges from its middle are log(1 + range / near), or true too.
+
+    Args:
+        nearest: meters of the nearest thing.
+        rim: meters of what is drawn at 1 and farthest.
+        middle: (2,) east and north of the middle.
+        true: whether ranges are true.
+    """
+
+    nearest: float
+    rim: float
+    middle: NDArray[np.float64] = dataclasses.field(default_factory=lambda: np.zeros(2))
+    true: bool = False
+
+    def radius(self, meters: float | NDArray[np.float64]) -> NDArray[np.float64]:
+        """Of ranges, on the plan."""
+        meters = np.minimum(meters, self.rim)
+        near = max(self.nearest / 2.0, self.rim / 1000.0)
+        return np.asarray(meters / self.rim if self.true else np.log1p(meters / near) / math.log1p(self.rim / near))
+
+    def place(self, enu: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(..., 2) on the plan of (..., 2 or more) east and north in meters."""
+        offset = enu[..., :2] - self.middle
+        distance = np.hypot(offset[..., 0], offset[..., 1])[..., None]
+        return np.asarray(offset / np.maximum(distance, 1e-9) * self.radius(distance))
+
+
+def draw_field(axes: Axes, outline: NDArray[np.float64], color: str) -> None:
+    """Draw the (M, 2) outline of what a camera sees on a plan."""
+    axes.fill(*outline.T, facecolor=color, alpha=0.08, edgecolor="none", zorder=0)
+    axes.plot(*outline.T, color=color, alpha=0.5, linewidth=0.9, zorder=1)
 
 
 def field_outline(

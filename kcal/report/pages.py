@@ -21,8 +21,8 @@ from kcal.texts import length_text, number_text, page_policy, range_text, visibl
 _HERE = Path(__file__).parent
 CAPTIONS = {
     "ranges": "Standard deviations of ranges, and what is required.",
-    "coverage": "Where corners were seen, one color for each view, with magnified residuals. Empty parts of the image, "
-    "its border above all, rest on the lens model alone.",
+    "coverage": "Where corners were seen, with magnified residuals, in the color of the RMS of their view. Empty parts "
+    "of the image, its border above all, rest on the lens model alone.",
     "uncertainty": "Standard deviation of where the camera sees far things; it grows where no board was.",
     "residuals": "Residuals of all corners beside a circular Gaussian. Noise is round and without structure.",
     "views": "RMS of each view. A view that stands out is blurred, moved, or has wrong corners.",

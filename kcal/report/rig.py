@@ -22,15 +22,20 @@ from kcal.report.figures import (
     ACCENT,
     CAMERA_COLORS,
     FAINT,
-    HALO,
+    GRAY,
     INK,
     WARN,
+    RangeScale,
     draw_arrows,
+    draw_field,
     draw_north,
+    draw_way,
     field_outline,
     frame_image,
-    new_figure,
-    wrapped,
+    framed_figure,
+    image_figure,
+    name_point,
+    shortened,
 )
 from kcal.skyline.attitude import SkylineAttitude
 from kcal.texts import length_text, measured_length, range_text
@@ -55,7 +60,7 @@ _WIDE = 0.1
 
 
 @in_one_thread
-def rig_figure(result: RigResult) -> Figure:
+def rig_figure(result: RigResult, narrow: bool = False) -> Figure:
     """Draw a rig on the map, with what it was solved from, and each item's residual in sigmas.
 
     Distances from the rig are drawn as log(1 + range / r0), directions as they are; to scale where the cameras stand as
@@ -63,6 +68,7 @@ def rig_figure(result: RigResult) -> Figure:
 
     Args:
         result: from `solve_rig` or `calibrate_rig`.
+        narrow: for a phone: the bars below the map.
 
     Returns:
         A matplotlib figure that belongs to no window and no global state: the map, then the bars.
@@ -82,22 +88,16 @@ def rig_figure(result: RigResult) -> Figure:
         >>> len(figure.axes)
         2
     """
-    figure = new_figure(13.0, 7.6)
-    plan, bars = figure.subplots(1, 2, width_ratios=[1.25, 1.0])
-    _draw_plan(plan, result)
-    _draw_items(bars, result)
     apart = torch.cdist(result.center, result.center)
     size = f"up to {length_text(float(apart.max()))} apart"
     if len(result.names) == 2:
         size = f"baseline {measured_length(float(apart[0, 1]), result.sigma_baseline)}"
-    figure.suptitle(
-        f"Rig of {len(result.names)} cameras, {size}",
-        x=0.015,
-        ha="left",
-        fontsize=14,
-    )
-    figure.text(0.015, 0.02, _footer(result), fontsize=9, color="#4b5563", va="bottom", linespacing=1.45)
-    figure.subplots_adjust(left=0.015, right=0.975, top=0.9, bottom=0.19, wspace=0.28)
+    title = f"Rig of {len(result.names)} cameras, {size}"
+    figure = framed_figure(*((4.4, 8.4, title, _notes(result), 160) if narrow else (13.0, 7.0, title, _notes(result))))
+    parts = figure.subfigures(2, 1) if narrow else figure.subfigures(1, 2, width_ratios=[1.25, 1.0])
+    plan, bars = (part.subplots() for part in np.asarray(parts))
+    _draw_plan(plan, result, 2 if narrow else 4)
+    _draw_items(bars, result)
     return figure
 
 
@@ -118,76 +118,55 @@ def _places(result: RigResult) -> dict[str, tuple[Array, list[str], list[bool]]]
     return out
 
 
-def _draw_plan(axes: Axes, result: RigResult) -> None:
+def _draw_plan(axes: Axes, result: RigResult, columns: int) -> None:
     centers = _flat(result, result.center.numpy())
     middle = centers.mean(0)
     places = _places(result)
     spans = [np.hypot(*(centers - middle).T)] + [np.hypot(*(xy - middle).T) for xy, _, _ in places.values()]
     reach = max(float(np.max(span)) for span in spans) * 1.15
     nearest = min((float(np.min(span)) for span in spans[1:]), default=reach)
-    unit = max(nearest / 2.0, reach / 1000.0)
     # Stations around what they see are drawn to scale.
-    wide = float(np.max(spans[0])) > _WIDE * reach
-
-    def length(distance: Any) -> Any:
-        return distance / reach if wide else np.log1p(distance / unit) / math.log1p(reach / unit)
-
-    def place(points: Array) -> Array:
-        offset = points - middle
-        distance = np.maximum(np.hypot(offset[..., 0], offset[..., 1]), 1e-9)[..., None]
-        return np.asarray(offset / distance * length(distance))
-
+    scale = RangeScale(nearest=nearest, rim=reach, middle=middle, true=float(np.max(spans[0])) > _WIDE * reach)
     extent = []
     for c, camera in enumerate(result.cameras):
         color, edges = CAMERA_COLORS[c % len(CAMERA_COLORS)], _edges(result, c, camera)
         if edges is not None:
-            extent.append(place(field_outline(centers[c], *edges, 1.1 * reach, 100)))
-            axes.fill(*extent[-1].T, facecolor=color, alpha=0.07, edgecolor="none", zorder=0)
-            axes.plot(*extent[-1].T, color=color, alpha=0.5, linewidth=0.9, zorder=1)
+            extent.append(scale.place(field_outline(centers[c], *edges, reach, 100)))
+            draw_field(axes, extent[-1], color)
     circle = np.linspace(0.0, 2.0 * math.pi, 200)
     for radius in (step * 10.0**power for power in range(-3, 7) for step in (1.0, 5.0)):
         if nearest / 4 <= radius <= reach:
-            ring = length(radius)
+            ring = float(scale.radius(radius))
             axes.plot(ring * np.sin(circle), ring * np.cos(circle), color=FAINT, linewidth=0.7, linestyle=":")
-            axes.text(
-                0.0, ring, range_text(radius), fontsize=8, color="#4b5563", ha="center", va="bottom", path_effects=HALO
-            )
+            name_point(axes, (0.0, ring), range_text(radius), (0, 1), color=GRAY, ha="center", va="bottom", fontsize=8)
     for kind, (points, names, used) in places.items():
-        drawn, good = place(points), np.array(used)
+        drawn, good = scale.place(points), np.array(used)
         marker = {"landmarks": "^", "boards": "s", "features": "o"}[kind]
         axes.plot(*drawn[good].T, marker, label=kind, markersize=6, color=_COLORS[kind], markerfacecolor="white")
         axes.plot(*drawn[~good].T, "x", color=WARN, markersize=8, markeredgewidth=1.8)
         for xy, name, fine in zip(drawn, names, used, strict=True):
             if not fine or (kind == "landmarks" and len(names) <= 30):
-                color = _COLORS[kind] if fine else WARN
-                axes.annotate(
-                    name, (float(xy[0]), float(xy[1])), (6, 0), textcoords="offset points", fontsize=8, color=color,
-                    va="center",
-                )  # fmt: skip
+                name_point(axes, xy, name, fontsize=8, color=_COLORS[kind] if fine else WARN)
     if any(not item.used for item in result.items):
         axes.plot([], [], "x", color=WARN, markeredgewidth=1.8, label="left out")
     looks = result.rotation[:, 2].numpy()
     for c, name in enumerate(result.names):
-        here = place(centers[c])
+        here = scale.place(centers[c])
         ahead = _flat(result, looks[c])
         ahead = ahead / max(float(np.hypot(*ahead)), 1e-9)
-        axes.annotate(
-            "", (float(here[0] + 0.12 * ahead[0]), float(here[1] + 0.12 * ahead[1])), (float(here[0]), float(here[1])),
-            arrowprops={"arrowstyle": "-|>", "color": "#111827", "linewidth": 1.2},
-        )  # fmt: skip
-        axes.plot(
-            *here, "o", color=CAMERA_COLORS[c % len(CAMERA_COLORS)], markersize=6, zorder=5, label=f"{name} camera"
-        )
-    seen = np.concatenate([place(centers), *extent, *(place(points) for points, _, _ in places.values())])
+        draw_way(axes, here, here + 0.12 * ahead, INK, linewidth=1.2)
+        color = CAMERA_COLORS[c % len(CAMERA_COLORS)]
+        axes.plot(*here, "o", color=color, markersize=6, zorder=9, label=f"{name} camera")
+    seen = np.concatenate([scale.place(centers), *extent, *(scale.place(points) for points, _, _ in places.values())])
     low, high = seen.min(0) - 0.1, seen.max(0) + 0.15
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     axes.axis("off")
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.005), ncols=4, fontsize=9, frameon=False)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.005), ncols=columns, fontsize=9, frameon=False)
     if result.absolute:
         draw_north(axes, 0.04)
     where = "north up" if result.absolute else "first camera's axis up"
-    scale = "to scale" if wide else "ranges on a logarithmic scale"
-    axes.set_title(f"From above, {where}, {scale}", fontsize=10.5, color="#374151")
+    ranges = "to scale" if scale.true else "ranges on a logarithmic scale"
+    axes.set_title(f"From above, {where}, {ranges}", fontsize=9)
 
 
 def _edges(result: RigResult, c: int, camera: Camera) -> tuple[float, float] | None:
@@ -214,21 +193,20 @@ def _draw_items(axes: Axes, result: RigResult) -> None:
         axes.barh(row, length, color=_COLORS[item.source] if item.used else WARN, height=0.7, alpha=0.85)
         if item.sigmas > limit:
             axes.text(limit * 0.99, row, f"{item.sigmas:.0f} ▸", ha="right", va="center", fontsize=7.5, color="white")
-    axes.axvline(1.0, color="#374151", linewidth=0.9, linestyle=(0, (4, 3)))
+    axes.axvline(1.0, color=INK, linewidth=0.9, linestyle=(0, (4, 3)))
     axes.set_yticks(range(len(items)), [_label(item) for item in items], fontsize=7 if len(items) > 25 else 8.5)
     axes.set(xlim=(0, limit), ylim=(len(items) - 0.4, -0.6), xlabel="residual in sigmas; 1 is typical")
     axes.spines[["top", "right", "left"]].set_visible(False)
     axes.tick_params(axis="y", length=0)
     shown = "" if len(items) == len(result.items) else f", the worst {len(items)} of {len(result.items)}"
-    axes.set_title(f"Residuals by item{shown}", fontsize=10.5, color="#374151")
+    axes.set_title(f"Residuals by item{shown}", fontsize=9)
 
 
 def _label(item: ItemResidual) -> str:
-    name = item.name if len(item.name) <= 28 else f"{item.name[:27]}…"
-    return dataclasses.replace(item, name=name).label
+    return dataclasses.replace(item, name=shortened(item.name, 28)).label
 
 
-def _footer(result: RigResult) -> str:
+def _notes(result: RigResult) -> list[str]:
     parts = []
     for source in result.sources:
         values = [f"{source.used} used"] + ([f"{source.left_out} left out"] if source.left_out else [])
@@ -236,8 +214,7 @@ def _footer(result: RigResult) -> str:
         values += [] if source.rms_m is None else [length_text(source.rms_m)]
         values += [] if source.sigmas is None else [f"{source.sigmas:.2f} sigma"]
         parts.append(f"{source.name}: {', '.join(values)}")
-    texts = ["   ".join(parts), *(f"{item.label}: {item.reason}" for item in result.left_out[:2])]
-    return "\n".join(line for text in texts for line in wrapped(text, 12.6, 9.0))
+    return ["   ".join(parts), *(f"{item.label}: {item.reason}" for item in result.left_out[:2])]
 
 
 # Draw a night image with the names of its stars, and the residuals of all of them as magnified arrows.
@@ -267,23 +244,18 @@ def stars_figure(
         title: the line above.
     """
     height, width = image.shape
-    figure = new_figure(9.0, 9.0 * height / width + 0.9)
-    axes = figure.add_axes((0.07, 0.07, 0.91, 0.86))
+    known = np.array([bool(name) for name in names], bool)
+    figure, (axes,) = image_figure((width, height), 1, title, ["Arrows: residuals, modeled minus seen."])
     # Turned over: stars are dark on a bright sky, so that marks and names can be read.
     axes.imshow(-_above_sky(image), cmap="gray", vmin=-30.0, vmax=2.0, interpolation="nearest")
-    frame_image(axes, (width, height))
-    known = np.array([bool(name) for name in names], bool)
     axes.plot(*pixels[~known].T, "x", color=WARN, markersize=4, label=f"{int((~known).sum())} without a name")
-    axes.plot(
-        *pixels[known].T, "o", markersize=9, markerfacecolor="none", color=ACCENT, label=f"{int(known.sum())} named"
-    )
+    style: dict[str, Any] = {"markersize": 9, "markerfacecolor": "none", "color": ACCENT}
+    axes.plot(*pixels[known].T, "o", label=f"{int(known.sum())} named", **style)
     for place, name in [(at, name) for at, name in zip(pixels, names, strict=True) if name][:_MOST_NAMES]:
-        beside = (7, "left") if place[0] < _NEAR_EDGE * width else (-7, "right")
-        axes.annotate(name, place, (beside[0], -3), textcoords="offset points", fontsize=7, color=INK, ha=beside[1])
+        name_point(axes, place, name, (7 if place[0] < _NEAR_EDGE * width else -7, -3), fontsize=7, va="baseline")
     if known.any():
         longest = max(float(np.linalg.norm(residual[known], axis=1).max()), 1e-3)
-        scale = draw_arrows(axes, pixels[known], residual[known], 0.04 * width / longest, color=WARN, width=0.0015)
-        axes.set_title(f"{title}  arrows: residuals x {scale:g}".strip(), fontsize=9, color=INK, loc="left")
+        draw_arrows(axes, pixels[known], residual[known], 0.04 * width / longest, color=WARN, width=0.0015)
     axes.legend(loc="lower right", fontsize=8)
     return figure
 
@@ -308,8 +280,8 @@ def _interpolated(places: NDArray[np.float64], count: int, values: NDArray[np.fl
 
 # Draw the skyline of a terrain raster over an image, and how far the image's own is from it.
 
-# Images that are drawn at most; inches of one.
-_MOST, _WIDTH = 6, 9.0
+# Images that are drawn at most.
+_MOST = 6
 
 
 def skyline_figure(images: Sequence[tuple[str, NDArray[Any]]], found: Sequence[SkylineAttitude]) -> Figure:
@@ -322,35 +294,28 @@ def skyline_figure(images: Sequence[tuple[str, NDArray[Any]]], found: Sequence[S
     shown = list(zip(images, found, strict=True))[:_MOST]
     # The band around the skyline is what there is to see.
     bands = [_band(image.shape[0], one) for (_, image), one in shown]
-    sizes = [
-        0.92 * _WIDTH * (high - low) / image.shape[1] for ((_, image), _), (low, high) in zip(shown, bands, strict=True)
-    ]
-    total = sum(sizes) + 2.3 * len(shown)
-    figure = new_figure(_WIDTH, total)
-    top = 1.0
-    for ((name, image), one), (low, high), size in zip(shown, bands, sizes, strict=True):
-        width = image.shape[1]
-        axes = figure.add_axes((0.07, top - (0.4 + size) / total, 0.91, size / total))
-        below = figure.add_axes((0.07, top - (0.7 + size + 1.1) / total, 0.91, 1.1 / total))
-        top -= (2.3 + size) / total
+    sizes = [8.3 * (high - low) / image.shape[1] for ((_, image), _), (low, high) in zip(shown, bands, strict=True)]
+    ratios = [height for size in sizes for height in (size, 1.1)]
+    figure = framed_figure(9.0, sum(sizes) + 2.3 * len(shown))
+    panels = figure.subplots(2 * len(shown), 1, height_ratios=ratios, squeeze=False)[:, 0]
+    for k, (((name, image), one), (low, high)) in enumerate(zip(shown, bands, strict=True)):
+        axes, below = panels[2 * k : 2 * k + 2]
+        column, width = np.arange(image.shape[1]), image.shape[1]
         axes.imshow(image, cmap="gray", interpolation="nearest")
         frame_image(axes, (width, image.shape[0]))
-        axes.set_ylim(high - 0.5, low - 0.5)
-        axes.set_xlabel("")
-        column = np.arange(width)
+        axes.set(ylim=(high - 0.5, low - 0.5), xlabel="")
         axes.plot(column, one.expected, color=ACCENT, linewidth=1.0, label="raster")
         left_out = one.border.clear & ~one.used
         axes.plot(column[left_out], one.border.row[left_out], ".", color=WARN, markersize=2, label="image, left out")
         axes.legend(loc="lower right", fontsize=7)
-        heading, pitch, roll = one.sigma_deg
-        axes.set_title(
-            f"{name}: heading {one.heading_deg:.3f} ± {heading:.3f}°, pitch {one.pitch_deg:.3f} ± {pitch:.3f}°, roll "
-            f"{one.roll_deg:.3f} ± {roll:.3f}°",
-            fontsize=9, color=INK, loc="left",
-        )  # fmt: skip
+        angles = zip(
+            ("heading", "pitch", "roll"), (one.heading_deg, one.pitch_deg, one.roll_deg), one.sigma_deg, strict=True
+        )
+        text = ", ".join(f"{angle} {value:.3f} ± {sigma:.3f}°" for angle, value, sigma in angles)
+        axes.set_title(f"{name}: {text}", fontsize=9, color=INK, loc="left")
         off = one.expected - one.border.row
-        below.plot(column, np.where(one.used, off, np.nan), ".", color=ACCENT, markersize=2)
-        below.plot(column, np.where(left_out, off, np.nan), ".", color=WARN, markersize=2)
+        for part, color in ((one.used, ACCENT), (left_out, WARN)):
+            below.plot(column, np.where(part, off, np.nan), ".", color=color, markersize=2)
         below.axhline(0.0, color=INK, linewidth=0.5)
         most = float(np.nanquantile(np.abs(off[one.used]), 0.99)) * 1.6
         below.set(xlim=(-0.5, width - 0.5), ylim=(-most, most))
@@ -393,10 +358,9 @@ def attitude_figure(
     span = float(time[-1] - time[0]) if len(time) else 0.0
     unit, word = next((unit, word) for least, unit, word in _SPANS if span >= least)
     along = (time - (time[0] if len(time) else 0.0)) / unit
-    figure = new_figure(9.0, 6.5)
-    for k, name in enumerate(_ANGLES):
-        axes = figure.add_axes((0.1, 0.7 - 0.3 * k, 0.88, 0.24))
-        middle, wide = angle[:, k], 1.96 * sigma[:, k]
+    figure = framed_figure(9.0, 6.3, title)
+    panels = figure.subplots(3, 1, sharex=True)
+    for axes, name, middle, wide in zip(panels, _ANGLES, angle.T, 1.96 * sigma.T, strict=True):
         axes.fill_between(along, middle - wide, middle + wide, color=ACCENT, alpha=0.25, linewidth=0, label="95 %")
         axes.plot(along, middle, color=ACCENT, linewidth=1.0)
         for sign in (-1.0, 1.0):
@@ -405,11 +369,7 @@ def attitude_figure(
             low = axes.get_ylim()[0]
             axes.plot(along[~seen], np.full(int((~seen).sum()), low), "|", color=INK, markersize=6, label="not seen")
             axes.set_ylim(bottom=low)
-        axes.set_ylabel(f"{name}, degrees", color=INK, fontsize=9)
-        axes.tick_params(labelsize=8, colors=INK)
-        if k == 0:
-            axes.set_title(title, fontsize=9, color=INK, loc="left")
-            axes.legend(loc="upper right", fontsize=8, ncols=3)
-        if k == 2:
-            axes.set_xlabel(word, color=INK, fontsize=9)
+        axes.set_ylabel(f"{name}, degrees")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper right", fontsize=8, ncols=3, frameon=False)
+    panels[2].set_xlabel(word)
     return figure

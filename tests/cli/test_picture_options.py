@@ -16,6 +16,9 @@ from kcal.cli.main import app
 from kcal.report.calibration import models_figure
 from kcal.report.figures import new_figure, save_picture
 
+# What a command needs before it looks at its options.
+_FILES = {"towers.csv": "name,lat,lon,height\nmill,1.5,2,9\n"}
+_REQUIRED = {"sites": "towers.csv --area 1,2,3,4 --ground 0"}
 _PICTURES = {"picture", "skyline_picture", "gallery", "coverage"}
 
 
@@ -41,9 +44,14 @@ def test_commands_that_draw() -> None:
 
 @pytest.mark.parametrize(("name", "flag"), [pair for pair in picture_options() if pair[0] != "calibrate"])
 @pytest.mark.parametrize("file", ["a.jpg", "a", "no/a.pdf"])
-def test_a_name_that_no_picture_can_have_is_refused_first(command: Command, name: str, flag: str, file: str) -> None:
-    """Before any other argument is looked at."""
-    said = command(f"{name} {flag} {file}", code=1).err
+def test_a_name_that_no_picture_can_have_is_refused_first(
+    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, flag: str, file: str
+) -> None:
+    """Before anything is computed, whatever else is missing."""
+    monkeypatch.chdir(tmp_path)
+    for path, text in _FILES.items():
+        Path(path).write_text(text)
+    said = command(f"{name} {_REQUIRED.get(name, '')} {flag} {file}", code=1).err
     assert ("the folder no does not exist" if "/" in file else f"{file}: the name of a picture must end with") in said
 
 

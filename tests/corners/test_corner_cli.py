@@ -481,8 +481,8 @@ class TestPictures:
     def test_coverage_counts_what_was_reached(self):
         figure = coverage_figure(self.observations())
         (axes,) = figure.axes
-        assert "3 views, 87 corners" in axes.get_title(loc="left")
-        assert "boards reached 17 % of the image, hatched: not" in axes.get_title(loc="left")
+        assert "3 views, 87 corners" in figure.texts[0].get_text()
+        assert "boards reached 17 % of the image, hatched: not" in figure.texts[0].get_text()
         hatched, corners = axes.collections
         assert hatched.hatches == ["///"]
         assert len(hatched.get_paths()[0].vertices) > 10  # the border, which no corner reached

@@ -14,7 +14,7 @@ from drawn_scenes import FIGURES, boxes, calibrated, landmarks_rig, sites
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.quiver import Quiver
+from matplotlib.quiver import Quiver, QuiverKey
 
 from kcal.calibrate.camera.advice import unreached_share
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
@@ -123,7 +123,7 @@ def test_a_view_that_was_left_out_has_no_arrows() -> None:
 
 def test_the_share_that_boards_reached_is_everywhere_the_same() -> None:
     seen = observed()
-    text = coverage_figure(seen).axes[0].get_title(loc="left")
+    text = coverage_figure(seen).texts[0].get_text()
     assert f"boards reached {100 * (1 - unreached_share(seen)):.0f} % of the image" in text
 
 
@@ -160,7 +160,7 @@ def test_heights_and_arrows() -> None:
     figure = board_figure(bent_board(2e-4))
     axes = figure.axes[0]
     assert "plate: 6x9 inner corners" in figure.texts[0].get_text()
-    assert "bending 0.200 ± 0.0" in figure.texts[0].get_text()
+    assert "bending 0.200 ± 0.0" in figure.texts[1].get_text()
     levels = axes.collections[0].norm
     assert 0.2 <= float(levels.vmax) < 0.3
     assert float(levels.vmin) == -float(levels.vmax)
@@ -248,13 +248,14 @@ def test_north_is_up() -> None:
 def test_a_typical_residual_is_a_sixtieth_of_the_image() -> None:
     result = calibrated()
     axes = Figure().add_subplot()
-    draw_coverage(axes, result.observations, result)
+    draw_coverage(axes, result)
     (drawn,) = [part for part in axes.collections if isinstance(part, Quiver)]
     error = -result.residuals.numpy().reshape(-1, 2)
-    scale = float(axes.get_title(loc="left").rpartition("x ")[2])
-    wanted = 640 / 60 / np.sqrt((error**2).mean())
-    # The round factor at or below it.
-    assert 0.4 * wanted < scale <= wanted
+    scale = 640 / 60 / np.sqrt((error**2).mean())
+    # The bar above says how long a residual is: the longest round one in an eighth of the width.
+    (key,) = [part for part in axes.artists if isinstance(part, QuiverKey)]
+    assert scale * float(key.label.removesuffix(" px")) == pytest.approx(key.U)
+    assert 0.4 * 0.12 * 640 < key.U <= 0.12 * 640
     np.testing.assert_allclose(np.stack([drawn.U, drawn.V], -1), scale * error)
 
 

@@ -114,6 +114,7 @@ class TestSentences:
         found = camera_difference(CAMERA, CAMERA.with_parameters(CAMERA.params + 1.0))
         for drawn, ratio in ((found, 640 / 480),):
             figure = difference_figure(drawn, "title", ["line"])
+            figure.canvas.draw()
             box = figure.axes[0].get_window_extent()
             assert box.width / box.height == pytest.approx(ratio, rel=0.02)
             assert figure.axes[0].get_xlim() == (-0.5, 639.5)
