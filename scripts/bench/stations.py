@@ -120,7 +120,7 @@ def frame(rounds: int) -> list[str]:
 
 
 def two(count: int) -> list[str]:
-    """`Localizer` beside `Localizer` on the same pairs of marks."""
+    """Two ways to weigh two cameras, on the same pairs of marks."""
     rows, generator = [], torch.Generator().manual_seed(0)
     for name, pose in (("marks alone", None), ("and lenses and pose", 1e-10 * torch.eye(6).double())):
         rig = planned_rig()
@@ -146,7 +146,7 @@ def two(count: int) -> list[str]:
             f"{float(off.median()):.1e}",
         ])  # fmt: skip
     return table(
-        ["errors", "`Localizer`, CPU s per million", "`Localizer`", "times", "median difference in σ"],
+        ["errors", "weights by marks, CPU s per million", "by all errors", "times", "median difference in σ"],
         rows,
     )
 
