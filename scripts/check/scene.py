@@ -333,7 +333,7 @@ BLOCK = 120.0  # px
 
 @torch.no_grad()
 def common() -> list[str]:
-    """Whether means of matches' errors over parts of the image are as large as stated, as independent ones and with what they share.
+    """Whether means of errors over parts of the image are as large as stated, with and without what matches share.
 
     The scene stands still, and pairs differ by noise alone and by vehicles. Each part's weighted mean of
     distances from epipolar lines is compared with its standard deviation.
