@@ -250,6 +250,10 @@ class BoardImages:
         # Without an image a corner of weight zero is NaN.
         return torch.where(weights > 0, vectors * weights, 0.0)
 
+    def weighted(self, vectors: Tensor) -> Tensor:
+        """(V, Q, 2 K) vectors (V, Q, 2, N) of pixels, in the order in which work is done, times the weights."""
+        return self._counted(self.shown(vectors.movedim(-1, 1)).movedim(1, -1), ALL).flatten(-2)
+
     def _counted(self, vectors: Tensor, views: slice) -> Tensor:
         """Vectors as in `_weighted`, zero where a corner does not count."""
         if not self._all_count:

@@ -14,7 +14,6 @@ from kcal.calibrate.rig.problem import RigProblem, own_fits
 from kcal.calibrate.rig.source import OWN, Context, Effects, ItemFit, ItemSource, RigState, Start, typical_ratio
 from kcal.calibrate.rig.sources import RigData
 from kcal.calibrate.rig.unknowns import SharedUnknowns
-from kcal.calibrate.rig.unknowns import held as nothing
 from kcal.checks import beyond_chance
 from kcal.errors import InputError
 from kcal.solve.lm import LMOptions, minimize
@@ -92,7 +91,7 @@ class Adjustment:
     def problem(self, mask: Tensor, loss: RobustLoss | None = None, *, held: bool = False) -> RigProblem:
         """The problem of the items in the mask; `held`: of these alone, with cameras and board as they are."""
         cameras = self.data.cameras
-        unknowns = nothing(cameras) if held else self.unknowns
+        unknowns = self.unknowns.none() if held else self.unknowns
         turning, moving = ([not held and one for one in each] for each in (self._turning, self._moving))
         blocks = [
             source.block(mask[at], self._context(source, at, unknowns))
@@ -115,7 +114,6 @@ class Adjustment:
             cameras=self.data.cameras,
             state=self.state._replace(items=self.state.items[at]),
             unknowns=unknowns,
-            shapes=self.unknowns.shapes,
             anchor=self.anchor,
             times=self.widened[source.kind],
             effects=effects,
@@ -230,11 +228,11 @@ class Adjustment:
                 rig.put(c, before.pop(c))
             camera = self.data.cameras[c]
             reads = camera.model.hybrid or camera.calibration is None
-            columns, reach = block.motion_columns(posed[c], state, c, reads=reads)
-            found = self.motion[c] = board_motion(columns, block.whitening[:, c], reach, rig, c)
+            columns, reach = block.motion_columns(c, posed[c], state, reads=reads)
+            found = self.motion[c] = board_motion(columns, block.weighted(c, columns), reach, rig, c)
             if found is not None:
                 before[c] = rig.parts[c].rows
-                rig.put(c, WithoutMotion(found.columns, block.whitening[:, c])(before[c]))
+                rig.put(c, WithoutMotion(block.weighted(c, found.columns))(before[c]))
 
     def fit_widened(self, mask: Tensor) -> float:
         """Multiply the stated sigmas of each kind by what its fit to itself tells, never below 1.

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from kcal.calibrate.problem.board_problem import apply_twist
-from kcal.calibrate.problem.poses import spread_out
-from kcal.calibrate.problem.state import MOTION, Readout
-from kcal.calibrate.problem.views import whitening
-from kcal.calibrate.rig.motion import WithoutMotion
-from kcal.calibrate.rig.problem import RigProblem
+from kcal.calibrate.problem.board_problem import BoardProblem, apply_twist
+from kcal.calibrate.problem.poses import refine_poses, spread_out
+from kcal.calibrate.problem.state import MOTION, BoardState, Readout
+from kcal.calibrate.problem.views import Views, whitening
+from kcal.calibrate.rig.motion import CameraRows, WithoutMotion
 from kcal.calibrate.rig.source import (
     LOCAL_SIZE,
     Block,
@@ -30,14 +29,13 @@ from kcal.calibrate.rig.source import (
     require_positive,
     typical_ratio,
 )
-from kcal.calibrate.rig.unknowns import held
+from kcal.calibrate.rig.unknowns import SharedUnknowns
 from kcal.checks import chi2_quantile
 from kcal.corners.board import Board
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.lens.pose import step_rows
 from kcal.lens.projection import project_components
-from kcal.solve.lm import LMOptions, minimize
+from kcal.solve.lm import LMOptions
 from kcal.texts import brief
 
 MINIMUM_CORNERS = 6
@@ -113,9 +111,9 @@ class Boards(ItemSource):
             require_positive("boards: sigma", self.sigma)
 
     def whitening(self, sigma: float) -> Tensor:
-        """(V, C, N, 2, 2) by which residuals are multiplied; corners have `sigma` on average."""
+        """(V, C, N), or (V, C, N, 2, 2), by which residuals are multiplied; corners have `sigma` on average."""
         if self.covariance is None:
-            return (torch.eye(2, dtype=torch.float64) / sigma).expand(*self.pixels.shape, 2)
+            return torch.full(self.pixels.shape[:-1], 1.0 / sigma, dtype=torch.float64)
         flat = self.covariance.flatten(0, 2)
         return (whitening(flat, sigma**2) / sigma).unflatten(0, self.pixels.shape[:3])
 
@@ -139,8 +137,8 @@ class Boards(ItemSource):
     def block(self, mask: Tensor, given: Context) -> Block:
         """See `ItemSource.block`."""
         motion = [one and one.columns[mask] for one in given.motion]
-        white = self.whitening(given.sigma_corner)[mask]
-        return BoardBlock(self.pixels[mask], white, self.points, given.shapes, given.unknowns.board, motion)
+        weights = self.whitening(given.sigma_corner)[mask]
+        return BoardBlock(self.pixels[mask], weights, self.points, given.cameras, given.unknowns, motion)
 
     def over_limit(self, fit: ItemFit, level: float, given: Context, *, certain: bool) -> Tensor:
         """See `ItemSource.over_limit`; each board by the part of its χ² that is farther over its limit."""
@@ -158,23 +156,26 @@ class Boards(ItemSource):
 
     def _each_camera_alone(self, mask: Tensor, given: Context) -> tuple[Tensor, Tensor]:
         """χ² of every board with a pose of its own for each camera, and how many degrees of freedom that costs."""
-        cameras = given.cameras
         squares = torch.full(mask.shape, torch.nan, dtype=torch.float64)
         squares[mask] = 0.0
-        further = torch.zeros(mask.shape, dtype=torch.int64)
-        whitening, still = self.whitening(given.sigma_corner), [False] * len(cameras)
-        for c in range(len(cameras)):
-            some = mask & (torch.isfinite(self.pixels[:, c]).all(-1).sum(-1) >= _CORNERS)
-            if not bool(some.any()):
-                continue
-            pixels = torch.full_like(self.pixels[some], torch.nan)
-            pixels[:, c] = self.pixels[some, c]
-            block = BoardBlock(pixels, whitening[some], self.points, given.shapes)
-            problem = RigProblem(cameras, [block], (), held(cameras), still, still)
-            start = given.state._replace(items=given.state.items[some])
-            found = RigState(*minimize(problem, start, _POSES).state)
-            squares[some] += problem.item_squares(found)[0]
-            further[some] += LOCAL_SIZE
+        further, weights, state = (
+            torch.zeros(mask.shape, dtype=torch.int64),
+            self.whitening(given.sigma_corner),
+            given.state,
+        )
+        turn, shift = board_pose(state.items)
+        board = self.points
+        if len(state.board):
+            board = board + torch.einsum("b,bkn->nk", state.board, given.unknowns.shapes)
+        parameters = state.parameters.split([camera.params.shape[-1] for camera in given.cameras])
+        for c, camera in enumerate(given.cameras):
+            some = mask & (self.marked[:, c].sum(-1) >= _CORNERS)
+            if bool(some.any()):
+                views = Views(board_points=board, pixels=self.pixels[some, c], whitening=weights[some, c])
+                pose = state.rotation[c] @ turn[some], (shift[some] - state.center[c]) @ state.rotation[c].T
+                cost = refine_poses(views, camera.model, BoardState.flat(parameters[c], *pose), _POSES)[1]
+                squares[some] += 2.0 * cost
+                further[some] += LOCAL_SIZE
         return squares, (further - LOCAL_SIZE).clamp_min(0)
 
     def doubt(self, off: str, sigmas: float, over: float) -> str:
@@ -204,12 +205,15 @@ def board_pose(items: Tensor) -> tuple[Tensor, Tensor]:
 class BoardBlock(Block):
     """Boards, of which each has a pose of its own, as `board_pose` has it; all have the same shape.
 
+    What a camera sees of them is its `BoardProblem`, whose poses cam_from_board follow from those of the board and of
+    the camera in the world.
+
     Args:
         pixels: see `Block`.
-        whitening: see `Block`.
+        whitening: (V, C, N) or (V, C, N, 2, 2) by which pixel residuals are multiplied.
         board_points: (N, 3) meters.
-        shapes: (B, 3, N) by which the state's amplitudes displace the corners.
-        by_unknown: (B, K) these amplitudes by the unknowns.
+        cameras: of the rig.
+        unknowns: of cameras and board.
         motion: for each camera (V, 12, 2, N) what boards move while it reads its rows; None where they stand still.
     """
 
@@ -222,60 +226,99 @@ class BoardBlock(Block):
         pixels: Tensor,
         whitening: Tensor,
         board_points: Tensor,
-        shapes: Tensor | None = None,
-        by_unknown: Tensor | None = None,
+        cameras: Sequence[Camera],
+        unknowns: SharedUnknowns,
         motion: Sequence[Tensor | None] = (),
     ) -> None:
-        super().__init__(pixels, whitening)
-        self._motion = [
-            None if one is None else WithoutMotion(one, self.whitening[:, c]) for c, one in enumerate(motion)
-        ]
-        self._board, self._shapes, self._by_unknown = board_points.T.contiguous(), shapes, by_unknown
+        super().__init__(pixels)
+        self._unknowns, flat = unknowns, board_points.new_zeros(0, *board_points.T.shape)
+        # What each camera sees, and what takes motions out of its rows; nothing for cameras that see no board.
+        self._seen_by: dict[int, tuple[BoardProblem, WithoutMotion | None]] = {}
+        for c, camera in enumerate(cameras):
+            if self._used[c]:
+                problem = BoardProblem(
+                    board_points,
+                    pixels[:, c],
+                    camera.model,
+                    unknowns.cameras[c].any(1).nonzero()[:, 0].tolist(),
+                    shapes=unknowns.shapes if len(unknowns.shapes) else flat,
+                    free_board=bool(unknowns.board.any()),
+                    weights=whitening[:, c],
+                )
+                own = motion[c] if motion else None
+                self._seen_by[c] = problem, None if own is None else WithoutMotion(problem.weighted(own))
 
-    def _white(self, camera: int, rows: Tensor) -> Tensor:
-        white = super()._white(camera, rows)
-        taken_out = self._motion[camera] if self._motion else None
-        return white if taken_out is None else taken_out(white)
+    def _each(
+        self, cameras: Sequence[PosedCamera], state: RigState
+    ) -> Iterator[tuple[int, PosedCamera, BoardProblem, BoardState, Callable[[Tensor], Tensor]]]:
+        """For each camera that sees boards what it sees of them, where, and what takes motions out of its rows."""
+        for c, (problem, off) in self._seen_by.items():
+            yield c, cameras[c], problem, self._placed(cameras[c], state), off or (lambda rows: rows)
 
-    def shaped(self, state: RigState) -> Tensor:
-        """(3, N) the board, meters."""
-        if self._shapes is None or not len(self._shapes):
-            return self._board
-        return self._board + torch.einsum("b,bkn->kn", state.board, self._shapes)
+    def _placed(self, posed: PosedCamera, state: RigState) -> BoardState:
+        """The boards in the frame of a camera."""
+        turn, shift = board_pose(state.items)
+        board = state.board[: len(self._unknowns.shapes)]
+        place = (shift - posed.center) @ posed.rotation.T
+        return BoardState.still(posed.parameters, board, posed.rotation @ turn, place)
 
-    def motion_columns(self, posed: PosedCamera, state: RigState, camera: int, *, reads: bool) -> tuple[Tensor, float]:
+    def errors(self, cameras: Sequence[PosedCamera], state: RigState) -> Tensor:
+        """See `Block.errors`."""
+        found = state.items.new_zeros(*self.seen.shape[:2], 2, self.seen.shape[2])
+        for c, _, problem, placed, _ in self._each(cameras, state):
+            found[:, c] = problem.pixel_errors(placed)
+        return found
+
+    def residuals(self, cameras: Sequence[PosedCamera], state: RigState) -> Tensor:
+        """See `Block.residuals`."""
+        each = self._each(cameras, state)
+        return torch.cat([off(problem.residuals(at)[:, None])[:, 0] for _, _, problem, at, off in each], -1)
+
+    def camera_rows(self, cameras: Sequence[PosedCamera], state: RigState) -> Iterator[CameraRows]:
+        """See `Block.camera_rows`; a step of the camera moves the boards in its frame."""
+        for c, posed, problem, placed, off in self._each(cameras, state):
+            rows = off(problem.corner_rows(placed))
+            by_turn, by_shift = rows[:, :3], rows[:, 3:6]
+            # About the axes of the world.
+            own = (posed.rotation.T @ rows[:, :6].unflatten(1, (2, 3))).flatten(1, 2)
+            bends = self._unknowns.board[: problem.unknown_count - len(problem.free)]
+            onto = torch.cat([posed.by_unknown[list(problem.free)], bends])
+            columns = onto.any(0).nonzero()[:, 0]
+            parts = [own, onto[:, columns].T @ rows[:, 6:-1]]
+            if posed.turn is not None:
+                # By ω × t, too.
+                far = placed.translation[..., None].expand_as(by_shift)
+                parts.append(by_turn + torch.linalg.cross(far, by_shift, dim=1))
+            if posed.shift is not None:
+                parts.append(-own[:, 3:])
+            slots = [torch.arange(slot.start, slot.stop) for slot in (posed.turn, posed.shift) if slot is not None]
+            yield CameraRows(c, torch.cat([columns, *slots]), torch.cat([*parts, rows[:, -1:]], 1))
+
+    def motion_columns(self, c: int, posed: PosedCamera, state: RigState, *, reads: bool) -> tuple[Tensor, float]:
         """(V, M, 2, N) derivatives of a camera's pixels by motions, and how far a board reaches, in distances of it.
 
+        Each row is read at the time of the pixel where the state shows it: at that of the observed one, motions would
+        take up the noise of corners.
+
         Args:
+            c: number of the camera.
             posed: the camera.
             state: where.
-            camera: its number.
             reads: whether boards may move while its rows are read, too.
         """
-        turn, shift = board_pose(state.items)
-        points, rotation = self.shaped(state), posed.rotation @ turn
-        translation = (shift - posed.center) @ posed.rotation.T
-        found = project_components(rotation @ points + translation[..., None], posed.parameters, posed.camera.model, [])
-        distance = float(translation.norm(dim=-1).median())
+        problem, placed = self._seen_by[c][0], self._placed(posed, state)
+        points = problem.board_points.T + torch.einsum("b,bkn->kn", placed.board, problem.shapes)
+        distance = float(placed.translation.norm(dim=-1).median())
         readout = Readout(center=points.mean(-1), distance=distance, size=posed.camera.size)
-        time = readout.time(self.target[:, camera].mT)
-        columns = readout.columns_of(found.by_point, rotation, time, points, apart=True).nan_to_num(0.0)
+        q = placed.rotation @ points + placed.translation[..., None]
+        found = project_components(q, posed.parameters, posed.camera.model, [])
+        time = readout.time(found.pixels.mT)
+        columns = readout.columns_of(found.by_point, placed.rotation, time, points, apart=True).nan_to_num(0.0)
         return columns if reads else columns[:, MOTION:], readout.reach(points.T)
 
-    def _place(self, state: RigState) -> tuple[Tensor, Tensor]:
-        rotation, translation = board_pose(state.items)
-        points = rotation @ self.shaped(state) + translation[..., None]
-        return points, points.new_ones(len(self), 1, 1)
-
-    def _by_own(self, state: RigState, by_q: Tensor, center: Tensor, by_w: Tensor | None) -> Tensor:
-        # By ω through ω × (R x), then by v.
-        return step_rows(by_q, board_pose(state.items)[0] @ self.shaped(state))
-
-    def _by_shared(self, state: RigState, by_q: Tensor, offset: Tensor) -> tuple[Tensor, Tensor] | None:
-        if self._shapes is None or self._by_unknown is None or not bool(self._by_unknown.any()):
-            return None
-        by_point = torch.einsum("vjun,vjl->vlun", by_q, board_pose(state.items)[0])
-        return torch.einsum("vlun,bln->vbun", by_point, self._shapes), self._by_unknown
+    def weighted(self, c: int, columns: Tensor) -> Tensor:
+        """(V, M, R) columns (V, M, 2, N) of a camera's pixels in the order and the units of its rows."""
+        return self._seen_by[c][0].weighted(columns)
 
     def moved(self, items: Tensor, step: Tensor) -> Tensor:
         """See `Block.moved`."""

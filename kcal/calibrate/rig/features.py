@@ -16,6 +16,7 @@ from kcal.calibrate.rig.source import (
     Effect,
     Effects,
     ItemSource,
+    MarkBlock,
     RigState,
     Start,
     as_items,
@@ -132,11 +133,11 @@ def inverse_range_beyond(meters: float) -> tuple[float, float]:
     return 0.5 / meters, 1.0 / (meters * math.sqrt(12.0))
 
 
-class FeatureBlock(Block):
+class FeatureBlock(MarkBlock):
     """Things of unknown position: a unit vector (V, 3) and an inverse range (V, 1), 1/m, from `anchor` each.
 
     Args:
-        pixels: (V, C, 2), see `Block`, as `whitening` (V, C, 2, 2) and `effects`.
+        pixels: (V, C, 2), see `MarkBlock`, as `whitening` (V, C, 2, 2) and `effects`.
         inverse_range: (V,) as known beforehand, with `sigma`.
     """
 
@@ -153,7 +154,7 @@ class FeatureBlock(Block):
         anchor: Tensor,
         effects: Effects | None = None,
     ) -> None:
-        super().__init__(pixels[:, :, None], whitening[:, :, None], effects)
+        super().__init__(pixels, whitening, effects)
         self._mean, self._weight = inverse_range, torch.where(torch.isfinite(sigma), 1.0 / sigma, 0.0)
         self._anchor = anchor
 

@@ -16,6 +16,7 @@ from kcal.calibrate.rig.source import (
     Effect,
     Effects,
     ItemSource,
+    MarkBlock,
     Pose,
     RigState,
     Start,
@@ -138,16 +139,16 @@ _HALF_CURVATURE = 0.5 / 6_371_008.8
 _UP = 2
 
 
-class LandmarkBlock(Block):
+class LandmarkBlock(MarkBlock):
     """Surveyed points, whose adjusted positions (V, 3), meters, are the unknowns.
 
     Args:
-        pixels: (V, C, 2), see `Block`.
-        whitening: (V, C, 2, 2), see `Block`.
+        pixels: (V, C, 2), see `MarkBlock`.
+        whitening: (V, C, 2, 2), see `MarkBlock`.
         points: (V, 3) meters, as surveyed; the third axis is up.
         sigma: (V, 3) meters.
         by_refraction: (K,) of the coefficient of refraction by the unknowns; None: it is held.
-        effects: see `Block`.
+        effects: see `MarkBlock`.
     """
 
     kind = "landmarks"
@@ -163,7 +164,7 @@ class LandmarkBlock(Block):
         by_refraction: Tensor | None = None,
         effects: Effects | None = None,
     ) -> None:
-        super().__init__(pixels[:, :, None], whitening[:, :, None], effects)
+        super().__init__(pixels, whitening, effects)
         self._surveyed, self._sigma, self._by_refraction = points, sigma, by_refraction
 
     def _prior_count(self) -> Tensor:

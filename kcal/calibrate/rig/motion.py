@@ -102,13 +102,13 @@ class BoardMotion(NamedTuple):
     reach: float
 
 
-def board_motion(columns: Tensor, whitening: Tensor, reach: float, rig: RigRows, camera: int) -> BoardMotion | None:
+def board_motion(columns: Tensor, white: Tensor, reach: float, rig: RigRows, camera: int) -> BoardMotion | None:
     """Estimate how boards move while a camera reads its rows, and between exposures; None where they stand still.
 
     Args:
         columns: (V, 18, 2, N) derivatives of its pixels by motions; (V, 6, 2, N) if they do not move while rows are
             read.
-        whitening: (V, 2, 2, N) by which residuals are multiplied; zero where not seen.
+        white: (V, 18, R) or (V, 6, R) the same of the rows of the camera, in standard deviations of their residuals.
         reach: of the board about its middle, distances of the board.
         rig: rows of all cameras, other cameras' motions integrated out.
         camera: its number.
@@ -116,7 +116,6 @@ def board_motion(columns: Tensor, whitening: Tensor, reach: float, rig: RigRows,
     good = rig.good
     if int(good.sum()) < _FEWEST or camera not in rig.parts:
         return None
-    white = torch.einsum("vuwn,vpwn->vpun", whitening, columns).flatten(-2)
     variance = rig.variance
     # Residuals without noise need no motion to explain them.
     if variance < _EXACT:
@@ -282,12 +281,11 @@ class WithoutMotion:
     """(I + U Uᵀ)^-½ of each view of a camera.
 
     Args:
-        columns: (V, 12, 2, N) as `BoardMotion.columns`.
-        whitening: (V, 2, 2, N).
+        columns: (V, 12, R) as `BoardMotion.columns`, of the rows of the camera, in standard deviations.
     """
 
-    def __init__(self, columns: Tensor, whitening: Tensor) -> None:
-        self._columns = torch.einsum("vuwn,vpwn->vpun", whitening, columns).flatten(-2)
+    def __init__(self, columns: Tensor) -> None:
+        self._columns = columns
         values, vectors = torch.linalg.eigh(self._columns @ self._columns.transpose(-1, -2))
         root = (1.0 + values.clamp_min(0.0)).sqrt()
         # (1 / √(1 + λ) - 1) / λ, for small λ too.

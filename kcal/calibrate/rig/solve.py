@@ -94,7 +94,7 @@ def robust_solution(initial: InitialPoses, mask: Tensor, unknowns: SharedUnknown
         some[features] = _evenly_taken(mask[features], _SCREENED)
         if unknowns.refine_lenses:
             # From poses that are far off, lenses would bend towards them, beyond their folds even.
-            work.unknowns = held(initial.data.cameras)
+            work.unknowns = unknowns.none()
         here = possible(work, some)
         work.fit_corners(here, robust=True)
         problem, result = work.solve(here, _SCREENING, LOSS)

@@ -187,7 +187,6 @@ class Context(NamedTuple):
         cameras: of the rig.
         state: as it is, with the items of the source alone.
         unknowns: those of the problem.
-        shapes: (B, 3, N) by which the state's amplitudes displace a board's corners, meters.
         anchor: (3,) from where features are counted, meters.
         times: by which the source's sigmas are multiplied.
         effects: of the source; None without any.
@@ -198,7 +197,6 @@ class Context(NamedTuple):
     cameras: Sequence[Camera]
     state: RigState
     unknowns: SharedUnknowns
-    shapes: Tensor
     anchor: Tensor
     times: float
     effects: Effects | None
@@ -401,24 +399,16 @@ class Measurement(Source):
 
 
 # Rows of the items of one kind.
-#
-# A camera with rotation R and center c sees the pixel of R q, q = y - w c. For points, w = 1 and y is the point. A
-# feature in direction d at inverse range ρ from a place a near the rig has y = d + ρ a and w = ρ, so that q = d + ρ (a
-# - c) is as regular at infinity as anywhere (Civera, Davison, Montiel 2008). In its units a meter is w, which entrance
-# pupils that move depend on.
-#
-# Residuals are divided by their standard deviations: their squares add up to χ².
 
 
 class Block(ABC):
     """V items of one kind, each with its own unknowns that no other item shares.
 
-    States that its methods take contain its own items alone.
+    States that its methods take contain its own items alone. Residuals are divided by their standard deviations: their
+    squares add up to χ².
 
     Args:
         pixels: (V, C, N, 2), NaN where not seen.
-        whitening: (V, C, N, 2, 2) by which pixel residuals are multiplied.
-        effects: of the items; None without any.
 
     Attributes:
         kind: of the source.
@@ -435,27 +425,83 @@ class Block(ABC):
     many: ClassVar[bool] = False
     surveyed: ClassVar[bool] = False
 
-    def __init__(self, pixels: Tensor, whitening: Tensor, effects: Effects | None = None) -> None:
-        self._effects = effects
+    def __init__(self, pixels: Tensor) -> None:
         self.seen = torch.isfinite(pixels).all(-1)
         self._used = self.seen.any(-1).any(0).tolist()
-        self.target = torch.where(self.seen[..., None], pixels, 0.0).transpose(-1, -2).contiguous()
-        self.whitening = torch.where(self.seen[..., None, None], whitening, 0.0).movedim(-3, -1).contiguous()
 
     def __len__(self) -> int:
         """How many items there are."""
-        return len(self.target)
+        return len(self.seen)
 
     @property
     def counts(self) -> Tensor:
         """(V,) residuals of each item."""
-        return 2 * self.seen.sum((-2, -1)) + self._prior_count()
+        return 2 * self.seen.sum((-2, -1))
 
     @property
     def added(self) -> Tensor:
         """(C,) how many more residuals the items have with each camera than without it."""
         seen = self.seen.sum(-1)
         return (2 * seen * (seen.sum(1, keepdim=True) > seen)).sum(0)
+
+    @abstractmethod
+    def errors(self, cameras: Sequence[PosedCamera], state: RigState) -> Tensor:
+        """(V, C, 2, N) projected minus seen, pixels; 0 where not seen."""
+
+    @abstractmethod
+    def residuals(self, cameras: Sequence[PosedCamera], state: RigState) -> Tensor:
+        """(V, R) whitened residuals, pixels first."""
+
+    @abstractmethod
+    def camera_rows(self, cameras: Sequence[PosedCamera], state: RigState) -> Iterator[CameraRows]:
+        """Rows of each camera that sees anything; last those of what is known of the items beforehand."""
+
+    @abstractmethod
+    def moved(self, items: Tensor, step: Tensor) -> Tensor:
+        """Items (V, 12) after a step (V, L)."""
+
+    def rows(self, cameras: Sequence[PosedCamera], state: RigState, shared_size: int) -> Tensor:
+        """(V, L + S + 1, R) derivatives of whitened residuals by local and shared unknowns; last the residuals."""
+        return self.joined(self.camera_rows(cameras, state), shared_size)
+
+    def joined(self, parts: Iterable[CameraRows], shared_size: int) -> Tensor:
+        """(V, L + S + 1, R) rows of all cameras and of what is known beforehand, with all columns."""
+        out = []
+        for _, columns, rows in parts:
+            wide = rows.new_zeros(len(self), self.size + shared_size + 1, rows.shape[-1])
+            wide[:, : self.size], wide[:, self.size + columns] = rows[:, : self.size], rows[:, self.size : -1]
+            wide[:, -1] = rows[:, -1]
+            out.append(wide)
+        return torch.cat(out, -1)
+
+
+# Rows of single marks.
+#
+# A camera with rotation R and center c sees the pixel of R q, q = y - w c. For points, w = 1 and y is the point. A
+# feature in direction d at inverse range ρ from a place a near the rig has y = d + ρ a and w = ρ, so that q = d + ρ (a
+# - c) is as regular at infinity as anywhere (Civera, Davison, Montiel 2008). In its units a meter is w, which entrance
+# pupils that move depend on.
+
+
+class MarkBlock(Block):
+    """Items of which each camera that sees them has one mark.
+
+    Args:
+        pixels: (V, C, 2), NaN where not seen.
+        whitening: (V, C, 2, 2) by which pixel residuals are multiplied.
+        effects: of the items; None without any.
+    """
+
+    def __init__(self, pixels: Tensor, whitening: Tensor, effects: Effects | None = None) -> None:
+        super().__init__(pixels[:, :, None])
+        self._effects = effects
+        self._target = torch.where(self.seen, pixels, 0.0)[..., None]
+        self._whitening = torch.where(self.seen[..., None], whitening, 0.0)[..., None]
+
+    @property
+    def counts(self) -> Tensor:
+        """See `Block.counts`."""
+        return super().counts + self._prior_count()
 
     def _prior_count(self) -> Tensor:
         """(V,) residuals of what is known of each item beforehand."""
@@ -468,10 +514,6 @@ class Block(ABC):
     @abstractmethod
     def _by_own(self, state: RigState, by_q: Tensor, center: Tensor, by_w: Tensor | None) -> Tensor:
         """Derivatives (V, L, 2, N) of pixels by each item's unknowns, from those by q (V, 3, 2, N) and by w."""
-
-    @abstractmethod
-    def moved(self, items: Tensor, step: Tensor) -> Tensor:
-        """Items (V, 12) after a step (V, L)."""
 
     def _by_shared(self, state: RigState, by_q: Tensor, offset: Tensor) -> tuple[Tensor, Tensor] | None:
         """How pixels depend on what all items share, a board's shape or the air; None if they do not.
@@ -500,7 +542,7 @@ class Block(ABC):
 
     def _white(self, camera: int, rows: Tensor) -> Tensor:
         """(V, P, 2 N) rows (V, P, 2, N) of pixels of one camera in units of their standard deviations."""
-        return torch.einsum("vuwn,vpwn->vpun", self.whitening[:, camera], rows).flatten(-2)
+        return torch.einsum("vuwn,vpwn->vpun", self._whitening[:, camera], rows).flatten(-2)
 
     def _prior(self, state: RigState) -> Tensor | None:
         """(V, L + 1, Q): derivatives of Q residuals of what is known of each item; the last row holds the residuals."""
@@ -528,24 +570,24 @@ class Block(ABC):
             found = project_components(q, posed.parameters, posed.camera.model, wanted, w[..., 0])
             # NaN where a seen point has no projection, so that such a pose is never accepted.
             bad = torch.where(found.regular, 0.0, torch.nan)[..., None, :]
-            error = torch.where(self.seen[:, c, None, :], found.pixels + beside - self.target[:, c] + bad, 0.0)
+            error = torch.where(self.seen[:, c, None, :], found.pixels + beside - self._target[:, c] + bad, 0.0)
             yield c, posed, offset, q, w, found, error
 
     def errors(self, cameras: Sequence[PosedCamera], state: RigState) -> Tensor:
-        """(V, C, 2, N) projected minus seen, pixels; 0 where not seen."""
-        found = torch.zeros_like(self.target).unbind(1)
+        """See `Block.errors`."""
+        found = torch.zeros_like(self._target).unbind(1)
         used = {c: error for c, *_, error in self._projected(cameras, state, False)}
         return torch.stack([used.get(c, none) for c, none in enumerate(found)], 1)
 
     def residuals(self, cameras: Sequence[PosedCamera], state: RigState) -> Tensor:
-        """(V, R) whitened residuals, pixels first."""
+        """See `Block.residuals`."""
         errors = self.errors(cameras, state).unbind(1)
         white = torch.cat([self._white(c, error[:, None])[:, 0] for c, error in enumerate(errors)], -1)
         prior = self._prior(state)
         return white if prior is None else torch.cat([white, prior[:, -1]], -1)
 
     def camera_rows(self, cameras: Sequence[PosedCamera], state: RigState) -> Iterator[CameraRows]:
-        """Rows of each camera that sees anything; last those of what is known of the items beforehand."""
+        """See `Block.camera_rows`."""
         for c, posed, offset, q, w, found, error in self._projected(cameras, state, True):
             by_q = torch.einsum("vkun,kj->vjun", found.by_point, posed.rotation)
             by_offset = self._by_offset(state, by_q, offset)
@@ -579,19 +621,3 @@ class Block(ABC):
         prior = self._prior(state)
         if prior is not None:
             yield CameraRows(None, torch.zeros(0, dtype=torch.long), prior)
-
-    def rows(self, cameras: Sequence[PosedCamera], state: RigState, shared_size: int) -> Tensor:
-        """(V, L + S + 1, R) derivatives of whitened residuals by local and shared unknowns; last the residuals."""
-        return self.joined(self.camera_rows(cameras, state), shared_size)
-
-    def joined(self, parts: Iterable[CameraRows], shared_size: int) -> Tensor:
-        """(V, L + S + 1, R) rows of all cameras and of what is known beforehand, with all columns."""
-        (_, count, *_), width = self.seen.shape, self.size + shared_size + 1
-        out = [self.target.new_zeros(len(self), width, self.target[0, 0].numel()) for _ in range(count)]
-        for camera, columns, rows in parts:
-            if camera is None:
-                out.append(rows.new_zeros(len(self), width, rows.shape[-1]))
-            wide = out[-1 if camera is None else camera]
-            wide[:, : self.size], wide[:, self.size + columns] = rows[:, : self.size], rows[:, self.size : -1]
-            wide[:, -1] = rows[:, -1]
-        return torch.cat(out, -1)

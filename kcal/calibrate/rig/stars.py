@@ -16,6 +16,7 @@ from kcal.calibrate.rig.source import (
     Effect,
     Effects,
     ItemSource,
+    MarkBlock,
     Pose,
     RigState,
     Start,
@@ -127,19 +128,19 @@ class StarSource(ItemSource):
         return f"off by {off} ({sigmas:.0f} sigma): not that star, or an aircraft or satellite"
 
 
-class StarBlock(Block):
+class StarBlock(MarkBlock):
     """Stars, each with a unit vector (V, 3) that the catalogue knows, if the star has a name.
 
     Camera c sees star i in the direction d_i + Σ_e u_e (t_eci × d_i + s_eic) with the unknowns u_e of clocks and air,
     which are standard normal beforehand.
 
     Args:
-        pixels: (V, C, 2), see `Block`.
-        whitening: (V, C, 2, 2), see `Block`.
+        pixels: (V, C, 2), see `MarkBlock`.
+        whitening: (V, C, 2, 2), see `MarkBlock`.
         direction: (V, 3) of the catalogue; anything for stars without a name.
         sigma: (V,) radians; infinite for these.
         turns: (E, C, V, 3) radians, see `star_turns`.
-        effects: see `Block`; its amounts are the u_e.
+        effects: see `MarkBlock`; its amounts are the u_e.
     """
 
     kind = "stars"
@@ -154,7 +155,7 @@ class StarBlock(Block):
         turns: Tensor,
         effects: Effects | None = None,
     ) -> None:
-        super().__init__(pixels[:, :, None], whitening[:, :, None], effects)
+        super().__init__(pixels, whitening, effects)
         named = torch.isfinite(sigma)
         self._weight = torch.where(named, 1.0 / sigma, 0.0)
         self._known = torch.where(named[:, None], direction, 0.0)

@@ -61,6 +61,11 @@ class SharedUnknowns:
         """How many unknowns there are."""
         return len(self.known)
 
+    def none(self) -> SharedUnknowns:
+        """None of these: cameras, board and air keep the values of a state."""
+        cameras, nothing = tuple(by[:, :0] for by in self.cameras), held(())
+        return dataclasses.replace(nothing, cameras=cameras, shapes=self.shapes, board=self.board[:, :0])
+
     def at_places(self, lenses: Sequence[int]) -> SharedUnknowns:
         """These for places, given the number of the lens that is used at each: the same lens has the same unknowns."""
         return dataclasses.replace(self, cameras=tuple(self.cameras[lens] for lens in lenses))

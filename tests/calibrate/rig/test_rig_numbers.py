@@ -86,7 +86,7 @@ class TestRedundancy:
     def test_boards_and_what_was_measured(self) -> None:
         shown = boards(count=2, cameras=2)
         shown.pixels[1, 1] = torch.nan
-        block = BoardBlock(shown.pixels, white(shown.pixels), BOARD.points)
+        block = BoardBlock(shown.pixels, white(shown.pixels), BOARD.points, CAMERAS[:2], held(CAMERAS[:2]))
         assert redundancy(problem_of(block)) == [2 * 42 - 6, 2 * 42 - 6]
         terms = (
             Baseline(first=0, second=1, length=10.0, sigma=0.01),

@@ -110,7 +110,7 @@ def mixed_problem() -> tuple[RigProblem, RigState]:
         by_refraction=tensor(0.0, 0.1, 0.0, 0.2, 0.3),
     )
     blocks = [
-        BoardBlock(shown.pixels, white(shown.pixels), BOARD.points, unknowns.shapes, unknowns.board),
+        BoardBlock(shown.pixels, white(shown.pixels), BOARD.points, CAMERAS, unknowns),
         LandmarkBlock(marks.pixels, white(marks.pixels), marks.points, marks.sigma, unknowns.by_refraction),
         FeatureBlock(far.pixels, white(far.pixels), far.inverse_range, sigma, anchor),
     ]
