@@ -24,7 +24,7 @@ from kcal.files import read_text
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
-from kcal.lens.pose import nearest_rotation
+from kcal.lens.pose import Pose, nearest_rotation
 from kcal.lens.rig import Rig
 from kcal.strict_formats import MOST_YAML, read_yaml
 from kcal.texts import brief
@@ -45,17 +45,6 @@ class Hints(NamedTuple):
     meters: float | None = None
 
 
-class CameraPose(NamedTuple):
-    """Where a camera stands: a point of the reference frame is seen at rotation (3, 3) @ point + translation (3,)."""
-
-    rotation: Tensor
-    translation: Tensor
-
-
-# Of the camera whose frame is the reference.
-STILL = CameraPose(torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class ImportedCameras:
     """Cameras and poses from a file of another program.
@@ -71,7 +60,7 @@ class ImportedCameras:
 
     format: str
     cameras: tuple[Camera, ...]
-    poses: tuple[CameraPose, ...] = ()
+    poses: tuple[Pose, ...] = ()
     notes: tuple[str, ...] = ()
     unread: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
@@ -115,16 +104,15 @@ class ImportedCameras:
         return brief(self)
 
 
-def _second_from_first(poses: Sequence[CameraPose]) -> CameraPose:
+def _second_from_first(poses: Sequence[Pose]) -> Pose:
     """Of the second camera from the first."""
     first, second = poses
-    rotation = second.rotation @ first.rotation.T
-    return CameraPose(rotation, second.translation - rotation @ first.translation)
+    return second.after(first.inverse())
 
 
-def rig_poses(rig: Rig) -> tuple[CameraPose, ...]:
+def rig_poses(rig: Rig) -> tuple[Pose, ...]:
     """Each camera from the rig's frame."""
-    return tuple(map(CameraPose, rig.rotation, rig.translation))
+    return tuple(map(Pose, rig.rotation, rig.translation))
 
 
 def each_readable(
@@ -148,7 +136,7 @@ def each_readable(
     return tuple(cameras), unread
 
 
-def checked_pose(rotation: Any, translation: Any) -> CameraPose:
+def checked_pose(rotation: Any, translation: Any) -> Pose:
     """A pose from lists: the rotation is made exact, because files round it.
 
     Raises:
@@ -162,7 +150,7 @@ def checked_pose(rotation: Any, translation: Any) -> CameraPose:
         raise ValueError("its rotation is no rotation matrix (R Rᵀ must be 1 and det R = +1)")
     # One that is exact already stays as it is, to the last bit.
     same = float((matrix - exact).abs().max()) < 1e-14
-    return CameraPose(matrix if same else exact, torch.tensor(translation, dtype=torch.float64).reshape(3))
+    return Pose(matrix if same else exact, torch.tensor(translation, dtype=torch.float64).reshape(3))
 
 
 def named_camera(

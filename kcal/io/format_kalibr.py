@@ -21,6 +21,7 @@ from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.hybrid_terms import HybridForm, radius_over_angle
 from kcal.lens.model import LensModel
+from kcal.lens.pose import Pose
 from kcal.lens.projection import project_components
 from kcal.lens.zernike import ZernikeModes
 from kcal.strict_formats import MOST_YAML, read_yaml
@@ -179,7 +180,7 @@ def read_kalibr(path: Path, hints: foreign.Hints) -> foreign.ImportedCameras:
     cameras, unread = foreign.each_readable((name, partial(_chain_camera, name, parts[name], notes)) for name in names)
     if not names:
         raise ValueError("no cam0")
-    whole, poses = np.eye(4), dict[str, foreign.CameraPose]()
+    whole, poses = np.eye(4), dict[str, Pose]()
     first: np.ndarray | None = None
     for i, (name, part) in enumerate(parts.items()):
         imu = next((_transform(part, key, name) for key in ("T_cam_imu", "T_imu_cam") if key in part), None)
@@ -263,7 +264,7 @@ class KalibrLens(NamedTuple):
     resolution: tuple[int, int]
 
 
-def write_kalibr(cameras: Sequence[Camera], poses: Sequence[foreign.CameraPose], path: Path) -> list[Path]:
+def write_kalibr(cameras: Sequence[Camera], poses: Sequence[Pose], path: Path) -> list[Path]:
     """Write a chain of cameras."""
     names = {model: name for name, model in _LENSES.items()}
     lenses = [
@@ -280,7 +281,7 @@ def write_kalibr(cameras: Sequence[Camera], poses: Sequence[foreign.CameraPose],
 
 
 def write_omni(
-    cameras: Sequence[Camera], values: Sequence[Sequence[float]], poses: Sequence[foreign.CameraPose], path: Path
+    cameras: Sequence[Camera], values: Sequence[Sequence[float]], poses: Sequence[Pose], path: Path
 ) -> list[Path]:
     """Write a chain of cameras as omni-radtan, with the nine numbers of `fit_omni` for each."""
     lenses = [
@@ -290,7 +291,7 @@ def write_omni(
     return write_chain(lenses, poses, path)
 
 
-def write_chain(lenses: Sequence[KalibrLens], poses: Sequence[foreign.CameraPose], path: Path) -> list[Path]:
+def write_chain(lenses: Sequence[KalibrLens], poses: Sequence[Pose], path: Path) -> list[Path]:
     """Write lenses, and the pose of each from the one before, as a camchain."""
     content: dict[str, Any] = {}
     for i, lens in enumerate(lenses):

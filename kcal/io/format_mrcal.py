@@ -20,7 +20,7 @@ from kcal.files import read_text, write_atomic
 from kcal.gaussian import posterior_half, triangular
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector, step_rows, vector_from_rotation
+from kcal.lens.pose import Pose, rotation_from_vector, step_rows, vector_from_rotation
 from kcal.lens.projection import project_components
 from kcal.strict_formats import read_npz
 
@@ -198,7 +198,7 @@ def read_mrcal(path: Path, hints: foreign.Hints) -> foreign.ImportedCameras:
     )
 
 
-def write_mrcal(cameras: Sequence[Camera], poses: Sequence[foreign.CameraPose], path: Path) -> list[Path]:
+def write_mrcal(cameras: Sequence[Camera], poses: Sequence[Pose], path: Path) -> list[Path]:
     """Write a file for each camera."""
     lenses = {model: name for name, model in _LENSES.items()}
     paths = foreign.paths_for(path, len(cameras))
@@ -208,9 +208,7 @@ def write_mrcal(cameras: Sequence[Camera], poses: Sequence[foreign.CameraPose], 
     return paths
 
 
-def write_model(
-    path: Path, camera: Camera, lens: str, values: Sequence[float], pose: foreign.CameraPose | None
-) -> Path:
+def write_model(path: Path, camera: Camera, lens: str, values: Sequence[float], pose: Pose | None) -> Path:
     """Write a camera whose intrinsics in mrcal's lens model are given, with as many digits as they have."""
     motion = [0.0] * 6
     if pose is not None:

@@ -19,8 +19,6 @@ from kcal.errors import InputError
 from kcal.files import read_bytes, read_text, write_atomic
 from kcal.io.foreign import (
     MOST_BYTES,
-    STILL,
-    CameraPose,
     Hints,
     ImportedCameras,
     camera_name,
@@ -38,7 +36,7 @@ from kcal.io.foreign import (
 )
 from kcal.io.keyed import flat, read_keyed
 from kcal.lens.camera import Camera
-from kcal.lens.pose import vector_from_rotation
+from kcal.lens.pose import Pose, vector_from_rotation
 from kcal.strict_formats import read_mat, read_npz, read_storage
 from kcal.strict_json import read_json
 
@@ -58,7 +56,7 @@ def read_opencv(path: Path, hints: Hints) -> ImportedCameras:
     return read_keyed(stored, path.stem, hints, "opencv")
 
 
-def write_opencv(cameras: Sequence[Camera], poses: Sequence[CameraPose], path: Path) -> list[Path]:
+def write_opencv(cameras: Sequence[Camera], poses: Sequence[Pose], path: Path) -> list[Path]:
     """Write one camera, or two with their relative pose."""
     kind = {".xml": ".xml", ".json": ".json"}.get(path.suffix.lower(), ".yml")
     file = cv2.FileStorage(kind, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
@@ -134,7 +132,7 @@ def _sections(text: str) -> dict[str, Any]:
     return found
 
 
-def write_ros(cameras: Sequence[Camera], poses: Sequence[CameraPose], path: Path) -> list[Path]:
+def write_ros(cameras: Sequence[Camera], poses: Sequence[Pose], path: Path) -> list[Path]:
     """Write a file for each camera; two with poses are rectified as by `cv2.stereoRectify`."""
     rectified = [(np.eye(3), _projection(camera)) for camera in cameras]
     if len(cameras) == 2 and poses:
@@ -206,7 +204,7 @@ def read_toml(path: Path, hints: Hints) -> ImportedCameras:
     return read_keyed(content, path.stem, hints, "toml")
 
 
-def write_toml(cameras: Sequence[Camera], poses: Sequence[CameraPose], path: Path) -> list[Path]:
+def write_toml(cameras: Sequence[Camera], poses: Sequence[Pose], path: Path) -> list[Path]:
     """Write cameras as aniposelib does, with translations in meters."""
     lines: list[str] = []
     for index, camera in enumerate(cameras):
@@ -337,10 +335,10 @@ def _pair(value: Mapping[str, Any], hints: Hints) -> ImportedCameras:
     unsaid = hints.meters is None and not stated
     notes = ("WorldUnits is not in the file: the translation is taken as millimeters (--unit)",) if unsaid else ()
     pose = checked_pose(rotation.tolist(), (meters * translation).tolist())
-    return ImportedCameras(format="matlab", cameras=cameras, poses=(STILL, pose), notes=notes)
+    return ImportedCameras(format="matlab", cameras=cameras, poses=(Pose.still(), pose), notes=notes)
 
 
-def write_matlab(cameras: Sequence[Camera], poses: Sequence[CameraPose], path: Path) -> list[Path]:
+def write_matlab(cameras: Sequence[Camera], poses: Sequence[Pose], path: Path) -> list[Path]:
     """Write a struct `cameraParams`, or `stereoParams` of two cameras, in millimeters as MATLAB expects."""
     from scipy.io import savemat
 

@@ -22,6 +22,7 @@ from kcal.io.format_kalibr import central_camera
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
+from kcal.lens.pose import Pose
 from kcal.strict_json import read_json, read_xml
 
 # Agisoft Metashape's XML: a calibration, or the sensors of exported cameras with the covariances of their parameters.
@@ -226,7 +227,7 @@ def _from_binary(data: bytes) -> list[tuple[int, str, tuple[int, int], list[floa
     return entries
 
 
-def write_colmap(cameras: Sequence[Camera], poses: Sequence[foreign.CameraPose], path: Path) -> list[Path]:
+def write_colmap(cameras: Sequence[Camera], poses: Sequence[Pose], path: Path) -> list[Path]:
     """Write the cameras, numbered from 1, as text or, for the suffix .bin, in binary."""
     entries = []
     for number, camera in enumerate(cameras, 1):
@@ -320,7 +321,7 @@ def _nerfstudio_camera(values: dict[str, Any], name: str, hints: foreign.Hints) 
 _NUMBERS = {*_FIELDS} - {"camera_model", "distortion_params", "is_fisheye"}
 
 
-def write_nerfstudio(cameras: Sequence[Camera], poses: Sequence[foreign.CameraPose], path: Path) -> list[Path]:
+def write_nerfstudio(cameras: Sequence[Camera], poses: Sequence[Pose], path: Path) -> list[Path]:
     """Write the intrinsics of one camera, and no frames."""
     if len(cameras) != 1:
         raise InputError("transforms.json has one camera; write the cameras one by one")
@@ -385,7 +386,7 @@ def _opensfm_camera(name: str, value: foreign.Keys) -> Camera:
     return foreign.named_camera(name, (fx, fy, cx, cy), size, model, lens)
 
 
-def write_opensfm(cameras: Sequence[Camera], poses: Sequence[foreign.CameraPose], path: Path) -> list[Path]:
+def write_opensfm(cameras: Sequence[Camera], poses: Sequence[Pose], path: Path) -> list[Path]:
     """Write all cameras, by their names."""
     content: dict[str, Any] = {}
     for i, camera in enumerate(cameras):
@@ -448,7 +449,7 @@ def _qualisys_camera(part: Element, name: str) -> Camera:
     return foreign.named_camera(name, (fx, fy, *center), size, "opencv5", _attributes(part, "intrinsic", _LENS), skew)
 
 
-def _qualisys_pose(part: Element) -> foreign.CameraPose:
+def _qualisys_pose(part: Element) -> Pose:
     names = tuple(f"r{row}{column}" for row in "123" for column in "123")
     axes = np.array(_attributes(part, "transform", names)).reshape(3, 3)
     # From axes to the right, up and backwards to those to the right, down and ahead.

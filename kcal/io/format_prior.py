@@ -23,6 +23,7 @@ from kcal.io.format_photos import WRITTEN
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
+from kcal.lens.pose import Pose
 from kcal.lens.projection import parameter_names
 from kcal.lens.uncertainty import square_root_information
 from kcal.strict_formats import read_npz
@@ -132,7 +133,7 @@ def write_priors(program: str, priors: Sequence[dict[str, Any]], path: Path) -> 
 def prior_writer(program: str) -> Any:
     """A writer of cameras as `CameraFormat.write` is one, for programs without a file format of cameras."""
 
-    def write(cameras: Sequence[Camera], poses: Sequence[foreign.CameraPose], path: Path) -> list[Path]:
+    def write(cameras: Sequence[Camera], poses: Sequence[Pose], path: Path) -> list[Path]:
         return [write_priors(program, [prior_of(program, camera) for camera in cameras], path)]
 
     return write

@@ -23,7 +23,6 @@ from kcal.io import (
 from kcal.io.camera_file import load_camera
 from kcal.io.foreign import (
     MOST_BYTES,
-    CameraPose,
     Hints,
     ImportedCameras,
     camera_name,
@@ -35,6 +34,7 @@ from kcal.io.rig_file import load_pair
 from kcal.lens.camera import Camera
 from kcal.lens.camera_conversions import OPENCV_MODELS, size_doubt
 from kcal.lens.model import LensModel
+from kcal.lens.pose import Pose
 from kcal.strict_json import MOST_BYTES as MOST_JSON
 from kcal.strict_json import read_json
 
@@ -58,7 +58,7 @@ class CameraFormat:
     models: tuple[str, ...]
     read: Callable[[Path, Hints], ImportedCameras]
     suffixes: tuple[str, ...] = ()
-    write: Callable[[Sequence[Camera], Sequence[CameraPose], Path], list[Path]] | None = None
+    write: Callable[[Sequence[Camera], Sequence[Pose], Path], list[Path]] | None = None
     skew: bool = False
     pose: bool = True
     prior: bool = False

@@ -15,8 +15,6 @@ import torch
 
 from kcal.io.foreign import (
     BEFORE,
-    STILL,
-    CameraPose,
     Hints,
     ImportedCameras,
     Keys,
@@ -36,7 +34,7 @@ from kcal.io.foreign import (
 from kcal.io.format_kalibr import central_camera
 from kcal.lens.camera import Camera
 from kcal.lens.camera_conversions import OPENCV_MODELS, ImageTransform
-from kcal.lens.pose import rotation_from_vector
+from kcal.lens.pose import Pose, rotation_from_vector
 
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _COEFS = "(?:coef+s?|coef+icients?|param(?:eter)?s?|vec(?:tor)?)"
@@ -340,9 +338,7 @@ def _delivered(named: _Named, side: str, camera: Camera, notes: list[str]) -> Ca
     return cut.transformed(ImageTransform.resize(cut.size, (wide, high)))
 
 
-def _poses(
-    named: _Named, parts: Sequence[tuple[_Named, str]], hints: Hints, notes: list[str]
-) -> tuple[CameraPose, ...]:
+def _poses(named: _Named, parts: Sequence[tuple[_Named, str]], hints: Hints, notes: list[str]) -> tuple[Pose, ...]:
     """Of each camera, or of the second one of two from the first."""
     meters = hints.meters or 1.0
     each = [part.get("rotation", side) is not None and part.get("translation", side) is not None and part is not named
@@ -350,7 +346,7 @@ def _poses(
     if each and all(each):
         poses = [_pose_of_keys(part, side, meters) for part, side in parts]
     elif len(parts) in (0, 2) and named.get("rotation") is not None and named.get("translation") is not None:
-        poses = [STILL, _pose_of_keys(named, "", meters)]
+        poses = [Pose.still(), _pose_of_keys(named, "", meters)]
     else:
         if any(each):
             notes.append("some cameras have no rotation: no pose is read")
@@ -362,7 +358,7 @@ def _poses(
     return tuple(poses)
 
 
-def _pose_of_keys(named: _Named, side: str, meters: float) -> CameraPose:
+def _pose_of_keys(named: _Named, side: str, meters: float) -> Pose:
     turn = numbers(named.get("rotation", side), (3, 9), named.key("rotation", side))
     rotation = plain(rotation_from_vector(torch.tensor(turn, dtype=torch.float64))) if len(turn) == 3 else turn
     shift = numbers(named.get("translation", side), 3, named.key("translation", side))

@@ -5,7 +5,8 @@ A step is six numbers: a rotation vector ω (radians) and a translation v (meter
 
 from __future__ import annotations
 
-from typing import Any, Self
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
@@ -13,6 +14,54 @@ from torch import Tensor, nn
 from kcal.checks import Float64Module, as_tensor, require_finite
 from kcal.dispatch import is_differentiated
 from kcal.errors import InputError
+
+
+class Pose(NamedTuple):
+    """Rigid motions dst_from_src: `points_dst = rotation @ points_src + translation`.
+
+    All poses of kcal have this convention; their names say from which frame and into which, as `cam_from_board`.
+
+    Attributes:
+        rotation: (..., 3, 3).
+        translation: (..., 3) meters.
+
+    Example:
+        >>> there = Pose(torch.eye(3), torch.tensor([1.0, 0.0, 0.0]))
+        >>> there.after(there).translation.tolist(), there.center.tolist()
+        ([2.0, 0.0, 0.0], [-1.0, 0.0, 0.0])
+    """
+
+    rotation: Tensor
+    translation: Tensor
+
+    @classmethod
+    def still(cls) -> Pose:
+        """The motion that moves nothing."""
+        return cls(torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+
+    @classmethod
+    def at(cls, rotation: Tensor, center: Tensor) -> Pose:
+        """cam_from_world of a camera with this rotation whose projection center (..., 3) is known in the world."""
+        return cls(rotation, -(rotation @ center[..., None])[..., 0])
+
+    @property
+    def center(self) -> Tensor:
+        """(..., 3) the point that is moved to the origin: of cam_from_world, where the camera stands."""
+        return -(self.rotation.mT @ self.translation[..., None])[..., 0]
+
+    def after(self, other: Pose) -> Pose:
+        """This motion applied after another."""
+        return Pose(
+            self.rotation @ other.rotation, (self.rotation @ other.translation[..., None])[..., 0] + self.translation
+        )
+
+    def inverse(self) -> Pose:
+        """The motion back."""
+        return Pose(self.rotation.mT, self.center)
+
+    def some(self, chosen: int | slice | Sequence[int] | Tensor) -> Pose:
+        """Some of many motions."""
+        return Pose(self.rotation[chosen], self.translation[chosen])
 
 
 def rotation_from_vector(vector: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from torch import Tensor
 from kcal.checks import StatedModule, as_covariance, as_points, expanded, scalar
 from kcal.dispatch import is_differentiated, is_traced, known_true
 from kcal.errors import InputError
-from kcal.io.rig_file import load_pair
+from kcal.io.rig_file import load_rig
 from kcal.lens.pose import Movable, rotation_from_vector
 from kcal.lens.rig import (
     REFRACTION,
@@ -365,7 +365,7 @@ class Localizer(Operations, Movable, StatedModule):
         """Read a rig file; `options` are those of the class, and replace what the file says.
 
         Raises:
-            FileError: see `kcal.load_rig`; also a file of any other number of cameras than two.
+            FileError: see `kcal.load_rig`.
 
         Example:
             >>> import tempfile
@@ -378,7 +378,7 @@ class Localizer(Operations, Movable, StatedModule):
             >>> localize.origin
             Origin(lat=19.07, lon=72.87, height=14.0)
         """
-        return cls(load_pair(path), **options)
+        return cls(load_rig(path), **options)
 
     def apart(self, errors: int | None = None) -> Rig:
         """Two cameras as a rig whose frame is that of the positions, with all that is known of it as its `root`.

@@ -12,7 +12,7 @@ from torch import Tensor
 from kcal.checks import as_points
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.lens.pose import check_motion, rotation_from_vector
+from kcal.lens.pose import Pose, check_motion, rotation_from_vector
 from kcal.sim.raytrace import Misalignment, Prescription
 from kcal.sim.truth import TruthLens
 
@@ -64,7 +64,7 @@ def sample_board_poses(
     *,
     fill: tuple[float, float] = (0.4, 0.9),
     options: PoseOptions | None = None,
-) -> list[BoardPose]:
+) -> list[Pose]:
     """Choose poses to calibrate one camera: over the whole image, at several distances, tilted in all directions.
 
     Args:
@@ -160,7 +160,7 @@ def choose_poses(
     board: BoardLike,
     count: int,
     options: PoseOptions,
-) -> list[BoardPose]:
+) -> list[Pose]:
     """Choose drawn poses, far from each other, that all cameras (lens, rotation, translation) see completely."""
     points = board_points(board, options.border)
     columns = board.columns + 2 * options.border
@@ -181,7 +181,7 @@ def choose_poses(
     while len(chosen) < count:
         apart = torch.minimum(apart, torch.linalg.vector_norm(places - places[chosen[-1]], dim=-1))
         chosen.append(int(apart.argmax()))
-    return [BoardPose(rotation[i].clone(), translation[i].clone()) for i in chosen]
+    return [Pose(rotation[i].clone(), translation[i].clone()) for i in chosen]
 
 
 def _see(
@@ -401,13 +401,6 @@ class PrintedBoard:
         return torch.stack([x + 1.5e-3 * off[..., 0] + 2e-4 * off[..., 1], y, 0.7e-3 * (1.0 - across**2)], -1)
 
 
-class BoardPose(NamedTuple):
-    """cam_from_board: `points_cam = rotation @ points_board + translation`; (3, 3) and (3,) float64 meters."""
-
-    rotation: Tensor
-    translation: Tensor
-
-
 def check_board(board: BoardLike) -> None:
     """Raise `InputError` unless the board has at least 2 x 2 inner corners and squares of a positive size."""
     if board.columns < 2 or board.rows < 2 or not (board.square > 0 and math.isfinite(board.square)):
@@ -417,7 +410,7 @@ def check_board(board: BoardLike) -> None:
         )
 
 
-def check_pose(cam_from_board: tuple[Tensor, Tensor]) -> BoardPose:
+def check_pose(cam_from_board: tuple[Tensor, Tensor]) -> Pose:
     """Return the pose as float64.
 
     Raises:
@@ -426,7 +419,7 @@ def check_pose(cam_from_board: tuple[Tensor, Tensor]) -> BoardPose:
     rotation = as_points("cam_from_board rotation", cam_from_board[0], 3)
     translation = as_points("cam_from_board translation", cam_from_board[1], 3)
     check_motion("cam_from_board", rotation, translation)
-    return BoardPose(rotation, translation)
+    return Pose(rotation, translation)
 
 
 def board_points(board: BoardLike, border: int = 0) -> Tensor:
@@ -472,7 +465,7 @@ def project_board(camera: LensLike, cam_from_board: tuple[Tensor, Tensor], board
     Example:
         >>> from kcal import Camera
         >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480))
-        >>> pose = BoardPose(torch.eye(3), torch.tensor([0.0, 0.0, 2.0]))
+        >>> pose = Pose(torch.eye(3), torch.tensor([0.0, 0.0, 2.0]))
         >>> pixels, visible = project_board(camera, pose, BoardSize(9, 6, 0.05))
         >>> pixels[1].tolist(), bool(visible.all())
         ([339.5, 239.5], True)

@@ -15,9 +15,9 @@ from torch import Tensor
 from kcal.checks import as_points, require_finite
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
+from kcal.lens.pose import Pose
 from kcal.sim.captures import (
     BoardLike,
-    BoardPose,
     LensLike,
     PrintedBoard,
     TrueRig,
@@ -193,7 +193,7 @@ def render_board(
     Example:
         >>> from kcal.sim.captures import BoardSize
         >>> camera = Camera.build(focal=(400, 400), center=(159.5, 119.5), size=(320, 240))
-        >>> pose = BoardPose(torch.eye(3), torch.tensor([-0.2, -0.125, 1.0]))
+        >>> pose = Pose(torch.eye(3), torch.tensor([-0.2, -0.125, 1.0]))
         >>> image = render_board(camera, pose, BoardSize(9, 6, 0.05), RenderOptions(noise=0, vignetting=0))
         >>> image.shape, int(image[60, 70]), int(image[60, 90])
         (torch.Size([240, 320]), 40, 215)
@@ -221,7 +221,7 @@ def render_light(
     Example:
         >>> from kcal.sim.captures import BoardSize
         >>> camera = Camera.build(focal=(400, 400), center=(159.5, 119.5), size=(320, 240))
-        >>> pose = BoardPose(torch.eye(3), torch.tensor([-0.2, -0.125, 1.0]))
+        >>> pose = Pose(torch.eye(3), torch.tensor([-0.2, -0.125, 1.0]))
         >>> light = render_light(camera, pose, BoardSize(9, 6, 0.05), RenderOptions(vignetting=0))
         >>> [round(value, 6) for value in light[60, 78:82].tolist()]  # an edge half way between columns 79 and 80
         [44.244125, 84.751421, 170.248754, 210.755908]
@@ -252,9 +252,7 @@ def _in_light(options: RenderOptions) -> RenderOptions:
     return options if options.gamma == 1 else replace(options, **levels)
 
 
-def _light(
-    camera: LensLike, pose: BoardPose, board: BoardLike, window: PixelRectangle, options: RenderOptions
-) -> Tensor:
+def _light(camera: LensLike, pose: Pose, board: BoardLike, window: PixelRectangle, options: RenderOptions) -> Tensor:
     """The scene in gray levels, before the optics: (2 height, 2 width), four samples in each pixel of a window.
 
     Along x and y, a sample is the average over half a pixel, and of two such averages a quarter of a pixel apart: what
@@ -303,7 +301,7 @@ def _paint(
 
 
 def _board_coordinates(
-    camera: LensLike, pose: BoardPose, board: BoardLike, window: PixelRectangle, margin: int
+    camera: LensLike, pose: Pose, board: BoardLike, window: PixelRectangle, margin: int
 ) -> tuple[Tensor, Tensor]:
     """Find where each pixel's ray meets the board, x and y in squares; far away where it does not."""
     looks, valid = invert_window(camera, window)
@@ -356,7 +354,7 @@ def _linear(count: int, step: int) -> tuple[Tensor, Tensor]:
     return weights, nodes
 
 
-def _paper_window(camera: LensLike, pose: BoardPose, board: BoardLike, margin: int, radius: int) -> PixelRectangle:
+def _paper_window(camera: LensLike, pose: Pose, board: BoardLike, margin: int, radius: int) -> PixelRectangle:
     """Bound the part of the image that the paper and its blur reach; the whole image where that is uncertain."""
     outline = _outline(board, 1 + margin) @ pose.rotation.T + pose.translation
     if bool((outline[:, 2] <= 0).any()):
@@ -479,7 +477,7 @@ class DemoView(NamedTuple):
     name: str
     image: Tensor
     corners: Tensor
-    cam_from_board: BoardPose
+    cam_from_board: Pose
 
 
 @functools.cache
@@ -669,7 +667,7 @@ def render_demo(scene: DemoScene, progress: Callable[[str], None] | None = None)
         yield DemoView(side, name, image, corners, pose)
 
 
-def scene_views(scene: DemoScene) -> Iterator[tuple[Literal["left", "right"], str, BoardPose]]:
+def scene_views(scene: DemoScene) -> Iterator[tuple[Literal["left", "right"], str, Pose]]:
     """Camera, name and pose of each view of the board."""
     sides: tuple[Literal["left", "right"], ...] = ("left", "right")
     for stream, side in enumerate(sides):

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcal.corners.board import Board
-from kcal.sim.captures import BoardPose
+from kcal.lens.pose import Pose
 from scripts.bench.hard_scenes import SIZE, Light, Scene
 
 BOARD = Board(columns=9, rows=6, square=0.025)
@@ -192,7 +192,7 @@ def cut(generator: torch.Generator, scene: Scene = CHECKERS) -> Picture:
         inside = ((truth > 0) & (truth < limit)).all(-1)
         if float((~inside).double().mean()) >= lost:
             break
-        pose = BoardPose(pose.rotation, pose.translation + step)
+        pose = Pose(pose.rotation, pose.translation + step)
     light = scene.light(pose)
     return Picture(_sensor(light, generator), torch.where(inside[:, None], truth, math.nan))
 

@@ -10,9 +10,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kcal.lens.pose import Pose
 from kcal import Board, Camera
 from kcal.corners.print_board import pattern_shapes
-from kcal.sim.captures import BoardPose, BoardSize, PoseOptions, sample_board_poses
+from kcal.sim.captures import BoardSize, PoseOptions, sample_board_poses
 from kcal.sim.scene import RenderOptions, render_light
 from scripts.shared.printed_board import Paper, light_of, points_of, through_lens
 
@@ -52,18 +53,16 @@ class Scene:
         self.board, self.lens = board, camera(size)
         self.extent = BoardSize(board.columns, board.rows, board.square)
 
-    def pose(
-        self, generator: torch.Generator, fill: tuple[float, float] = (0.45, 0.85), tilt: float = 40.0
-    ) -> BoardPose:
+    def pose(self, generator: torch.Generator, fill: tuple[float, float] = (0.45, 0.85), tilt: float = 40.0) -> Pose:
         """Draw a pose of the whole board."""
         options = PoseOptions(max_tilt=math.radians(tilt))
         return sample_board_poses(self.lens, self.extent, 1, generator, fill=fill, options=options)[0]
 
-    def places(self, pose: BoardPose) -> Tensor:
+    def places(self, pose: Pose) -> Tensor:
         """The true corners, inside the image and outside."""
         return points_of(self.board, self.lens, *pose)
 
-    def light(self, pose: BoardPose, **look: float) -> Light:
+    def light(self, pose: Pose, **look: float) -> Light:
         """Gray levels before the sensor; `look` changes `RenderOptions`."""
         return render_light(self.lens, pose, self.extent, _look(look)).numpy()
 
@@ -104,14 +103,12 @@ class Marked(Scene):
         x, y = (0.001 * place - self.extent.square for place in shapes.origin)
         self._origin = torch.tensor([x, y, 0.0], dtype=torch.float64)
 
-    def pose(
-        self, generator: torch.Generator, fill: tuple[float, float] = (0.45, 0.85), tilt: float = 40.0
-    ) -> BoardPose:
+    def pose(self, generator: torch.Generator, fill: tuple[float, float] = (0.45, 0.85), tilt: float = 40.0) -> Pose:
         """Draw a pose of the whole board."""
         rotation, translation = super().pose(generator, fill, tilt)
-        return BoardPose(rotation, translation + rotation @ self._origin)
+        return Pose(rotation, translation + rotation @ self._origin)
 
-    def light(self, pose: BoardPose, **look: float) -> Light:
+    def light(self, pose: Pose, **look: float) -> Light:
         """Gray levels before the sensor; `look` changes `RenderOptions`."""
         options = _look(look)
         black, white, wall = (

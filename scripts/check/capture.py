@@ -27,12 +27,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kcal.lens.pose import Pose
 from kcal import Board, Camera, Observations, View, calibrate_camera
 from kcal.calibrate.camera.advice import NextView, far_sigma
 from kcal.capture.session import CaptureOptions, CaptureSession
 from kcal.corners.detect import detect_board, view_of
 from kcal.lens import rotation_from_vector
-from kcal.sim.captures import BoardPose, BoardSize, sample_board_poses
+from kcal.sim.captures import BoardSize, sample_board_poses
 from kcal.sim.scene import RenderOptions, render_board
 from scripts.shared.page import table, tell
 
@@ -54,7 +55,7 @@ def lens(seed: int) -> Camera:
     )
 
 
-def held(wanted: NextView, generator: torch.Generator) -> BoardPose:
+def held(wanted: NextView, generator: torch.Generator) -> Pose:
     """The view as a person holds the board."""
     u = torch.randn(6, generator=generator, dtype=torch.float64)
     turn = rotation_from_vector(torch.tensor([TILT, TILT, ROLL], dtype=torch.float64) * u[:3])
@@ -63,7 +64,7 @@ def held(wanted: NextView, generator: torch.Generator) -> BoardPose:
     distance = float(center.norm())
     center = center * (1.0 + ALONG * float(u[3])) + ACROSS * distance * torch.cat([u[4:], u.new_zeros(1)])
     rotation = turn @ wanted.rotation
-    return BoardPose(rotation, center - rotation @ middle)
+    return Pose(rotation, center - rotation @ middle)
 
 
 def true_error(found: Camera, truth: Camera) -> float:
@@ -86,7 +87,7 @@ def at_random(truth: Camera, seed: int) -> tuple[float, float]:
     return far_sigma(camera), true_error(camera, truth)
 
 
-def frame(truth: Camera, pose: BoardPose, generator: torch.Generator) -> np.ndarray[Any, np.dtype[np.uint8]]:
+def frame(truth: Camera, pose: Pose, generator: torch.Generator) -> np.ndarray[Any, np.dtype[np.uint8]]:
     """A rendered frame."""
     return np.asarray(render_board(truth, pose, PRINT, RenderOptions(), generator).numpy(), np.uint8)
 
@@ -115,7 +116,7 @@ def guided(truth: Camera, goal: float, seed: int) -> list[dict[str, float]]:
     return out
 
 
-def seen_whole(truth: Camera, pose: BoardPose) -> bool:
+def seen_whole(truth: Camera, pose: Pose) -> bool:
     """All corners are inside the image, with a margin for the outer squares."""
     pixels, valid = truth.project(BOARD.points @ pose.rotation.T + pose.translation)
     inside: Tensor = (pixels > 25) & (pixels < torch.tensor(SIZE) - 26)

@@ -19,9 +19,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from kcal.lens.pose import Pose
 from kcal import Board, Camera, KcalError, Observations, RigOptions, calibrate_rig
 from kcal.lens import rotation_from_vector, vector_from_rotation
-from kcal.sim.captures import BoardPose, BoardSize, sample_board_poses
+from kcal.sim.captures import BoardSize, sample_board_poses
 from scripts.shared.moving_captures import Hands, MovingCapture, moving_capture
 from scripts.shared.page import table, tell
 from scripts.shared.records import Record, finish, read, seeds
@@ -41,7 +42,7 @@ def captured(held_by: str, seed: int, fit: str) -> Record:
     """One rig."""
     generator = torch.Generator().manual_seed(seed)
     poses = sample_board_poses(CAMERA, SIZE, BOARDS, generator, fill=(0.25, 0.5))
-    right = [BoardPose(TURN @ pose.rotation, TURN @ pose.translation + SHIFT) for pose in poses]
+    right = [Pose(TURN @ pose.rotation, TURN @ pose.translation + SHIFT) for pose in poses]
     hands = Hands() if held_by == "hand" else None
     sides = [
         moving_capture(CAMERA, own, sigma=SIGMA, seed=2 * seed + k, hands=hands, board=SIZE)

@@ -10,9 +10,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from kcal.lens.pose import Pose
 from kcal import Board, CalibrationOptions, Observations, View
 from kcal.lens import rotation_from_vector
-from kcal.sim.captures import BoardPose, PoseOptions, TrueRig, drawn_lens, drawn_rig, sample_board_poses
+from kcal.sim.captures import PoseOptions, TrueRig, drawn_lens, drawn_rig, sample_board_poses
 from kcal.sim.truth import TruthLens
 from scripts.shared.pair_poses import sample_pair_poses
 from scripts.shared.prescriptions import PRESCRIPTIONS
@@ -146,14 +147,14 @@ def drawn(kind: str, seed: int) -> Planted | PlantedPair:
     return Planted(lens=lens, observations=observed(pixels, lens.size, stated, names), options=options, detail=detail)
 
 
-def _parallel(pose: BoardPose, tilt: float, generator: torch.Generator) -> BoardPose:
+def _parallel(pose: Pose, tilt: float, generator: torch.Generator) -> Pose:
     """The board at its place, parallel to the image up to a tilt, rolled at random."""
     turn, towards = (math.pi * (2.0 * torch.rand(2, dtype=torch.float64, generator=generator) - 1.0)).tolist()
     axis = torch.tensor([tilt * math.cos(towards), tilt * math.sin(towards), 0.0], dtype=torch.float64)
     roll = torch.tensor([0.0, 0.0, 0.5 * turn], dtype=torch.float64)
     rotation = rotation_from_vector(axis) @ rotation_from_vector(roll)
     middle = BOARD.points.mean(0)
-    return BoardPose(rotation, pose.rotation @ middle + pose.translation - rotation @ middle)
+    return Pose(rotation, pose.rotation @ middle + pose.translation - rotation @ middle)
 
 
 def _bent(points: Tensor, height: float, angle: float) -> Tensor:

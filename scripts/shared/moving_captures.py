@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.lens.pose import rotation_from_vector
-from kcal.sim.captures import BoardLike, BoardPose, LensLike, true_corners
+from kcal.lens.pose import Pose, rotation_from_vector
+from kcal.sim.captures import BoardLike, LensLike, true_corners
 from scripts.shared.captures import PAPER_BOARD
 
 # Width of an edge in a sharp image, pixels (standard deviation). Where motion of length L widens it to s, an edge is
@@ -133,7 +133,7 @@ class MovingCapture(NamedTuple):
 
 def moving_capture(
     lens: LensLike,
-    poses: Sequence[BoardPose],
+    poses: Sequence[Pose],
     *,
     sigma: float,
     seed: int,
@@ -158,7 +158,7 @@ def moving_capture(
     Example:
         >>> from kcal import Camera
         >>> lens = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480))
-        >>> pose = BoardPose(torch.eye(3, dtype=torch.float64), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+        >>> pose = Pose(torch.eye(3, dtype=torch.float64), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
         >>> still, moving = (moving_capture(lens, [pose], sigma=0.1, seed=3, hands=hands) for hands in (None, Hands()))
         >>> bool((moving.true_pixels - still.true_pixels).norm(dim=-1).max() > 0.1)
         True

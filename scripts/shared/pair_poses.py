@@ -5,8 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from kcal.lens.pose import Pose
 from kcal.lens.rig import Rig
-from kcal.sim.captures import BoardLike, BoardPose, PoseOptions, TrueRig, check_draws, choose_poses, draw_poses
+from kcal.sim.captures import BoardLike, PoseOptions, TrueRig, check_draws, choose_poses, draw_poses
 
 
 def sample_pair_poses(
@@ -17,7 +18,7 @@ def sample_pair_poses(
     *,
     distance: tuple[float, float],
     options: PoseOptions | None = None,
-) -> list[BoardPose]:
+) -> list[Pose]:
     """Choose poses that both cameras of a rig see completely, tilted against the line from the rig's middle.
 
     Args:
@@ -53,7 +54,7 @@ def sample_pair_poses(
     return choose_poses(drawn, [(rig.left, *still), (rig.right, rotation, translation)], board, count, options)
 
 
-def rig_pose(rig: Rig | TrueRig, left_from_board: tuple[Tensor, Tensor]) -> BoardPose:
+def rig_pose(rig: Rig | TrueRig, left_from_board: tuple[Tensor, Tensor]) -> Pose:
     """Convert left_from_board to right_from_board."""
     rotation, translation = left_from_board
-    return BoardPose(rig.right_from_left_rotation @ rotation, rig.right_from_left(translation))
+    return Pose(rig.right_from_left_rotation @ rotation, rig.right_from_left(translation))

@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from kcal.lens.pose import Pose
 from kcal import Camera, Rig
-from kcal.io.foreign import CameraPose, rig_poses
+from kcal.io.foreign import rig_poses
 from kcal.io.formats import FORMATS, import_cameras
 from kcal.lens import LensModel, rotation_from_vector
 
@@ -73,7 +74,7 @@ def test_a_pair(name: str, tmp_path: Path) -> None:
     cameras = [one for part in found for one in part.cameras]
     for got, wanted in zip(cameras, (rig.left, rig.right), strict=True):
         same(got, wanted)
-    poses: list[CameraPose] = [pose for part in found for pose in part.poses]
+    poses: list[Pose] = [pose for part in found for pose in part.poses]
     assert len(poses) == 2
     rotation = poses[1].rotation @ poses[0].rotation.T
     torch.testing.assert_close(rotation, rig.right_from_left_rotation, rtol=0, atol=1e-9)

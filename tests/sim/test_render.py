@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 
+from kcal.lens.pose import Pose
 from kcal import Board, Camera, InputError
 from kcal.lens import rotation_from_vector
 from kcal.sim import coast
 from kcal.sim.captures import (
-    BoardPose,
     BoardSize,
     PrintedBoard,
     area_colors,
@@ -46,7 +46,7 @@ def camera_of(coefficients=(), size=(1280, 720), focal=1067.0, model="opencv12")
 def pose_of(vector, middle, board=BOARD):
     rotation = rotation_from_vector(torch.tensor(vector, dtype=torch.float64))
     points = board_points(board)
-    return BoardPose(rotation, torch.tensor(middle, dtype=torch.float64) - rotation @ points.mean(0))
+    return Pose(rotation, torch.tensor(middle, dtype=torch.float64) - rotation @ points.mean(0))
 
 
 POSES = {
@@ -388,7 +388,7 @@ def test_area_averages_are_integrals():
 
 def test_visible_is_valid_and_inside():
     camera = Camera.build(focal=(800, 800), center=(319.0, 239.5), size=(640, 480))
-    pose = BoardPose(torch.eye(3), torch.tensor([0.0, 0.0, 1.0]))
+    pose = Pose(torch.eye(3), torch.tensor([0.0, 0.0, 1.0]))
     pixels, visible = project_board(camera, pose, BoardSize(9, 2, 0.1))
     assert pixels[:, 0].tolist() == pytest.approx([319.0 + 80 * i for i in range(9)] * 2)
     assert visible.tolist() == ([True] * 5 + [False] * 4) * 2  # the fifth lies half a pixel inside the edge at 639.5
@@ -530,4 +530,4 @@ def test_bad_values_are_refused() -> None:
     with pytest.raises(InputError, match="sigma"):
         moving_capture(PINHOLE, MOVING_POSES, sigma=-0.1, seed=1)
     with pytest.raises(InputError, match="0 poses"):
-        moving_capture(PINHOLE, list[BoardPose](), sigma=0.1, seed=1)
+        moving_capture(PINHOLE, list[Pose](), sigma=0.1, seed=1)

@@ -17,7 +17,7 @@ from torch import Tensor
 from kcal.calibrate.problem.parameters import CoefficientPrior
 from kcal.errors import DegenerateError, InputError
 from kcal.files import write_atomic
-from kcal.io.foreign import CameraPose, camera_name, paths_for, plain, rig_poses
+from kcal.io.foreign import camera_name, paths_for, plain, rig_poses
 from kcal.io.format_kalibr import NAME as OMNI
 from kcal.io.format_kalibr import fit_omni, project_omni, write_omni
 from kcal.io.format_mrcal import fit_spline, project_spline, write_model, write_mrcal
@@ -28,6 +28,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.difference import PixelShift
 from kcal.lens.images import undistort_maps
 from kcal.lens.model import LensModel
+from kcal.lens.pose import Pose
 from kcal.lens.projection import INTRINSICS, parameter_names, project_components
 from kcal.lens.rig import Rig
 from kcal.lens.uncertainty import carried_covariance
@@ -236,7 +237,7 @@ def export_cameras(
         ('colmap', ('opencv4',), (None,), ())
     """
     path = Path(path)
-    poses: tuple[CameraPose, ...] = ()
+    poses: tuple[Pose, ...] = ()
     rig = None
     if isinstance(cameras, Rig):
         rig, several, poses = cameras, cameras.each, rig_poses(cameras)
@@ -431,7 +432,7 @@ def _richest(models: Sequence[str]) -> list[LensModel]:
 def _write_splines(
     cameras: Sequence[Camera],
     exact: Sequence[Camera | None],
-    poses: Sequence[CameraPose],
+    poses: Sequence[Pose],
     path: Path,
     lost: tuple[str, ...],
 ) -> ExportedCameras:

@@ -64,8 +64,6 @@ def apply_twist(rotation: Tensor, translation: Tensor, step: Tensor) -> tuple[Te
     return moved[..., :3], moved[..., 3] + screwed
 
 
-# What a camera shows of boards at a state: pixels, errors, and derivatives of the corners by all unknowns.
-#
 # Of a hybrid lens there may be hundreds of derivatives. They are written where they belong, each once, and what the
 # cost of a trial step needed of them is kept for the linearization that follows.
 
@@ -75,11 +73,82 @@ ALL = slice(None)
 POSE, TURN = 6, 3
 
 
-class BoardImages:
-    """Corners of boards in the views of one camera; see `BoardProblem`.
+# Numbers in the rows of derivatives that are formed at a time: with fewer, default cameras took longer (measured).
+_CHUNK = 600_000
+
+
+def _shown_corners(seen: Tensor) -> Tensor | None:
+    """(V, K) numbers of the corners that each view shows, then of others; None where most are seen, or in batches."""
+    if seen.ndim > 2 or 2 * int(seen.sum()) > seen.numel():
+        return None
+    return (~seen).byte().argsort(dim=-1, stable=True)[:, : max(1, int(seen.sum(-1).max()))]
+
+
+def _of_views(values: Tensor, views: slice) -> Tensor:
+    """Some of values (V, ...) by view; all of values (1, ...) that all views share."""
+    return values if len(values) == 1 else values[views]
+
+
+class _Placed(NamedTuple):
+    """The board (..., 3, K) in its frame; in each view rotated, and in the camera's frame; turns while it is read."""
+
+    flat: Tensor
+    rotated: Tensor
+    points: Tensor
+    turn: Tensor | None
+
+    def of(self, views: slice) -> _Placed:
+        """The same of some of all views of one camera."""
+        turn = None if self.turn is None else self.turn[views]
+        return _Placed(_of_views(self.flat, views), self.rotated[views], self.points[views], turn)
+
+
+class _Imaged(NamedTuple):
+    """Boards in some views as the camera shows them: placed, projected, and cam_from_board (..., V, 3, 3)."""
+
+    placed: _Placed
+    seen: Projection
+    rotation: Tensor
+    views: slice
+
+    def of(self, views: slice) -> _Imaged:
+        """The same of some of all views of one camera."""
+        if views == ALL:
+            return self
+        return _Imaged(self.placed.of(views), self.seen.of(views), self.rotation[views], views)
+
+
+# Least squares of one camera and the boards that it sees, for every lens alike (Eq. 5 and 7 of the paper).
+#
+# Shared unknowns: the camera's free parameters (`FreeParameters`; tied ones share one), then the amplitudes of the
+# board's modes. A `Gaussian` of them has the names (LENS_SLOT, 0), ... and (BOARD_SLOT, 0), ... in that order, without
+# those that are held. Local unknowns are eliminated view by view: the pose of the board, of which only the rotation is
+# unknown where points are infinitely far, and its motion while the image is read (`kcal.calibrate.problem.state`).
+# Terms are residuals of the shared unknowns alone: priors, barriers, what other data say.
+
+
+class BoardProblem(SchurProblem[BoardState]):
+    """Reprojection residuals (pixels) of one camera's views of a board, for `kcal.solve.lm.minimize`.
 
     Where views show few of the board's N corners, work is done on K corners of each view: those that it shows come
     first, and K is the largest number of them. Otherwise K = N.
+
+    Args:
+        board_points: (N, 3) meters, or (V, N, 3) where each view shows points of its own.
+        pixels: (..., V, N, 2) observed corners; NaN where not seen. Leading dimensions broadcast with `batch`.
+        model: the lens model.
+        free: indices of the camera's free parameters, or which of them are tied.
+        shapes: (B, 3, N) displacements of the corners by the board's modes, meters; None: the two parabolas of a warp.
+        free_board: whether the amplitudes of these modes are estimated.
+        held: (S,) unknowns that keep their values all the same; None: none does.
+        weights: (..., V, N) or (..., V, N, 2, 2) by which each corner's residual is multiplied; 0 leaves it out. None:
+            all corners count alike.
+        loss: of the length of each corner's residual (after weighting), or None for plain least squares.
+        terms: priors and barriers on the camera's parameters and the board's amplitudes, as further residuals.
+        readout: how views move while they are read, and how the board bends in them; None: neither.
+        stillness: (M,) or (V, M) the squared noise over the variance of each of these numbers.
+        batch: leading shape of the states, () for one solve.
+        turning: the points are so far away that views differ by their rotations alone; translations are held.
 
     Attributes:
         weights: (..., V, K) or (..., V, 2, 2, K).
@@ -87,6 +156,23 @@ class BoardImages:
         local_size: unknowns of each view: of its pose, and of its motion.
         unknown_count: of camera and board, those that are held among them.
         joint: whether a linearization costs little more than the cost alone: with hundreds of columns it costs more.
+        moving: (M,) numbers of the unknowns that are not held.
+        slots: (5 + P + B,) for each of `values` its place among these; -1 where it has none.
+
+    Example:
+        >>> from kcal import Camera
+        >>> from kcal.lens import rotation_from_vector
+        >>> from kcal.solve.lm import minimize
+        >>> camera = Camera.build(focal=(800, 805), center=(322, 238), size=(640, 480), model="pinhole")
+        >>> board = 0.05 * torch.cartesian_prod(torch.arange(6.0), torch.arange(5.0), torch.zeros(1)).double()
+        >>> tilts = torch.tensor([[0.5, 0.0, 0.0], [-0.5, 0.1, 0.0], [0.0, 0.5, 0.2]], dtype=torch.float64)
+        >>> rotation, translation = rotation_from_vector(tilts), torch.tensor([[-0.1, -0.1, 0.6]] * 3).double()
+        >>> pixels, _ = camera.project(board @ rotation.mT + translation[:, None])
+        >>> problem = BoardProblem(board, pixels, camera.model, free=[0, 1, 2, 3])  # fx, fy, cx, cy
+        >>> guess = torch.tensor([700.0, 700.0, 320.0, 240.0, 0.0], dtype=torch.float64)
+        >>> result = minimize(problem, BoardState.flat(guess, rotation, translation))
+        >>> [round(float(value), 6) for value in result.state.parameters[:4]], bool(result.converged)
+        ([800.0, 805.0, 322.0, 238.0], True)
     """
 
     def __init__(
@@ -94,14 +180,18 @@ class BoardImages:
         board_points: Tensor,
         pixels: Tensor,
         model: LensModel,
-        free: Sequence[int] | FreeParameters,
-        shapes: Tensor | None,
-        free_board: bool,
-        weights: Tensor | None,
-        loss: RobustLoss | None,
-        readout: Readout | None,
-        batch: tuple[int, ...],
-        turning: bool,
+        free: Sequence[int] | FreeParameters = (),
+        *,
+        shapes: Tensor | None = None,
+        free_board: bool = False,
+        held: Tensor | None = None,
+        weights: Tensor | None = None,
+        loss: RobustLoss | None = None,
+        terms: Sequence[Term] = (),
+        readout: Readout | None = None,
+        stillness: Tensor | None = None,
+        batch: tuple[int, ...] = (),
+        turning: bool = False,
     ) -> None:
         self.model, self.loss, self.batch = model, loss, batch
         self.free, self.free_board = FreeParameters.of(free), free_board
@@ -130,6 +220,15 @@ class BoardImages:
         first = len(INTRINSICS) + len(LEADING)
         self._leading = [index for index in self.free.indices if index < first]
         self._field = self._field_slots(first, weights) if model.hybrid and not batch else None
+        self.terms = tuple(terms)
+        self.residual_count = 2 * int(self._seen.sum((-2, -1)).max())
+        if readout is not None:
+            self._still = torch.zeros(readout.numbers, dtype=pixels.dtype) if stillness is None else stillness
+        self.moving = torch.arange(self.unknown_count) if held is None else (~held).nonzero()[:, 0]
+        self.shared_size = len(self.moving)
+        self._all_move = self.shared_size == self.unknown_count
+        self._kept: list[tuple[BoardState, Products]] = []
+        self.slots = self._places(model.size)
 
     def shown(self, values: Tensor) -> Tensor:
         """(..., V, K, ...) of values (..., V, N, ...) of all corners, in the order in which work is done."""
@@ -323,129 +422,6 @@ class BoardImages:
         if self.weights is not None:
             scale = scale * self.weights[views, None]
         fill_field_columns(shared[:, self._field].transpose(0, 1), x, y, scale, self.model.hybrid)
-
-
-def _shown_corners(seen: Tensor) -> Tensor | None:
-    """(V, K) numbers of the corners that each view shows, then of others; None where most are seen, or in batches."""
-    if seen.ndim > 2 or 2 * int(seen.sum()) > seen.numel():
-        return None
-    return (~seen).byte().argsort(dim=-1, stable=True)[:, : max(1, int(seen.sum(-1).max()))]
-
-
-def _of_views(values: Tensor, views: slice) -> Tensor:
-    """Some of values (V, ...) by view; all of values (1, ...) that all views share."""
-    return values if len(values) == 1 else values[views]
-
-
-class _Placed(NamedTuple):
-    """The board (..., 3, K) in its frame; in each view rotated, and in the camera's frame; turns while it is read."""
-
-    flat: Tensor
-    rotated: Tensor
-    points: Tensor
-    turn: Tensor | None
-
-    def of(self, views: slice) -> _Placed:
-        """The same of some of all views of one camera."""
-        turn = None if self.turn is None else self.turn[views]
-        return _Placed(_of_views(self.flat, views), self.rotated[views], self.points[views], turn)
-
-
-class _Imaged(NamedTuple):
-    """Boards in some views as the camera shows them: placed, projected, and cam_from_board (..., V, 3, 3)."""
-
-    placed: _Placed
-    seen: Projection
-    rotation: Tensor
-    views: slice
-
-    def of(self, views: slice) -> _Imaged:
-        """The same of some of all views of one camera."""
-        if views == ALL:
-            return self
-        return _Imaged(self.placed.of(views), self.seen.of(views), self.rotation[views], views)
-
-
-# Least squares of one camera and the boards that it sees, for every lens alike (Eq. 5 and 7 of the paper).
-#
-# Shared unknowns: the camera's free parameters (`FreeParameters`; tied ones share one), then the amplitudes of the
-# board's modes. A `Gaussian` of them has the names (LENS_SLOT, 0), ... and (BOARD_SLOT, 0), ... in that order, without
-# those that are held. Local unknowns are eliminated view by view: the pose of the board, of which only the rotation is
-# unknown where points are infinitely far, and its motion while the image is read (`kcal.calibrate.problem.state`).
-# Terms are residuals of the shared unknowns alone: priors, barriers, what other data say.
-
-# Numbers in the rows of derivatives that are formed at a time: with fewer, default cameras took longer (measured).
-_CHUNK = 600_000
-
-
-class BoardProblem(BoardImages, SchurProblem[BoardState]):
-    """Reprojection residuals (pixels) of one camera's views of a board, for `kcal.solve.lm.minimize`.
-
-    Args:
-        board_points: (N, 3) meters, or (V, N, 3) where each view shows points of its own.
-        pixels: (..., V, N, 2) observed corners; NaN where not seen. Leading dimensions broadcast with `batch`.
-        model: the lens model.
-        free: indices of the camera's free parameters, or which of them are tied.
-        shapes: (B, 3, N) displacements of the corners by the board's modes, meters; None: the two parabolas of a warp.
-        free_board: whether the amplitudes of these modes are estimated.
-        held: (S,) unknowns that keep their values all the same; None: none does.
-        weights: (..., V, N) or (..., V, N, 2, 2) by which each corner's residual is multiplied; 0 leaves it out. None:
-            all corners count alike.
-        loss: of the length of each corner's residual (after weighting), or None for plain least squares.
-        terms: priors and barriers on the camera's parameters and the board's amplitudes, as further residuals.
-        readout: how views move while they are read, and how the board bends in them; None: neither.
-        stillness: (M,) or (V, M) the squared noise over the variance of each of these numbers.
-        batch: leading shape of the states, () for one solve.
-        turning: the points are so far away that views differ by their rotations alone; translations are held.
-
-    Attributes:
-        moving: (M,) numbers of the unknowns that are not held.
-        slots: (5 + P + B,) for each of `values` its place among these; -1 where it has none.
-
-    Example:
-        >>> from kcal import Camera
-        >>> from kcal.lens import rotation_from_vector
-        >>> from kcal.solve.lm import minimize
-        >>> camera = Camera.build(focal=(800, 805), center=(322, 238), size=(640, 480), model="pinhole")
-        >>> board = 0.05 * torch.cartesian_prod(torch.arange(6.0), torch.arange(5.0), torch.zeros(1)).double()
-        >>> tilts = torch.tensor([[0.5, 0.0, 0.0], [-0.5, 0.1, 0.0], [0.0, 0.5, 0.2]], dtype=torch.float64)
-        >>> rotation, translation = rotation_from_vector(tilts), torch.tensor([[-0.1, -0.1, 0.6]] * 3).double()
-        >>> pixels, _ = camera.project(board @ rotation.mT + translation[:, None])
-        >>> problem = BoardProblem(board, pixels, camera.model, free=[0, 1, 2, 3])  # fx, fy, cx, cy
-        >>> guess = torch.tensor([700.0, 700.0, 320.0, 240.0, 0.0], dtype=torch.float64)
-        >>> result = minimize(problem, BoardState.flat(guess, rotation, translation))
-        >>> [round(float(value), 6) for value in result.state.parameters[:4]], bool(result.converged)
-        ([800.0, 805.0, 322.0, 238.0], True)
-    """
-
-    def __init__(
-        self,
-        board_points: Tensor,
-        pixels: Tensor,
-        model: LensModel,
-        free: Sequence[int] | FreeParameters = (),
-        *,
-        shapes: Tensor | None = None,
-        free_board: bool = False,
-        held: Tensor | None = None,
-        weights: Tensor | None = None,
-        loss: RobustLoss | None = None,
-        terms: Sequence[Term] = (),
-        readout: Readout | None = None,
-        stillness: Tensor | None = None,
-        batch: tuple[int, ...] = (),
-        turning: bool = False,
-    ) -> None:
-        super().__init__(board_points, pixels, model, free, shapes, free_board, weights, loss, readout, batch, turning)
-        self.terms = tuple(terms)
-        self.residual_count = 2 * int(self._seen.sum((-2, -1)).max())
-        if readout is not None:
-            self._still = torch.zeros(readout.numbers, dtype=pixels.dtype) if stillness is None else stillness
-        self.moving = torch.arange(self.unknown_count) if held is None else (~held).nonzero()[:, 0]
-        self.shared_size = len(self.moving)
-        self._all_move = self.shared_size == self.unknown_count
-        self._kept: list[tuple[BoardState, Products]] = []
-        self.slots = self._places(model.size)
 
     def _places(self, coefficients: int) -> Tensor:
         """(5 + P + B,) the place of each of `values` among the unknowns of a step; -1 where it has none."""

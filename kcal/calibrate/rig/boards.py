@@ -34,6 +34,7 @@ from kcal.checks import chi2_quantile
 from kcal.corners.board import Board
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
+from kcal.lens.pose import Pose
 from kcal.lens.projection import project_components
 from kcal.solve.lm import LMOptions
 from kcal.texts import brief
@@ -197,9 +198,9 @@ class Boards(ItemSource):
         return rotation @ self.points.mean(0) + translation
 
 
-def board_pose(items: Tensor) -> tuple[Tensor, Tensor]:
-    """world_from_board of items (V, 12): rotation (V, 3, 3) and translation (V, 3) meters."""
-    return items[:, :9].unflatten(1, (3, 3)), items[:, 9:12]
+def board_pose(items: Tensor) -> Pose:
+    """world_from_board (V) of items (V, 12)."""
+    return Pose(items[:, :9].unflatten(1, (3, 3)), items[:, 9:12])
 
 
 class BoardBlock(Block):

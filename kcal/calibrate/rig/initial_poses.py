@@ -10,11 +10,12 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.rig.boards import Boards
-from kcal.calibrate.rig.pairs import Poses, SeenAlone, check_cameras, half_turn, pose_alone, refuse_wrong_pairs
+from kcal.calibrate.rig.pairs import SeenAlone, check_cameras, half_turn, pose_alone, refuse_wrong_pairs
 from kcal.calibrate.rig.resection import consensus_rotation, distinct_poses
 from kcal.calibrate.rig.source import Start, as_items
 from kcal.calibrate.rig.sources import RigData
 from kcal.errors import DegenerateError
+from kcal.lens.pose import Pose
 from kcal.lens.turning import rotation_between
 from kcal.solve.lm import LMOptions
 
@@ -54,7 +55,7 @@ class InitialPoses:
 
 
 # The cameras whose poses (cam_from_world) were found so far.
-_Known = dict[int, Poses]
+_Known = dict[int, Pose]
 
 
 def first_poses(data: RigData, solver: LMOptions) -> InitialPoses:
@@ -66,13 +67,13 @@ def first_poses(data: RigData, solver: LMOptions) -> InitialPoses:
     places, known = {p.camera: p.point for p in reversed(data.positions)}, _Known()
     # Where several sources tell a pose, the first of them counts.
     for source in reversed(data.sources):
-        known |= {c: Poses.at(*pose) for c, pose in source.poses(data.cameras, places).items()}
+        known |= source.poses(data.cameras, places)
     views = _BoardViews(data, solver)
     placed = bool(known)
     starts = None if placed else _level_starts(data)
     if starts is None:
         if not placed:
-            known[0] = _at_origin()
+            known[0] = Pose.still()
         tried: list[int] = []
         while waiting := [c for c in range(len(data.cameras)) if c not in known]:
             if views.link(known, waiting):
@@ -91,10 +92,6 @@ def first_poses(data: RigData, solver: LMOptions) -> InitialPoses:
     return InitialPoses(data=views.data, starts=starts, flipped=views.flipped, foreign=views.foreign)
 
 
-def _at_origin() -> Poses:
-    return Poses(torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
-
-
 def _stacked(known: _Known) -> tuple[Tensor, Tensor]:
     poses = [known[c] for c in sorted(known)]
     return torch.stack([pose.rotation for pose in poses]), torch.stack([pose.center for pose in poses])
@@ -105,7 +102,7 @@ def _level_starts(data: RigData) -> list[Start] | None:
     places = {p.camera: p.point for p in reversed(data.positions)}
     if _far_pixels(data) is None or data.boards is not None or len(places) < len(data.cameras):
         return None
-    known = {0: _at_origin()}
+    known = {0: Pose.still()}
     for _ in data.cameras:
         for camera in range(len(data.cameras)):
             if camera not in known:
@@ -145,7 +142,7 @@ def _from_features(data: RigData, camera: int, known: _Known, tried: list[int], 
             # In which direction the camera stands is tried later.
             center = known[other].center + length * known[other].rotation[0]
             tried.append(camera)
-        known[camera] = Poses.at(rotation, center)
+        known[camera] = Pose.at(rotation, center)
         return True
     return False
 
@@ -218,7 +215,7 @@ class _BoardViews:
         self.data = data
         self.flipped: list[TurnedBoard] = []
         self.foreign: dict[int, str] = {}
-        self._alone: list[Poses] = []
+        self._alone: list[Pose] = []
         self._compared: set[tuple[int, int]] = set()
         alone = list[SeenAlone]()
         self._good = torch.zeros(0, len(data.cameras), dtype=torch.bool)
@@ -233,7 +230,7 @@ class _BoardViews:
             if bool(enough.any()):
                 found, rms[enough] = pose_alone(points, boards.pixels[enough, c], camera, solver)
                 rotation[enough], translation[enough] = found.rotation, found.translation
-            alone.append(SeenAlone(Poses(rotation, translation), rms))
+            alone.append(SeenAlone(Pose(rotation, translation), rms))
         check_cameras(data, self._good, alone, solver)
         self._alone = [one.poses for one in alone]
 
@@ -253,13 +250,13 @@ class _BoardViews:
             if (0, camera) not in self._compared and bool((self._good[:, 0] & self._good[:, camera]).any()):
                 self._relative(0, camera)
 
-    def _relative(self, first: int, second: int) -> Poses:
+    def _relative(self, first: int, second: int) -> Pose:
         boards = self.data.boards
         assert boards is not None
         self._compared.add((first, second))
         both = (self._good[:, first] & self._good[:, second]).nonzero()[:, 0]
         cameras = self.data.cameras[first], self.data.cameras[second]
-        one, two = (Poses(self._alone[c].rotation[both], self._alone[c].translation[both]) for c in (first, second))
+        one, two = (self._alone[c].some(both) for c in (first, second))
         seen = dataclasses.replace(
             boards,
             pixels=boards.pixels[:, [first, second]],
@@ -287,7 +284,7 @@ class _BoardViews:
             self.data, boards=dataclasses.replace(boards, pixels=pixels, covariance=covariance)
         )
         alone = self._alone[camera]
-        new = Poses(alone.rotation[views], alone.translation[views]).after(half_turn(boards.points))
+        new = alone.some(views).after(half_turn(boards.points))
         alone.rotation[views], alone.translation[views] = new.rotation, new.translation
         self.flipped += [TurnedBoard(boards.names[i], self.data.names[camera]) for i in views.tolist()]
 

@@ -17,7 +17,6 @@ from kcal.calibrate.rig.source import (
     Effects,
     ItemSource,
     MarkBlock,
-    Pose,
     RigState,
     Start,
     as_items,
@@ -26,6 +25,7 @@ from kcal.calibrate.rig.source import (
 from kcal.checks import as_points, require_finite
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
+from kcal.lens.pose import Pose
 from kcal.texts import brief
 
 
@@ -100,7 +100,7 @@ class Landmarks(ItemSource):
             rays, valid = camera.unproject(self.pixels[:, c])
             pose = consensus_pose(rays[valid], self.points[valid], places.get(c))
             if pose is not None:
-                found[c] = pose[:2]
+                found[c] = Pose.at(*pose[:2])
         return found
 
     def begin(self, cameras: Sequence[Camera], start: Start) -> Tensor:

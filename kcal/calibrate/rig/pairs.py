@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
 import io
 import itertools
 import math
@@ -25,6 +24,7 @@ from kcal.corners.observations import Observations
 from kcal.errors import FileError, InputError
 from kcal.files import read_bytes
 from kcal.lens.camera import Camera
+from kcal.lens.pose import Pose
 from kcal.solve.lm import LMOptions
 from kcal.strict_json import MOST_BYTES
 
@@ -169,10 +169,7 @@ def paired_boards(
     if not pairs:
         raise InputError("no pair of views")
     moments = [(" ".join(dict.fromkeys(pair)), dict(enumerate(pair))) for pair in pairs]
-    found = _boards_at(cameras, ("left", "right"), dict(enumerate(observations)), moments)
-    sides = [seen.subset([pair[side] for pair in pairs]) for side, seen in enumerate(observations)]
-    known = [covariance for side in sides if (covariance := side.covariances()) is not None]
-    return dataclasses.replace(found, covariance=torch.stack(known, 1) if len(known) == 2 else None)
+    return _boards_at(cameras, ("left", "right"), dict(enumerate(observations)), moments)
 
 
 def boards_of_several(
@@ -209,7 +206,7 @@ def _boards_at(
     observations: Mapping[int, Observations],
     moments: Sequence[tuple[str, Mapping[int, str]]],
 ) -> Boards:
-    """Boards at some moments.
+    """Boards at some moments, with the covariances of their corners if all views have them.
 
     Args:
         cameras: of the rig.
@@ -219,6 +216,7 @@ def _boards_at(
     """
     board = next(iter(observations.values())).board
     pixels = torch.full((len(moments), len(cameras), board.corners, 2), math.nan, dtype=torch.float64)
+    covariance, known = pixels[..., None].repeat(1, 1, 1, 1, 2), True
     for number, seen in observations.items():
         if seen.board != board:
             raise InputError(f"the cameras saw different boards: {board} and {seen.board}")
@@ -229,13 +227,18 @@ def _boards_at(
                 f"{seen.image_size[0]}x{seen.image_size[1]}: are the files mixed up?"
             )
         rows = [i for i, (_, own) in enumerate(moments) if number in own]
-        pixels[rows, number] = seen.subset([moments[i][1][number] for i in rows]).pixels()
+        some = seen.subset([moments[i][1][number] for i in rows])
+        pixels[rows, number], own = some.pixels(), some.covariances()
+        known = known and own is not None
+        if own is not None:
+            covariance[rows, number] = own
     return Boards(
         board=board,
         pixels=pixels,
         names=tuple(name for name, _ in moments),
         deviation=_deviation([cameras[number] for number in observations], board),
         views=tuple(tuple(own.get(c, "") for _, own in moments) for c in range(len(cameras))),
+        covariance=covariance if known else None,
     )
 
 
@@ -259,43 +262,10 @@ _PART, _MOVED = 3, 1.0
 _TURNED = 0.2
 
 
-@dataclasses.dataclass(frozen=True)
-class Poses:
-    """Rigid motions: rotation (..., 3, 3) and translation (..., 3) meters."""
-
-    rotation: Tensor
-    translation: Tensor
-
-    @classmethod
-    def at(cls, rotation: Tensor, center: Tensor) -> Poses:
-        """World to camera, of a camera whose center is in the world."""
-        return cls(rotation, -(rotation @ center))
-
-    @property
-    def center(self) -> Tensor:
-        """The point that is moved to the origin."""
-        return self.inverse().translation
-
-    def after(self, other: Poses) -> Poses:
-        """This motion applied after another."""
-        return Poses(
-            self.rotation @ other.rotation,
-            (self.rotation @ other.translation[..., None])[..., 0] + self.translation,
-        )
-
-    def inverse(self) -> Poses:
-        """The motion back."""
-        back = self.rotation.transpose(-1, -2)
-        return Poses(back, -(back @ self.translation[..., None])[..., 0])
-
-    def __getitem__(self, index: int | slice) -> Poses:
-        return Poses(self.rotation[index], self.translation[index])
-
-
-def pose_alone(board: Tensor, pixels: Tensor, camera: Camera, solver: LMOptions) -> tuple[Poses, Tensor]:
+def pose_alone(board: Tensor, pixels: Tensor, camera: Camera, solver: LMOptions) -> tuple[Pose, Tensor]:
     """Board poses from one camera alone, and the RMS (V,) of each view, px; NaN where a view has no pose."""
     state, cost = poses_under(camera, Views(board_points=board, pixels=pixels), solver)
-    return Poses(state.rotation, state.translation), _view_rms(pixels, cost)
+    return Pose(state.rotation, state.translation), _view_rms(pixels, cost)
 
 
 def _view_rms(pixels: Tensor, cost: Tensor) -> Tensor:
@@ -316,7 +286,7 @@ class SeenAlone(NamedTuple):
         rms: (V,) px of each view; NaN for others.
     """
 
-    poses: Poses
+    poses: Pose
     rms: Tensor
 
 
@@ -368,7 +338,7 @@ def _may_fit(boards: Boards, index: int, good: Tensor, alone: SeenAlone, camera:
     which = good.nonzero()[:, 0]
     which = which[evenly(len(which), _FEW)]
     pixels = boards.pixels[which, index]
-    start = BoardState.flat(camera.params.detach(), alone.poses.rotation[which], alone.poses.translation[which])
+    start = BoardState.flat(camera.params.detach(), *alone.poses.some(which))
     _, cost = refine_poses(Views(board_points=boards.points, pixels=pixels), camera.model, start, _ROUGH)
     return _median_rms(_view_rms(pixels, cost)) < _median_rms(alone.rms[which])
 
@@ -378,26 +348,26 @@ def evenly(count: int, most: int) -> Tensor:
     return torch.linspace(0, count - 1, min(count, most)).round().long()
 
 
-def half_turn(board: Tensor) -> Poses:
+def half_turn(board: Tensor) -> Pose:
     """From a board (N, 3) to the same board read from its other end: half a turn about its middle."""
     turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))
-    return Poses(turn, board.amin(0) + board.amax(0))
+    return Pose(turn, board.amin(0) + board.amax(0))
 
 
 def consensus(
-    board: Tensor, pixels: Tensor, cameras: tuple[Camera, Camera], left: Poses, right: Poses
-) -> tuple[Poses, Tensor, Tensor]:
+    board: Tensor, pixels: Tensor, cameras: tuple[Camera, Camera], left: Pose, right: Pose
+) -> tuple[Pose, Tensor, Tensor]:
     """Find the relative pose that most pairs agree with, which pairs are turned under it, and each pair's error (px).
 
     Each of some pairs, evenly taken, proposes a relative pose, with the corners as read and with the second camera's
     order turned by 180°.
     """
     some = evenly(len(pixels), _PROPOSALS).tolist()
-    proposals = [right[i].after(left[i].inverse()) for i in some]
-    proposals += [right[i].after(half_turn(board)).after(left[i].inverse()) for i in some]
+    proposals = [right.some(i).after(left.some(i).inverse()) for i in some]
+    proposals += [right.some(i).after(half_turn(board)).after(left.some(i).inverse()) for i in some]
     as_read, other_end = pixels[:, 1], pixels[:, 1].flip(-2)
     points_left = board @ left.rotation.transpose(-1, -2) + left.translation[:, None]
-    best: tuple[float, Poses, Tensor, Tensor] | None = None
+    best: tuple[float, Pose, Tensor, Tensor] | None = None
     for number, proposal in enumerate(proposals):
         projected, valid = cameras[1].project(points_left @ proposal.rotation.T + proposal.translation)
         projected = torch.where(valid[..., None], projected, torch.inf)
@@ -420,8 +390,8 @@ def _distance(projected: Tensor, observed: Tensor) -> Tensor:
 
 
 def refuse_wrong_pairs(
-    boards: Boards, both: Tensor, cameras: tuple[Camera, Camera], names: Sequence[str], poses: tuple[Poses, Poses]
-) -> tuple[Poses, Tensor, Tensor]:
+    boards: Boards, both: Tensor, cameras: tuple[Camera, Camera], names: Sequence[str], poses: tuple[Pose, Pose]
+) -> tuple[Pose, Tensor, Tensor]:
     """`consensus` of two cameras; refuse views that are paired with those of other moments, and cameras that moved.
 
     Args:
@@ -447,7 +417,7 @@ def refuse_wrong_pairs(
             if count - abs(later) < _PART:
                 continue
             shifted = torch.stack([pixels[first, 0], pixels[second, 1]], 1)
-            better = float(consensus(points, shifted, cameras, poses[0][first], poses[1][second])[2].median())
+            better = float(consensus(points, shifted, cameras, poses[0].some(first), poses[1].some(second))[2].median())
             if better < _BETTER * typical and better < _OTHER_MOMENT * math.hypot(*cameras[1].size):
                 views = boards.views or (boards.names, boards.names)
                 mates = [views[c][int(both[part.start])] for c, part in enumerate((first, second))]

@@ -8,12 +8,12 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.source import Measurement, Pose, PosedCamera
+from kcal.calibrate.rig.source import Measurement, PosedCamera
 from kcal.checks import require_finite
 from kcal.errors import InputError
 from kcal.lens.calibration import ItemResidual
 from kcal.lens.camera import Camera
-from kcal.lens.pose import vector_from_rotation
+from kcal.lens.pose import Pose, vector_from_rotation
 from kcal.texts import brief
 
 
@@ -79,7 +79,7 @@ class SkylineSource(Measurement):
 
     def poses(self, cameras: Sequence[Camera], places: Mapping[int, Tensor]) -> dict[int, Pose]:
         """See `Source.poses`; where the cameras were taken to be."""
-        return {c: (self.rotation[c], self.center[c]) for c in self.cameras}
+        return {c: Pose.at(self.rotation[c], self.center[c]) for c in self.cameras}
 
     @property
     def about(self) -> tuple[int, ...]:

@@ -18,7 +18,7 @@ from kcal.checks import chi2_quantile
 from kcal.errors import InputError
 from kcal.lens.calibration import ItemResidual
 from kcal.lens.camera import Camera
-from kcal.lens.pose import step_rows
+from kcal.lens.pose import Pose, step_rows
 from kcal.lens.projection import Projection, project_components
 
 # The state of a rig's adjustment.
@@ -222,9 +222,6 @@ class ItemFit(NamedTuple):
 
 # The language of sources. A new source is a file with one class of these, and a line in `kcal.calibrate.rig.sources`.
 
-# World to camera: rotation (3, 3) and center (3,).
-Pose = tuple[Tensor, Tensor]
-
 
 class Source(ABC):
     """Something that a rig is solved from.
@@ -242,7 +239,7 @@ class Source(ABC):
         """Refuse what does not fit so many cameras, or needs a frame on the Earth that is not there."""
 
     def poses(self, cameras: Sequence[Camera], places: Mapping[int, Tensor]) -> dict[int, Pose]:
-        """Poses of cameras, by their numbers, that this source alone tells; `places` are their measured centers."""
+        """cam_from_world of cameras, by number, that this source alone tells; `places` are their measured centers."""
         return {}
 
 

@@ -17,7 +17,6 @@ from kcal.calibrate.rig.source import (
     Effects,
     ItemSource,
     MarkBlock,
-    Pose,
     RigState,
     Start,
     as_items,
@@ -26,7 +25,7 @@ from kcal.calibrate.rig.source import (
 from kcal.checks import require_finite
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.lens.pose import side_axes
+from kcal.lens.pose import Pose, side_axes
 
 
 def star_turns(effects: Sequence[Effect], stars: int, cameras: int) -> Tensor:
@@ -105,7 +104,7 @@ class StarSource(ItemSource):
             rays, valid = cameras[c].unproject(self.pixels[:, c])
             use = valid & self.named
             if int(use.sum()) >= 2:
-                found[c] = consensus_rotation(rays[use], self.direction[use])[0], place
+                found[c] = Pose.at(consensus_rotation(rays[use], self.direction[use])[0], place)
         return found
 
     def begin(self, cameras: Sequence[Camera], start: Start) -> Tensor:

@@ -25,8 +25,8 @@ from kcal.corners.observations import Observations
 from kcal.errors import InputError
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector, vector_from_rotation
-from kcal.sim.captures import BoardPose, BoardSize, sample_board_poses
+from kcal.lens.pose import Pose, rotation_from_vector, vector_from_rotation
+from kcal.sim.captures import BoardSize, sample_board_poses
 from kcal.solve.schur import Products, without_local
 from scripts.shared.moving_captures import Hands, moving_capture
 
@@ -41,7 +41,7 @@ HANDS = Hands(turning=(0.4, 0.4), speed=(0.1, 0.1), readout=(0.02, 0.02), exposu
 @functools.cache
 def captured(by_hand: bool, seed: int) -> tuple[Observations, Observations]:
     poses = sample_board_poses(CAMERA, SIZE, 10, torch.Generator().manual_seed(seed), fill=(0.25, 0.4))
-    right = [BoardPose(TURN @ pose.rotation, TURN @ pose.translation + SHIFT) for pose in poses]
+    right = [Pose(TURN @ pose.rotation, TURN @ pose.translation + SHIFT) for pose in poses]
     hands = HANDS if by_hand else None
     sides = [
         moving_capture(CAMERA, own, sigma=0.1, seed=2 * seed + k, hands=hands, board=SIZE).pixels
@@ -175,8 +175,8 @@ def taken_apart(seed: int, turn: float, *, later: int = 0, bump: float = 0.0) ->
     right = []
     for i, (pose, step) in enumerate(zip(poses, twist, strict=True)):
         rotation = TURN @ pose.rotation @ rotation_from_vector(step[:3])
-        moved = BoardPose(rotation, TURN @ (pose.translation + step[3:]) + SHIFT)
-        right.append(moved if i < 6 else BoardPose(bumped @ moved.rotation, bumped @ moved.translation))
+        moved = Pose(rotation, TURN @ (pose.translation + step[3:]) + SHIFT)
+        right.append(moved if i < 6 else Pose(bumped @ moved.rotation, bumped @ moved.translation))
     sides = [
         moving_capture(CAMERA, own, sigma=0.1, seed=2 * seed + k, board=SIZE).pixels
         for k, own in enumerate((poses, right))

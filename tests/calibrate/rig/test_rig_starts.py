@@ -24,7 +24,7 @@ from torch import Tensor
 
 from kcal import Baseline, MeasuredPosition, RigData
 from kcal.calibrate.rig.initial_poses import _baseline, _in_all_places, _into_frame, _level_starts, _starts
-from kcal.calibrate.rig.pairs import Poses, _median_rms, _view_rms, consensus, evenly, half_turn
+from kcal.calibrate.rig.pairs import _median_rms, _view_rms, consensus, evenly, half_turn
 from kcal.calibrate.rig.resection import (
     _real_roots,
     _samples,
@@ -36,7 +36,7 @@ from kcal.calibrate.rig.resection import (
 )
 from kcal.calibrate.rig.source import Start
 from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
+from kcal.lens.pose import Pose, rotation_from_vector
 from kcal.lens.rig import Rig
 from kcal.lens.turning import rotation_between
 from kcal.report.judge_rig import synchrony
@@ -140,19 +140,19 @@ class TestFewPoints:
 class TestPoses:
     def test_motions(self) -> None:
         turns = rotation_from_vector(normal((3, 3), 4))
-        one, two = Poses(turns[0], normal((3,), 5)), Poses(turns[1], normal((3,), 6))
+        one, two = Pose(turns[0], normal((3,), 5)), Pose(turns[1], normal((3,), 6))
         x = normal((3,), 7)
         there = two.rotation @ x + two.translation
         both = one.after(two)
         torch.testing.assert_close(both.rotation @ x + both.translation, one.rotation @ there + one.translation)
         back = two.inverse()
         torch.testing.assert_close(back.rotation @ there + back.translation, x)
-        at = Poses.at(turns[2], x)
+        at = Pose.at(turns[2], x)
         torch.testing.assert_close(at.center, x)
         torch.testing.assert_close(at.rotation @ x + at.translation, torch.zeros(3).double())
-        several = Poses(turns, normal((3, 3), 8))
+        several = Pose(turns, normal((3, 3), 8))
         torch.testing.assert_close(several.inverse().after(several).rotation, torch.eye(3).double().expand(3, 3, 3))
-        assert torch.equal(several[1].translation, several.translation[1])
+        assert torch.equal(several.some(1).translation, several.translation[1])
 
     def test_a_board_from_its_other_end(self) -> None:
         turn = half_turn(BOARD.points)
@@ -175,9 +175,9 @@ class TestPoses:
     @pytest.mark.parametrize("turned", [(), (2,), (0, 5)])
     def test_the_relative_pose_of_most_pairs(self, turned: tuple[int, ...]) -> None:
         """Some boards read from the other end, one that moved between both exposures by 0.2 m across."""
-        relative = Poses(ROTATION[1] @ ROTATION[0].T, ROTATION[1] @ (CENTER[0] - CENTER[1]))
+        relative = Pose(ROTATION[1] @ ROTATION[0].T, ROTATION[1] @ (CENTER[0] - CENTER[1]))
         turns = rotation_from_vector(0.3 * normal((8, 3), 3))
-        left = Poses(turns, tensor(-1.0, -1.0, 20.0) + normal((8, 3), 4))
+        left = Pose(turns, tensor(-1.0, -1.0, 20.0) + normal((8, 3), 4))
         right = relative.after(left)
         right.translation[3] += tensor(0.2, 0.0, 0.0)
         pixels = torch.stack([
@@ -190,7 +190,7 @@ class TestPoses:
         other = right
         for k in turned:
             pixels[k, 1] = pixels[k, 1].flip(0)
-            new = Poses(right.rotation[k], right.translation[k]).after(half_turn(BOARD.points))
+            new = right.some(k).after(half_turn(BOARD.points))
             other.rotation[k], other.translation[k] = new.rotation, new.translation
         found, which, error = consensus(BOARD.points, pixels, (CAMERAS[0], CAMERAS[1]), left, other)
         torch.testing.assert_close(found.rotation, relative.rotation, rtol=0, atol=1e-9)
@@ -218,7 +218,7 @@ class TestPlaces:
         assert _baseline(some, 0, 2) is None
 
     def test_six_directions_are_tried(self) -> None:
-        known = {0: Poses.at(ROTATION[0], CENTER[0]), 1: Poses.at(ROTATION[1], CENTER[0] + 2.0 * ROTATION[0, 0])}
+        known = {0: Pose.at(ROTATION[0], CENTER[0]), 1: Pose.at(ROTATION[1], CENTER[0] + 2.0 * ROTATION[0, 0])}
         starts = _starts(known, [1])
         places = torch.stack([start.center[1] - CENTER[0] for start in starts])
         wanted = 2.0 * torch.cat([ROTATION[0], -ROTATION[0]])
