@@ -113,6 +113,7 @@ def test_file_of_many_cameras(tmp_path: Path) -> None:
     assert again.calibration == rig.calibration
     with pytest.raises(FileError, match="a rig of 4 cameras; a rig of two is needed here"):
         load_pair(path)
+    assert Localizer.from_file(path).rig.names == rig.names
     content = json.loads(path.read_text())
     content["poses"].pop()
     path.write_text(json.dumps(content))

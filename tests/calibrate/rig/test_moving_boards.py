@@ -16,10 +16,13 @@ from torch import Tensor
 from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.hybrid.evidence import EvidenceLoss, view_data
 from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies
+from kcal.calibrate.rig.boards import BoardBlock
 from kcal.calibrate.rig.motion import CameraRows, RigRows, WithoutMotion
 from kcal.calibrate.rig.pairs import pair_by_name
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, calibrate_rig
+from kcal.calibrate.rig.source import PosedCamera, RigState, as_items
+from kcal.calibrate.rig.unknowns import held
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations
 from kcal.errors import InputError
@@ -83,6 +86,26 @@ def test_whitening_is_that_of_the_dense_covariance() -> None:
     dense = rows @ torch.linalg.solve(covariance, rows.transpose(1, 2))
     # A condition of some thousands.
     torch.testing.assert_close(found @ found.transpose(1, 2), dense, rtol=1e-9, atol=1e-9)
+
+
+def test_rows_are_read_at_the_times_of_the_pixels_shown() -> None:
+    """Derivatives by motions do not depend on the noise of the corners."""
+    found = []
+    poses = sample_board_poses(CAMERA, SIZE, 3, torch.Generator().manual_seed(1), fill=(0.25, 0.4))
+    at = Pose(torch.stack([pose.rotation for pose in poses]), torch.stack([pose.translation for pose in poses]))
+    nothing = torch.zeros(0, dtype=F64)
+    state = RigState(
+        CAMERA.params.detach(), nothing, nothing.sum(), torch.eye(3, dtype=F64)[None], torch.zeros(1, 3, dtype=F64),
+        nothing, as_items(*at),
+    )  # fmt: skip
+    posed = PosedCamera(
+        CAMERA, CAMERA.params.detach(), state.rotation[0], state.center[0], nothing[:, None], None, None
+    )
+    for noise in (0.0, 5.0):
+        pixels = CAMERA.project(BOARD.points @ at.rotation.mT + at.translation[:, None])[0][:, None] + noise
+        block = BoardBlock(pixels, torch.ones(3, 1, BOARD.corners).double(), BOARD.points, [CAMERA], held([CAMERA]))
+        found.append(block.motion_columns(0, posed, state, reads=True)[0])
+    assert torch.equal(*found)
 
 
 @pytest.mark.parametrize("shared", [8, 70])

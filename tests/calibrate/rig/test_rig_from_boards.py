@@ -14,7 +14,7 @@ from rig_scenes import CAMERAS, landmarks, tensor
 from torch import Tensor
 
 from kcal.calibrate.problem.state import warp_modes
-from kcal.calibrate.rig.pairs import pair_by_name, read_pairs
+from kcal.calibrate.rig.pairs import boards_of_several, pair_by_name, read_pairs
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, calibrate_rig, solve_rig
 from kcal.calibrate.rig.sources import RigData
@@ -218,6 +218,19 @@ class TestWeights:
                 # The RMS that is reported stays the plain one.
                 assert result.rms == pytest.approx(float(noise.square().mean().sqrt()) * 2**0.5, rel=0.2)
         assert sum(error[True]) < 0.25 * sum(error[False])
+
+    def test_boards_of_several_cameras_have_covariances_if_all_views_do(self) -> None:
+        pixels, spread = views(4, 5), ((0.04, 0.01, 0.09),) * BOARD.corners
+        plain, seen = {}, {}
+        for c, name in enumerate(("left", "right")):
+            plain[c] = observe(pixels[:, c], names=[f"{name}-{i}.png" for i in range(4)])
+            known = tuple(view.model_copy(update={"covariance": spread}) for view in plain[c].views)
+            seen[c] = plain[c].model_copy(update={"views": known})
+        found = boards_of_several((LEFT, RIGHT), ("left", "right"), seen).covariance
+        assert found is not None
+        expected = torch.tensor([[0.04, 0.01], [0.01, 0.09]], dtype=torch.float64)
+        assert torch.equal(found, expected.expand(4, 2, BOARD.corners, 2, 2))
+        assert boards_of_several((LEFT, RIGHT), ("left", "right"), {**seen, 1: plain[1]}).covariance is None
 
     def test_covariance_is_that_of_the_sigmas(self) -> None:
         for refine in (False, True):
