@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections.abc import Hashable, Sequence
 from typing import NamedTuple
 
@@ -202,21 +203,85 @@ def posterior_half(rows: Tensor) -> Tensor:
     return torch.where(known, change, change / _ROUNDING).T
 
 
-def inverse_root(information: Tensor, scale: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
-    """Invert scaled normal equations as far as they determine anything.
+class Covariance:
+    """Covariance of unknowns from their normal equations, of which some directions may be open.
+
+    What is not finite determines nothing: the covariance is NaN then, and `computed` is False.
 
     Args:
         information: (S, S) of unknowns over their scale.
         scale: (S,).
-        tolerance: eigenvalues below this share of the largest are rounding.
+        variance: by which the covariance is multiplied.
+        tolerance: eigenvalues below this share of the largest are rounding, and their directions open.
+        lost: a function of the unknowns with more than this share of its length in open directions is not determined.
 
-    Returns:
-        a root (S, R) of the covariance of the unknowns, and orthonormal directions (S, O) that are open, of the scaled
-        unknowns.
+    Attributes:
+        root: (S, K) with root rootᵀ the covariance of what is determined.
+        open: (S, O) orthonormal directions of the scaled unknowns that are open.
+
+    Example:
+        >>> known = Covariance(torch.diag(torch.tensor([4.0, 0.0])).double(), torch.ones(2).double())
+        >>> known.sigma.tolist(), known.determined.tolist()
+        ([0.5, inf], [True, False])
     """
-    values, vectors = torch.linalg.eigh(information)
-    known = values > tolerance * values[-1:].sum()
-    return (scale[:, None] * vectors)[:, known] * values[known].rsqrt(), vectors[:, ~known]
+
+    def __init__(
+        self, information: Tensor, scale: Tensor, variance: float = 1.0, *, tolerance: float = 1e-12, lost: float = 1e-6
+    ) -> None:
+        self.computed = bool(information.isfinite().all()) and math.isfinite(variance)
+        self._scale, self._least_lost = scale, lost
+        values, vectors = torch.linalg.eigh(information if self.computed else torch.eye(len(scale)).to(scale))
+        floor = tolerance * values[-1:].sum()
+        known = values > floor
+        along = scale[:, None] * vectors * math.sqrt(max(variance, 0.0) if self.computed else math.nan)
+        self.root, self.open = along[:, known] * values[known].rsqrt(), vectors[:, ~known]
+        # The smallest variance that an open direction can have.
+        self._floor = along[:, ~known] * floor.rsqrt()
+
+    @property
+    def matrix(self) -> Tensor:
+        """(S, S) of all unknowns; with the smallest possible variance along directions that are open."""
+        return self.root @ self.root.T + self._floor @ self._floor.T
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing is open."""
+        return not self.open.shape[1]
+
+    def of(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Covariance (K, K) of K linear functions (K, S) of a step, and which of them are determined.
+
+        What is not determined has infinite variance, and no covariance with anything.
+        """
+        factor, lost = rows @ self.root, self._lost(rows)
+        matrix = factor @ factor.T
+        matrix = torch.where(lost[:, None] | lost[None, :], 0.0, 0.5 * (matrix + matrix.T))
+        return matrix + torch.diag(torch.where(lost, torch.inf, 0.0)), ~lost
+
+    def variances(self, rows: Tensor) -> Tensor:
+        """(K,) variances of K linear functions (K, S) of a step; infinite for what is not determined."""
+        return torch.where(self._lost(rows), torch.inf, (rows @ self.root).square().sum(-1))
+
+    def half_of(self, rows: Tensor) -> Tensor | None:
+        """(S, K) root of the covariance of K linear functions (K, S) of a step; None where one is not determined."""
+        return None if bool(self._lost(rows).any()) else (rows @ self.root).T
+
+    @property
+    def sigma(self) -> Tensor:
+        """(S,) standard deviations, infinite where not determined."""
+        return self.variances(torch.eye(len(self._scale)).to(self._scale)).sqrt()
+
+    @property
+    def determined(self) -> Tensor:
+        """(S,) which unknowns are determined."""
+        return ~self._lost(torch.eye(len(self._scale)).to(self._scale))
+
+    def _lost(self, rows: Tensor) -> Tensor:
+        """(K,) which functions are not determined."""
+        scaled = rows * self._scale
+        length = scaled.square().sum(-1)
+        share = (scaled @ self.open).square().sum(-1)
+        return (share > self._least_lost * torch.where(length > 0, length, 1.0)) | (not self.computed)
 
 
 class Whitened(NamedTuple):

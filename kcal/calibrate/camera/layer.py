@@ -51,7 +51,7 @@ def exact_minimum(problem: BoardProblem, state: BoardState) -> tuple[BoardState,
                 f"the views do not determine {', '.join(dict.fromkeys(lost))}, and the solution has no derivatives: "
                 "fix parameters, choose a smaller model, add views or priors"
             )
-        spread = problem.free.by_parameter(known.covariance, len(state.parameters))
+        spread = problem.free.by_parameter(known.matrix, len(state.parameters))
         check_directions(state.parameters, problem.model, problem.points(state), problem.seen, spread, state.rotation)
     return state, found
 

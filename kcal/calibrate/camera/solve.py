@@ -36,7 +36,6 @@ from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.views import (
     LEAST_NOISE,
     CameraViews,
-    Uncertainty,
     information_of,
     noise_variance,
     uncertainty_of,
@@ -44,6 +43,7 @@ from kcal.calibrate.problem.views import (
 )
 from kcal.corners.observations import Observations
 from kcal.errors import InputError
+from kcal.gaussian import Covariance
 from kcal.lens.camera import Camera
 from kcal.lens.hybrid_terms import radius_over_angle
 from kcal.lens.information import CameraInformation
@@ -418,7 +418,7 @@ def assess(observations: Observations, solution: Solution, options: CalibrationO
     uncertainty, information = _uncertainty(observations, solution, state, options.loss)
     free = problem.free
     slot = {camera.names[i]: k for i, k in zip(free.indices, free.slots, strict=True)}
-    spread = free.by_parameter(uncertainty.covariance, len(camera.names))
+    spread = free.by_parameter(uncertainty.matrix, len(camera.names))
     sigma = {name: float(uncertainty.sigma[k]) if bool(uncertainty.determined[k]) else None for name, k in slot.items()}
     fixed = tuple(name for name in camera.names if name in solution.views.constraints.fixed)
     sigma = {name: sigma.get(name) for name in camera.names if name in slot or name in fixed}
@@ -474,11 +474,11 @@ def assess(observations: Observations, solution: Solution, options: CalibrationO
 
 def _uncertainty(
     observations: Observations, solution: Solution, state: BoardState, loss: RobustLoss | None
-) -> tuple[Uncertainty, CameraInformation | None]:
+) -> tuple[Covariance, CameraInformation | None]:
     """Covariance of the unknowns, and what is said of the camera; None where that is not finite."""
     if not solution.problem.shared_size:
         # Under a known camera and a flat board nothing is shared by the views.
-        return Uncertainty(state.parameters.new_zeros(0, 0), torch.zeros(0, dtype=torch.bool)), None
+        return Covariance(state.parameters.new_zeros(0, 0), state.parameters.new_zeros(0)), None
     # Barriers before folds are no information about the lens.
     known = [term for term in solution.terms if isinstance(term, GaussianPrior)]
     plain = solution.problem_for(observations.pixels(), observations.covariances(), loss, known)
@@ -494,7 +494,7 @@ def _uncertainty(
 
 
 def _led_by_prior(
-    solution: Solution, names: Sequence[str], slot: Mapping[str, int], uncertainty: Uncertainty
+    solution: Solution, names: Sequence[str], slot: Mapping[str, int], uncertainty: Covariance
 ) -> tuple[str, ...]:
     """Parameters whose variance would more than double without their prior."""
     led = []

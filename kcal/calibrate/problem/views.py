@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, Self
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -13,7 +13,7 @@ from torch import Tensor
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.parameters import FreeParameters, GaussianPrior, ParameterConstraints, Term
 from kcal.calibrate.problem.state import BoardState
-from kcal.gaussian import triangular
+from kcal.gaussian import Covariance, triangular
 from kcal.lens.information import CameraInformation
 from kcal.lens.model import LensModel
 from kcal.lens.projection import parameter_names, project_components
@@ -210,54 +210,20 @@ _RANK_TOLERANCE = 1e-13
 _UNDETERMINED_SHARE = 1e-2
 
 
-class Uncertainty(NamedTuple):
-    """Covariance of the shared parameters (S, S), and whether the data determine each (S,).
-
-    Where the linearization is not finite, because a corner lies on a fold of the lens, the covariance is NaN and no
-    parameter counts as determined.
-    """
-
-    covariance: Tensor
-    determined: Tensor
-
-    @property
-    def computed(self) -> bool:
-        """Whether the covariance is finite."""
-        return bool(torch.isfinite(self.covariance).all())
-
-    @property
-    def sigma(self) -> Tensor:
-        """(S,) standard deviations, infinite where not determined."""
-        return torch.where(self.determined, self.covariance.diagonal().sqrt(), torch.inf)
-
-
-def uncertainty_of(linear: SchurLinearization, residual_count: int, parameter_count: int) -> Uncertainty:
+def uncertainty_of(linear: SchurLinearization, residual_count: int, parameter_count: int) -> Covariance:
     """Covariance of the shared parameters from the information at a minimum, all other parameters free.
 
     (JᵀJ)⁻¹ ‖r‖² / (residuals - parameters), whose diagonal is the square of what `cv2.calibrateCameraExtended` reports:
-    the noise is estimated from the residuals themselves and assumed independent and equal.
+    the noise is estimated from the residuals themselves and assumed independent and equal. Where the linearization is
+    not finite, because a corner lies on a fold of the lens, nothing is determined.
 
     Args:
         linear: the linearization at the minimum, not a batch.
         residual_count: scalar residuals.
         parameter_count: all parameters that were free, poses included.
     """
-    inverse, scale, determined = _invert(linear)
-    noise = noise_variance(linear, residual_count, parameter_count)
-    return Uncertainty(inverse * scale[:, None] * scale * noise, determined)
-
-
-def _invert(linear: SchurLinearization) -> tuple[Tensor, Tensor, Tensor]:
-    """The inverse of the scaled information (S, S), the scale of each parameter, and whether each is determined."""
-    information, scale = linear.information()
-    if not bool(torch.isfinite(information).all() & torch.isfinite(linear.cost)):
-        return torch.full_like(information, torch.nan), scale, torch.zeros_like(scale, dtype=torch.bool)
-    eigenvalues, vectors = torch.linalg.eigh(information)
-    floor = _RANK_TOLERANCE * eigenvalues[-1]
-    undetermined = (vectors[:, eigenvalues <= floor] ** 2).sum(-1)
-    # Below the floor an eigenvalue is unknown; the floor gives the smallest possible variance.
-    inverse = (vectors / eigenvalues.clamp_min(floor)) @ vectors.T
-    return inverse, scale, undetermined < _UNDETERMINED_SHARE
+    noise = float(noise_variance(linear, residual_count, parameter_count))
+    return Covariance(*linear.information(), noise, tolerance=_RANK_TOLERANCE, lost=_UNDETERMINED_SHARE)
 
 
 def noise_variance(linear: SchurLinearization, residual_count: int, parameter_count: int) -> Tensor:

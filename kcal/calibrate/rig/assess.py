@@ -26,7 +26,6 @@ from kcal.calibrate.rig.uncertainty import (
     parameter_rows,
     relative_rows,
 )
-from kcal.calibrate.rig.unknowns import held
 from kcal.errors import DegenerateError, InputError
 from kcal.finding import Finding
 from kcal.io.camera_file import provenance
@@ -352,7 +351,7 @@ def refuse_several(work: Adjustment, mask: Tensor) -> None:
     if not explanations.decided_by_landmarks(work, mask):
         return
     here = copy.copy(work)
-    here.unknowns = held(work.data.cameras)
+    here.unknowns = work.unknowns.none()
     problem, _ = here.solve(mask, explanations.TRIAL)
     own = goodness_of_fit(problem, here.part(mask))
     matrix, scale = problem.linearize(here.part(mask)).information()

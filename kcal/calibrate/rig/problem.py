@@ -12,7 +12,7 @@ from kcal.calibrate.rig.motion import CameraRows, summed_products
 from kcal.calibrate.rig.source import LOCAL_SIZE, Block, Measurement, PosedCamera, RigState
 from kcal.calibrate.rig.unknowns import SharedUnknowns
 from kcal.checks import variance_factor
-from kcal.gaussian import inverse_root
+from kcal.gaussian import Covariance
 from kcal.lens.camera import Camera
 from kcal.lens.pose import nearest_rotation, rotation_from_vector
 from kcal.solve.problem import RobustLoss, State
@@ -335,7 +335,7 @@ def least(gram: Tensor) -> Least:
     """The minimum of rows whose products (S + 1, S + 1) are given, residuals last."""
     N, g = gram[:-1, :-1], gram[:-1, -1]
     scale = torch.where(N.diagonal() > 0, N.diagonal(), 1.0).rsqrt()
-    root, _ = inverse_root(N * scale[:, None] * scale, scale, _RANK_TOLERANCE)
+    root = Covariance(N * scale[:, None] * scale, scale, tolerance=_RANK_TOLERANCE).root
     pull = g @ root
     return Least(float(gram[-1, -1] - pull.square().sum()), root.shape[1], -root @ pull, root)
 

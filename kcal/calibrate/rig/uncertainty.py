@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import torch
@@ -10,68 +9,29 @@ from torch import Tensor
 
 from kcal.calibrate.rig.problem import RigProblem
 from kcal.calibrate.rig.source import RigState
-from kcal.gaussian import inverse_root
+from kcal.gaussian import Covariance
 
-# Eigenvalues of the scaled information below this share of the largest are rounding, not information.
-_RANK_TOLERANCE = 1e-12
-# A function of the unknowns with more than this share of its length in open directions is not determined.
-_LOST_SHARE = 1e-6
 # A motion gives an open direction its name if it lies in the open directions but for this share.
 _NAMED_SHARE = 0.02
 _IDENTITY = torch.eye(3, dtype=torch.float64)
 
 
-class SharedCovariance:
-    """Covariance of the shared unknowns at a solution, with all others free.
+class SharedCovariance(Covariance):
+    """Covariance of the shared unknowns of a rig at a solution, with all others free.
 
     Args:
         problem: the problem.
         state: its solution.
         variance: by which the covariance is multiplied: 1 where the stated sigmas are right.
-
-    Attributes:
-        root: (S, K) with root rootᵀ the covariance.
     """
 
     def __init__(self, problem: RigProblem, state: RigState, variance: float = 1.0) -> None:
         self._problem, self._state = problem, state
-        information, self._scale = problem.linearize(state).information()
-        root, self._open = inverse_root(information, self._scale, _RANK_TOLERANCE)
-        self.root = root * math.sqrt(variance)
-
-    @property
-    def complete(self) -> bool:
-        """Whether nothing is open."""
-        return not self._open.shape[1]
-
-    def of(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Covariance (K, K) of K linear functions (K, S) of a step, and which of them are determined.
-
-        What is not determined has infinite variance, and no covariance with anything.
-        """
-        factor, lost = rows @ self.root, self._lost(rows)
-        matrix = factor @ factor.T
-        matrix = torch.where(lost[:, None] | lost[None, :], 0.0, 0.5 * (matrix + matrix.T))
-        return matrix + torch.diag(torch.where(lost, torch.inf, 0.0)), ~lost
-
-    def variances(self, rows: Tensor) -> Tensor:
-        """(K,) variances of K linear functions (K, S) of a step; infinite for what is not determined."""
-        return torch.where(self._lost(rows), torch.inf, (rows @ self.root).square().sum(-1))
-
-    def _lost(self, rows: Tensor) -> Tensor:
-        """(K,) which functions are not determined."""
-        scaled = rows * self._scale
-        length = scaled.square().sum(-1)
-        return (scaled @ self._open).square().sum(-1) > _LOST_SHARE * torch.where(length > 0, length, 1.0)
-
-    def half_of(self, rows: Tensor) -> Tensor | None:
-        """(S, K) root of the covariance of K linear functions (K, S) of a step; None where one is not determined."""
-        _, determined = self.of(rows)
-        return (rows @ self.root).T if bool(determined.all()) else None
+        super().__init__(*problem.linearize(state).information(), variance)
 
     def open_directions(self, names: Sequence[str], *, absolute: bool) -> tuple[str, ...]:
         """Names of what the data leave open, plainest first."""
-        left, found = self._open, []
+        left, found = self.open, []
         motions = _named_motions(self._problem, self._state, names, absolute=absolute)
         while left.shape[1]:
             best: tuple[float, str, Tensor] = (0.0, "", left[0])

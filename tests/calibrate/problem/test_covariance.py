@@ -14,8 +14,9 @@ from kcal.calibrate.camera.advice import check_directions
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.state import BoardState
-from kcal.calibrate.problem.views import Uncertainty, free_parameters, information_of, noise_variance, uncertainty_of
+from kcal.calibrate.problem.views import free_parameters, information_of, noise_variance, uncertainty_of
 from kcal.errors import DegenerateError
+from kcal.gaussian import Covariance
 from kcal.lens.model import LensModel
 from kcal.lens.projection import project_components
 from kcal.solve.lm import LMOptions, minimize
@@ -33,7 +34,7 @@ def true_state(model: str, poses: tuple[Tensor, Tensor]) -> BoardState:
     return BoardState.flat(camera(model).params.detach().clone(), *poses)
 
 
-def solved(pixels: Tensor, model: str, poses: tuple[Tensor, Tensor]) -> tuple[BoardState, Uncertainty]:
+def solved(pixels: Tensor, model: str, poses: tuple[Tensor, Tensor]) -> tuple[BoardState, Covariance]:
     problem = problem_of(pixels, model)
     result = minimize(problem, true_state(model, poses), TIGHT)
     assert bool(result.converged)
@@ -64,7 +65,7 @@ def test_it_is_a_block_of_the_whole_inverse(missing: bool) -> None:
     sigma = expected.diagonal().sqrt()
     # As correlations, so that small parameters count; the inverse has a condition number near 1e6.
     scale = sigma * sigma[:, None]
-    torch.testing.assert_close(found.covariance / scale, expected / scale, rtol=0, atol=1e-8)
+    torch.testing.assert_close(found.matrix / scale, expected / scale, rtol=0, atol=1e-8)
     assert bool(found.determined.all())
     # The square roots of information, by another way, say the same.
     noise = math.sqrt(float(noise_variance(problem.linearize(state), problem.residual_count, count)))
@@ -123,7 +124,7 @@ def test_monte_carlo_of_projections() -> None:
         state, found = solved(pixels_of(truth, poses, noise=0.2, seed=seed + 500), model, poses)
         seen = project_components(points.T, state.parameters, truth.model, free)
         error, slope = seen.pixels.T - places, seen.by_camera.permute(2, 1, 0)
-        spot = slope @ found.covariance @ slope.mT
+        spot = slope @ found.matrix @ slope.mT
         squared.append((error * torch.linalg.solve(spot, error)).sum(-1))
     distances = torch.stack(squared)
     for k in range(4):
@@ -148,7 +149,7 @@ class TestWhatCannotBeComputed:
         gram[0, 3, 6] = gram[0, 6, 3] = torch.nan
         found = uncertainty_of(SchurLinearization.of_gram(gram, 6), 9, 7)
         assert not found.computed
-        assert bool(found.covariance.isnan().all())
+        assert bool(found.matrix.isnan().all())
         assert not bool(found.determined.any())
         assert bool(found.sigma.isinf().all())
 
