@@ -302,8 +302,7 @@ def _of_pairs(solved: Rig, own: LocateOptions, noise: float) -> tuple[PointLocat
         )  # fmt: skip
         localize = Localizer(
             standing, weights="marks", origin=place, heading_deg=heading, pitch_deg=own.pitch, roll_deg=own.roll,
-            pixel_sigma=noise, calibration=errors.calibration, mounting=errors.mounting, link=errors.link,
-            refraction=own.refraction, refraction_sigma=own.refraction_sigma,
+            pixel_sigma=noise, refraction=own.refraction, refraction_sigma=own.refraction_sigma, **errors._asdict(),
         )  # fmt: skip
         return PointLocator(localize, geoid=find_geoid(own.geoid))
 

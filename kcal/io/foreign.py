@@ -69,13 +69,13 @@ class ImportedCameras:
         """The cameras' names."""
         return tuple(camera.calibration.name if camera.calibration else "" for camera in self.cameras)
 
+    @property
+    def _second_from_first(self) -> Pose:
+        return self.poses[1].after(self.poses[0].inverse())
+
     def is_rig(self) -> bool:
         """Whether these are two cameras at different places."""
-        return (
-            len(self.cameras) == 2
-            and len(self.poses) == 2
-            and float(_second_from_first(self.poses).translation.norm()) > 0
-        )
+        return len(self.cameras) == 2 and len(self.poses) == 2 and float(self._second_from_first.translation.norm()) > 0
 
     def rig(self) -> Rig:
         """Both cameras as a rig, the first one on the left.
@@ -89,7 +89,7 @@ class ImportedCameras:
                 f"({', '.join(self.names)}) and {len(self.poses)} poses"
             )
         left, right = self.cameras
-        return Rig.pair(left, right, *_second_from_first(self.poses))
+        return Rig.pair(left, right, *self._second_from_first)
 
     def camera_rig(self) -> Rig:
         """All cameras as a rig, in the frame of the file.
@@ -102,12 +102,6 @@ class ImportedCameras:
 
     def __repr__(self) -> str:
         return brief(self)
-
-
-def _second_from_first(poses: Sequence[Pose]) -> Pose:
-    """Of the second camera from the first."""
-    first, second = poses
-    return second.after(first.inverse())
 
 
 def rig_poses(rig: Rig) -> tuple[Pose, ...]:

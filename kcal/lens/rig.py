@@ -315,6 +315,11 @@ class Rig(Movable, StatedModule):
         return self.place is None and torch.equal(first[0], torch.eye(3).to(first[0])) and not bool(first[1].any())
 
     @property
+    def is_pair(self) -> bool:
+        """Whether these are two cameras in the left one's frame."""
+        return len(self) == 2 and self.in_first_frame
+
+    @property
     def pose_slots(self) -> dict[str, Any]:
         """What `free` takes: `pose`, `rotation` and `translation`, or names of cameras; a step is that of `Movable`."""
         free = slice(int(self.in_first_frame and len(self) > 1), None)
@@ -356,7 +361,7 @@ class Rig(Movable, StatedModule):
     def fingerprint(self) -> str:
         """Twelve hex digits that change with any camera and any pose."""
         own = [camera.fingerprint for camera in self.each]
-        if len(self) == 2 and self.in_first_frame:
+        if self.is_pair:
             pose = self.right_from_left_rotation.tolist(), self.right_from_left_translation.tolist()
             # As in 1.0, whose histories of a rig that is watched name it.
             return hashlib.sha256(repr((*own, pose)).encode()).hexdigest()[:12]

@@ -193,9 +193,8 @@ class Localizer(Operations, Movable, StatedModule):
             raise InputError(f"weights {weights!r}: marks or all is needed")
         if not 0.0 <= clock_sigma < math.inf:
             raise InputError(f"clock_sigma: seconds, not negative, are needed, got {clock_sigma}")
-        pair = len(rig) == 2 and rig.in_first_frame
         known = root is not None or rig.root is not None
-        self.weights: Weights = weights or ("marks" if pair and not known else "all")
+        self.weights: Weights = weights or ("marks" if rig.is_pair and not known else "all")
         stated = {
             "origin": origin, "heading_deg": heading_deg, "pitch_deg": pitch_deg or None, "roll_deg": roll_deg or None,
             "calibration": calibration, "mounting": mounting, "link": link, "refraction": refraction,
@@ -206,13 +205,13 @@ class Localizer(Operations, Movable, StatedModule):
             self.register_buffer(name, scalar(value, rig.translation))
         self.lens: tuple[tuple[int, ...], ...] = ()
         if self.weights == "marks":
-            if not pair or known:
+            if not rig.is_pair or known:
                 raise InputError('weights "marks": two cameras in the left one\'s frame are needed, without a root')
             checked_rig(rig, pixel_sigma)
             self._stand(rig, more)
             self._weigh(rig, None)
             return
-        if pair and not known:
+        if rig.is_pair and not known:
             rig = Localizer(rig, weights="marks", **more).apart()  # type: ignore[arg-type]
         elif more:
             raise InputError(f"{next(iter(more))}: where these cameras stand, and how well that is known, says the rig")

@@ -133,7 +133,7 @@ class Triangulate(Operations, StatedModule):
             raise InputError(f"method {method!r}: one of {', '.join(get_args(Method))} is needed")
         self.register_buffer("pixel_sigma", scalar(checked_rig(rig, pixel_sigma), rig.translation))
         self.rig, self.method = rig, method
-        self._pair = len(rig) == 2 and rig.in_first_frame
+        self._pair = rig.is_pair
 
     @property
     def constants(self) -> object:
