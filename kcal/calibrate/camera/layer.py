@@ -96,55 +96,6 @@ def differentiated(
     return state
 
 
-def hybrid_views(
-    pixels: Tensor,
-    board_points: Tensor,
-    size: tuple[int, int],
-    options: CalibrationOptions,
-    start: tuple[HybridFit, BoardState] | None,
-    backward: Backward,
-) -> tuple[BoardState, Tensor, HybridFit]:
-    """The default camera, with gradients by the corners and the board's points.
-
-    Amplitudes of lens, board and motions, and the noise, come from the evidence of the corners, or from the start; they
-    count as constants of the gradient, which is that of the most probable camera under them.
-
-    Args:
-        pixels: (V, N, 2), NaN where not seen.
-        board_points: (N, 3) meters.
-        size: (width, height) of the image.
-        options: with the hybrid lens.
-        start: fit and state of nearly the same data, whose amplitudes are kept.
-        backward: see `differentiated`.
-
-    Returns:
-        the state; residuals (V, N, 2) projected minus observed, pixels, 0 where a corner was not seen; and the fit
-        whose amplitudes and noise were held.
-    """
-    if isinstance(options.board, MeasuredBoard):
-        raise InputError("calibrate_views: a measured board has no gradients; give its corners as board_points")
-    data = (pixels, board_points)
-    fixed = tuple(tensor.detach() for tensor in data)
-    if start is None:
-        fit = fit_hybrid(fixed[1], fixed[0], size, options=options.of_fit(size))
-        begin = fit.state
-    else:
-        fit, begin = start[0], BoardState(*(part.detach() for part in start[1]))
-    families = fit.families
-    precision = fit.sigma**2 / families.deviation(fit.expected).square()
-    if options.board == "exact":
-        precision[-len(fit.board_shapes.unit) :] = torch.inf
-
-    def problem_of(corners: Tensor, points: Tensor) -> BoardProblem:
-        weights = torch.ones_like(corners[..., 0])
-        return fit.problem(points, corners, weights, families.mean, precision)
-
-    state, found = newton_minimum(problem_of(*fixed), begin, _POLISH)
-    state = differentiated(problem_of, data, state, found, backward)
-    at = problem_of(*(fixed if backward == "none" else data))
-    return state, at.pixel_errors(state).transpose(-1, -2), fit
-
-
 # Calibration as a layer of a network: from corners to a camera, with gradients through the solution.
 
 # Pixels of a corner's noise along an axis, against which priors of parametric models count.
@@ -284,9 +235,46 @@ def calibrate_views(
     device, (pixels, board_points, means) = pixels.device, (tensor.cpu() for tensor in checked)
     if start is not None and (start.hybrid is not None) != options.hybrid:
         raise InputError("calibrate_views: the start is of another lens model")
+    fit: HybridFit | None = None
+    data = (pixels, board_points) if options.hybrid else (pixels, board_points, means)
+    fixed = tuple(tensor.detach() for tensor in data)
     if options.hybrid:
-        return _default_views(pixels, board_points, size, options, start, backward).to(device)
-    sigma = _CORNER_SIGMA if corner_sigma is None else corner_sigma
+        problem_of, begin, fit = _default_problem(*fixed, size, options, start)
+        state, found = newton_minimum(problem_of(*fixed), begin, _POLISH)
+        placed = fixed[1] @ state.rotation.mT + state.translation[:, None]
+        angle = torch.atan2(placed[..., :2].norm(dim=-1), placed[..., 2])
+        reach = float(torch.where(torch.isfinite(pixels).all(-1), angle, 0.0).max())
+    else:
+        sigma = _CORNER_SIGMA if corner_sigma is None else corner_sigma
+        problem_of, begin, reach = _parametric_problem(*fixed, size, options, sigma, start)
+        problem = problem_of(*fixed)
+        state, found = exact_minimum(problem, problem.tidy(begin))
+    state = differentiated(problem_of, data, state, found, backward)
+    at = problem_of(*(fixed if backward == "none" else data))
+    return CalibratedViews(
+        parameters=state.parameters,
+        board_warp=state.board if fit is None else state.parameters.new_zeros(2),
+        cam_from_board_rotation=state.rotation,
+        cam_from_board_translation=state.translation,
+        residuals=at.pixel_errors(state).transpose(-1, -2),
+        model=options.lens if fit is None else fit.model,
+        size=size,
+        reach=reach,
+        fit=fit,
+        hybrid=None if fit is None else state,
+    ).to(device)
+
+
+def _parametric_problem(
+    pixels: Tensor,
+    board_points: Tensor,
+    means: Tensor,
+    size: tuple[int, int],
+    options: CalibrationOptions,
+    sigma: float,
+    start: CalibratedViews | None,
+) -> tuple[ProblemOf, BoardState, float]:
+    """The problem of data with a parametric model, where to begin, and the radius of the outermost corner."""
     constraints = options.constraints(size)
     known = [parameter_names(options.lens).index(name) for name in options.priors]
     weights = torch.tensor([sigma / spread for _, spread in options.priors.values()], dtype=torch.float64)
@@ -299,62 +287,48 @@ def calibrate_views(
         views = Views(board_points=board, pixels=corners, loss=options.loss, free_warp=options.board_warp)
         return views.problem(options.lens, constraints.free_parameters(options.lens), terms=terms)
 
-    data = (pixels, board_points, means)
-    fixed = tuple(tensor.detach() for tensor in data)
     if start is None:
-        priors = {n: (float(m), s) for (n, (_, s)), m in zip(options.priors.items(), fixed[2], strict=True)}
+        priors = {n: (float(m), s) for (n, (_, s)), m in zip(options.priors.items(), means, strict=True)}
         changed = dataclasses.replace(options, priors=priors)
-        begin = solve_corners(fixed[1], fixed[0], size, changed, lambda _: None).result.state
-        reach = Views(board_points=fixed[1], pixels=fixed[0]).observed_radius(begin)
+        begin = solve_corners(board_points, pixels, size, changed, lambda _: None).result.state
+        reach = Views(board_points=board_points, pixels=pixels).observed_radius(begin)
     else:
         begin, reach = start.state(), start.reach
         if start.model != options.lens or len(begin.translation) != len(pixels):
             raise InputError("calibrate_views: the start is of another lens model or another number of views")
-    problem = problem_of(*fixed)
-    state, found = exact_minimum(problem, problem.tidy(begin))
-    state = differentiated(problem_of, data, state, found, backward)
-    at = problem if backward == "none" else problem_of(*data)
-    return CalibratedViews(
-        parameters=state.parameters,
-        board_warp=state.board,
-        cam_from_board_rotation=state.rotation,
-        cam_from_board_translation=state.translation,
-        residuals=at.pixel_errors(state).transpose(-1, -2),
-        model=options.lens,
-        size=size,
-        reach=reach,
-    ).to(device)
+    return problem_of, begin, reach
 
 
-def _default_views(
+def _default_problem(
     pixels: Tensor,
     board_points: Tensor,
     size: tuple[int, int],
     options: CalibrationOptions,
     start: CalibratedViews | None,
-    backward: Backward,
-) -> CalibratedViews:
-    """`calibrate_views` with the default lens."""
-    before = None
-    if start is not None and start.fit is not None and start.hybrid is not None:
-        before = start.fit, start.hybrid
-        if len(start.hybrid.translation) != len(pixels):
+) -> tuple[ProblemOf, BoardState, HybridFit]:
+    """The problem of data with the default lens, where to begin, and the fit whose amplitudes are held.
+
+    Amplitudes of lens, board and motions, and the noise, come from the evidence of the corners, or from the start; they
+    count as constants of the gradient, which is that of the most probable camera under them.
+    """
+    if isinstance(options.board, MeasuredBoard):
+        raise InputError("calibrate_views: a measured board has no gradients; give its corners as board_points")
+    if start is None or start.fit is None or start.hybrid is None:
+        fit = fit_hybrid(board_points, pixels, size, options=options.of_fit(size))
+        begin = fit.state
+    else:
+        fit, begin = start.fit, BoardState(*(part.detach() for part in start.hybrid))
+        if len(begin.translation) != len(pixels):
             raise InputError("calibrate_views: the start is of another number of views")
-    state, residuals, fit = hybrid_views(pixels, board_points, size, options, before, backward)
-    placed = board_points.detach() @ state.rotation.detach().mT + state.translation.detach()[:, None]
-    angle = torch.atan2(placed[..., :2].norm(dim=-1), placed[..., 2])
-    return CalibratedViews(
-        parameters=state.parameters,
-        board_warp=state.parameters.new_zeros(2),
-        cam_from_board_rotation=state.rotation,
-        cam_from_board_translation=state.translation,
-        residuals=residuals,
-        model=fit.model,
-        size=size,
-        reach=float(torch.where(torch.isfinite(pixels).all(-1), angle, 0.0).max()),
-        fit=fit,
-        hybrid=state,
-    )
+    families = fit.families
+    precision = fit.sigma**2 / families.deviation(fit.expected).square()
+    if options.board == "exact":
+        precision[-len(fit.board_shapes.unit) :] = torch.inf
+
+    def problem_of(corners: Tensor, points: Tensor) -> BoardProblem:
+        return fit.problem(points, corners, torch.ones_like(corners[..., 0]), families.mean, precision)
+
+    return problem_of, begin, fit
 
 
 class CalibrationLayer(StatedModule):
