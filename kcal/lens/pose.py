@@ -27,7 +27,7 @@ class Pose(NamedTuple):
 
     Example:
         >>> there = Pose(torch.eye(3), torch.tensor([1.0, 0.0, 0.0]))
-        >>> there.after(there).translation.tolist(), there.center.tolist()
+        >>> there.after(there).translation.tolist(), (0.0 + there.center).tolist()
         ([2.0, 0.0, 0.0], [-1.0, 0.0, 0.0])
     """
 

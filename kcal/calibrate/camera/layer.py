@@ -239,14 +239,14 @@ def calibrate_views(
     data = (pixels, board_points) if options.hybrid else (pixels, board_points, means)
     fixed = tuple(tensor.detach() for tensor in data)
     if options.hybrid:
-        problem_of, begin, fit = _default_problem(*fixed, size, options, start)
+        problem_of, begin, fit = _default_problem(fixed, size, options, start)
         state, found = newton_minimum(problem_of(*fixed), begin, _POLISH)
         placed = fixed[1] @ state.rotation.mT + state.translation[:, None]
         angle = torch.atan2(placed[..., :2].norm(dim=-1), placed[..., 2])
         reach = float(torch.where(torch.isfinite(pixels).all(-1), angle, 0.0).max())
     else:
         sigma = _CORNER_SIGMA if corner_sigma is None else corner_sigma
-        problem_of, begin, reach = _parametric_problem(*fixed, size, options, sigma, start)
+        problem_of, begin, reach = _parametric_problem(fixed, size, options, sigma, start)
         problem = problem_of(*fixed)
         state, found = exact_minimum(problem, problem.tidy(begin))
     state = differentiated(problem_of, data, state, found, backward)
@@ -266,15 +266,14 @@ def calibrate_views(
 
 
 def _parametric_problem(
-    pixels: Tensor,
-    board_points: Tensor,
-    means: Tensor,
+    data: tuple[Tensor, ...],
     size: tuple[int, int],
     options: CalibrationOptions,
     sigma: float,
     start: CalibratedViews | None,
 ) -> tuple[ProblemOf, BoardState, float]:
     """The problem of data with a parametric model, where to begin, and the radius of the outermost corner."""
+    pixels, board_points, means = data
     constraints = options.constraints(size)
     known = [parameter_names(options.lens).index(name) for name in options.priors]
     weights = torch.tensor([sigma / spread for _, spread in options.priors.values()], dtype=torch.float64)
@@ -300,17 +299,14 @@ def _parametric_problem(
 
 
 def _default_problem(
-    pixels: Tensor,
-    board_points: Tensor,
-    size: tuple[int, int],
-    options: CalibrationOptions,
-    start: CalibratedViews | None,
+    data: tuple[Tensor, ...], size: tuple[int, int], options: CalibrationOptions, start: CalibratedViews | None
 ) -> tuple[ProblemOf, BoardState, HybridFit]:
     """The problem of data with the default lens, where to begin, and the fit whose amplitudes are held.
 
     Amplitudes of lens, board and motions, and the noise, come from the evidence of the corners, or from the start; they
     count as constants of the gradient, which is that of the most probable camera under them.
     """
+    pixels, board_points = data
     if isinstance(options.board, MeasuredBoard):
         raise InputError("calibrate_views: a measured board has no gradients; give its corners as board_points")
     if start is None or start.fit is None or start.hybrid is None:
