@@ -10,9 +10,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcal.lens.pose import Pose
 from kcal import Board, Camera
 from kcal.corners.print_board import pattern_shapes
+from kcal.lens.pose import Pose
 from kcal.sim.captures import BoardSize, PoseOptions, sample_board_poses
 from kcal.sim.scene import RenderOptions, render_light
 from scripts.shared.printed_board import Paper, light_of, points_of, through_lens

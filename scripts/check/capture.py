@@ -27,12 +27,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.lens.pose import Pose
 from kcal import Board, Camera, Observations, View, calibrate_camera
 from kcal.calibrate.camera.advice import NextView, far_sigma
 from kcal.capture.session import CaptureOptions, CaptureSession
 from kcal.corners.detect import detect_board, view_of
 from kcal.lens import rotation_from_vector
+from kcal.lens.pose import Pose
 from kcal.sim.captures import BoardSize, sample_board_poses
 from kcal.sim.scene import RenderOptions, render_board
 from scripts.shared.page import table, tell

@@ -19,9 +19,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from kcal.lens.pose import Pose
 from kcal import Board, Camera, KcalError, Observations, RigOptions, calibrate_rig
 from kcal.lens import rotation_from_vector, vector_from_rotation
+from kcal.lens.pose import Pose
 from kcal.sim.captures import BoardSize, sample_board_poses
 from scripts.shared.moving_captures import Hands, MovingCapture, moving_capture
 from scripts.shared.page import table, tell

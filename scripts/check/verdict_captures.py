@@ -10,9 +10,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from kcal.lens.pose import Pose
 from kcal import Board, CalibrationOptions, Observations, View
 from kcal.lens import rotation_from_vector
+from kcal.lens.pose import Pose
 from kcal.sim.captures import PoseOptions, TrueRig, drawn_lens, drawn_rig, sample_board_poses
 from kcal.sim.truth import TruthLens
 from scripts.shared.pair_poses import sample_pair_poses

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from kcal.lens.pose import Pose
 from kcal import Camera, Rig
 from kcal.io.foreign import rig_poses
 from kcal.io.formats import FORMATS, import_cameras
 from kcal.lens import LensModel, rotation_from_vector
+from kcal.lens.pose import Pose
 
 LENS = (-0.21, 0.052, 1.1e-3, -2.3e-3, 0.013, 0.021, -0.032, 0.0041, 5e-4, -6e-4, 7e-4, -8e-4)
 SUFFIXES = {

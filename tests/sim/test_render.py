@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from kcal.lens.pose import Pose
 from kcal import Board, Camera, InputError
 from kcal.lens import rotation_from_vector
+from kcal.lens.pose import Pose
 from kcal.sim import coast
 from kcal.sim.captures import (
     BoardSize,
