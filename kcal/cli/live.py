@@ -176,7 +176,7 @@ def live_command(
             tracker, run, output, log,
             senders=[sender_to(address) for address in to or []], start=moment_zero, shown=None,
         )  # fmt: skip
-        page = None if port is None else _live_map(stream.run, port)
+        page = None if port is None else _live_map(stream.run, port, moment_zero)
         stream.shown = _progress(advance, stream, page)
         if stream.ledger.place.sequence:
             err.print(f"continuing after {stream.ledger.place.sequence:,} moments of {log}", markup=False)
@@ -297,10 +297,10 @@ def _videos(
     return Videos(videos, rig, load_detector(detector), options, late=late, match_sigma=match_sigma, tell=tell)
 
 
-def _live_map(run: Located, port: int) -> LiveMap:
+def _live_map(run: Located, port: int, start: datetime.datetime | None) -> LiveMap:
     with with_extra("mark", "--port needs"):
         from kcal.pipeline.senders import LiveMap
-    page = LiveMap(run, port)
+    page = LiveMap(run, port, start)
     err.print(f"live map: {page.address}", markup=False)
     return page
 
@@ -314,7 +314,7 @@ def _progress(
     def show(columns: PositionColumns, tracks: Tracks) -> None:
         nonlocal next_time, read
         if page is not None:
-            page.show(columns, stream.counts.moments)
+            page.show(columns, stream.counts.moments, tracks.time)
         if clocks.monotonic() >= next_time:
             next_time, before, read = clocks.monotonic() + 0.5, read, stream.ledger.place.offset
             advance(f"{len(tracks.number)} tracks; {summary(stream.counts)}", read - before)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 import datetime
 import itertools
+import math
 import re
 import secrets
 import socket
@@ -24,10 +26,12 @@ from starlette.responses import PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
 
 from kcal.errors import InputError, with_extra
+from kcal.lens.rig import Origin
 from kcal.locate.export import cot_events, point_features
 from kcal.locate.positions import CORNER_DECIMALS, Located, camera_place, field_of_view, near, ring_blocks
 from kcal.locate.tables import PositionColumns
-from kcal.texts import length_text
+from kcal.texts import length_text, number_text
+from kcal.web.coast import coast_near
 from kcal.web.serving import LocalServer, local_app, page_files
 
 # Where positions go besides files: Cursor-on-Target by UDP or TCP, and MQTT.
@@ -213,18 +217,33 @@ _POLL, _ALIVE, _MAP_FAREWELL = 0.1, 10.0, 3.0
 _FIELD_REACH_M = 100_000.0
 
 
+# Points of a trail, seconds between two of them, and for which it stays once its track has ended.
+_TRAIL, _TRAIL_STEP_S, _TRAIL_KEPT_S = 300, 0.5, 60.0
+# The year 2001 in Unix seconds: smaller times are not of the calendar.
+CALENDAR = 1e9
+
+
+@dataclasses.dataclass
+class Trail:
+    """Where a track has been, and when last."""
+
+    places: deque[list[float]] = dataclasses.field(default_factory=lambda: deque(maxlen=_TRAIL))
+    time_s: float = 0.0
+
+
 class LiveMap:
     """The server; `address` is what to open, `readers` the number of pages that are open.
 
     Args:
         run: where the cameras stand.
         port: 0 for any that is free.
+        start: calendar time of second 0, if times are not Unix seconds.
 
     Raises:
         InputError: the port cannot be used.
     """
 
-    def __init__(self, run: Located, port: int) -> None:
+    def __init__(self, run: Located, port: int, start: datetime.datetime | None = None) -> None:
         cameras = [
             {
                 "name": camera.name if run.feet is not None else f"{camera.name} camera",
@@ -233,10 +252,14 @@ class LiveMap:
             }
             for camera in run.cameras
         ]
-        self.run, self.readers = run, 0
-        self._site = orjson.dumps({"cameras": cameras})
-        # Number of the news, its columns and its time step; the last that was written for pages.
-        self._news: tuple[int, PositionColumns | None, int] = (0, None, 0)
+        self.run, self.readers, self._start = run, 0, start
+        coast = coast_near(run.place.lat, run.place.lon)
+        self._site = orjson.dumps({"cameras": cameras, "coast": coast})
+        # Number of the news, its columns, its time step and time; the last that was written for pages.
+        self._news: tuple[int, PositionColumns | None, int, float] = (0, None, 0, 0.0)
+        self._trails: dict[str, Trail] = {}
+        self._trails_end = -math.inf
+        self._lock = threading.Lock()
         self._written = (0, b"")
         self._ending = b""
         self._server = LocalServer(self._app, port, fallback=False)
@@ -245,9 +268,22 @@ class LiveMap:
         self._thread = threading.Thread(target=self._server.run, daemon=True)
         self._thread.start()
 
-    def show(self, columns: PositionColumns, sequence: int) -> None:
-        """Show the tracks of a time step. It is written out only if a page asks for it."""
-        self._news = (self._news[0] + 1, columns, sequence)
+    def show(self, columns: PositionColumns, sequence: int, time_s: float) -> None:
+        """Show the tracks of a time step, at a time in seconds. They are written out only if a page asks for them."""
+        if not 0.0 <= time_s - self._trails_end < _TRAIL_STEP_S:
+            self._trails_end = time_s
+            with self._lock:
+                self._follow(columns, time_s)
+        self._news = (self._news[0] + 1, columns, sequence, time_s)
+
+    def _follow(self, columns: PositionColumns, time_s: float) -> None:
+        """Where each track has been, for pages that are opened later."""
+        for i in np.flatnonzero(columns.located).tolist():
+            trail = self._trails.setdefault(columns.names[i], Trail())
+            trail.places.append(_place_of(columns, i, self.run.place))
+            trail.time_s = time_s
+        for name in [name for name, one in self._trails.items() if not 0.0 <= time_s - one.time_s <= _TRAIL_KEPT_S]:
+            del self._trails[name]
 
     def close(self, words: str = "finished") -> None:
         """Tell each page how it ended, and end the server."""
@@ -272,13 +308,16 @@ class LiveMap:
         self.readers += 1
         try:
             yield b"event: site\ndata: " + self._site + b"\n\n"
+            with self._lock:
+                trails = {name: list(trail.places) for name, trail in self._trails.items()}
+            yield b"event: trails\ndata: " + orjson.dumps(trails) + b"\n\n"
             seen, quiet = 0, 0.0
             while not await request.is_disconnected():
                 # Looked at before the news: what came before the end is shown before it.
-                ending, (number, columns, sequence) = self._ending, self._news
+                ending, (number, columns, sequence, time_s) = self._ending, self._news
                 if number != seen and columns is not None:
                     seen, quiet = number, 0.0
-                    yield b"event: tracks\ndata: " + self._text(number, columns, sequence) + b"\n\n"
+                    yield b"event: tracks\ndata: " + self._text(number, columns, sequence, time_s) + b"\n\n"
                 elif quiet >= _ALIVE:
                     quiet = 0.0
                     yield b": alive\n\n"
@@ -290,14 +329,31 @@ class LiveMap:
         finally:
             self.readers -= 1
 
-    def _text(self, number: int, columns: PositionColumns, sequence: int) -> bytes:
+    def _text(self, number: int, columns: PositionColumns, sequence: int, time_s: float) -> bytes:
         """News as JSON, written once for all pages."""
         if self._written[0] != number:
-            self._written = number, _tracks_text(columns, sequence, self.run)
+            news = {"sequence": sequence, "time": time_s, "clock": clock_text(time_s, self._start)}
+            self._written = number, orjson.dumps({**news, "tracks": _tracks(columns, self.run)})
         return self._written[1]
 
 
-def _tracks_text(columns: PositionColumns, sequence: int, run: Located) -> bytes:
+def clock_text(time_s: float, start: datetime.datetime | None = None) -> str:
+    """A time of the stream, as of the calendar where it is known.
+
+    Example:
+        >>> clock_text(1767225600.25), clock_text(12.34)
+        ('2026-01-01 00:00:00 UTC', '12.3 s')
+    """
+    if start is not None:
+        moment = (start + datetime.timedelta(seconds=time_s)).astimezone(datetime.UTC)
+    elif time_s > CALENDAR:
+        moment = datetime.datetime.fromtimestamp(time_s, datetime.UTC)
+    else:
+        return f"{time_s:.1f} s"
+    return f"{moment:%Y-%m-%d %H:%M:%S} UTC"
+
+
+def _tracks(columns: PositionColumns, run: Located) -> list[dict[str, Any]]:
     """The tracks with a position: name, place, 95 % region, and what is said of each."""
     origin = run.place
     located = np.flatnonzero(columns.located)
@@ -307,15 +363,39 @@ def _tracks_text(columns: PositionColumns, sequence: int, run: Located) -> bytes
     sigmas = (columns.column("range_high_m") - columns.column("range_low_m")) / 3.92
     tracks = []
     for i, ring in zip(located.tolist(), rings, strict=True):
-        lat, lon = columns.numbers[i, :2].tolist()
-        # As `near` does for one: the whole ring lies on the origin's side of the antimeridian.
-        turn = near(lon, origin.lon) - lon
+        place = _place_of(columns, i, origin)
+        # The whole ring lies on the origin's side of the antimeridian.
+        turn = place[1] - columns.numbers[i, 1]
+        words = [_called(columns, i), length_text(distances[i], sigmas[i]), *_speed(columns, i)]
         tracks.append(
             {
                 "name": columns.names[i],
-                "place": [lat, lon + turn],
+                "place": place,
                 "region": np.round(ring + np.array([0.0, turn]), CORNER_DECIMALS).tolist(),
-                "text": f"{columns.extras['category'][i]}, {length_text(distances[i], sigmas[i])}",
+                "text": ", ".join(words),
             }
         )
-    return orjson.dumps({"sequence": sequence, "tracks": tracks})
+    return tracks
+
+
+def _place_of(columns: PositionColumns, row: int, origin: Origin) -> list[float]:
+    lat, lon = columns.numbers[row, :2].tolist()
+    return [lat, near(lon, origin.lon)]
+
+
+def _called(columns: PositionColumns, row: int) -> str:
+    """`car 12` of the category car and the name `track 12`, if the category is a word."""
+    name, category = columns.names[row], columns.extras["category"][row]
+    return name if not category or category.isdigit() else f"{category} {name.rpartition(' ')[2]}"
+
+
+def _speed(columns: PositionColumns, row: int) -> list[str]:
+    """The level speed and where it leads, where that is known to be more than nothing."""
+    east, north, east_sigma, north_sigma = (
+        float(columns.extras[f"velocity_{part}_mps"][row]) for part in ("east", "north", "east_sigma", "north_sigma")
+    )
+    speed = math.hypot(east, north)
+    sigma = math.hypot(east * east_sigma, north * north_sigma) / max(speed, 1e-9)
+    if not speed > 2.0 * sigma:
+        return []
+    return [f"{number_text(speed, sigma)} m/s toward {math.degrees(math.atan2(east, north)) % 360:03.0f}°"]

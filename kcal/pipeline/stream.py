@@ -31,7 +31,7 @@ from kcal.locate.tabulate import number_table
 from kcal.pipeline.estimates import TrackStates
 from kcal.pipeline.grouping import Moment
 from kcal.pipeline.imm_filter import Beliefs
-from kcal.pipeline.senders import Sender
+from kcal.pipeline.senders import CALENDAR, Sender
 from kcal.pipeline.tracks import Tracker, TrackRecord, Tracks
 from kcal.threads import Handover
 
@@ -380,8 +380,6 @@ def _texts(values: torch.Tensor, ok: torch.Tensor) -> list[str]:
 _WAITING, _CHECKPOINT = 32, 250
 # Bytes; a longer line is malformed, so that memory stays bounded.
 _LONGEST = 1 << 22
-# The year 2001 in Unix seconds: smaller times are not of the calendar.
-CALENDAR = 1e9
 
 
 class SourceItem(NamedTuple):

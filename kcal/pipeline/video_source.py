@@ -29,7 +29,8 @@ from kcal.pipeline.association import AssociationOptions
 from kcal.pipeline.detections import Detections, Detector, detect_in
 from kcal.pipeline.grouping import Moment, group_objects
 from kcal.pipeline.pairing import ObjectDisparity, ObjectViews, pair_objects
-from kcal.pipeline.stream import CALENDAR, SourceItem
+from kcal.pipeline.senders import CALENDAR
+from kcal.pipeline.stream import SourceItem
 from kcal.threads import Handover
 
 # Frames of video files with their own times, decoded by PyAV (the extra `video`).

@@ -12,14 +12,7 @@
     for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
     return made;
   };
-  const North = L.Control.extend({onAdd: () => {
-    const box = L.DomUtil.create("div", "north");
-    const drawn = node(box, "svg", {viewBox: "0 0 20 40", width: 20, height: 40});
-    node(drawn, "polygon", {points: "10,0 16,20 10,16 4,20", fill: "#374151"});
-    node(drawn, "text", {x: 10, y: 36, "text-anchor": "middle"}).append(text("N"));
-    return box;
-  }});
-  new North({position: "topleft"}).addTo(map);
+  addNorth(map);
   const head = (azimuth) => {
     const box = document.createElement("div");
     node(node(box, "svg", {viewBox: "-6 -6 12 12"}), "path",
@@ -56,6 +49,7 @@
       if (tip && tip.getElement()) tip.getElement().style.display = far ? "" : "none";
     }
   };
+  if (data.coast.length) drawCoast(map, data.coast, layer("coastline"));
   drawCameras(data.cameras, labels, layer("fields of view"), layer("cameras"));
   for (const arc of data.arcs) {
     L.polyline(arc.line, {color: "#4b5563", weight: 1, dashArray: "5 4", smoothFactor: 0.2, interactive: false}).addTo(layer("range arcs"));
@@ -93,6 +87,6 @@
   }
   L.control.layers(null, overlays, {collapsed: map.getSize().x < 600}).addTo(map);
   map.on("zoomend moveend overlayadd", tidy);
-  map.fitBounds(data.bounds, {padding: [30, 30]});
+  fitClear(map, data.bounds);
   map.whenReady(() => { tidy(); labels.place(); document.documentElement.dataset.drawn = data.points.length + "/" + document.querySelectorAll("#map path").length; });
 })();

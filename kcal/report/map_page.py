@@ -38,6 +38,7 @@ from kcal.locate.positions import (
 )
 from kcal.locate.stereo import PositionStatus
 from kcal.report.tables import interval_text, range_sigma, range_unit
+from kcal.web.coast import coast_near
 from kcal.texts import Unit, length_text, number_text, page_data, page_policy, page_text, range_text
 
 # Embed a folder of map tiles or a GeoTIFF in a map that works without a network.
@@ -338,7 +339,7 @@ def _content(located: Located, truth: Tensor | None) -> dict[str, Any]:
     rings = [[(lat, near(lon, located.place.lon)) for lat, lon in ring] for ring in region_rings(located)]
     return {
         "cameras": cameras, "arcs": arcs, "regions": rings, "bearings": bearings, "arrows": arrows, "truth": true,
-        "points": points,
+        "points": points, "coast": coast_near(located.place.lat, located.place.lon),
     }  # fmt: skip
 
 
@@ -357,9 +358,11 @@ def _popup_rows(position: Position, unit: Unit) -> list[tuple[str, str]]:
     sigma = range_sigma(position)
     up = None if position.covariance is None else math.sqrt(position.covariance[2][2])
     height = position.height or 0.0
+    # Six digits are 0.1 m; what is known better has more.
+    digits = 6 if up is None or up > 0.05 else 8
     rows = [
-        ("latitude", f"{position.lat:.7f}°"),
-        ("longitude", f"{position.lon:.7f}°"),
+        ("latitude", f"{position.lat:.{digits}f}°"),
+        ("longitude", f"{position.lon:.{digits}f}°"),
         ("ellipsoidal height", f"{number_text(height, up)} m"),
     ]
     if position.geoid_height is not None:

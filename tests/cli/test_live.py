@@ -102,7 +102,7 @@ def test_the_map_is_told_how_it_ended(folder: Path, how: str, monkeypatch: pytes
             raise FileError("the disk is full")
 
     monkeypatch.setattr(LiveMap, "close", ended)
-    monkeypatch.setattr(LiveMap, "show", lambda page, columns, sequence: shown.append(sequence))
+    monkeypatch.setattr(LiveMap, "show", lambda page, columns, sequence, time_s: shown.append(sequence))
     monkeypatch.setattr(Stream, "_write", disturbed)
     if how.startswith("ended"):
         with pytest.raises(FileError, match="disk is full"):

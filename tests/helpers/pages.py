@@ -115,7 +115,7 @@ def crowded_map(targets: int) -> Iterator[LiveMap]:
     reach = 100.0 * 30.0 ** torch.linspace(0, 1, targets).double()
     side = 0.3 * reach * torch.sin(2.4 * torch.arange(targets).double())
     left, right = site.rig(torch.stack([side, 0 * side, reach], -1))[0].unbind(-2)
-    page.show(track_columns(Tracker(site, TrackOptions(confirm_hits=1))(pairs_of(left, right, 1.0, 0.05)), 1), 1)
+    page.show(track_columns(Tracker(site, TrackOptions(confirm_hits=1))(pairs_of(left, right, 1.0, 0.05)), 1), 1, 1.0)
     yield page
     page.close()
 

@@ -45,7 +45,7 @@ def show(page: LiveMap, category: str = "car") -> PositionColumns:
     left, right = SITE.rig(torch.tensor([[0.0, 0.0, 500.0], [30.0, 0.0, 90_000.0]]).double())[0].unbind(-2)
     columns = track_columns(tracker(pairs_of(left, right, 1.0)), 1)
     columns.extras["category"][0] = category
-    page.show(columns, 7)
+    page.show(columns, 7, 1.0)
     return columns
 
 
@@ -68,18 +68,19 @@ def events(page: LiveMap, count: int) -> dict[str, Any]:
 
 def test_site_and_tracks_are_told(page: LiveMap) -> None:
     show(page)
-    told = events(page, 2)
+    told = events(page, 3)
     assert [camera["name"] for camera in told["site"]["cameras"]] == ["left camera", "right camera"]
     assert told["tracks"]["sequence"] == 7
     (track,) = told["tracks"]["tracks"]  # the other is too far for a position
     assert track["name"] == "track 1"
     assert track["place"] == pytest.approx([SITE.origin.lat + 500 / 110_700, SITE.origin.lon], abs=1e-4)
-    assert track["text"] == "car, 500.0 m"
+    assert track["text"] == "car 1, 500.0 m"
+    assert told["tracks"]["clock"] == "1.0 s"
 
 
 def test_regions_are_those_of_the_covariance(page: LiveMap) -> None:
     columns = show(page)
-    (track,) = events(page, 2)["tracks"]["tracks"]
+    (track,) = events(page, 3)["tracks"]["tracks"]
     ring = level(track["region"])
     east, north = (columns.column(f"cov_{axes}_m2")[0] ** 0.5 for axes in ("ee", "nn"))
     # 95 % of two Gaussian coordinates lie within 2.45 sigma; the target is north, and its range is the worst known.
@@ -101,8 +102,8 @@ def test_nothing_jumps_at_the_antimeridian() -> None:
     site = tracked_site(origin=Origin(lat=10.0, lon=179.9999, height=0.0), heading_deg=90.0)
     live = LiveMap(PointLocator(Localizer(site.rig, origin=site.origin, heading_deg=90.0)).located(), 0)
     left, right = site.rig(torch.tensor([[0.0, 0.0, 500.0]]).double())[0].unbind(-2)
-    live.show(track_columns(Tracker(site, TrackOptions(confirm_hits=1))(pairs_of(left, right, 1.0)), 1), 1)
-    told = events(live, 2)
+    live.show(track_columns(Tracker(site, TrackOptions(confirm_hits=1))(pairs_of(left, right, 1.0)), 1), 1, 1.0)
+    told = events(live, 3)
     live.close()
     (track,) = told["tracks"]["tracks"]
     lons = [
@@ -113,13 +114,13 @@ def test_nothing_jumps_at_the_antimeridian() -> None:
 
 def test_the_last_tracks_and_the_end_are_told(page: LiveMap) -> None:
     found: dict[str, Any] = {}
-    reader = threading.Thread(target=lambda: found.update(events(page, 3)))
+    reader = threading.Thread(target=lambda: found.update(events(page, 4)))
     reader.start()
     wait_for(lambda: page.readers == 1)
     show(page)
     page.close("stopped")
     reader.join()
-    assert list(found) == ["site", "tracks", "end"]
+    assert list(found) == ["site", "trails", "tracks", "end"]
     assert found["end"] == {"words": "stopped"}
 
 
@@ -143,9 +144,11 @@ def test_the_page_in_a_browser(page: LiveMap) -> None:
         show(page, "<img src=x onerror=alert(1)>")
         tab.wait_for_function("() => document.documentElement.dataset.sequence === '7'")
         status(tab, "running")
-        assert tab.inner_text("#count") == "1 track, moment 7"
+        assert tab.inner_text("#count") == "1 target"
+        assert tab.inner_text("#clock") == "1.0 s"
+        assert tab.locator("svg[aria-label='North is up']").is_visible()
         names = tab.locator(".leaflet-tooltip").all_inner_texts()
-        assert names == ["left camera", "right camera", "track 1, <img src=x onerror=alert(1)>, 500.0 m"]
+        assert names == ["left camera", "right camera", "<img src=x onerror=alert(1)> 1, 500.0 m"]
         assert tab.locator("#map img").count() == 0
         # A field of view for each camera, two cameras, a region, a trail, a target.
         assert tab.locator("#map path").count() == 2 + 2 + 1 + 1 + 1

@@ -1,5 +1,5 @@
 "use strict";
-// What every map draws alike: names of dots, and cameras with their fields of view.
+// What every map draws alike: names of dots, cameras with their fields of view, the coast, north, and where to look.
 
 // What is taken of a picture of some pixels, so that names find room: boxes are [left, top, right, bottom].
 function takenRoom(width, height) {
@@ -144,4 +144,46 @@ function drawCameras(cameras, labels, fields, dots) {
     labels.add(dot, camera.name, 1, others.some((other) => other.place[1] > camera.place[1]) ? 1 : 0);
     dot.addTo(dots);
   });
+}
+
+// An arrow to the north: up, on these maps.
+function addNorth(map) {
+  const North = L.Control.extend({onAdd: () => {
+    const box = L.DomUtil.create("div", "north"), name = "http://www.w3.org/2000/svg";
+    const node = (parent, kind, attributes) => {
+      const made = parent.appendChild(document.createElementNS(name, kind));
+      for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+      return made;
+    };
+    const drawn = node(box, "svg", {viewBox: "0 0 20 40", width: 20, height: 40, role: "img", "aria-label": "North is up"});
+    node(drawn, "polygon", {points: "10,0 16,20 10,16 4,20", fill: "#374151"});
+    node(drawn, "text", {x: 10, y: 36, "text-anchor": "middle"}).textContent = "N";
+    return box;
+  }});
+  new North({position: "topleft"}).addTo(map);
+}
+
+// Coastlines, which are some 2 km off: shown while that is less than a fifth of the map's width.
+function drawCoast(map, lines, layer) {
+  if (!lines.length) return;
+  const coast = L.polyline(lines, {color: "#4a7a96", weight: 1.2, smoothFactor: 0.5, interactive: false, attribution: "coast: Natural Earth, ± 2 km"}).addTo(layer);
+  const judge = () => {
+    const size = map.getSize(), wide = map.containerPointToLatLng([0, size.y / 2]).distanceTo(map.containerPointToLatLng([size.x, size.y / 2]));
+    coast.setStyle({opacity: wide > 10000 ? 0.9 : 0});
+  };
+  map.on("zoomend resize", judge);
+  map.whenReady(judge);
+}
+
+// Show all of some bounds beside the controls, or below and above them, whichever shows it larger.
+function fitClear(map, bounds, options = {}) {
+  const size = map.getSize(), free = 24;
+  const across = (corner) => Math.max(0, ...[...map.getContainer().querySelectorAll(corner + " .leaflet-control")].map((e) => e.offsetWidth));
+  const down = (corner) => map.getContainer().querySelector(corner).offsetHeight;
+  const [left, right] = [".leaflet-top.leaflet-left", ".leaflet-top.leaflet-right"].map((corner) => (across(corner) ? across(corner) + 10 : 0) + free);
+  const top = Math.max(down(".leaflet-top.leaflet-left"), down(".leaflet-top.leaflet-right")) + free;
+  const bottom = Math.max(down(".leaflet-bottom.leaflet-left"), down(".leaflet-bottom.leaflet-right")) + free;
+  const zoom = (x, y) => (x < size.x && y < size.y ? map.getBoundsZoom(bounds, false, L.point(x, y)) : -1);
+  const beside = zoom(left + right, free + bottom) >= zoom(2 * free, top + bottom);
+  map.fitBounds(bounds, {...options, paddingTopLeft: beside ? [left, free] : [free, top], paddingBottomRight: [beside ? right : free, bottom]});
 }
