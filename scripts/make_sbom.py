@@ -36,6 +36,13 @@ EMBEDDED = (
         "description": "Hoffleit and Warren 1991, packed in kcal/stars/bright_stars.bin",
         "licenses": [{"license": {"name": "not stated by its authors: positions and brightness of stars"}}],
     },
+    {
+        "type": "data",
+        "name": "Natural Earth 1:50m land",
+        "version": "4.1.0",
+        "description": "coastlines of maps, packed in kcal/web/map/coast.npz; kcal/web/map/COAST.txt names the source",
+        "licenses": [{"license": {"name": "public domain"}}],
+    },
 )
 
 

@@ -3,7 +3,7 @@
   const data = JSON.parse(document.getElementById("data").textContent);
   const map = L.map("map", {preferCanvas: false, maxZoom: 22, zoomSnap: 0.25, worldCopyJump: false});
   map.attributionControl.setPrefix("kcal, Leaflet");
-  L.control.scale({imperial: false, maxWidth: 200}).addTo(map);
+  L.control.scale({imperial: false, maxWidth: 140}).addTo(map);
   const text = (value) => document.createTextNode(value);
   // Leaflet takes attributions as HTML: this is the HTML that shows a text.
   const attribution = (value) => { const s = document.createElement("span"); s.append(text(value)); return s.innerHTML; };

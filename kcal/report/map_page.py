@@ -38,8 +38,8 @@ from kcal.locate.positions import (
 )
 from kcal.locate.stereo import PositionStatus
 from kcal.report.tables import interval_text, range_sigma, range_unit
-from kcal.web.coast import coast_near
 from kcal.texts import Unit, length_text, number_text, page_data, page_policy, page_text, range_text
+from kcal.web.coast import coast_near
 
 # Embed a folder of map tiles or a GeoTIFF in a map that works without a network.
 

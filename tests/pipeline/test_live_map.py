@@ -137,6 +137,56 @@ def status(page: Any, words: str) -> None:
     page.wait_for_function("words => document.getElementById('status').textContent === words", arg=words)
 
 
+def moving(page: LiveMap, seconds: float) -> None:
+    """A car that drives east at 20 m/s, 500 m away, told ten times a second."""
+    tracker = Tracker(SITE, TrackOptions(confirm_hits=1))
+    for step in range(int(10 * seconds)):
+        time = 1_767_225_600.0 + 0.1 * step
+        left, right = SITE.rig(torch.tensor([[2.0 * step - 100.0, 0.0, 500.0]]).double())[0].unbind(-2)
+        page.show(track_columns(tracker(pairs_of(left, right, time, 0.05)), step), step, time)
+
+
+def test_speed_clock_and_where_it_has_been_are_told(page: LiveMap) -> None:
+    moving(page, 10.0)
+    told = events(page, 3)
+    assert told["tracks"]["clock"] == "2026-01-01 00:00:09 UTC"
+    (track,) = told["tracks"]["tracks"]
+    name, distance, speed = track["text"].split(", ")
+    assert name == "car 1"
+    assert distance.endswith(" m")
+    value, toward = speed.removesuffix("°").split(" m/s toward ")
+    assert float(value) == pytest.approx(20.0, abs=0.5)
+    assert float(toward) == pytest.approx(90.0, abs=3.0)
+    # Twice a second, for pages that are opened later.
+    trail = level(told["trails"]["track 1"])
+    assert len(trail) == 20
+    assert trail[-1, 0] - trail[0, 0] == pytest.approx(190.0, abs=3.0)
+    # A minute after its end, a trail is gone.
+    nothing = page._news[1].rows(np.arange(0))
+    page.show(nothing, 100, 1_767_225_600.0 + 65.0)
+    assert events(page, 2)["trails"]
+    page.show(nothing, 101, 1_767_225_600.0 + 71.0)
+    assert not events(page, 2)["trails"]
+
+
+@needs_browser
+def test_a_page_that_is_opened_later_shows_trails(page: LiveMap) -> None:
+    moving(page, 5.0)
+    with chromium_page() as tab:
+        tab.goto(page.address)
+        tab.wait_for_function("() => document.documentElement.dataset.sequence === '49'")
+        trail = tab.locator("path[stroke='#c02a6b']")
+        assert trail.bounding_box()["width"] > 20
+        page.show(page._news[1].rows(np.arange(0)), 50, 1_767_225_606.0)
+        tab.wait_for_function("() => document.documentElement.dataset.sequence === '50'")
+        assert trail.count() == 1
+        assert tab.inner_text("#count") == "0 targets"
+        page.show(page._news[1].rows(np.arange(0)), 51, 1_767_225_670.0)
+        tab.wait_for_function("() => document.documentElement.dataset.sequence === '51'")
+        assert trail.count() == 0
+        assert tab.complaints == []
+
+
 @needs_browser
 def test_the_page_in_a_browser(page: LiveMap) -> None:
     with chromium_page() as tab:
@@ -150,8 +200,8 @@ def test_the_page_in_a_browser(page: LiveMap) -> None:
         names = tab.locator(".leaflet-tooltip").all_inner_texts()
         assert names == ["left camera", "right camera", "<img src=x onerror=alert(1)> 1, 500.0 m"]
         assert tab.locator("#map img").count() == 0
-        # A field of view for each camera, two cameras, a region, a trail, a target.
-        assert tab.locator("#map path").count() == 2 + 2 + 1 + 1 + 1
+        # A field of view for each camera, two cameras, a region, a trail, a target, the coast.
+        assert tab.locator("#map path").count() == 2 + 2 + 1 + 1 + 1 + 1
         page.close()
         status(tab, "finished")
         tab.wait_for_timeout(500)

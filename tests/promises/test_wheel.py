@@ -43,6 +43,7 @@ def test_two_builds_are_the_same(tmp_path: Path) -> None:
         names = wheel.namelist()
         assert json.loads(wheel.read("kcal/sbom.cdx.json")) == json.loads(SBOM.read_text(encoding="utf-8"))
     assert {"kcal/py.typed", "kcal/stars/bright_stars.bin", "kcal/report/leaflet/leaflet.js"} <= set(names)
+    assert {"kcal/web/map/coast.npz", "kcal/web/map/COAST.txt"} <= set(names)
     assert sum(name.endswith("/LICENSE") and ".dist-info/" in name for name in names) == 2
     assert not [name for name in names if name.startswith(("tests", "scripts")) or name.endswith(".pyc")]
 

@@ -85,9 +85,11 @@ def dom(file: Path) -> str:
 def test_a_browser_draws_it_without_errors(tmp_path: Path, lon: float) -> None:
     located, truth = scene(Origin(lat=19.07, lon=lon, height=14.0))
     drawn = dom(save_map(tmp_path / "map.html", located, truth))
-    # Points, true ones, cameras with fields, arcs with ends, regions, arrows with heads, a bearing.
+    # Points, true ones, cameras with fields, arcs with ends, regions, arrows with heads, a bearing; the coast of India.
     assert 'data-drawn="3/' in drawn
-    assert int(re.search(r'data-drawn="3/(\d+)"', drawn).group(1)) == 3 + 4 + 4 + 6 + 3 + 6 + 1
+    coast = lon == 72.87
+    assert int(re.search(r'data-drawn="3/(\d+)"', drawn).group(1)) == 3 + 4 + 4 + 6 + 3 + 6 + 1 + coast
+    assert ("coast: Natural Earth ± 2 km" in drawn) == coast
     for text in ("gate", "&lt;/script&gt;&lt;b&gt;mast", "ship", "5 km", "estimated positions"):
         assert text in drawn
 
@@ -251,3 +253,34 @@ def test_numbers_are_within_the_keyboards_reach(tmp_path: Path) -> None:
                 break
         page.keyboard.press("Enter")
         assert page.locator(".leaflet-popup-content").inner_text().startswith("latitude")
+
+
+COVERED = """() => {
+  const boxes = (kind) => [...document.querySelectorAll(kind)].map((e) => e.getBoundingClientRect());
+  const controls = boxes('.leaflet-control');
+  return boxes('#map path[aria-label]').filter((a) => controls.some((b) =>
+    a.left < b.right && b.left < a.right && a.top < b.bottom && b.top < a.bottom)).length;
+}"""
+
+
+@needs_browser
+@pytest.mark.parametrize(("width", "height"), [(1280, 800), (390, 800)])
+@pytest.mark.parametrize("heading", [45.0, 135.0, 225.0, 315.0])
+def test_controls_cover_no_camera_and_no_point(tmp_path: Path, width: int, height: int, heading: float) -> None:
+    left, right = pinhole_rig()(TRUTH[:3])[0].unbind(-2)
+    located = located_pairs(pinhole_rig(), left, right, origin=ORIGIN, heading_deg=heading, names=["a", "b", "c"])
+    with chromium_page(width, height) as page:
+        page.goto(save_map(tmp_path / "map.html", located).as_uri())
+        page.wait_for_function("() => document.documentElement.dataset.drawn")
+        assert page.locator("#map path[aria-label]").count() == 5
+        assert page.evaluate(COVERED) == 0
+
+
+@pytest.mark.parametrize(("scale", "digits"), [(1.0, 6), (1e-3, 8)])
+def test_coordinates_have_the_digits_that_mean_something(scale: float, digits: int) -> None:
+    left, right = pinhole_rig(baseline=10.0 * scale)(TRUTH[:1] * scale)[0].unbind(-2)
+    located = located_pairs(
+        pinhole_rig(baseline=10.0 * scale), left, right, origin=ORIGIN, heading_deg=0.0, names=["a"]
+    )
+    rows = dict(data(map_page(located))["points"][0]["rows"])
+    assert all(len(rows[name].rstrip("°").split(".")[1]) == digits for name in ("latitude", "longitude"))

@@ -2,7 +2,7 @@
 (function () {
   const map = L.map("map", {maxZoom: 22, zoomSnap: 0.25});
   map.attributionControl.setPrefix("kcal, Leaflet");
-  L.control.scale({imperial: false, maxWidth: 200}).addTo(map);
+  L.control.scale({imperial: false, maxWidth: 140}).addTo(map);
   const [fields, cameras, regions, trails] = [0, 1, 2, 3].map(() => L.layerGroup().addTo(map));
   addNorth(map);
   const labels = mapLabels(map);

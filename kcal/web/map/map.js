@@ -166,7 +166,7 @@ function addNorth(map) {
 // Coastlines, which are some 2 km off: shown while that is less than a fifth of the map's width.
 function drawCoast(map, lines, layer) {
   if (!lines.length) return;
-  const coast = L.polyline(lines, {color: "#4a7a96", weight: 1.2, smoothFactor: 0.5, interactive: false, attribution: "coast: Natural Earth, ± 2 km"}).addTo(layer);
+  const coast = L.polyline(lines, {color: "#4a7a96", weight: 1.2, smoothFactor: 0.5, interactive: false, attribution: "coast: Natural Earth ± 2 km"}).addTo(layer);
   const judge = () => {
     const size = map.getSize(), wide = map.containerPointToLatLng([0, size.y / 2]).distanceTo(map.containerPointToLatLng([size.x, size.y / 2]));
     coast.setStyle({opacity: wide > 10000 ? 0.9 : 0});
