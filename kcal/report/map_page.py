@@ -359,7 +359,7 @@ def _popup_rows(position: Position, unit: Unit) -> list[tuple[str, str]]:
     up = None if position.covariance is None else math.sqrt(position.covariance[2][2])
     height = position.height or 0.0
     # Six digits are 0.1 m; what is known better has more.
-    digits = 6 if up is None or up > 0.05 else 8
+    digits = 6 if (position.cep50_m or 1.0) > 0.05 else 8
     rows = [
         ("latitude", f"{position.lat:.{digits}f}°"),
         ("longitude", f"{position.lon:.{digits}f}°"),

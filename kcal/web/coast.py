@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from importlib import resources
+from pathlib import Path
 
 import numpy as np
 
-PACKED_FILE = resources.files("kcal.web") / "map" / "coast.npz"
+PACKED_FILE = Path(__file__).parent / "map" / "coast.npz"
 # Degrees of latitude around a site; of longitude as far in meters.
 _REACH = 5.0
 
@@ -20,7 +20,7 @@ def coast_near(lat: float, lon: float, reach: float = _REACH) -> list[list[list[
         >>> len(coast_near(46.8, 8.2)) > 0, coast_near(47.0, 65.0, 2.0)
         (True, [])
     """
-    with PACKED_FILE.open("rb") as file, np.load(file) as packed:
+    with np.load(PACKED_FILE) as packed:
         counts, starts, steps = packed["counts"], packed["starts"], packed["steps"].astype(np.int64)
         scale, corner = packed["scale"], packed["corner"]
     ends = np.cumsum(counts)
