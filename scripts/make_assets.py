@@ -36,7 +36,7 @@ def main() -> None:
     for size, square, page in BOARDS:
         for suffix in ("pdf", "svg"):
             name = boards / f"board_{size}_{square}_{page}.{suffix}"
-            kcal("board", "--board", size, "--square", square, "--page", page, "-o", str(name))
+            kcal("board", "--board", size, "--square", square, "--paper", page, "-o", str(name))
     with tempfile.TemporaryDirectory() as folder:
         kcal("demo", "-o", folder)
         for source, target in FROM_DEMO.items():

@@ -7,52 +7,29 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from kcal.cli import kinds
 from kcal.cli.console import err, out, print_table, print_wrote, steps
-from kcal.cli.inputs import Refine, RefineMethod
-from kcal.errors import DegenerateError, InputError
+from kcal.cli.detect import given_board
+from kcal.cli.options import Kind
+from kcal.errors import DegenerateError
 
 if TYPE_CHECKING:
     from kcal.calibrate.batch.results import SummaryRow
 
 
 def batch_command(
-    cameras: Annotated[
-        Path,
-        typer.Argument(
-            help="A folder with a folder of images for each camera, or a CSV with the columns camera,images and, where "
-            "they differ, board,square,model.",
-            show_default=False,
-        ),
-    ],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the results; made if it is missing.")],
-    size: Annotated[
-        str | None,
-        typer.Option(
-            "--board", metavar="BOARD", help="As for `kcal detect`: 9x6, circles:7x6, ...", show_default=False
-        ),
-    ] = None,
-    square: Annotated[
-        str | None,
-        typer.Option("--square", metavar="LENGTH", help="Side of a square with its unit: 25mm.", show_default=False),
-    ] = None,
-    model: Annotated[str, typer.Option(metavar="NAME", help="Lens model, see `kcal calibrate`.")] = "hybrid",
-    refine: RefineMethod = Refine.erf,
-    board_warp: Annotated[bool, typer.Option("--board-warp", help="Also estimate how each board bends.")] = False,
-    one_type: Annotated[
-        bool,
-        typer.Option("--one-type", help="The cameras, four or more, are of one type: each learns from the others."),
-    ] = False,
-    workers: Annotated[
-        int,
-        typer.Option(help="Processes on this machine; one per core if not given.", min=0, show_default=False),
-    ] = 0,
-    scheduler: Annotated[
-        str | None,
-        typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers see the same files: tcp://host:8786."),
-    ] = None,
-    time_limit: Annotated[
-        float, typer.Option(metavar="S", help="Seconds of processor time for one image or one calibration.", min=1)
-    ] = 300.0,
+    cameras: Path,
+    *,
+    output: kinds.Output,
+    board: kinds.BoardOrAuto = "auto",
+    square: kinds.Square | None = None,
+    model: Annotated[str, Kind(metavar="NAME")] = "hybrid",
+    refine: kinds.RefineMethod = kinds.Refine.erf,
+    board_warp: bool = False,
+    one_type: bool = False,
+    workers: Annotated[int, Kind(least=0)] = 0,
+    scheduler: Annotated[str | None, Kind(metavar="ADDRESS")] = None,
+    time_limit: Annotated[float, Kind(metavar="S", least=1)] = 300.0,
 ) -> None:
     """Calibrate many cameras: images in, observations, camera files and one table out.
 
@@ -70,18 +47,31 @@ def batch_command(
     `kcal batch cameras.csv -o results --workers 4`
 
     `kcal batch /shared/cameras --board 9x6 --square 25mm -o /shared/results --scheduler tcp://10.0.0.1:8786`
+
+    Args:
+        cameras: A folder with a folder of images for each camera, or a CSV with the columns camera,images and, where
+            they differ, board,square,model.
+        output: Folder for the results; made if it is missing.
+        model: Lens model, see `kcal calibrate`.
+        board_warp: Also estimate how each board bends.
+        one_type: The cameras, four or more, are of one type: each learns from the others.
+        workers: Processes on this machine; one per core if 0.
+        scheduler: Dask scheduler whose workers see the same files: tcp://host:8786.
+        time_limit: Seconds of processor time for one image or one calibration.
     """
     from kcal.calibrate.batch.jobs import BatchOptions, pieces, read_jobs
     from kcal.calibrate.batch.results import calibrate_batch
-    from kcal.corners.board import Board
     from kcal.lens.model import LensModel
 
-    if size is None and square is not None:
-        raise InputError("--board and --square belong together: give both")
-    board = None if size is None else Board.parse(size, square)
+    given = given_board(board, square)
     if model != "hybrid":
         LensModel.named(model)
-    jobs = read_jobs(cameras, board, model)
+    with steps("looking at the images", None):
+        jobs = read_jobs(cameras, given, model, square)
+    if given is None:
+        for job in jobs:
+            if job.board is not None:
+                out.print(f"{job.name}: board {job.board}", markup=False)
     options = BatchOptions(refine=refine.value, board_warp=board_warp, one_type=one_type, time_limit=time_limit)
     try:
         with steps("images and cameras", pieces(jobs)) as advance:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from kcal.cli.console import out, print_wrote, steps, warn, with_json
-from kcal.cli.inputs import OBSERVATIONS, BoardSize, SquareSide, with_inputs
-from kcal.cli.options import Command, group_with_default
-from kcal.cli.settings import picture_option
+from kcal.cli import kinds
+from kcal.cli.console import out, print_wrote, steps, warn
+from kcal.cli.options import Command, Kind, declared, group_with_default
 from kcal.errors import InputError
 from kcal.files import check_writable, write_atomic
 
@@ -20,20 +18,12 @@ app = typer.Typer(
 )
 
 
-@app.command("print", cls=Command)
-@with_json
 def print_command(
-    size: BoardSize,
-    output: Annotated[Path, typer.Option("-o", "--output", help="File to write, .svg or .pdf.")],
-    square: SquareSide = None,
-    page: Annotated[
-        str,
-        typer.Option(
-            "--page",
-            metavar="PAGE",
-            help="Page size: A5, A4, A3, A2, A1, A0, letter, legal, tabloid, or auto for as large as needed.",
-        ),
-    ] = "auto",
+    *,
+    board: kinds.Board,
+    output: kinds.Output,
+    square: kinds.Square | None = None,
+    paper: Annotated[str, Kind(metavar="PAPER")] = "auto",
 ) -> None:
     """Draw a board to print at true scale: checkerboard, ChArUco board, circles or AprilGrid.
 
@@ -44,15 +34,19 @@ def print_command(
 
     **Examples**
 
-    `kcal board --board 9x6 --square 25mm --page A4 -o board.pdf`
+    `kcal board --board 9x6 --square 25mm --paper A4 -o board.pdf`
 
-    `kcal board --board charuco:9x6 --square 25mm --page A4 -o charuco.pdf`
+    `kcal board --board charuco:9x6 --square 25mm --paper A4 -o charuco.pdf`
 
-    `kcal board --board 7x6 --square 50mm --page A2 -o board.svg`
+    `kcal board --board 7x6 --square 50mm --paper A2 -o board.svg`
 
-    `kcal board --board aprilgrid:6x6 --square 25mm --page A4 -o april.pdf`
+    `kcal board --board aprilgrid:6x6 --square 25mm --paper A4 -o april.pdf`
 
-    `kcal board --board asymmetric:4x11 --square 20mm --page A4 -o circles.pdf`
+    `kcal board --board asymmetric:4x11 --square 20mm --paper A4 -o circles.pdf`
+
+    Args:
+        output: File to write, .svg or .pdf.
+        paper: Size of the paper: A5, A4, A3, A2, A1, A0, letter, legal, tabloid, or auto for as large as needed.
     """
     from kcal.corners.board import Board
     from kcal.corners.print_board import board_sheet, to_pdf, to_svg
@@ -60,8 +54,8 @@ def print_command(
     suffix = output.suffix.lower()
     if suffix not in (".svg", ".pdf"):
         raise InputError(f"{output}: give a file name that ends in .svg or .pdf")
-    pattern = Board.parse(size, square)
-    sheet = board_sheet(pattern, page)
+    pattern = Board.parse(board, square)
+    sheet = board_sheet(pattern, paper)
     check_writable(output)
     write_atomic(output, to_svg(sheet.drawing) if suffix == ".svg" else to_pdf(sheet.drawing))
     out.print(f"{output}: {pattern}, page {sheet.drawing.width:g}x{sheet.drawing.height:g} mm")
@@ -76,15 +70,8 @@ def print_command(
         out.print(f"note: this board looks the same turned by 180°; for stereo {pattern.stereo_advice}")
 
 
-@app.command("measure", cls=Command)
-@with_json
-@with_inputs
 def measure_command(
-    observations: Annotated[
-        list[Path], typer.Argument(metavar="OBS...", help="Observations files of one or several cameras."), OBSERVATIONS
-    ],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Board file to write.")],
-    picture: Annotated[Path | None, picture_option("heights as colors, print errors as arrows.")] = None,
+    observations: list[kinds.Observed], *, output: kinds.Output, picture: kinds.Picture | None = None
 ) -> None:
     """Measure a printed board: how it bends, and how its print errs, each with its σ.
 
@@ -95,6 +82,11 @@ def measure_command(
     **Examples**
 
     `kcal board measure left.obs.json right.obs.json -o plate.board.json --picture plate.png`
+
+    Args:
+        observations: Observations files of one or several cameras.
+        output: Board file to write.
+        picture: Heights as colors, print errors as arrows.
     """
     from kcal.calibrate.hybrid.cameras_fit import fit_cameras
     from kcal.calibrate.hybrid.measured_board import save_measured_board
@@ -130,3 +122,7 @@ def measure_command(
             f"{', '.join(board.observations)}. Two prints of one pattern are two boards; measure {others} apart"
         )
     print_wrote(output, picture)
+
+
+app.command("print", cls=Command)(declared(print_command))
+app.command("measure", cls=Command)(declared(measure_command))

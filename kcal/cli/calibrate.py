@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
 
 import typer
 from rich.markup import escape
 
+from kcal.cli import kinds
 from kcal.cli.console import ending_with, out, print_table, print_wrote, steps, tell, views_cure, warn, with_command
-from kcal.cli.inputs import BOARD, CAMERA, OBSERVATIONS, PixelSigma, calibrated_camera, check_file, pixel_sigma_of
-from kcal.cli.report import NO, REQUIRE_HELP, judged, required, told_usable
-from kcal.cli.settings import rarely
-from kcal.cli.stars import TIME_HELP, by_night, joined_by_stars
+from kcal.cli.inputs import BOARD, calibrated_camera, check_file, pixel_sigma_of
+from kcal.cli.options import Kind, Rare, Several
+from kcal.cli.report import NO, judged, required, told_usable
+from kcal.cli.stars import by_night, joined_by_stars
 from kcal.errors import DegenerateError, InputError, KcalError
 from kcal.files import check_picture, check_writable, make_folder
 from kcal.texts import measured_text, number_text, percent_text
@@ -150,143 +151,44 @@ def _parameters(result: CameraCalibrationResult) -> list[list[str]]:
     return rows
 
 
-_PARAMETRIC, _USE = "Options of parametric models", "May it be used?"
+_USE = "May it be used?"
+_T = TypeVar("_T")
+_Parametric = Annotated[_T, Kind(rare=True, panel="Options of parametric models")]
 
 
 def calibrate_command(
-    output: Annotated[
-        Path,
-        typer.Option(
-            "-o", "--output", help="Camera file to write; of several cameras a folder, for a NAME.camera.json of each."
-        ),
-    ],
-    observations: Annotated[
-        list[Path] | None,
-        typer.Argument(metavar="OBS...", help="Observations file of each camera, from `kcal detect`."),
-        OBSERVATIONS,
-    ] = None,
-    stars: Annotated[
-        list[str] | None,
-        typer.Option(metavar="IMAGES", help="Night images: the lens at infinity, by stars, alone or with boards."),
-    ] = None,
-    star_time: Annotated[str | None, rarely("TIME", f"Of --stars. {TIME_HELP}", "--time")] = None,
-    star_place: Annotated[str | None, rarely("LAT,LON,HEIGHT", "Of --stars, for refraction.", "--place")] = None,
-    picture: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Picture to write (.png, .svg or .pdf): coverage, where the camera is uncertain, residuals, RMS of "
-            "each view. Of several cameras: a folder, for a NAME.png of each.",
-        ),
-    ] = None,
-    verbose: Annotated[bool, rarely("", "Print every parameter with its σ.", "--verbose")] = False,
-    board: Annotated[
-        str,
-        typer.Option(
-            "--board-shape",
-            metavar="KIND",
-            help="printed: bending and print errors are estimated. exact: a metrology plate. Or the file of a "
-            "board that `kcal board measure` wrote.",
-        ),
-    ] = "printed",
-    without: Annotated[
-        list[str] | None,
-        rarely("KIND", "motion: nothing moves while rows are read. bending: the board is stiff in all views."),
-    ] = None,
-    one_type: Annotated[
-        bool,
-        typer.Option("--one-type", help="The cameras, four or more, are of one type: each learns from the others."),
-    ] = False,
-    reject: Annotated[
-        bool, typer.Option("--reject", help="Leave out and list corners and views that noise cannot explain.")
-    ] = False,
-    reject_limit: Annotated[float, rarely("SHARE", "Largest share of all corners that --reject may leave out.")] = 0.1,
-    temperature: Annotated[
-        float | None, rarely("°C", "Of the camera when the views were taken; kept in its file.")
-    ] = None,
-    setting: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=NUMBER",
-            help="Where zoom or focus of the lens stood, for `kcal interpolate`; may be repeated. Of several cameras "
-            "one number for all, or focus=1,2.5,4 for each.",
-        ),
-    ] = None,
-    name: Annotated[str, rarely("", "Name of the camera; the name of the observations file if not given.")] = "",
-    model: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME",
-            help="hybrid, which fits any camera; network, the same with a small trained network as its field; or for "
-            "exchange a parametric lens: pinhole, opencv4, opencv5, opencv8, opencv12, opencv14, ext16 ... ext24, "
-            "fisheye4.",
-        ),
-    ] = "hybrid",
-    require: Annotated[
-        str,
-        typer.Option(metavar="RANGE:ERROR", help=f"{REQUIRE_HELP} Exit code 3 if it is not met.", rich_help_panel=_USE),
-    ] = "",
-    report: Annotated[
-        Path | None,
-        typer.Option(
-            help="HTML page to write: may it be used, and why not; of several cameras, NAME.html in this folder.",
-            rich_help_panel=_USE,
-        ),
-    ] = None,
-    baseline: Annotated[float, rarely("M", "Distance to a second camera like this one.", min=1e-3, panel=_USE)] = 10.0,
-    pixel_sigma: PixelSigma = None,
-    focal: Annotated[
-        float | None, rarely("PX", "Rough focal length to start from, in pixels; estimated if not given.")
-    ] = None,
-    fov: Annotated[
-        float | None,
-        rarely(
-            "DEG", "Rough horizontal field of view to start from, instead of --focal; a fisheye may have 180 and more."
-        ),
-    ] = None,
-    board_warp: Annotated[
-        bool, rarely("", "Parametric: estimate how the board bends.", "--board-warp", panel=_PARAMETRIC)
-    ] = False,
-    fix: Annotated[
-        list[str] | None,
-        rarely(
-            "NAME[=VALUE]",
-            "Hold a parameter at a value; without one, cx and cy at the image center, all others at 0.",
-            panel=_PARAMETRIC,
-        ),
-    ] = None,
-    tie: Annotated[
-        list[str] | None, rarely("NAME=NAME", "Keep parameters equal, for example fx=fy.", panel=_PARAMETRIC)
-    ] = None,
-    free: Annotated[
-        list[str] | None, rarely("NAME", "Estimate a parameter that is held by default, as skew.", panel=_PARAMETRIC)
-    ] = None,
-    prior: Annotated[
-        list[str] | None,
-        rarely("NAME=VALUE±SIGMA", "Gaussian prior of a parameter; +- may be typed for ±.", panel=_PARAMETRIC),
-    ] = None,
-    weak_prior: Annotated[
-        float,
-        rarely(
-            "SHARE",
-            "How far a rich lens is expected to be from a pinhole; 0: no such prior, as in OpenCV.",
-            min=0.0,
-            panel=_PARAMETRIC,
-        ),
-    ] = 0.3,
-    camera: Annotated[
-        Path | None,
-        rarely(
-            "",
-            "Camera file with known parameters; only board poses and what --free names are estimated.",
-            panel=_PARAMETRIC,
-        ),
-        CAMERA,
-    ] = None,
-    loss: Annotated[
-        str | None, rarely("KIND", "Robust loss against wrong corners: huber, cauchy or tukey.", panel=_PARAMETRIC)
-    ] = None,
-    loss_scale: Annotated[float, rarely("PX", "Residual at which the robust loss sets in.", panel=_PARAMETRIC)] = 1.0,
+    obs: list[kinds.Observed] | None = None,
+    *,
+    output: kinds.Output,
+    stars: Several[Annotated[str, Kind(metavar="IMAGES")]] | None = None,
+    time: Rare[Annotated[str | None, Kind(metavar="TIME")]] = None,
+    site: Rare[Annotated[str | None, Kind(metavar="LAT,LON,HEIGHT")]] = None,
+    picture: Path | None = None,
+    verbose: Rare[bool] = False,
+    board_shape: Annotated[str, Kind(metavar="KIND")] = "printed",
+    without: Rare[Annotated[list[str] | None, Kind(metavar="KIND")]] = None,
+    one_type: bool = False,
+    reject: bool = False,
+    reject_limit: Rare[Annotated[float, Kind(metavar="SHARE")]] = 0.1,
+    temperature: Rare[kinds.Celsius] | None = None,
+    setting: Annotated[list[str] | None, Kind(metavar="NAME=NUMBER")] = None,
+    name: Rare[str] = "",
+    model: Annotated[str, Kind(metavar="NAME")] = "hybrid",
+    require: Annotated[str, Kind(metavar="RANGE:ERROR", panel=_USE)] = "",
+    report: Annotated[Path | None, Kind(panel=_USE)] = None,
+    baseline: Rare[Annotated[float, Kind(metavar="M", least=1e-3, panel=_USE)]] = 10.0,
+    pixel_sigma: kinds.PixelSigma | None = None,
+    focal: Rare[kinds.Pixels] | None = None,
+    fov: Rare[kinds.Degrees] | None = None,
+    board_warp: _Parametric[bool] = False,
+    fix: _Parametric[Annotated[list[str] | None, Kind(metavar="NAME[=VALUE]")]] = None,
+    tie: _Parametric[Annotated[list[str] | None, Kind(metavar="NAME=NAME")]] = None,
+    free: _Parametric[Annotated[list[str] | None, Kind(metavar="NAME")]] = None,
+    prior: _Parametric[Annotated[list[str] | None, Kind(metavar="NAME=VALUE±SIGMA")]] = None,
+    weak_prior: _Parametric[Annotated[float, Kind(metavar="SHARE", least=0)]] = 0.3,
+    camera: _Parametric[kinds.CameraFile] | None = None,
+    loss: _Parametric[Annotated[str | None, Kind(metavar="KIND")]] = None,
+    loss_scale: _Parametric[kinds.Pixels] = 1.0,
 ) -> None:
     """Calibrate a camera, or several: intrinsics, lens and error bars.
 
@@ -307,21 +209,60 @@ def calibrate_command(
 
     `kcal calibrate left.obs.json -o left.camera.json --require 5km:10% --report left.html`: exit code 3 for a no.
 
-    `kcal calibrate --stars night/ --time name:Z --place 40.762,-113.896,1282 -o left.camera.json`
+    `kcal calibrate --stars night/ --time name:Z --site 40.762,-113.896,1282 -o left.camera.json`
 
     `kcal calibrate left.obs.json -o left.camera.json --model opencv14`: for exchange with OpenCV.
+
+    Args:
+        obs: Observations file of each camera, from `kcal detect`.
+        output: Camera file to write; of several cameras a folder, for a NAME.camera.json of each.
+        stars: Night images: the lens at infinity, by stars, alone or with boards.
+        time: Of --stars. When, with its zone: 2026-11-24T20:47:26Z; name:Z or name:+02:00 reads it from each file's
+            name.
+        site: Of --stars, for refraction.
+        picture: Picture to write (.png, .svg or .pdf): coverage, where the camera is uncertain, residuals, RMS of each
+            view; of several cameras, NAME.png in this folder.
+        verbose: Print every parameter with its σ.
+        board_shape: printed: bending and print errors are estimated. exact: a metrology plate. Or the file of a board
+            that `kcal board measure` wrote.
+        without: motion: nothing moves while rows are read. bending: the board is stiff in all views.
+        one_type: The cameras, four or more, are of one type: each learns from the others.
+        reject: Leave out and list corners and views that noise cannot explain.
+        reject_limit: Largest share of all corners that --reject may leave out.
+        temperature: Of the camera when the views were taken; kept in its file.
+        setting: Where zoom or focus of the lens stood, for `kcal interpolate`; may be repeated. Of several cameras one
+            number for all, or focus=1,2.5,4 for each.
+        name: Name of the camera; the name of the observations file if not given.
+        model: hybrid, which fits any camera; network, the same with a small trained network as its field; or for
+            exchange a parametric lens: pinhole, opencv4, opencv5, opencv8, opencv12, opencv14, ext16 ... ext24,
+            fisheye4.
+        require: What you need: ranges and the largest σ of each, for example 5km:10% or 800m:20m,5km:10%. Exit code 3
+            if it is not met.
+        report: HTML page to write: may it be used, and why not; of several cameras, NAME.html in this folder.
+        baseline: Distance to a second camera like this one.
+        focal: Rough focal length to start from, in pixels; estimated if not given.
+        fov: Rough horizontal field of view to start from, instead of --focal; a fisheye may have 180 and more.
+        board_warp: Estimate how the board bends.
+        fix: Hold a parameter at a value; without one, cx and cy at the image center, all others at 0.
+        tie: Keep parameters equal, for example fx=fy.
+        free: Estimate a parameter that is held by default, as skew.
+        prior: Gaussian prior of a parameter; +- may be typed for ±.
+        weak_prior: How far a rich lens is expected to be from a pinhole; 0: no such prior, as in OpenCV.
+        camera: Camera file with known parameters; only board poses and what --free names are estimated.
+        loss: Robust loss against wrong corners: huber, cauchy or tukey.
+        loss_scale: Residual at which the robust loss sets in.
     """
     from kcal.lens.model import LensModel
 
-    stood = stated_settings(setting, len(observations or [output]))
-    if observations is None and any(stood):
+    stood = stated_settings(setting, len(obs or [output]))
+    if obs is None and any(stood):
         raise InputError("--setting: cameras of stars alone do not keep it; give observations of a board as well")
-    if by_night(stars, observations, star_time, star_place, output, name) or observations is None:
+    if by_night(stars, obs, time, site, output, name) or obs is None:
         return
     needs = required(require)
-    if board not in ("printed", "exact"):
-        check_file("--board-shape", board, BOARD)
-    places = _camera_files(observations, output, picture, report, name)
+    if board_shape not in ("printed", "exact"):
+        check_file("--board-shape", board_shape, BOARD)
+    places = _camera_files(obs, output, picture, report, name)
     if model not in ("hybrid", "network"):
         LensModel.named(model)
     known = None
@@ -343,7 +284,7 @@ def calibrate_command(
         motion="motion" not in (without or ()),
         bending="bending" not in (without or ()),
         # An unknown kind is refused by the options themselves, and that of a loss by the loss.
-        board=load_measured_board(board) if Path(board).suffix else board,  # type: ignore[arg-type]
+        board=load_measured_board(board_shape) if Path(board_shape).suffix else board_shape,  # type: ignore[arg-type]
         board_warp=board_warp,
         focal=focal,
         field_of_view=fov,
@@ -370,7 +311,7 @@ def calibrate_command(
             with ending_with(lambda error: cure(error, 0)):
                 outcomes = [calibrate_camera(sets[0], options, advance)]
     if stars and not isinstance(outcomes[0], KcalError):
-        outcomes = [joined_by_stars(outcomes[0], stars, star_time, star_place, places[0].output)]
+        outcomes = [joined_by_stars(outcomes[0], stars, time, site, places[0].output)]
     failed = [place.name for place, result in zip(places, outcomes, strict=True) if isinstance(result, KcalError)]
     usable = True
     figures: dict[str, dict[str, Any]] = {}

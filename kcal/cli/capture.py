@@ -8,38 +8,33 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
+from kcal.cli import kinds
 from kcal.cli.console import err, out, show_page
-from kcal.cli.inputs import BoardSize, Refine, RefineMethod, SquareSide
+from kcal.cli.detect import board_in_images, given_board
+from kcal.cli.options import Kind
 from kcal.errors import InputError, KcalError, with_extra
 from kcal.files import check_writable
 
 if TYPE_CHECKING:
     from kcal.capture.session import CaptureSession
+    from kcal.corners.board import Board
     from kcal.web.serving import LocalServer
 
 _PORT = 8348
 
 
 def capture_command(
-    source: Annotated[
-        str, typer.Argument(help="camera:0, a stream (rtsp://...), a video, or a folder into which images come.")
-    ],
-    size: BoardSize,
-    output: Annotated[Path, typer.Option("-o", "--output", help="Observations file to write, or to continue.")],
-    square: SquareSide = None,
-    until: Annotated[
-        float,
-        typer.Option(metavar="PX", help="Stop when far directions are known to this σ, on average over the image."),
-    ] = 0.1,
-    most: Annotated[int, typer.Option(metavar="N", help="Stop at this number of views.", min=4)] = 60,
-    refine: RefineMethod = Refine.erf,
-    page: Annotated[
-        bool, typer.Option("--page/--no-page", help="Show it on a local page; without, only in this terminal.")
-    ] = True,
-    port: Annotated[int, typer.Option(help="Of the local address; 0 for any that is free.", min=0, max=65535)] = _PORT,
-    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
+    source: str,
+    *,
+    output: kinds.Output,
+    board: kinds.BoardOrAuto = "auto",
+    square: kinds.Square | None = None,
+    until: kinds.Pixels = 0.1,
+    most: Annotated[int, Kind(metavar="N", least=4)] = 60,
+    refine: kinds.RefineMethod = kinds.Refine.erf,
+    page: bool = True,
+    port: Annotated[int, Kind(least=0)] = _PORT,
+    browser: bool = True,
 ) -> None:
     """Photograph a board, and be told what to photograph next, until the camera is known well enough.
 
@@ -54,14 +49,21 @@ def capture_command(
     `kcal capture camera:0 --board 9x6 --square 25mm -o left.obs.json`
 
     `kcal capture incoming/ --board 9x6 --square 25mm -o left.obs.json --until 0.05`
+
+    Args:
+        source: camera:0, a stream (rtsp://...), a video, or a folder into which images come.
+        output: Observations file to write, or to continue.
+        until: Stop when far directions are known to this σ, on average over the image.
+        most: Stop at this number of views.
+        page: Show it on a local page; without, only in this terminal.
+        port: Of the local address; 0 for any that is free.
+        browser: Open the page in the browser.
     """
     from kcal.capture.session import CaptureOptions, CaptureSession, follow, shots
-    from kcal.corners.board import Board
 
     check_writable(output)
-    session = CaptureSession(
-        output, Board.parse(size, square), CaptureOptions(until=until, most=most, refine=refine.value)
-    )
+    pattern = given_board(board, square) or _known_board(source, square, output)
+    session = CaptureSession(output, pattern, CaptureOptions(until=until, most=most, refine=refine.value))
     if session.views:
         err.print(f"{output} has {session.views} views; going on", markup=False)
     stop = threading.Event()
@@ -117,6 +119,15 @@ def capture_command(
     out.print(f"wrote {output} and {session.views} frames in {session.frames}", markup=False)
     camera = f"{output.name.split('.')[0]}.camera.json"
     out.print(f"next: kcal calibrate {output} -o {output.with_name(camera)}", markup=False, soft_wrap=True)
+
+
+def _known_board(source: str, square: str | None, output: Path) -> Board:
+    """The board of the file that is continued, or the one that is shown to the camera now."""
+    if output.exists():
+        from kcal.corners.observations import Observations
+
+        return Observations.load(output).board
+    return board_in_images([source], square)
 
 
 def _stop_server(threads: list[threading.Thread], server: LocalServer) -> None:

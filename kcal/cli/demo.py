@@ -7,42 +7,23 @@ from typing import Annotated
 
 import typer
 
+from kcal.cli import kinds
+from kcal.cli.options import Kind
 from kcal.files import make_folder
 
 
 def demo_command(
-    output: Annotated[
-        Path, typer.Option("-o", "--output", help="Folder for the results; made if it is missing.")
-    ] = Path("kcal-demo"),
+    *,
+    output: kinds.Output = Path("kcal-demo"),
     # The draw in which the noise of the targets' marks is nearest to what is said of it, by its RMS.
-    seed: Annotated[int, typer.Option(help="Seed of the simulated site's poses, noise and marks.", min=0)] = 1,
-    practice: Annotated[
-        Path | None,
-        typer.Option(metavar="FOLDER", help="Render a site to practise on into a folder; results are then yours."),
-    ] = None,
-    score: Annotated[
-        Path | None,
-        typer.Option(metavar="FOLDER", help="Compare your results on a practice site with its truth, in meters."),
-    ] = None,
-    images: Annotated[
-        Path | None, typer.Option(help="Folder of real pairs: left01.jpg with right01.jpg, or left/ and right/.")
-    ] = None,
-    size: Annotated[
-        str, typer.Option("--board", metavar="CxR", help="With --images: inner corners, columns by rows.")
-    ] = "9x6",
-    square: Annotated[
-        str, typer.Option("--square", metavar="LENGTH", help="With --images: side of a square with its unit.")
-    ] = "25mm",
-    origin: Annotated[
-        str | None,
-        typer.Option(
-            metavar="LAT,LON,HEIGHT",
-            help="With --images: position of the left camera in degrees and meters; 0,0,0 if not given.",
-        ),
-    ] = None,
-    heading: Annotated[
-        float, typer.Option(metavar="DEG", help="With --images: azimuth of the left camera's axis.")
-    ] = 0.0,
+    seed: Annotated[int, Kind(least=0)] = 1,
+    practice: Annotated[Path | None, Kind(metavar="FOLDER")] = None,
+    score: Annotated[Path | None, Kind(metavar="FOLDER")] = None,
+    images: Path | None = None,
+    board: Annotated[str, Kind(metavar="CxR")] = "9x6",
+    square: Annotated[str, Kind(metavar="LENGTH")] = "25mm",
+    site: kinds.Place | None = None,
+    heading: kinds.Degrees = 0.0,
 ) -> None:
     """Run the main job from images to positions, and compare the result with the truth.
 
@@ -65,6 +46,17 @@ def demo_command(
     `kcal demo --score practice`
 
     `kcal demo --images calibration/ --board 9x6 --square 25mm -o results`
+
+    Args:
+        output: Folder for the results; made if it is missing.
+        seed: Seed of the simulated site's poses, noise and marks.
+        practice: Render a site to practise on into a folder; results are then yours.
+        score: Compare your results on a practice site with its truth, in meters.
+        images: Folder of real pairs: left01.jpg with right01.jpg, or left/ and right/.
+        board: With --images: inner corners, columns by rows.
+        square: With --images: side of a square with its unit.
+        site: With --images: where the left camera stands; 0,0,0 if not given.
+        heading: With --images: azimuth of the left camera's axis.
     """
     if sum(each is not None for each in (practice, score, images)) > 1:
         raise typer.BadParameter("--practice, --score and --images exclude each other")
@@ -83,7 +75,6 @@ def demo_command(
         simulated_site(output, seed)
         return
     from kcal.corners.board import Board
-    from kcal.locate.geodesy import Origin
 
-    place = None if origin is None else Origin.parse(origin)
-    real_pairs(output, images, size, square, Board.parse(size, square), place, heading)
+    place = None if site is None else site.origin
+    real_pairs(output, images, board, square, Board.parse(board, square), place, heading)

@@ -18,6 +18,7 @@ from kcal.cli.calibrate import calibrate_command
 from kcal.cli.console import err, out, print_table, steps
 from kcal.cli.detect import detect_command
 from kcal.cli.locate import locate_command
+from kcal.cli.options import Command, declared
 from kcal.cli.report import report_command
 from kcal.cli.rig import app as rig
 from kcal.corners.board import Board
@@ -192,7 +193,7 @@ def run(name: str, *arguments: object) -> None:
             "locate": locate_command,
             "report": report_command,
         }
-        app.command()(commands[name])  # type: ignore[type-var]
+        app.command(cls=Command)(declared(commands[name]) if name in ("detect", "calibrate") else commands[name])  # type: ignore[arg-type,type-var]
     get_command(app).main(words, standalone_mode=False)
 
 
@@ -248,7 +249,7 @@ def real_pairs(
     print_table(rows)
     save_pairs_summary(output, rows, command)
     if origin is None:
-        err.print("[yellow]note:[/] no --origin was given: positions are placed at latitude 0, longitude 0")
+        err.print("[yellow]note:[/] no --site was given: positions are placed at latitude 0, longitude 0")
     print_results(output, command)
 
 

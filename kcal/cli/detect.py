@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+import shlex
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
 from rich.markup import escape
 
+from kcal.cli import kinds
 from kcal.cli.console import board_words, ending_with, err, out, print_left_out, steps, tell, warn
-from kcal.cli.inputs import IMAGES, BoardOrAuto, Refine, RefineMethod, SquareSide, typed, typed_with
-from kcal.cli.settings import picture_option
+from kcal.cli.inputs import typed, typed_with
+from kcal.cli.options import Kind
 from kcal.errors import InputError
 from kcal.files import check_writable, is_stream, make_folder, source_name
 
@@ -22,37 +23,17 @@ if TYPE_CHECKING:
 
 
 def detect_command(
-    images: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="IMAGES",
-            help="Images of one camera: files, folders or quoted wildcards; or one video, or a stream (rtsp://..., "
-            "camera:0).",
-            show_default=False,
-        ),
-        IMAGES,
-    ],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Observations file to write.")],
-    size: BoardOrAuto = "auto",
-    square: SquareSide = None,
-    refine: RefineMethod = Refine.erf,
-    gallery: Annotated[
-        Path | None,
-        picture_option("images that failed and why, then the views with their corners, worst first.", "--gallery"),
-    ] = None,
-    coverage: Annotated[Path | None, picture_option("where in the image corners were seen.", "--coverage")] = None,
-    time_limit: Annotated[
-        float,
-        typer.Option(
-            metavar="S", help="Seconds of processor time after which the search in one image is given up.", min=0.1
-        ),
-    ] = 60.0,
-    duration: Annotated[
-        float, typer.Option(metavar="S", help="Seconds for which a stream is watched.", min=1.0)
-    ] = 120.0,
-    keep: Annotated[
-        Path | None, typer.Option(help="Folder for the frames of a video or stream that became views, as PNG.")
-    ] = None,
+    images: list[kinds.Images],
+    *,
+    output: kinds.Output,
+    board: kinds.BoardOrAuto = "auto",
+    square: kinds.Square | None = None,
+    refine: kinds.RefineMethod = kinds.Refine.erf,
+    gallery: kinds.Picture | None = None,
+    coverage: kinds.Picture | None = None,
+    time_limit: Annotated[float, Kind(metavar="S", least=0.1)] = 60.0,
+    duration: Annotated[float, Kind(metavar="S", least=1.0)] = 120.0,
+    keep: Path | None = None,
 ) -> None:
     """Find the board in the images of one camera.
 
@@ -71,9 +52,19 @@ def detect_command(
     `kcal detect rtsp://10.0.0.7/main --board 9x6 --square 25mm -o left.obs.json --duration 60 --keep frames/`
 
     `kcal detect "shots/left*.png" --board 9x6 --square 25mm -o left.obs.json --refine opencv`
+
+    Args:
+        images: Images of one camera: files, folders or quoted wildcards; or one video, or a stream (rtsp://...,
+            camera:0).
+        output: Observations file to write.
+        gallery: Images that failed and why, then the views with their corners, worst first.
+        coverage: Where in the image corners were seen.
+        time_limit: Seconds of processor time after which the search in one image is given up.
+        duration: Seconds for which a stream is watched.
+        keep: Folder for the frames of a video or stream that became views, as PNG.
     """
     check_writable(output)
-    given = given_board(size, square)
+    given = given_board(board, square)
 
     from kcal.corners.detect import Detection, detect
     from kcal.corners.images import VIDEO_SUFFIXES, expand_images, turned_images
@@ -95,23 +86,23 @@ def detect_command(
             nonlocal searched
             searched += 1
 
-        board = given or board_in_images(images, square, time_limit)
+        pattern = given or board_in_images(images, square, time_limit)
         with steps(f"watching {streams[0]} for {duration:g} s" if streams else "searching the video", None):
             observations = detect_video(
-                images[0], board, refine.value, progress=count, time_limit=time_limit, duration=duration, keep=keep
+                images[0], pattern, refine.value, progress=count, time_limit=time_limit, duration=duration, keep=keep
             )
         source = f"of {searched} sharp frames (repeats left out)"
     else:
         paths = expand_images(images)
         check_writable(output, *paths)
-        board = given or board_in_images(paths, square, time_limit)
+        pattern = given or board_in_images(paths, square, time_limit)
         with (
-            ending_with(lambda error: _right_board(str(error), size, board, paths)),
+            ending_with(lambda error: _next_command(str(error), board, pattern, images, paths, output)),
             steps("detecting", len(paths)) as advance,
         ):
             observations = detect(
                 paths,
-                board,
+                pattern,
                 refine.value,
                 progress=advance,
                 time_limit=time_limit,
@@ -135,8 +126,8 @@ def detect_command(
     found, unseen = len(observations.views), sum(view.pixels.count(None) for view in observations.views)
     tell(views=found, failures={failure.name: failure.reason for failure in observations.failures})
     out.print(f"{escape(str(output))}: board found in {found} {source} of {width}x{height} px")
-    wide, high = (1e3 * side for side in board.extent)
-    out.print(f"board {board}: {wide:g} x {high:g} mm from the first point to the last")
+    wide, high = (1e3 * side for side in pattern.extent)
+    out.print(f"board {pattern}: {wide:g} x {high:g} mm from the first point to the last")
     for text in notes:
         warn(text)
     if turned:
@@ -145,14 +136,14 @@ def detect_command(
             "pixels of the sensor"
         )
     if unseen:
-        out.print(f"corners left out as uncertain: {unseen} of {found * board.corners}")
+        out.print(f"corners left out as uncertain: {unseen} of {found * pattern.corners}")
     print_left_out(
         [f"failed {failure.name}: {failure.reason}" for failure in observations.failures],
         output,
         f"{len(observations.failures)} images failed",
     )
-    if not board.unambiguous:
-        out.print(f"note: this board looks the same turned by 180°; for stereo {board.stereo_advice}")
+    if not pattern.unambiguous:
+        out.print(f"note: this board looks the same turned by 180°; for stereo {pattern.stereo_advice}")
 
 
 def given_board(size: str, square: str | None) -> Board | None:
@@ -183,8 +174,12 @@ def board_in_images(images: Sequence[str | Path], square: str | None, time_limit
 _CURED = 6  # images that are looked at to name the board of a refusal
 
 
-def _right_board(refusal: str, size: str, board: Board, paths: Sequence[Path]) -> str:
-    """The command with the board that was found instead, or one that draws the board that was asked for."""
+def _next_command(
+    refusal: str, given: str, board: Board, images: Sequence[str], paths: Sequence[Path], output: Path
+) -> str:
+    """The command for images of each size, that with the board that was found, or one that draws the board."""
+    if "different sizes" in refusal:
+        return f"To split them: {' && '.join(_of_each_size(images, paths, output))}"
     found = re.search(r"a board of (\d+x\d+)", refusal) or re.search(r"give --board ((?:\w+:)?\d+x\d\S*)$", refusal)
     text = found[1] if found else ""
     if "COLUMNSxROWS" in refusal:
@@ -192,6 +187,20 @@ def _right_board(refusal: str, size: str, board: Board, paths: Sequence[Path]) -
 
         seen = recognize_images(paths, _CURED).seen
         text = seen.text if seen is not None else ""
-    if text and size in typed:
-        return f"Perhaps: {typed_with({size: text})}"
+    if text and given in typed:
+        return f"Perhaps: {typed_with({given: text})}"
     return f"To see what this board looks like: kcal board {board_words(board)} -o board.svg"
+
+
+def _of_each_size(images: Sequence[str], paths: Sequence[Path], output: Path) -> Iterator[str]:
+    """A command for the images of each size, those of most first."""
+    from kcal.corners.detect import size_of
+
+    groups: dict[tuple[int, int], list[str]] = {}
+    for path in paths:
+        if (size := size_of(path)) is not None:
+            groups.setdefault(size, []).append(str(path))
+    for (width, height), files in sorted(groups.items(), key=lambda group: -len(group[1])):
+        own = output.with_name(f"{output.name.split('.')[0]}-{width}x{height}.obs.json")
+        words = [str(own) if word == str(output) else word for word in typed if word not in images]
+        yield shlex.join(["kcal", words[0], *files, *words[1:]])

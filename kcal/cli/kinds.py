@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
@@ -71,6 +72,35 @@ def read_site(text: str, name: str) -> KnownPlace:
 
 Place = Annotated[KnownPlace, Kind(metavar="LAT,LON,HEIGHT[±M]", read=read_site)]
 
+# Boards. What a corner is refined by has the names of `kcal.corners.refine.Refinement`.
+
+
+class Refine(StrEnum):
+    """Names of the refinements, for the command line."""
+
+    erf = "erf"
+    saddle = "saddle"
+    opencv = "opencv"
+    skimage = "skimage"
+    none = "none"
+
+
+_PATTERNS = (
+    "inner corners, columns by rows: 9x6 has 10x7 squares; charuco:9x6[:DICTIONARY][:MARKER]; circles:7x6; "
+    "asymmetric:4x11; aprilgrid:6x6[:SPACING]; or a target file of Kalibr, april.yaml."
+)
+Board = Annotated[str, Kind(metavar="BOARD", about=f"I{_PATTERNS[1:]}")]
+BoardOrAuto = Annotated[str, Kind(metavar="BOARD", about=f"auto: the images tell. Otherwise {_PATTERNS}")]
+Square = Annotated[
+    str,
+    Kind(
+        metavar="LENGTH",
+        about="Side of a square or tag, or distance of circles (of rows of asymmetric ones), with its unit: 25mm, "
+        "2.5cm, 1in. Not with a target file.",
+    ),
+]
+RefineMethod = Annotated[Refine, Kind(metavar="METHOD", about="erf (most accurate), saddle, opencv, skimage or none.")]
+
 # Files that are read: what they must be.
 RigFile = Annotated[Path, inputs.RIG]
 CameraFile = Annotated[Path, inputs.CAMERA]
@@ -92,4 +122,6 @@ def _read_picture(text: str, name: str) -> Path:
 
 
 Output = Annotated[Path, Kind(flags=("-o", "--output"))]
-Picture = Annotated[Path, Kind(metavar="FILE", read=_read_picture, about="Picture to write (.png, .svg or .pdf): {}")]
+Picture = Annotated[
+    Path, Kind(metavar="FILE", read=_read_picture, early=True, about="Picture to write (.png, .svg or .pdf): {}")
+]

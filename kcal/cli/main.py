@@ -117,15 +117,15 @@ def _global_options(
     pass
 
 
-app.command("demo", cls=Command)(with_json(demo_command))
+app.command("demo", cls=Command)(declared(demo_command))
 app.command("init", cls=Command)(with_json(init_command))
 app.add_typer(board, name="board")
-app.command("capture", cls=Command)(with_inputs(capture_command))
-app.command("detect", cls=Command)(with_json(with_inputs(detect_command)))
-app.command("calibrate", cls=Command)(with_json(with_inputs(calibrate_command)))
+app.command("capture", cls=Command)(declared(capture_command, json=False))
+app.command("detect", cls=Command)(declared(detect_command))
+app.command("calibrate", cls=Command)(declared(calibrate_command))
 app.command("interpolate", cls=Command)(with_json(with_inputs(interpolate_command)))
 app.command("compare", cls=Command)(with_json(with_inputs(compare_command)))
-app.command("batch", cls=Command)(with_json(with_inputs(batch_command)))
+app.command("batch", cls=Command)(declared(batch_command))
 app.command("mark", cls=Command)(declared(mark_command, json=False))
 app.add_typer(rig, name="rig")
 app.command("station", cls=Command)(with_json(with_inputs(station_command)))

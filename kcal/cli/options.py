@@ -35,6 +35,7 @@ class Kind:
     Args:
         metavar: what stands for the value in the help.
         read: makes the value of the text, and is told the option's name; None: the annotation's type does.
+        early: whether the text is read before it is known whether others are missing.
         usage: whether a text that cannot be read is wrong usage, exit code 2, as a word for a number is.
         least: the smallest number allowed.
         flags: of the option, where they are not its name.
@@ -46,6 +47,7 @@ class Kind:
 
     metavar: str | None = None
     read: Callable[[str, str], Any] | None = None
+    early: bool = False
     usage: bool = False
     least: float | None = None
     flags: tuple[str, ...] = ()
@@ -95,6 +97,8 @@ class _Option:
             text, default = _of_text(text), default if default in (None, inspect.Parameter.empty) else str(default)
         shared: dict[str, Any] = {"help": self.about.replace("[", r"\[")}
         shared |= {"min": self.kind.least, "rich_help_panel": self.kind.panel, "show_default": bool(str(default))}
+        if self.kind.early:
+            shared["callback"] = self._checked
         if self.argument:
             info: Any = typer.Argument(**shared)
         else:
@@ -112,6 +116,11 @@ class _Option:
         if isinstance(given, list | tuple):
             return type(given)(map(self._read, given))
         return self._read(str(given))
+
+    def _checked(self, text: str | None) -> str | None:
+        if text is not None:
+            self._read(text)
+        return text
 
     def _read(self, text: str) -> Any:
         assert self.kind.read is not None

@@ -43,7 +43,7 @@ def _for(parameter: str, *commands: str) -> tuple[tuple[str, str], ...]:
 _JUDGING = ("calibrate", "report", "rig solve")
 SETTINGS = {
     "board": _Setting(
-        str, _for("size", "detect", "capture", "board print", "batch"), "Pattern, as for kcal detect --board.", '"9x6"'
+        str, _for("board", "detect", "capture", "board print", "batch"), "Pattern, as for kcal detect --board.", '"9x6"'
     ),
     "square": _Setting(
         str, _for("square", "detect", "capture", "board print", "batch"), "Side of a square, with its unit.", '"25mm"'
@@ -138,7 +138,7 @@ def settings_text(values: dict[str, Any], path: Path) -> str:
     """What was taken from the file, in one line.
 
     Example:
-        >>> settings_text({"size": "9x6", "pixel_sigma": 0.1}, Path("../kcal.toml"))
+        >>> settings_text({"board": "9x6", "pixel_sigma": 0.1}, Path("../kcal.toml"))
         'from ../kcal.toml: board 9x6, pixel_sigma 0.1'
     """
     keys = {parameter: key for key, setting in SETTINGS.items() for _, parameter in setting.takers}

@@ -441,7 +441,7 @@ def detect(
     failures: list[Failure] = []
     failed: list[tuple[Any, str]] = []
     numberings: dict[bool | None, list[str]] = {}
-    common = common_size(names, [_size_of(file) for file in files])
+    common = common_size(names, [size_of(file) for file in files])
     for text in common.notes:
         note(text)
     with Limited(time_limit) as limited:
@@ -571,7 +571,7 @@ def _size(image: Any) -> tuple[int, int]:
     return image.shape[-1], image.shape[-2]
 
 
-def _size_of(file: Any) -> tuple[int, int] | None:
+def size_of(file: Any) -> tuple[int, int] | None:
     """(width, height), without decoding the image where its header tells it."""
     if not isinstance(file, Path):
         return _size(file)

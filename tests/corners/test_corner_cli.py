@@ -138,7 +138,7 @@ def test_old_file_survives_a_failure(shots, tmp_path):
 def test_board_command(tmp_path):
     for suffix, begin in ((".svg", b"<?xml"), (".pdf", b"%PDF-1.4")):
         output = tmp_path / f"board{suffix}"
-        result = kcal("board", "--board", "9x6", "--square", "25mm", "--page", "A4", "-o", output)
+        result = kcal("board", "--board", "9x6", "--square", "25mm", "--paper", "A4", "-o", output)
         assert result.exit_code == 0
         assert "9x6 inner corners, 25 mm squares, page 297x210 mm" in result.output
         assert output.read_bytes().startswith(begin)
@@ -146,7 +146,7 @@ def test_board_command(tmp_path):
 
 def test_board_command_refuses(tmp_path):
     common = ["board", "--board", "9x6", "--square"]
-    refused(InputError, "A2 would do", *common, "40mm", "--page", "A4", "-o", tmp_path / "b.pdf")
+    refused(InputError, "A2 would do", *common, "40mm", "--paper", "A4", "-o", tmp_path / "b.pdf")
     refused(InputError, ".svg or .pdf", *common, "25mm", "-o", tmp_path / "b.png")
     refused(FileError, "does not exist", *common, "25mm", "-o", tmp_path / "none" / "b.pdf")
     assert list(tmp_path.iterdir()) == []
@@ -157,7 +157,7 @@ def test_shipped_boards_are_what_the_command_draws(tmp_path):
     for size, square, page in (("9x6", "25mm", "A4"), ("7x6", "50mm", "A2")):
         for suffix in (".svg", ".pdf"):
             output = tmp_path / f"board_{size}_{square}_{page}{suffix}"
-            assert kcal("board", "--board", size, "--square", square, "--page", page, "-o", output).exit_code == 0
+            assert kcal("board", "--board", size, "--square", square, "--paper", page, "-o", output).exit_code == 0
             assert output.read_bytes() == (shipped / output.name).read_bytes()
 
 

@@ -349,7 +349,7 @@ def test_commands(charuco_paper, tmp_path, command: Command):
     what = ["--board", "charuco:9x6", "--square", "25mm", "-o"]
     command("detect", tmp_path / "a.png", *what, output)
     assert Observations.load(output).board == CHARUCO
-    command("board", *what, tmp_path / "b.pdf", "--page A4")
+    command("board", *what, tmp_path / "b.pdf", "--paper A4")
     assert b"charuco:9x6:4x4_50:17.5mm" in (tmp_path / "b.pdf").read_bytes()
 
 

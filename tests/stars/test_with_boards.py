@@ -121,7 +121,7 @@ def test_the_command(night: Night, tmp_path: Path) -> None:
     seen.save(tmp_path / "left.obs.json")
     output = tmp_path / "left.camera.json"
     command = ["calibrate", str(tmp_path / "left.obs.json"), "--stars", str(folder), "--time", "name:Z", "--json"]
-    command += ["--place", f"{PLACE.lat},{PLACE.lon},{PLACE.height}"]
+    command += ["--site", f"{PLACE.lat},{PLACE.lon},{PLACE.height}"]
     done = CliRunner().invoke(app, [*command, "-o", str(output)])
     assert done.exit_code == 0, done.output
     told = json.loads(done.stdout)
@@ -284,7 +284,7 @@ def test_six_real_images(tmp_path: Path) -> None:
     camera = tmp_path / "camera.json"
     place = ["--time", "name:Z"]
     done = CliRunner().invoke(
-        app, ["calibrate", "--stars", str(REAL), *place, "--place", "52,4.37,0", "-o", str(camera)]
+        app, ["calibrate", "--stars", str(REAL), *place, "--site", "52,4.37,0", "-o", str(camera)]
     )
     assert done.exit_code == 0, done.output
     assert float(load_camera(camera).params[0]) == pytest.approx(5117, abs=3)

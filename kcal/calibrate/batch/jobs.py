@@ -20,7 +20,7 @@ import kcal
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
 from kcal.calibrate.camera.result import HYBRID
 from kcal.corners.board import Board
-from kcal.corners.detect import detect_board, refuse_other_board, view_of
+from kcal.corners.detect import detect_board, recognize_board, refuse_other_board, view_of
 from kcal.corners.images import decode_gray, expand_images, unique_names
 from kcal.corners.observations import Failure, Observations, PackedCovariance, Pixel, View, common_size, rescaled
 from kcal.corners.refine import Refinement
@@ -85,11 +85,12 @@ class Calibrated(NativeFile):
     error: str = ""
 
 
-def read_jobs(source: Path, board: Board | None, model: str) -> list[CameraJob]:
+def read_jobs(source: Path, board: Board | None, model: str, square: str | None = None) -> list[CameraJob]:
     """Read which cameras a folder of folders or a CSV table names.
 
     In a folder, every folder with images is a camera. A table has the columns `camera` and `images` (a file, folder or
-    wildcard, relative to the table) and may have `board`, `square` and `model`, which override the arguments.
+    wildcard, relative to the table) and may have `board`, `square` and `model`, which override the arguments. Without a
+    board, the images of each camera tell which one it is, with squares of a side such as `25mm`.
 
     Raises:
         FileError: no such file or folder, no camera in it, or a table that cannot be read.
@@ -110,7 +111,7 @@ def read_jobs(source: Path, board: Board | None, model: str) -> list[CameraJob]:
             raise InputError(f"{source}: two cameras are named {name!r}")
         if not name or Path(name).name != name or name.startswith("."):
             raise InputError(f"{source}: {name!r} cannot name a camera: it becomes a file name")
-    return [_job(source, row, board, model) for row in rows]
+    return [_job(source, row, board, model, square) for row in rows]
 
 
 def pieces(jobs: Sequence[CameraJob]) -> int:
@@ -127,7 +128,7 @@ def sharing_jobs(jobs: Sequence[CameraJob]) -> list[list[int]]:
     return [numbers for numbers in kinds.values() if len(numbers) > 1]
 
 
-def _job(source: Path, row: dict[str, str], board: Board | None, model: str) -> CameraJob:
+def _job(source: Path, row: dict[str, str], board: Board | None, model: str, square: str | None) -> CameraJob:
     name = row["camera"]
     try:
         if row.get("board") or row.get("square"):
@@ -136,10 +137,14 @@ def _job(source: Path, row: dict[str, str], board: Board | None, model: str) -> 
                 kind = str(source.parent / kind)
             board = Board.parse(kind, row.get("square", ""))
         images = expand_images([source.parent / row["images"] if source.is_file() else row["images"]])
+        if board is None and square is not None:
+            board = recognize_board(images, square)
     except KcalError as error:
         return CameraJob(name=name, error=str(error))
     if board is None:
-        raise InputError(f"camera {name!r}: no board; give --board and --square, or columns of these names")
+        raise InputError(
+            f"camera {name!r}: no board; give --square, and --board if images do not tell it, or columns of these names"
+        )
     return CameraJob(name=name, images=tuple(images), board=board, model=row.get("model") or model)
 
 
