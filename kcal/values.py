@@ -48,6 +48,19 @@ def with_sigma(text: str, name: str) -> WithSigma:
     return WithSigma(*values)
 
 
+def share(text: str, name: str) -> float:
+    """A number from 0 to 1.
+
+    Example:
+        >>> share("0.5", "--alpha")
+        0.5
+    """
+    value = _number_or_nan(text)
+    if not 0 <= value <= 1:
+        raise InputError(f"{name} {text}: a number from 0 to 1 is needed")
+    return value
+
+
 def number_list(text: str, name: str, count: int | None = None, form: str = "250,1000,5000") -> tuple[float, ...]:
     """Numbers with commas between them.
 

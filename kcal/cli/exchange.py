@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import importlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import orjson
-import typer
 
+from kcal.cli import kinds
 from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
-from kcal.cli.inputs import CAMERA_OR_RIG, FOREIGN, cameras_and_rig, named_source, parse_size, picked
-from kcal.cli.settings import picture_option
+from kcal.cli.inputs import cameras_and_rig, named_source, picked
 from kcal.errors import InputError
 from kcal.files import check_writable, write_atomic
 
@@ -20,36 +19,22 @@ if TYPE_CHECKING:
 
 # Pixels (RMS) beyond which a lens model does not stand for a lens.
 _FAR = 0.5
-_UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
 
 
 def export_command(
-    source: Annotated[
-        str,
-        typer.Argument(metavar="FILE", help="Camera or rig of kcal; RIG.json:left is one of its cameras."),
-        CAMERA_OR_RIG,
-    ],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="File to write.")],
-    format: Annotated[
-        str | None,
-        typer.Option(
-            "--to",
-            "--format",
-            metavar="NAME",
-            help="opencv, ros, kalibr, mrcal, colmap, nerfstudio, matlab, opensfm, toml, gtsam, ceres, numpy or remap.",
-        ),
-    ] = None,
-    model: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Lens model of the format to fit, for example opencv5.")
-    ] = None,
-    picture: Annotated[Path | None, picture_option("error of a refitted lens over the image.")] = None,
+    source: kinds.AnyFile,
+    *,
+    output: kinds.Output,
+    format: kinds.Name | None = None,
+    model: kinds.Name | None = None,
+    picture: kinds.Picture | None = None,
 ) -> None:
     """Write a camera or a rig for another program.
 
     The format follows from the suffix: .yaml and .xml OpenCV, .cameramodel mrcal, .txt and .bin COLMAP, .json
-    nerfstudio, .mat MATLAB, .toml aniposelib, .npz maps for cv2.remap. Others are named by --to. A lens that the format
-    cannot hold is never cut short: the nearest model of the format is fitted, and its error over the image is printed.
-    Pixel origins are converted.
+    nerfstudio, .mat MATLAB, .toml aniposelib, .npz maps for cv2.remap. Others are named by --format. A lens that the
+    format cannot hold is never cut short: the nearest model of the format is fitted, and its error over the image is
+    printed. Pixel origins are converted.
 
     What is known of a camera goes along as a prior for bundle adjustment: the parameters in the program's order and
     their square-root information, in NAME.prior.json.
@@ -58,11 +43,18 @@ def export_command(
 
     `kcal export left.camera.json -o left.yaml`
 
-    `kcal export rig.json --to kalibr -o camchain.yaml`
+    `kcal export rig.json --format kalibr -o camchain.yaml`
 
-    `kcal export left.camera.json --to gtsam -o left.gtsam.json`
+    `kcal export left.camera.json --format gtsam -o left.gtsam.json`
 
     `kcal export left.camera.json -o left.cameramodel --picture misfit.png`
+
+    Args:
+        source: Camera or rig of kcal; RIG.json:left is one of its cameras.
+        output: File to write.
+        format: opencv, ros, kalibr, mrcal, colmap, nerfstudio, matlab, opensfm, toml, gtsam, ceres, numpy or remap.
+        model: Lens model of the format to fit, for example opencv5.
+        picture: error of a refitted lens over the image.
     """
     path, name = named_source(source)
     check_writable(output, path)
@@ -105,40 +97,17 @@ def export_command(
 
 
 def import_command(
-    sources: Annotated[
-        list[Path], typer.Argument(metavar="FILE...", help="File of another program; two of a pair."), FOREIGN
-    ],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="Camera or rig file to write.")],
-    format: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME",
-            help="opencv, ros, kalibr, mrcal, colmap, nerfstudio, matlab, opensfm, toml, qualisys or agisoft.",
-        ),
-    ] = None,
-    camera: Annotated[str | None, typer.Option(metavar="NAME", help="Take this camera of several.")] = None,
-    size: Annotated[
-        str | None, typer.Option(metavar="WIDTHxHEIGHT", help="Image size, where the file has none or a wrong one.")
-    ] = None,
-    fisheye: Annotated[
-        bool | None, typer.Option("--fisheye/--no-fisheye", help="Whether four coefficients of OpenCV are a fisheye's.")
-    ] = None,
-    board: Annotated[
-        str | None, typer.Option(metavar="CxR", help="Read corners instead, of a board with these inner corners.")
-    ] = None,
-    square: Annotated[
-        str | None, typer.Option(metavar="LENGTH", help="Side of a square of the board with its unit: 25mm.")
-    ] = None,
-    sigma: Annotated[
-        float | None, typer.Option(metavar="M", help="Of surveyed places, along each axis, where the file has none.")
-    ] = None,
-    geoid: Annotated[
-        float | None, typer.Option(metavar="M", help="Height of the geoid there, for the elevations of GPX.")
-    ] = None,
-    unit: Annotated[
-        str | None,
-        typer.Option(metavar="UNIT", help="Unit of the translation, where the file has none: mm, cm, m, in."),
-    ] = None,
+    sources: list[kinds.ForeignFile],
+    *,
+    output: kinds.Output,
+    format: kinds.Name | None = None,
+    size: kinds.Size | None = None,
+    fisheye: bool | None = None,
+    board: kinds.Inner | None = None,
+    square: kinds.Side | None = None,
+    survey_sigma: kinds.Sigma | None = None,
+    geoid: kinds.Meters | None = None,
+    unit: kinds.Unit | None = None,
 ) -> None:
     """Read a camera or a rig from a file of another program.
 
@@ -152,29 +121,39 @@ def import_command(
 
     `kcal import intrinsics.yml extrinsics.yml --size 640x480 --unit mm -o rig.json`
 
-    `kcal import cameras.txt --camera 2 -o second.camera.json`
+    `kcal import cameras.txt:2 -o second.camera.json`
 
     `kcal import corners.vnl --board 10x10 --square 58.8mm --size 6000x3376 -o left.obs.json`
 
-    `kcal import places.gpx --sigma 0.02 --geoid -67.3 -o survey.csv`
+    `kcal import places.gpx --survey-sigma 0.02 --geoid -67.3 -o survey.csv`
+
+    Args:
+        sources: File of another program, FILE:NAME for one of its cameras; two files of a pair.
+        output: Camera or rig file to write.
+        format: opencv, ros, kalibr, mrcal, colmap, nerfstudio, matlab, opensfm, toml, qualisys or agisoft.
+        size: Image size, where the file has none or a wrong one.
+        fisheye: Whether four coefficients of OpenCV are a fisheye's.
+        board: Read corners instead, of a board with these inner corners.
+        square: Side of a square of the board with its unit: 25mm.
+        survey_sigma: Of surveyed places, along each axis, where the file has none.
+        geoid: Height of the geoid above the WGS84 ellipsoid, added to the elevations of GPX.
+        unit: Unit of the translation, where the file has none: mm, cm, m, in.
     """
-    check_writable(output, *sources)
+    named = [named_source(source) for source in sources]
+    paths, camera = [path for path, _ in named], next((name for _, name in named if name), None)
+    check_writable(output, *paths)
     if board is not None:
-        _import_corners(sources, output, board, square, parse_size(size))
+        _import_corners(paths, output, board, square, size)
         return
-    if sources[0].suffix.lower() in (".gpx", ".geojson"):
-        _import_survey(sources, output, sigma, geoid)
+    if paths[0].suffix.lower() in (".gpx", ".geojson"):
+        _import_survey(paths, output, survey_sigma, geoid)
         return
-    if unit is not None and unit not in _UNITS:
-        raise InputError(f"--unit {unit}: write mm, cm, m or in")
 
     from kcal.io.camera_file import save_camera
     from kcal.io.formats import import_cameras
     from kcal.io.rig_file import save_rig
 
-    found = import_cameras(
-        *sources, format=format, size=parse_size(size), fisheye=fisheye, meters=_UNITS[unit] if unit else None
-    )
+    found = import_cameras(*paths, format=format, size=size, fisheye=fisheye, meters=unit)
     for note in found.notes:
         warn(note)
     if camera is None and len(found.poses) > 2 and not found.unread:
@@ -185,7 +164,7 @@ def import_command(
         save_rig(rig, output)
         out.print(f"rig from {found.format}: baseline {float(rig.baseline):.6g} m", markup=False)
     else:
-        chosen = picked(found, camera, " ".join(map(str, sources)))
+        chosen = picked(found, camera, " ".join(map(str, paths)))
         save_camera(chosen, output)
         out.print(f"camera from {found.format}: {chosen.model}, {chosen.size[0]}x{chosen.size[1]} px", markup=False)
     if without := [name for name, one in zip(found.names, found.cameras, strict=True) if not _has_error_bars(one)]:
@@ -271,12 +250,7 @@ def file_schema(kind: str) -> dict[str, Any]:
     }
 
 
-def schema_command(
-    kind: Annotated[
-        str | None,
-        typer.Argument(metavar="KIND", help="camera, rig, observations or board; a list of them if not given."),
-    ] = None,
-) -> None:
+def schema_command(kind: str | None = None) -> None:
     """Print the JSON schema of a kind of file, for programs that read or check kcal's files.
 
     What a schema cannot say (that a covariance is one, or that names fit the model) is checked when kcal reads a file.
@@ -284,6 +258,9 @@ def schema_command(
     **Example**
 
     `kcal schema camera > camera.schema.json`
+
+    Args:
+        kind: camera, rig, observations or board; a list of them if not given.
     """
     if kind is None:
         print_table([["kind", "written by"], *([name, writer] for name, (*_, writer) in FILES.items())], left=(0, 1))

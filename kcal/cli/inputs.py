@@ -107,20 +107,6 @@ def calibrated_camera(source: str | Path) -> Camera:
     return rig.left if name == "left" else rig.right
 
 
-def parse_size(text: str | None) -> tuple[int, int] | None:
-    """Read `1920x1080`.
-
-    Raises:
-        InputError: something else.
-    """
-    if text is None:
-        return None
-    width, _, height = text.lower().partition("x")
-    if not (width.isdigit() and height.isdigit()) or not (int(width) and int(height)):
-        raise InputError(f"--size {text}: write WIDTHxHEIGHT in pixels, for example 1920x1080")
-    return int(width), int(height)
-
-
 # Check what was given before anything is loaded: is each file there, and is it what the command needs there?
 
 
@@ -212,7 +198,7 @@ MARKS = Wanted("a table of marks (name,left_u,left_v,right_u,right_v)", frozense
 SURVEY = Wanted(
     "a table of places (name,lat,lon,height,sigma), GeoJSON or GPX",
     frozenset({"survey", "table", "geojson", "gpx", "json"}),
-    "kcal import places.gpx --sigma 0.02 --geoid -67.3 -o survey.csv",
+    "kcal import places.gpx --survey-sigma 0.02 --geoid -67.3 -o survey.csv",
 )
 SITES = Wanted(
     "a table of sites (name,lat,lon,height) or a kcal rig file",
@@ -234,6 +220,7 @@ FOREIGN = Wanted(
     frozenset({"camera", "rig", "foreign", "json", "unknown", "table", "survey", "marks", "geojson", "gpx"}),
     "kcal import left.yaml -o left.camera.json",
     (("observations", _CALIBRATE),),
+    part=True,
 )
 
 # As it was typed, after `kcal`; set by `kcal.cli.main`.

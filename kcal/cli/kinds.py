@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 from kcal import values
 from kcal.cli import inputs
 from kcal.cli.options import Kind
+from kcal.errors import InputError
 from kcal.files import check_picture
 from kcal.values import WithSigma
 
@@ -47,7 +48,18 @@ def _read_area(text: str, name: str) -> tuple[float, ...]:
     return values.number_list(text, name, 4, "SOUTH,WEST,NORTH,EAST in degrees, for example 44.8,5.8,45.2,6.3")
 
 
+def _read_unit(text: str, name: str) -> float:
+    if text not in ("mm", "cm", "m", "in"):
+        raise InputError(f"{name} {text}: write mm, cm, m or in")
+    return values.distance(f"1{text}", name)
+
+
 Area = Annotated[tuple[float, ...], Kind(metavar="S,W,N,E", read=_read_area)]
+Unit = Annotated[float, Kind(metavar="UNIT", read=_read_unit)]
+Share = Annotated[float, Kind(metavar="0...1", read=values.share, usage=True)]
+Name = Annotated[str, Kind(metavar="NAME")]
+Inner = Annotated[str, Kind(metavar="CxR")]
+Side = Annotated[str, Kind(metavar="LENGTH")]
 
 
 class KnownPlace(NamedTuple):
@@ -111,6 +123,8 @@ Survey = Annotated[Path, Kind(metavar="CSV"), inputs.SURVEY]
 Table = Annotated[Path, Kind(metavar="CSV"), inputs.TABLE]
 Sites = Annotated[Path, Kind(metavar="CSV"), inputs.SITES]
 Images = Annotated[str, Kind(metavar="IMAGES"), inputs.IMAGES]
+AnyFile = Annotated[str, inputs.CAMERA_OR_RIG]
+ForeignFile = Annotated[str, inputs.FOREIGN]
 Raster = Annotated[Path, Kind(metavar="RASTER")]
 
 # Files that are written. A name that no picture can have is refused before anything is computed.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import io
 import math
@@ -10,11 +11,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
 from rich.markup import escape
 
+from kcal.cli import kinds
 from kcal.cli.console import err, out, print_table, print_wrote, steps, tell, warn
-from kcal.cli.inputs import CAMERA_OR_RIG, IMAGES, cameras_and_rig, named_source, parse_size, single_camera
+from kcal.cli.inputs import cameras_and_rig, named_source, single_camera
+from kcal.cli.options import Kind
 from kcal.errors import FileError, InputError
 from kcal.files import check_writable, dump_json, make_folder, read_bytes, write_atomic
 from kcal.strict_json import read_json
@@ -161,47 +163,40 @@ _FELT = 0.1
 # Of a disparity, as block matchers have it.
 _DISPARITY_SIGMA = 0.3
 
-_OUTPUT = Annotated[Path, typer.Option("-o", "--output", metavar="FOLDER", help="Folder to write to.")]
-_ALPHA = Annotated[
-    float,
-    typer.Option(
-        "--alpha", min=0, max=1, help="0 keeps only pixels that the source shows, 1 all of the source with a black rim."
-    ),
-]
-_MASK = Annotated[bool, typer.Option("--mask", help="Also write a PNG that is white where the images are valid.")]
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ViewOptions:
+    """Which view the new images show, and what is written besides.
+
+    Args:
+        fov: Horizontal field of view, in place of --alpha.
+        cylinder: On an upright cylinder, up to 360 degrees.
+        pan: Look to the right; needs --fov.
+        tilt: Look up; needs --fov.
+        size: Of the new images; as the source's.
+        alpha: 0 keeps only pixels that the source shows, 1 all of the source with a black rim.
+        distance: Of what is seen: there the maps are exact; infinitely far if not given.
+        maps: Also write the maps as .npy, for cv2.remap and torch's grid_sample.
+        mask: Also write a PNG that is white where the images are valid.
+    """
+
+    fov: kinds.Degrees | None = None
+    cylinder: bool = False
+    pan: kinds.Degrees = 0.0
+    tilt: kinds.Degrees = 0.0
+    size: kinds.Size | None = None
+    alpha: kinds.Share = 0.0
+    distance: kinds.Distance = math.inf
+    maps: bool = False
+    mask: bool = False
 
 
 def rectify_command(
-    source: Annotated[
-        str, typer.Argument(metavar="CAMERA|RIG", help="Camera or rig file.", show_default=False), CAMERA_OR_RIG
-    ],
-    images: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="IMAGES",
-            help="Images of the camera: files, folders or quoted wildcards. Of a rig: LEFT RIGHT.",
-            show_default=False,
-        ),
-        IMAGES,
-    ] = None,
-    output: _OUTPUT = Path("rectified"),
-    fov: Annotated[
-        float | None, typer.Option("--fov", metavar="DEG", help="Horizontal field of view, in place of --alpha.")
-    ] = None,
-    cylinder: Annotated[bool, typer.Option("--cylinder", help="On an upright cylinder, up to 360 degrees.")] = False,
-    pan: Annotated[float, typer.Option("--pan", metavar="DEG", help="Look to the right; needs --fov.")] = 0.0,
-    tilt: Annotated[float, typer.Option("--tilt", metavar="DEG", help="Look up; needs --fov.")] = 0.0,
-    size: Annotated[
-        str | None, typer.Option("--size", metavar="WxH", help="Of the new images; as the source's.")
-    ] = None,
-    alpha: _ALPHA = 0.0,
-    at: Annotated[
-        float, typer.Option("--at", metavar="M", min=1e-3, help="Range at which the maps are exact; infinity.")
-    ] = math.inf,
-    maps: Annotated[
-        bool, typer.Option("--maps", help="Also write the maps as .npy, for cv2.remap and torch's grid_sample.")
-    ] = False,
-    mask: _MASK = False,
+    source: kinds.AnyFile,
+    images: list[kinds.Images] | None = None,
+    *,
+    output: Annotated[kinds.Output, Kind(metavar="FOLDER")] = Path("rectified"),
+    view: ViewOptions,
 ) -> None:
     """Resample images: pinhole without distortion, part of a fisheye as a perspective image, cylinder, stereo pair.
 
@@ -220,17 +215,19 @@ def rectify_command(
     `kcal rectify fisheye.camera.json "shots/*.jpg" -o view --fov 60 --pan 40 --size 1280x720`
 
     `kcal rectify rig.json left/ right/ -o stereo --maps`
+
+    Args:
+        source: Camera or rig file.
+        images: Images of the camera: files, folders or quoted wildcards. Of a rig: LEFT RIGHT.
+        output: Folder to write to.
     """
     rig = rig_of(source)
-    shape = parse_size(size)
     if rig is None:
-        _rectify_camera(
-            source, images or [], output, fov, cylinder, (pan, tilt), maps, mask, alpha=alpha, size=shape, at=at
-        )
-    elif cylinder or pan or tilt:
+        _rectify_camera(source, images or [], output, view)
+    elif view.cylinder or view.pan or view.tilt:
         raise InputError("--cylinder, --pan and --tilt are for a camera, not for a rig; RIG.json:left is a camera")
     else:
-        _rectify_rig(rig, images or [], output, fov, maps, mask, alpha=alpha, size=shape, at=at)
+        _rectify_rig(rig, images or [], output, view)
 
 
 def rig_of(source: str) -> Rig | None:
@@ -239,31 +236,19 @@ def rig_of(source: str) -> Rig | None:
     return cameras_and_rig(path)[1] if name is None else None
 
 
-def _rectify_camera(
-    source: str,
-    images: list[str],
-    folder: Path,
-    fov: float | None,
-    cylinder: bool,
-    look: tuple[float, float],
-    maps: bool,
-    mask: bool,
-    *,
-    alpha: float,
-    size: tuple[int, int] | None,
-    at: float,
-) -> None:
+def _rectify_camera(source: str, images: list[str], folder: Path, options: ViewOptions) -> None:
     from kcal.corners.images import expand_images
 
-    if not images and not maps:
+    if not images and not options.maps:
         raise InputError("name the images, or write the maps alone with --maps")
-    if any(look) and fov is None:
+    look = options.pan, options.tilt
+    if any(look) and options.fov is None:
         raise InputError("--pan and --tilt need --fov: which part of the image is to be shown")
     paths = expand_images(images) if images else []
     path, part = named_source(source)
     name = part or path.name.removesuffix(".json").removesuffix(".camera")
     camera_path = folder / f"{name}_rectified.json"
-    extras = [*([] if cylinder else [camera_path]), *_extra_paths(folder, name, maps, mask)]
+    extras = [*([] if options.cylinder else [camera_path]), *_extra_paths(folder, name, options)]
     targets = targets_of(paths, folder, extras)
 
     from kcal.io.camera_file import save_camera
@@ -273,19 +258,20 @@ def _rectify_camera(
     old = single_camera(source)
     prepare(folder, [*targets, *extras])
     with steps("rectifying", 1 + len(paths)) as advance:
-        if cylinder:
+        fov, size = options.fov, options.size
+        if options.cylinder:
             view: Any = cylinder_view(old, fov, size)
         else:
-            view = new_pinhole(old, alpha, size) if fov is None else pinhole_view(fov, size or old.size)
-        module = Undistort(old, view, looking(*look) if any(look) else None, at=at)
+            view = new_pinhole(old, options.alpha, size) if fov is None else pinhole_view(fov, size or old.size)
+        module = Undistort(old, view, looking(*look) if any(look) else None, at=options.distance)
         advance("maps")
         before, failures = convert_images(paths, targets, module, advance) if paths else (0, [])
     _refuse_none(paths, failures)
-    if not cylinder:
+    if not options.cylinder:
         save_camera(view, camera_path, name=f"{name} rectified")
-    _write_extras(folder, name, module, maps, mask)
+    _write_extras(folder, name, module, options)
     _tell_images(len(paths), before, failures, view.size)
-    if cylinder:
+    if options.cylinder:
         focal, cx, cy = view.params.tolist()
         out.print(f"cylinder: {focal:.2f} px a radian; straight ahead is {cx:.2f}, {cy:.2f}")
     else:
@@ -296,27 +282,16 @@ def _rectify_camera(
     _fail_at_end(paths, failures)
 
 
-def _rectify_rig(
-    rig: Rig,
-    images: list[str],
-    folder: Path,
-    fov: float | None,
-    maps: bool,
-    mask: bool,
-    *,
-    alpha: float,
-    size: tuple[int, int] | None,
-    at: float,
-) -> None:
+def _rectify_rig(rig: Rig, images: list[str], folder: Path, options: ViewOptions) -> None:
     from kcal.corners.images import expand_images
 
-    if len(images) not in ((0, 2) if maps else (2,)):
+    if len(images) not in ((0, 2) if options.maps else (2,)):
         got = f"got {len(images)}" if images else "or --maps for the maps alone"
         raise InputError(f"a rig needs LEFT and RIGHT: two files, folders or quoted wildcards, {got}")
     names = ("left", "right")
     sides = {name: expand_images([given]) for name, given in zip(names, images, strict=False)}
     rig_path, matrix_path = folder / "rectified.rig.json", folder / "Q.npy"
-    extras = [rig_path, matrix_path, *(path for name in names for path in _extra_paths(folder, name, maps, mask))]
+    extras = [rig_path, matrix_path, *(path for name in names for path in _extra_paths(folder, name, options))]
     targets = {name: targets_of(paths, folder / name, []) for name, paths in sides.items()}
 
     import torch
@@ -330,7 +305,9 @@ def _rectify_rig(
         prepare(folder / name, files)
     before, failures = 0, list[str]()
     with steps("rectifying", 1 + sum(map(len, sides.values()))) as advance:
-        module = StereoRectification(rig, alpha=alpha, size=size, field_of_view=fov, at=at)
+        module = StereoRectification(
+            rig, alpha=options.alpha, size=options.size, field_of_view=options.fov, at=options.distance
+        )
         advance("maps")
         for name, side in zip(names, (module.left, module.right), strict=True):
             if name in sides:
@@ -341,7 +318,7 @@ def _rectify_rig(
     save_rig(Rig.pair(module.camera, module.camera, torch.eye(3), -module.right_center), rig_path)
     _save_array(matrix_path, module.depth_matrix)
     for name, side in zip(names, (module.left, module.right), strict=True):
-        _write_extras(folder, name, side, maps, mask)
+        _write_extras(folder, name, side, options)
     _tell_images(len(paths), before, failures, module.camera.size)
     focal, _, cx, cy = module.camera.params[:4].tolist()
     out.print(f"both cameras: focal length {focal:.2f} px, cx {cx:.2f}, cy {cy:.2f}, baseline {rig.baseline:.6g} m")
@@ -353,23 +330,23 @@ def _rectify_rig(
     _fail_at_end(paths, failures)
 
 
-def _extra_paths(folder: Path, name: str, maps: bool, mask: bool) -> list[Path]:
-    found = [folder / f"{name}_map.npy", folder / f"{name}_grid.npy"] if maps else []
-    return [*found, *([folder / f"{name}_mask.png"] if mask else [])]
+def _extra_paths(folder: Path, name: str, options: ViewOptions) -> list[Path]:
+    found = [folder / f"{name}_map.npy", folder / f"{name}_grid.npy"] if options.maps else []
+    return [*found, *([folder / f"{name}_mask.png"] if options.mask else [])]
 
 
-def _write_extras(folder: Path, name: str, module: Undistort, maps: bool, mask: bool) -> None:
+def _write_extras(folder: Path, name: str, module: Undistort, options: ViewOptions) -> None:
     """Maps (2, H, W) for cv2.remap, (1, H, W, 2) for grid_sample with align_corners=True, and the mask."""
     import torch
 
     from kcal.io.images import write_png
 
-    if maps:
+    if options.maps:
         last = torch.tensor(module.camera.size, dtype=torch.float64)[:, None, None] - 1.0
         grid = torch.stack([module.grid_x, module.grid_y])
         _save_array(folder / f"{name}_map.npy", ((grid.double() + 1.0) * 0.5 * last).float())
         _save_array(folder / f"{name}_grid.npy", grid.movedim(0, -1)[None].float())
-    if mask:
+    if options.mask:
         write_png(folder / f"{name}_mask.png", (module.mask.byte() * 255).numpy())
 
 
@@ -403,7 +380,7 @@ def _tell_view(camera: Camera, module: Undistort, label: str) -> None:
         where = "far away" if math.isinf(module.at) else f"at {module.at:g} m"
         out.print(
             f"{label}the entrance pupil moves: maps are exact {where}; things at {_NEAR:g} m and far away are up to "
-            f"{shift:.2g} px apart, at {shift / _FELT * _NEAR:.2g} m {_FELT} px (--at)",
+            f"{shift:.2g} px apart, at {shift / _FELT * _NEAR:.2g} m {_FELT} px (--distance)",
             markup=False,
         )
     told = {"valid": shown.valid, "source_shown": shown.source, "degrees": shown.degrees, "pupil_px": shift}
@@ -471,14 +448,7 @@ def _fail_at_end(paths: list[Path], failures: list[str]) -> None:
 # `kcal rays`: the ray of every pixel, for renderers such as gsplat.
 
 
-def rays_command(
-    sources: Annotated[
-        list[str],
-        typer.Argument(metavar="CAMERA...", help="Camera files of one image size, or one rig file."),
-        CAMERA_OR_RIG,
-    ],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="NPZ", help="File to write.")],
-) -> None:
+def rays_command(sources: list[kinds.AnyFile], *, output: Annotated[kinds.Output, Kind(metavar="NPZ")]) -> None:
     """Write the ray of every pixel, for Gaussian splatting and other renderers without lens models.
 
     The file has `rays` (C, H, W, 6) in float32, as gsplat takes them from version 1.6 on: origin, in meters, and
@@ -491,6 +461,10 @@ def rays_command(
     `kcal rays left.camera.json -o rays.npz`
 
     `kcal rays rig.json -o rays.npz`
+
+    Args:
+        sources: Camera files of one image size, or one rig file.
+        output: File to write.
     """
     paths = [named_source(source)[0] for source in sources]
     check_writable(output, *paths)

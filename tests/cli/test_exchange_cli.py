@@ -98,7 +98,7 @@ def test_corners_and_surveys(tmp_path: Path) -> None:
     assert Observations.load(tmp_path / "c.obs.json").image_size == (64, 48)
     assert "1 views with 6 corners" in run("show", tmp_path / "c.obs.json")
     (tmp_path / "s.gpx").write_text('<gpx><wpt lat="19.07" lon="72.87"><ele>80</ele><name>post</name></wpt></gpx>')
-    run("import", tmp_path / "s.gpx", "--sigma", 0.02, "--geoid", -66, "-o", tmp_path / "s.csv")
+    run("import", tmp_path / "s.gpx", "--survey-sigma", 0.02, "--geoid", -66, "-o", tmp_path / "s.csv")
     survey = read_survey(tmp_path / "s.csv")
     assert (survey.origin.lat, survey.origin.height) == pytest.approx((19.07, 14.0), abs=1e-5)
 
@@ -110,7 +110,7 @@ def test_bad_options(tmp_path: Path, camera: Path, words: list[str]) -> None:
 
 
 def test_error_bars_come_along_and_a_rig_says_who_has_none(tmp_path: Path, camera: Path) -> None:
-    run("export", camera, "--to", "gtsam", "-o", tmp_path / "a.gtsam.json", "--model", "opencv4")
+    run("export", camera, "--format", "gtsam", "-o", tmp_path / "a.gtsam.json", "--model", "opencv4")
     assert "no error bars" not in run("import", tmp_path / "a.gtsam.json", "-o", tmp_path / "b.json")
     known, bare = load_camera(tmp_path / "b.json"), Camera.build(focal=(1000, 1000), center=(320, 240), size=(640, 480))
     assert known.calibration.covariance is not None

@@ -493,7 +493,7 @@ def test_one_camera_that_cannot_be_read_does_not_refuse_the_others(tmp_path: Pat
         ("2", (1, "RAD_TAN")),
         (None, (1, "2 cameras; name")),
     ):
-        code, words = run("import", path, "-o", out, *(["--camera", camera] if camera else []))
+        code, words = run("import", f"{path}:{camera}" if camera else path, "-o", out)
         assert code == wanted[0]
         assert wanted[1] in words
     chain = kalibr("pinhole", "radtan", [], D[:4]) + kalibr("pinhole", "strange", [], []).replace("cam0", "cam1")

@@ -189,7 +189,7 @@ def format_for(path: str | Path, format: str | None = None) -> str:
     if path.name == "camera_models.json":
         return "opensfm"
     if path.suffix.lower() not in by_suffix:
-        raise InputError(f"{path}: no format for this suffix; name one (--to {', '.join(_written())})")
+        raise InputError(f"{path}: no format for this suffix; name one (--format {', '.join(_written())})")
     return by_suffix[path.suffix.lower()]
 
 
