@@ -278,7 +278,7 @@ def find_again(
         before: (H, W) gray levels of the old image.
         after: (H, W) of the new one.
         pixels: (N, 2) in the old image.
-        reach: pixels by which things may have moved along each axis.
+        reach: pixels by which objects may have moved along each axis.
         options: `half`, `min_score` and `max_rival` of `MatchOptions`.
 
     Returns:

@@ -201,7 +201,7 @@ def propose(rig: Rig, images: tuple[Gray, Gray], side: Side, u: float, v: float,
 def at_shape(found: Proposal, image: Gray, how: str) -> Proposal:
     """A match moved to the shape that is there, if that is the shape of the mark it was matched to.
 
-    What stands behind a thing is displaced against it between the images, and pulls at a match by its contrast. The
+    What stands behind an item is displaced against it between the images, and pulls at a match by its contrast. The
     shape's own edges are free of that.
 
     Args:
@@ -400,7 +400,7 @@ _NOT_FOUND = {
 
 
 class Reference:
-    """Marks of static things in old images.
+    """Marks of static items in old images.
 
     Args:
         marks: their file.
@@ -419,7 +419,7 @@ class Reference:
             raise InputError("--reference-images: one old pair of images is needed")
 
     def find(self, name: str, side: Side, image: Gray, reach: int) -> Proposal:
-        """Where a thing is now, or why it was not found.
+        """Where an item is now, or why it was not found.
 
         Raises:
             InputError: no such name, or images of unlike sizes.

@@ -1,4 +1,4 @@
-"""What is marked: things with a name, a kind and a mark in either image; and the actions that change them.
+"""What is marked: items with a name, a kind and a mark in either image; and the actions that change them.
 
 State is a value: `applied(state, action)` returns the next one, so that undoing is going back to an earlier value.
 """
@@ -68,7 +68,7 @@ class Mark(_Strict):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Item:
-    """A thing and its marks.
+    """An item and its marks.
 
     Args:
         kind: "landmark" (surveyed), "feature" (it does not move) or "target" (to be located).
@@ -98,14 +98,14 @@ class Place(_Strict):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class MarkingState:
-    """All things by name, in the order in which they were added, and the survey."""
+    """All items by name, in the order in which they were added, and the survey."""
 
     items: Mapping[str, Item] = dataclasses.field(default_factory=dict)
     survey: Mapping[str, Place] = dataclasses.field(default_factory=dict)
 
 
 class Add(_Strict):
-    """Add a thing without marks."""
+    """Add an item without marks."""
 
     do: Literal["add"]
     name: _Name
@@ -116,7 +116,7 @@ class Put(_Strict):
     """Set a mark.
 
     Args:
-        name: of the thing.
+        name: of the item.
         side: of the image.
         mark: as it was clicked, dragged, matched or found.
         matched: it was matched to the other side's mark and shares its error.
@@ -141,14 +141,14 @@ class Take(_Strict):
 
 
 class Drop(_Strict):
-    """Remove a thing with its marks; surveyed places stay."""
+    """Remove an item with its marks; surveyed places stay."""
 
     do: Literal["drop"]
     name: _Name
 
 
 class Rename(_Strict):
-    """Give a thing another name or kind."""
+    """Give an item another name or kind."""
 
     do: Literal["rename"]
     name: _Name
@@ -195,7 +195,7 @@ def applied(state: MarkingState, action: Change) -> MarkingState:
     """The state after an action.
 
     Raises:
-        InputError: a name that does not exist or exists already, or marks of a moving thing at two moments.
+        InputError: a name that does not exist or exists already, or marks of a moving item at two moments.
 
     Example:
         >>> mark = Mark(u=10.5, v=20.0, cov=(0.01, 0.0, 0.01), frame="1")
@@ -261,7 +261,7 @@ def _with_mark(action: Put, item: Item) -> Item:
 
 
 def _known_to(action: Put) -> Mark:
-    """The mark with the sigma that its zoom allows: from afar, a shape within reach may be another thing."""
+    """The mark with the sigma that its zoom allows: from afar, a shape within reach may be another item."""
     least = 0.0 if action.zoom is None else 1.0 / action.zoom
     exact = action.mark.how != "hand" and 2.0 * least <= REACH
     if exact or action.mark.sigma >= least:

@@ -324,7 +324,7 @@ class Desk:
         }  # fmt: skip
 
     def state(self) -> Json:
-        """Things, marks, residuals, positions, and what the landmarks promise."""
+        """Items, marks, residuals, positions, and what the landmarks promise."""
         # The thread sets `_solved` last, so it is read first, and a change counts last, so its number is read last:
         # what is told not to be pending is solved with all marks that are told.
         solved = self._solved
@@ -409,7 +409,7 @@ class Desk:
         return "no relative pose yet: " + ("the rig is being solved" if solving else self._live.text)
 
     def again(self, name: str, side: Side, frame: Number, reach: Reach = 40) -> Json:
-        """Where a thing of the reference is now."""
+        """Where an item of the reference is now."""
         if self.reference is None:
             raise InputError("start with --reference and --reference-images to find points again")
         return _proposal(self.reference.find(name, side, self.pictures.image(side, frame), reach))

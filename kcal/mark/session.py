@@ -197,7 +197,7 @@ class Journal:
         self.notes += [f"{self.path}: {text}" for text in damaged]
 
     def _named(self, action: marking.Change | marking.Step) -> marking.Change | marking.Step:
-        """The action; marks of a thing whose own line was lost bring the thing back."""
+        """The action; marks of an item whose own line was lost bring the item back."""
         if isinstance(action, marking.Put) and action.name not in self.state.items:
             states, _ = self._after(marking.Add(do="add", name=action.name, kind="target"))
             self._states[-1] = states[-1]
@@ -378,7 +378,7 @@ class Session:
             self._journal.close()
 
     def marks(self, *kinds: marking.Kind, single: bool = True) -> Marks:
-        """The marks of these kinds; of things marked in both images only, if not `single`."""
+        """The marks of these kinds; of items marked in both images only, if not `single`."""
         return marks_of(self.state, kinds, single=single)
 
     def _write(self) -> None:
@@ -456,7 +456,7 @@ class Session:
 
 
 def marks_of(state: marking.MarkingState, kinds: tuple[marking.Kind, ...], *, single: bool = True) -> Marks:
-    """Marks of the things of some kinds, with their covariance where both images have one."""
+    """Marks of the items of some kinds, with their covariance where both images have one."""
     chosen = {
         name: item
         for name, item in state.items.items()

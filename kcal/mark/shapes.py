@@ -81,7 +81,7 @@ def _corner(where: Floats, p: Floats) -> Floats:
 
 
 def _wedge(where: Floats, p: Floats) -> Floats:
-    """The corner of one thing before one background: a wedge of less or more than 180° and nothing else."""
+    """The corner of one object before one background: a wedge of less or more than 180° and nothing else."""
     return _corner(where, p)[:, [0, 3]]
 
 

@@ -226,7 +226,7 @@ class RangeScale:
     """A plan on which directions are true, and ranges from its middle are log(1 + range / near), or true too.
 
     Args:
-        nearest: meters of the nearest thing.
+        nearest: meters of the nearest object.
         rim: meters of what is drawn at 1 and farthest.
         middle: (2,) east and north of the middle.
         true: whether ranges are true.

@@ -161,7 +161,7 @@ def rig_verdict(
 
     Args:
         rig: with its covariance; of two cameras, or of any number with its `root`: then ranges are those from each
-            camera to things that another one sees, where they are worst.
+            camera to objects that another one sees, where they are worst.
         requirements: ranges, and how well they must be known.
         mark_sigma: noise of a mark along each axis, px.
         result: as it was solved, for its warnings and its pairs of boards.
@@ -358,7 +358,7 @@ def _pairs_compared(rig: Rig, result: RigResult | None, pairs: tuple[Tensor, Ten
 def _unseen_finding(distance: float) -> Finding:
     text = (
         f"at {range_text(distance)} from a camera, along the middle rows of the images, no two cameras see one "
-        "thing: no range can be told"
+        "object: no range can be told"
     )
     action = "turn the cameras so that their views overlap, or add one (kcal sites says where)"
     return Finding("view", "stop", text, action)

@@ -471,7 +471,7 @@ def siting_figure(
 
 
 def _map_sigma(found: SitingMap) -> NDArray[np.float64]:
-    """(rows, columns) standard deviations where two sites or more see a thing."""
+    """(rows, columns) standard deviations where two sites or more see an object."""
     return np.where((found.seen_by > 1).numpy(), found.sigma.numpy(), np.nan)
 
 

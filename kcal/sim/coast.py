@@ -1,4 +1,4 @@
-"""A coast to look at: noise, facets, things that stand on it, and what is behind."""
+"""A coast to look at: noise, facets, objects that stand on it, and what is behind."""
 
 from __future__ import annotations
 
@@ -194,7 +194,7 @@ def _seen_part(camera: Eye, facet: Facet) -> tuple[slice, slice] | None:
 
 
 class Haze(NamedTuple):
-    """Air between the camera and things.
+    """Air between the camera and objects.
 
     Attributes:
         color: of the air.
@@ -205,7 +205,7 @@ class Haze(NamedTuple):
     length: float
 
     def seen(self, color: Floats, distance: Floats) -> Floats:
-        """Colors (..., 3) of things at distances (...,) in meters."""
+        """Colors (..., 3) of objects at distances (...,) in meters."""
         clear = np.exp(-np.maximum(distance, 0.0) / self.length)[..., None]
         return np.array(self.color) + clear * (color - np.array(self.color))
 
@@ -324,7 +324,7 @@ def _glass_before(t: Floats) -> Floats:
     return 0.5 * whole + np.clip(t - whole - 0.25, 0.0, 0.5)
 
 
-# Things on a coast, made of flat pieces: panels, poles, buildings, ridges, ships.
+# Objects on a coast, made of flat pieces: panels, poles, buildings, ridges, ships.
 
 UP = np.array([0.0, 0.0, 1.0])
 BLACK: Color = (34.0, 36.0, 40.0)

@@ -186,9 +186,9 @@ def _emptiest(seen: Tensor) -> str:
 # Refuse a calibration whose views leave open where the camera sees what they showed.
 #
 # A parameter with a large σ is no fault by itself: others may make up for it everywhere that a board was. So what
-# counts is the projection: how uncertain the directions are in which the corners were seen, after the best turn of the
-# camera, in shares of how far these corners are from their middle. For a pinhole that is the relative σ of its focal
-# length.
+# counts is the projection: how uncertain the directions are in which the corners were seen, after the best-fit
+# rotation of the camera, in shares of how far these corners are from their middle. For a pinhole that is the relative
+# σ of its focal length.
 
 # Directions less certain than this are no calibration: 5 % of range at every distance.
 _MOST = 0.05
@@ -385,9 +385,9 @@ def possible_views(camera: Camera, board: Board) -> BoardViews:
 
 
 def far_sigma(camera: Camera) -> float:
-    """Standard deviation along an axis of where a camera sees far things, RMS over its image, pixels.
+    """Standard deviation along an axis of where a camera sees far points, RMS over its image, pixels.
 
-    After the best turn of the camera, as `kcal.lens.uncertainty.projection_sigma`. NaN for a camera without error bars.
+    After the best-fit rotation, as `kcal.lens.uncertainty.projection_sigma`. NaN for a camera without error bars.
     """
     if camera.calibration is None or camera.calibration.known(camera.params.detach()) is None:
         return math.nan
@@ -445,7 +445,7 @@ def _kept(items: Sequence[T], good: Tensor) -> list[T]:
 
 
 def _image_slopes(camera: Camera, known: CameraInformation) -> Tensor:
-    """(2 G, U) derivatives of the image's grid by the unknowns, far away, after the best turn."""
+    """(2 G, U) derivatives of the image's grid by the unknowns, far away, after the best-fit rotation."""
     wanted = [index for index, slot in enumerate(known.slots) if slot >= 0]
     by_camera, by_motion, good = pixel_slopes(camera, camera.grid(*_GRID).reshape(-1, 2), math.inf, wanted)
     flat, by_turn = by_camera[good].flatten(0, 1), by_motion[good][..., :3].flatten(0, 1)

@@ -53,8 +53,8 @@ class Refit(NamedTuple):
 
     Attributes:
         seed: of its noise and of its true camera.
-        errors: (R, P, 2) px of the refitted camera at each range and place, after the best turn; NaN without an image.
-            All NaN where the fit failed.
+        errors: (R, P, 2) px of the refitted camera at each range and place, after the best-fit rotation; NaN without an
+            image. All NaN where the fit failed.
         own: (R, P) squares of these errors over the covariances that the refitted camera states itself.
     """
 

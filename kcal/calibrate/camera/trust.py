@@ -335,7 +335,7 @@ class CalibrationSummary:
     """The figures of a calibration to read first.
 
     Args:
-        center: px, standard deviation of a far direction in the middle of the image, after the best turn of the camera
+        center: px, standard deviation of a point at infinity in the middle of the image, after the best-fit rotation
             (`kcal.lens.uncertainty.pixel_covariance`).
         border: its median along the image's border.
         worst: its largest value in the image; NaN where the camera has no error bars.

@@ -136,7 +136,7 @@ def spacing_findings(result: CameraCalibrationResult, refused: bool = False) -> 
 
 # Say what a fitted movement of the entrance pupil stands for, where it is larger than any lens has.
 #
-# A hybrid lens may move its entrance pupil, and the views tell how far. Only near things show that, so that whatever
+# A hybrid lens may move its entrance pupil, and the views tell how far. Only near points show that, so that whatever
 # errs with the distance of the board can pass for it: a board of another size, one that bends from view to view,
 # motion.
 

@@ -186,7 +186,7 @@ def _advice(problem: RigProblem, state: RigState) -> str:
 
 
 def _surveyed(problem: RigProblem, state: RigState) -> Tensor | None:
-    """(L, 3) where surveyed things are, meters; None without any."""
+    """(L, 3) where surveyed points are, meters; None without any."""
     return next((own.items[:, :3] for block, own in problem.parts(state) if block.surveyed), None)
 
 

@@ -117,7 +117,7 @@ def swap_findings(data: RigData, problem: RigProblem, state: RigState, covarianc
     if behind > seen / 2:
         text = (
             f"{behind} of {seen} features have negative parallax, as if they were behind the cameras: left and right "
-            "marks are swapped, or are not of the same things"
+            "marks are swapped, or are not of the same points"
         )
         found.append(Finding("swapped", "doubt", text))
     return found
@@ -392,7 +392,7 @@ class _Explanation(NamedTuple):
         mask: the items that take part.
         terms: numbers of the measurements that do not.
         fit: of the rest.
-        size: how many things are left out.
+        size: how many points are left out.
     """
 
     names: tuple[str, ...]

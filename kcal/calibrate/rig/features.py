@@ -1,4 +1,4 @@
-"""Things matched between the images whose position nobody surveyed, as a source of a rig."""
+"""Points matched between the images whose position nobody surveyed, as a source of a rig."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _LEAST_INVERSE_RANGE = 1e-5
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Features(ItemSource):
-    """Things matched between the images whose position nobody surveyed.
+    """Points matched between the images whose position nobody surveyed.
 
     A feature alone determines the epipolar geometry: relative pitch and roll. It determines relative yaw if something
     is known of its range, and the farther away it is, the less need be known: a summit 20 km ± 2 km away is
@@ -113,7 +113,7 @@ class Features(ItemSource):
 
     def doubt(self, off: str, sigmas: float, over: float) -> str:
         """See `ItemSource.doubt`."""
-        return f"its marks do not meet: off by {off} ({sigmas:.0f} sigma): not the same thing, or it moved"
+        return f"its marks do not meet: off by {off} ({sigmas:.0f} sigma): not the same point, or it moved"
 
     def places(self, items: Tensor, anchor: Tensor) -> Tensor:
         """See `ItemSource.places`; as far away as their inverse range says, at most 100 km."""
@@ -134,7 +134,7 @@ def inverse_range_beyond(meters: float) -> tuple[float, float]:
 
 
 class FeatureBlock(MarkBlock):
-    """Things of unknown position: a unit vector (V, 3) and an inverse range (V, 1), 1/m, from `anchor` each.
+    """Points of unknown position: a unit vector (V, 3) and an inverse range (V, 1), 1/m, from `anchor` each.
 
     Args:
         pixels: (V, C, 2), see `MarkBlock`, as `whitening` (V, C, 2, 2) and `effects`.

@@ -148,7 +148,7 @@ def _from_features(data: RigData, camera: int, known: _Known, tried: list[int], 
 
 
 def _far_pixels(data: RigData) -> Tensor | None:
-    """(N, C, 2) marks of things that tell how cameras are turned; None without any."""
+    """(N, C, 2) marks of points that tell how cameras are turned; None without any."""
     far = [source.pixels for source in data.seen if source.turns]
     return torch.cat(far) if far else None
 

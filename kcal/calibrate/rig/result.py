@@ -270,7 +270,7 @@ class Records(NamedTuple):
     """What is told of the residuals of a solved rig.
 
     Attributes:
-        items: one record for each thing that was seen or measured.
+        items: one record for each point that was seen or measured.
         sources: one for each source.
         squared: (C,) squares of the residuals in each image, px².
         counts: (C,) how many marks, or columns of a skyline, these are.

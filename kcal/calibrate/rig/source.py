@@ -71,12 +71,12 @@ class Start(NamedTuple):
 
 
 def first_rays(cameras: Sequence[Camera], start: Start, pixels: Tensor, inverse: Tensor, anchor: Tensor) -> Tensor:
-    """(V, 3) unit vectors along the ray of the first camera that sees each thing; up where none does.
+    """(V, 3) unit vectors along the ray of the first camera that sees each point; up where none does.
 
     Args:
         cameras: of the rig.
         start: their poses.
-        pixels: (V, C, 2) of the things.
+        pixels: (V, C, 2) of the points.
         inverse: (V,) inverse ranges from the anchor, 1/m.
         anchor: (3,) where the vectors begin.
     """
@@ -530,11 +530,11 @@ class MarkBlock(Block):
         return effects.shifts[:, :, camera]
 
     def _bent(self, state: RigState, offset: Tensor) -> Tensor:
-        """Where things are seen (V, 3, N) that stand at `offset` from the camera."""
+        """Where points are seen (V, 3, N) that stand at `offset` from the camera."""
         return offset
 
     def _by_offset(self, state: RigState, by_q: Tensor, offset: Tensor) -> Tensor:
-        """Derivatives by where things stand, from those by where they are seen."""
+        """Derivatives by where points stand, from those by where they are seen."""
         return by_q
 
     def _white(self, camera: int, rows: Tensor) -> Tensor:
