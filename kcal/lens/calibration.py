@@ -98,7 +98,8 @@ class CalibrationRecord:
         noise: of a corner along an axis, pixels; None if it was not estimated.
         board_deviation: x, y, z in meters of each corner of the board, as measured, from where it was ordered; None if
             it was not measured.
-        tempering: by how much the corners count less because residuals repeat within views; None if not estimated.
+        tempering: dispersion factor that divides the weight of all corners, because residuals within a view are
+            correlated; None if not estimated.
         observations: name of the observations file, if there was one.
         temperature: of the camera when the views were taken, °C; None if nobody said.
         warnings: what should be doubted of it, a sentence each.

@@ -172,7 +172,7 @@ def settle(
 ) -> Rounds:
     """Settle amplitudes, camera, board, poses and motions, with arguments as of `fit_hybrid`.
 
-    If `rough`, another fit will begin where this one ends, so that it need not come to rest entirely.
+    If `rough`, another fit will begin where this one ends, so that it need not converge entirely.
     """
     lens, square, modes, known = options.lens, options.square, options.modes, options.known_board(points)
     if start is not None:
@@ -223,7 +223,7 @@ def settle(
         estimate = estimate._replace(families=families, state=state, amplitudes=estimate.amplitudes._replace(h=h))
         return run(capture, estimate, start.iterations)
     undecided = square is None and lens is None
-    # Whether pixels are square is told well enough before amplitudes are entirely at rest.
+    # Whether pixels are square is known well enough before amplitudes have converged.
     rounds = begin(capture, rough or undecided)
     if undecided:
         score = aspect_score(rounds)
@@ -255,7 +255,7 @@ def rough_start(
     options: FitOptions | None = None,
     progress: Callable[[str], object] = lambda _: None,
 ) -> FitStart:
-    """Fit roughly, as a start for a fit with other weights: without error bars, and not entirely at rest.
+    """Fit roughly, as a start for a fit with other weights: without error bars, and not entirely converged.
 
     Raises:
         InputError: as `fit_hybrid`.
@@ -304,7 +304,7 @@ class HybridFit:
         information: the same before anything was inverted, with data and priors apart.
         sigma: px, of a corner of weight one, tempering included.
         wider: by which variances are larger than the posterior's, where few views moved (`widening`); else 1.
-        tempering: T, by which the data count less because residuals repeat within views.
+        tempering: dispersion factor that divides the weight of all data: residuals within a view are correlated.
         hyperparameters: (H,) of largest evidence.
         expected: (H,) the same with the mean squares of amplitudes, which set the priors.
         families: the priors that these set; of a board with a prior of its own, those after the change of variables.
@@ -320,7 +320,7 @@ class HybridFit:
         weights: (V, N) by which the residuals were multiplied.
         weighted_rms: sqrt(mean w² ‖r‖²), pixels.
         iterations: trial steps of the solver.
-        converged: whether the hyperparameters came to rest.
+        converged: whether the hyperparameters converged.
 
     Example:
         >>> from kcal.lens import rotation_from_vector

@@ -293,7 +293,7 @@ def _cauchy_weights(problem: BoardProblem, state: BoardState, weights: Tensor) -
     return torch.where(shown, weights * RobustLoss(kind="cauchy", scale=scale).weight(length.square()).sqrt(), 0.0)
 
 
-# Solve for camera, board, poses and motions, and set all amplitudes by the evidence, until both come to rest.
+# Solve for camera, board, poses and motions, and set all amplitudes by the evidence, until both converge.
 
 _ROUNDS = 12
 # Rounds after which the evidence of one compares with that of another: the first begins with typical amplitudes.
@@ -307,7 +307,7 @@ _REWEIGHED = 3
 _DRIFT = 5.0
 # Motions beyond this stand for something else.
 _TOO_MUCH = 0.5 * LARGEST
-# Hyperparameters have come to rest when none, nor the logarithm of the tempering, moves by more.
+# Hyperparameters have converged when none, nor the logarithm of the tempering, changes by more.
 _AT_REST = 0.1
 # The same for a fit from which another begins.
 _NEAR_REST = 0.3
@@ -331,7 +331,7 @@ class Rounds(NamedTuple):
         data: near it.
         loss: the negative logarithm of the evidence; of data that count less by the tempering, where views stand still.
         steps: trial steps of the solver.
-        converged: whether the hyperparameters came to rest.
+        converged: whether the hyperparameters converged.
         gained: nats by which motion raised the evidence, where that was too little for it to be kept.
     """
 
@@ -411,14 +411,14 @@ def run_rounds(
     progress: Callable[[str], object] = lambda _: None,
     reweigh: Callable[[FittedViews, Estimate], FittedViews] | None = None,
 ) -> Rounds:
-    """Solve for all unknowns and set amplitudes by the evidence, in turn, until both come to rest.
+    """Solve for all unknowns and set amplitudes by the evidence, in turn, until both converge.
 
     Args:
         capture: what is fitted.
         estimate: to begin with.
         cold: the estimate is that of the base projection, so that its amplitudes mean nothing yet.
         spent: trial steps before.
-        rough: another fit will begin where this one ends, so that it need not come to rest entirely.
+        rough: another fit will begin where this one ends, so that it need not converge entirely.
         progress: called after each round.
         reweigh: called after each of the first rounds: the same views with other weights, such as without outliers.
     """
@@ -471,7 +471,7 @@ def run_rounds(
         last = best.loss
         # Where its amplitudes rest and the solver does not, more rounds of a few steps would end as those before.
         effort = LAST if bends and change < _AT_REST and not ended else _LATER
-        progress(f"evidence, round {turn + 1}")
+        progress(f"prior amplitudes from the evidence, step {turn + 1}")
         if reweigh is not None and turn < _REWEIGHED:
             weighed = reweigh(capture, estimate)
             resting &= torch.equal(weighed.weights, capture.weights)

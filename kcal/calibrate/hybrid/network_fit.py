@@ -90,7 +90,7 @@ def train_network(
     options: FieldTraining,
     progress: Callable[[str], object] = lambda _: None,
 ) -> Rounds:
-    """Train the network of a fit's field, beginning where the fit came to rest.
+    """Train the network of a fit's field, beginning where the fit converged.
 
     Args:
         rounds: where it did.

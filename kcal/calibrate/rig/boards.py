@@ -182,14 +182,14 @@ class Boards(ItemSource):
     def doubt(self, off: str, sigmas: float, over: float) -> str:
         """See `ItemSource.doubt`."""
         why = "it moved between the views, or a lens differs from its model"
-        # A board of many corners is wrong at few sigmas. One that is within its own limit was left out because the
-        # others fit better without it.
+        # With many corners, a few sigmas on average are already significant. A board within that limit was left out
+        # because the others fit significantly better without it.
         if over > 1.0:
             most = f"{sigmas:.2f} sigma on average, where so many corners allow {sigmas / math.sqrt(over):.2f}"
             return f"it does not fit the other boards: off by {off} ({most}): {why}"
         return (
-            "it does not fit the other boards: with it, these fit worse than chance explains, though it is off by only "
-            f"{off} ({sigmas:.2f} sigma on average): {why}"
+            f"it does not fit the other boards: its own residuals are small ({off}; {sigmas:.2f} sigma on average), "
+            f"but the others fit significantly better without it: {why}"
         )
 
     def places(self, items: Tensor, anchor: Tensor) -> Tensor:
