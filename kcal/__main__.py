@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import _thread
 import gc
 import os
 import signal
 import sys
 import threading
+
+from kcal.interrupts import listen, only_interruptions
 
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 
@@ -22,12 +23,13 @@ def main() -> None:
     # The garbage collector would search the imported libraries again and again while they load and once more at the
     # end: .55 of 2.1 CPU s of `kcal diff`. Cyclic garbage of ordinary work stays below 50,000 objects.
     gc.set_threshold(50_000, 20, 20)
-    sys.unraisablehook = _unraisable
+    listen()
     code: int | str | None = None
     try:
-        from kcal.cli.main import main as run
+        with only_interruptions():
+            from kcal.cli.main import main as run
 
-        run()
+            run()
     except KeyboardInterrupt:
         print("interrupted; nothing was written", file=sys.stderr)
         code = 130
@@ -41,14 +43,6 @@ def main() -> None:
         sys.stdout.flush()
         os._exit(code if isinstance(code, int) else bool(code))
     sys.exit(code)
-
-
-def _unraisable(what: sys.UnraisableHookArgs) -> None:
-    """Interrupt again, a moment later, where Python drops an interruption: in callbacks of its import system."""
-    if issubclass(what.exc_type, KeyboardInterrupt):
-        threading.Timer(0.01, _thread.interrupt_main).start()
-    else:
-        sys.__unraisablehook__(what)
 
 
 if __name__ == "__main__":

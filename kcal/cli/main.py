@@ -41,6 +41,7 @@ from kcal.cli.stations import station_command
 from kcal.cli.watch import watch_command
 from kcal.errors import KcalError
 from kcal.files import written_files
+from kcal.interrupts import only_interruptions
 from kcal.texts import visible
 
 
@@ -75,7 +76,8 @@ class _Commands(TyperGroup):
         with usage_errors_shown(), written_files() as written, working(name):
             try:
                 try:
-                    return super().invoke(ctx)
+                    with only_interruptions():
+                        return super().invoke(ctx)
                 finally:
                     print_replaced(written)
             except KeyboardInterrupt:

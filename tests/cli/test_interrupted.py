@@ -37,10 +37,15 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("module", ["kcal.cli.main", "torch"])
-def test_while_it_loads(module: str, folder: Path) -> None:
-    said = interrupt(folder, f"import:{module}", "export left.camera.json -o left.yaml")
+@pytest.mark.parametrize("moment", ["import:kcal.cli.main", "import:torch", "lost:kcal.cli.main", "lost:torch"])
+def test_while_it_loads(moment: str, folder: Path) -> None:
+    said = interrupt(folder, moment, "export left.camera.json -o left.yaml")
     assert said == "interrupted; nothing was written"
+
+
+def test_while_a_table_is_located(folder: Path) -> None:
+    said = interrupt(folder, "step:1", f"locate {SAMPLE} {POINTS} -o a.csv")
+    assert said == "interrupted after 7 rows; written: nothing; other files are as they were"
 
 
 def test_a_file_that_came_into_place_is_named(folder: Path) -> None:

@@ -3,6 +3,7 @@
 `python interrupted.py KIND:VALUE COMMAND...`, where the moment is
 
 * `import:NAME`: when that module is imported;
+* `lost:NAME`: likewise, but an extension module makes another error of it;
 * `search:N`: during the N-th search of an image by OpenCV;
 * `step:N`: at the N-th step of a progress bar;
 * `write:N`, `written:N`: right before and right after the N-th file comes into its place;
@@ -31,7 +32,7 @@ def interrupt_at(moment: str) -> None:
     # Where tests run in the background of a shell, it was ignored.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     kind, _, value = moment.partition(":")
-    left = [1 if kind == "import" else int(value)]
+    left = [1 if kind in ("import", "lost") else int(value)]
     sent = signal.SIGKILL if kind == "killed" else signal.SIGINT
 
     def strike() -> None:
@@ -53,12 +54,15 @@ def interrupt_at(moment: str) -> None:
 
         return run
 
-    if kind == "import":
+    if kind in ("import", "lost"):
         load = builtins.__import__
 
         def imported(name: str, *arguments: Any, **options: Any) -> Any:
             if name == value:
-                strike()
+                try:
+                    strike()
+                except KeyboardInterrupt:
+                    raise KeyboardInterrupt if kind == "import" else ImportError("initialization failed") from None
             return load(name, *arguments, **options)
 
         builtins.__import__ = imported
