@@ -46,7 +46,7 @@ def main() -> None:
     levels = [0.05, 0.1, 0.2, 0.5, 1.0]
     shown = right.contourf(places[..., 0], places[..., 1], sigma, levels=levels, cmap="viridis_r", extend="both")
     frame_image(right, camera.size)
-    right.set_title("σ of far directions, pixels", fontsize=10, loc="left")
+    right.set_title("σ of points at infinity, pixels", fontsize=10, loc="left")
     figure.colorbar(shown, ax=right, fraction=0.035, pad=0.02)
     print(f"wrote {save_picture(FOLDER / 'camera.png', figure)}")
 

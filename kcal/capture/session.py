@@ -121,7 +121,7 @@ class CaptureOptions:
     """When to stop, and how frames are searched.
 
     Args:
-        until: px, standard deviation of far directions along an axis, RMS over the image, at which to stop.
+        until: px, standard deviation of points at infinity along an axis, RMS over the image, at which to stop.
         most: number of views at which to stop.
         refine: see `kcal.corners.refine.refine_corners`.
     """
@@ -180,14 +180,14 @@ class CaptureSession:
 
     @property
     def sigma(self) -> float:
-        """px, of far directions (`far_sigma`); NaN before the first calibration."""
+        """px, of points at infinity (`far_sigma`); NaN before the first calibration."""
         return self.history[-1][1] if self.history else math.nan
 
     @property
     def finished(self) -> str:
         """Why no more views are needed; empty while they are."""
         if self.sigma <= self.options.until:
-            return f"far directions are known to ± {self.sigma:.3f} px: enough"
+            return f"points at infinity are known to ± {self.sigma:.3f} px: enough"
         return f"{self.views} views were kept: the most that were asked for" if self.views >= self.options.most else ""
 
     def offer(self, image: Gray, name: str, *, moving: bool) -> bool:

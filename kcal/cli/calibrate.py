@@ -77,7 +77,7 @@ def print_calibration(result: CameraCalibrationResult, *, reject: bool, verbose:
     if brief.worst == brief.worst:
         center, border, worst = (number_text(one, digits=2) for one in (brief.center, brief.border, brief.worst))
         out.print(
-            f"far directions: ± {center} px in the middle of the image, "
+            f"points at infinity: ± {center} px in the middle of the image, "
             f"{border} px at its border, {worst} px at worst; no board reached {percent_text(brief.unreached)} of it"
         )
     if result.hybrid is not None:
@@ -194,7 +194,7 @@ def calibrate_command(
 
     There is no lens model to choose: the views themselves tell how much of each term of the lens, of the entrance
     pupil's movement and of the board's bending and print errors there is. A small RMS does not prove an accurate
-    camera; read the uncertainty of far directions, in pixels, and what to photograph next.
+    camera; read the uncertainty of points at infinity, in pixels, and what to photograph next.
 
     With --stars no board is needed: tilt the camera up by 30°. It is then right at infinity, without an entrance pupil.
     With observations as well, boards and stars give one camera; whether they contradict each other is tested.

@@ -53,7 +53,7 @@ def capture_command(
     Args:
         source: camera:0, a stream (rtsp://...), a video, or a folder into which images come.
         output: Observations file to write, or to continue.
-        until: Stop when far directions are known to this σ, on average over the image.
+        until: Stop when points at infinity are known to this σ, on average over the image.
         most: Stop at this number of views.
         page: Show it on a local page; without, only in this terminal.
         port: Of the local address; 0 for any that is free.
@@ -112,7 +112,7 @@ def capture_command(
     if session.finished:
         out.print(session.finished)
     elif session.views:
-        known = f"; far directions are known to ± {session.sigma:.3f} px" if session.history else ""
+        known = f"; points at infinity are known to ± {session.sigma:.3f} px" if session.history else ""
         out.print(f"{session.views} views kept{known}")
     if not session.views:
         raise InputError(f"no frame showed the board: {session.message}")

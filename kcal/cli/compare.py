@@ -230,10 +230,11 @@ def interpolate_command(
     if isinstance(made, LensSetting) and made.interpolated_from:
         text = ", ".join(f"{number_text(value, digits=2)} by {name}" for name, value in parts.items() if value)
         out.print(
-            f"{made}, interpolated: far directions ± {number_text(total, digits=2)} px (median): {text}", markup=False
+            f"{made}, interpolated: points at infinity ± {number_text(total, digits=2)} px (median): {text}",
+            markup=False,
         )
     else:
-        out.print(f"{made}, calibrated: far directions ± {number_text(total, digits=2)} px (median)", markup=False)
+        out.print(f"{made}, calibrated: points at infinity ± {number_text(total, digits=2)} px (median)", markup=False)
     tell(setting=wanted, weights=list(found.weights), sigma_px={"median": total, **parts})
     save_camera(found.camera, output, name=output.name.split(".")[0])
     print_wrote(output)

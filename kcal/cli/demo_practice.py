@@ -322,7 +322,7 @@ def _score_cameras(folder: Path, truth: dict[str, Any]) -> None:
             found = score_lens(load_camera(path), truth["cameras"][side], truth["baseline_m"])
             pixels = [f"{value:.3f}" for value in (found.rms, found.middle, found.largest)]
             rows.append([side, *pixels, f"{found.sideways_m:.2f} m", f"{found.range_m:.0f} m"])
-    _head("Cameras: error over the image after the best turn")
+    _head("Cameras: error over the image after the best-fit rotation")
     _print_or_missing(rows)
 
 

@@ -396,11 +396,11 @@ def _against_reference(
     """What the reference finds that was left out: the board's shape, the pupil's movement, or another lens."""
     plain = found.structure.image < _LENS
     if plain and (bends := _board_fault(result, options, found.reference)):
-        text = f"{bends}, but was taken as flat and exact: far directions are wrong by {far:.2g} px"
+        text = f"{bends}, but was taken as flat and exact: points at infinity are wrong by {far:.2g} px"
         action = "calibrate with the default lens and --board printed, which measures the board, or use a stiffer board"
         return Finding("board", "doubt", text, action, FAULTS)
     if plain and (pupil := _pupil_fault(result, found.reference)):
-        text = f"{pupil}, which {result.camera.model} does not have: far directions are off by {far:.2g} px"
+        text = f"{pupil}, which {result.camera.model} does not have: points at infinity are off by {far:.2g} px"
         action = "calibrate with the default lens (--model hybrid), or show the board from farther away"
         return Finding("pupil", "doubt", text, action, FAULTS)
     if (
@@ -601,7 +601,7 @@ def other_views(stored: Camera, result: CameraCalibrationResult) -> tuple[list[F
 
 
 def _image_rms(camera: Camera) -> float:
-    """RMS over the image of the standard deviation of far directions, px; infinite without error bars."""
+    """RMS over the image of the standard deviation of points at infinity, px; infinite without error bars."""
     known = camera.calibration
     if known is None or known.known(camera.params.detach()) is None:
         return math.inf

@@ -131,7 +131,7 @@ def test_calibrations_and_the_end(session: CaptureSession) -> None:
     for number in (4, 5):
         session.offer(frame(number), str(number), moving=False)
         session.think()
-    assert session.finished == "far directions are known to ± 0.167 px: enough"
+    assert session.finished == "points at infinity are known to ± 0.167 px: enough"
     session.history.clear()
     session.offer(frame(6), "6", moving=False)
     assert session.finished == "7 views were kept: the most that were asked for"

@@ -401,7 +401,7 @@ def test_interpolate(tmp_path: Path, command: Command) -> None:
     made = tmp_path / "now.camera.json"
     words = ["interpolate", *paths, "--setting", "focus=1.5", "-o", str(made)]
     done = command(*words, "--setting-sigma focus=0.1")
-    assert "focus=1.5, interpolated: far directions ± " in done.out
+    assert "focus=1.5, interpolated: points at infinity ± " in done.out
     assert all(f" by {part}" in done.out for part in ("calibrations", "interpolation", "setting"))
     known = load_camera(made).calibration
     assert known is not None
@@ -412,7 +412,7 @@ def test_interpolate(tmp_path: Path, command: Command) -> None:
     assert told["sigma_px"]["setting"] == 0.0 < told["sigma_px"]["interpolation"]
     assert sum(told["weights"]) == pytest.approx(1.0)
     same = RUNNER.invoke(app, ["interpolate", *paths, "--setting", "focus=2", "-o", str(made)])
-    assert "focus=2, calibrated: far directions ± " in same.output
+    assert "focus=2, calibrated: points at infinity ± " in same.output
     assert load_camera(made).focal.tolist() == [504.0, 504.0]
     made.unlink()
     beyond = RUNNER.invoke(app, ["interpolate", *paths, "--setting", "focus=3.5", "-o", str(made)])

@@ -15,7 +15,7 @@ from kcal.lens.information import CameraInformation
 from kcal.lens.uncertainty import image_sigma, pixel_covariance, projection_sigma
 from scripts.shared.infinity import error_at_infinity
 
-# Uncertainty of far directions: what a change of a parameter does to the image after the best turn.
+# Uncertainty of points at infinity: what a change of a parameter does to the image after the best-fit rotation.
 
 
 SIZE = (640, 480)

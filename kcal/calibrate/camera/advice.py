@@ -291,7 +291,7 @@ def check_directions(
 # Find the view of the board that would tell most about a camera, from what its calibration leaves open.
 #
 # Of many places, distances, tilts and rolls of the board, each adds rows to the square-root information of the camera
-# once its own pose is eliminated. The best one reduces the variance of far directions most, averaged over the image
+# once its own pose is eliminated. The best one reduces the variance of points at infinity most, averaged over the image
 # (A-optimal design; for calibration: Peng and Sturm, "Calibration wizard", ICCV 2019).
 
 T = TypeVar("T")
@@ -396,7 +396,7 @@ def far_sigma(camera: Camera) -> float:
 
 
 def next_view(camera: Camera, board: Board, noise: float, taken: Tensor | None = None) -> NextView | None:
-    """The view that reduces the uncertainty of far directions most.
+    """The view that reduces the uncertainty of points at infinity most.
 
     Args:
         camera: with its calibration.

@@ -328,7 +328,7 @@ class InterpolatedCamera:
     Args:
         camera: with its covariance; `camera.calibration.setting` names its sources.
         weights: of the cameras that were given; their sum is 1.
-        calibration_px: median over the image of the standard deviation of a far direction that comes from the
+        calibration_px: median over the image of the standard deviation of a point at infinity that comes from the
             calibrations (as `kcal.lens.uncertainty.projection_sigma`).
         interpolation_px: likewise of the curve between the settings.
         setting_px: likewise of the settings themselves.

@@ -109,7 +109,7 @@ def test_a_change_of_variables_is_the_same_board() -> None:
     ids=str,
 )
 def test_a_turned_board_has_turned_amplitudes(board: Board, turns: tuple[int, ...]) -> None:
-    """Corners in another order are those of the turned modes, after the best turn, shift and scale."""
+    """Corners in another order are those of the turned modes, after the best-fit rotation, shift and scale."""
     assert board.quarter_turns == turns
     modes = board_modes(board.points)
     a = 1e-5 * modes.unit / modes.unit.max() * normal(28, seed=8)

@@ -117,7 +117,7 @@ def test_turned_views_are_found_within_and_between_cameras() -> None:
 
 
 def far_error(found: Camera, true: Camera) -> float:
-    """RMS distance in pixels of far directions over the image's middle, after the best turn."""
+    """RMS distance in pixels of points at infinity over the image's middle, after the best-fit rotation."""
     pixels = true.grid(15, 11).reshape(-1, 2)
     middle = 0.5 * torch.tensor(SIZE, dtype=torch.float64)
     pixels = pixels[(pixels - middle).norm(dim=-1) < 0.75 * float(middle.norm())]

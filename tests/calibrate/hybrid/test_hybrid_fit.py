@@ -88,7 +88,7 @@ def seen_pixels(camera: Camera) -> Tensor:
 
 
 def error_at_infinity(found: Camera, true: Camera) -> float:
-    """RMS distance in pixels of the images of the same far directions, after the best turn of one camera."""
+    """RMS distance in pixels of the images of points at infinity, after the best-fit rotation of one camera."""
     pixels = seen_pixels(true)
     rays, valid = true.unproject(pixels)
     rays, valid_here = found.unproject(pixels)[0], valid & found.unproject(pixels)[1]
@@ -128,7 +128,7 @@ def test_pupil_and_board_come_back() -> None:
 
 
 def test_errors_are_as_large_as_predicted() -> None:
-    """Images of far directions: their squared errors over their variances, after the best turn, are about one."""
+    """Squared errors of points at infinity over their variances, after the best-fit rotation, are about one."""
     found, true = printed(), truth()
     pixels = seen_pixels(true)
     rays = true.unproject(pixels)[0]
