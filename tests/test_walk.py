@@ -60,9 +60,8 @@ def test_a_site_is_marked_by_clicks(tmp_path: Path) -> None:
                 page.wait_for_function("side => kcal.item() && kcal.item()[side]", arg=side)
                 page.get_by_role("button", name="Fit").click()
         page.get_by_role("button", name="New target").click()
-        page.wait_for_function("() => (kcal.selected || '').startsWith('target ')")
-        page.get_by_label("Name").fill("gate")
-        page.get_by_role("button", name="Rename").click()
+        page.get_by_role("dialog").get_by_label("Name").fill("gate")
+        page.get_by_role("button", name="Add").click()
         page.wait_for_function("() => kcal.selected === 'gate'")
         for side, place in zip(("left", "right"), site.pixels["gate"], strict=True):
             zoom_and_click(page, side, place)
@@ -128,12 +127,14 @@ def test_targets_are_watched_until_the_stream_ends(tmp_path: Path) -> None:
                 if frame == 9:
                     # They are there while more are to come.
                     page.wait_for_function("() => document.documentElement.dataset.sequence === '10'")
-                    assert page.inner_text("#count") == "2 tracks, moment 10"
+                    assert page.inner_text("#count") == "2 targets"
+                    assert page.inner_text("#clock") == "2023-11-14 22:13:20 UTC"
                     assert page.inner_text("#status") == "running"
                     shown = page.locator(".leaflet-tooltip").all_inner_texts()
             process.stdin.close()
             page.wait_for_function("() => document.getElementById('status').textContent === 'finished'")
-            assert page.inner_text("#count") == "2 tracks, moment 20"
+            assert page.inner_text("#count") == "2 targets"
+            assert page.inner_text("#clock") == "2023-11-14 22:13:21 UTC"
             assert page.complaints == []
         assert process.wait(timeout=PATIENCE) == 0
     assert [text.split(",")[0] for text in shown] == ["left camera", "right camera", "track 1", "track 2"]

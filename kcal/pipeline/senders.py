@@ -384,9 +384,9 @@ def _place_of(columns: PositionColumns, row: int, origin: Origin) -> list[float]
 
 
 def _called(columns: PositionColumns, row: int) -> str:
-    """`car 12` of the category car and the name `track 12`, if the category is a word."""
+    """`car 12` of the category car and the name `track 12`; the name where the category tells nothing."""
     name, category = columns.names[row], columns.extras["category"][row]
-    return name if not category or category.isdigit() else f"{category} {name.rpartition(' ')[2]}"
+    return name if category in ("", "object") or category.isdigit() else f"{category} {name.rpartition(' ')[2]}"
 
 
 def _speed(columns: PositionColumns, row: int) -> list[str]:

@@ -107,6 +107,7 @@ def main() -> None:
                 page.wait_for_timeout(2000)
                 dragged(page, "panning at 1:1", (2900, 1950))
                 page.keyboard.press("n")
+                page.keyboard.press("Enter")
                 page.wait_for_function("() => kcal.item()")
                 page.evaluate(
                     "kcal.place('left', 3000, 2000, false).then(() => kcal.place('right', 2900, 2000, false))"

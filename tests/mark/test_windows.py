@@ -215,7 +215,8 @@ def test_a_click_from_afar_says_what_it_is_worth(site: tuple[Desk, MarkingSite, 
 SPREAD = """() => {
   const left = (i) => ({u: 400 + 40 * (i % 6), v: 300 + 25 * Math.floor(i / 6), cov: [1, 0, 1], how: 'hand', sigma: 1});
   kcal.items = Array.from({length: 30}, (_, i) => ({name: 'thing ' + i, kind: 'feature', left: left(i)}));
-  kcal.selected = null;
+  kcal.items.push({name: 'chosen', kind: 'feature', left: {...left(0), u: 200, v: 150}});
+  kcal.selected = 'chosen';
   const view = kcal.views.left, c = view.context, fill = c.fillText, names = [];
   c.fillText = function (words, x, y) {
     names.push([x, y - 11, x + c.measureText(words).width, y + 3]);
@@ -223,7 +224,8 @@ SPREAD = """() => {
   };
   view.paint();
   const marks = kcal.items.map((item) => view.screen(item.left.u, item.left.v));
-  return [names, marks.map(([x, y]) => [x - 7, y - 7, x + 7, y + 7])];
+  const [x, y] = marks.pop(), cross = [[x - 26, y - 1, x + 26, y + 1], [x - 1, y - 26, x + 1, y + 26]];
+  return [names, [...cross, ...marks.map(([x, y]) => [x - 7, y - 7, x + 7, y + 7])]];
 }"""
 
 
@@ -233,7 +235,7 @@ def test_names_stand_beside_marks(site: tuple[Desk, MarkingSite, str]) -> None:
     with chromium_page() as page:
         opened(page, address)
         names, marks = page.evaluate(SPREAD)
-    assert 5 <= len(names) < 30
+    assert 5 <= len(names) < 31
     for a, b in [*itertools.combinations(names, 2), *itertools.product(names, marks)]:
         assert min(a[2], b[2]) - max(a[0], b[0]) <= 0.5 or min(a[3], b[3]) - max(a[1], b[1]) <= 0.5
 

@@ -163,7 +163,7 @@ class App {
   guide() { return this.askGuide().catch((error) => this.unanswered(error)); }
   async askGuide() {
     const item = this.item(), key = this.key();
-    if (!item) return;
+    if (!item || !this.about.cameras && !this.about.reference.length) return;
     if (this.about.reference.includes(item.name)) {
       for (const side of SIDES) {
         if (item[side]) continue;
@@ -272,9 +272,11 @@ class App {
     this.side = side;
     this.proposals[side] = undefined;
     await this.act({do: "put", name: item.name, side, mark, zoom});
+    await this.guide();
     const kept = this.item(item.name)?.[side];
-    if (kept && 1 / zoom > this.about.hand_sigma && kept.sigma > 0.99 / zoom) this.say(`${item.name}, ${side}: σ ${kept.sigma.toFixed(1)} px, one pixel of the screen at ${zoom.toFixed(2)}×. Press Z to see it closer, then S to snap it.`);
-    this.guide();
+    if (!kept || 1 / zoom <= this.about.hand_sigma || kept.sigma < 0.99 / zoom) return;
+    const far = `${item.name}, ${side}: σ ${kept.sigma.toFixed(1)} px, one pixel of the screen at ${zoom.toFixed(2)}×. Press Z to see it closer, then S to snap it.`;
+    this.say(this.proposals[other(side)] && !this.proposals[other(side)].refusal ? `${byId("status").textContent} ${far}` : far);
   }
   // Screen pixels per pixel of the image, and what a mark by hand is worth there: the server sees to the same.
   zoomed(side) { return this.views[side].scale / this.views[side].ratio; }

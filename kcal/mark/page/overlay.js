@@ -80,7 +80,7 @@ export function drawOverlay(view, c) {
   }
   c.font = font(ratio);
   for (const {key, words, x, y, r, rank} of named.sort((a, b) => a.rank - b.rank)) {
-    const width = c.measureText(words).width, height = 14 * ratio, offsets = aroundDot(r + 3 * ratio, width, height);
+    const width = c.measureText(words).width, height = 14 * ratio, offsets = aroundDot((rank ? r + 3 * ratio : 29 * ratio), width, height);
     const box = ([dx, dy]) => [x + dx - width / 2, y + dy - height / 2, x + dx + width / 2, y + dy + height / 2];
     // Where it was before, if there still is room.
     const found = [view.names.get(key) ?? 0, ...offsets.keys()].find((k) => taken.free(box(offsets[k])));
