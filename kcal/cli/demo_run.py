@@ -268,7 +268,7 @@ def _board_ends(output: Path, board: Board) -> Marks:
     left, right = (Observations.load(output / f"{side}.obs.json") for side in SIDES)
     record = RigFile.load(output / "rig.json").calibration
     assert record is not None
-    # A board that one camera read from its other end has other corners there: its marks would not be the same thing.
+    # A board that one camera read from its other end has other corners there: its marks would not be the same point.
     used = set(record.per_pair_rms) - set(record.flipped)
     pairs = [
         pair

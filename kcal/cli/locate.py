@@ -274,7 +274,7 @@ def _refuse_of_pairs(own: LocateOptions) -> None:
             "--heading, --yaw-sigma, --heading-sigma, --origin-sigma, --refraction, --aged and --watch"
         )
     if own.height is not None and own.terrain is not None:
-        raise typer.BadParameter("--height and --terrain both say where a thing that one camera saw stands: give one")
+        raise typer.BadParameter("--height and --terrain both say where a point that one camera saw stands: give one")
 
 
 def _of_pairs(solved: Rig, own: LocateOptions, noise: float) -> tuple[PointLocator, Locate | None]:
@@ -443,7 +443,7 @@ def locate_command(
     needed. Without any position, points are meters in the rig's own frame, which is the left camera's (x right, y down,
     z forward); they can be written as CSV.
 
-    Of several cameras (one line for each mark: name,camera,u,v) any may have seen a thing; with three or more, a mark
+    Of several cameras (one line for each mark: name,camera,u,v) any may have seen a point; with three or more, a mark
     that contradicts the others is left out and named. One camera alone gives a bearing, or a position at --height or
     where its line of sight meets the --terrain.
 

@@ -379,7 +379,7 @@ def _tell_view(camera: Camera, module: Undistort, label: str) -> None:
     if shift >= _FELT:
         where = "far away" if math.isinf(module.at) else f"at {module.at:g} m"
         out.print(
-            f"{label}the entrance pupil moves: maps are exact {where}; things at {_NEAR:g} m and far away are up to "
+            f"{label}the entrance pupil moves: maps are exact {where}; points at {_NEAR:g} m and far away are up to "
             f"{shift:.2g} px apart, at {shift / _FELT * _NEAR:.2g} m {_FELT} px (--distance)",
             markup=False,
         )
@@ -395,7 +395,7 @@ def _tell_side(module: StereoRectification) -> None:
     if line == "row":
         where = "below" if down > 0 else "above"
         warn(
-            f"the right camera stands {where} the left one, so that the same thing is in the same column, and "
+            f"the right camera stands {where} the left one, so that the same point is in the same column, and "
             f"disparities are {sign}: transpose both images for a matcher that searches along rows"
         )
     elif sign == "negative":

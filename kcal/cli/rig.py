@@ -86,7 +86,7 @@ def solve_command(
         Path | None,
         rarely(
             "CSV",
-            "Far things matched between the images: left_u,left_v,right_u,right_v and range,range_sigma or "
+            "Distant points matched between the images: left_u,left_v,right_u,right_v and range,range_sigma or "
             "beyond (meters), if known.",
         ),
         inputs.MARKS,
@@ -217,7 +217,7 @@ def solve_command(
 
     `kcal rig check` tells later whether the cameras have turned since.
 
-    Three cameras and more may stand kilometers apart and see different things: each needs four landmarks or more, of
+    Three cameras and more may stand kilometers apart and see different points: each needs four landmarks or more, of
     its own or in common, and measured positions (--positions, by the cameras' names) help.
 
     For one camera that is moved from place to place, give its file once for each place. Its lens is then the same
@@ -370,10 +370,10 @@ def check(
 ) -> None:
     """Check whether the cameras have turned since the rig was solved, and what that does to ranges.
 
-    Needs things that do not move, marked in new images: either the same things as in old images (`--reference`; what
+    Needs points that do not move, marked in new images: either the same points as in old images (`--reference`; what
     they are and how far away does not matter, and errors of the calibration cancel), or surveyed places (`--landmarks`;
     the rig must have been solved with some). Forty features marked to 0.1 px determine the yaw to a thousandth of a
-    degree. Things that moved are left out and named.
+    degree. Points that moved are left out and named.
 
     With `--relock rig.json` a rig with the present attitudes is written, if these have changed beyond chance. It may be
     the same file: the old one is kept beside it.
@@ -390,7 +390,7 @@ def check(
     Args:
         rig: Rig file from `kcal rig`.
         marks: Marks in new images: name,left_u,left_v,right_u,right_v.
-        reference: The same static things, marked in images from when the rig was solved.
+        reference: The same static points, marked in images from when the rig was solved.
         landmarks: Surveyed places among the marks, as for `kcal rig`.
         relock: Rig file to write if it has turned; an old one of that name is kept.
     """
@@ -399,7 +399,7 @@ def check(
     from kcal.watch.turned import check_rig, seen_again
 
     if reference is None and landmarks is None:
-        raise InputError("give --reference (marks of the same things in old images) or --landmarks (a survey)")
+        raise InputError("give --reference (marks of the same points in old images) or --landmarks (a survey)")
     if reference is not None and landmarks is not None:
         raise InputError("give --reference or --landmarks, not both: with old marks no survey is needed")
     if relock is not None:
@@ -441,7 +441,7 @@ def _landmarks(rig: Rig, path: Path, now: Marks, sigma: float) -> Landmarks:
 
 
 def print_turns(drift: Drift, used: str = "") -> None:
-    """Print what has turned by how much, and of how many things that was found, if that is known."""
+    """Print what has turned by how much, and of how many points that was found, if that is known."""
     import math
 
     rows = [["turn of", "pitch °", "yaw °", "roll °", *(["used"] if used else [])]]

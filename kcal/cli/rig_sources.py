@@ -51,8 +51,8 @@ def _add_tracks(read: RigReading, files: tuple[Path, Path]) -> None:
     wrong = [one for one in found.identities if one.track != one.label]
     unknown = [one for one in wrong if one.track is None]
     read.notes.append(
-        f"tracks: {len(found.landmarks.names)} fixes of {len({one.track for one in found.identities} - {None})} things "
-        f"in {len(found.identities) - len(unknown)} of {len(found.identities)} sightings"
+        f"tracks: {len(found.landmarks.names)} fixes of {len({one.track for one in found.identities} - {None})} "
+        f"targets in {len(found.identities) - len(unknown)} of {len(found.identities)} sightings"
     )
     known = {track.name for track in tracks}
     read.notes += [
@@ -502,7 +502,7 @@ def _add_stars(read: RigReading, night: NightOptions) -> None:
 
 
 def _add_features(read: RigReading, path: Path) -> None:
-    """A table of things that several cameras see."""
+    """A table of points that several cameras see."""
     from kcal.locate.survey import read_features
 
     read.add("features", read_features(path, read.given.mark_sigma, read.given.names))

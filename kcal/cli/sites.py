@@ -54,7 +54,7 @@ def sites_command(
         area: What they should see: south, west, north, east, in degrees.
         candidates: Sites for the next tower, in such a table.
         build: How many of them are to be built, one after the other.
-        terrain: Heights of the ground that hides things: an ESRI ASCII grid (.asc), or a GeoTIFF (needs
+        terrain: Heights of the ground that hides what is behind it: an ESRI ASCII grid (.asc), or a GeoTIFF (needs
             'kcal[terrain]'). Level ground if not given.
         geoid: Height of the geoid above the WGS84 ellipsoid, added to the terrain's heights if these are above the sea.
         ground: Without a terrain: height of the ground above the ellipsoid.

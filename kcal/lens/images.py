@@ -316,12 +316,12 @@ _LEAST_ANGLE, _MOST_TURNED = 20.0, 80.0
 
 
 class StereoRectification(Float64Module):
-    """Resample both images of a rig so that the same thing is in the same row of both.
+    """Resample both images of a rig so that the same point is in the same row of both.
 
     Convention: the rectified frame has its origin in the left camera; points_left = rotation @ points_rectified, and
     the right pinhole stands at `right_center`, commonly (baseline, 0, 0). Disparity is the column in the left minus
     that in the right image. Images stay upright, as with cv2.stereoRectify. So disparities are negative where the right
-    camera stands to the left of the left one. Where one camera stands above the other, the same thing is in the same
+    camera stands to the left of the left one. Where one camera stands above the other, the same point is in the same
     column, and disparity is the row in the left minus that in the right image. Where one camera is rolled against the
     other by more than 90 degrees, both images are upright as the left one is.
 
