@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
+import itertools
 import json
 import os
 import signal
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -81,6 +84,23 @@ def test_sigterm_ends_it_and_the_next_run_continues(folder: Path, monkeypatch: p
     monkeypatch.setattr(Stream, "_write", write)
     assert "continuing after 7 moments" in live(folder, "--clock-sigma", "0.1")
     assert (folder / "tracks.csv").read_bytes() == whole
+
+
+def test_the_bar_tells_how_much_of_the_file_is_done(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    done: list[float] = []
+
+    @contextlib.contextmanager
+    def steps(what: str, total: int | None) -> Iterator[Callable[..., None]]:
+        assert total == (folder / "lines.jsonl").stat().st_size
+        yield lambda text, by: done.append(by)
+
+    monkeypatch.setattr("kcal.cli.live.steps", steps)
+    monkeypatch.setattr("kcal.cli.live.clocks.monotonic", itertools.count().__next__)
+    live(folder)
+    size = len((folder / "lines.jsonl").read_text())
+    # All but the last lines, which are told with the end.
+    assert 0.8 * size < sum(done) <= size
+    assert len(done) > 15
 
 
 @pytest.mark.parametrize("how", ["finished", "stopped", "ended by an error: see the terminal"])
