@@ -42,7 +42,6 @@ from kcal.report.figures import (
     frame_image,
     framed_figure,
     image_figure,
-    new_figure,
     round_levels,
     shortened,
 )
@@ -346,25 +345,14 @@ def gallery_figure(observations: Observations, failed: Sequence[FailedImage] = (
         failed: images that gave no view, from `kcal.corners.detect.detect`.
     """
     order, standing_out = _order(observations.views)
-    shown, drawn = order[:_MOST_VIEWS], failed[:_MOST_FAILED]
-    across = max(1, min(_VIEWS_ACROSS, len(shown) + len(drawn)))
-    down = max(1, math.ceil((len(shown) + len(drawn)) / across))
+    tiles: list[FailedImage | View] = [*failed[:_MOST_FAILED], *(observations.views[i] for i in order[:_MOST_VIEWS])]
+    across = max(1, min(_VIEWS_ACROSS, len(tiles)))
+    down = max(1, math.ceil(len(tiles) / across))
     width, height = observations.image_size
-    names = {one.name for one in drawn}
-    listed = [f"{failure.name}: {failure.reason}" for failure in observations.failures if failure.name not in names]
-    listed = listed[:10]
-    foot = 0.22 * len(listed) + 0.15
-    gap = 0.32 + (0.35 if drawn else 0.0)  # room for reasons
-    tall = down * (3.6 * height / width + gap) + 0.7 + foot
-    figure = new_figure(3.6 * across + 0.3, tall, dpi=110)
-    between = gap / (3.6 * height / width)
-    grid = figure.add_gridspec(
-        down, across, left=0.02, right=0.98, top=1 - 0.7 / tall, bottom=foot / tall, hspace=between, wspace=0.04
-    )
-    for place, one in enumerate(drawn):
-        _draw_failed(figure.add_subplot(grid[place // across, place % across]), one, observations.image_size)
-    for place, i in enumerate(shown, len(drawn)):
-        _draw_view(figure.add_subplot(grid[place // across, place % across]), observations, observations.views[i])
+    names = {one.name for one in failed[:_MOST_FAILED]}
+    listed = [
+        f"{failure.name}: {failure.reason}"[:130] for failure in observations.failures if failure.name not in names
+    ]
     title = f"{len(observations.views)} views"
     if standing_out:
         title += "; the first stands out" if standing_out == 1 else f"; the first {standing_out} stand out"
@@ -372,9 +360,14 @@ def gallery_figure(observations: Observations, failed: Sequence[FailedImage] = (
         title += f" ({_MOST_VIEWS} are shown)"
     if observations.failures:
         title += f"; without a board: {len(observations.failures)}"
-    figure.text(0.02, 1 - 0.25 / tall, title, fontsize=13, color=INK, va="center")
-    for row, text in enumerate(listed):
-        figure.text(0.02, (foot - 0.15 - 0.22 * row) / tall, text[:130], fontsize=8, color=WARN, va="center")
+    gap = 0.7 if failed else 0.35  # room for reasons
+    figure = framed_figure(3.6 * across + 0.3, down * (3.5 * height / width + gap), title, listed[:10], 110)
+    for place, tile in enumerate(tiles, 1):
+        axes = figure.add_subplot(down, across, place)
+        if isinstance(tile, View):
+            _draw_view(axes, observations, tile)
+        else:
+            _draw_failed(axes, tile, observations.image_size)
     return figure
 
 
@@ -441,38 +434,33 @@ def _predicted_sigma(view: View) -> float | None:
     return math.sqrt(sum(traces) / len(traces)) if traces else None
 
 
+def _draw_tile(axes: Axes, path: str | Path | None, size: tuple[int, int], title: str, color: str) -> None:
+    whole = (-0.5, size[0] - 0.5, size[1] - 0.5, -0.5)
+    axes.imshow(_thumbnail(path, size), cmap="gray", vmin=0, vmax=255, extent=whole)
+    frame_image(axes, size)
+    axes.set(xticks=[], yticks=[], xlabel="", ylabel="")
+    axes.set_title(title, fontsize=8, loc="left", pad=3, color=color)
+
+
 def _draw_view(axes: Axes, observations: Observations, view: View) -> None:
-    width, height = observations.image_size
-    whole = (-0.5, width - 0.5, height - 0.5, -0.5)
-    axes.imshow(_thumbnail(view.image, (width, height)), cmap="gray", vmin=0, vmax=255, extent=whole)
+    sigma, unseen = _predicted_sigma(view), view.pixels.count(None)
+    text = shortened(view.name, 34) + (f"  σ {sigma:.3f} px" if sigma is not None else "")
+    text += f"  {unseen} left out" if unseen else ""
+    _draw_tile(axes, view.image, observations.image_size, text, WARN if unseen else INK)
     places = np.array([(math.nan, math.nan) if pixel is None else pixel for pixel in view.pixels])
-    first = places[: observations.board.columns]
-    axes.plot(first[:, 0], first[:, 1], color=ACCENT, linewidth=1.2)
+    axes.plot(*places[: observations.board.columns].T, color=ACCENT, linewidth=1.2)
     axes.scatter(places[:, 0], places[:, 1], s=9, color=WARN, linewidths=0)
     axes.scatter(places[:1, 0], places[:1, 1], s=60, facecolors="none", edgecolors=ACCENT, linewidths=1.6)
-    frame_image(axes, (width, height))
-    axes.set(xticks=[], yticks=[], xlabel="", ylabel="")
-    sigma, unseen = _predicted_sigma(view), view.pixels.count(None)
-    text = view.name if len(view.name) <= 34 else "…" + view.name[-33:]
-    text += f"  σ {sigma:.3f} px" if sigma is not None else ""
-    text += f"  {unseen} left out" if unseen else ""
-    axes.set_title(text, fontsize=8.5, loc="left", pad=3, color=WARN if unseen else INK)
 
 
 def _draw_failed(axes: Axes, failed: FailedImage, size: tuple[int, int]) -> None:
-    width, height = size
-    whole = (-0.5, width - 0.5, height - 0.5, -0.5)
-    axes.imshow(_thumbnail(failed.path, size), cmap="gray", vmin=0, vmax=255, extent=whole)
+    text = textwrap.wrap(f"failed: {shortened(failed.name, 34)}: {failed.reason}", 62)[:3]
+    _draw_tile(axes, failed.path, size, "\n".join(text), WARN)
     if failed.rejected is not None:
         u, v = failed.rejected.numpy().T
         axes.scatter(u, v, s=16, marker="x", color=WARN, linewidths=1.0)
-    frame_image(axes, size)
-    axes.set(xticks=[], yticks=[], xlabel="", ylabel="")
     for spine in axes.spines.values():
         spine.set(visible=True, color=WARN, linewidth=2.0)
-    name = failed.name if len(failed.name) <= 34 else "…" + failed.name[-33:]
-    text = textwrap.wrap(f"failed: {name}: {failed.reason}", 66)[:3]
-    axes.set_title("\n".join(text), fontsize=7.5, loc="left", pad=3, color=WARN)
 
 
 def _thumbnail(path: str | Path | None, size: tuple[int, int]) -> npt.NDArray[np.uint8]:

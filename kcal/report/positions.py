@@ -154,8 +154,7 @@ def _draw_map(axes: Axes, located: Located, true_enu: Array | None, shown: list[
         direction = line[-1] - line[-2]
         place = line[-1] + direction / np.hypot(*direction) * 0.012
         labels.append(place)
-        turn = (90.0 - sweep[-1]) - 90.0
-        turn = (turn + 90) % 180 - 90
+        turn = (90.0 - sweep[-1]) % 180.0 - 90.0
         outward = direction[0] >= 0
         axes.text(
             place[0], place[1], range_text(arc), fontsize=8.5, color=GRAY, rotation=turn,
