@@ -343,7 +343,7 @@ def arguments(folder: Path, tracks: str = "tracks.csv") -> list[str]:
 def test_a_rig_from_a_drone(given: Path, command: Command) -> None:
     more = ["--positions", str(given / "gnss.csv"), "--baseline", "10.0+-0.02", "--intrinsics", "fixed"]
     result = command(*arguments(given), *more)
-    assert "1 things in 2 of 2 sightings" in result.out
+    assert "1 targets in 2 of 2 sightings" in result.out
     (line,) = [line for line in result.out.splitlines() if "ahead of the cameras" in line]
     assert float(line.split(" is ")[1].split()[0]) == pytest.approx(LATE, abs=0.01)
     assert float(load_rig(given / "rig.json").baseline) == pytest.approx(10.0, abs=0.05)
