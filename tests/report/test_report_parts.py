@@ -395,7 +395,10 @@ class TestMap:
         found, _ = located()
         first = found.positions[0]
         rows = dict(_content(found, None)["points"][0]["rows"])
-        assert rows["latitude"] == f"{first.lat:.7f}°"
+        # Six digits are 0.1 m, and its place is known to some centimeters only.
+        assert first.cep50_m is not None
+        assert first.cep50_m > 0.05
+        assert rows["latitude"] == f"{first.lat:.6f}°"
         assert first.range_m is not None
         # In the unit of the farthest.
         assert rows["range"] == f"{first.range_m / 1e3:.5f} km"
