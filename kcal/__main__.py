@@ -25,7 +25,12 @@ def main() -> None:
     gc.set_threshold(50_000, 20, 20)
     listen()
     # What loads now takes .3 s; the line that shows the progress then takes this place.
-    if sys.stderr.isatty() and sys.argv[1:] and not {"--help", "--help-all", "--version"} & set(sys.argv):
+    if (
+        sys.stderr
+        and sys.stderr.isatty()
+        and sys.argv[1:]
+        and not {"--help", "--help-all", "--version"} & set(sys.argv)
+    ):
         print("kcal ...", end="\r", file=sys.stderr, flush=True)
     code: int | str | None = None
     try:
