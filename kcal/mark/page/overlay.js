@@ -80,10 +80,12 @@ export function drawOverlay(view, c) {
   }
   c.font = font(ratio);
   for (const {key, words, x, y, r, rank} of named.sort((a, b) => a.rank - b.rank)) {
-    const width = c.measureText(words).width, height = 14 * ratio, offsets = aroundDot((rank ? r + 3 * ratio : 29 * ratio), width, height);
+    // What is selected has arms, and may be named farther away.
+    const width = c.measureText(words).width, height = 14 * ratio, reaches = rank ? [r / ratio + 3] : [29, 48, 70];
+    const offsets = reaches.flatMap((reach) => aroundDot(reach * ratio, width, height));
     const box = ([dx, dy]) => [x + dx - width / 2, y + dy - height / 2, x + dx + width / 2, y + dy + height / 2];
     // Where it was before, if there still is room.
-    const found = [view.names.get(key) ?? 0, ...offsets.keys()].find((k) => taken.free(box(offsets[k])));
+    const found = [view.names.get(key) ?? 0, ...offsets.keys()].find((k) => k < offsets.length && taken.free(box(offsets[k])));
     // Others wait until there is room; what is selected or wrong is named all the same.
     if (found === undefined && rank === 2) continue;
     view.names.set(key, found ?? 0);

@@ -101,7 +101,7 @@ function drawHistory(history) {
   };
   const first = points[0][0], last = Math.max(points[points.length - 1][0], first + 1);
   const logs = points.map((point) => Math.log10(point[1])), low = Math.min(...logs) - 0.1, high = Math.max(...logs) + 0.1;
-  const at = ([count], i) => [30 + 250 * (count - first) / (last - first), 52 - 40 * (logs[i] - low) / (high - low)];
+  const at = ([count], i) => [30 + 250 * (count - first) / (last - first), 54 - 32 * (logs[i] - low) / (high - low)];
   const spots = points.map(at);
   add("polyline", {points: spots.map((spot) => spot.join(",")).join(" "), fill: "none", stroke: "#0072b2", "stroke-width": 2});
   spots.forEach(([x, y], i) => {
