@@ -518,7 +518,8 @@ def difference_figure(
     # The border is no place for an arrow: half of those would be outside.
     shown = np.nan_to_num(found.shift.numpy())[step // 2 :: step, step // 2 :: step]
     longest = float(np.linalg.norm(shown, axis=-1).max())
-    if longest > 0:
+    # Of a camera and itself, rounding alone is left.
+    if longest > 1e-6:
         wanted = 1.5 * step * width / places.shape[1] / longest
         draw_arrows(panels[0], places[step // 2 :: step, step // 2 :: step], shown, wanted, width=0.004)
     for axes, text in zip(panels, ("Difference", "Its standard deviation σ"), strict=False):

@@ -170,7 +170,8 @@ def draw_arrows(
     drawn = axes.quiver(*places.reshape(-1, 2).T, *moved, *colors, angles="xy", scale_units="xy", scale=1, **style)
     left, right = axes.get_xlim()
     room = 0.12 * abs(right - left) / scale
-    length = max(step for step in round_levels(1e-7, room) if step <= max(room, 1e-7))
+    power = 10.0 ** math.floor(math.log10(room))
+    length = power * max(step for step in (1, 2, 5) if step * power <= room)
     key = {"labelpos": "W", "color": INK, "labelcolor": INK, "fontproperties": {"size": 9}}
     axes.quiverkey(drawn, 0.87, 1.04, scale * length, f"{length:g} {unit}", **key)
 

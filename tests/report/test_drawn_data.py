@@ -25,7 +25,7 @@ from drawn_scenes import (
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
-from matplotlib.quiver import Quiver
+from matplotlib.quiver import Quiver, QuiverKey
 
 from kcal.calibrate.camera.advice import board_tilts
 from kcal.lens.camera import Camera
@@ -35,7 +35,7 @@ from kcal.locate.geodesy import geodetic_to_enu
 from kcal.locate.siting import Site, siting_map
 from kcal.report import positions as siting_module
 from kcal.report.calibration import difference_figure
-from kcal.report.figures import WARN
+from kcal.report.figures import WARN, draw_arrows
 from kcal.report.positions import (
     _siting_marks,
     _siting_notes,
@@ -555,6 +555,25 @@ class TestVerdictPictures:
         np.testing.assert_allclose(arrows(axes).U, scale * some[..., 0].ravel())
         assert figure.texts[0].get_text() == "halves"
         assert axes.get_xlim() == (-0.5, 639.5)
+
+
+def test_a_camera_and_itself_differ_by_no_arrows() -> None:
+    camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), coefficients=[-0.2, 0.05])
+    found = camera_difference(camera, camera)
+    assert not [part for part in difference_figure(found, "", []).axes[0].collections if isinstance(part, Quiver)]
+
+
+@pytest.mark.parametrize("scale", [1e-9, 0.3, 41.0, 1e12])
+def test_a_scale_bar_is_a_round_length_that_fits(scale: float) -> None:
+    axes = Figure().add_subplot()
+    axes.set(xlim=(0.0, 640.0), ylim=(480.0, 0.0))
+    draw_arrows(axes, np.array([[9.0, 9.0]]), np.array([[1.0, 0.0]]) / scale, scale, "mm")
+    (key,) = [part for part in axes.artists if isinstance(part, QuiverKey)]
+    length, unit = key.label.split()
+    assert unit == "mm"
+    assert f"{float(length):.0e}"[0] in "125"
+    assert float(key.U) == pytest.approx(scale * float(length))
+    assert 0.4 * 0.12 * 640 < key.U <= 0.12 * 640
 
 
 def test_arrows_of_a_difference_are_as_long_as_there_is_room() -> None:
