@@ -13,16 +13,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal.calibrate.camera.calibrate import calibrate_camera
+from kcal import Board, Camera, InputError, Observations, View, calibrate_camera
 from kcal.checks import Float64Module, as_covariance, as_points, as_size, require_finite
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations, View
-from kcal.errors import InputError
 from kcal.file_kind import check_pixel_count
 from kcal.files import is_stream, source_name
-from kcal.lens.camera import Camera
-from kcal.lens.model import LensModel
-from kcal.lens.pose import rotation_from_vector
+from kcal.lens import LensModel, rotation_from_vector
 
 # docs/reference/conventions.md: conventions of more than one floor, and every test that the page names exists.
 

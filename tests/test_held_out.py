@@ -7,10 +7,9 @@ import math
 import pytest
 import torch
 
+from kcal import Board, Camera
 from kcal.calibrate.hybrid.board_modes import board_modes
-from kcal.corners.board import Board
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
+from kcal.lens import rotation_from_vector
 from scripts.shared.held_out import NOISE, TWIST_PRIOR, held_out
 
 CAMERA = Camera.build(focal=(700, 700), center=(322, 236), size=(640, 480), coefficients=[-0.2, 0.05])

@@ -11,15 +11,13 @@ from torch import Tensor
 from torch._dynamo.testing import CompileCounterWithBackend
 from whole_graphs import traced_whole
 
-from kcal.lens.camera import Camera
-from kcal.lens.camera_like import Unproject
-from kcal.lens.field_modes import NetworkModes
+from kcal import Camera, Localizer, Origin, Rig
+from kcal.lens import LensModel, Unproject
 from kcal.lens.hybrid_terms import HybridForm
-from kcal.lens.model import LensModel
-from kcal.lens.rig import Origin, Rig, RigCovariance
 from kcal.lens.zernike import ZernikeModes
-from kcal.locate.localizer import Localizer
-from kcal.locate.triangulate import Triangulate
+from kcal.locate import Triangulate
+from kcal.nets import NetworkModes
+from kcal.rig import RigCovariance
 
 pytestmark = traced_whole
 

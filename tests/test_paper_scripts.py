@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 from calibrate_scenes import camera, motions, observe, pixels_of
 
-from kcal.calibrate.camera.result import CalibrationOptions
-from kcal.corners.observations import Observations
-from kcal.lens.camera import Camera
+from kcal import CalibrationOptions, Camera, Observations
 from scripts.paper import chain, figures, locate, reproduce, solve, train_eq12, train_net_lens
 from scripts.paper.numbers import TABLE_3
 from scripts.shared import page

@@ -13,12 +13,10 @@ from capture_frames import BOARD, images
 from command_line import Command
 from typer.testing import CliRunner
 
+from kcal import Board, FileError, InputError, Observations
 from kcal.capture.session import FIRST_VIEWS, CaptureOptions, CaptureSession, Shot, follow, shots
 from kcal.cli.main import app
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations
 from kcal.corners.video import Frame
-from kcal.errors import FileError, InputError
 from kcal.io.images import write_png
 
 

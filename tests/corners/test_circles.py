@@ -3,7 +3,8 @@ import numpy as np
 import pytest
 import torch
 
-from kcal.corners.board import Board
+from kcal import Board, Camera, InputError, detect
+from kcal.corners import CornerStatus, detect_board
 from kcal.corners.circles import (
     _with_statuses,
     center_shift,
@@ -14,10 +15,6 @@ from kcal.corners.circles import (
     local_maps,
     refine_circles,
 )
-from kcal.corners.detect import detect, detect_board
-from kcal.corners.saddle import CornerStatus
-from kcal.errors import InputError
-from kcal.lens.camera import Camera
 from scripts.shared.printed_board import Paper, errors, pose
 
 CAMERA = Camera.build(focal=(430, 430), center=(243, 177), size=(480, 360), coefficients=[-0.1, 0.02])

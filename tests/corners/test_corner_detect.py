@@ -16,8 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
 
-from kcal.corners.board import Board
-from kcal.corners.detect import detect, detect_board
+from kcal import Board, InputError, Observations, detect
+from kcal.corners import detect_board
 from kcal.corners.grid import (
     as_grid,
     cell_levels,
@@ -30,10 +30,8 @@ from kcal.corners.grid import (
     without_false_sides,
 )
 from kcal.corners.images import read_gray
-from kcal.corners.observations import Observations
 from kcal.corners.patches import filtered, gaussian_kernel
 from kcal.corners.search import board_ends, canonical_order, find_sector
-from kcal.errors import InputError
 
 BOARD = Board(columns=9, rows=6, square=0.025)
 

@@ -5,12 +5,10 @@ import pytest
 import torch
 from skimage.registration import phase_cross_correlation
 
+from kcal import Camera, InputError, Rig
 from kcal.corners.match import MatchOptions, MatchStatus, enlarge, match_points, refine_point
 from kcal.corners.patches import filtered, gaussian_kernel, has_samples, image_windows, sample
-from kcal.errors import InputError
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Rig
+from kcal.lens import rotation_from_vector
 
 
 def corner_image(u, v, noise=0.0, seed=0, size=60):

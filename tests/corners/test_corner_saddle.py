@@ -15,16 +15,13 @@ from board_render import homography, render
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from kcal import Board, Camera, InputError, detect
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.corners.board import Board
-from kcal.corners.detect import detect
 from kcal.corners.erf import erf_saddle
 from kcal.corners.erf_board import NAMES, LineDistances, crossing
 from kcal.corners.grid import line_bend, local_side, neighbors
 from kcal.corners.refine import _saturation_levels, refine_corners
 from kcal.corners.saddle import CornerStatus, saddle
-from kcal.errors import InputError
-from kcal.lens.camera import Camera
 from kcal.sim.captures import BoardSize, project_board
 from kcal.sim.scene import RenderOptions, render_light
 

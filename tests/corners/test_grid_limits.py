@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcal.corners.board import Board
+from kcal import Board, InputError
 from kcal.corners.circles import _degree, homography, local_maps
 from kcal.corners.grid import false_sides, goes_on, grid_trouble, sides, skips, uneven
 from kcal.corners.match import MatchOptions, MatchStatus, PatchMatch, fit_peak, joined
@@ -27,7 +27,6 @@ from kcal.corners.search import (
     grown_grid,
     uprightness,
 )
-from kcal.errors import InputError
 
 MIDDLE, CONTRAST = 120.0, 80.0
 

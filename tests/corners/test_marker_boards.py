@@ -8,17 +8,13 @@ import pytest
 import torch
 from command_line import Command
 
-from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.corners.board import Board
+from kcal import Board, Camera, InputError, Observations, calibrate_camera
 from kcal.corners.detect import detect, detect_board, view_of
 from kcal.corners.images import read_gray
 from kcal.corners.marker_boards import _opencv_board, find_aprilgrid, find_charuco, free_side
 from kcal.corners.markers import marker_cells, opencv_dictionary
-from kcal.corners.observations import Observations
 from kcal.corners.print_board import board_sheet, pattern_shapes
-from kcal.errors import InputError
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
+from kcal.lens import rotation_from_vector
 from scripts.bench.hard_boards import covered, cut, moving, noisy, pictures, plain, small
 from scripts.bench.hard_scenes import Marked
 from scripts.bench.marked_boards import WRONG

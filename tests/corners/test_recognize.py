@@ -9,11 +9,9 @@ import pytest
 from command_line import Command
 from numpy.typing import NDArray
 
-from kcal.corners.board import Board
-from kcal.corners.detect import detect, detect_board, recognize_board
+from kcal import Board, Camera, InputError, detect
+from kcal.corners import detect_board, recognize_board
 from kcal.corners.recognize import Recognized, circle_board, marker_board, most_markers, seen_board, spread_order
-from kcal.errors import InputError
-from kcal.lens.camera import Camera
 from scripts.shared.printed_board import Paper, pose
 
 CAMERA = Camera.build(focal=(700, 700), center=(379.5, 279.5), size=(760, 560))

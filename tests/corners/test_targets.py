@@ -13,13 +13,12 @@ import pytest
 import torch
 from scipy.io import savemat
 
+from kcal import FileError, InputError, Observations, View
 from kcal.corners.board import DICTIONARIES, Board
 from kcal.corners.detect import Detection, view_of
 from kcal.corners.foreign_corners import import_corners
 from kcal.corners.markers import opencv_dictionary
-from kcal.corners.observations import Observations, View
 from kcal.corners.print_board import Circle, Drawing, board_sheet, pattern_shapes, tag_cells, to_pdf, to_svg
-from kcal.errors import FileError, InputError
 from kcal.lens.calibration import BoardRecord
 
 # What boards are: texts, target files of Kalibr, where their points lie, and what files keep of them.

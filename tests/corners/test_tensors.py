@@ -14,17 +14,13 @@ from elsewhere import DEVICE, Elsewhere
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcal.calibrate.camera.layer import CalibrationLayer
-from kcal.calibrate.camera.result import CalibrationOptions
-from kcal.corners.board import Board
+from kcal import Board, CalibrationOptions, Camera, InputError
+from kcal.calibrate import CalibrationLayer
+from kcal.corners import CornerStatus, refine_point
 from kcal.corners.detect import as_image, detect_board
 from kcal.corners.grid import local_side
-from kcal.corners.match import refine_point
 from kcal.corners.refine import RefineCorners, refine_corners
-from kcal.corners.saddle import CornerStatus
-from kcal.errors import InputError
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
+from kcal.lens import rotation_from_vector
 from scripts.shared.printed_board import Paper, pose
 
 # Boards in tensors: `detect_board` for images as pipelines hold them, and `RefineCorners` before a calibration.

@@ -8,10 +8,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations, View
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
+from kcal import Board, Camera, Observations, View
+from kcal.lens import rotation_from_vector
 
 BOARD = Board(columns=7, rows=6, square=0.05)
 SIZE = (640, 480)

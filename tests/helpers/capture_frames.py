@@ -8,8 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from kcal.corners.board import Board
-from kcal.lens.camera import Camera
+from kcal import Board, Camera
 from kcal.sim.captures import BoardSize, sample_board_poses
 from kcal.sim.scene import RenderOptions, render_board
 

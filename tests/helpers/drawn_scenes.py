@@ -16,21 +16,15 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from kcal import Landmarks, RigData
+from kcal import Board, Camera, Landmarks, Observations, Origin, RigData, RigOptions, View, solve_rig
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.camera.interval_check import IntervalCheck
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard
 from kcal.calibrate.rig.result import RigResult
-from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations, View
-from kcal.lens.camera import Camera
 from kcal.lens.difference import camera_difference, difference_text
-from kcal.lens.rig import Origin
+from kcal.locate import enu_from_cam, level_ground
 from kcal.locate.budget import RangeError
-from kcal.locate.geodesy import enu_from_cam
-from kcal.locate.ground import level_ground
 from kcal.locate.positions import Located
 from kcal.locate.siting import Area, RankedSite, Site, area_of, rank_sites
 from kcal.report.calibration import (

@@ -9,11 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kcal.lens.camera import Camera
-from kcal.lens.rig import Rig
-from kcal.locate.localizer import Localizer
-from kcal.locate.marks import Marks
-from kcal.locate.points import locate_points
+from kcal import Camera, Localizer, Rig, locate_points
+from kcal.locate import Marks
 from kcal.locate.positions import Located
 from kcal.locate.tabulate import Geoid
 

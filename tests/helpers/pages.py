@@ -19,12 +19,10 @@ from starlette.applications import Starlette
 from track_scenes import pairs_of, tracked_site
 from typer.testing import CliRunner
 
+from kcal import Localizer, Observations, Origin, View
 from kcal.capture.session import CaptureSession, capture_app
 from kcal.cli.main import app
-from kcal.corners.observations import Observations, View
 from kcal.io.images import write_png
-from kcal.lens.rig import Origin
-from kcal.locate.localizer import Localizer
 from kcal.locate.points import PointLocator
 from kcal.mark.guide import open_pictures
 from kcal.mark.items import Add, Mark, Put
@@ -33,9 +31,9 @@ from kcal.mark.server import marking_app
 from kcal.mark.session import Session
 from kcal.pipeline.senders import LiveMap
 from kcal.pipeline.stream import track_columns
-from kcal.pipeline.tracks import Tracker, TrackOptions
-from kcal.report.map_page import save_map
+from kcal.report import save_map
 from kcal.report.pages import Part, save_summary
+from kcal.track import Tracker, TrackOptions
 from kcal.web.serving import LocalServer
 from scripts.shared.marking_scene import LANDMARKS, TARGETS, MarkingSite, marking_site
 

@@ -7,10 +7,9 @@ import math
 import torch
 from torch import Tensor
 
+from kcal import Board, Camera
 from kcal.calibrate.hybrid.board_modes import board_modes
-from kcal.corners.board import Board
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
+from kcal.lens import rotation_from_vector
 
 
 def printed_points(board: Board, seed: int, share: float = 5e-4) -> Tensor:

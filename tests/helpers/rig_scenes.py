@@ -7,10 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from kcal import Boards, Features, Landmarks
-from kcal.corners.board import Board
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
+from kcal import Board, Boards, Camera, Features, Landmarks
+from kcal.lens import rotation_from_vector
 
 BOARD = Board(columns=7, rows=6, square=0.4)
 # Left, right, and a narrower one of another size and model between them.

@@ -6,10 +6,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Rig
-from kcal.scene.match import ImagePair
+from kcal import Camera, Rig
+from kcal.lens import rotation_from_vector
+from kcal.rig import ImagePair
 from kcal.sim.coast import exposed, smooth_noise
 
 SIZE = (480, 320)

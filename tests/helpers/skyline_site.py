@@ -9,11 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kcal.lens.camera import Camera
-from kcal.lens.rig import Origin
-from kcal.locate.geodesy import enu_from_cam
+from kcal import Camera, Origin
+from kcal.locate import enu_from_cam
 from kcal.locate.raster import Raster
-from kcal.skyline.horizon import RasterError
+from kcal.rig import RasterError
 from scripts.shared.skyline_scenes import Hills, HillWeather, skyline_image
 from scripts.shared.skyline_trials import level_system, raster_around
 

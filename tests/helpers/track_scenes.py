@@ -8,11 +8,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Origin, Rig, RigCovariance
-from kcal.locate.budget import planned_rig
-from kcal.locate.localizer import Localizer
+from kcal import Localizer, Origin, Rig
+from kcal.lens import rotation_from_vector
 from kcal.pipeline.pairing import ObjectViews
+from kcal.rig import RigCovariance, planned_rig
 
 ORIGIN = Origin(lat=19.07, lon=72.87, height=14.0)
 

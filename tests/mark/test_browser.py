@@ -15,11 +15,10 @@ from marking_browser import Server, choose, click_at, look_at, settled
 from ports import free_port
 from typer.testing import CliRunner
 
+from kcal import load_rig, save_camera, save_rig
 from kcal.cli.main import app
-from kcal.io.camera_file import save_camera
 from kcal.io.images import write_png
-from kcal.io.rig_file import load_rig, save_rig
-from kcal.locate.marks import read_marks
+from kcal.locate import read_marks
 from scripts.shared.marking_scene import LANDMARKS, TARGETS, MarkingSite, marking_site
 
 for library in ("starlette", "uvicorn"):

@@ -12,18 +12,17 @@ from lenses import FEW_MODES, hybrid_camera
 from locate_rigs import located_pairs
 from waiting import wait_for
 
+from kcal import InputError, Origin, Rig
 from kcal.corners.match import Matches, MatchStatus, find_again
-from kcal.errors import InputError
 from kcal.io.images import write_png
-from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Origin, Rig, RigCovariance
+from kcal.lens import rotation_from_vector
 from kcal.locate.marks import Marks, write_marks
-from kcal.locate.survey import Survey
 from kcal.mark.guide import Reference, RigBand, at_shape, open_pictures, propose
 from kcal.mark.items import SIDES, Add, Mark, MarkingState, Place, Put, Side, SurveyPlace, applied
 from kcal.mark.marking_service import Desk, Promise, map_content, solve_live, verdict
 from kcal.mark.session import Session, marks_of
 from kcal.mark.shapes import snap
+from kcal.rig import RigCovariance, Survey
 from kcal.watch.turned import check_rig, seen_again
 from scripts.shared.marking_scene import (
     LANDMARKS,

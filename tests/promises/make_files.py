@@ -17,17 +17,10 @@ import numpy as np
 import torch
 
 import kcal
-from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.calibrate.camera.result import CalibrationOptions
-from kcal.calibrate.hybrid.measured_board import load_measured_board, save_measured_board
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations, View
-from kcal.io.camera_file import load_camera, save_camera
-from kcal.io.lookup_file import load_lookup, save_lookup
+from kcal import Board, CalibrationOptions, Camera, Observations, View, calibrate_camera, load_camera, save_camera
+from kcal.calibrate import load_measured_board, save_measured_board
 from kcal.io.rig_file import load_rig, save_rig
-from kcal.lens.baking import bake
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
+from kcal.lens import bake, load_lookup, rotation_from_vector, save_lookup
 from kcal.lens.rig import Origin, Rig
 
 SIZE = (640, 480)

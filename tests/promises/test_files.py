@@ -8,13 +8,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from kcal.calibrate.hybrid.measured_board import load_measured_board, save_measured_board
-from kcal.corners.observations import Observations
+from kcal import Camera, Observations
+from kcal.calibrate import load_measured_board, save_measured_board
 from kcal.io.camera_file import CameraFile, load_camera, save_camera
 from kcal.io.file_summary import sigma_of
-from kcal.io.lookup_file import load_lookup
 from kcal.io.rig_file import RigFile, load_rig, save_rig
-from kcal.lens.camera import Camera
+from kcal.lens import load_lookup
 
 FILES = Path(__file__).parent / "files"
 VERSIONS = sorted(path.parent.name for path in FILES.glob("*/rig.json"))

@@ -10,11 +10,9 @@ import jsonschema
 import pytest
 from typer.testing import CliRunner
 
+from kcal import Observations, load_camera, load_rig, save_camera, save_rig
 from kcal.cli.exchange import FILES, file_schema
 from kcal.cli.main import app
-from kcal.corners.observations import Observations
-from kcal.io.camera_file import load_camera, save_camera
-from kcal.io.rig_file import load_rig, save_rig
 
 STORED = Path(__file__).parent / "files"
 WRITTEN = {

@@ -16,6 +16,8 @@ import torch
 from typer.testing import CliRunner
 from waiting import wait_for
 
+from kcal import Board, Camera, DegenerateError, FileError, InputError, KcalError, Observations
+from kcal.calibrate import calibrate_cameras
 from kcal.calibrate.batch.jobs import BatchOptions, detect_image, pieces, read_jobs, sharing_jobs
 from kcal.calibrate.batch.results import (
     Pool,
@@ -27,13 +29,8 @@ from kcal.calibrate.batch.results import (
     run_tasks,
     write_summary,
 )
-from kcal.calibrate.camera.calibrate import calibrate_cameras
 from kcal.cli.main import app
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations
-from kcal.errors import DegenerateError, FileError, InputError, KcalError
 from kcal.io.camera_file import CameraFile, load_camera
-from kcal.lens.camera import Camera
 from kcal.sim.captures import BoardSize, sample_board_poses
 from kcal.sim.scene import RenderOptions, render_board
 

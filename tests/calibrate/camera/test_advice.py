@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from kcal import Board, Camera, Observations, View
 from kcal.calibrate.camera.advice import (
     board_rolls,
     board_tilts,
@@ -19,13 +20,9 @@ from kcal.calibrate.camera.advice import (
     what_to_photograph,
 )
 from kcal.calibrate.camera.warnings import corner_pupil, pupil_findings
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations, View
 from kcal.finding import sentences
-from kcal.lens.camera import Camera
+from kcal.lens import LensModel, rotation_from_vector
 from kcal.lens.hybrid_terms import HybridForm
-from kcal.lens.model import LensModel
-from kcal.lens.pose import rotation_from_vector
 from kcal.lens.zernike import ZernikeModes
 
 BOARD = Board(columns=2, rows=2, square=0.1)

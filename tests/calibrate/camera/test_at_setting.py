@@ -15,15 +15,10 @@ from calibrate_scenes import camera, motions, observe, pixels_of
 from scipy.interpolate import CubicSpline
 from torch import Tensor
 
+from kcal import Camera, InputError, Rig, calibrate_camera, load_camera, load_rig, save_camera, save_rig
 from kcal.calibrate.camera.at_setting import SettingSpline, _errors, camera_at_setting
-from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.errors import InputError
-from kcal.io.camera_file import load_camera, save_camera
-from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.calibration import BoardRecord, CalibrationRecord, CameraCalibration, LensSetting
-from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
-from kcal.lens.rig import Rig
 from kcal.lens.uncertainty import pixel_covariance, pixel_errors
 
 SIZE, SETTINGS = (640, 480), (0.0, 1.0, 2.0, 3.5, 5.0)

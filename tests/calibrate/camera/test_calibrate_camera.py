@@ -10,14 +10,13 @@ import torch
 from calibrate_scenes import BOARD, SIZE, camera, motions, observe, pixels_of
 from torch import Tensor
 
+from kcal import Camera, DegenerateError, InputError
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.state import BoardState, warp_modes
 from kcal.calibrate.problem.views import free_parameters, uncertainty_of
-from kcal.errors import DegenerateError, InputError
-from kcal.lens.camera import Camera
+from kcal.solve import SolverStatus
 from kcal.solve.lm import LMOptions, minimize
-from kcal.solve.problem import SolverStatus
 
 
 def solve(pixels: Tensor, model: str = "opencv5", **options: object) -> CameraCalibrationResult:

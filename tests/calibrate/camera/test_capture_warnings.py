@@ -9,15 +9,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from kcal import Board, Camera, InputError, Observations, View
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.camera.warnings import check_end, measured_aspect, motion_findings, pixel_findings
 from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations, View
-from kcal.errors import InputError
 from kcal.finding import sentences
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
+from kcal.lens import rotation_from_vector
 from kcal.lens.uncertainty import paraxial_focal
 from kcal.lens.zernike import ZernikeModes
 from kcal.sim.captures import BoardSize, board_points, sample_board_poses

@@ -14,21 +14,14 @@ from lenses import HYBRID, strong
 from torch import Tensor
 from typer.testing import CliRunner
 
+from kcal import Board, CalibrationOptions, Camera, DegenerateError, InputError, Observations, View, calibrate_camera
 from kcal.calibrate.camera.advice import possible_views
 from kcal.calibrate.camera.at_setting import ComparisonResult, compare_models
-from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.camera.checks import OutlierRejection
-from kcal.calibrate.camera.export import refit_camera
-from kcal.calibrate.camera.result import CalibrationOptions
 from kcal.cli.main import app
-from kcal.corners.board import Board
 from kcal.corners.marker_boards import _opencv_board
-from kcal.corners.observations import Observations, View
-from kcal.errors import DegenerateError, InputError
 from kcal.io.camera_file import CameraFile, load_camera, save_camera
-from kcal.lens.camera import Camera
-from kcal.lens.difference import camera_difference
-from kcal.lens.pose import rotation_from_vector
+from kcal.lens import camera_difference, refit_camera, rotation_from_vector
 from kcal.lens.uncertainty import paraxial_focal
 from scripts.shared.printed_board import Paper, pose
 

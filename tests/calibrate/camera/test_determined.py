@@ -11,21 +11,16 @@ from calibrate_scenes import BOARD, SIZE, camera, motions, observe, pixels_of
 from lenses import FEW_MODES, hybrid_camera
 from torch import Tensor
 
+from kcal import Board, Camera, DegenerateError, Observations, View, detect
 from kcal.calibrate.camera.advice import check_directions, direction_share, reached, roll_findings, what_to_photograph
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.camera.checks import stray_corners
 from kcal.calibrate.camera.warnings import corner_pupil, general_findings, outlier_findings, pupil_findings
-from kcal.corners.board import Board
-from kcal.corners.detect import detect
-from kcal.corners.observations import Observations, View
-from kcal.errors import DegenerateError
 from kcal.finding import sentences
-from kcal.lens.camera import Camera
-from kcal.lens.model import LensModel
-from kcal.lens.pose import rotation_from_vector
+from kcal.lens import LensModel, rotation_from_vector
 from kcal.lens.projection import FAR, project_components
 from kcal.lens.uncertainty import paraxial_focal
-from kcal.solve.problem import SolverStatus
+from kcal.solve import SolverStatus
 
 # Whether views determine where a camera sees what they show: its directions, not its parameters.
 

@@ -11,13 +11,10 @@ import pytest
 import torch
 from lenses import hybrid_camera
 
-from kcal.calibrate.camera.export import export_cameras
-from kcal.errors import InputError
+from kcal import Camera, InputError, Rig
 from kcal.io.format_mrcal import SplineGrid
 from kcal.io.formats import FORMATS, import_cameras
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Rig
+from kcal.lens import export_cameras, rotation_from_vector
 
 LENSES = {
     "pinhole": [],

@@ -6,10 +6,8 @@ from pathlib import Path
 
 import torch
 
-from kcal.calibrate.camera.export import export_cameras
-from kcal.io.formats import import_cameras
-from kcal.lens.camera import Camera
-from kcal.lens.rig import Rig
+from kcal import Camera, Rig
+from kcal.lens import export_cameras, import_cameras
 
 
 def camera(focal: float, model: str, *coefficients: float) -> Camera:

@@ -12,10 +12,9 @@ import pytest
 import torch
 from lenses import hybrid_camera
 
-from kcal.calibrate.camera.export import export_cameras
+from kcal import Camera
 from kcal.io.formats import FORMATS, import_cameras
-from kcal.lens.calibration import CameraCalibration
-from kcal.lens.camera import Camera
+from kcal.lens import CameraCalibration, export_cameras
 from kcal.lens.uncertainty import carried_covariance, pixel_slopes, square_root_information
 
 PAGE = Path(__file__).parents[3] / "docs" / "howto" / "bundle-adjustment.md"

@@ -10,15 +10,12 @@ import torch
 from calibrate_scenes import BOARD, SIZE, camera, motions, observe, pixels_of
 from torch import Tensor
 
+from kcal import Camera, DegenerateError, InputError, Observations, load_camera
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
 from kcal.calibrate.camera.checks import OutlierRejection
 from kcal.calibrate.camera.trust import summarize
-from kcal.corners.observations import Observations
-from kcal.errors import DegenerateError, InputError
-from kcal.io.camera_file import load_camera
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
-from kcal.solve.lm import LMOptions
+from kcal.lens import rotation_from_vector
+from kcal.solve import LMOptions
 from scripts.shared.infinity import error_at_infinity
 
 NOISE = 0.1

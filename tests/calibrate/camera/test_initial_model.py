@@ -10,14 +10,12 @@ import pytest
 import torch
 from calibrate_scenes import BOARD, SIZE, camera, motions, observe, pixels_of
 
+from kcal import Board, Camera, Observations, View
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
 from kcal.calibrate.camera.solve import first_states, follow_base
 from kcal.calibrate.problem.views import CameraViews
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations, View
-from kcal.lens.camera import Camera
+from kcal.lens import LensModel
 from kcal.lens.hybrid_terms import radius_over_angle
-from kcal.lens.model import LensModel
 from scripts.shared.distorted import distort
 
 TRUTH = camera("opencv14")

@@ -12,14 +12,12 @@ import pytest
 import torch
 
 import kcal.calibrate.camera.interval_check as module
-from kcal.calibrate.camera.calibrate import calibrate_camera
+from kcal import Camera, Observations, calibrate_camera
 from kcal.calibrate.camera.interval_check import interval_check, simulated_refits
 from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult
 from kcal.cli.main import main
-from kcal.corners.observations import Observations
 from kcal.finding import Finding
-from kcal.lens.calibration import CameraCalibration
-from kcal.lens.camera import Camera
+from kcal.lens import CameraCalibration
 from kcal.lens.uncertainty import pixel_covariance, pixel_errors
 from kcal.report.judge_camera import fault_of_views
 from scripts.shared.views import observed, simulate

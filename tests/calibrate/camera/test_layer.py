@@ -9,14 +9,12 @@ import torch
 from calibrate_scenes import BOARD, SIZE, camera, motions, pixels_of
 from torch import Tensor, nn
 
+from kcal import CalibrationOptions, Camera, DegenerateError, InputError
 from kcal.calibrate.camera.checks import OutlierRejection
 from kcal.calibrate.camera.layer import CalibratedViews, CalibrationLayer, calibrate_views
-from kcal.calibrate.camera.result import CalibrationOptions
 from kcal.calibrate.problem.board_problem import BoardProblem
-from kcal.errors import DegenerateError, InputError
-from kcal.lens.camera import Camera
-from kcal.lens.model import LensModel
-from kcal.solve.problem import RobustLoss
+from kcal.lens import LensModel
+from kcal.solve import RobustLoss
 
 # Of the rays (0.3, 0.2), (-0.4, 0.1), (0.1, -0.3).
 POINTS = torch.tensor([[0.3, 0.2, 1.0], [-0.4, 0.1, 1.0], [0.1, -0.3, 1.0]], dtype=torch.float64)

@@ -8,12 +8,9 @@ from calibrate_scenes import BOARD, SIZE, camera, motions, pixels_of
 from elsewhere import DEVICE, Elsewhere
 from torch import Tensor
 
+from kcal import CalibrationOptions, Camera, Localizer, Origin, Rig
 from kcal.calibrate.camera.layer import CalibratedViews, CalibrationLayer
-from kcal.calibrate.camera.result import CalibrationOptions
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Origin, Rig
-from kcal.locate.localizer import Localizer
+from kcal.lens import rotation_from_vector
 
 TURN = rotation_from_vector(torch.tensor([0.01, -0.03, 0.02], dtype=torch.float64))
 SHIFT = torch.tensor([-0.06, 0.01, 0.02], dtype=torch.float64)

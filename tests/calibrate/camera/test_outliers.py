@@ -12,16 +12,12 @@ import torch
 from calibrate_scenes import BOARD, SIZE, camera, motions, observe, pixels_of
 from torch import Tensor
 
+from kcal import Board, Camera, DegenerateError, InputError, detect
 from kcal.calibrate.camera import hybrid
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
 from kcal.calibrate.camera.checks import OutlierRejection, copied_views, corners_beyond, least_planar, repeated_poses
 from kcal.calibrate.problem.parameters import CoefficientPrior, is_overparameterized
-from kcal.corners.board import Board
-from kcal.corners.detect import detect
-from kcal.errors import DegenerateError, InputError
-from kcal.lens.camera import Camera
-from kcal.lens.model import LensModel
-from kcal.lens.pose import rotation_from_vector
+from kcal.lens import LensModel, rotation_from_vector
 from kcal.lens.projection import project_components
 
 # Wrong corners and views are found, listed and left out; good ones stay.

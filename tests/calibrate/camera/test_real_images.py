@@ -9,15 +9,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from kcal import Board, Camera, Observations, RigOptions, calibrate_rig, detect
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
-from kcal.calibrate.rig.pairs import pair_by_name
 from kcal.calibrate.rig.result import RigResult
-from kcal.calibrate.rig.solve import RigOptions, calibrate_rig
-from kcal.corners.board import Board
-from kcal.corners.detect import detect
-from kcal.corners.observations import Observations
-from kcal.lens.camera import Camera
 from kcal.report.judge_rig import triangulated_sides
+from kcal.rig import pair_by_name
 
 cv2 = pytest.importorskip("cv2")
 

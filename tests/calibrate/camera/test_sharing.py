@@ -13,6 +13,8 @@ from printed_boards import printed_points, printed_views
 from torch import Tensor
 from typer.testing import CliRunner
 
+from kcal import Board, Camera, DegenerateError, InputError, KcalError, Observations, load_camera, save_camera
+from kcal.calibrate import OutlierRejection
 from kcal.calibrate.camera.calibrate import (
     CalibrationOptions,
     CameraCalibrationResult,
@@ -20,16 +22,10 @@ from kcal.calibrate.camera.calibrate import (
     calibrate_cameras,
     sharing,
 )
-from kcal.calibrate.camera.result import OutlierRejection
 from kcal.calibrate.hybrid.board_modes import turned_corners
 from kcal.calibrate.rig.unknowns import gathered, joint_unknowns
 from kcal.cli.main import app
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations
-from kcal.errors import DegenerateError, InputError, KcalError
 from kcal.finding import Finding
-from kcal.io.camera_file import load_camera, save_camera
-from kcal.lens.camera import Camera
 
 BOARD = Board(columns=8, rows=6, square=0.03)
 SIZE = (1280, 960)

@@ -13,15 +13,13 @@ import torch
 from standing_views import quadratic, standing
 from torch import Tensor
 
-from kcal.calibrate.camera.calibrate import calibrate_camera
+from kcal import Board, Observations, calibrate_camera
 from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult
 from kcal.calibrate.hybrid.board_modes import board_modes, find_turns, mode_turn, turned, turned_corners
 from kcal.calibrate.hybrid.cameras_fit import fleet_priors, hyper_likelihood
 from kcal.calibrate.hybrid.evidence import Amplitudes, maximize_evidence, negative_log_evidence
 from kcal.calibrate.hybrid.families import BOARD, Hyperprior, PriorFamilies, typical_hyperprior
 from kcal.calibrate.hybrid.measured_board import BoardPrior, evidence, printed_board, printed_prior
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations
 from kcal.gaussian import Gaussian, numbered
 from kcal.lens.information import BOARD_SLOT
 from scripts.shared.infinity import error_at_infinity

@@ -12,14 +12,11 @@ from calibrate_scenes import observe
 from printed_boards import printed_points, printed_views
 from torch import Tensor
 
+from kcal import Board, Camera, InputError, Observations
 from kcal.calibrate.hybrid.board_modes import turned_corners
 from kcal.calibrate.hybrid.cameras_fit import CamerasFit, fit_cameras, measure_board
 from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations
-from kcal.errors import InputError
-from kcal.lens.camera import Camera
 from kcal.lens.zernike import ZernikeModes
 
 BOARD = Board(columns=8, rows=6, square=0.03)

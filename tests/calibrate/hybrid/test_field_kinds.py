@@ -8,15 +8,14 @@ import pytest
 import torch
 from torch import Tensor
 
+from kcal import Board, Camera
 from kcal.calibrate.hybrid import fitted_views
 from kcal.calibrate.hybrid.board_modes import board_modes
 from kcal.calibrate.hybrid.families import SQUARE, prior_families, typical_hyperprior
 from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid
-from kcal.corners.board import Board
-from kcal.lens.camera import Camera
+from kcal.lens import rotation_from_vector
 from kcal.lens.field_modes import FieldModes, GaussianModes, NetworkModes
 from kcal.lens.hybrid_terms import HybridForm
-from kcal.lens.pose import rotation_from_vector
 from kcal.lens.zernike import ZernikeModes
 
 BOARD = Board(columns=8, rows=6, square=0.05)

@@ -11,6 +11,7 @@ import torch
 from standing_views import quadratic, standing
 from torch import Tensor
 
+from kcal import Board, Camera, InputError
 from kcal.calibrate.hybrid.board_modes import BENDING, PRINT, STRETCH, TRAPEZOID, board_modes
 from kcal.calibrate.hybrid.evidence import (
     Amplitudes,
@@ -23,12 +24,8 @@ from kcal.calibrate.hybrid.families import PriorFamilies, prior_families, typica
 from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid, rough_start
 from kcal.calibrate.hybrid.fitted_views import hybrid_problem
 from kcal.calibrate.problem.state import BoardState
-from kcal.corners.board import Board
-from kcal.errors import InputError
-from kcal.lens.camera import Camera
+from kcal.lens import LensModel, rotation_from_vector
 from kcal.lens.hybrid_terms import HybridForm
-from kcal.lens.model import LensModel
-from kcal.lens.pose import rotation_from_vector
 from kcal.lens.zernike import ZernikeModes
 from kcal.sim.captures import drawn_lens
 from kcal.solve.lm import LMOptions, minimize

@@ -10,10 +10,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from kcal.calibrate.camera.at_setting import compare_models
-from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.calibrate.camera.layer import calibrate_views
-from kcal.calibrate.camera.result import CalibrationOptions
+from kcal import CalibrationOptions, InputError, calibrate_camera
+from kcal.calibrate import calibrate_views, compare_models
 from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid, settle
 from kcal.calibrate.hybrid.fitted_views import Estimate
 from kcal.calibrate.hybrid.network_fit import (
@@ -26,8 +24,7 @@ from kcal.calibrate.hybrid.network_fit import (
     _with_weights,
     weights_of,
 )
-from kcal.errors import InputError
-from kcal.lens.field_modes import NetworkModes
+from kcal.nets import NetworkModes
 from scripts.shared.dented_lens import BOARD, NOISE, SIZE, capture, network, off
 
 

@@ -15,6 +15,7 @@ from calibrate_scenes import observe
 from printed_boards import printed_points, printed_views
 from torch import Tensor
 
+from kcal import Board, Camera
 from kcal.calibrate.hybrid import cameras_fit, fitted_views
 from kcal.calibrate.hybrid.board_modes import board_modes
 from kcal.calibrate.hybrid.cameras_fit import CameraFit, _measured, fit_turned
@@ -24,9 +25,7 @@ from kcal.calibrate.hybrid.fit import FitOptions
 from kcal.calibrate.hybrid.fitted_views import Rounds, columns_may_be_read
 from kcal.calibrate.hybrid.measured_board import printed_board
 from kcal.calibrate.problem.state import Readout, motion_sigma
-from kcal.corners.board import Board
 from kcal.gaussian import Gaussian, numbered
-from kcal.lens.camera import Camera
 from kcal.lens.information import BOARD_SLOT, LENS_SLOT
 from kcal.lens.zernike import ZernikeModes
 

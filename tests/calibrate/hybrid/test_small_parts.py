@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from kcal import Board, InputError
 from kcal.calibrate.hybrid.base_fit import Base, _through_base, _with_constants
 from kcal.calibrate.hybrid.board_modes import KNOWN, board_modes, undetermined_modes
 from kcal.calibrate.hybrid.cameras_fit import _but_one, fleet_priors, typical_lens
@@ -19,11 +20,9 @@ from kcal.calibrate.hybrid.fit import pixels_are_square, with_square_pixels
 from kcal.calibrate.hybrid.fitted_views import Estimate
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard, load_measured_board, save_measured_board
 from kcal.calibrate.problem.state import BoardState
-from kcal.corners.board import Board
-from kcal.errors import InputError
 from kcal.gaussian import Gaussian
+from kcal.lens import LensModel
 from kcal.lens.hybrid_terms import HybridForm
-from kcal.lens.model import LensModel
 from kcal.lens.zernike import ZernikeModes
 from kcal.solve.schur import Products
 

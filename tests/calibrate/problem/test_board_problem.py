@@ -8,14 +8,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from kcal import Board, Camera
 from kcal.calibrate.problem import board_problem
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.parameters import GaussianPrior
 from kcal.calibrate.problem.state import BoardState, warp_modes
-from kcal.corners.board import Board
-from kcal.lens.camera import Camera
-from kcal.lens.model import LensModel
-from kcal.lens.pose import rotation_from_vector
+from kcal.lens import LensModel, rotation_from_vector
 from kcal.lens.projection import parameter_names
 from kcal.solve.lm import LevenbergMarquardt, LMOptions, minimize
 from kcal.solve.problem import RobustLoss, SolverStatus, map_state

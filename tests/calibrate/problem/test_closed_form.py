@@ -10,6 +10,7 @@ import torch
 from calibrate_scenes import BOARD, SIZE, Motions, camera, motions, observe, pixels_of
 from torch import Tensor
 
+from kcal import Board, Camera, InputError
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
 from kcal.calibrate.problem.board_problem import apply_twist
 from kcal.calibrate.problem.parameters import CoefficientPrior, is_overparameterized
@@ -24,14 +25,10 @@ from kcal.calibrate.problem.poses import (
 )
 from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.views import Views, whitening
-from kcal.corners.board import Board
-from kcal.errors import InputError
-from kcal.lens.camera import Camera
+from kcal.lens import LensModel, rotation_from_vector
 from kcal.lens.camera_parameters import parameter_names
-from kcal.lens.model import LensModel
-from kcal.lens.pose import rotation_from_vector
 from kcal.lens.projection import project_components
-from kcal.solve.lm import LMOptions
+from kcal.solve import LMOptions
 
 # Closed-form starts are exact where the theory says so, without any iteration.
 

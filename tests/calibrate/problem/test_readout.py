@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from kcal import Board, Camera
 from kcal.calibrate.hybrid.base_fit import fit_base
 from kcal.calibrate.hybrid.board_modes import board_modes
 from kcal.calibrate.hybrid.evidence import Amplitudes, Quadratic, ViewData, maximize_evidence, view_data
@@ -32,11 +33,8 @@ from kcal.calibrate.problem.state import (
     stillness,
     widening,
 )
-from kcal.corners.board import Board
-from kcal.lens.camera import Camera
+from kcal.lens import LensModel, rotation_from_vector
 from kcal.lens.hybrid_terms import HybridForm
-from kcal.lens.model import LensModel
-from kcal.lens.pose import rotation_from_vector
 from kcal.lens.zernike import ZernikeModes
 from kcal.solve.lm import LMOptions, minimize
 from kcal.solve.schur import Products, without_local

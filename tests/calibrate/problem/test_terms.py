@@ -7,17 +7,15 @@ import torch
 from calibrate_scenes import BOARD, camera, motions, observe, pixels_of
 from torch import Tensor
 
+from kcal import InputError, Observations
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.problem.board_problem import BoardProblem, apply_twist
 from kcal.calibrate.problem.parameters import FoldBarrier, GaussianPrior, Term
 from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.views import free_parameters, whitening
-from kcal.corners.observations import Observations
-from kcal.errors import InputError
-from kcal.lens.model import LensModel
-from kcal.lens.pose import rotation_from_vector
+from kcal.lens import LensModel, rotation_from_vector
+from kcal.solve import RobustLoss
 from kcal.solve.lm import LMOptions, minimize
-from kcal.solve.problem import RobustLoss
 
 # Steps along twists, barriers before folds, and priors as residuals.
 

@@ -10,18 +10,16 @@ import torch
 from rig_scenes import CAMERAS, CENTER, NAMES, boards, features, landmarks, normal, tensor
 from torch import Tensor
 
-from kcal import Baseline, Landmarks, MeasuredPosition, RigData
+from kcal import Baseline, DegenerateError, InputError, Landmarks, MeasuredPosition, RigData, RigOptions, solve_rig
 from kcal.calibrate.rig import assess
 from kcal.calibrate.rig.adjustment import Adjustment
 from kcal.calibrate.rig.explanations import contradictions, redundancy
 from kcal.calibrate.rig.initial_poses import first_poses
 from kcal.calibrate.rig.resection import distinct_poses, poses_from_three
-from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.unknowns import held
-from kcal.errors import DegenerateError, InputError
-from kcal.lens.pose import rotation_from_vector
-from kcal.report.judge_rig import rig_verdict
-from kcal.solve.lm import LMOptions
+from kcal.lens import rotation_from_vector
+from kcal.report import rig_verdict
+from kcal.solve import LMOptions
 
 APART = float((CENTER[0] - CENTER[1]).norm())
 STRAIGHT = RigOptions(refraction=0.0, refraction_sigma=0.0)

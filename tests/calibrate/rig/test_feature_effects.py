@@ -8,13 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal import Baseline, Features, Landmarks, RigData
+from kcal import Baseline, Camera, Features, InputError, Landmarks, RigData, RigOptions, solve_rig
 from kcal.calibrate.rig.result import RigResult
-from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.calibrate.rig.source import Effect
-from kcal.errors import InputError
-from kcal.lens.camera import Camera
-from kcal.lens.pose import vector_from_rotation
+from kcal.lens import vector_from_rotation
+from kcal.rig import Effect
 
 CAMERA = Camera.build(focal=(800, 800), center=(479.5, 269.5), size=(960, 540), model="pinhole")
 CENTERS = torch.tensor([[0.0, 0, 0], [10.0, 0, 0]], dtype=torch.float64)

@@ -7,11 +7,8 @@ import dataclasses
 import pytest
 import torch
 
-from kcal import Landmarks, RigData
-from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.calibrate.rig.source import Effect
-from kcal.errors import InputError
-from kcal.lens.camera import Camera
+from kcal import Camera, InputError, Landmarks, RigData, RigOptions, solve_rig
+from kcal.rig import Effect
 
 CAMERA = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
 LOOK = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)

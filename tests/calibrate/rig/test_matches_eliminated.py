@@ -7,14 +7,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal import Baseline, Features, Landmarks, RigData
+from kcal import Baseline, Camera, Features, InputError, Landmarks, RigData
 from kcal.calibrate.rig.adjustment import Adjustment
 from kcal.calibrate.rig.problem import RigProblem, _few_others_fall, _others_fall
 from kcal.calibrate.rig.source import LOCAL_SIZE, Start
 from kcal.calibrate.rig.unknowns import held
-from kcal.errors import InputError
-from kcal.lens.camera import Camera
-from kcal.solve.lm import LMOptions
+from kcal.solve import LMOptions
 from kcal.solve.schur import SchurLinearization
 
 CAMERA = Camera.build(focal=(800, 801), center=(318, 242), size=(640, 480), coefficients=[-0.1, 0.02, 1e-4, 2e-4])

@@ -10,10 +10,7 @@ import pytest
 import torch
 from rig_scenes import CAMERAS, CENTER, boards, features, landmarks, normal, see, spread_points, tensor
 
-from kcal import Baseline, Features, MeasuredPosition, RigData
-from kcal.calibrate.rig.solve import solve_rig
-from kcal.errors import InputError
-from kcal.lens.camera import Camera
+from kcal import Baseline, Camera, Features, InputError, MeasuredPosition, RigData, solve_rig
 
 BASELINE = Baseline(first=0, second=1, length=float((CENTER[0] - CENTER[1]).norm()), sigma=0.005)
 POSITIONS = tuple(MeasuredPosition(camera=c, point=CENTER[c], sigma=torch.full((3,), 0.02).double()) for c in (0, 1))

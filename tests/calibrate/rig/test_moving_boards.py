@@ -13,22 +13,17 @@ import torch
 from calibrate_scenes import observe
 from torch import Tensor
 
-from kcal.calibrate.camera.calibrate import calibrate_camera
+from kcal import Board, Camera, InputError, Observations, RigOptions, calibrate_camera, calibrate_rig
 from kcal.calibrate.hybrid.evidence import EvidenceLoss, view_data
 from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies
 from kcal.calibrate.rig.boards import BoardBlock
 from kcal.calibrate.rig.motion import CameraRows, RigRows, WithoutMotion
-from kcal.calibrate.rig.pairs import pair_by_name
 from kcal.calibrate.rig.result import RigResult
-from kcal.calibrate.rig.solve import RigOptions, calibrate_rig
 from kcal.calibrate.rig.source import PosedCamera, RigState, as_items
 from kcal.calibrate.rig.unknowns import held
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations
-from kcal.errors import InputError
-from kcal.lens.calibration import CameraCalibration
-from kcal.lens.camera import Camera
+from kcal.lens import CameraCalibration
 from kcal.lens.pose import Pose, rotation_from_vector, vector_from_rotation
+from kcal.rig import pair_by_name
 from kcal.sim.captures import BoardSize, sample_board_poses
 from kcal.solve.schur import Products, without_local
 from scripts.shared.moving_captures import Hands, moving_capture

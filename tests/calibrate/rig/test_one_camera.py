@@ -12,15 +12,10 @@ from calibrate_scenes import observe
 from rig_scenes import BOARD, CENTER, ROTATION, generator, normal, spread_points, tensor
 from torch import Tensor
 
-from kcal import Landmarks, RigData
+from kcal import Camera, InputError, Landmarks, Localizer, Observations, RigData, RigOptions, calibrate_rig, solve_rig
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.rig.result import RigResult
-from kcal.calibrate.rig.solve import RigOptions, calibrate_rig, solve_rig
-from kcal.corners.observations import Observations
-from kcal.errors import InputError
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
-from kcal.locate.localizer import Localizer
+from kcal.lens import rotation_from_vector
 
 SIZE, NOISE, SURVEY = (1920, 1080), 0.1, 0.02
 LENS = [-0.2, 0.06, 3e-4, -2e-4]

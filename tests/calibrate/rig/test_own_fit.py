@@ -10,13 +10,11 @@ import torch
 from rig_scenes import CAMERAS, CENTER, NAMES, ROTATION, features, landmarks
 from torch import Tensor
 
-from kcal import Baseline, Landmarks, RigData
+from kcal import Baseline, InputError, Landmarks, RigData, RigOptions, solve_rig
 from kcal.calibrate.rig.problem import own_fits
 from kcal.calibrate.rig.result import RigResult
-from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.uncertainty import turn_rows
-from kcal.errors import InputError
-from kcal.lens.pose import vector_from_rotation
+from kcal.lens import vector_from_rotation
 
 LENGTH = float((CENTER[1] - CENTER[0]).norm())
 # Of the marks, px, as the user states it.

@@ -11,16 +11,12 @@ from calibrate_scenes import observe
 from printed_boards import printed_points, seen_whole, shown
 from torch import Tensor
 
+from kcal import Board, Camera, Observations, RigOptions, calibrate_rig
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.rig.result import RigResult
-from kcal.calibrate.rig.solve import RigOptions, calibrate_rig
 from kcal.calibrate.rig.unknowns import gathered, joint_unknowns, less
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations
-from kcal.lens.camera import Camera
+from kcal.lens import pixel_covariance, rotation_from_vector
 from kcal.lens.information import CameraInformation
-from kcal.lens.pose import rotation_from_vector
-from kcal.lens.uncertainty import pixel_covariance
 
 BOARD = Board(columns=7, rows=6, square=0.05)
 SIZE = (1280, 960)

@@ -13,17 +13,12 @@ from calibrate_scenes import BOARD, SIZE, Motions, camera, motions, observe, pix
 from rig_scenes import CAMERAS, landmarks, tensor
 from torch import Tensor
 
+from kcal import Board, Camera, FileError, InputError, RigData, RigOptions, calibrate_rig, load_rig, solve_rig
 from kcal.calibrate.problem.state import warp_modes
 from kcal.calibrate.rig.pairs import boards_of_several, pair_by_name, read_pairs
 from kcal.calibrate.rig.result import RigResult
-from kcal.calibrate.rig.solve import RigOptions, calibrate_rig, solve_rig
-from kcal.calibrate.rig.sources import RigData
-from kcal.corners.board import Board
-from kcal.errors import FileError, InputError
-from kcal.io.rig_file import load_rig
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector, vector_from_rotation
-from kcal.solve.problem import SolverStatus
+from kcal.lens import rotation_from_vector, vector_from_rotation
+from kcal.solve import SolverStatus
 from kcal.texts import counted_text
 
 # 8 x 6 corners: the colors are the same after half a turn, so that a detector cannot know the first corner.

@@ -22,7 +22,7 @@ from rig_scenes import (
 )
 from torch import Tensor
 
-from kcal import Baseline, MeasuredPosition, RigData
+from kcal import Baseline, Camera, MeasuredPosition, Rig, RigData
 from kcal.calibrate.rig.initial_poses import _baseline, _in_all_places, _into_frame, _level_starts, _starts
 from kcal.calibrate.rig.pairs import _median_rms, _view_rms, consensus, evenly, half_turn
 from kcal.calibrate.rig.resection import (
@@ -35,9 +35,7 @@ from kcal.calibrate.rig.resection import (
     poses_from_three,
 )
 from kcal.calibrate.rig.source import Start
-from kcal.lens.camera import Camera
 from kcal.lens.pose import Pose, rotation_from_vector
-from kcal.lens.rig import Rig
 from kcal.lens.turning import rotation_between
 from kcal.report.judge_rig import synchrony
 

@@ -10,17 +10,12 @@ import torch
 from rig_scenes import CAMERAS, CENTER, NAMES, ROTATION, generator, landmarks, normal, see, tensor
 from torch import Tensor
 
-from kcal import Landmarks, MeasuredPosition, RigData
+from kcal import Camera, DegenerateError, Landmarks, Localizer, MeasuredPosition, Origin, RigData, RigOptions, solve_rig
 from kcal.calibrate.rig.assess import OpenPlace, _first_order, _targets, open_place
 from kcal.calibrate.rig.result import RigResult
-from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.errors import DegenerateError
-from kcal.lens.calibration import CameraCalibration
-from kcal.lens.camera import Camera
-from kcal.lens.model import LensModel
-from kcal.lens.rig import Origin, RigCovariance
-from kcal.locate.geodesy import enu_from_cam
-from kcal.locate.localizer import Localizer
+from kcal.lens import CameraCalibration, LensModel
+from kcal.locate import enu_from_cam
+from kcal.rig import RigCovariance
 
 HELD = RigOptions(intrinsics="fixed")
 ORIGIN = Origin(lat=19.07, lon=72.87, height=14.0)
