@@ -236,6 +236,24 @@ def test_no_text_covers_another(name: str) -> None:
     assert len(covered) <= (3 if name in _DATA else 0), covered
 
 
+@pytest.mark.parametrize("kind", ["rig", "difference"])
+def test_pictures_for_a_phone_are_narrow_and_whole(kind: str) -> None:
+    result = calibrated()
+    other = result.camera.with_parameters(result.camera.params + 0.5)
+    figure = (
+        rig_figure(landmarks_rig(), narrow=True)
+        if kind == "rig"
+        else difference_figure(camera_difference(result.camera, other), "june and december", narrow=True)
+    )
+    # A screen of 390 px shows letters of 9 points, an eighth of an inch, at 9 px or more.
+    assert figure.get_figwidth() < 4.9
+    texts, _ = boxes(figure)
+    wide, tall = figure.canvas.get_width_height()
+    assert [text for text, box in texts if box.x0 < -2 or box.y0 < -2 or box.x1 > wide + 2 or box.y1 > tall + 2] == []
+    first, second = (axes.get_window_extent() for axes in figure.axes)
+    assert second.y1 < first.y0
+
+
 # Arrows of pictures: of a plan's north, and of residuals, as long as there is room; levels of very small errors.
 
 
