@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from kcal.cli import kinds
 from kcal.cli.console import err, out, print_answer, print_table, print_wrote, steps, tell, warn
-from kcal.cli.inputs import CALIBRATED, OBSERVATIONS
+from kcal.cli.options import Kind, Several
 from kcal.cli.report import NO
 from kcal.cli.rig_sources import check_views_of
-from kcal.cli.settings import picture_option
 from kcal.errors import FileError, InputError
 from kcal.files import check_writable, read_bytes, write_atomic
 
@@ -32,27 +32,14 @@ _OFTEN = 5.0
 
 
 def check_command(
-    camera: Annotated[Path, typer.Argument(help="Camera file from `kcal calibrate`.", show_default=False), CALIBRATED],
-    observations: Annotated[
-        Path | None,
-        typer.Option(metavar="OBS", help="What it was calibrated from; found beside the camera if not given."),
-        OBSERVATIONS,
-    ] = None,
-    ranges: Annotated[
-        list[float] | None,
-        typer.Option("--range", metavar="M", min=1e-3, help="Distance of what you look at; far away if not given."),
-    ] = None,
-    against: Annotated[
-        Path | None,
-        typer.Option(metavar="OBS", help="A second capture of this camera: is it where the first one says?"),
-        OBSERVATIONS,
-    ] = None,
-    refits: Annotated[int, typer.Option(min=10, max=100_000, help="Captures to simulate.")] = 100,
-    picture: Annotated[Path | None, picture_option("how often the intervals contain the truth.")] = None,
-    output: Annotated[
-        Path | None,
-        typer.Option("-o", "--output", metavar="NPZ", help="Refits that are done; CAMERA.check.npz if not given."),
-    ] = None,
+    camera: kinds.CalibratedCamera,
+    *,
+    observations: kinds.Observed | None = None,
+    distance: Several[kinds.Distance] | None = None,
+    against: kinds.Observed | None = None,
+    refits: Annotated[int, Kind(metavar="N", least=10)] = 100,
+    picture: kinds.Picture | None = None,
+    output: kinds.Output | None = None,
 ) -> None:
     """Are the error bars of a camera true, here and at my ranges? Yes or no.
 
@@ -71,16 +58,25 @@ def check_command(
 
     **Examples**
 
-    `kcal check left.camera.json --range 1000 --picture check.png`
+    `kcal check left.camera.json --distance 1km --picture check.png`
 
     `kcal check left.camera.json --against december.obs.json`
+
+    Args:
+        camera: Camera file from `kcal calibrate`.
+        observations: What it was calibrated from; found beside the camera if not given.
+        distance: Of what you look at, one or more: 800, 5km, inf. Far away if not given.
+        against: A second capture of this camera: is it where the first one says?
+        refits: Captures to simulate.
+        picture: map of where the intervals are right.
+        output: File of the refits that are done (.npz); CAMERA.check.npz if not given.
     """
     name = camera.name.removesuffix(".json").removesuffix(".camera")
     kept = check_writable(output or camera.with_name(f"{name}.check.npz"), camera)
 
     from kcal.calibrate.camera.interval_check import FEWEST, interval_check
 
-    at = [float(one) for one in ranges] if ranges else [math.inf]
+    at = distance or [math.inf]
     result, options, fingerprint = _calibration_of(camera, observations)
     done, whole = _all_refits(result, options, at, refits, fingerprint, kept)
     if len(done) < FEWEST:

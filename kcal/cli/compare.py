@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
-from kcal.cli.calibrate import named_numbers, stated_settings
+from kcal.cli import kinds
 from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
-from kcal.cli.inputs import ANY_CAMERA, CALIBRATED, CAMERA, OBSERVATIONS, calibrated_camera, single_camera
-from kcal.cli.settings import picture_option
+from kcal.cli.inputs import calibrated_camera, single_camera
+from kcal.cli.options import Kind, Several
 from kcal.errors import InputError
 from kcal.files import check_writable, write_atomic
 from kcal.texts import csv_line, number_text
@@ -24,19 +21,14 @@ if TYPE_CHECKING:
 
 
 def compare_command(
-    observations: Annotated[Path, typer.Argument(help="Observations file from `kcal detect`."), OBSERVATIONS],
-    models: Annotated[list[str] | None, typer.Argument(metavar="[MODEL]...", help="More models.")] = None,
-    model: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="Models to compare, for example hybrid opencv5 opencv14.")
-    ] = None,
-    groups: Annotated[
-        str, typer.Option(metavar="KIND", help="Hold out blocks of views together, or views one by one.")
-    ] = "blocks",
-    parts: Annotated[int, typer.Option(min=2, help="Number of times that a part of the groups is held out.")] = 5,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="CSV", help="The same numbers, to write.")
-    ] = None,
-    picture: Annotated[Path | None, picture_option("held-out RMS of each model with its standard error.")] = None,
+    observations: kinds.Observed,
+    models: list[str] | None = None,
+    *,
+    model: Several[str] | None = None,
+    groups: str = "blocks",
+    parts: Annotated[int, Kind(metavar="N", least=2)] = 5,
+    output: kinds.Output | None = None,
+    picture: kinds.Picture | None = None,
 ) -> None:
     """Compare lens models on views that were held out. A tool for research: calibrating needs no model to choose.
 
@@ -48,6 +40,15 @@ def compare_command(
     `kcal compare left.obs.json --model hybrid opencv5 opencv14`
 
     `kcal compare left.obs.json --model hybrid opencv14 -o models.csv --picture models.png`
+
+    Args:
+        observations: Observations file from `kcal detect`.
+        models: More models.
+        model: Models to compare, for example hybrid opencv5 opencv14.
+        groups: Hold out blocks of views together (blocks), or views one by one (views).
+        parts: Number of times that a part of the groups is held out.
+        output: The same numbers, to write (.csv).
+        picture: held-out RMS of each model with its standard error.
     """
     if groups not in ("blocks", "views"):
         raise InputError(f"--groups {groups}: write blocks or views")
@@ -93,19 +94,12 @@ def compare_command(
 
 
 def diff_command(
-    first: Annotated[
-        str, typer.Argument(metavar="CAMERA", help="Camera file of kcal or of another program."), ANY_CAMERA
-    ],
-    second: Annotated[
-        str, typer.Argument(metavar="CAMERA", help="Another one; RIG.json:left is a camera of a rig."), ANY_CAMERA
-    ],
-    at: Annotated[
-        float, typer.Option("--at", min=1e-3, metavar="METERS", help="Distance of what is seen; infinity if not given.")
-    ] = math.inf,
-    turn: Annotated[
-        bool, typer.Option("--turn/--no-turn", help="Turn the second camera until it agrees best with the first.")
-    ] = True,
-    picture: Annotated[Path | None, picture_option("maps of the difference and of its σ.")] = None,
+    first: kinds.AnyCamera,
+    second: kinds.AnyCamera,
+    *,
+    distance: kinds.Distance = math.inf,
+    turn: bool = True,
+    picture: kinds.Picture | None = None,
 ) -> None:
     """Compare two calibrations of a camera: are they the same within their uncertainty?
 
@@ -117,6 +111,13 @@ def diff_command(
     `kcal diff june.camera.json december.camera.json --picture diff.png`
 
     `kcal diff left.camera.json left.cameramodel`
+
+    Args:
+        first: Camera file of kcal or of another program.
+        second: Another one; RIG.json:left is a camera of a rig.
+        distance: Of what is seen.
+        turn: Turn the second camera until it agrees best with the first.
+        picture: maps of the difference and of its σ.
     """
     import torch
 
@@ -125,9 +126,9 @@ def diff_command(
     cameras = [single_camera(source) for source in (first, second)]
     for source, camera in zip((first, second), cameras, strict=True):
         out.print(f"{source}: {_history(camera)}", markup=False)
-    found = camera_difference(*cameras, at=at, rotation=None if turn else torch.eye(3))
+    found = camera_difference(*cameras, at=distance, rotation=None if turn else torch.eye(3))
     tell(
-        at_m=None if math.isinf(at) else at,
+        at_m=None if math.isinf(distance) else distance,
         rms_px=found.rms,
         largest_px=found.largest,
         turn_deg=found.turn_deg,
@@ -172,26 +173,7 @@ def _history(camera: Camera) -> str:
 
 
 def interpolate_command(
-    cameras: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="CAMERA...",
-            help="Camera file at each setting, from `kcal calibrate --setting`.",
-            show_default=False,
-        ),
-        CALIBRATED,
-    ],
-    setting: Annotated[
-        list[str], typer.Option(metavar="NAME=NUMBER", help="Setting of the camera to make; may be repeated.")
-    ],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Camera file to write.")],
-    setting_sigma: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=NUMBER",
-            help="Standard deviation with which the lens comes back to a setting (0 if not given).",
-        ),
-    ] = None,
+    cameras: list[kinds.CalibratedCamera], *, setting: list[kinds.Setting], output: kinds.Output
 ) -> None:
     """Make a camera at a zoom or focus between those at which its lens was calibrated, with its error bars.
 
@@ -200,15 +182,19 @@ def interpolate_command(
 
     **Example**
 
-    `kcal interpolate near.camera.json middle.camera.json far.camera.json --setting focus=4 -o now.camera.json`
+    `kcal interpolate near.camera.json middle.camera.json far.camera.json --setting focus=4±0.1 -o now.camera.json`
+
+    Args:
+        cameras: Camera file at each setting, from `kcal calibrate --setting`.
+        setting: Setting of the camera to make, and the standard deviation with which the lens comes back to it (0 if
+            not given); may be repeated.
+        output: Camera file to write.
     """
     check_writable(output, *cameras)
-    (wanted,) = stated_settings(setting, 1)
-    spread = {}
-    for name, values in named_numbers(setting_sigma, "--setting-sigma").items():
-        if len(values) > 1:
-            raise InputError(f"--setting-sigma {name}: one number is needed")
-        spread[name] = values[0]
+    wanted = {name: stated.value for name, stated in setting}
+    if len(wanted) < len(setting):
+        raise InputError(f"--setting {' '.join(name for name, _ in setting)}: a name is stated twice")
+    spread = {name: stated.sigma for name, stated in setting if stated.sigma is not None}
 
     from kcal.calibrate.camera.at_setting import camera_at_setting
     from kcal.io.camera_file import load_camera, save_camera
@@ -244,16 +230,10 @@ def interpolate_command(
 
 
 def bake_command(
-    camera: Annotated[Path, typer.Argument(help="Camera file from `kcal calibrate`.", show_default=False), CAMERA],
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "-o", "--output", metavar="FILE", help="File to write, .npz; beside the camera file if not given."
-        ),
-    ] = None,
-    tolerance: Annotated[
-        float, typer.Option("--tolerance", min=1e-8, help="Largest allowed error in pixels, in both directions.")
-    ] = 1e-3,
+    camera: kinds.CameraFile,
+    *,
+    output: kinds.Output | None = None,
+    tolerance: Annotated[float, Kind(metavar="PX", least=1e-8)] = 1e-3,
 ) -> None:
     """Turn a camera into lookup tables, for programs without lens models.
 
@@ -263,6 +243,11 @@ def bake_command(
     **Example**
 
     `kcal bake left.camera.json --tolerance 0.001 -o left.npz`
+
+    Args:
+        camera: Camera file from `kcal calibrate`.
+        output: File to write (.npz); beside the camera file if not given.
+        tolerance: Largest allowed error in pixels, in both directions.
     """
     name = camera.name.removesuffix(".json").removesuffix(".camera")
     path = check_writable(output or camera.with_name(f"{name}_lookup.npz"), camera)

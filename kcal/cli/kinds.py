@@ -15,6 +15,7 @@ from kcal.values import WithSigma
 
 if TYPE_CHECKING:
     from kcal.lens.rig import Origin
+    from kcal.report.verdict import Requirement
 
 # Numbers with their unit. `Positive...` and `Least...` refuse others as wrong usage.
 Meters = Annotated[float, Kind(metavar="M")]
@@ -27,6 +28,7 @@ Celsius = Annotated[float, Kind(metavar="°C")]
 Hectopascal = Annotated[float, Kind(metavar="HPA")]
 Millimeters = Annotated[float, Kind(metavar="MM")]
 Port = Annotated[int, Kind(metavar="PORT", least=0, about="Of the local address; 0 for any that is free.")]
+LeastMeters = Annotated[float, Kind(metavar="M", least=1e-3)]
 Count = Annotated[int, Kind(metavar="N", least=1)]
 PixelSigma = Annotated[
     float,
@@ -113,8 +115,26 @@ Square = Annotated[
 ]
 RefineMethod = Annotated[Refine, Kind(metavar="METHOD", about="erf (most accurate), saddle, opencv, skimage or none.")]
 
+
+def _read_needs(text: str, _name: str) -> tuple[Requirement, ...]:
+    from kcal.report.verdict import Requirement
+
+    return Requirement.parse(text)
+
+
+Needs = Annotated["tuple[Requirement, ...]", Kind(metavar="RANGE:ERROR", read=_read_needs)]
+
+
+def _read_setting(text: str, name: str) -> tuple[str, WithSigma]:
+    setting, value = values.named(text, name, "NAME=NUMBER, for example focus=3.2")
+    return setting, values.with_sigma(value, f"{name} {setting}")
+
+
+Setting = Annotated[tuple[str, WithSigma], Kind(metavar="NAME=NUMBER[±SIGMA]", read=_read_setting)]
+
 # Files that are read: what they must be.
 RigFile = Annotated[Path, inputs.RIG]
+AnyCamera = Annotated[str, inputs.ANY_CAMERA]
 CameraFile = Annotated[Path, inputs.CAMERA]
 CalibratedCamera = Annotated[Path, inputs.CALIBRATED]
 Observed = Annotated[Path, Kind(metavar="OBS.json"), inputs.OBSERVATIONS]

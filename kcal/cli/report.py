@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 import typer
 
+from kcal.cli import kinds
 from kcal.cli.console import out, print_answer, print_wrote, steps, tell
-from kcal.cli.inputs import CAMERA_OR_RIG, OBSERVATIONS, PixelSigma, pixel_sigma_of, single_camera
+from kcal.cli.inputs import CAMERA_OR_RIG, pixel_sigma_of, single_camera
+from kcal.cli.options import Several
 from kcal.cli.rig_sources import cameras_of_files, check_views_of
 from kcal.errors import InputError
 from kcal.file_kind import file_kind
@@ -33,24 +35,13 @@ REQUIRE_HELP = "What you need: ranges and the largest σ of each, for example 5k
 
 
 def report_command(
-    subject: Annotated[Path, typer.Argument(metavar="CAMERA-OR-RIG", help="Camera or rig file."), CAMERA_OR_RIG],
-    observations: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--observations",
-            metavar="OBS",
-            help="Views that it was calibrated from; for a rig once for left, once for right; for one of more "
-            "cameras once for each, named as it is. Faults of lens model and "
-            "board can only be found with them.",
-        ),
-        OBSERVATIONS,
-    ] = None,
-    require: Annotated[str, typer.Option(metavar="RANGE:ERROR", help=REQUIRE_HELP)] = "",
-    baseline: Annotated[
-        float, typer.Option(metavar="M", help="For a camera: distance to a second one like it.", min=1e-3)
-    ] = 10.0,
-    pixel_sigma: PixelSigma = None,
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="HTML page to write.")] = None,
+    camera_or_rig: Annotated[Path, CAMERA_OR_RIG],
+    *,
+    observations: Several[kinds.Observed] | None = None,
+    require: kinds.Needs | None = None,
+    baseline: kinds.LeastMeters = 10.0,
+    pixel_sigma: kinds.PixelSigma | None = None,
+    output: kinds.Output | None = None,
 ) -> None:
     """May I use this camera or rig? Yes or no for each range, one reason, and the next picture to take.
 
@@ -66,8 +57,16 @@ def report_command(
     `kcal report left.camera.json --observations left.obs.json --require 5km:10% -o report.html`
 
     `kcal report rig.json --require 800m:2%,5km:10% --pixel-sigma 0.1 -o report.html`
+
+    Args:
+        camera_or_rig: Camera or rig file.
+        observations: Views that it was calibrated from; for a rig those of left, then of right; for one of more cameras
+            those of each, named as it is. Faults of lens model and board can only be found with them.
+        require: What you need: ranges and the largest σ of each, for example 5km:10% or 800m:20m,5km:10%.
+        baseline: For a camera: distance to a second one like it.
+        output: HTML page to write.
     """
-    needs = required(require)
+    subject, needs = camera_or_rig, require or ()
     given = observations or []
     if output is not None:
         check_writable(output, subject, *given)

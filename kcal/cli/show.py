@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, TypeVar
 
 import pydantic
-import typer
 
 from kcal.cli.console import out, print_table
 from kcal.cli.inputs import SHOWN
@@ -39,14 +38,15 @@ _SHOWN = 26
 _INTRINSICS = ("fx", "fy", "cx", "cy", "skew")
 
 
-def show_command(
-    file: Annotated[Path, typer.Argument(help="Camera, rig or observations of kcal, or a foreign camera file."), SHOWN],
-) -> None:
+def show_command(file: Annotated[Path, SHOWN]) -> None:
     """Print what is in a file: cameras with their error bars and history, rigs, observations.
 
     **Example**
 
     `kcal show left.camera.json`
+
+    Args:
+        file: Camera, rig or observations of kcal, or a foreign camera file.
     """
     if file_kind(file) not in ("camera", "rig", "observations"):
         _show_foreign(file)

@@ -400,7 +400,7 @@ def test_interpolate(tmp_path: Path, command: Command) -> None:
     paths = [stored(tmp_path, focus) for focus in (0.0, 1.0, 2.0, 3.0)]
     made = tmp_path / "now.camera.json"
     words = ["interpolate", *paths, "--setting", "focus=1.5", "-o", str(made)]
-    done = command(*words, "--setting-sigma focus=0.1")
+    done = command("interpolate", *paths, "--setting focus=1.5±0.1 -o", made)
     assert "focus=1.5, interpolated: points at infinity ± " in done.out
     assert all(f" by {part}" in done.out for part in ("calibrations", "interpolation", "setting"))
     known = load_camera(made).calibration
@@ -417,6 +417,6 @@ def test_interpolate(tmp_path: Path, command: Command) -> None:
     made.unlink()
     beyond = RUNNER.invoke(app, ["interpolate", *paths, "--setting", "focus=3.5", "-o", str(made)])
     assert "focus=3.5 is outside the calibrated focus of 0 to 3" in str(beyond.exception)
-    several = RUNNER.invoke(app, [*words, "--setting-sigma", "focus=1,2"])
-    assert "--setting-sigma focus: one number is needed" in str(several.exception)
+    for setting, message in (("focus=1,2", "--setting focus '1,2': write VALUE±SIGMA"), ("focus=1", "is stated twice")):
+        assert message in str(RUNNER.invoke(app, [*words, "--setting", setting]).exception)
     assert not made.exists()
