@@ -98,7 +98,7 @@ class Finding:
     def sentence(self) -> str:
         """What was found, and what to do."""
         between = "" if not self.action else ". " if self.action[0].isupper() else "; "
-        return f"{self.told}{between}{self.step}"
+        return f"{self.text}{between}{self.action}"
 
     def content(self) -> dict[str, Any]:
         """As plain texts, for JSON."""

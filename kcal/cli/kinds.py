@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 from kcal import values
 from kcal.cli import inputs
@@ -122,7 +122,7 @@ def _read_needs(text: str, _name: str) -> tuple[Requirement, ...]:
     return Requirement.parse(text)
 
 
-Needs = Annotated["tuple[Requirement, ...]", Kind(metavar="RANGE:ERROR", read=_read_needs)]
+Needs = Annotated[tuple[Any, ...], Kind(metavar="RANGE:ERROR", read=_read_needs)]
 
 
 def _read_setting(text: str, name: str) -> tuple[str, WithSigma]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, TypeAlias
 import typer
 
 from kcal.cli import kinds
-from kcal.cli.console import out, print_answer, print_wrote, steps, tell
+from kcal.cli.console import out, print_wrote, steps, tell
 from kcal.cli.inputs import CAMERA_OR_RIG, pixel_sigma_of, single_camera
 from kcal.cli.options import Several
 from kcal.cli.rig_sources import cameras_of_files, check_views_of
@@ -118,19 +118,26 @@ def told_usable(
 
 
 def print_verdict(verdict: Verdict, warned: Iterable[Finding] = ()) -> None:
-    """Print answers, reason, next step and findings but those that were told already."""
+    """Print findings but those that were told already, ranges, and last the answer, its reason and the next step."""
+    # What is the reason is said there.
+    told = {finding.text for finding in warned} | {one.text for one in verdict.stops if one.told == verdict.reason}
+    for cameras, findings in verdict.groups:
+        lines = [
+            f"  {one.title}: {one.sentence}" for one in findings if one.severity != "fine" and one.text not in told
+        ]
+        for line in [f"{' and '.join(cameras)}:" if cameras else "found:", *lines] if lines else ():
+            out.print(line, markup=False)
+    if verdict.answers:
+        out.print(f"ranges {verdict.basis}:", markup=False)
     # A single answer is the reason, and said once.
     single = [answer.text for answer in verdict.answers] == [verdict.reason]
     for answer in () if single else verdict.answers:
-        out.print(f"{'[green]yes[/]' if answer.ok else '[red]no[/]'}: {answer.text}")
-    print_answer(verdict.usable, verdict.reason)
+        out.print(f"  {'[green]met[/]' if answer.ok else '[red]missed[/]'}: {answer.text}")
+    word = "YES" if verdict.usable else "NO"
+    out.print(f"[bold]{word}[/]{verdict.but and f', {verdict.but}'}:", end=" ")
+    out.print(verdict.reason, markup=False)
     if not verdict.usable:
         out.print(f"next: {verdict.next_step}", markup=False)
-    told = {finding.text for finding in warned}
-    for finding in verdict.findings:
-        if finding.severity == "fine" or finding.text in told:
-            continue
-        out.print(f"  {finding.title}: {finding.sentence}", markup=False)
 
 
 def warned_of(result: RigResult) -> list[Finding]:
@@ -207,7 +214,7 @@ def _of_rig(path: Path, observations: list[Path], needs: tuple[Requirement, ...]
     mark_sigma = pixel_sigma_of(pixel_sigma, rig)
     cameras = named_cameras(rig)
     if pair and observations and len(observations) != 2:
-        raise InputError("a rig needs --observations twice: left, then right")
+        raise InputError("a rig needs --observations LEFT RIGHT")
     if not pair and observations:
         cameras = [cameras[number] for number in cameras_of_files(observations, [name for name, _ in cameras])]
     if observations:

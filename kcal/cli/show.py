@@ -33,8 +33,8 @@ _Camera: TypeAlias = "tuple[dict[str, Any], CameraSummary]"
 _Rig: TypeAlias = "tuple[dict[str, Any], RigSummary]"
 _Summary = TypeVar("_Summary", bound=pydantic.BaseModel)
 
-# Parameters of hybrid lenses that are shown; their hundreds of weights say nothing one by one.
-_SHOWN = 26
+# Parameters that are shown: of hybrid lenses those before the hundreds of weights, which say nothing one by one.
+_SHOWN, _SHOWN_HYBRID = 26, 8
 _INTRINSICS = ("fx", "fy", "cx", "cy", "skew")
 
 
@@ -168,13 +168,14 @@ def _show_camera(content: Mapping[str, Any], known: CameraSummary) -> None:
     axis = ", on its axis; fx and fy below are parameters of the base projection alone" if hybrid else ""
     out.print(f"focal length {known.focal_length}{axis}", markup=False)
     values = {name: content["intrinsics"][name] for name in _INTRINSICS} | content["coefficients"]
+    shown = _SHOWN_HYBRID if hybrid else _SHOWN
     rows = [["parameter", "value", "sigma"]]
-    for name, value in list(values.items())[:_SHOWN]:
+    for name, value in list(values.items())[:shown]:
         error = known.sigma.get(name)
         rows.append([name, number_text(value, error, digits=8), "" if error is None else number_text(error, error)])
     print_table(rows)
-    if len(values) > _SHOWN:
-        out.print(f"and {len(values) - _SHOWN} more weights of the field")
+    if len(values) > shown:
+        out.print(f"and {len(values) - shown} weights of the field")
     if known.sigma_px is not None:
         median, largest = known.sigma_px
         out.print(f"sigma in the image: {median:.3g} px (median), {largest:.3g} px (largest)")

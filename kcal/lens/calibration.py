@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 from kcal.errors import InputError
 from kcal.finding import Finding
-from kcal.texts import brief, setting_text
+from kcal.texts import brief, range_text, setting_text
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -71,9 +71,9 @@ class BoardRecord:
             raise InputError(f"board: an aprilgrid, and only this, has a gap that is positive, got {self!r}")
 
     def __str__(self) -> str:
-        length = f"{self.square * 1000:g} mm"
+        length = range_text(self.square)
         if self.gap is not None:
-            return f"{self.columns // 2}x{self.rows // 2} tags of {length}, {self.gap * 1000:g} mm apart"
+            return f"{self.columns // 2}x{self.rows // 2} tags of {length}, {range_text(self.gap)} apart"
         if self.pattern == "circles":
             return f"{self.columns}x{self.rows} circles, {length} apart"
         if self.pattern == "asymmetric":

@@ -275,13 +275,10 @@ def difference_text(found: CameraDifference) -> list[str]:
     whose = {(True, True): "both cameras", (True, False): "the first camera alone"}.get(
         found.known, "the second camera alone"
     )
-    lines.append(
-        f"expected from the error bars of {whose}: sigma {number_text(typical, typical)} px (median), "
-        f"{number_text(float(spread.max()), digits=2)} px (largest)"
-    )
-    likely = (
+    explained = (
         f"{number_text(found.ratio)} times what they predict, as large by chance with probability "
         f"{number_text(found.probability, digits=2)}"
     )
-    verdict = "same within their uncertainty" if found.same else "not the same within their uncertainty"
-    return [*lines, f"{verdict}: {likely}"]
+    wide = f"σ {number_text(typical, typical)} px (median), {number_text(float(spread.max()), digits=2)} px (largest)"
+    verdict = "no difference beyond" if found.same else "a difference beyond"
+    return [*lines, f"{verdict} the error bars of {whose}, {wide}: {explained}"]

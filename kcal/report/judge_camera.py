@@ -570,7 +570,7 @@ def stored_findings(camera: Camera) -> list[Finding]:
     """What a camera's file tells of its calibration, and that its views were not looked at."""
     record = camera.calibration.record if camera.calibration else None
     text = "the views were not looked at, and a camera file alone cannot show that its lens model or board is wrong"
-    action = "give the observations too (--observations FILE, for a rig twice: left, then right)"
+    action = "give the observations too (--observations FILE, for a rig those of left and of right)"
     unseen = Finding("halves", "doubt", text, action)
     return [unseen, *([] if record is None else record_findings(record))]
 

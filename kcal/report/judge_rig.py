@@ -366,7 +366,7 @@ def _unseen_finding(distance: float) -> Finding:
 
 def _unpaired_finding(why: str) -> Finding:
     text = f"whether both cameras saw the board at the same moments could not be checked: {why}"
-    action = "give the observations of the pairs (--observations twice: left, then right)"
+    action = "give the observations of the pairs (--observations LEFT RIGHT)"
     return Finding("synchronization", "doubt", text, action)
 
 

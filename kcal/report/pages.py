@@ -32,7 +32,7 @@ CAPTIONS = {
     "board": "The board as the views show it, beside the one that was ordered.",
     "rig": "The site from above, and residuals by source and item.",
 }
-_MOST_PARAMETERS = 24
+_MOST_PARAMETERS, MOST_HYBRID = 24, 8  # weights of a hybrid lens, 1e-7 each, say nothing one by one
 
 
 def verdict_page(
@@ -131,7 +131,7 @@ def camera_tables(
         facts.append(["solver", result.status.message])
     sigma = dict(known.sigma) if known and known.sigma else {}
     rows = [["parameter", "value", "σ"]]
-    for name, value in list(zip(camera.names, camera.params.detach().tolist(), strict=True))[:_MOST_PARAMETERS]:
+    for name, value in list(zip(camera.names, camera.params.detach().tolist(), strict=True))[: _most(camera)]:
         own = sigma.get(name)
         rows.append([name, number_text(value, own, digits=6), "" if own is None else number_text(own, own)])
     tables = [facts, rows]
@@ -140,10 +140,14 @@ def camera_tables(
     return tables
 
 
+def _most(camera: Camera) -> int:
+    return MOST_HYBRID if camera.model.hybrid else _MOST_PARAMETERS
+
+
 def _correlations(camera: Camera) -> list[list[str]]:
     assert camera.calibration is not None
     assert camera.calibration.covariance is not None
-    names = camera.names[:_MOST_PARAMETERS]
+    names = camera.names[: _most(camera)]
     covariance = camera.calibration.covariance[: len(names), : len(names)]
     spread = covariance.diagonal().clamp_min(0.0).sqrt()
     found = []
@@ -175,9 +179,9 @@ def _percent(value: float) -> str:
     return f"{value:.0f} %" if value >= 100 else f"{value:.2g} %"
 
 
-def _sentence(text: str) -> str:
+def _sentence(text: str, stop: str = ".") -> str:
     """With a capital and a full stop."""
-    return text[:1].upper() + text[1:].rstrip(".") + "."
+    return text[:1].upper() + text[1:].rstrip(".") + stop
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

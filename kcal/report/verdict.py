@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from kcal.finding import FAULTS, Finding, sorted_findings
 from kcal.locate.stereo import BEARING_SIGMAS
-from kcal.texts import range_text
+from kcal.texts import counted_text, range_text
 from kcal.values import ranges_and_errors
 
 # What lessens each source, where no finding tells more.
@@ -134,6 +135,18 @@ class Verdict:
         return not self.stops and all(answer.ok for answer in self.answers)
 
     @property
+    def but(self) -> str:
+        """What stands beside a yes: how many doubts there are; empty for none."""
+        doubts = sum(finding.severity == "doubt" for finding in self.findings)
+        return f"with {counted_text(doubts, 'doubt')}" if doubts and self.usable else ""
+
+    @property
+    def groups(self) -> list[tuple[tuple[str, ...], list[Finding]]]:
+        """The findings about the same cameras together; no camera stands for all of the subject."""
+        grouped = itertools.groupby(self.findings, lambda finding: finding.cameras)
+        return [(cameras, list(findings)) for cameras, findings in grouped]
+
+    @property
     def reason(self) -> str:
         """The one reason: the largest contribution to what misses a requirement, else what forbids the use."""
         named, worst = self._forbidding, self._worst
@@ -143,9 +156,7 @@ class Verdict:
             return f"{worst.text}; most of it is from {worst.most}" + (f": {named.told}" if named else "")
         if self.answers:
             return max(self.answers, key=lambda answer: answer.sigma / answer.requirement.meters).text
-        doubts = sum(finding.severity == "doubt" for finding in self.findings)
-        but = f", but there {'are' if doubts > 1 else 'is'} {doubts} doubt{'s' if doubts > 1 else ''}" if doubts else ""
-        return f"nothing was found that forbids its use{but}; no range was required"
+        return "nothing was found that forbids its use; no range was required"
 
     @property
     def next_step(self) -> str:
@@ -189,6 +200,7 @@ class Verdict:
         return {
             "subject": self.subject,
             "usable": self.usable,
+            "doubts": sum(finding.severity == "doubt" for finding in self.findings),
             "reason": self.reason,
             "next": self.next_step,
             "ranges": [

@@ -96,7 +96,7 @@ def test_a_rig_is_judged_by_its_covariance(tmp_path: Path) -> None:
     code, text = kcal("report", tmp_path / "rig.json", "--require", "1km:5%", "--pixel-sigma", 0.1)
     assert (code, text.count("at 1 km the range is known"), "YES" in text) == (0, 1, True)
     code, text = kcal("report", tmp_path / "rig.json", "--require", "500m:5%,1km:5%", "--pixel-sigma", 0.1)
-    assert (code, text.count("yes: at"), "YES" in text) == (0, 2, True)
+    assert (code, text.count("met: at"), "YES" in text) == (0, 2, True)
     code, text = kcal("report", tmp_path / "rig.json", "--require", "5km:1%", "--pixel-sigma", 0.1)
     assert (code, "most of it is from marks" in text) == (3, True)
 

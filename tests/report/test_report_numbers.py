@@ -98,17 +98,20 @@ class TestSentences:
         near = difference_text(camera_difference(CAMERA, other, at=2.0))
         assert near[0].startswith("difference at 2.00 m") or near[0].startswith("difference at 2 m")
         assert "and a shift by" in near[1]
-        for sigma, verdict in ((4.0, "same within"), (0.1, "not the same within")):
+        for sigma, verdict in (
+            (4.0, "no difference beyond the error bars of the first camera alone, σ "),
+            (0.1, "a difference beyond the error bars of the first camera alone, σ "),
+        ):
             known = [Camera(one.params, size=one.size, model=one.model) for one in (CAMERA, other)]
             focal = torch.diag(torch.tensor([1.0, 1.0, 0.0, 0.0, 0.0], dtype=torch.float64))
             known[0].calibration = CameraCalibration(covariance=sigma**2 * focal)
             lines = difference_text(camera_difference(known[0], known[1]))
-            assert "error bars of the first camera alone" in lines[-2]
+            assert "error bars of the first camera alone" in lines[-1]
             assert lines[-1].startswith(verdict)
         known[1].calibration, known[0].calibration = known[0].calibration, None
-        assert "error bars of the second camera alone" in difference_text(camera_difference(*known))[-2]
+        assert "error bars of the second camera alone" in difference_text(camera_difference(*known))[-1]
         known[0].calibration = known[1].calibration
-        assert "error bars of both cameras" in difference_text(camera_difference(*known))[-2]
+        assert "error bars of both cameras" in difference_text(camera_difference(*known))[-1]
 
     def test_the_picture_of_a_difference_has_the_shape_of_the_image(self) -> None:
         found = camera_difference(CAMERA, CAMERA.with_parameters(CAMERA.params + 1.0))

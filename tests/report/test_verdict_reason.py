@@ -88,8 +88,12 @@ def test_error_bars_that_nobody_can_believe_come_first() -> None:
 
 def test_a_yes_tells_of_doubts() -> None:
     assert "nothing was found that forbids its use; no" in Verdict(subject="left").reason
-    assert "but there is 1 doubt;" in Verdict(subject="left", findings=(SLIGHT,)).reason
-    assert "but there are 2 doubts;" in Verdict(subject="left", findings=(SLIGHT, SLIGHT)).reason
+    assert Verdict(subject="left", findings=(SLIGHT,)).but == "with 1 doubt"
+    doubted = Verdict(subject="left", findings=(SLIGHT, SLIGHT))
+    assert (doubted.but, doubted.to_dict()["doubts"]) == ("with 2 doubts", 2)
+    # Beside the answer, above all else; a no says what stands against it.
+    assert 'YES <a href="#findings">with 2 doubts</a></p>' in verdict_page(doubted)
+    assert Verdict(subject="left", findings=(SLIGHT, TILT)).but == ""
 
 
 def test_what_is_not_known_is_no_yes() -> None:
