@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from kcal.cli import kinds
-from kcal.cli.console import err, out, print_answer, print_table, print_wrote, steps, tell, warn
+from kcal.cli.console import err, out, print_answer, print_wrote, steps, tell, tell_table, warn
 from kcal.cli.options import Kind, Several
 from kcal.cli.report import NO
 from kcal.cli.rig_sources import check_views_of
 from kcal.errors import FileError, InputError
 from kcal.files import check_writable, read_bytes, write_atomic
+from kcal.table import Table
 
 if TYPE_CHECKING:
     from kcal.calibrate.camera.interval_check import IntervalCheck, Refit
@@ -214,18 +215,23 @@ def _told_refits(found: IntervalCheck, count: int) -> bool:
     """Print the answer."""
     from kcal.report.calibration import range_label
 
-    rows = [["range", "refits inside, %", "±", "lowest place, %", "error px, RMS", "stated px, RMS", "σ should be"]]
+    columns = {
+        "range_m": "range", "share": "refits inside, %", "share_error": "±", "lowest_share": "lowest place, %",
+        "error_px": "error px, RMS", "stated_px": "stated px, RMS", "factor": "σ should be",
+    }  # fmt: skip
+    rows = []
     parts = zip(found.ranges, found.shares, found.coverage, found.rms, found.factors, strict=True)
     for at, (share, error), places, (seen, told), factor in parts:
         lowest = float(places[places.isfinite()].min())
         rows.append([
-            range_label(at), f"{100 * share:.1f}", f"{100 * error:.1f}", f"{100 * lowest:.0f}", f"{seen:.3g}",
-            f"{told:.3g}", f"x {factor:.2f}",
+            (at, range_label(at)), (share, f"{100 * share:.1f}"), (error, f"{100 * error:.1f}"),
+            (lowest, f"{100 * lowest:.0f}"), (seen, f"{seen:.3g}"), (told, f"{told:.3g}"),
+            (factor, f"x {factor:.2f}"),
         ])  # fmt: skip
-    print_table(rows)
+    tell_table("ranges", Table(columns, rows))
     if found.failed:
         warn(f"{found.failed} of {count} simulated captures could not be calibrated; they are not counted")
-    worst = min(range(len(rows) - 1), key=lambda i: found.shares[i][0])
+    worst = min(range(len(rows)), key=lambda i: found.shares[i][0])
     share, where = 100 * found.shares[worst][0], range_label(found.ranges[worst])
     if found.true:
         text = f"the stated 95 % intervals are true: they contain {share:.0f} % of {count} refits, {where}"
@@ -235,15 +241,7 @@ def _told_refits(found: IntervalCheck, count: int) -> bool:
             f"multiply σ by {found.factors[worst]:.2f}, or take more views"
         )
     print_answer(found.true, text)
-    tell(
-        true=found.true,
-        refits=count,
-        failed=found.failed,
-        ranges_m=[None if math.isinf(at) else at for at in found.ranges],
-        shares=[share for share, _ in found.shares],
-        share_errors=[error for _, error in found.shares],
-        factors=found.factors,
-    )
+    tell(true=found.true, refits=count, failed=found.failed)
     return found.true
 
 
@@ -273,16 +271,21 @@ def _told_against(
     check_views_of([result.camera], [second], [path])
     with steps(f"calibrating {path.name}", None):
         found = against_capture(result, second, options, ranges)
-    rows = [["range", "seen px, RMS", "predicted px, RMS", "seen / predicted", "probability"]]
+    columns = {
+        "range_m": "range", "seen_px": "seen px, RMS", "predicted_px": "predicted px, RMS",
+        "ratio": "seen / predicted", "probability": "probability",
+    }  # fmt: skip
+    rows = []
     for at, one in zip(ranges, found, strict=True):
         ratio, chance = one.ratio or math.nan, one.probability if one.probability is not None else math.nan
-        rows.append([range_label(at), f"{one.rms:.3g}", f"{one.rms / ratio:.3g}", f"{ratio:.2f}", f"{chance:.2g}"])
-    print_table(rows)
+        rows.append([
+            (at, range_label(at)), (one.rms, f"{one.rms:.3g}"), (one.rms / ratio, f"{one.rms / ratio:.3g}"),
+            (ratio, f"{ratio:.2f}"), (chance, f"{chance:.2g}"),
+        ])  # fmt: skip
+    tell_table("against", Table(columns, rows))
     same = all(bool(one.same) for one in found)
     verdict = "agrees with" if same else "contradicts"
     more = "" if same else ": a lens or board that the model does not describe, or a camera that changed"
     print_answer(same, f"the second capture {verdict} the stated intervals{more}")
-    tell(
-        against={"same": same, "ratios": [one.ratio for one in found], "probabilities": [o.probability for o in found]}
-    )
+    tell(against_same=same)
     return same

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from kcal.cli import kinds
-from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
+from kcal.cli.console import out, print_wrote, steps, tell, tell_table, warn
 from kcal.cli.inputs import calibrated_camera, single_camera
 from kcal.cli.options import Kind, Several
 from kcal.errors import InputError
 from kcal.files import check_writable, write_atomic
-from kcal.texts import csv_line, number_text
+from kcal.table import Table
+from kcal.texts import number_text
 
 if TYPE_CHECKING:
     from kcal.lens.camera import Camera
@@ -71,15 +72,18 @@ def compare_command(
         )
     count = len(result.corners)
     out.print(f"{len(seen.views)} views; held out in {count} groups, {parts} parts; RMS per corner")
-    rows = [["model", "held-out RMS, px", "more than the best, px", "± standard error"]]
-    lines = [csv_line(["model", "held_out_rms_px", "more_than_best_px", "standard_error_px"])]
-    for place, (name, rms, more, error) in enumerate(result.ranking):
-        cells = [number_text(more, error), number_text(error, error)] if place else ["", ""]
-        rows.append([name, number_text(rms, digits=4), *cells])
-        lines.append(csv_line([name, rms, *((more, error) if place else (None, None))]))
-    print_table(rows)
+    columns = {
+        "model": "model", "held_out_rms_px": "held-out RMS, px", "more_than_best_px": "more than the best, px",
+        "standard_error_px": "± standard error",
+    }  # fmt: skip
+    rows: list[list[Any]] = [
+        [name, (rms, number_text(rms, digits=4)), (more, number_text(more, error)), (error, number_text(error, error))]
+        for name, rms, more, error in result.ranking
+    ]
+    table = Table(columns, [[*rows[0][:2], None, None], *rows[1:]])
+    tell_table("models", table)
     if output is not None:
-        write_atomic(output, "".join(lines))
+        write_atomic(output, table.csv)
     if picture is not None:
         from kcal.report.calibration import models_figure
         from kcal.report.figures import save_picture
@@ -203,9 +207,10 @@ def interpolate_command(
     loaded = [load_camera(path) for path in cameras]
     found = camera_at_setting(loaded, wanted, setting_sigma=spread, names=[str(path) for path in cameras])
     *stated, made = [camera.calibration and camera.calibration.setting for camera in (*loaded, found.camera)]
-    weights = [number_text(weight, 0.01, sign=True) for weight in found.weights]
-    rows = zip(map(str, cameras), map(str, stated), weights, strict=True)
-    print_table([["camera", "setting", "weight"], *map(list, rows)], left=(0, 1))
+    weights = [(weight, number_text(weight, 0.01, sign=True)) for weight in found.weights]
+    columns = {name: name for name in ("camera", "setting", "weight")}
+    rows = list(zip(map(str, cameras), map(str, stated), weights, strict=True))
+    tell_table("cameras", Table(columns, rows), left=(0, 1))
     parts = {
         "calibrations": found.calibration_px,
         "interpolation": found.interpolation_px,
@@ -221,7 +226,7 @@ def interpolate_command(
         )
     else:
         out.print(f"{made}, calibrated: points at infinity ± {number_text(total, digits=2)} px (median)", markup=False)
-    tell(setting=wanted, weights=list(found.weights), sigma_px={"median": total, **parts})
+    tell(setting=wanted, sigma_px={"median": total, **parts})
     save_camera(found.camera, output, name=output.name.split(".")[0])
     print_wrote(output)
 

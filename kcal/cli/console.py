@@ -29,6 +29,7 @@ from kcal.texts import one_line, visible
 if TYPE_CHECKING:
     from kcal.corners.board import Board
     from kcal.corners.observations import Observations
+    from kcal.table import Table
 
 
 # Printing for all commands: output, warnings, tables, JSON for programs, and progress bars for long work.
@@ -167,6 +168,12 @@ def print_table(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> 
         aligned = [cell.ljust(w) if i in left else cell.rjust(w) for i, (cell, w) in enumerate(cells)]
         lines.append("  ".join(aligned).rstrip())
     out.print("\n".join(lines), markup=False)
+
+
+def tell_table(name: str, table: Table, left: Collection[int] = (0,)) -> None:
+    """Print a table, and tell programs its rows under this name."""
+    print_table(table.cells, left)
+    tell(**{name: table.records})
 
 
 def print_answer(yes: bool, text: str) -> None:

@@ -193,7 +193,7 @@ def run(name: str, *arguments: object) -> None:
             "locate": locate_command,
             "report": report_command,
         }
-        app.command(cls=Command)(declared(commands[name]) if name in ("detect", "calibrate") else commands[name])  # type: ignore[arg-type,type-var]
+        app.command(cls=Command)(declared(commands[name]) if name != "locate" else commands[name])  # type: ignore[arg-type,type-var]
     get_command(app).main(words, standalone_mode=False)
 
 

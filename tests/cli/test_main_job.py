@@ -217,6 +217,13 @@ class TestCompare:
         more, error_px = float(other["more_than_best_px"]), float(other["standard_error_px"])
         assert float(other["held_out_rms_px"]) - float(first["held_out_rms_px"]) == pytest.approx(more, rel=1e-12)
         assert more > 0 < error_px
+        # The numbers are the same for people, for programs and in the table.
+        told = json.loads(run(*command.split(), "--json")[1])["models"]
+        assert [(one["model"], one["held_out_rms_px"]) for one in told] == [
+            (one["model"], float(one["held_out_rms_px"])) for one in (first, other)
+        ]
+        assert told[0]["more_than_best_px"] is None
+        assert told[1]["more_than_best_px"] == more
         assert Path("m.svg").read_bytes().startswith(b"<?xml")
 
     def test_bad_input(self, run: Run) -> None:
@@ -410,7 +417,7 @@ def test_interpolate(tmp_path: Path, command: Command) -> None:
     assert f"setting focus=1.5, interpolated from {paths[0]}, " in RUNNER.invoke(app, ["show", str(made)]).output
     told = json.loads(RUNNER.invoke(app, [*words, "--json"]).stdout)
     assert told["sigma_px"]["setting"] == 0.0 < told["sigma_px"]["interpolation"]
-    assert sum(told["weights"]) == pytest.approx(1.0)
+    assert sum(row["weight"] for row in told["cameras"]) == pytest.approx(1.0)
     same = RUNNER.invoke(app, ["interpolate", *paths, "--setting", "focus=2", "-o", str(made)])
     assert "focus=2, calibrated: points at infinity ± " in same.output
     assert load_camera(made).focal.tolist() == [504.0, 504.0]

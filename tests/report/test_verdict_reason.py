@@ -92,7 +92,7 @@ def test_a_yes_tells_of_doubts() -> None:
     doubted = Verdict(subject="left", findings=(SLIGHT, SLIGHT))
     assert (doubted.but, doubted.to_dict()["doubts"]) == ("with 2 doubts", 2)
     # Beside the answer, above all else; a no says what stands against it.
-    assert 'YES <a href="#findings">with 2 doubts</a></p>' in verdict_page(doubted)
+    assert 'YES<a href="#findings">with 2 doubts</a></p>' in verdict_page(doubted)
     assert Verdict(subject="left", findings=(SLIGHT, TILT)).but == ""
 
 

@@ -1,0 +1,48 @@
+"""A table of results, each number written once: for the screen, for pages, as JSON and as CSV."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from kcal.texts import csv_line
+
+
+@dataclasses.dataclass(frozen=True)
+class Table:
+    r"""Rows of results.
+
+    Args:
+        columns: name of each column for programs -> its head for people.
+        rows: cells, one for each column: a text; a value with its text; or None where there is none.
+
+    Example:
+        >>> found = Table({"model": "model", "rms_px": "RMS, px"}, [["opencv5", (0.12345, "0.123")], ["mine", None]])
+        >>> found.cells
+        [['model', 'RMS, px'], ['opencv5', '0.123'], ['mine', '']]
+        >>> found.records
+        [{'model': 'opencv5', 'rms_px': 0.12345}, {'model': 'mine', 'rms_px': None}]
+        >>> found.csv
+        'model,rms_px\nopencv5,0.12345\nmine,\n'
+    """
+
+    columns: Mapping[str, str]
+    rows: Sequence[Sequence[str | tuple[Any, str] | None]]
+
+    @property
+    def cells(self) -> list[list[str]]:
+        """Texts, the heads first."""
+        texts = [[cell[1] if isinstance(cell, tuple) else cell or "" for cell in row] for row in self.rows]
+        return [list(self.columns.values()), *texts]
+
+    @property
+    def records(self) -> list[dict[str, Any]]:
+        """Each row as values by name."""
+        values = [[cell[0] if isinstance(cell, tuple) else cell for cell in row] for row in self.rows]
+        return [dict(zip(self.columns, row, strict=True)) for row in values]
+
+    @property
+    def csv(self) -> str:
+        """With every digit."""
+        return "".join(map(csv_line, [self.columns, *(record.values() for record in self.records)]))
