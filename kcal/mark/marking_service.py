@@ -171,8 +171,6 @@ def located(rig: Rig, marks: Marks, hand_sigma: float) -> Located:
 
 # The map of a marking session: cameras, landmarks and targets with their 95 % regions, as latitudes and longitudes.
 
-_NOWHERE = Origin(lat=0.0, lon=0.0, height=0.0)
-
 
 def map_content(rig: Rig, located: Located | None, survey: Survey | None, *, anchored: bool) -> dict[str, Any]:
     """What the page draws with Leaflet.
@@ -183,7 +181,7 @@ def map_content(rig: Rig, located: Located | None, survey: Survey | None, *, anc
         survey: the landmarks.
         anchored: whether latitudes mean anything; otherwise the page shows meters only.
     """
-    origin, turn = _NOWHERE, enu_from_cam(0.0)
+    origin, turn = NOWHERE, enu_from_cam(0.0)
     if rig.mounting is not None:
         stands = rig.mounting
         origin, turn = stands.origin, enu_from_cam(stands.heading_deg, stands.pitch_deg, stands.roll_deg)
@@ -193,7 +191,7 @@ def map_content(rig: Rig, located: Located | None, survey: Survey | None, *, anc
 
     right = -rig.right_from_left_rotation.T @ rig.right_from_left_translation
     centers = torch.stack([torch.zeros_like(right), right]) @ turn.T
-    frame = _NOWHERE if survey is None or survey.origin is None else survey.origin
+    frame = NOWHERE if survey is None or survey.origin is None else survey.origin
     rings = iter([] if located is None else region_rings(located))
     targets = []
     for position in () if located is None else located.positions:
@@ -376,8 +374,7 @@ class Desk:
             found = snap(self.pictures.image(side, frame), u, v)
         except InputError as error:
             return {"refusal": str(error)}
-        return {"refusal": "", "u": found.u, "v": found.v, "cov": found.cov, "how": found.how,
-                "sigma": math.sqrt(max(found.cov[0], found.cov[2]))}  # fmt: skip
+        return _proposal(Proposal("", *found[:3], how=found.how))
 
     def curve(self, side: Side, u: float, v: float) -> Json:
         """The epipolar curve of a pixel in the other image with its band of two sigmas, or why there is none."""

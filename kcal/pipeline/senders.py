@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import dataclasses
 import datetime
 import itertools
 import math
@@ -223,14 +222,6 @@ _TRAIL, _TRAIL_STEP_S, _TRAIL_KEPT_S = 300, 0.5, 60.0
 CALENDAR = 1e9
 
 
-@dataclasses.dataclass
-class Trail:
-    """Where a track has been, and when last."""
-
-    places: deque[list[float]] = dataclasses.field(default_factory=lambda: deque(maxlen=_TRAIL))
-    time_s: float = 0.0
-
-
 class LiveMap:
     """The server; `address` is what to open, `readers` the number of pages that are open.
 
@@ -257,7 +248,8 @@ class LiveMap:
         self._site = orjson.dumps({"cameras": cameras, "coast": coast})
         # Number of the news, its columns, its time step and time; the last that was written for pages.
         self._news: tuple[int, PositionColumns | None, int, float] = (0, None, 0, 0.0)
-        self._trails: dict[str, Trail] = {}
+        # Where each track has been, and when last.
+        self._trails: dict[str, tuple[deque[list[float]], float]] = {}
         self._trails_end = -math.inf
         self._lock = threading.Lock()
         self._written = (0, b"")
@@ -279,11 +271,11 @@ class LiveMap:
     def _follow(self, columns: PositionColumns, time_s: float) -> None:
         """Where each track has been, for pages that are opened later."""
         for i in np.flatnonzero(columns.located).tolist():
-            trail = self._trails.setdefault(columns.names[i], Trail())
-            trail.places.append(_place_of(columns, i, self.run.place))
-            trail.time_s = time_s
-        for name in [name for name, one in self._trails.items() if not 0.0 <= time_s - one.time_s <= _TRAIL_KEPT_S]:
-            del self._trails[name]
+            places, _ = self._trails.get(columns.names[i], (deque(maxlen=_TRAIL), 0.0))
+            places.append(_place_of(columns, i, self.run.place))
+            self._trails[columns.names[i]] = places, time_s
+        kept = (one for one in self._trails.items() if 0.0 <= time_s - one[1][1] <= _TRAIL_KEPT_S)
+        self._trails = dict(kept)
 
     def close(self, words: str = "finished") -> None:
         """Tell each page how it ended, and end the server."""
@@ -309,7 +301,7 @@ class LiveMap:
         try:
             yield b"event: site\ndata: " + self._site + b"\n\n"
             with self._lock:
-                trails = {name: list(trail.places) for name, trail in self._trails.items()}
+                trails = {name: list(places) for name, (places, _) in self._trails.items()}
             yield b"event: trails\ndata: " + orjson.dumps(trails) + b"\n\n"
             seen, quiet = 0, 0.0
             while not await request.is_disconnected():

@@ -188,6 +188,8 @@ def test_marks_of_landmarks_are_removed_by_a_button(site: tuple[Desk, MarkingSit
         settled(page)
         page.click("#take-right")
         page.wait_for_function("() => !kcal.item('post 12').right && kcal.item('post 12').left")
+        # What was removed is proposed again, as after any mark.
+        page.wait_for_function("() => kcal.proposals.right")
         assert not page.is_enabled("#take-right")
         page.click("#take-left")
         page.wait_for_function("() => !kcal.item('post 12').left")

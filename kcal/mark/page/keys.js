@@ -16,7 +16,12 @@ export function listen(app) {
   const step = (event) => (event.shiftKey ? 1 : 0.1);
   const moves = {ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1]};
   const again = () => { const name = app.about.reference.find((n) => { const item = app.item(n); return !item || !item.left || !item.right; }); if (name) app.again(name); else app.say("all points of the reference are marked"); };
-  const remove = (side = app.side) => { const item = app.item(); if (item && item[side]) app.act({do: "take", name: item.name, side}); };
+  const remove = async (side = app.side) => {
+    const item = app.item();
+    if (!item || !item[side]) return;
+    await app.act({do: "take", name: item.name, side});
+    app.guide();
+  };
   const fit = () => { app.views.left.fit(); app.views.right.fit(); };
   let kind = "target";
   const ask = (what) => {
