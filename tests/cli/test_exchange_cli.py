@@ -9,15 +9,10 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
+from kcal import Camera, InputError, Observations, Rig, load_camera, load_rig, save_camera, save_rig
 from kcal.cli.main import app
 from kcal.cli.stations import _exact_line
-from kcal.corners.observations import Observations
-from kcal.errors import InputError
-from kcal.io.camera_file import load_camera, save_camera
-from kcal.io.rig_file import load_rig, save_rig
-from kcal.lens.calibration import CameraCalibration
-from kcal.lens.camera import Camera
-from kcal.lens.rig import Rig
+from kcal.lens import CameraCalibration
 from kcal.locate.survey import read_survey
 
 

@@ -17,11 +17,9 @@ from calibrate_scenes import BOARD, camera, motions, observe, pixels_of
 from interrupted import interrupt
 from typer.testing import CliRunner, Result
 
-from kcal import load_rig, save_camera
+from kcal import Observations, load_camera, load_rig, save_camera
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.cli.main import app
-from kcal.corners.observations import Observations
-from kcal.io.camera_file import load_camera
 
 # Ctrl-C: a command ends with one line and exit code 130, whatever it is doing, and leaves nothing torn behind.
 

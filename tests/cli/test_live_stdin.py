@@ -10,9 +10,8 @@ from pathlib import Path
 import pytest
 from waiting import PATIENCE, wait_for
 
-from kcal.io.rig_file import save_rig
-from kcal.lens.rig import Mounting, Origin
-from kcal.rig import planned_rig
+from kcal import Origin, save_rig
+from kcal.rig import Mounting, planned_rig
 
 
 @pytest.mark.slow

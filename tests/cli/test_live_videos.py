@@ -21,10 +21,8 @@ from typer.testing import CliRunner
 from video_scenes import VELOCITY, bright_spots, film, places, small_rig, write_video
 from waiting import wait_for
 
+from kcal import FileError, InputError, Origin, Rig, save_rig
 from kcal.cli.main import app
-from kcal.errors import FileError, InputError
-from kcal.io.rig_file import save_rig
-from kcal.lens.rig import Origin, Rig
 from kcal.pipeline.stream import Stream
 from kcal.threads import Handover
 

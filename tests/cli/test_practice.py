@@ -15,11 +15,10 @@ from typer.testing import CliRunner
 
 import kcal.cli.demo_practice
 import kcal.io.images
+from kcal import FileError, Origin
 from kcal.cli.demo_practice import STEPS, TRUTH, next_step, night_name, practice_score, practice_site
 from kcal.cli.main import app
-from kcal.errors import FileError
-from kcal.lens.rig import Origin
-from kcal.locate.geodesy import enu_to_geodetic
+from kcal.locate import enu_to_geodetic
 from kcal.mark.items import Add, Mark, Put, Side
 from kcal.mark.session import Session
 from kcal.report.practice_score import score_positions, score_tracks

@@ -11,14 +11,10 @@ import pytest
 import torch
 from command_line import Command
 
+from kcal import Camera, FileError, InputError, Rig, load_camera, load_rig, save_camera, save_rig
 from kcal.corners.images import decode_image
-from kcal.errors import FileError, InputError
-from kcal.io.camera_file import load_camera, save_camera
 from kcal.io.images import encode_png
-from kcal.io.rig_file import load_rig, save_rig
-from kcal.lens.camera import Camera
-from kcal.lens.images import StereoRectification, Undistort
-from kcal.lens.rig import Rig
+from kcal.lens import StereoRectification, Undistort
 from kcal.lens.views import new_pinhole
 
 CAMERA = Camera.build(focal=(60, 60), center=(31, 24), size=(64, 48), coefficients=[-0.2, 0.02, 1e-3, -1e-3])

@@ -18,11 +18,9 @@ from calibrate_scenes import BOARD, camera, motions
 from locate_rigs import pinhole_rig
 from typer.testing import CliRunner
 
+from kcal import InputError, KcalError, Observations, View, save_rig
 from kcal.cli.main import app
-from kcal.corners.observations import Observations, View
-from kcal.errors import InputError, KcalError
-from kcal.io.rig_file import save_rig
-from kcal.lens.rig import RigCovariance
+from kcal.rig import RigCovariance
 from scripts.shared.station_scenes import ring
 
 # `kcal report` and `--require`: exit codes, JSON for programs, the page in a browser, completion of shells.

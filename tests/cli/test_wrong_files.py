@@ -21,13 +21,11 @@ from printed_boards import printed_points, printed_views
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from kcal import Board, Observations, View, load_camera, load_rig, save_camera, save_rig
-from kcal.calibrate.hybrid.measured_board import load_measured_board
+from kcal import Board, Camera, FileError, KcalError, Observations, View, load_camera, load_rig, save_camera, save_rig
+from kcal.calibrate import load_measured_board
 from kcal.cli.main import app, main
-from kcal.errors import FileError, KcalError
 from kcal.file_kind import file_kind
-from kcal.io.lookup_file import load_lookup
-from kcal.lens.camera import Camera
+from kcal.lens import load_lookup
 from scripts.fuzz import commands as fuzz
 from scripts.fuzz.damage import damage_json
 

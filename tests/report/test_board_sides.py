@@ -1,10 +1,7 @@
 import pytest
 import torch
 
-from kcal.corners.board import Board
-from kcal.errors import InputError
-from kcal.lens.camera import Camera
-from kcal.lens.rig import Rig
+from kcal import Board, Camera, InputError, Rig
 from kcal.report.judge_rig import triangulated_sides
 
 

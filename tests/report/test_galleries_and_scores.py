@@ -15,11 +15,10 @@ from drawn_scenes import calibrated, located
 from locate_rigs import located_pairs, pinhole_rig, tensor
 from matplotlib.colors import to_hex
 
+from kcal import FileError, Origin
 from kcal.corners.observations import Failure, Observations, View
-from kcal.errors import FileError
 from kcal.io.images import write_png
-from kcal.lens.rig import Origin
-from kcal.locate.geodesy import enu_to_geodetic
+from kcal.locate import enu_to_geodetic
 from kcal.report import positions
 from kcal.report.calibration import FailedImage, _predicted_sigma, _thumbnail, coverage_figure, gallery_figure
 from kcal.report.figures import ACCENT, WARN, round_levels

@@ -16,9 +16,8 @@ from locate_rigs import located_pairs, pinhole_rig, tensor
 from PIL import Image, TiffImagePlugin
 from waiting import wait_for
 
-from kcal.errors import FileError, InputError
-from kcal.lens.rig import Origin
-from kcal.locate.geodesy import enu_from_cam, geodetic_to_enu
+from kcal import FileError, InputError, Origin
+from kcal.locate import enu_from_cam, geodetic_to_enu
 from kcal.locate.positions import Located
 from kcal.report.map_page import local_image, local_tiles, map_page, save_map
 

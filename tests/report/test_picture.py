@@ -10,10 +10,9 @@ from locate_rigs import located_pairs, pinhole_rig, tensor
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from kcal.errors import InputError
-from kcal.lens.rig import Origin
+from kcal import InputError, Origin
+from kcal.locate import enu_from_cam
 from kcal.locate.budget import RangeError
-from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.positions import Located
 from kcal.report.figures import new_figure, save_picture
 from kcal.report.positions import budget_figure, positions_figure

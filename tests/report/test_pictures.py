@@ -16,16 +16,14 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver, QuiverKey
 
+from kcal import Board, Camera, InputError, Observations, View
 from kcal.calibrate.camera.advice import unreached_share
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.camera.export import Misfit
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations, View
-from kcal.errors import InputError
-from kcal.lens.camera import Camera
-from kcal.lens.difference import camera_difference
+from kcal.lens import camera_difference
 from kcal.locate.siting import siting_map
+from kcal.report import rig_figure, save_picture
 from kcal.report.calibration import (
     board_figure,
     board_text,
@@ -36,9 +34,7 @@ from kcal.report.calibration import (
     draw_coverage,
     gallery_figure,
 )
-from kcal.report.figures import save_picture
 from kcal.report.positions import _sigma_levels
-from kcal.report.rig import rig_figure
 
 # Pictures of cameras: no title is cut, panels fill the page, and they say the same as the commands do.
 

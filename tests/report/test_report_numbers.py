@@ -10,12 +10,9 @@ import pytest
 import torch
 from locate_rigs import located_pairs
 
-from kcal.errors import InputError
-from kcal.lens.calibration import CameraCalibration
-from kcal.lens.camera import Camera
+from kcal import Camera, InputError, Origin, Rig
+from kcal.lens import CameraCalibration, rotation_from_vector
 from kcal.lens.difference import camera_difference, difference_text
-from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Origin, Rig
 from kcal.report.calibration import difference_figure
 from kcal.report.pages import _correlations, _percent, _sentence, range_rows
 from kcal.report.positions import plotted_ranges

@@ -16,19 +16,12 @@ from drawn_scenes import FIGURES, calibrated, landmarks_rig, located, stations
 from locate_rigs import pinhole_rig
 from PIL import Image, TiffImagePlugin
 
-from kcal.calibrate.camera.result import CalibrationOptions
+from kcal import Board, CalibrationOptions, Camera, InputError, Observations, Origin, View
 from kcal.calibrate.camera.trust import Examination, HalvesDifference, PlainLens, ResidualStructure
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations, View
-from kcal.errors import InputError
 from kcal.finding import FAULTS, Finding
-from kcal.lens.calibration import CameraCalibration
-from kcal.lens.camera import Camera
-from kcal.lens.difference import camera_difference
-from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Origin, RigCovariance
+from kcal.lens import CameraCalibration, camera_difference, rotation_from_vector
+from kcal.locate import geodetic_to_enu
 from kcal.locate.budget import range_sigmas
-from kcal.locate.geodesy import geodetic_to_enu
 from kcal.locate.positions import map_places, region_rings
 from kcal.report.judge_camera import (
     _blur_finding,
@@ -54,6 +47,7 @@ from kcal.report.map_page import _box, _content, _placing, _tile, _warp, arcs_wi
 from kcal.report.pages import _caption, _correlations, camera_tables
 from kcal.report.verdict import RangeAnswer, Requirement, weighed_findings
 from kcal.report.verdict_pictures import _PART_COLORS
+from kcal.rig import RigCovariance
 
 CAMERA = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480), model="pinhole")
 

@@ -11,17 +11,15 @@ import torch
 from command_line import Command
 from locate_rigs import pinhole_rig
 
-from kcal import Board, Observations, View
+from kcal import Board, InputError, Observations, Rig, View, load_rig, save_rig
 from kcal.cli import report
 from kcal.cli.rig_sources import check_views_of
-from kcal.errors import InputError
 from kcal.finding import FAULTS, Finding
-from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.calibration import BoardRecord, CalibrationRecord, CameraCalibration, RigCalibration, RigSource
-from kcal.lens.rig import Rig, RigCovariance
+from kcal.report import rig_verdict
 from kcal.report.judge_camera import record_findings
-from kcal.report.judge_rig import rig_verdict
 from kcal.report.verdict import Requirement, Verdict
+from kcal.rig import RigCovariance
 
 NEED = Requirement.parse("1km:5%")
 NOW = datetime.datetime(2026, 1, 1, tzinfo=datetime.UTC)

@@ -8,8 +8,7 @@ import pytest
 import torch
 from locate_rigs import located_pairs, pinhole_rig, tensor
 
-from kcal.corners.board import Board
-from kcal.lens.rig import Rig
+from kcal import Board, Rig
 from kcal.locate.budget import range_sigmas
 from kcal.locate.geodesy import Origin
 from kcal.locate.positions import position_errors

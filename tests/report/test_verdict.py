@@ -12,15 +12,12 @@ import torch
 from calibrate_scenes import BOARD, camera, motions
 from torch import Tensor
 
+from kcal import Camera, InputError, Observations, Rig, View
 from kcal.calibrate.camera import trust
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
 from kcal.calibrate.camera.trust import Examination, HalvesDifference, examine, residual_structure
-from kcal.corners.observations import Observations, View
-from kcal.errors import InputError
 from kcal.finding import Finding
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Rig
+from kcal.lens import rotation_from_vector
 from kcal.lens.uncertainty import image_sigma
 from kcal.report.judge_camera import camera_verdict, stored_verdict, view_findings
 from kcal.report.judge_rig import rig_verdict, synchrony
