@@ -56,6 +56,8 @@ class BoardRecord:
     Example:
         >>> print(BoardRecord(columns=9, rows=6, square=0.025))
         9x6 inner corners, 25 mm squares
+        >>> print(BoardRecord(columns=9, rows=6, square=25.0))
+        9x6 inner corners, 25 m squares
     """
 
     columns: int
