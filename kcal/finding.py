@@ -30,7 +30,7 @@ KINDS = {
     "excluded": ("not used", "views", "lenses"), "start": ("focal length for the start", "", "lenses"),
     "copies": ("copies of views", "", "lenses"), "repeated": ("poses that repeat", "poses", "lenses"),
     "moving-lens": ("lens that moves", "", "lenses"), "alone": ("calibrated alone", "", "lenses"),
-    "stars": ("boards and stars", "", "lenses"),
+    "stars": ("boards and stars", "", "lenses"), "unit": ("size of the board", "", FAULTS),
     "error-bars": ("error bars", "", ""), "view": ("common view", "", ""),
     "misfit": ("size of residuals", "rig", "relative pose"), "record": ("no record", "", "relative pose"),
     "synchronization": ("same moment", "rig", "relative pose"), "exact-lenses": ("exact lenses", "", "lenses"),

@@ -10,7 +10,18 @@ import typer
 from rich.markup import escape
 
 from kcal.cli import kinds
-from kcal.cli.console import ending_with, out, print_table, print_wrote, steps, tell, views_cure, warn, with_command
+from kcal.cli.console import (
+    ending_with,
+    out,
+    print_left_out,
+    print_table,
+    print_wrote,
+    steps,
+    tell,
+    views_cure,
+    warn,
+    with_command,
+)
 from kcal.cli.inputs import BOARD, calibrated_camera, check_file, pixel_sigma_of
 from kcal.cli.options import Kind, Rare, Several
 from kcal.cli.report import NO, judged, required, told_usable
@@ -59,8 +70,8 @@ def stated_settings(texts: list[str] | None, count: int) -> list[dict[str, float
 # What `kcal calibrate` tells of a calibration: to persons, and to programs.
 
 
-def print_calibration(result: CameraCalibrationResult, *, reject: bool, verbose: bool) -> None:
-    """Print what a person reads: noise, uncertainty, parameters, board, warnings, what to photograph next."""
+def print_calibration(result: CameraCalibrationResult, beside: Path, *, reject: bool, verbose: bool) -> None:
+    """Print what a person reads; a long list of what was left out goes to a file beside the camera's."""
     from kcal.calibrate.camera.trust import distances_text, summarize
 
     assert result.camera.calibration is not None
@@ -103,8 +114,8 @@ def print_calibration(result: CameraCalibrationResult, *, reject: bool, verbose:
         out.print(f"board warp: {x:+.3f} mm along its rows, {y:+.3f} mm along its columns")
     if reject:
         out.print(f"left out: {100 * result.rejected_share:.2f} % of the corners")
-    for entry in result.excluded:
-        out.print(f"  {entry.name}: {entry.reason}", markup=False)
+    lines = [f"{entry.name}: {entry.reason}" for entry in result.excluded]
+    print_left_out(lines, beside, f"{len(lines)} views and corners were left out")
     for text in result.warnings:
         warn(text)
     for text in result.advice:
@@ -329,7 +340,7 @@ def calibrate_command(
             from kcal.report.figures import save_picture
 
             save_picture(place.picture, calibration_figure(result, place.name))
-        print_calibration(result, reject=reject, verbose=verbose or not options.hybrid)
+        print_calibration(result, place.output, reject=reject, verbose=verbose or not options.hybrid)
         if result.shared_board is not None:
             others = ", ".join(places[i].name for i in result.shared_board.others)
             out.print(f"the board is that of {others} (evidence {result.shared_board.evidence:.0f} nats)", markup=False)

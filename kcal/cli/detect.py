@@ -193,13 +193,15 @@ def _next_command(
 
 
 def _of_each_size(images: Sequence[str], paths: Sequence[Path], output: Path) -> Iterator[str]:
-    """A command for the images of each size, those of most first."""
+    """A command for the images of each size, those of most first; sizes that may be of one camera stay together."""
     from kcal.corners.detect import size_of
+    from kcal.corners.observations import nearly, resized_alike
 
     groups: dict[tuple[int, int], list[str]] = {}
     for path in paths:
         if (size := size_of(path)) is not None:
-            groups.setdefault(size, []).append(str(path))
+            alike = (other for other in groups if nearly(size, other) or resized_alike(size, other))
+            groups.setdefault(next(alike, size), []).append(str(path))
     for (width, height), files in sorted(groups.items(), key=lambda group: -len(group[1])):
         own = output.with_name(f"{output.name.split('.')[0]}-{width}x{height}.obs.json")
         words = [str(own) if word == str(output) else word for word in typed if word not in images]

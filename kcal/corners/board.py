@@ -183,6 +183,9 @@ def target_fields(path: str | Path) -> dict[str, Any]:
 
 # Describe a calibration board: its points, the size of its squares, its markers.
 
+# Meters: the longer side of an A0 sheet, and a board so small that it is seldom printed; and what is usual.
+_SHEETS, _LIKELY = (0.02, 1.19), 0.08
+
 Pattern = Literal["checkerboard", "circles", "asymmetric", "aprilgrid"]
 TAGS = "apriltag_36h11"  # the dictionary of an AprilGrid
 _TARGET_FILES = (".yaml", ".yml")
@@ -362,6 +365,22 @@ class Board(Record):
             return (0,)
         square = self.columns == self.rows and (self.pattern == "circles" or self.rows % 2 == 0)
         return (0, 1, 2, 3) if square else (0, 2)
+
+    @property
+    def likelier_square(self) -> float | None:
+        """The side of a square with which the board has the size of a sheet of paper; None if it has about that now.
+
+        Meters. Nothing in images tells a unit that was mistyped: a board ten times as large is ten times as far away.
+
+        Example:
+            >>> Board.parse("9x6", "25.4cm").likelier_square, Board.parse("9x6", "25.4mm").likelier_square
+            (0.0254, None)
+        """
+        longest = max(self.extent)
+        if _SHEETS[0] <= longest <= _SHEETS[1]:
+            return None
+        sizes = (self.square * 10.0**power for power in (-1, -2, -3, 1, 2, 3))
+        return next((round(size, 9) for size in sizes if _LIKELY <= longest * size / self.square <= _SHEETS[1]), None)
 
     @property
     def unambiguous(self) -> bool:

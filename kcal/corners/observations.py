@@ -220,12 +220,12 @@ def common_size(names: Sequence[str], sizes: Sequence[Size | None]) -> CommonSiz
         return CommonSize((0, 0), {}, {}, ())
 
     def fitting(size: Size) -> int:
-        return sum(len(group) for other, group in groups.items() if _nearly(other, size) or resized_alike(other, size))
+        return sum(len(group) for other, group in groups.items() if nearly(other, size) or resized_alike(other, size))
 
     most = max(groups, key=lambda size: (fitting(size), len(groups[size]), size[0] * size[1]))
     shown = f"{most[0]}x{most[1]} px of most images"
     others = sorted((size for size in groups if size != most), key=lambda size: (-len(groups[size]), size))
-    near = [size for size in others if _nearly(size, most)]
+    near = [size for size in others if nearly(size, most)]
     alike = [size for size in others if resized_alike(size, most)]
     wrong = [size for size in others if size not in (*near, *alike)]
     turned = {size for size in wrong if (size[1], size[0]) == most or resized_alike((size[1], size[0]), most)}
@@ -235,8 +235,8 @@ def common_size(names: Sequence[str], sizes: Sequence[Size | None]) -> CommonSiz
         )
         cure = "turn back those that were turned by 90 degrees, or " if turned else ""
         raise InputError(
-            f"images of different sizes, of which none has more than half: {counts}; {cure}run kcal detect on those of "
-            "each size apart, as on a camera of its own"
+            f"images of different sizes, of which none has more than half: {counts}; {cure}detect those of each size "
+            "apart, as those of a camera of its own"
         )
     notes = [
         f"images of {w}x{h} px were taken as they are among the {shown}; which edge has more pixels is not known: "
@@ -267,7 +267,8 @@ def common_size(names: Sequence[str], sizes: Sequence[Size | None]) -> CommonSiz
     return CommonSize(most, scales, left_out, tuple(notes))
 
 
-def _nearly(one: Size, other: Size) -> bool:
+def nearly(one: Size, other: Size) -> bool:
+    """Whether images differ by a pixel or two, as programs cut or pad them."""
     return max(abs(one[0] - other[0]), abs(one[1] - other[1])) <= _SAME
 
 

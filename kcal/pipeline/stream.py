@@ -460,6 +460,9 @@ class Stream:
         if self.ledger.state is not None:
             try:
                 restore(tracker, self.ledger.state)
+            except FileError as error:
+                self.ledger.close()
+                raise FileError(f"{journal}: {error}") from error
             except BaseException:
                 self.ledger.close()
                 raise

@@ -8,10 +8,14 @@ import numpy as np
 import pytest
 from command_line import Command
 from numpy.typing import NDArray
+from PIL import Image
 
-from kcal import Board, Camera, InputError, detect
+from kcal import Board, Camera, InputError, Observations, detect
+from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.corners import detect_board, recognize_board
+from kcal.corners.images import decode_gray, decode_image, exif_orientation, expand_images, image_header
 from kcal.corners.recognize import Recognized, circle_board, marker_board, most_markers, seen_board, spread_order
+from kcal.io.images import write_png
 from scripts.shared.printed_board import Paper, pose
 
 CAMERA = Camera.build(focal=(700, 700), center=(379.5, 279.5), size=(760, 560))
@@ -126,3 +130,80 @@ def test_a_board_that_is_often_covered_is_no_other_one() -> None:
     assert seen.names[0] == "image 0"
     # Fewer than half, so that others were looked at.
     assert 2 * len(seen.views) < 5
+
+
+def test_images_of_two_cameras_end_with_a_command_for_each(
+    kcal_data: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The commands can be pasted: they are run here."""
+    monkeypatch.chdir(tmp_path)
+    files = [*(f"left0{number}.jpg" for number in (1, 2)), *(f"calibration{number}.jpg" for number in (1, 7))]
+    for name, folder in zip(files, 2 * ["opencv_stereo"] + 2 * ["captures/carnd"], strict=True):
+        (tmp_path / name).symlink_to(kcal_data / folder / name)
+    said = command("detect . --board 9x6 --square 25mm -o x.obs.json", code=1).err
+    lines = said.split("To split them: ")[1].strip().split(" && ")
+    assert [line.split(" -o ")[1] for line in lines] == ["x-1280x720.obs.json", "x-640x480.obs.json"]
+    for line in lines:
+        command(line.removeprefix("kcal "))
+    found = [Observations.load(line.split(" -o ")[1]) for line in lines]
+    assert [len(seen.views) + len(seen.failures) for seen in found] == [2, 2]
+    assert all(seen.views for seen in found)
+
+
+def test_many_images_that_failed_are_one_line_and_a_file(
+    tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_png(tmp_path / "a.png", shots(Board.parse("9x6", "25mm"), 0.4, TILTS[0])[0])
+    for number in range(13):
+        (tmp_path / f"b{number}.png").write_bytes(b"")
+    said = command("detect . --board 9x6 --square 25mm -o x.obs.json").out
+    line = "13 images failed, 13 of them: the file is empty; copy it again; all of them: x.left-out.txt"
+    assert line in said.splitlines()
+    assert len((tmp_path / "x.left-out.txt").read_text().splitlines()) == 13
+    (tmp_path / "b0.png").unlink()
+    few = command("detect . --board 9x6 --square 25mm -o y.obs.json").out
+    assert "  failed b1.png: the file is empty; copy it again" in few.splitlines()
+    assert not (tmp_path / "y.left-out.txt").exists()
+
+
+def test_raw_and_heic_images_of_a_folder_are_named_with_what_to_do(tmp_path: Path) -> None:
+    page = shots(Board.parse("9x6", "25mm"), 0.4, TILTS[0])[0]
+    write_png(tmp_path / "a.png", page)
+    for name in ("a.CR2", "b.CR2", "c.heic"):
+        (tmp_path / name).write_bytes(
+            bytes(3) + b"\x18ftypheic" + bytes(100) if "heic" in name else b"II*\0" + bytes(99)
+        )
+    # The raw image of which a picture is there is not a failure of its own.
+    assert [path.name for path in expand_images([tmp_path])] == ["a.png", "b.CR2", "c.heic"]
+    seen = detect(tmp_path, Board.parse("9x6", "25mm"), note=lambda _: None)
+    raw, heic = seen.failures
+    assert (raw.name, heic.name) == ("b.CR2", "c.heic")
+    assert "a raw image, which has to be developed first" in raw.reason
+    assert heic.reason.startswith("a HEIC image, which needs one more package: pip install pillow-heif")
+
+
+@pytest.mark.parametrize(("turns", "orientation"), [(0, 1), (1, 8), (2, 3), (3, 6)])
+def test_heic_is_as_the_sensor_wrote_it(turns: int, orientation: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Decoders turn it as the file asks; kcal turns it back."""
+    stored = np.arange(40 * 30, dtype=np.uint8).reshape(30, 40)
+    data = bytes(3) + b"\x18ftypheic" + bytes(8) + b"\0\0\0\x09irot" + bytes([turns])
+    shown = Image.fromarray(np.ascontiguousarray(np.rot90(stored, turns)))
+    monkeypatch.setattr("kcal.corners.images._opened_heif", lambda data, source: shown)
+    assert np.array_equal(decode_gray(data, "a.heic"), stored)
+    assert np.array_equal(decode_image(data, "a.heic")[..., 0], stored)
+    assert image_header(data, "a.heic") == (40, 30)
+    assert exif_orientation(data) == orientation
+
+
+def test_a_unit_that_cannot_be_is_asked_about(kcal_data: Path) -> None:
+    """A board of 2 m, where a sheet of paper is meant."""
+    seen = Observations.load(kcal_data / "captures" / "st1_l.obs.json")
+    seen = seen.subset(list(seen.names[::3]))
+    large = seen.model_copy(update={"board": seen.board.model_copy(update={"square": 10.0 * seen.board.square})})
+    assert large.board.likelier_square == pytest.approx(seen.board.square)
+    told = [[found for found in calibrate_camera(one).findings if found.name == "unit"] for one in (seen, large)]
+    assert told[0] == []
+    (found,) = told[1]
+    assert "with squares of 242.3 mm the board is 1.94 x 1.21 m, photographed with a focal length of " in found.text
+    assert "with squares of 24.23 mm it would be 0.194 x 0.121 m, from 0.3" in found.text

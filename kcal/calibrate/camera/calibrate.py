@@ -26,7 +26,7 @@ from kcal.calibrate.camera.result import (
     SharedBoard,
 )
 from kcal.calibrate.camera.solve import calibrate_parametric
-from kcal.calibrate.camera.warnings import spacing_findings
+from kcal.calibrate.camera.warnings import spacing_findings, unit_findings
 from kcal.calibrate.hybrid.base_fit import may_be_unequal
 from kcal.calibrate.hybrid.board_modes import turned_corners
 from kcal.calibrate.hybrid.cameras_fit import LEAST_CAMERAS, Run, fit_cameras
@@ -101,6 +101,7 @@ def sharing(
         pixels = before.observations.pixels()
         copied = {k: of for k, of in copied_views(pixels, before.noise).items() if k not in used[i]}
         repeats = (*copy_findings(before.observations.names, copied), *pose_findings(pixels[used[i]]))
+        repeats = (*repeats, *unit_findings(after))
         found[i] = dataclasses.replace(
             after,
             findings=(*lasting_findings(before), *after.findings, *repeats),
@@ -243,6 +244,7 @@ def _complete(
     """A result without copies as one for all observations, with doubts about views that add nothing."""
     pixels, names = observations.pixels(), observations.names
     findings = (*result.findings, *copy_findings(names, copied), *pose_findings(result.observations.pixels()))
+    findings = (*findings, *unit_findings(result))
     kept = [i for i in range(len(names)) if i not in copied]
     left_out = tuple(
         Rejected(

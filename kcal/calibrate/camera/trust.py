@@ -18,7 +18,7 @@ from torch import Tensor
 from kcal.calibrate.camera.advice import unreached_share
 from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult, OutlierRejection, Progress
-from kcal.calibrate.camera.warnings import corner_pupil
+from kcal.calibrate.camera.warnings import board_distances, corner_pupil, distance_text
 from kcal.calibrate.hybrid.fitted_views import moving_residuals
 from kcal.calibrate.problem.poses import poses_under
 from kcal.calibrate.problem.views import Views
@@ -402,16 +402,9 @@ def distances_text(result: CameraCalibrationResult) -> str:
     The board in millimeters from outer corner to outer corner, and distances in meters.
     """
     board = result.observations.board
-    far = result.cam_from_board_translation
-    middle = (result.cam_from_board_rotation @ board.points.mean(0)) + far
-    distance = middle.norm(dim=-1)
-    distance = distance[distance.isfinite()]
+    nearest, farthest = board_distances(result)
     width, height = (1e3 * side for side in board.extent)
     return (
         f"board {board.record}: {width:g} x {height:g} mm; "
-        f"nearest view {_distance_text(float(distance.min()))}, farthest {_distance_text(float(distance.max()))}"
+        f"nearest view {distance_text(nearest)}, farthest {distance_text(farthest)}"
     )
-
-
-def _distance_text(value: float) -> str:
-    return f"{value:.{max(0, 1 - math.floor(math.log10(value)))}f} m" if value > 0 else "0 m"

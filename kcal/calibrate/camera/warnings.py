@@ -18,6 +18,7 @@ from kcal.errors import InputError
 from kcal.finding import Finding
 from kcal.lens.camera import Camera
 from kcal.lens.projection import pupil_depth
+from kcal.lens.uncertainty import paraxial_focal
 from kcal.solve.problem import SolverStatus
 from kcal.texts import percent_text
 
@@ -389,3 +390,39 @@ def general_findings(
                 "choose a smaller model, or add views with corners there",
             )  # fmt: skip
     return found
+
+
+# The size of the board, and its unit.
+
+
+def board_distances(result: CameraCalibrationResult) -> tuple[float, float]:
+    """Of the board's middle in the nearest and in the farthest view, meters."""
+    board = result.observations.board
+    far = result.cam_from_board_translation
+    middle = (result.cam_from_board_rotation @ board.points.mean(0)) + far
+    distance = middle.norm(dim=-1)
+    distance = distance[distance.isfinite()]
+    return float(distance.min()), float(distance.max())
+
+
+def unit_findings(result: CameraCalibrationResult) -> list[Finding]:
+    """Ask about a board that is larger than any sheet of paper, or tiny: another unit of its squares may be meant."""
+    board = result.observations.board
+    square = board.likelier_square
+    if square is None:
+        return []
+    (wide, high), scale, (nearest, farthest) = board.extent, square / board.square, board_distances(result)
+    focal = float(paraxial_focal(result.camera).value.mean())
+    text = (
+        f"with squares of {1e3 * board.square:g} mm the board is {wide:.3g} x {high:.3g} m, photographed with a focal "
+        f"length of {focal:.0f} px from "
+        f"{distance_text(nearest)} to {distance_text(farthest)}; with squares of {1e3 * square:g} mm it would be "
+        f"{wide * scale:.3g} x {high * scale:.3g} m, from {distance_text(nearest * scale)} to "
+        f"{distance_text(farthest * scale)}. All lengths that come of it scale alike"
+    )
+    return [Finding("unit", "doubt", text, "measure a square, and detect again if its unit was wrong (--square)")]
+
+
+def distance_text(value: float) -> str:
+    """Meters with two digits."""
+    return f"{value:.{max(0, 1 - math.floor(math.log10(value)))}f} m" if value > 0 else "0 m"
