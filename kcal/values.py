@@ -35,7 +35,7 @@ def with_sigma(text: str, name: str) -> WithSigma:
     """A number, with its standard deviation if that is known; `+-` may be typed for `±`.
 
     Raises:
-        InputError: no finite number, or a negative standard deviation.
+        InputError: no number, or a standard deviation that is negative.
 
     Example:
         >>> with_sigma("10.02+-0.005", "--baseline")
@@ -43,7 +43,8 @@ def with_sigma(text: str, name: str) -> WithSigma:
     """
     parts = text.replace("+-", "±").split("±")
     values = [_number_or_nan(part) for part in parts]
-    if len(values) > 2 or not all(map(math.isfinite, values)) or (len(values) == 2 and values[1] < 0):
+    unread = any(value != value and part.strip().lower() != "nan" for value, part in zip(values, parts, strict=True))
+    if len(values) > 2 or unread or not all(0 <= sigma < math.inf for sigma in values[1:]):
         raise InputError(f"{name} {text!r}: write VALUE±SIGMA, for example 12±3, or the value alone")
     return WithSigma(*values)
 

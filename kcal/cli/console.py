@@ -59,6 +59,7 @@ err = _PlainConsole(stderr=True, soft_wrap=True, highlight=False, emoji=False)
 
 # What the running command tells programs, if it was asked to.
 _told: dict[str, Any] = {}
+_as_json = False
 
 
 def tell(**content: Any) -> None:
@@ -66,9 +67,16 @@ def tell(**content: Any) -> None:
     _told.update(content)
 
 
-def tell_anew() -> None:
-    """Forget what was told before: a command begins."""
+def tell_anew(as_json: bool) -> None:
+    """A command begins: forget what was told before."""
+    global _as_json
+    _as_json = as_json
     _told.clear()
+
+
+def json_asked() -> bool:
+    """Whether what the command tells is printed as JSON, in place of what a person reads."""
+    return _as_json
 
 
 def told() -> dict[str, Any]:

@@ -82,7 +82,7 @@ def readme_text(scene: DemoScene) -> str:
         f"{number}. {step.name}\n" + "\n".join(f"   {command}" for command in step.commands)
         for number, step in enumerate(STEPS, 1)
     )
-    place = f"--lat {scene.lat:g} --lon {scene.lon:g} --height {scene.height:g}"
+    place = f"--site {scene.lat:g},{scene.lon:g},{scene.height:g}"
     return _template("README.txt").format(commands=commands, night=night_name("left"), place=place)
 
 

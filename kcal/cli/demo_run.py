@@ -190,7 +190,7 @@ def run(name: str, *arguments: object) -> None:
         commands = {
             "detect": detect_command,
             "calibrate": calibrate_command,
-            "locate": locate_command,
+            "locate": declared(locate_command),
             "report": report_command,
         }
         app.command(cls=Command)(declared(commands[name]) if name != "locate" else commands[name])  # type: ignore[arg-type,type-var]
@@ -236,11 +236,11 @@ def real_pairs(
         run("calibrate", output / f"{side}.obs.json", "-o", camera, "--picture", picture)
     cameras, seen = ([output / f"{side}.{kind}.json" for side in SIDES] for kind in ("camera", "obs"))
     # Few pairs: none is left out, so that each board can be compared.
-    run("rig", *cameras, "--pairs", *seen, "--keep-all", "-o", output / "rig.json")
+    run("rig", *cameras, "--pairs", *seen, "--no-reject", "-o", output / "rig.json")
 
     write_marks(output / "points.csv", _board_ends(output, board))
     where = origin or Origin(lat=0.0, lon=0.0, height=0.0)
-    command = locate_again(output, f"--origin={where.lat},{where.lon},{where.height}", f"--heading={heading}")
+    command = locate_again(output, f"--site={where.lat},{where.lon},{where.height}", f"--heading={heading}")
     marks = read_marks(output / "points.csv")
     rig = load_pair(output / "rig.json")
     located = locate_points(Localizer(rig, origin=where, heading_deg=heading), marks)
@@ -315,9 +315,9 @@ def simulated_site(output: Path, seed: int) -> None:
     run(
         "rig", *(output / f"{side}.camera.json" for side in SIDES),
         "--landmarks", output / "survey.csv", "--marks", output / "landmarks.csv", "--pixel-sigma", scene.mark_sigma,
-        f"--origin={scene.lat},{scene.lon},{scene.height}", "-o", output / "rig.json", "--picture", output / "rig.png",
+        f"--site={scene.lat},{scene.lon},{scene.height}", "-o", output / "rig.json", "--picture", output / "rig.png",
         # The simulated light goes straight.
-        "--refraction=0", "--refraction-sigma=0",
+        "--refraction=0±0",
     )  # fmt: skip
     clock.lap("rig")
 

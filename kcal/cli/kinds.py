@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import datetime
+import math
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -40,6 +42,17 @@ MeasuredMeters = Annotated[WithSigma, Kind(metavar="M±SIGMA", read=values.with_
 MeasuredDegrees = Annotated[WithSigma, Kind(metavar="DEG±SIGMA", read=values.with_sigma, usage=True)]
 MeasuredRefraction = Annotated[WithSigma, Kind(metavar="K±SIGMA", read=values.with_sigma, usage=True)]
 
+
+def _read_height(text: str, name: str) -> tuple[float, float]:
+    found = values.with_sigma(text, name)
+    if not math.isfinite(found.value) or found.sigma == 0:
+        raise InputError(f"{name} {text!r}: write meters above the ellipsoid, and their sigma, for example 12±3")
+    return (found.value, 1.0 if found.sigma is None else found.sigma)
+
+
+Height = Annotated[tuple[float, float], Kind(metavar="M±SIGMA", read=_read_height)]
+Clock = Annotated[float, Kind(metavar="S")]
+
 # Texts that stand for more than one number.
 Distance = Annotated[float, Kind(metavar="DISTANCE", read=values.distance)]
 Distances = Annotated[tuple[float, ...], Kind(metavar="M,M,...", read=values.number_list)]
@@ -64,6 +77,21 @@ Inner = Annotated[str, Kind(metavar="CxR")]
 Side = Annotated[str, Kind(metavar="LENGTH")]
 
 
+def read_time(text: str, name: str) -> datetime.datetime:
+    """A time with its zone."""
+    return values.instant(text, name)
+
+
+Times = Annotated[
+    str,
+    Kind(
+        metavar="TIME",
+        about="When, with its zone: 2026-11-24T20:47:26Z; name:Z or name:+02:00 reads it from each file's name.",
+    ),
+]
+Time = Annotated[datetime.datetime, Kind(metavar="TIME", read=read_time)]
+
+
 class KnownPlace(NamedTuple):
     """Where a camera stands on the Earth.
 
@@ -76,7 +104,7 @@ class KnownPlace(NamedTuple):
     sigma: float | None = None
 
 
-def read_site(text: str, name: str) -> KnownPlace:
+def read_place(text: str, name: str) -> KnownPlace:
     """`LAT,LON,HEIGHT`, or `LAT,LON,HEIGHT±SIGMA`."""
     from kcal.lens.rig import Origin
 
@@ -84,7 +112,32 @@ def read_site(text: str, name: str) -> KnownPlace:
     return KnownPlace(Origin(lat=lat, lon=lon, height=height), sigma)
 
 
-Place = Annotated[KnownPlace, Kind(metavar="LAT,LON,HEIGHT[±M]", read=read_site)]
+Place = Annotated[KnownPlace, Kind(metavar="LAT,LON,HEIGHT[±M]", read=read_place)]
+
+
+def _read_origin(text: str, name: str) -> Origin:
+    known = read_place(text, name)
+    if known.sigma is not None:
+        raise InputError(f"{name} {text!r}: no ± is used here; write LAT,LON,HEIGHT")
+    return known.origin
+
+
+Site = Annotated["Origin", Kind(metavar="LAT,LON,HEIGHT", read=_read_origin)]
+
+
+def _read_needs(text: str, name: str) -> tuple[Requirement, ...]:
+    from kcal.report.verdict import Requirement
+
+    return Requirement.parse(text) if text else ()
+
+
+Requirements = Annotated[
+    tuple["Requirement", ...],
+    Kind(
+        metavar="RANGE:ERROR", read=_read_needs,
+        about="What you need: ranges and the largest σ of each, for example 5km:10% or 800m:20m,5km:10%.{}",
+    ),
+]  # fmt: skip
 
 # Boards. What a corner is refined by has the names of `kcal.corners.refine.Refinement`.
 
@@ -145,6 +198,8 @@ Sites = Annotated[Path, Kind(metavar="CSV"), inputs.SITES]
 Images = Annotated[str, Kind(metavar="IMAGES"), inputs.IMAGES]
 AnyFile = Annotated[str, inputs.CAMERA_OR_RIG]
 ForeignFile = Annotated[str, inputs.FOREIGN]
+History = Annotated[Path, Kind(metavar="CSV")]
+Videos = Annotated[list[str], inputs.VIDEO]
 Raster = Annotated[Path, Kind(metavar="RASTER")]
 
 # Files that are written. A name that no picture can have is refused before anything is computed.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 import os
 import sys
 import time as clocks
@@ -12,9 +11,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from kcal.cli import kinds
 from kcal.cli.console import err, on_signals, steps
-from kcal.cli.inputs import RIG, VIDEO, PixelSigma, pixel_sigma_of
-from kcal.cli.settings import rarely, settings_file, taken
+from kcal.cli.inputs import pixel_sigma_of
+from kcal.cli.locate import LocateOptions, pair_localizer
+from kcal.cli.options import Kind, Only, Rare
+from kcal.cli.settings import taken
 from kcal.errors import InputError, with_extra
 from kcal.files import check_writable
 from kcal.texts import measured_text
@@ -32,79 +34,22 @@ if TYPE_CHECKING:
 
 
 def live_command(
-    rig: Annotated[Path, typer.Argument(help="Rig file from `kcal rig`."), RIG],
-    output: Annotated[
-        list[Path], typer.Option("-o", "--output", help="File that grows: .geojsonl, .csv or .cot; may be repeated.")
-    ],
-    videos: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="[LEFT RIGHT]",
-            help="Video files or addresses (rtsp://...), with --detector: one for each camera, in the rig's order.",
-        ),
-        VIDEO,
-    ] = None,
-    detector: Annotated[
-        str | None,
-        typer.Option(
-            metavar="MODULE:CALLABLE",
-            help="Called with each image, uint8 (H, W, 3) in the order red, green, blue; returns boxes in pixels.",
-        ),
-    ] = None,
-    detections: Annotated[
-        str | None,
-        typer.Option(
-            metavar="JSONL", help="In place of videos: lines of JSON, one for each moment; - for the standard input."
-        ),
-    ] = None,
-    to: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="ADDRESS",
-            help="Where positions go besides: udp://HOST:PORT or tcp://HOST:PORT for Cursor-on-Target, "
-            "mqtt://HOST/TOPIC; may be repeated.",
-        ),
-    ] = None,
-    port: Annotated[
-        int | None,
-        typer.Option("--port", metavar="PORT", help="Serve the live map to this machine's browser; 0: any free port."),
-    ] = None,
-    journal: Annotated[
-        Path | None, rarely("", "Remembers what was written; the first output with .journal if not given.")
-    ] = None,
-    origin: Annotated[
-        str | None,
-        typer.Option(metavar="LAT,LON,HEIGHT", help="Position of the left camera; from the rig file if not given."),
-    ] = None,
-    heading: Annotated[
-        float | None, typer.Option(metavar="DEG", help="Azimuth of the left camera's axis; needed with --origin.")
-    ] = None,
-    pixel_sigma: PixelSigma = None,
-    box_sigma: Annotated[float, rarely("PX", "Noise of the middle of a box, each axis.")] = 2.0,
-    match_sigma: Annotated[
-        float, rarely("PX", "Error of matched images that compression of the videos adds, each axis.")
-    ] = 0.06,
-    clock_offset: Annotated[
-        float, rarely("S", "Seconds by which the right images are later than their times; of two cameras.")
-    ] = 0.0,
-    clock_sigma: Annotated[
-        float,
-        typer.Option(
-            metavar="S", help="Its standard deviation, also as a drift in an hour; above 0 it is estimated.", min=0
-        ),
-    ] = 0.0,
-    compiled: Annotated[
-        bool, rarely("", "Translate the filter to C++ first, which takes minutes; for many targets.", "--compile")
-    ] = False,
-    watch: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="HISTORY", help="History that `kcal watch` writes meanwhile: attitudes and sigmas of each moment."
-        ),
-    ] = None,
-    start: Annotated[
-        str | None, rarely("ISO", "Calendar time of second 0, if times are not Unix seconds; for events.")
-    ] = None,
+    rig: kinds.RigFile,
+    videos: kinds.Videos | None = None,
+    *,
+    output: list[kinds.Output],
+    detector: Annotated[str, Kind(metavar="MODULE:CALLABLE")] | None = None,
+    detections: Annotated[str, Kind(metavar="JSONL")] | None = None,
+    to: Annotated[list[str], Kind(metavar="ADDRESS")] | None = None,
+    port: Annotated[int, Kind(metavar="PORT")] | None = None,
+    journal: Rare[Path | None] = None,
+    options: Annotated[LocateOptions, Only(("site", "heading", "pixel_sigma", "history"))],
+    box_sigma: Rare[kinds.Pixels] = 2.0,
+    match_sigma: Rare[kinds.Pixels] = 0.06,
+    clock_offset: Rare[kinds.Clock] = 0.0,
+    clock_sigma: kinds.Seconds = 0.0,
+    compile: Rare[bool] = False,
+    start: Rare[kinds.Time | None] = None,
 ) -> None:
     """Follow what cameras see: tracks with latitude, longitude, velocity and honest errors, written as they come.
 
@@ -133,6 +78,24 @@ def live_command(
     `kcal live rig.json left.mp4 right.mp4 --detector mydetector:find -o tracks.geojsonl`
 
     `detector | kcal live rig.json --detections - -o tracks.csv --to udp://239.2.3.1:6969`
+
+    Args:
+        rig: Rig file from `kcal rig`.
+        videos: Video files or addresses (rtsp://...), with --detector: one for each camera, in the rig's order.
+        output: File that grows: .geojsonl, .csv or .cot; may be repeated.
+        detector: Called with each image, uint8 (H, W, 3) in the order red, green, blue; returns boxes in pixels.
+        detections: In place of videos: lines of JSON, one for each moment; - for the standard input.
+        to: Where positions go besides: udp://HOST:PORT or tcp://HOST:PORT for Cursor-on-Target, mqtt://HOST/TOPIC; may
+            be repeated.
+        port: Serve the live map to this machine's browser; 0: any free port.
+        journal: Remembers what was written; the first output with .journal if not given.
+        box_sigma: Noise of the middle of a box, each axis.
+        match_sigma: Error of matched images that compression of the videos adds, each axis.
+        clock_offset: Seconds by which the right images are later than their times; of two cameras.
+        clock_sigma: Standard deviation of the offset between the cameras' clocks, also as a drift in an hour; above 0
+            the offset is estimated.
+        compile: Translate the filter to C++ first, which takes minutes; for many targets.
+        start: Calendar time of second 0, if times are not Unix seconds; for events.
     """
     from kcal.locate.stations import names_of_rig
     from kcal.pipeline.association import AssociationOptions
@@ -142,39 +105,38 @@ def live_command(
     from kcal.pipeline.stream import Stream, lines_of
     from kcal.pipeline.tracks import Tracker, TrackOptions
 
-    if (origin is None) != (heading is None):
-        raise typer.BadParameter("--origin and --heading belong together")
+    if (options.site is None) != (options.heading is None):
+        raise typer.BadParameter("--site and --heading belong together")
     if (detections is None) == (not videos):
         raise typer.BadParameter("give videos and --detector, or --detections")
     names = names_of_rig(rig)
     if videos and (len(videos) != len(names) or detector is None):
         raise typer.BadParameter(f"{len(names)} videos, of the cameras {', '.join(names)}, and --detector are needed")
     many = names != ("left", "right")
-    if many and (clock_offset or {"origin", "heading", "match_sigma"} & taken or heading is not None):
-        raise typer.BadParameter("--origin, --heading, --clock-offset and --match-sigma are of rigs of two cameras")
-    if many and watch is not None:
-        raise typer.BadParameter("--watch is for rigs of two cameras")
+    if many and (clock_offset or {"site", "heading", "match_sigma"} & taken or options.heading is not None):
+        raise typer.BadParameter("--site, --heading, --clock-offset and --match-sigma are of rigs of two cameras")
+    if many and options.history is not None:
+        raise typer.BadParameter("--history is for rigs of two cameras")
     lines = Path(detections) if detections not in (None, "-") else None
     for path in output:
         check_writable(path, rig, *([lines] if lines else []), *(videos or []))
-    moment_zero = None if start is None else _calendar_time(start)
     clock = ClockPrior(offset_s=clock_offset, offset_sigma_s=clock_sigma, drift_sigma=clock_sigma / 3600.0)
-    options = AssociationOptions(box_sigma=box_sigma)
-    localize, run = _stations(rig, pixel_sigma) if many else _mast(rig, origin, heading, pixel_sigma)
+    joining = AssociationOptions(box_sigma=box_sigma)
+    localize, run = _stations(rig, options.pixel_sigma) if many else _mast(rig, options)
     solved = localize if many else localize.rig
 
-    if compiled:
+    if compile:
         err.print("compiling: some three minutes the first time")
     follow = TrackOptions.for_video(match_sigma) if videos else None
-    moments, moving = (None, 0) if watch is None else _moments(watch, localize)
-    tracker = Tracker(localize, follow, clock=clock, compiled=compiled, moments=moments, moving=moving)
-    frames = _videos(videos, detector, solved, tracker, options, match_sigma) if videos and detector else None
-    source = frames or lines_of(lines, lambda line: read_moment(line, solved, options, float(localize.pixel_sigma)))
+    moments, moving = (None, 0) if options.history is None else _moments(options.history, localize)
+    tracker = Tracker(localize, follow, clock=clock, compiled=compile, moments=moments, moving=moving)
+    frames = _videos(videos, detector, solved, tracker, joining, match_sigma) if videos and detector else None
+    source = frames or lines_of(lines, lambda line: read_moment(line, solved, joining, float(localize.pixel_sigma)))
     log = journal if journal is not None else output[0].with_name(output[0].name + ".journal")
     with steps("live", lines.stat().st_size if lines is not None and lines.is_file() else None) as advance:
         stream = Stream(
             tracker, run, output, log,
-            senders=[sender_to(address) for address in to or []], start=moment_zero, shown=None,
+            senders=[sender_to(address) for address in to or []], start=start, shown=None,
         )  # fmt: skip
         page = None if port is None else _live_map(stream.run, port, moment_zero)
         stream.shown = _progress(advance, stream, page)
@@ -240,19 +202,13 @@ def summary(counts: StreamCounts) -> str:
     return "; ".join(parts)
 
 
-def _mast(rig: Path, origin: str | None, heading: float | None, pixel_sigma: float | None) -> tuple[Localizer, Located]:
+def _mast(rig: Path, options: LocateOptions) -> tuple[Localizer, Located]:
     """Two cameras, and how positions of them are told."""
     from kcal.io.rig_file import load_pair
-    from kcal.lens.rig import Origin
-    from kcal.locate.localizer import Localizer
     from kcal.locate.points import PointLocator
 
-    known, place = load_pair(rig), None if origin is None else Origin.parse(origin)
-    if known.mounting is not None and {"origin", "heading"} <= taken:
-        place = heading = None
-        err.print(f"the position of the rig is that in its file, not that in {settings_file()}", markup=False)
-    noise = pixel_sigma_of(pixel_sigma, known)
-    localize = Localizer(known, weights="marks", origin=place, heading_deg=heading, pixel_sigma=noise)
+    known = load_pair(rig)
+    localize = pair_localizer(known, options, pixel_sigma_of(options.pixel_sigma, known))(known)
     return localize, PointLocator(localize).located()
 
 
@@ -320,13 +276,3 @@ def _progress(
             advance(f"{len(tracks.number)} tracks; {summary(stream.counts)}", read - before)
 
     return show
-
-
-def _calendar_time(text: str) -> datetime.datetime:
-    try:
-        moment = datetime.datetime.fromisoformat(text)
-    except ValueError as error:
-        raise InputError(f"--start {text!r}: write a time such as 2026-05-01T12:00:00Z") from error
-    if moment.tzinfo is None:
-        raise InputError(f"--start {text!r} has no zone: end it with Z for UTC, or with +02:00")
-    return moment

@@ -25,7 +25,7 @@ from typer.core import TyperCommand, TyperGroup
 from kcal.cli import console
 from kcal.cli.inputs import Wanted, check_given
 from kcal.cli.settings import settings_file, settings_text, taken
-from kcal.errors import InputError
+from kcal.errors import InputError, KcalError
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -230,7 +230,7 @@ def declared(function: Callable[..., None], *, json: bool = True) -> Callable[..
 
     @functools.wraps(function)
     def run(*, as_json: bool = False, **given: Any) -> None:
-        console.tell_anew()
+        console.tell_anew(as_json)
         outputs = given.get("output") or []
         check_given(
             [(one.label, one.wanted, given[one.name]) for one in options if one.wanted is not None],
@@ -244,16 +244,17 @@ def declared(function: Callable[..., None], *, json: bool = True) -> Callable[..
         bound.arguments.update({name: own[name] for name in signature.parameters})
         if not as_json:
             return function(*bound.args, **bound.kwargs)
-        code = 0
+        ended: Exception = typer.Exit(0)
         with console.out.capture() as captured:
             try:
                 function(*bound.args, **bound.kwargs)
-            except typer.Exit as stopped:
-                code = stopped.exit_code
-        told = {"exit_code": code, **console.told(), "text": captured.get().splitlines()}
-        console.end_line()
-        print(orjson.dumps(told).decode())
-        raise typer.Exit(code)
+            except (typer.Exit, KcalError) as stopped:
+                ended = stopped
+        if isinstance(ended, typer.Exit) or console.told():
+            told = {"exit_code": getattr(ended, "exit_code", 1), **console.told(), "text": captured.get().splitlines()}
+            console.end_line()
+            print(orjson.dumps(told).decode())
+        raise ended
 
     parameters = [one.parameter for one in options]
     if json:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import datetime
+import itertools
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
 import typer
 
@@ -14,19 +17,9 @@ import kcal.cli.rig_sources as rig_sources
 from kcal.cli import kinds
 from kcal.cli.console import err, out, print_table, print_wrote, warn
 from kcal.cli.inputs import pixel_sigma_of
-from kcal.cli.options import Command, declared, group_with_default
-from kcal.cli.report import (
-    NO,
-    REQUIRE_HELP,
-    judged_sides,
-    required,
-    side_pictures,
-    stored_tables,
-    told_usable,
-    warned_of,
-)
-from kcal.cli.settings import picture_option, rarely
-from kcal.cli.stars import TIME_HELP, NightOptions, images_of_nights
+from kcal.cli.options import Command, Rare, declared, group_with_default
+from kcal.cli.report import NO, judged_sides, side_pictures, stored_tables, told_usable, warned_of
+from kcal.cli.rig_options import Sources
 from kcal.cli.stations import print_rig, rig_lines, solve_stations
 from kcal.errors import InputError
 from kcal.files import check_writable, write_atomic
@@ -42,160 +35,18 @@ app = typer.Typer(cls=group_with_default("solve"), rich_markup_mode="markdown", 
 
 
 def solve_command(
-    left: Annotated[Path, typer.Argument(help="Camera file of the left camera."), inputs.CALIBRATED],
-    right: Annotated[Path, typer.Argument(help="Camera file of the right camera."), inputs.CALIBRATED],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Rig file to write.")],
-    others: Annotated[
-        list[Path] | None,
-        typer.Argument(metavar="[CAMERA]...", help="More cameras; each is named by its file, up to the first dot."),
-        inputs.CALIBRATED,
-    ] = None,
-    pairs: Annotated[
-        tuple[Path, Path] | None,
-        typer.Option("--pairs", metavar="LEFT.obs.json RIGHT.obs.json", help="Observations of boards seen by both."),
-        inputs.OBSERVATIONS,
-    ] = None,
-    observations: Annotated[
-        list[Path] | None,
-        rarely("OBS.json", "Of three cameras and more: boards seen by any two, once for each camera, named as it is."),
-        inputs.OBSERVATIONS,
-    ] = None,
-    match: Annotated[
-        Path | None,
-        rarely("CSV", "Which views belong together: columns left,right. By name if not given."),
-        inputs.TABLE,
-    ] = None,
-    landmarks: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Surveyed places: CSV (name,lat,lon,height,sigma or name,east,north,up,sigma), GeoJSON, GPX.",
-        ),
-        inputs.SURVEY,
-    ] = None,
-    marks: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="CSV",
-            help="Where they are in the images: name,left_u,left_v,right_u,right_v, or one line for each camera: "
-            "name,camera,u,v.",
-        ),
-        inputs.MARKS,
-    ] = None,
-    features: Annotated[
-        Path | None,
-        rarely(
-            "CSV",
-            "Distant points matched between the images: left_u,left_v,right_u,right_v and range,range_sigma or "
-            "beyond (meters), if known.",
-        ),
-        inputs.MARKS,
-    ] = None,
-    positions: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="CSV", help="Measured camera positions (GNSS): as --landmarks, names left and right, or of files."
-        ),
-        inputs.SURVEY,
-    ] = None,
-    baseline: Annotated[
-        str | None,
-        typer.Option(
-            metavar="M±SIGMA",
-            help="Measured distance between the cameras, e.g. 10.02±0.005; of three and more mill:mast=812.4±0.1,...",
-        ),
-    ] = None,
-    origin: Annotated[
-        str | None,
-        rarely("LAT,LON,HEIGHT", "Of the local frame; the first surveyed place if not given."),
-    ] = None,
-    survey_sigma: Annotated[
-        float | None,
-        rarely("M", "How well places of GeoJSON and GPX files are known, where these do not say."),
-    ] = None,
-    geoid: Annotated[
-        float | None,
-        rarely("M", "Height of the geoid above the WGS84 ellipsoid, added to elevations of GPX."),
-    ] = None,
-    stars: Annotated[
-        tuple[str, str] | None,
-        typer.Option(
-            metavar="LEFT RIGHT",
-            help="Night images of each camera (folder or quoted wildcard), paired by their times: they determine how "
-            "the cameras are turned, yaw included; with --origin and --star-time also on the Earth.",
-        ),
-    ] = None,
-    scene: Annotated[
-        tuple[str, str] | None,
-        typer.Option(
-            metavar="LEFT RIGHT",
-            help="Images of the scene by each camera at the same moments (file, folder or quoted wildcard): features "
-            "seen by both determine how the cameras are turned; a length must come from elsewhere (--baseline).",
-        ),
-    ] = None,
-    skyline: Annotated[Path | None, rarely("DEM", rig_sources.SKYLINE_HELP)] = None,
-    skyline_images: Annotated[
-        list[str] | None, rarely("NAME=IMAGES", rig_sources.IMAGES_HELP, "--skyline-images")
-    ] = None,
-    skyline_sigma: Annotated[float | None, rarely("M", rig_sources.SIGMA_HELP, "--skyline-sigma", min=0)] = None,
-    skyline_picture: Annotated[
-        Path | None, picture_option(rig_sources.PICTURE_HELP, "--skyline-picture", hidden=True)
-    ] = None,
-    night: Annotated[
-        list[str] | None,
-        rarely(
-            "NAME=IMAGES",
-            "Of three cameras and more, in place of --stars: the night images of one of them, once for each.",
-        ),
-    ] = None,
-    tracks: Annotated[
-        tuple[Path, Path] | None,
-        rarely(
-            "TRACKS.csv SIGHTINGS.csv",
-            "Where drones, ships or aircraft were (name,time,lat,lon,height,sigma), and what the cameras followed "
-            "(name,camera,time,u,v): landmarks that move.",
-        ),
-        inputs.TABLE,
-    ] = None,
-    tracks_clock: Annotated[
-        float,
-        rarely("S", "Of the cameras' clocks against that of --tracks; found within three of it.", min=0),
-    ] = 2.0,
-    star_time: Annotated[str | None, rarely("TIME", TIME_HELP, "--star-time")] = None,
-    clock_sigma: Annotated[
-        float,
-        rarely("S", "Of the offset between the two cameras' clocks: 1 s is 2.3 % of a range of 5 km.", min=0),
-    ] = 0.1,
-    clock_drift: Annotated[
-        float,
-        rarely(
-            "S", "Of the rate at which it changes, seconds an hour; 0 where GPS or a network keeps the clocks.", min=0
-        ),
-    ] = 0.05,
-    celsius: Annotated[float | None, rarely("C", "Temperature at night, for stars.")] = None,
-    hectopascal: Annotated[float | None, rarely("HPA", "Pressure there, for stars.")] = None,
-    dut1: Annotated[float | None, rarely("S", "UT1 - UTC at night, if known.")] = None,
-    require: Annotated[
-        str, typer.Option(metavar="RANGE:ERROR", help=f"{REQUIRE_HELP} Exit code 3 if it is not met.")
-    ] = "",
-    report: Annotated[Path | None, typer.Option(help="HTML page to write: may it be used, and why not.")] = None,
-    pixel_sigma: inputs.PixelSigma = None,
-    intrinsics: Annotated[
-        Literal["prior", "fixed", "free"],
-        rarely(
-            "",
-            "Refine the cameras within what their calibrations know, hold them as if they were exact, or let them "
-            "free.",
-        ),
-    ] = "prior",
-    refraction: Annotated[
-        float,
-        rarely("K", "Refraction of light from landmarks beforehand; 0 for straight lines."),
-    ] = 0.13,
-    refraction_sigma: Annotated[float, rarely("K", "Its standard deviation; 0 holds it.", min=0)] = 0.1,
-    keep_all: Annotated[bool, rarely("", "Leave nothing out; only warn.", "--keep-all")] = False,
-    board_warp: Annotated[bool, rarely("", "Also estimate how the board bends.", "--board-warp")] = False,
-    picture: Annotated[Path | None, picture_option("a plan, and residuals.", hidden=True)] = None,
+    left: kinds.CalibratedCamera,
+    right: kinds.CalibratedCamera,
+    others: list[kinds.CalibratedCamera] | None = None,
+    *,
+    output: kinds.Output,
+    sources: Sources,
+    require: kinds.Requirements | None = None,
+    report: Path | None = None,
+    intrinsics: Rare[Literal["prior", "fixed", "free"]] = "prior",
+    reject: Rare[bool] = True,
+    board_warp: Rare[bool] = False,
+    picture: Rare[kinds.Picture | None] = None,
 ) -> None:
     """Solve a rig: where the right camera stands from the left, and where both, or any number, stand on the Earth.
 
@@ -213,7 +64,7 @@ def solve_command(
 
     So does the scene itself (--scene): pairs of images, best of several days, and a taped baseline. Drones with RTK,
     ships with AIS and aircraft with ADS-B (--tracks) are landmarks that move. The skyline and a raster of the terrain
-    (--skyline) tell how the cameras look on the Earth.
+    (--skyline, --terrain) tell how the cameras look on the Earth.
 
     `kcal rig check` tells later whether the cameras have turned since.
 
@@ -232,6 +83,19 @@ def solve_command(
     --baseline 10.02±0.005 -o rig.json --require 5km:10% --report rig.html`
 
     `kcal rig mill.camera.json mast.camera.json church.camera.json --landmarks survey.csv --marks marks.csv -o rig.json`
+
+    Args:
+        left: Camera file of the left camera.
+        right: Camera file of the right camera.
+        others: More cameras; each is named by its file, up to the first dot.
+        output: Rig file to write.
+        require: Exit code 3 if it is not met.
+        report: HTML page to write: may it be used, and why not.
+        intrinsics: Refine the cameras within what their calibrations know, hold them as if they were exact, or let
+            them free.
+        reject: Leave out what contradicts the rest, and name it; otherwise only warn.
+        board_warp: Also estimate how the board bends.
+        picture: a plan, and residuals.
     """
     from kcal.calibrate.rig.solve import RigOptions
     from kcal.corners.observations import Observations
@@ -241,60 +105,38 @@ def solve_command(
     from kcal.locate.mounting import placed_rig
     from kcal.report.tables import range_sigma_rows
 
-    noise, _ = inputs.pixel_sigma_and_source(pixel_sigma)
-    nights = None
-    if stars is not None or night:
-        nights = NightOptions(
-            images=images_of_nights(stars, night or ()), time=star_time, clock_sigma=clock_sigma,
-            drift_sigma=clock_drift, celsius=celsius, hectopascal=hectopascal, dut1=dut1,
-        )  # fmt: skip
-    sources = rig_sources.Sources(
-        pairs=pairs, match=match, landmarks=landmarks, marks=marks, features=features, positions=positions,
-        baseline=baseline, origin=origin, mark_sigma=noise, survey_sigma=survey_sigma, geoid=geoid,
-        stars=nights, scene=scene, observations=tuple(observations or ()), tracks=tracks, tracks_clock=tracks_clock,
-        clock_sigma=clock_sigma,
-        skyline=rig_sources.skyline_options(
-            skyline, skyline_images or (), scene, geoid, skyline_sigma, (refraction, refraction_sigma), skyline_picture
-        ),
-        names=rig_sources.place_names((left, right)),
-    )  # fmt: skip
-    check_writable(output, left, right, *sources.files)
-    needs = required(require)
-    if report is not None:
-        check_writable(report, left, right, *sources.files)
-    if not any(
-        (pairs, landmarks, marks, features, positions, baseline, stars, scene, tracks, observations, night, skyline)
-    ):
+    needs, pairs = require or (), sources.pairs
+    inputs.pixel_sigma_and_source(sources.pixel_sigma)
+    for path in (output, report):
+        if path is not None:
+            check_writable(path, left, right, *sources.files)
+    if not sources.given:
         raise typer.BadParameter("give boards (--pairs), landmarks (--landmarks and --marks) or features (--features)")
     options = RigOptions(
-        intrinsics=intrinsics, board_warp=board_warp, reject=not keep_all, refraction=refraction,
-        refraction_sigma=refraction_sigma,
+        intrinsics=intrinsics, board_warp=board_warp, reject=reject, refraction=sources.refraction.value,
+        refraction_sigma=sources.refraction_sigma,
     )  # fmt: skip
     if others:
         solve_stations([left, right, *others], sources, options, output, needs=needs, report=report, picture=picture)
         return
-    if night:
-        raise typer.BadParameter("--night is for three cameras and more; give --stars LEFT RIGHT")
-    if observations:
-        raise typer.BadParameter("--observations is for three cameras and more; give --pairs LEFT RIGHT")
     calibrated = rig_sources.load_cameras((left, right))
     rig_sources.check_sides(calibrated, (left, right))
 
     def cure(error: object) -> str:
-        if pairs is not None and landmarks is None and isinstance(error, InputError):
+        if pairs and sources.landmarks is None and isinstance(error, InputError):
             return console.look_at_views(Observations.load(pairs[0]), pairs[0])
-        return console.mark_again(landmarks, marks, cameras=(left, right))
+        return console.mark_again(sources.landmarks, sources.marks, cameras=(left, right))
 
     with console.ending_with(cure):
-        read = rig_sources.read_sources(calibrated, sources)
+        read = rig_sources.read_sources(calibrated, sources, rig_sources.place_names((left, right)))
         frame = read.origin
         with console.steps("solving the rig", None) as advance:
             result = solve_surveyed(read.data, frame, options, advance)
     rig = result.stereo() if frame is None else placed_rig(result, frame)
-    known = read.pixel_sigma if pixel_sigma is None else pixel_sigma
+    known = read.pixel_sigma if sources.pixel_sigma is None else sources.pixel_sigma
     if rig.calibration is not None and known is not None:
         rig.calibration = dataclasses.replace(rig.calibration, pixel_sigma=known)
-    noise, note = inputs.pixel_sigma_and_source(pixel_sigma, rig)
+    noise, note = inputs.pixel_sigma_and_source(sources.pixel_sigma, rig)
     # Everything that can fail comes before the file.
     lines = rig_lines(result, rig, read.unpaired)
     console.tell(
@@ -323,7 +165,7 @@ def solve_command(
         from kcal.report.judge_rig import named_cameras, rig_verdict
         from kcal.report.verdict_pictures import rig_pictures
 
-        sides = pairs if pairs is not None and _calibrated_from(rig, pairs) else ()
+        sides = tuple(pairs) if pairs and _calibrated_from(rig, pairs) else ()
         cameras = judged_sides(named_cameras(rig), sides, noise)
         verdict = rig_verdict(
             rig, needs, mark_sigma=noise, result=result, cameras=[found[0] for found in cameras],
@@ -339,7 +181,7 @@ def solve_command(
             raise typer.Exit(NO)
 
 
-def _calibrated_from(rig: Rig, pairs: tuple[Path, Path]) -> bool:
+def _calibrated_from(rig: Rig, pairs: Sequence[Path]) -> bool:
     """Whether these are the views from which both cameras were calibrated, as far as their names tell."""
     from kcal.corners.observations import Observations
 
@@ -350,7 +192,7 @@ def _calibrated_from(rig: Rig, pairs: tuple[Path, Path]) -> bool:
     )
 
 
-app.command("solve", hidden=True, cls=Command)(console.with_json(inputs.with_inputs(solve_command)))
+app.command("solve", hidden=True, cls=Command)(declared(solve_command))
 
 
 # Check whether the cameras of a rig have turned, and correct the rig file (`kcal rig check`).
@@ -428,7 +270,7 @@ def check(
             out.print("nothing was written")
         return
     if relock is not None:
-        _relock(relock, drift, marks)
+        replace_rig(relock, drift.relocked(f"{now_stamp()}, from {marks.name}"))
     raise typer.Exit(DRIFTED)
 
 
@@ -460,21 +302,22 @@ def _print_effect(drift: Drift) -> None:
         out.print(f"with the old rig a target at {distance:g} m is found at {shift}")
 
 
-def _relock(path: Path, drift: Drift, marks: Path) -> None:
-    """Write the rig as it stands now; a file of that name is kept beside it."""
-    import datetime
+def now_stamp() -> str:
+    """The time, for names of files."""
+    return datetime.datetime.now(datetime.UTC).strftime("%Y%m%dT%H%M%SZ")
 
+
+def replace_rig(path: Path, new: Rig) -> None:
+    """Write a corrected rig; a file of that name is kept beside it."""
     from kcal.io.rig_file import save_rig
 
-    stamp = datetime.datetime.now(datetime.UTC).strftime("%Y%m%dT%H%M%SZ")
-    new = drift.relocked(f"{stamp}, from {marks.name}")
     # The old one first: whatever happens in between, there is a good rig.
     if path.exists():
-        kept = path.with_name(f"{path.stem}.before-{stamp}{path.suffix}")
-        number = 1
-        while kept.exists():
-            number += 1
-            kept = path.with_name(f"{path.stem}.before-{stamp}-{number}{path.suffix}")
+        names = (
+            f"{path.stem}.before-{now_stamp()}{more}{path.suffix}"
+            for more in itertools.chain([""], itertools.count(-2, -1))
+        )
+        kept = next(found for found in map(path.with_name, names) if not found.exists())
         write_atomic(kept, path.read_bytes())
         out.print(f"kept the old rig as {kept}", markup=False)
     save_rig(new, path)

@@ -6,15 +6,17 @@ import dataclasses
 import functools
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from kcal.cli.console import err, steps, warn
 from kcal.cli.inputs import typed_with
-from kcal.cli.stars import NightOptions, read_stars
+from kcal.cli.rig_options import Sources
+from kcal.cli.stars import images_by_camera, read_stars
 from kcal.errors import InputError
 from kcal.texts import measured_text
+from kcal.values import with_sigma
 
 if TYPE_CHECKING:
     from kcal.calibrate.rig.measured import Baseline, MeasuredPosition
@@ -25,7 +27,6 @@ if TYPE_CHECKING:
     from kcal.lens.camera import Camera
     from kcal.lens.rig import Origin
     from kcal.skyline.attitude import SkylineAttitude, SkylineImage
-    from kcal.skyline.horizon import RasterError
 
 
 # Drones, ships and aircraft that tell where they are, for `kcal rig --tracks`.
@@ -42,9 +43,9 @@ def _add_tracks(read: RigReading, files: tuple[Path, Path]) -> None:
     given, names = read.given, list(read.cameras)
     tracks, frame = read_tracks(files[0], read.origin)
     if (read.positions or "landmarks" in read.sources) and frame != read.origin:
-        raise InputError(f"{files[0]}: it has latitudes, the landmarks or positions local meters; give an --origin")
+        raise InputError(f"{files[0]}: it has latitudes, the landmarks or positions local meters; give a --site")
     options = MovingOptions(
-        clock_sigma=given.tracks_clock, between_sigma=given.clock_sigma, pixel_sigma=given.mark_sigma
+        clock_sigma=given.tracks_clock, between_sigma=given.clock_sigma, pixel_sigma=given.marks_sigma
     )
     sightings = read_sightings(files[1], names)
     found = match_moving(tracks, sightings, list(read.cameras.values()), names, read.positions, options)
@@ -78,7 +79,7 @@ def _add_tracks(read: RigReading, files: tuple[Path, Path]) -> None:
 # Pairs of images of the scene itself, for `kcal rig --scene`.
 
 
-def _add_scene(read: RigReading, given: tuple[str, str]) -> None:
+def _add_scene(read: RigReading, words: Sequence[str]) -> None:
     """Matches of all pairs of images, and what was matched and left out.
 
     Raises:
@@ -95,11 +96,12 @@ def _add_scene(read: RigReading, given: tuple[str, str]) -> None:
             "--scene alone leaves the scale open: with twice the baseline everything would be twice as far away, and "
             "the images the same. Add --baseline, --landmarks, --positions or boards (--pairs)"
         )
-    files = [{path.name: path for path in expand_images([one])} for one in given]
+    given = [*images_by_camera("--scene", words, list(read.cameras)).values()]
+    files = [{path.name: path for path in expand_images(list(one))} for one in given]
     named = [list(own) for own in files]
     chosen = [(named[0][0], named[1][0])] if len(named[0]) == len(named[1]) == 1 else pair_by_name(*named)
     if not chosen:
-        raise InputError(f"--scene: no image of {given[0]} belongs to one of {given[1]}; name pairs alike")
+        raise InputError(f"--scene: no image of {given[0][0]} belongs to one of {given[1][0]}; name pairs alike")
     pairs, found, refused = [], [], list[str]()
     with steps("matching the scene", len(chosen)) as advance:
         for left, right in chosen:
@@ -132,100 +134,48 @@ def _add_scene(read: RigReading, given: tuple[str, str]) -> None:
 
 # A terrain raster and images of the skyline, for `kcal rig --skyline` and `kcal station --skyline`.
 
-SKYLINE_HELP = (
-    "Raster of terrain heights (GeoTIFF or .asc), with --skyline-images and --positions: the skyline tells how the "
-    "cameras look on the Earth, heading included."
-)
-IMAGES_HELP = "Images of the skyline by a camera: file, folder or quoted wildcard; once for each camera."
-SIGMA_HELP = "Of a height of the --skyline raster; 2 is a 30 m raster from satellites, 0.3 one from lidar."
-PICTURE_HELP = "the raster's skyline over each image, and the residuals."
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class SkylineOptions:
-    """What the user gave of skylines, as on the command line.
-
-    Args:
-        raster: file of heights.
-        images: of each camera, by its name; "" for the only one.
-        geoid: meters added to the raster's heights.
-        error: of these, and of refraction.
-        picture: file to draw the fit to.
-    """
-
-    raster: Path
-    images: Mapping[str, str]
-    geoid: float
-    error: RasterError
-    picture: Path | None = None
-
-
-def skyline_options(
-    raster: Path | None, images: Sequence[str], scene: tuple[str, str] | None, geoid: float | None,
-    sigma: float | None, refraction: tuple[float, float], picture: Path | None,
-) -> SkylineOptions | None:  # fmt: skip
-    """Check the options; without images of their own, those of `--scene` are taken.
+def _add_skyline(read: RigReading, raster: Path) -> None:
+    """What the skylines tell, and what was found in each image; without images of their own, those of the scene.
 
     Raises:
-        InputError: images without a raster or the other way round, or a camera twice.
-    """
-    from kcal.skyline.horizon import RasterError
-
-    if raster is None:
-        if images or picture is not None:
-            raise InputError("--skyline-images and --skyline-picture need the raster of the terrain: --skyline DEM.tif")
-        return None
-    found: dict[str, str] = {}
-    for text in images:
-        name, equals, given = text.partition("=")
-        if not equals:
-            name, given = "", text
-        if name in found:
-            raise InputError(f"--skyline-images {text!r}: give NAME=IMAGES once for each camera")
-        found[name] = given
-    if not found and scene is not None:
-        found = dict(zip(("left", "right"), scene, strict=True))
-    if not found:
-        raise InputError("--skyline needs images: --skyline-images IMAGES, or NAME=IMAGES once for each camera")
-    known = {} if sigma is None else {"sigma": sigma, "offset": 0.5 * sigma}
-    error = RasterError(refraction=refraction[0], refraction_sigma=refraction[1], **known)
-    return SkylineOptions(raster=raster, images=found, geoid=geoid or 0.0, error=error, picture=picture)
-
-
-def _add_skyline(read: RigReading, given: SkylineOptions) -> None:
-    """What the skylines tell, and what was found in each image.
-
-    Raises:
-        InputError: a camera without a place, and what `skyline_source` refuses.
+        InputError: no images, a camera without a place, and what `skyline_source` refuses.
     """
     import torch
 
     from kcal.locate.raster import terrain
     from kcal.skyline.attitude import skyline_source
+    from kcal.skyline.horizon import RasterError
 
-    names = list(read.cameras)
-    images = _read_images(names, given.images)
+    given, names = read.given, list(read.cameras)
+    words = given.skyline or given.scene
+    if not words:
+        raise InputError("--terrain needs images of the skyline: --skyline IMAGES, or NAME=IMAGES for each camera")
+    images = _read_images(names, words)
     places = {position.camera: position for position in read.positions}
     without = sorted({names[image.camera] for image in images if image.camera not in places})
     if read.origin is None or without:
         raise InputError(
             f"--skyline needs the place of {' and '.join(without) or 'each camera'} on the Earth: measure it (GNSS) "
-            f"and give --position{'s' * (len(names) > 1)} with latitudes and longitudes (or with local meters and "
-            "--origin)"
+            "and give --positions with latitudes and longitudes (or with local meters and --site)"
         )
     centers, sigma = torch.zeros(len(names), 3).double(), torch.ones(len(names), 3).double()
     for number, position in places.items():
         centers[number], sigma[number] = position.point, position.sigma
     with steps("comparing skylines with the terrain", None):
-        raster = terrain(given.raster, given.geoid)
+        known = {} if given.terrain_sigma is None else {
+            "sigma": given.terrain_sigma, "offset": 0.5 * given.terrain_sigma,
+        }  # fmt: skip
+        error = RasterError(refraction=given.refraction.value, refraction_sigma=given.refraction_sigma, **known)
         source, found = skyline_source(
-            images, list(read.cameras.values()), raster, read.origin, centers, sigma, error=given.error
-        )
-    if given.picture is not None:
+            images, list(read.cameras.values()), terrain(raster, given.geoid or 0.0), read.origin, centers, sigma,
+            error=error,
+        )  # fmt: skip
+    if given.skyline_picture is not None:
         from kcal.report.figures import save_picture
         from kcal.report.rig import skyline_figure
 
-        save_picture(given.picture, skyline_figure([(image.name, image.image) for image in images], found))
+        save_picture(given.skyline_picture, skyline_figure([(image.name, image.image) for image in images], found))
     read.notes += [line for image, one in zip(images, found, strict=True) for line in _lines(image, names, one)]
     for image, one in zip(images, found, strict=True):
         for text in one.warnings:
@@ -233,21 +183,14 @@ def _add_skyline(read: RigReading, given: SkylineOptions) -> None:
     read.add("skyline", source)
 
 
-def _read_images(names: Sequence[str], given: Mapping[str, str]) -> list[SkylineImage]:
+def _read_images(names: Sequence[str], words: Sequence[str]) -> list[SkylineImage]:
     from kcal.corners.images import expand_images, read_gray
     from kcal.skyline.attitude import SkylineImage
 
-    if "" in given and len(names) == 1:
-        given = {names[0]: given[""]}
-    unknown = [name for name in given if name not in names]
-    if unknown:
-        raise InputError(
-            f"--skyline-images {unknown[0] or given[unknown[0]]}: write NAME=IMAGES; the cameras are {', '.join(names)}"
-        )
     return [
         SkylineImage(name=f"{name} {path.name}", camera=names.index(name), image=read_gray(path))
-        for name, text in given.items()
-        for path in expand_images([text])
+        for name, given in images_by_camera("--skyline", words, names).items()
+        for path in expand_images(given)
     ]
 
 
@@ -346,45 +289,13 @@ def _exchanged(paths: Sequence[Path]) -> str:
 CAMERAS = ("left", "right")
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Sources:
-    """What the user gave, as on the command line."""
-
-    pairs: tuple[Path, Path] | None = None
-    match: Path | None = None
-    landmarks: Path | None = None
-    marks: Path | None = None
-    features: Path | None = None
-    positions: Path | None = None
-    baseline: str | None = None
-    origin: str | None = None
-    mark_sigma: float = 0.3
-    survey_sigma: float | None = None
-    geoid: float | None = None
-    stars: NightOptions | None = None
-    scene: tuple[str, str] | None = None
-    skyline: SkylineOptions | None = None
-    observations: tuple[Path, ...] = ()
-    tracks: tuple[Path, Path] | None = None
-    tracks_clock: float = 2.0
-    clock_sigma: float = 0.1
-    names: tuple[str, ...] = CAMERAS
-
-    @property
-    def files(self) -> list[Path]:
-        """All files that are read."""
-        raster = None if self.skyline is None else self.skyline.raster
-        single = (self.match, self.landmarks, self.marks, self.features, self.positions, raster)
-        more = (*(self.pairs or ()), *(self.tracks or ()), *self.observations)
-        return [*more, *(path for path in single if path is not None)]
-
-
 @dataclasses.dataclass(kw_only=True)
 class RigReading:
     """What has been read so far. Each reader adds a source, notes of what was read, and what tells of it later.
 
     Args:
         cameras: of the rig, by their names.
+        names: of the files of the cameras, by which tables and observations name them.
         given: what the user gave.
         origin: of the frame; None where no latitude is known.
         sources: fields of `RigData`.
@@ -395,6 +306,7 @@ class RigReading:
     """
 
     cameras: dict[str, Camera]
+    names: tuple[str, ...]
     given: Sources
     origin: Origin | None
     sources: dict[str, Any] = dataclasses.field(default_factory=dict)
@@ -446,12 +358,13 @@ def parse_baselines(text: str, names: Sequence[str] = CAMERAS) -> tuple[Baseline
     found = []
     for part in text.split(","):
         pair, equals, measured = part.strip().rpartition("=")
-        lengths = measured.replace("+-", "±").split("±")
         try:
-            length, sigma = (float(value) for value in lengths)
-        except ValueError:
+            length, sigma = with_sigma(measured, "baseline")
+        except InputError:
+            sigma = None
+        if sigma is None:
             example = "10.02±0.005" if len(names) == 2 else f"{names[0]}:{names[1]}=10.02±0.005"
-            raise InputError(f"baseline {part!r}: write LENGTH±SIGMA in meters, for example {example}") from None
+            raise InputError(f"baseline {part!r}: write LENGTH±SIGMA in meters, for example {example}")
         ends = pair.strip().split(":") if equals else list(names)
         if len(ends) != 2 or not set(ends) <= set(names):
             raise InputError(
@@ -481,22 +394,22 @@ def _add_landmarks(read: RigReading, path: Path) -> None:
     assert given.marks is not None
     survey = import_survey(path, read.origin, sigma=given.survey_sigma, geoid=given.geoid)
     if given.positions is not None and survey.origin != read.origin:
-        raise InputError("landmarks and positions: one has latitudes, the other local meters; give an --origin")
+        raise InputError("landmarks and positions: one has latitudes, the other local meters; give a --site")
     read.origin = survey.origin
-    marks = read_marks(given.marks, given.names, single=True, others=len(read.cameras) == 1)
-    found = match_landmarks(survey, marks, marks.sigmas(given.mark_sigma))
+    marks = read_marks(given.marks, read.names, single=True, others=len(read.cameras) == 1)
+    found = match_landmarks(survey, marks, marks.sigmas(given.marks_sigma))
     if marks.covariance is not None:
-        read.pixel_sigma = marks.typical_sigma(given.mark_sigma)
+        read.pixel_sigma = marks.typical_sigma(given.marks_sigma)
     read.add("landmarks", found.landmarks)
     for some, text in ((found.unmarked, "surveyed, but not marked"), (found.unsurveyed, "marked, not surveyed")):
         if some:
             err.print(f"[yellow]warning:[/] {text}:", ", ".join(some), markup=True)
 
 
-def _add_stars(read: RigReading, night: NightOptions) -> None:
+def _add_stars(read: RigReading, _: Sequence[str]) -> None:
     """Stars of night images."""
     placed = "landmarks" in read.sources
-    stars, positions, lines = read_stars(read.cameras, night, read.origin, read.positions, placed=placed)
+    stars, positions, lines = read_stars(read.cameras, read.given, read.origin, read.positions, placed=placed)
     read.sources |= {"stars": stars, "positions": positions}
     read.notes += lines
 
@@ -505,14 +418,20 @@ def _add_features(read: RigReading, path: Path) -> None:
     """A table of points that several cameras see."""
     from kcal.locate.survey import read_features
 
-    read.add("features", read_features(path, read.given.mark_sigma, read.given.names))
+    read.add("features", read_features(path, read.given.marks_sigma, read.names))
 
 
-def _add_pairs(read: RigReading, files: tuple[Path, Path]) -> None:
-    """Boards that two cameras saw."""
-    from kcal.calibrate.rig.pairs import pair_by_name, paired_boards, read_pairs
+def _add_pairs(read: RigReading, files: Sequence[Path]) -> None:
+    """Boards that two cameras saw, or any of more."""
+    from kcal.calibrate.rig.pairs import boards_of_several, pair_by_name, paired_boards, read_pairs
     from kcal.corners.observations import Observations
 
+    if len(read.cameras) != 2:
+        own = {c: Observations.load(path) for c, path in zip(cameras_of_files(files, read.names), files, strict=True)}
+        read.add("boards", boards_of_several(list(read.cameras.values()), read.names, own))
+        return
+    if len(files) != 2:
+        raise InputError("--pairs: two files are needed, of the left and of the right camera")
     match = read.given.match
     first, second = read.cameras.values()
     seen = Observations.load(files[0]), Observations.load(files[1])
@@ -521,16 +440,6 @@ def _add_pairs(read: RigReading, files: tuple[Path, Path]) -> None:
     matched = pair_by_name(*views) if match is None else read_pairs(match, *views)
     read.add("boards", paired_boards((first, second), seen, matched))
     read.unpaired = len(views[0]) + len(views[1]) - 2 * len(matched)
-
-
-def _add_observations(read: RigReading, files: tuple[Path, ...]) -> None:
-    """Boards that any of the cameras saw."""
-    from kcal.calibrate.rig.pairs import boards_of_several
-    from kcal.corners.observations import Observations
-
-    names = read.given.names
-    own = {c: Observations.load(path) for c, path in zip(cameras_of_files(files, names), files, strict=True)}
-    read.add("boards", boards_of_several(list(read.cameras.values()), names, own))
 
 
 def _add_baselines(read: RigReading, text: str) -> None:
@@ -543,9 +452,8 @@ READERS: dict[str, Callable[[RigReading, Any], None]] = {
     "positions": _add_positions,
     "landmarks": _add_landmarks,
     "pairs": _add_pairs,
-    "observations": _add_observations,
     "stars": _add_stars,
-    "skyline": _add_skyline,
+    "terrain": _add_skyline,
     "features": _add_features,
     "scene": _add_scene,
     "tracks": _add_tracks,
@@ -553,15 +461,17 @@ READERS: dict[str, Callable[[RigReading, Any], None]] = {
 }
 
 
-def read_sources(cameras: Sequence[Camera], sources: Sources) -> RigReading:
+def read_sources(cameras: Sequence[Camera], sources: Sources, names: Sequence[str] = CAMERAS) -> RigReading:
     """Read everything; warnings about it are printed. Two cameras are left and right, one or more have their names."""
-    from kcal.lens.rig import Origin
-
     if (sources.landmarks is None) != (sources.marks is None):
         raise InputError("--landmarks and --marks belong together: places by name, and where they are in the images")
-    names = CAMERAS if len(cameras) == 2 else sources.names
-    origin = None if sources.origin is None else Origin.parse(sources.origin)
-    read = RigReading(cameras=dict(zip(names, cameras, strict=True)), given=sources, origin=origin)
+    if sources.terrain is None and (sources.skyline or sources.skyline_picture is not None):
+        raise InputError("--skyline and --skyline-picture need the raster of the terrain: --terrain DEM.tif")
+    known = CAMERAS if len(cameras) == 2 else names
+    read = RigReading(
+        cameras=dict(zip(known, cameras, strict=True)), names=tuple(names), given=sources,
+        origin=None if sources.site is None else sources.site.origin,
+    )  # fmt: skip
     for option, reader in READERS.items():
         if value := getattr(sources, option):
             reader(read, value)

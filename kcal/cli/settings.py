@@ -15,6 +15,7 @@ from typing import Annotated, Any, NamedTuple
 
 import typer
 
+from kcal import values
 from kcal.cli.console import print_wrote
 from kcal.errors import FileError, InputError
 from kcal.files import check_picture, check_writable, is_stream, read_bytes, write_atomic
@@ -28,12 +29,13 @@ taken: set[str] = set()
 
 
 class _Setting(NamedTuple):
-    """One key: its type, the commands' parameters that it gives, and what it is."""
+    """One key: its type, the commands' parameters that it gives, what it is, and what reads its text if not they."""
 
     kind: type
     takers: tuple[tuple[str, str], ...]
     about: str
     example: str
+    read: Callable[[str, str], Any] | None = None
 
 
 def _for(parameter: str, *commands: str) -> tuple[tuple[str, str], ...]:
@@ -46,16 +48,21 @@ SETTINGS = {
         str, _for("board", "detect", "capture", "board print", "batch"), "Pattern, as for kcal detect --board.", '"9x6"'
     ),
     "square": _Setting(
-        str, _for("square", "detect", "capture", "board print", "batch"), "Side of a square, with its unit.", '"25mm"'
+        str,
+        _for("square", "detect", "capture", "board print", "batch"),
+        "Side of a square, with its unit.",
+        '"25mm"',
+        values.length,
     ),
-    "camera": _Setting(
+    "source": _Setting(
         str, _for("source", "capture"), "Where kcal capture gets images: a device, a stream or a folder.", '"camera:0"'
     ),
-    "origin": _Setting(
+    "site": _Setting(
         str,
-        _for("origin", "locate", "live"),
-        "The site: latitude, longitude, height above WGS84, where the rig's file has none.",
+        _for("site", "locate", "live"),
+        "Where the left camera stands: latitude, longitude, height above WGS84, where the rig's file does not say.",
         '"19.07,72.87,14"',
+        values.place_on_earth,
     ),
     "heading": _Setting(
         float, _for("heading", "locate", "live"), "Azimuth of the left camera's axis there, degrees.", "35.0"
@@ -66,7 +73,9 @@ SETTINGS = {
         "Noise of marks along each axis, pixels.",
         "0.3",
     ),
-    "require": _Setting(str, _for("require", *_JUDGING), "Ranges, and the largest σ of each.", '"5km:10%"'),
+    "require": _Setting(
+        str, _for("require", *_JUDGING), "Ranges, and the largest σ of each.", '"5km:10%"', values.ranges_and_errors
+    ),
     "baseline": _Setting(
         float, _for("baseline", "calibrate", "report", "budget"), "Distance between the cameras, meters.", "10.0"
     ),
@@ -104,8 +113,8 @@ def read_settings(folder: str | Path = ".") -> dict[str, Any]:
         again = shlex.join(["kcal", "init", *([] if path.parent == Path() else [str(path.parent)]), "--force"])
         raise FileError(f"{path}: not TOML: {error}. To write a new one: {again}") from error
     found = {key: _checked_setting(key, value, path) for key, value in content.items()}
-    if not is_stream(found.get("camera", "camera:0")):  # a folder of images, which is named from where the file is
-        found["camera"] = os.path.join(os.path.relpath(path.parent, folder), found["camera"]).removeprefix("./")
+    if not is_stream(found.get("source", "camera:0")):  # a folder of images, which is named from where the file is
+        found["source"] = os.path.join(os.path.relpath(path.parent, folder), found["source"]).removeprefix("./")
     return found
 
 
@@ -119,6 +128,11 @@ def _checked_setting(key: str, value: Any, path: Path) -> Any:
     if not number and (wanted is float or not isinstance(value, str)):
         what = "a number" if wanted is float else "a text in quotation marks"
         raise FileError(f"{path}: {key} must be {what}, for example {key} = {SETTINGS[key].example}")
+    if (read := SETTINGS[key].read) is not None:
+        try:
+            read(value, key)
+        except InputError as error:
+            raise FileError(f"{path}: {error}") from None
     return wanted(value)
 
 
@@ -134,7 +148,7 @@ def defaults_of(settings: dict[str, Any]) -> dict[str, Any]:
     return found
 
 
-def settings_text(values: dict[str, Any], path: Path) -> str:
+def settings_text(found: dict[str, Any], path: Path) -> str:
     """What was taken from the file, in one line.
 
     Example:
@@ -142,7 +156,7 @@ def settings_text(values: dict[str, Any], path: Path) -> str:
         'from ../kcal.toml: board 9x6, pixel_sigma 0.1'
     """
     keys = {parameter: key for key, setting in SETTINGS.items() for _, parameter in setting.takers}
-    return f"from {path}: {', '.join(f'{keys[name]} {value}' for name, value in values.items())}"
+    return f"from {path}: {', '.join(f'{keys[name]} {value}' for name, value in found.items())}"
 
 
 def toml_text(given: dict[str, Any]) -> str:
@@ -211,7 +225,7 @@ def init_command(
 
     **Examples**
 
-    `kcal init --board 9x6 --square 25mm --origin 19.07,72.87,14 --pixel-sigma 0.1`
+    `kcal init --board 9x6 --square 25mm --site 19.07,72.87,14 --pixel-sigma 0.1`
 
     `kcal detect left/ -o left.obs.json`
     """
@@ -220,6 +234,9 @@ def init_command(
         raise FileError(f"{path}: is there already; edit it, or write it anew: kcal init --force")
     if not any(value is not None for value in given.values()) and not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
+    for key, value in given.items():
+        if value is not None:
+            _checked_setting(key, value, path)
     check_writable(path)
     write_atomic(path, toml_text(given))
     read_settings(folder)

@@ -8,18 +8,19 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
+from kcal.cli import kinds
 from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
-from kcal.cli.inputs import IMAGES, single_camera
-from kcal.cli.settings import picture_option
+from kcal.cli.inputs import single_camera
+from kcal.cli.options import Kind
 from kcal.errors import InputError, KcalError
 from kcal.files import check_writable
+from kcal.values import named
 
 if TYPE_CHECKING:
     from kcal.calibrate.camera.result import CameraCalibrationResult
     from kcal.calibrate.rig.measured import MeasuredPosition
     from kcal.calibrate.rig.stars import StarSource
+    from kcal.cli.rig_options import Sources
     from kcal.lens.camera import Camera
     from kcal.lens.rig import Origin
     from kcal.stars.detect import DetectedStars
@@ -36,28 +37,22 @@ TIME_HELP = "When, with its zone: 2026-11-24T20:47:26Z; name:Z or name:+02:00 re
 def sky_view(
     path: Path,
     time: str | None,
-    lat: float | None,
-    lon: float | None,
-    height: float,
+    site: Origin | None,
     *,
     dut1: float | None = None,
     time_sigma: float = 0.1,
-    celsius: float | None = None,
+    temperature: float | None = None,
     pressure: float | None = None,
 ) -> SkyView:
     """When and where an image was taken, from options of the command line."""
-    from kcal.lens.rig import Origin
     from kcal.stars.detect import time_of
     from kcal.stars.night import SkyView
     from kcal.stars.sky import Air
 
-    if (lat is None) != (lon is None):
-        raise InputError("--lat and --lon belong together")
-    origin = None if lat is None or lon is None else Origin(lat=lat, lon=lon, height=height)
-    known = {} if celsius is None else {"celsius": celsius, "celsius_sigma": 1.0}
+    known = {} if temperature is None else {"celsius": temperature, "celsius_sigma": 1.0}
     known |= {} if pressure is None else {"hectopascal": pressure, "hectopascal_sigma": 1.0}
-    air = None if origin is None else Air.at_height(origin.height, **known)
-    return SkyView(time=time_of(time, path), origin=origin, air=air, dut1=dut1, time_sigma=time_sigma)
+    air = None if site is None else Air.at_height(site.height, **known)
+    return SkyView(time=time_of(time, path), origin=site, air=air, dut1=dut1, time_sigma=time_sigma)
 
 
 def camera_by_stars(
@@ -164,7 +159,7 @@ def by_night(
         images: files, folders and wildcards.
         observations: of boards.
         time: as `--time`.
-        place: as `--place`: latitude, longitude and height, for refraction.
+        place: as `--site`: latitude, longitude and height, for refraction.
         output: camera file.
         name: of the camera.
 
@@ -216,13 +211,10 @@ def _by_stars(
 
     origin = None if place is None else Origin.parse(place)
     if origin is not None and time is None:
-        raise InputError("--place without --time tells nothing: refraction depends on both")
-    where: tuple[Any, Any, float] = (None, None, 0.0)
-    if origin is not None:
-        where = (origin.lat, origin.lon, origin.height)
+        raise InputError("--site without --time tells nothing: refraction depends on both")
     files = expand_nights(images)
     check_writable(output, *files)
-    views = [sky_view(path, time, *where) for path in files]
+    views = [sky_view(path, time, origin) for path in files]
     found, size = camera_by_stars(files, views, "calibrating by stars", boards)
     count = sum(int(use.sum()) for use in found.lens.used)
     left_out = sum(len(use) for use in found.lens.used) - count
@@ -243,7 +235,7 @@ def _by_stars(
         warn(text)
     if origin is None:
         warn(
-            "without --time and --place refraction stays in the lens: it shrinks heights by 0.03 % overhead, 0.12 % at "
+            "without --time and --site refraction stays in the lens: it shrinks heights by 0.03 % overhead, 0.12 % at "
             "30° of altitude and 1 % at 10°; give both"
         )
     return found
@@ -271,26 +263,13 @@ def sparse_parts(found: StarCamera, size: tuple[int, int]) -> list[str]:
 
 # Night images of the cameras of a rig, for `kcal rig --stars`.
 
-# m: how well the place of `--origin` is known to be that of the first camera, along each axis.
+# m: how well the place of `--site` is known to be that of the first camera, along each axis, if not stated.
 _PLACE_SIGMA = 3.0
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class NightOptions:
-    """What the user gave of night images, as on the command line."""
-
-    images: tuple[str, str] | Mapping[str, str]
-    time: str | None = None
-    clock_sigma: float = 0.1
-    drift_sigma: float = 0.05
-    celsius: float | None = None
-    hectopascal: float | None = None
-    dut1: float | None = None
 
 
 def read_stars(
     cameras: Mapping[str, Camera],
-    night: NightOptions,
+    night: Sources,
     origin: Origin | None,
     positions: tuple[MeasuredPosition, ...],
     *,
@@ -310,7 +289,7 @@ def read_stars(
     from kcal.calibrate.rig.measured import MeasuredPosition
     from kcal.stars.rig_stars import moments_of, star_source
 
-    given = _images_by_camera(cameras, night.images)
+    given = images_by_camera("--stars", night.stars or (), tuple(cameras))
     images = [_named_images(name, given[name], camera, night, origin) if name in given else []
               for name, camera in cameras.items()]  # fmt: skip
     moments, alone = moments_of(images)
@@ -323,10 +302,11 @@ def read_stars(
         )
     if on_earth and not placed and not positions:
         there = torch.zeros(3, dtype=torch.float64)
-        positions = (MeasuredPosition(camera=0, point=there, sigma=torch.full_like(there, _PLACE_SIGMA)),)
+        known = night.site.sigma if night.site and night.site.sigma is not None else _PLACE_SIGMA
+        positions = (MeasuredPosition(camera=0, point=there, sigma=torch.full_like(there, known)),)
     frame = origin if placed or positions else None
     source = star_source(
-        moments, list(cameras.values()), clock_sigma=night.clock_sigma, drift_sigma=night.drift_sigma, origin=frame
+        moments, list(cameras.values()), clock_sigma=night.clock_sigma, drift_sigma=night.clock_drift, origin=frame
     )
     named = int(source.named.sum())
     lines = [
@@ -337,7 +317,7 @@ def read_stars(
     ]
     if any(effect.factor is not None for effect in source.effects):
         lines.append(
-            f"their drift: ± {night.drift_sigma:g} s an hour since the night's first images (--clock-drift 0 where GPS "
+            f"their drift: ± {night.clock_drift:g} s an hour since the night's first images (--clock-drift 0 where GPS "
             "or a network keeps them)"
         )
     if on_earth and night.dut1 is None:
@@ -345,50 +325,56 @@ def read_stars(
     return source, positions, lines
 
 
-def images_of_nights(pair: tuple[str, str] | None, named: Sequence[str]) -> tuple[str, str] | dict[str, str]:
-    """Where night images are: LEFT RIGHT of two cameras, or NAME=IMAGES, one for each of more.
+def images_by_camera(option: str, words: Sequence[str], names: Sequence[str]) -> dict[str, list[str]]:
+    """Which images are whose: one place for each camera, in their order; NAME=IMAGES; or files in a folder of each.
+
+    Args:
+        option: what the images were given with.
+        words: files, folders and wildcards, or such with a name before them.
+        names: of the cameras.
 
     Raises:
-        InputError: both, no name, or a name twice.
+        InputError: another number of places than of cameras, or a name that no camera has.
+
+    Example:
+        >>> images_by_camera("--stars", ["l/1.png", "l/2.png", "r/1.png"], ("left", "right"))
+        {'left': ['l/1.png', 'l/2.png'], 'right': ['r/1.png']}
     """
-    if pair is not None and not named:
-        return pair
-    found = {}
-    for text in named:
-        name, equals, images = text.partition("=")
-        if pair is not None or not (name and equals and images) or name in found:
-            raise InputError(f"--night {text!r}: write NAME=IMAGES, once for each camera, and no --stars")
-        found[name] = images
-    return found
-
-
-def _images_by_camera(cameras: Mapping[str, Camera], images: tuple[str, str] | Mapping[str, str]) -> dict[str, str]:
-    if isinstance(images, tuple):
-        if len(cameras) != 2:
-            raise InputError("--stars LEFT RIGHT is for rigs of two cameras; give --night NAME=IMAGES for each")
-        return dict(zip(cameras, images, strict=True))
-    if not set(images) <= set(cameras):
-        raise InputError(f"--night: the cameras are {', '.join(cameras)}, got {', '.join(images)}")
-    return dict(images)
+    found: dict[str, list[str]] = {}
+    if words and all("=" in word and not Path(word).exists() for word in words):
+        for word in words:
+            name, images = named(word, option, "NAME=IMAGES for each camera")
+            if name not in names:
+                raise InputError(f"{option} {word}: write NAME=IMAGES; the cameras are {', '.join(names)}")
+            found.setdefault(name, []).append(images)
+        return found
+    folders = list(dict.fromkeys(Path(word).parent for word in words))
+    if len(names) == 1:
+        return {names[0]: list(words)}
+    if len(words) == len(names):
+        return {name: [word] for name, word in zip(names, words, strict=True)}
+    if len(folders) == len(names):
+        return {name: [word for word in words if Path(word).parent == own]
+                for name, own in zip(names, folders, strict=True)}  # fmt: skip
+    places = " ".join(name.upper() for name in names)
+    raise InputError(f"{option}: give a folder or a quoted wildcard for each camera, {places}; or NAME=IMAGES for each")
 
 
 def _named_images(
-    side: str, given: str, camera: Camera, night: NightOptions, origin: Origin | None
+    side: str, given: list[str], camera: Camera, night: Sources, origin: Origin | None
 ) -> list[NamedStars]:
     from kcal.stars.detect import expand_nights, read_night
     from kcal.stars.night import clock_doubts, name_stars
 
-    files = expand_nights([given])
+    files = expand_nights(given)
     found: list[NamedStars] = []
     # A place without a time tells nothing.
     place = origin if night.time is not None else None
-    where = (None, None, 0.0) if place is None else (place.lat, place.lon, place.height)
     with steps(f"naming stars of {side}", len(files)) as advance:
         for path in files:
             view = sky_view(
-                path, night.time, *where, dut1=night.dut1, celsius=night.celsius,
-                pressure=night.hectopascal,
-            )  # fmt: skip
+                path, night.time, place, dut1=night.dut1, temperature=night.temperature, pressure=night.pressure
+            )
             try:
                 image = name_stars(read_night(path), camera, view)
             except KcalError as error:
@@ -409,36 +395,16 @@ def _named_images(
 
 
 def stars_command(
-    images: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="IMAGES",
-            help="Night images of one camera: files, folders or quoted wildcards; PNG (8 or 16 bit), FITS, or a video "
-            "whose frames are summed.",
-            show_default=False,
-        ),
-        IMAGES,
-    ],
-    camera: Annotated[
-        str | None,
-        typer.Option(
-            metavar="CAMERA",
-            help="Camera file; FILE:left names one of a rig. Without one, the lens is found from the stars first.",
-        ),
-    ] = None,
-    time: Annotated[str | None, typer.Option(metavar="TIME", help=TIME_HELP)] = None,
-    lat: Annotated[float | None, typer.Option(metavar="DEG", help="Latitude of the camera.")] = None,
-    lon: Annotated[float | None, typer.Option(metavar="DEG", help="Longitude of the camera.")] = None,
-    height: Annotated[float, typer.Option(metavar="M", help="Height above the WGS84 ellipsoid.")] = 0.0,
-    dut1: Annotated[
-        float | None, typer.Option(metavar="S", help="UT1 - UTC, if known; not known, it is 0 ± 0.52 s (8″).")
-    ] = None,
-    time_sigma: Annotated[float, typer.Option(metavar="S", help="Of the camera's clock; 1 s is 15″.", min=0)] = 0.1,
-    celsius: Annotated[float | None, typer.Option(metavar="C", help="Temperature, for refraction.")] = None,
-    hectopascal: Annotated[
-        float | None, typer.Option(metavar="HPA", help="Pressure at the camera; standard air if not given.")
-    ] = None,
-    picture: Annotated[Path | None, picture_option("the first image that has names, with them.")] = None,
+    images: list[kinds.Images],
+    *,
+    camera: Annotated[str, Kind(metavar="CAMERA")] | None = None,
+    time: kinds.Times | None = None,
+    site: kinds.Site | None = None,
+    dut1: kinds.Clock | None = None,
+    time_sigma: kinds.Seconds = 0.1,
+    temperature: kinds.Celsius | None = None,
+    pressure: kinds.Hectopascal | None = None,
+    picture: kinds.Picture | None = None,
 ) -> None:
     """Name the stars of night images, and find how the camera looks.
 
@@ -449,9 +415,20 @@ def stars_command(
 
     **Examples**
 
-    `kcal stars night/ --camera left.camera.json --time name:Z --lat 40.762 --lon -113.896 --height 1282`
+    `kcal stars night/ --camera left.camera.json --time name:Z --site 40.762,-113.896,1282`
 
     `kcal stars night/0001.png --camera left.camera.json --picture named.png`
+
+    Args:
+        images: Night images of one camera: files, folders or quoted wildcards; PNG (8 or 16 bit), FITS, or a video
+            whose frames are summed.
+        camera: Camera file; FILE:left names one of a rig. Without one, the lens is found from the stars first.
+        site: Where the camera stands: latitude, longitude, height above the WGS84 ellipsoid.
+        dut1: UT1 - UTC, if known; not known, it is 0 ± 0.52 s (8″).
+        time_sigma: Standard deviation of the camera's clock; 1 s is 15″.
+        temperature: Of the air, for refraction.
+        pressure: At the camera; standard air if not given.
+        picture: the first image that has names, with them.
     """
     from kcal.stars.detect import expand_nights, read_night
     from kcal.stars.night import clock_doubts, name_stars
@@ -461,13 +438,13 @@ def stars_command(
     if picture is not None:
         check_writable(picture, *files)
     views = [
-        sky_view(path, time, lat, lon, height, dut1=dut1, time_sigma=time_sigma, celsius=celsius, pressure=hectopascal)
+        sky_view(path, time, site, dut1=dut1, time_sigma=time_sigma, temperature=temperature, pressure=pressure)
         for path in files
     ]
     catalog = StarCatalog.bundled()
     lens = single_camera(camera) if camera else camera_by_stars(files, views, "finding the lens")[0].lens.camera
     told: list[dict[str, Any]] = []
-    named: list[tuple[str, NamedStars]] = []
+    seen: list[tuple[str, NamedStars]] = []
     rows = [["image", "stars", "named", "RMS px", *_heads(views[0])]]
     drawn = picture is None
     with steps("naming stars", len(files)) as advance:
@@ -482,7 +459,7 @@ def stars_command(
                 warn(f"{path.name}: {error}")
             else:
                 told.append(_told(path, found))
-                named.append((path.name, found))
+                seen.append((path.name, found))
                 rows.append(_row(path, found))
                 for text in found.warnings:
                     warn(f"{path.name}: {text}")
@@ -491,9 +468,9 @@ def stars_command(
                     _draw(picture, image, found, catalog, path.name)
                     drawn = True
             advance(path.name)
-    for number, text in clock_doubts([found for _, found in named]):
-        warn(f"{named[number][0]}: {text}")
-        next(image for image in told if image["image"] == named[number][0])["warnings"].append(text)
+    for number, text in clock_doubts([found for _, found in seen]):
+        warn(f"{seen[number][0]}: {text}")
+        next(image for image in told if image["image"] == seen[number][0])["warnings"].append(text)
     tell(images=told)
     if len(rows) == 1:
         raise InputError(f"in none of {len(files)} images stars have names")

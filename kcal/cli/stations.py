@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import kcal.cli.rig_sources as rig_sources
+from kcal.cli import kinds
 from kcal.cli.console import err, out, print_table, print_wrote, steps, tell
-from kcal.cli.inputs import ASSUMED, CALIBRATED, MARKS, SURVEY, PixelSigma
+from kcal.cli.options import Only
 from kcal.cli.report import NO, stored_tables, told_usable, warned_of
-from kcal.cli.settings import picture_option
+from kcal.cli.rig_options import Sources
 from kcal.errors import InputError
 from kcal.files import check_writable
 from kcal.texts import length_text, measured_length, measured_text, number_text
@@ -137,29 +138,33 @@ def camera_names(paths: Sequence[Path]) -> tuple[str, ...]:
 
 
 def solve_stations(
-    paths: Sequence[Path], sources: rig_sources.Sources, options: RigOptions, output: Path, *,
-    needs: tuple[Requirement, ...] = (), report: Path | None = None, picture: Path | None = None,
-) -> None:  # fmt: skip
+    paths: Sequence[Path],
+    sources: Sources,
+    options: RigOptions,
+    output: Path,
+    *,
+    needs: tuple[Requirement, ...] = (),
+    report: Path | None = None,
+    picture: Path | None = None,
+) -> None:
     """Solve one camera, or three and more, write the rig, print how each stands and whether it may be used."""
     from kcal.io.rig_file import save_rig
     from kcal.locate.mirrored import solve_surveyed
 
     names = camera_names(paths)
     for given, option, instead in (
-        (sources.pairs, "--pairs", "give boards by --observations"),
         (sources.match, "--match", "views belong together by their names"),
         (sources.scene, "--scene", "give matches as a table by --features"),
     ):
         if given is not None:
             raise InputError(f"{option} is for rigs of two cameras; {instead}")
     check_writable(output, *paths, *sources.files)
-    sources = dataclasses.replace(sources, names=names)
-    read = rig_sources.read_sources(rig_sources.load_cameras(paths), sources)
+    read = rig_sources.read_sources(rig_sources.load_cameras(paths), sources, names)
     with steps("solving the stations", None) as advance:
         result = solve_surveyed(read.data, read.origin, options, advance)
     rig = result.stations(read.origin)
     assert rig.calibration is not None
-    rig.calibration = dataclasses.replace(rig.calibration, pixel_sigma=sources.mark_sigma)
+    rig.calibration = dataclasses.replace(rig.calibration, pixel_sigma=sources.marks_sigma)
     tell(
         rms_px=result.rms, cameras=told_stands(rig), warnings=list(result.warnings),
         undetermined=list(result.undetermined), left_out={item.label: item.reason for item in result.left_out},
@@ -177,7 +182,7 @@ def solve_stations(
         from kcal.report.verdict_pictures import rig_pictures
 
         subject = output.name.split(".")[0]
-        verdict = rig_verdict(rig, needs, mark_sigma=sources.mark_sigma, result=result, subject=subject)
+        verdict = rig_verdict(rig, needs, mark_sigma=sources.marks_sigma, result=result, subject=subject)
         tell(verdict=verdict.to_dict())
         pictures = functools.partial(rig_pictures, result)
         if not told_usable(verdict, pictures, stored_tables(rig), report, warned=warned_of(result)):
@@ -191,7 +196,7 @@ def _print_stations(result: RigResult, rig: Rig, notes: Sequence[str]) -> None:
     if rig.root is None:
         err.print("[yellow]warning:[/] the data leave something open, so that the rig has no error bars")
     if rig.origin is None:
-        out.print("No latitudes were given: positions are meters of the local frame. --origin anchors it on the Earth.")
+        out.print("No latitudes were given: positions are meters of the local frame. --site anchors it on the Earth.")
 
 
 def station_rows(rig: Rig) -> list[list[str]]:
@@ -244,77 +249,37 @@ def told_stands(rig: Rig) -> dict[str, dict[str, float]]:
     return told
 
 
+# The sources of one camera.
+_OF_ONE = (
+    "landmarks", "marks", "positions", "site", "skyline", "terrain", "terrain_sigma", "skyline_picture", "geoid",
+    "pixel_sigma",
+)  # fmt: skip
+
+
 def station_command(
-    camera: Annotated[Path, typer.Argument(help="Camera file."), CALIBRATED],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Rig file to write, with one camera.")],
-    landmarks: Annotated[
-        Path | None, typer.Argument(help="Surveyed places, as for `kcal rig --landmarks`."), SURVEY
-    ] = None,
-    marks: Annotated[
-        Path | None,
-        typer.Option(metavar="CSV", help="Where they are in the image: name,camera,u,v, camera by file name."),
-        MARKS,
-    ] = None,
-    position: Annotated[
-        Path | None,
-        typer.Option(metavar="CSV", help="Its measured position (GNSS), as a table of places with its name."),
-        SURVEY,
-    ] = None,
-    origin: Annotated[
-        str | None, typer.Option(metavar="LAT,LON,HEIGHT", help="Of the local frame, if the places have none.")
-    ] = None,
-    skyline: Annotated[Path | None, typer.Option(metavar="DEM", help=rig_sources.SKYLINE_HELP)] = None,
-    skyline_images: Annotated[
-        list[str] | None, typer.Option("--skyline-images", metavar="IMAGES", help=rig_sources.IMAGES_HELP)
-    ] = None,
-    skyline_sigma: Annotated[
-        float | None, typer.Option("--skyline-sigma", metavar="M", help=rig_sources.SIGMA_HELP, min=0)
-    ] = None,
-    skyline_picture: Annotated[Path | None, picture_option(rig_sources.PICTURE_HELP, "--skyline-picture")] = None,
-    geoid: Annotated[
-        float | None, typer.Option(metavar="M", help="Height of the geoid above the WGS84 ellipsoid, for --skyline.")
-    ] = None,
-    pixel_sigma: PixelSigma = None,
+    camera: kinds.CalibratedCamera,
+    *,
+    output: kinds.Output,
+    sources: Annotated[Sources, Only(_OF_ONE)],
 ) -> None:
     """Solve how one camera stands on the Earth: position, heading, pitch and roll, with error bars.
 
-    Four landmarks are needed, six or more are good; or images of the skyline, a raster of the terrain (--skyline) and
+    Four landmarks are needed, six or more are good; or images of the skyline, a raster of the terrain (--terrain) and
     the measured position. Light of landmarks is bent as for `kcal rig`; east, north and up are those at the camera.
     `kcal locate` then gives bearings, or positions of what stands at a known height.
 
     **Example**
 
-    `kcal station mast.camera.json survey.csv --marks marks.csv -o mast.rig.json`
+    `kcal station mast.camera.json --landmarks survey.csv --marks marks.csv -o mast.rig.json`
 
-    `kcal station mast.camera.json --position gnss.csv --skyline dem.tif --skyline-images noon.jpg -o mast.rig.json`
+    `kcal station mast.camera.json --positions gnss.csv --skyline noon.jpg --terrain dem.tif -o mast.rig.json`
+
+    Args:
+        camera: Camera file.
+        output: Rig file to write, with one camera.
     """
     from kcal.calibrate.rig.solve import RigOptions
 
-    if landmarks is None and skyline is None:
-        raise typer.BadParameter("give surveyed places and --marks, or a raster of the terrain (--skyline)")
-    options = RigOptions()
-    sources = rig_sources.Sources(
-        landmarks=landmarks, marks=marks, positions=position, origin=origin, mark_sigma=pixel_sigma or ASSUMED,
-        geoid=geoid,
-        skyline=rig_sources.skyline_options(
-            skyline, skyline_images or (), None, geoid, skyline_sigma, (options.refraction, options.refraction_sigma),
-            skyline_picture,
-        ),
-    )  # fmt: skip
-    solve_stations([camera], sources, options, output)
-
-
-def parse_height(text: str) -> tuple[float, float]:
-    """`"12"` or `"12±3"`, meters above the ellipsoid; ± 1 m if not given.
-
-    Raises:
-        InputError: not that.
-    """
-    parts = text.replace("+-", "±").split("±")
-    try:
-        values = [float(part) for part in parts]
-    except ValueError:
-        values = []
-    if len(values) not in (1, 2) or not all(map(math.isfinite, values)) or (len(values) == 2 and not values[1] > 0):
-        raise InputError(f"height {text!r}: write meters above the ellipsoid, and their sigma, for example 12±3")
-    return values[0], values[1] if len(values) == 2 else 1.0
+    if sources.landmarks is None and sources.terrain is None:
+        raise typer.BadParameter("give surveyed places and --marks, or a raster of the terrain (--terrain)")
+    solve_stations([camera], sources, RigOptions(), output)

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from kcal.cli import kinds
 from kcal.cli.console import err, on_signals, out, print_wrote, steps, warn
-from kcal.cli.inputs import RIG
-from kcal.cli.rig import DRIFTED, print_turns
-from kcal.cli.settings import picture_option
+from kcal.cli.options import Kind
+from kcal.cli.rig import DRIFTED, print_turns, replace_rig
 from kcal.errors import InputError, with_extra
 from kcal.files import check_writable
 from kcal.texts import measured_text
@@ -30,39 +30,17 @@ _DRAWN = 2000
 
 
 def watch_command(
-    rig: Annotated[Path, typer.Argument(help="Rig file from `kcal rig`."), RIG],
-    history: Annotated[Path, typer.Option("-o", "--history", help="CSV file that grows, a row for each measurement.")],
-    images: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="[LEFT RIGHT]",
-            help="Two folders of images, videos or addresses (rtsp://...); without them the history is shown.",
-        ),
-    ] = None,
-    every: Annotated[float, typer.Option(metavar="S", help="Seconds between measurements.", min=1.0)] = 60.0,
-    reference: Annotated[
-        tuple[Path, Path] | None,
-        typer.Option(metavar="LEFT RIGHT", help="Images of when the rig was solved; else the first ones count."),
-    ] = None,
-    temperature: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="Columns time,temperature (°C); it may grow meanwhile.")
-    ] = None,
-    limit: Annotated[
-        float, typer.Option(metavar="DEG", help="Relative turn beyond which there is an alarm.", min=1e-4)
-    ] = 0.005,
-    alarm: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="URL|exit", help="Where an alarm is sent as JSON (POST); exit: end then. May be repeated."
-        ),
-    ] = None,
-    relock: Annotated[
-        Path | None,
-        typer.Option(metavar="JSON", help="Rig file to write at the end, if the history proves the old one wrong."),
-    ] = None,
-    picture: Annotated[
-        Path | None, picture_option("the attitude over time and its 95 % intervals, at the end.")
-    ] = None,
+    rig: kinds.RigFile,
+    images: list[str] | None = None,
+    *,
+    output: Annotated[kinds.Output, Kind(metavar="CSV")],
+    every: Annotated[float, Kind(metavar="S", least=1.0)] = 60.0,
+    reference_images: Annotated[tuple[Path, Path], Kind(metavar="LEFT RIGHT")] | None = None,
+    temperatures: kinds.History | None = None,
+    limit: Annotated[float, Kind(metavar="DEG", least=1e-4)] = 0.005,
+    alarm: Annotated[list[str], Kind(metavar="URL|exit")] | None = None,
+    relock: Path | None = None,
+    picture: kinds.Picture | None = None,
 ) -> None:
     """Watch how the cameras of a rig turn, from what they see, and keep a history with the sigma of every moment.
 
@@ -71,7 +49,7 @@ def watch_command(
     likelihood, so that gaps and nights have honest sigmas. Few features, by fog or a dirty lens, make them larger, and
     are told.
 
-    `kcal locate --watch HISTORY` and `kcal live --watch HISTORY` use the attitude and the sigma of each moment.
+    `kcal locate --history HISTORY` and `kcal live --history HISTORY` use the attitude and the sigma of each moment.
 
     Images of folders need a time in their names (20260501T120000Z.png, UTC) or in EXIF, and pair by their names.
 
@@ -84,34 +62,46 @@ def watch_command(
     `kcal watch rig.json left/ right/ -o history.csv --picture attitude.png`
 
     `kcal watch rig.json rtsp://10.0.0.7/main rtsp://10.0.0.8/main -o history.csv --alarm https://example.org/rig`
+
+    Args:
+        rig: Rig file from `kcal rig`.
+        images: Folders of images, videos or addresses (rtsp://...), LEFT RIGHT; without them the history is shown.
+        output: CSV file that grows, the history: a row for each measurement.
+        every: Seconds between measurements.
+        reference_images: Images of when the rig was solved; else the first ones count.
+        temperatures: Columns time,temperature (°C); it may grow meanwhile.
+        limit: Relative turn beyond which there is an alarm.
+        alarm: Where an alarm is sent as JSON (POST); exit: end then. May be repeated.
+        relock: Rig file to write at the end, if the history proves the old one wrong; an old one of that name is kept.
+        picture: The attitude over time and its 95 % intervals, at the end.
     """
     from kcal.corners.images import read_gray
-    from kcal.io.rig_file import load_pair, save_rig
+    from kcal.io.rig_file import load_pair
     from kcal.watch.history import Temperatures
     from kcal.watch.watcher import Watched, Watcher, Webhook
     from kcal.watch.watcher import relock as relocked_by
 
     if images and len(images) != 2:
         raise typer.BadParameter("two folders, videos or addresses, of the left and the right camera, are needed")
-    if history.suffix.lower() != ".csv":
-        raise typer.BadParameter(f"--history {history}: a name that ends with .csv is needed")
-    check_writable(history, rig)
+    if output.suffix.lower() != ".csv":
+        raise typer.BadParameter(f"--output {output}: a name that ends with .csv is needed")
+    check_writable(output, rig)
     if relock is not None:
-        check_writable(relock, rig, history)
+        check_writable(relock, output)
     hooks = [Webhook(address) for address in alarm or [] if address != _EXIT]
     known = load_pair(rig)
     raised = 0
     if images:
-        air = None if temperature is None else Temperatures(temperature)
+        air = None if temperatures is None else Temperatures(temperatures)
         watcher = Watcher(
-            known, history, every_s=every, limit_deg=limit, temperatures=air,
+            known, output, every_s=every, limit_deg=limit, temperatures=air,
             tell=lambda text: err.print(text, markup=False),
         )  # fmt: skip
         try:
-            if reference is not None and watcher.looks == 0 and watcher.last_time == -math.inf:
-                watcher.refer_to(*(read_gray(path) for path in reference))
+            if reference_images is not None and watcher.looks == 0 and watcher.last_time == -math.inf:
+                watcher.refer_to(*(read_gray(path) for path in reference_images))
             if watcher.offset:
-                err.print(f"continuing after {watcher.last_time:.3f} s of {history}", markup=False)
+                err.print(f"continuing after {watcher.last_time:.3f} s of {output}", markup=False)
             _follow(watcher, known, (images[0], images[1]), hooks, ends=_EXIT in (alarm or []))
         finally:
             watcher.close()
@@ -120,16 +110,15 @@ def watch_command(
         if not watcher.last_time > -math.inf:
             raise InputError("no pair of images was looked at")
     with steps("fitting how it turns", None):
-        watched = Watched.read(history, known)
+        watched = Watched.read(output, known)
     _tell_turns(watched, limit)
     if picture is not None:
-        _draw_turns(watched, picture, limit, history.name)
+        _draw_turns(watched, picture, limit, output.name)
     if relock is not None:
         better = relocked_by(watched)
         out.print(("re-locked: " if better.rig else "not re-locked: ") + better.reason, markup=False)
         if better.rig is not None:
-            save_rig(better.rig, relock)
-            print_wrote(relock)
+            replace_rig(relock, better.rig)
     if raised:
         raise typer.Exit(DRIFTED)
 

@@ -659,18 +659,16 @@ def forgotten_yaw(*, hours: float = 0.0, per_hour: float = 0.0, kelvin: float = 
     return math.hypot(per_hour * math.sqrt(hours), per_kelvin * kelvin)
 
 
-def parse_aging(text: str | None) -> float:
-    """`forgotten_yaw` of a text like 9h:0.0004,8K:0.0002; 0 for none.
+def parse_aging(text: str, name: str) -> float:
+    """`forgotten_yaw` of a text like 9h:0.0004,8K:0.0002.
 
     Raises:
         InputError: another text.
 
     Example:
-        >>> parse_aging("9h:0.0004,8K:0.0002"), parse_aging("4h:0.001")
+        >>> parse_aging("9h:0.0004,8K:0.0002", "--aged"), parse_aging("4h:0.001", "--aged")
         (0.002, 0.002)
     """
-    if text is None:
-        return 0.0
     known: dict[str, tuple[float, float]] = {}
     for part in text.split(","):
         found = _PART.fullmatch(part.strip())
@@ -679,7 +677,7 @@ def parse_aging(text: str | None) -> float:
             known[unit] = float(count), float(degrees)
         except (AttributeError, ValueError):
             raise InputError(
-                f"--aged {text}: write hours and degrees in an hour, kelvin and degrees per kelvin, like "
+                f"{name} {text}: write hours and degrees in an hour, kelvin and degrees per kelvin, like "
                 "9h:0.0004,8K:0.0002"
             ) from None
     (hours, per_hour), (kelvin, per_kelvin) = known.get("h", (0.0, 0.0)), known.get("K", (0.0, 0.0))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bisect
 import dataclasses
+import itertools
 import json
 import math
 import urllib.request
@@ -25,6 +26,9 @@ from kcal.errors import FileError, InputError
 from kcal.lens.rig import Rig, RigCovariance
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.localizer import Localizer
+from kcal.locate.marks import Marks
+from kcal.locate.points import PointLocator
+from kcal.locate.tables import PositionColumns
 from kcal.pipeline.stream import Ledger
 from kcal.watch.turned import Drift, drift_of_turns
 
@@ -248,7 +252,7 @@ class Followed:
         for row in self._tail.rows():
             self._watched.take(row, _KEPT)
         if not self._watched.times:
-            raise InputError("--watch: the history has no rows yet: let `kcal watch` look at the scene first")
+            raise InputError("--history: it has no rows yet: let `kcal watch` look at the scene first")
         self._now = standing(self._solved, self._watched, time)
         self._until = time + _STEP_S
         return self._now
@@ -279,6 +283,43 @@ LIMIT = 0.005
 _MONTH = 30 * 86400.0
 # Seconds for an answer; what was not delivered is tried again at the next measurement.
 _PATIENCE = 5.0
+
+
+def located_at(
+    history: Path, rig: Rig, locator: Callable[[Rig], PointLocator]
+) -> Callable[[Marks], tuple[PositionColumns, Tensor | None]]:
+    """What locates rows with a column `time`: by the rig of that second.
+
+    Args:
+        history: of `kcal watch`.
+        rig: as it was solved and watched.
+        locator: makes what locates by a rig.
+    """
+    watched: Watched | None = None
+
+    def locate(marks: Marks) -> tuple[PositionColumns, Tensor | None]:
+        nonlocal watched
+        texts = marks.extras.get("time")
+        if texts is None:
+            raise InputError("--history: the table needs a column time (Unix seconds, or like 2026-05-01T12:00:00Z)")
+        times = []
+        for name, text in zip(marks.names, texts, strict=True):
+            try:
+                times.append(round(past.seconds_of(text)))
+            except InputError as error:
+                raise InputError(f"{name}: {error}") from None
+        if not times:
+            return locator(rig)(marks)
+        if watched is None or min(times) < watched.since or max(times) > watched.until:
+            watched = Watched.read(history, rig, since=min(times), until=max(times))
+        parts = []
+        for time, group in itertools.groupby(range(len(times)), times.__getitem__):
+            rows = list(group)
+            standing = locator(watched.rig_at(float(time)))
+            parts.append(standing(marks.rows(slice(rows[0], rows[-1] + 1)))[0])
+        return PositionColumns.joined(parts), None
+
+    return locate
 
 
 def alarm_sigmas(every_s: float) -> float:

@@ -28,7 +28,7 @@ from kcal import load_rig
 
 REPO = Path(__file__).resolve().parents[2]
 FILES = REPO / "tests" / "promises" / "files" / "1.0"
-PLACE = ("--origin", "19.07,72.87,14", "--heading", "35")
+PLACE = ("--site", "19.07,72.87,14", "--heading", "35")
 Numbers = dict[str, list[float]]
 """Name -> the value, and its standard deviation where it has one."""
 

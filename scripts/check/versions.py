@@ -71,7 +71,7 @@ run("--help")
 run("calibrate left.obs.json -o left.camera.json")
 run("calibrate right.obs.json -o right.camera.json")
 run("rig left.camera.json right.camera.json --pairs left.obs.json right.obs.json -o rig.json")
-run("locate rig.json marks.csv -o out.csv --origin 19.07,72.87,14 --heading 35")
+run("locate rig.json marks.csv -o out.csv --site 19.07,72.87,14 --heading 35")
 row = next(csv.DictReader(open("out.csv")))
 distance = float(target.norm())
 assert float(row["range_low_m"]) < distance < float(row["range_high_m"]), row

@@ -317,7 +317,7 @@ def test_the_position_of_a_rig_goes_before_that_of_the_folder(folder: Path) -> N
     printed = kcal("locate", "rig.json", "points.csv")
     assert printed.stdout == plain
     assert "that in its file, not that in kcal.toml" in printed.stderr
-    assert kcal("locate", "rig.json", "points.csv", "--origin", "1,2,3", "--heading", "4").stdout != plain
+    assert kcal("locate", "rig.json", "points.csv", "--site", "1,2,3", "--heading", "4").stdout != plain
 
 
 def test_the_noise_of_marks_is_that_of_the_rig(folder: Path) -> None:
@@ -472,7 +472,7 @@ COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 
 PLACES = ["a,0,100,0,0.02", "b,30,120,5,0.02", "c,-30,140,-5,0.02", "d,10,200,3,0.02"]
 
-RIG = "rig left.camera.json right.camera.json -o rig.json --origin 19,72,0"
+RIG = "rig left.camera.json right.camera.json -o rig.json --site 19,72,0"
 
 FEW = "kcal capture camera:0 --board 7x6 --square 50mm -o"
 
@@ -530,7 +530,7 @@ def refusal_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (f"{PAIRS} a/left.obs.json other.obs.json", "different boards", f"{SEEN} a/left.obs.json"),
         (f"{PAIRS} a/left.obs.json named.obs.json", "v00", f"{SEEN} a/left.obs.json"),
         (f"{TWICE} a/left.obs.json b/left.obs.json", "the same camera", f"{SEEN} a/left.obs.json"),
-        ("locate placeless.json far.csv --origin 0,0,0 --heading 0", "far.csv", f"{MARK} --rig placeless.json"),
+        ("locate placeless.json far.csv --site 0,0,0 --heading 0", "far.csv", f"{MARK} --rig placeless.json"),
         ("detect board.png --board 9x6 --square 25mm -o x.json", "7x6", "kcal detect board.png --board 7x6 --square"),
         ("detect blank.png --board 9x6 --square 25mm -o x.json", "blank.png", "kcal board --board 9x6 --square 25mm"),
     ],

@@ -181,7 +181,7 @@ def test_a_rig_that_does_not_say_where_it_stands(folder: Path) -> None:
     save_rig(tracked_site().rig, folder / "rig.json")
     with pytest.raises(InputError, match="give origin and heading_deg"):
         live(folder)
-    assert "20 moments" in live(folder, "--origin", "19.07,72.87,14", "--heading", "35")
+    assert "20 moments" in live(folder, "--site", "19.07,72.87,14", "--heading", "35")
 
 
 def test_what_compression_leaves_lasts_in_tracks() -> None:
@@ -224,5 +224,5 @@ def test_stations_into_files(tmp_path: Path) -> None:
         assert found == pytest.approx(wanted, abs=15.0)
     # Azimuths count from the tower: the first one stands east of the target, at its own vertical.
     assert 180.0 < float(rows[-1]["azimuth_deg"]) < 360.0
-    refused = CliRunner().invoke(app, [*command, *outputs, "--heading", "3", "--origin", "1,2,3"])
+    refused = CliRunner().invoke(app, [*command, *outputs, "--heading", "3", "--site", "1,2,3"])
     assert refused.exit_code == 2

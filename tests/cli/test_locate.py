@@ -18,7 +18,7 @@ from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Rig
 
 HEADER = "name,left_u,left_v,right_u,right_v\n"
 ORIGIN = "-33.9,151.2,10"
-POINTS = f"rig.json points.csv --origin {ORIGIN}"
+POINTS = f"rig.json points.csv --site {ORIGIN}"
 
 
 @pytest.fixture
@@ -33,7 +33,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("origin", [f"--origin {ORIGIN}", f"--origin={ORIGIN}"])
+@pytest.mark.parametrize("origin", [f"--site {ORIGIN}", f"--site={ORIGIN}"])
 def test_writes_files_and_a_table(folder: Path, command: Command, origin: str) -> None:
     outputs = "-o out.geojson -o out.csv --picture map.png"
     printed = command("locate rig.json points.csv", origin, "--heading -90", outputs).out
@@ -83,15 +83,15 @@ def test_what_is_doubted_of_a_rig_travels_with_it(folder: Path, command: Command
     save_rig(rig, folder / "rig.json")
     shown = command("locate", POINTS, "--heading 0 --json")
     assert f"warning: rig.json: {doubt}" in shown.err
-    assert json.loads(shown.out)["warnings"] == [doubt]
+    assert json.loads(shown.out)["warnings"] == [f"rig.json: {doubt}"]
     assert f"warning: {doubt}" in command("show rig.json").out
 
 
 def test_options_for_errors_grids_and_formats(folder: Path, command: Command) -> None:
-    arguments = "rig.json points.csv --origin 19.07,72.87,14 --heading 0.0 -o out.csv"
+    arguments = "rig.json points.csv --site 19.07,72.87,14 --heading 0.0 -o out.csv"
     command("locate", arguments, "--pixel-sigma 0.1 --refraction 0")
     plain = next(iter(csv.DictReader((folder / "out.csv").open())))
-    more = "--grid EPSG:32643 --yaw-sigma 0.05 --heading-sigma 0.1 --refraction 0.13"
+    more = "--grid EPSG:32643 --yaw-sigma 0.05 --heading 0±0.1 --refraction 0.13"
     outputs = "-o out.kml -o out.cot"
     printed = command("locate", arguments, "--pixel-sigma 0.1", more, outputs).out
     row = next(iter(csv.DictReader((folder / "out.csv").open())))
@@ -103,7 +103,7 @@ def test_options_for_errors_grids_and_formats(folder: Path, command: Command) ->
     # The library's own defaults, which the command states for its help.
     command("locate", arguments)
     usual = (folder / "out.csv").read_text()
-    defaults = f"--refraction {REFRACTION} --refraction-sigma {REFRACTION_SIGMA}"
+    defaults = f"--refraction {REFRACTION}±{REFRACTION_SIGMA}"
     command("locate", arguments, defaults)
     assert (folder / "out.csv").read_text() == usual
     assert "noise in the marks and of the errors in calibration and mounting" in printed
@@ -122,15 +122,18 @@ def test_nothing_located_is_a_failure_with_its_reasons(folder: Path, command: Co
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("rig.json points.csv --origin 151.2,-33.9,10 --heading 0", "longitude came first"),
+        ("rig.json points.csv --site 151.2,-33.9,10 --heading 0", "longitude came first"),
         (f"{POINTS} --heading nan", "heading nan"),
         (f"{POINTS} --heading 0 --pixel-sigma 0", "--pixel-sigma 0.0"),
-        (f"rig.json nothing.csv --origin {ORIGIN} --heading 0", "nothing.csv: cannot read"),
+        (f"rig.json nothing.csv --site {ORIGIN} --heading 0", "nothing.csv: cannot read"),
         (
-            f"points.csv points.csv --origin {ORIGIN} --heading 0",
+            f"points.csv points.csv --site {ORIGIN} --heading 0",
             "points.csv: this is a table of marks; a kcal rig file is needed",
         ),
-        ("mast.camera.json long.csv", "To make one: kcal station mast.camera.json survey.csv --marks marks.csv"),
+        (
+            "mast.camera.json long.csv",
+            "To make one: kcal station mast.camera.json --landmarks survey.csv --marks marks.csv",
+        ),
         ("mast.camera.json points.csv", "To make one: kcal rig mast.camera.json right.camera.json"),
         (f"{POINTS} --heading 0 -o a.shp", "a.shp: unknown format"),
         (f"{POINTS} --heading 0 -o no/a.csv", "does not exist"),

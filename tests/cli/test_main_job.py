@@ -107,7 +107,7 @@ class TestRealImages:
         assert [file.calibration.rms < 0.17 for file in files if file.calibration] == [True, True]
         code, text, error = run(
             *("rig", "left.camera.json", "right.camera.json", "--pairs", "left.obs.json", "right.obs.json"),
-            *("-o", "r.json", "--keep-all"),
+            *("-o", "r.json", "--no-reject"),
         )
         assert code == 0
         # One pair of this capture is three times as far off as the others; at most one more is named.
@@ -126,7 +126,7 @@ class TestRealImages:
             lines.append(",".join([name, *map(repr, (*(left[i] or ()), *(right[i] or ())))]))
         Path("points.csv").write_text("\n".join(lines))
         code, text, error = run(
-            *("locate", "r.json", "points.csv", "--origin", "-33.9,151.2,10", "--heading", "250"),
+            *("locate", "r.json", "points.csv", "--site", "-33.9,151.2,10", "--heading", "250"),
             *("-o", "p.geojson", "-o", "p.csv", "--picture", "map.png"),
         )
         assert code == 0
@@ -146,7 +146,7 @@ class TestRealImages:
     def test_demo_on_a_folder_of_pairs(self, run: Run, kcal_data: Path) -> None:
         code, text, error = run("demo", "--images", kcal_data / "opencv_stereo", "-o", "out")
         assert code == 0
-        assert "no --origin was given" in error
+        assert "no --site was given" in error
         assert "13 of 13 pairs" in text
         for name in ("map.png", "points.geojson", "positions.csv", "left.png", "right.png", "rig.json", "points.csv"):
             assert Path("out", name).stat().st_size > 100

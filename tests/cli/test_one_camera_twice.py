@@ -17,7 +17,7 @@ from kcal.lens.calibration import CameraCalibration
 
 CAMERA, NOISE = CAMERAS[0], 0.1
 TARGET = CENTER[0] + 1500.0 * ROTATION[0, 2] + 200.0 * ROTATION[0, 0]
-SURVEYED = "--landmarks survey.csv --refraction 0 --refraction-sigma 0 --pixel-sigma 0.1 -o rig.json"
+SURVEYED = "--landmarks survey.csv --refraction 0±0 --pixel-sigma 0.1 -o rig.json"
 
 
 def see(points: Tensor, place: int) -> Tensor:

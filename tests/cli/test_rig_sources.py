@@ -15,7 +15,8 @@ from torch import Tensor
 from typer.testing import CliRunner
 
 from kcal.cli.main import app
-from kcal.cli.rig_sources import Sources, read_sources
+from kcal.cli.rig_options import Sources
+from kcal.cli.rig_sources import read_sources
 from kcal.io.camera_file import camera_to_file, save_camera
 from kcal.io.images import write_png
 from kcal.io.rig_file import RigFile, load_rig
@@ -266,7 +267,7 @@ def test_usage(site: Path, command: Command) -> None:
     assert "--reference" in command("rig check rig.json --marks now.csv", code=1).err
     both = "--reference then.csv --landmarks survey.csv"
     assert "not both" in command("rig check rig.json --marks now.csv", both, code=1).err
-    command("locate rig.json points.csv --origin 1,2,3", code=2)
+    command("locate rig.json points.csv --site 1,2,3", code=2)
     command("locate rig.json points.csv --pitch 1", code=2)
 
 
@@ -275,7 +276,7 @@ def test_marks_count_with_their_own_noise(site: Path) -> None:
     spread = torch.full((12, 4), 0.2**2, dtype=torch.float64)
     spread[3], spread[5] = 0.4**2, math.nan
     write_marks(site / "own.csv", marks._replace(covariance=torch.diag_embed(spread)))
-    sources = Sources(landmarks=site / "survey.csv", marks=site / "own.csv", mark_sigma=0.1)
+    sources = Sources(landmarks=site / "survey.csv", marks=site / "own.csv", pixel_sigma=0.1)
     read = read_sources((CAMERAS[0], CAMERAS[1]), sources)
     found = read.data.landmarks
     expected = torch.full((12, 2), 0.2, dtype=torch.float64)
@@ -354,7 +355,7 @@ def test_latitudes_beside_local_positions_are_refused(given: Path) -> None:
     (given / "earth.csv").write_text("name,time,lat,lon,height,sigma\n" + rows)
     result = CliRunner().invoke(app, [*arguments(given, "earth.csv"), "--positions", str(given / "gnss.csv")])
     assert result.exit_code == 1
-    assert "--origin" in str(result.exception)
+    assert "--site" in str(result.exception)
 
 
 # `kcal rig --scene`: a rig from images and a tape; without a length it is refused.
@@ -412,8 +413,8 @@ def run_skyline(folder: Path, *options: str) -> tuple[int, str]:
 
 def test_a_station_from_its_skyline(files: Path) -> None:
     code, text = run_skyline(
-        files, "--position", str(files / "gnss.csv"), "--skyline", str(files / "dem.asc"), "--skyline-images",
-        str(files / "noon.png"), "--skyline-sigma", "0.5", "--skyline-picture", str(files / "fit.png"),
+        files, "--positions", str(files / "gnss.csv"), "--terrain", str(files / "dem.asc"), "--skyline",
+        str(files / "noon.png"), "--terrain-sigma", "0.5", "--skyline-picture", str(files / "fit.png"),
     )  # fmt: skip
     assert code == 0, text
     assert "variance of its heading: " in text
@@ -426,11 +427,11 @@ def test_a_station_from_its_skyline(files: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--skyline", "dem.asc"], "--skyline needs images"),
-        (["--skyline-images", "noon.png"], "give surveyed places and --marks, or a raster"),
-        (["--skyline", "dem.asc", "--skyline-images", "noon.png"], "needs the place of mast"),
-        (["--skyline", "dem.asc", "--skyline-images", "left=noon.png", "--position", "gnss.csv"], "cameras are mast"),
-        (["--skyline", "noon.png", "--skyline-images", "noon.png", "--position", "gnss.csv"], "coordinate|raster"),
+        (["--terrain", "dem.asc"], "--terrain needs images"),
+        (["--skyline", "noon.png"], "give surveyed places and --marks, or a raster"),
+        (["--terrain", "dem.asc", "--skyline", "noon.png"], "needs the place of mast"),
+        (["--terrain", "dem.asc", "--skyline", "left=noon.png", "--positions", "gnss.csv"], "cameras are mast"),
+        (["--terrain", "noon.png", "--skyline", "noon.png", "--positions", "gnss.csv"], "coordinate|raster"),
     ],
 )  # fmt: skip
 def test_what_is_missing(files: Path, options: list[str], said: str) -> None:

@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +15,8 @@ from typer.testing import CliRunner, Result
 
 from kcal.cli.demo_practice import _first, _short_meters, _signed
 from kcal.cli.main import app
-from kcal.cli.rig_sources import Sources, parse_baselines, place_names, read_sources
+from kcal.cli.rig_options import Sources
+from kcal.cli.rig_sources import parse_baselines, place_names, read_sources
 from kcal.errors import InputError
 from kcal.io.camera_file import save_camera
 from kcal.io.images import write_png
@@ -107,7 +108,7 @@ class TestSources:
         survey, marks = tmp_path / "survey.csv", tmp_path / "marks.csv"
         survey.write_text("name,east,north,up,sigma\n" + "".join(f"p{k},{k},{100 + k},2,0.02\n" for k in range(3)))
         marks.write_text("name,left_u,left_v,right_u,right_v\n" + "".join(f"p{k},{k},1,2,3\n" for k in range(3)))
-        given = Sources(stars=cast(Any, object()))
+        given = Sources(stars=["l", "r"])
         if landmarks:
             given = dataclasses.replace(given, landmarks=survey, marks=marks)
         found = read_sources(CAMERAS, given)
@@ -126,7 +127,7 @@ class TestSources:
         assert place_names(paths) == ("mill-1", "mast", "mill-2")
         mill = CAMERAS[0].with_parameters(CAMERAS[0].params)
         mill.calibration = CameraCalibration(name="mill")
-        told = read_sources((mill, CAMERAS[1], mill), Sources(names=place_names(paths))).one_camera
+        told = read_sources((mill, CAMERAS[1], mill), Sources(), place_names(paths)).one_camera
         assert told == ["mill-1 and mill-2 are one camera that stood at 2 places: its lens is the same unknown"]
 
     def test_baselines(self) -> None:
@@ -143,8 +144,8 @@ class TestSources:
     def test_files(self) -> None:
         """All that are read, those of a kind in their order."""
         some = Sources(
-            pairs=(Path("l"), Path("r")), match=Path("m"), landmarks=Path("a"), features=Path("f"),
-            tracks=(Path("t"), Path("u")), observations=(Path("o"),),
+            pairs=[Path("l"), Path("r")], match=Path("m"), landmarks=Path("a"), features=Path("f"),
+            tracks=(Path("t"), Path("u")), terrain=Path("d"),
         )  # fmt: skip
-        assert [str(path) for path in some.files] == ["l", "r", "t", "u", "o", "m", "a", "f"]
+        assert [str(path) for path in some.files] == ["l", "r", "t", "u", "m", "a", "f", "d"]
         assert Sources().files == []

@@ -106,7 +106,9 @@ def test_four_cameras_are_solved_and_locate_what_some_of_them_saw(folder: Path) 
 
 
 def test_one_station_alone(folder: Path) -> None:
-    text = run(folder, "station", "mill.camera.json", "survey.csv", "--marks", "marks.csv", "-o", "mill.json")
+    text = run(
+        folder, "station", "mill.camera.json", "--landmarks", "survey.csv", "--marks", "marks.csv", "-o", "mill.json"
+    )
     assert "mill" in text
     assert load_rig(folder / "mill.json").names == ("mill",)
 
@@ -121,8 +123,8 @@ def test_one_station_in_local_meters(folder: Path, tmp_path: Path, command: Comm
     lines = [f"{name},{','.join(f'{x:.4f}' for x in place)},0.05" for name, place in zip(names, local, strict=True)]
     (tmp_path / "local.csv").write_text("\n".join(["name,east,north,up,sigma", *lines]) + "\n")
     rows = []
-    for more in ([], ["--origin", f"{ORIGIN.lat},{ORIGIN.lon},{ORIGIN.height}"]):
-        given = [str(folder / "mill.camera.json"), str(tmp_path / "local.csv"), "--marks", str(folder / "marks.csv")]
+    for more in ([], ["--site", f"{ORIGIN.lat},{ORIGIN.lon},{ORIGIN.height}"]):
+        given = [folder / "mill.camera.json", "--landmarks", tmp_path / "local.csv", "--marks", folder / "marks.csv"]
         result = command("station", *given, "-o", tmp_path / "mill.rig.json", *more, "--json")
         rows.append(json.loads(result.out)["cameras"]["mill"])
     assert rows[0].keys() >= {"east_m", "heading_deg", "sigma_m"}
@@ -196,8 +198,10 @@ def test_surveys_of_strangers(kcal_data: Path, tmp_path: Path, folder: str, came
     """One line of landmarks gives no place; exchanged columns are said, and right ones place the camera."""
 
     def solved(survey: Path) -> Result:
-        given = [str(here / f"{camera}.camera.json"), str(survey), "--marks", str(here / "marks.csv"), "--json"]
-        return CliRunner().invoke(app, ["station", *given, "-o", str(tmp_path / "rig.json")])
+        given = ["--landmarks", str(survey), "--marks", str(here / "marks.csv"), "--json"]
+        return CliRunner().invoke(
+            app, ["station", str(here / f"{camera}.camera.json"), *given, "-o", str(tmp_path / "rig.json")]
+        )
 
     here = kcal_data / "field" / folder
     as_given = solved(here / "survey.csv")
@@ -296,7 +300,7 @@ def test_boards_seen_by_any_two_of_three_and_distances_of_named_pairs(tmp_path: 
     for one, name in zip(camera, NAMES, strict=False):
         save_camera(one, tmp_path / f"{name}.camera.json")
     three = [f"{name}.camera.json" for name in NAMES[:3]]
-    boards = [word for name in boards_of(rig, tmp_path) for word in ("--observations", name)]
+    boards = ["--pairs", *boards_of(rig, tmp_path)]
     run(tmp_path, "rig", *three, *boards, "-o", "rig.json")
     found = load_rig(tmp_path / "rig.json")
     assert float((found.center - centers).norm(dim=-1).max()) < 0.01
@@ -304,7 +308,15 @@ def test_boards_seen_by_any_two_of_three_and_distances_of_named_pairs(tmp_path: 
     # A distance that is known better than by boards moves the cameras to it, and only those two by all of it.
     far = float((centers[0] - centers[2]).norm()) * 1.01
     run(
-        tmp_path, "rig", *three, *boards, "--baseline", f"mill:church={far:.5f}±0.00001", "--keep-all", "-o", "rig.json"
+        tmp_path,
+        "rig",
+        *three,
+        *boards,
+        "--baseline",
+        f"mill:church={far:.5f}±0.00001",
+        "--no-reject",
+        "-o",
+        "rig.json",
     )
     held = load_rig(tmp_path / "rig.json")
     assert float((held.center[0] - held.center[2]).norm()) == pytest.approx(far, abs=1e-4)
@@ -314,8 +326,8 @@ def test_boards_seen_by_any_two_of_three_and_distances_of_named_pairs(tmp_path: 
         run(tmp_path, "rig", *three, *boards, "--baseline", "mill:hill=3.0±0.1", "-o", "rig.json")
     with pytest.raises(InputError, match=r"a second file of camera 'mill'"):
         run(tmp_path, "rig", *three, *boards, *boards[:2], "-o", "rig.json")
-    with pytest.raises(InputError, match=r"give boards by --observations"):
-        run(tmp_path, "rig", *three, "--pairs", "mill.obs.json", "mast.obs.json", "-o", "rig.json")
+    with pytest.raises(InputError, match=r"--scene is for rigs of two cameras; give matches as a table by --features"):
+        run(tmp_path, "rig", *three, "--scene", "mill.png", "mast.png", "-o", "rig.json")
 
 
 def test_a_rig_of_four_is_judged(folder: Path, command: Command) -> None:

@@ -92,7 +92,7 @@ def marks(folder: Path, times: list[str]) -> Path:
 def test_rows_are_located_by_the_rig_of_their_time(watched: Path, command: Command) -> None:
     points = marks(watched, [f"{START + 1800.5}", "2026-05-01T12:30:00Z", f"{START + 36_000}"])
     words = ["locate", str(watched / "rig.json"), str(points), "--pixel-sigma", "0.02", "-o", str(watched / "out.csv")]
-    found = command(*words, "--watch", watched / "h.csv")
+    found = command(*words, "--history", watched / "h.csv")
     assert "errors in calibration and mounting are not included" not in " ".join((found.out + found.err).split())
     with (watched / "out.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -107,7 +107,7 @@ def test_rows_are_located_by_the_rig_of_their_time(watched: Path, command: Comma
 
 def test_what_locate_needs_for_it(watched: Path, command: Command) -> None:
     points = marks(watched, ["yesterday"])
-    words = ["locate", str(watched / "rig.json"), str(points), "--watch", str(watched / "h.csv")]
+    words = ["locate", str(watched / "rig.json"), str(points), "--history", str(watched / "h.csv")]
     for text, message in (("yesterday", "p0: time 'yesterday'"), (f"{START - 60}", "tells nothing of that time")):
         marks(watched, [text])
         found = RUNNER.invoke(app, words)
@@ -132,7 +132,7 @@ def test_live_tracks_have_the_sigma_of_the_moment(watched: Path, command: Comman
         source.write_bytes(b"\n".join(lines) + b"\n")
         output = watched / f"{name}.csv"
         words = ["live", str(watched / "rig.json"), "--detections", str(source), "-o", str(output)]
-        command(*words, "--watch", watched / "h.csv")
+        command(*words, "--history", watched / "h.csv")
         with output.open() as file:
             last = list(csv.DictReader(file))[-1]
         assert float(last["range_low_m"]) < 1500.0 < float(last["range_high_m"])

@@ -84,7 +84,7 @@ def test_nothing_is_written_of_a_refused_table(tmp_path: Path, monkeypatch: pyte
     whole = tables.read_chunks
     monkeypatch.setattr("kcal.locate.marks.read_chunks", lambda *given, **more: whole(*given, **more | {"at_once": 5}))
     words = ["locate", str(tmp_path / "rig.json"), str(tmp_path / "marks.csv"), "-o", str(tmp_path / "out.csv")]
-    words += ["--origin", "0,0,0", "--heading", "0"]
+    words += ["--site", "0,0,0", "--heading", "0"]
     done = CliRunner().invoke(app, words)
     assert "line 42: the name 'a0' was used on line 2" in str(done.exception)
     assert not (tmp_path / "out.csv").exists()

@@ -326,7 +326,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    options = ["--origin=-33.9,151.2,40", "--heading", "200"]
+    options = ["--site=-33.9,151.2,40", "--heading", "200"]
     monkeypatch.setattr(sys, "argv", ["kcal", "locate", "rig.json", "points.csv", *options, *arguments])
     with pytest.raises(SystemExit) as stopped:
         main()
@@ -398,6 +398,6 @@ def test_a_summary_for_programs(
 ) -> None:
     assert run(monkeypatch, "--json", "-o", "out.csv") == 0
     summary = json.loads(capsys.readouterr().out)
-    assert (summary["rows"], summary["written"]) == (ROWS, ["out.csv"])
+    assert (summary["rows"], summary["wrote"]) == (ROWS, ["out.csv"])
     rows = list(csv.DictReader((folder / "out.csv").open()))
     assert summary["statuses"]["ok"] == sum(row["status"] == "ok" for row in rows)

@@ -13,7 +13,7 @@ from command_line import Command
 from typer.testing import CliRunner
 
 from kcal.cli.main import app
-from kcal.cli.stars import images_of_nights
+from kcal.cli.stars import images_by_camera
 from kcal.errors import FileError, InputError
 from kcal.io.rig_file import save_rig
 from kcal.locate import marks as tables
@@ -201,11 +201,14 @@ def test_range_errors_of_many_cameras_are_those_of_a_pair() -> None:
         station_sigmas(many, 0.0)
 
 
-def test_nights_are_given_by_name() -> None:
-    assert images_of_nights(("l", "r"), ()) == ("l", "r")
-    assert images_of_nights(None, ["mill=a/*.png", "mast=b"]) == {"mill": "a/*.png", "mast": "b"}
-    for named in (["mill"], ["mill=a", "mill=b"], ["=a"]):
-        with pytest.raises(InputError, match="write NAME=IMAGES"):
-            images_of_nights(None, named)
-    with pytest.raises(InputError, match="no --stars"):
-        images_of_nights(("l", "r"), ["mill=a"])
+def test_images_are_given_in_order_by_name_or_in_folders() -> None:
+    assert images_by_camera("--stars", ["l", "r"], ("left", "right")) == {"left": ["l"], "right": ["r"]}
+    named = ["mill=a/*.png", "mast=b", "mill=c"]
+    assert images_by_camera("--stars", named, ("mill", "mast", "hill")) == {"mill": ["a/*.png", "c"], "mast": ["b"]}
+    files = ["a/1.png", "b/1.png", "a/2.png"]
+    assert images_by_camera("--scene", files, ("left", "right")) == {"left": files[::2], "right": ["b/1.png"]}
+    assert images_by_camera("--skyline", files, ("mast",)) == {"mast": files}
+    for words, message in ((["=a", "b"], "for each camera, LEFT RIGHT"), (["x"], "LEFT RIGHT"),
+                           (["mast="], "write NAME=IMAGES"), (["hill=a"], "the cameras are left, right")):  # fmt: skip
+        with pytest.raises(InputError, match=message):
+            images_by_camera("--stars", words if len(words) == 1 else [*words, "c"], ("left", "right"))

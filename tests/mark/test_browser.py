@@ -129,7 +129,7 @@ def test_a_whole_site_while_the_server_is_killed(site: tuple[Path, MarkingSite],
     done = runner.invoke(
         app,
         ["rig", *(str(folder / f"{side}.camera.json") for side in ("left", "right")), "--landmarks",
-         str(tmp_path / "marks.landmarks.csv"), "--marks", str(tmp_path / "marks.csv"), "--origin", "40,-113,1280",
+         str(tmp_path / "marks.landmarks.csv"), "--marks", str(tmp_path / "marks.csv"), "--site", "40,-113,1280",
          "--pixel-sigma", str(solved["sigma"]), "-o", str(output)],
     )  # fmt: skip
     assert done.exit_code == 0, done.output

@@ -201,10 +201,10 @@ def test_the_command(tmp_path: Path) -> None:
     (tmp_path / "far.csv").write_text("\n".join(["left_u,left_v,right_u,right_v", *lines]))
     common = [
         "rig", *files, "--features", str(tmp_path / "far.csv"), "--baseline", "10.000±0.002", "--pixel-sigma", "0.1",
-        "--refraction", "0", "--refraction-sigma", "0",
+        "--refraction", "0±0",
     ]  # fmt: skip
     stars = ["--stars", str(tmp_path / "left"), str(tmp_path / "right"), "--json"]
-    place = ["--star-time", "name:Z", "--origin", f"{PLACE.lat},{PLACE.lon},{PLACE.height}", "--dut1", "0"]
+    place = ["--time", "name:Z", "--site", f"{PLACE.lat},{PLACE.lon},{PLACE.height}", "--dut1", "0"]
     for more in (place, []):
         done = CliRunner().invoke(app, [*common, *stars, *more, "-o", str(tmp_path / "rig.json")])
         assert done.exit_code == 0, done.output

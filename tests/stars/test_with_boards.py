@@ -289,7 +289,7 @@ def test_six_real_images(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     assert float(load_camera(camera).params[0]) == pytest.approx(5117, abs=3)
     picture = tmp_path / "named.png"
-    where = ["--lat", "52", "--lon", "4.37", "--picture", str(picture), "--json"]
+    where = ["--site", "52,4.37,0", "--picture", str(picture), "--json"]
     done = CliRunner().invoke(app, ["stars", str(REAL), "--camera", str(camera), *place, *where])
     assert done.exit_code == 0, done.output
     told = json.loads(done.stdout)["images"]
