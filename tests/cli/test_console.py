@@ -215,7 +215,7 @@ def test_a_missing_file_is_refused_before_torch_is_loaded(command: str, tmp_path
 
 ASSETS = Path(__file__).parents[2] / "assets"
 
-EXAMPLE = {"board": "9x6", "square": "25mm", "camera": "camera:0", "origin": "1,2,3", "heading": 4.0,
+EXAMPLE = {"board": "9x6", "square": "25mm", "source": "camera:0", "site": "1,2,3", "heading": 4.0,
            "pixel_sigma": 0.2, "require": "5km:10%", "baseline": 12.5}  # fmt: skip
 
 
@@ -243,7 +243,7 @@ def test_what_is_written_is_read(folder: Path) -> None:
 
 
 def test_odd_texts_survive(folder: Path) -> None:
-    odd = {"camera": 'C:\\"a"\n\t\x07é'}
+    odd = {"source": 'C:\\"a"\n\t\x07é'}
     Path("kcal.toml").write_text(toml_text(odd), encoding="utf-8")
     assert read_settings(folder) == odd
 
@@ -290,15 +290,15 @@ def test_commands_take_what_is_not_typed_and_say_so(folder: Path) -> None:
 
 
 def test_the_file_of_a_folder_above_is_used_and_named(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    Path("kcal.toml").write_text(toml_text({"board": "9x6", "square": "25mm", "camera": "frames"}))
+    Path("kcal.toml").write_text(toml_text({"board": "9x6", "square": "25mm", "source": "frames"}))
     Path("shots", "left").mkdir(parents=True)
     monkeypatch.chdir("shots/left")
     printed = kcal("board", "-o", "board.svg")
     assert "board.svg: 9x6 inner corners, 25 mm squares" in printed.stdout
     assert "from ../../kcal.toml: board 9x6, square 25mm\n" in printed.stderr
     # Folders are named from where the file is.
-    assert read_settings()["camera"] == "../../frames"
-    assert read_settings(folder)["camera"] == "frames"
+    assert read_settings()["source"] == "../../frames"
+    assert read_settings(folder)["source"] == "frames"
     # The nearest file alone counts.
     Path("../kcal.toml").write_text("bord = 1")
     with pytest.raises(FileError, match=r"^\.\./kcal\.toml: unknown key"):
@@ -313,7 +313,7 @@ def test_the_file_of_a_folder_above_is_used_and_named(folder: Path, monkeypatch:
 
 def test_the_position_of_a_rig_goes_before_that_of_the_folder(folder: Path) -> None:
     plain = kcal("locate", "rig.json", "points.csv").stdout
-    Path("kcal.toml").write_text(toml_text({"origin": "1,2,3", "heading": 4.0}))
+    Path("kcal.toml").write_text(toml_text({"site": "1,2,3", "heading": 4.0}))
     printed = kcal("locate", "rig.json", "points.csv")
     assert printed.stdout == plain
     assert "that in its file, not that in kcal.toml" in printed.stderr
