@@ -170,8 +170,8 @@ RIG = Wanted(
 # Where marks are of any number of cameras, `name,camera,u,v`.
 _STATION = (
     "kcal station {given} --landmarks survey.csv --marks marks.csv -o {name}.rig.json (several cameras: kcal rig; a "
-    "pose that you know: kcal place), then kcal locate {name}.rig.json {marks}, with --height 12±3 or --terrain dem.tif "
-    "for positions"
+    "pose that you know: kcal place), then kcal locate {name}.rig.json {marks}, with --height 12±3 or --terrain "
+    "dem.tif for positions"
 )
 CAMERA_OR_RIG = dataclasses.replace(
     ANY_CAMERA, words="a camera or rig file", kinds=frozenset({"camera", "rig", "foreign", "json", "unknown"})
