@@ -190,10 +190,10 @@ def run(name: str, *arguments: object) -> None:
         commands = {
             "detect": detect_command,
             "calibrate": calibrate_command,
-            "locate": declared(locate_command),
+            "locate": locate_command,
             "report": report_command,
         }
-        app.command(cls=Command)(declared(commands[name]) if name != "locate" else commands[name])  # type: ignore[arg-type,type-var]
+        app.command(cls=Command)(declared(commands[name]))  # type: ignore[arg-type]
     get_command(app).main(words, standalone_mode=False)
 
 

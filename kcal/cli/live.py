@@ -22,6 +22,8 @@ from kcal.files import check_writable
 from kcal.texts import measured_text
 
 if TYPE_CHECKING:
+    import datetime
+
     from kcal.lens.rig import Rig
     from kcal.locate.localizer import Localizer
     from kcal.locate.positions import Located
@@ -138,7 +140,7 @@ def live_command(
             tracker, run, output, log,
             senders=[sender_to(address) for address in to or []], start=start, shown=None,
         )  # fmt: skip
-        page = None if port is None else _live_map(stream.run, port, moment_zero)
+        page = None if port is None else _live_map(stream.run, port, start)
         stream.shown = _progress(advance, stream, page)
         if stream.ledger.place.sequence:
             err.print(f"continuing after {stream.ledger.place.sequence:,} moments of {log}", markup=False)

@@ -30,8 +30,8 @@ class Sources:
         landmarks: Surveyed places: CSV (name,lat,lon,height,sigma or name,east,north,up,sigma), GeoJSON, GPX.
         marks: Where they are in the images: name,left_u,left_v,right_u,right_v, or one line for each camera:
             name,camera,u,v.
-        features: Far things matched between the images: left_u,left_v,right_u,right_v and range,range_sigma or beyond
-            (meters), if known.
+        features: Distant points matched between the images: left_u,left_v,right_u,right_v and range,range_sigma or
+            beyond (meters), if known.
         positions: Measured camera positions (GNSS): as --landmarks, names left and right, or of files.
         baseline: Measured distance between the cameras, e.g. 10.02±0.005; of three and more mill:mast=812.4±0.1,...
         site: Origin of the local frame, where the first camera stands; the first surveyed place if not given.
