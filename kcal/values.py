@@ -160,11 +160,9 @@ def instant(text: str, name: str) -> datetime.datetime:
     try:
         time = datetime.datetime.fromisoformat(text.strip())
     except ValueError:
-        raise InputError(f"{name} {text!r}: write it like 2026-11-24T20:47:26Z") from None
+        raise InputError(f"{name} {text!r}: write it like 2026-05-01T12:00:00Z") from None
     if time.tzinfo is None:
-        raise InputError(
-            f"{name} {text!r} has no zone, and an hour is 15° of heading; end it with Z for UTC, or with +02:00"
-        )
+        raise InputError(f"{name} {text!r} has no zone: end it with Z for UTC, or with +02:00")
     return time.astimezone(datetime.UTC)
 
 
