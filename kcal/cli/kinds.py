@@ -125,20 +125,6 @@ def _read_origin(text: str, name: str) -> Origin:
 Site = Annotated["Origin", Kind(metavar="LAT,LON,HEIGHT", read=_read_origin)]
 
 
-def _read_needs(text: str, name: str) -> tuple[Requirement, ...]:
-    from kcal.report.verdict import Requirement
-
-    return Requirement.parse(text) if text else ()
-
-
-Requirements = Annotated[
-    tuple["Requirement", ...],
-    Kind(
-        metavar="RANGE:ERROR", read=_read_needs,
-        about="What you need: ranges and the largest σ of each, for example 5km:10% or 800m:20m,5km:10%.{}",
-    ),
-]  # fmt: skip
-
 # Boards. What a corner is refined by has the names of `kcal.corners.refine.Refinement`.
 
 

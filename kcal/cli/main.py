@@ -24,7 +24,6 @@ from kcal.cli.console import err, option_for_each, print_replaced, with_json, wo
 from kcal.cli.demo import demo_command
 from kcal.cli.detect import detect_command
 from kcal.cli.exchange import export_command, import_command, schema_command
-from kcal.cli.inputs import with_inputs
 from kcal.cli.live import live_command
 from kcal.cli.locate import locate_command
 from kcal.cli.mark import mark_command

@@ -41,7 +41,7 @@ def solve_command(
     *,
     output: kinds.Output,
     sources: Sources,
-    require: kinds.Requirements | None = None,
+    require: kinds.Needs | None = None,
     report: Path | None = None,
     intrinsics: Rare[Literal["prior", "fixed", "free"]] = "prior",
     reject: Rare[bool] = True,
@@ -89,7 +89,8 @@ def solve_command(
         right: Camera file of the right camera.
         others: More cameras; each is named by its file, up to the first dot.
         output: Rig file to write.
-        require: Exit code 3 if it is not met.
+        require: What you need: ranges and the largest σ of each, for example 5km:10% or 800m:20m,5km:10%. Exit code 3
+            if it is not met.
         report: HTML page to write: may it be used, and why not.
         intrinsics: Refine the cameras within what their calibrations know, hold them as if they were exact, or let
             them free.
