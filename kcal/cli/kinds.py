@@ -29,7 +29,6 @@ Seconds = Annotated[float, Kind(metavar="S", least=0)]
 Celsius = Annotated[float, Kind(metavar="°C")]
 Hectopascal = Annotated[float, Kind(metavar="HPA")]
 Millimeters = Annotated[float, Kind(metavar="MM")]
-Port = Annotated[int, Kind(metavar="PORT", least=0, about="Of the local address; 0 for any that is free.")]
 LeastMeters = Annotated[float, Kind(metavar="M", least=1e-3)]
 Count = Annotated[int, Kind(metavar="N", least=1)]
 PixelSigma = Annotated[
@@ -57,6 +56,17 @@ Clock = Annotated[float, Kind(metavar="S")]
 Distance = Annotated[float, Kind(metavar="DISTANCE", read=values.distance)]
 Distances = Annotated[tuple[float, ...], Kind(metavar="M,M,...", read=values.number_list)]
 Size = Annotated[tuple[int, int], Kind(metavar="WIDTHxHEIGHT", read=values.size)]
+
+
+def _read_port(text: str, name: str) -> int:
+    if not (text.isascii() and text.isdigit() and int(text) <= 65535):
+        raise InputError(f"{name} {text}: a port is a number from 0 to 65535")
+    return int(text)
+
+
+Port = Annotated[
+    int, Kind(metavar="PORT", read=_read_port, usage=True, about="Of the local address; 0 for any that is free.")
+]
 
 
 def _read_area(text: str, name: str) -> tuple[float, ...]:

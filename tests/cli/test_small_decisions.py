@@ -78,6 +78,13 @@ class TestMark:
         return CliRunner().invoke(app, words, env={"COLUMNS": "40"})
 
     @pytest.mark.usefixtures("folder")
+    @pytest.mark.parametrize("port", ["70000", "-1", "x"])
+    def test_a_port_that_cannot_be_is_wrong_usage(self, port: str) -> None:
+        found = self.marking("--port", port)
+        assert found.exit_code == 2
+        assert "0 to 65535" in " ".join(found.output.replace("│", " ").split())
+
+    @pytest.mark.usefixtures("folder")
     def test_what_goes_together(self) -> None:
         """A rig or its cameras, not both; old marks with the images that they are in."""
         cameras, rig = ["--cameras", "l.json", "r.json"], ["--rig", "rig.json"]
